@@ -10,7 +10,7 @@ from pydrake.multibody.tree import BodyIndex, ModelInstanceIndex
 
 from drake_pose.body.formats.parsing import ModelSource
 from drake_pose.body.limits import Positions
-from drake_pose.body.surfaces.mesh import TriangleMesh
+from drake_pose.body.surfaces.meshes import TriangleMesh
 from drake_pose.body.surfaces.skin_file import SkinBand
 from drake_pose.body.surfaces.visual_geometry import make_drawable
 from drake_pose.errors import UnknownNameError

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from drake_pose.body.formats.parsing import limit_kinds
 from drake_pose.body.model import ArticulatedModel, load_model
-from drake_pose.body.surfaces.mesh import TriangleMesh, is_watertight
+from drake_pose.body.surfaces.meshes import TriangleMesh, is_watertight
 from drake_pose.body.tree.link_graph import build_link_graph
 from drake_pose.body.tree.pose_tree import PoseTree, PoseTreeNode
 from drake_pose.errors import DrakePoseError

@@ -10,8 +10,14 @@ from typing import Any
 import numpy as np
 import yaml
 
-from drake_pose.camera.checks import check_number, check_pose, write_file
-from drake_pose.camera.models import Camera, ParallelCamera, PinholeCamera
+from drake_pose.camera.models import (
+    Camera,
+    ParallelCamera,
+    PinholeCamera,
+    check_number,
+    check_pose,
+    write_file,
+)
 from drake_pose.errors import CameraError
 from drake_pose.yaml_files import read_yaml
 

@@ -24,8 +24,7 @@ from pydrake.geometry import (
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.sensors import CameraConfig, CameraInfo
 
-from drake_pose.camera.checks import write_file
-from drake_pose.camera.models import Camera, PinholeCamera
+from drake_pose.camera.models import Camera, PinholeCamera, write_file
 from drake_pose.errors import CameraError
 
 # What yaml_load_typed raises, and some values of CameraConfig end a process that does not ask.

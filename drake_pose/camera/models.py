@@ -1,14 +1,116 @@
-"""The two cameras: pinhole, and the parallel projection of Kameda's experiments."""
+"""The two cameras, pinhole and parallel (Kameda), what they may be, and ready rigs of several."""
 
 from __future__ import annotations
 
 import dataclasses
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TypeVar
+from pathlib import Path
+from typing import Any, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
-from drake_pose.camera.checks import check_number, check_pose, check_side
+from drake_pose.errors import CameraError
+
+LARGEST_SIDE = 16384
+"""The largest supported width or height [pixel]."""
+
+_ROTATION_TOLERANCE = 1e-4
+_EXACT_ROTATION = 1e-13
+
+
+def check_side(value: Any, field: str, where: str) -> int:
+    """A width or height [pixel], a whole number from 1 to LARGEST_SIDE, or CameraError."""
+    number = check_number(value, field, where)
+    if number != math.floor(number) or not 1 <= number <= LARGEST_SIDE:
+        raise CameraError(
+            f"{where}: {field} must be a whole number of pixels from 1 to {LARGEST_SIDE}, "
+            f"not {value!r}"
+        )
+    return int(number)
+
+
+def check_number(value: Any, field: str, where: str, *, positive: bool = False) -> float:
+    """A finite (and on request positive) number as a float, or CameraError.
+
+    YAML 1.1 reads ``1e-3`` as text, so text that spells a number is accepted.
+    """
+    try:
+        if isinstance(value, bool) or not isinstance(
+            value, int | float | str | np.integer | np.floating
+        ):
+            raise ValueError
+        number = float(value)
+        if not math.isfinite(number) or (positive and number <= 0.0):
+            raise ValueError
+    except (ValueError, OverflowError):
+        kind = "a finite positive number" if positive else "a finite number"
+        raise CameraError(f"{where}: {field} must be {kind}, not {_short(value)}") from None
+    return number
+
+
+def check_pose(value: Any, field: str, where: str) -> np.ndarray:
+    """A rigid transform as a read-only (4, 4) float64 array.
+
+    A rounded rotation is replaced by the nearest exact one, on which Drake insists.
+
+    Raises CameraError: not a finite 4 x 4 matrix, a last row that is not 0 0 0 1, or no rotation.
+    """
+    rows = value.tolist() if isinstance(value, np.ndarray) else value
+    if not (
+        isinstance(rows, list | tuple)
+        and [len(row) if isinstance(row, list | tuple) else 0 for row in rows] == [4] * 4
+    ):
+        raise CameraError(
+            f"{where}: {field} must be a 4 x 4 matrix of numbers, not {_short(value)}"
+        )
+    if isinstance(value, np.ndarray) and value.dtype.kind in "fiu":
+        matrix = np.array(value, dtype=np.float64)
+    else:
+        matrix = np.array([[check_number(entry, field, where) for entry in row] for row in rows])
+    if not np.all(np.isfinite(matrix)):
+        raise CameraError(f"{where}: {field} has entries that are not finite")
+    if not np.allclose(matrix[3], [0.0, 0.0, 0.0, 1.0], rtol=0.0, atol=1e-12):
+        raise CameraError(f"{where}: the last row of {field} must be 0 0 0 1")
+    R = matrix[:3, :3]
+    with np.errstate(over="ignore", invalid="ignore"):
+        deviation = np.abs(R @ R.T - np.eye(3)).max()
+    if not deviation <= _ROTATION_TOLERANCE:
+        raise CameraError(
+            f"{where}: the upper left 3 x 3 block of {field} is not a rotation (R R^T differs from "
+            f"the identity by {deviation:.3g}); its columns must be the camera's axes in the world"
+        )
+    if np.linalg.det(R) < 0.0:
+        raise CameraError(
+            f"{where}: the upper left 3 x 3 block of {field} is a reflection, not a rotation; "
+            "a camera's axes are x right, y down, z forward"
+        )
+    if deviation > _EXACT_ROTATION:
+        U, _, Vt = np.linalg.svd(R)
+        matrix[:3, :3] = U @ Vt
+    matrix[3] = [0.0, 0.0, 0.0, 1.0]
+    matrix.flags.writeable = False
+    return matrix
+
+
+def write_file(path: str | Path, text: str, what: str) -> None:
+    """Writes a text; CameraError, which says what it holds, where that cannot be."""
+    try:
+        Path(path).write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise CameraError(f"{path}: cannot write {what}: {error.strerror}") from error
+
+
+def _short(value: Any) -> str:
+    """A value as text that cannot flood a message."""
+    if isinstance(value, dict | list | tuple | set):
+        return f"a {type(value).__name__} of {len(value)}"
+    if isinstance(value, np.ndarray):
+        return f"an array of shape {value.shape}"
+    text = repr(value)
+    return text if len(text) <= 40 else text[:37] + "..."
 
 
 class _PosedCamera:
@@ -139,3 +241,80 @@ def inverse_pose(X_AB: np.ndarray) -> np.ndarray:
     X_BA[:3, :3] = X_AB[:3, :3].T
     X_BA[:3, 3] = -X_AB[:3, :3].T @ X_AB[:3, 3]
     return X_BA
+
+
+Array = NDArray[np.float64]
+
+FACE_CAMERA = "face"
+"""The name of the camera that looks at the face."""
+
+# As high as a grown person's face; a narrow view, for the face should fill the picture.
+_FACE_HEIGHT, _FACE_VIEW = 1.6, math.radians(22.0)
+
+
+def circle_of_cameras(
+    count: int = 8,
+    *,
+    radius: float = 3.0,
+    height: float = 1.3,
+    target: Sequence[float] = (0.0, 0.0, 0.95),
+    field_of_view: float = math.radians(46.0),
+    size: tuple[int, int] = (640, 480),
+    face_camera: bool = True,
+) -> dict[str, PinholeCamera]:
+    """Cameras evenly on a circle that look at its middle, and one that looks at the face.
+
+    Date et al. (figure 1) have eight "horizontal" cameras about 45 degrees apart and one for the
+    face. The world's z is up; a person in the middle who faces +x looks into the face camera.
+
+    Args:
+        count: cameras on the circle, camera_0, camera_1 ... counterclockwise from above; the x axis
+            lies half-way between the last and the first.
+        radius, height: where the cameras of the circle are [m].
+        target: (3,) the point they look at [m].
+        field_of_view: of a camera on the circle, upright [rad].
+        size: width and height of the pictures [pixel].
+
+    Raises CameraError when there is no camera, or a number is out of its range.
+    """
+    if count < 1 and not face_camera:
+        raise CameraError("a rig needs at least one camera")
+    if not (0.0 < radius < math.inf and 0.0 < field_of_view < math.pi):
+        raise CameraError("a rig's radius must be positive, its field of view below 180 degrees")
+    cameras = {}
+    for k in range(count):
+        angle = 2.0 * math.pi * (k + 0.5) / count
+        eye = [radius * math.cos(angle), radius * math.sin(angle), height]
+        name = f"camera_{k}"
+        cameras[name] = _camera(name, look_at(eye, target), field_of_view, size)
+    if face_camera:
+        face = [target[0], target[1], _FACE_HEIGHT]
+        eye = [target[0] + radius, target[1], _FACE_HEIGHT]
+        cameras[FACE_CAMERA] = _camera(FACE_CAMERA, look_at(eye, face), _FACE_VIEW, size)
+    return cameras
+
+
+def look_at(
+    eye: Sequence[float] | Array, target: Sequence[float] | Array, up: Sequence[float] = (0, 0, 1)
+) -> Array:
+    """The pose X_WC (4, 4) of a camera at `eye` (3,) that looks at `target` (3,) [m].
+
+    Raises CameraError when both points coincide, or the camera looks along `up`.
+    """
+    forward = np.asarray(target, dtype=np.float64) - np.asarray(eye, dtype=np.float64)
+    right = np.cross(forward, np.asarray(up, dtype=np.float64))
+    if not np.linalg.norm(right) > 1e-9 * np.linalg.norm(forward):
+        raise CameraError(f"a camera at {list(eye)} cannot look at {list(target)} with {up} up")
+    forward /= np.linalg.norm(forward)
+    right /= np.linalg.norm(right)
+    X_WC = np.eye(4)
+    X_WC[:3, :3] = np.column_stack([right, np.cross(forward, right), forward])
+    X_WC[:3, 3] = eye
+    return X_WC
+
+
+def _camera(name: str, X_WC: Array, field_of_view: float, size: tuple[int, int]) -> PinholeCamera:
+    width, height = size
+    focal = 0.5 * height / math.tan(0.5 * field_of_view)
+    center = 0.5 * (width - 1), 0.5 * (height - 1)
+    return PinholeCamera(name, width, height, focal, focal, *center, X_WC)

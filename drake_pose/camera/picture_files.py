@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_pose.camera.checks import LARGEST_SIDE
+from drake_pose.camera.models import LARGEST_SIDE
 from drake_pose.errors import DrakePoseError
 from drake_pose.regular_files import read_regular
 
@@ -32,26 +32,52 @@ def read_picture(path: Path, error_type: type[DrakePoseError]) -> Picture:
     return np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB), dtype=np.uint8)
 
 
-def read_person_mask(path: Path, error_type: type[DrakePoseError]) -> Mask:
-    """Reads a PNG or JPEG picture of a mask (H, W), which may be empty; the error names the file.
+def read_two_colours(
+    path: Path,
+    error_type: type[DrakePoseError],
+    size: tuple[int | None, int | None] = (None, None),
+    *,
+    may_be_empty: bool = False,
+    lossy: bool = False,
+) -> Mask:
+    """Reads a mask (H, W): a PNG picture of black and one other colour, the object.
 
-    A PNG is black and one other colour; a JPEG, whose values its compression blurs, dark and light.
+    Args:
+        size: width and height that it must have [pixel]; None: any.
+        may_be_empty: whether a picture that shows nothing is as good as any.
+        lossy: whether a JPEG, whose values its compression blurs, will do: dark, and light.
+
+    The error names the file; when it cannot be read, is damaged, of another size, empty or full, or
+    has more than two values.
     """
-    data = read_picture_file(path, error_type)
+    data = read_picture_file(path, error_type, only_png=not lossy)
     picture = decode_picture(data, cv2.IMREAD_UNCHANGED, path, error_type)
-    if picture.ndim == 3 and picture.shape[2] == 4 and np.ptp(picture[:, :, 3]) == 0:
-        picture = np.ascontiguousarray(picture[:, :, :3])  # An alpha channel that says nothing.
+    found = picture.shape[1], picture.shape[0]
+    expected = size[0] or found[0], size[1] or found[1]
+    if found != expected:
+        raise error_type(
+            f"{path}: the mask has {found[0]} x {found[1]} pixels (width x height), but its camera "
+            f"has {expected[0]} x {expected[1]}"
+        )
+    layers = picture[:, :, None] if picture.ndim == 2 else picture
+    if layers.shape[2] == 4 and (layers[:, :, 3] == layers[0, 0, 3]).all():
+        layers = layers[:, :, :3]  # an alpha channel that says nothing
+    elif layers.shape[2] == 4 and (layers[:, :, :3] == layers[0, 0, :3]).all():
+        layers = layers[:, :, 3:]  # one that says all
     if data.startswith(_JPEG):
-        mask = mask_of_picture(picture)
+        mask, is_one_colour = mask_of_picture(picture), True
     else:
-        mask, is_one_colour = split_colours(picture)
-        if not is_one_colour:
-            raise error_type(
-                f"{path}: has more than two values, but a mask is black, and one other colour on "
-                "the person; threshold it, or give a background instead of masks"
-            )
+        mask, is_one_colour = _split_colours(np.ascontiguousarray(layers))
     if mask.all():
         raise error_type(f"{path}: the mask is full (no black pixel): no background to be seen")
+    if not (may_be_empty or mask.any()):
+        raise error_type(f"{path}: the mask is empty (all black): no object to be seen")
+    if not is_one_colour:
+        values = len(np.unique(layers.reshape(-1, layers.shape[2]), axis=0))
+        raise error_type(
+            f"{path}: the mask has {values} values, but must have two: black, and one other on the "
+            "object; threshold it first (or give a camera's source a background instead of masks)"
+        )
     return np.asarray(mask, dtype=np.bool_)
 
 
@@ -66,7 +92,7 @@ def list_pictures(folder: Path, error_type: type[DrakePoseError]) -> dict[str, P
     return files
 
 
-def split_colours(picture: NDArray[np.integer]) -> tuple[Mask, bool]:
+def _split_colours(picture: NDArray[np.integer]) -> tuple[Mask, bool]:
     """Where a picture (H, W) or (H, W, channels) is not black, and if that is all of one colour."""
     mask = cv2.inRange(picture, (0, 0, 0, 0), (0, 0, 0, 0)) == 0
     first = np.atleast_1d(picture[np.unravel_index(mask.argmax(), mask.shape)])
@@ -81,26 +107,19 @@ def mask_of_picture(picture: Picture) -> Mask:
     return np.asarray(grey >= _HALF, dtype=np.bool_)
 
 
-def read_picture_file(path: Path, error_type: type[DrakePoseError]) -> bytes:
+def read_picture_file(
+    path: Path, error_type: type[DrakePoseError], *, only_png: bool = False
+) -> bytes:
     """A whole PNG or JPEG file's content, as far as its frame tells; the error names the file."""
     try:
         data = read_regular(path)
     except OSError as error:
         raise error_type(f"{path}: cannot read the picture: {error.strerror}") from error
-    if data.startswith(_JPEG):
+    if data.startswith(_JPEG) and not only_png:
         if not data.rstrip(b"\0").endswith(_JPEG_END):
             raise error_type(f"{path}: the JPEG picture is cut short")
         return data
-    if max(check_png(data, path, error_type)) > LARGEST_SIDE:
-        raise error_type(f"{path}: has more than {LARGEST_SIDE} pixels a side")
-    return data
-
-
-def check_png(data: bytes, path: Path, error_type: type[DrakePoseError]) -> tuple[int, int]:
-    """A PNG picture's width and height; the error names a file that is cut short or damaged.
-
-    OpenCV's decoders differ from version to version in what they make of half a picture.
-    """
+    # OpenCV's decoders differ from version to version in what they make of half a picture.
     if not data.startswith(_PNG):
         raise error_type(f"{path}: not a PNG picture")
     position, kind = len(_PNG), b""
@@ -116,7 +135,11 @@ def check_png(data: bytes, path: Path, error_type: type[DrakePoseError]) -> tupl
             raise error_type(f"{path}: the PNG picture is damaged")
         position = begin + length + 4
     width, height = struct.unpack(">II", data[16:24])
-    return width, height
+    if max(width, height) > LARGEST_SIDE:
+        raise error_type(
+            f"{path}: {width} x {height} pixels are too many: at most {LARGEST_SIDE} a side"
+        )
+    return data
 
 
 def decode_picture(data: bytes, how: int, path: Path, error_type: type[DrakePoseError]) -> Picture:

@@ -125,7 +125,7 @@ def undistort(
         lenses: The lens file that calibrate wrote.
         out: Folder for the pictures.
     """
-    from drake_pose.camera.calibration.lens import load_lenses
+    from drake_pose.camera.calibration.rig import load_lenses
     from drake_pose.jobs.calibrate import undistort_pictures
 
     written = undistort_pictures(folder, load_lenses(lenses), out)

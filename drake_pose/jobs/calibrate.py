@@ -21,7 +21,7 @@ from drake_pose.camera.calibration.board import (
     read_board_picture,
 )
 from drake_pose.camera.calibration.calibrate import Calibration, CalibrationSettings, calibrate
-from drake_pose.camera.calibration.lens import Lens, save_lenses
+from drake_pose.camera.calibration.rig import Lens, save_lenses
 from drake_pose.camera.camera_files import save_cameras
 from drake_pose.errors import CameraError, OutputError
 

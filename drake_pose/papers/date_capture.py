@@ -17,8 +17,7 @@ from pydrake.systems.sensors import ImageRgba8U
 
 from drake_pose.body.formats.packages import bundled_model
 from drake_pose.body.model import ArticulatedModel, load_model
-from drake_pose.camera.models import Camera, PinholeCamera
-from drake_pose.camera.rigs import FACE_CAMERA, circle_of_cameras
+from drake_pose.camera.models import FACE_CAMERA, Camera, PinholeCamera, circle_of_cameras
 from drake_pose.errors import SettingsError
 from drake_pose.fit.contour_fit import ContourFit
 from drake_pose.person.date.capture import CaptureSetup, PersonView, see_person

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from drake_pose.body.model import OBJECT_POSITIONS
-from drake_pose.body.tree.joint_map import inverse_transforms
+from drake_pose.body.tree.link_graph import inverse_transforms
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import RegistrationError
 from drake_pose.fit.levenberg_marquardt import AnnealingStage

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from drake_pose.body.model import OBJECT, OBJECT_POSITIONS, ArticulatedModel
-from drake_pose.body.surfaces.mesh import TriangleMesh, join_meshes
-from drake_pose.body.tree.joint_map import inverse_transforms
+from drake_pose.body.surfaces.meshes import TriangleMesh, join_meshes
+from drake_pose.body.tree.link_graph import inverse_transforms
 from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.body.tree.root import RootRotation
 from drake_pose.body.tree.tree_kinematics import TreeKinematics

@@ -27,8 +27,8 @@ from drake_pose.fit.surfaces import VERY_FEW, few_triangles
 from drake_pose.silhouette.areas.bending import TreeSurfaces
 from drake_pose.silhouette.areas.outline import Outline
 from drake_pose.silhouette.areas.scoring import draw_mask
-from drake_pose.silhouette.pictures.mask_agreement import intersection_over_union
-from drake_pose.silhouette.segmentation.background_beside import tell_from_background
+from drake_pose.silhouette.pictures.masks import intersection_over_union
+from drake_pose.silhouette.segmentation.background import tell_from_background
 from drake_pose.silhouette.segmentation.grab_cut import cut
 
 Array = NDArray[np.float64]

@@ -20,7 +20,7 @@ import yaml
 from drake_pose.body.formats.packages import bundled_model
 from drake_pose.body.model import load_model
 from drake_pose.camera.camera_files import save_cameras
-from drake_pose.camera.rigs import FACE_CAMERA
+from drake_pose.camera.models import FACE_CAMERA
 from drake_pose.files.settings import EstimateSettings
 from drake_pose.jobs.batch.batch import run_batch
 from drake_pose.jobs.batch.job import SceneJob

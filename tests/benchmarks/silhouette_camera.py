@@ -18,8 +18,7 @@ from drake_pose.body.formats.packages import bundled_model
 from drake_pose.body.model import load_model
 from drake_pose.body.parsed_model import ParsedModel
 from drake_pose.camera.drake import camera_to_drake
-from drake_pose.camera.models import PinholeCamera
-from drake_pose.camera.rigs import look_at
+from drake_pose.camera.models import PinholeCamera, look_at
 from drake_pose.silhouette.pictures.label_images import EMPTY, label_data
 from drake_pose.systems.pictures.silhouette_camera import SilhouetteCamera
 from tests.benchmarks.speed import limb_mesh, write_limb

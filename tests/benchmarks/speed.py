@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from drake_pose.body.formats.packages import bundled_model
 from drake_pose.body.model import load_model
-from drake_pose.body.surfaces.mesh import TriangleMesh
+from drake_pose.body.surfaces.meshes import TriangleMesh
 from drake_pose.camera.models import ParallelCamera, PinholeCamera
 from drake_pose.papers.date_capture import SilhouetteTrack, Studio
 from drake_pose.papers.kameda import experiment_camera, experiment_search, run_experiment

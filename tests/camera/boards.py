@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from drake_pose.camera.calibration.board import Board, BoardDetections, Detection
-from drake_pose.camera.rigs import look_at
+from drake_pose.camera.models import look_at
 
 CHECKERBOARD = Board("checkerboard", 8, 5, 0.12)
 CHARUCO = Board("charuco", 8, 5, 0.12, marker_length=0.09, dictionary="4X4_50")

@@ -14,8 +14,7 @@ from drake_pose.camera.drake import (
     dump_scenario,
     save_scenario,
 )
-from drake_pose.camera.models import ParallelCamera, PinholeCamera
-from drake_pose.camera.rigs import circle_of_cameras
+from drake_pose.camera.models import ParallelCamera, PinholeCamera, circle_of_cameras
 from drake_pose.errors import CameraError
 
 FRONT = """

@@ -7,8 +7,13 @@ from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.systems.sensors import CameraInfo
 
 from drake_pose.camera.drake import camera_from_drake, camera_to_drake
-from drake_pose.camera.models import Camera, ParallelCamera, PinholeCamera
-from drake_pose.camera.rigs import FACE_CAMERA, circle_of_cameras
+from drake_pose.camera.models import (
+    FACE_CAMERA,
+    Camera,
+    ParallelCamera,
+    PinholeCamera,
+    circle_of_cameras,
+)
 from drake_pose.errors import CameraError
 
 

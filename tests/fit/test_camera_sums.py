@@ -5,7 +5,7 @@ import pytest
 
 from drake_pose.body.formats.packages import bundled_model
 from drake_pose.body.model import load_model
-from drake_pose.camera.rigs import circle_of_cameras
+from drake_pose.camera.models import circle_of_cameras
 from drake_pose.fit.camera_sums import (
     SumRequest,
     Views,

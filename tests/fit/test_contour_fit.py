@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from drake_pose.camera.rigs import circle_of_cameras
+from drake_pose.camera.models import circle_of_cameras
 from drake_pose.fit.contour_fit import ContourFit, Prior, pack_views
 from drake_pose.fit.evidence import find_edge_points
 from drake_pose.fit.kernel import collect, nearest_alike

@@ -6,8 +6,7 @@ import pytest
 from drake_pose.body.formats.packages import bundled_model
 from drake_pose.body.model import load_model
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
-from drake_pose.camera.models import ParallelCamera, PinholeCamera
-from drake_pose.camera.rigs import circle_of_cameras
+from drake_pose.camera.models import ParallelCamera, PinholeCamera, circle_of_cameras
 from drake_pose.fit.parameters import CAMERA_NAMES, BodyParameters, CameraParameters
 from drake_pose.fit.surfaces import VERY_FEW, few_triangles
 from drake_pose.silhouette.areas.bending import TreeSurfaces

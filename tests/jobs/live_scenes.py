@@ -10,7 +10,7 @@ import yaml
 
 from drake_pose.body.model import ArticulatedModel
 from drake_pose.camera.camera_files import save_cameras
-from drake_pose.camera.rigs import circle_of_cameras
+from drake_pose.camera.models import circle_of_cameras
 from drake_pose.systems.pictures.camera_rig import build_camera_rig
 
 SIZE = (240, 180)

@@ -10,7 +10,7 @@ import numpy as np
 from drake_pose.body.formats.packages import bundled_model
 from drake_pose.body.model import ArticulatedModel, load_model
 from drake_pose.camera.camera_files import save_cameras
-from drake_pose.camera.rigs import circle_of_cameras
+from drake_pose.camera.models import circle_of_cameras
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from drake_pose.silhouette.pictures.masks import write_mask
 

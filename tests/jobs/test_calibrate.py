@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from drake_pose.camera.calibration.calibrate import CalibrationSettings
-from drake_pose.camera.calibration.lens import load_lenses
+from drake_pose.camera.calibration.rig import load_lenses
 from drake_pose.camera.camera_files import load_cameras
 from drake_pose.errors import CameraError, UnknownNameError
 from drake_pose.jobs.calibrate import calibrate_folder, undistort_pictures

@@ -6,7 +6,7 @@ import numpy as np
 
 from drake_pose.body.formats.packages import bundled_model
 from drake_pose.body.model import load_model
-from drake_pose.camera.rigs import FACE_CAMERA, circle_of_cameras
+from drake_pose.camera.models import FACE_CAMERA, circle_of_cameras
 from drake_pose.person.date.capture import see_person
 from drake_pose.person.date.faces import cut_face, learn_faces
 from drake_pose.person.date.features import SkinColour, find_features

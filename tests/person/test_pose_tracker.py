@@ -5,7 +5,7 @@ import pytest
 
 from drake_pose.body.formats.packages import bundled_model
 from drake_pose.body.model import load_model
-from drake_pose.camera.rigs import circle_of_cameras
+from drake_pose.camera.models import circle_of_cameras
 from drake_pose.errors import ModelError, SettingsError
 from drake_pose.fit.contour_fit import ContourFit
 from drake_pose.person.body_plan import crowding

@@ -5,8 +5,8 @@ import pytest
 
 from drake_pose.body.formats.packages import bundled_model
 from drake_pose.body.model import load_model
-from drake_pose.body.surfaces.mesh import TriangleMesh
-from drake_pose.camera.rigs import circle_of_cameras
+from drake_pose.body.surfaces.meshes import TriangleMesh
+from drake_pose.camera.models import circle_of_cameras
 from drake_pose.fit.contour_fit import ContourFit, pack_views
 from drake_pose.fit.evidence import find_edge_points
 from drake_pose.fit.levenberg_marquardt import AnnealingStage

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from drake_pose.body.model import load_model
-from drake_pose.body.surfaces.mesh import TriangleMesh
+from drake_pose.body.surfaces.meshes import TriangleMesh
 from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.camera.models import Camera, PinholeCamera
 from drake_pose.search.estimates import View

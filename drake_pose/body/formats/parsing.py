@@ -17,7 +17,7 @@ from pydrake.multibody.tree import ModelInstanceIndex
 from drake_pose.body.formats.link_files import Limits, cure_sdf, cure_urdf
 from drake_pose.body.formats.mjcf import cure_mjcf
 from drake_pose.body.formats.packages import FileFinder
-from drake_pose.body.surfaces.mesh_files import workspace
+from drake_pose.body.surfaces.meshes import workspace
 from drake_pose.errors import ModelError
 
 # What Drake's parser calls each kind of file.

@@ -12,8 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_pose.body.surfaces.mesh import TriangleMesh, is_watertight
-from drake_pose.body.surfaces.mesh_files import read_mesh_file
+from drake_pose.body.surfaces.meshes import TriangleMesh, is_watertight, read_mesh_file
 from drake_pose.errors import ModelError, UnknownNameError
 from drake_pose.yaml_files import read_yaml
 

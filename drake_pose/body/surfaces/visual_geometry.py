@@ -29,8 +29,14 @@ from pydrake.geometry import (
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import ModelInstanceIndex, RigidBody
 
-from drake_pose.body.surfaces.mesh import TriangleMesh, join_meshes, merge_duplicate_vertices
-from drake_pose.body.surfaces.mesh_files import drawable_file, is_drawn_by_drake, read_mesh_file
+from drake_pose.body.surfaces.meshes import (
+    TriangleMesh,
+    drawable_file,
+    is_drawn_by_drake,
+    join_meshes,
+    merge_duplicate_vertices,
+    read_mesh_file,
+)
 from drake_pose.errors import ModelError
 
 _VTK_RESOLUTION = 50

@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.multibody.tree import Joint, RigidBody
 
-from drake_pose.body.tree.joint_map import chain_transforms
-from drake_pose.body.tree.link_graph import PlantKinematics
+from drake_pose.body.tree.link_graph import PlantKinematics, chain_transforms
 from drake_pose.body.tree.pose_tree import PoseTree
 
 Array = NDArray[np.float64]

@@ -15,10 +15,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_pose.body.parsed_model import ParsedModel
-from drake_pose.body.surfaces.mesh import TriangleMesh
+from drake_pose.body.surfaces.meshes import TriangleMesh
 from drake_pose.body.surfaces.skin_file import SkinBand, skin_file
-from drake_pose.body.tree.joint_map import ChainStep, chain_transforms, inverse_transforms
-from drake_pose.body.tree.link_graph import LinkGraph, PlantKinematics, build_link_graph
+from drake_pose.body.tree.link_graph import (
+    ChainStep,
+    LinkGraph,
+    PlantKinematics,
+    build_link_graph,
+    chain_transforms,
+    inverse_transforms,
+)
 from drake_pose.errors import ModelError, SettingsError
 
 if TYPE_CHECKING:

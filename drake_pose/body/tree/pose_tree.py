@@ -15,12 +15,10 @@ from numpy.typing import NDArray
 
 from drake_pose.body.limits import one_turn, turns_around
 from drake_pose.body.parsed_model import ParsedModel
-from drake_pose.body.surfaces.mesh import TriangleMesh
-from drake_pose.body.tree.base_pose import BasePose
-from drake_pose.body.tree.joint_map import ChainStep, chain_transforms
-from drake_pose.body.tree.link_graph import PlantKinematics
+from drake_pose.body.surfaces.meshes import TriangleMesh
+from drake_pose.body.tree.link_graph import ChainStep, PlantKinematics, chain_transforms
 from drake_pose.body.tree.node_skin import NodeSkin
-from drake_pose.body.tree.root import RootRotation, even_rotations
+from drake_pose.body.tree.root import BasePose, RootRotation, even_rotations
 from drake_pose.errors import SettingsError, UnknownNameError
 
 DEFAULT_LENGTH_INTERVAL = 0.05

@@ -7,12 +7,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_pose.body.parsed_model import ParsedModel
-from drake_pose.body.tree.base_pose import BasePose, base_of_chain
-from drake_pose.body.tree.joint_map import ChainStep, chain_transforms
-from drake_pose.body.tree.link_graph import JointEdge, LinkGraph, PlantKinematics, build_link_graph
+from drake_pose.body.tree.link_graph import (
+    ChainStep,
+    JointEdge,
+    LinkGraph,
+    PlantKinematics,
+    build_link_graph,
+    chain_transforms,
+)
 from drake_pose.body.tree.node_skin import find_skin, require_placed
 from drake_pose.body.tree.pose_tree import NodePlacement, PoseTree, PoseTreeNode, place_node
-from drake_pose.body.tree.root import RootRotation
+from drake_pose.body.tree.root import BasePose, RootRotation, base_of_chain
 from drake_pose.errors import ModelError, SettingsError, UnknownNameError
 
 Array = NDArray[np.float64]

@@ -16,7 +16,7 @@ import numpy as np
 
 from drake_pose.body.limits import nearest_turn
 from drake_pose.body.tree.joint_kernel import PackedSteps, find_joint, pack_steps
-from drake_pose.body.tree.joint_map import ChainStep, JointMap
+from drake_pose.body.tree.link_graph import ChainStep, JointMap
 from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.compiled import compiled, multiply
 from drake_pose.errors import SettingsError

@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_pose.camera.checks import check_number
+from drake_pose.camera.models import check_number
 from drake_pose.camera.picture_files import decode_picture, list_pictures
 from drake_pose.errors import CameraError
 from drake_pose.regular_files import read_regular

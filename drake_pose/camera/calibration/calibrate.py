@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_pose.camera.calibration.board import BoardDetections, Detection, Picture
-from drake_pose.camera.calibration.lens import Lens
 from drake_pose.camera.calibration.rig import (
     FREE_COEFFICIENTS,
+    Lens,
     Rig,
     adjust_rig,
     chain_rig,

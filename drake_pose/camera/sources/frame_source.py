@@ -9,9 +9,11 @@ import abc
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from drake_pose.camera.picture_files import Mask, Picture, mask_of_picture
 from drake_pose.errors import SettingsError
@@ -68,12 +70,12 @@ class SourceSpecification:
         """Whether the source delivers masks of the person instead of pictures."""
         return self.background is None
 
-    def seen(self, picture: Picture) -> Picture | Mask:
+    def seen(self, picture: NDArray[Any]) -> Picture | Mask:
         """The picture red, green, blue, or the mask, of one (H, W, 3) blue, green, red."""
         rgb = np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB), dtype=np.uint8)
         return mask_of_picture(rgb) if self.gives_masks else rgb
 
-    def wrong_size(self, picture: Picture | Mask) -> str:
+    def wrong_size(self, picture: NDArray[Any]) -> str:
         """What is wrong with a picture's size; "" where it is the calibrated one."""
         height, width = picture.shape[:2]
         if (width, height) == (self.width, self.height):

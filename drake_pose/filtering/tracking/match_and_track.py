@@ -17,7 +17,7 @@ from drake_pose.filtering.tracking.contour_tracker import ContourTracker, Track,
 from drake_pose.fit.colours import Picture
 from drake_pose.search.estimates import TRACKED, UNEXPLAINED, PoseEstimate, View
 from drake_pose.search.scoring import PoseSearch
-from drake_pose.silhouette.pictures.mask_agreement import edge_area
+from drake_pose.silhouette.pictures.masks import edge_area
 
 Array = NDArray[np.float64]
 

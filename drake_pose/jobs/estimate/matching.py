@@ -24,7 +24,7 @@ from drake_pose.search.grid.beam_search import BeamSearch
 from drake_pose.search.scoring import PoseSearch
 from drake_pose.search.starts.root_placement import scale_camera
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
-from drake_pose.silhouette.pictures.mask_agreement import compare_masks
+from drake_pose.silhouette.pictures.masks import compare_masks
 from drake_pose.silhouette.pictures.scenes import Scene
 from drake_pose.systems.estimators.diagrams import build_recorded_matching
 

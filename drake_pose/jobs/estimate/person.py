@@ -25,7 +25,7 @@ from drake_pose.person.recordings.person_capture import PersonCapture, capture_b
 from drake_pose.person.recordings.persons_in_view import ReadFrame, ViewFaults
 from drake_pose.search.estimates import PoseEstimate
 from drake_pose.silhouette.areas.scoring import draw_labels
-from drake_pose.silhouette.pictures.mask_agreement import edge_area
+from drake_pose.silhouette.pictures.masks import edge_area
 from drake_pose.silhouette.pictures.scene_checks import (
     describe_unreadable,
     frame_ranges,

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from drake_pose.body.model import ArticulatedModel
-from drake_pose.camera.sources.recorded import TIME_STAMPS
+from drake_pose.camera.sources.source_files import TIME_STAMPS
 from drake_pose.csv_files import csv_text
 from drake_pose.files.records import FrameRecord, PoseRow, SceneEstimate, record_deviations
 from drake_pose.files.settings import EstimateSettings
@@ -21,7 +21,7 @@ from drake_pose.jobs.live.scene import LiveScene
 from drake_pose.person.pose_tracker import PersonPoseTracker
 from drake_pose.person.recordings.persons_in_view import keep_person
 from drake_pose.silhouette.areas.scoring import draw_mask
-from drake_pose.silhouette.pictures.mask_agreement import compare_masks
+from drake_pose.silhouette.pictures.masks import compare_masks
 from drake_pose.silhouette.pictures.scenes import Scene
 from drake_pose.systems.person.live_capture import LiveSensors
 from drake_pose.systems.pictures.picture_capture import CameraCount

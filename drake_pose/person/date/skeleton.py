@@ -13,7 +13,7 @@ import numpy as np
 from drake_pose.arrays import Array, Integers
 from drake_pose.body.model import ArticulatedModel
 from drake_pose.body.parsed_model import ParsedModel
-from drake_pose.body.surfaces.mesh import TriangleMesh
+from drake_pose.body.surfaces.meshes import TriangleMesh
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.errors import ModelError
 

@@ -11,8 +11,7 @@ from drake_pose.search.estimates import View
 from drake_pose.search.grid.pair_kernel import Reaches, unite_poses
 from drake_pose.search.grid.sampled_body import SampledBody
 from drake_pose.search.settings import BoundLimits
-from drake_pose.silhouette.bits.bit_kernel import draw_bits
-from drake_pose.silhouette.bits.bit_view import WORD, BitView, make_bit_view
+from drake_pose.silhouette.bits.bit_kernel import WORD, BitView, draw_bits, make_bit_view
 from drake_pose.silhouette.bits.bounding_balls import draw_discs, prune_by_balls
 
 BAND = 24

@@ -5,13 +5,13 @@ import copy
 import fast_simplification
 import numpy as np
 
-from drake_pose.body.surfaces.mesh import TriangleMesh
+from drake_pose.body.surfaces.meshes import TriangleMesh
 from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.camera.models import Camera, ParallelCamera
 from drake_pose.search.scoring import SampledTree
 from drake_pose.search.settings import BeamSearchSettings
-from drake_pose.silhouette.areas.inscribed_balls import VisualHull
 from drake_pose.silhouette.areas.outline import Outline, outline_from_mesh
+from drake_pose.silhouette.areas.scoring import VisualHull
 from drake_pose.silhouette.contours.direction_cells import CelledOutline, divide_outline
 
 _BALLS = 10

@@ -25,7 +25,7 @@ from drake_pose.search.starts.coarse_kernel import (
     score_samples,
     unite_pairs,
 )
-from drake_pose.silhouette.pictures.mask_agreement import signed_distances
+from drake_pose.silhouette.pictures.masks import signed_distances
 
 _WORDS = 4
 _LEVELS = 10

@@ -24,8 +24,7 @@ from drake_pose.errors import SettingsError
 from drake_pose.search.estimates import View
 from drake_pose.search.grid.sampled_body import SampledBody
 from drake_pose.silhouette.areas.scoring import score_bodies
-from drake_pose.silhouette.bits.bit_kernel import draw_bits
-from drake_pose.silhouette.bits.bit_view import WORD, make_bit_view
+from drake_pose.silhouette.bits.bit_kernel import WORD, draw_bits, make_bit_view
 
 # The picture in which random poses are measured [pixel], and how many.
 _SIDE, _POSES = 240, 100

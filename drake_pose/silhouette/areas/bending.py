@@ -21,7 +21,7 @@ from drake_pose.silhouette.areas.outline import (
 from drake_pose.silhouette.areas.projection import bend
 
 if TYPE_CHECKING:
-    from drake_pose.body.surfaces.mesh import TriangleMesh
+    from drake_pose.body.surfaces.meshes import TriangleMesh
     from drake_pose.body.tree.pose_tree import PoseTree
 
 

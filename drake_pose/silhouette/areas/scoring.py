@@ -1,12 +1,19 @@
-"""Areas and masks of projected surfaces, by the span kernel."""
+"""Areas and masks of projected surfaces, by the span kernel, and what follows from masks.
+
+A ball is in the visual hull if every line that meets it meets the surface; a point's distance to
+the edges of pictures from many sides bounds it. The mesh may have holes and inner parts.
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
+import cv2
 import numpy as np
 
-from drake_pose.camera.models import Camera
+from drake_pose.camera.models import Camera, ParallelCamera, PinholeCamera
+from drake_pose.errors import CameraError
 from drake_pose.silhouette.areas.bending import BendingOutline
 from drake_pose.silhouette.areas.label_kernel import paint_labels
 from drake_pose.silhouette.areas.outline import Outline, PackedOutlines, own_copy, pack
@@ -128,3 +135,151 @@ def _check_body(
         raise ValueError("poses must be finite")
     outlines = tuple(s.rest if isinstance(s, BendingOutline) else s for s in surfaces)
     return pack(outlines), np.array(poses[:, :, :3], dtype=np.float64, order="C")
+
+
+_SIDE = 96
+_DIRECTIONS = 72
+_POINTS_A_SIDE = 15
+# Between the directions that were looked from, the hull may be a little narrower.
+_SHRINK = 0.97
+# From a point to the nearest pixel centre, and from a distance between centres to the edge.
+_ROUNDING = 0.75 + 0.5
+
+
+class VisualHull:
+    """A surface's distances to the edges of its pictures from many sides; may be empty."""
+
+    def __init__(self, outline: Outline) -> None:
+        self._center = outline.ball[:3]
+        self._size = float(outline.ball[3])
+        self._views: list[tuple[np.ndarray, np.ndarray]] = []
+        if self._size > 0.0 and len(outline.triangles):
+            scale = 0.46 * _SIDE / self._size
+            self._views = [_look(outline, R_CN, scale) for R_CN in _rotations(_DIRECTIONS)]
+            self._scale = scale
+
+    def radii(self, p_N: np.ndarray) -> np.ndarray:
+        """Returns the radii (n,) [m] of the largest balls around points (n, 3) in the hull."""
+        if not self._views:
+            return np.zeros(len(p_N))
+        smallest = np.full(len(p_N), np.inf)
+        for rows, distances in self._views:
+            uv = np.rint((p_N - self._center) @ rows.T + 0.5 * (_SIDE - 1)).astype(int)
+            inside = np.all((uv >= 0) & (uv < _SIDE), axis=1)
+            u, v = np.clip(uv, 0, _SIDE - 1).T
+            smallest = np.minimum(smallest, np.where(inside, distances[v, u], 0.0))
+        return np.maximum(0.0, _SHRINK * (smallest - _ROUNDING) / self._scale)
+
+    def spread_balls(self, count: int) -> np.ndarray:
+        """Returns (count or fewer, 4) centres and radii [m] of balls that reach far apart."""
+        if not self._views:
+            return np.zeros((0, 4))
+        steps = np.linspace(-self._size, self._size, _POINTS_A_SIDE)
+        grid = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), axis=-1).reshape(-1, 3)
+        points = grid + self._center
+        radii = self.radii(points)
+        points, radii = points[radii > 0.0], radii[radii > 0.0]
+        if len(points) == 0:
+            return np.zeros((0, 4))
+        chosen = [int(np.argmax(radii))]
+        beyond = np.full(len(points), np.inf)
+        while len(chosen) < min(count, len(points)):
+            last = chosen[-1]
+            gap = np.linalg.norm(points - points[last], axis=1) - radii[last]
+            beyond = np.minimum(beyond, gap)
+            # How far the ball reaches beyond all those chosen before.
+            chosen.append(int(np.argmax(beyond + radii)))
+        return np.column_stack([points, radii])[chosen]
+
+
+def _rotations(count: int) -> np.ndarray:
+    """Returns rotations R_CN (count, 3, 3) whose viewing directions fill half a sphere evenly."""
+    index = np.arange(count) + 0.5
+    z = index / count
+    azimuth = index * np.pi * (1.0 + 5.0**0.5)
+    flat = np.sqrt(1.0 - z**2)
+    forward = np.column_stack([flat * np.cos(azimuth), flat * np.sin(azimuth), z])
+    right = np.column_stack([-np.sin(azimuth), np.cos(azimuth), np.zeros(count)])
+    return np.stack([right, np.cross(forward, right), forward], axis=1)
+
+
+def _look(outline: Outline, R_CN: np.ndarray, scale: float) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the axes (2, 3) [pixel/m] of a picture and its pixels' distances to its edge."""
+    middle = 0.5 * (_SIDE - 1)
+    camera = ParallelCamera("hull", _SIDE, _SIDE, scale, middle, middle, np.eye(4))
+    X_CN = np.eye(4)
+    X_CN[:3, :3] = R_CN
+    X_CN[:3, 3] = -R_CN @ outline.ball[:3]
+    mask = draw_mask([outline], X_CN[None], camera)
+    distances = cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    return scale * R_CN[:2], distances
+
+
+# A body that is as large as this many pictures is not what they show.
+_LARGER = 10.0
+
+
+def require_visible(outlines: Sequence[Outline], X_CN: np.ndarray, camera: Camera) -> None:
+    """Refuses a camera that cannot show a body whose surfaces are at X_CN (nodes, 4, 4).
+
+    Raises:
+        CameraError: names the camera; when the body is wholly behind it, when the camera is inside
+            one of the surfaces, when the body is far larger than the picture, or wholly outside.
+    """
+    solid = [
+        (outline, np.asarray(X))
+        for outline, X in zip(outlines, X_CN, strict=True)
+        if len(outline.triangles)
+    ]
+    where = f"camera '{camera.name}'"
+    placed = [(outline, _in_camera(outline, X)) for outline, X in solid]
+    if isinstance(camera, PinholeCamera):
+        if all((p_C[:, 2] < camera.near).all() for _, p_C in placed):
+            raise CameraError(
+                f"{where} has the whole body behind it (z forward is the viewing direction); "
+                "check X_WC, which is the camera's pose in the world and not its inverse"
+            )
+        if any(_winding_at_origin(p_C[outline.triangles]) > 0.5 for outline, p_C in placed):
+            raise CameraError(f"{where} is inside the body; check X_WC and the body's position")
+    size, picture = _least_size(placed, camera), math.hypot(camera.width, camera.height)
+    if size > _LARGER * picture:
+        raise CameraError(
+            f"{where}: the body is larger than the picture, at least {size:.3g} pixels across, "
+            f"the picture {picture:.0f}; check the focal length [pixel], X_WC and the model's "
+            "scale [m]"
+        )
+    mask = draw_mask([outline for outline, _ in solid], np.array([X for _, X in solid]), camera)
+    if not mask.any():
+        raise CameraError(
+            f"{where} shows nothing of the body: it lies outside the picture of "
+            f"{camera.width} x {camera.height} pixels; check X_WC and the body's position"
+        )
+
+
+def _least_size(placed: Sequence[tuple[Outline, np.ndarray]], camera: Camera) -> float:
+    """The diagonal of a body's box as it would look at its farthest point [pixel]."""
+    corners = np.vstack([p_C for _, p_C in placed])
+    scale = float(camera.kernel_parameters()[1])
+    if isinstance(camera, PinholeCamera):
+        scale /= float(corners[:, 2].max())
+    return scale * float(np.linalg.norm(np.ptp(corners, axis=0)))
+
+
+def _in_camera(outline: Outline, X_CN: np.ndarray) -> np.ndarray:
+    """Returns the vertices (n, 3) of a surface in the camera's frame."""
+    return outline.vertices @ X_CN[:3, :3].T + X_CN[:3, 3]
+
+
+def _winding_at_origin(corners: np.ndarray) -> float:
+    """Returns how often triangles (m, 3, 3) enclose the origin: 1 inside a closed surface."""
+    # Solid angles: van Oosterom and Strackee (1983), equation 8.
+    a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
+    la, lb, lc = (np.linalg.norm(side, axis=1) for side in (a, b, c))
+    numerator = np.einsum("ij,ij->i", a, np.cross(b, c))
+    denominator = (
+        la * lb * lc
+        + np.einsum("ij,ij->i", a, b) * lc
+        + np.einsum("ij,ij->i", b, c) * la
+        + np.einsum("ij,ij->i", c, a) * lb
+    )
+    return float(abs(np.arctan2(numerator, denominator).sum()) / (2.0 * np.pi))

@@ -7,8 +7,7 @@ import math
 import numpy as np
 
 from drake_pose.compiled import compiled, multiply
-from drake_pose.silhouette.bits.bit_kernel import write_runs
-from drake_pose.silhouette.bits.bit_view import NEAREST_STRIDE, WORD, BitView
+from drake_pose.silhouette.bits.bit_kernel import NEAREST_STRIDE, WORD, BitView, write_runs
 
 
 @compiled

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from drake_pose.body.surfaces.mesh import TriangleMesh
+from drake_pose.body.surfaces.meshes import TriangleMesh
 from drake_pose.compiled import compiled
 from drake_pose.silhouette.areas.outline import (
     Outline,

@@ -1,16 +1,16 @@
-"""Mask files: two-valued PNG pictures, black background."""
+"""Mask files, two-valued PNG pictures, and how masks agree."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
 
-from drake_pose.camera.checks import LARGEST_SIDE
-from drake_pose.camera.picture_files import check_png, split_colours
+from drake_pose.camera.picture_files import read_two_colours
 from drake_pose.errors import MaskError
-from drake_pose.regular_files import read_regular
 
 
 def read_mask(
@@ -28,24 +28,8 @@ def read_mask(
         MaskError: names the file; when it cannot be read, is no whole PNG picture, is not of
             ``width`` and ``height`` [pixel], is empty or full, or has more than two values.
     """
-    path = Path(path)
-    try:
-        data = read_regular(path)
-    except OSError as error:
-        raise MaskError(f"{path}: cannot read the mask: {error.strerror}") from error
-    found = check_png(data, path, MaskError)
-    if max(found) > LARGEST_SIDE:
-        raise MaskError(f"{path}: {found[0]} x {found[1]} pixels are too many")
-    expected = (found[0] if width is None else width, found[1] if height is None else height)
-    if found != expected:
-        raise MaskError(
-            f"{path}: the mask has {found[0]} x {found[1]} pixels (width x height), but its camera "
-            f"has {expected[0]} x {expected[1]}"
-        )
-    picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-    if picture is None:
-        raise MaskError(f"{path}: the PNG picture is damaged")
-    return _to_mask(picture, path, may_be_empty)
+    size = width, height
+    return read_two_colours(Path(path), MaskError, size, may_be_empty=may_be_empty)
 
 
 def write_mask(path: str | Path, mask: np.ndarray) -> None:
@@ -61,24 +45,54 @@ def encode_mask(mask: np.ndarray) -> bytes:
     return cv2.imencode(".png", np.where(mask, 255, 0).astype(np.uint8))[1].tobytes()
 
 
-def _to_mask(picture: np.ndarray, path: Path, may_be_empty: bool) -> np.ndarray:
-    """Returns the mask of a decoded picture (H, W) or (H, W, channels)."""
-    layers = picture[:, :, None] if picture.ndim == 2 else picture
-    if layers.shape[2] == 4 and (layers[:, :, 3] == layers[0, 0, 3]).all():
-        layers = layers[:, :, :3]  # an alpha channel that says nothing
-    elif layers.shape[2] == 4 and (layers[:, :, :3] == layers[0, 0, :3]).all():
-        layers = layers[:, :, 3:]  # one that says all
-    mask, is_one_colour = split_colours(np.ascontiguousarray(layers))
-    if not mask.any():
-        if may_be_empty:
-            return mask
-        raise MaskError(f"{path}: the mask is empty (all black): no object to be seen")
-    if mask.all():
-        raise MaskError(f"{path}: the mask is full (no black pixel): no background to be seen")
-    if not is_one_colour:
-        values = len(np.unique(layers.reshape(-1, layers.shape[2]), axis=0))
-        raise MaskError(
-            f"{path}: the mask has {values} values, but must have two: black, and one other on the "
-            "object; threshold it first"
-        )
-    return mask
+# A pixel's neighbours: what a mask loses to them is its edge.
+_CROSS = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
+
+
+@dataclass(frozen=True)
+class MaskAgreement:
+    """How a frame's silhouettes and body agree: intersection over union by camera, and E_total.
+
+    E_total: the area where they differ over the silhouettes' area; NaN without a silhouette.
+    """
+
+    E_total: float
+    ious: Mapping[str, float]
+
+
+def intersection_over_union(one: np.ndarray, other: np.ndarray) -> float:
+    """Of two masks (H, W) bool; 1 where both are empty."""
+    either = int(np.count_nonzero(one | other))
+    return int(np.count_nonzero(one & other)) / either if either else 1.0
+
+
+def compare_masks(
+    masks: Mapping[str, np.ndarray], bodies: Mapping[str, np.ndarray]
+) -> MaskAgreement:
+    """Compares masks (H, W) bool with the body's, both by camera."""
+    wrong, area = 0, 0
+    ious: dict[str, float] = {}
+    for camera, mask in masks.items():
+        wrong += int(np.count_nonzero(mask ^ bodies[camera]))
+        area += int(np.count_nonzero(mask))
+        ious[camera] = intersection_over_union(mask, bodies[camera])
+    return MaskAgreement(wrong / area if area else float("nan"), ious)
+
+
+def edge_area(mask: np.ndarray) -> int:
+    """How many pixels of a mask (H, W) bool lie on its edge."""
+    inner = cv2.erode(mask.view(np.uint8), _CROSS)
+    return int(np.count_nonzero(mask)) - int(np.count_nonzero(inner))
+
+
+def signed_distances(mask: np.ndarray) -> np.ndarray:
+    """(H, W) float32 distance from the edge of a mask, half way between pixels; positive outside.
+
+    The picture's edge is no edge of the mask.
+    """
+    inside = np.asarray(mask, dtype=np.uint8)
+    if inside.all():
+        return np.full(mask.shape, -float(max(mask.shape)), dtype=np.float32)
+    within = cv2.distanceTransform(inside, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    beyond = cv2.distanceTransform(1 - inside, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    return np.where(inside > 0, 0.5 - within, beyond - 0.5).astype(np.float32)

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_pose.camera.checks import LARGEST_SIDE
+from drake_pose.camera.models import LARGEST_SIDE
 from drake_pose.errors import MaskError
 from drake_pose.regular_files import read_regular
 

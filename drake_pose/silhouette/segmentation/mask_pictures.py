@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from drake_pose.camera.checks import LARGEST_SIDE
+from drake_pose.camera.models import LARGEST_SIDE
 from drake_pose.camera.picture_files import read_picture_file
 from drake_pose.errors import MaskError
 

@@ -10,8 +10,7 @@ import numpy as np
 
 from drake_pose.arrays import Array, Mask, Picture
 from drake_pose.body.model import ArticulatedModel
-from drake_pose.camera.models import Camera, PinholeCamera
-from drake_pose.camera.rigs import circle_of_cameras
+from drake_pose.camera.models import Camera, PinholeCamera, circle_of_cameras
 from drake_pose.errors import UnknownNameError
 from drake_pose.person.date.body_pose import waist_of
 from drake_pose.person.date.capture import CaptureSettings, CaptureSetup, see_person

@@ -8,8 +8,13 @@ import pytest
 
 from drake_pose.camera.calibration.board import Board, Detection, find_boards, load_board
 from drake_pose.camera.calibration.calibrate import CalibrationSettings, calibrate
-from drake_pose.camera.calibration.lens import Lens, load_lenses, save_lenses
-from drake_pose.camera.calibration.rig import _vector, corner_residuals
+from drake_pose.camera.calibration.rig import (
+    Lens,
+    _vector,
+    corner_residuals,
+    load_lenses,
+    save_lenses,
+)
 from drake_pose.errors import CameraError, UnknownNameError
 from tests.camera.boards import (
     CHARUCO,

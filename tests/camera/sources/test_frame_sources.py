@@ -7,7 +7,7 @@ import pytest
 import yaml
 
 from drake_pose.camera.camera_files import save_cameras
-from drake_pose.camera.rigs import circle_of_cameras
+from drake_pose.camera.models import circle_of_cameras
 from drake_pose.camera.sources.frame_source import SourceSpecification
 from drake_pose.camera.sources.source_files import (
     load_background_pictures,
@@ -103,7 +103,7 @@ class TestFolder:
         np.testing.assert_array_equal(found[0].picture, mask > 0)
         np.testing.assert_array_equal(found[1].picture, mask > 0)
         assert not found[2].picture.any(), "nobody is there: no fault"
-        assert "two values" in source.problems[0]
+        assert "must have two" in source.problems[0]
         assert "full" in source.problems[1]
 
     @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ import zmq
 
 from drake_pose.body.formats.packages import bundled_model
 from drake_pose.body.model import load_model
-from drake_pose.camera.rigs import circle_of_cameras
+from drake_pose.camera.models import circle_of_cameras
 from drake_pose.errors import ClusterError
 from drake_pose.fit.contour_fit import ContourFit
 from drake_pose.jobs.cluster.camera_worker import EdgeServer

@@ -16,8 +16,7 @@ from drake_pose.body.formats.packages import bundled_model
 from drake_pose.body.landmarks import landmark_positions, load_landmarks
 from drake_pose.body.model import ArticulatedModel, load_model
 from drake_pose.camera.camera_files import load_cameras, save_cameras
-from drake_pose.camera.models import Camera
-from drake_pose.camera.rigs import circle_of_cameras
+from drake_pose.camera.models import Camera, circle_of_cameras
 from drake_pose.commands.main import app
 from drake_pose.jobs.estimate.person import (
     describe_camera,

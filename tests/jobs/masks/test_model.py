@@ -9,7 +9,7 @@ import pytest
 from drake_pose import MaskSettings, load_scene, make_masks
 from drake_pose.commands.main import app
 from drake_pose.errors import CameraError, SceneError, SettingsError
-from drake_pose.silhouette.segmentation.background_beside import tell_from_background
+from drake_pose.silhouette.segmentation.background import tell_from_background
 from tests.cli import CliRunner
 from tests.jobs.masks.rooms import iou, moving, texture, write_pictures
 from tests.jobs.scenes import NAMES

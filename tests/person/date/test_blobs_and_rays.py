@@ -4,8 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from drake_pose.camera.models import ParallelCamera
-from drake_pose.camera.rigs import circle_of_cameras, look_at
+from drake_pose.camera.models import ParallelCamera, circle_of_cameras, look_at
 from drake_pose.errors import SettingsError
 from drake_pose.person.date.features import (
     SkinColour,

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from drake_pose.body.formats.packages import bundled_model
 from drake_pose.body.landmarks import landmark_positions, load_landmarks
 from drake_pose.body.model import load_model
-from drake_pose.camera.rigs import circle_of_cameras
+from drake_pose.camera.models import circle_of_cameras
 from drake_pose.errors import ModelError
 from drake_pose.person.date.body_pose import (
     Waist,

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from drake_pose.camera.rigs import FACE_CAMERA
+from drake_pose.camera.models import FACE_CAMERA
 from drake_pose.errors import SettingsError
 from drake_pose.person.date.capture import CaptureSetup
 from drake_pose.person.date.faces import (

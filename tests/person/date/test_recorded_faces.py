@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from drake_pose.camera.rigs import FACE_CAMERA
+from drake_pose.camera.models import FACE_CAMERA
 from drake_pose.errors import SceneError
 from drake_pose.person.date.faces import find_face, learn_recorded_faces
 from tests.person.studio import shared_studio

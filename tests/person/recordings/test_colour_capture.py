@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from drake_pose.body.landmarks import landmark_positions, load_landmarks
-from drake_pose.camera.rigs import circle_of_cameras
+from drake_pose.camera.models import circle_of_cameras
 from drake_pose.fit.colour_lines import BESIDE, ON
 from drake_pose.fit.contour_fit import ContourFit
 from drake_pose.person.pose_tracker import PersonPoseTracker

@@ -9,8 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from drake_pose.body.formats.packages import bundled_model
 from drake_pose.body.model import ArticulatedModel, load_model
-from drake_pose.camera.models import Camera
-from drake_pose.camera.rigs import circle_of_cameras
+from drake_pose.camera.models import Camera, circle_of_cameras
 from drake_pose.fit.contour_fit import ContourFit
 from drake_pose.fit.evidence import find_edge_points
 from drake_pose.person.pose_tracker import PersonPoseTracker

@@ -16,7 +16,7 @@ from drake_pose.search.starts.coarse_search import (
     CoarseSearch,
     _spread_points,
 )
-from drake_pose.silhouette.pictures.mask_agreement import signed_distances
+from drake_pose.silhouette.pictures.masks import signed_distances
 from tests.search.arms import arm_cameras, arm_tree, damaged_views, draw_pose, draw_view, split
 
 

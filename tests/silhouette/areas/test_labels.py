@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from drake_pose.body.surfaces.mesh import TriangleMesh
+from drake_pose.body.surfaces.meshes import TriangleMesh
 from drake_pose.camera.models import Camera
 from drake_pose.silhouette.areas.outline import outline_from_mesh
 from drake_pose.silhouette.areas.scoring import draw_labels, draw_mask

@@ -1,6 +1,6 @@
 import numpy as np
 
-from drake_pose.body.surfaces.mesh import TriangleMesh
+from drake_pose.body.surfaces.meshes import TriangleMesh
 from drake_pose.silhouette.areas.outline import outline_from_mesh
 from tests.silhouette.shapes import box, soup
 

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from drake_pose.body.surfaces.mesh import TriangleMesh
+from drake_pose.body.surfaces.meshes import TriangleMesh
 from drake_pose.camera.models import Camera, ParallelCamera, PinholeCamera
 from drake_pose.silhouette.areas.outline import outline_from_mesh
 from drake_pose.silhouette.areas.scoring import (

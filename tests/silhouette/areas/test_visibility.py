@@ -4,7 +4,7 @@ import pytest
 from drake_pose.camera.models import ParallelCamera, PinholeCamera
 from drake_pose.errors import CameraError
 from drake_pose.silhouette.areas.outline import outline_from_mesh
-from drake_pose.silhouette.areas.visibility import require_visible
+from drake_pose.silhouette.areas.scoring import require_visible
 from tests.silhouette.shapes import box
 
 PINHOLE = PinholeCamera("eye", 64, 48, 60.0, 60.0, 31.5, 23.5, np.eye(4))

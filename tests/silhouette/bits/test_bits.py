@@ -5,13 +5,11 @@ import pytest
 from scipy.ndimage import distance_transform_edt
 from scipy.spatial.transform import Rotation
 
-from drake_pose.body.surfaces.mesh import TriangleMesh
+from drake_pose.body.surfaces.meshes import TriangleMesh
 from drake_pose.camera.models import Camera, ParallelCamera, PinholeCamera
-from drake_pose.silhouette.areas.inscribed_balls import VisualHull
 from drake_pose.silhouette.areas.outline import Outline, outline_from_mesh
-from drake_pose.silhouette.areas.scoring import draw_mask
-from drake_pose.silhouette.bits.bit_kernel import draw_bits
-from drake_pose.silhouette.bits.bit_view import NEAREST_STRIDE, BitView, make_bit_view
+from drake_pose.silhouette.areas.scoring import VisualHull, draw_mask
+from drake_pose.silhouette.bits.bit_kernel import NEAREST_STRIDE, BitView, draw_bits, make_bit_view
 from drake_pose.silhouette.bits.bounding_balls import draw_discs, prune_by_balls
 from drake_pose.silhouette.contours.direction_cells import divide_outline
 

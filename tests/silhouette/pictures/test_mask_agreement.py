@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from drake_pose.silhouette.pictures.mask_agreement import signed_distances
+from drake_pose.silhouette.pictures.masks import signed_distances
 
 
 def test_signed_distances_are_those_to_the_nearest_pixel_of_the_other_kind() -> None:

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from drake_pose.camera.camera_files import save_cameras
-from drake_pose.camera.models import Camera, ParallelCamera
-from drake_pose.camera.rigs import circle_of_cameras
+from drake_pose.camera.models import Camera, ParallelCamera, circle_of_cameras
 from drake_pose.errors import MaskError
 from drake_pose.silhouette.pictures.masks import write_mask
 from drake_pose.silhouette.pictures.scene_checks import (

@@ -9,7 +9,7 @@ from pydrake.systems.framework import LeafSystem
 from pydrake.systems.sensors import ImageRgba8U
 from pydrake.trajectories import PiecewisePolynomial
 
-from drake_pose.camera.rigs import FACE_CAMERA
+from drake_pose.camera.models import FACE_CAMERA
 from drake_pose.errors import SettingsError
 from drake_pose.person.date.body_pose import estimate_pose, waist_of
 from drake_pose.person.date.capture import CaptureSettings, CaptureSetup, see_person

@@ -4,7 +4,7 @@ from pydrake.geometry import Meshcat, MeshcatParams
 from pydrake.systems.analysis import Simulator
 from pydrake.trajectories import PiecewisePolynomial
 
-from drake_pose.camera.rigs import circle_of_cameras
+from drake_pose.camera.models import circle_of_cameras
 from drake_pose.errors import SettingsError, UnknownNameError
 from drake_pose.fit.contour_fit import ContourFit
 from drake_pose.person.pose_tracker import PersonPoseTracker

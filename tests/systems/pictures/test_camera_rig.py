@@ -6,7 +6,7 @@ import pytest
 from pydrake.trajectories import PiecewisePolynomial
 
 from drake_pose.camera.camera_files import load_cameras, save_cameras
-from drake_pose.camera.rigs import circle_of_cameras, look_at
+from drake_pose.camera.models import circle_of_cameras, look_at
 from drake_pose.errors import CameraError, UnknownNameError
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from drake_pose.systems.pictures.camera_rig import build_camera_rig

@@ -5,7 +5,7 @@ from pydrake.systems.sensors import ImageLabel16I, ImageRgba8U
 
 from drake_pose.body.formats.packages import bundled_model
 from drake_pose.body.model import load_model
-from drake_pose.camera.rigs import circle_of_cameras
+from drake_pose.camera.models import circle_of_cameras
 from drake_pose.camera.sources.frame_source import FrameSource, SourceSpecification, TimedPicture
 from drake_pose.errors import SettingsError, UnknownNameError
 from drake_pose.person.views import edge_spacing, see_silhouette, shows_somebody

@@ -24,12 +24,10 @@ from drake_pose.body.formats.packages import bundled_model
 from drake_pose.body.model import load_model
 from drake_pose.body.tree.node_skin import ModelSkin
 from drake_pose.camera.drake import camera_to_drake
-from drake_pose.camera.models import ParallelCamera, PinholeCamera
-from drake_pose.camera.rigs import look_at
+from drake_pose.camera.models import ParallelCamera, PinholeCamera, look_at
 from drake_pose.errors import ModelError
-from drake_pose.silhouette.pictures.drake_skin import DeformableSkin
 from drake_pose.silhouette.pictures.label_images import EMPTY, label_data
-from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
+from drake_pose.silhouette.pictures.label_renderer import DeformableSkin, LabelRenderer
 from drake_pose.systems.pictures.silhouette_camera import SilhouetteCamera
 from tests.benchmarks.silhouette_camera import arm_model, measure_camera
 

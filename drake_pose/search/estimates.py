@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -57,15 +57,12 @@ class JointEstimate:
             the ends of what was seen.
         low, high: the interval or the range [rad or m]; of an angle that turns around it may go
             beyond its limits, as the same directions a full turn before or after.
-        values: (n,) the different values seen, smallest first [rad or m].
     """
 
     name: str
-    node: int
     determined: bool
     low: float
     high: float
-    values: np.ndarray
     turns_around: bool = False
 
     def holds(self, value: float, margin: float = 1e-9) -> bool:
@@ -76,27 +73,14 @@ class JointEstimate:
 
 
 def joint_estimates(
-    kinematics: TreeKinematics,
-    low: np.ndarray,
-    high: np.ndarray,
-    determined: np.ndarray,
-    seen: np.ndarray,
+    kinematics: TreeKinematics, low: np.ndarray, high: np.ndarray, determined: np.ndarray
 ) -> tuple[JointEstimate, ...]:
-    """What is known of each of a pose tree's values: ends and whether determined (m,).
-
-    ``seen``: (n, m) those of the poses that were found.
-    """
+    """What is known of each of a pose tree's values: ends and whether determined (m,)."""
     return tuple(
-        JointEstimate(
-            name,
-            int(kinematics.value_nodes[k]),
-            bool(determined[k]),
-            float(low[k]),
-            float(high[k]),
-            np.unique(seen[:, k]),
-            bool(kinematics.turns_around[k]),
+        JointEstimate(name, bool(known), float(least), float(most), bool(around))
+        for name, known, least, most, around in zip(
+            kinematics.names, determined, low, high, kinematics.turns_around, strict=True
         )
-        for k, name in enumerate(kinematics.names)
     )
 
 
@@ -123,13 +107,13 @@ class PoseFamily:
     def of_values(
         cls,
         tree: PoseTree,
-        node_values: tuple[np.ndarray, ...],
+        node_values: Sequence[np.ndarray],
         J: float,
         joints: tuple[JointEstimate, ...],
         size: float = 1.0,
     ) -> PoseFamily:
         """The family of a pose tree's values, (k_i,) of each node."""
-        return cls(*tree.positions_from(node_values), node_values, J, joints, size)
+        return cls(*tree.positions_from(node_values), tuple(node_values), J, joints, size)
 
 
 @dataclass(frozen=True)
@@ -157,33 +141,10 @@ class PoseSet:
         """For each value of the pose tree whether it is determined."""
         return tuple(joint.determined for joint in self.joints)
 
-    def within_intervals(self, node_values: Sequence[np.ndarray]) -> bool:
-        """Whether a pose lies in some one family's intervals, as every member does."""
-        values = np.concatenate([np.ravel(value) for value in node_values])
-        return any(
-            all(joint.holds(float(v)) for joint, v in zip(family.joints, values, strict=True))
-            for family in self.families
-        )
-
     def position_intervals(self, names: Sequence[str]) -> np.ndarray:
         """``determined``, ``low`` and ``high``, (3, nq), of positions; NaN: not in the tree."""
         known = {joint.name: (joint.determined, joint.low, joint.high) for joint in self.joints}
         return np.array([known.get(name, (np.nan,) * 3) for name in names], dtype=float).T
-
-
-@dataclass(frozen=True)
-class Candidates:
-    """Joint angle candidates JAC_i(t) of one node that were not adopted.
-
-    Args:
-        value_names: the k positions that the values are of (or a root's angles).
-        values: (n, k), the candidates in the order of the list [rad or m].
-        scores: (n,), their scores e_i(t) [pixel] when the list was made (5).
-    """
-
-    value_names: tuple[str, ...]
-    values: np.ndarray
-    scores: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -195,14 +156,12 @@ class SearchStatistics:
         first_J: of the first whole pose, before the re-estimation of section 5.2 [pixel]; None: of
             the answer.
         outside_limit: the paper's threshold r in each view [pixel].
-        untried: the paper's candidates not adopted in the answer, by node name.
         interval_seconds: wall time of the intervals, which ``seconds`` leaves out.
     """
 
     runs: int = 0
     first_J: float | None = None
     outside_limit: tuple[float, ...] = ()
-    untried: Mapping[str, Candidates] = field(default_factory=dict)
     interval_seconds: float = 0.0
 
 
@@ -284,38 +243,24 @@ class PoseEstimate:
 
     def turned(self, tree: PoseTree, turns: Sequence[np.ndarray]) -> PoseEstimate:
         """The same pose with full turns (k_i,) [rad] added to each node's values."""
-        pose_set = self.pose_set
-        if pose_set is not None:
-            families = [
-                replace(
-                    family,
-                    joints=_turned_joints(family.joints, turns),
-                    **_turned_pose(family, tree, turns),
-                )
-                for family in pose_set.families
-            ]
-            joints = _turned_joints(pose_set.joints, turns)
-            pose_set = replace(pose_set, families=tuple(families), joints=joints)
-        return replace(self, pose_set=pose_set, **_turned_pose(self, tree, turns))
 
+        def pose(one: PoseFamily | PoseEstimate) -> dict[str, Any]:
+            q = np.array(one.q)
+            for node, added in zip(tree.nodes, turns, strict=True):
+                # The values of a root that is turned by a RootRotation are no positions.
+                if node.positions:
+                    q[list(node.positions)] += added
+            values = tuple(np.add(*both) for both in zip(one.node_values, turns, strict=True))
+            return {"q": q, "node_values": values}
 
-def _turned_pose(
-    pose: PoseFamily | PoseEstimate, tree: PoseTree, turns: Sequence[np.ndarray]
-) -> dict[str, Any]:
-    """``q`` and ``node_values`` with turns added to them."""
-    q = np.array(pose.q)
-    for node, added in zip(tree.nodes, turns, strict=True):
-        # The values of a root that is turned by a RootRotation are no positions.
-        if node.positions:
-            q[list(node.positions)] += added
-    values = tuple(value + added for value, added in zip(pose.node_values, turns, strict=True))
-    return {"q": q, "node_values": values}
+        def joints(one: PoseFamily | PoseSet) -> tuple[JointEstimate, ...]:
+            return tuple(
+                replace(joint, low=joint.low + turn, high=joint.high + turn)
+                for joint, turn in zip(one.joints, np.concatenate(turns).tolist(), strict=True)
+            )
 
-
-def _turned_joints(
-    joints: Sequence[JointEstimate], turns: Sequence[np.ndarray]
-) -> tuple[JointEstimate, ...]:
-    return tuple(
-        replace(joint, low=joint.low + turn, high=joint.high + turn, values=joint.values + turn)
-        for joint, turn in zip(joints, np.concatenate(turns).tolist(), strict=True)
-    )
+        known = self.pose_set
+        if known is not None:
+            families = [replace(one, joints=joints(one), **pose(one)) for one in known.families]
+            known = replace(known, families=tuple(families), joints=joints(known))
+        return replace(self, pose_set=known, **pose(self))

@@ -51,8 +51,6 @@ class PaperSearchSettings(GridSettings):
             by e - outside_weight * (area outside). 0 is the paper's order, by e alone.
         candidate_limit: K, how many of a node's candidates are kept.
         run_limit: of runs of step 3; the answer is then the best pose so far.
-        leaf_combination_limit: up to so many combinations of the leaves' candidates are all tried
-            (section 5.2.1); beyond, each leaf's in turn.
 
     Raises:
         SettingsError: if a value is out of its range.
@@ -62,14 +60,13 @@ class PaperSearchSettings(GridSettings):
     outside_weight: float = 0.0
     candidate_limit: int = 5
     run_limit: int = 10_000
-    leaf_combination_limit: int = 100_000
 
     def __post_init__(self) -> None:
         super().__post_init__()
         self._require(0, "outside_limit", "outside_weight")
         if math.isinf(self.outside_weight):
             raise SettingsError("outside_weight must be finite")
-        self._require(1, "candidate_limit", "run_limit", "leaf_combination_limit")
+        self._require(1, "candidate_limit", "run_limit")
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from drake_pose.body.model import load_model
 from drake_pose.body.surfaces.meshes import TriangleMesh
 from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.camera.models import Camera, PinholeCamera
-from drake_pose.search.estimates import View
+from drake_pose.search.estimates import PoseSet, View
 from drake_pose.silhouette.areas.outline import Outline, outline_from_mesh
 from drake_pose.silhouette.areas.scoring import draw_mask
 from tests.search.mask_damage import MaskDamage, damage_views, nudge_camera
@@ -76,6 +76,14 @@ def draw_view(
     X_WN = tree.node_poses(split(tree, values))
     real = seen_by or camera
     return View(camera, draw_mask(outlines, real.X_CW @ X_WN, real))
+
+
+def is_held(answer: PoseSet, values: np.ndarray) -> bool:
+    """Whether some one family's intervals hold all of a pose's values (m,)."""
+    return any(
+        all(joint.holds(float(v)) for joint, v in zip(family.joints, values, strict=True))
+        for family in answer.families
+    )
 
 
 def split(tree: PoseTree, values: np.ndarray) -> list[np.ndarray]:

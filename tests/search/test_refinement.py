@@ -9,10 +9,7 @@ from drake_pose.body.formats.packages import bundled_model
 from drake_pose.body.model import load_model
 from drake_pose.camera.models import ParallelCamera, PinholeCamera
 from drake_pose.errors import SettingsError
-from drake_pose.search.continuous.intervals import (
-    IntervalSettings,
-    find_intervals,
-)
+from drake_pose.search.continuous.families import find_intervals
 from drake_pose.search.estimates import View
 from drake_pose.search.refinement import (
     COARSE_PASSES,
@@ -274,7 +271,7 @@ def test_intervals_hold_the_truth_and_say_what_is_free(body, search):
         about.improve(refined, 0.0, everywhere=True)
         others = about.others(refined, 2.0 * problem.J(refined) + 40.0, 0.1)
         others = [pose for pose in others if problem.J(pose) <= problem.J(refined) + 20.0]
-        intervals, covariance = find_intervals(problem, others, refined, IntervalSettings())
+        intervals, covariance = find_intervals(problem, others, refined)
         assert len(intervals.joints) == len(covariance) == len(true) - 4
         first = np.concatenate(intervals.families[0].node_values)
         np.testing.assert_allclose(first, refined[:-4], atol=1e-12)
@@ -306,9 +303,5 @@ def test_bad_settings_are_refused(body):
         Pass(1, 1, 1.0, 1.0, slack=0.6)
     with pytest.raises(SettingsError, match="scale"):
         Pass(1, 1, 0.0, 1.0)
-    with pytest.raises(SettingsError, match="confidence"):
-        IntervalSettings(confidence=1.0)
-    with pytest.raises(SettingsError, match="noise_factor"):
-        IntervalSettings(noise_factor=0.0)
     with pytest.raises(SettingsError, match="view"):
         RefinementProblem(body, [])

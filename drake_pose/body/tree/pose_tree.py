@@ -8,6 +8,7 @@ import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from types import MappingProxyType
 
 import numpy as np
@@ -149,6 +150,14 @@ class PoseTree:
         """Whether the first root is turned by a rotation vector, in all ways."""
         rotation = self.placements[0].rotation
         return rotation is not None and rotation.kind == "free"
+
+    @cached_property
+    def subtrees(self) -> tuple[tuple[int, ...], ...]:
+        """For each node itself and all that hang on it, rising."""
+        below = [[i] for i in range(len(self.nodes))]
+        for i in reversed(range(len(self.nodes))):
+            below[i] += [j for child in self.nodes[i].children for j in below[child]]
+        return tuple(tuple(sorted(nodes)) for nodes in below)
 
     def with_root_position(self, root_position: NDArray[np.float64]) -> "PoseTree":
         """The same tree with the root's origin at another known position (3,) [m].

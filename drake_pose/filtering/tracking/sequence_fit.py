@@ -9,7 +9,7 @@ the same mirrored in depth. These starts are poses that explain the first frame,
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,7 +29,7 @@ from drake_pose.fit.proportions import (
     fit_proportions,
 )
 from drake_pose.fit.surfaces import few_rigid_triangles
-from drake_pose.search.estimates import JointEstimate, PoseFamily, PoseSet
+from drake_pose.search.estimates import JointEstimate, PoseFamily, PoseSet, joint_estimates
 from drake_pose.silhouette.areas.bending import TreeSurfaces
 
 Array = NDArray[np.float64]
@@ -154,18 +154,13 @@ class FittedSequence:
     def estimates(self, frame: int) -> tuple[JointEstimate, ...]:
         """What is known of each of the tree's values in a frame."""
         kinematics = self.body.kinematics
-        found = []
-        for k, name in enumerate(kinematics.names):
-            value = float(self.fitted.parameters[frame, k])
-            half = _NORMAL_95 * float(self.fitted.deviations[frame, k])
-            turns = bool(kinematics.turns_around[k])
-            lower, upper = float(kinematics.lower[k]), float(kinematics.upper[k])
-            low = value - min(half, np.pi) if turns else max(value - half, lower)
-            high = value + min(half, np.pi) if turns else min(value + half, upper)
-            node = int(kinematics.value_nodes[k])
-            determined = _is_determined(low, high, lower, upper)
-            found.append(JointEstimate(name, node, determined, low, high, np.array([value]), turns))
-        return tuple(found)
+        count, around = len(kinematics.names), kinematics.turns_around
+        values = self.fitted.parameters[frame, :count]
+        half = _NORMAL_95 * self.fitted.deviations[frame, :count]
+        half = np.where(around, np.minimum(half, np.pi), half)
+        low = np.where(around, values - half, np.maximum(values - half, kinematics.lower))
+        high = np.where(around, values + half, np.minimum(values + half, kinematics.upper))
+        return joint_estimates(kinematics, low, high, _are_determined(kinematics, low, high))
 
 
 def fit_sequence(
@@ -233,20 +228,12 @@ def pose_set(
         values = kinematics.split(one.fitted.parameters[frame, : len(kinematics.names)])
         families.append(PoseFamily(q, X_WB, values, J, one.estimates(frame), 1.0))
     kinematics = explanations[0].body.kinematics
-    joints = []
-    for k, same in enumerate(zip(*(family.joints for family in families), strict=True)):
-        low, high = min(one.low for one in same), max(one.high for one in same)
-        limits = float(kinematics.lower[k]), float(kinematics.upper[k])
-        joints.append(
-            replace(
-                same[0],
-                determined=_is_determined(low, high, *limits),
-                low=low,
-                high=high,
-                values=np.unique(np.concatenate([one.values for one in same])),
-            )
-        )
-    return PoseSet(tuple(families), tuple(joints), 0.0, False, len(families))
+    low, high = (
+        extreme([[getattr(joint, end) for joint in one.joints] for one in families], axis=0)
+        for end, extreme in (("low", np.min), ("high", np.max))
+    )
+    joints = joint_estimates(kinematics, low, high, _are_determined(kinematics, low, high))
+    return PoseSet(tuple(families), joints, 0.0, False, len(families))
 
 
 def _are_same(body: ProportionedBody, one: FittedProportions, other: FittedProportions) -> bool:
@@ -258,9 +245,10 @@ def _are_same(body: ProportionedBody, one: FittedProportions, other: FittedPropo
     return bool(np.sqrt(np.square(off).mean(axis=0)).max(initial=0.0) < _SAME)
 
 
-def _is_determined(low: float, high: float, lower: float, upper: float) -> bool:
-    """Whether an interval is shorter than half a value's range, that of an angle a turn at most."""
-    return high - low < 0.5 * min(upper - lower, 2.0 * np.pi)
+def _are_determined(kinematics: TreeKinematics, low: Array, high: Array) -> Array:
+    """Which intervals are shorter than half a value's range, that of an angle a turn at most."""
+    ranges = np.minimum(kinematics.upper - kinematics.lower, 2.0 * np.pi)
+    return np.asarray(high - low < 0.5 * ranges)
 
 
 def _sequence_prior(tracker: ContourTracker, period: float) -> SequencePrior:

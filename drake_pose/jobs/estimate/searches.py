@@ -15,7 +15,7 @@ from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.body.tree.root import RootRotation
 from drake_pose.errors import SettingsError
 from drake_pose.files.settings import EstimateSettings, RootTurns
-from drake_pose.search.continuous.multi_start import MultiStartSearch, MultiStartSettings
+from drake_pose.search.continuous.multi_start import MultiStartSearch
 from drake_pose.search.continuous.root_placement_search import RootPlacementSearch
 from drake_pose.search.grid.beam_search import BeamSearch
 from drake_pose.search.grid.examination import ExaminationSettings
@@ -46,7 +46,7 @@ def make_search(
         return BeamSearch(tree, beam, ExaminationSettings())
     # It samples as coarsely as it likes; but intervals of joints that are none are refused.
     tree.grid(0, beam.interval, beam.intervals, beam.length_interval)
-    return MultiStartSearch(tree, MultiStartSettings(beam))
+    return MultiStartSearch(tree, beam.time_limit)
 
 
 def make_placement_search(

@@ -10,7 +10,7 @@ from __future__ import annotations
 import copy
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -20,7 +20,7 @@ from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.errors import SettingsError
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.fit.surfaces import few_triangles
-from drake_pose.search.continuous.equivalent_poses import RobustFamilies, RobustFamilySettings
+from drake_pose.search.continuous.families import RobustFamilies
 from drake_pose.search.continuous.views_fit import (
     FittedPose,
     ViewsFit,
@@ -61,26 +61,8 @@ _APART = 0.13
 _SOUGHT_ABOUT, _TRIED, _FLIPPED = 3, 6, 3
 
 
-@dataclass(frozen=True)
-class MultiStartSettings:
-    """Parameters of the multi-start search.
-
-    Args:
-        beam: of these, the coarse search heeds the time limit alone.
-        rounds: how often other explanations are sought about the best poses.
-        families: of the answer as a set; None: only the best pose is wanted.
-
-    Raises:
-        SettingsError: if a value is out of its range.
-    """
-
-    beam: BeamSearchSettings = field(default_factory=BeamSearchSettings)
-    rounds: int = 2
-    families: RobustFamilySettings | None = field(default_factory=RobustFamilySettings)
-
-    def __post_init__(self) -> None:
-        if self.rounds < 0:
-            raise SettingsError(f"rounds must be 0 or more, not {self.rounds}")
+# How often other explanations are sought about the best poses.
+_ROUNDS = 2
 
 
 class MultiStartSearch:
@@ -88,14 +70,13 @@ class MultiStartSearch:
 
     Args:
         tree: the pose tree.
-        settings: the parameters.
+        time_limit: the search returns its best pose so far after this time [s]; None: no limit.
     """
 
-    def __init__(self, tree: PoseTree, settings: MultiStartSettings | None = None) -> None:
+    def __init__(self, tree: PoseTree, time_limit: float | None = None) -> None:
         self.tree = tree
-        self.settings = settings or MultiStartSettings()
-        beam = self.settings.beam
-        coarse = replace(beam, interval=INTERVAL, length_interval=LENGTH_INTERVAL, intervals={})
+        self._time_limit, self._alternatives = time_limit, True
+        coarse = BeamSearchSettings(interval=INTERVAL, length_interval=LENGTH_INTERVAL)
         self._body = SampledBody(tree, coarse)
         self.sampled = self._body.sampled
         self._outlines = few_triangles(self.sampled.surfaces)
@@ -104,16 +85,11 @@ class MultiStartSearch:
     def without_alternatives(self) -> MultiStartSearch:
         """The same search where only E_total is wanted: one round, and no set of poses."""
         other = copy.copy(self)
-        other.settings = replace(self.settings, rounds=0, families=None)
+        other._alternatives = False
         return other
 
     def match(self, views: Sequence[View], root_position: np.ndarray | None = None) -> PoseEstimate:
-        """Estimate the pose that the views show.
-
-        Args:
-            views: one or several silhouettes of the same instant.
-            root_position: (3,), the root's known position in the world [m], where it is not the
-                pose tree's own.
+        """Estimate the pose that the views show; see ``PoseSearch``.
 
         Returns:
             The best pose found. ``stopped_by`` is "end" if all was tried, or "time_limit".
@@ -125,146 +101,120 @@ class MultiStartSearch:
             raise SettingsError("a match needs at least one view, but none was given")
         start = time.perf_counter()
         clean = [View(view.camera, without_specks(view.mask)) for view in views]
-        result = self._run(clean, root_position, start).result(views)
-        return replace(result, seconds=time.perf_counter() - start)
-
-    def _run(
-        self, views: Sequence[View], root_position: np.ndarray | None, start: float
-    ) -> _MultiStartRun:
         body, kinematics = self._body, self._kinematics
         if root_position is not None:
             body = body.with_root_position(root_position)
             kinematics = TreeKinematics(body.sampled.tree)
-        limit = self.settings.beam.time_limit
-        deadline = np.inf if limit is None else start + limit
-        fit = ViewsFit(kinematics, self._outlines, views)
-        run = _MultiStartRun(body, kinematics, fit, views, deadline)
-        run.search(self.settings)
-        return run
+        deadline = np.inf if self._time_limit is None else start + self._time_limit
+        fit = ViewsFit(kinematics, self._outlines, clean)
+        run = _Run(body, fit, clean, views, deadline)
+        result = run.search(_ROUNDS if self._alternatives else 0, self._alternatives)
+        return replace(result, seconds=time.perf_counter() - start)
 
 
-class _MultiStartRun:
-    """One match of a body, sampled roughly, with silhouettes, until a deadline."""
+class _Run:
+    """One match of a body, sampled roughly, with clean silhouettes, until a deadline.
+
+    Answers are judged by the silhouettes as they were given.
+    """
 
     def __init__(
         self,
         body: SampledBody,
-        kinematics: TreeKinematics,
         fit: ViewsFit,
+        clean: Sequence[View],
         views: Sequence[View],
         deadline: float,
     ) -> None:
-        self.body = body
-        self.kinematics = kinematics
-        self.fit = fit
-        self.poses: list[FittedPose] = []
-        self.first = FittedPose(np.zeros(0), np.inf)
-        self.stopped_by = "end"
-        self._views = views
-        self._deadline = deadline
-        self._families: RobustFamilies | None = None
+        self._body, self._fit, self._kinematics = body, fit, fit.kinematics
+        self._views, self._deadline, self._stopped_by = views, deadline, "end"
+        self._coarse = CoarseSearch(body, clean, HYPOTHESES if self._proceed() else 1)
 
-    def search(self, settings: MultiStartSettings) -> None:
+    def search(self, rounds: int, as_set: bool) -> PoseEstimate:
         """Find coarse poses, refine them, seek other explanations, and refine to the end."""
-        search = CoarseSearch(self.body, self._views, HYPOTHESES if self._proceed() else 1)
-        starts = search.choose_distinct(search.find(), _STARTS, _APART)
-        pool = refine_best(
-            self.fit,
-            self._values(starts),
-            [(COARSE, _SURVIVORS), (MEDIUM, _SURVIVORS)],
-            self._proceed,
-        )
-        self.first = pool[0]
+        starts = self._coarse.choose_distinct(self._coarse.find(), _STARTS, _APART)
+        passes = [(COARSE, _SURVIVORS), (MEDIUM, _SURVIVORS)]
+        pool = refine_best(self._fit, self._values(starts), passes, self._proceed)
+        first_J = self._J(pool[0].values)
         done: list[np.ndarray] = []
-        for _ in range(settings.rounds):
+        for _ in range(rounds):
             found = []
             for pose in pool[:_SOUGHT_ABOUT]:
                 if any(pose.values is values for values in done) or not self._proceed():
                     continue
                 done.append(pose.values)
-                found += self._others(search, pose.values)
-            pool = distinct([*pool, *found], _SURVIVORS, self.kinematics.turns_around)
+                found += self._others(pose.values)
+            pool = distinct([*pool, *found], _SURVIVORS, self._kinematics.turns_around)
         refined = refine_best(
-            self.fit,
+            self._fit,
             [pose.values for pose in pool[:_FINALISTS]],
             [(FINAL, _FINALISTS)],
             self._proceed,
         )
-        turned = [self.kinematics.nearest_turns(pose.values) for pose in refined]
-        self.poses = [
-            replace(pose, values=values) for pose, values in zip(refined, turned, strict=True)
+        poses = [
+            replace(pose, values=self._kinematics.nearest_turns(pose.values)) for pose in refined
         ]
-        if settings.families is not None:
-            self._families = RobustFamilies(self.fit, settings.families, self._proceed)
+        # Before the families, whose evaluations are not the search's.
+        statistics, pose_set = SearchStatistics(self._fit.evaluations, first_J), None
+        if as_set:
+            pose_set = RobustFamilies(self._fit, self._proceed).find(poses, self._J)
+        return PoseEstimate.of_values(
+            self._kinematics.tree,
+            self._kinematics.split(poses[0].values),
+            self._J(poses[0].values),
+            float(sum(np.count_nonzero(view.mask) for view in self._views)),
+            stopped_by=self._stopped_by,
+            statistics=statistics,
+            pose_set=pose_set,
+        )
 
     def _proceed(self) -> bool:
         if time.perf_counter() < self._deadline:
             return True
-        self.stopped_by = "time_limit"
+        self._stopped_by = "time_limit"
         return False
 
-    def _others(self, search: CoarseSearch, values: np.ndarray) -> list[FittedPose]:
+    def _others(self, values: np.ndarray) -> list[FittedPose]:
         """Other explanations near a pose, refined."""
-        kinematics = self.kinematics
+        kinematics = self._kinematics
         flipped = [flip.values for flip in flips(kinematics, values)]
         tried = counter_turns(kinematics, values, INTERVAL)
         X_WN = kinematics.poses(values)
-        for nodes in self._limbs():
-            found = search.find_again(X_WN, nodes)
-            best = search.choose_distinct(found, _TRIED, _APART)
-            tried += self._values(best, values)
+        # The subtrees of no more than half of the nodes.
+        for nodes in (one for one in kinematics.tree.subtrees if 2 * len(one) <= len(X_WN)):
+            again = self._coarse.find_again(X_WN, nodes)
+            tried += self._values(self._coarse.choose_distinct(again, _TRIED, _APART), values)
         look = AnnealingStage(MEDIUM[0].scale, COARSE[0].spacing)
         best_looks = []
         for group, count in ((flipped, _FLIPPED), (tried, _TRIED)):
-            looks = [FittedPose(one, self.fit.cost(one, look)) for one in group]
+            looks = [FittedPose(one, self._fit.cost(one, look)) for one in group]
             best_looks += distinct(looks, count, kinematics.turns_around, 0.5 * INTERVAL)
-        return [self.fit.refine(look.values, MEDIUM) for look in best_looks if self._proceed()]
-
-    def _limbs(self) -> list[list[int]]:
-        """The subtrees of no more than half of the nodes."""
-        nodes = self.body.sampled.tree.nodes
-        subtrees: list[list[int]] = [[] for _ in nodes]
-        for i in reversed(range(len(nodes))):
-            subtrees[i] = [i, *(j for child in nodes[i].children for j in subtrees[child])]
-        return [tree for tree in subtrees if 2 * len(tree) <= len(nodes)]
+        return [self._fit.refine(look.values, MEDIUM) for look in best_looks if self._proceed()]
 
     def _values(self, coarse: CoarsePoses, values: np.ndarray | None = None) -> list[np.ndarray]:
         """All values (m,) of coarse poses; those of nodes not searched are taken from values."""
-        grids = self.body.sampled.values
-        base = np.zeros(len(self.kinematics.names)) if values is None else values
+        grids = self._body.sampled.values
+        base = np.zeros(len(self._kinematics.names)) if values is None else values
         found = []
         for samples in coarse.samples:
-            parts = list(self.kinematics.split(base.copy()))
+            parts = list(self._kinematics.split(base.copy()))
             for node, sample in enumerate(samples):
                 if sample >= 0:
                     parts[node] = grids[node][sample]
-            found.append(self.kinematics.flatten(parts))
+            found.append(self._kinematics.flatten(parts))
         return found
 
-    def _J(self, views: Sequence[View], values: np.ndarray) -> float:
+    def _J(self, values: np.ndarray) -> float:
         """The objective (1) at values (m,), skin included [pixel]."""
-        outlines = self.body.sampled.surfaces.at(self.kinematics.split(values))
-        X_WN = self.kinematics.poses(values)
-        drawn = (draw_mask(outlines, view.camera.X_CW @ X_WN, view.camera) for view in views)
-        return float(sum(np.count_nonzero(d != v.mask) for d, v in zip(drawn, views, strict=True)))
-
-    def result(self, views: Sequence[View]) -> PoseEstimate:
-        """What the search found, judged by silhouettes as they were given."""
-        best = self.poses[0]
-        J = self._J(views, best.values)
-        # Before the families, whose evaluations are not the search's.
-        statistics = SearchStatistics(self.fit.evaluations, self._J(views, self.first.values))
-        pose_set = None
-        if self._families is not None:
-            pose_set = self._families.find(self.poses, lambda values: self._J(views, values))
-        return PoseEstimate.of_values(
-            self.body.sampled.tree,
-            self.kinematics.split(best.values),
-            J,
-            float(sum(np.count_nonzero(view.mask) for view in views)),
-            stopped_by=self.stopped_by,
-            statistics=statistics,
-            pose_set=pose_set,
+        outlines = self._body.sampled.surfaces.at(self._kinematics.split(values))
+        X_WN = self._kinematics.poses(values)
+        return float(
+            sum(
+                np.count_nonzero(
+                    draw_mask(outlines, view.camera.X_CW @ X_WN, view.camera) != view.mask
+                )
+                for view in self._views
+            )
         )
 
 

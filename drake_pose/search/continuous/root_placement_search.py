@@ -288,7 +288,7 @@ class RootPlacementSearch:
                 COARSE_PASSES,
                 moves,
             )
-            for values in poses.node_values
+            for values in poses
         ]
 
     def _finish(self, start: _Placed, moves: bool, deadline: float) -> _Placed:

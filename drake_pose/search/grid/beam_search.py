@@ -16,7 +16,7 @@ from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.errors import SettingsError
 from drake_pose.search.estimates import PoseEstimate, SearchStatistics, View
 from drake_pose.search.grid.beam_stages import run_stage, search_limbs_again, turn_single_nodes
-from drake_pose.search.grid.distinct_poses import Gathering, GridPoses, check_choice
+from drake_pose.search.grid.distinct_poses import choose_distinct
 from drake_pose.search.grid.examination import ExaminationSettings, examine
 from drake_pose.search.grid.node_poses import BAND, Pictures, PoseStore, coarsen
 from drake_pose.search.grid.partial_poses import Expansion, PartialPoses
@@ -58,13 +58,12 @@ class BeamSearch:
             SettingsError: if there is no view.
         """
         start = time.perf_counter()
-        run = self._prepare(views, root_position)
+        run = _Run(self.body, views, self.settings, root_position)
         run.search()
-        result = run.result(time.perf_counter() - start)
+        result = run.result()
         if self.examination is not None:
             result = examine(self.body, views, result, self.examination, root_position)
-            result = replace(result, seconds=time.perf_counter() - start)
-        return result
+        return replace(result, seconds=time.perf_counter() - start)
 
     def without_alternatives(self) -> "BeamSearch":
         """The same search where only E_total is wanted: no examination."""
@@ -78,8 +77,8 @@ class BeamSearch:
         root_position: np.ndarray | None = None,
         count: int = 30,
         alike: float = 0.7,
-    ) -> GridPoses:
-        """The best whole poses that the search came by and that do not look alike.
+    ) -> list[list[np.ndarray]]:
+        """Each node's values in the best whole poses met that do not look alike, best first.
 
         Slower than :meth:`match`: the search does not end at J = 0 before it has also looked at
         poses that leave the silhouette a little.
@@ -90,163 +89,152 @@ class BeamSearch:
                 in common in all views, or it is hidden in both, covering nothing that other nodes
                 do not cover. Above 1: all poses of the grid differ.
 
-        Returns:
-            The poses, the smallest J first; an empty list if a limit of the settings left none.
-
         Raises:
-            SettingsError: if there is no view, count is below 1 or alike is not positive.
+            SettingsError: if there is no view.
         """
-        check_choice(count, alike)
-        gathering = Gathering()
-        run = self._prepare(views, root_position, gathering)
+        run = _Run(self.body, views, self.settings, root_position, gathers=True)
         run.search()
-        return gathering.choose(run.scoring, run.pictures(exact=False), count, alike)
-
-    def _prepare(
-        self,
-        views: Sequence[View],
-        root_position: np.ndarray | None,
-        gathering: Gathering | None = None,
-    ) -> "_Run":
-        if not views:
-            raise SettingsError("a match needs at least one view, but none was given")
-        body = self.body
-        if root_position is not None:
-            body = body.with_root_position(root_position)
-        return _Run(body, views, self.settings, gathering)
+        chosen = choose_distinct(
+            run.scoring, run.pictures(exact=False), run.gathered(), count, alike
+        )
+        return [run.scoring.sampled.values_at(samples) for samples in chosen]
 
 
 class _Run:
-    """One match."""
+    """One match; it may gather all whole poses that it comes by."""
 
     def __init__(
         self,
         body: SampledBody,
         views: Sequence[View],
         settings: BeamSearchSettings,
-        gathering: Gathering | None,
+        root_position: np.ndarray | None,
+        gathers: bool = False,
     ) -> None:
+        if not views:
+            raise SettingsError("a match needs at least one view, but none was given")
         limit = settings.time_limit
-        self.deadline = np.inf if limit is None else time.perf_counter() + limit
-        self.gathering = gathering
-        self.body = body
-        self.views = views
-        self.settings = settings
-        self.scoring = Scoring(body.sampled, views)
-        self.samples: np.ndarray | None = None
+        self._deadline = np.inf if limit is None else time.perf_counter() + limit
+        self._body = body if root_position is None else body.with_root_position(root_position)
+        self._views, self._settings, self._gathers = views, settings, gathers
+        self.scoring = Scoring(self._body.sampled, views)
+        self._gathered: list[tuple[np.ndarray, np.ndarray]] = []
         self._pictures: dict[bool, Pictures] = {}
-        self.J = np.inf
-        self.first_J = np.nan
-        self.runs = 0
-        self.stopped_by = ""
         self._expansions: dict[float, Expansion] = {}
+        self._samples: np.ndarray | None = None
+        self._J, self._first_J = np.inf, np.nan
+        self._runs, self._stopped_by = 0, ""
 
     def search(self) -> None:
         """Run stage after stage until J = 0 or a limit is reached; then polish the answer."""
         skip_exact = False
-        for stage in self.settings.stages:
+        for stage in self._settings.stages:
             exact = stage.outside_share == 0.0
             if exact and skip_exact:
                 continue
-            if stage.outside_share not in self._expansions:
-                store = PoseStore(self.body, self.pictures(exact), stage.outside_share)
-                self._expansions[stage.outside_share] = Expansion(store)
-            complete = self._run_stage(self._expansions[stage.outside_share], stage)
-            if self.stopped_by or (self.J == 0 and (self.gathering is None or not exact)):
+            complete = self._run_stage(self._expansion(stage.outside_share), stage)
+            if self._stopped_by or (self._J == 0 and not (self._gathers and exact)):
                 break
-            skip_exact = skip_exact or complete or self.J == 0
-        if self.samples is None:
-            self._answer_somehow()
-        elif self.J > 0 and self.settings.research_hypotheses and not self.stopped_by:
-            turned = turn_single_nodes(
-                self.scoring, self.pictures(exact=False), self.samples, self.proceed
+            skip_exact = skip_exact or complete or self._J == 0
+        if self._samples is None:
+            # A pose whatever lies outside; found by one hypothesis alone if a limit was reached.
+            width = 1 if self._stopped_by else self._settings.stages[-1].hypotheses
+            expansion = self._expansion(np.inf)
+            last, _ = run_stage(
+                expansion, expansion.start(), self._body.order, width, 2, False, lambda: True
             )
-            self._keep_if_better(turned)
-        self.stopped_by = "exact" if self.J == 0 else self.stopped_by or "end"
+            if last is not None:
+                best = int(np.argmin(self._gather(expansion, last)))
+                self._keep_if_better(expansion.store.samples(last.poses[best]))
+        elif self._J > 0 and self._settings.research_hypotheses and not self._stopped_by:
+            pictures = self.pictures(exact=False)
+            self._keep_if_better(
+                turn_single_nodes(self.scoring, pictures, self._samples, self._proceed)
+            )
+        self._stopped_by = "exact" if self._J == 0 else self._stopped_by or "end"
 
     def pictures(self, exact: bool) -> Pictures:
         """The silhouettes as bits: coarse ones with a band for stages that are not exact."""
         if exact not in self._pictures:
-            views, band = self.views, 0
+            views, band = self._views, 0
             if not exact:
                 views = tuple(coarsen(view, _COARSE_PIXELS) for view in views)
                 band = BAND
-            self._pictures[exact] = Pictures(self.body, views, band)
+            self._pictures[exact] = Pictures(self._body, views, band)
         return self._pictures[exact]
 
-    def proceed(self) -> bool:
+    def _expansion(self, outside_share: float) -> Expansion:
+        if outside_share not in self._expansions:
+            store = PoseStore(self._body, self.pictures(outside_share == 0.0), outside_share)
+            self._expansions[outside_share] = Expansion(store)
+        return self._expansions[outside_share]
+
+    def _proceed(self) -> bool:
         """Whether the time allows to go on, after one more node."""
-        self.runs += 1
-        if time.perf_counter() >= self.deadline:
-            self.stopped_by = "time_limit"
-        return not self.stopped_by
+        self._runs += 1
+        if time.perf_counter() >= self._deadline:
+            self._stopped_by = "time_limit"
+        return not self._stopped_by
 
     def _run_stage(self, expansion: Expansion, stage: Stage) -> bool:
         """Returns whether the stage lost no hypothesis."""
         exact = stage.outside_share == 0.0
-        order = self.body.limb_order if stage.limb_by_limb else self.body.order
+        order = self._body.limb_order if stage.limb_by_limb else self._body.order
         last, complete = run_stage(
             expansion, expansion.start(), order, stage.hypotheses, stage.outside_weight, exact,
-            self.proceed,
+            self._proceed,
         )  # fmt: skip
         if last is None:
             return complete
         Js = self._gather(expansion, last)
         best = int(np.argmin(Js))
-        poses = last.poses[best]
-        self._keep_if_better(expansion.store.samples(poses))
-        if self.settings.research_hypotheses and (self.J > 0 or (self.gathering and not exact)):
+        self._keep_if_better(expansion.store.samples(last.poses[best]))
+        width = self._settings.research_hypotheses
+        if width and (self._J > 0 or (self._gathers and not exact)):
             better = search_limbs_again(
                 expansion,
                 order,
-                poses,
+                last.poses[best],
                 float(Js[best]),
-                self.settings.research_hypotheses,
-                self.proceed,
+                width,
+                self._proceed,
                 lambda whole: self._gather(expansion, whole),
             )
             self._keep_if_better(expansion.store.samples(better))
         return complete
 
-    def _answer_somehow(self) -> None:
-        """A pose whatever lies outside; found by one hypothesis alone if a limit was reached."""
-        width = 1 if self.stopped_by else self.settings.stages[-1].hypotheses
-        expansion = Expansion(PoseStore(self.body, self.pictures(exact=False)))
-        last, _ = run_stage(
-            expansion, expansion.start(), self.body.order, width, 2, False, lambda: True
-        )
-        if last is not None:
-            best = int(np.argmin(self._gather(expansion, last)))
-            self._keep_if_better(expansion.store.samples(last.poses[best]))
-
     def _gather(self, expansion: Expansion, whole: PartialPoses) -> np.ndarray:
         """What J is (n,) as the pictures show it; poses are gathered if that is wanted."""
         Js = expansion.objectives(whole)
-        if self.gathering is not None:
+        if self._gathers:
             area = expansion.store.pictures.area
-            self.gathering.add(expansion.store.samples(whole.poses), Js / area)
+            self._gathered.append((expansion.store.samples(whole.poses), Js / area))
         return Js
+
+    def gathered(self) -> np.ndarray:
+        """All poses (n, nodes) gathered, each once, the smallest errors first."""
+        if not self._gathered:
+            return np.empty((0, len(self._body.sampled.values)), dtype=np.int32)
+        samples, errors = (np.concatenate(both) for both in zip(*self._gathered, strict=True))
+        samples = samples[np.argsort(errors, kind="stable")]
+        first = np.unique(samples, axis=0, return_index=True)[1]
+        return np.asarray(samples[np.sort(first)])
 
     def _keep_if_better(self, samples: np.ndarray) -> None:
         """Keep samples (nodes,) if their J is the smallest so far."""
         X_WN = self.scoring.sampled.poses(samples[None])
         J = float(self.scoring.J(X_WN, samples[None])[0])
-        if self.samples is None:
-            self.first_J = J
-        if J < self.J:
-            self.J, self.samples = J, samples
-            if self.gathering is not None:
-                self.gathering.add(samples[None], np.array([J / self.scoring.silhouette_area]))
+        if self._samples is None:
+            self._first_J = J
+        if J < self._J:
+            self._J, self._samples = J, samples
+            self._gathered.append((samples[None], np.array([J / self.scoring.silhouette_area])))
 
-    def result(self, seconds: float) -> PoseEstimate:
+    def result(self) -> PoseEstimate:
         """What the search found."""
-        tree = self.body.sampled.tree
-        told: dict[str, Any] = {
-            "stopped_by": self.stopped_by,
-            "seconds": seconds,
-            "statistics": SearchStatistics(self.runs, self.first_J),
-        }
-        if self.samples is None:
-            return PoseEstimate.nothing(tree, **told)
-        values = self.body.sampled.values_at(self.samples)
-        return PoseEstimate.of_values(tree, values, self.J, self.scoring.silhouette_area, **told)
+        sampled, statistics = self._body.sampled, SearchStatistics(self._runs, self._first_J)
+        told: dict[str, Any] = {"stopped_by": self._stopped_by, "statistics": statistics}
+        if self._samples is None:
+            return PoseEstimate.nothing(sampled.tree, **told)
+        values, area = sampled.values_at(self._samples), self.scoring.silhouette_area
+        return PoseEstimate.of_values(sampled.tree, values, self._J, area, **told)

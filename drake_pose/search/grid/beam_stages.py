@@ -35,13 +35,9 @@ def grow(
         The new ones, best first, None where no pose stays inside the limit; and whether some were
         lost because there were too many.
     """
-    is_leaf = not expansion.nodes[node].children
-    hidden = None
-    if is_leaf and not expansion.store.pictures.has_bands:
-        hidden = expansion.hidden(partial, node)
-    pairs = all_pairs(expansion.groups(partial, node, hidden))
+    pairs = all_pairs(expansion.groups(partial, node))
     areas, added = expansion.score(partial, node, pairs)
-    if is_leaf:
+    if not expansion.nodes[node].children:
         # Of those that add nothing at all, the first of each partial pose is enough.
         nothing = np.flatnonzero(~areas.any(axis=1))
         if len(nothing) > 1:
@@ -147,20 +143,14 @@ def search_limbs_again(
 def find_limbs(expansion: Expansion) -> list[frozenset[int]]:
     """The largest subtrees without a fork but the whole tree; of a chain, its outer half."""
     nodes = expansion.nodes
-    subtrees: list[frozenset[int]] = [frozenset()] * len(nodes)
-    forked = [len(node.children) > 1 for node in nodes]
-    for i in reversed(range(len(nodes))):
-        below = [subtrees[child] for child in nodes[i].children]
-        subtrees[i] = frozenset({i}).union(*below)
-        forked[i] = forked[i] or any(forked[child] for child in nodes[i].children)
+    body = expansion.store.body
+    subtrees, forked = body.sampled.tree.subtrees, body.forked
     limbs = [
-        subtrees[i]
+        frozenset(subtrees[i])
         for i, node in enumerate(nodes)
         if not forked[i] and node.parent >= 0 and forked[node.parent]
     ]
-    if limbs:
-        return limbs
-    return [subtree for subtree in subtrees if 2 * len(subtree) <= len(nodes)][:1]
+    return limbs or [frozenset(one) for one in subtrees if 2 * len(one) <= len(nodes)][:1]
 
 
 def turn_single_nodes(

@@ -12,21 +12,19 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from drake_pose.search.estimates import View
-from drake_pose.search.grid.node_poses import LimitReached, Pictures, PoseStore
-from drake_pose.search.grid.pair_kernel import prune_pairs
+from drake_pose.search.grid.node_poses import LimitReached, Pictures, PoseStore, RowTable
+from drake_pose.search.grid.pair_kernel import NO_CHILDREN, prune_pairs, unite
 from drake_pose.search.grid.partial_poses import Expansion, PartialPoses, all_pairs
-from drake_pose.search.grid.pose_graph import Layer, PartialPoseGraph, make_layer
+from drake_pose.search.grid.pose_graph import Layer, PartialPoseGraph, make_layer, spread
 from drake_pose.search.grid.sampled_body import SampledBody
-from drake_pose.search.grid.subtree_reaches import SubtreeReaches
 from drake_pose.search.settings import BoundLimits
 
 # What lies outside counts so much where partial poses must be ranked: it stays outside, while what
 # is not covered yet may be covered by a later node.
 _OUTSIDE_WEIGHT = 2
-# More pairs than these are worth a look at what later nodes can really cover: quickly, or closely.
-_FEW_PAIRS, _MANY_PAIRS = 300, 2000
-# How many poses of a node are tried for a quick and for a close look.
-_QUICK_TRIES, _CLOSE_TRIES = 5000, 100_000
+# More pairs than these are worth a look at what later nodes can really cover; so many poses of a
+# node are tried for it at a time, and where there are more, a disc that holds all will do.
+_FEW_PAIRS, _TRIES = 300, 5000
 # Masks of more words than these get narrower bands, but none narrower than this many pixels.
 _WORDS = 2000
 _LEAST_BAND = 8
@@ -92,8 +90,7 @@ class _BranchAndBound:
         self.store = PoseStore(body, self.pictures, outside_limit=J_limit, limits=limits)
         self.expansion = Expansion(self.store)
         self.nodes = self.expansion.nodes
-        self.quick = SubtreeReaches(self.store, _QUICK_TRIES)
-        self.close = SubtreeReaches(self.store, _CLOSE_TRIES)
+        self.reaches = _SubtreeReaches(self.store)
         self._layers: list[Layer] = []
         self._complete = True
         self._limited = False
@@ -136,7 +133,7 @@ class _BranchAndBound:
         waiting = [
             i for i in self.order if i not in placed and self.nodes[i].parent in (-1, *placed)
         ]
-        forks = [i for i in waiting if self._is_forked(i)]
+        forks = [i for i in waiting if self.store.body.forked[i]]
         if forks or len(partial) == 0:
             node = (forks or waiting)[0]
             partial = self._fit_pairs(partial, node)
@@ -144,55 +141,35 @@ class _BranchAndBound:
         totals = [int(np.diff(self.expansion.groups(partial, node)).sum()) for node in waiting]
         node = waiting[int(np.argmin(totals))]
         partial = self._fit_pairs(partial, node)
-        best = None
+        pairs = self._pairs(partial, node)
         if min(totals) > _FEW_PAIRS:
-            best = self._prune(partial, waiting, self.quick)
-            if best is not None and len(best[1]) > _MANY_PAIRS:
-                best = self._prune(partial, waiting, self.close)
-        return (partial, *(best or (node, self._pairs(partial, node))))
+            for other in waiting:
+                if np.diff(self.expansion.groups(partial, other)).sum() <= self.limits.pairs:
+                    pruned = self._pruned_pairs(partial, other, waiting)
+                    if len(pruned) < len(pairs):
+                        node, pairs = other, pruned
+        return partial, node, pairs
 
     def _pairs(self, partial: PartialPoses, node: int) -> np.ndarray:
         return all_pairs(self.expansion.groups(partial, node))
 
-    def _prune(
-        self, partial: PartialPoses, waiting: Sequence[int], reaches: SubtreeReaches
-    ) -> tuple[int, np.ndarray] | None:
-        """The waiting node that leaves the fewest pairs, and these; None: all have too many."""
-        best: tuple[int, np.ndarray] | None = None
-        for node in waiting:
-            if np.diff(self.expansion.groups(partial, node)).sum() <= self.limits.pairs:
-                pairs = self._pruned_pairs(partial, node, waiting, reaches)
-                if best is None or len(pairs) < len(best[1]):
-                    best = node, pairs
-        return best
-
-    def _pruned_pairs(
-        self, partial: PartialPoses, node: int, waiting: Sequence[int], reaches: SubtreeReaches
-    ) -> np.ndarray:
+    def _pruned_pairs(self, partial: PartialPoses, node: int, waiting: Sequence[int]) -> np.ndarray:
         """Those pairs that leave no more than what the waiting nodes can really cover."""
         pairs = self._pairs(partial, node)
-        below = reaches.child_rows(node, pairs[:, 1])
-        others = []
-        for other in waiting:
-            if other != node:
-                parents = self.store.parents(partial.poses, other)
-                others.append(reaches.rows(other, parents)[parents])
-        everything = self.pictures.everything
+        below = self.reaches.child_rows(node, pairs[:, 1])
+        others = [
+            self.reaches.rows(other, self.store.parents(partial.poses, other))
+            for other in waiting
+            if other != node
+        ]
+        table, everything = self.reaches.table, self.pictures.everything
         uncovered = everything & ~partial.masks[:, : len(everything)]
         for rows in others:
-            uncovered &= ~reaches.table[rows]
+            uncovered &= ~table[rows]
         room = np.floor(self.J_limit - partial.least_outside).astype(np.int64)
-        stored = self.store.nodes[node]
-        good = prune_pairs(
-            uncovered, room, pairs, stored.runs, stored.words, len(self.pictures.views), below,
-            reaches.table,
-        )  # fmt: skip
+        stored, views = self.store.nodes[node], len(self.pictures.views)
+        good = prune_pairs(uncovered, room, pairs, stored.runs, stored.words, views, below, table)
         return pairs[good]
-
-    def _is_forked(self, node: int) -> bool:
-        """Whether the node or one of its descendants has several children."""
-        children = self.nodes[node].children
-        return len(children) > 1 or any(self._is_forked(child) for child in children)
 
     def _place(self, partial: PartialPoses, node: int, pairs: np.ndarray) -> PartialPoses:
         """Place a node as pairs (p, 2) say, and note the edges."""
@@ -258,6 +235,55 @@ class _BranchAndBound:
         found = (origins == self._kept) & (samples == self.kept_samples[node])
         edges = np.flatnonzero(found)
         self._kept = int(numbers[edges[0]]) if len(edges) else -1
+
+
+class _SubtreeReaches:
+    """The silhouettes' pixels that a node and its descendants can cover, by pose of its parent.
+
+    Attributes:
+        table: (r, w) uint64 unions; the rows beyond those in use are zero.
+    """
+
+    def __init__(self, store: PoseStore) -> None:
+        self._store = store
+        self.table = np.zeros((256, len(store.pictures.everything)), dtype=np.uint64)
+        self._used = 0
+        self._rows = [RowTable(1) for _ in store.tree_nodes]
+
+    def rows(self, node: int, parents: np.ndarray) -> np.ndarray:
+        """For poses (n,) of the node's parent the rows of ``table``."""
+        missing = self._rows[node].missing(parents)
+        if len(missing):
+            self._rows[node].make(missing, self._unite(node, missing)[:, None])
+        return self._rows[node].rows[parents, 0]
+
+    def child_rows(self, node: int, poses: np.ndarray) -> np.ndarray:
+        """(children, all poses) int64 the rows of a node's children at poses (n,) of the node."""
+        children = self._store.tree_nodes[node].children
+        rows = np.zeros((len(children), len(self._store.nodes[node].samples)), dtype=np.int64)
+        for row, child in zip(rows, children, strict=True):
+            row[poses] = self.rows(child, poses)
+        return rows
+
+    def _unite(self, node: int, parents: np.ndarray) -> np.ndarray:
+        """New rows for poses (n,) of a node's parent, within the store's limits."""
+        store = self._store
+        if len(parents) * len(store.body.sampled.values[node]) > _TRIES:
+            places = store.reach_rows(node, parents)
+            groups = np.column_stack([places, places + 1])
+            runs, words, below = store.reach_runs, store.reach_words, NO_CHILDREN
+        else:
+            groups = store.groups(node, parents)
+            below = self.child_rows(node, spread(groups[:, 0], groups[:, 1])[1])
+            runs, words = store.nodes[node].runs, store.nodes[node].words
+        rows = np.arange(self._used, self._used + len(parents))
+        self._used += len(parents)
+        if self._used > len(self.table):
+            store.reserve(8 * self._used * self.table.shape[1])
+            more = np.zeros((self._used, self.table.shape[1]), dtype=np.uint64)
+            self.table = np.concatenate([self.table, more])
+        unite(self.table, rows, groups, runs, words, len(store.pictures.views), below)
+        return rows
 
 
 def _make_pictures(body: SampledBody, views: Sequence[View], J_limit: float) -> Pictures:

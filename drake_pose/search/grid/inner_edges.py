@@ -81,38 +81,25 @@ class EdgeErrors:
 
 @dataclass(frozen=True)
 class InnerEdges:
-    """The edges that one camera's picture shows inside its silhouette.
-
-    Args:
-        edges: (H, W) bool.
-        window: first row, row after the last, first column and column after the last of the
-            silhouette's surroundings.
-        mask: (H, W) bool, the silhouette.
-    """
+    """The edges (H, W) bool that one camera's picture shows inside its silhouette, the mask."""
 
     edges: np.ndarray
-    window: tuple[int, int, int, int]
     mask: np.ndarray
     errors: EdgeErrors = EdgeErrors()
 
     @cached_property
-    def _inside(self) -> np.ndarray:
-        """The pixels of the window at which edges count."""
-        top, bottom, left, right = self.window
-        return self.mask[top:bottom, left:right]
+    def _window(self) -> tuple[slice, slice]:
+        """The rows and columns of the silhouette."""
+        left, top, width, height = cv2.boundingRect(self.mask.astype(np.uint8))
+        return slice(top, top + height), slice(left, left + width)
 
     @cached_property
-    def _seen(self) -> np.ndarray:
-        """(pixels inside,) int: 1 where an edge is seen."""
-        top, bottom, left, right = self.window
-        return self.edges[top:bottom, left:right][self._inside].astype(np.int64)
-
-    @cached_property
-    def _patches(self) -> np.ndarray:
-        """(pixels inside,) int: the patch that each lies in."""
-        rows, columns = (places // self.errors.patch for places in np.nonzero(self._inside))
-        across = 1 + int(columns.max(initial=0))
-        return np.unique(rows * across + columns, return_inverse=True)[1]
+    def _inside(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Where edges count in the window, (pixels,) 1 where one is seen, and each one's patch."""
+        mask = self.mask[self._window]
+        rows, columns = (places // self.errors.patch for places in np.nonzero(mask))
+        patches = np.unique(rows * (1 + int(columns.max())) + columns, return_inverse=True)[1]
+        return mask, self.edges[self._window][mask].astype(np.int64), patches
 
     def log_likelihood(self, segments: np.ndarray) -> float:
         """The log probability of the edges if a pose's picture is segments (H, W) int.
@@ -120,21 +107,17 @@ class InnerEdges:
         That the edges are without any error counts as likely beforehand as that they have the
         errors which ``errors`` describes.
         """
-        top, bottom, left, right = self.window
-        window = (slice(top, bottom), slice(left, right))
-        borders = find_borders(np.where(self.mask[window], segments[window], -1))
+        mask, seen, patches = self._inside
+        borders = find_borders(np.where(mask, segments[self._window], -1))
         near = cv2.boxFilter(
             borders.astype(np.float32), -1, (3, 3), normalize=False, borderType=cv2.BORDER_CONSTANT
         )
-        expected = np.rint(near[self._inside]).astype(np.int64)
-        sums = [
-            np.bincount(self._patches, table[self._seen, expected])
-            for table in self.errors.log_pixel
-        ]
-        seen = int(self._seen.sum())
-        weights = self.errors.log_patch(seen, max(1.0, len(expected) / self.errors.patch**2))
+        expected = np.rint(near[mask]).astype(np.int64)
+        sums = [np.bincount(patches, table[seen, expected]) for table in self.errors.log_pixel]
+        count = max(1.0, len(expected) / self.errors.patch**2)
+        weights = self.errors.log_patch(int(seen.sum()), count)
         damaged = float(logsumexp(np.array(sums) + weights[:, None], axis=0).sum()) / _CLASSES
-        flawless = 0.0 if np.array_equal(borders[self._inside], self._seen > 0) else -np.inf
+        flawless = 0.0 if np.array_equal(borders[mask], seen > 0) else -np.inf
         return float(np.logaddexp(flawless, damaged) + np.log(0.5))
 
 
@@ -144,19 +127,24 @@ def edges_of_labels(labels: np.ndarray, mask: np.ndarray) -> InnerEdges:
     Raises:
         SettingsError: if the shapes differ or the silhouette is empty.
     """
-    window = _window(labels.shape[:2], mask)
-    edges = find_borders(np.where(mask, labels, -1))
-    return InnerEdges(edges, window, mask)
+    if labels.shape != mask.shape:
+        raise SettingsError(
+            f"the picture for inner edges is {labels.shape[::-1]} pixels (width, height), but the "
+            f"silhouette is {mask.shape[::-1]}: give both of the same camera and size"
+        )
+    if not mask.any():
+        raise SettingsError("the silhouette is empty: it has no inner edges")
+    return InnerEdges(find_borders(np.where(mask, labels, -1)), mask)
 
 
 def find_borders(segments: np.ndarray) -> np.ndarray:
     """Pixels (H, W) bool of a segment whose right or lower neighbour is of another segment."""
     borders = np.zeros(segments.shape, dtype=np.bool_)
-    right, lower = segments[:, 1:], segments[1:]
-    here = segments[:, :-1]
-    borders[:, :-1] |= (here >= 0) & (right >= 0) & (here != right)
-    here = segments[:-1]
-    borders[:-1] |= (here >= 0) & (lower >= 0) & (here != lower)
+    for own, here, other in (
+        (borders[:, :-1], segments[:, :-1], segments[:, 1:]),
+        (borders[:-1], segments[:-1], segments[1:]),
+    ):
+        own |= (here >= 0) & (other >= 0) & (here != other)
     return borders
 
 
@@ -254,12 +242,7 @@ def _turn_subtrees(
     random: np.random.Generator,
 ) -> None:
     """Judge what can be reached from a pose by turning one node and all that hangs on it."""
-    nodes = answer.sampled.tree.nodes
-    subtrees = [{i} for i in range(len(nodes))]
-    for i in reversed(range(len(nodes))):
-        if nodes[i].parent >= 0:
-            subtrees[nodes[i].parent] |= subtrees[i]
-    order = sorted(subtrees, key=len)
+    order = sorted(answer.sampled.tree.subtrees, key=len)
     best, unchanged = judge(samples), 0
     for subtree in itertools.cycle(order):
         allowed = [
@@ -278,19 +261,4 @@ def _turn_subtrees(
 
 def _members(graph: PartialPoseGraph, most: int, random: np.random.Generator) -> np.ndarray:
     """All poses (n, nodes) of a graph, or this many of them drawn at random."""
-    if graph.size <= most:
-        return graph.members()
-    return graph.draw(most, random)
-
-
-def _window(shape: tuple[int, ...], mask: np.ndarray) -> tuple[int, int, int, int]:
-    """The rows and columns of a silhouette."""
-    if shape != mask.shape:
-        raise SettingsError(
-            f"the picture for inner edges is {shape[::-1]} pixels (width, height), but the "
-            f"silhouette is {mask.shape[::-1]}: give both of the same camera and size"
-        )
-    rows, columns = np.nonzero(mask)
-    if len(rows) == 0:
-        raise SettingsError("the silhouette is empty: it has no inner edges")
-    return int(rows.min()), int(rows.max()) + 1, int(columns.min()), int(columns.max()) + 1
+    return graph.members() if graph.size <= most else graph.draw(most, random)

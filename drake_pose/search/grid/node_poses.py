@@ -2,11 +2,12 @@
 
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
-from drake_pose.camera.models import Camera, ParallelCamera, PinholeCamera
+from drake_pose.camera.models import ParallelCamera
 from drake_pose.search.estimates import View
 from drake_pose.search.grid.pair_kernel import Reaches, unite_poses
 from drake_pose.search.grid.sampled_body import SampledBody
@@ -17,7 +18,6 @@ from drake_pose.silhouette.bits.bounding_balls import draw_discs, prune_by_balls
 BAND = 24
 """How far around a silhouette the union of what lies outside is told from its sum [pixel]."""
 
-_ONE, _ALL = 1, 2
 # How many poses of a node, and discs that hold what can be reached, are drawn before the limits are
 # looked at again.
 _TRIED_TOGETHER, _REACHES_TOGETHER = 100_000, 20_000
@@ -32,35 +32,20 @@ def coarsen(view: View, pixels: int) -> View:
 
     A pixel is in the silhouette if at least half of those that it replaces are.
     """
-    factor = round(float(np.sqrt(view.mask.sum() / pixels)))
+    factor, camera = round(float(np.sqrt(view.mask.sum() / pixels))), view.camera
     if factor < 2:
         return view
     height, width = (-(-side // factor) for side in view.mask.shape)
     padded = np.zeros((height * factor, width * factor), dtype=np.uint8)
     padded[: view.mask.shape[0], : view.mask.shape[1]] = view.mask
     counts = padded.reshape(height, factor, width, factor).sum(axis=(1, 3), dtype=np.int64)
-    return View(_coarse_camera(view.camera, factor, width, height), 2 * counts >= factor**2)
-
-
-def _coarse_camera(camera: Camera, factor: int, width: int, height: int) -> Camera:
-    """The camera with pixels this many times as large, in a picture of the given size."""
+    parallel = isinstance(camera, ParallelCamera)
+    scales = ("pixels_per_metre",) if parallel else ("focal_x", "focal_y")
+    coarse: dict[str, Any] = {name: getattr(camera, name) / factor for name in scales}
     # Pixel centres are at integers.
-    center_x = (camera.center_x + 0.5) / factor - 0.5
-    center_y = (camera.center_y + 0.5) / factor - 0.5
-    if isinstance(camera, ParallelCamera):
-        scale = camera.pixels_per_metre / factor
-        return ParallelCamera(camera.name, width, height, scale, center_x, center_y, camera.X_WC)
-    return PinholeCamera(
-        camera.name,
-        width,
-        height,
-        camera.focal_x / factor,
-        camera.focal_y / factor,
-        center_x,
-        center_y,
-        camera.X_WC,
-        camera.near,
-    )
+    for name in ("center_x", "center_y"):
+        coarse[name] = (getattr(camera, name) + 0.5) / factor - 0.5
+    return View(replace(camera, width=width, height=height, **coarse), 2 * counts >= factor**2)
 
 
 class Pictures:
@@ -81,8 +66,7 @@ class Pictures:
     def __init__(
         self, body: SampledBody, views: Sequence[View], band: int, in_full: bool = False
     ) -> None:
-        self.body = body
-        self.views = tuple(views)
+        self.body, self.views = body, tuple(views)
         self.has_bands = band > 0
         self.coarse = self.has_bands and not in_full
         self.bit_views: list[BitView] = [
@@ -91,10 +75,9 @@ class Pictures:
         ]
         pixels = [int(view.inside[-1, -1]) for view in self.bit_views]
         self.area = float(sum(pixels))
+        self.everything = np.concatenate([_ones(count) for count in pixels])
         if self.has_bands:
             pixels += [int(view.band[-1, -1]) for view in self.bit_views]
-        counts = pixels[: len(views)]
-        self.everything = np.concatenate([_ones(count) for count in counts])
         self.part_starts = np.concatenate([[0], np.cumsum([n // WORD + 1 for n in pixels])])
 
     def draw_node(
@@ -109,11 +92,9 @@ class Pictures:
         total = np.zeros((len(X_WN), 3), dtype=np.int64)
         pairs = np.column_stack([np.arange(len(X_WN)), samples]).astype(np.int32)
         in_place = np.tile(np.eye(4), (len(self.body.sampled.values[node]), 1, 1))
-        all_of_them = np.zeros(len(X_WN), dtype=np.bool_)
         for index, view in enumerate(self.bit_views):
             celled = self.body.celled_outline(node, self.views[index].camera, self.coarse)
-            drawn = draw_bits(celled, view, X_WN, in_place, pairs, np.inf, all_of_them)
-            _, areas, runs, words = drawn
+            _, areas, runs, words = draw_bits(celled, view, X_WN, in_place, pairs, np.inf)
             runs[:, :, 0] += np.array([starts[index], starts[views + index]])
             unite_poses(masks, np.arange(len(masks)), runs, words)
             total += areas
@@ -127,13 +108,29 @@ def _ones(count: int) -> np.ndarray:
     return np.packbits(bits, bitorder="little").view(np.uint64)
 
 
-def _with_rows(table: np.ndarray, rows: np.ndarray, value: int) -> np.ndarray:
-    """A table that has all these rows; new ones hold a value."""
-    size = int(rows.max(initial=0)) + 1
-    if len(table) >= size:
-        return table
-    more = np.full((size - len(table) + 64, *table.shape[1:]), value, dtype=np.int64)
-    return np.concatenate([table, more])
+class RowTable:
+    """Rows of numbers (k,) by index, made where they are first asked for."""
+
+    def __init__(self, width: int) -> None:
+        self.rows = np.zeros((0, width), dtype=np.int64)
+        self._made = np.zeros(0, dtype=np.bool_)
+
+    def missing(self, indices: np.ndarray) -> np.ndarray:
+        """Of indices those, each once, whose rows are not made; they count as made from now."""
+        size = int(indices.max(initial=0)) + 1
+        if len(self.rows) < size:
+            more = size - len(self.rows) + 64
+            self.rows = np.pad(self.rows, ((0, more), (0, 0)))
+            self._made = np.pad(self._made, (0, more))
+        if self._made[indices].all():
+            return np.zeros(0, dtype=np.int64)
+        wanted = np.zeros_like(self._made)
+        wanted[indices] = True
+        return np.flatnonzero(wanted & ~self._made)
+
+    def make(self, indices: np.ndarray, rows: np.ndarray) -> None:
+        """Take in rows (n, k)."""
+        self.rows[indices], self._made[indices] = rows, True
 
 
 @dataclass
@@ -164,10 +161,8 @@ class PoseStore:
         outside_limit: float | None = None,
         limits: BoundLimits | None = None,
     ) -> None:
-        self.body = body
-        self.pictures = pictures
+        self.body, self.pictures, self.limits = body, pictures, limits
         self.tree_nodes = body.sampled.tree.nodes
-        self.limits = limits
         self.deadline = np.inf if limits is None else limits.deadline
         self._outside_share, self._outside_limit = outside_share, outside_limit
         self._reserved = 0
@@ -182,10 +177,9 @@ class PoseStore:
             )
             for _ in self.tree_nodes
         ]
-        # For each node and pose of its parent: where its poses begin and end, and how many of
-        # them are drawn: none, one that is enough, or all.
-        self._groups = [np.zeros((0, 3), dtype=np.int64) for _ in self.nodes]
-        self._reach_rows = [np.full(0, -1, dtype=np.int64) for _ in self.nodes]
+        # For each node and pose of its parent: where its poses begin and end; and what it reaches.
+        self._groups = [RowTable(2) for _ in self.nodes]
+        self._reach_rows = [RowTable(1) for _ in self.nodes]
         self.reach_runs = np.empty((0, len(pictures.views), 3), dtype=np.int64)
         self.reach_words = np.empty(0, dtype=np.uint64)
 
@@ -211,26 +205,18 @@ class PoseStore:
             self.reserve()
             yield missing[begin : begin + together]
 
-    def groups(
-        self, node: int, parents: np.ndarray, hidden: np.ndarray | None = None
-    ) -> np.ndarray:
+    def groups(self, node: int, parents: np.ndarray) -> np.ndarray:
         """Where the node's poses begin and end (n, 2), for poses (n,) of its parent; 0 for a root.
 
-        What is missing is drawn. Where ``hidden`` (n,) one pose is enough.
+        What is missing is drawn.
         """
-        known = self._groups[node] = _with_rows(self._groups[node], parents, 0)
-        if known[parents, 2].min(initial=_ALL) == _ALL:
-            return known[parents, :2]
-        wanted = np.zeros(len(known), dtype=np.int64)
-        wanted[parents] = _ONE
-        wanted[parents if hidden is None else parents[~hidden]] = _ALL
+        known = self._groups[node]
         together = max(1, _TRIED_TOGETHER // len(self.body.sampled.X_PN[node]))
-        for missing in self._in_turn(np.flatnonzero(wanted > known[:, 2]), together):
-            counts = self._draw(node, missing, wanted[missing] == _ONE)
+        for missing in self._in_turn(known.missing(parents), together):
+            counts = self._draw(node, missing)
             ends = len(self.nodes[node].samples) - counts.sum() + np.cumsum(counts)
-            known[missing, 0], known[missing, 1] = ends - counts, ends
-            known[missing, 2] = wanted[missing]
-        return known[parents, :2]
+            known.make(missing, np.column_stack([ends - counts, ends]))
+        return known.rows[parents]
 
     def samples(self, poses: np.ndarray) -> np.ndarray:
         """The samples (..., nodes) that the nodes take at poses (..., nodes)."""
@@ -239,17 +225,10 @@ class PoseStore:
         )
 
     def reach_rows(self, node: int, parents: np.ndarray) -> np.ndarray:
-        """For all poses of the node's parent the row of ``reach_runs`` of what the node can reach.
-
-        Only the rows of the poses (n,) asked for are sure to be there.
-        """
-        rows = self._reach_rows[node] = _with_rows(self._reach_rows[node], parents, -1)
-        if rows[parents].min(initial=0) >= 0:
-            return rows
-        wanted = np.zeros(len(rows), dtype=np.bool_)
-        wanted[parents] = True
-        ball, views = self.body.reach_balls[node], self.pictures.bit_views
-        for missing in self._in_turn(np.flatnonzero(wanted & (rows < 0)), _REACHES_TOGETHER):
+        """For poses (n,) of the node's parent the rows of ``reach_runs`` of what it can reach."""
+        known, views = self._reach_rows[node], self.pictures.bit_views
+        ball = self.body.reach_balls[node]
+        for missing in self._in_turn(known.missing(parents), _REACHES_TOGETHER):
             runs = np.empty((len(missing), len(views), 3), dtype=np.int64)
             used, pieces = len(self.reach_words), [self.reach_words]
             X_WP = self._parent_poses(node, missing)
@@ -258,10 +237,10 @@ class PoseStore:
                 runs[:, index] = view_runs + np.array([self.pictures.part_starts[index], 0, used])
                 used += len(words)
                 pieces.append(words)
-            rows[missing] = len(self.reach_runs) + np.arange(len(missing))
+            known.make(missing, len(self.reach_runs) + np.arange(len(missing))[:, None])
             self.reach_runs = np.concatenate([self.reach_runs, runs])
             self.reach_words = np.concatenate(pieces)
-        return rows
+        return known.rows[parents, 0]
 
     def parents(self, poses: np.ndarray, node: int) -> np.ndarray:
         """The poses (B,) of a node's parent among poses (B, nodes); 0 for a root."""
@@ -277,7 +256,7 @@ class PoseStore:
         for i, other in enumerate(waiting if len(pairs) else ()):
             own = self.tree_nodes[other].parent == node
             parents = pairs[:, 1] if own else self.parents(poses, other)[pairs[:, 0]]
-            rows[i] = self.reach_rows(other, parents)[parents]
+            rows[i] = self.reach_rows(other, parents)
         return Reaches(self.reach_runs, self.reach_words, rows)
 
     def open_nodes(self, poses: np.ndarray, node: int) -> np.ndarray:
@@ -293,32 +272,28 @@ class PoseStore:
         parent = self.tree_nodes[node].parent
         return np.eye(4)[None] if parent < 0 else self.nodes[parent].X_WN[parents]
 
-    def _draw(self, node: int, parents: np.ndarray, one_enough: np.ndarray) -> np.ndarray:
+    def _draw(self, node: int, parents: np.ndarray) -> np.ndarray:
         """Draw the node for poses of its parent; returns how many poses each adds."""
         X_WP = self._parent_poses(node, parents)
         X_PN = self.body.sampled.X_PN[node]
         pairs = np.empty((len(X_WP) * len(X_PN), 2), dtype=np.int32)
         pairs[:, 0] = np.repeat(np.arange(len(X_WP)), len(X_PN))
         pairs[:, 1] = np.tile(np.arange(len(X_PN)), len(X_WP))
-        limit = self._limit(node)
-        for view in self.pictures.bit_views:
+        views, limit = self.pictures.bit_views, self._limit(node)
+        for view in views:
             left = prune_by_balls(
                 view, X_WP, self.body.p_PB[node], self.body.ball_radii[node], pairs, limit
             )
             pairs = pairs[left]
-        several = len(self.pictures.views) > 1
-        if several:
-            # A pose that is enough for one view may not be one for another.
-            one_enough = np.zeros_like(one_enough)
         drawn: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
-        for index, view in enumerate(self.pictures.bit_views):
+        for index, view in enumerate(views):
             celled = self.body.celled_outline(
                 node, self.pictures.views[index].camera, self.pictures.coarse
             )
-            kept, areas, runs, words = draw_bits(celled, view, X_WP, X_PN, pairs, limit, one_enough)
+            kept, areas, runs, words = draw_bits(celled, view, X_WP, X_PN, pairs, limit)
             pairs = pairs[kept]
             drawn = [(a[kept], r[kept], w) for a, r, w in drawn] + [(areas, runs, words)]
-        if several:
+        if len(views) > 1:
             kept = sum(areas[:, 1:].sum(axis=1) for areas, _, _ in drawn) <= limit
             pairs = pairs[kept]
             drawn = [(a[kept], r[kept], w) for a, r, w in drawn]
@@ -343,14 +318,12 @@ class PoseStore:
     ) -> None:
         """Add drawn poses to the node's arrays."""
         poses, starts = self.nodes[node], self.pictures.part_starts
-        views = len(drawn)
         runs = np.empty((len(pairs), len(starts) - 1, 3), dtype=np.int64)
         areas = np.zeros((len(pairs), 3), dtype=np.int32)
         used = len(poses.words)
         for index, (view_areas, view_runs, words) in enumerate(drawn):
             areas += view_areas
-            for kind in range(2 if self.pictures.has_bands else 1):
-                part = kind * views + index
+            for kind, part in enumerate(range(index, len(starts) - 1, len(drawn))):
                 runs[:, part] = view_runs[:, kind] + np.array([starts[part], 0, used])
             used += len(words)
         X_WN = X_WP[pairs[:, 0]] @ self.body.sampled.X_PN[node][pairs[:, 1]]

@@ -74,7 +74,7 @@ def score_pairs(
             words and where they begin in words.
         words: (m,) uint64.
         silhouettes: how many parts come first that are silhouettes; the others are bands.
-        keys: (2 W,) uint64 of the hashes; or (0,): none are wanted.
+        keys: (2 W,) uint64 of the hashes.
 
     Returns:
         (p, 2) int64 the silhouette and the band newly covered [pixel]; and (p,) uint64 what is
@@ -82,7 +82,6 @@ def score_pairs(
     """
     areas = np.zeros((pairs.shape[0], 2), dtype=np.int64)
     codes = np.zeros(pairs.shape[0], dtype=np.uint64)
-    hashed = keys.shape[0] > 0
     for i in range(pairs.shape[0]):
         h, c = pairs[i, 0], pairs[i, 1]
         code = np.uint64(0)
@@ -93,9 +92,8 @@ def score_pairs(
                 added = words[place + k] & ~masks[h, begin + k]
                 if added != np.uint64(0):
                     ones += count_bits(added)
-                    if hashed:
-                        code += (added & _LOW_HALF) * keys[2 * (begin + k)]
-                        code += (added >> _HALF) * keys[2 * (begin + k) + 1]
+                    code += (added & _LOW_HALF) * keys[2 * (begin + k)]
+                    code += (added >> _HALF) * keys[2 * (begin + k) + 1]
             areas[i, 0 if part < silhouettes else 1] += np.int64(ones)
         codes[i] = code
     return areas, codes
@@ -215,9 +213,6 @@ def unite(
                 for k in range(union.shape[0]):
                     union[k] |= below[k]
 
-
-NO_KEYS = np.zeros(0, dtype=np.uint64)
-"""The ``keys`` of who asks for areas alone."""
 
 NO_CHILDREN = np.zeros((0, 0), dtype=np.int64)
 """The ``child_rows`` of who asks for the poses alone."""

@@ -11,7 +11,6 @@ import numpy as np
 
 from drake_pose.search.grid.node_poses import PoseStore
 from drake_pose.search.grid.pair_kernel import (
-    NO_KEYS,
     choose_pairs,
     hash_mask,
     random_keys,
@@ -107,13 +106,11 @@ class Expansion:
         """(B,) what the objective of whole poses is, as far as the pictures show [pixel]."""
         return np.asarray(self.store.pictures.area - whole.covered + whole.outside)
 
-    def groups(
-        self, partial: PartialPoses, node: int, hidden: np.ndarray | None = None
-    ) -> np.ndarray:
-        """Where the node's poses begin and end (B, 2) that each may take; hidden: one will do."""
+    def groups(self, partial: PartialPoses, node: int) -> np.ndarray:
+        """Where the node's poses begin and end (B, 2) that each may take."""
         if len(partial) == 0:
             return np.zeros((0, 2), dtype=np.int64)
-        return self.store.groups(node, self.store.parents(partial.poses, node), hidden)
+        return self.store.groups(node, self.store.parents(partial.poses, node))
 
     def score(
         self, partial: PartialPoses, node: int, pairs: np.ndarray
@@ -121,16 +118,6 @@ class Expansion:
         """Areas newly covered (p, 2) of silhouette and band [pixel], and what hashes gain (p,)."""
         stored, views = self.store.nodes[node], len(self.store.pictures.views)
         return score_pairs(partial.masks, pairs, stored.runs, stored.words, views, self._mask_keys)
-
-    def hidden(self, partial: PartialPoses, node: int) -> np.ndarray:
-        """(B,) bool whether the node can cover nothing of the silhouettes that is not covered."""
-        store = self.store
-        parents = store.parents(partial.poses, node)
-        rows = store.reach_rows(node, parents)[parents]
-        pairs = np.column_stack([np.arange(len(rows)), rows]).astype(np.int32)
-        runs, views = store.reach_runs, len(store.pictures.views)
-        areas, _ = score_pairs(partial.masks, pairs, runs, store.reach_words, views, NO_KEYS)
-        return np.asarray(areas[:, 0] == 0)
 
     def make(
         self,

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.ndimage import binary_erosion
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
@@ -74,7 +75,7 @@ def estimate_joints(
             low, high = float(values[0] - margin), float(values[-1] + margin)
             if not around[k]:
                 low, high = max(low, float(lower[k])), min(high, float(upper[k]))
-            reports.append(JointEstimate(name, i, determined, low, high, values, bool(around[k])))
+            reports.append(JointEstimate(name, determined, low, high, bool(around[k])))
     return tuple(reports)
 
 
@@ -243,12 +244,9 @@ def samples_at(sampled: SampledTree, node_values: Sequence[np.ndarray]) -> np.nd
 
 def contour_length(views: Sequence[View]) -> int:
     """How many pixels of the silhouettes have a neighbour in the picture that is in none."""
-    total = 0
-    for view in views:
-        padded = np.pad(view.mask, 1, mode="edge")
-        inner = padded[:-2, 1:-1] & padded[2:, 1:-1] & padded[1:-1, :-2] & padded[1:-1, 2:]
-        total += int((view.mask & ~inner).sum())
-    return total
+    return sum(
+        int((view.mask & ~binary_erosion(view.mask, border_value=1)).sum()) for view in views
+    )
 
 
 def _describe(
@@ -291,14 +289,6 @@ def _describe_family(
     samples: np.ndarray,
     complete: bool,
 ) -> PoseFamily:
-    central = samples if graph.objective(samples) == family.J else graph.central()
-    values = sampled.values_at(central)
-    q, X_WB = sampled.tree.positions_from(values)
-    return PoseFamily(
-        q=q,
-        X_WB=X_WB,
-        node_values=tuple(values),
-        J=family.J,
-        joints=estimate_joints(sampled, graph.samples_seen(), values, complete=complete),
-        size=family.size,
-    )
+    values = sampled.values_at(samples if graph.objective(samples) == family.J else graph.central())
+    joints = estimate_joints(sampled, graph.samples_seen(), values, complete=complete)
+    return PoseFamily.of_values(sampled.tree, values, family.J, joints, family.size)

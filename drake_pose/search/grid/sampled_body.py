@@ -35,6 +35,7 @@ class SampledBody:
         ball_radii: for each node (k,) radii of balls that its picture covers [m]: balls inside the
             node, and inside its children about points that their joints leave where they are.
         p_PB: for each node (n, k, 3) their centres in its parent's frame at each sample [m].
+        forked: for each node whether it or one that hangs on it has several children.
         reach_balls: (nodes, 4) centre in the parent's frame and radius [m] of a ball that holds the
             node and its descendants at all samples.
     """
@@ -55,6 +56,9 @@ class SampledBody:
         self.reach_balls = self._find_reaches()
         self._celled: dict[tuple[int, float, bool], CelledOutline] = {}
         self._frontiers: dict[frozenset[int], tuple[np.ndarray, list[int]]] = {}
+        self.forked = [
+            any(len(tree.nodes[j].children) > 1 for j in below) for below in tree.subtrees
+        ]
         self.order = self._find_order(limb_by_limb=False)
         self.limb_order = self._find_order(limb_by_limb=True)
 
@@ -163,12 +167,8 @@ class SampledBody:
 
     def _find_order(self, limb_by_limb: bool) -> tuple[int, ...]:
         """Trunk first, then limb after limb, the larger before the smaller."""
-        nodes = self.sampled.tree.nodes
-        forks = [len(node.children) > 1 for node in nodes]
-        sizes = [round(area, 6) for area in self.surface_areas]
-        for i in reversed(range(len(nodes))):
-            forks[i] = forks[i] or any(forks[child] for child in nodes[i].children)
-            sizes[i] += sum(sizes[child] for child in nodes[i].children)
+        nodes, subtrees = self.sampled.tree.nodes, self.sampled.tree.subtrees
+        sizes = [round(sum(self.surface_areas[j] for j in below), 5) for below in subtrees]
         placed: list[int] = []
         while len(placed) < len(nodes):
             last = placed[-1] if placed else -1
@@ -176,14 +176,9 @@ class SampledBody:
             def rank(i: int, last: int = last) -> tuple[bool, bool, bool, float, int]:
                 is_end = not nodes[i].children and not limb_by_limb
                 follows = not is_end and nodes[i].parent == last
-                return not forks[i], is_end, not follows, -sizes[i], i
+                return not self.forked[i], is_end, not follows, -sizes[i], i
 
-            waiting = [
-                i
-                for i, node in enumerate(nodes)
-                if i not in placed and (node.parent < 0 or node.parent in placed)
-            ]
-            placed.append(min(waiting, key=rank))
+            placed.append(min(self.frontier(frozenset(placed))[1], key=rank))
         return tuple(placed)
 
 

@@ -95,13 +95,11 @@ def find_reflections(tree: PoseTree) -> tuple[Part, ...]:
         elif parent >= 0:
             owners.add(parent)
             partners |= dict(zip(limb, other, strict=True)) | dict(zip(other, limb, strict=True))
-    below: list[list[int]] = [[i] for i in range(len(tree.nodes))]
-    for i in range(len(tree.nodes) - 1, -1, -1):
-        below[i] += [j for child in tree.nodes[i].children for j in below[child]]
-    reflections: list[tuple[list[int], tuple[int, ...]]] = []
+    below = tree.subtrees
+    reflections: list[tuple[Sequence[int], tuple[int, ...]]] = []
     for i in range(len(tree.nodes)):
         if owners & set(below[i]):
-            reflections.append((sorted(below[i]), ()))
+            reflections.append((below[i], ()))
         if i in owners:
             held = tuple(child for child in tree.nodes[i].children if partners[child] == child)
             left = set(below[i]).difference(*(below[child] for child in held))

@@ -264,7 +264,6 @@ def _draw_root(
         placed.sampled.X_PN[0],
         pairs,
         np.inf,
-        np.zeros(1, dtype=np.bool_),
     )
     bits = np.zeros((rotations, -(-(inner**2) // WORD) * WORD // 8), dtype=np.uint8)
     data = words.view(np.uint8).reshape(-1, 8)

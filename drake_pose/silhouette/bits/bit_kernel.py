@@ -111,7 +111,6 @@ def draw_bits(
     X_PN: np.ndarray,
     pairs: np.ndarray,
     limit: float,
-    one_enough: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Draws a surface at many poses as bits.
 
@@ -121,7 +120,6 @@ def draw_bits(
         X_PN: (n, 4, 4) poses of the node in its parent at its samples.
         pairs: (m, 2) int32 parent pose and sample.
         limit: the area that may lie outside the silhouette [pixel].
-        one_enough: (g,) bool the parent poses for which one pose that stays inside will do.
 
     Returns:
         kept (m,) bool: the pairs that stay inside the limit. The rest is about them alone, in the
@@ -144,10 +142,8 @@ def draw_bits(
     band_size = view.band[-1, -1] // WORD + 1 if view.band.shape[0] else 0
     words = np.empty(16 * (inside_size + band_size) + pairs.shape[0], dtype=np.uint64)
     spans = np.empty((4 * int(camera[7]) + int(camera[6]), 3), dtype=np.int32)
-    found, used, satisfied = 0, 0, -1
+    found, used = 0, 0
     for i in range(pairs.shape[0]):
-        if pairs[i, 0] == satisfied:
-            continue
         multiply(X_WP[pairs[i, 0]], X_PN[pairs[i, 1]], X_WN)
         multiply(view.X_CW, X_WN, X_CN[0])
         multiply(view.X_CW, X_WN, X_CN[1])
@@ -171,8 +167,6 @@ def draw_bits(
             used = write_runs(view.band, spans, count, words, used, runs[found, 1])
         kept[i] = True
         found += 1
-        if one_enough[pairs[i, 0]]:
-            satisfied = pairs[i, 0]
     return kept, areas[:found].copy(), runs[:found].copy(), words[:used].copy()
 
 

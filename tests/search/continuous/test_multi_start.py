@@ -6,12 +6,17 @@ import pytest
 
 from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.errors import SettingsError
-from drake_pose.search.continuous.multi_start import MultiStartSearch, MultiStartSettings
+from drake_pose.search.continuous.multi_start import MultiStartSearch
 from drake_pose.search.estimates import PoseEstimate, View
-from drake_pose.search.settings import BeamSearchSettings
-from tests.search.arms import arm_cameras, arm_tree, damaged_views, draw_pose, draw_view, split
-
-GRID = np.radians(20.0)
+from tests.search.arms import (
+    arm_cameras,
+    arm_tree,
+    damaged_views,
+    draw_pose,
+    draw_view,
+    is_held,
+    split,
+)
 
 
 @pytest.fixture(scope="module")
@@ -21,7 +26,7 @@ def tree(tmp_path_factory: pytest.TempPathFactory) -> PoseTree:
 
 @pytest.fixture(scope="module")
 def search(tree: PoseTree) -> MultiStartSearch:
-    return MultiStartSearch(tree, MultiStartSettings(BeamSearchSettings(interval=GRID)))
+    return MultiStartSearch(tree)
 
 
 @pytest.fixture(scope="module")
@@ -68,7 +73,7 @@ def test_continuous_pose_is_found_and_said_to_be_known(
     assert worst_place(tree, result, pose) < 0.01
     answer = result.pose_set
     assert answer is not None
-    assert answer.within_intervals(split(tree, pose))
+    assert is_held(answer, pose)
     np.testing.assert_array_equal(answer.families[0].q, result.q)
     assert answer.families[0].J == result.J
     assert sum(answer.determined) >= 4
@@ -104,9 +109,8 @@ def test_the_same_every_time(tree: PoseTree, search: MultiStartSearch, pose: np.
 
 
 def test_no_time_at_all(tree: PoseTree, pose: np.ndarray) -> None:
-    settings = MultiStartSettings(BeamSearchSettings(interval=GRID, time_limit=0.0))
     views = clean_views(tree, pose)
-    result = MultiStartSearch(tree, settings).match(views)
+    result = MultiStartSearch(tree, time_limit=0.0).match(views)
     assert result.found
     assert result.stopped_by == "time_limit"
     assert result.J == recount(tree, result, views)
@@ -185,8 +189,3 @@ def test_salt_noise(tree: PoseTree, search: MultiStartSearch, pose: np.ndarray) 
 def test_no_view(search: MultiStartSearch) -> None:
     with pytest.raises(SettingsError, match="at least one view"):
         search.match([])
-
-
-def test_settings_out_of_range() -> None:
-    with pytest.raises(SettingsError, match="rounds"):
-        MultiStartSettings(rounds=-1)

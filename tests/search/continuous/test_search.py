@@ -1,12 +1,10 @@
 """The continuous search: from silhouettes to a refined pose with intervals."""
 
-import math
-
 import numpy as np
 import pytest
 
 from drake_pose.errors import SettingsError
-from drake_pose.search.continuous.search import ContinuousSearch, ContinuousSearchSettings
+from drake_pose.search.continuous.search import ContinuousSearch
 from drake_pose.search.estimates import View
 from drake_pose.silhouette.areas.bending import TreeSurfaces
 from drake_pose.silhouette.areas.scoring import draw_mask
@@ -77,52 +75,6 @@ def test_families_are_as_good_as_the_best(tree, search):
         assert family.joints[0].holds(family.node_values[0][0])
 
 
-def test_without_time_there_is_still_an_answer(tree):
-    hurried = ContinuousSearch(tree, ContinuousSearchSettings(time_limit=0.0))
-    found = hurried.match([view_of(tree, drawn_values(tree, np.random.default_rng(2)))])
-    assert found.found
-    assert found.stopped_by == "time_limit"
-    assert math.isfinite(found.J)
-
-
-def test_refining_from_a_given_pose(tree):
-    rng = np.random.default_rng(3)
-    values = drawn_values(tree, rng)
-    start = [np.clip(v + 0.1, *tree.value_bounds(i)) for i, v in enumerate(values)]
-    refiner = ContinuousSearch(tree, ContinuousSearchSettings(intervals=None))
-    found = refiner.refine([view_of(tree, values)], [start])
-    assert found.pose_set is None
-    assert found.covariance is None
-    np.testing.assert_allclose(
-        np.concatenate(found.node_values), np.concatenate(values), atol=math.radians(2.0)
-    )
-    with pytest.raises(SettingsError, match="start from"):
-        refiner.refine([view_of(tree, values)], [])
-
-
-def test_more_starts_are_asked_for_only_where_none_is_good(tree):
-    values = drawn_values(tree, np.random.default_rng(5))
-    view = view_of(tree, values)
-    bounds = [tree.value_bounds(i) for i in range(len(values))]
-    far = [np.where(2.0 * v > a + b, a, b) for v, (a, b) in zip(values, bounds, strict=True)]
-    refiner = ContinuousSearch(tree, ContinuousSearchSettings(intervals=None))
-    asked = []
-
-    def others():
-        asked.append(1)
-        yield [values]
-        asked.append(2)
-        yield [far]
-
-    assert refiner.refine([view], [values], others=others()).E_total < 0.01
-    assert asked == []
-    spoilt = View(view.camera, np.roll(view.mask, (0, 40), axis=(0, 1)))
-    alone = refiner.refine([spoilt], [far])
-    helped = refiner.refine([spoilt], [far], others=others())
-    assert helped.E_total <= alone.E_total
-    assert asked[0] == 1
-
-
 def test_nothing_is_determined_where_the_body_does_not_fit(tree, search):
     values = drawn_values(tree, np.random.default_rng(6))
     view = view_of(tree, values)
@@ -135,12 +87,6 @@ def test_nothing_is_determined_where_the_body_does_not_fit(tree, search):
     np.testing.assert_allclose([(joint.low, joint.high) for joint in joints], limits)
 
 
-def test_bad_settings_are_refused(search):
-    with pytest.raises(SettingsError, match="starts"):
-        ContinuousSearchSettings(starts=0)
-    with pytest.raises(SettingsError, match="grid"):
-        ContinuousSearchSettings(grids=())
-    with pytest.raises(SettingsError, match="enough"):
-        ContinuousSearchSettings(enough=-1.0)
+def test_no_view_is_refused(search):
     with pytest.raises(SettingsError, match="view"):
         search.match([])

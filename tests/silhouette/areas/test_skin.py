@@ -112,8 +112,7 @@ def test_bits_have_the_band_of_their_sample(tmp_path: Path) -> None:
         silhouette = rng.random((SIDE, SIDE)) < 0.5
         view = make_bit_view(silhouette, camera.kernel_parameters(), camera.X_CW, 0)
         celled = divide_outline(surfaces.rigid[2], spread, skin.mesh, skin.vertices(values))
-        never = np.zeros(1, dtype=bool)
-        kept, areas, runs, words = draw_bits(celled, view, X_WP, X_PN, pairs, np.inf, never)
+        kept, areas, runs, words = draw_bits(celled, view, X_WP, X_PN, pairs, np.inf)
         assert kept.all()
         for i in range(12):
             X_CN = camera.X_CW @ X_WP @ X_PN[i]

@@ -72,10 +72,8 @@ def test_bits_are_the_pixels_of_the_span_kernel(camera: Camera, spread: float) -
     view = make_bit_view(mask, camera.kernel_parameters(), camera.X_CW, 5)
     # Some poses come so near that no table suits, and some are cut by the near plane.
     X_WN = np.concatenate([random_poses(3)[: _POSES // 2], random_poses(4, 0.2)[_POSES // 2 :]])
-    no = np.zeros(1, dtype=np.bool_)
-    kept, areas, runs, words = draw_bits(
-        divide_outline(outline, spread), view, np.eye(4)[None], X_WN, pairs(), np.inf, no
-    )
+    celled = divide_outline(outline, spread)
+    kept, areas, runs, words = draw_bits(celled, view, np.eye(4)[None], X_WN, pairs(), np.inf)
     assert kept.all()
     band = np.zeros(mask.shape, dtype=bool)
     for i, X in enumerate(X_WN):
@@ -98,12 +96,8 @@ def test_poses_with_too_much_outside_are_left_out() -> None:
     masks = [draw_mask([outline], X[None], camera) for X in X_WN]
     outside = np.array([int((drawn & ~mask).sum()) for drawn in masks])
     limit = float(np.median(outside))
-    no = np.zeros(1, dtype=np.bool_)
-    celled = divide_outline(outline)
-    kept = draw_bits(celled, view, np.eye(4)[None], X_WN, pairs(), limit, no)[0]
+    kept = draw_bits(divide_outline(outline), view, np.eye(4)[None], X_WN, pairs(), limit)[0]
     assert np.array_equal(kept, outside <= limit)
-    one = draw_bits(celled, view, np.eye(4)[None], X_WN, pairs(), limit, ~no)[0]
-    assert np.flatnonzero(one).tolist() == [int(np.argmax(outside <= limit))]
 
 
 def thick_surface() -> Outline:

@@ -7,25 +7,22 @@ import pytest
 
 from drake_pose.body.model import load_model
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
-from drake_pose.errors import SettingsError
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.fit.surfaces import few_triangles
-from drake_pose.search.continuous.equivalent_poses import RobustFamilies, RobustFamilySettings
+from drake_pose.search.continuous.families import RobustFamilies
 from drake_pose.search.continuous.views_fit import ViewsFit
 from drake_pose.search.estimates import PoseSet, View
 from drake_pose.search.starts.self_motions import flips
 from drake_pose.silhouette.areas.bending import TreeSurfaces
-from tests.search.arms import arm_cameras, arm_tree, damaged_views, draw_view, split
+from tests.search.arms import arm_cameras, arm_tree, damaged_views, draw_view, is_held
 
 TRUTH = np.array([0.6, 0.7, -0.7, 0.9, 0.3])
 FINE = tuple(AnnealingStage(scale, 0.0125, 8) for scale in (0.025, 0.0125))
 
 
-def find(
-    kinematics: TreeKinematics, views: list[View], values: np.ndarray, **settings: object
-) -> PoseSet:
+def find(kinematics: TreeKinematics, views: list[View], values: np.ndarray) -> PoseSet:
     fit = ViewsFit(kinematics, few_triangles(TreeSurfaces(kinematics.tree)), views)
-    families = RobustFamilies(fit, RobustFamilySettings(**settings), lambda: True)
+    families = RobustFamilies(fit, lambda: True)
     return families.find([fit.refine(values, FINE)], lambda values: float(values[0]))
 
 
@@ -40,7 +37,7 @@ def test_intervals_hold_the_truth_and_widen_with_the_damage(kinematics: TreeKine
     widths = []
     for views in (clean, damaged_views(tree, TRUTH, 1)):
         answer = find(kinematics, views, TRUTH)
-        assert answer.within_intervals(split(tree, TRUTH))
+        assert is_held(answer, TRUTH)
         family = answer.families[0]
         assert family.J == family.q[0]
         widths.append([joint.high - joint.low for joint in family.joints])
@@ -51,12 +48,16 @@ def test_intervals_hold_the_truth_and_widen_with_the_damage(kinematics: TreeKine
     assert np.median(np.array(widths[1]) / widths[0]) > 1.03
 
 
-def test_flips_are_families_of_their_own(kinematics: TreeKinematics) -> None:
+def test_flips_are_families_of_their_own(
+    kinematics: TreeKinematics, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Where nothing is significant, all that flips make is as good; nothing is determined."""
     tree = kinematics.tree
     views = [draw_view(tree, TRUTH, camera) for camera in arm_cameras()]
-    answer = find(kinematics, views, TRUTH, significance=1e6, families=5)
-    assert not any(answer.determined)
+    with monkeypatch.context() as patch:
+        patch.setattr("drake_pose.search.continuous.families._SIGNIFICANCE", 1e6)
+        patch.setattr("drake_pose.search.continuous.families._FAMILIES", 5)
+        assert not any(find(kinematics, views, TRUTH).determined)
     answer = find(kinematics, damaged_views(tree, TRUTH, 1), TRUTH)
     flipped = [flip.values for flip in flips(kinematics, answer.families[0].q)]
     for family in answer.families[1:]:
@@ -95,16 +96,7 @@ def test_time_that_is_up_leaves_the_intervals_of_the_curvature(kinematics: TreeK
     fit = ViewsFit(kinematics, few_triangles(TreeSurfaces(kinematics.tree)), views)
     pose = fit.refine(TRUTH, FINE)
     before = fit.evaluations
-    answer = RobustFamilies(fit, RobustFamilySettings(), lambda: False).find([pose], lambda _: 0.0)
+    answer = RobustFamilies(fit, lambda: False).find([pose], lambda _: 0.0)
     assert answer.family_count == 1
     assert fit.evaluations - before < 5
     assert all(joint.low < joint.high for joint in answer.joints)
-
-
-@pytest.mark.parametrize(
-    "name",
-    ["significance", "widest_angle", "widest_length", "moved_angle", "moved_length", "families"],
-)
-def test_settings_out_of_range(name: str) -> None:
-    with pytest.raises(SettingsError, match=name):
-        RobustFamilySettings(**{name: 0})

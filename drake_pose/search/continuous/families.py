@@ -1,0 +1,318 @@
+"""What silhouettes leave open of continuous values: intervals, free values, families of poses.
+
+How far a pose may be off that is right says its covariance. Whether another pose fits as well say
+other optima that were found: those as good are families of their own. Two fits ask: that of exact
+masks, drawn by pixels (``find_intervals``), and the robust one of damaged masks or bodies that fit
+badly (``RobustFamilies``).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from scipy.special import ndtri, stdtrit
+
+from drake_pose.body.tree.pose_tree import PoseTree
+from drake_pose.body.tree.tree_kinematics import TreeKinematics
+from drake_pose.fit.covariance import ErrorSizes, estimate_sizes, excess, values_covariance
+from drake_pose.fit.levenberg_marquardt import AnnealingStage
+from drake_pose.search.continuous.views_fit import FittedPose, ViewsFit
+from drake_pose.search.estimates import JointEstimate, PoseFamily, PoseSet, joint_estimates
+from drake_pose.search.refinement import FINE_PASSES, RefinementProblem
+from drake_pose.search.starts.self_motions import Flip, flips
+
+# A value is free whose interval is wider than this on either side, angle [rad] and length [m].
+_WIDEST = math.radians(10.0), 0.02
+
+
+class _Family(NamedTuple):
+    """A pose (m,), the ends (m,) of what its values may be, and how many poses are in it."""
+
+    values: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+    size: int = 1
+
+
+def _widest(kinematics: TreeKinematics) -> np.ndarray:
+    """(m,) how wide the intervals of determined values are at most."""
+    return 2.0 * np.where(kinematics.is_angle, *_WIDEST)
+
+
+def _describe(
+    kinematics: TreeKinematics,
+    tree: PoseTree,
+    families: Sequence[_Family],
+    Js: Sequence[float],
+    tolerance: float,
+    is_known: bool,
+) -> PoseSet:
+    """The set of families, the best first; where it is not known, no value is determined."""
+
+    def joints(some: Sequence[_Family]) -> tuple[JointEstimate, ...]:
+        # All in the turns nearest to the first one.
+        first = some[0].values
+        turns = [kinematics.nearest_turns(one.values, first) - one.values for one in some]
+        lower, upper = kinematics.reach(first)
+        low = np.maximum(np.min([one.low for one in some] + np.array(turns), axis=0), lower)
+        high = np.minimum(np.max([one.high for one in some] + np.array(turns), axis=0), upper)
+        determined = (high - low <= _widest(kinematics)) & is_known
+        return joint_estimates(kinematics, low, high, determined)
+
+    described = tuple(
+        PoseFamily.of_values(tree, kinematics.split(one.values), J, joints([one]), one.size)
+        for one, J in zip(families, Js, strict=True)
+    )
+    return PoseSet(described, joints(families), tolerance, False, len(described))
+
+
+# Of exact masks.
+
+CONFIDENCE = 0.95
+"""How often the truth shall lie in a determined value's interval, where masks are exact."""
+
+TOLERANCE, SAME = 0.03, 0.1
+"""Poses are as good as the best whose J is larger by no more than this share of the contours'
+length, and one whose values differ by no more than this [rad or m]."""
+
+# The variance of a border that lies anywhere between two pixel centres [pixel^2].
+_PIXEL_VARIANCE = 1.0 / 12.0
+# How much larger the standard deviation is than if the distances of all rows and columns were
+# independent; and the share of the contours' pixels that a pose which was found does not leave
+# wrong: found on drawn bodies.
+_NOISE_FACTOR, _MISFIT = 1.4, 0.025
+
+
+def find_intervals(
+    problem: RefinementProblem,
+    others: Sequence[np.ndarray],
+    parameters: np.ndarray,
+    tree: PoseTree | None = None,
+) -> tuple[PoseSet, np.ndarray]:
+    """What exact silhouettes say of each value.
+
+    Where more pixels are wrong than a found pose leaves, the pose may be another one altogether:
+    nothing is known then. Where intervals missed the truth on drawn bodies, it was by another
+    optimum, and no margin would have held it; about the true optimum they held 99 %.
+
+    Args:
+        problem: the silhouettes.
+        others: (m + 4,) each: other poses that are as good, best first.
+        parameters: (m + 4,) the best pose, refined.
+        tree: the pose tree, with its root where the body is; None: the body's.
+
+    Returns:
+        The poses that are as good, the best leading the first family, and the covariance (m, m) of
+        the tree's values about the best pose, 0 where they are held.
+    """
+    body, kinematics = problem.body, problem.body.kinematics
+    count = len(kinematics.names)
+    covariance = _covariance(problem, parameters)
+    margins = float(ndtri(0.5 + 0.5 * CONFIDENCE)) * np.sqrt(np.diag(covariance))
+    fits = problem.J(parameters) <= _MISFIT * problem.border_length
+    near = np.maximum(margins, SAME)
+    groups = [[parameters]]
+    for other in others:
+        # The same pose is not another one for a full turn.
+        pose = body.nearest_turns(other, parameters)
+        # What differs less is the same optimum, not quite reached.
+        if np.abs(pose - parameters).max() <= SAME:
+            continue
+        of_group = (g for g in groups if np.all(np.abs(pose - g[0])[:count] <= near))
+        group = next(of_group, None)
+        if group is None:
+            groups.append([pose])
+        else:
+            group.append(pose)
+    families, Js = [], []
+    for group in groups:
+        first = body.nearest_turns(group[0])
+        poses = [body.nearest_turns(member, first)[:count] for member in group]
+        ends = np.min(poses, axis=0) - margins, np.max(poses, axis=0) + margins
+        if not fits:
+            ends = np.full(count, -np.inf), np.full(count, np.inf)
+        families.append(_Family(poses[0], *ends, len(poses)))
+        Js.append(float(problem.J(first)))
+    tolerance = TOLERANCE * problem.border_length
+    described = _describe(kinematics, tree or body.tree, families, Js, tolerance, fits)
+    return described, covariance
+
+
+def _covariance(problem: RefinementProblem, parameters: np.ndarray) -> np.ndarray:
+    """The covariance (m, m) of the tree's values about the best pose."""
+    body = problem.body
+    free = body.freedom()
+    equations = problem.equations(parameters, free, FINE_PASSES[-1])
+    variance = max(_PIXEL_VARIANCE, equations.squares / max(equations.weight, 1e-9))
+    variance *= _NOISE_FACTOR**2
+    # Limits are worth what a value spread evenly between them is.
+    spans = np.clip(body.upper[free.columns] - body.lower[free.columns], 1e-6, 2.0 * np.pi)
+    information = equations.H[0] / variance + np.diag(12.0 / spans**2)
+    covariance = np.zeros((len(body.kinematics.names),) * 2)
+    covariance[np.ix_(free.columns, free.columns)] = np.linalg.inv(information)
+    return covariance
+
+
+# Of damaged masks, or where the body fits badly.
+
+_LOOK = AnnealingStage(0.0125, 0.026, 2)
+# What follows a value that is moved.
+_FOLLOW = (AnnealingStage(0.025, 0.026, 2), AnnealingStage(0.0125, 0.026, 2))
+# Distances that count less in the fit tell of errors, too.
+_FINE = AnnealingStage(0.025, 0.0125)
+# Poses are as good as the best whose cost is larger by no more than so many standard deviations of
+# the difference; and at most so many families are told apart.
+_SIGNIFICANCE, _FAMILIES = 1.96, 8
+# A value that the covariance lets go so far is moved step by step, angle [rad] and length [m]; its
+# longest step, by what factor each step is longer, and the first one's share of what the covariance
+# allows.
+_MOVED = math.radians(3.0), 0.01
+_LONGEST_STEPS, _GROWTH, _FIRST_STEP = (0.5, 0.1), 1.6, 0.5
+# As often shall a value lie below the upper end of its interval, and above the lower one.
+_ONE_SIDED = 0.975
+# How large errors are is told by the motions of each camera.
+_CAMERA_MOTIONS = 6
+# A fit of which most does not fit can be wrong altogether: no robust estimate outlives that.
+_BREAKDOWN = 0.5
+_ROUNDING = 1e-9
+
+
+class RobustFamilies:
+    """The families of one match, where parts, masks and cameras err together.
+
+    What no pose explains, such as a part that is missing in a mask, costs all poses alike and says
+    nothing. A value that may go far is moved step by step, the others following, until what does
+    not fit any more is significant.
+
+    Args:
+        fit: the body and the silhouettes.
+        proceed: asked again and again whether to go on.
+    """
+
+    def __init__(self, fit: ViewsFit, proceed: Callable[[], bool]) -> None:
+        self._fit, self._kinematics, self._proceed = fit, fit.kinematics, proceed
+        self._pieces, self._tolerance = np.zeros(0), 0.0
+        self._sizes: ErrorSizes | None = None
+
+    def find(self, poses: Sequence[FittedPose], J: Callable[[np.ndarray], float]) -> PoseSet:
+        """The poses that fit as well as the best.
+
+        Args:
+            poses: refined, best first; the first is the answer.
+            J: the objective (1) at values (m,) [pixel].
+        """
+        pieces = [self._fit.piece_costs(pose.values, _LOOK) for pose in poses]
+        self._pieces = min(pieces, key=lambda one: float(one.sum()))
+        broken = float(self._pieces.sum()) > _BREAKDOWN * 2.0 * self._fit.edge_length
+        good = [
+            pose.values for pose, one in zip(poses, pieces, strict=True) if self._is_as_good(one)
+        ]
+        families: list[_Family] = []
+        for values in good or [poses[0].values]:
+            if not self._is_in(families, values) and self._has_room(families):
+                families.append(self._spread(values))
+                self._add_flipped(families, families[-1])
+        tree, Js = self._kinematics.tree, [J(one.values) for one in families]
+        return _describe(self._kinematics, tree, families, Js, self._tolerance, not broken)
+
+    def _is_as_good(self, pieces: np.ndarray) -> bool:
+        """Whether costs by pieces are not significantly above the best pose's."""
+        as_good = excess(pieces, self._pieces) <= _SIGNIFICANCE
+        if as_good:
+            self._tolerance = max(self._tolerance, float((pieces - self._pieces).sum()))
+        return as_good
+
+    def _has_room(self, families: Sequence[_Family]) -> bool:
+        return not families or (len(families) < _FAMILIES and self._proceed())
+
+    def _is_in(self, families: list[_Family], values: np.ndarray) -> bool:
+        """Whether some family holds a pose; it is counted there.
+
+        What is free in a family may be anything: that widens it.
+        """
+        for i, family in enumerate(families):
+            near = self._kinematics.nearest_turns(values, family.values)
+            outside = (near < family.low - _ROUNDING) | (near > family.high + _ROUNDING)
+            if not np.any(outside & (family.high - family.low <= _widest(self._kinematics))):
+                low, high = np.minimum(family.low, near), np.maximum(family.high, near)
+                families[i] = _Family(family.values, low, high, family.size + 1)
+                return True
+        return False
+
+    def _add_flipped(self, families: list[_Family], family: _Family) -> None:
+        """Add what flips make of a family, as far as it fits."""
+        for flip in flips(self._kinematics, family.values):
+            if not self._has_room(families):
+                return
+            look = self._fit.refine(flip.values, (_LOOK,))
+            if self._is_as_good(self._fit.piece_costs(look.values, _LOOK)) and not self._is_in(
+                families, look.values
+            ):
+                values = self._kinematics.nearest_turns(look.values)
+                families.append(self._flipped(family, flip, values))
+
+    def _flipped(self, family: _Family, flip: Flip, values: np.ndarray) -> _Family:
+        """A family after a flip, about a pose (m,): an interval flips as its middle does."""
+        below, above = family.values - family.low, family.high - family.values
+        lower, upper = self._kinematics.reach(family.values)
+        # Where a limit ended the interval, the flipped one may go further.
+        below = np.where(flip.changed & (family.low <= lower + _ROUNDING), math.inf, below)
+        above = np.where(flip.changed & (family.high >= upper - _ROUNDING), math.inf, above)
+        swapped = np.where(flip.mirrored, [above, below], [below, above])
+        lower, upper = self._kinematics.reach(values)
+        low, high = values - swapped[0], values + swapped[1]
+        return _Family(values, np.maximum(low, lower), np.minimum(high, upper))
+
+    def _spread(self, values: np.ndarray) -> _Family:
+        """What the values (m,) may be about a pose."""
+        kinematics = self._kinematics
+        lower, upper = kinematics.reach(values)
+        free = np.flatnonzero(upper > lower)
+        seen = self._fit.distances(values, _FINE)
+        if self._sizes is None:
+            self._sizes = estimate_sizes(seen, kinematics.is_angle)
+        covariance = values_covariance(seen, self._sizes, free, kinematics.is_angle)
+        low, high = values.copy(), values.copy()
+        freedom = _CAMERA_MOTIONS * self._fit.camera_count
+        widths = stdtrit(freedom, _ONE_SIDED) * np.sqrt(np.diag(covariance))
+        low[free], high[free] = values[free] - widths, values[free] + widths
+        wide = widths > np.where(kinematics.is_angle[free], *_MOVED)
+        found = [values]
+        for column in np.flatnonzero(wide):
+            along = np.zeros(len(values))
+            along[free] = covariance[:, column] / covariance[column, column]
+            for way in (-along, along):
+                found += self._move(values, int(free[column]), way, float(widths[column]))
+        # Poses found while one value was moved show what others may be, too.
+        moved = free[wide]
+        low[moved] = np.minimum(low[moved], np.min(found, axis=0)[moved])
+        high[moved] = np.maximum(high[moved], np.max(found, axis=0)[moved])
+        return _Family(values, np.maximum(low, lower), np.minimum(high, upper))
+
+    def _move(
+        self, values: np.ndarray, index: int, along: np.ndarray, width: float
+    ) -> list[np.ndarray]:
+        """Poses (m,) that fit as well, a value moved from some, the others following along (m,).
+
+        ``width``: how far the value may go in any case.
+        """
+        longest = _LONGEST_STEPS[0 if self._kinematics.is_angle[index] else 1]
+        lower, upper = self._kinematics.lower.copy(), self._kinematics.upper.copy()
+        # Beyond half a turn the values come back from the other side.
+        lower[index], upper[index] = (ends[index] for ends in self._kinematics.reach(values))
+        step, found, worse = _FIRST_STEP * width, [values], 0.0
+        while lower[index] < found[-1][index] < upper[index] and self._proceed():
+            trial = np.clip(found[-1] + min(step, longest) * along, lower, upper)
+            looked = self._fit.refine(trial, _FOLLOW, held=(index,)).values
+            costs = self._fit.piece_costs(looked, _LOOK)
+            before, worse = worse, excess(costs, self._pieces)
+            if worse > _SIGNIFICANCE:
+                # Costs are parabolas in the rough, and their differences scatter as values differ.
+                share = (_SIGNIFICANCE - before) / (worse - before)
+                return [*found, found[-1] + share * (looked - found[-1])]
+            found.append(looked)
+            step *= _GROWTH
+        return found

@@ -119,9 +119,9 @@ class RowTable:
         """Of indices those, each once, whose rows are not made; they count as made from now."""
         size = int(indices.max(initial=0)) + 1
         if len(self.rows) < size:
-            more = size - len(self.rows) + 64
-            self.rows = np.pad(self.rows, ((0, more), (0, 0)))
-            self._made = np.pad(self._made, (0, more))
+            more = np.zeros((size - len(self.rows) + 64, self.rows.shape[1]), dtype=np.int64)
+            self.rows = np.concatenate([self.rows, more])
+            self._made = np.concatenate([self._made, np.zeros(len(more), dtype=np.bool_)])
         if self._made[indices].all():
             return np.zeros(0, dtype=np.int64)
         wanted = np.zeros_like(self._made)

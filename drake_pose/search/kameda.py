@@ -202,12 +202,13 @@ class _Run:
         current = np.array([self.lists[leaf].adopted for leaf in leaves])
         first = best = worth(current[None])[0]
         together = np.prod(counts, dtype=np.float64) <= _COMBINATIONS
-        groups = [range(len(leaves))] if together else [[k] for k in range(len(leaves))]
+        every = list(range(len(leaves)))
+        groups = [every] if together else [[k] for k in every]
         unchanged = 0
         while unchanged < len(groups):
             # A leaf's candidates after another's, while that is an improvement; or all at once.
-            group = list(groups[0])
-            groups.append(groups.pop(0))
+            group = groups.pop(0)
+            groups.append(group)
             tried = np.indices([counts[k] for k in group]).reshape(len(group), -1).T
             choices = np.repeat(current[None], len(tried), axis=0)
             choices[:, group] = tried

@@ -16,7 +16,7 @@ from drake_pose.errors import SceneError
 from drake_pose.files.options import percent
 
 if TYPE_CHECKING:
-    from drake_pose.jobs.batch.state import BatchResult, SceneState
+    from drake_pose.jobs.batch.batch import Batch, SceneState
 
 # Of what contradicts in a scene as many are shown.
 _NAMED = 4
@@ -81,7 +81,7 @@ def batch(
         raise SceneError(f"{len(result.failed)} of {len(result.scenes)} scenes failed")
 
 
-def _print_batch(result: BatchResult) -> None:
+def _print_batch(result: Batch) -> None:
     """A row a scene, and where the results are."""
     estimates = {n: one for n, one in result.scenes.items() if one.job.audit is None}
     audits = {n: one for n, one in result.scenes.items() if one.job.audit is not None}

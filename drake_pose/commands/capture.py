@@ -148,7 +148,6 @@ def _capture_live(
 ) -> LiveResult:
     """Captures as the pictures come, here or on workers, or by the paper's stages."""
     from drake_pose.jobs.live.capture import capture_live
-    from drake_pose.jobs.live.paper_capture import capture_paper
     from drake_pose.jobs.live.scene import hush_opencv, is_live_scene, load_live_scene
     from drake_pose.systems.person.live_capture import LiveSensors
 
@@ -172,11 +171,10 @@ def _capture_live(
         def show(count: int, _: bool) -> None:
             progress.show_stage("frames", count, None)
 
-        if method == "person":
-            return capture_live(scene, out, model, settings, sensors, warn, show)
-        if any(one.live for one in scene.specifications.values()):
+        by_stages = method == "paper"
+        if by_stages and any(one.live for one in scene.specifications.values()):
             say("drake-pose: stand upright before the cameras, both arms spread to the sides")
-        return capture_paper(scene, out, model, settings, sensors, warn, show)
+        return capture_live(scene, out, model, settings, sensors, warn, show, by_stages)
 
 
 def _print_result(result: LiveResult, json: bool) -> None:

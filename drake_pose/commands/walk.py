@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
 
@@ -23,8 +23,10 @@ from drake_pose.files.settings import Packages
 from drake_pose.jobs.live.settings import LiveSettings, Seconds, Shape
 
 if TYPE_CHECKING:
+    from distributed import Client
     from pydrake.geometry import Meshcat
 
+    from drake_pose.jobs.live.walk import Player
     from drake_pose.systems.person.live_capture import LiveSensors
 
 
@@ -103,53 +105,53 @@ def walk(
         raise UsageError("--rate is for a result")
     from drake_pose.jobs.live import walk as walking
 
-    if options.live is not None:
-        _print(_walk_live(options.live, options), json)
-        return
-    if result is not None:
-        player = walking.recorded_player(result, options.model, options.rate, options.package)
+    with workers_of(options.workers, options.scheduler) as client:
+        if options.live is not None:
+            player = _live_player(options.live, options, client)
+        elif result is not None:
+            player = walking.recorded_player(result, options.model, options.rate, options.package)
+        else:
+            player = walking.simulated_player() if options.simulate else walking.key_player()
+        waits = player.q is not None and (options.browser if options.wait is None else options.wait)
+        page = _open_page(options, waits)
+
+        def ask() -> bool:
+            if waits and options.seconds is None:
+                say("drake-pose: the end; space or the page's button plays it again, Ctrl-C ends")
+                return walking.wait_for_replay(page)
+            return False
+
+        walked = walking.walk(
+            player, page, options.seconds, options.speed, _say_command, ask, options.on_spot,
+            lambda text: say(f"drake-pose: {text}"),
+        )  # fmt: skip
+    for text in walked.get("warnings", ()):
+        warn(text)
+    if json:
+        print_json(walked)
     else:
-        player = walking.simulated_player() if options.simulate else walking.key_player()
-    waits = player.q is not None and (options.browser if options.wait is None else options.wait)
-    page = _open_page(options, waits)
-
-    def ask() -> bool:
-        say("drake-pose: the end; space or the page's button plays it again, Ctrl-C ends")
-        return walking.wait_for_replay(page)
-
-    again = ask if waits and options.seconds is None else lambda: False
-    walked = walking.walk(
-        player, page, options.seconds, options.speed, _say_command, again, options.on_spot
-    )
-    _print(walked, json)
+        say(f"drake-pose: {walking.summary_line(walked)}")
 
 
-def _walk_live(folder: Path, options: WalkOptions) -> dict[str, Any]:
-    """Walks with the cameras of a folder; what it is to walk with is read before the page opens."""
+def _live_player(folder: Path, options: WalkOptions, client: Client | None) -> Player:
+    """Walks with the cameras of a folder."""
     from drake_pose.jobs.live.scene import hush_opencv, load_live_scene
-    from drake_pose.jobs.live.walk import walk_live
+    from drake_pose.jobs.live.walk import live_player
 
     hush_opencv()
-    settings = LiveSettings(seconds=options.seconds, shape=options.shape, packages=options.package)
-    with workers_of(options.workers, options.scheduler) as client:
-        # Workers may have another working folder.
-        scene = load_live_scene(folder if client is None else folder.absolute())
+    settings = LiveSettings(shape=options.shape, packages=options.package)
+    # Workers may have another working folder.
+    scene = load_live_scene(folder if client is None else folder.absolute())
 
-        def sensors() -> LiveSensors:
-            if client is None:
-                return scene.open_sensors(live=True)
-            from drake_pose.jobs.cluster.remote_views import ClusterSensors
+    def sensors() -> LiveSensors:
+        if client is None:
+            return scene.open_sensors(live=True)
+        from drake_pose.jobs.cluster.remote_views import ClusterSensors
 
-            # A recording cannot be skipped from afar as fast as its moments pass: it is waited for.
-            return ClusterSensors(client, scene)
+        # A recording cannot be skipped from afar as fast as its moments pass: it is waited for.
+        return ClusterSensors(client, scene)
 
-        walked = walk_live(
-            scene, _open_page(options), options.model, settings, sensors, _say_command,
-            lambda text: say(f"drake-pose: {text}"), options.on_spot,
-        )  # fmt: skip
-    for text in walked["warnings"]:
-        warn(text)
-    return walked
+    return live_player(scene, options.model, settings, sensors)
 
 
 def _open_page(options: WalkOptions, waits: bool = False) -> Meshcat:
@@ -170,13 +172,3 @@ def _open_page(options: WalkOptions, waits: bool = False) -> Meshcat:
 
 def _say_command(words: str) -> None:
     say(f"drake-pose: {words or 'stand'}")
-
-
-def _print(walked: dict[str, Any], json: bool) -> None:
-    """A walk's result."""
-    from drake_pose.jobs.live.walk import summary_line
-
-    if json:
-        print_json(walked)
-    else:
-        say(f"drake-pose: {summary_line(walked)}")

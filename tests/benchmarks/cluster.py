@@ -7,6 +7,7 @@ the processor's own, so that a busy machine changes little but the frames a seco
 
 from __future__ import annotations
 
+import math
 import tempfile
 import time
 from dataclasses import replace
@@ -16,6 +17,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import cv2
 import numpy as np
 import yaml
+from pydrake.systems.framework import Context
 
 from drake_pose.body.formats.packages import bundled_model
 from drake_pose.body.model import load_model
@@ -26,7 +28,7 @@ from drake_pose.jobs.batch.batch import run_batch
 from drake_pose.jobs.batch.job import SceneJob
 from drake_pose.jobs.cluster.remote_views import ClusterSensors
 from drake_pose.jobs.cluster.scheduler import open_cluster
-from drake_pose.jobs.live.run import FrameWatch, run_live
+from drake_pose.jobs.live.run import run_live
 from drake_pose.jobs.live.scene import LiveScene, load_live_scene
 from drake_pose.papers.date_capture import Studio
 from drake_pose.papers.kameda import experiment_camera
@@ -140,14 +142,17 @@ def measure_live(scene: LiveScene, client: Client | None) -> LiveFigures:
     sensors: LiveSensors = scene.open_sensors() if client is None else ClusterSensors(client, scene)
     tracker = tracker_of_person(load_model(bundled_model("person"), check=False).pose_tree(), None)
     diagram = build_live_capture(tracker, scene.cameras, sensors)
-    times: list[tuple[float, float]] = []
-    watch = FrameWatch(
-        diagram,
-        scene.cameras,
-        lambda _: times.append((time.perf_counter(), time.process_time())),
-    )
+    moments, times = [math.nan], []
+
+    def note(context: Context) -> None:
+        moment = float(diagram.GetOutputPort("time").Eval(context)[0])
+        if not math.isnan(moment) and moment != moments[-1]:
+            diagram.GetOutputPort("estimated_positions").Eval(context)
+            moments.append(moment)
+            times.append((time.perf_counter(), time.process_time()))
+
     try:
-        run_live(diagram, sensors, None, lambda _: None, monitor=watch)
+        run_live(diagram, sensors, None, monitor=note)
     finally:
         sensors.close()
     # In the first frame the person is searched, not followed.
@@ -155,7 +160,7 @@ def measure_live(scene: LiveScene, client: Client | None) -> LiveFigures:
     figures = LiveFigures(len(walls), float(walls.sum()), float(np.median(processors)))
     if not isinstance(sensors, ClusterSensors):
         return figures
-    groups = sensors.watchers.groups
+    groups = sensors.groups
     views = sum(group.views for group in groups)
     return figures._replace(
         view_seconds=sum(group.seconds for group in groups) / views,

@@ -37,19 +37,6 @@ WORK = ".chunks"
 _ATTEMPTS = "attempts.txt"
 _PART = ".part-"
 
-# What bad input can raise where nobody foresaw it; Drake's failed demands raise SystemExit, which
-# would end a worker.
-_FAILURES = (
-    DrakePoseError,
-    ArithmeticError,
-    LookupError,
-    MemoryError,
-    OSError,
-    RuntimeError,
-    SystemExit,
-    ValueError,
-)
-
 
 @dataclass(frozen=True)
 class Task:
@@ -141,7 +128,8 @@ def perform(task: Task) -> Outcome:
         _note_attempt(task)
         _make(task)
         return Outcome(None, time.perf_counter() - begin, _totals(task))
-    except _FAILURES as error:
+    except (Exception, SystemExit) as error:  # noqa: BLE001
+        # Drake's failed demands raise SystemExit, which would end a worker.
         return Outcome(describe_failure(error), time.perf_counter() - begin)
 
 

@@ -8,9 +8,10 @@ from __future__ import annotations
 import pickle
 import threading
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing
-from dataclasses import dataclass
+from itertools import islice
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -35,6 +36,9 @@ from drake_pose.silhouette.segmentation.background import (
     person_region,
 )
 
+COUNT = 4
+"""How many pictures of each camera are asked for at once, and again when fewer wait."""
+
 # Cameras for which nobody asks are let go after this time [s].
 _IDLE = 30.0
 # Between two checks whether a live camera has a new picture [s].
@@ -45,23 +49,18 @@ _LIVE_PATIENCE = 0.1
 _KEPT = 64
 
 
-@dataclass(frozen=True, eq=False)
-class WatchReply:
+class WatchReply(NamedTuple):
     """What a worker saw.
 
-    Args:
-        views: by camera, time stamps [s], names of frames, and views as of pack_view.
-        ended: the cameras that will give nothing any more.
-        dropped: by camera, pictures that could not be used since the sources were opened.
-        rates: by camera, pictures a second, where known.
-        seconds: of its processor's time, for views and sums [s].
+    views: by camera, time stamps [s], names of frames, and views as of pack_view.
+    states: by camera, whether it will give nothing any more, pictures that could not be used since
+    the sources were opened, and pictures a second, where known. seconds: of its processor's time,
+    for views and sums [s].
     """
 
     views: Mapping[str, Sequence[tuple[float, str, bytes]]]
-    ended: tuple[str, ...]
+    states: Mapping[str, tuple[bool, int, float | None]]
     problems: tuple[str, ...]
-    dropped: Mapping[str, int]
-    rates: Mapping[str, float | None]
     seconds: float
 
 
@@ -117,8 +116,7 @@ class CameraWatch:
         self, specifications: Sequence[SourceSpecification], spacings: Mapping[str, float]
     ) -> None:
         self._spacings, self._edges = spacings, EdgeServer(len(specifications))
-        self._closed, self._lock = threading.Event(), threading.Lock()
-        self._used, self._seconds = time.monotonic(), 0.0
+        self._closed, self._lock, self._used = threading.Event(), threading.Lock(), time.monotonic()
         warm()
         with ExitStack() as opened:
             self._backgrounds: dict[str, Background] = {
@@ -134,69 +132,51 @@ class CameraWatch:
             host = host_of(get_worker().address)
             self.listening = serve(host, (self._answer, self._edges.answer), self._closed)
             self._opened = opened.pop_all()
-        threading.Thread(target=self._close_when_idle, daemon=True).start()
+        self._keeping_open = threading.Thread(target=self._keep_open, daemon=True)
+        self._keeping_open.start()
 
     def close(self) -> None:
         """Lets go of the sources."""
         self._closed.set()
+        self._keeping_open.join()
+
+    def _keep_open(self) -> None:
+        """Lets go of the sources when they are closed, or the capture ended without a word."""
+        while not self._closed.wait(_IDLE / 10.0) and time.monotonic() - self._used < _IDLE:
+            pass
+        self._closed.set()
         with self._lock:
             self._opened.close()
 
-    @property
-    def is_closed(self) -> bool:
-        """Whether the sources were let go."""
-        return self._closed.is_set()
-
-    def _close_when_idle(self) -> None:
-        """Lets go of sources whose capture ended without a word."""
-        while not self._closed.wait(_IDLE / 10.0):
-            if time.monotonic() - self._used > _IDLE:
-                self.close()
-
     def _answer(self, parts: Sequence[bytes]) -> bytes:
-        """The pickled reply to a pickled request."""
+        """The pickled reply: what each camera sees now, or next after a pickled time stamp [s]."""
+        after: Mapping[str, float] = pickle.loads(parts[0])
         with self._lock:
-            return pickle.dumps(self._poll(*pickle.loads(parts[0])))
+            begin, end = time.thread_time(), time.monotonic() + _LIVE_PATIENCE
+            while True:
+                views = {
+                    name: list(islice(self._see(number, name, after[name]), COUNT))
+                    for number, name in enumerate(self._sources)
+                }
+                live = [o for o in self._sources.values() if o.specification.live and not o.ended]
+                if any(views.values()) or not live or time.monotonic() > end:
+                    break
+                time.sleep(_POLL_PAUSE)
+            self._used = time.monotonic()
+            problems = tuple(text for one in self._sources.values() for text in one.problems)
+            for source in self._sources.values():
+                source.problems.clear()
+            states = {
+                name: (one.ended, one.dropped, one.rate_hz) for name, one in self._sources.items()
+            }
+            seconds = time.thread_time() - begin + self._edges.seconds
+            self._edges.seconds = 0.0
+            return pickle.dumps(WatchReply(views, states, problems, seconds))
 
-    def _poll(self, count: int, after: Mapping[str, float]) -> WatchReply:
-        """What the cameras see now, or next: of each so many pictures, after a time stamp [s]."""
-        sources = self._sources
-        views: dict[str, list[tuple[float, str, bytes]]] = {name: [] for name in sources}
-        end = time.monotonic() + _LIVE_PATIENCE
-        while not all(source.ended for source in sources.values()):
-            begin = time.thread_time()
-            for number, name in enumerate(sources):
-                self._see(number, name, views[name], count, after[name])
-            self._seconds += time.thread_time() - begin
-            live = any(one.specification.live for one in sources.values())
-            if not live or any(views.values()) or time.monotonic() > end:
-                break
-            time.sleep(_POLL_PAUSE)
-        self._used = time.monotonic()
-        problems = tuple(text for one in sources.values() for text in one.problems)
-        for source in sources.values():
-            source.problems.clear()
-        seconds, self._seconds, self._edges.seconds = self._seconds + self._edges.seconds, 0.0, 0.0
-        return WatchReply(
-            views,
-            tuple(name for name, source in sources.items() if source.ended),
-            problems,
-            {name: source.dropped for name, source in sources.items()},
-            {name: source.rate_hz for name, source in sources.items()},
-            seconds,
-        )
-
-    def _see(
-        self,
-        number: int,
-        name: str,
-        views: list[tuple[float, str, bytes]],
-        count: int,
-        after: float,
-    ) -> None:
-        """The next views of one camera."""
+    def _see(self, number: int, name: str, after: float) -> Iterator[tuple[float, str, bytes]]:
+        """The views of one camera that are there now."""
         source = self._sources[name]
-        while len(views) < count and (one := source.read()) is not None:
+        while (one := source.read()) is not None:
             # A recording that is opened again begins at its beginning.
             if one.time <= after:
                 continue
@@ -207,7 +187,7 @@ class CameraWatch:
                 region = person_region(picture, self._backgrounds[name])
             view = see_silhouette(region, self._spacings[name])
             self._edges.put(number, one.time, view.edge)
-            views.append((one.time, one.frame, pack_view(view)))
+            yield one.time, one.frame, pack_view(view)
 
 
 def host_of(address: str) -> str:
@@ -229,17 +209,22 @@ def warm() -> None:
 
 
 def open_watch(
-    key: str, specifications: Sequence[SourceSpecification], spacings: Mapping[str, float]
+    key: str,
+    specifications: Sequence[SourceSpecification],
+    spacings: Mapping[str, float],
 ) -> Listening:
-    """Opens sources if they are not open yet under this key; where polls and sums are answered.
+    """Opens sources, under this key anew; where requests for views and for sums are answered.
+
+    Args:
+        spacings: from edge point to edge point, by camera [pixel].
 
     Raises:
         SceneError: a source cannot be opened.
         ClusterError: this worker's own address cannot be listened at.
     """
+    close_watch(key)
     with _watches_lock:
-        if key not in _watches or _watches[key].is_closed:
-            _watches[key] = CameraWatch(specifications, spacings)
+        _watches[key] = CameraWatch(specifications, spacings)
         return _watches[key].listening
 
 

@@ -28,8 +28,8 @@ SURFACES, SUM = b"surfaces", b"sum"
 
 # How long a sum, and a connection, is waited for [s].
 _PATIENCE, _CONNECTING = 0.5, 5.0
-# A worker that was late, or could not be reached, is tried again after longer and longer times [s].
-_RETRY, _LONGEST_RETRY = 3.0, 60.0
+# A worker that was late, or could not be reached, is tried again after this time [s].
+_RETRY = 10.0
 
 # How often a server looks whether it was closed [ms].
 _LOOK = 200
@@ -115,6 +115,11 @@ def _serve(socket: zmq.Socket, answer: Answer, closed: threading.Event) -> None:
                 socket.send(answer(socket.recv_multipart()))
 
 
+def listed(cameras: Iterable[str]) -> str:
+    """Cameras' names, for messages."""
+    return ", ".join(f"'{name}'" for name in cameras)
+
+
 class RemoteKeeper:
     """Asks a worker for sums over its cameras; see EdgeKeeper. answers: how many came."""
 
@@ -125,7 +130,6 @@ class RemoteKeeper:
         self._packed: PackedOutlines | None = None
         self._is_ready = self._is_reported = False
         self._sent_at = self._retry_at = 0.0
-        self._retry_pause = _RETRY
         self.answers = 0
 
     def move_to(self, line: Line | None) -> None:
@@ -133,7 +137,7 @@ class RemoteKeeper:
         if self._line is not None:
             self._line.close()
         self._line, self._packed = line, None
-        self._sent_at, self._retry_at, self._retry_pause = time.monotonic(), 0.0, _RETRY
+        self._sent_at, self._retry_at = time.monotonic(), 0.0
 
     def ask(self, request: SumRequest) -> bool:
         """Sends a request; False where the worker cannot be asked, now or at all."""
@@ -156,7 +160,7 @@ class RemoteKeeper:
         if data is None:
             self._put_off("do not come in time")
             return None
-        self._retry_pause, self._is_reported = _RETRY, False
+        self._is_reported = False
         self.answers += bool(data)
         return unpack_sum(data) if data else None
 
@@ -171,9 +175,8 @@ class RemoteKeeper:
     def _put_off(self, why: str) -> None:
         """Tries again later."""
         self._packed = None
-        self._sent_at = self._retry_at = time.monotonic() + self._retry_pause
-        self._retry_pause = min(2.0 * self._retry_pause, _LONGEST_RETRY)
+        self._sent_at = self._retry_at = time.monotonic() + _RETRY
         if not self._is_reported:
-            names = ", ".join(f"'{name}'" for name in self._numbers)
-            self._report(f"sums of camera {names} {why}; this process compares their contours")
+            cameras = f"sums of camera {listed(self._numbers)}"
+            self._report(f"{cameras} {why}; this process compares their contours")
             self._is_reported = True

@@ -8,7 +8,7 @@ import logging
 import os
 import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
@@ -171,47 +171,43 @@ def require_fit_workers(client: Client, out: Path | None = None) -> None:
             f"the scheduler at {address_of(client)} has no workers; start some with "
             "'dask worker ADDRESS --nthreads 1'"
         )
-    with _shown_file(out) as file:
+    with ExitStack() as shown:
+        file = None
+        if out is not None:
+            try:
+                out.mkdir(parents=True, exist_ok=True)
+                seen = shown.enter_context(tempfile.NamedTemporaryFile(prefix=".seen_", dir=out))
+            except OSError as error:
+                raise ClusterError(f"{out}: cannot be written: {error.strerror}") from error
+            file = Path(seen.name).absolute()
         here = worker_facts(file)
         try:
             there = client.run(worker_facts, file)
         except (ImportError, AttributeError) as error:
             raise ClusterError(
                 f"a worker cannot use drake_pose ({error}); install the same version there as "
-                f"here, {here.version}"
+                f"here, {version.VERSION}"
             ) from error
     for address, facts in there.items():
+        if facts == here:
+            continue
+        how = (
+            f"does not see the folder {out}; scenes, models and results must lie where all "
+            "machines find them under the same path"
+        )
         if facts.version != here.version:
-            raise ClusterError(
-                f"the worker {address} has drake_pose {facts.version}, but here is {here.version}; "
-                "install the same version on both"
+            how = (
+                f"has drake_pose {facts.version}, but here is {here.version}; install the same "
+                "version on both"
             )
-        if facts.code != here.code:
-            raise ClusterError(
-                f"the worker {address} has another development version of drake_pose "
-                f"{facts.version}; install the same one on both, and start the worker again"
+        elif facts.code != here.code:
+            how = (
+                f"has another development version of drake_pose {facts.version}; install the same "
+                "one on both, and start the worker again"
             )
-        if not facts.sees:
-            raise ClusterError(
-                f"the worker {address} does not see the folder {out}; scenes, models and results "
-                "must lie where all machines find them under the same path"
-            )
+        raise ClusterError(f"the worker {address} {how}")
 
 
 def address_of(client: Client) -> str:
     """A client's scheduler, for messages."""
     return "its address" if client.scheduler is None else str(client.scheduler.address)
-
-
-@contextmanager
-def _shown_file(out: Path | None) -> Iterator[Path | None]:
-    """A file in the folder, for others to look whether they see it."""
-    if out is None:
-        yield None
-        return
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        with tempfile.NamedTemporaryFile(prefix=".seen_", dir=out) as file:
-            yield Path(file.name).absolute()
-    except OSError as error:
-        raise ClusterError(f"{out}: cannot be written: {error.strerror}") from error

@@ -11,20 +11,22 @@ from __future__ import annotations
 
 import os
 import pickle
-import queue
 import signal
 import subprocess
 import sys
 import tempfile
 import threading
+import time
 from contextlib import suppress
-from typing import TYPE_CHECKING, BinaryIO
+from typing import IO, TYPE_CHECKING
 
 from drake_pose.errors import ClusterError
 
 if TYPE_CHECKING:
     from distributed import Worker
 
+# Between two looks of a child whether its parent is there [s].
+_LOOK = 0.2
 # How much of what a child said last is looked at [byte].
 _TAIL = 4096
 _local = threading.local()
@@ -44,58 +46,44 @@ def call_in_child(payload: bytes) -> bytes:
     Raises:
         ClusterError: the child died of it.
     """
-    child = getattr(_local, "child", None) or _Child(_memory_limit())
+    process, remarks = getattr(_local, "child", None) or _start_child()
     _local.child = None
-    result = child.call(payload)
-    _local.child = child
+    assert process.stdin is not None, "it is a pipe"
+    assert process.stdout is not None, "it is a pipe"
+    try:
+        process.stdin.write(payload)
+        process.stdin.flush()
+        result = pickle.dumps(pickle.load(process.stdout))
+    except (OSError, EOFError, pickle.UnpicklingError):
+        code = process.wait()
+        with remarks:
+            remarks.seek(max(0, remarks.seek(0, os.SEEK_END) - _TAIL))
+            said = remarks.read().decode("utf-8", "replace").strip()
+        how = f"exit status {code}" if code >= 0 else signal.Signals(-code).name
+        why = f": {said.splitlines()[-1]}" if said else ""
+        raise ClusterError(f"its process died ({how}){why}") from None
+    _local.child = process, remarks
     return result
 
 
-def _memory_limit() -> int:
-    """What the worker may take is its child's [byte]; 0: no limit."""
+def _start_child() -> tuple[subprocess.Popen[bytes], IO[bytes]]:
+    """A child of this worker, and the file of what it says to stderr: perhaps why it dies."""
     from distributed import get_worker
 
     try:
-        return int(get_worker().memory_manager.memory_limit or 0)
+        limit = int(get_worker().memory_manager.memory_limit or 0)
     except ValueError:
         # Not called by a worker.
-        return 0
-
-
-class _Child:
-    """The child, as its parent sees it. memory_limit: of its data [byte]; 0: none."""
-
-    def __init__(self, memory_limit: int) -> None:
-        paths = os.pathsep.join(path for path in sys.path if path)
-        # Whatever it says to stderr may tell why it died.
-        self._remarks = tempfile.TemporaryFile()  # noqa: SIM115
-        self._process = subprocess.Popen(
-            [sys.executable, "-m", __name__, str(memory_limit)],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=self._remarks,
-            env={**os.environ, "PYTHONPATH": paths},
-        )
-
-    def call(self, payload: bytes) -> bytes:
-        """As call_in_child; ClusterError: the child died and cannot be used again."""
-        process = self._process
-        assert process.stdin is not None, "it is a pipe"
-        assert process.stdout is not None, "it is a pipe"
-        try:
-            process.stdin.write(payload)
-            process.stdin.flush()
-            return pickle.dumps(pickle.load(process.stdout))
-        except (OSError, EOFError, pickle.UnpicklingError):
-            raise ClusterError(self._why_dead()) from None
-
-    def _why_dead(self) -> str:
-        code = self._process.wait()
-        with self._remarks as file:
-            file.seek(max(0, file.seek(0, os.SEEK_END) - _TAIL))
-            remarks = file.read().decode("utf-8", "replace").strip()
-        how = f"exit status {code}" if code >= 0 else signal.Signals(-code).name
-        return f"its process died ({how}){': ' + remarks.splitlines()[-1] if remarks else ''}"
+        limit = 0
+    remarks = tempfile.TemporaryFile()  # noqa: SIM115
+    process = subprocess.Popen(
+        [sys.executable, "-m", __name__, str(limit)],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=remarks,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(path for path in sys.path if path)},
+    )
+    return process, remarks
 
 
 def main() -> None:
@@ -103,22 +91,21 @@ def main() -> None:
     # Ctrl-C is the parent's business.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     _limit_memory(int(sys.argv[1]))
+    threading.Thread(target=_end_with, args=(os.getppid(),), daemon=True).start()
     requests, answers = os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb")
     # What a task prints must not mix with the answers.
     os.dup2(2, 1)
-    waiting: queue.SimpleQueue = queue.SimpleQueue()
-    threading.Thread(target=_listen, args=(requests, waiting), daemon=True).start()
-    while True:
-        function, argument = waiting.get()
-        pickle.dump(function(argument), answers)
-        answers.flush()
-
-
-def _listen(requests: BinaryIO, waiting: queue.SimpleQueue) -> None:
-    """Passes requests on; a parent that ends takes this process with it, whatever it does."""
     with suppress(EOFError):
         while True:
-            waiting.put(pickle.load(requests))
+            function, argument = pickle.load(requests)
+            pickle.dump(function(argument), answers)
+            answers.flush()
+
+
+def _end_with(parent: int) -> None:
+    """Ends this process with its parent, whatever it does."""
+    while os.getppid() == parent:
+        time.sleep(_LOOK)
     os._exit(0)
 
 

@@ -3,24 +3,29 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
-from pydrake.systems.framework import Context, Diagram, DiagramBuilder
+from pydrake.systems.framework import Context, DiagramBuilder
 
+from drake_pose.arrays import Mask
+from drake_pose.body.formats.packages import bundled_model
 from drake_pose.body.model import load_model
 from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.errors import OutputError, SettingsError
 from drake_pose.files.folder import read_summary, require_empty
 from drake_pose.jobs.estimate.inputs import bundled_person
-from drake_pose.jobs.live.frame_results import LiveResult, LiveWriter
-from drake_pose.jobs.live.run import FrameWatch, Mask, look_until, run_live
+from drake_pose.jobs.live.frame_results import PAPER, PERSON, LiveResult, LiveWriter
+from drake_pose.jobs.live.paper_capture import find_registered_pose
+from drake_pose.jobs.live.run import look_until
 from drake_pose.jobs.live.scene import LiveScene
 from drake_pose.jobs.live.settings import LiveSettings
 from drake_pose.person.recordings.person_capture import capture_person
 from drake_pose.person.recordings.persons_in_view import PersonRecording
 from drake_pose.person.shape import KnownShape, shape_values, tracker_of_person
 from drake_pose.person.views import shows_somebody
+from drake_pose.systems.date.capture import build_paper_capture
 from drake_pose.systems.person.live_capture import LiveSensors, build_live_capture
 from drake_pose.systems.ports import evaluate
 
@@ -36,6 +41,7 @@ def capture_live(
     open_sensors: Callable[[], LiveSensors] | None = None,
     on_report: Callable[[str], None] = lambda _: None,
     on_frame: Callable[[int, bool], None] = lambda _, __: None,
+    by_stages: bool = False,
 ) -> LiveResult:
     """Captures a person as the pictures come, and writes the result's folder.
 
@@ -43,59 +49,48 @@ def capture_live(
 
     Args:
         out: the result's folder, empty or not there.
-        model_path: a person with landmarks.yaml beside it; the bundled one with shape joints where
-            not given.
+        model_path: a person with landmarks.yaml beside it; the bundled one, with shape joints
+            unless ``by_stages``, where not given.
         open_sensors: opens the sensors; where not given the scene's, in this process. Called once
-            more for the frames that give the person's shape.
+            more for the frames that give the person's shape, or show the registered pose.
         on_report: called at once when cameras stop and return, and with bad pictures.
         on_frame: called with each frame: how many there are, and whether a person was found.
+        by_stages: captures by the stages of Date et al.: skin, rays, inverse kinematics, search;
+            see find_registered_pose.
 
     Raises:
-        SceneError, ModelError, SettingsError: what was given cannot be captured.
+        SceneError, CameraError, ModelError, SettingsError, UnknownNameError: what was given cannot
+            be captured so.
         OutputError: the result cannot be written.
     """
     settings, opener = settings or LiveSettings(), open_sensors or scene.open_sensors
-    model = load_model(model_path or bundled_person(), package_paths=settings.packages)
+    usual = bundled_model("person") if by_stages else bundled_person()
+    model = load_model(model_path or usual, package_paths=settings.packages)
     # A folder that cannot be written is refused before a camera is opened.
     require_empty(out)
-    shape = None
-    if settings.shape is not None:
+    setup = shape = None
+    if by_stages:
+        setup = find_registered_pose(scene, model, settings, opener, on_report)
+    elif settings.shape is not None:
         shape = shape_of_result(settings.shape)
     elif settings.fit_shape:
         shape = _fit_first_frames(scene, opener(), model.pose_tree(), on_report)
     tracker = tracker_of_person(model.pose_tree(), shape)
-    sensors = opener()
-    try:
-        writer = LiveWriter(
-            scene, model, tracker, out, sensors.period, settings.packages, on_report, on_frame
-        )
-        if shape is not None:
-            writer.writer.more |= {"lengths_m": shape.lengths, "girths": shape.girths}
-        diagram = build_live_capture(tracker, scene.cameras, sensors, with_deviations=True)
-        watch = FrameWatch(diagram, scene.cameras, writer.add)
-        return record_frames("person", diagram, sensors, watch, writer, settings)
-    finally:
-        sensors.close()
-
-
-def record_frames(
-    method: str,
-    diagram: Diagram,
-    sensors: LiveSensors,
-    watch: FrameWatch,
-    result: LiveWriter,
-    settings: LiveSettings,
-) -> LiveResult:
-    """Runs the diagram of a capture, ``method`` in summary.json, and writes what comes out."""
-    result.writer.more["method"] = method
-    result.writer.begin()
-    try:
-        interrupted = run_live(diagram, sensors, settings.seconds, result.tell, monitor=watch)
-        result.writer.warnings += watch.doubts()
-        result.finish(sensors, settings.replay)
-    finally:
-        result.writer.write_summary()
-    return result.result(interrupted)
+    found = {} if shape is None else {"lengths_m": shape.lengths, "girths": shape.girths}
+    more = {"method": PAPER if by_stages else PERSON, **found}
+    with closing(opener()) as sensors:
+        if setup is None:
+            kind, cameras = "silhouette", scene.cameras
+            diagram = build_live_capture(tracker, cameras, sensors, with_deviations=True)
+        else:
+            kind, cameras = "person_view", setup.cameras
+            diagram = build_paper_capture(setup, sensors, sensors.period).diagram
+        views = {name: diagram.GetOutputPort(f"{kind}_{name}") for name in cameras}
+        result = LiveWriter(
+            scene, model, tracker, diagram, views, out, sensors.period, more, settings, on_report,
+            on_frame,
+        )  # fmt: skip
+        return result.run(sensors)
 
 
 def shape_of_result(result: Path) -> KnownShape:

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import time
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from pydrake.systems.framework import Context, Diagram, OutputPort
 
+from drake_pose.arrays import Array, Mask
 from drake_pose.body.model import ArticulatedModel
 from drake_pose.camera.sources.source_files import TIME_STAMPS
 from drake_pose.csv_files import csv_text
@@ -16,15 +20,26 @@ from drake_pose.files.settings import EstimateSettings
 from drake_pose.files.summary import describe_job
 from drake_pose.files.writer import ResultWriter
 from drake_pose.jobs.estimate.person import FOLLOWED
-from drake_pose.jobs.live.run import LiveFrame, Mask
+from drake_pose.jobs.live.run import run_live
 from drake_pose.jobs.live.scene import LiveScene
+from drake_pose.jobs.live.settings import LiveSettings
+from drake_pose.person.date.capture import PersonView
+from drake_pose.person.date.skeleton import FEATURES
 from drake_pose.person.pose_tracker import PersonPoseTracker
 from drake_pose.person.recordings.persons_in_view import keep_person
+from drake_pose.person.views import SilhouetteView
 from drake_pose.silhouette.areas.scoring import draw_mask
 from drake_pose.silhouette.pictures.masks import compare_masks
+from drake_pose.silhouette.pictures.scene_checks import frame_ranges
 from drake_pose.silhouette.pictures.scenes import Scene
 from drake_pose.systems.person.live_capture import LiveSensors
 from drake_pose.systems.pictures.picture_capture import CameraCount
+
+PERSON, PAPER = "person", "paper_capture"
+"""What summary.json calls capture by all silhouettes, and by the stages of Date et al."""
+
+# A choice: of simulated persons who are followed the mean IoU is about 0.8 and more.
+_LEAST_IOU = 0.6
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,7 +56,10 @@ class LiveWriter:
 
     Args:
         tracker: made for the person's pose tree; gives its surfaces.
+        diagram: of build_live_capture, or of build_paper_capture.
+        views: by camera, the diagram's port of what its picture says, None where there is none.
         period: time between two frames [s].
+        more: the method, and what it adds to summary.json.
     """
 
     def __init__(
@@ -49,62 +67,89 @@ class LiveWriter:
         scene: LiveScene,
         model: ArticulatedModel,
         tracker: PersonPoseTracker,
+        diagram: Diagram,
+        views: Mapping[str, OutputPort],
         out: Path,
         period: float,
-        packages: Mapping[str, Path],
+        more: Mapping[str, Any],
+        settings: LiveSettings,
         on_report: Callable[[str], None],
         on_frame: Callable[[int, bool], None],
     ) -> None:
-        self._scene, self._tracker, self._period = scene, tracker, period
-        self._model = model
+        self._scene, self._tracker, self._diagram, self._views = scene, tracker, diagram, views
+        self._period, self._settings = period, settings
         self._on_report, self._on_frame = on_report, on_frame
         self._times: dict[str, float] = {}
         self._seen: dict[tuple[str, str], Path] = {}
+        self._doubts: dict[str, list[str]] = {}
         self._told: list[str] = []
-        self._last = -1
+        self._index, self._moment, self._begin = -1, float("nan"), time.perf_counter()
         recorded = Scene(scene.path, scene.cameras, (), {}, True, 1.0 / period)
-        settings = EstimateSettings(method="person", packages=packages)
-        job = describe_job(scene.path, model.path, settings)
-        self.writer = ResultWriter(recorded, model, job, out)
+        described = EstimateSettings(method="person", packages=settings.packages)
+        job = describe_job(scene.path, model.path, described)
+        self._writer = ResultWriter(recorded, model, job, out)
+        self._writer.more |= more
 
-    def tell(self, text: str) -> None:
-        """Tells the user while the capture runs, and notes it."""
-        self._told.append(text)
-        self.writer.warnings.append(text)
-        self._on_report(text)
-
-    def result(self, interrupted: bool) -> LiveResult:
-        """What came out, when the folder is closed."""
-        estimate = self.writer.result()
+    def run(self, sensors: LiveSensors) -> LiveResult:
+        """Writes frames as they come, and what is made of all of them."""
+        self._writer.begin()
+        try:
+            seconds, monitor = self._settings.seconds, self._watch
+            interrupted = run_live(self._diagram, sensors, seconds, self._tell, monitor=monitor)
+            self._finish(sensors)
+        finally:
+            self._writer.write_summary()
+        estimate = self._writer.result()
         troubles = tuple(text for text in estimate.warnings if text not in self._told)
         return LiveResult(estimate, interrupted, troubles)
 
-    def add(self, frame: LiveFrame) -> None:
-        """Writes a frame, which is named after the periods since the first."""
-        self._last = max(self._last + 1, round(frame.time / self._period))
-        name = f"{self._last:06d}"
-        self._times[name] = frame.time
-        found = bool(np.isfinite(frame.q).all())
-        error, ious = self._agreement(frame) if found else (float("nan"), {})
-        for camera in frame.views:
+    def _tell(self, text: str) -> None:
+        """Tells the user while the capture runs, and notes it."""
+        self._told.append(text)
+        self._writer.warnings.append(text)
+        self._on_report(text)
+
+    def _watch(self, context: Context) -> None:
+        """Writes a frame where there is a new moment; its name counts periods from the first."""
+        moment = float(self._value(context, "time")[0])
+        if np.isnan(moment) or moment == self._moment:
+            return
+        self._moment, self._index = moment, max(self._index + 1, round(moment / self._period))
+        name, q = f"{self._index:06d}", self._value(context, "estimated_positions")
+        seen = {camera: port.Eval(context) for camera, port in self._views.items()}
+        views = {camera: view for camera, view in seen.items() if view is not None}
+        for camera in views:
             self._seen[camera, name] = Path(self._scene.specifications[camera].location)
-        row = PoseRow(name, frame.q, None, error, frame.seconds)
+        share, others = (float(self._value(context, what)[0]) for what in ("share", "others"))
+        seconds = time.perf_counter() - self._begin
+        error, ious = self._agreement(q, views, others > 0.0)
+        row = PoseRow(name, q, None, error, seconds)
         record = FrameRecord.of(
             row,
             stopped_by=FOLLOWED,
-            joints=record_deviations(self._model, frame.q, frame.deviations),
+            joints=record_deviations(
+                self._writer.model, q, self._value(context, "deviations", len(q))
+            ),
             ious=ious,
-            share=frame.share if np.isfinite(frame.share) else None,
+            share=share if np.isfinite(share) else None,
         )
-        self.writer.add(row, record)
+        self._writer.add(row, record)
+        self._times[name] = moment
+        for text in self._doubts_of(context, ious) if self._writer.more["method"] == PAPER else ():
+            self._doubts.setdefault(text, []).append(name)
         self._on_frame(len(self._times), row.found)
+        self._begin = time.perf_counter()
 
-    def finish(self, sensors: LiveSensors, replay: bool) -> None:
+    def _finish(self, sensors: LiveSensors) -> None:
         """Writes what is made of all frames."""
-        writer = self.writer
+        writer = self._writer
+        writer.warnings += [
+            f"frame {frame_ranges(frames, list(self._times))}: {text}"
+            for text, frames in self._doubts.items()
+        ]
         # A moment that no camera saw, or nobody had time for, is a frame without a pose.
-        frames = tuple(f"{k:06d}" for k in range(self._last + 1))
-        writer.scene = replace(writer.scene, frames=frames, masks=self._seen)
+        names = tuple(f"{k:06d}" for k in range(self._index + 1))
+        writer.scene = replace(writer.scene, frames=names, masks=self._seen)
         counts, sources = sensors.counts(), {}
         for name, count in counts.items():
             given = self._scene.specifications[name]
@@ -112,22 +157,32 @@ class LiveWriter:
                 {"time": one.time, "what": "stopped" if one.stopped else "returned"}
                 for one in count.changes
             ]
-            sources[name] = {"kind": given.kind, "location": given.location, **asdict(count)}
-            sources[name]["changes"] = changes
+            known = {"kind": given.kind, "location": given.location, **asdict(count)}
+            sources[name] = known | {"changes": changes}
         writer.more |= {"sources": sources, "skipped_moments": sensors.skipped}
         writer.warnings += camera_troubles(counts, sensors.skipped)
         if writer.rows:
-            writer.finish(replay)
+            writer.finish(self._settings.replay)
             times = [(frame, f"{time:.6f}") for frame, time in self._times.items()]
             writer.write(TIME_STAMPS, csv_text([("frame", "time"), *times]))
 
-    def _agreement(self, frame: LiveFrame) -> tuple[float, Mapping[str, float]]:
-        """E_total over all views, and each one's IoU."""
+    def _value(self, context: Context, name: str, size: int = 1) -> Array:
+        """An output's value; nan where the diagram has no such output."""
+        if not self._diagram.HasOutputPort(name):
+            return np.full(size, np.nan)
+        return np.array(self._diagram.GetOutputPort(name).Eval(context))
+
+    def _agreement(
+        self, q: Array, views: Mapping[str, SilhouetteView | PersonView], has_others: bool
+    ) -> tuple[float, Mapping[str, float]]:
+        """E_total over all views, nan where nobody was found, and each one's IoU."""
+        if not np.isfinite(q).all():
+            return float("nan"), {}
         fit, cameras = self._tracker.fit, self._scene.cameras
-        values = self._tracker.values(frame.q)
+        values = self._tracker.values(q)
         X_WN = fit.kinematics.poses(values)
-        masks: Mapping[str, Mask] = {name: view.region for name, view in frame.views.items()}
-        if frame.has_others:
+        masks: Mapping[str, Mask] = {name: view.region for name, view in views.items()}
+        if has_others:
             masks = keep_person(cameras, masks, self._tracker.place(values)).masks
         bodies = {
             name: draw_mask(fit.outlines, cameras[name].X_CW @ X_WN, cameras[name])
@@ -135,6 +190,23 @@ class LiveWriter:
         }
         agreement = compare_masks(masks, bodies)
         return agreement.E_total, agreement.ious
+
+    def _doubts_of(self, context: Context, ious: Mapping[str, float]) -> Iterator[str]:
+        """Why one should not trust the paper's method in a frame."""
+        if not np.isfinite(self._value(context, "estimated_positions")).all():
+            yield "before the registered pose; no pose"
+            return
+        # Where a pose was recognised no feature need be measured.
+        if np.isfinite(self._value(context, "limb_points")).all():
+            support = self._value(context, "last_support")
+            for name in np.array(FEATURES)[support == 0]:
+                yield f"{name.replace('_', ' ')} not seen; held where it was last"
+        if np.mean(list(ious.values()) or [0.0]) < _LEAST_IOU:
+            yield (
+                f"the body and the silhouettes hardly agree (mean IoU below {_LEAST_IOU}); the "
+                "paper's method does not notice when it has lost the person, until the registered "
+                "pose is shown again"
+            )
 
 
 def camera_troubles(counts: Mapping[str, CameraCount], skipped: int) -> list[str]:

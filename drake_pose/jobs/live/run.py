@@ -1,23 +1,15 @@
-"""The one loop of what happens live: a diagram's periods, what came out of them, and their end."""
+"""The one loop of what happens live: a diagram's periods, and their end."""
 
 from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable
 
-import numpy as np
-from numpy.typing import NDArray
 from pydrake.systems.analysis import Simulator, SimulatorStatus
 from pydrake.systems.framework import Context, Diagram
 
-from drake_pose.person.date.capture import PersonView
-from drake_pose.person.views import SilhouetteView
 from drake_pose.systems.person.live_capture import LiveSensors
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 # Between two looks whether a walk without cameras has ended [s].
 _LOOK = 0.5
@@ -100,72 +92,3 @@ def look_until(
             raise KeyboardInterrupt
     finally:
         sensors.close()
-
-
-@dataclass(frozen=True, eq=False)
-class LiveFrame:
-    """What a moment's pictures say.
-
-    Args:
-        time: the pictures' time stamp, from the first ones on [s].
-        q: (nq,) estimated positions [rad or m]; nan where nobody was found.
-        share: of the contours, what fits; nan where the diagram does not say.
-        views: by camera that gave a picture, what it says.
-        has_others: whether other persons are in the views, whom the tracker has cut out.
-        deviations: (nq,) standard deviations of q [rad or m]; nan where not known.
-        seconds: the work since the frame before [s].
-    """
-
-    time: float
-    q: Array
-    share: float
-    views: Mapping[str, SilhouetteView | PersonView]
-    has_others: bool
-    deviations: Array
-    seconds: float
-
-
-class FrameWatch:
-    """A monitor that notes each new moment of a diagram of build_live_capture or the paper's.
-
-    Args:
-        view: before a camera's name, the output with what the camera's picture says.
-    """
-
-    def __init__(
-        self,
-        diagram: Diagram,
-        cameras: Iterable[str],
-        on_frame: Callable[[LiveFrame], None],
-        view: str = "silhouette",
-    ) -> None:
-        self._diagram, self._on_frame = diagram, on_frame
-        self._views = {name: diagram.GetOutputPort(f"{view}_{name}") for name in cameras}
-        self._last = math.nan
-        self._begin = time.perf_counter()
-
-    def __call__(self, context: Context) -> None:
-        """Looks whether there is a new moment."""
-        moment = float(self._value(context, "time")[0])
-        if math.isnan(moment) or moment == self._last:
-            return
-        self._last = moment
-        views = {name: port.Eval(context) for name, port in self._views.items()}
-        seen = {name: view for name, view in views.items() if view is not None}
-        q = self._value(context, "estimated_positions")
-        share = float(self._value(context, "share")[0])
-        has_others = bool(self._value(context, "others")[0] > 0.0)
-        deviations = self._value(context, "deviations", len(q))
-        seconds = time.perf_counter() - self._begin
-        self._on_frame(LiveFrame(moment, q, share, seen, has_others, deviations, seconds))
-        self._begin = time.perf_counter()
-
-    def doubts(self) -> list[str]:
-        """What the user should know of the frames at the end."""
-        return []
-
-    def _value(self, context: Context, name: str, size: int = 1) -> Array:
-        """An output's value; nan where the diagram has no such output."""
-        if not self._diagram.HasOutputPort(name):
-            return np.full(size, np.nan)
-        return np.array(self._diagram.GetOutputPort(name).Eval(context))

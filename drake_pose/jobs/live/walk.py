@@ -6,21 +6,22 @@ import math
 import time
 import webbrowser
 from collections.abc import Callable, Mapping
+from contextlib import closing, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.geometry import Meshcat
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPort
-from pydrake.trajectories import PiecewisePolynomial
+from pydrake.trajectories import PiecewisePolynomial, Trajectory
 
+from drake_pose.arrays import Array
 from drake_pose.body.formats.packages import bundled_model
 from drake_pose.body.model import ArticulatedModel, load_model
-from drake_pose.csv_files import read_csv
 from drake_pose.errors import OutputError, SettingsError
-from drake_pose.files.folder import POSES, read_summary
+from drake_pose.files.folder import read_summary
+from drake_pose.files.records import PoseTable
 from drake_pose.jobs.estimate.inputs import bundled_person
 from drake_pose.jobs.live.capture import shape_of_result
 from drake_pose.jobs.live.frame_results import camera_troubles
@@ -32,9 +33,7 @@ from drake_pose.person.date.walking_motion import make_motion
 from drake_pose.person.shape import tracker_of_person
 from drake_pose.systems.person.live_capture import LiveSensors, add_person_tracker
 from drake_pose.systems.ports import evaluate
-from drake_pose.systems.walk import KEYS, build_walk
-
-Array = NDArray[np.float64]
+from drake_pose.systems.walk import KEYS, AddPositions, build_walk
 
 RATE_HZ = 30.0
 """Frames a second where a recording does not say."""
@@ -57,12 +56,18 @@ class Player:
     """What moves the avatar.
 
     Args:
-        q: (n, nq) positions [rad or m], nan where the person was not found; None: keys alone.
+        q: (n, nq) positions [rad or m], nan where the person was not found.
+        period: time between two of them, or two looks at the keys or the cameras [s].
+        sensors: of the cameras that see the person, in place of q.
+        add: adds the sensors and who follows the person to a diagram. Without it and q the keys
+            alone move the avatar.
     """
 
     model: ArticulatedModel
     q: Array | None = None
-    rate_hz: float = RATE_HZ
+    period: float = 1.0 / RATE_HZ
+    sensors: LiveSensors | None = None
+    add: AddPositions | None = None
 
 
 def recorded_player(
@@ -82,33 +87,20 @@ def recorded_player(
         OutputError: there is no such result, or it is one of another model.
         SettingsError: the rate is not positive.
     """
-    if rate_hz is None:
-        rate_hz = float(read_summary(result).get("frame_rate_hz") or RATE_HZ)
+    summary = read_summary(result)
+    rate_hz = float(summary.get("frame_rate_hz") or RATE_HZ) if rate_hz is None else rate_hz
     if not (math.isfinite(rate_hz) and rate_hz > 0):
         raise SettingsError(f"frames a second must be a positive number, not {rate_hz}")
     if model_path is None:
-        name = str(read_summary(result).get("model", ""))
+        name = str(summary.get("model", ""))
         model_path = bundled_model("person").with_name(Path(name).name)
         if not model_path.is_file():
             raise OutputError(f"{result}: its model '{name}' is not a bundled one; give --model")
     model = load_model(model_path, package_paths=packages)
-    path = result / POSES
-    header, rows = read_csv(path, OutputError)
-    missing = [name for name in model.position_names if name not in header]
-    if missing:
-        raise OutputError(
-            f"{path}: has no column '{missing[0]}', which {model.path.name} needs; give the model "
-            "it was captured with"
-        )
-    columns = [header.index(name) for name in model.position_names]
-    try:
-        q = np.array([[float(row[k] or "nan") for k in columns] for _, row in rows])
-        q = q.reshape(-1, len(columns))
-    except ValueError:
-        raise OutputError(f"{path}: is damaged: there is a cell that is no number") from None
-    if not np.isfinite(q).all(axis=-1).any():
-        raise OutputError(f"{path}: nobody was found in any frame, so nobody can walk")
-    return Player(model, q, rate_hz)
+    rows = PoseTable(result, model.position_names, with_base=False).read()
+    if not any(row.found for row in rows):
+        raise OutputError(f"{result}: nobody was found in any frame, so nobody can walk")
+    return Player(model, np.array([row.q for row in rows]), 1.0 / rate_hz)
 
 
 def simulated_player() -> Player:
@@ -120,6 +112,37 @@ def simulated_player() -> Player:
 def key_player() -> Player:
     """Leaves the walk to the keys."""
     return Player(load_model(bundled_model("person"), check=False))
+
+
+def live_player(
+    scene: LiveScene,
+    model_path: Path | None = None,
+    settings: LiveSettings | None = None,
+    open_sensors: Callable[[], LiveSensors] | None = None,
+) -> Player:
+    """Walks as the person before the cameras commands; recorded sources are played as if live.
+
+    Args:
+        model_path: a person with landmarks.yaml beside it; the bundled one where not given.
+        settings: whose shape; the model's where not given.
+        open_sensors: opens the sensors; those of the scene in this process where not given.
+
+    Raises:
+        SceneError, ModelError, SettingsError: what was given cannot be walked with.
+        OutputError: the shape's result is none.
+    """
+    settings = settings or LiveSettings()
+    model = load_model(model_path or bundled_person(), package_paths=settings.packages)
+    known = None if settings.shape is None else shape_of_result(settings.shape)
+    tracker = tracker_of_person(model.pose_tree(), known)
+    sensors = scene.open_sensors(live=True) if open_sensors is None else open_sensors()
+
+    def add(builder: DiagramBuilder) -> OutputPort:
+        seen, period, time = sensors.add(builder), sensors.period, sensors.GetOutputPort("time")
+        system = add_person_tracker(builder, tracker, scene.cameras, seen, period, time)
+        return system.GetOutputPort("estimated_positions")
+
+    return Player(model, None, sensors.period, sensors, add)
 
 
 def stride_positions(model: ArticulatedModel) -> Array:
@@ -143,19 +166,23 @@ def walk(
     on_command: Callable[[str], None] = lambda _: None,
     again: Callable[[], bool] = lambda: False,
     on_spot: bool = False,
+    on_report: Callable[[str], None] = lambda _: None,
 ) -> dict[str, Any]:
     """Lets the avatar walk until its recording, the given time, or the user (Ctrl-C) ends it.
 
     Args:
-        seconds: how long; the recording's length where not given, without end for keys alone.
-        speed: seconds walked a second; 0: as fast as the machine can.
+        player: its sensors are used up.
+        seconds: how long; the recording's length where not given, else without end.
+        speed: seconds walked a second; 0: as fast as the machine can; cameras: 1.
         on_command: called when the command changes, with its words, "" for none.
-        again: asked at the end whether to walk once more from the start.
+        again: asked at the end of what is not live whether to walk once more from the start.
         on_spot: as of Walker.
+        on_report: told of cameras that stop and return, bad pictures, a person found or lost.
 
     Returns:
         Of the last walk: seconds walked; x, y [m] and heading_deg where it ended; and by command
-            how many seconds it was followed.
+            how many seconds it was followed. Live, found_share of the periods in which the person
+            was known; and warnings.
 
     Raises:
         SettingsError: a time or a speed that cannot be.
@@ -164,100 +191,51 @@ def walk(
         raise SettingsError(f"the walk's length must be a positive number, not {seconds} s")
     if not (math.isfinite(speed) and speed >= 0):
         raise SettingsError(f"the speed must be 0 or a positive number, not {speed}")
-    period = 1.0 / player.rate_hz
-    positions = None
+    period, sensors = player.period, player.sensors
+    positions: Trajectory | AddPositions | None = player.add
     if player.q is not None:
         times = period * np.arange(len(player.q) + 1)
-        positions = PiecewisePolynomial.ZeroOrderHold(
-            times, player.q[[*range(len(player.q)), -1]].T
-        )
+        q = player.q[[*range(len(player.q)), -1]]
+        positions = PiecewisePolynomial.ZeroOrderHold(times, q.T)
         seconds = min(seconds or times[-1], times[-1])
+    settle, speed = (0.0, speed) if sensors is None else (SETTLE, 1.0)
     stride = stride_positions(player.model)
-    diagram = build_walk(player.model, meshcat, positions, stride, period, on_spot)
-    while True:
-        log = _WalkLog(diagram, on_command)
-        interrupted = run_live(diagram, None, seconds, monitor=log.watch, speed=speed)
-        if interrupted or not again():
-            return log.as_json()
-        # What was pressed before does not move the next walker.
-        for name, key in KEYS.items():
-            meshcat.AddButton(name, key)
-
-
-def walk_live(
-    scene: LiveScene,
-    meshcat: Meshcat,
-    model_path: Path | None = None,
-    settings: LiveSettings | None = None,
-    open_sensors: Callable[[], LiveSensors] | None = None,
-    on_command: Callable[[str], None] = lambda _: None,
-    on_report: Callable[[str], None] = lambda _: None,
-    on_spot: bool = False,
-) -> dict[str, Any]:
-    """Lets the avatar walk as the person before the cameras commands, until Ctrl-C.
-
-    Recorded sources are played as if they were live.
-
-    Args:
-        model_path: a person with landmarks.yaml beside it; the bundled one where not given.
-        settings: how long, and whose shape; the model's where not given.
-        open_sensors: opens the sensors; those of the scene in this process where not given.
-        on_command: as for walk, like ``on_spot``.
-        on_report: told of cameras that stop and return, bad pictures, a person found or lost.
-
-    Returns:
-        As walk; found_share of the periods in which the person was known; and warnings.
-
-    Raises:
-        SceneError, ModelError, SettingsError: what was given cannot be walked with.
-        OutputError: the shape's result is none.
-    """
-    settings = settings or LiveSettings()
-    model = load_model(model_path or bundled_person(), package_paths=settings.packages)
-    known = None if settings.shape is None else shape_of_result(settings.shape)
-    tracker = tracker_of_person(model.pose_tree(), known)
-    opened: LiveSensors = scene.open_sensors(live=True) if open_sensors is None else open_sensors()
-
-    def add(builder: DiagramBuilder) -> OutputPort:
-        seen, period, time = opened.add(builder), opened.period, opened.GetOutputPort("time")
-        system = add_person_tracker(builder, tracker, scene.cameras, seen, period, time)
-        return system.GetOutputPort("estimated_positions")
-
-    try:
-        stride = stride_positions(model)
-        diagram = build_walk(model, meshcat, add, stride, opened.period, on_spot, SETTLE)
-        log = _WalkLog(diagram, on_command, on_report)
-        run_live(diagram, opened, settings.seconds, on_report, monitor=log.watch, speed=1.0)
-        warnings = camera_troubles(opened.counts(), 0)
-    finally:
-        opened.close()
-    return {**log.as_json(), "warnings": warnings}
+    with nullcontext() if sensors is None else closing(sensors):
+        diagram = build_walk(player.model, meshcat, positions, stride, period, on_spot, settle)
+        while True:
+            log = _WalkLog(diagram, on_command, on_report)
+            interrupted = run_live(
+                diagram, sensors, seconds, on_report, monitor=log.watch, speed=speed
+            )
+            if sensors is not None:
+                return log.as_json() | {"warnings": camera_troubles(sensors.counts(), 0)}
+            if interrupted or not again():
+                return log.as_json()
+            # What was pressed before does not move the next walker.
+            for name, key in KEYS.items():
+                meshcat.AddButton(name, key)
 
 
 class _WalkLog:
-    """Which commands of a diagram of build_walk were followed for how long, and where to.
-
-    on_report: told when the person before the cameras is found or lost; None: there are none.
-    """
+    """Which commands of a diagram of build_walk were followed for how long, and where to."""
 
     def __init__(
         self,
         diagram: Diagram,
         on_command: Callable[[str], None],
-        on_report: Callable[[str], None] | None = None,
+        on_report: Callable[[str], None],
     ) -> None:
-        self._command, self._pose = (
-            diagram.GetOutputPort(name) for name in ("command", "walker_pose")
-        )
+        self._command, self._pose = map(diagram.GetOutputPort, ("command", "walker_pose"))
         self._seconds = dict.fromkeys(COMMANDS, 0.0)
         self._on_command, self._on_report = on_command, on_report
         self._person: OutputPort | None = None
-        if on_report is not None:
+        if diagram.HasSubsystemNamed("person_tracker"):
             tracker = diagram.GetSubsystemByName("person_tracker")
             self._person = tracker.GetOutputPort("estimated_positions")
         self._words: tuple[str, ...] = ()
         self._time, self._last = 0.0, self._pose.Eval(diagram.CreateDefaultContext())
-        self._count, self._found, self._is_known = 0, 0, False
+        # In each period, whether the person was known.
+        self._known = [False]
 
     def watch(self, context: Context) -> None:
         """Notes the command that holds from a time on, and whether the person is known."""
@@ -270,20 +248,18 @@ class _WalkLog:
         if words != self._words:
             self._on_command(" and ".join(words))
         self._words, self._last = words, self._pose.Eval(context)
-        if self._person is not None and self._on_report is not None:
-            known = math.isfinite(evaluate(self._person, context)[0])
-            if known != self._is_known:
-                self._on_report("the person is found" if known else "the person is lost")
-            self._count, self._found, self._is_known = self._count + 1, self._found + known, known
+        if self._person is not None:
+            self._known.append(math.isfinite(evaluate(self._person, context)[0]))
+            if self._known[-1] != self._known[-2]:
+                self._on_report(f"the person is {'found' if self._known[-1] else 'lost'}")
 
     def as_json(self) -> dict[str, Any]:
         """How long the walk was, where it ended, what was commanded, and the person's share."""
         x, y, heading = (float(value) for value in self._last)
         place = {"x": x, "y": y, "heading_deg": math.degrees(heading)}
-        walked = {"seconds": self._time, **place, "commands": self._seconds}
-        if self._person is not None:
-            walked["found_share"] = self._found / max(self._count, 1)
-        return walked
+        share = sum(self._known) / max(len(self._known) - 1, 1)
+        seen = {} if self._person is None else {"found_share": share}
+        return {"seconds": self._time, **place, "commands": self._seconds, **seen}
 
 
 def show(page: Meshcat, patience: float = 10.0) -> bool:

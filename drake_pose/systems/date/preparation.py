@@ -16,7 +16,7 @@ from drake_pose.person.date.body_pose import waist_of
 from drake_pose.person.date.capture import CaptureSettings, CaptureSetup, see_person
 from drake_pose.person.date.faces import FaceTemplates, cut_face, learn_faces
 from drake_pose.person.date.features import SkinColour, find_features
-from drake_pose.person.date.recognition import register_pose
+from drake_pose.person.date.recognition import RegisteredPose, register_pose
 from drake_pose.person.date.skeleton import Skeleton, load_skeleton
 from drake_pose.silhouette.segmentation.background import Background, person_region
 from drake_pose.systems.pictures.camera_rig import build_camera_rig
@@ -62,14 +62,7 @@ def prepare_paper_capture(
     ring = {name: camera for name, camera in cameras.items() if name != face_camera}
     own = load_skeleton(model)
     skeleton = own.with_features(q, _features_of(own, q, ring, pictures, backgrounds, settings))
-    rig = build_camera_rig(model, ring)
-    context = rig.diagram.CreateDefaultContext()
-
-    def draw(camera: Camera, positions: Array) -> Mask:
-        rig.set_positions(context, positions)
-        return rig.mask(context, camera.name)
-
-    registered = register_pose(skeleton, q, list(ring.values()), draw)
+    registered = render_registered_pose(skeleton, q, ring)
     if face_camera is not None and faces is None:
         faces = learn_rendered_faces(model, own, q, settings.skin)
     return CaptureSetup(
@@ -81,6 +74,20 @@ def prepare_paper_capture(
         backgrounds,
         replace(settings, waist=waist_of(skeleton)),
     )
+
+
+def render_registered_pose(
+    skeleton: Skeleton, q: Array, cameras: Mapping[str, PinholeCamera]
+) -> RegisteredPose:
+    """The registered pose at q (nq,) [rad or m] as Drake renders it; raises as register_pose."""
+    rig = build_camera_rig(skeleton.model, cameras)
+    context = rig.diagram.CreateDefaultContext()
+
+    def draw(camera: Camera, positions: Array) -> Mask:
+        rig.set_positions(context, positions)
+        return rig.mask(context, camera.name)
+
+    return register_pose(skeleton, q, list(cameras.values()), draw)
 
 
 def _features_of(

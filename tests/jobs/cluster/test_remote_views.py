@@ -1,9 +1,11 @@
 """Live capture with workers that look through the cameras."""
 
 import itertools
+import math
 import os
 import signal
 from contextlib import nullcontext
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -14,7 +16,7 @@ from drake_pose.errors import ClusterError, SceneError
 from drake_pose.jobs.cluster.camera_groups import assign_cameras
 from drake_pose.jobs.cluster.remote_views import ClusterSensors
 from drake_pose.jobs.cluster.scheduler import open_cluster
-from drake_pose.jobs.live.run import FrameWatch, run_live
+from drake_pose.jobs.live.run import run_live
 from drake_pose.jobs.live.scene import load_live_scene
 from drake_pose.person.shape import tracker_of_person
 from drake_pose.systems.person.live_capture import build_live_capture
@@ -42,6 +44,12 @@ def cluster():
         yield client
 
 
+class Frame(NamedTuple):
+    time: float
+    q: np.ndarray
+    views: list[str]
+
+
 class Capture:
     """Runs sensors to the end, and keeps what came out."""
 
@@ -50,13 +58,18 @@ class Capture:
         diagram = build_live_capture(tracker, scene.cameras, sensors)
         self.frames, self.reports = [], []
 
-        def note(frame):
-            self.frames.append(frame)
+        def note(context):
+            moment = diagram.GetOutputPort("time").Eval(context)[0]
+            if math.isnan(moment) or (self.frames and moment == self.frames[-1].time):
+                return
+            q = np.array(diagram.GetOutputPort("estimated_positions").Eval(context))
+            ports = {name: diagram.GetOutputPort(f"silhouette_{name}") for name in scene.cameras}
+            views = [name for name, port in ports.items() if port.Eval(context) is not None]
+            self.frames.append(Frame(moment, q, views))
             on_frame(len(self.frames))
 
-        watch = FrameWatch(diagram, scene.cameras, note)
         try:
-            run_live(diagram, sensors, 60.0, self.reports.append, monitor=watch)
+            run_live(diagram, sensors, 60.0, self.reports.append, monitor=note)
             self.used = {name: count.used for name, count in sensors.counts().items()}
         finally:
             sensors.close()
@@ -73,7 +86,7 @@ class Capture:
         """The same answer: sums over cameras are added in another order."""
         return [one.time for one in self.frames] == [one.time for one in other.frames] and all(
             np.allclose(one.q, two.q, rtol=0.0, atol=1e-9, equal_nan=True)
-            and list(one.views) == list(two.views)
+            and one.views == two.views
             for one, two in zip(self.frames, other.frames, strict=True)
         )
 
@@ -87,8 +100,8 @@ def here(scene, person):
 @pytest.mark.slow
 def test_workers_see_what_this_process_sees(scene, person, cluster, here):
     sensors = ClusterSensors(cluster, scene)
-    groups = sensors.watchers.groups
-    assert [list(group.specifications) for group in groups] == [
+    groups = sensors.groups
+    assert [list(group.sources) for group in groups] == [
         ["camera_0", "camera_1"], ["camera_2", "camera_3"],
     ]  # fmt: skip
     assert groups[0].address != groups[1].address
@@ -110,7 +123,7 @@ def test_workers_see_what_this_process_sees(scene, person, cluster, here):
 @pytest.mark.slow
 def test_recording_loses_nothing_with_its_worker(scene, person, cluster, here):
     sensors = ClusterSensors(cluster, scene)
-    victim = cluster.run(os.getpid)[sensors.watchers.groups[0].address]
+    victim = cluster.run(os.getpid)[sensors.groups[0].address]
 
     def kill(count):
         if count == 4:
@@ -125,11 +138,11 @@ def test_recording_loses_nothing_with_its_worker(scene, person, cluster, here):
 
 @pytest.mark.slow
 def test_live_capture_goes_on_without_a_worker_that_stops(scene, person, cluster, monkeypatch):
-    monkeypatch.setattr("drake_pose.jobs.cluster.camera_groups._SILENCE", 0.3)
+    monkeypatch.setattr("drake_pose.jobs.cluster.remote_views._SILENCE", 0.3)
     ticks = itertools.count()
     # A clock that waits for the slowest machine that runs this test.
     sensors = ClusterSensors(cluster, scene, live=True, clock=lambda: next(ticks) / RATE_HZ)
-    victim = cluster.run(os.getpid)[sensors.watchers.groups[1].address]
+    victim = cluster.run(os.getpid)[sensors.groups[1].address]
 
     def stop(count):
         if count in (4, 14):

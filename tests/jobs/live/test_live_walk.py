@@ -1,19 +1,16 @@
 import json
-import math
 
 import numpy as np
 import pytest
+from pydrake.systems.framework import DiagramBuilder
 
-from drake_pose.commands.main import app
-from drake_pose.errors import SettingsError
 from drake_pose.jobs.live.local_proxy import open_page
 from drake_pose.jobs.live.run import run_live
 from drake_pose.jobs.live.scene import load_live_scene
-from drake_pose.jobs.live.settings import LiveSettings
-from drake_pose.jobs.live.walk import SETTLE, walk_live
+from drake_pose.jobs.live.walk import SETTLE, live_player, walk
 from drake_pose.person.date.walk_commands import SPEED
 from drake_pose.systems.walk import START
-from tests.cli import CliRunner
+from tests.cli import run_command
 from tests.jobs.live_scenes import RATE_HZ, absent, standing, write_studio
 
 REST, AHEAD, AWAY = round(1.4 * RATE_HZ), round(1.0 * RATE_HZ), round(0.6 * RATE_HZ)
@@ -34,15 +31,9 @@ def studio(tmp_path_factory, person):
 def test_person_before_the_cameras_walks_is_lost_and_found_again(studio, person):
     scene = load_live_scene(studio)
     commands, reports = [], []
-    found = walk_live(
-        scene,
-        open_page(),
-        person.path,
-        # The simulation's time, so that a busy computer skips nothing.
-        open_sensors=lambda: scene.open_sensors(live=False),
-        on_command=commands.append,
-        on_report=reports.append,
-    )
+    # The simulation's time, so that a busy computer skips nothing.
+    player = live_player(scene, person.path, None, lambda: scene.open_sensors(live=False))
+    found = walk(player, open_page(), on_command=commands.append, on_report=reports.append)
     assert commands == ["walk ahead", "", "walk ahead"]
     assert reports == ["the person is found", "the person is lost", "the person is found"]
     walked = found["commands"]["walk ahead"]
@@ -54,49 +45,38 @@ def test_person_before_the_cameras_walks_is_lost_and_found_again(studio, person)
     assert 0.6 < found["found_share"] < 0.95
 
 
-def test_recordings_are_walked_as_if_live(studio, person):
+@pytest.mark.parametrize(
+    "more", [["--seconds", "1.5"], pytest.param(["--workers", "2"], marks=pytest.mark.slow)]
+)
+def test_recordings_are_walked_as_if_live(studio, person, more):
     words = ["walk", "--live", str(studio), "--model", str(person.path), "--no-browser", "--json"]
-    done = CliRunner().invoke(app, [*words, "--seconds", "1.5"])
+    done = run_command([*words, *more])
     assert done.exit_code == 0, done.output
     found = json.loads(done.stdout)
     assert set(found["commands"]) == {"turn left", "turn right", "walk ahead", "walk behind"}
-    assert 0.0 < found["seconds"] < 2.5
     assert "http://localhost:" in done.stderr
-
-
-@pytest.mark.slow
-def test_workers_look_through_the_cameras(studio, person):
-    words = ["walk", "--live", str(studio), "--model", str(person.path), "--no-browser", "--json"]
-    done = CliRunner().invoke(app, [*words, "--workers", "2"])
-    assert done.exit_code == 0, done.output
-    found = json.loads(done.stdout)
+    if "--seconds" in more:
+        assert 0.0 < found["seconds"] < 2.5
+        return
     # Recordings lose nothing with workers, however busy the computer is.
     assert found["commands"]["walk ahead"] == pytest.approx((2 * AHEAD + 2) / RATE_HZ, abs=0.4)
     assert found["seconds"] > REST / RATE_HZ
 
 
 def test_wrong_usage_is_refused(studio, tmp_path):
-    done = CliRunner().invoke(app, ["walk", "--live", str(studio), "--simulate", "--no-browser"])
-    assert done.exit_code == 2
-    for words in (
-        ["--workers", "2"],
-        ["--live", str(studio), "--workers", "2", "--scheduler", "a"],
-    ):
-        assert CliRunner().invoke(app, ["walk", *words, "--no-browser"]).exit_code == 2
-    done = CliRunner().invoke(app, ["walk", "--live", str(tmp_path), "--no-browser"])
+    live = ["--live", str(studio)]
+    both = [*live, "--workers", "2", "--scheduler", "a"]
+    for words in ([*live, "--simulate"], ["--workers", "2"], both):
+        assert run_command(["walk", *words, "--no-browser"]).exit_code == 2
+    done = run_command(["walk", "--live", str(tmp_path), "--no-browser"])
     assert done.exit_code == 1
     assert "sources.yaml" in done.stderr
-    with pytest.raises(SettingsError, match="positive"):
-        LiveSettings(seconds=math.inf)
 
 
 def test_a_slow_computer_does_not_make_up_for_lost_time(studio, monkeypatch):
     clock = {"now": 0.0}
     monkeypatch.setattr("drake_pose.jobs.live.run.time.monotonic", lambda: clock["now"])
-    scene = load_live_scene(studio)
-    sensors = scene.open_sensors(live=False)
-    from pydrake.systems.framework import DiagramBuilder
-
+    sensors = load_live_scene(studio).open_sensors(live=False)
     builder = DiagramBuilder()
     sensors.add(builder)
     diagram = builder.Build()
@@ -108,6 +88,6 @@ def test_a_slow_computer_does_not_make_up_for_lost_time(studio, monkeypatch):
             times.append(context.get_time())
             clock["now"] += 1.0
 
-    run_live(diagram, sensors, 10.0, lambda _: None, monitor=work)
+    run_live(diagram, sensors, 10.0, monitor=work)
     # Ten seconds of the clock, one a period: the simulation's time does not run after it.
     assert len(times) == pytest.approx(10, abs=1)

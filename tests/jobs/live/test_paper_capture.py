@@ -8,7 +8,8 @@ import pytest
 
 from drake_pose.commands.main import app
 from drake_pose.errors import SceneError, SettingsError
-from drake_pose.jobs.live.paper_capture import METHOD, capture_paper
+from drake_pose.jobs.live.capture import capture_live
+from drake_pose.jobs.live.frame_results import PAPER
 from drake_pose.jobs.live.scene import load_live_scene
 from drake_pose.jobs.live.settings import LiveSettings
 from drake_pose.person.date.recognition import registered_positions
@@ -54,7 +55,7 @@ def test_person_is_followed_from_the_registered_pose_on(studio, person, skeleton
     done = CliRunner().invoke(app, [*words, "--out", str(out)])
     assert done.exit_code == 0, done.output
     summary = json.loads(done.stdout)
-    assert summary["method"] == METHOD
+    assert summary["method"] == PAPER
     assert "before the registered pose" in done.stderr
     with (out / "poses.csv").open(newline="") as stream:
         rows = list(csv.DictReader(stream))
@@ -79,18 +80,17 @@ def test_person_is_followed_from_the_registered_pose_on(studio, person, skeleton
 def test_whoever_never_shows_the_registered_pose_is_refused(tmp_path, person):
     write_studio(tmp_path, person, [standing(person)] * 3, "videos", cameras=3)
     with pytest.raises(SettingsError, match=r"registered pose.*likest silhouettes"):
-        capture_paper(load_live_scene(tmp_path), tmp_path / "out", person.path)
+        capture_live(load_live_scene(tmp_path), tmp_path / "out", person.path, by_stages=True)
     assert not (tmp_path / "out").exists()
 
 
 def test_what_cannot_be_captured_so_is_refused_before(tmp_path, person):
     write_studio(tmp_path, person, [standing(person)], "masks")
     with pytest.raises(SceneError, match="'camera_0' delivers masks"):
-        capture_paper(load_live_scene(tmp_path), tmp_path / "out")
+        capture_live(load_live_scene(tmp_path), tmp_path / "out", by_stages=True)
+    given = LiveSettings(shape=tmp_path)
     with pytest.raises(SettingsError, match="give no shape"):
-        capture_paper(
-            load_live_scene(tmp_path), tmp_path / "out", settings=LiveSettings(shape=tmp_path)
-        )
+        capture_live(load_live_scene(tmp_path), tmp_path / "out", None, given, by_stages=True)
     words = ["capture", str(tmp_path), "--out", str(tmp_path / "out"), "--method", "paper"]
     done = CliRunner().invoke(app, [*words, "--no-track"])
     assert done.exit_code == 2

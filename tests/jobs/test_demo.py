@@ -6,17 +6,16 @@ import pytest
 
 from drake_pose.body.formats.packages import bundled_model
 from drake_pose.body.model import load_model
-from drake_pose.commands.main import app
 from drake_pose.jobs.demo import demo_scene, demo_settings
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from drake_pose.silhouette.pictures.scenes import load_scene
-from tests.cli import CliRunner
+from tests.cli import run_command
 from tests.jobs.scenes import read_rows
 
 
-def test_demo(runner: CliRunner, tmp_path: Path) -> None:
+def test_demo(tmp_path: Path) -> None:
     out = tmp_path / "demo"
-    result = runner.invoke(app, ["demo", "--out", str(out)])
+    result = run_command(["demo", "--out", str(out)])
     assert result.exit_code == 0, result.output
     scene = load_scene(demo_scene())
     (camera,) = scene.cameras.values()
@@ -40,15 +39,15 @@ def test_demo(runner: CliRunner, tmp_path: Path) -> None:
     np.testing.assert_allclose(foot.translation(), ankle, atol=1e-6)
 
     (out / "mine.txt").write_text("mine")
-    refused = runner.invoke(app, ["demo", "--out", str(out)])
+    refused = run_command(["demo", "--out", str(out)])
     assert refused.exit_code == 1
     assert "not empty" in refused.stderr
     assert {"mine.txt", "poses.csv"} <= {path.name for path in out.iterdir()}
 
 
-def test_demo_leaves_other_results_alone(runner: CliRunner, tmp_path: Path) -> None:
+def test_demo_leaves_other_results_alone(tmp_path: Path) -> None:
     (tmp_path / "summary.json").write_text(json.dumps({"scene": "elsewhere"}))
-    refused = runner.invoke(app, ["demo", "--out", str(tmp_path)])
+    refused = run_command(["demo", "--out", str(tmp_path)])
     assert refused.exit_code == 1
     assert "not empty" in refused.stderr
     assert (tmp_path / "summary.json").is_file()

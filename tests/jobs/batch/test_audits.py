@@ -9,8 +9,7 @@ import pytest
 import yaml
 
 from drake_pose.camera.camera_files import save_cameras
-from drake_pose.commands.main import app
-from tests.cli import CliRunner, Result
+from tests.cli import Result, run_command
 from tests.jobs.registration.arm_scenes import ArmScene, write_arm_scene
 
 
@@ -40,8 +39,8 @@ def jobs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def audited(jobs: Path, runner: CliRunner) -> Result:
-    return runner.invoke(app, ["batch", str(jobs), "--out", str(jobs.parent / "out")])
+def audited(jobs: Path) -> Result:
+    return run_command(["batch", str(jobs), "--out", str(jobs.parent / "out")])
 
 
 @pytest.mark.slow
@@ -67,7 +66,7 @@ def test_what_contradicts_is_named_by_scene(jobs: Path, audited: Result) -> None
 
 
 @pytest.mark.slow
-def test_it_is_resumed(jobs: Path, audited: Result, runner: CliRunner) -> None:
+def test_it_is_resumed(jobs: Path, audited: Result) -> None:
     out = jobs.parent / "out"
     before = {name: (out / name / "summary.json").stat().st_mtime_ns for name in ("right", "wrong")}
     content = yaml.safe_load(jobs.read_text())
@@ -75,7 +74,7 @@ def test_it_is_resumed(jobs: Path, audited: Result, runner: CliRunner) -> None:
     content["scenes"]["found"] = content["scenes"].pop("lost")
     (jobs.parent / "more.yaml").write_text(yaml.safe_dump(content, sort_keys=False))
     given = ["batch", str(jobs.parent / "more.yaml"), "--out", str(out), "--resume", "--json"]
-    result = runner.invoke(app, given)
+    result = run_command(given)
     assert result.exit_code == 0, result.output
     scenes = json.loads(result.stdout)["scenes"]
     assert scenes["found"]["state"] == "finished"
@@ -86,7 +85,7 @@ def test_it_is_resumed(jobs: Path, audited: Result, runner: CliRunner) -> None:
     masks = jobs.parent / "first" / "scene" / "masks" / "left"
     first = (masks / "0000.png").read_bytes()
     (masks / "0000.png").write_bytes((masks / "0001.png").read_bytes())
-    result = runner.invoke(app, given)
+    result = run_command(given)
     (masks / "0000.png").write_bytes(first)
     assert result.exit_code == 1
     assert "masks of frame 0000 were replaced" in " ".join(result.stderr.split())

@@ -11,16 +11,14 @@ import numpy as np
 import pytest
 
 from drake_pose.camera.sources.frame_source import SourceSpecification
-from drake_pose.commands.main import app
 from drake_pose.errors import ClusterError, SceneError
 from drake_pose.jobs.cluster.camera_groups import assign_cameras
 from drake_pose.jobs.cluster.remote_views import ClusterSensors
-from drake_pose.jobs.cluster.scheduler import open_cluster
 from drake_pose.jobs.live.run import run_live
 from drake_pose.jobs.live.scene import load_live_scene
 from drake_pose.person.shape import tracker_of_person
 from drake_pose.systems.person.live_capture import build_live_capture
-from tests.cli import CliRunner
+from tests.cli import run_command
 from tests.jobs.live_scenes import RATE_HZ, standing, write_studio
 
 FRAMES = 40
@@ -36,12 +34,6 @@ def scene(tmp_path_factory, person):
     for k in GAP:
         (folder / "masks" / "camera_1" / f"{k:04d}.png").unlink()
     return load_live_scene(folder)
-
-
-@pytest.fixture(scope="module")
-def cluster():
-    with open_cluster(2) as client:
-        yield client
 
 
 class Frame(NamedTuple):
@@ -197,8 +189,8 @@ def test_command(scene, cluster, tmp_path, monkeypatch):
     )
     arguments = ["capture", str(scene.path), "--out", str(tmp_path / "out"), "--no-fit-shape",
                  "--no-replay", "--seconds", "0.3"]  # fmt: skip
-    both = CliRunner().invoke(app, [*arguments, "--workers", "2", "--scheduler", "tcp://here:1"])
+    both = run_command([*arguments, "--workers", "2", "--scheduler", "tcp://here:1"])
     assert both.exit_code == 2
-    result = CliRunner().invoke(app, [*arguments, "--workers", "2"])
+    result = run_command([*arguments, "--workers", "2"])
     assert result.exit_code == 0, result.stderr
     assert len((tmp_path / "out" / "poses.csv").read_text().splitlines()) == 1 + 5

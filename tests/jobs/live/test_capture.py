@@ -4,13 +4,14 @@ import json
 import numpy as np
 import pytest
 
-from drake_pose.commands.main import app
-from drake_pose.errors import OutputError, SceneError, SettingsError
+from drake_pose.body.formats.packages import bundled_model
+from drake_pose.body.model import load_model
+from drake_pose.errors import OutputError, SceneError, SettingsError, UnknownNameError
 from drake_pose.jobs.live.capture import capture_live
 from drake_pose.jobs.live.scene import load_live_scene, take_empty_room
 from drake_pose.jobs.live.settings import LiveSettings
 from drake_pose.person.shape import KnownShape, tracker_of_person
-from tests.cli import CliRunner
+from tests.cli import run_command
 from tests.jobs.live_scenes import RATE_HZ, absent, standing, write_studio
 
 FRAMES = 12
@@ -29,29 +30,23 @@ def studio(tmp_path_factory, person):
     return folder
 
 
-def read(path):
+def rows_of(path):
     with path.open(newline="") as stream:
         return list(csv.DictReader(stream))
 
 
 @pytest.fixture(scope="module")
 def captured(studio, person, tmp_path_factory):
-    out = tmp_path_factory.mktemp("results") / "out"
-    reports = []
-    result = capture_live(
-        load_live_scene(studio),
-        out,
-        person.path,
-        LiveSettings(replay=False),
-        on_report=reports.append,
-    )
-    return out, result, reports
+    out, reports = tmp_path_factory.mktemp("results") / "out", []
+    settings, scene = LiveSettings(replay=False), load_live_scene(studio)
+    result = capture_live(scene, out, person.path, settings, on_report=reports.append)
+    return out, result, "\n".join(reports)
 
 
 def test_person_is_captured_as_pictures_come(captured, person):
     out, result, _ = captured
     assert not result.interrupted
-    rows = read(out / "poses.csv")
+    rows = rows_of(out / "poses.csv")
     assert [row["frame"] for row in rows] == [f"{k:06d}" for k in range(FRAMES + 1)]
     assert rows[0]["error"] == "", "nobody was there"
     found = [np.degrees(float(row["left_upper_arm_z"])) for row in rows[1:]]
@@ -59,7 +54,7 @@ def test_person_is_captured_as_pictures_come(captured, person):
     # Three small pictures do not always tell where an arm is.
     assert np.median(off) < 3.0
     assert np.sort(off)[-2] < 9.0
-    times = [float(row["time"]) for row in read(out / "timestamps.csv")]
+    times = [float(row["time"]) for row in rows_of(out / "timestamps.csv")]
     np.testing.assert_allclose(times, np.arange(FRAMES + 1) / RATE_HZ, atol=1e-6)
     assert {"joint_centres.csv", "joint_centres.trc", "positions.mot"} <= {
         path.name for path in out.iterdir()
@@ -69,16 +64,14 @@ def test_person_is_captured_as_pictures_come(captured, person):
 
 def test_how_sure_each_position_is_is_written(captured, person):
     out, _, _ = captured
-    rows = read(out / "joints.csv")
+    rows = rows_of(out / "joints.csv")
     frames = [row["frame"] for row in rows if row["joint"] == "left_upper_arm_z"]
     assert frames == [f"{k:06d}" for k in range(1, FRAMES + 1)], "nobody was there at first"
-    poses = {row["frame"]: row for row in read(out / "poses.csv")}
-    unit = {"angle": np.degrees(1.0), "length": 1.0}
+    poses = {row["frame"]: row for row in rows_of(out / "poses.csv")}
     widths = {}
     for row in rows:
-        k = person.position_index(row["joint"])
-        factor = unit.get(person.position_kinds[k], 1.0)
-        low, high = float(row["low"]), float(row["high"])
+        is_angle = person.position_kinds[person.position_index(row["joint"])] == "angle"
+        low, high, factor = float(row["low"]), float(row["high"]), np.degrees(1.0) ** is_angle
         found = factor * float(poses[row["frame"]][row["joint"]])
         assert low - 1e-3 <= found <= high + 1e-3
         widths.setdefault(row["frame"], []).append((high - low) / factor)
@@ -88,20 +81,16 @@ def test_how_sure_each_position_is_is_written(captured, person):
 
 
 def test_what_happened_to_cameras_is_told(captured):
-    out, result, reports = captured
-    text = "\n".join(reports)
+    out, result, text = captured
     assert "camera 'camera_1' stopped at 0.27 s" in text
     assert "camera 'camera_1' returned at 0.67 s" in text
     assert "0004.png" in text
     summary = json.loads((out / "summary.json").read_text())
-    frames = summary["frames"]
-    assert set(frames["000006"]["ious"]) == {"camera_0", "camera_2"}
-    assert set(frames["000011"]["ious"]) == {"camera_0", "camera_1", "camera_2"}
-    assert summary["sources"]["camera_2"]["dropped"] == 1
-    assert [one["what"] for one in summary["sources"]["camera_1"]["changes"]] == [
-        "stopped",
-        "returned",
-    ]
+    assert set(summary["frames"]["000006"]["ious"]) == {"camera_0", "camera_2"}
+    assert set(summary["frames"]["000011"]["ious"]) == {"camera_0", "camera_1", "camera_2"}
+    sources = summary["sources"]
+    assert sources["camera_2"]["dropped"] == 1
+    assert [one["what"] for one in sources["camera_1"]["changes"]] == ["stopped", "returned"]
     assert not result.troubles or "could not be used" in result.troubles[0]
 
 
@@ -110,34 +99,35 @@ def test_ctrl_c_keeps_everything(studio, person, tmp_path):
         if count == 6:
             raise KeyboardInterrupt
 
-    out = tmp_path / "out"
-    settings = LiveSettings(replay=False)
-    result = capture_live(load_live_scene(studio), out, person.path, settings, on_frame=interrupt)
+    settings = LiveSettings(replay=False, fit_shape=False)
+    result = capture_live(
+        load_live_scene(studio), tmp_path / "out", person.path, settings, on_frame=interrupt
+    )
     assert result.interrupted
-    assert len(read(out / "poses.csv")) == 6
-    assert json.loads((out / "summary.json").read_text())["complete"]
-    assert (out / "joint_centres.trc").is_file()
+    assert len(rows_of(tmp_path / "out" / "poses.csv")) == 6
+    assert json.loads((tmp_path / "out" / "summary.json").read_text())["complete"]
+    assert (tmp_path / "out" / "joint_centres.trc").is_file()
 
 
 @pytest.mark.slow
-def test_command_captures_and_refuses(studio, person, tmp_path):
-    words = ["capture", str(studio), "--model", str(person.path), "--no-replay", "--json"]
-    done = CliRunner().invoke(app, [*words, "--out", str(tmp_path / "a"), "--seconds", "0.3"])
+def test_command_captures_and_refuses(studio, captured, person, tmp_path):
+    words = ["capture", str(studio), "--model", str(person.path), "--no-replay"]
+    new = ["--out", str(tmp_path / "a"), "--no-fit-shape"]
+    done = run_command([*words, *new, "--seconds", "0.3", "--json"])
     assert done.exit_code == 0, done.output
-    summary = json.loads(done.stdout)
-    assert 3 <= summary["frame_count"] <= 6
-    assert "0004.png" in done.stderr or summary["frame_count"] < 5
-    done = CliRunner().invoke(app, [*words, "--out", str(tmp_path / "a")])
-    assert done.exit_code == 1
-    assert "not empty" in done.stderr
-    done = CliRunner().invoke(app, [*words[:-1], "--out", str(tmp_path / "c"), "--no-fit-shape"])
+    assert 3 <= json.loads(done.stdout)["frame_count"] <= 6
+    done = run_command([*words, "--out", str(tmp_path / "b"), "--no-fit-shape"])
     assert done.exit_code == 0, done.output
+    assert "0004.png" in done.stderr
     assert "stopped at 0.27 s, returned at 0.67 s" in done.stdout
-    done = CliRunner().invoke(app, [*words, "--out", str(tmp_path / "b"), "--frame", "3"])
-    assert done.exit_code == 2
-    done = CliRunner().invoke(
-        app, ["capture", str(tmp_path), "--out", str(tmp_path / "b"), "--seconds", "3"]
-    )
+    for more, status, text in (
+        (["--out", str(captured[0])], 1, "not empty"),
+        (["--out", str(tmp_path / "c"), "--frame", "3"], 2, "sources.yaml"),
+    ):
+        done = run_command([*words, *more])
+        assert done.exit_code == status
+        assert text in done.stderr
+    done = run_command(["capture", str(tmp_path), "--out", str(tmp_path / "c"), "--seconds", "3"])
     assert done.exit_code == 2
     assert "sources.yaml" in done.stderr
 
@@ -159,10 +149,6 @@ def test_persons_own_shape_is_found_in_a_video_and_taken_from_its_result(person,
 
 
 def test_known_shape_is_worn(person):
-    from drake_pose.body.formats.packages import bundled_model
-    from drake_pose.body.model import load_model
-    from drake_pose.errors import UnknownNameError
-
     model = load_model(bundled_model("person").with_name("person_shape.urdf"), check=False)
     tree = model.pose_tree()
     shape = KnownShape({"left_thigh_stretch": 0.02}, {"trunk": 1.2})
@@ -198,7 +184,7 @@ def test_empty_room_is_taken_once(person, tmp_path):
         path.unlink()
     with pytest.raises(SceneError, match="3 of 9"):
         take_empty_room(tmp_path, 9)
-    done = CliRunner().invoke(app, ["empty-room", str(tmp_path), "--pictures", "2"])
+    done = run_command(["empty-room", str(tmp_path), "--pictures", "2"])
     assert done.exit_code == 0, done.output
     assert len(list((tmp_path / "empty").glob("*/*.png"))) == 4
     assert set(load_live_scene(tmp_path).backgrounds) == {"camera_0", "camera_1"}

@@ -6,7 +6,6 @@ import json
 import numpy as np
 import pytest
 
-from drake_pose.commands.main import app
 from drake_pose.errors import SceneError, SettingsError
 from drake_pose.jobs.live.capture import capture_live
 from drake_pose.jobs.live.frame_results import PAPER
@@ -14,7 +13,7 @@ from drake_pose.jobs.live.scene import load_live_scene
 from drake_pose.jobs.live.settings import LiveSettings
 from drake_pose.person.date.recognition import registered_positions
 from drake_pose.person.date.skeleton import load_skeleton
-from tests.cli import CliRunner
+from tests.cli import run_command
 from tests.jobs.live_scenes import standing, write_studio
 
 PLACE = (0.12, -0.1, 1.55)
@@ -52,7 +51,7 @@ def studio(tmp_path_factory, person, path):
 def test_person_is_followed_from_the_registered_pose_on(studio, person, skeleton, path, tmp_path):
     out = tmp_path / "out"
     words = ["capture", str(studio), "--method", "paper", "--no-replay", "--json"]
-    done = CliRunner().invoke(app, [*words, "--out", str(out)])
+    done = run_command([*words, "--out", str(out)])
     assert done.exit_code == 0, done.output
     summary = json.loads(done.stdout)
     assert summary["method"] == PAPER
@@ -86,17 +85,15 @@ def test_whoever_never_shows_the_registered_pose_is_refused(tmp_path, person):
 
 def test_what_cannot_be_captured_so_is_refused_before(tmp_path, person):
     write_studio(tmp_path, person, [standing(person)], "masks")
+    scene, out = load_live_scene(tmp_path), tmp_path / "out"
     with pytest.raises(SceneError, match="'camera_0' delivers masks"):
-        capture_live(load_live_scene(tmp_path), tmp_path / "out", by_stages=True)
-    given = LiveSettings(shape=tmp_path)
+        capture_live(scene, out, by_stages=True)
     with pytest.raises(SettingsError, match="give no shape"):
-        capture_live(load_live_scene(tmp_path), tmp_path / "out", None, given, by_stages=True)
+        capture_live(scene, out, None, LiveSettings(shape=tmp_path), by_stages=True)
     words = ["capture", str(tmp_path), "--out", str(tmp_path / "out"), "--method", "paper"]
-    done = CliRunner().invoke(app, [*words, "--no-track"])
-    assert done.exit_code == 2
-    done = CliRunner().invoke(app, [*words, "--face-camera", "camera_0"])
-    assert done.exit_code == 2
+    for more in (["--no-track"], ["--face-camera", "camera_0"]):
+        assert run_command([*words, *more]).exit_code == 2
     (tmp_path / "sources.yaml").unlink()
-    done = CliRunner().invoke(app, words)
+    done = run_command(words)
     assert done.exit_code == 1
     assert "has no sources.yaml" in done.stderr

@@ -1,0 +1,15 @@
+"""Fixtures of what several jobs are tested with."""
+
+import pytest
+
+from drake_pose.jobs.cluster.scheduler import open_cluster
+
+
+@pytest.fixture(scope="module")
+def cluster():
+    """A client of two workers, which come back when they are killed.
+
+    No longer than a module: its threads would take apart what Drake made in this one.
+    """
+    with open_cluster(2) as client:
+        yield client

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import struct
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -266,6 +266,21 @@ class FrameViews:
     cameras: Sequence[Camera]
     views: Sequence[SilhouetteView]
     _packed: dict[tuple[int, ...], Views] = field(default_factory=dict, init=False, repr=False)
+
+    @property
+    def pairs(self) -> list[tuple[Camera, SilhouetteView]]:
+        """Cameras and their views."""
+        return list(zip(self.cameras, self.views, strict=True))
+
+    @property
+    def showing(self) -> list[str]:
+        """The names of the cameras that see somebody."""
+        return [camera.name for camera, view in self.pairs if shows_somebody(view)]
+
+    def without(self, names: Collection[str]) -> FrameViews:
+        """What the cameras see that are not named."""
+        pairs = [pair for pair in self.pairs if pair[0].name not in names]
+        return FrameViews([camera for camera, _ in pairs], [view for _, view in pairs])
 
     def add_up(self, fit: ContourFit) -> AddUp:
         """What compares a body's contours with all cameras, as `fit` weighs them, and adds up."""

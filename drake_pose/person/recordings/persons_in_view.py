@@ -229,17 +229,11 @@ def keep_person(
 
 def keep_views(frame: FrameViews, place: Array | None = None) -> tuple[FrameViews, KeptPerson]:
     """What cameras see of one person only, who was at a place (3,) [m], as in keep_person."""
-    pairs = list(zip(frame.cameras, frame.views, strict=True))
-    kept = keep_person(
-        {camera.name: camera for camera in frame.cameras},
-        {camera.name: view.region for camera, view in pairs},
-        place,
-    )
+    cameras = {camera.name: camera for camera in frame.cameras}
+    kept = keep_person(cameras, {one.name: view.region for one, view in frame.pairs}, place)
     alone = [
-        see_silhouette(kept.masks[camera.name], edge_spacing(camera))
-        if camera.name in kept.cut
-        else view
-        for camera, view in pairs
+        see_silhouette(kept.masks[one.name], edge_spacing(one)) if one.name in kept.cut else view
+        for one, view in frame.pairs
     ]
     return FrameViews(frame.cameras, alone), kept
 

@@ -16,7 +16,7 @@ from drake_pose.fit.colour_lines import COLOURS
 from drake_pose.fit.contour_fit import inlier_ratio_of
 from drake_pose.person.pose_tracker import PersonPoseTracker, TrackState
 from drake_pose.person.recordings.persons_in_view import keep_views
-from drake_pose.person.views import ColourViews, FrameViews, SilhouetteView, shows_somebody
+from drake_pose.person.views import ColourViews, FrameViews, shows_somebody
 from drake_pose.systems.bodies import body_poses
 from drake_pose.systems.colour_images import ColourPorts
 from drake_pose.systems.ports import MemorySystem, require_different, require_period
@@ -142,54 +142,59 @@ class PersonTracker(MemorySystem):
                 return {}
         elapsed = 0.0 if np.isnan(before) else time - before
         last = _person(known, elapsed)
-        moment, colours = self._moment(context), self._colour_views(context, known["colours"])
-        is_blind = sum(shows_somebody(view) for view in moment.seen.views) < _SEERS
-        found: TrackState | None
-        if is_blind and colours is not None and last is not None:
-            found, colours = self._followed_by_colour(last, colours)
-            kept, by_colour = _Moment(FrameViews((), ())), colours
+        views = self._views(context)
+        cameras = [camera for camera in self._cameras if camera.name in views]
+        moment = _Moment(FrameViews(cameras, list(views.values())))
+        colours = self._colour_views(context, known["colours"])
+        seen: FrameViews | ColourViews
+        if len(moment.seen.showing) < _SEERS and colours is not None and last is not None:
+            found: TrackState | None
+            found, seen = self._followed_by_colour(last, colours)
+            moment, seers = _Moment(FrameViews((), ())), {one.name for one in seen.cameras}
         else:
-            found, kept = self._followed(last, moment, known["watched"][0] > 0)
-            by_colour = None
-        changed = {"time": np.array([time]), **self._seen(kept, by_colour)}
+            found, moment = self._followed(last, moment, known["watched"][0] > 0)
+            seen, seers = moment.seen, {*moment.seen.showing, *moment.merged}
+        changed = {
+            "time": np.array([time]),
+            "seen": np.array([float(camera.name in seers) for camera in self._cameras]),
+            "others": np.array([float(moment.others)]),
+        }
         if self._with_deviations:
             changed["deviations"] = np.full(len(known["last_positions"]), np.nan)
         if found is None and last is not None:
             found = TrackState(last.values, np.zeros(len(last.step)), 0.0, last.usual)
         if found is None:
             return changed
-        found = self._judged(found, kept)
-        watched = _REMEMBERED if kept.others else max(known["watched"][0] - 1.0, 0.0)
+        found = self._judged(found, moment)
+        watched = _REMEMBERED if moment.others else max(known["watched"][0] - 1.0, 0.0)
         changed |= {"watched": np.array([watched]), "elapsed": np.array([elapsed])}
         changed |= self._packed(found)
         if not found.is_lost:
             changed["last_positions"] = self._tracker.positions(found.values)
             if self._with_deviations:
-                seen = kept.seen if by_colour is None else by_colour
                 changed["deviations"] = self._tracker.deviations(found.values, seen)
             if colours is not None:
-                changed["colours"] = self._learned(found.values, kept, colours, known["colours"])
+                colours = seen if isinstance(seen, ColourViews) else colours
+                changed["colours"] = self._learned(found.values, moment, colours, known["colours"])
         return changed
 
     def _packed(self, person: TrackState) -> dict[str, Array]:
         """What is known of the person, as vectors."""
         q = self._tracker.positions(person.values)
+        numbers = {"share": person.share, "usual": person.usual, "troubled": person.troubled}
         return {
             "estimated_positions": np.full(len(q), np.nan) if person.is_lost else q,
-            "share": np.array([person.share]),
             "values": person.values,
             "step": person.step,
-            "usual": np.array([person.usual]),
-            "troubled": np.array([float(person.troubled)]),
+            **{name: np.array([float(number)]) for name, number in numbers.items()},
         }
 
-    def _learned(self, values: Array, kept: _Moment, colours: ColourViews, before: Array) -> Array:
+    def _learned(
+        self, values: Array, moment: _Moment, colours: ColourViews, before: Array
+    ) -> Array:
         """What is known of the colours after a frame in which the person is not lost."""
-        regions = {
-            camera.name: view.region
-            for camera, view in kept.pairs
-            if camera.name not in kept.merged and shows_somebody(view)
-        }
+        alone = moment.seen.without(moment.merged)
+        regions = {one.name: view.region for one, view in alone.pairs if shows_somebody(view)}
         known = colours.learned(self._tracker.fit, values, regions)
         packed = before.reshape(self._colours_shape)
         for k, name in enumerate(self._colours.cameras):
@@ -197,26 +202,13 @@ class PersonTracker(MemorySystem):
                 packed[k] = known[name]
         return packed
 
-    def _seen(self, kept: _Moment, by_colour: ColourViews | None) -> dict[str, Array]:
-        """Which cameras saw the person, and whether others were there."""
-        seers = {camera.name for camera, view in kept.pairs if shows_somebody(view)}
-        seers |= {*kept.merged}
-        if by_colour is not None:
-            seers = {camera.name for camera in by_colour.cameras}
-        seen = np.array([float(camera.name in seers) for camera in self._cameras])
-        return {"seen": seen, "others": np.array([float(kept.others)])}
-
     def _colour_views(self, context: Context, colours: Array) -> ColourViews | None:
         """The pictures that are there, and what is known of the colours; None: no picture."""
         pictures = self._colours.pictures(context)
         if not pictures:
             return None
-        packed = colours.reshape(self._colours_shape)
-        known = {
-            name: packed[k].astype(np.float32)
-            for k, name in enumerate(self._colours.cameras)
-            if packed[k].any()
-        }
+        packed = zip(self._colours.cameras, colours.reshape(self._colours_shape), strict=True)
+        known = {name: one.astype(np.float32) for name, one in packed if one.any()}
         cameras = [camera for camera in self._cameras if camera.name in pictures]
         return ColourViews(cameras, [pictures[camera.name] for camera in cameras], known)
 
@@ -229,12 +221,6 @@ class PersonTracker(MemorySystem):
             known = colours.learned(self._tracker.fit, last.values)
             colours = ColourViews(colours.cameras, colours.pictures, known)
         return self._tracker.follow_by_colour(last, colours), colours
-
-    def _moment(self, context: Context) -> _Moment:
-        """What those cameras see that have a picture."""
-        views = self._views(context)
-        cameras = [camera for camera in self._cameras if camera.name in views]
-        return _Moment(FrameViews(cameras, list(views.values())))
 
     def _followed(
         self, last: TrackState | None, moment: _Moment, is_watching: bool
@@ -252,22 +238,19 @@ class PersonTracker(MemorySystem):
 
     def _follow_one(self, last: TrackState | None, seen: FrameViews) -> TrackState | None:
         """The next state; None where fewer than two cameras see anybody."""
-        if sum(shows_somebody(view) for view in seen.views) < _SEERS:
-            return None
-        return self._tracker.follow(last, seen)
+        return self._tracker.follow(last, seen) if len(seen.showing) >= _SEERS else None
 
     def _alone(self, seen: FrameViews, last: TrackState | None) -> _Moment:
         """What cameras see without other persons than the one who was seen last."""
-        place = None if last is None else self._tracker.place(last.values)
-        alone, kept = keep_views(seen, place)
-        clean = _without(alone, kept.merged)
-        if kept.merged and sum(shows_somebody(view) for view in clean.views) >= _ENOUGH:
-            return _Moment(clean, True, kept.merged)
+        alone, kept = keep_views(seen, None if last is None else self._tracker.place(last.values))
+        clean = alone.without(kept.merged)
+        if kept.merged and len(clean.showing) >= _ENOUGH:
+            alone = clean
         return _Moment(alone, bool(kept.cut or kept.merged), kept.merged)
 
     def _judged(self, found: TrackState, moment: _Moment) -> TrackState:
         """A state whose share is that of the cameras in which nobody else's contours are."""
-        clean = _without(moment.seen, moment.merged)
+        clean = moment.seen.without(moment.merged)
         if not 0 < len(clean.cameras) < len(moment.seen.cameras):
             return found
         fit = self._tracker.fit
@@ -276,23 +259,12 @@ class PersonTracker(MemorySystem):
         return replace(found, share=inlier_ratio_of(total.sums))
 
 
-def _without(seen: FrameViews, names: Collection[str]) -> FrameViews:
-    """What the cameras see that are not named."""
-    chosen = [k for k, camera in enumerate(seen.cameras) if camera.name not in names]
-    return FrameViews([seen.cameras[k] for k in chosen], [seen.views[k] for k in chosen])
-
-
 class _Moment(NamedTuple):
     """What cameras see; whether others were cut out, and who merges person and others."""
 
     seen: FrameViews
     others: bool = False
     merged: tuple[str, ...] = ()
-
-    @property
-    def pairs(self) -> list[tuple[Camera, SilhouetteView]]:
-        """Cameras and their views."""
-        return list(zip(self.seen.cameras, self.seen.views, strict=True))
 
 
 def _person(known: Mapping[str, Array], elapsed: float) -> TrackState | None:

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform
 from pydrake.systems.analysis import Simulator
-from pydrake.systems.framework import DiagramBuilder
 from pydrake.trajectories import PiecewisePolynomial
 
 from drake_pose.camera.camera_files import save_cameras
@@ -26,8 +25,10 @@ from drake_pose.systems.estimators.silhouette_matcher import (
     SilhouetteTracker,
 )
 from tests.search.bodies import box_link, front_camera, joint, load_body, swinging_chain
+from tests.systems.bench import Bench
 
 PERIOD = 0.1
+TRUTH = np.radians([[30.0, -60.0, 0.0], [-30.0, 60.0, 90.0], [60.0, 30.0, -30.0]])
 
 
 @pytest.fixture
@@ -47,9 +48,8 @@ def pinhole(shift=0.1234):
 @pytest.mark.parametrize("camera", [pinhole(), front_camera(200, shift=0.1234)])
 def test_simulated_camera_to_estimated_positions(chain, camera):
     """Drake's own renderer draws the truth; the kernel of the matcher must find it again."""
-    truth = np.radians([[30.0, -60.0, 0.0], [-30.0, 60.0, 90.0], [60.0, 30.0, -30.0]])
     trajectory = PiecewisePolynomial.ZeroOrderHold(
-        PERIOD * np.arange(4) - 0.01, np.vstack([truth, truth[-1:]]).T
+        PERIOD * np.arange(4) - 0.01, np.vstack([TRUTH, TRUTH[-1:]]).T
     )
     built = build_simulated_matching(search_for(chain), [camera], trajectory, PERIOD)
     simulator = Simulator(built.diagram)
@@ -58,7 +58,7 @@ def test_simulated_camera_to_estimated_positions(chain, camera):
     log = built.positions_log.FindLog(context)
     # The log samples just before each update: the first sample is the default pose.
     np.testing.assert_allclose(log.sample_times()[:4], PERIOD * np.arange(4))
-    np.testing.assert_allclose(log.data().T[1:4], truth, atol=1e-9)
+    np.testing.assert_allclose(log.data().T[1:4], TRUTH, atol=1e-9)
     errors = built.error_log.FindLog(context).data()[0]
     assert np.isinf(errors[0])
     assert (errors[1:4] < 0.02).all()
@@ -66,50 +66,35 @@ def test_simulated_camera_to_estimated_positions(chain, camera):
 
 def test_one_camera_of_two_is_enough(chain):
     cameras = [front_camera(200, "left", 0.12), front_camera(200, "right", 0.34)]
-    search, truth = search_for(chain), np.radians([30.0, -60.0, 0.0])
-    alone = SilhouetteMatcher(search, cameras, PERIOD)
-    context = alone.CreateDefaultContext()
-    image = mask_to_label_image(LabelRenderer(chain, cameras[1]).mask(truth))
-    alone.GetInputPort("label_image_right").FixValue(context, image)
-    Simulator(alone, context).AdvanceTo(0.01)
-    found = alone.GetOutputPort("estimated_positions").Eval(context)
-    np.testing.assert_allclose(found, truth, atol=1e-9)
+    run, truth = Bench(SilhouetteMatcher(search_for(chain), cameras, PERIOD)), TRUTH[0]
+    mask = LabelRenderer(chain, cameras[1]).mask(truth)
+    run.update(label_image_right=mask_to_label_image(mask))
+    np.testing.assert_allclose(run["estimated_positions"], truth, atol=1e-9)
 
 
 def test_no_pose_keeps_the_last_estimate_and_says_so(chain):
     search = search_for(chain, outside_limit=0.0)
-    matcher = SilhouetteMatcher(search, [front_camera()], PERIOD)
-    context = matcher.CreateDefaultContext()
+    run = Bench(SilhouetteMatcher(search, [front_camera()], PERIOD))
     blot = np.zeros((100, 100), dtype=bool)
     blot[:2, :2] = True
-    matcher.GetInputPort("label_image").FixValue(context, mask_to_label_image(blot))
-    Simulator(matcher, context).AdvanceTo(0.01)
-    np.testing.assert_array_equal(
-        matcher.GetOutputPort("estimated_positions").Eval(context), chain.default_positions
-    )
-    statistics = dict(
-        zip(STATISTICS, matcher.GetOutputPort("statistics").Eval(context), strict=True)
-    )
-    assert statistics["found"] == 0
-    assert statistics["runs"] == 1
-    assert np.isinf(matcher.GetOutputPort("error").Eval(context)).all()
+    run.update(label_image=mask_to_label_image(blot))
+    np.testing.assert_array_equal(run["estimated_positions"], chain.default_positions)
+    statistics = dict(zip(STATISTICS, run["statistics"], strict=True))
+    assert (statistics["found"], statistics["runs"]) == (0, 1)
+    assert np.isinf(run["error"]).all()
 
 
 def test_labels_choose_the_body(chain):
     """Other things in the label image do not disturb where the body's labels are given."""
     camera = front_camera(200, shift=0.12)
-    truth = np.radians([30.0, -60.0, 0.0])
-    labels = LabelRenderer(chain, camera).label_image(truth)
+    labels = LabelRenderer(chain, camera).label_image(TRUTH[0])
     own = {int(label) for label in np.unique(labels)} - {32766}
     labels[5:60, 5:60] = 999
-    matcher = SilhouetteMatcher(search_for(chain), [camera], PERIOD, labels=own)
-    context = matcher.CreateDefaultContext()
     image = mask_to_label_image(np.ones((200, 200), dtype=bool))
     image.mutable_data[..., 0] = labels
-    matcher.GetInputPort("label_image").FixValue(context, image)
-    Simulator(matcher, context).AdvanceTo(0.01)
-    found = matcher.GetOutputPort("estimated_positions").Eval(context)
-    np.testing.assert_allclose(found, truth, atol=1e-9)
+    run = Bench(SilhouetteMatcher(search_for(chain), [camera], PERIOD, labels=own))
+    run.update(label_image=image)
+    np.testing.assert_allclose(run["estimated_positions"], TRUTH[0], atol=1e-9)
 
 
 def write_scene(folder, model, camera, poses):
@@ -144,28 +129,22 @@ def test_recorded_masks_with_a_root_position_for_each_frame(tmp_path):
     built = build_recorded_matching(scene, search, [camera], root_positions=roots)
     simulator = Simulator(built.diagram)
     simulator.Initialize()
-    context = built.matcher.GetMyContextFromRoot(simulator.get_context())
+    run = Bench(built.matcher, built.matcher.GetMyContextFromRoot(simulator.get_context()))
     for k, pose in enumerate(poses):
         simulator.AdvanceTo(k / 30 + 1e-4)
-        found = built.matcher.GetOutputPort("estimated_positions").Eval(context)
-        np.testing.assert_allclose(found, pose, atol=1e-9)
-        X_WB = built.matcher.GetOutputPort("base_pose").Eval(context)
-        assert X_WB.IsExactlyEqualTo(RigidTransform())
+        np.testing.assert_allclose(run["estimated_positions"], pose, atol=1e-9)
+        assert run["base_pose"].IsExactlyEqualTo(RigidTransform())
 
 
 def test_mask_player_plays_frame_by_frame(tmp_path, chain):
     camera = front_camera()
-    poses = np.radians([[30.0, -60.0, 0.0], [-30.0, 60.0, 90.0]])
-    scene = write_scene(tmp_path / "scene", chain, camera, poses)
-    player = MaskPlayer(scene, [camera])
-    builder = DiagramBuilder()
-    builder.AddSystem(player)
-    context = player.CreateDefaultContext()
+    scene = write_scene(tmp_path / "scene", chain, camera, TRUTH[:2])
+    player = Bench(MaskPlayer(scene, [camera]))
     for time, frame in ((-1.0, 0), (0.0, 0), (0.02, 0), (1 / 30, 1), (5.0, 1)):
-        context.SetTime(time)
-        assert player.GetOutputPort("frame_index").Eval(context)[0] == frame
-        image = player.GetOutputPort("label_image").Eval(context).data[..., 0]
-        np.testing.assert_array_equal(image == 1, scene.read("front", f"{frame:04d}"))
+        player.context.SetTime(time)
+        assert player["frame_index"][0] == frame
+        labels = player["label_image"].data[..., 0]
+        np.testing.assert_array_equal(labels == 1, scene.read("front", f"{frame:04d}"))
 
 
 @pytest.mark.parametrize("system", [SilhouetteMatcher, SilhouetteTracker])
@@ -188,29 +167,17 @@ def test_what_the_answer_is_worth_comes_out(tmp_path):
     )
     camera = front_camera(160, shift=0.1234)
     search = BeamSearch(model.pose_tree(), BeamSearchSettings(interval=0.25), ExaminationSettings())
-    matcher = SilhouetteMatcher(search, [camera], PERIOD, family_limit=3)
-    context = matcher.CreateDefaultContext()
-
-    def output(name):
-        return matcher.GetOutputPort(name).Eval(context)
-
-    assert np.isnan(output("proved_optimal")).all()
-    truth = np.array([0.5])
-    image = mask_to_label_image(LabelRenderer(model, camera).mask(truth))
-    matcher.GetInputPort("label_image").FixValue(context, image)
-    Simulator(matcher, context).AdvanceTo(0.01)
-    assert output("proved_optimal") == 1.0
-    families = output("family_positions")
-    np.testing.assert_allclose(np.sort(families[:2]), [-0.5, 0.5], atol=1e-9)
-    assert np.isnan(families[2])
-    assert output("determined") == 0.0
-    np.testing.assert_allclose([output("lower")[0], output("upper")[0]], [-0.5, 0.5], atol=1e-9)
-
+    run = Bench(SilhouetteMatcher(search, [camera], PERIOD, family_limit=3))
+    assert np.isnan(run["proved_optimal"]).all()
+    mask = LabelRenderer(model, camera).mask(np.array([0.5]))
+    run.update(label_image=mask_to_label_image(mask))
+    assert run["proved_optimal"] == 1.0
+    np.testing.assert_allclose(np.sort(run["family_positions"][:2]), [-0.5, 0.5], atol=1e-9)
+    assert np.isnan(run["family_positions"][2])
+    assert run["determined"] == 0.0
+    np.testing.assert_allclose([run["lower"][0], run["upper"][0]], [-0.5, 0.5], atol=1e-9)
     # An empty image says nothing, and a search that does not examine leaves it open.
-    matcher.GetInputPort("label_image").FixValue(
-        context, mask_to_label_image(np.zeros((160, 160), bool))
-    )
-    Simulator(matcher, context).AdvanceTo(PERIOD + 0.01)
-    assert np.isnan(output("family_positions")).all()
+    run.update(label_image=mask_to_label_image(0 * mask > 0))
+    assert np.isnan(run["family_positions"]).all()
     with pytest.raises(SettingsError, match="family limit"):
         SilhouetteMatcher(search, [camera], PERIOD, family_limit=0)

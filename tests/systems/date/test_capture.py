@@ -2,11 +2,8 @@
 
 import numpy as np
 import pytest
-from pydrake.common.value import AbstractValue
 from pydrake.geometry import Meshcat, MeshcatParams
 from pydrake.systems.analysis import Simulator
-from pydrake.systems.framework import LeafSystem
-from pydrake.systems.sensors import ImageRgba8U
 from pydrake.trajectories import PiecewisePolynomial
 
 from drake_pose.camera.models import FACE_CAMERA
@@ -22,6 +19,7 @@ from drake_pose.systems.colour_images import picture_to_colour_image
 from drake_pose.systems.date.capture import PaperPoseEstimator, build_paper_capture
 from drake_pose.systems.pictures.camera_rig import build_camera_rig
 from tests.person.studio import shared_studio
+from tests.systems.bench import Bench
 
 PERIOD = 0.1
 
@@ -56,27 +54,20 @@ def film(studio):
     return path, [{n: studio.picture(q, n) for n in studio.cameras} for q in path]
 
 
-class Run:
+class Run(Bench):
     """The diagram, frame by frame, in a context of its own."""
 
     def __init__(self, capture):
-        self.diagram, self.simulator = capture.diagram, Simulator(capture.diagram)
-        self.context = self.simulator.get_mutable_context()
-        self.estimator = capture.estimator
-        self.frames = 0
+        super().__init__(capture.diagram)
+        self.simulator, self.frames = Simulator(capture.diagram, self.context), 0
 
     def step(self, pictures):
         if self.frames:
             self.simulator.AdvanceTo(PERIOD * self.frames)
         self.frames += 1
-        for name, picture in pictures.items():
-            image = AbstractValue.Make(picture_to_colour_image(picture))
-            self.diagram.GetInputPort(f"color_image_{name}").FixValue(self.context, image)
+        self.give(**{f"color_image_{n}": picture_to_colour_image(p) for n, p in pictures.items()})
         self.simulator.AdvancePendingEvents()
-        return self.output("estimated_positions")
-
-    def output(self, name):
-        return np.array(self.diagram.GetOutputPort(name).Eval(self.context))
+        return self["estimated_positions"]
 
 
 class Core:
@@ -117,46 +108,29 @@ class Core:
         return self.q
 
 
-class PassImages(LeafSystem):
-    """A source of pictures that says when they are fresh."""
-
-    def __init__(self, cameras, fresh):
-        super().__init__()
-        self.pictures = None
-        for name in cameras:
-            self.DeclareAbstractOutputPort(
-                f"color_image_{name}",
-                lambda: AbstractValue.Make(ImageRgba8U()),
-                lambda _, out, name=name: out.set_value(
-                    picture_to_colour_image(self.pictures[name])
-                ),
-                {self.time_ticket()},
-            )
-        self.DeclareVectorOutputPort(
-            "fresh", 1, lambda context, out: out.SetFromVector([fresh(context.get_time())])
-        )
-
-
 class TestPaperCapture:
     def test_diagram_is_the_core_bit_for_bit_and_near_the_truth(self, setup, film):
         capture = build_paper_capture(setup, period=PERIOD)
+        assert list(capture.stages) == ["region", "skin", "recognition", "features", "face"]
         run, core = Run(capture), Core(setup)
         path, pictures = film
         last = len(pictures)
         # In the end the registered pose is shown again, which overwrites whatever was believed.
         for k, shots in enumerate([*pictures, pictures[0]]):
             if k == last:
-                limbs = run.output("limb_points").reshape(4, 3, 3)
-                assert (run.output("last_support") > 0).all()
+                limbs = run["limb_points"].reshape(4, 3, 3)
+                assert (run["last_support"] > 0).all()
             shots = dict(shots)
             if k in (4, 5):
                 # Two cameras stop, and return.
                 shots["camera_2"] = shots[FACE_CAMERA] = None
             np.testing.assert_array_equal(run.step(shots), core.step(shots))
-            np.testing.assert_array_equal(run.output("last_features"), core.features.ravel())
-            assert (run.output("similarity")[0] > 0) == (k < 2 or k == last)
-            assert np.isnan(run.output("face_direction")).all() == (k in (4, 5))
-        assert np.isnan(run.output("limb_points")).all()
+            for stage in capture.stages:
+                capture.evaluate(run.context, stage)
+            np.testing.assert_array_equal(run["last_features"], core.features.ravel())
+            assert (run["similarity"][0] > 0) == (k < 2 or k == last)
+            assert np.isnan(run["face_direction"]).all() == (k in (4, 5))
+        assert np.isnan(run["limb_points"]).all()
         true = np.array([setup.skeleton.limb_points(path[-1], name) for name in LIMBS])
         errors = np.linalg.norm(limbs - true, axis=2).max(axis=0)
         assert (errors < [0.06, 0.10, 0.04]).all()
@@ -169,33 +143,19 @@ class TestPaperCapture:
         silent = run.step(dict.fromkeys(studio.cameras))
         # Head, hands and feet stay where they were.
         np.testing.assert_allclose(silent[:3], known[:3], atol=1e-3)
-        assert not run.output("last_support").any()
+        assert not run["last_support"].any()
 
-    def test_images_that_are_not_fresh_are_passed_over(self, studio, setup, film):
+    def test_images_that_are_not_fresh_are_passed_over(self, setup, film):
         _, pictures = film
-
-        def run(fresh):
-            source = PassImages(studio.cameras, fresh)
-            capture = build_paper_capture(setup, source, PERIOD)
-            simulator = Simulator(capture.diagram)
-            source.pictures = pictures[0]
-            simulator.AdvanceTo(0.5 * PERIOD)
-            source.pictures = pictures[2]
-            simulator.AdvanceTo(1.5 * PERIOD)
-            return capture.diagram.GetOutputPort("last_features").Eval(simulator.get_context())
-
-        start, moved = (setup.skeleton.features(film[0][k]).ravel() for k in (0, 2))
-        np.testing.assert_allclose(run(lambda time: time == 0.0), start, atol=0.08)
-        assert np.abs(run(lambda time: 1.0) - run(lambda time: time == 0.0)).max() > 0.05
-        np.testing.assert_allclose(run(lambda time: 1.0), moved, atol=0.05)
-
-    def test_stages_are_what_the_pose_needs(self, setup, film):
-        capture = build_paper_capture(setup, period=PERIOD)
-        assert list(capture.stages) == ["region", "skin", "recognition", "features", "face"]
-        run = Run(capture)
-        run.step(film[1][0])
-        for stage in capture.stages:
-            capture.evaluate(run.context, stage)
+        run = Run(build_paper_capture(setup, period=PERIOD))
+        estimator = run.system.GetSubsystemByName("pose")
+        known = run.step(pictures[0])
+        fresh = estimator.GetInputPort("fresh")
+        own = estimator.GetMyMutableContextFromRoot(run.context)
+        fresh.FixValue(own, [0.0])
+        np.testing.assert_array_equal(run.step(pictures[-1]), known)
+        fresh.FixValue(own, [1.0])
+        assert np.abs(run.step(pictures[2]) - known).max() > 0.05
 
     def test_simulated_rig_and_avatar(self, studio):
         registered = studio.registered

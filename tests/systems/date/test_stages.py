@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from pydrake.common.value import AbstractValue
 
 from drake_pose.errors import CameraError, SettingsError, UnknownNameError
 from drake_pose.person.date.capture import see_person
@@ -20,6 +19,7 @@ from drake_pose.systems.date.stages import (
     PoseRecogniser,
 )
 from tests.person.studio import shared_studio
+from tests.systems.bench import Bench
 
 
 @pytest.fixture(scope="module")
@@ -34,12 +34,7 @@ def backgrounds(studio):
 
 def evaluated(system, port="person_view", **values):
     """The value of a system's output at given inputs."""
-    context = system.CreateDefaultContext()
-    for name, value in values.items():
-        if not isinstance(value, np.ndarray):
-            value = AbstractValue.Make(value)
-        system.GetInputPort(name).FixValue(context, value)
-    return system.GetOutputPort(port).Eval(context)
+    return Bench(system).give(**values)[port]
 
 
 class TestColourImages:
@@ -113,31 +108,26 @@ class TestFeatureFinder:
 class TestPreparation:
     def test_skin_is_where_the_cameras_see_it(self, studio, backgrounds):
         q = studio.registered.q
-        names = ("camera_0", "camera_1", "camera_3", "camera_6")
-        ring = {name: studio.ring[name] for name in names}
-        pictures = {name: studio.picture(q, name) for name in names}
+        ring = {f"camera_{k}": studio.ring[f"camera_{k}"] for k in (0, 1, 3, 6)}
+        pictures = {name: studio.picture(q, name) for name in ring}
         setup = prepare_paper_capture(studio.model, ring, None, q, pictures, backgrounds)
         assert setup.face_camera is None
-        assert list(setup.cameras) == list(names)
-        views = {
-            f"person_view_{name}": see_person(
-                shot, person_region(shot, backgrounds[name]), SkinColour()
-            )
-            for name, shot in pictures.items()
-        }
+        assert list(setup.cameras) == list(ring)
+        views = {}
+        for name, shot in pictures.items():
+            region = person_region(shot, backgrounds[name])
+            views[f"person_view_{name}"] = see_person(shot, region, SkinColour())
         last = studio.skeleton.features(q)
-        finder = FeatureFinder(list(ring.values()))
-        seen = evaluated(finder, "features", **views, last_features=last.ravel())
-        assert (evaluated(finder, "support", **views, last_features=last.ravel()) > 0).all()
+        finder = Bench(FeatureFinder(list(ring.values()))).give(**views, last_features=last.ravel())
+        assert (finder["support"] > 0).all()
         off = [
-            np.linalg.norm(s.features(q) - seen.reshape(5, 3))
-            for s in (setup.skeleton, studio.skeleton)
+            np.linalg.norm(one.features(q) - finder["features"].reshape(5, 3))
+            for one in (setup.skeleton, studio.skeleton)
         ]
         assert off[0] < 0.25 * off[1]
         recogniser = PoseRecogniser(setup.skeleton, setup.registered, list(ring.values()))
-        np.testing.assert_allclose(
-            evaluated(recogniser, "recognised_positions", **views)[:3], q[:3], atol=0.03
-        )
+        found = evaluated(recogniser, "recognised_positions", **views)
+        np.testing.assert_allclose(found[:3], q[:3], atol=0.03)
 
     def test_face_camera_must_be_there(self, studio, backgrounds):
         with pytest.raises(UnknownNameError, match="camera 'nose'"):

@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from pydrake.common.value import AbstractValue
 from pydrake.systems.analysis import Simulator
 
 from drake_pose.errors import SettingsError
@@ -13,6 +12,7 @@ from drake_pose.silhouette.segmentation.background import person_region
 from drake_pose.systems.colour_images import picture_to_colour_image
 from drake_pose.systems.person.live_capture import build_silhouette_capture
 from tests.person.studio import Studio
+from tests.systems.bench import Bench
 
 # A power of two, for times between frames that are all exactly the same.
 PERIOD = 1.0 / 32.0
@@ -43,47 +43,35 @@ def path(studio):
     return [studio.posed(left_upper_arm_z=40.0 + 4.0 * k, right_thigh_x=-5.0 * k) for k in range(5)]
 
 
-@pytest.fixture(scope="module")
-def frames(studio, cameras, path):
-    return [{name: studio.picture(q, name) for name in cameras} for q in path]
-
-
-def test_diagram_is_the_plain_functions_in_turn(
-    studio, cameras, backgrounds, tracker, path, frames
-):
+def test_diagram_is_the_plain_functions_in_turn(studio, cameras, backgrounds, tracker, path):
     capture = build_silhouette_capture(tracker, cameras, backgrounds, PERIOD)
     assert list(capture.stages) == ["region", "edge"]
-    simulator = Simulator(capture.diagram)
-    context = simulator.get_mutable_context()
-    own = capture.person.GetMyMutableContextFromRoot(context)
+    run = Bench(capture.diagram)
+    simulator = Simulator(capture.diagram, run.context)
+    own = capture.person.GetMyMutableContextFromRoot(run.context)
     assert capture.person.known_person(own) is None
     state = tracker.start(tracker.values(path[0]))
     capture.person.set_person(own, state)
-    for k, pictures in enumerate(frames):
+    for k, q in enumerate(path):
         if k:
             simulator.AdvanceTo(PERIOD * k)
-        for name, shot in pictures.items():
-            image = AbstractValue.Make(picture_to_colour_image(shot))
-            capture.diagram.GetInputPort(f"color_image_{name}").FixValue(context, image)
+        shots = {name: studio.picture(q, name) for name in cameras}
+        run.give(**{f"color_image_{n}": picture_to_colour_image(p) for n, p in shots.items()})
         for stage in capture.stages:
-            capture.evaluate(context, stage)
+            capture.evaluate(run.context, stage)
         simulator.AdvancePendingEvents()
         views = [
             see_silhouette(person_region(shot, backgrounds[name]), edge_spacing(cameras[name]))
-            for name, shot in pictures.items()
+            for name, shot in shots.items()
         ]
         state = tracker.follow(state, FrameViews(list(cameras.values()), views))
-        found = capture.diagram.GetOutputPort("estimated_positions").Eval(context)
-        np.testing.assert_array_equal(found, tracker.positions(state.values))
+        positions = tracker.positions(state.values)
+        np.testing.assert_array_equal(run["estimated_positions"], positions)
         known = capture.person.known_person(own)
-        assert (known.share, known.usual, known.troubled) == (
-            state.share,
-            state.usual,
-            state.troubled,
-        )
-        np.testing.assert_array_equal(known.step, state.step)
+        for name in ("share", "usual", "troubled", "step"):
+            np.testing.assert_array_equal(getattr(known, name), getattr(state, name))
     elbow = studio.model.position_index("left_upper_arm_z")
-    assert np.degrees(found[elbow] - path[-1][elbow]) == pytest.approx(0.0, abs=3.0)
+    assert np.degrees(positions[elbow] - q[elbow]) == pytest.approx(0.0, abs=3.0)
 
 
 def test_person_said_to_be_lost_has_no_estimated_positions(cameras, backgrounds, tracker, path):

@@ -3,8 +3,6 @@ import pytest
 from pydrake.systems.analysis import Simulator, SimulatorStatus
 from pydrake.systems.sensors import ImageLabel16I, ImageRgba8U
 
-from drake_pose.body.formats.packages import bundled_model
-from drake_pose.body.model import load_model
 from drake_pose.camera.models import circle_of_cameras
 from drake_pose.camera.sources.frame_source import FrameSource, SourceSpecification, TimedPicture
 from drake_pose.errors import SettingsError, UnknownNameError
@@ -14,6 +12,8 @@ from drake_pose.silhouette.segmentation.background import learn_background, pers
 from drake_pose.systems.person.live_capture import SilhouetteSensor
 from drake_pose.systems.pictures.camera_rig import build_camera_rig
 from drake_pose.systems.pictures.picture_capture import PictureCapture
+from tests.person.persons_in_view import posed
+from tests.systems.bench import Bench
 
 SIZE = (40, 30)
 PERIOD = 0.1
@@ -89,13 +89,9 @@ def test_images_are_those_of_the_sources():
         "camera_0": Recording("camera_0", [0.0]),
         "camera_1": Recording("camera_1", [0.0], masks=True),
     }
-    capture = PictureCapture(sources, CAMERAS)
-    simulator = Simulator(capture)
-    simulator.AdvanceTo(0.5 * PERIOD)
-    context = simulator.get_context()
-    colour = capture.GetOutputPort("color_image_camera_0").Eval(context)
-    assert (colour.data == (0, 100, 200, 255)).all()
-    mask = label_image_to_mask(capture.GetOutputPort("label_image_camera_1").Eval(context))
+    run = Bench(PictureCapture(sources, CAMERAS)).advance(0.5 * PERIOD)
+    assert (run["color_image_camera_0"].data == (0, 100, 200, 255)).all()
+    mask = label_image_to_mask(run["label_image_camera_1"])
     assert mask.sum() == SIZE[0]
     assert mask[0].all()
 
@@ -187,62 +183,41 @@ def test_what_cannot_be_is_refused():
 
 
 @pytest.fixture(scope="module")
-def rig():
-    person = load_model(bundled_model("person"), check=False)
+def rig(person):
     cameras = circle_of_cameras(1, size=(160, 120), face_camera=False)
     rig = build_camera_rig(person, cameras)
     context = rig.diagram.CreateDefaultContext()
-    q = np.array(person.default_positions)
-    q[person.position_index("position_z")] = -9.0
-    rig.set_positions(context, q)
+    rig.set_positions(context, posed(person, z=-9.0))
     empty = rig.picture(context, "camera_0")
-    q[person.position_index("position_z")] = 1.5
-    return rig, cameras["camera_0"], q, learn_background([empty])
+    rig.set_positions(context, posed(person))
+    return rig, context, cameras["camera_0"], learn_background([empty])
 
 
-class TestEye:
-    @pytest.mark.parametrize("kind", ["label", "color"])
-    def test_drakes_sensors_connect(self, rig, kind):
-        rig, camera, q, background = rig
-        sensor = SilhouetteSensor(camera, background if kind == "color" else None)
-        context = rig.diagram.CreateDefaultContext()
-        rig.set_positions(context, q)
-        image = rig.diagram.GetOutputPort(f"{kind}_image_camera_0").Eval(context)
-        own = sensor.CreateDefaultContext()
-        sensor.GetInputPort(f"{kind}_image").FixValue(own, image)
-        found = sensor.GetOutputPort("silhouette").Eval(own)
-        if kind == "label":
-            region = rig.mask(context, "camera_0")
-        else:
-            region = person_region(rig.picture(context, "camera_0"), background)
-        expected = see_silhouette(region, edge_spacing(camera))
-        np.testing.assert_array_equal(found.region, region)
-        np.testing.assert_array_equal(found.edge.uv, expected.edge.uv)
-        assert len(found.edge.uv) > 20
+@pytest.mark.parametrize("kind", ["label", "color"])
+def test_a_sensor_sees_what_drakes_sensors_show(rig, kind):
+    rig, context, camera, background = rig
+    sensor = Bench(SilhouetteSensor(camera, background if kind == "color" else None))
+    assert sensor["silhouette"] is None
+    nothing = ImageLabel16I() if kind == "label" else ImageRgba8U()
+    assert sensor.give(**{f"{kind}_image": nothing})["silhouette"] is None
+    image = rig.diagram.GetOutputPort(f"{kind}_image_camera_0").Eval(context)
+    found = sensor.give(**{f"{kind}_image": image})["silhouette"]
+    region = rig.mask(context, "camera_0")
+    if kind == "color":
+        region = person_region(rig.picture(context, "camera_0"), background)
+    expected = see_silhouette(region, edge_spacing(camera))
+    np.testing.assert_array_equal(found.region, region)
+    np.testing.assert_array_equal(found.edge.uv, expected.edge.uv)
+    assert len(found.edge.uv) > 20
 
-    def test_nothing_shown_is_none(self, rig):
-        _, camera, _, background = rig
-        for sensor, kind, image in (
-            (SilhouetteSensor(camera), "label", ImageLabel16I()),
-            (SilhouetteSensor(camera, background), "color", ImageRgba8U()),
-        ):
-            context = sensor.CreateDefaultContext()
-            assert sensor.GetOutputPort("silhouette").Eval(context) is None
-            sensor.GetInputPort(f"{kind}_image").FixValue(context, image)
-            assert sensor.GetOutputPort("silhouette").Eval(context) is None
 
-    def test_nobody_shown_is_an_empty_region(self, rig):
-        _, camera, _, _ = rig
-        sensor = SilhouetteSensor(camera)
-        context = sensor.CreateDefaultContext()
-        empty = np.zeros((camera.height, camera.width), dtype=bool)
-        sensor.GetInputPort("label_image").FixValue(context, mask_to_label_image(empty))
-        found = sensor.GetOutputPort("silhouette").Eval(context)
-        assert not found.region.any()
-        assert len(found.edge.uv) == 0
-        assert not shows_somebody(found)
-        assert not shows_somebody(None)
-        empty[40:43, 70:73] = True
-        assert not shows_somebody(see_silhouette(empty, 2.0)), "a speck is nobody"
-        empty[20:100, 60:80] = True
-        assert shows_somebody(see_silhouette(empty, 2.0))
+def test_who_is_somebody(rig):
+    mask = np.zeros((120, 160), dtype=bool)
+    sensor = Bench(SilhouetteSensor(rig[2])).give(label_image=mask_to_label_image(mask))
+    assert not sensor["silhouette"].region.any()
+    assert not shows_somebody(sensor["silhouette"])
+    assert not shows_somebody(None)
+    mask[40:43, 70:73] = True
+    assert not shows_somebody(see_silhouette(mask, 2.0)), "a speck is nobody"
+    mask[20:100, 60:80] = True
+    assert shows_somebody(see_silhouette(mask, 2.0))

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.analysis import Simulator
-from pydrake.systems.framework import Context, System
 from pydrake.trajectories import PiecewisePolynomial
 
 from drake_pose.body.model import ArticulatedModel, load_model
@@ -18,6 +17,7 @@ from drake_pose.systems.estimators.camera_registration import REGISTRATION, Came
 from drake_pose.systems.estimators.diagrams import build_simulated_registration
 from tests.registration.test_register import looking_at
 from tests.search.arms import arm_urdf
+from tests.systems.bench import Bench
 
 PERIOD = 0.5
 CAMERA = looking_at(np.array([1.6, 0.4, 0.5]), np.array([0.0, 0.0, 0.4]), 0.1)
@@ -35,51 +35,32 @@ def online(model: ArticulatedModel) -> OnlineRegistration:
     return OnlineRegistration(RegistrationBody(model.pose_tree()), CAMERA.with_pose(np.eye(4)))
 
 
-def outputs(system: System, context: Context) -> dict[str, np.ndarray]:
-    """All outputs, X_WC as a matrix."""
-    values = {
-        name: system.GetOutputPort(name).Eval(context)
-        for name in ("X_WC", "covariance", "status", "registration")
-    }
-    values["X_WC"] = values["X_WC"].GetAsMatrix4()
-    return values
-
-
 class TestCameraRegistration:
     def test_knows_nothing_at_first(self, online: OnlineRegistration) -> None:
-        system = CameraRegistration(online, PERIOD)
-        context = system.CreateDefaultContext()
-        known = outputs(system, context)
-        assert known["status"] == [0.0]
-        assert np.isnan(known["X_WC"][:3, 3]).all()
-        assert np.isinf(np.diag(known["covariance"].reshape(6, 6))).all()
-        named = dict(zip(REGISTRATION, known["registration"], strict=True))
+        run = Bench(CameraRegistration(online, PERIOD))
+        assert run["status"] == [0.0]
+        assert np.isnan(run["X_WC"].translation()).all()
+        assert np.isinf(np.diag(run["covariance"].reshape(6, 6))).all()
+        named = dict(zip(REGISTRATION, run["registration"], strict=True))
         assert named["keyframes"] == 0
         assert np.isnan(named["mean_iou"])
-        assert system.registered_camera(context) is None
+        assert run.system.registered_camera(run.context) is None
 
     def test_waits_for_pictures_and_positions(self, online: OnlineRegistration) -> None:
         system = CameraRegistration(online, PERIOD)
-        simulator = Simulator(system)
-        context = simulator.get_mutable_context()
-        positions = system.GetInputPort("measured_positions")
-        positions.FixValue(context, np.full(5, np.nan))
-        simulator.AdvanceTo(0.1 * PERIOD)
+        run = Bench(system).update(measured_positions=np.full(5, np.nan))
         mask = np.zeros((480, 640), dtype=bool)
-        system.GetInputPort("label_image").FixValue(context, mask_to_label_image(mask))
-        simulator.AdvanceTo(1.1 * PERIOD)
-        positions.FixValue(context, np.zeros(5))
-        simulator.AdvanceTo(2.1 * PERIOD)
-        assert system.online_state(context).keyframes == ()
+        run.update(label_image=mask_to_label_image(mask))
+        run.update(measured_positions=np.zeros(5))
+        assert system.online_state(run.context).keyframes == ()
         mask[100:200, 100:200] = True
-        system.GetInputPort("label_image").FixValue(context, mask_to_label_image(mask))
-        simulator.AdvanceTo(3.1 * PERIOD)
-        (kept,) = system.online_state(context).keyframes
+        run.update(1.5, label_image=mask_to_label_image(mask))
+        (kept,) = system.online_state(run.context).keyframes
         assert kept.name == "1.5 s"
         np.testing.assert_array_equal(kept.mask, mask)
         # What is known is state of the context.
-        context.SetStateAndParametersFrom(system.CreateDefaultContext())
-        assert system.online_state(context).keyframes == ()
+        run.context.SetStateAndParametersFrom(system.CreateDefaultContext())
+        assert system.online_state(run.context).keyframes == ()
 
     def test_refuses_a_period_that_is_none(self, online: OnlineRegistration) -> None:
         with pytest.raises(SettingsError, match="period"):
@@ -102,22 +83,21 @@ def test_a_camera_is_found_and_found_again_after_a_bump(
 
     def check(X_WC: np.ndarray, moves: int) -> None:
         context = built.registration.GetMyContextFromRoot(simulator.get_context())
-        known = outputs(built.registration, context)
-        off = pose_difference(known["X_WC"], X_WC)
-        assert known["status"] == [1.0]
+        run = Bench(built.registration, context)
+        found = run["X_WC"].GetAsMatrix4()
+        off = pose_difference(found, X_WC)
+        assert run["status"] == [1.0]
         assert np.linalg.norm(off[:3]) < np.radians(0.2)
         assert np.linalg.norm(off[3:]) < 3e-3
-        covariance = known["covariance"].reshape(6, 6)
+        covariance = run["covariance"].reshape(6, 6)
         # 99.9 % of a chi-square distribution with six degrees of freedom.
         assert off @ np.linalg.solve(covariance, off) < 22.5
         # A covariance that says nothing would hold anything.
         assert np.sqrt(np.diag(covariance)).max() < 3e-3
-        named = dict(zip(REGISTRATION, known["registration"], strict=True))
+        named = dict(zip(REGISTRATION, run["registration"], strict=True))
         assert named["moves"] == moves
         assert named["mean_iou"] > 0.99
-        camera = built.registration.registered_camera(context)
-        assert camera is not None
-        np.testing.assert_array_equal(camera.X_WC, known["X_WC"])
+        np.testing.assert_array_equal(built.registration.registered_camera(context).X_WC, found)
 
     simulator.AdvanceTo(5.9 * PERIOD)
     check(CAMERA.X_WC, 0)

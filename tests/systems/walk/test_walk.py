@@ -21,6 +21,8 @@ from drake_pose.systems.walk import (
     garden_obstacles,
     walker_transform,
 )
+from tests.person.persons_in_view import posed
+from tests.systems.bench import Bench
 
 PERIOD = 1 / 30
 # How far the thigh is lifted on the way through three steps [rad], left positive.
@@ -32,44 +34,39 @@ def page():
     return Meshcat(MeshcatParams(host="localhost"))
 
 
-def standing(person, x=0.0, head_deg=0.0):
-    q = np.zeros(len(person.position_names))
-    q[person.position_index("position_x")] = x
-    q[person.position_index("position_z")] = 1.55
-    q[person.position_index("head_y")] = math.radians(head_deg)
-    return q
+def standing(person, x=0.0, head_deg=0.0, **degrees):
+    return posed(person, x, head_y=head_deg, **degrees)
 
 
-def run(person, page, stances, seconds_each=1.0):
-    """Shows each stance for a while; the pose and the command after each."""
+def walked(person, page, stances, seconds_each=1.0, **how):
+    """A walk that shows each stance for a while."""
     times = seconds_each * np.arange(len(stances) + 1)
     path = PiecewisePolynomial.ZeroOrderHold(times, np.array([*stances, stances[-1]]).T)
-    diagram = build_walk(person, page, path, np.array([standing(person)]), PERIOD)
-    simulator, found = Simulator(diagram), []
-    for time in times[1:]:
-        simulator.AdvanceTo(time - 0.5 * PERIOD)
-        context = simulator.get_context()
-        found.append(
-            [diagram.GetOutputPort(n).Eval(context).copy() for n in ("walker_pose", "command")]
-        )
+    return Bench(build_walk(person, page, path, np.array([standing(person)]), PERIOD, **how))
+
+
+def run(person, page, stances):
+    """The pose and the command after each stance of a second."""
+    walk, found = walked(person, page, stances), []
+    for k in range(1, len(stances) + 1):
+        walk.advance(k - 0.5 * PERIOD)
+        found.append([walk["walker_pose"], walk["command"]])
     return found
 
 
 def test_the_paper_asks_for_steps_on_the_spot(person):
     """Standing ahead is no command by itself, nor are steps at the place of rest."""
-    walker = Walker(person, standing(person), PERIOD, on_spot=True)
-    simulator = Simulator(walker)
-    context = simulator.get_mutable_context()
+    walker = Bench(Walker(person, standing(person), PERIOD, on_spot=True))
+    simulator = Simulator(walker.system, walker.context)
     frames = [(0.0, 0.0), *[(0.3, 0.0)] * 20, *[(0.3, s) for s in SPOT], *[(0.0, s) for s in SPOT]]
     found = []
     for k, (ahead, lifted) in enumerate(frames):
-        q = standing(person, x=ahead)
-        q[person.position_index(f"{'left' if lifted > 0 else 'right'}_thigh_x")] = -abs(lifted)
-        q[person.position_index(f"{'left' if lifted > 0 else 'right'}_shin_x")] = 2 * abs(lifted)
-        walker.get_input_port(0).FixValue(context, q)
+        side, bend = "left" if lifted > 0 else "right", math.degrees(abs(lifted))
+        lift = {f"{side}_thigh_x": -bend, f"{side}_shin_x": 2 * bend}
+        walker.give(positions=standing(person, ahead, **lift))
         simulator.AdvanceTo(k * PERIOD)
         simulator.AdvancePendingEvents()
-        found.append(walker.GetOutputPort("command").Eval(context)[1])
+        found.append(walker["command"][1])
     assert not any(found[:21])
     assert found[20 + len(SPOT)] == 1
     assert found[-1] == 0
@@ -83,13 +80,8 @@ def drawn_pose(page, path):
 
 def test_gestures_walk_and_turn(person, page):
     lost = np.full(len(person.position_names), np.nan)
-    stances = [
-        standing(person, 0.1),
-        standing(person, 0.4),
-        standing(person, 0.1, 40.0),
-        lost,
-        standing(person, -0.2),
-    ]
+    seen = [standing(person, *one) for one in ((0.1,), (0.4,), (0.1, 40.0), (-0.2,))]
+    stances = [*seen[:3], lost, seen[3]]
     found = run(person, page, stances)
     assert [tuple(command) for _, command in found] == [(0, 0), (0, 1), (1, 0), (0, 0), (0, -1)]
     ways = np.diff([pose for pose, _ in found], axis=0)
@@ -116,19 +108,14 @@ def test_who_was_taken_for_facing_the_wrong_way_turns_the_rest_around(person, pa
 
 def test_rest_is_where_the_person_stands_still(person, page):
     ways = [standing(person, x) for x in np.linspace(-0.5, 0.0, 30)]
-    times = PERIOD * np.arange(30 + 40 + 30)
-    q = np.array([*ways, *[standing(person)] * 40, *[standing(person, 0.4)] * 30])
-    path = PiecewisePolynomial.ZeroOrderHold(times, q.T)
-    stride = np.array([standing(person)])
-    diagram = build_walk(person, page, path, stride, PERIOD, settle=1.0)
-    simulator = Simulator(diagram)
-    rest = diagram.GetSubsystemByName("walker").GetOutputPort("rest")
-    own = diagram.GetSubsystemByName("walker").GetMyContextFromRoot(simulator.get_context())
-    simulator.AdvanceTo(1.5)
-    assert np.isnan(rest.Eval(own)).all()
-    simulator.AdvanceTo(3.2)
-    assert rest.Eval(own)[3] == pytest.approx(0.0, abs=0.09)
-    assert tuple(diagram.GetOutputPort("command").Eval(simulator.get_context())) == (0, 1)
+    stances = [*ways, *[standing(person)] * 40, *[standing(person, 0.4)] * 30]
+    walk = walked(person, page, stances, PERIOD, settle=1.0)
+    walker = walk.system.GetSubsystemByName("walker")
+    rest = Bench(walker, walker.GetMyContextFromRoot(walk.advance(1.5).context))
+    assert np.isnan(rest["rest"]).all()
+    walk.advance(3.2)
+    assert rest["rest"][3] == pytest.approx(0.0, abs=0.09)
+    assert tuple(walk["command"]) == (0, 1)
 
 
 def press(page, button):
@@ -141,16 +128,12 @@ def press(page, button):
 def test_keys_walk_where_nobody_is_captured(person):
     page = Meshcat(MeshcatParams(host="localhost"))
     stride = np.array([standing(person, head_deg=d) for d in (5.0, 10.0, 5.0, 0.0)])
-    diagram = build_walk(person, page, None, stride, PERIOD)
+    walk = Bench(build_walk(person, page, None, stride, PERIOD))
     assert set(page.GetButtonNames()) == set(KEYS)
-    simulator = Simulator(diagram)
-    simulator.AdvanceTo(1.0)
-    pose = diagram.GetOutputPort("walker_pose")
-    np.testing.assert_allclose(pose.Eval(simulator.get_context()), START)
+    np.testing.assert_allclose(walk.advance(1.0)["walker_pose"], START)
     press(page, "ahead")
     press(page, "left")
-    simulator.AdvanceTo(3.0)
-    x, y, heading = pose.Eval(simulator.get_context())
+    x, y, heading = walk.advance(3.0)["walker_pose"]
     # A press counts for about half a second, on an arc to the left.
     assert 0.5 < np.hypot(x - START[0], y - START[1]) / SPEED < 0.7
     assert 0.5 < heading / TURN_RATE < 0.7

@@ -3,63 +3,49 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from drake_pose.body.formats.packages import bundled_model
-from drake_pose.body.model import load_model
 from drake_pose.body.surfaces.meshes import TriangleMesh
 from drake_pose.camera.models import circle_of_cameras
 from drake_pose.fit.contour_fit import ContourFit, pack_views
-from drake_pose.fit.evidence import find_edge_points
+from drake_pose.fit.evidence import NO_EDGE, find_edge_points
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.person.pose_tracker import pose_uncertainty
 from drake_pose.silhouette.areas.outline import outline_from_mesh
 from drake_pose.silhouette.areas.scoring import draw_mask
+from tests.person.persons_in_view import posed
 
 STEP = AnnealingStage(0.03, 0.05)
 
 
 class World:
-    def __init__(self):
-        self.person = load_model(bundled_model("person"), check=False)
-        self.fit = ContourFit(self.person.pose_tree())
+    def __init__(self, person):
+        self.person, self.fit = person, ContourFit(person.pose_tree())
         self.cameras = list(circle_of_cameras(6, size=(320, 240), face_camera=False).values())
         self.names = self.fit.kinematics.names
 
     def values(self, **degrees):
-        values = np.zeros(len(self.names))
-        values[self.names.index("position_z")] = 1.55
-        for name, angle in degrees.items():
-            values[self.names.index(name)] = np.radians(angle)
-        return values
+        order = [self.person.position_index(name) for name in self.names]
+        return posed(self.person, **degrees)[order]
 
-    def edges(self, values, outlines=None, cameras=None):
+    def views(self, values, outlines=None):
         X_WN = self.fit.kinematics.poses(values)
         outlines = self.fit.outlines if outlines is None else outlines
-        return [
-            find_edge_points(draw_mask(outlines, camera.X_CW @ X_WN, camera), 4.0)
-            for camera in (self.cameras if cameras is None else cameras)
-        ]
+        masks = [draw_mask(outlines, camera.X_CW @ X_WN, camera) for camera in self.cameras]
+        return pack_views(self.cameras, [find_edge_points(mask, 4.0) for mask in masks])
 
-    def deviations(self, values, edges, cameras=None, **more):
-        cameras = self.cameras if cameras is None else cameras
-        views = pack_views(cameras, edges)
+    def deviations(self, values, views, **more):
         found = pose_uncertainty(self.fit, self.fit.compare(views, values, STEP), **more)
         return dict(zip(self.names, np.sqrt(np.diag(found.covariance)), strict=True))
 
 
 @pytest.fixture(scope="module")
-def world():
-    return World()
+def world(person):
+    return World(person)
 
 
 POSE = {
-    "left_upper_arm_z": 50.0,
-    "right_upper_arm_z": -60.0,
-    "left_forearm_x": -70.0,
-    "right_forearm_x": -50.0,
-    "left_thigh_x": -30.0,
-    "left_shin_x": 50.0,
-    "right_shin_x": 15.0,
-}
+    "left_upper_arm_z": 50.0, "right_upper_arm_z": -60.0, "left_forearm_x": -70.0,
+    "right_forearm_x": -50.0, "left_thigh_x": -30.0, "left_shin_x": 50.0, "right_shin_x": 15.0,
+}  # fmt: skip
 
 
 def misshapen(outlines, generator, size):
@@ -83,11 +69,9 @@ class TestUncertainty:
         for _ in range(6):
             pose = {name: angle * generator.uniform(0.7, 1.3) for name, angle in POSE.items()}
             true = world.values(**pose, head_y=generator.uniform(-20, 20))
-            edges = world.edges(true, misshapen(world.fit.outlines, generator, size))
-            values = world.fit.fit(pack_views(world.cameras, edges), true, [STEP] * 6).values
-            found = pose_uncertainty(
-                world.fit, world.fit.compare(pack_views(world.cameras, edges), values, STEP)
-            )
+            views = world.views(true, misshapen(world.fit.outlines, generator, size))
+            values = world.fit.fit(views, true, [STEP] * 6).values
+            found = pose_uncertainty(world.fit, world.fit.compare(views, values, STEP))
             ratios.append((values - true) / np.sqrt(np.diag(found.covariance)))
             surfaces.append(found.surface)
         inside = (np.abs(ratios) < 2.0).mean()
@@ -100,7 +84,7 @@ class TestUncertainty:
 
     def test_what_silhouettes_do_not_tell_is_as_unsure_as_the_limits_allow(self, world):
         values = world.values(**POSE)
-        nobody = [find_edge_points(np.zeros((240, 320), dtype=bool), 4.0) for _ in world.cameras]
+        nobody = pack_views(world.cameras, [NO_EDGE] * len(world.cameras))
         found = world.deviations(values, nobody)
         kinematics = world.fit.kinematics
         for k, name in enumerate(world.names):
@@ -111,14 +95,14 @@ class TestUncertainty:
         stretched = world.values(left_upper_arm_z=20.0)
         bent = world.values(left_upper_arm_z=20.0, left_forearm_x=-90.0)
         twists = [
-            world.deviations(pose, world.edges(pose))["left_upper_arm_y"]
+            world.deviations(pose, world.views(pose))["left_upper_arm_y"]
             for pose in (stretched, bent)
         ]
         assert twists[0] > 1.5 * twists[1]
 
     def test_held_values_bring_their_own_uncertainty(self, world):
         values = world.values(**POSE)
-        edges = world.edges(values)
+        edges = world.views(values)
         held = np.array([name == "left_upper_arm_z" for name in world.names])
         exact = world.deviations(values, edges, held=held)
         assert exact["left_upper_arm_z"] == 0.0
@@ -129,7 +113,7 @@ class TestUncertainty:
 
     def test_noise_is_measured_not_assumed(self, world):
         values = world.values(**POSE)
-        views = pack_views(world.cameras, world.edges(values))
+        views = world.views(values)
         noise = replace(world.fit.noise, deviation=2.0 * world.fit.noise.deviation)
         bold = ContourFit(world.person.pose_tree(), noise=noise)
         modest, assumed = (

@@ -2,6 +2,7 @@ import math
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from drake_pose.person.date.walk_commands import (
     BODY_RADIUS,
@@ -20,17 +21,11 @@ from drake_pose.person.date.walk_commands import (
 
 def stance(heading_deg=0.0, ahead=0.0, left=0.0, feet_ahead=None, nod_deg=0.0):
     """Somebody who rests at (1, 2), facing along y: ahead is +y, left is -x."""
-    heading, nod = math.radians(heading_deg + 90.0), math.radians(nod_deg)
-    forward = np.array(
-        [math.cos(heading) * math.cos(nod), math.sin(heading) * math.cos(nod), -math.sin(nod)]
-    )
-    up = np.array(
-        [math.cos(heading) * math.sin(nod), math.sin(heading) * math.sin(nod), math.cos(nod)]
-    )
+    R = Rotation.from_euler("ZY", [heading_deg + 90.0, nod_deg], degrees=True).as_matrix()
     feet = ahead if feet_ahead is None else feet_ahead
     head_W = np.array([1.0 - left, 2.0 + ahead, 1.6])
     feet_W = np.array([[0.9 - left, 2.1 + feet, 0.05], [1.1 - left, 1.9 + feet, 0.05]])
-    return stance_of(np.cross(up, forward), head_W, feet_W)
+    return stance_of(R[:, 1], head_W, feet_W)
 
 
 REST = stance()
@@ -69,23 +64,27 @@ def spot_walk(lifts, seconds=0.1):
 
 
 def test_one_foot_and_then_the_other_is_walking_on_the_spot():
-    step = [0.0, 0.1, 0.1, 0.0]
-    left, right = np.array(step), -np.array(step)
-    assert spot_walk([*left, *right, *left]) == [False] * 5 + [True] * 7
+    step = np.array([0.0, 0.1, 0.1, 0.0])
+    assert spot_walk([*step, *-step, *step]) == [False] * 5 + [True] * 7
     # It ends one pause after the last step.
-    found = spot_walk([*left, *right, *([0.0] * 12)])
+    found = spot_walk([*step, *-step, *([0.0] * 12)])
     assert found[5:14] == [True] * 9
     assert not any(found[16:])
 
 
-def test_what_is_no_walking_on_the_spot():
-    foot_held_up = [0.2] * 30
-    same_foot = [0.1, 0.0] * 15
-    noise = list(np.random.default_rng(0).normal(0.0, 0.01, 60))
-    slow = ([0.1] + [0.0] * 12 + [-0.1] + [0.0] * 12) * 3
-    lost = [math.nan] * 10
-    for lifts in (foot_held_up, same_foot, noise, slow, lost):
-        assert not any(spot_walk(lifts))
+@pytest.mark.parametrize(
+    "lifts",
+    [
+        [0.2] * 30,
+        [0.1, 0.0] * 15,
+        np.random.default_rng(0).normal(0.0, 0.01, 60),
+        ([0.1] + [0.0] * 12 + [-0.1] + [0.0] * 12) * 3,
+        [math.nan] * 10,
+    ],
+    ids=["one foot held up", "the same foot", "noise", "slow", "lost"],
+)
+def test_what_is_no_walking_on_the_spot(lifts):
+    assert not any(spot_walk(lifts))
 
 
 def test_command_begins_late_and_ends_early():
@@ -97,14 +96,11 @@ def test_command_begins_late_and_ends_early():
 
 
 def test_leaning_stepping_aside_and_being_lost_do_not_walk():
-    assert commands([stance(ahead=0.4, feet_ahead=0.0)]) == [NO_COMMAND]
-    assert commands([stance(ahead=0.0, feet_ahead=-0.4)]) == [NO_COMMAND]
-    assert commands([stance(ahead=0.3, feet_ahead=-0.3)]) == [NO_COMMAND]
+    for head, feet in ((0.4, 0.0), (0.0, -0.4), (0.3, -0.3)):
+        assert commands([stance(ahead=head, feet_ahead=feet)]) == [NO_COMMAND]
     assert commands([stance(left=0.5)]) == [NO_COMMAND]
     assert commands([stance(ahead=0.4), np.full(5, np.nan)]) == [(0, 1), NO_COMMAND]
-
-
-def test_facing_backwards_is_a_turn_whichever_way_the_angle_wraps():
+    # Facing backwards is a turn whichever way the angle wraps.
     assert commands([stance(175.0)]) == [(1, 0)]
     assert commands([stance(-175.0)]) == [(-1, 0)]
 

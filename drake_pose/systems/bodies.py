@@ -1,6 +1,7 @@
 """Bodies in a diagram that stand as given positions say, with their skin and no dynamics."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from typing import Any
 
 import numpy as np
 from pydrake.geometry import (
@@ -27,32 +28,6 @@ from drake_pose.body.parsed_model import ParsedModel
 from drake_pose.body.tree.node_skin import ModelSkin
 from drake_pose.silhouette.pictures.label_renderer import DeformableSkin
 from drake_pose.systems.ports import PortedSystem
-
-
-class KnownPositions(PortedSystem):
-    """Passes positions on, and others instead while they are not known.
-
-    .. pydrake_system::
-
-        name: KnownPositions
-        input_ports: [positions]
-        output_ports: [known_positions]
-
-    A plant refuses positions that are nan, which is what estimators say before they found a body.
-
-    Args:
-        otherwise: (nq,) the output while the input is not finite.
-    """
-
-    def __init__(self, otherwise: Array) -> None:
-        super().__init__()
-        given = self.add_input("positions", len(otherwise))
-
-        def known(context: Context) -> Array:
-            q = given.Eval(context)
-            return q if np.isfinite(q).all() else otherwise
-
-        self.add_output("known_positions", len(otherwise), known)
 
 
 def body_poses(plant: MultibodyPlant, q: Array, X_WB: Array | None = None) -> list[RigidTransform]:
@@ -107,7 +82,12 @@ def add_avatar(
         period: time between two drawings [s].
     """
     scene_graph = builder.AddNamedSystem("avatar_scene_graph", SceneGraph())
-    known = builder.AddNamedSystem("avatar_positions", KnownPositions(model.default_positions))
+    default = model.default_positions
+    # A plant refuses nan, which estimators say before they found a body.
+    known = builder.AddNamedSystem(
+        "avatar_positions",
+        OnePort(len(default), len(default), lambda q: q if np.isfinite(q).all() else default),
+    )
     builder.Connect(positions, known.get_input_port())
     add_posed_plant(builder, scene_graph, model, known.get_output_port(), "avatar_pose")
     parameters = MeshcatVisualizerParams(prefix=prefix, publish_period=period)
@@ -118,24 +98,24 @@ MESHCAT_PERIOD = 1.0 / 64.0
 """Time between two drawings [s]: that of Drake's MeshcatVisualizer."""
 
 
-class SkinPoser(PortedSystem):
-    """Bends a skin that is registered with a SceneGraph, where sensors see it.
+class OnePort(PortedSystem):
+    """Gives a function of positions.
 
     .. pydrake_system::
 
-        name: SkinPoser
+        name: OnePort
         input_ports: [positions]
-        output_ports: [geometry_configuration]
+        output_ports: [value]
+
+    Args:
+        count: how many positions.
+        like: what the value is like.
     """
 
-    def __init__(self, deformable: DeformableSkin, position_count: int) -> None:
+    def __init__(self, count: int, like: Any, function: Callable[[Array], Any]) -> None:
         super().__init__()
-        positions = self.add_input("positions", position_count)
-
-        def configure(context: Context) -> GeometryConfigurationVector:
-            return deformable.configuration(deformable.skin.vertices(positions.Eval(context)))
-
-        self.add_output("geometry_configuration", GeometryConfigurationVector(), configure)
+        given = self.add_input("positions", count)
+        self.add_output("value", like, lambda context: function(given.Eval(context)))
 
 
 class MeshcatSkin(LeafSystem):
@@ -223,9 +203,12 @@ def add_skin(
     if not model.skin:
         return
     deformable = DeformableSkin(ModelSkin(model), scene_graph, labels or {}, f"{name}_skin")
-    poser = builder.AddNamedSystem(
-        f"{name}_skin_poser", SkinPoser(deformable, model.plant.num_positions())
+    bend = OnePort(
+        model.plant.num_positions(),
+        GeometryConfigurationVector(),
+        lambda q: deformable.configuration(deformable.skin.vertices(q)),
     )
+    poser = builder.AddNamedSystem(f"{name}_skin_poser", bend)
     builder.Connect(positions, poser.get_input_port())
     builder.Connect(
         poser.get_output_port(), scene_graph.get_source_configuration_port(deformable.source)

@@ -174,24 +174,23 @@ def _read_directions(path: Path) -> list[tuple[str, float, float]]:
     if header != _COLUMNS:
         raise SceneError(f"{path}: the first line must be {','.join(_COLUMNS)}")
     table: dict[str, tuple[str, float, float]] = {}
-    for number, row in rows:
-        line = _read_line(row, f"{path}, line {number}")
-        if line[0] in table:
-            raise SceneError(f"{path}, line {number}: '{line[0]}' has a line already")
-        table[line[0]] = line
+    for number, (name, *cells) in rows:
+        where = f"{path}, line {number}"
+        try:
+            turn, nod = (float(cell) for cell in cells)
+        except ValueError as error:
+            raise SceneError(f"{where}: expected a picture and two angles [deg]: {error}") from None
+        if Path(name).name != name or Path(name).suffix.lower() not in SUFFIXES:
+            known = " or ".join(SUFFIXES)
+            raise SceneError(f"{where}: '{name}' is no picture {known} in the folder")
+        if not (abs(turn) <= 180.0 and abs(nod) <= 180.0):
+            raise SceneError(
+                f"{where}: turn and nod must be -180 to 180 degrees, not {turn} and {nod}"
+            )
+        if name in table:
+            raise SceneError(f"{where}: '{name}' has a line already")
+        table[name] = name, turn, nod
     return list(table.values())
-
-
-def _read_line(row: list[str], where: str) -> tuple[str, float, float]:
-    try:
-        name, turn, nod = row[0], *(float(cell) for cell in row[1:])
-    except ValueError as error:
-        raise SceneError(f"{where}: expected a picture and two angles [deg]: {error}") from error
-    if Path(name).name != name or Path(name).suffix.lower() not in SUFFIXES:
-        raise SceneError(f"{where}: '{name}' is no picture {' or '.join(SUFFIXES)} in the folder")
-    if not (math.isfinite(turn) and math.isfinite(nod) and max(abs(turn), abs(nod)) <= 180.0):
-        raise SceneError(f"{where}: turn and nod must be -180 to 180 degrees, not {turn} and {nod}")
-    return name, turn, nod
 
 
 def _read_background(folder: Path) -> Background | None:

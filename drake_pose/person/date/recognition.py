@@ -37,7 +37,8 @@ class Contour:
 
 def measure_contour(region: Mask) -> Contour | None:
     """The contour of a region (H, W); None where nobody is seen, or it touches the edge."""
-    if not region.any() or _touches_edge(region):
+    edges = (region[0], region[-1], region[:, 0], region[:, -1])
+    if not region.any() or any(edge.any() for edge in edges):
         return None
     rows, columns = np.flatnonzero(region.any(axis=1)), np.flatnonzero(region.any(axis=0))
     corner = np.array([columns[0], rows[0]], dtype=np.float64)
@@ -52,23 +53,15 @@ def measure_contour(region: Mask) -> Contour | None:
     reach = np.zeros(DIRECTIONS)
     np.maximum.at(reach, place, np.linalg.norm(off, axis=1))
     middle = corner + 0.5 * (points.min(axis=0) + points.max(axis=0))
-    return Contour(_filled(reach) / np.sqrt(area), middle)
+    # A contour thinner than a direction leaves gaps.
+    known = np.flatnonzero(reach)
+    filled = np.interp(np.arange(DIRECTIONS), known, reach[known], period=DIRECTIONS)
+    return Contour(filled / np.sqrt(area), middle)
 
 
 def similarity(first: Array, second: Array) -> float:
     """How alike two contour shapes (DIRECTIONS,) are: 1 for equal ones, 0 for nothing in common."""
     return float(1.0 - np.abs(first - second).sum() / np.maximum(first, second).sum())
-
-
-def _touches_edge(region: Mask) -> bool:
-    edges = (region[0], region[-1], region[:, 0], region[:, -1])
-    return any(bool(edge.any()) for edge in edges)
-
-
-def _filled(reach: Array) -> Array:
-    """Distances (n,) on a circle, with gaps (a contour thinner than a direction) interpolated."""
-    known = np.flatnonzero(reach)
-    return np.interp(np.arange(len(reach)), known, reach[known], period=len(reach))
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,12 +120,11 @@ def register_pose(
 ) -> RegisteredPose:
     """Makes the templates of a pose q (nq,), about where it is shown; `draw` gives masks."""
     index = int(skeleton.head_angles[0])
-    headings = np.arange(heading_count) * 2.0 * np.pi / heading_count
-    headings = np.array([math.remainder(heading, 2.0 * math.pi) for heading in headings])
-    shapes, middles = {}, {}
+    turns = np.arange(heading_count) * 2.0 * np.pi / heading_count
+    headings = np.array([math.remainder(turn, 2.0 * math.pi) for turn in turns])
+    shapes = {one.name: np.full((heading_count, DIRECTIONS), np.nan) for one in cameras}
+    middles = {one.name: np.full((heading_count, 2), np.nan) for one in cameras}
     for camera in cameras:
-        shapes[camera.name] = np.full((heading_count, DIRECTIONS), np.nan)
-        middles[camera.name] = np.full((heading_count, 2), np.nan)
         for k, heading in enumerate(headings):
             turned = np.array(q)
             turned[index] = heading

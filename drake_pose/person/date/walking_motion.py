@@ -13,7 +13,7 @@ from drake_pose.errors import SettingsError
 from drake_pose.person.date.recognition import registered_positions
 from drake_pose.person.date.skeleton import Skeleton
 
-KeyPose = Mapping[str, float]
+KeyPose = dict[str, float]
 
 MOTIONS = ("walk", "reach", "lean", "crouch", "turn", "cross")
 """The motions, in their order; before the first and after the last the registered pose is shown."""
@@ -27,25 +27,20 @@ FEWEST_FRAMES = 40
 # In fewer frames the motions would be faster than people are; so they are not all shown.
 _WHOLE = 120
 
-_RELAXED: KeyPose = {
-    "left_upper_arm_z": 8.0,
-    "right_upper_arm_z": -8.0,
-    "left_forearm_x": -10.0,
-    "right_forearm_x": -10.0,
-}
+
+def _sides(left: float = 1.0, right: float = 1.0, **degrees: float) -> KeyPose:
+    """Angles [deg] of joints on both sides, times what is theirs."""
+    sides = {"left": left, "right": right}
+    return {f"{side}_{joint}": k * a for joint, a in degrees.items() for side, k in sides.items()}
+
+
+_RELAXED: KeyPose = _sides(forearm_x=-10.0) | _sides(right=-1.0, upper_arm_z=8.0)
 
 
 def _stride(side: float) -> KeyPose:
-    return {
-        "left_upper_arm_x": 28.0 * side,
-        "right_upper_arm_x": -28.0 * side,
-        "left_forearm_x": -25.0,
-        "right_forearm_x": -25.0,
-        "left_thigh_x": -25.0 * side,
-        "right_thigh_x": 25.0 * side,
-        "left_shin_x": 18.0 - 12.0 * side,
-        "right_shin_x": 18.0 + 12.0 * side,
-    }
+    swung = _sides(side, -side, upper_arm_x=28.0, thigh_x=-25.0)
+    bent = {"left_shin_x": 18.0 - 12.0 * side, "right_shin_x": 18.0 + 12.0 * side}
+    return swung | bent | _sides(forearm_x=-25.0)
 
 
 # Angles [deg] that differ from the relaxed pose; a motion goes from one to the next and back.
@@ -54,35 +49,19 @@ _KEY_POSES: Mapping[str, tuple[KeyPose, ...]] = {
     "reach": (
         {"left_upper_arm_x": -85.0, "left_forearm_x": -35.0},
         {"left_upper_arm_x": -140.0, "right_upper_arm_z": -75.0, "right_forearm_x": -85.0},
-        {
-            "left_upper_arm_z": 80.0,
-            "left_forearm_x": -95.0,
-            "left_upper_arm_y": -35.0,
-            "right_upper_arm_z": -80.0,
-        },
+        _sides(right=-1.0, upper_arm_z=80.0) | {"left_forearm_x": -95.0, "left_upper_arm_y": -35.0},
     ),
-    "lean": ({"neck_base_x": 35.0, "left_thigh_x": -35.0, "right_thigh_x": -35.0},),
+    "lean": ({"neck_base_x": 35.0} | _sides(thigh_x=-35.0),),
     "crouch": (
-        {
-            "left_thigh_x": -75.0,
-            "right_thigh_x": -75.0,
-            "left_shin_x": 110.0,
-            "right_shin_x": 110.0,
-            "left_thigh_z": 15.0,
-            "right_thigh_z": -15.0,
-            "neck_base_x": 12.0,
-        },
+        {"neck_base_x": 12.0}
+        | _sides(thigh_x=-75.0, shin_x=110.0)
+        | _sides(right=-1.0, thigh_z=15.0),
     ),
     "turn": ({"head_y": 45.0}, {"head_y": -45.0}),
     "cross": (
-        {
-            "left_upper_arm_x": -45.0,
-            "left_upper_arm_y": -45.0,
-            "left_forearm_x": -85.0,
-            "right_upper_arm_x": -55.0,
-            "right_upper_arm_y": 45.0,
-            "right_forearm_x": -75.0,
-        },
+        {"left_upper_arm_x": -45.0, "left_forearm_x": -85.0}
+        | {"right_upper_arm_x": -55.0, "right_forearm_x": -75.0}
+        | _sides(right=-1.0, upper_arm_y=-45.0),
     ),
 }
 

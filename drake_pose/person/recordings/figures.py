@@ -16,7 +16,8 @@ import cv2
 import numpy as np
 
 from drake_pose.arrays import Array, Integers, Mask, Picture
-from drake_pose.camera.models import Camera, ParallelCamera
+from drake_pose.camera.models import Camera
+from drake_pose.fit import contour_fit
 from drake_pose.person.rays import meeting_points, triangulate, viewing_rays
 
 # Silhouettes of a sound rig are filled but for this much.
@@ -345,10 +346,7 @@ def _is_other(person: Person, persons: Sequence[Person]) -> bool:
 
 def pixels_per_metre(camera: Camera, place: Array) -> float:
     """How large a metre is in a picture at a place (3,), however far to the side [pixel/m]."""
-    if isinstance(camera, ParallelCamera):
-        return camera.pixels_per_metre
-    depth = abs(float(camera.X_CW[2, :3] @ place + camera.X_CW[2, 3]))
-    return camera.focal_y / max(depth, camera.near)
+    return float(contour_fit.pixels_per_metre(contour_fit.pack_cameras([camera]), place)[0])
 
 
 def metres_off(camera: Camera, uv: Array, places: Array) -> Array:

@@ -90,15 +90,9 @@ class AxisSensor(PortedSystem):
         covariance = self.add_input("covariance", n * n)
         self.add_input("statistics", len(STATISTICS))
         measured = self.add_cache("measured", self._measure)
-        for row, (name, size) in enumerate(
-            (("measurement", m), ("measurement_variances", m), ("restart", 1))
-        ):
-
-            def read(context: Context, row: int = row) -> Array:
-                found: Array = measured.Eval(context)[row]
-                return found
-
-            self.add_output(name, size, read)
+        sizes = {"measurement": m, "measurement_variances": m, "restart": 1}
+        for row, (name, size) in enumerate(sizes.items()):
+            self.add_output(name, size, lambda context, row=row: measured.Eval(context)[row])
         self._matched = self.add_output("matched_state", n, self._match, {image.ticket()})
         nq = len(body.tree.model.position_names)
         # What shows the estimated body must not seem to depend on the image that it is beside.
@@ -173,28 +167,34 @@ class HandTracking:
     restart_log: VectorLogSink
 
 
-def add_hand_tracking(
-    builder: DiagramBuilder,
+def build_hand_tracking(
     search: PoseSearch,
     camera: Camera,
     axes: Mapping[str, Ends],
-    label_image: OutputPort,
+    true_positions: Trajectory | np.ndarray,
     period: float,
+    meshcat: Meshcat | None = None,
     tracking: TrackingSettings | None = None,
-) -> HandTracking:
-    """Wire label images to a filter of all free positions, inside the model's limits and couplings.
+) -> tuple[Diagram, HandTracking]:
+    """A simulated hand, or any body, and its camera, whose label images a filter gets.
+
+    The filter is of all free positions, inside the model's limits and couplings.
 
     Args:
         search: asked in the first frame, and when the track is lost; its tree says what is free.
         axes: start and end of each segment's axis (3,), (3,) in its link's frame, by name [m].
-        label_image: the images, labelled by the links' indices.
+        true_positions: the true body's positions (nq,), constant or over time.
         period: time between two frames [s].
+        meshcat: where to show the true and the estimated body.
         tracking: how the body may move; its ``root_moves`` and what is about contours is not used.
 
     Raises:
         SettingsError: a period that is not positive, no axes, or a tree without free values.
         UnknownNameError: there is no segment of such a name.
     """
+    builder, model = DiagramBuilder(), search.tree.model
+    scene_graph = builder.AddNamedSystem("scene_graph", SceneGraph())
+    _, images = add_simulated_cameras(builder, scene_graph, model, [camera], true_positions)
     body = ContourObservation(search.tree, [camera])
     middle = (0.5 * (camera.width - 1), 0.5 * (camera.height - 1))
     observation = AxisObservation(body, camera, axes, middle)
@@ -204,22 +204,26 @@ def add_hand_tracking(
     ekf = builder.AddNamedSystem("truncated_ekf", TruncatedEkf(belief_filter, start, period))
     sensor = AxisSensor(observation, transition, search, camera)
     builder.AddNamedSystem("axis_sensor", sensor)
-    builder.Connect(label_image, sensor.GetInputPort("label_image"))
+    builder.Connect(images[0], sensor.GetInputPort("label_image"))
     builder.Connect(sensor.GetOutputPort("matched_state"), ekf.GetInputPort("reset_state"))
     connect_same(builder, sensor, ekf)
     connect_same(builder, ekf, sensor)
+    estimate = sensor.GetOutputPort("estimated_positions")
+    if meshcat is not None:
+        show_estimate(builder, scene_graph, model, estimate, meshcat, ESTIMATE_COLOUR)
 
     def log(port: OutputPort) -> VectorLogSink:
         return LogVectorOutput(port, builder, publish_period=period)
 
-    return HandTracking(
+    parts = HandTracking(
         ekf=ekf,
         sensor=sensor,
-        positions_log=log(sensor.GetOutputPort("estimated_positions")),
+        positions_log=log(estimate),
         deviations_log=log(sensor.GetOutputPort("position_deviations")),
         statistics_log=log(ekf.GetOutputPort("statistics")),
         restart_log=log(sensor.GetOutputPort("restart")),
     )
+    return builder.Build(), parts
 
 
 def _axis_filter(
@@ -241,30 +245,3 @@ def _axis_filter(
         transition,
     )
     return belief_filter, transition, start
-
-
-def build_hand_tracking(
-    search: PoseSearch,
-    camera: Camera,
-    axes: Mapping[str, Ends],
-    true_positions: Trajectory | np.ndarray,
-    period: float,
-    meshcat: Meshcat | None = None,
-    tracking: TrackingSettings | None = None,
-) -> tuple[Diagram, HandTracking]:
-    """A simulated hand, or any body, and its camera, tracked by ``add_hand_tracking``.
-
-    Arguments and errors are those of that function, and:
-
-    Args:
-        true_positions: the true body's positions (nq,), constant or over time.
-        meshcat: where to show the true and the estimated body.
-    """
-    builder, model = DiagramBuilder(), search.tree.model
-    scene_graph = builder.AddNamedSystem("scene_graph", SceneGraph())
-    _, images = add_simulated_cameras(builder, scene_graph, model, [camera], true_positions)
-    parts = add_hand_tracking(builder, search, camera, axes, images[0], period, tracking)
-    if meshcat is not None:
-        estimate = parts.sensor.GetOutputPort("estimated_positions")
-        show_estimate(builder, scene_graph, model, estimate, meshcat, ESTIMATE_COLOUR)
-    return builder.Build(), parts

@@ -64,24 +64,19 @@ class MaskPlayer(PortedSystem):
             for camera in cameras
             if any((camera.name, frame) in scene.images for frame in self.frames)
         )
-        kinds = (
-            (
-                "label_image",
-                ImageLabel16I(),
-                self._label_image,
-                [camera.name for camera in cameras],
-            ),
+        every = [camera.name for camera in cameras]
+        for kind, image, read, names in (
+            ("label_image", ImageLabel16I(), self._label_image, every),
             ("color_image", ImageRgba8U(), self._color_image, self.color_cameras),
-        )
-        for kind, image, read, names in kinds:
+        ):
             for camera in cameras:
                 if camera.name in names:
                     self._play(camera_port(kind, camera, cameras), image, partial(read, camera))
         given = {"measured_positions": positions, "root_position": root_positions}
         for name, values in given.items():
             if values:
-                size = len(next(iter(values.values())))
-                self._play(name, size, partial(_known_or_nan, values, size))
+                unknown = np.full(len(next(iter(values.values()))), np.nan)
+                self._play(name, len(unknown), partial(_known, values, unknown))
         self.add_output(
             "frame_index",
             1,
@@ -110,10 +105,10 @@ class MaskPlayer(PortedSystem):
         return mask_to_label_image(np.zeros((camera.height, camera.width), dtype=bool))
 
     def _color_image(self, camera: Camera, frame: str) -> ImageRgba8U:
-        if (camera.name, frame) in self._scene.images:
-            return picture_to_colour_image(self._scene.read_image(camera.name, frame))
-        return picture_to_colour_image(None)
+        is_there = (camera.name, frame) in self._scene.images
+        picture = self._scene.read_image(camera.name, frame) if is_there else None
+        return picture_to_colour_image(picture)
 
 
-def _known_or_nan(values: Mapping[str, Array], size: int, frame: str) -> Array:
-    return values.get(frame, np.full(size, np.nan))
+def _known(values: Mapping[str, Array], unknown: Array, frame: str) -> Array:
+    return values.get(frame, unknown)

@@ -6,7 +6,7 @@ label image -> AxisSensor <-> TruncatedEkf; AxisSensor -> logs.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -90,9 +90,13 @@ class AxisSensor(PortedSystem):
         covariance = self.add_input("covariance", n * n)
         self.add_input("statistics", len(STATISTICS))
         measured = self.add_cache("measured", self._measure)
+
+        def row(k: int) -> Callable[[Context], Array]:
+            return lambda context: measured.Eval(context)[k]
+
         sizes = {"measurement": m, "measurement_variances": m, "restart": 1}
-        for row, (name, size) in enumerate(sizes.items()):
-            self.add_output(name, size, lambda context, row=row: measured.Eval(context)[row])
+        for k, (name, size) in enumerate(sizes.items()):
+            self.add_output(name, size, row(k))
         self._matched = self.add_output("matched_state", n, self._match, {image.ticket()})
         nq = len(body.tree.model.position_names)
         # What shows the estimated body must not seem to depend on the image that it is beside.

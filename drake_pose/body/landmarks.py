@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from drake_pose.arrays import Array, Integers
 from drake_pose.body.parsed_model import ParsedModel
 from drake_pose.body.tree.link_graph import PlantKinematics, build_link_graph
 from drake_pose.body.tree.pose_tree import PoseTree
@@ -19,7 +19,7 @@ class Landmark(NamedTuple):
     """A point of the object: (3,) in the frame of the link it is fixed to [m]."""
 
     link: str
-    point: NDArray[np.float64]
+    point: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,10 +27,10 @@ class NodeLandmarks:
     """Landmarks at ``points`` (n, 3) [m] in the frames of a pose tree's ``nodes`` (n,)."""
 
     names: tuple[str, ...]
-    nodes: NDArray[np.int64]
-    points: NDArray[np.float64]
+    nodes: Integers
+    points: Array
 
-    def positions(self, X_WN: NDArray[np.float64]) -> NDArray[np.float64]:
+    def positions(self, X_WN: Array) -> Array:
         """The landmarks (..., n, 3) in the world [m], given X_WN (..., nodes, 4, 4)."""
         X = np.asarray(X_WN, dtype=np.float64)[..., self.nodes, :, :]
         turned = np.einsum("...nij,nj->...ni", X[..., :3, :3], self.points)
@@ -61,11 +61,8 @@ def load_landmarks(model_path: Path | str) -> dict[str, Landmark]:
 
 
 def landmark_positions(
-    model: ParsedModel,
-    landmarks: Mapping[str, Landmark],
-    q: NDArray[np.float64],
-    X_WB: NDArray[np.float64] | None = None,
-) -> NDArray[np.float64]:
+    model: ParsedModel, landmarks: Mapping[str, Landmark], q: Array, X_WB: Array | None = None
+) -> Array:
     """The landmarks (n, 3) in the world [m], in the mapping's order.
 
     Args:

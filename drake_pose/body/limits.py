@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import Joint
 
+from drake_pose.arrays import Array
 from drake_pose.errors import ModelError, UnknownNameError
 
 PositionKind = Literal["angle", "length", "quaternion"]
@@ -52,31 +53,25 @@ class Positions:
 
     position_names: tuple[str, ...]
     position_kinds: tuple[PositionKind, ...]
-    lower: NDArray[np.float64]
-    upper: NDArray[np.float64]
-    default_positions: NDArray[np.float64]
+    lower: Array
+    upper: Array
+    default_positions: Array
     periodic: NDArray[np.bool_]
     turns_freely: NDArray[np.bool_]
 
 
-def turns_around(
-    lower: NDArray[np.float64], upper: NDArray[np.float64], periodic: NDArray[np.bool_]
-) -> NDArray[np.bool_]:
+def turns_around(lower: Array, upper: Array, periodic: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Which values (k,) can take every direction inside their limits (k,)."""
     return np.asarray(periodic & (upper - lower >= _FULL_TURN - _ROUNDING))
 
 
-def one_turn(
-    lower: NDArray[np.float64], upper: NDArray[np.float64], near: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def one_turn(lower: Array, upper: Array, near: Array) -> tuple[Array, Array]:
     """Limits (k,), and of those wider than a turn the turn inside them nearest to values (k,)."""
     low = np.clip(near - np.pi, lower, np.maximum(upper - _FULL_TURN, lower))
     return low, np.minimum(low + _FULL_TURN, upper)
 
 
-def nearest_turn(
-    values: NDArray[np.float64], near: NDArray[np.float64], periodic: NDArray[np.bool_] | bool
-) -> NDArray[np.float64]:
+def nearest_turn(values: Array, near: Array, periodic: NDArray[np.bool_] | bool) -> Array:
     """Values (k,), periodic ones moved by full turns to within half a turn of ``near``.
 
     What is half a turn away on either side stays there.
@@ -139,7 +134,7 @@ def describe_positions(
 
 def _written_limits(
     joint: Joint, names: list[str], given: Mapping[str, tuple[float, float]]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+) -> tuple[Array, Array]:
     """The limits (k,) of one joint: those given, else the file's."""
     lower = np.array(joint.position_lower_limits(), dtype=np.float64)
     upper = np.array(joint.position_upper_limits(), dtype=np.float64)
@@ -160,9 +155,7 @@ def _title(joint: Joint, index: int) -> str:
     return f"joint '{joint.name()}'{suffix}"
 
 
-def _too_wide(
-    joint: Joint, lower: NDArray[np.float64], upper: NDArray[np.float64]
-) -> NDArray[np.bool_]:
+def _too_wide(joint: Joint, lower: Array, upper: Array) -> NDArray[np.bool_]:
     """Which limits (k,) are too far apart to be limits."""
     angle = _WIDEST_SCREW if joint.type_name() == "screw" else _WIDEST_ANGLE
     kinds = _KINDS[joint.type_name()]
@@ -174,8 +167,8 @@ def _remarks(
     joint: Joint,
     names: list[str],
     wide: NDArray[np.bool_],
-    limits: tuple[NDArray[np.float64], NDArray[np.float64]],
-    turn: tuple[NDArray[np.float64], NDArray[np.float64]],
+    limits: tuple[Array, Array],
+    turn: tuple[Array, Array],
 ) -> list[str]:
     """What is said of limits that are too wide; nothing of a joint that has none at all."""
     remarks = []

@@ -7,7 +7,6 @@ from pathlib import Path
 from types import MappingProxyType
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.geometry import SceneGraph
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
@@ -22,6 +21,7 @@ from pydrake.multibody.tree import (
 )
 from scipy.spatial.transform import Rotation
 
+from drake_pose.arrays import Array
 from drake_pose.body.formats.parsing import ModelSource, limit_kinds
 from drake_pose.body.formats.safety import check_in_child
 from drake_pose.body.formats.urdf_shape import Vectors, reshaped, with_base_joints
@@ -57,7 +57,7 @@ class ArticulatedModel(ParsedModel):
         self,
         root: str | None = None,
         *,
-        root_position: Sequence[float] | NDArray[np.float64] | None = None,
+        root_position: Sequence[float] | Array | None = None,
         root_rotation: RootRotation | None = None,
         held: Mapping[str, float] | None = None,
     ) -> PoseTree:
@@ -119,7 +119,7 @@ class ArticulatedModel(ParsedModel):
         skin = [replace(band, mesh=mesh) for band, mesh in zip(kept, meshes, strict=True)]
         return self._changed(text, skin)
 
-    def with_base_joints(self, X_WB: NDArray[np.float64]) -> "ArticulatedModel":
+    def with_base_joints(self, X_WB: Array) -> "ArticulatedModel":
         """The same on BASE_JOINTS, which are 0 at X_WB (4, 4); ModelError for no URDF."""
         rpy = Rotation.from_matrix(X_WB[:3, :3]).as_euler("xyz")
         text = with_base_joints(self._urdf_text(), X_WB[:3, 3].tolist(), rpy.tolist())
@@ -127,9 +127,7 @@ class ArticulatedModel(ParsedModel):
         positions, _ = describe_positions(moved.plant, self._source.limits, str(self.path))
         return replace(moved, **vars(positions))
 
-    def before_object(
-        self, link: str, mesh: TriangleMesh, X_WO: NDArray[np.float64]
-    ) -> "ArticulatedModel":
+    def before_object(self, link: str, mesh: TriangleMesh, X_WO: Array) -> "ArticulatedModel":
         """The joints between the world and a link, and a rigid object that stands in the world.
 
         What matters to a camera on the link: only the object has looks, the world and the link are
@@ -295,7 +293,7 @@ def _weld_bases(model: ParsedModel, plant: MultibodyPlant) -> None:
             plant.WeldFrames(plant.world_frame(), frame, RigidTransform(kinematics.pose(index)))
 
 
-def _add_object(plant: MultibodyPlant, X_WO: NDArray[np.float64]) -> None:
+def _add_object(plant: MultibodyPlant, X_WO: Array) -> None:
     """Six joints, one after another, between the world and a link without looks."""
     world = plant.world_frame()
     frame = plant.AddFrame(FixedOffsetFrame(f"{OBJECT}_start", world, RigidTransform(X_WO)))

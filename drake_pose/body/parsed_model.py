@@ -38,11 +38,7 @@ class ParsedModel(Positions):
     _source: ModelSource = field(repr=False)
 
     def add_to(
-        self,
-        plant: MultibodyPlant,
-        scene_graph: SceneGraph | None = None,
-        *,
-        prefix: str = "",
+        self, plant: MultibodyPlant, scene_graph: SceneGraph | None = None, *, prefix: str = ""
     ) -> list[ModelInstanceIndex]:
         """Add the same model to another plant, for example one of a diagram; its new instances.
 

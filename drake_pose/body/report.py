@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from drake_pose.arrays import Array
 from drake_pose.body.formats.parsing import limit_kinds
 from drake_pose.body.model import ArticulatedModel, load_model
 from drake_pose.body.surfaces.meshes import TriangleMesh, is_watertight
@@ -157,7 +157,7 @@ def _symmetry_warnings(model: ArticulatedModel) -> list[str]:
     return warnings
 
 
-def _is_symmetric(mesh: TriangleMesh, X_turn: NDArray[np.float64]) -> bool:
+def _is_symmetric(mesh: TriangleMesh, X_turn: Array) -> bool:
     """Whether a surface looks the same from all around the axis of a quarter turn X_turn."""
     axis = Rotation.from_matrix(X_turn[:3, :3]).as_rotvec()
     axis /= np.linalg.norm(axis)
@@ -176,7 +176,7 @@ def _is_symmetric(mesh: TriangleMesh, X_turn: NDArray[np.float64]) -> bool:
     return bool(np.ptp(outline, axis=1).max() < _SYMMETRY_TOLERANCE * radius.max())
 
 
-def _spread_points(mesh: TriangleMesh, count: int) -> NDArray[np.float64]:
+def _spread_points(mesh: TriangleMesh, count: int) -> Array:
     """Points (count, 3) spread evenly over a surface, always the same ones."""
     a, b, c = (mesh.vertices[mesh.triangles[:, corner]] for corner in range(3))
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1)

@@ -108,10 +108,7 @@ def camera_from_drake(
 
 
 def _pinhole(
-    name: str,
-    source: CameraInfo | CameraConfig,
-    X_WC: np.ndarray,
-    near: float = PinholeCamera.near,
+    name: str, source: CameraInfo | CameraConfig, X_WC: np.ndarray, near: float = PinholeCamera.near
 ) -> PinholeCamera:
     """The camera of what has Drake's intrinsics."""
     if isinstance(source, CameraInfo):

@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from drake_pose.arrays import Array
 from drake_pose.errors import CameraError
 
 LARGEST_SIDE = 16384
@@ -242,8 +242,6 @@ def inverse_pose(X_AB: np.ndarray) -> np.ndarray:
     X_BA[:3, 3] = -X_AB[:3, :3].T @ X_AB[:3, 3]
     return X_BA
 
-
-Array = NDArray[np.float64]
 
 FACE_CAMERA = "face"
 """The name of the camera that looks at the face."""

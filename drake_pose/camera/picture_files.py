@@ -10,12 +10,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from drake_pose.arrays import Mask, Picture
 from drake_pose.camera.models import LARGEST_SIDE
 from drake_pose.errors import DrakePoseError
 from drake_pose.regular_files import read_regular
-
-Picture = NDArray[np.uint8]
-Mask = NDArray[np.bool_]
 
 SUFFIXES = (".png", ".jpg", ".jpeg")
 

@@ -72,11 +72,7 @@ _SIZES: dict[str, dict[str, int]] = {
     "ellipsoid": {"a": 1, "b": 1, "c": 1},
     "mesh": {},
 }
-_SDF_SIZES = _SIZES | {
-    "ellipsoid": {"radii": 3, **_SIZES["ellipsoid"]},
-    "plane": {},
-    "empty": {},
-}
+_SDF_SIZES = _SIZES | {"ellipsoid": {"radii": 3, **_SIZES["ellipsoid"]}, "plane": {}, "empty": {}}
 Limits = dict[str, tuple[float, float]]
 
 
@@ -291,10 +287,7 @@ def cure_sdf(
 
 
 def _cure_include(
-    include: ElementTree.Element,
-    path: Path,
-    finder: FileFinder,
-    cure_file: Callable[[Path], Path],
+    include: ElementTree.Element, path: Path, finder: FileFinder, cure_file: Callable[[Path], Path]
 ) -> None:
     """Name the file that stands in for an included model."""
     uri = include.find("uri")

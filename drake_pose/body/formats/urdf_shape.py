@@ -6,9 +6,9 @@ import xml.etree.ElementTree as ElementTree
 from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from drake_pose.arrays import Array
 from drake_pose.body.formats.xml_files import xml_text
 
 Vectors = Mapping[str, Sequence[float]]
@@ -98,7 +98,7 @@ def with_base_joints(text: str, place: Sequence[float], rpy: Sequence[float]) ->
 def _place(
     element: ElementTree.Element,
     factor: Sequence[float] | None,
-    *moves: Sequence[float] | NDArray[np.float64] | None,
+    *moves: Sequence[float] | Array | None,
 ) -> None:
     """Stretch an element's place (3,), then move it."""
     given = [np.array(move) for move in moves if move is not None]
@@ -131,7 +131,7 @@ def _origin(element: ElementTree.Element) -> ElementTree.Element:
     return ElementTree.SubElement(element, "origin") if origin is None else origin
 
 
-def _stretch_shapes(visual: ElementTree.Element, factor: NDArray[np.float64]) -> None:
+def _stretch_shapes(visual: ElementTree.Element, factor: Array) -> None:
     """Make what a visual shows larger; where it is turned, by the mean."""
     mean = [float(np.prod(factor)) ** (1.0 / 3.0)]
     if any(_numbers(_origin(visual).get("rpy", "0 0 0"))):
@@ -151,5 +151,5 @@ def _numbers(text: str) -> list[float]:
     return [float(number) for number in text.split()]
 
 
-def _text(numbers: Sequence[float] | NDArray[np.float64]) -> str:
+def _text(numbers: Sequence[float] | Array) -> str:
     return " ".join(repr(float(number)) for number in numbers)

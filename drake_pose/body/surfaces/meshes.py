@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.geometry import ReadObjToTriangleSurfaceMesh
 
+from drake_pose.arrays import Array
 from drake_pose.errors import ModelError
 
 
@@ -28,7 +29,7 @@ class TriangleMesh:
     ``vertices``: (n, 3) [m] in the frame of the link; ``triangles``: (m, 3) indices into them.
     """
 
-    vertices: NDArray[np.float64]
+    vertices: Array
     triangles: NDArray[np.int32]
 
     def __post_init__(self) -> None:
@@ -50,7 +51,7 @@ class TriangleMesh:
         """True where there is nothing to draw."""
         return len(self.triangles) == 0
 
-    def transformed(self, X_AB: NDArray[np.float64]) -> "TriangleMesh":
+    def transformed(self, X_AB: Array) -> "TriangleMesh":
         """The same surface in frame A, given this mesh in frame B and X_AB (4, 4)."""
         vertices_A = self.vertices @ X_AB[:3, :3].T + X_AB[:3, 3]
         return TriangleMesh(vertices_A, self.triangles)
@@ -110,7 +111,7 @@ _STL_TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("at
 _R_DRAKE_GLTF = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 
 
-def read_mesh_file(path: Path, scale: NDArray[np.float64] | None = None) -> TriangleMesh:
+def read_mesh_file(path: Path, scale: Array | None = None) -> TriangleMesh:
     """The triangles of an OBJ, glTF, GLB, STL or DAE file, duplicate vertices merged.
 
     ``scale``: (3,) factors along x, y and z.

@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from drake_pose.arrays import Array
 from drake_pose.body.surfaces.meshes import TriangleMesh, is_watertight, read_mesh_file
 from drake_pose.errors import ModelError, UnknownNameError
 from drake_pose.yaml_files import read_yaml
@@ -33,7 +33,7 @@ class SkinBand:
     parent: str
     child: str
     mesh: TriangleMesh
-    weights: NDArray[np.float64]
+    weights: Array
     colour: tuple[float, float, float] = _COLOUR
 
     def __post_init__(self) -> None:
@@ -110,7 +110,7 @@ def _make_band(path: Path, entry: dict[str, Any], link_names: Sequence[str]) -> 
     return SkinBand(parent, child, mesh, share**2 * (3.0 - 2.0 * share), (red, green, blue))
 
 
-def _numbers(value: Any) -> NDArray[np.float64]:
+def _numbers(value: Any) -> Array:
     """Finite numbers as an array; an empty one for anything else."""
     try:
         numbers = np.array(value, dtype=np.float64)

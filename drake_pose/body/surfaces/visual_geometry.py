@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.geometry import (
     Box,
     Capsule,
@@ -29,6 +28,7 @@ from pydrake.geometry import (
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import ModelInstanceIndex, RigidBody
 
+from drake_pose.arrays import Array
 from drake_pose.body.surfaces.meshes import (
     TriangleMesh,
     drawable_file,
@@ -108,9 +108,7 @@ def labelled_meshes(
 
 
 def make_drawable(
-    plant: MultibodyPlant,
-    scene_graph: SceneGraph | None,
-    instances: Iterable[ModelInstanceIndex],
+    plant: MultibodyPlant, scene_graph: SceneGraph | None, instances: Iterable[ModelInstanceIndex]
 ) -> None:
     """Replace mesh files that Drake's renderer would silently not draw, and hide ground planes.
 
@@ -162,9 +160,7 @@ def _box_mesh(width: float, depth: float, height: float) -> TriangleMesh:
     return TriangleMesh(corners * (width, depth, height), np.array(triangles, dtype=np.int32))
 
 
-def _round_mesh(
-    radii: NDArray[np.float64], heights: NDArray[np.float64], first: float = 0.0
-) -> TriangleMesh:
+def _round_mesh(radii: Array, heights: Array, first: float = 0.0) -> TriangleMesh:
     """A surface about z, closed between rings of radii (n,) at heights (n,) [m], the highest first.
 
     The first vertex of each ring lies at the angle ``first`` [rad] from x.

@@ -6,13 +6,11 @@ from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.multibody.tree import Joint, RigidBody
 
+from drake_pose.arrays import Array
 from drake_pose.body.tree.link_graph import PlantKinematics, chain_transforms
 from drake_pose.body.tree.pose_tree import PoseTree
-
-Array = NDArray[np.float64]
 
 # A joint stands on its link's own joint that is no farther off than this [m].
 _NO_LENGTH = 1e-3

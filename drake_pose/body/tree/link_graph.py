@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.multibody.tree import BodyIndex, Joint, RigidBody
 
+from drake_pose.arrays import Array
 from drake_pose.body.limits import FLOATING_TYPES
 from drake_pose.body.parsed_model import ParsedModel, link_names
 from drake_pose.body.surfaces.meshes import TriangleMesh, join_meshes
@@ -21,7 +22,7 @@ from drake_pose.errors import ModelError
 _SAMPLES = np.array([0.0, np.pi / 2.0, np.pi, -np.pi / 2.0])
 
 
-def inverse_transforms(X: NDArray[np.float64]) -> NDArray[np.float64]:
+def inverse_transforms(X: Array) -> Array:
     """Inverses of rigid transforms (..., 4, 4)."""
     inverse = np.zeros_like(X)
     R_transposed = np.swapaxes(X[..., :3, :3], -1, -2)
@@ -38,13 +39,11 @@ class JointMap:
     ``coefficients``: (4^k, 16), a row for each product of basis functions of the k positions.
     """
 
-    coefficients: NDArray[np.float64]
+    coefficients: Array
     position_count: int
 
     @staticmethod
-    def measure(
-        pose: Callable[[NDArray[np.float64]], NDArray[np.float64]], position_count: int, name: str
-    ) -> "JointMap":
+    def measure(pose: Callable[[Array], Array], position_count: int, name: str) -> "JointMap":
         """Determine the map from X_AC (4, 4) of the plant at given values (k,), k at most three.
 
         Raises ModelError, which names the joint, where it does not move as this class assumes.
@@ -163,14 +162,14 @@ class PlantKinematics:
         self.context = model.plant.CreateDefaultContext()
         self._defaults = model.default_positions
 
-    def pose(self, body: int, positions: Mapping[int, float] | None = None) -> NDArray[np.float64]:
+    def pose(self, body: int, positions: Mapping[int, float] | None = None) -> Array:
         """X_B_body (4, 4), B the plant's world, at defaults except for the given positions."""
         q = np.array(self._defaults)
         for index, value in (positions or {}).items():
             q[index] = value
         return self.pose_at(body, q)
 
-    def pose_at(self, body: int, q: NDArray[np.float64]) -> NDArray[np.float64]:
+    def pose_at(self, body: int, q: Array) -> Array:
         """X_B_body (4, 4) at q (nq,)."""
         positions: Any = q  # Drake's type stubs name no array type that numpy has.
         self.plant.SetPositions(self.context, positions)
@@ -220,10 +219,7 @@ def build_link_graph(model: ParsedModel, preferred_frame: str | None) -> LinkGra
 
 
 def _make_group(
-    model: ParsedModel,
-    kinematics: PlantKinematics,
-    bodies: list[int],
-    preferred_frame: str | None,
+    model: ParsedModel, kinematics: PlantKinematics, bodies: list[int], preferred_frame: str | None
 ) -> LinkGroup:
     """Join the meshes of welded bodies in one frame."""
     names = link_names(model.plant)
@@ -245,11 +241,7 @@ def _make_group(
 
 
 def _make_edge(
-    kinematics: PlantKinematics,
-    groups: tuple[LinkGroup, ...],
-    joint: Joint,
-    inner: int,
-    outer: int,
+    kinematics: PlantKinematics, groups: tuple[LinkGroup, ...], joint: Joint, inner: int, outer: int
 ) -> JointEdge:
     """Measure one joint."""
     start, count = joint.position_start(), joint.num_positions()
@@ -257,7 +249,7 @@ def _make_edge(
     if joint.type_name() in FLOATING_TYPES:
         return JointEdge(int(joint.index()), inner, outer, positions, None)
 
-    def pose(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    def pose(values: Array) -> Array:
         given = dict(zip(positions, values, strict=True))
         X_BA = kinematics.pose(groups[inner].body, given)
         return inverse_transforms(X_BA) @ kinematics.pose(groups[outer].body, given)

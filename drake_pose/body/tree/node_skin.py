@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from drake_pose.arrays import Array
 from drake_pose.body.parsed_model import ParsedModel
 from drake_pose.body.surfaces.meshes import TriangleMesh
 from drake_pose.body.surfaces.skin_file import SkinBand, skin_file
@@ -45,7 +46,7 @@ class NodeSkin:
     """
 
     mesh: TriangleMesh
-    weights: NDArray[np.float64]
+    weights: Array
     colour: tuple[float, float, float]
     turned: bool
     steps: tuple[ChainStep, ...]
@@ -55,7 +56,7 @@ class NodeSkin:
         """(m, 3) int32, read-only, indices into the vertices, the same at all values."""
         return self.mesh.triangles
 
-    def vertices(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+    def vertices(self, values: Array) -> Array:
         """The vertices (n, v, 3) [m] in the node's frame at its values (n, k) [rad or m]."""
         from drake_pose.body.tree.joint_kernel import place_band  # Slow to import: it needs numba.
 
@@ -86,19 +87,15 @@ class NodeSkin:
         )
 
 
-def _pose_at_rest(steps: tuple[ChainStep, ...]) -> NDArray[np.float64]:
+def _pose_at_rest(steps: tuple[ChainStep, ...]) -> Array:
     """A chain's transform (4, 4) with all its positions at zero."""
     count = sum(step.joint_map.position_count for step in steps)
-    rest: NDArray[np.float64] = chain_transforms(steps, np.zeros((1, count)))[0]
+    rest: Array = chain_transforms(steps, np.zeros((1, count)))[0]
     return rest
 
 
 def find_skin(
-    model: ParsedModel,
-    graph: LinkGraph,
-    parent: int,
-    group: int,
-    steps: tuple[ChainStep, ...],
+    model: ParsedModel, graph: LinkGraph, parent: int, group: int, steps: tuple[ChainStep, ...]
 ) -> NodeSkin | None:
     """The band between the groups of a node's parent and the node (``steps`` between), or None."""
     for band in model.skin:
@@ -127,7 +124,7 @@ def require_placed(
             )
 
 
-def _pose_in_group(model: ParsedModel, graph: LinkGraph, link: str) -> NDArray[np.float64]:
+def _pose_in_group(model: ParsedModel, graph: LinkGraph, link: str) -> Array:
     """The pose (4, 4) of a link in the frame of its group."""
     kinematics = PlantKinematics(model)
     body = graph.groups[graph.group_of(link)].body
@@ -158,7 +155,7 @@ class ModelSkin:
         """The bands at rest, each in its child's frame."""
         return tuple(band.mesh for band in self.bands)
 
-    def vertices(self, q: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+    def vertices(self, q: Array) -> list[Array]:
         """Each band's vertices (v, 3) [m] in the plant's world at positions q (nq,)."""
         placed = []
         for body, positions, skin in self._parts:

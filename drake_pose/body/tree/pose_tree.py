@@ -14,6 +14,7 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
+from drake_pose.arrays import Array
 from drake_pose.body.limits import one_turn, turns_around
 from drake_pose.body.parsed_model import ParsedModel
 from drake_pose.body.surfaces.meshes import TriangleMesh
@@ -55,7 +56,7 @@ class PoseTreeNode:
     mesh: TriangleMesh
     skin: NodeSkin | None = None
 
-    def surface(self, values: NDArray[np.float64]) -> TriangleMesh:
+    def surface(self, values: Array) -> TriangleMesh:
         """The node's whole surface in frame N at its values (k,): the rigid part, then the band."""
         if self.skin is None:
             return self.mesh
@@ -80,12 +81,12 @@ class NodePlacement:
         turns_freely: (k,) bool, angles without limits that are searched.
     """
 
-    X_PA: NDArray[np.float64]
+    X_PA: Array
     rotation: RootRotation | None
     steps: tuple[ChainStep, ...]
-    lower: NDArray[np.float64]
-    upper: NDArray[np.float64]
-    defaults: NDArray[np.float64]
+    lower: Array
+    upper: Array
+    defaults: Array
     is_angle: NDArray[np.bool_]
     periodic: NDArray[np.bool_]
     turns_freely: NDArray[np.bool_]
@@ -95,7 +96,7 @@ def place_node(
     model: ParsedModel,
     positions: Sequence[int],
     held: Mapping[int, float],
-    X_PA: NDArray[np.float64],
+    X_PA: Array,
     rotation: RootRotation | None,
     steps: tuple[ChainStep, ...],
 ) -> NodePlacement:
@@ -139,7 +140,7 @@ class PoseTree:
     root: str
     placements: tuple[NodePlacement, ...] = field(repr=False)
     _base: BasePose = field(repr=False)
-    _rebuild: "Callable[[NDArray[np.float64]], PoseTree] | None" = field(default=None, repr=False)
+    _rebuild: "Callable[[Array], PoseTree] | None" = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
         """Freeze the mapping."""
@@ -159,7 +160,7 @@ class PoseTree:
             below[i] += [j for child in self.nodes[i].children for j in below[child]]
         return tuple(tuple(sorted(nodes)) for nodes in below)
 
-    def with_root_position(self, root_position: NDArray[np.float64]) -> "PoseTree":
+    def with_root_position(self, root_position: Array) -> "PoseTree":
         """The same tree with the root's origin at another known position (3,) [m].
 
         Raises SettingsError where there is no single root, ModelError where base joints forbid it.
@@ -181,7 +182,7 @@ class PoseTree:
         interval: float,
         intervals: Mapping[str, float] | None = None,
         length_interval: float = DEFAULT_LENGTH_INTERVAL,
-    ) -> NDArray[np.float64]:
+    ) -> Array:
         """The node's sampling grid (n, k): every combination of its positions' samples.
 
         A position is sampled as in ``axis_samples``, at its one value where it is held; the last
@@ -214,13 +215,13 @@ class PoseTree:
                 axes.append(axis_samples(lower[k], upper[k], spacing, is_angle=is_angle))
         return product_grid(axes, self.nodes[node].name)
 
-    def value_bounds(self, node: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def value_bounds(self, node: int) -> tuple[Array, Array]:
         """Limits (k,) for the search [rad or m], or one turn about the default position."""
         given, around = self.placements[node], self.turns_around(node)
         low, high = one_turn(given.lower, given.upper, given.defaults)
         return np.where(around, low, given.lower), np.where(around, high, given.upper)
 
-    def value_limits(self, node: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def value_limits(self, node: int) -> tuple[Array, Array]:
         """Limits (k,) of a node's values [rad or m]; equal where held, infinite where free."""
         given = self.placements[node]
         lower = np.where(given.turns_freely, -np.inf, given.lower)
@@ -231,7 +232,7 @@ class PoseTree:
         given = self.placements[node]
         return turns_around(given.lower, given.upper, given.periodic)
 
-    def relative_transforms(self, node: int, values: NDArray[np.float64]) -> NDArray[np.float64]:
+    def relative_transforms(self, node: int, values: Array) -> Array:
         """X_PN (n, 4, 4) in the parent (or W) at values (n, k); SettingsError for a wrong width."""
         values = np.asarray(values, dtype=np.float64)
         width = len(self.nodes[node].value_names)
@@ -248,11 +249,11 @@ class PoseTree:
             X = X @ chain_transforms(placement.steps, values)
         return X
 
-    def node_poses(self, values: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
+    def node_poses(self, values: Sequence[Array]) -> Array:
         """X_WN (n_nodes, 4, 4), given each node's values (k_i,)."""
         return self.node_poses_batch([np.asarray(v, dtype=np.float64)[None] for v in values])[0]
 
-    def node_poses_batch(self, values: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
+    def node_poses_batch(self, values: Sequence[Array]) -> Array:
         """X_WN (n, n_nodes, 4, 4) at each node's (n, k_i); SettingsError for a wrong width."""
         if len(values) != len(self.nodes):
             raise SettingsError(f"{len(self.nodes)} arrays of values expected, got {len(values)}")
@@ -262,13 +263,11 @@ class PoseTree:
             X_WN[:, index] = X_PN if node.parent < 0 else X_WN[:, node.parent] @ X_PN
         return X_WN
 
-    def default_values(self) -> list[NDArray[np.float64]]:
+    def default_values(self) -> list[Array]:
         """Each node's values (k_i,) at the model's default positions and the root as given."""
         return [np.array(placement.defaults) for placement in self.placements]
 
-    def positions_from(
-        self, values: Sequence[NDArray[np.float64]]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def positions_from(self, values: Sequence[Array]) -> tuple[Array, Array]:
         """The plant's own positions that put every link where the tree does at each node's (k_i,).
 
         Returns:
@@ -280,10 +279,8 @@ class PoseTree:
         return self._base.solve(self.model, self._completed(values), self.node_poses(values))
 
     def positions_with_root_at(
-        self,
-        values: Sequence[NDArray[np.float64]],
-        root_position: NDArray[np.float64],
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        self, values: Sequence[Array], root_position: Array
+    ) -> tuple[Array, Array]:
         """As with_root_position at (3,) [m] and positions_from, but no tree is built."""
         if self._base.kind == "constant":
             return self.with_root_position(root_position).positions_from(values)
@@ -297,7 +294,7 @@ class PoseTree:
                 X_WN[index, :3, 3] += shift
         return self._base.solve(self.model, self._completed(values), X_WN)
 
-    def _completed(self, values: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
+    def _completed(self, values: Sequence[Array]) -> Array:
         """The plant's positions (nq,) as far as the values and what is held tell them."""
         q = np.array(self.model.default_positions)
         for index, value in self.held.items():
@@ -307,9 +304,7 @@ class PoseTree:
                 q[list(node.positions)] = node_values
         return q
 
-    def values_from_positions(
-        self, q: NDArray[np.float64], X_WB: NDArray[np.float64] | None = None
-    ) -> list[NDArray[np.float64]]:
+    def values_from_positions(self, q: Array, X_WB: Array | None = None) -> list[Array]:
         """Each node's values (k_i,) at the plant's q (nq,): the inverse of positions_from.
 
         X_WB (4, 4), the pose of the plant's world frame, moves a root with a RootRotation alone.
@@ -365,7 +360,7 @@ def axis_samples(lower: float, upper: float, interval: float, *, is_angle: bool)
     return [min(max(multiple * interval, lower), upper) for multiple in multiples]
 
 
-def product_grid(axes: Sequence[Sequence[float]], node: str) -> NDArray[np.float64]:
+def product_grid(axes: Sequence[Sequence[float]], node: str) -> Array:
     """All combinations (n, k) of the axes' samples, the last axis changing fastest.
 
     Raises SettingsError, which names the node, where memory would not hold them.

@@ -6,12 +6,13 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from pydrake.math import RigidTransform
 from pydrake.multibody.tree import Frame, JointIndex
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
+from drake_pose.arrays import Array
 from drake_pose.body.limits import nearest_turn, one_turn
 from drake_pose.body.parsed_model import ParsedModel
 from drake_pose.body.tree.link_graph import (
@@ -42,10 +43,10 @@ class RootRotation:
     """
 
     kind: Literal["fixed", "free", "limited"]
-    R_W0: NDArray[np.float64]
+    R_W0: Array
     axes: tuple[Axis, ...]
-    lower: NDArray[np.float64]
-    upper: NDArray[np.float64]
+    lower: Array
+    upper: Array
     interval: float | None
 
     @staticmethod
@@ -102,7 +103,7 @@ class RootRotation:
             return ("root_rotation_x", "root_rotation_y", "root_rotation_z")
         return tuple(f"root_{axis}" for axis in self.axes)
 
-    def rotations(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+    def rotations(self, values: Array) -> Array:
         """R_WR (n, 3, 3) at values (n, k) [rad]."""
         if self.kind == "free":
             return self.R_W0 @ Rotation.from_rotvec(values).as_matrix()
@@ -110,7 +111,7 @@ class RootRotation:
             return self.R_W0 @ Rotation.from_euler("".join(self.axes).upper(), values).as_matrix()
         return np.broadcast_to(self.R_W0, (len(values), 3, 3)).copy()
 
-    def values_from(self, R_WR: NDArray[np.float64]) -> NDArray[np.float64]:
+    def values_from(self, R_WR: Array) -> Array:
         """The values (k,) [rad] of a rotation (3, 3), the nearest there are where it is limited."""
         rotation = Rotation.from_matrix(self.R_W0.T @ R_WR)
         if self.kind == "fixed":
@@ -147,7 +148,7 @@ def _root_rotation(
     return RootRotation(kind, R, axes, limits[:, 0], limits[:, 1], interval)
 
 
-def even_rotations(interval: float) -> NDArray[np.float64]:
+def even_rotations(interval: float) -> Array:
     """Rotation vectors (n, 3) [rad] about ``interval`` [rad] apart, nearest to none first.
 
     Rz(azimuth) Ry(polar) Rz(turn - azimuth), with directions on circles of latitude and turns that
@@ -164,7 +165,7 @@ def even_rotations(interval: float) -> NDArray[np.float64]:
     return vectors[order]
 
 
-def _full_turn(count: float) -> NDArray[np.float64]:
+def _full_turn(count: float) -> Array:
     """About so many angles [rad] of a full turn, evenly spaced, zero first; at least one."""
     whole = max(1, round(count))
     return np.asarray(np.arange(whole) * (2.0 * math.pi / whole), dtype=np.float64)
@@ -194,7 +195,7 @@ class BasePose:
     """
 
     kind: Literal["constant", "floating", "joints", "placed"]
-    X_WB: NDArray[np.float64] = field(default_factory=lambda: np.eye(4))
+    X_WB: Array = field(default_factory=lambda: np.eye(4))
     node: int = -1
     body: int = 0
     positions: tuple[int, ...] = ()
@@ -202,9 +203,7 @@ class BasePose:
     chain: tuple[int, ...] = ()
     joint: int = -1
 
-    def solve(
-        self, model: ParsedModel, q: NDArray[np.float64], X_WN: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def solve(self, model: ParsedModel, q: Array, X_WN: Array) -> tuple[Array, Array]:
         """Complete q (nq,) and find X_WB (4, 4), given all node poses X_WN (n_nodes, 4, 4).
 
         Raises ModelError where no base positions give the root's pose.
@@ -221,9 +220,7 @@ class BasePose:
             return q, np.eye(4)
         return q, X_WA @ inverse_transforms(kinematics.pose_at(self.body, q))
 
-    def _set_floating(
-        self, kinematics: PlantKinematics, q: NDArray[np.float64], X_WA: NDArray[np.float64]
-    ) -> None:
+    def _set_floating(self, kinematics: PlantKinematics, q: Array, X_WA: Array) -> None:
         """Set the floating joint's positions in q so that the anchor body A is at X_WA."""
         # Drake's type stubs know neither SetPose nor numpy's array types.
         joint: Any = kinematics.plant.get_joint(JointIndex(self.joint))
@@ -240,9 +237,7 @@ class BasePose:
         solved = kinematics.plant.GetPositions(kinematics.context)
         q[list(self.positions)] = solved[list(self.positions)]
 
-    def _solve_joints(
-        self, model: ParsedModel, q: NDArray[np.float64], X_WA: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
+    def _solve_joints(self, model: ParsedModel, q: Array, X_WA: Array) -> Array:
         """Base positions (n,) that put the anchor at X_WA, inside their limits if possible."""
         index = list(self.positions)
         periodic = model.periodic[index]
@@ -252,15 +247,15 @@ class BasePose:
 
         solved = np.isin(self.chain, index)
 
-        def completed(values: NDArray[np.float64]) -> NDArray[np.float64]:
+        def completed(values: Array) -> Array:
             every = q[list(self.chain)]
             every[solved] = values
             return every
 
-        def residual(values: NDArray[np.float64]) -> NDArray[np.float64]:
+        def residual(values: Array) -> Array:
             return (chain_transforms(self.steps, completed(values)[None])[0] - X_WA)[:3].reshape(12)
 
-        def jacobian(values: NDArray[np.float64]) -> NDArray[np.float64]:
+        def jacobian(values: Array) -> Array:
             return chain_jacobian(self.steps, completed(values))[:, solved]
 
         random = np.random.default_rng(0)
@@ -287,7 +282,7 @@ class BasePose:
         return outside
 
 
-def chain_jacobian(steps: Sequence[ChainStep], values: NDArray[np.float64]) -> NDArray[np.float64]:
+def chain_jacobian(steps: Sequence[ChainStep], values: Array) -> Array:
     """Derivative (12, k) of the upper rows of a chain's end pose, exact, by complex steps."""
     stepped = values + 1j * _COMPLEX_STEP * np.eye(len(values))
     change = chain_transforms(steps, stepped).imag / _COMPLEX_STEP
@@ -328,12 +323,12 @@ def base_of_chain(
     return BasePose("placed", node=node, body=body)
 
 
-def _pose_in_body(frame: Frame) -> NDArray[np.float64]:
+def _pose_in_body(frame: Frame) -> Array:
     """A fixed frame's pose (4, 4) in its body."""
     return np.asarray(frame.GetFixedPoseInBodyFrame().GetAsMatrix4())
 
 
-def _orthonormal(X: NDArray[np.float64]) -> NDArray[np.float64]:
+def _orthonormal(X: Array) -> Array:
     """The transform with its rotation freed from rounding errors."""
     u, _, vt = np.linalg.svd(X[:3, :3])
     cleaned = np.array(X)

@@ -4,8 +4,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from drake_pose.arrays import Array
 from drake_pose.body.parsed_model import ParsedModel
 from drake_pose.body.tree.link_graph import (
     ChainStep,
@@ -20,7 +20,6 @@ from drake_pose.body.tree.pose_tree import NodePlacement, PoseTree, PoseTreeNode
 from drake_pose.body.tree.root import BasePose, RootRotation, base_of_chain
 from drake_pose.errors import ModelError, SettingsError, UnknownNameError
 
-Array = NDArray[np.float64]
 Roots = dict[int, tuple[Array, RootRotation | None]]
 """By branch that hangs on the world: X_WA (4, 4), and how it is turned there."""
 

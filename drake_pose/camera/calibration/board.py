@@ -16,13 +16,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from drake_pose.arrays import Array, Integers
 from drake_pose.camera.models import check_number
 from drake_pose.camera.picture_files import decode_picture, list_pictures
 from drake_pose.errors import CameraError
 from drake_pose.regular_files import read_regular
 from drake_pose.yaml_files import read_yaml
 
-Array = NDArray[np.float64]
 Picture = tuple[str, str]
 """A camera's name and a frame's name; pictures of the same frame were taken at the same instant."""
 
@@ -38,7 +38,7 @@ _FEWEST_CORNERS = 8
 class Detection:
     """Which corners of a board (n,), increasing, were found in a picture, and where (n, 2)."""
 
-    corners: NDArray[np.int64]
+    corners: Integers
     uv: Array
 
 

@@ -7,8 +7,8 @@ from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from drake_pose.arrays import Array
 from drake_pose.camera.calibration.board import BoardDetections, Detection, Picture
 from drake_pose.camera.calibration.rig import (
     FREE_COEFFICIENTS,
@@ -22,8 +22,6 @@ from drake_pose.camera.calibration.rig import (
 )
 from drake_pose.camera.models import PinholeCamera, inverse_pose
 from drake_pose.errors import CameraError, UnknownNameError
-
-Array = NDArray[np.float64]
 
 # A picture is spoilt whose error is above this many pixels, and times its camera's median.
 _SPOILT_PIXELS, _SPOILT_MEDIANS = 0.5, 4.0

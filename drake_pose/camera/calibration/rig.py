@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import breadth_first_order, connected_components, minimum_spanning_tree
 
+from drake_pose.arrays import Array
 from drake_pose.camera.calibration.board import BoardDetections, Detection, Picture
 from drake_pose.camera.models import (
     PinholeCamera,
@@ -30,8 +31,6 @@ from drake_pose.camera.models import (
 )
 from drake_pose.errors import CameraError
 from drake_pose.yaml_files import read_yaml
-
-Array = NDArray[np.float64]
 
 NUMBERS = ("focal_x", "focal_y", "center_x", "center_y", "k1", "k2", "p1", "p2", "k3")
 """Focal lengths, principal point and distortion coefficients of a Lens, in OpenCV's order."""

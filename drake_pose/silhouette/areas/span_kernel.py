@@ -21,12 +21,7 @@ import numpy as np
 
 from drake_pose.compiled import compiled
 from drake_pose.silhouette.areas.outline import PackedOutlines
-from drake_pose.silhouette.areas.projection import (
-    bend,
-    clip_triangle,
-    find_facings,
-    project,
-)
+from drake_pose.silhouette.areas.projection import bend, clip_triangle, find_facings, project
 
 SHIFT, BIAS = 3, 4
 """A crossing is kept as 8 * pixel + weight + BIAS; a weight is a whole number from -2 to 2."""

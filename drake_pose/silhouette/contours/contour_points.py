@@ -252,10 +252,5 @@ def sample_contour(
                     clearances[count, 1] = straight * (place - places[spans[k // 2 - 1, 1]])
                 count += 1
     return ContourPoints(
-        uv[:count],
-        normals[:count],
-        lengths[:count],
-        nodes[:count],
-        p_N[:count],
-        clearances[:count],
+        uv[:count], normals[:count], lengths[:count], nodes[:count], p_N[:count], clearances[:count]
     )

@@ -185,10 +185,7 @@ def find_images(
 
 
 def _no_masks(
-    root: Path,
-    names: Sequence[str],
-    strangers: Iterable[str],
-    others: Mapping[str, Sequence[str]],
+    root: Path, names: Sequence[str], strangers: Iterable[str], others: Mapping[str, Sequence[str]]
 ) -> str:
     """What to say where no camera has a mask."""
     text = f"{root}: holds no mask <camera>/<frame>.png of: {', '.join(names)}"

@@ -11,11 +11,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from drake_pose.arrays import Mask, Picture
 from drake_pose.errors import SettingsError
 
 Array = NDArray[np.float32]
-Picture = NDArray[np.uint8]
-Mask = NDArray[np.bool_]
 
 _LEAST_DEVIATION = 3.0
 # How many standard deviations the colour must be off.

@@ -13,13 +13,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from drake_pose.arrays import Array, Mask
 from drake_pose.camera.models import LARGEST_SIDE
 from drake_pose.errors import MaskError
 from drake_pose.regular_files import read_regular
-
-Mask = NDArray[np.bool_]
 
 _LARGEST_FILE = 1 << 30
 
@@ -137,7 +135,7 @@ def _draw(segmentation: Any, height: int, width: int) -> Mask:
     return mask
 
 
-def fill_polygon(corners: NDArray[np.float64], height: int, width: int) -> Mask:
+def fill_polygon(corners: Array, height: int, width: int) -> Mask:
     """The pixels (H, W) whose centres lie in a polygon (n, 2) by the even-odd rule.
 
     Raises ValueError for fewer than three corners, or one that is no finite number.

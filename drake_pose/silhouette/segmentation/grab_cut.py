@@ -8,10 +8,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from drake_pose.arrays import Mask, Picture
 from drake_pose.errors import SettingsError
-
-Picture = NDArray[np.uint8]
-Mask = NDArray[np.bool_]
 
 # GrabCut draws its first clusters at random.
 _SEED = 1

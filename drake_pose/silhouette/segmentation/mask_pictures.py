@@ -12,11 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from drake_pose.arrays import Mask
 from drake_pose.camera.models import LARGEST_SIDE
 from drake_pose.camera.picture_files import read_picture_file
 from drake_pose.errors import MaskError
 
-Mask = NDArray[np.bool_]
 Layer = NDArray[np.integer]
 
 PixelMeaning = Literal["auto", "classes", "alpha", "probability"]

@@ -9,11 +9,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from drake_pose.arrays import Mask, Picture
 from drake_pose.errors import SettingsError
 from drake_pose.silhouette.segmentation.mask_pictures import ALL
 
-Picture = NDArray[np.uint8]
-Mask = NDArray[np.bool_]
 Array = NDArray[np.float32]
 
 

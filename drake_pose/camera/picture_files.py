@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import struct
-import zlib
+import io
 from pathlib import Path
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
 from drake_pose.arrays import Mask, Picture
 from drake_pose.camera.models import LARGEST_SIDE
@@ -120,19 +120,14 @@ def read_picture_file(
     # OpenCV's decoders differ from version to version in what they make of half a picture.
     if not data.startswith(_PNG):
         raise error_type(f"{path}: not a PNG picture")
-    position, kind = len(_PNG), b""
-    while kind != b"IEND":
-        header, begin = data[position : position + 8], position + 8
-        length, kind = struct.unpack(">I4s", header) if len(header) == 8 else (0, b"")
-        checksum = data[begin + length : begin + length + 4]
-        if len(checksum) < 4:
-            raise error_type(f"{path}: the PNG picture is cut short")
-        is_header = kind == b"IHDR" and length == 13
-        whole = struct.unpack(">I", checksum)[0] == zlib.crc32(data[begin - 4 : begin + length])
-        if not whole or (position == len(_PNG) and not is_header):
-            raise error_type(f"{path}: the PNG picture is damaged")
-        position = begin + length + 4
-    width, height = struct.unpack(">II", data[16:24])
+    try:
+        with Image.open(io.BytesIO(data)) as picture:
+            width, height = picture.size
+            picture.verify()
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+        raise error_type(
+            f"{path}: the PNG picture is cut short, damaged or too large: {error}"
+        ) from error
     if max(width, height) > LARGEST_SIDE:
         raise error_type(
             f"{path}: {width} x {height} pixels are too many: at most {LARGEST_SIDE} a side"

@@ -75,9 +75,9 @@ def test_bad_masks_are_refused(tmp_path: Path, case: str) -> None:
 def test_damaged_files_are_refused(tmp_path: Path) -> None:
     path = save(tmp_path, MASK.astype(np.uint8) * 255)
     data = path.read_bytes()
-    for end in (0, 5, 8, 20, 40, len(data) - 13, len(data) - 1):
+    for end in (0, 5, 8, 20, 40, len(data) - 13, len(data) - 8):
         path.write_bytes(data[:end])
-        with pytest.raises(MaskError, match=r"0007\.png: .*(not a PNG|cut short)"):
+        with pytest.raises(MaskError, match=r"0007\.png: .*(not a PNG|cut short|damaged)"):
             read_mask(path)
     for place in (9, 14, 18, 30, len(data) - 20):
         path.write_bytes(data[:place] + bytes([data[place] ^ 0x55]) + data[place + 1 :])
@@ -92,7 +92,7 @@ def test_a_picture_that_would_fill_the_memory_is_refused(tmp_path: Path) -> None
         checksum = struct.pack(">I", zlib.crc32(kind + content))
         data += struct.pack(">I", len(content)) + kind + content + checksum
     (tmp_path / "bomb.png").write_bytes(data)
-    with pytest.raises(MaskError, match=r"bomb\.png.*60000"):
+    with pytest.raises(MaskError, match=r"bomb\.png.*too large"):
         read_mask(tmp_path / "bomb.png")
 
 

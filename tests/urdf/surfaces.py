@@ -107,8 +107,3 @@ class Silhouettes:
 def pieces(mask: np.ndarray) -> int:
     """How many connected pieces a mask has."""
     return cv2.connectedComponents(mask.astype(np.uint8), connectivity=8)[0] - 1
-
-
-def spans(row: np.ndarray) -> int:
-    """How many runs of True a row has."""
-    return int(np.count_nonzero(np.diff(np.concatenate([[0], row.astype(int)])) == 1))

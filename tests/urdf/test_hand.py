@@ -5,7 +5,7 @@ import pytest
 
 from drake_pose.body.model import ArticulatedModel, load_model
 from drake_pose.filtering.truncation.couplings import model_inequalities
-from tests.urdf.surfaces import URDF, Silhouettes, pieces, spans
+from tests.urdf.surfaces import URDF
 from tests.urdf.test_bundled_bodies import FINGERS, HAND_JOINTS
 
 HANDS = ("hand", "right_hand")
@@ -110,36 +110,6 @@ def test_right_hand_mirrors_the_left(both: tuple[ArticulatedModel, ArticulatedMo
             np.testing.assert_allclose(
                 tip(right, finger, q), tip(left, finger, q) * [-1, 1, 1], atol=1e-6
             )
-
-
-def test_thumb_reaches_the_index_and_the_little_finger(
-    both: tuple[ArticulatedModel, ArticulatedModel],
-) -> None:
-    left = both[0]
-    pinch = {"thumb_cmc_flexion": 25, "thumb_cmc_abduction": 25, "thumb_mcp_flexion": 25}
-    rng = np.random.default_rng(2)
-    names = [n for n in left.position_names if n.startswith("thumb")]
-    for finger, curl in (("index", 60), ("little", 75)):
-        fist = {f"{finger}_{joint}_flexion": curl for joint in ("mcp", "pip")}
-        target = tip(left, finger, posed(left, fist))
-        nearest = np.inf
-        for _ in range(1000):
-            q = posed(left, pinch)
-            for name in names:
-                index = left.position_index(name)
-                q[index] = rng.uniform(left.lower[index], left.upper[index])
-            nearest = min(nearest, float(np.linalg.norm(tip(left, "thumb", q) - target)))
-        assert nearest < 0.025, finger
-
-
-def test_spread_fingers_are_seen_apart_down_to_the_webs(hand: ArticulatedModel) -> None:
-    mask = Silhouettes(hand).mask(
-        posed(hand, SPREAD), np.array([1.0, 0, 0]), np.array([0, 0, 0.1]), 0.25, 500
-    )
-    rows = {share: 250 - round((share * HAND_LENGTH - 0.1) / 0.25 * 500) for share in (0.5, 0.66)}
-    assert spans(mask[rows[0.66]]) >= 4
-    assert spans(mask[rows[0.5]]) <= 2  # below the webs: the palm, and perhaps the thumb
-    assert pieces(mask) == 1
 
 
 def test_couplings_allow_a_fist_and_forbid_what_no_hand_does(hand: ArticulatedModel) -> None:

@@ -9,11 +9,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from drake_pose.body.formats.packages import bundled_model, package_map
 from drake_pose.body.model import load_model
 from drake_pose.body.report import describe_model
-from drake_pose.body.surfaces.meshes import (
-    TriangleMesh,
-    is_watertight,
-    merge_duplicate_vertices,
-)
+from drake_pose.body.surfaces.meshes import TriangleMesh, is_watertight, merge_duplicate_vertices
 from drake_pose.errors import ModelError, UnknownNameError
 
 from .models import FLOATING_URDF, WELDED_URDF, cube_obj, joint, link, urdf, write

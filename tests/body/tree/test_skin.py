@@ -12,14 +12,7 @@ from drake_pose.body.report import describe_model
 from drake_pose.body.tree.node_skin import ModelSkin
 from drake_pose.body.tree.root import RootRotation
 from drake_pose.errors import DrakePoseError, ModelError, UnknownNameError
-from tests.body.skins import (
-    LIMB_URDF,
-    REACH,
-    band_entry,
-    load_limb,
-    tube_obj,
-    write_limb,
-)
+from tests.body.skins import LIMB_URDF, REACH, band_entry, load_limb, tube_obj, write_limb
 
 WRIST = ("wrist_x", "wrist_z", "wrist_y")
 

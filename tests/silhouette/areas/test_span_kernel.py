@@ -4,12 +4,7 @@ import pytest
 from drake_pose.body.surfaces.meshes import TriangleMesh
 from drake_pose.camera.models import Camera, ParallelCamera, PinholeCamera
 from drake_pose.silhouette.areas.outline import outline_from_mesh
-from drake_pose.silhouette.areas.scoring import (
-    draw_mask,
-    prefix_sums,
-    score_bodies,
-    subtract_body,
-)
+from drake_pose.silhouette.areas.scoring import draw_mask, prefix_sums, score_bodies, subtract_body
 from tests.silhouette.shapes import box, brute_force_mask, random_pose, soup
 
 CAMERAS: list[Camera] = [

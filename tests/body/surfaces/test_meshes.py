@@ -1,6 +1,5 @@
 import re
 import struct
-import time
 
 import numpy as np
 import pytest
@@ -116,26 +115,3 @@ def test_written_meshes_are_what_drake_reads(tmp_path):
     assert write_obj(TriangleMesh(points + 1.0, triangles), "name with / and \xe9") != path
     (tmp_path / "t.stl").write_bytes(binary_stl())
     assert drawable_file(tmp_path / "t.stl") == drawable_file(tmp_path / "t.stl")
-
-
-@pytest.mark.slow
-def test_a_million_triangles_are_read_within_15_seconds(tmp_path):
-    side = 708
-    x, y = np.meshgrid(np.arange(side, dtype=float), np.arange(side, dtype=float))
-    points = np.stack([x, y, np.sin(x) * np.cos(y)], axis=-1).reshape(-1, 3)
-    index = np.arange(side * side, dtype=np.int32).reshape(side, side)
-    a, b, c, d = index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]
-    triangles = np.stack([a, b, c, a, c, d], axis=-1).reshape(-1, 3)
-    corners = np.zeros(len(triangles), [("n", "<f4", 3), ("v", "<f4", (3, 3)), ("a", "<u2")])
-    corners["v"] = points[triangles]
-    count = struct.pack("<I", len(triangles))
-    (tmp_path / "t.stl").write_bytes(bytes(80) + count + corners.tobytes())
-    text = (
-        '<robot name="r"><link name="hand"><visual><geometry><mesh filename="t.stl"/></geometry>'
-        "</visual></link></robot>"
-    )
-    begin = time.process_time()
-    mesh = load_model(write(tmp_path, text), check=False).link_meshes["hand"]
-    assert time.process_time() - begin < 15.0
-    assert len(mesh.triangles) == len(triangles) > 999_000
-    assert len(mesh.vertices) == side * side

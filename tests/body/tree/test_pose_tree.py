@@ -252,15 +252,6 @@ def test_held_joint_has_one_sample(models):
     assert len(grid) == 5
 
 
-def test_real_arm_agrees_with_drake(shared_data):
-    model = load_model(shared_data / "arm_two_views" / "med7" / "med7.urdf", check=False)
-    fixed = model.pose_tree(root_position=[0, 0, 0], root_rotation=RootRotation.fixed())
-    assert [node.name for node in fixed.nodes] == [f"link_{i}" for i in range(8)]
-    assert largest_difference_from_drake(model, fixed) < 1e-9
-    turned = model.pose_tree("link_5", root_position=[0, 0, 0])
-    assert largest_difference_from_drake(model, turned) < 1e-9
-
-
 def test_bad_arguments_name_what_exists(models):
     floating, jointed = models["floating"], models["jointed"]
     with pytest.raises(UnknownNameError, match=r"link 'nose'.*trunk"):

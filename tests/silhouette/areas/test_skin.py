@@ -56,14 +56,17 @@ def test_kernel_and_brute_force_agree(tmp_path: Path) -> None:
     surfaces = TreeSurfaces(tree)
     rng = np.random.default_rng(0)
     gained = 0
-    for camera in cameras(rng):
+    # The last one's near plane cuts a band.
+    X_WC = looking_along([0, 1, 0.1], 0.06)
+    near = PinholeCamera("near", SIDE, SIDE, 60.0, 60.0, 80.2, 79.7, X_WC, near=0.02)
+    for camera in [*cameras(rng), near]:
         for _ in range(3):
             values, X_CN = pose(model, rng.uniform(model.lower, model.upper), camera)
             expected = np.zeros((SIDE, SIDE), dtype=bool)
             for node, part, X in zip(tree.nodes, values, X_CN, strict=True):
                 expected |= brute_force_mask(node.surface(part), X, camera)
             drawn = draw_mask(surfaces.at(values), X_CN, camera)
-            assert np.count_nonzero(drawn != expected) <= 2
+            assert np.count_nonzero(drawn != expected) <= 3
             gained += np.count_nonzero(draw_mask(surfaces.rigid, X_CN, camera) != drawn)
     assert gained > 100
 
@@ -141,31 +144,6 @@ def test_drake_draws_the_same(tmp_path: Path, seed: int) -> None:
     assert np.count_nonzero(moved != there) <= 0.004 * (there >= 0).sum()
     names = {renderer.link_names[label] for label in np.unique(there) if label >= 0}
     assert names <= {"upper", "lower", "hand"}
-
-
-def test_a_band_cut_by_the_near_plane(tmp_path: Path) -> None:
-    model = load_limb(tmp_path)
-    tree = model.pose_tree()
-    surfaces = TreeSurfaces(tree)
-    camera = PinholeCamera(
-        "near", SIDE, SIDE, 60.0, 60.0, 80.2, 79.7, looking_along([0, 1, 0.1], 0.06), near=0.02
-    )
-    q = np.array([0.1, 0.8, 0.3, -0.2, 0.4])
-    values, X_CN = pose(model, q, camera)
-    drawn = draw_mask(surfaces.at(values), X_CN, camera)
-    expected = np.zeros_like(drawn)
-    for node, part, X in zip(tree.nodes, values, X_CN, strict=True):
-        expected |= brute_force_mask(node.surface(part), X, camera)
-    assert drawn.any()
-    assert np.count_nonzero(drawn != expected) <= 3
-    prefixes = np.zeros((0, SIDE, SIDE + 1), dtype=np.int32)
-    bands = [
-        node.skin.vertices(part[None])
-        for node, part in zip(tree.nodes, values, strict=True)
-        if node.skin is not None
-    ]
-    whole = [surfaces.whole(i) for i in range(3)]
-    assert score_bodies(whole, X_CN[None], camera, prefixes, bands)[0, 0] == drawn.sum()
 
 
 def test_wrong_bands_are_refused() -> None:

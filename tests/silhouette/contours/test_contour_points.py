@@ -4,7 +4,6 @@ import pytest
 from drake_pose.body.surfaces.meshes import TriangleMesh
 from drake_pose.camera.models import ParallelCamera, PinholeCamera
 from drake_pose.silhouette.areas.outline import outline_from_mesh, pack
-from drake_pose.silhouette.areas.scoring import draw_mask
 from drake_pose.silhouette.contours.contour_points import ContourPoints, sample_contour
 from tests.silhouette.shapes import box, random_pose, soup
 
@@ -55,22 +54,6 @@ def test_points_lie_on_the_border_of_the_union(camera, kind):
         assert np.allclose(np.linalg.norm(points.normals, axis=1), 1.0)
         assert np.all(points.uv > -0.5)
         assert np.all(points.uv < [camera.width - 0.5, camera.height - 0.5])
-
-
-def test_every_row_and_column_that_the_mask_changes_in_has_its_point():
-    rng = np.random.default_rng(6)
-    camera = CAMERAS[1]
-    X = np.array([random_pose(rng, (0.0, 0.1, 2.5)), random_pose(rng, (0.3, -0.2, 2.2))])
-    outlines = (outline_from_mesh(box(0.8)), outline_from_mesh(box(0.5)))
-    points = find_contour_points(outlines, X, camera)
-    mask = np.pad(draw_mask(outlines, X, camera), 1).astype(int)
-    ends = np.argwhere(np.diff(mask, axis=1))  # between u - 1 and u of the row v - 1, unpadded
-    steep = np.abs(points.normals[:, 0]) >= np.abs(points.normals[:, 1])
-    rows = points.uv[steep]
-    for v, u in ends:
-        near = (rows[:, 1] == v - 1) & (rows[:, 0] > u - 1) & (rows[:, 0] <= u)
-        flat = np.abs(points.uv[~steep] - [u - 0.5, v - 1]).max(axis=1) < 1.5
-        assert near.any() or flat.any()
 
 
 def test_lengths_sum_to_the_perimeter():

@@ -45,9 +45,6 @@ def test_deep_colour_and_transparent_masks(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read_mask(save(tmp_path, white)), MASK)
 
 
-def test_recorded_masks(shared_data: Path) -> None:
-    mask = read_mask(shared_data / "human_four_views" / "masks" / "cam01" / "0000.png", 1088, 1920)
-    assert 20_000 < mask.sum() < 400_000
 
 
 def bad_pictures() -> dict[str, tuple[np.ndarray, str]]:

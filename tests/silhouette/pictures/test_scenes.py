@@ -126,10 +126,3 @@ def test_masks_must_fit_their_camera(tmp_path: Path) -> None:
         load_scene(tmp_path).read("left", "0001")
 
 
-def test_recorded_scenes(shared_data: Path) -> None:
-    human = load_scene(shared_data / "human_four_views")
-    assert (len(human.frames), human.sequence, human.frame_rate_hz) == (50, True, 60.0)
-    arm = load_scene(shared_data / "arm_two_views")
-    for frame in arm.frames:
-        for name in arm.cameras_of(frame):
-            assert arm.read(name, frame).any()

@@ -21,7 +21,7 @@ from drake_pose.errors import ModelError
 
 _ALMOST_MASSLESS = {"pos": "0 0 0", "mass": "1e-6", "diaginertia": "1e-9 1e-9 1e-9"}
 # Groups above are collision geometry, which MuJoCo's viewer does not draw.
-_LAST_DRAWN_GROUP = 2
+_LAST_DRAWN_GROUP, _NOT_DRAWN = 2, 5
 # A geom of this colour has its material's.
 _NO_COLOUR = (0.5, 0.5, 0.5, 1.0)
 # How many of a shape's three sizes count, by MuJoCo's name of the shape; others are not drawn.
@@ -47,7 +47,7 @@ def cure_mjcf(path: Path, warn: Warn) -> str:
     bodies = [ElementTree.SubElement(text, "worldbody")]
     for body, name in enumerate(_body_names(model)[1:], start=1):
         bodies.append(_add_body(model, body, name, bodies[model.body_parentid[body]]))
-    drawn = [geom for geom in range(model.ngeom) if _kind(model, geom) and _is_drawn(model, geom)]
+    drawn = [geom for geom in range(model.ngeom) if _kind(model, geom)]
     for mesh in sorted({model.geom_dataid[g] for g in drawn if _kind(model, g) == "mesh"}):
         file = write_obj(_mesh(model, mesh), _name(model, model.name_meshadr[mesh]))
         ElementTree.SubElement(asset, "mesh", name=f"mesh{mesh}", file=str(file))
@@ -73,14 +73,19 @@ def _compile(path: Path, warn: Warn) -> Any:
             *spec.pairs, *spec.excludes, *spec.tuples, *spec.skins, *spec.textures,
         ):  # fmt: skip
             spec.delete(element)
-        materials = {material.name: material for material in spec.materials}
+        colours = {material.name: material.rgba for material in spec.materials}
+        for geom in spec.geoms:
+            geom.contype = geom.conaffinity = 0
+            if np.allclose(geom.rgba, _NO_COLOUR):
+                geom.rgba = colours.get(geom.material, geom.rgba)
+            geom.material = ""
+            if geom.group > _LAST_DRAWN_GROUP or not geom.rgba[3] > 0.0:
+                geom.group = _NOT_DRAWN
+                if geom.meshname:
+                    spec.delete(geom)
         for material in spec.materials:
             for k in range(len(material.textures)):
                 material.textures[k] = ""
-        for geom in spec.geoms:
-            geom.contype = geom.conaffinity = 0
-            if geom.meshname and not _is_seen(geom.group, geom.rgba, materials.get(geom.material)):
-                spec.delete(geom)
         used = {geom.meshname for geom in spec.geoms}
         for mesh in spec.meshes:
             # The looks of a link need not enclose a volume.
@@ -96,22 +101,12 @@ def _compile(path: Path, warn: Warn) -> Any:
         raise ModelError(f"{path}: {' '.join(str(error).split())}") from error
 
 
-def _is_seen(group: int, rgba: ArrayLike, material: Any) -> bool:
-    """Whether MuJoCo's viewer draws a geom."""
-    colour = material.rgba if material is not None and np.allclose(rgba, _NO_COLOUR) else rgba
-    return group <= _LAST_DRAWN_GROUP and bool(np.asarray(colour)[3] > 0.0)
-
-
-def _is_drawn(model: Any, geom: int) -> bool:
-    material = model.geom_matid[geom]
-    of_material = model.mat(material) if material >= 0 else None
-    return _is_seen(model.geom_group[geom], model.geom_rgba[geom], of_material)
-
-
 def _kind(model: Any, geom: int) -> str:
-    """The name of a geom's shape; empty for one that Drake does not draw."""
+    """The name of a geom's shape; empty for one that is not seen, or that Drake does not draw."""
     import mujoco
 
+    if model.geom_group[geom] == _NOT_DRAWN:
+        return ""
     name = mujoco.mjtGeom(model.geom_type[geom]).name.removeprefix("mjGEOM_").lower()
     return name if name in _SIZES else ""
 
@@ -169,11 +164,9 @@ def _add_joint(model: Any, joint: int, body: ElementTree.Element) -> None:
 
 
 def _add_geom(model: Any, geom: int, body: ElementTree.Element) -> None:
-    kind, material = _kind(model, geom), model.geom_matid[geom]
-    colour = model.geom_rgba[geom]
-    if material >= 0 and np.allclose(colour, _NO_COLOUR):
-        colour = model.mat_rgba[material]
-    said = {"type": kind, "rgba": _text(colour), "contype": "0", "conaffinity": "0"}
+    kind = _kind(model, geom)
+    said = {"type": kind, "rgba": _text(model.geom_rgba[geom])}
+    said |= {"contype": "0", "conaffinity": "0"}
     said |= {"pos": _text(model.geom_pos[geom]), "quat": _text(model.geom_quat[geom])}
     if kind == "mesh":
         said["mesh"] = f"mesh{model.geom_dataid[geom]}"

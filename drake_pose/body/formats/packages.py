@@ -1,8 +1,10 @@
 """Where the bundled models are, and how ``package://...`` and other file names are resolved."""
 
+import itertools
 import os
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from urllib.parse import unquote
 
@@ -100,50 +102,32 @@ class FileFinder:
             return [Path(self._known.GetPath(name))]
         if not _PACKAGE_NAME.fullmatch(name):
             return []
-        return [*_folders_above(name, file), *_folders_of_environment(name)]
+        found = [place for parent in file.absolute().parents for place in _folders_at(parent, name)]
+        for variable, inside in _SEARCH_PATHS:
+            for text in filter(None, os.environ.get(variable, "").split(os.pathsep)):
+                folder = Path(text) / inside
+                found += _folders_at(folder, name)
+                if not (folder / name).is_dir():
+                    found += [one / name for one in _folders_in(folder) if (one / name).is_dir()]
+        return found
 
 
-def _folders_above(name: str, file: Path) -> Iterator[Path]:
-    """Folders of a package on the way up from a file; only parents and their children are seen."""
-    for parent in file.absolute().parents:
-        yield from _folders_at(parent, name)
-
-
-def _folders_at(folder: Path, name: str) -> Iterator[Path]:
+def _folders_at(folder: Path, name: str) -> list[Path]:
     """A folder where it is the package, and the one of the package's name in it."""
-    if folder.name == name or _package_name(folder) == name:
-        yield folder
-    if (folder / name).is_dir():
-        yield folder / name
+    names = [folder.name]
+    with suppress(ModelError, OSError):
+        if (folder / "package.xml").is_file():
+            names.append((read_xml(folder / "package.xml").findtext("name") or "").strip())
+    own = [folder] if name in names else []
+    return [*own, folder / name] if (folder / name).is_dir() else own
 
 
-def _folders_of_environment(name: str) -> Iterator[Path]:
-    """Folders of a package in ROS' and Gazebo's search paths, there or in a repository there."""
-    for variable, inside in _SEARCH_PATHS:
-        for text in filter(None, os.environ.get(variable, "").split(os.pathsep)):
-            folder = Path(text) / inside
-            yield from _folders_at(folder, name)
-            if not (folder / name).is_dir():
-                yield from (one / name for one in _some_folders(folder) if (one / name).is_dir())
-
-
-def _some_folders(folder: Path) -> list[Path]:
+def _folders_in(folder: Path) -> list[Path]:
     """The folders in a folder; at most as many as a workspace has repositories."""
-    try:
-        with os.scandir(folder) as entries:
-            few = [entry for entry, _ in zip(entries, range(_MOST_REPOSITORIES), strict=False)]
+    with suppress(OSError), os.scandir(folder) as entries:
+        few = list(itertools.islice(entries, _MOST_REPOSITORIES))
         return sorted(Path(entry.path) for entry in few if entry.is_dir())
-    except OSError:
-        return []
-
-
-def _package_name(folder: Path) -> str | None:
-    """The name in a folder's package.xml; None where it has none that can be read."""
-    path = folder / "package.xml"
-    try:
-        return (read_xml(path).findtext("name") or "").strip() if path.is_file() else None
-    except (ModelError, OSError):
-        return None
+    return []
 
 
 def bundled_model(name: str) -> Path:

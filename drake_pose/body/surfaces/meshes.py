@@ -65,20 +65,12 @@ def merge_duplicate_vertices(mesh: TriangleMesh) -> TriangleMesh:
     by_place = np.lexsort(mesh.vertices.T)
     ordered = mesh.vertices[by_place]
     begins = np.concatenate([[True], np.any(ordered[1:] != ordered[:-1], axis=1)])
-    first = by_place[begins]
-    inverse = np.empty(len(by_place), dtype=np.int64)
-    inverse[by_place] = np.cumsum(begins) - 1
-    order = np.argsort(first, kind="stable")
-    rank = np.empty(len(order), dtype=np.int32)
-    rank[order] = np.arange(len(order), dtype=np.int32)
-    triangles = rank[inverse][mesh.triangles]
-    a, b, c = triangles.T
-    triangles = triangles[(a != b) & (b != c) & (c != a)]
-    vertices = mesh.vertices[first[order]]
-    used = np.zeros(len(vertices), dtype=bool)
-    used[triangles] = True
-    renumbered = np.cumsum(used, dtype=np.int32) - 1
-    return TriangleMesh(vertices[used], renumbered[triangles].astype(np.int32))
+    first = np.empty_like(by_place)
+    first[by_place] = by_place[begins][np.cumsum(begins) - 1]
+    a, b, c = triangles = first[mesh.triangles].T
+    triangles = triangles[:, (a != b) & (b != c) & (c != a)].T
+    used, renumbered = np.unique(triangles, return_inverse=True)
+    return TriangleMesh(mesh.vertices[used], renumbered.reshape(-1, 3).astype(np.int32))
 
 
 def join_meshes(meshes: Sequence[TriangleMesh]) -> TriangleMesh:

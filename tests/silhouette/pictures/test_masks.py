@@ -45,8 +45,6 @@ def test_deep_colour_and_transparent_masks(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read_mask(save(tmp_path, white)), MASK)
 
 
-
-
 def bad_pictures() -> dict[str, tuple[np.ndarray, str]]:
     grey = MASK.astype(np.uint8) * 255
     soft = cv2.GaussianBlur(grey, (5, 5), 0)

@@ -124,5 +124,3 @@ def test_masks_must_fit_their_camera(tmp_path: Path) -> None:
     write_mask(tmp_path / "masks" / "left" / "0001.png", MASK.T)
     with pytest.raises(MaskError, match=r"left/0001\.png.*20 x 30"):
         load_scene(tmp_path).read("left", "0001")
-
-

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -65,7 +65,7 @@ def turns_around(lower: Array, upper: Array, periodic: NDArray[np.bool_]) -> NDA
     return np.asarray(periodic & (upper - lower >= _FULL_TURN - _ROUNDING))
 
 
-def one_turn(lower: Array, upper: Array, near: Array) -> tuple[Array, Array]:
+def one_turn(lower: Any, upper: Any, near: Any) -> tuple[Any, Any]:
     """Limits (k,), and of those wider than a turn the turn inside them nearest to values (k,)."""
     low = np.clip(near - np.pi, lower, np.maximum(upper - _FULL_TURN, lower))
     return low, np.minimum(low + _FULL_TURN, upper)
@@ -106,25 +106,27 @@ def describe_positions(
     defaults = np.array(plant.GetDefaultPositions(), dtype=np.float64)
     warnings: list[str] = []
     for joint in (plant.get_joint(index) for index in plant.GetJointIndices()):
-        if joint.type_name() not in _KINDS:
+        kind = joint.type_name()
+        if kind not in _KINDS:
             raise ModelError(
-                f"joint '{joint.name()}' is of type '{joint.type_name()}', which cannot be "
-                f"searched; use one of {', '.join(_KINDS)}"
+                f"joint '{joint.name()}' is of type '{kind}', which cannot be searched; use one of "
+                f"{', '.join(_KINDS)}"
             )
-        span = slice(joint.position_start(), joint.position_start() + joint.num_positions())
-        kinds[span] = _KINDS[joint.type_name()]
-        periodic[span] = [kind == "angle" for kind in kinds[span]]
-        periodic[span] &= joint.type_name() != "screw"
-        if joint.type_name() not in FLOATING_TYPES:
-            lower[span], upper[span] = _written_limits(joint, names[span], given)
-            wide = _too_wide(joint, lower[span], upper[span])
-            turn = one_turn(lower[span], upper[span], defaults[span])
-            warnings += _remarks(joint, names[span], wide, (lower[span], upper[span]), turn)
-            free[span] = wide & periodic[span]
-            # Slides may say where the object stands: see tree_builder.
-            slides = np.array([kind == "length" for kind in kinds[span]], dtype=np.bool_)
-            lower[span] = np.where(wide, np.where(slides, -np.inf, turn[0]), lower[span])
-            upper[span] = np.where(wide, np.where(slides, np.inf, turn[1]), upper[span])
+        first = joint.position_start()
+        for i in range(first, first + joint.num_positions()):
+            kinds[i] = _KINDS[kind][i - first]
+            periodic[i] = kinds[i] == "angle" and kind != "screw"
+            if kind in FLOATING_TYPES:
+                continue
+            low, high = _written_limits(joint, i - first, given.get(names[i]))
+            lower[i], upper[i] = one_turn(low, high, defaults[i])
+            free[i], remark = _too_wide(joint, i - first, names[i], (low, high), lower[i])
+            warnings += [remark] * bool(remark)
+            if kinds[i] == "length":  # Slides may say where the object stands: see tree_builder.
+                lower[i], upper[i] = (-np.inf, np.inf) if free[i] else (low, high)
+            elif not free[i]:
+                lower[i], upper[i] = low, high
+    free &= periodic
     defaults = np.clip(defaults, lower, upper)
     for array in (lower, upper, defaults, periodic, free):
         array.setflags(write=False)
@@ -133,20 +135,20 @@ def describe_positions(
 
 
 def _written_limits(
-    joint: Joint, names: list[str], given: Mapping[str, tuple[float, float]]
-) -> tuple[Array, Array]:
-    """The limits (k,) of one joint: those given, else the file's."""
-    lower = np.array(joint.position_lower_limits(), dtype=np.float64)
-    upper = np.array(joint.position_upper_limits(), dtype=np.float64)
-    for index, name in enumerate(names):
-        low, high = lower[index], upper[index] = given.get(name, (lower[index], upper[index]))
-        if np.isnan(low) or np.isnan(high):
-            raise ModelError(f"{_title(joint, index)}: a limit is NaN; give numbers, lower first")
-        if low > high:
-            raise ModelError(
-                f"{_title(joint, index)}: lower limit {low:g} is above upper limit {high:g}"
-            )
-    return lower, upper
+    joint: Joint, index: int, given: tuple[float, float] | None
+) -> tuple[float, float]:
+    """The limits of one position of a joint: those given, else the file's."""
+    low, high = given or (
+        float(joint.position_lower_limits()[index]),
+        float(joint.position_upper_limits()[index]),
+    )
+    if np.isnan(low) or np.isnan(high):
+        raise ModelError(f"{_title(joint, index)}: a limit is NaN; give numbers, lower first")
+    if low > high:
+        raise ModelError(
+            f"{_title(joint, index)}: lower limit {low:g} is above upper limit {high:g}"
+        )
+    return low, high
 
 
 def _title(joint: Joint, index: int) -> str:
@@ -155,50 +157,43 @@ def _title(joint: Joint, index: int) -> str:
     return f"joint '{joint.name()}'{suffix}"
 
 
-def _too_wide(joint: Joint, lower: Array, upper: Array) -> NDArray[np.bool_]:
-    """Which limits (k,) are too far apart to be limits."""
-    angle = _WIDEST_SCREW if joint.type_name() == "screw" else _WIDEST_ANGLE
-    kinds = _KINDS[joint.type_name()]
-    widest = np.array([angle if kind == "angle" else _WIDEST_LENGTH for kind in kinds])
-    return np.asarray(upper - lower > widest * (1.0 + _ROUNDING))
+def _too_wide(
+    joint: Joint, index: int, name: str, limits: tuple[float, float], start: float
+) -> tuple[bool, str]:
+    """Whether limits are too far apart to be limits, and what is said of that, if anything.
 
-
-def _remarks(
-    joint: Joint,
-    names: list[str],
-    wide: NDArray[np.bool_],
-    limits: tuple[Array, Array],
-    turn: tuple[Array, Array],
-) -> list[str]:
-    """What is said of limits that are too wide; nothing of a joint that has none at all."""
-    remarks = []
-    for index in np.flatnonzero(wide):
-        low, high = float(limits[0][index]), float(limits[1][index])
-        title, kind = _title(joint, int(index)), joint.type_name()
-        unlimited, one_sided = low == -high == -np.inf, np.isinf(low) != np.isinf(high)
-        advice = (
-            "give it a lower and an upper limit in the model file (or to load_model: "
-            f"limits={{'{names[index]}': (low, high)}})"
+    ``start``: where the turn begins that is searched instead [rad].
+    """
+    (low, high), title, is_screw = limits, _title(joint, index), joint.type_name() == "screw"
+    is_length = _KINDS[joint.type_name()][index] == "length"
+    widest = _WIDEST_LENGTH if is_length else _WIDEST_SCREW if is_screw else _WIDEST_ANGLE
+    if not high - low > widest * (1.0 + _ROUNDING):
+        return False, ""
+    unlimited, one_sided = low == -high == -np.inf, np.isinf(low) != np.isinf(high)
+    advice = (
+        "give it a lower and an upper limit in the model file (or to load_model: "
+        f"limits={{'{name}': (low, high)}})"
+    )
+    answers = f"{np.degrees(start):.6g} to {np.degrees(start + _FULL_TURN):.6g} degrees"
+    if is_length:
+        return True, (
+            ""
+            if unlimited or one_sided
+            else f"{title} has limits of {low:g} and {high:g} m, more than {_WIDEST_LENGTH:g} m "
+            "apart: they are taken as none"
         )
-        answers = f"{np.degrees(turn[0][index]):.6g} to {np.degrees(turn[1][index]):.6g} degrees"
-        if _KINDS[kind][index] == "length":
-            if not unlimited and not one_sided:
-                remarks.append(
-                    f"{title} has limits of {low:g} and {high:g} m, more than {_WIDEST_LENGTH:g} m "
-                    "apart: they are taken as none"
-                )
-        elif one_sided or (kind == "screw" and not unlimited):
-            lacks = "limits" if one_sided else "limits that can be searched"
-            raise ModelError(
-                f"{title} has no {lacks}: lower {low:g}, upper {high:g} [rad]; {advice}, so that "
-                "its values can be searched"
-            )
-        elif kind == "screw":
-            remarks.append(f"{title} is a screw without limits: searched from {answers}; {advice}")
-        elif not unlimited:
-            remarks.append(
-                f"{title} has limits of {low:g} and {high:g} rad, more than "
-                f"{_WIDEST_ANGLE / _FULL_TURN:g} turns apart: it is taken to turn freely, and "
-                f"answers are given from {answers}"
-            )
-    return remarks
+    if one_sided or (is_screw and not unlimited):
+        lacks = "limits" if one_sided else "limits that can be searched"
+        raise ModelError(
+            f"{title} has no {lacks}: lower {low:g}, upper {high:g} [rad]; {advice}, so that its "
+            "values can be searched"
+        )
+    if is_screw:
+        return True, f"{title} is a screw without limits: searched from {answers}; {advice}"
+    if unlimited:
+        return True, ""
+    return True, (
+        f"{title} has limits of {low:g} and {high:g} rad, more than "
+        f"{_WIDEST_ANGLE / _FULL_TURN:g} turns apart: it is taken to turn freely, and answers are "
+        f"given from {answers}"
+    )

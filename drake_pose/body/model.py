@@ -25,8 +25,7 @@ from drake_pose.arrays import Array
 from drake_pose.body.formats.parsing import ModelSource, limit_kinds
 from drake_pose.body.formats.safety import check_in_child
 from drake_pose.body.formats.urdf_shape import Vectors, reshaped, with_base_joints
-from drake_pose.body.limits import describe_positions
-from drake_pose.body.parsed_model import ParsedModel, link_names
+from drake_pose.body.parsed_model import ParsedModel, describe_positions, link_names
 from drake_pose.body.surfaces.meshes import TriangleMesh
 from drake_pose.body.surfaces.skin_file import SkinBand, load_skin
 from drake_pose.body.surfaces.visual_geometry import body_mesh, make_drawable

@@ -1,19 +1,208 @@
-"""What a model file says of links, joints, limits and looks, as plain values and Drake's plant."""
+"""What a model file says: names, kinds and limits of positions, links, looks, as plain values."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any, Literal
 
+import numpy as np
+from numpy.typing import NDArray
 from pydrake.geometry import SceneGraph
 from pydrake.multibody.plant import MultibodyPlant
-from pydrake.multibody.tree import BodyIndex, ModelInstanceIndex
+from pydrake.multibody.tree import BodyIndex, Joint, ModelInstanceIndex
 
+from drake_pose.arrays import Array
 from drake_pose.body.formats.parsing import ModelSource
-from drake_pose.body.limits import Positions
 from drake_pose.body.surfaces.meshes import TriangleMesh
 from drake_pose.body.surfaces.skin_file import SkinBand
 from drake_pose.body.surfaces.visual_geometry import make_drawable
-from drake_pose.errors import UnknownNameError
+from drake_pose.errors import ModelError, UnknownNameError
+
+PositionKind = Literal["angle", "length", "quaternion"]
+
+_KINDS: dict[str, tuple[PositionKind, ...]] = {
+    "weld": (),
+    "revolute": ("angle",),
+    "prismatic": ("length",),
+    "screw": ("angle",),
+    "universal": ("angle", "angle"),
+    "ball_rpy": ("angle", "angle", "angle"),
+    "planar": ("length", "length", "angle"),
+    "rpy_floating": ("angle", "angle", "angle", "length", "length", "length"),
+    "quaternion_floating": (
+        "quaternion", "quaternion", "quaternion", "quaternion", "length", "length", "length",
+    ),
+}  # fmt: skip
+FLOATING_TYPES = ("rpy_floating", "quaternion_floating")
+
+_FULL_TURN = 2.0 * np.pi
+# Limits further apart than this are written for none [rad, rad, m]. An angle turns freely then, but
+# what a screw or a slide does looks different everywhere.
+_WIDEST_ANGLE, _WIDEST_SCREW, _WIDEST_LENGTH = 4.0 * _FULL_TURN, 100.0 * _FULL_TURN, 1e3
+# Limits written with ten digits are a full turn.
+_ROUNDING = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class Positions:
+    """What a plant's q means; all in the plant's order, arrays (nq,) and read-only.
+
+    Attributes:
+        position_names: the joint's name, or ``joint_suffix`` for joints of several positions.
+        position_kinds: "angle" [rad], "length" [m] or "quaternion".
+        lower, upper: limits [rad or m]; half a turn either side of the default position for a joint
+            that turns freely; infinite for a floating body's pose and slides without limits.
+        default_positions: Drake's default positions moved inside the limits.
+        periodic: angles that look the same after a full turn: all but those of screws.
+        turns_freely: angles without limits, or with limits so wide that they mean none.
+    """
+
+    position_names: tuple[str, ...]
+    position_kinds: tuple[PositionKind, ...]
+    lower: Array
+    upper: Array
+    default_positions: Array
+    periodic: NDArray[np.bool_]
+    turns_freely: NDArray[np.bool_]
+
+
+def turns_around(lower: Array, upper: Array, periodic: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Which values (k,) can take every direction inside their limits (k,)."""
+    return np.asarray(periodic & (upper - lower >= _FULL_TURN - _ROUNDING))
+
+
+def one_turn(lower: Any, upper: Any, near: Any) -> tuple[Any, Any]:
+    """Limits (k,), and of those wider than a turn the turn inside them nearest to values (k,)."""
+    low = np.clip(near - np.pi, lower, np.maximum(upper - _FULL_TURN, lower))
+    return low, np.minimum(low + _FULL_TURN, upper)
+
+
+def nearest_turn(values: Array, near: Array, periodic: NDArray[np.bool_] | bool) -> Array:
+    """Values (k,), periodic ones moved by full turns to within half a turn of ``near``.
+
+    What is half a turn away on either side stays there.
+    """
+    turns = np.round((values - near) / _FULL_TURN)
+    return np.asarray(np.where(periodic, values - _FULL_TURN * turns, values))
+
+
+def describe_positions(
+    plant: MultibodyPlant, given: Mapping[str, tuple[float, float]], where: str
+) -> tuple[Positions, list[str]]:
+    """Names, kinds and limits of all positions of a finalized plant, and warnings.
+
+    Args:
+        given: limits (lower, upper) [rad or m] by position name that replace the plant's own.
+        where: the model's file, for messages.
+
+    Raises:
+        UnknownNameError: ``given`` names a position that does not exist.
+        ModelError: names a joint of an unknown type, or with limits that cannot be searched.
+    """
+    names = plant.GetPositionNames(add_model_instance_prefix=False, always_add_suffix=False)
+    scoped = plant.GetPositionNames(add_model_instance_prefix=True, always_add_suffix=False)
+    names = [a if names.count(a) == 1 else b for a, b in zip(names, scoped, strict=True)]
+    for name in given:
+        if name not in names:
+            raise UnknownNameError("joint", name, names, where)
+    count = plant.num_positions()
+    kinds: list[PositionKind] = ["angle"] * count
+    lower, upper = np.full(count, -np.inf), np.full(count, np.inf)
+    periodic, free = np.zeros(count, dtype=np.bool_), np.zeros(count, dtype=np.bool_)
+    defaults = np.array(plant.GetDefaultPositions(), dtype=np.float64)
+    warnings: list[str] = []
+    for joint in (plant.get_joint(index) for index in plant.GetJointIndices()):
+        kind = joint.type_name()
+        if kind not in _KINDS:
+            raise ModelError(
+                f"joint '{joint.name()}' is of type '{kind}', which cannot be searched; use one of "
+                f"{', '.join(_KINDS)}"
+            )
+        first = joint.position_start()
+        for i in range(first, first + joint.num_positions()):
+            kinds[i] = _KINDS[kind][i - first]
+            periodic[i] = kinds[i] == "angle" and kind != "screw"
+            if kind in FLOATING_TYPES:
+                continue
+            low, high = _written_limits(joint, i - first, given.get(names[i]))
+            lower[i], upper[i] = one_turn(low, high, defaults[i])
+            free[i], remark = _too_wide(joint, i - first, names[i], (low, high), lower[i])
+            warnings += [remark] * bool(remark)
+            if kinds[i] == "length":  # Slides may say where the object stands: see tree_builder.
+                lower[i], upper[i] = (-np.inf, np.inf) if free[i] else (low, high)
+            elif not free[i]:
+                lower[i], upper[i] = low, high
+    free &= periodic
+    defaults = np.clip(defaults, lower, upper)
+    for array in (lower, upper, defaults, periodic, free):
+        array.setflags(write=False)
+    positions = Positions(tuple(names), tuple(kinds), lower, upper, defaults, periodic, free)
+    return positions, warnings
+
+
+def _written_limits(
+    joint: Joint, index: int, given: tuple[float, float] | None
+) -> tuple[float, float]:
+    """The limits of one position of a joint: those given, else the file's."""
+    low, high = given or (
+        float(joint.position_lower_limits()[index]),
+        float(joint.position_upper_limits()[index]),
+    )
+    if np.isnan(low) or np.isnan(high):
+        raise ModelError(f"{_title(joint, index)}: a limit is NaN; give numbers, lower first")
+    if low > high:
+        raise ModelError(
+            f"{_title(joint, index)}: lower limit {low:g} is above upper limit {high:g}"
+        )
+    return low, high
+
+
+def _title(joint: Joint, index: int) -> str:
+    """What messages call one position of a joint."""
+    suffix = f" (its {joint.position_suffix(index)})" if joint.num_positions() > 1 else ""
+    return f"joint '{joint.name()}'{suffix}"
+
+
+def _too_wide(
+    joint: Joint, index: int, name: str, limits: tuple[float, float], start: float
+) -> tuple[bool, str]:
+    """Whether limits are too far apart to be limits, and what is said of that, if anything.
+
+    ``start``: where the turn begins that is searched instead [rad].
+    """
+    (low, high), title, is_screw = limits, _title(joint, index), joint.type_name() == "screw"
+    is_length = _KINDS[joint.type_name()][index] == "length"
+    widest = _WIDEST_LENGTH if is_length else _WIDEST_SCREW if is_screw else _WIDEST_ANGLE
+    if not high - low > widest * (1.0 + _ROUNDING):
+        return False, ""
+    unlimited, one_sided = low == -high == -np.inf, np.isinf(low) != np.isinf(high)
+    advice = (
+        "give it a lower and an upper limit in the model file (or to load_model: "
+        f"limits={{'{name}': (low, high)}})"
+    )
+    answers = f"{np.degrees(start):.6g} to {np.degrees(start + _FULL_TURN):.6g} degrees"
+    if is_length:
+        return True, (
+            ""
+            if unlimited or one_sided
+            else f"{title} has limits of {low:g} and {high:g} m, more than {_WIDEST_LENGTH:g} m "
+            "apart: they are taken as none"
+        )
+    if one_sided or (is_screw and not unlimited):
+        lacks = "limits" if one_sided else "limits that can be searched"
+        raise ModelError(
+            f"{title} has no {lacks}: lower {low:g}, upper {high:g} [rad]; {advice}, so that its "
+            "values can be searched"
+        )
+    if is_screw:
+        return True, f"{title} is a screw without limits: searched from {answers}; {advice}"
+    if unlimited:
+        return True, ""
+    return True, (
+        f"{title} has limits of {low:g} and {high:g} rad, more than "
+        f"{_WIDEST_ANGLE / _FULL_TURN:g} turns apart: it is taken to turn freely, and answers are "
+        f"given from {answers}"
+    )
 
 
 @dataclass(frozen=True, eq=False)

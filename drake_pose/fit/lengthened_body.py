@@ -11,9 +11,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_pose.body.tree.joint_offsets import JointOffset
 from drake_pose.body.tree.link_graph import chain_transforms
-from drake_pose.body.tree.tree_kinematics import TreeKinematics
+from drake_pose.body.tree.tree_kinematics import JointOffset, TreeKinematics
 from drake_pose.fit.parameters import BodyParameters, Placement, affine_motions, owners_of
 from drake_pose.silhouette.areas.outline import Outline
 

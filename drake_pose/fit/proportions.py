@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array, diags_array, eye_array, kron, vstack
 
 from drake_pose.body.model import ArticulatedModel
-from drake_pose.body.tree.joint_offsets import joint_offsets
-from drake_pose.body.tree.tree_kinematics import Motions, TreeKinematics
+from drake_pose.body.tree.tree_kinematics import Motions, TreeKinematics, joint_offsets
 from drake_pose.camera.models import Camera
 from drake_pose.fit.contour_fit import Noise
 from drake_pose.fit.evidence import EdgePoints, pack_evidence

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from scipy.special import stdtr, stdtrit
 
 from drake_pose.body.model import OBJECT_POSITIONS
-from drake_pose.body.tree.joint_offsets import JointOffset, joint_offsets
 from drake_pose.body.tree.pose_tree import PoseTree
+from drake_pose.body.tree.tree_kinematics import JointOffset, joint_offsets
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import RegistrationError, UnknownNameError
 from drake_pose.fit.lengthened_body import length_name

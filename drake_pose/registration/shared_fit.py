@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_pose.body.model import OBJECT_POSITIONS
-from drake_pose.body.tree.joint_offsets import JointOffset
+from drake_pose.body.tree.tree_kinematics import JointOffset
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.fit.contour_fit import Noise
 from drake_pose.fit.covariance import (

@@ -28,8 +28,7 @@ from drake_pose.silhouette.areas.bending import TreeSurfaces
 from drake_pose.silhouette.areas.outline import Outline
 from drake_pose.silhouette.areas.scoring import draw_mask
 from drake_pose.silhouette.pictures.masks import intersection_over_union
-from drake_pose.silhouette.segmentation.background import tell_from_background
-from drake_pose.silhouette.segmentation.grab_cut import cut
+from drake_pose.silhouette.segmentation.background import cut, tell_from_background
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

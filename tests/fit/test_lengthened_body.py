@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from drake_pose.body.model import load_model
-from drake_pose.body.tree.joint_offsets import joint_offsets
 from drake_pose.body.tree.root import RootRotation
-from drake_pose.body.tree.tree_kinematics import TreeKinematics
+from drake_pose.body.tree.tree_kinematics import TreeKinematics, joint_offsets
 from drake_pose.fit.lengthened_body import LengthenedBody
 from drake_pose.silhouette.areas.outline import outline_from_mesh
 

@@ -15,8 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_pose.arrays import Array
-from drake_pose.body.limits import one_turn, turns_around
-from drake_pose.body.parsed_model import ParsedModel
+from drake_pose.body.parsed_model import ParsedModel, one_turn, turns_around
 from drake_pose.body.surfaces.meshes import TriangleMesh
 from drake_pose.body.tree.link_graph import ChainStep, PlantKinematics, chain_transforms
 from drake_pose.body.tree.node_skin import NodeSkin

@@ -13,8 +13,7 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from drake_pose.arrays import Array
-from drake_pose.body.limits import nearest_turn, one_turn
-from drake_pose.body.parsed_model import ParsedModel
+from drake_pose.body.parsed_model import ParsedModel, nearest_turn, one_turn
 from drake_pose.body.tree.link_graph import (
     ChainStep,
     JointEdge,

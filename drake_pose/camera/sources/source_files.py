@@ -24,11 +24,11 @@ from drake_pose.camera.picture_files import (
 )
 from drake_pose.camera.sources.frame_source import (
     Clock,
+    DeviceSource,
     FrameSource,
     SourceSpecification,
     TimedPicture,
 )
-from drake_pose.camera.sources.live import DeviceSource
 from drake_pose.csv_files import read_csv
 from drake_pose.errors import CameraError, SceneError, SettingsError
 from drake_pose.yaml_files import read_yaml

@@ -36,10 +36,10 @@ from drake_pose.silhouette.segmentation.background import (
     Background,
     background_of_recording,
     background_support,
+    cut_box,
     learn_background,
     person_region,
 )
-from drake_pose.silhouette.segmentation.grab_cut import cut_box
 from drake_pose.silhouette.segmentation.mask_pictures import (
     ALL,
     mask_of_video_picture,

@@ -12,7 +12,11 @@ from drake_pose.camera.picture_files import SUFFIXES, Mask, Picture, list_pictur
 from drake_pose.errors import SceneError
 from drake_pose.silhouette.pictures.scene_files import VIDEOS, VideoPictures
 from drake_pose.silhouette.pictures.scenes import CAMERA_FILE
-from drake_pose.silhouette.segmentation.coco import AnnotatedPicture, Annotations, read_coco
+from drake_pose.silhouette.segmentation.mask_pictures import (
+    AnnotatedPicture,
+    Annotations,
+    read_coco,
+)
 
 UNNAMED = ""
 """The only camera's name, where nothing names it: its masks lie in no folder of their own."""

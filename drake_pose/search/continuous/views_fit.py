@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from drake_pose.body.limits import nearest_turn
+from drake_pose.body.parsed_model import nearest_turn
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.fit.contour_fit import (
     FINEST_SCALE,

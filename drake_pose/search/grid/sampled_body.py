@@ -12,7 +12,7 @@ from drake_pose.search.scoring import SampledTree
 from drake_pose.search.settings import BeamSearchSettings
 from drake_pose.silhouette.areas.outline import Outline, outline_from_mesh
 from drake_pose.silhouette.areas.scoring import VisualHull
-from drake_pose.silhouette.contours.direction_cells import CelledOutline, divide_outline
+from drake_pose.silhouette.contours.contour_points import CelledOutline, divide_outline
 
 _BALLS = 10
 # Surfaces of more triangles are simplified to fewer for stages that need not be exact.

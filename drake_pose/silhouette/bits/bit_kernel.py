@@ -24,7 +24,7 @@ from drake_pose.silhouette.areas.span_kernel import (
     find_spans,
     make_rows,
 )
-from drake_pose.silhouette.contours.direction_cells import CelledOutline, find_cell
+from drake_pose.silhouette.contours.contour_points import CelledOutline, find_cell
 
 WORD = 64
 NEAREST_STRIDE = 32768

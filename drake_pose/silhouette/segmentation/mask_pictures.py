@@ -1,21 +1,28 @@
-"""Masks of other tools in pictures: classes in a palette, transparency, probabilities."""
+"""Masks of other tools: pictures of classes, transparency, probabilities; COCO's polygons and runs.
+
+A polygon's corners lie between pixels (pixel 0 is 0..1), and a pixel belongs to what its centre
+lies in; OpenCV's ``fillPoly`` takes every pixel that the border touches, half a pixel too many.
+"""
 
 from __future__ import annotations
 
 import io
-from collections.abc import Sequence
+import json
+from collections.abc import Container, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from drake_pose.arrays import Mask
+from drake_pose.arrays import Array, Mask
 from drake_pose.camera.models import LARGEST_SIDE
 from drake_pose.camera.picture_files import read_picture_file
 from drake_pose.errors import MaskError
+from drake_pose.regular_files import read_regular
 
 Layer = NDArray[np.integer]
 
@@ -166,3 +173,169 @@ def _listed(values: NDArray[np.integer]) -> str:
     """A few numbers."""
     some = ", ".join(str(value) for value in values[:_LISTED])
     return f"{some} and more" if len(values) > _LISTED else some or "none"
+
+
+_LARGEST_FILE = 1 << 30
+
+
+@dataclass(frozen=True)
+class AnnotatedPicture:
+    """A picture of a COCO file, with its size [pixel] and annotations, each with its class."""
+
+    file: str
+    width: int
+    height: int
+    annotations: Sequence[tuple[str, Mapping[str, Any]]] = ()
+
+    def draw(self, classes: Container[str]) -> Mask:
+        """The areas of some classes together (H, W); ValueError names what cannot be drawn."""
+        mask = np.zeros((self.height, self.width), dtype=np.bool_)
+        for name, entry in self.annotations:
+            if name not in classes:
+                continue
+            try:
+                mask |= _draw(entry["segmentation"], self.height, self.width)
+            except (KeyError, TypeError, ValueError, OverflowError) as error:
+                what = f"lacks {error}" if isinstance(error, KeyError) else str(error)
+                where = f"annotation {entry.get('id')} of image {entry['image_id']}"
+                raise ValueError(f"{where}: {what}") from error
+        return mask
+
+
+@dataclass(frozen=True)
+class Annotations:
+    """A COCO file's pictures in its order, classes' names by number, and what was left out."""
+
+    path: Path
+    pictures: tuple[AnnotatedPicture, ...]
+    names: Mapping[str, str]
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def classes(self) -> tuple[str, ...]:
+        """The names of all classes that have an area."""
+        return tuple(
+            dict.fromkeys(name for picture in self.pictures for name, _ in picture.annotations)
+        )
+
+
+def read_coco(path: Path) -> Annotations:
+    """Reads a COCO file; MaskError names the file, and the annotation at fault."""
+    try:
+        content = json.loads(read_regular(path, _LARGEST_FILE))
+    except OSError as error:
+        raise MaskError(f"{path}: cannot be read: {error.strerror}") from error
+    except (ValueError, RecursionError) as error:
+        raise MaskError(f"{path}: is no JSON file: {error}") from error
+    if not isinstance(content, dict) or not {"images", "annotations"} <= set(content):
+        raise MaskError(f"{path}: is no COCO file: it needs images and annotations")
+    try:
+        return _annotations(content, path)
+    except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
+        what = f"lacks {error}" if isinstance(error, KeyError) else str(error)
+        raise MaskError(f"{path}: is no COCO file as it should be: {what}") from error
+
+
+def _annotations(content: Mapping[str, Any], path: Path) -> Annotations:
+    names = {entry["id"]: str(entry["name"]) for entry in content.get("categories", ())}
+    of_image: dict[Any, list[tuple[str, Mapping[str, Any]]]] = {}
+    for entry in content["images"]:
+        if entry["id"] in of_image:
+            raise ValueError(f"image {entry['id']} is given twice")
+        of_image[entry["id"]] = []
+    without = 0
+    for entry in content["annotations"]:
+        image = entry["image_id"]
+        if image not in of_image:
+            raise ValueError(
+                f"annotation {entry.get('id')} is of image {image}, which is not there"
+            )
+        if entry.get("segmentation"):
+            category = entry["category_id"]
+            of_image[image].append((names.get(category, str(category)), entry))
+        else:
+            without += 1
+    pictures = tuple(
+        AnnotatedPicture(
+            str(entry["file_name"]),
+            _side(entry["width"]),
+            _side(entry["height"]),
+            of_image[entry["id"]],
+        )
+        for entry in content["images"]
+    )
+    text = f"{path}: {without} annotations have a box, but no segmentation: left out"
+    numbers = {str(key): name for key, name in names.items()}
+    return Annotations(path, pictures, numbers, (text,) if without else ())
+
+
+def _side(value: Any) -> int:
+    if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= LARGEST_SIDE:
+        raise ValueError(
+            f"a picture's width and height must be whole numbers of 1 to {LARGEST_SIDE} pixels"
+        )
+    return value
+
+
+def _draw(segmentation: Any, height: int, width: int) -> Mask:
+    """The area (H, W) of a segmentation: run lengths, or a list of polygons."""
+    if isinstance(segmentation, dict):
+        if list(segmentation["size"]) != [height, width]:
+            raise ValueError(
+                f"is of a picture of another size, {segmentation['size']} (height, width)"
+            )
+        return decode_run_lengths(segmentation["counts"], height, width)
+    mask = np.zeros((height, width), dtype=np.bool_)
+    for polygon in segmentation:
+        mask |= fill_polygon(np.asarray(polygon, dtype=np.float64).reshape(-1, 2), height, width)
+    return mask
+
+
+def fill_polygon(corners: Array, height: int, width: int) -> Mask:
+    """The pixels (H, W) whose centres lie in a polygon (n, 2) by the even-odd rule.
+
+    Raises ValueError for fewer than three corners, or one that is no finite number.
+    """
+    if len(corners) < 3 or not np.isfinite(corners).all():
+        raise ValueError("a polygon needs three corners (x, y) or more, finite numbers")
+    # Each edge toggles what lies right of it.
+    toggled = np.zeros((height, width + 1), dtype=np.bool_)
+    for (x0, y0), (x1, y1) in zip(corners, np.roll(corners, -1, axis=0), strict=True):
+        ends = np.ceil(np.sort([y0, y1]) - 0.5).clip(0, height).astype(int)
+        rows = np.arange(*ends)
+        if len(rows):
+            x = x0 + (rows + 0.5 - y0) * (x1 - x0) / (y1 - y0)
+            toggled[rows, np.ceil(x - 0.5).clip(0, width).astype(int)] ^= True
+    return np.logical_xor.accumulate(toggled[:, :width], axis=1)
+
+
+def decode_run_lengths(counts: Sequence[int] | str, height: int, width: int) -> Mask:
+    """The area (H, W) of run lengths, or of the text that they are compressed to.
+
+    Raises ValueError where they do not fill the picture, MaskError without pycocotools.
+    """
+    try:
+        from pycocotools import mask as coco
+    except ImportError as error:
+        raise MaskError(
+            "run lengths of COCO are read by pycocotools: pip install 'drake_pose[coco]'"
+        ) from error
+    packed: dict[str, Any] = {"size": [height, width]}
+    if isinstance(counts, str):
+        packed["counts"] = counts.encode()
+    else:
+        if any(isinstance(run, bool) or not isinstance(run, int) or run < 0 for run in counts):
+            raise ValueError("run lengths must be whole numbers, none negative")
+        if sum(counts) != height * width:
+            raise ValueError(
+                f"the run lengths fill {sum(counts)} pixels of a picture of {width} x {height} "
+                "(width x height)"
+            )
+        packed = coco.frPyObjects(packed | {"counts": list(counts)}, height, width)
+    mask = coco.decode(packed)
+    # Where text ends too early the rest is memory that nobody has written.
+    if isinstance(counts, str) and coco.encode(mask)["counts"] != packed["counts"]:
+        raise ValueError(
+            f"the run lengths do not fill a picture of {width} x {height} (width x height)"
+        )
+    return np.asarray(mask, dtype=np.bool_)

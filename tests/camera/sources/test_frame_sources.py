@@ -200,7 +200,7 @@ class TestDevice:
     def test_newest_picture_is_kept_and_the_camera_opened_again(self, monkeypatch):
         FakeCamera.opened = 0
         monkeypatch.setattr(cv2, "VideoCapture", FakeCamera)
-        monkeypatch.setattr("drake_pose.camera.sources.live.FIRST_PAUSE", 0.02)
+        monkeypatch.setattr("drake_pose.camera.sources.frame_source.FIRST_PAUSE", 0.02)
         source = open_source(specify("7", "device"))
         try:
             # It cannot be opened at first, then gives three pictures at a time, and fails again.

@@ -13,7 +13,7 @@ from drake_pose.silhouette.areas.bending import BendingOutline, TreeSurfaces
 from drake_pose.silhouette.areas.outline import outline_from_mesh
 from drake_pose.silhouette.areas.scoring import draw_mask, prefix_sums, score_bodies, subtract_body
 from drake_pose.silhouette.bits.bit_kernel import draw_bits, make_bit_view
-from drake_pose.silhouette.contours.direction_cells import divide_outline
+from drake_pose.silhouette.contours.contour_points import divide_outline
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from tests.body.skins import load_limb
 from tests.silhouette.agreement import LARGEST_SHARE, measure_agreement

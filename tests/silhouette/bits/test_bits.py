@@ -11,7 +11,7 @@ from drake_pose.silhouette.areas.outline import Outline, outline_from_mesh
 from drake_pose.silhouette.areas.scoring import VisualHull, draw_mask
 from drake_pose.silhouette.bits.bit_kernel import NEAREST_STRIDE, BitView, draw_bits, make_bit_view
 from drake_pose.silhouette.bits.bounding_balls import draw_discs, prune_by_balls
-from drake_pose.silhouette.contours.direction_cells import divide_outline
+from drake_pose.silhouette.contours.contour_points import divide_outline
 
 _POSES = 120
 

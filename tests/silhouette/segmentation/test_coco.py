@@ -8,7 +8,7 @@ from matplotlib.path import Path
 from pycocotools import mask as coco
 
 from drake_pose.errors import MaskError
-from drake_pose.silhouette.segmentation.coco import decode_run_lengths, fill_polygon
+from drake_pose.silhouette.segmentation.mask_pictures import decode_run_lengths, fill_polygon
 
 HEIGHT, WIDTH = 60, 80
 PIXEL_CENTRES = np.indices((HEIGHT, WIDTH))[::-1].reshape(2, -1).T + 0.5

@@ -7,8 +7,8 @@ import pytest
 from pydrake.math import RotationMatrix
 from pydrake.multibody.tree import BodyIndex
 
-from drake_pose.body.limits import nearest_turn, one_turn, turns_around
 from drake_pose.body.model import load_model
+from drake_pose.body.parsed_model import nearest_turn, one_turn, turns_around
 from drake_pose.body.tree.root import RootRotation
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.errors import ModelError

@@ -13,7 +13,7 @@ import shutil
 import time
 import uuid
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -222,10 +222,8 @@ def _estimate(
 
 
 def _audit(job: SceneJob, joints: Path, part: Path) -> None:
-    given = job.settings
-    settings = AuditSettings(
-        cameras=given.cameras, frames=given.frames, hold=given.hold, packages=given.packages
-    )
+    names = [one.name for one in fields(AuditSettings)]
+    settings = AuditSettings(**{name: getattr(job.settings, name) for name in names})
     audit_scene(
         job.scene, job.model, joints, part, settings, cameras=job.camera_file, overlay=job.overlay
     )

@@ -9,7 +9,7 @@ import pickle
 import threading
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack, closing
+from contextlib import ExitStack
 from itertools import islice
 from typing import NamedTuple
 
@@ -17,8 +17,7 @@ import cv2
 import numpy as np
 from distributed import get_worker
 
-from drake_pose.camera.sources.frame_source import FrameSource, SourceSpecification
-from drake_pose.camera.sources.source_files import load_background_pictures, open_source
+from drake_pose.camera.sources.frame_source import SourceSpecification
 from drake_pose.fit.camera_sums import (
     Views,
     answer_request,
@@ -28,13 +27,10 @@ from drake_pose.fit.camera_sums import (
 )
 from drake_pose.fit.evidence import NO_EDGE, EdgePoints, pack_evidence
 from drake_pose.jobs.cluster.lines import SURFACES, Listening, serve
+from drake_pose.jobs.live.scene import learn_backgrounds, open_sources
 from drake_pose.person.views import pack_view, see_silhouette
 from drake_pose.silhouette.areas.outline import PackedOutlines
-from drake_pose.silhouette.segmentation.background import (
-    Background,
-    learn_background,
-    person_region,
-)
+from drake_pose.silhouette.segmentation.background import person_region
 
 COUNT = 4
 """How many pictures of each camera are asked for at once, and again when fewer wait."""
@@ -119,16 +115,10 @@ class CameraWatch:
         self._closed, self._lock, self._used = threading.Event(), threading.Lock(), time.monotonic()
         warm()
         with ExitStack() as opened:
-            self._backgrounds: dict[str, Background] = {
-                one.camera: learn_background(load_background_pictures(one))
-                for one in specifications
-                if not one.gives_masks
-            }
+            given = {one.camera: one for one in specifications}
+            self._backgrounds = learn_backgrounds(given)
             # Machines share no other clock than that of the day.
-            self._sources: dict[str, FrameSource] = {
-                one.camera: opened.enter_context(closing(open_source(one, time.time)))
-                for one in specifications
-            }
+            self._sources = open_sources(given, opened, time.time)
             host = host_of(get_worker().address)
             self.listening = serve(host, (self._answer, self._edges.answer), self._closed)
             self._opened = opened.pop_all()

@@ -26,10 +26,8 @@ from drake_pose.silhouette.areas.outline import PackedOutlines
 SURFACES, SUM = b"surfaces", b"sum"
 """The kinds of requests."""
 
-# How long a sum, and a connection, is waited for [s].
-_PATIENCE, _CONNECTING = 0.5, 5.0
-# A worker that was late, or could not be reached, is tried again after this time [s].
-_RETRY = 10.0
+# How long a sum is waited for, and after which time a worker that was late is asked again [s].
+_PATIENCE, _RETRY = 0.5, 10.0
 
 # How often a server looks whether it was closed [ms].
 _LOOK = 200
@@ -129,54 +127,41 @@ class RemoteKeeper:
         self._line: Line | None = None
         self._packed: PackedOutlines | None = None
         self._is_ready = self._is_reported = False
-        self._sent_at = self._retry_at = 0.0
+        self._asked_at = self._retry_at = 0.0
         self.answers = 0
 
     def move_to(self, line: Line | None) -> None:
         """Says by which connection the worker is asked; None: by none."""
         if self._line is not None:
             self._line.close()
-        self._line, self._packed = line, None
-        self._sent_at, self._retry_at = time.monotonic(), 0.0
+        self._line, self._packed, self._retry_at = line, None, 0.0
 
     def ask(self, request: SumRequest) -> bool:
         """Sends a request; False where the worker cannot be asked, now or at all."""
-        if self._line is None or time.monotonic() < self._retry_at:
+        self._asked_at = time.monotonic()
+        if self._line is None or self._asked_at < self._retry_at:
             return False
         if self._packed is not request.packed:
             self._is_ready = False
-            if self._send(self._line, SURFACES, pack_surfaces(request.packed)):
+            if self._line.send(SURFACES, pack_surfaces(request.packed)):
                 self._packed = request.packed
             return False
         # The worker says when it has loaded all it needs.
         self._is_ready = self._is_ready or self._line.receive() is not None
         data = pack_request(request, [self._numbers[name] for name in request.names])
-        return self._is_ready and self._send(self._line, SUM, data)
+        return self._is_ready and self._line.send(SUM, data)
 
     def answer(self) -> CameraSum | None:
         """The sum that was asked for; None where it does not come in time."""
-        patience = self._sent_at + _PATIENCE - time.monotonic()
+        patience = self._asked_at + _PATIENCE - time.monotonic()
         data = None if self._line is None else self._line.receive(patience)
         if data is None:
-            self._put_off("do not come in time")
+            self._packed, self._retry_at = None, time.monotonic() + _RETRY
+            if not self._is_reported:
+                cameras = f"sums of camera {listed(self._numbers)}"
+                self._report(f"{cameras} do not come in time; this process compares their contours")
+            self._is_reported = True
             return None
         self._is_reported = False
         self.answers += bool(data)
         return unpack_sum(data) if data else None
-
-    def _send(self, line: Line, kind: bytes, data: bytes) -> bool:
-        is_sent, now = line.send(kind, data), time.monotonic()
-        if is_sent:
-            self._sent_at = now
-        elif now - self._sent_at > _CONNECTING:
-            self._put_off("cannot be asked for")
-        return is_sent
-
-    def _put_off(self, why: str) -> None:
-        """Tries again later."""
-        self._packed = None
-        self._sent_at = self._retry_at = time.monotonic() + _RETRY
-        if not self._is_reported:
-            cameras = f"sums of camera {listed(self._numbers)}"
-            self._report(f"{cameras} {why}; this process compares their contours")
-            self._is_reported = True

@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable
 
 from pydrake.systems.analysis import Simulator, SimulatorStatus
-from pydrake.systems.framework import Context, Diagram
+from pydrake.systems.framework import Context, Diagram, EventStatus
 
 from drake_pose.systems.person.live_capture import LiveSensors
 
@@ -24,8 +24,7 @@ def run_live(
     sensors: LiveSensors | None,
     seconds: float | None,
     on_report: Callable[[str], None] = lambda _: None,
-    until: Callable[[], bool] = lambda: False,
-    monitor: Callable[[Context], None] | None = None,
+    monitor: Callable[[Context], EventStatus | None] | None = None,
     speed: float = 0.0,
 ) -> bool:
     """Runs a diagram until its recordings end or its time is up; True: until Ctrl-C instead.
@@ -34,8 +33,7 @@ def run_live(
         sensors: those in the diagram; None: it has none.
         seconds: how long; None: without end.
         on_report: called with what the user should know of cameras and pictures.
-        until: asked after every period whether it is enough.
-        monitor: called with the diagram's context after every step.
+        monitor: called with the diagram's context after every step; may end the run.
         speed: simulated seconds a second where no camera is live; 0: as fast as it can.
     """
     simulator = Simulator(diagram)
@@ -50,7 +48,7 @@ def run_live(
     try:
         simulator.Initialize()
         begin = start = time.monotonic()
-        while (time.monotonic() - start if is_live else context.get_time()) < end and not until():
+        while (time.monotonic() - start if is_live else context.get_time()) < end:
             goal = context.get_time() + period
             status = simulator.AdvanceTo(goal if is_live else min(goal, end))
             for report in [] if sensors is None else sensors.take_reports():
@@ -78,17 +76,18 @@ def look_until(
     Raises:
         KeyboardInterrupt: the user gave up.
     """
-    enough = False
 
-    def look(context: Context) -> None:
-        nonlocal enough
-        enough = looks(context) or enough
+    def look(context: Context) -> EventStatus:
+        is_enough = looks(context)
+        return (
+            EventStatus.ReachedTermination(diagram, "") if is_enough else EventStatus.DidNothing()
+        )
 
     # What is wrong with recorded pictures is said when they are captured.
     report = on_report if sensors.live else lambda _: None
     waited = _PATIENCE if sensors.live else None
     try:
-        if run_live(diagram, sensors, waited, report, lambda: enough, look):
+        if run_live(diagram, sensors, waited, report, look):
             raise KeyboardInterrupt
     finally:
         sensors.close()

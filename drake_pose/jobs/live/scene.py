@@ -13,7 +13,7 @@ import cv2
 
 from drake_pose.camera.camera_files import load_cameras
 from drake_pose.camera.models import Camera
-from drake_pose.camera.sources.frame_source import FrameSource, Picture, SourceSpecification
+from drake_pose.camera.sources.frame_source import Clock, FrameSource, Picture, SourceSpecification
 from drake_pose.camera.sources.source_files import (
     CAMERAS,
     SOURCES,
@@ -56,7 +56,7 @@ class LiveScene:
             SettingsError: the tolerance cannot be.
         """
         with ExitStack() as opened:
-            sources = _open(self.specifications, opened)
+            sources = open_sources(self.specifications, opened)
             sensors = LiveSensors(
                 sources, self.cameras, self.backgrounds, live=live, tolerance=tolerance
             )
@@ -64,12 +64,19 @@ class LiveScene:
         return sensors
 
 
-def _open(
-    specifications: Mapping[str, SourceSpecification], opened: ExitStack
+def open_sources(
+    given: Mapping[str, SourceSpecification], opened: ExitStack, clock: Clock = time.monotonic
 ) -> dict[str, FrameSource]:
+    """Opens sources, which ``opened`` closes; SceneError: one cannot be."""
+    return {k: opened.enter_context(closing(open_source(one, clock))) for k, one in given.items()}
+
+
+def learn_backgrounds(given: Mapping[str, SourceSpecification]) -> dict[str, Background]:
+    """How the empty room looks to the cameras whose sources do not deliver masks."""
     return {
-        name: opened.enter_context(closing(open_source(one)))
-        for name, one in specifications.items()
+        name: learn_background(load_background_pictures(one))
+        for name, one in given.items()
+        if not one.gives_masks
     }
 
 
@@ -99,12 +106,7 @@ def load_live_scene(path: Path) -> LiveScene:
     if len(cameras) < 2:
         raise SceneError(f"{path}: a person is captured by two calibrated cameras or more")
     specifications = load_sources(path / SOURCES, cameras)
-    backgrounds = {
-        name: learn_background(load_background_pictures(one))
-        for name, one in specifications.items()
-        if not one.gives_masks
-    }
-    return LiveScene(path, cameras, specifications, backgrounds)
+    return LiveScene(path, cameras, specifications, learn_backgrounds(specifications))
 
 
 def take_empty_room(folder: Path, count: int) -> dict[str, Path]:
@@ -126,7 +128,7 @@ def take_empty_room(folder: Path, count: int) -> dict[str, Path]:
                 f"{place}: the background of camera '{name}' exists already; move it away first"
             )
     with ExitStack() as opened:
-        pictures = _take(_open(specifications, opened), count)
+        pictures = _take(open_sources(specifications, opened), count)
     for name, place in places.items():
         for k, picture in enumerate(pictures[name]):
             _, data = cv2.imencode(".png", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))

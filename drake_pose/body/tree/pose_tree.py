@@ -196,7 +196,7 @@ class PoseTree:
             SettingsError: an interval that is not positive, or a grid that is too large.
             UnknownNameError: ``intervals`` names something that does not exist.
         """
-        intervals = self._checked_intervals(intervals or {}, interval, length_interval)
+        intervals = self.require_intervals(intervals or {}, interval, length_interval)
         placement, names = self.placements[node], self.nodes[node].value_names
         rotation = placement.rotation
         if rotation is not None:
@@ -320,10 +320,15 @@ class PoseTree:
             values.append(placement.rotation.values_from(R_WN))
         return values
 
-    def _checked_intervals(
+    def require_intervals(
         self, intervals: Mapping[str, float], interval: float, length_interval: float
     ) -> Mapping[str, float]:
-        """The intervals, after checks."""
+        """The intervals [rad or m], after checks.
+
+        Raises:
+            SettingsError: one that is not positive.
+            UnknownNameError: of a position that does not exist.
+        """
         known = [name for node in self.nodes for name in node.value_names]
         known += [name for name in self.model.position_names if name not in known]
         for name in intervals:

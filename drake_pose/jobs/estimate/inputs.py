@@ -63,8 +63,7 @@ class Inputs:
 
     def joint_errors(self, frame: str, q: np.ndarray) -> dict[str, float]:
         """Estimate q (nq,) minus truth by position [deg or m], where the truth is known."""
-        values = None if self.truth is None else self.truth.of(frame)
-        if self.truth is None or values is None:
+        if self.truth is None or (values := self.truth.of(frame)) is None:
             return {}
         places = [self.model.position_index(name) for name in self.truth.names]
         errors = q[places] - values
@@ -118,25 +117,23 @@ def read_inputs(
         warnings = (*scene.warnings, *check_upright(scene.cameras.values()), *model.warnings)
         return Inputs(scene, model, frames, tracked, None, truth, warnings, None, starts)
     centres: Mapping[str, np.ndarray] | None = None
-    position: np.ndarray | None = None
-    search: PoseSearch
-    root = settings.root_position
+    position, root = None, settings.root_position
     if isinstance(root, tuple) and len(root) == 2:
         centres = read_joint_centres(*root, frames)
         position = centres[frames[0]]
     elif isinstance(root, tuple):
         position = np.array(root)
+    scene_as_used = leave_out_unreadable(scene, frames)
+    search: PoseSearch
     if root == "unknown" or scene.scale_unknown:
         search = make_placement_search(model, settings, position, scene.scale_unknown)
     else:
         search = make_search(model, settings, position)
-    scene = leave_out_unreadable(scene, frames)
-    if not isinstance(search, RootPlacementSearch):
         X_WN = search.tree.node_poses(search.tree.default_values())
         for camera in scene.cameras.values():
             require_visible(search.sampled.outlines, camera.X_CW @ X_WN, camera)
-    warnings = (*scene.warnings, *model_warnings(model, search.tree, settings.hold))
-    return Inputs(scene, model, frames, tracked, search, truth, warnings, centres, starts)
+    warnings = (*scene_as_used.warnings, *model_warnings(model, search.tree, settings.hold))
+    return Inputs(scene_as_used, model, frames, tracked, search, truth, warnings, centres, starts)
 
 
 def _read_truth(scene: Path, given: Path | None, names: Sequence[str]) -> TrueAngles | None:

@@ -59,14 +59,9 @@ def estimate_frames(
     played = inputs.frames[max(len(inputs.known) - 1, 0) :] if follows else left
     rate_hz = inputs.scene.frame_rate_hz or USUAL_RATE_HZ
     matching = build_recorded_matching(
-        replace(inputs.scene, frame_rate_hz=rate_hz),
-        search,
-        tuple(inputs.scene.cameras.values()),
-        played,
-        inputs.root_positions,
-        tracking=inputs.tracking,
-        starts=inputs.starts,
-    )
+        replace(inputs.scene, frame_rate_hz=rate_hz), search, tuple(inputs.scene.cameras.values()),
+        played, inputs.root_positions, tracking=inputs.tracking, starts=inputs.starts,
+    )  # fmt: skip
     simulator = Simulator(matching.diagram)
     for index, frame in enumerate(played):
         # The frame is matched at index periods; half a period later the answer surely stands.
@@ -82,84 +77,64 @@ def match_frames(
     inputs: Inputs, search: PoseSearch, overlay: bool, missing: Sequence[str]
 ) -> Iterator[FinishedFrame]:
     """The missing frames, matched or tracked, compared with their masks and drawn."""
-    scene, model = inputs.scene, inputs.model
-    renderers: dict[str, LabelRenderer] = {}
+    scene, model, renderers = inputs.scene, inputs.model, dict[str, LabelRenderer]()
     for frame, pose in estimate_frames(inputs, search, missing):
-        shown = {name: scene.read(name, frame) for name in scene.cameras_of(frame)}
-        if overlay:
-            shown = {**read_pictures(scene, frame), **shown}
-        drawn = {name: _draw(inputs, renderers, name, seen, pose) for name, seen in shown.items()}
+        masks = {name: scene.read(name, frame) for name in scene.cameras_of(frame)}
+        shown: dict[str, np.ndarray] = {**read_pictures(scene, frame), **masks} if overlay else {}
+        parts, more = {}, dict[str, Any]()
+        for name in {**masks, **shown} if pose.found else ():
+            camera = scene.cameras[name]
+            own = renderers.get(name) or renderers.setdefault(name, LabelRenderer(model, camera))
+            if isinstance(camera, ParallelCamera):
+                own.camera = scale_camera(camera, pose.scale)
+                if scene.scale_unknown and name in masks:
+                    more["camera_scale"] = own.camera.pixels_per_metre
+            parts[name] = own.segments(pose.q, pose.X_WB)
         yield finish_frame(
-            inputs,
-            frame,
-            pose,
-            {name: drawn[name] for name in scene.cameras_of(frame)},
-            drawn if overlay else {},
+            inputs, frame, pose, masks, parts, shown, **more,
             first_E_total=pose.first_E_total if pose.found else None,
-            runs=pose.statistics.runs,
-            outside_limit=pose.statistics.outside_limit,
-            camera_scale=_camera_scale(scene, frame, pose),
-            explained=pose.explained,
-            **record_pose_set(pose.pose_set, model),
-        )
+            runs=pose.statistics.runs, outside_limit=pose.statistics.outside_limit,
+            explained=pose.explained, **record_pose_set(pose.pose_set, model),
+        )  # fmt: skip
 
 
 def finish_frame(
     inputs: Inputs,
     frame: str,
     pose: PoseEstimate,
-    compared: Mapping[str, Drawn],
-    drawn: Mapping[str, Drawn],
+    masks: Mapping[str, np.ndarray],
+    parts: Mapping[str, np.ndarray],
+    shown: Mapping[str, np.ndarray],
     **more: Any,
 ) -> FinishedFrame:
-    """A frame as written, its masks ``compared`` with the body; more: fields of FrameRecord."""
-    agreement = compare_masks(
-        {name: one.seen for name, one in compared.items()},
-        {name: one.body for name, one in compared.items()},
-    )
+    """A frame as written, its masks compared with the body.
+
+    Args:
+        masks: by camera, of those that the pose was found by.
+        parts: by camera (H, W), which part of the body is seen, -1 where none is; none where no
+            pose was found.
+        shown: the masks and pictures over which the body is drawn.
+        more: fields of FrameRecord.
+    """
     base = base_cells(pose.X_WB) if inputs.base_moves and pose.found else None
     row = PoseRow(frame, pose.q, base, pose.E_total, pose.seconds)
-    record = FrameRecord.of(
-        row,
-        stopped_by=pose.stopped_by,
-        joint_errors=inputs.joint_errors(frame, pose.q) if row.found else {},
-        ious=agreement.ious if row.found else {},
-        **more,
-    )
-    return FinishedFrame(row, record, drawn)
+    more["stopped_by"] = pose.stopped_by
+    if row.found:
+        more["joint_errors"] = inputs.joint_errors(frame, pose.q)
+        bodies = {name: own >= 0 for name, own in parts.items()}
+        more["ious"] = compare_masks(masks, bodies).ious
+    drawn = {}
+    for name, seen in shown.items():
+        own = parts.get(name)
+        body = np.zeros(seen.shape[:2], np.bool_) if own is None else own >= 0
+        drawn[name] = Drawn(seen, body, own)
+    return FinishedFrame(row, FrameRecord.of(row, **more), drawn)
 
 
 def read_pictures(scene: Scene, frame: str) -> dict[str, np.ndarray]:
     """The pictures (H, W, 3) of a frame by camera."""
     names = [name for name in scene.cameras if (name, frame) in scene.images]
     return {name: scene.read_image(name, frame) for name in names}
-
-
-def _draw(
-    inputs: Inputs,
-    renderers: dict[str, LabelRenderer],
-    name: str,
-    seen: np.ndarray,
-    pose: PoseEstimate,
-) -> Drawn:
-    """The body beside what a camera, whose scale may have been found, saw."""
-    if not pose.found:
-        return Drawn(seen, np.zeros(seen.shape[:2], dtype=np.bool_), None)
-    camera = inputs.scene.cameras[name]
-    if name not in renderers:
-        renderers[name] = LabelRenderer(inputs.model, camera)
-    if isinstance(camera, ParallelCamera):
-        renderers[name].camera = scale_camera(camera, pose.scale)
-    segments = renderers[name].segments(pose.q, pose.X_WB)
-    return Drawn(seen, segments >= 0, segments)
-
-
-def _camera_scale(scene: Scene, frame: str, pose: PoseEstimate) -> float | None:
-    """Pixels a metre of the frame's camera, where they were not known."""
-    if not (scene.scale_unknown and pose.found):
-        return None
-    camera = scene.cameras[scene.cameras_of(frame)[0]]
-    return pose.scale * camera.pixels_per_metre if isinstance(camera, ParallelCamera) else None
 
 
 def compare_cameras(
@@ -221,37 +196,23 @@ def find_contradiction(
     for one, other in alike[:_PAIRS]:
         after = error({n: {one: other, other: one}.get(n, n) for n in cameras})
         if after < _LEFT * together:
-            return [_say_exchanged(one, other, together, after)]
+            return [
+                f"cameras '{one}' and '{other}' are exchanged, it seems: E_total is "
+                f"{percent(together)} together, but {percent(after)} with each other's pictures; "
+                "exchange their folders of masks, or their names in cameras.yaml"
+            ]
     alone = {name: error({name: name}) for name in cameras}
     areas = [sum(float(own[name].sum()) for own in masks.values()) for name in cameras]
     bad: Sequence[str] = [name for name in cameras if alone[name] >= BADLY_EXPLAINED]
     good = [alone[name] for name in cameras if name not in bad]
     if np.average(list(alone.values()), weights=areas) < _LEFT * together:
-        bad = _one_of(worst, together, error) or list(cameras)
+        left = {n: error({m: m for m in worst if m != n}) for n in worst[:_PAIRS] if len(worst) > 2}
+        first = min(left, key=lambda name: left[name], default="")
+        bad = [first] if first and left[first] < _LEFT * together else list(cameras)
     # A camera whose place the model's own contradicts is not explained even alone.
     elif not (bad and good and max(good) < _LEFT * min(alone[name] for name in bad)):
         return []
     return [_say_contradiction(bad, together, alone)]
-
-
-def _one_of(
-    worst: Sequence[str], together: float, error: Callable[[Mapping[str, str]], float]
-) -> Sequence[str]:
-    """The camera without which the others agree, of those that fit worst; none: all."""
-    if len(worst) > 2:
-        left = {n: error({m: m for m in worst if m != n}) for n in worst[:_PAIRS]}
-        first = min(left, key=lambda name: left[name])
-        if left[first] < _LEFT * together:
-            return [first]
-    return []
-
-
-def _say_exchanged(one: str, other: str, together: float, after: float) -> str:
-    return (
-        f"cameras '{one}' and '{other}' are exchanged, it seems: E_total is {percent(together)} "
-        f"together, but {percent(after)} with each other's pictures; exchange their folders of "
-        "masks, or their names in cameras.yaml"
-    )
 
 
 def _say_contradiction(cameras: Sequence[str], together: float, alone: Mapping[str, float]) -> str:

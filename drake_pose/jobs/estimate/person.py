@@ -5,21 +5,17 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from drake_pose.errors import MaskError, SceneError
 from drake_pose.files.records import record_deviations
-from drake_pose.files.writer import Drawn, FinishedFrame, OnFrame, OnStage, ResultWriter
+from drake_pose.files.writer import FinishedFrame, OnStage, ResultWriter
 from drake_pose.jobs.estimate.inputs import Inputs
 from drake_pose.jobs.estimate.matching import finish_frame, read_pictures
 from drake_pose.person.recordings.camera_faults import CameraFault
-from drake_pose.person.recordings.checked_capture import (
-    CheckedCapture,
-    capture_checked,
-)
+from drake_pose.person.recordings.checked_capture import CheckedCapture, capture_checked
 from drake_pose.person.recordings.figures import RigFault
 from drake_pose.person.recordings.person_capture import PersonCapture, capture_by_colour
 from drake_pose.person.recordings.persons_in_view import ReadFrame, ViewFaults
@@ -40,69 +36,60 @@ FOLLOWED = "followed"
 _FITS_BADLY = 0.6
 
 
-class _Followed(NamedTuple):
-    """A person's poses and shape, masks, warnings, and distances (frames,) [pixel] by colour."""
-
-    captured: PersonCapture
-    read: ReadFrame
-    faults: tuple[str, ...]
-    distances: NDArray[np.float64] | None = None
-
-
 def follow_person(
-    inputs: Inputs,
-    result: ResultWriter,
-    overlay: bool,
-    on_frame: OnFrame | None,
-    on_stage: OnStage | None,
-) -> None:
-    """Follows the person through all frames; then writes them, compared with their masks and drawn.
+    inputs: Inputs, result: ResultWriter, overlay: bool, on_stage: OnStage | None
+) -> tuple[Inputs, Iterator[FinishedFrame]]:
+    """Follows the person through all frames, which are compared with their masks and drawn then.
 
-    A resumed recording is followed as a whole again.
+    A resumed recording is followed as a whole again, if frames are missing.
 
-    Args:
-        overlay: whether overlays are written.
+    Returns:
+        What is estimated then, and its frames; once they are written, warnings stand in the result.
 
     Raises:
         ModelError: the model has no landmarks of a person.
         SceneError: none of the masks can be read, or fewer than two are there of the first picture.
         SettingsError: in no frame two cameras see a person.
     """
+    if result.rows.keys() >= set(inputs.frames):
+        return inputs, iter(())
     asked = {*inputs.frames, *result.rows}
-    frames = tuple(frame for frame in inputs.scene.frames if frame in asked)
-    inputs = replace(inputs, frames=frames)
+    inputs = replace(inputs, frames=tuple(one for one in inputs.scene.frames if one in asked))
     reader = _Reader(inputs, on_stage)
     begin = time.perf_counter()
-    follow = _follow_colours if inputs.scene.images else _follow_masks
-    followed = follow(inputs, reader)
+    if inputs.scene.images:
+        captured, read, faults, distances = _follow_colours(inputs, reader)
+    else:
+        checked = capture_checked(
+            inputs.model.pose_tree(), inputs.scene.cameras, reader, len(inputs.frames),
+            inputs.tracked, reader.count_followed,
+        )  # fmt: skip
+        captured, read = checked.captured, checked.read
+        faults = describe_faults(checked, inputs.frames)
+        distances = np.full(len(inputs.frames), np.nan)
     reader.on_stage = None
-    seconds = (time.perf_counter() - begin) / len(frames)
+    seconds = (time.perf_counter() - begin) / len(inputs.frames)
     result.rows.clear()
     result.records.clear()
     result.begin()
-    shape = followed.captured.shape
-    if shape is not None:
-        result.more |= {"lengths_m": shape.known.lengths, "girths": shape.known.girths}
-    finished = _finished_frames(inputs, followed, reader, seconds, overlay)
-    result.add_all(finished, frames, on_frame)
-    unread = describe_unreadable(reader.refused, inputs.scene.frames)
-    result.warnings += (*unread, *followed.faults)
+    if captured.shape is not None:
+        known = captured.shape.known
+        result.more |= {"lengths_m": known.lengths, "girths": known.girths}
+
+    def finished() -> Iterator[FinishedFrame]:
+        for index in range(len(inputs.frames)):
+            own = read(index), reader, float(distances[index])
+            yield _finish(inputs, captured, index, *own, seconds, overlay)
+        unread = describe_unreadable(reader.refused, inputs.scene.frames)
+        result.warnings += (*unread, *faults)
+
+    return inputs, finished()
 
 
-def _follow_masks(inputs: Inputs, reader: _Reader) -> _Followed:
-    checked = capture_checked(
-        inputs.model.pose_tree(),
-        inputs.scene.cameras,
-        reader,
-        len(inputs.frames),
-        inputs.tracked,
-        reader.count_followed,
-    )
-    return _Followed(checked.captured, checked.read, describe_faults(checked, inputs.frames))
-
-
-def _follow_colours(inputs: Inputs, reader: _Reader) -> _Followed:
-    """A sequence of pictures of which few have masks."""
+def _follow_colours(
+    inputs: Inputs, reader: _Reader
+) -> tuple[PersonCapture, ReadFrame, tuple[str, ...], NDArray[np.float64]]:
+    """A sequence of pictures of which few have masks: distances (frames,) of contours [pixel]."""
     scene, frames = inputs.scene, inputs.frames
     masked = [k for k, frame in enumerate(frames) if len(scene.cameras_of(frame)) > 1]
     if frames[0] not in inputs.starts and 0 not in masked:
@@ -135,7 +122,7 @@ def _follow_colours(inputs: Inputs, reader: _Reader) -> _Followed:
             "FILE.csv, say where the person is"
         )
         faults += (text,)
-    return _Followed(captured, reader, faults, distances)
+    return captured, reader, faults, distances
 
 
 class _Reader:
@@ -158,78 +145,67 @@ class _Reader:
                     self.refused[camera, frame] = str(error)
         require_readable(self.refused, self._scene)
         self._read_count += 1
-        self._report_stage()
-        return masks
-
-    def _report_stage(self) -> None:
-        """Says what a mask is read for: all are read once before anything else is done."""
-        count = len(self._frames)
-        if self.on_stage is None:
-            return
-        if self._read_count <= count:
-            self.on_stage("reading", self._read_count, count)
+        # All masks are read once before anything else is done.
+        count, again = len(self._frames), self._read_count - len(self._frames)
+        if again <= 0:
+            self._tell("reading", self._read_count, count)
         elif not self._followed:
-            self.on_stage("finding and measuring the person", self._read_count - count, None)
+            self._tell("finding and measuring the person", again, None)
         elif self._followed >= count:
-            self.on_stage("comparing the cameras", self._read_count - count, None)
+            self._tell("comparing the cameras", again, None)
+        return masks
 
     def count_followed(self, _: int) -> None:
         """Called after each frame in which the person was followed."""
         self._followed += 1
+        self._tell("following", self._followed, len(self._frames))
+
+    def _tell(self, what: str, done: int, of: int | None) -> None:
         if self.on_stage is not None:
-            self.on_stage("following", self._followed, len(self._frames))
+            self.on_stage(what, done, of)
 
 
-def _finished_frames(
-    inputs: Inputs, followed: _Followed, reader: ReadFrame, seconds: float, overlay: bool
-) -> Iterator[FinishedFrame]:
-    """The frames' masks compared with the captured person, of the girth that was found."""
-    scene, captured = inputs.scene, followed.captured
-    for index, frame in enumerate(inputs.frames):
-        masks, q = followed.read(index), captured.q[index]
-        shown: dict[str, NDArray[np.generic]] = dict(masks)
-        # A camera that was left out is shown, too, so that one sees why.
-        if len(masks) < len(scene.cameras_of(frame)):
-            shown = {**reader(index), **shown}
-        if overlay:
-            shown = {**read_pictures(scene, frame), **shown}
-        found = bool(np.isfinite(q).all())
-        by_colour = found and not masks and followed.distances is not None
-        parts = _draw_parts(inputs, captured, q, scene.cameras if by_colour else shown)
-        bodies = {name: part > 0 for name, part in parts.items()}
+def _finish(
+    inputs: Inputs,
+    captured: PersonCapture,
+    index: int,
+    masks: Mapping[str, Mask],
+    reader: ReadFrame,
+    distance: float,
+    seconds: float,
+    overlay: bool,
+) -> FinishedFrame:
+    """A frame with the captured person, of the girth that was found; distance: see above."""
+    scene, frame, q = inputs.scene, inputs.frames[index], captured.q[index]
+    shown: dict[str, NDArray[np.generic]] = read_pictures(scene, frame) if overlay else {}
+    # A camera that was left out is shown, too, so that one sees why.
+    if overlay and len(masks) < len(scene.cameras_of(frame)):
+        shown |= reader(index)
+    if overlay:
+        shown |= masks
+    found, by_colour = bool(np.isfinite(q).all()), not masks and np.isfinite(distance)
+    parts = {}
+    if found:
+        X_WN = captured.tree.node_poses(captured.tree.values_from_positions(q))
+        labels, outlines = range(1, 1 + len(captured.outlines)), captured.outlines
+        for name in scene.cameras if by_colour else {**masks, **shown}:
+            camera = scene.cameras[name]
+            parts[name] = draw_labels(outlines, labels, camera.X_CW @ X_WN, camera) - 1
+    bodies = {name: own >= 0 for name, own in parts.items()}
+    wrong, area = np.nan, float(sum(np.count_nonzero(mask) for mask in masks.values()))
+    if found and by_colour:
+        # Without masks, E_total is the strip between both contours over the body's area.
+        area = float(sum(np.count_nonzero(body) for body in bodies.values())) or 1.0
+        wrong = sum(map(edge_area, bodies.values())) * distance
+    elif found and area:
         wrong = float(sum(np.count_nonzero(mask ^ bodies[k]) for k, mask in masks.items()))
-        area = float(sum(np.count_nonzero(mask) for mask in masks.values()))
-        if by_colour and followed.distances is not None:
-            # Without masks, E_total is the strip between both contours over the body's area.
-            area = float(sum(np.count_nonzero(body) for body in bodies.values())) or 1.0
-            wrong = sum(map(edge_area, bodies.values())) * float(followed.distances[index])
-        if not (found and area):
-            wrong, area = np.nan, 1.0
-        pose = PoseEstimate(
-            found, q, np.eye(4), (), wrong, area, stopped_by=FOLLOWED, seconds=seconds
-        )
-        drawn = {name: Drawn(seen, bodies[name], parts[name]) for name, seen in shown.items()}
-        yield finish_frame(
-            inputs,
-            frame,
-            pose,
-            {name: drawn[name]._replace(seen=mask) for name, mask in masks.items()},
-            drawn if overlay else {},
-            joints=record_deviations(inputs.model, q, captured.deviations[index]),
-            share=float(captured.shares[index]),
-        )
-
-
-def _draw_parts(
-    inputs: Inputs, captured: PersonCapture, q: NDArray[np.float64], names: Mapping[str, object]
-) -> dict[str, NDArray[np.int16]]:
-    """Which part of the person each pixel of cameras shows, from 1 on; 0: none."""
-    cameras = {name: inputs.scene.cameras[name] for name in names}
-    if not np.isfinite(q).all():
-        return {k: np.zeros((c.height, c.width), dtype=np.int16) for k, c in cameras.items()}
-    X_WN = captured.tree.node_poses(captured.tree.values_from_positions(q))
-    labels, outlines = range(1, 1 + len(captured.outlines)), captured.outlines
-    return {k: draw_labels(outlines, labels, c.X_CW @ X_WN, c) for k, c in cameras.items()}
+    pose = PoseEstimate(
+        found, q, np.eye(4), (), wrong, area or 1.0, stopped_by=FOLLOWED, seconds=seconds
+    )
+    return finish_frame(
+        inputs, frame, pose, masks, parts, shown, share=float(captured.shares[index]),
+        joints=record_deviations(inputs.model, q, captured.deviations[index]),
+    )  # fmt: skip
 
 
 def describe_faults(checked: CheckedCapture, frames: Sequence[str]) -> tuple[str, ...]:

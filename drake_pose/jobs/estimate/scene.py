@@ -61,16 +61,17 @@ def estimate_scene(
     search, by_search = inputs.search, "paper" if settings.method == "paper" else "beam"
     result.more |= {"method": by_search if search is not None else "person"} | of_body
     result.begin()
-    missing = [frame for frame in inputs.frames if frame not in result.rows]
     try:
         if shapes is not None:
             result.write(SHAPES, encode_png(shapes))
-        if search is not None:
+        if search is None:
+            inputs, frames = follow_person(inputs, result, overlay, on_stage)
+        else:
+            missing = [frame for frame in inputs.frames if frame not in result.rows]
             frames = match_frames(inputs, search, overlay, missing)
-            result.add_all(frames, inputs.frames, on_frame)
+        result.add_all(frames, inputs.frames, on_frame)
+        if search is not None:
             result.warnings += compare_cameras(inputs, search, result.records, on_stage)
-        elif missing:
-            follow_person(inputs, result, overlay, on_frame, on_stage)
         result.finish(replay)
     finally:
         result.write_summary()

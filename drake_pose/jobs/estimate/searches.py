@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from pydrake.multibody.tree import BodyIndex
@@ -14,6 +13,7 @@ from drake_pose.body.model import ArticulatedModel
 from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.body.tree.root import RootRotation
 from drake_pose.errors import SettingsError
+from drake_pose.files.records import user_units
 from drake_pose.files.settings import EstimateSettings, RootTurns
 from drake_pose.search.continuous.multi_start import MultiStartSearch
 from drake_pose.search.continuous.root_placement_search import RootPlacementSearch
@@ -32,20 +32,18 @@ def make_search(
     model: ArticulatedModel, settings: EstimateSettings, position: np.ndarray | None
 ) -> PoseSearch:
     """The search for a root at its own place, or at a position (3,) in the world [m]."""
-    tree, sampling = make_tree(model, settings, position), _sampling(model, settings)
+    tree, beam = make_tree(model, settings, position), _sampling(model, settings)
     if settings.method == "paper":
         paper = PaperSearchSettings(
-            **sampling,
-            outside_limit=settings.outside_limit,
-            candidate_limit=settings.candidates,
+            beam.interval, beam.length_interval, beam.intervals,
+            outside_limit=settings.outside_limit, candidate_limit=settings.candidates,
             run_limit=settings.run_limit,
-        )
+        )  # fmt: skip
         return PaperSearch(tree, paper)
-    beam = BeamSearchSettings(**sampling, time_limit=settings.time_limit)
     if settings.angles == "grid":
         return BeamSearch(tree, beam, ExaminationSettings())
     # It samples as coarsely as it likes; but intervals of joints that are none are refused.
-    tree.grid(0, beam.interval, beam.intervals, beam.length_interval)
+    tree.require_intervals(beam.intervals, beam.interval, beam.length_interval)
     return MultiStartSearch(tree, beam.time_limit)
 
 
@@ -75,11 +73,10 @@ def make_placement_search(
     first = np.zeros(3) if position is None else position
     tree = make_tree(model, settings, None if settings.root is None else first)
     if settings.root is None and settings.root_rotation is None and turns_freely(tree):
-        held = _in_plant_units(model, settings.hold)
         rotation = RootRotation.free(interval_deg=_FREE_ROOT_INTERVAL)
+        held = _in_plant_units(model, settings.hold)
         tree = model.pose_tree(hub(tree), root_position=first, root_rotation=rotation, held=held)
-    beam = BeamSearchSettings(**_sampling(model, settings), time_limit=settings.time_limit)
-    return RootPlacementSearch(tree, beam, scale_unknown)
+    return RootPlacementSearch(tree, _sampling(model, settings), scale_unknown)
 
 
 def make_tree(
@@ -119,13 +116,9 @@ def leave_out_links(
     centre = model.pose_tree(
         hub(model.pose_tree()), root_position=np.zeros(3), root_rotation=RootRotation.free()
     )
-    held = {}
-    for node in centre.nodes:
-        if node.name in settings.unseen:
-            for name in node.value_names:
-                index = model.position_index(name)
-                unit = math.degrees(1.0) if model.position_kinds[index] == "angle" else 1.0
-                held[name] = unit * float(model.default_positions[index])
+    names = [k for node in centre.nodes if node.name in settings.unseen for k in node.value_names]
+    usual = user_units(model) * model.default_positions
+    held = {name: float(usual[model.position_index(name)]) for name in names}
     return model.without(settings.unseen), replace(settings, hold={**held, **settings.hold})
 
 
@@ -146,16 +139,13 @@ def _root_rotation(model: ArticulatedModel, root: str, turns: RootTurns) -> Root
 def _in_plant_units(model: ArticulatedModel, values: Mapping[str, float]) -> dict[str, float]:
     """Degrees become radians; lengths stay metres. Names that are no positions are angles."""
     kinds = dict(zip(model.position_names, model.position_kinds, strict=True))
-    return {
-        name: math.radians(value) if kinds.get(name, "angle") == "angle" else value
-        for name, value in values.items()
-    }
+    is_angle = {name: kinds.get(name, "angle") == "angle" for name in values}
+    return {name: math.radians(one) if is_angle[name] else one for name, one in values.items()}
 
 
-def _sampling(model: ArticulatedModel, settings: EstimateSettings) -> dict[str, Any]:
-    """The sampling intervals that all searches take."""
-    return {
-        "interval": math.radians(settings.interval),
-        "length_interval": settings.length_interval,
-        "intervals": _in_plant_units(model, settings.joint_intervals),
-    }
+def _sampling(model: ArticulatedModel, settings: EstimateSettings) -> BeamSearchSettings:
+    """The sampling intervals that all searches take, and the time limit."""
+    return BeamSearchSettings(
+        math.radians(settings.interval), settings.length_interval,
+        _in_plant_units(model, settings.joint_intervals), time_limit=settings.time_limit,
+    )  # fmt: skip

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -77,20 +78,24 @@ def find_masks(source: Source, settings: MaskSettings) -> Iterator[FoundMask]:
         # Beside its pictures a scene may have those of the empty room, which say what is meant.
         room = source.path / "background"
         background = room if room.is_dir() else None
-    ways = (background, settings.box, settings.model, settings.network)
-    if all(way is None for way in ways):
+    if all(way is None for way in (background, settings.box, settings.model, settings.network)):
         return _read_given(source, settings)
     if source.annotated:
         raise SceneError(
             f"{source.path}: has annotations, but the object is to be found in pictures"
         )
+    if background is None and settings.box is None and settings.model is not None:
+        return _find_by_model(source, settings.model, settings)
     if background is not None:
         return _find_each(source, _by_empty_room(source, background))
     if settings.box is not None:
-        return _find_each(source, _by_box(settings.box))
-    if settings.model is not None:
-        return _find_by_model(source, settings.model, settings)
-    return _find_each(source, _by_network(settings))
+        return _find_each(source, partial(_by_box, settings.box))
+    assert settings.network is not None
+    network = SegmentationNetwork(
+        settings.network, settings.classes, settings.network_size, settings.network_mean,
+        settings.network_std, settings.network_bgr,
+    )  # fmt: skip
+    return _find_each(source, lambda _, picture: (network.find(picture), ()))
 
 
 def _find_each(source: Source, find: Find) -> Iterator[FoundMask]:
@@ -143,35 +148,21 @@ def _read_annotated(source: Source, wanted: Sequence[str]) -> Iterator[FoundMask
         yield FoundMask(camera, frame, where, mask, warnings=warnings)
 
 
-def _by_box(box: Sequence[float]) -> Find:
+def _by_box(box: Sequence[float], _: str, picture: Picture) -> tuple[Mask, tuple[str, ...]]:
     """GrabCut within x, y, width and height [pixel]."""
-
-    def find(_: str, picture: Picture) -> tuple[Mask, tuple[str, ...]]:
-        mask = cut_box(picture, box)
-        part = mask.sum() / (box[2] * box[3])
-        is_good = part == 0.0 or _NONE_OF_BOX <= part <= _ALL_OF_BOX
-        return mask, () if is_good else (f"the mask is {part:.1%} of its box: find it another way",)
-
-    return find
-
-
-def _by_network(settings: MaskSettings) -> Find:
-    assert settings.network is not None
-    network = SegmentationNetwork(
-        settings.network, settings.classes, settings.network_size, settings.network_mean,
-        settings.network_std, settings.network_bgr,
-    )  # fmt: skip
-    return lambda _, picture: (network.find(picture), ())
+    mask = cut_box(picture, box)
+    part = mask.sum() / (box[2] * box[3])
+    is_good = part == 0.0 or _NONE_OF_BOX <= part <= _ALL_OF_BOX
+    return mask, () if is_good else (f"the mask is {part:.1%} of its box: find it another way",)
 
 
 def _by_empty_room(source: Source, background: Path | str) -> Find:
     """What differs from the background, as of ``MaskSettings.background``."""
-    rooms, doubts = {}, {}
-    for name in source.names:
-        rooms[name], doubts[name] = _background(source, name, background)
+    rooms = {name: _background(source, name, background) for name in source.names}
+    doubts = {name: told for name, (_, told) in rooms.items()}
 
     def find(camera: str, picture: Picture) -> tuple[Mask, tuple[str, ...]]:
-        room = rooms[camera]
+        room, _ = rooms[camera]
         if picture.shape != room.mean.shape:
             height, width = room.mean.shape[:2]
             raise SceneError(
@@ -239,17 +230,15 @@ def _doubt(room: Background, recording: Sequence[Picture]) -> tuple[str, ...]:
     """Why a recording's median is no good background."""
     support = background_support(recording, room)
     masks = [person_region(picture, room) for picture in recording]
-    doubtful = [float((support[mask] < _SUPPORT).mean()) for mask in masks if mask.any()]
-    part = float(np.median(doubtful)) if doubtful else 0.0
-    if part <= _DOUBTFUL:
-        return ()
+    doubtful = [float((support[mask] < _SUPPORT).mean()) for mask in masks if mask.any()] or [0.0]
+    part = float(np.median(doubtful))
     text = (
         f"the median of {len(recording)} pictures is no good background, here and in this camera's "
         f"other pictures: in {part:.0%} of the masks' area it is seen in fewer than three of four "
         "pictures, so the body may stand in it; give pictures of the empty room, or a longer "
         "recording in which the body leaves every place"
     )
-    return (text,)
+    return (text,) if part > _DOUBTFUL else ()
 
 
 def _find_by_model(source: Source, model: Path, settings: MaskSettings) -> Iterator[FoundMask]:
@@ -264,23 +253,17 @@ def _find_by_model(source: Source, model: Path, settings: MaskSettings) -> Itera
         for name in source.names
     }
     frames = in_order(frame for own in seen.values() for frame in own)
-    starts = [
-        table.of(frame, next(name for name in seen if frame in seen[name])) for frame in frames
-    ]
-    pictures = [
-        [own[frame][1] if frame in own else None for own in seen.values()] for frame in frames
-    ]
-    search = PoseAndMask(
-        kinematics, cameras, PoseAndMaskSettings(angle=math.radians(settings.start_error))
-    )
-    warned = table.warnings
-    found = dict(zip(frames, search.run(pictures, starts), strict=True))
+    starts = [table.of(one, next(name for name in seen if one in seen[name])) for one in frames]
+    pictures = [[own[one][1] if one in own else None for own in seen.values()] for one in frames]
+    how = PoseAndMaskSettings(angle=math.radians(settings.start_error))
+    poses = PoseAndMask(kinematics, cameras, how).run(pictures, starts)
+    found, warned = dict(zip(frames, poses, strict=True)), table.warnings
     for c, (name, own) in enumerate(seen.items()):
-        for frame in frames:
-            mask = found[frame].masks[c]
+        for frame, pose in found.items():
+            mask = pose.masks[c]
             if mask is not None:
                 where, picture = own[frame]
-                refusal, warnings = _judge(found[frame], c, kinematics.names)
+                refusal, warnings = _judge(pose, c, kinematics.names)
                 yield FoundMask(name, frame, where, mask, picture, refusal, (*warned, *warnings))
                 warned = ()
 
@@ -315,16 +298,16 @@ def _judge(pose: FoundPose, camera: int, names: Sequence[str]) -> tuple[str, tup
             "hidden, or the model another?",
             (),
         )
-    warnings = []
+    warnings, off = [], np.abs(pose.deviations)
     if agreement < _DOUBTED:
         warnings.append(
             f"pose and colours hardly agree: they overlap by {agreement:.0%} (IoU); look at the "
             "overlay"
         )
-    worst = int(np.argmax(np.abs(pose.deviations)))
-    if abs(pose.deviations[worst]) > _FAR:
+    worst = int(np.argmax(off))
+    if off[worst] > _FAR:
         warnings.append(
-            f"joint {names[worst]} is {abs(pose.deviations[worst]):.1f} standard deviations from "
-            "its start (--start-error); look at the overlay"
+            f"joint {names[worst]} is {off[worst]:.1f} standard deviations from its start "
+            "(--start-error); look at the overlay"
         )
     return "", tuple(warnings)

@@ -87,8 +87,7 @@ def make_masks(
             mask = largest_patch(found.mask) if settings.largest else found.mask
             refusal = found.refusal or refuse_mask(mask)
             warnings = [*found.warnings, *([] if refusal else doubt_mask(mask))]
-            entry: dict[str, Any] = {"area": int(mask.sum())}
-            entry = {"refusal": refusal} if refusal else entry
+            entry: dict[str, Any] = {"refusal": refusal} if refusal else {"area": int(mask.sum())}
             entry |= {"warnings": warnings} if warnings else {}
             cameras.setdefault(found.camera, {})[found.frame] = entry
             doubts += [f"{found.where}: {text}" for text in warnings]
@@ -119,7 +118,7 @@ def _summarize(
     folder: Path,
 ) -> dict[str, Any]:
     """What summary.json says; MaskError: no picture has a good mask."""
-    count = sum(len(frames) for frames in cameras.values()) - len(refused)
+    count = sum(map(len, cameras.values())) - len(refused)
     if not count:
         first, *more = refused or [f"{source.path}: has no picture"]
         raise MaskError(first + (f" (and {len(more)} more)" if more else ""))

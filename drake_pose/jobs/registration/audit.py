@@ -19,7 +19,7 @@ from drake_pose.files.options import percent
 from drake_pose.files.settings import EstimateSettings
 from drake_pose.files.summary import mask_digests
 from drake_pose.jobs.estimate.searches import make_tree
-from drake_pose.jobs.registration.inputs import KnownScene
+from drake_pose.jobs.registration.inputs import Inputs
 from drake_pose.jobs.registration.positions import read_known_positions
 from drake_pose.jobs.registration.result import describe_run, write_overlays
 from drake_pose.jobs.registration.settings import AuditSettings
@@ -74,8 +74,7 @@ def audit_scene(
     Raises:
         DrakePoseError: names the file, camera, frame or joint at fault.
     """
-    settings = settings or AuditSettings()
-    folder = None if out is None else Path(out)
+    settings, folder = settings or AuditSettings(), None if out is None else Path(out)
     if folder is not None:
         require_empty(folder)
     files = {
@@ -84,48 +83,37 @@ def audit_scene(
         "joints": Path(joints),
     }
     inputs, frames = _read_inputs(Path(scene), files, cameras is not None, settings)
-    begin = time.perf_counter()
+    begin, warnings = time.perf_counter(), list(inputs.warnings)
     found, unseen = _audit(inputs, frames, on_frame)
     seconds = time.perf_counter() - begin
-    warnings = list(inputs.warnings)
-    if unseen:
-        named = frame_ranges(unseen, inputs.scene.frames)
-        warnings.append(f"frame {named}: the masks show nothing: there is nothing to compare")
-    count, agreeing = len(found.frames), len(found.frames) - len(found.contradicting)
-    if 2 * agreeing < count:
-        warnings.append(
-            f"{agreeing} of {count} frames agree with each other: which of them are "
-            "right is told by their being near to what is given, not by their number"
-        )
+    warnings += _doubts(inputs, found, unseen)
+    names = [camera.name for camera in inputs.held]
     summary = {
-        "contradictions": describe_contradictions(found),
-        "frame_count": count,
-        "agreeing_count": agreeing,
-        "frames": {one.frame: _describe_frame(inputs, one) for one in found.frames},
+        "contradictions": _describe_contradictions(found),
+        "frame_count": len(found.frames),
+        "agreeing_count": len(found.frames) - len(found.contradicting),
+        "frames": {
+            one.frame: {
+                "agrees": one.finding is None,
+                "fits": dict(one.given),
+                "fits_when_freed": dict(one.fitted),
+                "pixels": one.pixels,
+                "masks": mask_digests(inputs.scene, names, one.frame),
+            }
+            for one in found.frames
+        },
         "error_sizes_px": {name: float(getattr(found.sizes, name)) for name in _SIZES},
         **describe_run(Path(scene), files, settings, warnings, seconds),
         "unseen": unseen,
     }
     if folder is not None:
-        _write_result(folder, inputs, found.contradicting if overlay else (), summary)
+        _write_result(folder, inputs, found if overlay else None, summary)
     return SceneAudit(found, summary, tuple(warnings), folder)
-
-
-def _describe_frame(inputs: KnownScene, one: FrameAudit) -> dict[str, Any]:
-    """A frame's part of summary.json."""
-    names = [camera.name for camera in inputs.held]
-    return {
-        "agrees": one.finding is None,
-        "fits": dict(one.given),
-        "fits_when_freed": dict(one.fitted),
-        "pixels": one.pixels,
-        "masks": mask_digests(inputs.scene, names, one.frame),
-    }
 
 
 def _read_inputs(
     scene_path: Path, files: Mapping[str, Path], own: bool, settings: AuditSettings
-) -> tuple[KnownScene, tuple[str, ...]]:
+) -> tuple[Inputs, tuple[str, ...]]:
     """What is audited, and its frames, checked; own: whether it has a camera file of its own."""
     given = load_cameras(files["cameras"]) if own else None
     scene, frames = read_scene(scene_path, settings.cameras, settings.frames, given)
@@ -144,11 +132,11 @@ def _read_inputs(
             "all frames show the robot in one pose, to a degree: errors of a joint's zero and of a "
             "camera that are the same in all frames can hardly be told apart"
         )
-    return KnownScene(scene, tree, positions, chosen, tuple(warnings)), frames
+    return Inputs(scene, model, tree, positions, chosen, tuple(warnings)), frames
 
 
 def _audit(
-    inputs: KnownScene, frames: Sequence[str], on_frame: OnFrame | None
+    inputs: Inputs, frames: Sequence[str], on_frame: OnFrame | None
 ) -> tuple[Audit, list[str]]:
     """What was found, and the frames of which no mask shows anything."""
     body = RegistrationBody(inputs.tree)
@@ -156,105 +144,108 @@ def _audit(
     sample = [inputs.read(frames[int(k)]) for k in picks]
     fit = PerFrameFit(body.kinematics, (body.few, body.all), inputs.held, sample)
     fitted, unseen = [], []
-    for done, frame in enumerate(frames):
+    for done, frame in enumerate(frames, 1):
         seen = inputs.read(frame)
         if seen.masks:
             fitted.append(fit.fit(seen))
         else:
             unseen.append(frame)
         if on_frame is not None:
-            on_frame(done + 1)
+            on_frame(done)
     if not fitted:
         raise MaskError(f"{inputs.scene.path}: no mask shows the body; it must be white in them")
     return audit_frames(fit, fitted), unseen
 
 
-def describe_contradictions(found: Audit) -> list[dict[str, Any]]:
-    """What contradicts the rest, worst first: joints, cameras and the base, then frames."""
-    common = [_describe(one, one.kind, one.name, _say_common(one)) for one in found.common]
-    frames = [
-        _describe(one.finding, "frame", one.frame, _say_frame(one, one.finding))
-        for one in sorted(found.frames, key=lambda one: -one.pixels)
-        if one.finding is not None
-    ]
-    return common + frames
+def _doubts(inputs: Inputs, found: Audit, unseen: Sequence[str]) -> list[str]:
+    """What a user should know of the frames."""
+    warnings = []
+    if unseen:
+        named = frame_ranges(unseen, inputs.scene.frames)
+        warnings.append(f"frame {named}: the masks show nothing: there is nothing to compare")
+    count, agreeing = len(found.frames), len(found.frames) - len(found.contradicting)
+    if 2 * agreeing < count:
+        warnings.append(
+            f"{agreeing} of {count} frames agree with each other: which of them are "
+            "right is told by their being near to what is given, not by their number"
+        )
+    return warnings
 
 
 def _write_result(
-    path: Path, inputs: KnownScene, named: tuple[str, ...], summary: Mapping[str, Any]
+    path: Path, inputs: Inputs, found: Audit | None, summary: Mapping[str, Any]
 ) -> None:
-    """The summary, and the robot at its encoders' positions over the masks of some frames."""
-    frames = summary["frames"]
+    """The summary, and the robot at its encoders' positions over the masks of frames at fault."""
+    named = () if found is None else found.contradicting
     for camera in inputs.held if named else ():
-        name = camera.name
-        posed = [
-            PosedFrame(one.name, one.values, one.masks[name])
-            for one in map(inputs.read, named)
-            if name in one.masks
-        ]
-        titles = [
-            f"{name}  frame {one.name}  CONTRADICTS the others  "
-            f"{percent(frames[one.name]['fits'][name])} fits"
-            for one in posed
-        ]
-        write_overlays(path, inputs.tree, camera, zip(posed, titles, strict=True))
+        name, titled = camera.name, []
+        for one in map(inputs.read, named):
+            if name in one.masks:
+                fits = percent(summary["frames"][one.name]["fits"][name])
+                title = f"{name}  frame {one.name}  CONTRADICTS the others  {fits} fits"
+                titled.append((PosedFrame(one.name, one.values, one.masks[name]), title))
+        write_overlays(path, inputs.tree, camera, titled)
     write_summary(path, summary)
 
 
-def _describe(one: Finding, what: str, name: str, text: str) -> dict[str, Any]:
-    """A finding as summary.json holds it: lengths in mm, angles in degrees."""
-    return {
-        "what": what,
-        "name": name,
-        "text": text,
-        "cause": one.kind,
-        "cause_name": one.name,
-        "angle_deg": float(np.degrees(one.angle)),
-        "angle_sd_deg": float(np.degrees(one.angle_sd)),
-        "shift_mm": 1e3 * one.shift,
-        "shift_sd_mm": 1e3 * one.shift_sd,
-        "pixels": one.pixels,
-        "chance": one.p_value,
-        "rivals": list(one.rivals),
-        "joints": dict(one.joints),
-    }
-
-
-def _say_common(one: Finding) -> str:
-    """A contradiction of all frames in words."""
-    return f"{_name(one)}: off {_amount(one)} in all frames that agree, {_pixels(one)}"
+def _describe_contradictions(found: Audit) -> list[dict[str, Any]]:
+    """What contradicts the rest, worst first: joints, cameras and the base, then frames."""
+    told = [
+        (one, one.kind, one.name, f"{_off(one, 'off')} in all frames that agree, {_pixels(one)}")
+        for one in found.common
+    ]
+    told += [
+        (one.finding, "frame", one.frame, f"frame '{one.frame}': {_say_frame(one, one.finding)}")
+        for one in sorted(found.frames, key=lambda one: -one.pixels)
+        if one.finding is not None
+    ]
+    return [
+        {
+            "what": what,
+            "name": name,
+            "text": text,
+            "cause": one.kind,
+            "cause_name": one.name,
+            "angle_deg": float(np.degrees(one.angle)),
+            "angle_sd_deg": float(np.degrees(one.angle_sd)),
+            "shift_mm": 1e3 * one.shift,
+            "shift_sd_mm": 1e3 * one.shift_sd,
+            "pixels": one.pixels,
+            "chance": one.p_value,
+            "rivals": list(one.rivals),
+            "joints": dict(one.joints),
+        }
+        for one, what, name, text in told
+    ]
 
 
 def _say_frame(one: FrameAudit, found: Finding) -> str:
-    """A frame that contradicts the others in words."""
+    """What contradicts the others in a frame, in words."""
     if found.kind == "unexplained":
         worst = min(one.fitted, key=lambda name: one.fitted[name])
         return (
-            f"frame '{one.frame}': no positions near those given explain it: in camera '{worst}' "
+            f"no positions near those given explain it: in camera '{worst}' "
             f"{percent(one.fitted[worst])} of the contours fit at best"
         )
     if found.kind == "joints":
         named = sorted(found.joints.items(), key=lambda item: -abs(item[1]))
         joints = ", ".join(name for name, _ in named[:_NAMED])
         more = f" ({joints} most)" if joints else ""
-        return f"frame '{one.frame}': is of other positions: joints are off{more}, {_pixels(found)}"
-    return f"frame '{one.frame}': {_name(found)} is off {_amount(found)}, {_pixels(found)}"
+        return f"is of other positions: joints are off{more}, {_pixels(found)}"
+    return f"{_off(found, 'is off')}, {_pixels(found)}"
 
 
-def _name(one: Finding) -> str:
-    """What is off, and what explains it as well."""
+def _off(one: Finding, verb: str) -> str:
+    """What is off, and what explains it as well; by how much, with standard deviations."""
     name = "the base" if one.kind == "base" else f"{one.kind} '{one.name}'"
-    return name + (f" (or {', '.join(one.rivals)}: the masks cannot tell)" if one.rivals else "")
-
-
-def _amount(one: Finding) -> str:
-    """By how much, with standard deviations."""
+    if one.rivals:
+        name += f" (or {', '.join(one.rivals)}: the masks cannot tell)"
     parts = []
     if one.angle_sd > 0.0:
         parts.append(f"{np.degrees(one.angle):.2f} +- {np.degrees(one.angle_sd):.2f} degrees")
     if one.shift_sd > 0.0:
         parts.append(f"{1e3 * one.shift:.1f} +- {1e3 * one.shift_sd:.1f} mm")
-    return "by " + " and ".join(parts)
+    return f"{name}{':' if verb == 'off' else ''} {verb} by {' and '.join(parts)}"
 
 
 def _pixels(one: Finding) -> str:

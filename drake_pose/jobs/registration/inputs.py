@@ -54,39 +54,15 @@ _OF_A_PERSON = (
 
 
 @dataclass(frozen=True)
-class KnownScene:
-    """A scene of a robot at known joint positions.
+class Inputs:
+    """What is registered or audited, from what: a scene of a robot at known joint positions.
 
     Args:
         scene: the recorded scene; cameras whose X_WC is missing stand at the world's origin.
         tree: the robot's pose tree in the world, or in the frame of the link on which cameras ride.
         positions: of the joints in each frame.
         held: the cameras whose place is known.
-    """
-
-    scene: Scene
-    tree: PoseTree
-    positions: KnownPositions
-    held: tuple[Camera, ...]
-    warnings: tuple[str, ...]
-
-    def read(self, frame: str) -> SeenFrame:
-        """A frame's positions, and the held cameras' masks but for those that show nothing."""
-        masks = {
-            one.name: self.scene.read(one.name, frame, may_be_empty=True)
-            for one in self.held
-            if (one.name, frame) in self.scene.masks
-        }
-        seen = {name: mask for name, mask in masks.items() if mask.any()}
-        return SeenFrame(frame, self.positions.of(frame, next(iter(masks), "")), seen)
-
-
-@dataclass(frozen=True)
-class Inputs(KnownScene):
-    """What is registered, from what.
-
-    Args:
-        frames: what the cameras see.
+        frames: what the cameras see, where it was read already.
         searched: the cameras that are to be found.
         seen: the tree's nodes that the masks show; None: all.
         standing: the object that the cameras see from their link, if it is not the robot. Until it
@@ -95,23 +71,31 @@ class Inputs(KnownScene):
         left_out: cameras without X_WC that are not to be found.
     """
 
-    held: tuple[PinholeCamera, ...]
+    scene: Scene
     model: ArticulatedModel
-    frames: tuple[SeenFrame, ...]
-    searched: tuple[PinholeCamera, ...]
-    seen: tuple[str, ...] | None
-    standing: StandingObject | None
-    zeros: tuple[str, ...]
-    lengths: tuple[str, ...]
-    left_out: tuple[str, ...]
+    tree: PoseTree
+    positions: KnownPositions
+    held: tuple[Camera, ...]
+    warnings: tuple[str, ...]
+    frames: tuple[SeenFrame, ...] = ()
+    searched: tuple[PinholeCamera, ...] = ()
+    seen: tuple[str, ...] | None = None
+    standing: StandingObject | None = None
+    zeros: tuple[str, ...] = ()
+    lengths: tuple[str, ...] = ()
+    left_out: tuple[str, ...] = ()
+
+    def read(self, frame: str) -> SeenFrame:
+        """A frame's positions, and the held cameras' masks but for those that show nothing."""
+        names = [one.name for one in self.held if (one.name, frame) in self.scene.masks]
+        masks = {name: self.scene.read(name, frame, may_be_empty=True) for name in names}
+        seen = {name: mask for name, mask in masks.items() if mask.any()}
+        return SeenFrame(frame, self.positions.of(frame, next(iter(masks), "")), seen)
 
     def of(self, camera: str) -> list[PosedFrame]:
         """What a camera sees."""
-        return [
-            PosedFrame(one.name, one.values, one.masks[camera])
-            for one in self.frames
-            if camera in one.masks
-        ]
+        own = [one for one in self.frames if camera in one.masks]
+        return [PosedFrame(one.name, one.values, one.masks[camera]) for one in own]
 
     def moved(self, values: Mapping[str, Array]) -> tuple[SeenFrame, ...]:
         """The frames at other values (m,) of the tree, by name."""
@@ -140,7 +124,13 @@ def read_inputs(
     if joints_path is not None and standing is None:
         table = read_true_angles(joints_path, model.position_names)
     if joints_path is None or (table is not None and table.is_estimate):
-        _check_estimable(settings)
+        # Only measured joint positions tell these.
+        for name in ("zeros", "lengths", "focal", "on", "suggest"):
+            if getattr(settings, name):
+                raise SettingsError(
+                    f"--{name} needs measured joint positions (--joints FILE): those that are "
+                    "estimated follow what it asks for"
+                )
     if table is not None and table.bases:
         model, table = put_on_base(model, table)
     tree, seen = make_registration_tree(model, settings, standing)
@@ -154,18 +144,13 @@ def read_inputs(
     else:
         on_link = settings.on is not None
         positions = read_known_positions(joints_path, kinematics, on_link, table)
-    warnings = (*scene.warnings, *model.warnings, *positions.warnings)
-    known = KnownScene(scene, tree, positions, held, warnings)
-    frames = _read_frames(known, searched, settings.frames)
-    left_out = tuple(
-        name
-        for name in (*file.unplaced, *file.links)
-        if name not in [camera.name for camera in searched]
-    )
+    found = [camera.name for camera in searched]
     inputs = Inputs(
-        scene, tree, positions, held, warnings, model, frames, searched, seen, standing, zeros,
-        lengths, left_out,
+        scene, model, tree, positions, held,
+        (*scene.warnings, *model.warnings, *positions.warnings), (), searched, seen, standing,
+        zeros, lengths, tuple(k for k in (*file.unplaced, *file.links) if k not in found),
     )  # fmt: skip
+    inputs = replace(inputs, frames=_read_frames(inputs, settings.frames))
     return replace(inputs, warnings=(*inputs.warnings, *_look_at(inputs)))
 
 
@@ -203,16 +188,6 @@ def _select_cameras(
         elif isinstance(camera, PinholeCamera) and name not in unplaced and settings.on is None:
             held.append(camera)
     return tuple(searched), tuple(held)
-
-
-def _check_estimable(settings: RegistrationSettings) -> None:
-    """Refuses what only measured joint positions tell."""
-    for name in ("zeros", "lengths", "focal", "on", "suggest"):
-        if getattr(settings, name):
-            raise SettingsError(
-                f"--{name} needs measured joint positions (--joints FILE): those that are "
-                "estimated follow what it asks for"
-            )
 
 
 def _read_target(model: ArticulatedModel, settings: RegistrationSettings) -> StandingObject | None:
@@ -282,27 +257,31 @@ def _select_parameters(
     return zeros, lengths
 
 
-def _read_frames(
-    known: KnownScene, searched: Sequence[PinholeCamera], wanted: Sequence[str]
-) -> tuple[SeenFrame, ...]:
+def _read_frames(inputs: Inputs, wanted: Sequence[str]) -> tuple[SeenFrame, ...]:
     """What cameras see; a bad mask of one that is to be found is refused.
 
     Of cameras that are held there is what can be compared with them.
     """
-    scene, positions = known.scene, known.positions
-    if positions.is_estimate:
-        wanted = _spread_frames(scene, searched, positions, wanted)
+    scene, positions, searched = inputs.scene, inputs.positions, inputs.searched
+    estimated = positions.is_estimate
+    if estimated:
+        wanted = _spread_frames(inputs, select_frames(scene.frames, wanted, str(scene.path)))
     asked = {one.name: scene.of_cameras([one.name]).seen_frames(wanted) for one in searched}
     found = []
     for frame in select_frames(scene.frames, wanted, str(scene.path)):
         masks = {}
-        for camera in asked:
-            if frame in asked[camera]:
-                positions.of(frame, camera)
-                masks[camera] = _read_mask(scene, camera, frame, positions.is_estimate)
+        for camera in (name for name, frames in asked.items() if frame in frames):
+            positions.of(frame, camera)
+            try:
+                masks[camera] = scene.read(camera, frame, may_be_empty=estimated)
+            except MaskError as error:
+                raise MaskError(
+                    f"{error} (camera '{camera}', frame '{frame}'); mend it, or leave the frame "
+                    "out (--frame)"
+                ) from error
         masks = {camera: mask for camera, mask in masks.items() if mask.any()}
         if positions.has(frame):
-            masks |= known.read(frame).masks
+            masks |= inputs.read(frame).masks
         if masks:
             found.append(SeenFrame(frame, positions.of(frame, next(iter(masks))), masks))
     for camera in asked:
@@ -311,7 +290,7 @@ def _read_frames(
                 f"camera '{camera}': no mask shows the body in the frames in which its pose was "
                 f"estimated: {', '.join(wanted)}"
             )
-    if positions.is_estimate and not any(c.name in one.masks for c in known.held for one in found):
+    if estimated and not any(c.name in one.masks for c in inputs.held for one in found):
         raise SceneError(
             f"{scene.path}: the joint positions were estimated, so they are fitted together with "
             "the cameras, but no camera with an X_WC has a mask of those frames: leave X_WC of the "
@@ -320,32 +299,17 @@ def _read_frames(
     return tuple(found)
 
 
-def _read_mask(scene: Scene, camera: str, frame: str, may_be_empty: bool) -> NDArray[np.bool_]:
-    try:
-        return scene.read(camera, frame, may_be_empty=may_be_empty)
-    except MaskError as error:
-        raise MaskError(
-            f"{error} (camera '{camera}', frame '{frame}'); mend it, or leave the frame out "
-            "(--frame)"
-        ) from error
-
-
-def _spread_frames(
-    scene: Scene,
-    cameras: Sequence[PinholeCamera],
-    positions: KnownPositions,
-    wanted: Sequence[str],
-) -> tuple[str, ...]:
+def _spread_frames(inputs: Inputs, asked: Sequence[str]) -> tuple[str, ...]:
     """Frames with positions which the cameras see, as many as tell more than the first ones do."""
-    asked = select_frames(scene.frames, wanted, str(scene.path))
-    known = [frame for frame in asked if positions.has(frame)]
-    for camera in cameras:
-        if not any((camera.name, frame) in scene.masks for frame in known):
+    scene, names = inputs.scene, [camera.name for camera in inputs.searched]
+    known = [frame for frame in asked if inputs.positions.has(frame)]
+    for name in names:
+        if not any((name, frame) in scene.masks for frame in known):
             raise SceneError(
-                f"{scene.path}: camera '{camera.name}' has no mask of a frame in which the cameras "
+                f"{scene.path}: camera '{name}' has no mask of a frame in which the cameras "
                 "whose X_WC is known tell the body's pose; give masks of the same moments"
             )
-    seen = [frame for frame in known if any((one.name, frame) in scene.masks for one in cameras)]
+    seen = [frame for frame in known if any((name, frame) in scene.masks for name in names)]
     chosen = np.linspace(0, len(seen) - 1, _MOST_FRAMES).round().astype(int)
     return tuple(dict.fromkeys(seen[k] for k in chosen))
 

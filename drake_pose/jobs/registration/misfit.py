@@ -74,12 +74,14 @@ def require_explained(
     misfit = find_misfit(found)
     if misfit is None:
         return
-    search = search.rough()
-    better = [
-        text
-        for text, other, seen in _others(found.camera, frames)
-        if _explains(search, other, seen, _left(found))
-    ]
+    search, better = search.rough(), []
+    for text, camera, seen in _others(found.camera, frames):
+        try:
+            other = search.register(camera, seen)
+        except RegistrationError:
+            continue
+        if find_misfit(other) is None and _left(other) < _MUCH_BETTER * _left(found):
+            better.append(text)
     advice = "; ".join(better) or (
         "are these masks of this robot or object, are the joint positions those of these frames, "
         "in radians and with the signs and zeros of the model's file, are focal length and "
@@ -167,16 +169,6 @@ def _others(
             f"they fit with focal lengths near {focal_x:.0f}, {focal_y:.0f} pixels: calibrate it."
         )
         yield text, replace(camera, focal_x=focal_x, focal_y=focal_y), some
-
-
-def _explains(
-    search: Search, camera: PinholeCamera, frames: Sequence[PosedFrame], left: float
-) -> bool:
-    try:
-        found = search.register(camera, frames)
-    except RegistrationError:
-        return False
-    return find_misfit(found) is None and _left(found) < _MUCH_BETTER * left
 
 
 def _left(found: RegisteredCamera) -> float:

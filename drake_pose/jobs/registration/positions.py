@@ -42,52 +42,41 @@ class KnownPositions:
     """Where all joints are in each frame.
 
     Args:
-        kinematics: of the pose tree.
-        table: its columns and rows.
-        order: (m,) the column of each value of the pose tree; -1: it is held.
+        path: of what says so.
+        values: (m,) of the pose tree by ``frame_key`` [rad or m].
+        is_estimate: whether they were estimated, so that they are off.
         warnings: what the user should know of it.
         girths: (nodes,) how many times as wide as the model's the nodes were found to be.
     """
 
+    path: Path
     kinematics: TreeKinematics
-    table: TrueAngles
-    order: NDArray[np.intp]
+    values: Mapping[int | str, Array]
+    is_estimate: bool = False
     warnings: tuple[str, ...] = ()
     girths: Array | None = None
 
-    @property
-    def is_estimate(self) -> bool:
-        """Whether they were estimated, so that they are off."""
-        return self.table.is_estimate
-
     def has(self, frame: str) -> bool:
         """Whether there is a row of a frame."""
-        return self.table.of(frame) is not None
+        return frame_key(frame) in self.values
 
     def of(self, frame: str, camera: str) -> Array:
-        """(m,) values of the pose tree in a frame [rad or m].
+        """(m,) values of the pose tree in a frame that a camera sees [rad or m].
 
         Raises:
             SceneError: the table has no row of it.
         """
-        values = self.table.of(frame)
-        if values is None:
+        if not self.has(frame):
             raise SceneError(
-                f"{self.table.path}: has no row of frame '{frame}', which camera '{camera}' has a "
-                "mask of; add the joint positions of that moment, or leave the frame out (--frame)"
+                f"{self.path}: has no row of frame '{frame}', which camera '{camera}' has a mask "
+                "of; add the joint positions of that moment, or leave the frame out (--frame)"
             )
-        return np.where(self.order < 0, self.kinematics.lower, values[self.order])
+        return self.values[frame_key(frame)]
 
     def are_one_pose(self, rows: Iterable[Array], times: float = 1.0) -> bool:
-        """Whether the joints are at the same place in all of some rows (m,).
-
-        Args:
-            rows: the rows.
-            times: so many times a degree or 5 mm is the same.
-        """
-        values = np.array(list(rows))
+        """Whether joints are at one place in rows (m,), to so many times a degree or 5 mm."""
         same = times * np.where(self.kinematics.is_angle, _SAME_ANGLE, _SAME_LENGTH)
-        return bool((np.ptp(values, axis=0) < same).all())
+        return bool((np.ptp(np.array(list(rows)), axis=0) < same).all())
 
 
 def put_on_base(model: ArticulatedModel, table: TrueAngles) -> tuple[ArticulatedModel, TrueAngles]:
@@ -150,12 +139,12 @@ def read_known_positions(
             "robot in the world; the cameras are found in the world in which the robot stands as "
             "its model's file has it: leave the column out"
         )
-    order = np.array(
-        [table.names.index(name) if name in asked else -1 for name in kinematics.names],
-        dtype=np.intp,
-    )
-    warnings = _check_units(table, order, kinematics)
-    return KnownPositions(kinematics, table, order, warnings)
+    columns = [table.names.index(name) if name in asked else -1 for name in kinematics.names]
+    is_held = np.array(columns) < 0
+    rows = table.values.items()
+    values = {k: np.where(is_held, kinematics.lower, row[columns]) for k, row in rows}
+    warnings = _check_units(path, kinematics, values)
+    return KnownPositions(path, kinematics, values, table.is_estimate, warnings)
 
 
 def _as_they_are(table: TrueAngles, tree: PoseTree) -> set[str]:
@@ -170,39 +159,34 @@ def _as_they_are(table: TrueAngles, tree: PoseTree) -> set[str]:
 
 
 def _check_units(
-    table: TrueAngles, order: NDArray[np.intp], kinematics: TreeKinematics
+    path: Path, kinematics: TreeKinematics, known: Mapping[int | str, Array]
 ) -> tuple[str, ...]:
     """Refuses degrees and millimetres; warns of values outside the limits."""
     warnings = []
-    frames = list(table.values)
-    for column, name, is_angle, lower, upper in zip(
-        order, kinematics.names, kinematics.is_angle, kinematics.lower, kinematics.upper,
-        strict=True,
-    ):  # fmt: skip
-        if column < 0 or not frames or not np.isfinite([lower, upper]).all():
-            continue
-        values = np.array([table.values[frame][column] for frame in frames])
-        slack = _OUTSIDE if is_angle else _OUTSIDE_SHARE * (upper - lower)
+    bounded = np.isfinite(kinematics.lower) & np.isfinite(kinematics.upper)
+    for k in np.flatnonzero(bounded) if known else ():
+        name, lower, upper = kinematics.names[k], kinematics.lower[k], kinematics.upper[k]
+        values = np.array([row[k] for row in known.values()])
+        what, unit, other, scale = "length", "m", "metres", 1e-3
+        slack, most = _OUTSIDE_SHARE * (upper - lower), _MANY * max(abs(lower), abs(upper))
+        if kinematics.is_angle[k]:
+            what, unit, other, scale = "angle", "rad", "radians", math.pi / 180.0
+            slack, most = _OUTSIDE, _FULL_TURN
         off = np.maximum(lower - values, values - upper)
         worst = int(np.argmax(off))
         if off[worst] <= slack:
             continue
-        what, unit = ("angle", "rad") if is_angle else ("length", "m")
         text = (
-            f"{table.path}: column '{name}', frame {frames[worst]}: {values[worst]:g} {unit} lies "
+            f"{path}: column '{name}', frame {list(known)[worst]}: {values[worst]:g} {unit} lies "
             f"outside the joint's limits, {lower:.4g} to {upper:.4g} {unit}"
-        )
-        scale, other, most = (
-            (math.pi / 180.0, "degrees", _FULL_TURN)
-            if is_angle
-            else (1e-3, "millimetres", _MANY * max(abs(lower), abs(upper)))
         )
         scaled = scale * values
         inside = (lower - slack <= scaled) & (scaled <= upper + slack)
         if np.abs(values).max() > most and inside.all():
+            wrong = "degrees" if unit == "rad" else "millimetres"
             raise SceneError(
-                f"{text}, but not in {other}: the file seems to be in {other}; write every {what} "
-                f"in {'radians' if is_angle else 'metres'}"
+                f"{text}, but not in {wrong}: the file seems to be in {wrong}; write every {what} "
+                f"in {other}"
             )
         warnings.append(
             f"{text}: is its column another joint's, its zero or sign another, its unit another?"
@@ -224,43 +208,28 @@ def estimate_positions(
         DrakePoseError: as for an estimate.
     """
     names = tuple(camera.name for camera in known)
-    _require_enough(scene_path, model, names)
+    if not names:
+        raise SceneError(
+            f"{scene_path}: neither a camera's place nor the body's joint positions are known: "
+            "give X_WC of one camera or more (of two for a person), or joint positions (--joints)"
+        )
+    if len(names) < 2 and not missing_for_person(model):
+        raise SceneError(
+            f"{scene_path}: {names[0]} is the only camera that has an X_WC, and one camera does "
+            "not tell where a person is: give X_WC of two cameras or more, or the person's joint "
+            "positions (--joints)"
+        )
     found = estimate_scene(scene_path, model.path, None, replace(settings, cameras=names))
-    values: dict[int | str, Array] = {}
-    for row in found.rows:
-        if row.found:
-            values[frame_key(row.frame)] = row.q
+    columns = [found.position_names.index(name) for name in kinematics.names]
+    values = {frame_key(row.frame): row.q[columns] for row in found.rows if row.found}
     if not values:
         raise SceneError(
             f"{scene_path}: camera {', '.join(names)}, whose X_WC is known, sees the body in no "
             "frame well enough to tell its pose, so nothing tells where the others are: give its "
             "joint positions (--joints), or cameras with X_WC that see it"
         )
-    index = [found.position_names.index(name) for name in kinematics.names]
-    table = TrueAngles(scene_path, found.position_names, values, is_estimate=True)
-    girths = _girths(kinematics.tree, found.summary.get("girths", {}))
-    order = np.array(index, dtype=np.intp)
-    return KnownPositions(kinematics, table, order, found.warnings, girths)
-
-
-def _require_enough(path: Path, model: ArticulatedModel, names: Sequence[str]) -> None:
-    """Refuses to begin where known cameras are too few for the body."""
-    if not names:
-        raise SceneError(
-            f"{path}: neither a camera's place nor the body's joint positions are known: give X_WC "
-            "of one camera or more (of two for a person), or joint positions (--joints)"
-        )
-    if len(names) < 2 and not missing_for_person(model):
-        raise SceneError(
-            f"{path}: {names[0]} is the only camera that has an X_WC, and one camera does not tell "
-            "where a person is: give X_WC of two cameras or more, or the person's joint positions "
-            "(--joints)"
-        )
-
-
-def _girths(tree: PoseTree, of_parts: Mapping[str, float]) -> Array | None:
-    """(nodes,) of the girths by part; None where there are none."""
-    if not of_parts:
-        return None
-    parts, groups = shape_parts(tree)
-    return np.array([of_parts.get(parts[group], 1.0) for group in groups])
+    girths = None
+    if of_parts := found.summary.get("girths"):
+        parts, groups = shape_parts(kinematics.tree)
+        girths = np.array([of_parts.get(parts[group], 1.0) for group in groups])
+    return KnownPositions(scene_path, kinematics, values, True, found.warnings, girths)

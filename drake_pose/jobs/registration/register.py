@@ -2,27 +2,33 @@
 
 from __future__ import annotations
 
+import os
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from drake_pose.body.formats.urdf_shape import reshaped
 from drake_pose.body.model import OBJECT_POSITIONS
-from drake_pose.camera.models import Camera
+from drake_pose.body.tree.pose_tree import PoseTree
+from drake_pose.body.tree.tree_kinematics import TreeKinematics
+from drake_pose.camera.models import Camera, PinholeCamera
 from drake_pose.files.folder import require_empty
 from drake_pose.files.options import percent
 from drake_pose.files.summary import BADLY_EXPLAINED
-from drake_pose.jobs.registration.inputs import Inputs, read_inputs
+from drake_pose.jobs.estimate.inputs import missing_for_person
+from drake_pose.jobs.registration.inputs import Inputs, make_registration_tree, read_inputs
 from drake_pose.jobs.registration.misfit import (
     Search,
     check_focal_length,
     require_determined,
     require_explained,
 )
-from drake_pose.jobs.registration.refit import corrected_urdf, find_zeros, refit_poses
 from drake_pose.jobs.registration.result import (
     describe_camera,
     describe_parameters,
@@ -30,7 +36,13 @@ from drake_pose.jobs.registration.result import (
     write_result,
 )
 from drake_pose.jobs.registration.settings import RegistrationSettings
-from drake_pose.registration.joint_zeros import JointCalibration
+from drake_pose.person.shape import shape_parts, shape_values
+from drake_pose.registration.bundle_adjustment import adjust_bundle
+from drake_pose.registration.joint_zeros import (
+    JointCalibration,
+    calibrate_joints,
+    lengthened_joints,
+)
 from drake_pose.registration.object_search import ObjectSearch
 from drake_pose.registration.posed_frames import PosedFrames
 from drake_pose.registration.register import (
@@ -40,7 +52,7 @@ from drake_pose.registration.register import (
     RegistrationBody,
     suggest_pose,
 )
-from drake_pose.registration.start_poses import E_total, areas
+from drake_pose.registration.start_poses import E_total, areas, intersection_over_union
 from drake_pose.silhouette.pictures.scene_checks import frame_ranges
 from drake_pose.silhouette.pictures.scenes import CAMERA_FILE
 
@@ -89,82 +101,88 @@ def register_scene(
         RegistrationError: no pose of a camera explains its masks. Nothing is written then.
         DrakePoseError: names the file, camera, frame or joint at fault.
     """
-    settings = settings or RegistrationSettings()
-    paths = Path(scene), Path(model), None if joints is None else Path(joints)
-    folder = None if out is None else Path(out)
+    settings, folder = settings or RegistrationSettings(), None if out is None else Path(out)
+    files = {
+        "model": Path(model),
+        "cameras": Path(scene) / CAMERA_FILE,
+        "joints": None if joints is None else Path(joints),
+    }
     if folder is not None:
         require_empty(folder)
-    inputs = read_inputs(*paths, settings)
-    search = _Search(inputs, settings)
-    warnings = [*inputs.warnings, *_check_held(inputs, search.body)]
-    warnings += search.run(on_camera)
-    inputs, registered = replace(inputs, tree=search.body.tree), search.registered
-    start = time.perf_counter()
-    urdf, parameters = None, dict[str, dict[str, Any]](zeros={}, lengths={})
-    if inputs.positions.is_estimate:
-        registered, inputs, body = refit_poses(inputs, search.body, registered)
-        for found in registered.values():
-            require_explained(CameraSearch(body), found, inputs.of(found.camera.name))
+    work = _Registration(read_inputs(Path(scene), Path(model), files["joints"], settings), settings)
+    work.check_held()
+    work.find_each(on_camera)
+    start, urdf = time.perf_counter(), None
+    if work.inputs.positions.is_estimate:
+        work.refit_poses()
     # Cameras that see one object are found one after another, but it stands in one place.
-    several = inputs.standing is not None and len(registered) > 1
+    several = work.inputs.standing is not None and len(work.registered) > 1
     if settings.zeros or settings.lengths or settings.focal or several:
-        registered, corrected, zeros = find_zeros(inputs, settings, search.body, registered)
-        parameters = describe_parameters(zeros, search.body.kinematics)
-        warnings += _say_zeros(zeros)
-        urdf = corrected_urdf(inputs, zeros, folder)
-        inputs = corrected
-    more = (time.perf_counter() - start) / len(registered)
-    described = search.describe(registered, more, parameters)
+        urdf = work.find_zeros(folder)
+    described = work.describe((time.perf_counter() - start) / len(work.registered))
     cameras = {
-        name: registered[name].camera if name in registered else camera
-        for name, camera in inputs.scene.cameras.items()
-        if name not in inputs.left_out
+        name: work.registered[name].camera if name in work.registered else camera
+        for name, camera in work.inputs.scene.cameras.items()
+        if name not in work.inputs.left_out
     }
-    summary = _summarize(paths, settings, described, warnings)
+    seconds = sum(one["seconds"] for one in described.values())
+    summary = {
+        # A single camera's part stands at the top as well.
+        **(next(iter(described.values())) if len(described) == 1 else {}),
+        **describe_run(Path(scene), files, settings, work.warnings, seconds),
+        "cameras": described,
+    }
     if folder is not None:
-        write_result(folder, inputs, cameras, registered, summary, overlay, urdf)
-    return SceneRegistration(cameras, registered, summary, tuple(warnings), folder)
+        write_result(folder, work.inputs, cameras, work.registered, summary, overlay, urdf)
+    return SceneRegistration(cameras, work.registered, summary, tuple(work.warnings), folder)
 
 
-def _summarize(
-    paths: tuple[Path, Path, Path | None],
-    settings: RegistrationSettings,
-    cameras: Mapping[str, dict[str, Any]],
-    warnings: Sequence[str],
-) -> dict[str, Any]:
-    """The content of summary.json: a single camera's part stands at the top as well."""
-    scene, model, joints = paths
-    files = {"model": model, "cameras": scene / CAMERA_FILE, "joints": joints}
-    seconds = sum(one["seconds"] for one in cameras.values())
-    return {
-        **(next(iter(cameras.values())) if len(cameras) == 1 else {}),
-        **describe_run(scene, files, settings, warnings, seconds),
-        "cameras": dict(cameras),
-    }
+class _Registration:
+    """A registration under way.
 
-
-class _Search:
-    """The search for each camera by itself.
-
-    An object whose place is not known is found with the first camera, and then stands there.
+    Attributes:
+        inputs, body: as they are known by now.
+        registered, seconds, suggestions: of the cameras that were found, by name.
+        parameters: what the summary says of zeros and lengths.
     """
 
     def __init__(self, inputs: Inputs, settings: RegistrationSettings) -> None:
-        self._inputs, self._settings = inputs, settings
+        self.inputs, self._settings = inputs, settings
         self.body = RegistrationBody(inputs.tree, inputs.seen, girths=inputs.positions.girths)
+        self._held = [one for one in inputs.held if isinstance(one, PinholeCamera)]
+        self.warnings = list(inputs.warnings)
         self.registered = dict[str, RegisteredCamera]()
         self.seconds = dict[str, float]()
         self.suggestions = dict[str, dict[str, Any] | None]()
+        self.parameters: dict[str, Any] = {"zeros": {}, "lengths": {}}
 
-    def run(self, on_camera: OnCamera | None) -> list[str]:
-        """Finds all cameras; returns warnings.
+    def check_held(self) -> None:
+        """Says so where a camera whose X_WC is given does not see the robot where it stands."""
+        for camera in self._held:
+            frames = self.inputs.of(camera.name)
+            if not frames:
+                continue
+            posed = PosedFrames(self.body.kinematics, self.body.all, camera, frames)
+            left = float(np.median(E_total(areas(posed, camera.X_CW[None], np.inf)[0])))
+            if left >= BADLY_EXPLAINED:
+                self.warnings.append(
+                    f"camera '{camera.name}' is held at its X_WC, but the robot is not seen there: "
+                    f"body and silhouettes differ by {percent(left)} of the silhouettes' area; is "
+                    "its world another than the robot's base? It is found anew with "
+                    f"--camera {camera.name}"
+                )
+
+    def find_each(self, on_camera: OnCamera | None) -> None:
+        """Finds each camera by itself.
+
+        An object whose place is not known is found with the first camera, and then stands there.
 
         Raises:
             RegistrationError: no pose of a camera explains its masks.
         """
-        inputs, standing, seen = self._inputs, self._inputs.standing, None
+        inputs, standing, seen = self.inputs, self.inputs.standing, None
         search: Search = CameraSearch(self.body) if standing is None else ObjectSearch(standing)
-        measured, warnings = not inputs.positions.is_estimate, list[str]()
+        measured = not inputs.positions.is_estimate
         for camera in inputs.searched:
             start, frames = time.perf_counter(), inputs.of(camera.name)
             found = search.register(camera, frames)
@@ -175,28 +193,25 @@ class _Search:
                 if found.seen_object is not None:
                     seen, self.body = found.seen_object, standing.body(found.seen_object.X_WT)
                     search = CameraSearch(self.body)
-                    warnings += _say_object(seen)
+                    self.warnings += _say_object(seen)
                 found = replace(found, seen_object=seen)
             if measured:
-                warnings += check_focal_length(self.body, found, frames)
+                self.warnings += check_focal_length(self.body, found, frames)
             self.registered[camera.name] = found
             self.suggestions[camera.name] = self._suggestion(found)
             self.seconds[camera.name] = time.perf_counter() - start
-            warnings += _warnings_of(found)
+            self.warnings += _warnings_of(found)
             if on_camera is not None:
                 on_camera(len(self.registered))
-        return warnings + say_common(self.registered.values())
+        self.warnings += say_common(self.registered.values())
+        self.inputs = replace(inputs, tree=self.body.tree)
 
-    def describe(
-        self, registered: Mapping[str, RegisteredCamera], more: float, parameters: Mapping[str, Any]
-    ) -> dict[str, dict[str, Any]]:
+    def describe(self, more: float) -> dict[str, dict[str, Any]]:
         """The cameras' parts of the summary, each of which took so long more [s]."""
+        on, told = self._settings.on, self.suggestions
         return {
-            name: dict(parameters)
-            | describe_camera(
-                one, self.seconds[name] + more, self.suggestions[name], self._settings.on
-            )
-            for name, one in registered.items()
+            name: self.parameters | describe_camera(one, self.seconds[name] + more, told[name], on)
+            for name, one in self.registered.items()
         }
 
     def _suggestion(self, found: RegisteredCamera) -> dict[str, Any] | None:
@@ -211,21 +226,137 @@ class _Search:
         positions = {name: value for name, value in values if name not in OBJECT_POSITIONS}
         return {"positions": positions, "difference": told[1]}
 
+    def refit_poses(self) -> None:
+        """Cameras, frames' estimated positions and body, fitted to what all cameras see.
+
+        Positions that were estimated are off, and so the cameras that were found by them.
+
+        Raises:
+            RegistrationError: no pose of a camera explains its masks.
+        """
+        inputs, registered = self.inputs, self.registered
+        wrong = {name: found.contradictions for name, found in registered.items()}
+        frames = [
+            replace(
+                one, masks={c: m for c, m in one.masks.items() if one.name not in wrong.get(c, ())}
+            )
+            for one in inputs.frames
+        ]
+        cameras = [*self._held, *(found.camera for found in registered.values())]
+        shape: tuple[Any, ...] = (np.zeros(len(self.body.kinematics.names), np.bool_),)
+        if not missing_for_person(inputs.model):
+            shape = (shape_values(inputs.tree), *shape_parts(inputs.tree))
+        fitted = adjust_bundle(
+            self.body.kinematics, self.body.few, cameras, registered, frames, *shape
+        )
+        values = {one.name: own for one, own in zip(frames, fitted.values, strict=True)}
+        self.inputs = replace(inputs, frames=inputs.moved(values))
+        known = inputs.positions.girths
+        girths = fitted.girths * (1.0 if known is None else known)
+        self.body = RegistrationBody(inputs.tree, inputs.seen, girths=girths)
+        for camera, covariance in zip(fitted.cameras, fitted.covariances, strict=True):
+            self._found_again(self.body.kinematics, camera, covariance)
+            found = self.registered[camera.name]
+            require_explained(CameraSearch(self.body), found, self.inputs.of(camera.name))
+
+    def find_zeros(self, folder: Path | None) -> bytes | None:
+        """Zeros of joints, lengths of links and focal lengths, fitted with the cameras.
+
+        Returns:
+            the corrected URDF for a folder, if there is one.
+
+        Raises:
+            RegistrationError: fewer frames than zeros and lengths.
+        """
+        inputs, names, cameras = self.inputs, self.body.kinematics.names, self.registered
+        found = calibrate_joints(
+            self.body,
+            list(cameras.values()),
+            [inputs.of(name) for name in cameras],
+            inputs.zeros,
+            self._settings.focal,
+            lengths=inputs.lengths,
+        )
+        self.parameters = describe_parameters(found, self.body.kinematics)
+        self.warnings += _say_zeros(found)
+        offsets = np.zeros(len(names))
+        for zero in found.zeros:
+            offsets[names.index(zero.name)] = zero.value
+        model, tree, standing = inputs.model, inputs.tree, inputs.standing
+        seen = next(iter(cameras.values())).seen_object
+        shifts = _joint_shifts(tree, found)
+        if shifts:
+            model = model.reshaped(shifts=shifts)
+        if standing is not None and seen is not None:
+            standing = standing.before(model)
+            seen = standing.moved_pose(seen, found.object_values, found.object_covariance)
+            tree = standing.tree(seen.X_WT)
+        elif shifts:
+            tree, _ = make_registration_tree(model, self._settings)
+        values = {one.name: one.values + offsets for one in inputs.frames}
+        self.inputs = replace(inputs, model=model, tree=tree, frames=inputs.moved(values))
+        kinematics = TreeKinematics(tree)
+        for camera, covariance in zip(found.cameras, found.covariances, strict=True):
+            self._found_again(kinematics, camera, covariance, seen)
+        return None if folder is None else _corrected_urdf(inputs, found, shifts, folder)
+
+    def _found_again(
+        self,
+        kinematics: TreeKinematics,
+        camera: PinholeCamera,
+        covariance: NDArray[np.float64],
+        seen: ObjectPose | None = None,
+    ) -> None:
+        """A camera where it was found now, with its frames' misfits; which agree is as it was."""
+        before = self.registered[camera.name]
+        frames = PosedFrames(kinematics, self.body.all, camera, self.inputs.of(camera.name))
+        found = areas(frames, camera.X_CW[None], np.inf)[0]
+        misfits = zip(before.frames, E_total(found), intersection_over_union(found), strict=True)
+        again = [replace(one, E_total=float(off), iou=float(iou)) for one, off, iou in misfits]
+        self.registered[camera.name] = replace(
+            before, camera=camera, covariance=covariance, frames=tuple(again), seen_object=seen
+        )
+
+
+def _joint_shifts(tree: PoseTree, found: JointCalibration) -> dict[str, list[float]]:
+    """By how much joints stand elsewhere on their links (3,), by name [m]; empty: none does."""
+    longer = {one.name: one.value for one in found.lengths if one.determined}
+    offsets = lengthened_joints(tree, longer)
+    return {one.joint: (longer[one.link] * one.p_L).tolist() for one in offsets}
+
+
+def _corrected_urdf(
+    inputs: Inputs, found: JointCalibration, shifts: Mapping[str, list[float]], folder: Path
+) -> bytes | None:
+    """The URDF with zeros and lengths in its joints' origins; its meshes as seen from a folder.
+
+    None where nothing was asked for, or the model is no URDF.
+    """
+    model = inputs.model.path
+    if not inputs.model.changes_shape or not (found.zeros or found.lengths):
+        return None
+    zeros = {zero.name: zero.value for zero in found.zeros if zero.determined}
+    text = model.read_text(encoding="utf-8")
+    root = ElementTree.fromstring(reshaped(text, zeros=zeros, shifts=shifts))
+    for mesh in root.iter("mesh"):
+        name = mesh.get("filename", "")
+        if "://" not in name:
+            mesh.set("filename", os.path.relpath(model.parent / name, folder))
+    return ElementTree.tostring(root, encoding="utf-8", xml_declaration=True)
+
 
 def _say_zeros(found: JointCalibration) -> list[str]:
     """What a user should know of zeros and lengths."""
     asked = [(f"joint '{one.name}': its zero", one) for one in found.zeros]
     asked += [(f"link '{one.name}': its length", one) for one in found.lengths]
-    texts = []
-    for what, one in asked:
-        if not one.determined:
-            goes_with = f" it goes with {', '.join(one.gauge)};" if one.gauge else ""
-            texts.append(
-                f"{what} is not determined by these silhouettes and was left as it is;{goes_with} "
-                "frames in which the robot stands otherwise, or a part of it that does not move "
-                "with this one, would tell it"
-            )
-    return texts
+    return [
+        f"{what} is not determined by these silhouettes and was left as it is;"
+        + (f" it goes with {', '.join(one.gauge)};" if one.gauge else "")
+        + " frames in which the robot stands otherwise, or a part of it that does not move with "
+        "this one, would tell it"
+        for what, one in asked
+        if not one.determined
+    ]
 
 
 def _say_object(seen: ObjectPose) -> list[str]:
@@ -298,23 +429,4 @@ def _warnings_of(found: RegisteredCamera) -> list[str]:
             "be told; which is the camera's nobody knows: see registration.yaml and the overlays, "
             "and add frames in which the robot stands otherwise"
         )
-    return texts
-
-
-def _check_held(inputs: Inputs, body: RegistrationBody) -> list[str]:
-    """Says so where a camera whose X_WC is given does not see the robot where it stands."""
-    texts = []
-    for camera in inputs.held:
-        frames = inputs.of(camera.name)
-        if not frames:
-            continue
-        posed = PosedFrames(body.kinematics, body.all, camera, frames)
-        left = float(np.median(E_total(areas(posed, camera.X_CW[None], np.inf)[0])))
-        if left >= BADLY_EXPLAINED:
-            texts.append(
-                f"camera '{camera.name}' is held at its X_WC, but the robot is not seen there: "
-                f"body and silhouettes differ by {percent(left)} of the silhouettes' area; is its "
-                "world another than the robot's base? It is found anew with "
-                f"--camera {camera.name}"
-            )
     return texts

@@ -24,7 +24,7 @@ from drake_pose.files.folder import (
 )
 from drake_pose.files.options import percent
 from drake_pose.files.overlay import draw_overlay, encode_png
-from drake_pose.files.report_page import Picture, overlay_picture, page_template
+from drake_pose.files.report_page import overlay_picture, page_template
 from drake_pose.files.summary import file_digest, versions
 from drake_pose.jobs.registration.inputs import Inputs
 from drake_pose.jobs.registration.settings import AuditSettings
@@ -48,9 +48,6 @@ PARAMETERS = (
 """Keys of the summary that hold parameters of the robot: title, what they are of, what they are."""
 
 
-_ERROR_NAMES = ("turn_x", "turn_y", "turn_z", "x", "y", "z")
-
-
 def describe_camera(
     found: RegisteredCamera,
     seconds: float,
@@ -65,17 +62,15 @@ def describe_camera(
         suggestion: a pose of the robot that would tell poses apart.
         link: on which the camera rides, in whose frame its pose is then.
     """
-    poses = [found.camera.X_WC, *found.alternatives]
-    pose, on = ("X_WC", {}) if link is None else ("X_LC", {"link": link})
+    pose, on, seen = "X_WC", dict[str, Any](), found.seen_object
+    if link is not None:
+        pose, on = "X_LC", {"link": link}
     return {
         **on,
-        pose: found.camera.X_WC.tolist(),
-        "translation_sd_mm": 1e3 * found.translation_sd,
-        "rotation_sd_deg": float(np.degrees(found.rotation_sd)),
-        "families": [{pose: np.asarray(X).tolist()} for X in poses],
+        **_describe_pose(pose, found.camera.X_WC, found),
         "mean_iou": float(np.mean([frame.iou for frame in found.frames])),
         "suggestion": suggestion,
-        **({} if found.seen_object is None else {"target": _describe_object(found.seen_object)}),
+        **({} if seen is None else {"target": _describe_object(seen)}),
         "seconds": seconds,
         "contradictions": list(found.contradictions),
         "frames": {
@@ -90,16 +85,23 @@ def describe_camera(
     }
 
 
+def _describe_pose(name: str, X: Array, found: RegisteredCamera | ObjectPose) -> dict[str, Any]:
+    """A pose (4, 4), how sure it is, and those that look alike."""
+    return {
+        name: X.tolist(),
+        "translation_sd_mm": 1e3 * found.translation_sd,
+        "rotation_sd_deg": float(np.degrees(found.rotation_sd)),
+        "families": [{name: np.asarray(one).tolist()} for one in (X, *found.alternatives)],
+    }
+
+
 def _describe_object(seen: ObjectPose) -> dict[str, Any]:
     """Where an object stands that a camera on a link has seen."""
     return {
-        "X_WT": seen.X_WT.tolist(),
+        **_describe_pose("X_WT", seen.X_WT, seen),
         "determined": not len(seen.round_about),
-        "translation_sd_mm": 1e3 * seen.translation_sd,
-        "rotation_sd_deg": float(np.degrees(seen.rotation_sd)),
         "covariance": seen.covariance.tolist(),
         "round_about": seen.round_about.tolist(),
-        "families": [{"X_WT": X.tolist()} for X in (seen.X_WT, *seen.alternatives)],
     }
 
 
@@ -108,22 +110,22 @@ def describe_parameters(
 ) -> dict[str, dict[str, Any]]:
     """Zeros in degrees or mm, lengths in percent, by name; None where it is not determined."""
     described: dict[str, dict[str, Any]] = {"zeros": {}, "lengths": {}}
-    for kind, several in (("zeros", found.zeros), ("lengths", found.lengths)):
-        for one in several:
-            unit, factor = ("percent", 1e2)
-            if kind == "zeros":
-                turns = kinematics.is_angle[kinematics.names.index(one.name)]
-                unit, factor = ("deg", float(np.degrees(1.0))) if turns else ("mm", 1e3)
-            numbers = {"value": one.value, "sd": one.deviation, "low": one.low, "high": one.high}
-            described[kind][one.name] = {
-                "determined": one.determined,
-                "significant": one.significant,
-                **{
-                    f"{key}_{unit}": factor * value if one.determined else None
-                    for key, value in numbers.items()
-                },
-                "gauge": list(one.gauge),
-            }
+    for kind, one in (
+        *(("zeros", zero) for zero in found.zeros),
+        *(("lengths", length) for length in found.lengths),
+    ):
+        unit, factor = "percent", 1e2
+        if kind == "zeros":
+            turns = kinematics.is_angle[kinematics.names.index(one.name)]
+            unit, factor = ("deg", float(np.degrees(1.0))) if turns else ("mm", 1e3)
+        numbers = {"value": one.value, "sd": one.deviation, "low": one.low, "high": one.high}
+        told = {k: factor * value if one.determined else None for k, value in numbers.items()}
+        described[kind][one.name] = {
+            "determined": one.determined,
+            "significant": one.significant,
+            **{f"{key}_{unit}": value for key, value in told.items()},
+            "gauge": list(one.gauge),
+        }
     return described
 
 
@@ -165,6 +167,7 @@ def write_result(
         OutputError: the folder is not empty, or cannot be written.
     """
     require_empty(path)
+    parts = summary["cameras"]
     for name, found in registered.items() if overlay else ():
         titles = [
             f"{name}  frame {one.frame}  E_total {percent(one.E_total)}  IoU {one.iou:.2f}  "
@@ -175,14 +178,13 @@ def write_result(
         write_overlays(path, inputs.tree, found.camera, titled, inputs.seen)
     if urdf is not None:
         write_file(path, f"{inputs.model.path.stem}_calibrated.urdf", urdf)
-    text = yaml.safe_dump(
-        {name: _uncertainty(found, summary["cameras"][name]) for name, found in registered.items()},
-        sort_keys=False,
-    )
-    write_file(path, REGISTRATION, text)
+    described = {
+        name: without_nan(_uncertainty(registered[name], one)) for name, one in parts.items()
+    }
+    write_file(path, REGISTRATION, yaml.safe_dump(described, sort_keys=False))
     write_summary(path, summary)
     write_file(path, REPORT, make_registration_report(path, summary))
-    links = {name: one["link"] for name, one in summary["cameras"].items() if "link" in one}
+    links = {name: one["link"] for name, one in parts.items() if "link" in one}
     write_file(path, CAMERA_FILE, dump_cameras(cameras, links))
 
 
@@ -209,7 +211,15 @@ def parameter_rows(parameters: Mapping[str, Mapping[str, Any]]) -> list[tuple[st
 def make_registration_report(folder: Path, summary: Mapping[str, Any]) -> str:
     """The page report.html, with the overlays in the result's folder."""
     # Cameras see one robot: its zeros and lengths are the same in all their parts.
-    first = next(iter(summary["cameras"].values()))
+    first, pictures = next(iter(summary["cameras"].values())), []
+    for camera, one in summary["cameras"].items():
+        # From the worst to the best, as far as they were written.
+        errors = {frame: float(told["E_total"]) for frame, told in one["frames"].items()}
+        in_order = sorted(errors, key=lambda frame: -errors[frame])
+        count = min(_PICTURES, len(in_order))
+        for k in np.linspace(0, len(in_order) - 1, count).round().astype(int):
+            frame = in_order[k]
+            pictures.append(overlay_picture(folder, camera, frame, errors[frame]))
     return page_template("drake_pose.jobs.registration", "report_template.html.j2").render(
         summary=summary,
         title=Path(str(summary["scene"])).name or str(summary["scene"]),
@@ -220,38 +230,20 @@ def make_registration_report(folder: Path, summary: Mapping[str, Any]) -> str:
             for key, title, of, what in PARAMETERS
             if first[key]
         ],
-        pictures=[
-            picture
-            for camera, one in summary["cameras"].items()
-            for picture in _pick_pictures(folder, camera, one["frames"])
-        ],
+        pictures=[picture for picture in pictures if picture is not None],
     )
-
-
-def _pick_pictures(folder: Path, camera: str, frames: Mapping[str, Any]) -> list[Picture]:
-    """Overlays of a camera's frames from the worst to the best, as far as they were written."""
-    in_order = sorted(frames, key=lambda frame: float(-frames[frame]["E_total"]))
-    count = min(_PICTURES, len(in_order))
-    chosen = [in_order[k] for k in np.linspace(0, len(in_order) - 1, count).round().astype(int)]
-    shown = (
-        overlay_picture(folder, camera, frame, float(frames[frame]["E_total"])) for frame in chosen
-    )
-    return [picture for picture in shown if picture is not None]
 
 
 def _uncertainty(found: RegisteredCamera, summary: Mapping[str, Any]) -> dict[str, Any]:
     """A camera's part of registration.yaml, given its part of summary.json."""
-    values: dict[str, Any] = without_nan(
-        {
-            **{name: summary[name] for name in ("link", "X_LC", "X_WC") if name in summary},
-            "errors": list(_ERROR_NAMES),
-            "covariance": found.covariance,
-            "alternatives": [np.asarray(X_WC) for X_WC in found.alternatives],
-            "contradictions": list(found.contradictions),
-            **{name: summary[name] for name in ("zeros", "lengths", "target") if summary.get(name)},
-        }
-    )
-    return values
+    return {
+        **{name: summary[name] for name in ("link", "X_LC", "X_WC") if name in summary},
+        "errors": ["turn_x", "turn_y", "turn_z", "x", "y", "z"],
+        "covariance": found.covariance,
+        "alternatives": found.alternatives,
+        "contradictions": list(found.contradictions),
+        **{name: summary[name] for name in ("zeros", "lengths", "target") if summary.get(name)},
+    }
 
 
 def write_overlays(

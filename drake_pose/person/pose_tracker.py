@@ -263,10 +263,7 @@ class PersonPoseTracker:
         return self.plan.trunk_middle(self.fit.kinematics.poses(values))
 
     def deviations(
-        self,
-        values: Array,
-        seen: FrameViews | ColourViews,
-        held_covariance: Array | None = None,
+        self, values: Array, seen: FrameViews | ColourViews, held_covariance: Array | None = None
     ) -> Array:
         """(nq,) standard deviations of the plant's positions [rad or m] by the pictures alone.
 

@@ -72,10 +72,7 @@ class ColourViews:
     """
 
     def __init__(
-        self,
-        cameras: Sequence[Camera],
-        pictures: Sequence[Picture],
-        known: KnownColours,
+        self, cameras: Sequence[Camera], pictures: Sequence[Picture], known: KnownColours
     ) -> None:
         self.cameras = tuple(cameras)
         self.pictures = [

@@ -16,12 +16,7 @@ from drake_pose.body.tree.tree_kinematics import PackedTree, find_motions
 from drake_pose.camera.models import Camera
 from drake_pose.compiled import compiled
 from drake_pose.fit.levenberg_marquardt import eliminate
-from drake_pose.person.date.limb_search import (
-    FEATURE_ERROR,
-    Search,
-    limb_angles,
-    search_limb,
-)
+from drake_pose.person.date.limb_search import FEATURE_ERROR, Search, limb_angles, search_limb
 from drake_pose.person.date.skeleton import LIMBS, Limb, Skeleton
 
 _LARGEST_STEP = math.radians(2.0)

@@ -11,12 +11,7 @@ from drake_pose.arrays import Array
 from drake_pose.errors import SettingsError
 from drake_pose.filtering.kalman.truncated_filter import FilterState, TruncatedFilter
 from drake_pose.filtering.state import Belief, make_belief
-from drake_pose.systems.ports import (
-    BeliefSystem,
-    SharedValue,
-    require_period,
-    require_time_forward,
-)
+from drake_pose.systems.ports import BeliefSystem, SharedValue, require_period, require_time_forward
 
 STATISTICS = ("step", "hypotheses", "distance", "count", "lost")
 """What the elements of the output ``statistics`` are."""

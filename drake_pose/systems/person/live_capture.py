@@ -42,10 +42,7 @@ class SilhouetteSensor(PersonRegion):
     """
 
     def __init__(
-        self,
-        camera: Camera,
-        background: Background | None = None,
-        edge_points: float = EDGE_POINTS,
+        self, camera: Camera, background: Background | None = None, edge_points: float = EDGE_POINTS
     ) -> None:
         super().__init__(camera, background)
         spacing = edge_spacing(camera, edge_points)

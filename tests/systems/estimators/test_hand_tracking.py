@@ -21,10 +21,7 @@ from drake_pose.filtering.truncation.couplings import model_inequalities
 from drake_pose.search.grid.beam_search import BeamSearch
 from drake_pose.search.settings import BeamSearchSettings
 from drake_pose.silhouette.pictures.label_images import EMPTY
-from drake_pose.systems.estimators.hand_tracking import (
-    AxisSensor,
-    build_hand_tracking,
-)
+from drake_pose.systems.estimators.hand_tracking import AxisSensor, build_hand_tracking
 from drake_pose.systems.estimators.truncated_ekf import STATISTICS
 from tests.systems.bench import Bench
 
@@ -67,9 +64,7 @@ def camera():
 def search(hand):
     rotation = RotationMatrix.MakeXRotation(math.radians(30)).matrix()
     tree = hand.pose_tree(
-        root_position=(-0.12, -0.04, 0.0),
-        root_rotation=RootRotation.fixed(rotation),
-        held=SHAPE,
+        root_position=(-0.12, -0.04, 0.0), root_rotation=RootRotation.fixed(rotation), held=SHAPE
     )
     return CountingSearch(BeamSearch(tree, BeamSearchSettings(interval=math.radians(10))))
 

@@ -59,37 +59,33 @@ def joint_errors(person, found, truth):
     return 1e3 * np.linalg.norm(np.array(places[0]) - np.array(places[1]), axis=1)
 
 
-def given(cameras, recording, starts, pictures=None):
-    pictures = recording[0] if pictures is None else pictures
-    return cameras, FRAMES, lambda k: pictures[k], starts, {}, None
+def captured(person, cameras, recording, starts, pictures, on_frame=None):
+    given = cameras, FRAMES, lambda k: pictures[k], starts, {}, None, on_frame
+    return capture_by_colour(person.pose_tree(), *given)[0]
 
 
 def test_followed_from_a_start_without_any_mask(person, cameras, recording):
-    heard = []
-    start = given(cameras, recording, {0: recording[2][0]})
-    captured, _ = capture_by_colour(person.pose_tree(), *start, heard.append)
+    heard, (pictures, _, truth) = [], recording
+    found = captured(person, cameras, recording, {0: truth[0]}, pictures, heard.append)
     assert heard == list(range(FRAMES))
-    errors = np.array(
-        [joint_errors(person, *pair) for pair in zip(captured.q, recording[2], strict=True)]
-    )
+    errors = [joint_errors(person, *pair) for pair in zip(found.q, truth, strict=True)]
     # The person has moved on by more than that.
-    assert joint_errors(person, recording[2][0], recording[2][-1]).max() > 100.0
+    assert joint_errors(person, truth[0], truth[-1]).max() > 100.0
     assert np.mean(errors) < 15.0
-    assert np.all(captured.shares > 0.8)
+    assert np.all(found.shares > 0.8)
     angles = [k for k, kind in enumerate(person.position_kinds) if kind == "angle"]
-    assert np.all(captured.deviations[:, angles] > 0.0)
+    assert np.all(found.deviations[:, angles] > 0.0)
 
 
 def test_a_loss_is_said_and_a_start_goes_on(person, cameras, recording):
     grey = {name: np.full((240, 320, 3), 128, np.uint8) for name in cameras}
-    pictures = [*recording[0][:3], grey, grey, *recording[0][5:]]
-    starts = {0: recording[2][0], 5: recording[2][5]}
-    given_ = given(cameras, recording, starts, pictures=pictures)
-    found, _ = capture_by_colour(person.pose_tree(), *given_)
+    pictures, _, truth = recording
+    starts, shown = {k: truth[k] for k in (0, 5)}, [*pictures[:3], grey, grey, *pictures[5:]]
+    found = captured(person, cameras, recording, starts, shown)
     lost = np.isnan(found.q).any(axis=1)
     assert lost.tolist() == [False] * 3 + [True] * 2 + [False] * 3
     assert np.isnan(found.deviations[lost]).all()
-    assert np.mean(joint_errors(person, found.q[-1], recording[2][-1])) < 20.0
+    assert np.mean(joint_errors(person, found.q[-1], truth[-1])) < 20.0
 
 
 class TestLearning:

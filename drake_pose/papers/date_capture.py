@@ -20,7 +20,6 @@ from drake_pose.body.model import ArticulatedModel, load_model
 from drake_pose.camera.models import FACE_CAMERA, Camera, PinholeCamera, circle_of_cameras
 from drake_pose.errors import SettingsError
 from drake_pose.fit.contour_fit import ContourFit
-from drake_pose.person.date.capture import CaptureSetup, PersonView, see_person
 from drake_pose.person.date.faces import FACE_HEIGHT, FACE_WIDTH, cut_face, face_direction
 from drake_pose.person.date.features import Features, SkinColour
 from drake_pose.person.date.skeleton import LIMBS, Skeleton, load_skeleton
@@ -28,7 +27,12 @@ from drake_pose.person.pose_tracker import PersonPoseTracker, TrackState
 from drake_pose.silhouette.segmentation.background import Background, learn_background
 from drake_pose.systems.colour_images import colour_image_to_picture
 from drake_pose.systems.date.capture import PaperCapture, build_paper_capture
-from drake_pose.systems.date.preparation import prepare_paper_capture
+from drake_pose.systems.date.preparation import (
+    CaptureSetup,
+    PersonView,
+    prepare_paper_capture,
+    see_person,
+)
 from drake_pose.systems.person.live_capture import SilhouetteCapture, build_silhouette_capture
 from drake_pose.systems.pictures.camera_rig import CameraRig, build_camera_rig
 from drake_pose.systems.ports import StagedDiagram

@@ -23,7 +23,6 @@ from drake_pose.jobs.estimate.person import FOLLOWED
 from drake_pose.jobs.live.run import run_live
 from drake_pose.jobs.live.scene import LiveScene
 from drake_pose.jobs.live.settings import LiveSettings
-from drake_pose.person.date.capture import PersonView
 from drake_pose.person.date.skeleton import FEATURES
 from drake_pose.person.pose_tracker import PersonPoseTracker
 from drake_pose.person.recordings.persons_in_view import keep_person
@@ -32,6 +31,7 @@ from drake_pose.silhouette.areas.scoring import draw_mask
 from drake_pose.silhouette.pictures.masks import compare_masks
 from drake_pose.silhouette.pictures.scene_checks import frame_ranges
 from drake_pose.silhouette.pictures.scenes import Scene
+from drake_pose.systems.date.preparation import PersonView
 from drake_pose.systems.person.live_capture import LiveSensors
 from drake_pose.systems.pictures.picture_capture import CameraCount
 

@@ -16,7 +16,6 @@ from drake_pose.errors import CameraError, SceneError, SettingsError, UnknownNam
 from drake_pose.jobs.live.run import look_until
 from drake_pose.jobs.live.scene import LiveScene
 from drake_pose.jobs.live.settings import LiveSettings
-from drake_pose.person.date.capture import CaptureSetup
 from drake_pose.person.date.faces import learn_recorded_faces
 from drake_pose.person.date.recognition import (
     Recognition,
@@ -27,7 +26,11 @@ from drake_pose.person.date.recognition import (
 from drake_pose.person.date.skeleton import load_skeleton
 from drake_pose.systems.colour_images import colour_image_to_picture
 from drake_pose.systems.date.capture import build_paper_capture
-from drake_pose.systems.date.preparation import prepare_paper_capture, render_registered_pose
+from drake_pose.systems.date.preparation import (
+    CaptureSetup,
+    prepare_paper_capture,
+    render_registered_pose,
+)
 from drake_pose.systems.person.live_capture import LiveSensors
 from drake_pose.systems.ports import evaluate
 

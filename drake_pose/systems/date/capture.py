@@ -19,11 +19,11 @@ from pydrake.systems.framework import (
 from drake_pose.arrays import Array
 from drake_pose.errors import SettingsError
 from drake_pose.person.date.body_pose import estimate_pose
-from drake_pose.person.date.capture import CaptureSetup
 from drake_pose.person.date.faces import head_angles
 from drake_pose.person.date.features import expect_features
 from drake_pose.person.date.skeleton import FEATURES, LIMBS
 from drake_pose.systems.bodies import add_avatar
+from drake_pose.systems.date.preparation import CaptureSetup
 from drake_pose.systems.date.stages import (
     FaceDirectionFinder,
     FeatureFinder,

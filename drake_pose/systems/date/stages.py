@@ -10,13 +10,13 @@ from pydrake.systems.sensors import ImageRgba8U
 
 from drake_pose.arrays import Array
 from drake_pose.camera.models import Camera
-from drake_pose.person.date.capture import PersonView, see_person
 from drake_pose.person.date.faces import FaceTemplates, find_face
 from drake_pose.person.date.features import Features, SkinColour, find_features
 from drake_pose.person.date.recognition import Recognition, RegisteredPose, recognise
 from drake_pose.person.date.skeleton import FEATURES, Skeleton
 from drake_pose.silhouette.segmentation.background import Background
 from drake_pose.systems.colour_images import colour_image_to_picture
+from drake_pose.systems.date.preparation import PersonView, see_person
 from drake_pose.systems.pictures.person_region import PersonRegion
 from drake_pose.systems.ports import PortedSystem, require_different
 
@@ -49,7 +49,7 @@ class HorizontalImage(PersonRegion):
         output_ports: [region, person_view]
 
     The paper's horizontal image processing module (3.1.1). Outputs: ``region``, see PersonRegion,
-    and ``person_view``, a ``person.date.capture.PersonView``, None where either image is lost.
+    and ``person_view``, a ``systems.date.preparation.PersonView``, None where either image is lost.
     """
 
     def __init__(

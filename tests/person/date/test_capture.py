@@ -6,7 +6,6 @@ import pytest
 
 from drake_pose.camera.models import FACE_CAMERA
 from drake_pose.errors import SettingsError
-from drake_pose.person.date.capture import CaptureSetup
 from drake_pose.person.date.faces import (
     cut_face,
     face_direction,
@@ -16,6 +15,7 @@ from drake_pose.person.date.faces import (
 )
 from drake_pose.person.date.features import SkinColour, skin_blobs
 from drake_pose.person.date.recognition import measure_contour, recognise, similarity
+from drake_pose.systems.date.preparation import CaptureSetup
 from tests.person.studio import shared_studio
 
 

@@ -12,7 +12,7 @@ from drake_pose.body.tree.link_graph import PlantKinematics
 from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.camera.models import Camera, ParallelCamera
-from drake_pose.errors import SettingsError, UnknownNameError
+from drake_pose.errors import SettingsError
 from drake_pose.filtering.state import StateLayout
 from drake_pose.filtering.truncation.couplings import (
     UsualPose,
@@ -54,20 +54,18 @@ class BodyState:
     Args:
         moves: whether the root may be elsewhere than where the tree holds it.
         grows: whether the scale of the one parallel camera is unknown.
-        constant: names of values that never change, such as shape joints.
         rest: with so much weight each measurement also says that joints are held as usual.
 
     Attributes:
         layout: the state: the tree's values that are free to move, then ROOT_SHIFT and GROWTH,
-            their rates, and the constants.
-        usual: how joints are usually held, about the state's moving elements, then its constants:
-            what the model's couplings file says, and about the middle of their limits, as evenly
-            spread as these are wide, where it says nothing.
+            and their rates.
+        usual: how joints are usually held, about the state's moving elements: what the model's
+            couplings file says, and about the middle of their limits, as evenly spread as these are
+            wide, where it says nothing.
 
     Raises:
         SettingsError: no camera; the tree has no value to estimate; or a scale is unknown and there
             is not one parallel camera.
-        UnknownNameError: a constant is no value of the tree.
     """
 
     def __init__(
@@ -76,7 +74,6 @@ class BodyState:
         cameras: Sequence[Camera],
         moves: bool = False,
         grows: bool = False,
-        constant: Sequence[str] = (),
         rest: float = 0.0,
     ) -> None:
         if not cameras:
@@ -92,17 +89,13 @@ class BodyState:
         self._body = BodyParameters(self._kinematics, compared.rigid, surfaces=compared)
         free = self._kinematics.lower < self._kinematics.upper
         names = [n for n, is_free in zip(self._kinematics.names, free, strict=True) if is_free]
-        moving = [name for name in names if name not in constant]
-        for name in constant:
-            if name not in names:
-                raise UnknownNameError("value", name, names, f"the tree of {tree.model.path}")
         root = (*(ROOT_SHIFT if moves else ()), *((GROWTH,) if grows else ()))
-        self.layout = StateLayout((*moving, *root), tuple(constant))
+        self.layout = StateLayout((*names, *root), ())
         if not len(self.layout):
             raise SettingsError(f"{tree.model.path}: all values of its tree are held")
         self._moves = moves
         known = [*self._kinematics.names, *_ROOT]
-        self._seen_names = [*self.layout.moving, *self.layout.constant]
+        self._seen_names = [*self.layout.moving]
         self._state_index = self.layout.indices(self._seen_names)
         self._parameter_index = np.array([known.index(name) for name in self._seen_names], np.intp)
         self._values = self._kinematics.flatten(tree.default_values())

@@ -50,21 +50,16 @@ _FILTERS = (("paper", "sequential", 1), ("ours", "joint", FilterSettings().itera
 _NONE = "-"
 
 
-class Beside(NamedTuple):
-    """One figure of a paper, in words where it shows a picture, and what comes out here."""
-
-    what: str
-    paper: str
-    its_method: str
-    ours: str
-
-
 class Outcome(NamedTuple):
-    """What an experiment came to: figures by method, its tables, and the paper's beside ours."""
+    """What an experiment came to: figures by method, its tables, and the paper's beside ours.
+
+    A row of `beside`: what it is, a form, then the paper, its method and ours: words, or figures
+    that are put into the form.
+    """
 
     figures: Figures
     shown: Sequence[RenderableType]
-    beside: Sequence[Beside] = ()
+    beside: Sequence[tuple[Any, ...]] = ()
 
 
 class Experiment(NamedTuple):
@@ -74,11 +69,6 @@ class Experiment(NamedTuple):
     title: str
     command: str
     run: Callable[[bool, Path, Count], Outcome]
-
-
-def _beside(what: str, form: str, *columns: str | Figures) -> Beside:
-    """A row of the paper, its method and ours: words, or figures that are put into a form."""
-    return Beside(what, *(one if isinstance(one, str) else form.format(**one) for one in columns))
 
 
 def _kameda(short: bool, folder: Path, count: Count) -> Outcome:
@@ -95,12 +85,12 @@ def _kameda(short: bool, folder: Path, count: Count) -> Outcome:
     figures = {name: grid_figures(result) for name, result in results.items()}
     paper, beam = figures["paper"], figures["beam"]
     rows = (
-        _beside("mean E_total of poses found", "{mean_e_total:.2%}", PAPER, paper, beam),
-        _beside("silhouettes matched exactly", "{exact} of {images}", PAPER, paper, beam),
-        _beside("every joint angle right", "{pose_equal} of {images}", PAPER, paper, beam),
-        _beside("improved by re-estimation", "{improved} of {images}", PAPER, paper, _NONE),
-        _beside("runs of step 3, mean", "{mean_runs:.1f}", PAPER, paper, _NONE),
-        _beside("processor seconds an image, median", "{median_seconds:.2f}", _NONE, paper, beam),
+        ("mean E_total of poses found", "{mean_e_total:.2%}", PAPER, paper, beam),
+        ("silhouettes matched exactly", "{exact} of {images}", PAPER, paper, beam),
+        ("every joint angle right", "{pose_equal} of {images}", PAPER, paper, beam),
+        ("improved by re-estimation", "{improved} of {images}", PAPER, paper, _NONE),
+        ("runs of step 3, mean", "{mean_runs:.1f}", PAPER, paper, _NONE),
+        ("processor seconds an image, median", "{median_seconds:.2f}", _NONE, paper, beam),
     )
     return Outcome(figures, [grid_table([[one] for one in results.values()])], rows)
 
@@ -115,8 +105,8 @@ def _kameda_pictures(experiment: str, short: bool, folder: Path, count: Count) -
     paper, beam = figures["paper"], figures["beam"]
     said = "{paper_mean_e_total:.1%} ({paper_images} pictures)".format(**paper)
     rows = (
-        _beside("mean E_total", "{mean_e_total:.1%} ({images})", said, paper, beam),
-        _beside("processor seconds an image", "{seconds_an_image:.1f}", _NONE, paper, beam),
+        ("mean E_total", "{mean_e_total:.1%} ({images})", said, paper, beam),
+        ("processor seconds an image", "{seconds_an_image:.1f}", _NONE, paper, beam),
     )
     warnings = [f"Warning: {text}" for one in figures.values() for text in one["warnings"]]
     return Outcome(figures, [real_table(figures), *warnings], rows)
@@ -140,11 +130,11 @@ def _shimada(short: bool, folder: Path, count: Count) -> Outcome:
     ]
     inside = ("{inside_2sigma:.0%}", "in its figures 12 to 16")
     rows = (
-        _beside(f"{r_13} 35 [pixel]", form, "right (figure 15)", *first),
-        _beside(f"{r_13} 40 [pixel]", form, "right (figure 16)", *second),
-        _beside("truths within two deviations", *inside, *first),
-        _beside(angles, "{angle_rmse_at_end:.1f}", "right (figure 14)", *first),
-        Beside("sequences lost", "none of two", *lost),
+        (f"{r_13} 35 [pixel]", form, "right (figure 15)", *first),
+        (f"{r_13} 40 [pixel]", form, "right (figure 16)", *second),
+        ("truths within two deviations", *inside, *first),
+        (angles, "{angle_rmse_at_end:.1f}", "right (figure 14)", *first),
+        ("sequences lost", "", "none of two", *lost),
     )
     return Outcome(figures, shown, rows)
 
@@ -161,10 +151,10 @@ def _shimada_hypotheses(short: bool, folder: Path, count: Count) -> Outcome:
     later, lived = "{rejected_later_than_made}", f"{paper['frames_lived_median'] or 0:g} (median)"
     coupled = "{of_these_by_coupled_joints}"
     rows = (
-        _beside("hypotheses rejected later than made", later, "one is shown", paper, ours),
-        _beside("of these wrong", "{of_these_wrong}", "that one", paper, _NONE),
-        Beside("frames from its birth to its end", "2 (18 to 20)", lived, _NONE),
-        _beside("as two joints do not bend alike", coupled, "that one", paper, _NONE),
+        ("hypotheses rejected later than made", later, "one is shown", paper, ours),
+        ("of these wrong", "{of_these_wrong}", "that one", paper, _NONE),
+        ("frames from its birth to its end", "", "2 (18 to 20)", lived, _NONE),
+        ("as two joints do not bend alike", coupled, "that one", paper, _NONE),
     )
     return Outcome(figures, shown, rows)
 
@@ -174,18 +164,18 @@ def _date(short: bool, folder: Path, count: Count) -> Outcome:
     result = run_date(cameras, frames, 0, "silhouette", count, size)
     save_date(result, folder)
     figures: dict[str, Any] = result.as_json()
-    rows = []
+    rows: list[tuple[Any, ...]] = []
     for joint in ("elbow", "knee"):
         what = f"{joint}s, upright: by inverse kinematics alone, then with the search [mm]"
         found = f"{figures[f'{joint}_ik_mm']:.0f} to {figures[f'{joint}_mm']:.0f}"
         all_at_once = f"{figures[f'{joint}s']['silhouette_mm']:.1f} (all motions)"
-        rows.append(Beside(what, "wrong, then right (figure 7)", found, all_at_once))
+        rows.append((what, "", "wrong, then right (figure 7)", found, all_at_once))
     whole = f"{figures['ms_per_frame']['all']:.0f} ms, one core"
     back = figures["frames_to_recover_registered"]
     shown = "not" if back is None else str(back)
     rows += [
-        Beside("a frame", "real time, a cluster (15 ms for the face)", _NONE, whole),
-        Beside("frames until right when the registered pose is shown", "that frame", _NONE, shown),
+        ("a frame", "", "real time, a cluster (15 ms for the face)", _NONE, whole),
+        ("frames until right when the registered pose is shown", "", "that frame", _NONE, shown),
     ]
     return Outcome(figures, [*result.tables(), result.costs()], rows)
 
@@ -276,7 +266,14 @@ def reproduce_all(out: Path, short: bool, count: Count, say: Callable[[str], Non
 
 
 def _write_outcome(folder: Path, outcome: Outcome, cpu_seconds: float) -> None:
-    beside = [one._asdict() for one in outcome.beside]
+    beside = [
+        {"what": what}
+        | {
+            name: one if isinstance(one, str) else form.format(**one)
+            for name, one in zip(("paper", "its_method", "ours"), columns, strict=True)
+        }
+        for what, form, *columns in outcome.beside
+    ]
     for name, content in (
         (BESIDE, {"figures": beside, "cpu_seconds": round(cpu_seconds, 1)}),
         (FIGURES, without_nan(outcome.figures)),

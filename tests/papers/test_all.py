@@ -11,7 +11,6 @@ from drake_pose.papers.all_experiments import (
     EXPERIMENTS,
     FIGURES,
     REPORT,
-    Beside,
     Experiment,
     Outcome,
     reproduce_all,
@@ -35,7 +34,7 @@ def two_experiments(monkeypatch):
     def first(_short, folder, _count):
         ran.append("first")
         (folder / "some.png").write_bytes(b"no picture")
-        beside = [Beside("E", "22.3 % < 30 %", "34 %", "15 %")]
+        beside = [("E", "{x} %", "22.3 % < 30 %", {"x": 34}, "15 %")]
         return Outcome({"value": float("nan")}, ["a <table>"], beside)
 
     def second(_short, folder, _count):

@@ -127,12 +127,9 @@ class AxisObservation:
         """Axes (m,) at a state (n,), NaN where too short; Jacobian by central differences."""
         h = self._axes_at(x)
         H = np.zeros((len(h), len(x)))
-        layout = self.body.layout
-        for name in (*layout.moving, *layout.constant):
-            step = np.zeros_like(x)
-            step[layout.index(name)] = _STEP
+        for k, step in enumerate(_STEP * np.eye(len(x))[: len(self.body.layout.moving)]):
             change = difference(self._axes_at(x + step), self._axes_at(x - step), self.wraps)
-            H[:, layout.index(name)] = change / (2 * _STEP)
+            H[:, k] = change / (2 * _STEP)
         return h, H
 
     def mirrors(self, belief: Belief) -> list[Array]:

@@ -23,9 +23,9 @@ Array = NDArray[np.float64]
 
 # A frame's pose that changes by less is settled [rad, m].
 _STANDSTILL = 1e-3
-# Standard deviations at the start: angles [rad], the root's position and other lengths [m], the
-# logarithm of an unknown scale, and lengths that never change [m].
-_START_ANGLE, _START_LENGTH, _START_GROWTH, _CONSTANT_LENGTH = 0.2, 0.03, 0.1, 0.03
+# Standard deviations at the start: angles [rad], the root's position and other lengths [m], and the
+# logarithm of an unknown scale.
+_START_ANGLE, _START_LENGTH, _START_GROWTH = 0.2, 0.03, 0.1
 # The track is lost when the contour and the masks' edge are further apart than this [pixel], or a
 # smaller share of the contour has an edge beside it.
 _LOST_DISTANCE, _LOST_SHARE = 12.0, 0.6
@@ -149,7 +149,6 @@ class ContourTracker:
         deviations = [
             *(self._of_kind(name, *starts) for name in layout.moving),
             *(picked_up * self.acceleration(name) for name in layout.moving),
-            *(_CONSTANT_LENGTH for _ in layout.constant),
         ]
         return Belief(x, np.diag(np.square(deviations)))
 

@@ -115,23 +115,34 @@ def load_couplings(path: Path | str, columns: Sequence[str]) -> Inequalities:
     """
     file = Path(path)
     content = _read(file)
+    rows = [_difference(one, f"{file}: ") for one in content.differences]
+    rows += [(f"{file}: row '{one.name}'", one) for one in content.rows]
     parts = []
-    for difference in content.differences:
-        name = f"{difference.first} - {difference.second}"
-        where = f"{file}: '{name}'"
-        if difference.first == difference.second:
-            raise ModelError(f"{where}: give two different joints as first and second")
-        lower, upper = difference.lower, difference.upper
-        if math.isfinite(difference.within):
-            if math.isfinite(lower) or math.isfinite(upper):
-                raise ModelError(f"{where}: give either within, or lower and upper")
-            lower, upper = -difference.within, difference.within
-        terms = {difference.first: 1.0, difference.second: -1.0}
-        parts.append(_row(columns, name, terms, (lower, upper), difference.unit, where))
-    for row in content.rows:
-        where = f"{file}: row '{row.name}'"
-        parts.append(_row(columns, row.name, row.terms, (row.lower, row.upper), row.unit, where))
+    for where, row in rows:
+        bounds = (row.lower, row.upper)
+        lower, upper = (_unit(row.unit, where) * bound for bound in bounds)
+        if not np.isfinite(bounds).any():
+            raise ModelError(f"{where}: nothing is bounded; give within, lower or upper")
+        phi = row_from_terms(columns, row.terms, where)
+        try:
+            parts.append(two_sided(columns, row.name, phi, lower, upper))
+        except SettingsError as error:
+            raise ModelError(f"{where}: {error}") from error
     return stack(parts, columns)
+
+
+def _difference(one: Difference, file: str) -> tuple[str, GeneralRow]:
+    """A difference as a general row, and where it stands."""
+    name = f"{one.first} - {one.second}"
+    where = f"{file}'{name}'"
+    if one.first == one.second:
+        raise ModelError(f"{where}: give two different joints as first and second")
+    lower, upper = one.lower, one.upper
+    if math.isfinite(one.within):
+        if math.isfinite(lower) or math.isfinite(upper):
+            raise ModelError(f"{where}: give either within, or lower and upper")
+        lower, upper = -one.within, one.within
+    return where, GeneralRow(name, {one.first: 1.0, one.second: -1.0}, lower, upper, one.unit)
 
 
 def load_usual_pose(path: Path | str, columns: Sequence[str]) -> UsualPose:
@@ -205,22 +216,3 @@ def _unit(unit: str, where: str) -> float:
         known = ", ".join(key for key in _UNITS if key)
         raise ModelError(f"{where}: unit '{unit}' is unknown; use one of {known}")
     return _UNITS[unit]
-
-
-def _row(
-    columns: Sequence[str],
-    name: str,
-    terms: dict[str, float],
-    bounds: tuple[float, float],
-    unit: str,
-    where: str,
-) -> Inequalities:
-    factor = _unit(unit, where)
-    if not np.isfinite(bounds).any():
-        raise ModelError(f"{where}: nothing is bounded; give within, lower or upper")
-    lower, upper = (bound * factor for bound in bounds)
-    row = row_from_terms(columns, terms, where)
-    try:
-        return two_sided(columns, name, row, lower, upper)
-    except SettingsError as error:
-        raise ModelError(f"{where}: {error}") from error

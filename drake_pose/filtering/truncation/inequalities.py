@@ -1,7 +1,7 @@
 """Linear inequalities phi^T x <= b on a state, each with a name: (14) to (18) of Shimada et al."""
 
 import warnings
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -38,12 +38,6 @@ class Inequalities:
         """(K,) b - phi x: how far x (n,) is from each bound, negative where it is beyond."""
         return self.b - self.phi @ np.asarray(x, dtype=np.float64)
 
-    def take(self, indices: Iterable[int]) -> "Inequalities":
-        """The rows of these indices, in that order."""
-        chosen = list(indices)
-        rows = [self.rows[index] for index in chosen]
-        return make_inequalities(self.columns, rows, self.phi[chosen], self.b[chosen])
-
     def for_columns(self, columns: Sequence[str]) -> "Inequalities":
         """The same rows for a state with these elements, for example one with rates too.
 
@@ -64,7 +58,8 @@ class Inequalities:
         """The rows that use none but these elements, for a state that has these."""
         absent = [i for i, name in enumerate(self.columns) if name not in columns]
         kept = np.flatnonzero(~self.phi[:, absent].any(axis=1))
-        return self.take(kept).for_columns(columns)
+        rows = tuple(self.rows[k] for k in kept)
+        return Inequalities(self.columns, rows, self.phi[kept], self.b[kept]).for_columns(columns)
 
 
 def make_inequalities(

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from drake_pose.camera.models import PinholeCamera
-from drake_pose.errors import SettingsError, UnknownNameError
+from drake_pose.errors import SettingsError
 from drake_pose.filtering.body_state import ROOT_SHIFT
 from drake_pose.filtering.measurements import contour
 from drake_pose.filtering.measurements.contour import ContourObservation
@@ -100,5 +100,3 @@ def test_nothing_seen_and_bad_arguments(tmp_path):
         observation.look([np.zeros((50, 50), dtype=bool)])
     with pytest.raises(SettingsError, match="one camera"):
         ContourObservation(model.pose_tree(), [])
-    with pytest.raises(UnknownNameError, match="tail"):
-        ContourObservation(model.pose_tree(), [camera], constant=("tail",))

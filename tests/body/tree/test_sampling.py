@@ -2,8 +2,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from drake_pose.body.formats.packages import bundled_model
-from drake_pose.body.model import load_model
 from drake_pose.body.tree.pose_tree import axis_samples, product_grid
 from drake_pose.body.tree.root import RootRotation, even_rotations
 from drake_pose.errors import SettingsError
@@ -45,17 +43,6 @@ def test_last_axis_changes_fastest():
 def test_too_many_samples_name_the_node():
     with pytest.raises(SettingsError, match="node 'head'"):
         product_grid([range(1000)] * 3, "head")
-
-
-def test_woman_grid_sizes_follow_table_2():
-    tree = load_model(bundled_model("woman"), check=False).pose_tree(root_position=[0, 0, 0])
-    sizes = {node.name: len(tree.grid(i, TWENTY)) for i, node in enumerate(tree.nodes)}
-    # Multiples of 20 degrees in Table 2, for example chest: 7 (-60..60) x 3 (-30..30) x 3.
-    assert sizes["chest"] == 7 * 3 * 3
-    assert sizes["head"] == 9 * 3 * 3
-    assert sizes["right_upper_arm"] == 11 * 6 * 6
-    assert sizes["right_forearm"] == 9
-    assert sizes["left_shin"] == 7
 
 
 def test_even_rotations_leave_no_gap():

@@ -8,7 +8,6 @@ from pydrake.multibody.tree import BodyIndex
 from scipy.spatial.transform import Rotation
 
 from drake_pose.body.model import load_model
-from drake_pose.body.report import describe_model
 from drake_pose.body.tree.node_skin import ModelSkin
 from drake_pose.body.tree.root import RootRotation
 from drake_pose.errors import DrakePoseError, ModelError, UnknownNameError
@@ -134,17 +133,6 @@ def test_links_welded_to_each_other_share_a_band(tmp_path: Path) -> None:
     np.testing.assert_allclose(p_W, in_frame(link_pose(model, q, "lower"), in_node), atol=1e-12)
 
 
-def test_a_surface_is_the_rigid_part_and_the_band(tmp_path: Path) -> None:
-    node = load_limb(tmp_path).pose_tree().nodes[1]
-    surface = node.surface(np.array([0.7]))
-    count = len(node.mesh.vertices)
-    np.testing.assert_array_equal(surface.vertices[:count], node.mesh.vertices)
-    np.testing.assert_array_equal(
-        surface.vertices[count:], node.skin.vertices(np.array([[0.7]]))[0]
-    )
-    assert len(surface.triangles) == len(node.mesh.triangles) + len(node.skin.triangles)
-
-
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
@@ -196,7 +184,6 @@ def test_a_band_joins_neighbours(tmp_path: Path, parent: str, child: str) -> Non
     model = load_limb(tmp_path, "bands:\n" + band_entry(parent, child))
     with pytest.raises(ModelError, match="not neighbours"):
         model.pose_tree()
-    assert "not neighbours" in describe_model(model.path).errors[0]
 
 
 def test_exchanged_links_are_refused_where_drake_draws(tmp_path: Path) -> None:

@@ -1,8 +1,6 @@
 import numpy as np
 import pytest
-from pydrake.multibody.tree import JacobianWrtVariable
 
-from drake_pose.body.formats.packages import bundled_model
 from drake_pose.body.model import load_model
 from drake_pose.body.tree.root import RootRotation
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
@@ -90,29 +88,6 @@ def test_the_derivative_of_a_free_root_holds_near_no_turn(tmp_path):
             W = (turned[0] / 2e-5)[:3, :3] @ motions.X_WN[0, :3, :3].T
             found = np.array([W[2, 1], W[0, 2], W[1, 0]])
             assert np.abs(found - motions.twists[j, :3]).max() < 1e-8
-
-
-def test_motions_are_drakes_jacobian():
-    model = load_model(bundled_model("woman"))
-    tree = model.pose_tree()
-    kinematics = TreeKinematics(tree)
-    context = model.plant.CreateDefaultContext()
-    values = draw(kinematics, 1)
-    motions = kinematics.motions(values)
-    q, _ = tree.positions_from(kinematics.split(values))
-    model.plant.SetPositions(context, q)
-    world = model.plant.world_frame()
-    p_N = np.array([0.03, -0.2, 0.1])
-    columns = [position for node in tree.nodes for position in node.positions]
-    for i, node in enumerate(tree.nodes):
-        J = model.plant.CalcJacobianTranslationalVelocity(
-            context, JacobianWrtVariable.kQDot, model.plant.GetFrameByName(node.name), p_N,
-            world, world,
-        )  # fmt: skip
-        p_W = motions.X_WN[i, :3, :3] @ p_N + motions.X_WN[i, :3, 3]
-        points = np.broadcast_to(p_W, (len(tree.nodes), 1, 3))
-        mine = np.array([move(motions, j, points)[i, 0] for j in range(len(values))])
-        assert np.abs(mine.T - J[:, columns]).max() < 1e-12
 
 
 def test_shift_and_growth_move_the_root_and_all_behind_it(kinematics):

@@ -136,8 +136,7 @@ class ArticulatedModel(ParsedModel):
             mesh: the object's surface in its frame O.
             X_WO: (4, 4) where it stands at OBJECT_POSITIONS of zero.
 
-        Raises:
-            UnknownNameError, ModelError: no such link; the file is refused in another plant.
+        Raises UnknownNameError, ModelError: no such link; the file is refused in another plant.
         """
         self.link_index(link)
         plant, scene_graph = MultibodyPlant(time_step=0.0), SceneGraph()

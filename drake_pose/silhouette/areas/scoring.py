@@ -45,8 +45,7 @@ def score_bodies(
     Returns:
         (n, 1 + k) int64 area inside the picture, then of the intersection with each set [pixel].
 
-    Raises:
-        ValueError: when poses, bands or sums have the wrong shape, or are not finite.
+    Raises ValueError: when poses, bands or sums have the wrong shape, or are not finite.
     """
     packed, poses = _check_body(surfaces, X_CN)
     parts, sizes = [], [0]
@@ -222,9 +221,8 @@ _LARGER = 10.0
 def require_visible(outlines: Sequence[Outline], X_CN: np.ndarray, camera: Camera) -> None:
     """Refuses a camera that cannot show a body whose surfaces are at X_CN (nodes, 4, 4).
 
-    Raises:
-        CameraError: names the camera; when the body is wholly behind it, when the camera is inside
-            one of the surfaces, when the body is far larger than the picture, or wholly outside.
+    Raises CameraError: names the camera; when the body is wholly behind it, when the camera is
+    inside one of the surfaces, when the body is far larger than the picture, or wholly outside.
     """
     solid = [
         (outline, np.asarray(X))

@@ -24,9 +24,8 @@ def read_mask(
 
     ``may_be_empty``: whether a picture that shows nothing is as good as any.
 
-    Raises:
-        MaskError: names the file; when it cannot be read, is no whole PNG picture, is not of
-            ``width`` and ``height`` [pixel], is empty or full, or has more than two values.
+    Raises MaskError: names the file; when it cannot be read, is no whole PNG picture, is not of
+    ``width`` and ``height`` [pixel], is empty or full, or has more than two values.
     """
     size = width, height
     return read_two_colours(Path(path), MaskError, size, may_be_empty=may_be_empty)

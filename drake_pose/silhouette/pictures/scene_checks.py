@@ -35,8 +35,7 @@ def read_scene(
 
     Given ``cameras`` are used instead of the folder's.
 
-    Raises:
-        DrakePoseError: names the file, camera or frame that is wrong or not there.
+    Raises DrakePoseError: names the file, camera or frame that is wrong or not there.
     """
     scene = check_scene(load_scene(path, cameras, wanted)).of_cameras(wanted)
     return scene, scene.seen_frames(frames)
@@ -77,8 +76,7 @@ def check_upright(cameras: Iterable[Camera]) -> tuple[str, ...]:
 def leave_out_unreadable(scene: Scene, frames: Iterable[str]) -> Scene:
     """A scene without masks that cannot be read, where another camera has the frame, too.
 
-    Raises:
-        MaskError: a mask cannot be read, and no other camera has a readable one of that frame.
+    Raises MaskError: a mask cannot be read, and no other camera has a readable one of that frame.
     """
     refused: dict[tuple[str, str], str] = {}
     for frame in frames:

@@ -118,8 +118,7 @@ def find_masks(folder: Path, cameras: Iterable[str]) -> MaskFiles:
     pictures, are left over. Cameras that number their frames with and without leading zeros mean
     the same frames.
 
-    Raises:
-        SceneError: names a folder that cannot be read or holds no masks of a camera.
+    Raises SceneError: names a folder that cannot be read or holds no masks of a camera.
     """
     names = list(cameras)
     root = folder / "masks"
@@ -166,8 +165,7 @@ def find_images(
     Of a camera without such a folder the video videos/<camera>.mp4 is each of its frames, which are
     named 000000, 000001 and so on, or as known ``frames`` of these numbers are named already.
 
-    Raises:
-        SceneError: a folder or video that cannot be read.
+    Raises SceneError: a folder or video that cannot be read.
     """
     found: dict[tuple[str, str], Path] = {}
     known = {int(frame): frame for frame in frames if frame.isdecimal()}

@@ -58,8 +58,7 @@ def read_mask_picture(
     Returns:
         (H, W), which may be empty.
 
-    Raises:
-        MaskError: names the file; when it cannot be read, or is not of this kind.
+    Raises MaskError: names the file; when it cannot be read, or is not of this kind.
     """
     picture = _open(path)
     if meaning == "auto":

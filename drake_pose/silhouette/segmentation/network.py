@@ -29,9 +29,8 @@ class SegmentationNetwork:
         mean, std: of red, green and blue; the network takes ``(picture / 255 - mean) / std``.
         bgr: whether it takes blue, green, red.
 
-    Raises:
-        SettingsError: OpenCV cannot read the file, a class is no number, or a size or standard
-            deviation is not positive.
+    Raises SettingsError: OpenCV cannot read the file, a class is no number, or a size or standard
+    deviation is not positive.
     """
 
     def __init__(

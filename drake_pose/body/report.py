@@ -159,12 +159,15 @@ def _symmetry_warnings(model: ArticulatedModel) -> list[str]:
 
 def _is_symmetric(mesh: TriangleMesh, X_turn: Array) -> bool:
     """Whether a surface looks the same from all around the axis of a quarter turn X_turn."""
+    from trimesh import Trimesh  # Slow to import, and needed for checks alone.
+    from trimesh.sample import sample_surface
+
     axis = Rotation.from_matrix(X_turn[:3, :3]).as_rotvec()
     axis /= np.linalg.norm(axis)
     center = np.linalg.lstsq(np.eye(3) - X_turn[:3, :3], X_turn[:3, 3], rcond=None)[0]
     side = np.linalg.svd(axis[None])[2][1]
     # At each height the largest distance from the axis is the same in every direction.
-    points = _spread_points(mesh, 40_000) - center
+    points = sample_surface(Trimesh(mesh.vertices, mesh.triangles), 40_000, seed=0)[0] - center
     height, x, y = points @ axis, points @ side, points @ np.cross(axis, side)
     radius = np.hypot(x, y)
     level = (height - height.min()) / max(float(np.ptp(height)), 1e-12) * _LEVELS
@@ -174,14 +177,3 @@ def _is_symmetric(mesh: TriangleMesh, X_turn: Array) -> bool:
     column = np.clip(sector.astype(int), 0, _SECTORS - 1)
     np.maximum.at(outline, (row, column), radius)
     return bool(np.ptp(outline, axis=1).max() < _SYMMETRY_TOLERANCE * radius.max())
-
-
-def _spread_points(mesh: TriangleMesh, count: int) -> Array:
-    """Points (count, 3) spread evenly over a surface, always the same ones."""
-    a, b, c = (mesh.vertices[mesh.triangles[:, corner]] for corner in range(3))
-    area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
-    random = np.random.default_rng(0)
-    face = random.choice(len(area), size=count, p=area / area.sum())
-    u, v = np.sqrt(random.random(count)), random.random(count)
-    weights = np.stack([1.0 - u, u * (1.0 - v), u * v], axis=-1)[:, :, None]
-    return (weights * np.stack([a[face], b[face], c[face]], axis=1)).sum(axis=1)

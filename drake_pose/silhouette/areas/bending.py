@@ -37,7 +37,7 @@ class BendingOutline:
         edges = own.edges.copy()
         edges[:, :2] += len(rigid.vertices)
         edges[:, 2] += len(rigid.triangles)
-        edges[:, 4] += np.where(edges[:, 4] < 0, 0, len(rigid.triangles))
+        edges[:, 3] += np.where(edges[:, 3] < 0, 0, len(rigid.triangles))
         self.rest = Outline(
             vertices=np.concatenate([rigid.vertices, own.vertices]),
             triangles=np.concatenate(

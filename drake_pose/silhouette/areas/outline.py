@@ -25,9 +25,8 @@ class Outline:
     Args:
         vertices: (n, 3) float64 points in the surface's own frame N [m].
         triangles: (m, 3) int32 vertex indices, in any orientation.
-        edges: (e, 6) int32 records v0, v1, t0, s0, t1, s1: s is +1 where the triangle t runs from
-            v0 to v1 and -1 where it runs back; t1 = -1 and s1 = 0 where there is no second
-            triangle.
+        edges: (e, 5) int32 records v0, v1, t0, t1, s1: the triangle t0 runs from v0 to v1; s1 is +1
+            where t1 does, too, and -1 where it runs back; t1 = -1, s1 = 0: no second triangle.
         rest: the surface that this is with some vertices moved; what they share is packed once.
     """
 
@@ -47,8 +46,8 @@ class Outline:
     @cached_property
     def is_closed(self) -> bool:
         """Whether all parts are closed, and run around counter-clockwise seen from outside."""
-        neighbours = self.edges[:, [2, 4]]
-        if not np.all(self.edges[:, 3] * self.edges[:, 5] == -1):
+        neighbours = self.edges[:, [2, 3]]
+        if not np.all(self.edges[:, 4] == -1):
             return False
         count = len(self.triangles)
         graph = coo_array((np.ones(len(neighbours)), neighbours.T), shape=(count, count))
@@ -128,7 +127,6 @@ def edge_records(triangles: np.ndarray) -> np.ndarray:
         np.where(forward[first], low[first], high[first]),
         np.where(forward[first], high[first], low[first]),
         owners[first],
-        np.ones_like(first),
         np.where(paired, owners[following], -1),
         np.where(paired, side, 0),
     ]
@@ -184,13 +182,11 @@ def _pack_rest(outlines: tuple[Outline, ...]) -> PackedOutlines:
 
 
 def _kernel_edges(outline: Outline) -> np.ndarray:
-    """Returns (e, 5) v0, v1, t0, t1, s1 turned so that s0 = +1, those with s1 = -1 first."""
-    v0, v1, t0, s0, t1, s1 = outline.edges.T
-    start, end = np.where(s0 > 0, v0, v1), np.where(s0 > 0, v1, v0)
+    """Returns the records (e, 5) as the kernel has them, those with s1 = -1 first."""
+    v0, v1, t0, t1, s1 = outline.edges.T
     other = np.where(s1 == 0, len(outline.triangles), t1)
-    side = s0 * s1
-    order = np.lexsort((t0, side != -1))  # neighbours in memory, too
-    return np.column_stack([start, end, t0, other, side])[order]
+    order = np.lexsort((t0, s1 != -1))  # neighbours in memory, too
+    return np.column_stack([v0, v1, t0, other, s1])[order]
 
 
 def _stacked(parts: Sequence[np.ndarray], columns: int, dtype: type) -> np.ndarray:

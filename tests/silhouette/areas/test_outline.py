@@ -14,8 +14,8 @@ def directed_edges(triangles: np.ndarray) -> list[tuple[int, int, int]]:
 
 def uses_of_records(edges: np.ndarray) -> list[tuple[int, int, int]]:
     uses = []
-    for v0, v1, t0, s0, t1, s1 in edges.tolist():
-        uses.append((v0, v1, t0) if s0 > 0 else (v1, v0, t0))
+    for v0, v1, t0, t1, s1 in edges.tolist():
+        uses.append((v0, v1, t0))
         if s1 != 0:
             uses.append((v0, v1, t1) if s1 > 0 else (v1, v0, t1))
         else:

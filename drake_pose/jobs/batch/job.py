@@ -53,13 +53,12 @@ class SceneJob:
         """Returns plain JSON values that tell whether a resumed job is still the same."""
         truth = None if self.truth is None else str(self.truth)
         described = describe_job(self.scene, self.model, self.settings)
-        audited: dict[str, Any] = {}
-        if self.audit is not None:
-            files = {"audit": self.audit, "camera_file": self.camera_file}
-            audited = {
-                name: None if file is None else {"file": str(file), "sha256": file_digest(file)}
-                for name, file in files.items()
-            }
+        files = {"audit": self.audit, "camera_file": self.camera_file}
+        audited = {
+            name: None if file is None else {"file": str(file), "sha256": file_digest(file)}
+            for name, file in files.items()
+            if self.audit is not None
+        }
         return described | {"chunk": self.chunk, "truth": truth} | audited
 
 
@@ -111,8 +110,14 @@ def _known(value: Any, where: str, known: tuple[str, ...]) -> dict[str, Any]:
 def _scene_job(
     name: str, values: Mapping[str, Any], chunk: int, where: str, base: Path
 ) -> SceneJob:
-    given = _read_fields(SceneJob, {key: values.get(key) for key in _OWN}, where, base)
-    settings = _read_fields(EstimateSettings, values, where, base)
+    given, settings = (
+        {
+            key: _convert(values[key], hint, f"{where}: {key}", base)
+            for key, hint in get_type_hints(known, include_extras=True).items()
+            if key in keys and values.get(key) is not None
+        }
+        for known, keys in ((SceneJob, _OWN), (EstimateSettings, _SETTINGS))
+    )
     if "scene" not in given:
         raise SettingsError(f"{where}: 'scene' is missing, the scene's folder")
     if "audit" in given:
@@ -134,15 +139,6 @@ def _scene_job(
     )
 
 
-def _read_fields(known: type, values: Mapping[str, Any], where: str, base: Path) -> dict[str, Any]:
-    """The given fields of a dataclass, from what YAML has for them."""
-    return {
-        name: _convert(values[name], hint, f"{where}: {name}", base)
-        for name, hint in get_type_hints(known, include_extras=True).items()
-        if values.get(name) is not None
-    }
-
-
 def _convert(value: Any, hint: Any, where: str, base: Path) -> Any:
     """A YAML value as a field of that type has it; paths are relative to base."""
     reader = None
@@ -151,9 +147,9 @@ def _convert(value: Any, hint: Any, where: str, base: Path) -> Any:
         found = [one.converter for one in more if isinstance(one, Parameter)]
         reader = next((one for one in found if isinstance(one, FromText)), reader)
     origin, arguments = get_origin(hint), get_args(hint)
+    if origin in (Union, UnionType) and reader is not None:
+        return _parse(value, reader, where, base)
     if origin in (Union, UnionType):
-        if reader is not None:
-            return _parse(value, reader, where, base)
         return _convert(value, next(one for one in arguments if one is not type(None)), where, base)
     if origin is tuple:
         texts = value if isinstance(value, list) else [value]

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from pydrake.systems.framework import Context, Diagram, OutputPort
@@ -42,8 +42,7 @@ PERSON, PAPER = "person", "paper_capture"
 _LEAST_IOU = 0.6
 
 
-@dataclass(frozen=True, eq=False)
-class LiveResult:
+class LiveResult(NamedTuple):
     """What came out of a live capture; troubles: what the user was not told while it ran."""
 
     estimate: SceneEstimate

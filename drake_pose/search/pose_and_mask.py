@@ -33,6 +33,7 @@ from drake_pose.silhouette.segmentation.background import cut, tell_from_backgro
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Picture = NDArray[np.uint8]
+Likelihood = NDArray[np.float32]
 
 # Triangles of a part that the contour fit sees.
 _TRIANGLES = 600
@@ -52,8 +53,8 @@ _GOOD, _FAIR = 0.9, 0.8
 # A surface is this uncertain beside the pose, and the last mask follows colours along such a band,
 # as shares of the silhouette's size.
 _SURFACE, _BAND = 0.02, 0.01
-# Surely the body, and surely not, by log-odds; and the least that any pixel is left.
-_SURE, _LEAST_PROBABILITY = 4.0, 0.01
+# Surely the body, and surely not, by log-odds; and the least and most that any pixel is given.
+_SURE, _PROBABILITIES = 4.0, (0.01, 0.99)
 # GrabCut's rounds, and the side of the median filter that takes specks away [pixel].
 _CUTS, _SPECKS = 2, 5
 # The contour fit's first and last scale, as shares of the silhouette's size.
@@ -148,27 +149,40 @@ class PoseAndMask:
             chances = self._chances(values, shares)
             ratios = self._ratios(pictures, chances)
             if k < _SEARCHING:
-                values = [
-                    self._search(one, share, own, seen)
-                    for one, share, own, seen in zip(values, shares, ratios, pictures, strict=True)
-                ]
+                values = [self._search(*one) for one in zip(values, shares, ratios, strict=True)]
                 shares = np.minimum(shares, _SEARCHED_SHARE)
                 chances = self._chances(values, shares)
-            cuts = self._cut(pictures, chances, ratios)
+            cuts = [
+                [
+                    None if picture is None else cut_by_odds(picture, chance, ratio)
+                    for picture, chance, ratio in zip(*own, strict=True)
+                ]
+                for own in zip(pictures, chances, ratios, strict=True)
+            ]
             values = [self._refine(*one) for one in zip(values, starts, cuts, shares, strict=True)]
             drawn = [[self._draw(one, camera) for camera in self._cameras] for one in values]
-            agreements = [self._agree(*one) for one in zip(drawn, cuts, strict=True)]
+            agreements = [
+                tuple(
+                    math.nan if mask is None else intersection_over_union(silhouette, mask)
+                    for silhouette, mask in zip(*own, strict=True)
+                )
+                for own in zip(drawn, cuts, strict=True)
+            ]
             shares = np.array([_narrowed(*one) for one in zip(shares, agreements, strict=True)])
             on_round(k + 1)
             if last and (shares <= _FINEST_SHARE).all() and _settled(drawn, last):
                 break
             last = drawn
+        spread = np.where(self._spread > 0.0, self._spread, np.inf)
         return [
             FoundPose(
                 one,
-                self._finish(one, silhouettes, own),
+                tuple(
+                    None if mask is None else follow_colours(silhouette, mask)
+                    for silhouette, mask in zip(silhouettes, own, strict=True)
+                ),
                 agreed,
-                (one - start) / np.where(self._spread > 0.0, self._spread, np.inf),
+                (one - start) / spread,
             )
             for one, silhouettes, own, agreed, start in zip(
                 values, drawn, cuts, agreements, starts, strict=True
@@ -187,9 +201,7 @@ class PoseAndMask:
         drawn = values + spread * self._rng.standard_normal((count, len(values)))
         return np.clip(drawn, self._kinematics.lower, self._kinematics.upper)
 
-    def _chances(
-        self, values: Sequence[Array], shares: NDArray[np.float64]
-    ) -> list[list[NDArray[np.float32]]]:
+    def _chances(self, values: Sequence[Array], shares: Array) -> list[list[Likelihood]]:
         """How likely the body is at each pixel, of each frame and camera."""
         found = []
         for one, share in zip(values, shares, strict=True):
@@ -201,17 +213,16 @@ class PoseAndMask:
                     total += self._draw(pose, camera, few=True)
                 blur = max(1.0, _SURFACE * math.sqrt(float(total.sum()) / _SAMPLES))
                 chance = cv2.GaussianBlur(total / _SAMPLES, (0, 0), blur)
-                least = _LEAST_PROBABILITY
-                own.append(np.clip(chance, least, 1.0 - least).astype(np.float32))
+                own.append(np.clip(chance, *_PROBABILITIES).astype(np.float32))
             found.append(own)
         return found
 
     def _ratios(
         self,
         pictures: Sequence[Sequence[Picture | None]],
-        chances: Sequence[Sequence[NDArray[np.float32]]],
-    ) -> list[list[NDArray[np.float32]]]:
-        """What the background says, of each frame and camera."""
+        chances: Sequence[Sequence[Likelihood]],
+    ) -> list[list[Likelihood]]:
+        """What the background says, of each frame and camera; nothing where there is no picture."""
         found = [[np.zeros_like(one) for one in own] for own in chances]
         for c in range(len(self._cameras)):
             seen = [(f, own[c]) for f, own in enumerate(pictures)]
@@ -223,17 +234,11 @@ class PoseAndMask:
                 found[f][c] = ratio
         return found
 
-    def _search(
-        self,
-        values: Array,
-        share: float,
-        ratios: Sequence[NDArray[np.float32]],
-        pictures: Sequence[Picture | None],
-    ) -> Array:
+    def _search(self, values: Array, share: float, ratios: Sequence[Likelihood]) -> Array:
         """The pose near some values that covers most of what is not background."""
-        if not any(ratio.any() for ratio in ratios):
+        told = [pair for pair in zip(self._cameras, ratios, strict=True) if pair[1].any()]
+        if not told:
             return values
-        seen = [c for c, picture in enumerate(pictures) if picture is not None]
         first = share * self._spread
         middle, spread, best, most = values, first, values, -math.inf
         for _ in range(_SEARCH_ROUNDS):
@@ -241,10 +246,7 @@ class PoseAndMask:
             poses[0] = middle
             scores = np.array(
                 [
-                    sum(
-                        float(ratios[c][self._draw(pose, self._cameras[c], few=True)].sum())
-                        for c in seen
-                    )
+                    sum(float(ratio[self._draw(pose, c, few=True)].sum()) for c, ratio in told)
                     for pose in poses
                 ]
             )
@@ -255,21 +257,6 @@ class PoseAndMask:
             spread = np.maximum(_WIDENED * poses[order].std(axis=0), _LEAST_SPREAD * first)
         return best
 
-    def _cut(
-        self,
-        pictures: Sequence[Sequence[Picture | None]],
-        chances: Sequence[Sequence[NDArray[np.float32]]],
-        ratios: Sequence[Sequence[NDArray[np.float32]]],
-    ) -> list[list[Mask | None]]:
-        """What colours give, of each frame and camera."""
-        return [
-            [
-                None if picture is None else cut_by_odds(picture, chance, ratio)
-                for picture, chance, ratio in zip(*own, strict=True)
-            ]
-            for own in zip(pictures, chances, ratios, strict=True)
-        ]
-
     def _refine(
         self, values: Array, start: Array, masks: Sequence[Mask | None], share: float
     ) -> Array:
@@ -279,35 +266,17 @@ class PoseAndMask:
             return values
         size = math.sqrt(float(np.mean(areas)))
         edges = [NO_EDGE if mask is None else find_edge_points(mask, 2.0) for mask in masks]
-        scale = max(_SPACING, _WIDE * float(share))
         # Rounds are in hundreds of pixels.
         rounds = [
             AnnealingStage(one * size / 200.0, _SPACING, 8)
-            for one in np.geomspace(scale, _NARROW, 4)
+            for one in np.geomspace(max(_SPACING, _WIDE * float(share)), _NARROW, 4)
         ]
-        known = np.where(self._spread > 0.0, 1.0 / np.maximum(self._spread, 1e-9) ** 2, 0.0)
-        prior = Prior(start, known)
         held = self._spread <= 0.0
+        prior = Prior(start, np.where(held, 0.0, 1.0 / np.maximum(self._spread, 1e-9) ** 2))
         return self._fit.fit(pack_views(self._cameras, edges), values, rounds, prior, held).values
 
-    def _agree(self, drawn: Sequence[Mask], masks: Sequence[Mask | None]) -> tuple[float, ...]:
-        """IoU of silhouettes and masks; nan where there is no picture."""
-        return tuple(
-            math.nan if mask is None else intersection_over_union(own, mask)
-            for own, mask in zip(drawn, masks, strict=True)
-        )
 
-    def _finish(
-        self, values: Array, drawn: Sequence[Mask], masks: Sequence[Mask | None]
-    ) -> tuple[Mask | None, ...]:
-        """Silhouettes, along whose edges colours decide."""
-        return tuple(
-            None if mask is None else follow_colours(own, mask)
-            for own, mask in zip(drawn, masks, strict=True)
-        )
-
-
-def cut_by_odds(picture: Picture, chance: NDArray[np.float32], ratio: NDArray[np.float32]) -> Mask:
+def cut_by_odds(picture: Picture, chance: Likelihood, ratio: Likelihood) -> Mask:
     """The object (H, W) in a picture (H, W, 3), by GrabCut where neither pose nor colour is sure.
 
     Args:
@@ -318,7 +287,7 @@ def cut_by_odds(picture: Picture, chance: NDArray[np.float32], ratio: NDArray[np
     odds = np.log(chance / (1.0 - chance)) + ratio
     labels = np.where(odds > 0.0, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
     labels[odds > _SURE] = cv2.GC_FGD
-    labels[(odds < -_SURE) | (chance <= _LEAST_PROBABILITY)] = cv2.GC_BGD
+    labels[(odds < -_SURE) | (chance <= _PROBABILITIES[0])] = cv2.GC_BGD
     found = cut(picture, labels, _CUTS)
     return np.asarray(cv2.medianBlur(found.astype(np.uint8), _SPECKS) > 0)
 

@@ -253,18 +253,6 @@ class Pass:
     longest_step: float = 0.25
     slack: float = 0.0
 
-    def __post_init__(self) -> None:
-        if self.iterations < 1 or self.stride < 1:
-            raise SettingsError(
-                f"a pass needs 1 iteration and a stride of 1 or more, not {self.iterations} and "
-                f"{self.stride}"
-            )
-        if not 0.0 <= self.slack <= 0.5:
-            raise SettingsError(f"slack must lie between 0 and 0.5 pixel, not {self.slack}")
-        for name in ("scale", "damping", "longest_step"):
-            if not getattr(self, name) > 0.0:
-                raise SettingsError(f"{name} must be positive, not {getattr(self, name)}")
-
 
 COARSE_PASSES = (Pass(8, 4, 50.0, 300.0), Pass(8, 4, 10.0, 100.0))
 """From far: several nodes may be off by their own width."""
@@ -317,14 +305,14 @@ def descend(
             if iteration == part.iterations:
                 break
             equations.H[0][np.diag_indices(len(free))] += part.damping
-            before = parameters[free]
             after, _ = damped_step(
-                equations, before[None], np.zeros(0), limits, _RELATIVE_DAMPING, settings
+                equations, parameters[free][None], np.zeros(0), limits, _RELATIVE_DAMPING, settings
             )
             steps += 1
+            change = np.abs(after[0] - parameters[free]).max(initial=0.0)
             parameters = parameters.copy()
             parameters[free] = after[0]
-            if np.abs(after[0] - before).max(initial=0.0) < _STANDSTILL:
+            if change < _STANDSTILL:
                 break
         parameters = best
     return parameters, least, steps

@@ -146,78 +146,63 @@ class RootPlacementSearch:
         deadline = math.inf if limit is None else begin + limit
         layers = find_layers(self.body, views, self.scale_unknown, root_position)
         placed: list[_Placed] = []
-        width = math.ceil(_HYPOTHESES / len(layers))
-        runs = 0
+        width, runs = math.ceil(_HYPOTHESES / len(layers)), 0
         for outside_share in (_OUTSIDE_SHARE, math.inf):
-            for layer in layers:
-                if placed and time.perf_counter() >= deadline:
-                    break
-                placed += self._search_layer(layer, width, outside_share)
-                runs += len(self.tree.nodes)
-            if placed:
-                break
+            for layer in layers if not placed else ():
+                if not placed or time.perf_counter() < deadline:
+                    placed += self._search_layer(layer, width, outside_share)
+                    runs += len(self.tree.nodes)
         if not placed:
-            return PoseEstimate.nothing(
-                self.tree,
-                stopped_by="end",
-                seconds=time.perf_counter() - begin,
-                statistics=SearchStatistics(runs),
+            found = PoseEstimate.nothing(
+                self.tree, stopped_by="end", statistics=SearchStatistics(runs)
             )
-        placed.sort(key=lambda one: one.J)
-        first = placed[0].J / _area(views)
+            return replace(found, seconds=time.perf_counter() - begin)
+        placed.sort(key=_by_J)
         best = self._improve(placed[:_STARTS], root_position is None, deadline)
-        stopped_by = "time_limit" if time.perf_counter() >= deadline else "end"
-        result = self._answer(best, first, runs, stopped_by)
-        return replace(result, seconds=time.perf_counter() - begin)
+        first_J = placed[0].J / _area(views) * _area(best.views)
+        found = self._answer(best, SearchStatistics(runs, first_J))
+        now = time.perf_counter()
+        stopped_by = "time_limit" if now >= deadline else "end"
+        return replace(found, stopped_by=stopped_by, seconds=now - begin)
 
     def _search_layer(self, layer: Layer, width: int, outside_share: float) -> list[_Placed]:
         """The best whole poses of a scale or depth, of each root placement the best."""
         if len(layer.positions) == 0:
             return []
         views = [coarsen(view, _PIXELS) for view in layer.views]
-        turns = _ROOT_SPARE * _ROOT_FACTOR * self._quota(width)
+        quota = math.ceil(_QUOTA * width)
+        turns = _ROOT_SPARE * _ROOT_FACTOR * quota
         chosen = choose_root_samples(self.body, views, layer.positions, turns, _OUTSIDE_WEIGHT)
         body = place_body(self.body, layer.positions, chosen)
-        pictures = Pictures(body, views, BAND)
-        store = PoseStore(body, pictures, outside_share)
+        store = PoseStore(body, Pictures(body, views, BAND), outside_share)
         expansion = Expansion(store)
-        last = self._grow(expansion, width, chosen // len(self.sampled.X_PN[0]))
+        last = self._grow(expansion, width, quota, chosen // len(self.sampled.X_PN[0]))
         if last is None:
             return []
         # As many pixels as in the silhouettes themselves.
-        finer = _area(layer.views) / pictures.area
-        Js = finer * expansion.objectives(last)
+        Js = _area(layer.views) / store.pictures.area * expansion.objectives(last)
         samples = store.samples(last.poses)
-        found: dict[int, _Placed] = {}
-        for i in np.argsort(Js, kind="stable"):
-            root = int(samples[i, 0])
-            if root in found:
-                continue
-            values = [grid[t] for grid, t in zip(body.sampled.values, samples[i], strict=True)]
-            p_WR = body.sampled.X_PN[0][root, :3, 3]
-            parameters = self._refined.parameters(values, p_WR)
-            found[root] = _Placed(layer.views, layer.scale, parameters, float(Js[i]))
-            if len(found) >= _STARTS:
-                break
-        return list(found.values())
+        order = np.argsort(Js, kind="stable")
+        firsts = np.sort(np.unique(samples[order, 0], return_index=True)[1])[:_STARTS]
+        found = []
+        for i in order[firsts]:
+            p_WR = body.sampled.X_PN[0][samples[i, 0], :3, 3]
+            parameters = self._refined.parameters(body.sampled.values_at(samples[i]), p_WR)
+            found.append(_Placed(layer.views, layer.scale, parameters, float(Js[i])))
+        return found
 
-    def _quota(self, width: int) -> int:
-        return math.ceil(_QUOTA * width)
-
-    def _grow(self, expansion: Expansion, width: int, places: np.ndarray) -> PartialPoses | None:
+    def _grow(
+        self, expansion: Expansion, width: int, quota: int, places: np.ndarray
+    ) -> PartialPoses | None:
         """Whole poses, no root position having more than its quota at any time.
 
-        Args:
-            expansion: grows them.
-            width: how many.
-            places: the position of each of the root's samples.
+        ``places``: the position of each of the root's samples.
         """
-        quota = self._quota(width)
         hypotheses: PartialPoses | None = expansion.start()
-        for place, node in enumerate(self.body.order):
+        factor = _ROOT_FACTOR
+        for node in self.body.order:
             if hypotheses is None:
                 break
-            factor = _ROOT_FACTOR if place == 0 else 1
             spare = _SPARE * factor * width
             grown, _ = grow(expansion, hypotheses, node, spare, _OUTSIDE_WEIGHT, False)
             hypotheses = None
@@ -225,37 +210,34 @@ class RootPlacementSearch:
                 roots = expansion.store.nodes[0].samples[grown.poses[:, 0]]
                 kept = _within_quota(places[roots], factor * quota)[: factor * width]
                 hypotheses = grown.chosen(kept)
+            factor = 1
         return hypotheses
 
     def _improve(self, starts: Sequence[_Placed], moves: bool, deadline: float) -> _Placed:
         """The best pose reached from some; the root moves, too, if its position is unknown."""
         pool: list[_Placed] = []
         for start in starts:
-            if time.perf_counter() >= deadline:
-                break
-            pool.append(self._settle(start, COARSE_PASSES, moves))
-        pool.sort(key=lambda one: one.J)
+            if time.perf_counter() < deadline:
+                pool.append(self._settle(start, COARSE_PASSES, moves))
+        pool.sort(key=_by_J)
         for one in self._elsewhere(pool)[:_FINALISTS]:
             if time.perf_counter() < deadline:
                 pool += self._search_again(one, moves)
-        pool.sort(key=lambda one: one.J)
-        best = min([*pool, *starts], key=lambda one: one.J)
+        pool.sort(key=_by_J)
+        best = min([*pool, *starts], key=_by_J)
         for one in pool[:_FINALISTS]:
-            if time.perf_counter() >= deadline or best.J <= _ENOUGH * _area(best.views):
-                break
-            best = min(best, self._finish(one, moves, deadline), key=lambda one: one.J)
+            if time.perf_counter() < deadline and best.J > _ENOUGH * _area(best.views):
+                best = min(best, self._finish(one, moves, deadline), key=_by_J)
         return best
 
     def _elsewhere(self, pool: Sequence[_Placed]) -> list[_Placed]:
         """Those whose root is not near that of one before them."""
-        chosen: list[_Placed] = []
-        there: list[np.ndarray] = []
+        chosen: list[tuple[_Placed, np.ndarray]] = []
         for one in pool:
             here = whereabouts(one.views, self._root_of(one))
-            if all(np.abs(here - other).max() >= 1.0 for other in there):
-                chosen.append(one)
-                there.append(here)
-        return chosen
+            if all(np.abs(here - there).max() >= 1.0 for _, there in chosen):
+                chosen.append((one, here))
+        return [one for one, _ in chosen]
 
     def _settle(self, start: _Placed, passes: Sequence[Pass], moves: bool) -> _Placed:
         """The pose refined with its root free, growth turned into the camera's scale."""
@@ -300,29 +282,35 @@ class RootPlacementSearch:
         parameters, J = about.improve(near.parameters, enough, deadline)
         better = replace(near, parameters=parameters, J=float(J))
         end = self._settle(better, FINE_PASSES, moves)
-        return min(start, near, better, end, key=lambda one: one.J)
+        return min(start, near, better, end, key=_by_J)
 
-    def _answer(self, best: _Placed, first: float, runs: int, stopped_by: str) -> PoseEstimate:
+    def _answer(self, best: _Placed, statistics: SearchStatistics) -> PoseEstimate:
         """The result."""
         p_WR = self._root_of(best)
         tree = self.tree.with_root_position(p_WR)
-        node_values = []
         parameters = self._refined.nearest_turns(best.parameters)
-        for i, values in enumerate(self._refined.node_values(parameters)):
-            # The plant's own joints hold the root where it is now.
-            lower, upper = tree.value_bounds(i)
-            node_values.append(np.where(lower == upper, lower, values))
-        area = _area(best.views)
+        # The plant's own joints hold the root where it is now.
+        bounds = [tree.value_bounds(i) for i in range(len(tree.nodes))]
+        values = [
+            np.where(lower == upper, lower, own)
+            for own, (lower, upper) in zip(
+                self._refined.node_values(parameters), bounds, strict=True
+            )
+        ]
         return PoseEstimate.of_values(
             tree,
-            node_values,
+            values,
             RefinementProblem(self._refined, best.views).J(parameters),
-            area,
-            stopped_by=stopped_by,
+            _area(best.views),
+            stopped_by="end",
             root_position=p_WR,
             scale=best.scale,
-            statistics=SearchStatistics(runs, first * area),
+            statistics=statistics,
         )
+
+
+def _by_J(placed: _Placed) -> float:
+    return placed.J
 
 
 def _area(views: Sequence[View]) -> float:

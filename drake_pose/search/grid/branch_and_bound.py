@@ -53,22 +53,17 @@ def branch_and_bound(
     J_limit: float,
     limits: BoundLimits | None = None,
     kept_samples: np.ndarray | None = None,
-    deadline: float | None = None,
 ) -> PosesWithin:
     """Find all poses of the grid whose objective is no greater than a limit.
 
     Args:
         kept_samples: (nodes,) of a pose that is never dropped for want of room.
-        deadline: the value of time.perf_counter() at which it stops [s].
 
     Returns:
         The poses; not all if a limit was reached, or if an area beyond the bands around the
         silhouettes is counted twice.
     """
-    search = _BranchAndBound(body, views, J_limit, limits or BoundLimits(), kept_samples)
-    if deadline is not None:
-        search.store.deadline = deadline
-    return search.run()
+    return _BranchAndBound(body, views, J_limit, limits or BoundLimits(), kept_samples).run()
 
 
 class _BranchAndBound:

@@ -8,13 +8,9 @@ import pytest
 
 from drake_pose.errors import SettingsError
 from drake_pose.search.grid.beam_search import BeamSearch
-from drake_pose.search.grid.examination import (
-    ExaminationSettings,
-    examine,
-    prove_optimal,
-)
+from drake_pose.search.grid.examination import ExaminationSettings, examine
 from drake_pose.search.grid.pose_families import samples_at
-from drake_pose.search.settings import BeamSearchSettings, BoundLimits
+from drake_pose.search.settings import BeamSearchSettings
 from tests.search.grid_problems import ProblemMaker
 
 INTERVAL = 0.4
@@ -57,10 +53,7 @@ def test_a_worse_pose_is_replaced(maker: ProblemMaker) -> None:
         assert found.pose_set is None
         assert found.proved_optimal == (found.J == 0)
         wrong = int(generator.integers(len(problem.Js)))
-        values = tuple(
-            grid[t]
-            for grid, t in zip(maker.body.sampled.values, problem.choices[wrong], strict=True)
-        )
+        values = tuple(maker.body.sampled.values_at(problem.choices[wrong]))
         bad = replace(found, node_values=values, J=float(problem.Js[wrong]))
         mended = examine(search.body, problem.views, bad, ExaminationSettings())
         assert mended.proved_optimal
@@ -94,32 +87,25 @@ def test_a_pose_between_the_samples_is_refused(maker: ProblemMaker) -> None:
         examine(search.body, problem.views, moved, ExaminationSettings())
 
 
-@pytest.mark.parametrize(
-    "limit", [{"states": 2}, {"pairs": 8}, {"poses": 1}, {"time_limit": 0}, {"memory": 8_000}]
-)
+@pytest.mark.parametrize("limit", [{"proof_poses": 1}, {"memory": 8_000}])
 def test_a_limit_leaves_a_true_bound_and_no_false_proof(
     maker: ProblemMaker, limit: dict[str, int]
 ) -> None:
+    search = search_of(maker, None)
     generator = np.random.default_rng(12)
-    proved = 0
+    proved = []
     for number in range(12):
         problem = maker.make(generator, views=1, noise=0.01, on_grid=False)
         start = int(np.argsort(problem.Js)[number])
-        proof = prove_optimal(
-            problem.body,
-            problem.views,
-            problem.choices[start],
-            float(problem.Js[start]),
-            BoundLimits(**limit),
-        )
-        best = float(problem.Js.min())
-        assert proof.lower_bound <= best <= proof.J <= problem.Js[start]
-        assert tuple(proof.samples.tolist()) in problem.within(proof.J)
-        assert proof.budget_spent != proof.proved
-        if proof.proved:
-            proved += 1
-            assert proof.J == best
-    assert proved < 12
+        values = search.sampled.values_at(problem.choices[start])
+        found = replace(search.match(problem.views), node_values=values, J=float(problem.Js[start]))
+        settings = ExaminationSettings(family_poses=1, **limit)
+        proof = examine(search.body, problem.views, found, settings)
+        assert proof.lower_bound <= problem.best[1] <= proof.J <= found.J
+        assert proof.J in problem.Js
+        assert proof.budget_spent or proof.proved_optimal
+        proved.append(proof.proved_optimal)
+    assert not all(proved)
 
 
 @pytest.mark.parametrize(

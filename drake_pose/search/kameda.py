@@ -24,12 +24,9 @@ _COMBINATIONS, _BLOCK = 100_000, 4_000_000
 
 @dataclass(frozen=True)
 class NodeList:
-    """The candidate list of one node.
+    """The candidate list of one node, best first: JAC_i(1), JAC_i(2), ...
 
-    Args:
-        samples: (n,) indices into the node's sampling grid, best first: JAC_i(1), JAC_i(2), ...
-        X_WN: (n, 4, 4) their poses.
-        adopted: u_i, the one in use.
+    ``samples``: (n,) indices into the node's grid; X_WN: (n, 4, 4); ``adopted``: u_i, in use.
     """
 
     samples: np.ndarray
@@ -104,8 +101,7 @@ class _Run:
     def search(self) -> None:
         """Run sections 5.1 and 5.2 to their end, or to the run limit."""
         while self._complete():
-            samples, X_WN = self._adopted()
-            J = float(self.scoring.J(X_WN[None], samples[None])[0])
+            J = float(self.scoring.J(self._adopted()[0][None])[0])
             if self.best_J == np.inf:
                 self.first_J = J
             self._keep_if_better(J)
@@ -222,10 +218,10 @@ class _Run:
         return float(best - first)
 
     def _patterns(self, leaves: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
-        """Pixels that no inner node covers, by which of the leaves' candidates cover them.
+        """Distinct sets (n, candidates) bool of the leaves' candidates that cover pixels, their
+        worth.
 
-        Returns:
-            (n, candidates of all leaves) bool distinct patterns, and what covering each is worth.
+        Of pixels that no inner node covers.
         """
         inner = [i for i, node in enumerate(self.nodes) if node.children]
         adopted = [array[inner] for array in self._adopted()]

@@ -99,14 +99,7 @@ class FoundPose:
 
 
 class PoseAndMask:
-    """Finds poses and masks of a body in the pictures of cameras that stand still.
-
-    Args:
-        kinematics: of the body's pose tree.
-        cameras: the cameras.
-        settings: how far off the first poses may be.
-        seed: of the random poses.
-    """
+    """Finds poses and masks of a body in the pictures of cameras that stand still."""
 
     def __init__(
         self,
@@ -279,10 +272,7 @@ class PoseAndMask:
 def cut_by_odds(picture: Picture, chance: Likelihood, ratio: Likelihood) -> Mask:
     """The object (H, W) in a picture (H, W, 3), by GrabCut where neither pose nor colour is sure.
 
-    Args:
-        picture: the picture.
-        chance: (H, W) how likely the object is, by its pose.
-        ratio: (H, W) logarithm of how much more likely its colour makes it.
+    ``chance``: (H, W) of the object, by its pose; ``ratio``: logarithm of the odds by its colour.
     """
     odds = np.log(chance / (1.0 - chance)) + ratio
     labels = np.where(odds > 0.0, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)

@@ -47,13 +47,8 @@ class Freedom(NamedTuple):
 class RefinementBody:
     """A pose tree ready for refinement, made once and matched to many pictures.
 
-    The parameters are the tree's m values and, after them, ROOT_NAMES.
-
-    Attributes:
-        tree: the pose tree.
-        kinematics: its kinematics.
-        surfaces: its surfaces.
-        lower, upper: (m + 4,) limits of the parameters; infinite where an angle turns around.
+    The parameters (m + 4,) are the tree's m values and, after them, ROOT_NAMES; their limits
+    ``lower`` and ``upper`` are infinite where an angle turns around.
     """
 
     def __init__(self, tree: PoseTree) -> None:
@@ -79,9 +74,7 @@ class RefinementBody:
     ) -> np.ndarray:
         """The parameters (m + 4,) of a pose of the body's own size.
 
-        Args:
-            node_values: each node's values.
-            root_position: (3,) where the first root is [m]; None: where the tree says.
+        ``root_position``: (3,) where the first root is [m]; None: where the tree says.
         """
         parameters = np.append(self.kinematics.flatten(node_values), np.zeros(_EXTRA))
         if root_position is not None:
@@ -115,12 +108,9 @@ class RefinementBody:
     def place(
         self, parameters: np.ndarray, *, bent: bool = True, rooted: bool = False
     ) -> Placement:
-        """The body, in arrays that the next call changes.
+        """The body at parameters (m + 4,), in arrays that the next call changes.
 
-        Args:
-            parameters: (m + 4,).
-            bent: else its skin stays as it was.
-            rooted: whether it is to say how ROOT_NAMES move it, too.
+        ``bent``: else its skin stays; ``rooted``: whether it says how ROOT_NAMES move it, too.
         """
         rooted = rooted or bool(parameters[-_EXTRA:].any())
         values = parameters if rooted else parameters[:-_EXTRA]
@@ -136,9 +126,8 @@ class RefinementBody:
 class RasterEquations(Equations):
     """Normal equations (1, k, k) and (1, k) of distances along raster lines; cost: about J [pixel].
 
-    Attributes:
-        weight: the sum of all weights [pixel].
-        squares: that of the weighted squares of all distances [pixel^3].
+    ``weight``: the sum of all weights [pixel]; ``squares``: of weighted squared distances
+    [pixel^3].
     """
 
     weight: float
@@ -148,15 +137,7 @@ class RasterEquations(Equations):
 class RefinementProblem:
     """The pose of one body in the silhouettes of one instant.
 
-    Attributes:
-        body: the body.
-        views: the silhouettes.
-        area: the silhouettes' area [pixel].
-        border_length: about how long their borders are [pixel].
-
-    Args:
-        body: the body.
-        views: the silhouettes, at least one.
+    ``area`` of the silhouettes, and about how long their borders are, ``border_length`` [pixel].
 
     Raises:
         SettingsError: if there is no view.
@@ -204,12 +185,9 @@ class RefinementProblem:
         offset: int = 0,
         still: Sequence[Border] | None = None,
     ) -> RasterEquations:
-        """The normal equations at a pose.
+        """The normal equations of some parameters at a pose (m + 4,).
 
         Args:
-            parameters: (m + 4,).
-            freedom: which of them may change.
-            part: stride, scale and slack.
             offset: the first line that is looked at.
             still: the border in each view of what they do not move; None: made here.
         """
@@ -278,18 +256,13 @@ def descend(
     passes: Sequence[Pass],
     still: Sequence[Border] | None = None,
 ) -> tuple[np.ndarray, float, int]:
-    """Refine some parameters.
+    """Refine some of the parameters (m + 4,), one pass after another.
 
-    Args:
-        problem: the body and the silhouettes.
-        parameters: (m + 4,) to start from.
-        freedom: which of them may change.
-        passes: one after another.
-        still: the border in each view of what they do not move; None: made here.
+    ``still``: the border in each view of what they do not move; None: made here.
 
     Returns:
         The parameters with the least difference met in the last pass, that difference as far as
-        its lines show it [pixel], and the number of steps.
+            its lines show it [pixel], and the number of steps.
     """
     free = freedom.columns
     limits = problem.body.lower[free], problem.body.upper[free]

@@ -44,15 +44,8 @@ class SampledTree:
         # The same few samples are drawn again and again.
         self._bent_outline = lru_cache(maxsize=_BENT_OUTLINES)(self._bend)
 
-    def outlines_at(self, nodes: Sequence[int], samples: np.ndarray | None) -> list[Outline]:
-        """The whole surfaces of nodes at their samples (len(nodes),), each in its node's frame.
-
-        Raises:
-            ValueError: a node bends, and samples is None.
-        """
-        if samples is None:
-            self._require_rigid(nodes)
-            return [self.outlines[node] for node in nodes]
+    def outlines_at(self, nodes: Sequence[int], samples: np.ndarray) -> list[Outline]:
+        """The whole surfaces of nodes at their samples (len(nodes),), each in its node's frame."""
         return [
             self.outlines[node]
             if self.bands[node] is None
@@ -66,35 +59,24 @@ class SampledTree:
             self.outlines[node] if bending is None or bands is None else bending.at(bands[sample])
         )
 
-    def _require_rigid(self, nodes: Sequence[int]) -> None:
-        bent = [self.tree.nodes[node].name for node in nodes if self.bands[node] is not None]
-        if bent:
-            raise ValueError(f"the samples of {', '.join(bent)} are needed: their skin bends")
-
     def areas(
         self,
         nodes: Sequence[int],
-        samples: np.ndarray | None,
+        samples: np.ndarray,
         X_CN: np.ndarray,
         camera: Camera,
         prefixes: np.ndarray,
     ) -> np.ndarray:
         """Areas of the union of nodes at many poses: (n, 1 + k) int64, as score_bodies.
 
-        Args:
-            samples: (n, len(nodes)) the samples they take; may be None where no node bends.
-            X_CN: (n, len(nodes), 4, 4) their poses there, in the camera.
-            prefixes: (k, H, W + 1) int32 prefix sums of sets.
-
-        Raises:
-            ValueError: a node bends, and samples is None.
+        At samples (n, nodes) and poses X_CN (n, nodes, 4, 4), with prefix sums (k, H, W + 1) of
+        sets.
         """
         bands = [(column, self.bands[node]) for column, node in enumerate(nodes)]
-        bent = [(column, band) for column, band in bands if band is not None]
-        if not bent or samples is None:
-            return score_bodies(self.outlines_at(nodes, None), X_CN, camera, prefixes)
+        placed = [band[samples[:, column]] for column, band in bands if band is not None]
+        if not placed:
+            return score_bodies([self.outlines[node] for node in nodes], X_CN, camera, prefixes)
         surfaces = [self.surfaces.whole(node) for node in nodes]
-        placed = [band[samples[:, column]] for column, band in bent]
         return score_bodies(surfaces, X_CN, camera, prefixes, placed)
 
     def with_root_position(self, root_position: np.ndarray) -> "SampledTree":
@@ -165,12 +147,9 @@ class Scoring:
             regions.subtract(nodes, samples[list(nodes)], X_WN[list(nodes)])
         return regions
 
-    def J(self, X_WN: np.ndarray, samples: np.ndarray | None = None) -> np.ndarray:
-        """The objective (1) [pixel] (n,) of poses X_WN (n, nodes, 4, 4) at samples (n, nodes).
-
-        The samples may be left out where no node bends.
-        """
-        total = np.full(len(X_WN), self.silhouette_area)
+    def J(self, samples: np.ndarray) -> np.ndarray:
+        """The objective (1) [pixel] (n,) of poses at samples (n, nodes)."""
+        total, X_WN = np.full(len(samples), self.silhouette_area), self.sampled.poses(samples)
         everything = range(len(self.sampled.outlines))
         for view, prefixes, X_CW in zip(
             self.views, self.silhouette_prefixes, self.X_CW, strict=True
@@ -239,8 +218,4 @@ class PoseSearch(Protocol):
         """The pose tree with its sampling grids."""
 
     def match(self, views: Sequence[View], root_position: np.ndarray | None = None) -> PoseEstimate:
-        """Estimate the pose in views of one instant.
-
-        Args:
-            root_position: (3,) of the root in the world [m], where it is not the pose tree's own.
-        """
+        """Estimate the pose; ``root_position``: (3,) [m] where it is not the tree's own."""

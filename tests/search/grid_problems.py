@@ -82,7 +82,7 @@ class ProblemMaker:
 
     def problem(self, shown: list[View]) -> GridProblem:
         """The problem of given views."""
-        Js = Scoring(self.body.sampled, shown).J(self.X_WN, self.choices)
+        Js = Scoring(self.body.sampled, shown).J(self.choices)
         return GridProblem(self.body, shown, self.choices, Js)
 
     def _outlines(self) -> list[Outline]:

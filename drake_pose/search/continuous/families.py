@@ -186,10 +186,6 @@ class RobustFamilies:
     What no pose explains, such as a part that is missing in a mask, costs all poses alike and says
     nothing. A value that may go far is moved step by step, the others following, until what does
     not fit any more is significant.
-
-    Args:
-        fit: the body and the silhouettes.
-        proceed: asked again and again whether to go on.
     """
 
     def __init__(self, fit: ViewsFit, proceed: Callable[[], bool]) -> None:
@@ -198,12 +194,7 @@ class RobustFamilies:
         self._sizes: ErrorSizes | None = None
 
     def find(self, poses: Sequence[FittedPose], J: Callable[[np.ndarray], float]) -> PoseSet:
-        """The poses that fit as well as the best.
-
-        Args:
-            poses: refined, best first; the first is the answer.
-            J: the objective (1) at values (m,) [pixel].
-        """
+        """The poses that fit as well as the best of some, the answer first; J (1) of values."""
         pieces = [self._fit.piece_costs(pose.values, _LOOK) for pose in poses]
         self._pieces = min(pieces, key=lambda one: float(one.sum()))
         broken = float(self._pieces.sum()) > _BREAKDOWN * 2.0 * self._fit.edge_length

@@ -66,12 +66,7 @@ _ROUNDS = 2
 
 
 class MultiStartSearch:
-    """Matches silhouettes with a pose tree at continuous values.
-
-    Args:
-        tree: the pose tree.
-        time_limit: the search returns its best pose so far after this time [s]; None: no limit.
-    """
+    """Matches silhouettes with a pose tree at continuous values, for so long a time [s] at most."""
 
     def __init__(self, tree: PoseTree, time_limit: float | None = None) -> None:
         self.tree = tree
@@ -219,16 +214,10 @@ class _Run:
 
 
 def without_specks(mask: np.ndarray) -> np.ndarray:
-    """A mask without salt and pepper noise; one with few specks stays as it is.
+    """A mask (H, W) without salt and pepper noise, not emptied; with few specks it stays as it is.
 
     A median over 5 x 5 pixels takes specks away, but also what is thinner than three pixels, so it
     is only used where specks are many.
-
-    Args:
-        mask: (H, W) bool.
-
-    Returns:
-        (H, W) bool, not empty if the mask is not.
     """
     inside = mask.astype(np.uint8)
     specks = sum(_speck_area(side) for side in (inside, 1 - inside))

@@ -72,13 +72,9 @@ _TRANSLATION, _GROWTH = (0, 1, 2), (3,)
 
 @dataclass(frozen=True, eq=False)
 class _Placed:
-    """A pose somewhere.
+    """A pose somewhere: parameters of the refinement, the body of its own size, and J (1) [pixel].
 
-    Attributes:
-        views: the silhouettes, their camera scaled.
-        scale: of the camera, times what it was given as.
-        parameters: of the refinement; the body has its own size.
-        J: the objective (1) [pixel].
+    ``views``: the silhouettes, their camera scaled; ``scale``: times what it was given as.
     """
 
     views: tuple[View, ...]
@@ -127,17 +123,11 @@ class RootPlacementSearch:
         }
 
     def match(self, views: Sequence[View], root_position: np.ndarray | None = None) -> PoseEstimate:
-        """Estimate the pose that the views show, and where it is.
-
-        Args:
-            views: one or several silhouettes of the same instant.
-            root_position: (3,) [m] where it is known all the same.
-
-        Returns:
-            The best pose found. ``stopped_by`` is "end" or "time_limit".
+        """Estimate the pose that the views show, and where it is; see ``PoseSearch``.
 
         Raises:
-            SettingsError: if there is no view, or a scale cannot be searched with these cameras.
+            SettingsError: if there is no view, or a scale cannot be searched with these
+                cameras.
         """
         if not views:
             raise SettingsError("a match needs at least one view, but none was given")

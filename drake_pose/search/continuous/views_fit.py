@@ -38,12 +38,7 @@ _PIECE = 0.2
 
 @dataclass(frozen=True)
 class FittedPose:
-    """A fitted pose.
-
-    Args:
-        values: (m,) all values of the pose tree [rad or m].
-        cost: what does not fit [pixel of contour]; comparable at one scale and spacing only.
-    """
+    """Fitted values (m,), and what does not fit [pixel], comparable at one scale and spacing."""
 
     values: np.ndarray
     cost: float
@@ -53,16 +48,12 @@ class ViewsFit:
     """One body and the silhouettes of one instant.
 
     Attributes:
-        kinematics: the pose tree's.
         size: the root of the silhouettes' mean area [pixel], the unit of length of all rounds.
-        camera_count: how many cameras see it.
         edge_length: the length of the silhouettes' edges [pixel].
         evaluations: how often contours were compared.
 
     Args:
-        kinematics: the pose tree's kinematics.
         outlines: a surface for each node; few triangles will do, see ``few_triangles``.
-        views: the silhouettes.
     """
 
     def __init__(
@@ -124,10 +115,8 @@ def refine_best(
     """Refine many poses, after each pass only the best of those that still differ.
 
     Args:
-        fit: the body and the silhouettes.
         starts: each (m,), best first.
         parts: rounds, and how many poses are kept after each.
-        proceed: asked before each refinement whether to go on.
 
     Returns:
         The poses kept after the last pass, best first; at least one.
@@ -151,13 +140,9 @@ def distinct(
     turns_around: np.ndarray | bool = False,
     apart: float = 0.05,
 ) -> list[FittedPose]:
-    """The best poses some value of which differs by more than so much [rad or m] from better ones.
+    """The best poses some value of which is more than ``apart`` [rad or m] from better ones.
 
-    Args:
-        poses: in any order.
-        count: at most so many.
-        turns_around: (m,) the values that are the same after a full turn.
-        apart: the difference.
+    ``turns_around``: (m,) the values that are the same after a full turn.
     """
     chosen: list[FittedPose] = []
     for pose in sorted(poses, key=lambda one: one.cost):

@@ -30,11 +30,7 @@ _COARSE_PIXELS = 6000
 
 
 class BeamSearch:
-    """Matches silhouettes with a pose tree by the beam search; tables are made once.
-
-    Args:
-        examination: how every answer is examined; None: it is not.
-    """
+    """Matches silhouettes by the beam search; every answer is examined, or not (None)."""
 
     def __init__(
         self,
@@ -222,8 +218,7 @@ class _Run:
 
     def _keep_if_better(self, samples: np.ndarray) -> None:
         """Keep samples (nodes,) if their J is the smallest so far."""
-        X_WN = self.scoring.sampled.poses(samples[None])
-        J = float(self.scoring.J(X_WN, samples[None])[0])
+        J = float(self.scoring.J(samples[None])[0])
         if self._samples is None:
             self._first_J = J
         if J < self._J:

@@ -32,8 +32,8 @@ def grow(
         exact: drop what cannot cover the whole silhouettes any more.
 
     Returns:
-        The new ones, best first, None where no pose stays inside the limit; and whether some were
-        lost because there were too many.
+        The new ones, best first, None where none stays inside the limit; and whether some were
+            lost.
     """
     pairs = all_pairs(expansion.groups(partial, node))
     areas, added = expansion.score(partial, node, pairs)
@@ -81,14 +81,10 @@ def run_stage(
     exact: bool,
     proceed: Callable[[], bool],
 ) -> tuple[PartialPoses | None, bool]:
-    """Place nodes one after another.
-
-    Args:
-        proceed: asked after each node whether to go on.
+    """Place nodes one after another, asking after each whether to go on.
 
     Returns:
-        The last ones (None: none was left, or told to stop), and whether all possible ones were
-        kept throughout.
+        The last ones (None: none was left, or told to stop), and whether none was lost.
     """
     partial: PartialPoses | None = start
     complete = True
@@ -111,14 +107,9 @@ def search_limbs_again(
     proceed: Callable[[], bool],
     found: Callable[[PartialPoses], np.ndarray],
 ) -> np.ndarray:
-    """Search limbs again, one or two at a time, until that improves nothing any more.
+    """Better poses (nodes,) in the store, limbs searched again by one and two while that improves.
 
-    Args:
-        poses: (nodes,) the pose of each node in the PoseStore.
-        found: gives the objectives (n,) of the last partial poses of every search.
-
-    Returns:
-        (nodes,) the better poses, or the same.
+    ``found`` gives the objectives (n,) of the last partial poses of every search.
     """
     limbs = find_limbs(expansion)
     choices = [*((limb,) for limb in limbs), *itertools.combinations(limbs, 2)]
@@ -156,17 +147,12 @@ def find_limbs(expansion: Expansion) -> list[frozenset[int]]:
 def turn_single_nodes(
     scoring: Scoring, pictures: Pictures, samples: np.ndarray, proceed: Callable[[], bool]
 ) -> np.ndarray:
-    """Try all samples of one node after another, all that hangs on it moving along.
+    """Samples (nodes,) that turning no single node, all that hangs on it moving along, improves.
 
-    Args:
-        pictures: with bands.
-        proceed: asked before each node whether to go on.
-
-    Returns:
-        Samples (nodes,) that no single change improves in the pictures, as far as it got.
+    As far as pictures with bands tell, and as it got before it was told not to proceed.
     """
     current = samples.copy()
-    J = float(scoring.J(scoring.sampled.poses(current[None]), current[None])[0])
+    J = float(scoring.J(current[None])[0])
     unchanged = 0
     for node in itertools.cycle(range(len(current))):
         if not proceed():
@@ -175,7 +161,7 @@ def turn_single_nodes(
         tried[:, node] = np.arange(len(tried))
         approximate = _J_by_bits(scoring, pictures, tried, node)
         tried = tried[np.argsort(approximate, kind="stable")[:_JUDGED]]
-        Js = scoring.J(scoring.sampled.poses(tried), tried)
+        Js = scoring.J(tried)
         best = int(np.argmin(Js))
         unchanged += 1
         if Js[best] < J:

@@ -56,12 +56,8 @@ def branch_and_bound(
 ) -> PosesWithin:
     """Find all poses of the grid whose objective is no greater than a limit.
 
-    Args:
-        kept_samples: (nodes,) of a pose that is never dropped for want of room.
-
-    Returns:
-        The poses; not all if a limit was reached, or if an area beyond the bands around the
-        silhouettes is counted twice.
+    ``kept_samples``: (nodes,) of a pose that is never dropped for want of room. Some are missing if
+    a limit was reached, or an area beyond the bands around the silhouettes is counted twice.
     """
     return _BranchAndBound(body, views, J_limit, limits or BoundLimits(), kept_samples).run()
 
@@ -233,10 +229,9 @@ class _BranchAndBound:
 
 
 class _SubtreeReaches:
-    """The silhouettes' pixels that a node and its descendants can cover, by pose of its parent.
+    """What a node and its descendants can cover of the silhouettes, by pose of its parent.
 
-    Attributes:
-        table: (r, w) uint64 unions; the rows beyond those in use are zero.
+    ``table``: (r, w) uint64 unions; the rows beyond those in use are zero.
     """
 
     def __init__(self, store: PoseStore) -> None:

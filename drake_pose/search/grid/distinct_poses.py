@@ -31,7 +31,7 @@ def choose_distinct(
         looks = masks[kept], areas[kept], hidden[kept]
         if len(chosen) >= most:
             break
-    J = scoring.J(scoring.sampled.poses(chosen), chosen)
+    J = scoring.J(chosen)
     return np.asarray(chosen[np.argsort(J, kind="stable")[:count]])
 
 

@@ -65,11 +65,7 @@ def examine(
     settings: ExaminationSettings,
     root_position: np.ndarray | None = None,
 ) -> PoseEstimate:
-    """Examine what a search on a body's grid found.
-
-    Returns:
-        The result with ``lower_bound``, ``budget_spent`` and ``pose_set``; a
-        better pose in place of the one found if the proof met one. Nothing found stays as it is.
+    """The result, or a better pose, with ``lower_bound``, ``budget_spent`` and ``pose_set``.
 
     Raises:
         SettingsError: if the result is not of the body's grid.

@@ -154,8 +154,7 @@ class EdgeChoice:
 
     Attributes:
         samples: (n, nodes) the poses judged, best first.
-        probabilities: (n,) of each, if one of these is the true one and all are as likely
-            beforehand.
+        probabilities: (n,) of each, if one of these is true and all are as likely beforehand.
         left: how many of the first are not ruled out.
         joints: each value of the pose tree, over those left.
         exhaustive: whether all poses of the set were judged.

@@ -145,7 +145,7 @@ class _Poses:
 
 
 class PoseStore:
-    """All poses of nodes with so large a share of their area outside at most, by parent.
+    """All poses of nodes with so much of their area outside at most, by parent.
 
     Args:
         outside_share: of a node's mean projected area.
@@ -184,11 +184,7 @@ class PoseStore:
         self.reach_words = np.empty(0, dtype=np.uint64)
 
     def reserve(self, size: int = 0) -> None:
-        """Notes memory that what belongs to the poses takes [byte].
-
-        Raises:
-            LimitReached: with it, there is too much, or the time is over.
-        """
+        """Notes memory [byte]; raises LimitReached where it is too much, or the time is over."""
         self._reserved += size
         if self.limits is None:
             return
@@ -206,10 +202,7 @@ class PoseStore:
             yield missing[begin : begin + together]
 
     def groups(self, node: int, parents: np.ndarray) -> np.ndarray:
-        """Where the node's poses begin and end (n, 2), for poses (n,) of its parent; 0 for a root.
-
-        What is missing is drawn.
-        """
+        """Where the node's poses, drawn where missing, begin and end (n, 2) by parent (n,)."""
         known = self._groups[node]
         together = max(1, _TRIED_TOGETHER // len(self.body.sampled.X_PN[node]))
         for missing in self._in_turn(known.missing(parents), together):

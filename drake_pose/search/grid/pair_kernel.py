@@ -70,15 +70,13 @@ def score_pairs(
     Args:
         masks: (B, W) uint64 what these cover.
         pairs: (p, 2) int32 partial pose and pose.
-        runs: (n, K, 3) int64 of each pose, for each part of a mask, the first word, the number of
-            words and where they begin in words.
-        words: (m,) uint64.
+        runs: (n, K, 3) int64 of each pose, for each part of a mask, the first word, the number
+            of words and where they begin in words (m,) uint64.
         silhouettes: how many parts come first that are silhouettes; the others are bands.
         keys: (2 W,) uint64 of the hashes.
 
     Returns:
-        (p, 2) int64 the silhouette and the band newly covered [pixel]; and (p,) uint64 what is
-        added to the masks' hashes.
+        (p, 2) int64 silhouette and band newly covered [pixel]; (p,) uint64 what hashes gain.
     """
     areas = np.zeros((pairs.shape[0], 2), dtype=np.int64)
     codes = np.zeros(pairs.shape[0], dtype=np.uint64)
@@ -235,16 +233,13 @@ def prune_pairs(
     child_rows: np.ndarray,
     table: np.ndarray,
 ) -> np.ndarray:
-    """Find the pairs of a partial pose and a pose that can still cover enough.
+    """Which pairs (p,) bool of a partial pose and a pose can still cover enough.
 
     Args:
         uncovered: (B, w) uint64 what no other node can cover, for each partial pose.
         room: (B,) int64 this many pixels of it may stay uncovered.
         pairs, runs, words, silhouettes: as in score_pairs.
         child_rows, table: as in unite.
-
-    Returns:
-        (p,) bool.
     """
     good = np.ones(pairs.shape[0], dtype=np.bool_)
     places = np.empty(uncovered.shape[1], dtype=np.int64)

@@ -154,17 +154,16 @@ class Expansion:
         exact: bool = False,
         far_matters: bool = False,
     ) -> tuple[np.ndarray, PartialPoses, np.ndarray]:
-        """The first of what pairs (p, 2) made that are not equal.
+        """The first of what pairs (p, 2) made that are not equal, at most ``width``.
 
         Args:
-            width: at most so many.
             exact: nothing may be left that no later node can reach; and where the nodes with
                 children to come stand alike, none is chosen that covers less than another.
             far_matters: those are not equal that differ beyond the bands.
 
         Returns:
-            Their indices; themselves, without masks; and of each pair that was looked at the place
-            among them, -1 for none.
+            Their indices; themselves, without masks; of each pair looked at the place among
+                them, or -1.
         """
         is_open = self.store.open_nodes(made.poses, node)
         openings = made.poses[:, is_open].astype(np.uint64) @ self._node_keys[is_open]

@@ -51,13 +51,12 @@ def estimate_joints(
 ) -> tuple[JointEstimate, ...]:
     """Report each value of a tree, node after node.
 
-    A value is determined if it spans no more than one step of its grid; half a step is then
-    added on both sides, because the truth may lie between the grid's values.
+    A value is determined if it spans no more than one step of its grid; half a step is added on
+    both sides, because the truth may lie between the grid's values.
 
     Args:
         samples: for each node (n,) those of its samples that occur.
-        about: for each node the values (k,) of the answer; angles that turn around are given in
-            the turn nearest to them.
+        about: for each node (k,) the answer, near whose turn angles are given that turn around.
         complete: whether these are all; else nothing is determined but what cannot move.
     """
     reports = []
@@ -202,19 +201,17 @@ def find_families(
     most: int = 32,
     limits: BoundLimits | None = None,
 ) -> GridPoseSet:
-    """Find all poses of the grid as good as the best.
+    """Find all poses of the grid as good as the best, of samples (nodes,) with objective J [pixel].
 
     Args:
-        samples: (nodes,) the samples of the best pose known.
-        J: its objective [pixel].
         tolerance: a pose counts as good as the best if its objective is greater by no more than
-            this [pixel]; None: not at all where the best is exact, else 5 % of the length of the
-            silhouettes' contours.
+            this [pixel]; None: not at all where the best is exact, else 5 % of the contours'
+            length.
         most: how many families are described at most.
 
     Returns:
         The set. It holds the best pose known, and if a better one turns up, that one and those
-        within the tolerance of it.
+            within the tolerance of it.
     """
     if tolerance is None:
         tolerance = 0.0 if J == 0.0 else _CONTOUR_SHARE * contour_length(views)

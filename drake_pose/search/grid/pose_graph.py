@@ -5,19 +5,17 @@ next node at one of its samples. Every path from the first state to a last one i
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 
 @dataclass(frozen=True)
 class Layer:
-    """The edges that place one node, ordered by origin and sample.
+    """The edges that place one node, by origin and sample.
 
-    Attributes:
-        origins: (m,) int64 the states they start from.
-        samples: (m,) int64 the node's samples.
-        ends: (m,) int64 the states of the next layer that they lead to.
+    ``origins``: (m,) int64 states they start from; ``samples``: (m,) int64; ``ends``: (m,) int64
+    states of the next layer.
     """
 
     node: int
@@ -44,34 +42,26 @@ def make_layer(node: int, origins: np.ndarray, samples: np.ndarray, ends: np.nda
 
 
 class PartialPoseGraph:
-    """A set of poses of the grid.
+    """A set of poses of the grid; states not between the first (0) and a last are left out.
 
     Attributes:
         layers: one for each node.
         Js: (last states,) the objective of the poses that end in each [pixel].
-        ways: for each layer, and for the last states, (states,) how many partial poses lead there.
-        rests: the same, how many ways lead on to the end.
-
-    Args:
-        layers: one for each node; states that do not lie between the first state (0) and a last
-            one may be among them: they are taken out.
-        Js: (last states,).
+        ways, rests: for each layer, and for the last states, (states,) how many partial poses
+            lead there, and how many ways lead on to the end.
     """
 
     def __init__(self, layers: Sequence[Layer], Js: np.ndarray) -> None:
         self.layers, self.Js = _prune(list(layers), np.asarray(Js, dtype=np.float64))
+        counts = [int(layer.origins.max(initial=-1)) + 1 for layer in self.layers]
         self.ways: list[np.ndarray] = [np.ones(1)]
-        for layer, states in zip(self.layers, self._state_counts()[1:], strict=True):
+        self.rests: list[np.ndarray] = [np.ones(len(self.Js))]
+        for layer, states in zip(self.layers, [*counts[1:], len(self.Js)], strict=True):
             weights = self.ways[-1][layer.origins]
             self.ways.append(np.bincount(layer.ends, weights, minlength=states))
-        self.rests: list[np.ndarray] = [np.ones(len(self.Js))]
-        for layer, states in zip(self.layers[::-1], self._state_counts()[-2::-1], strict=True):
+        for layer, states in zip(self.layers[::-1], counts[::-1], strict=True):
             weights = self.rests[0][layer.ends]
             self.rests.insert(0, np.bincount(layer.origins, weights, minlength=states))
-
-    def _state_counts(self) -> list[int]:
-        """How many states each layer starts from, and the last states' number."""
-        return [int(layer.origins.max(initial=-1)) + 1 for layer in self.layers] + [len(self.Js)]
 
     @property
     def size(self) -> float:
@@ -108,26 +98,22 @@ class PartialPoseGraph:
 
     def restricted(self, allowed: Sequence[np.ndarray | None]) -> "PartialPoseGraph":
         """The poses that take allowed samples alone, (samples,) bool of each node; None: all."""
-        layers = []
-        for layer in self.layers:
-            rule = allowed[layer.node]
-            layers.append(layer if rule is None else layer.chosen(rule[layer.samples]))
+        rules = [allowed[layer.node] for layer in self.layers]
+        layers = [
+            layer if rule is None else layer.chosen(rule[layer.samples])
+            for layer, rule in zip(self.layers, rules, strict=True)
+        ]
         return PartialPoseGraph(layers, self.Js)
 
     def up_to(self, J: float) -> "PartialPoseGraph":
         """Those poses whose objective is no greater."""
         kept = self.Js <= J
-        numbers = np.cumsum(kept) - 1
         last = self.layers[-1].chosen(kept[self.layers[-1].ends])
-        last = Layer(last.node, last.origins, last.samples, numbers[last.ends])
+        last = replace(last, ends=(np.cumsum(kept) - 1)[last.ends])
         return PartialPoseGraph([*self.layers[:-1], last], self.Js[kept])
 
     def draw(self, count: int, generator: np.random.Generator) -> np.ndarray:
-        """Draw poses at random, each as likely as any other: samples (count, nodes).
-
-        Raises:
-            ValueError: if there is none to draw.
-        """
+        """Poses drawn at random, samples (count, nodes); ValueError if there is none to draw."""
         if not self.size:
             raise ValueError("a pose was to be drawn from an empty set")
         drawn = np.empty((count, len(self.layers)), dtype=np.int64)
@@ -151,11 +137,7 @@ class PartialPoseGraph:
         return partial
 
     def central(self) -> np.ndarray:
-        """A pose with the smallest objective, samples (nodes,): where most ways lead, step by step.
-
-        Raises:
-            ValueError: if there is none.
-        """
+        """Samples (nodes,) of a best pose, where most ways lead; ValueError if there is none."""
         if not self.size:
             raise ValueError("a pose was asked of an empty set")
         samples = np.empty(len(self.layers), dtype=np.int64)
@@ -170,28 +152,23 @@ class PartialPoseGraph:
 
 def _prune(layers: list[Layer], Js: np.ndarray) -> tuple[list[Layer], np.ndarray]:
     """The layers without states that lead nowhere or are led to from nowhere, numbered anew."""
+    origins = [layer.origins for layer in layers[1:]] + [np.arange(len(Js))]
     reached = [np.array([True])]
-    for index, layer in enumerate(layers):
-        following = layers[index + 1].origins if index + 1 < len(layers) else np.zeros(0, int)
-        size = max(
-            int(layer.ends.max(initial=-1)) + 1,
-            int(following.max(initial=-1)) + 1,
-            len(Js) if index + 1 == len(layers) else 1,
-        )
+    for layer, following in zip(layers, origins, strict=True):
+        size = int(max(layer.ends.max(initial=0), following.max(initial=-1))) + 1
         there = np.zeros(size, dtype=np.bool_)
         there[layer.ends[reached[-1][layer.origins]]] = True
         reached.append(there)
-    useful = reached[-1]
-    numbers = np.cumsum(useful) - 1
+    useful = reached[-1][: len(Js)]
     Js = Js[useful]
     pruned: list[Layer] = []
     for layer, there in zip(layers[::-1], reached[-2::-1], strict=True):
         kept = layer.chosen(useful[layer.ends] & there[layer.origins])
-        ends = numbers[kept.ends]
+        ends = (np.cumsum(useful) - 1)[kept.ends]
         useful = np.zeros(len(there), dtype=np.bool_)
         useful[kept.origins] = True
-        numbers = np.cumsum(useful) - 1
-        pruned.insert(0, Layer(kept.node, numbers[kept.origins], kept.samples, ends))
+        places = np.cumsum(useful) - 1
+        pruned.insert(0, Layer(kept.node, places[kept.origins], kept.samples, ends))
     return pruned, Js
 
 

@@ -108,10 +108,10 @@ class SampledBody:
         """The node's mean projected area in a camera, seen from all sides [pixel]."""
         scale = float(camera.kernel_parameters()[1])
         if not isinstance(camera, ParallelCamera):
-            scale /= float(self._root_distances(camera).mean())
+            scale /= float(self.root_distances(camera).mean())
         return self.surface_areas[node] * scale**2
 
-    def _root_distances(self, camera: Camera) -> np.ndarray:
+    def root_distances(self, camera: Camera) -> np.ndarray:
         """From the camera to where the roots can be [m]."""
         roots = [
             X[:, :3, 3]
@@ -123,7 +123,7 @@ class SampledBody:
     def _spread(self, node: int, camera: Camera) -> float:
         """How far the directions to the node's points may differ, from where the roots can be."""
         needed = self.sampled.outlines[node].ball[3] / max(
-            1e-6, _NEARER * self._root_distances(camera).min()
+            1e-6, _NEARER * self.root_distances(camera).min()
         )
         return next((spread for spread in _SPREADS if spread >= needed), _SPREADS[-1])
 

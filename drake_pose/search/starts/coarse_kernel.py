@@ -180,9 +180,7 @@ def score_samples(
     """Adds what a node at all its samples would add to hypotheses in one view.
 
     Args:
-        view: the view.
         X_CP: (B, 4, 4) poses of the node's parent in the camera.
-        balls: the node's.
         masks: (B, 4) uint64 the points that the hypotheses cover.
         outside_weight: what a pixel outside counts; one newly covered counts -1.
         scores: (B, n) added to [pixel].

@@ -58,12 +58,9 @@ _NEARER = 0.7
 
 @dataclass(frozen=True)
 class CoarsePoses:
-    """Poses on the grid, best first.
+    """Poses on the grid, best first: X_WN (n, nodes, 4, 4), costs (n,), comparable in one search.
 
-    Args:
-        samples: (n, nodes) the sample of each node; -1 where the node was not searched.
-        X_WN: (n, nodes, 4, 4) the nodes' poses.
-        costs: (n,) [pixel], comparable within one search only.
+    ``samples``: (n, nodes) of each node; -1 where it was not searched.
     """
 
     samples: np.ndarray
@@ -79,13 +76,7 @@ class CoarsePoses:
 
 
 class CoarseSearch:
-    """Finds coarse poses of one body in the silhouettes of one instant.
-
-    Args:
-        body: the body, sampled at the intervals above.
-        views: the silhouettes.
-        hypotheses: at most this many are kept after each node.
-    """
+    """Finds coarse poses of a body, sampled at the intervals above, in views of one instant."""
 
     def __init__(
         self, body: SampledBody, views: Sequence[View], hypotheses: int = HYPOTHESES
@@ -93,6 +84,7 @@ class CoarseSearch:
         self.body = body
         self._hypotheses = hypotheses
         self._views = _prepare_views(body, views)
+        self._cameras = [view.camera for view in views]
         self._size = _mean_size(views)
         self._nodes = body.sampled.tree.nodes
         self._reach = max(
@@ -118,12 +110,7 @@ class CoarseSearch:
         return self._find(start, set(nodes), self._hypotheses)
 
     def find_again(self, X_WN: np.ndarray, again: Sequence[int]) -> CoarsePoses:
-        """Search some nodes of a pose again.
-
-        Args:
-            X_WN: (nodes, 4, 4) the pose.
-            again: the nodes; with a node all its descendants must be among them.
-        """
+        """Search some nodes of a pose X_WN (nodes, 4, 4) again, with all their descendants."""
         return self._find(X_WN, set(again), _AGAIN)
 
     def _find(self, start: np.ndarray, wanted: set[int], hypotheses: int) -> CoarsePoses:
@@ -140,23 +127,20 @@ class CoarseSearch:
         return poses
 
     def choose_distinct(self, poses: CoarsePoses, count: int, apart: float) -> CoarsePoses:
-        """The best poses some ball of which lies apart from where it lies in any better one.
+        """The best poses some ball of which is seen apart from where it is in any better one.
 
-        Args:
-            poses: of find.
-            count: at most this many.
-            apart: in some view it is seen so far away, as a share of the root of the silhouette's
-                area.
+        ``apart``: in some view, as a share of the root of the silhouettes' area.
         """
-        places = []
-        for i, p_NB in enumerate(self._p_NB):
-            if len(p_NB) == 0:
-                continue
-            marks = np.vstack([p_NB.mean(axis=0), p_NB[0]])
-            X = poses.X_WN[:, i]
-            p_WB = marks @ np.swapaxes(X[:, :3, :3], 1, 2) + X[:, None, :3, 3]
-            places += [_project(p_WB, view.camera, view.X_CW) for view in self._views]
-        together = np.hstack([place.reshape(len(poses), -1) for place in places])
+        marks = [
+            np.vstack([p_NB.mean(axis=0), p_NB[0]]) @ np.swapaxes(X[:, :3, :3], 1, 2)
+            + X[:, None, :3, 3]
+            for p_NB, X in zip(self._p_NB, poses.X_WN.swapaxes(0, 1), strict=True)
+            if len(p_NB)
+        ]
+        p_WB = np.concatenate(marks, axis=1).reshape(-1, 3)
+        places = [camera.project(p_WB)[0].reshape(len(poses), -1) for camera in self._cameras]
+        # What is behind a camera is nowhere near.
+        together = np.nan_to_num(np.hstack(places), nan=1e9)
         chosen: list[int] = []
         for i in range(len(together)):
             gaps = np.abs(together[chosen] - together[i]).max(axis=1, initial=0.0)
@@ -264,7 +248,11 @@ def _prepare_views(body: SampledBody, views: Sequence[View]) -> list[CoarseView]
     for view in views:
         points = _spread_points(view.mask)
         # No ball counts whose middle is outside the picture, and one as large as it covers all.
-        reach = min(largest * _largest_scale(body, view), math.hypot(*view.mask.shape)) + slack
+        scale = float(view.camera.kernel_parameters()[1])
+        if not isinstance(view.camera, ParallelCamera):
+            nearest = float(body.root_distances(view.camera).min())
+            scale /= max(1e-6, _NEARER * nearest)
+        reach = min(largest * scale, math.hypot(*view.mask.shape)) + slack
         radii = np.linspace(0.15, 1.0, _LEVELS) * reach
         origin = np.maximum(points.min(axis=0) - reach, -1.0)
         end = np.minimum(points.max(axis=0) + reach, np.add(view.mask.shape, 1.0))
@@ -292,20 +280,6 @@ def _prepare_views(body: SampledBody, views: Sequence[View]) -> list[CoarseView]
     return seen
 
 
-def _largest_scale(body: SampledBody, view: View) -> float:
-    """Pixels a metre at the nearest place where the body may be."""
-    scale = float(view.camera.kernel_parameters()[1])
-    if isinstance(view.camera, ParallelCamera):
-        return scale
-    roots = [
-        X_PN[:, :3, 3]
-        for X_PN, node in zip(body.sampled.X_PN, body.sampled.tree.nodes, strict=True)
-        if node.parent < 0
-    ]
-    distances = np.linalg.norm(np.vstack(roots) - view.camera.X_WC[:3, 3], axis=1)
-    return scale / max(1e-6, _NEARER * float(distances.min()))
-
-
 def _spread_points(mask: np.ndarray) -> np.ndarray:
     """At most 64 * words points (n, 2) row, column of a mask, evenly spread; at least one."""
     most = 64 * _WORDS
@@ -322,10 +296,3 @@ def _spread_points(mask: np.ndarray) -> np.ndarray:
             places = np.argwhere(mask)
             return places[:: -(-len(places) // most)].astype(np.float64)
         step *= 1.02
-
-
-def _project(p_W: np.ndarray, camera: np.ndarray, X_CW: np.ndarray) -> np.ndarray:
-    """Pixels (n, k, 2) of points (n, k, 3), from the principal point."""
-    p_C = p_W @ X_CW[:3, :3].T + X_CW[:3, 3]
-    depth = np.maximum(p_C[..., 2:], camera[5]) if camera[0] == 0.0 else 1.0
-    return np.asarray(p_C[..., :2] * camera[1:3] / depth)

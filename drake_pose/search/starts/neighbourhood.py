@@ -58,13 +58,7 @@ class _Other(NamedTuple):
 
 
 class NeighbourhoodSearch:
-    """Searches about a pose.
-
-    Args:
-        problem: the silhouettes.
-        search: finds placements.
-        reflections: whether half of the body may be mirrored.
-    """
+    """Searches about a pose for placements of parts; ``reflections``: half of the body, too."""
 
     def __init__(
         self, problem: RefinementProblem, search: PartSearch, *, reflections: bool = True
@@ -91,17 +85,13 @@ class NeighbourhoodSearch:
         everywhere: bool = False,
         tries: int | None = None,
     ) -> tuple[np.ndarray, float]:
-        """Improve a refined pose.
+        """Better parameters than those (m + 4,) of a refined pose, and their J.
 
         Args:
-            parameters: (m + 4,) the pose.
             enough: J with which it ends [pixel].
             deadline: it ends when ``time.perf_counter`` says so.
             everywhere: try each part at least once.
             tries: it ends after this many; None: no limit.
-
-        Returns:
-            The parameters and their J.
         """
         J = float(self.problem.J(parameters))
         rounds = _ROUNDS * (2 if everywhere else 1)
@@ -129,12 +119,9 @@ class NeighbourhoodSearch:
         return parameters, J
 
     def others(self, parameters: np.ndarray, limit: float, same: float) -> list[np.ndarray]:
-        """Other poses that are nearly as good, refined to the end, best first.
+        """Other poses than the best (m + 4,) up to a limit of J, refined to the end, best first.
 
-        Args:
-            parameters: (m + 4,) the best pose, refined to the end.
-            limit: the most J that they may have [pixel].
-            same: poses none of whose values differ by more are one [rad or m].
+        ``same``: poses none of whose values differ by more are one [rad or m].
         """
         problem = self.problem
         known, kept = [parameters], []

@@ -111,16 +111,7 @@ def find_reflections(tree: PoseTree) -> tuple[Part, ...]:
 
 
 class PartSearch:
-    """Searches parts of a body again.
-
-    Attributes:
-        parts: the parts that are placed anew.
-        reflections: what may be mirrored in depth together.
-
-    Args:
-        body: the body.
-        grids: for each node its values (n, k) that are tried.
-    """
+    """Searches parts of a body again, on grids (n, k) of each node's values."""
 
     def __init__(self, body: RefinementBody, grids: Sequence[np.ndarray]) -> None:
         self.body = body
@@ -140,14 +131,7 @@ class PartSearch:
         part: Part,
         count: int,
     ) -> list[np.ndarray]:
-        """The parameters of at most so many other placements of a part, the best first.
-
-        Args:
-            problem: the silhouettes.
-            parameters: (m + 4,) the pose.
-            part: the part.
-            count: at most this many.
-        """
+        """At most ``count`` other placements of a part of a pose (m + 4,), the best first."""
         X_WN = self.body.poses(parameters)
         others = problem.still(parameters, np.isin(np.arange(len(X_WN)), part.nodes))
         regions = _find_regions(problem, others)
@@ -303,12 +287,7 @@ _Region = tuple[np.ndarray, np.ndarray, np.ndarray]
 def _find_regions(problem: RefinementProblem, others: Sequence[Border]) -> list[_Region]:
     """What a part may cover in each coarse view: silhouette and outside, less what others cover.
 
-    Args:
-        problem: the silhouettes.
-        others: the border of all that is not of the part in each view.
-
-    Returns:
-        X_CW and kernel parameters of the camera, and prefix sums of both sets.
+    Returns X_CW and kernel parameters of the camera, and prefix sums of both sets.
     """
     regions = []
     step = max(1, round((problem.area / (_COARSE_PIXELS * len(problem.views))) ** 0.5))

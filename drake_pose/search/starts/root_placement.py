@@ -65,8 +65,6 @@ def find_layers(
     """Where the root can be, the likeliest scales and depths first.
 
     Args:
-        body: the body, its root anywhere.
-        views: the silhouettes.
         scale_unknown: the camera is parallel and its pixels_per_metre is not known.
         known: (3,) the root's position [m] if only the scale is unknown.
 
@@ -141,12 +139,7 @@ def slide_root(camera: ParallelCamera, p_WR: np.ndarray, factor: float) -> np.nd
 
 
 def whereabouts(views: Sequence[View], p_WR: np.ndarray) -> np.ndarray:
-    """Where a root (3,) is seen, and how large: 1 apart is one step of what is tried.
-
-    Returns:
-        (3 n,) for each of n views the root's place in its picture, and the logarithm of the pixels
-        a metre there.
-    """
+    """(3 n,) where n views see a root (3,), and how large: 1 apart is one step of what is tried."""
     here: list[float] = []
     for view in views:
         camera = view.camera
@@ -161,12 +154,9 @@ def whereabouts(views: Sequence[View], p_WR: np.ndarray) -> np.ndarray:
 
 
 def place_body(body: SampledBody, positions: np.ndarray, chosen: np.ndarray) -> SampledBody:
-    """The body whose root is sampled at combinations of positions (n, 3) and its rotations.
+    """The body whose root is sampled at combinations of positions (n, 3) [m] and its r rotations.
 
-    Args:
-        body: the body.
-        positions: (n, 3) of the root's origin in the world [m].
-        chosen: (m,) the samples that it has: i is rotation i % r at position i // r, of r.
+    ``chosen``: (m,) the samples that it has: i is rotation i % r at position i // r.
     """
     placed, sampled = copy.copy(body), copy.copy(body.sampled)
     X_WR = sampled.X_PN[0]
@@ -191,15 +181,12 @@ def choose_root_samples(
     count: int,
     outside_weight: float,
 ) -> np.ndarray:
-    """At every position the rotations of the root whose pictures fit best.
+    """At positions (n, 3) of one depth the rotations of the root whose pictures fit best.
 
-    In one view the root looks nearly alike wherever it is in the picture: it is drawn once for
-    each rotation and moved by whole pixels. In several views all rotations are taken.
+    In one view the root looks nearly alike wherever it is in the picture: it is drawn once for each
+    rotation and moved by whole pixels. In several views all rotations are taken.
 
     Args:
-        body: the body.
-        views: the silhouettes.
-        positions: (n, 3) of the root's origin in the world [m], of one depth.
         count: so many rotations at each.
         outside_weight: what a pixel outside counts; one covered counts one.
 
@@ -228,14 +215,7 @@ def choose_root_samples(
 def _draw_root(
     body: SampledBody, camera: Camera, p_WR: np.ndarray, place: np.ndarray
 ) -> np.ndarray:
-    """Pictures (r, side, side) float32 of the root at its rotations, its place in the middle.
-
-    Args:
-        body: the body.
-        camera: the camera.
-        p_WR: (3,) where the root's origin is [m].
-        place: (2,) where that is seen [pixel].
-    """
+    """Pictures (r, side, side) float32 of the root at its rotations, its place (2,) amidst."""
     rotations = len(body.sampled.X_PN[0])
     ball = body.sampled.outlines[0].ball
     depth = float(_in_camera(camera, p_WR)[2])
@@ -388,12 +368,9 @@ def _meeting_point(views: Sequence[View]) -> np.ndarray | None:
 
 
 def _space_layer(views: Sequence[View], middle: np.ndarray, sizes: np.ndarray) -> Layer:
-    """A grid in space about a point, of which all views leave what lies in their silhouettes.
+    """A grid in space about a point (3,), of which all views leave what lies in their silhouettes.
 
-    Args:
-        views: the silhouettes.
-        middle: (3,) about the body's middle [m].
-        sizes: the pixels a metre in the largest silhouette, the likeliest first.
+    ``sizes``: the pixels a metre in the largest silhouette, the likeliest first.
     """
     main = max(views, key=lambda view: int(view.mask.sum()))
     extent = _extent(main.mask) / float(sizes[0])

@@ -27,12 +27,9 @@ _DIFFERENT = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class Flip:
-    """Three joints of a chain flipped, or several such flips one after another.
+    """Values (m,) with three joints of a chain flipped, or several such flips one after another.
 
-    Args:
-        values: (m,) all values afterwards.
-        changed: (m,) bool, those that were turned by 180 degrees or mirrored.
-        mirrored: (m,) bool, those that turn the other way round now.
+    ``changed``: (m,) bool, turned by 180 degrees or mirrored; ``mirrored``: turned round.
     """
 
     values: np.ndarray
@@ -43,13 +40,7 @@ class Flip:
 def counter_turns(
     kinematics: TreeKinematics, values: np.ndarray, interval: float
 ) -> list[np.ndarray]:
-    """Values (m,) with pairs of joints of nearly parallel axes turned against each other.
-
-    Args:
-        kinematics: the pose tree's.
-        values: (m,) to begin with.
-        interval: from one turn to the next [rad].
-    """
+    """Values (m,) with pairs of joints of nearly parallel axes turned against each other."""
     motions = kinematics.motions(values)
     turns, moves = motions.twists[:, :3], motions.moves
     steps = range(1, math.ceil(2.0 * math.pi / interval))
@@ -71,10 +62,7 @@ def counter_turns(
 def flips(kinematics: TreeKinematics, values: np.ndarray, count: int = 16) -> list[Flip]:
     """Poses with joints of a chain flipped, where what hangs on the last stays.
 
-    Args:
-        kinematics: the pose tree's.
-        values: (m,) to begin with; not among those returned.
-        count: at most this many poses are looked at; those outside the limits are left out.
+    ``count``: at most so many are looked at; those outside the limits are left out.
     """
     untouched = np.zeros(len(values), dtype=np.bool_)
     known = [Flip(values, untouched, untouched)]
@@ -119,15 +107,10 @@ def _single_flips(kinematics: TreeKinematics, start: Flip, triples: np.ndarray) 
 
 
 def _may_stay(axes: np.ndarray, triples: np.ndarray, turns: np.ndarray) -> np.ndarray:
-    """Whether (n, 2) what hangs on the last joint can have its old direction.
+    """Whether (n, 2) what hangs on the last joint can have its old direction, by axes (m, 3).
 
     Half turns about two axes make a turn about what is perpendicular to both, by twice the angle
-    between them, and the middle joint must undo it.
-
-    Args:
-        axes: (m, 3) of all joints as they stand.
-        triples: (n, 3) the first, middle and last joint.
-        turns: (n, 2) of the middle joint [rad].
+    between them, and turns (n, 2) of the middle joint must undo it.
     """
     first, middle, last = axes[triples].transpose(1, 0, 2)
     across = np.abs(np.stack([first * middle, last * middle]).sum(axis=2)).max(axis=0) < _NEARLY

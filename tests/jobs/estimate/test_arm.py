@@ -10,7 +10,7 @@ import pytest
 from drake_pose.files.settings import EstimateSettings
 from drake_pose.jobs.estimate.inputs import Inputs, read_inputs
 from drake_pose.search.estimates import View
-from drake_pose.search.scoring import Scoring
+from drake_pose.silhouette.areas.scoring import draw_mask
 
 BASE = slice(0, 4)
 
@@ -37,9 +37,10 @@ def view_errors(inputs: Inputs, views: list[View], values: np.ndarray) -> np.nda
     """E_total in each view alone."""
     counts = [len(node.value_names) for node in inputs.search.tree.nodes]
     by_node = np.split(values, np.cumsum(counts)[:-1])
-    X_WN = inputs.search.tree.node_poses(by_node)[None]
+    X_WN, outlines = inputs.search.tree.node_poses(by_node), inputs.search.sampled.outlines
+    drawn = [draw_mask(outlines, view.camera.X_CW @ X_WN, view.camera) for view in views]
     return np.array(
-        [Scoring(inputs.search.sampled, [view]).J(X_WN)[0] / view.mask.sum() for view in views]
+        [(one != view.mask).sum() / view.mask.sum() for one, view in zip(drawn, views, strict=True)]
     )
 
 

@@ -10,7 +10,7 @@ from drake_pose.body.tree.root import RootRotation
 from drake_pose.camera.models import ParallelCamera
 from drake_pose.errors import SettingsError
 from drake_pose.search.grid.beam_search import BeamSearch
-from drake_pose.search.scoring import Scoring
+from drake_pose.search.grid.pose_families import samples_at
 from drake_pose.search.settings import BeamSearchSettings, Stage
 from tests.search.bodies import (
     box_link,
@@ -109,8 +109,9 @@ def test_a_limit_still_answers_and_says_so(maker: ProblemMaker) -> None:
     assert result.found
     assert np.isfinite(result.q).all()
     assert result.stopped_by == "time_limit"
-    X_WN = maker.tree.node_poses(result.node_values)
-    assert result.J == Scoring(maker.body.sampled, problem.views).J(X_WN[None])
+    samples = samples_at(maker.body.sampled, result.node_values)
+    assert samples is not None
+    assert result.J == problem.Js[(problem.choices == samples).all(axis=1)]
 
 
 @pytest.mark.parametrize(

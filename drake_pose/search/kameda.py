@@ -218,8 +218,7 @@ class _Run:
         return float(best - first)
 
     def _patterns(self, leaves: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
-        """Distinct sets (n, candidates) bool of the leaves' candidates that cover pixels, their
-        worth.
+        """Distinct sets (n, candidates) bool of leaves' candidates that cover a pixel, their worth.
 
         Of pixels that no inner node covers.
         """

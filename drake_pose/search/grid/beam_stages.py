@@ -86,15 +86,15 @@ def run_stage(
     Returns:
         The last ones (None: none was left, or told to stop), and whether none was lost.
     """
-    partial: PartialPoses | None = start
-    complete = True
+    partial, complete = start, True
     for node in order:
-        if partial is None:
-            break
-        partial, lost = grow(expansion, partial, node, width, outside_weight, exact)
+        grown, lost = grow(expansion, partial, node, width, outside_weight, exact)
         complete = complete and not lost
-        if partial is not None and not proceed():
+        if grown is None:
+            return None, complete
+        if not proceed():
             return None, False
+        partial = grown
     return partial, complete
 
 
@@ -173,19 +173,15 @@ def turn_single_nodes(
 
 def _J_by_bits(scoring: Scoring, pictures: Pictures, samples: np.ndarray, node: int) -> np.ndarray:
     """J (n,) as the pictures show it of samples (n, nodes) that differ in one node's alone."""
-    X_WN = scoring.sampled.poses(samples)
-    silhouettes = int(pictures.part_starts[len(pictures.views)])
-    moving = {node}
-    still = np.zeros((1, int(pictures.part_starts[-1])), dtype=np.uint64)
-    far = np.zeros(len(samples), dtype=np.int64)
-    for i, other in enumerate(scoring.sampled.tree.nodes):
-        if i in moving or other.parent in moving:
-            moving.add(i)
-        else:
-            far += pictures.draw_node(i, samples[:1, i], X_WN[:1, i], still)[0, 2]
+    X_WN, words = scoring.sampled.poses(samples), int(pictures.part_starts[-1])
+    moving, far = scoring.sampled.tree.subtrees[node], np.zeros(len(samples), dtype=np.int64)
+    still = np.zeros((1, words), dtype=np.uint64)
+    for i in set(range(samples.shape[1])).difference(moving):
+        far += pictures.draw_node(i, samples[:1, i], X_WN[:1, i], still)[0, 2]
     masks = np.repeat(still, len(samples), axis=0)
-    for i in sorted(moving):
+    for i in moving:
         far += pictures.draw_node(i, samples[:, i], X_WN[:, i], masks)[:, 2]
-    covered = np.bitwise_count(masks[:, :silhouettes]).sum(axis=1, dtype=np.int64)
-    outside = np.bitwise_count(masks[:, silhouettes:]).sum(axis=1, dtype=np.int64)
+    ones = np.bitwise_count(masks).astype(np.int64)
+    silhouettes = int(pictures.part_starts[len(pictures.views)])
+    outside, covered = ones[:, silhouettes:].sum(axis=1), ones[:, :silhouettes].sum(axis=1)
     return np.asarray(pictures.area - covered + outside + far)

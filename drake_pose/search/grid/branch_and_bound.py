@@ -76,7 +76,6 @@ class _BranchAndBound:
         self.order = body.limb_order
         self.J_limit = J_limit
         self.limits = limits
-        self.kept_samples = kept_samples
         self.pictures = _make_pictures(body, views, J_limit)
         self.store = PoseStore(body, self.pictures, outside_limit=J_limit, limits=limits)
         self.expansion = Expansion(self.store)
@@ -88,6 +87,7 @@ class _BranchAndBound:
         self._lower_bound = np.inf
         # The partial pose that the pose to be kept is in; -1: none.
         self._kept = -1 if kept_samples is None else 0
+        self._kept_samples = np.zeros(0) if kept_samples is None else kept_samples
 
     def run(self) -> PosesWithin:
         """Place all nodes."""
@@ -170,8 +170,13 @@ class _BranchAndBound:
             partial, made, node, pairs, len(pairs), far_matters=True
         )
         samples = self.store.nodes[node].samples[pairs[:, 1]].astype(np.int64)
-        self._follow_kept(pairs[:, 0], samples, numbers, node)
-        kept = self._fit(made)
+        if self._kept >= 0:
+            own = np.flatnonzero(
+                (pairs[:, 0] == self._kept) & (samples == self._kept_samples[node])
+            )
+            self._kept = int(numbers[own[0]]) if len(own) else -1
+        room = min(self.limits.states, self.limits.memory // (4 * 8 * self.expansion.words))
+        kept = self._keep(made, np.ones(len(made)), max(1, room))
         places = np.cumsum(kept) - 1
         edges = kept[numbers]
         origins = pairs[edges, 0].astype(np.int64)
@@ -183,13 +188,9 @@ class _BranchAndBound:
     def _fit_pairs(self, partial: PartialPoses, node: int) -> PartialPoses:
         """Keep as many of the best as make no more pairs than allowed."""
         counts = np.diff(self.expansion.groups(partial, node)).ravel()
-        if counts.sum() <= self.limits.pairs or len(partial) == 1:
+        kept = self._keep(partial, counts, self.limits.pairs)
+        if kept.all():
             return partial
-        order = self._ranked(partial.costs(_OUTSIDE_WEIGHT))
-        count = max(1, int(np.searchsorted(np.cumsum(counts[order]), self.limits.pairs)))
-        kept = np.zeros(len(partial), dtype=np.bool_)
-        kept[order[:count]] = True
-        self._drop(partial.bounds[~kept], limited=True)
         places = np.cumsum(kept) - 1
         if self._layers:
             last = self._layers[-1].chosen(kept[self._layers[-1].ends])
@@ -198,34 +199,20 @@ class _BranchAndBound:
             self._kept = int(places[self._kept])
         return partial.chosen(kept)
 
-    def _fit(self, made: PartialPoses) -> np.ndarray:
-        """Which (B,) bool may be kept."""
-        alive = made.bounds <= self.J_limit
-        room = max(1, min(self.limits.states, self.limits.memory // (4 * 8 * self.expansion.words)))
-        if alive.sum() <= room:
+    def _keep(self, partial: PartialPoses, counts: np.ndarray, limit: float) -> np.ndarray:
+        """Which (B,) bool of those that may lead to poses: the best, by counts (B,) to a limit."""
+        alive = partial.bounds <= self.J_limit
+        if counts[alive].sum() <= limit:
             return np.asarray(alive)
-        costs = np.where(alive, made.costs(_OUTSIDE_WEIGHT), np.iinfo(np.int64).max)
-        kept = np.zeros(len(alive), dtype=np.bool_)
-        kept[self._ranked(costs)[:room]] = True
-        self._drop(made.bounds[alive & ~kept], limited=True)
-        return kept
-
-    def _ranked(self, costs: np.ndarray) -> np.ndarray:
-        """The numbers of partial poses, best first; that of the pose to be kept before all."""
+        costs = np.where(alive, partial.costs(_OUTSIDE_WEIGHT), np.iinfo(np.int64).max)
         if self._kept >= 0:
-            costs = costs.copy()
             costs[self._kept] = np.iinfo(np.int64).min
-        return np.argsort(costs, kind="stable")
-
-    def _follow_kept(
-        self, origins: np.ndarray, samples: np.ndarray, numbers: np.ndarray, node: int
-    ) -> None:
-        """Find the partial pose that the pose to be kept comes to."""
-        if self._kept < 0 or self.kept_samples is None:
-            return
-        found = (origins == self._kept) & (samples == self.kept_samples[node])
-        edges = np.flatnonzero(found)
-        self._kept = int(numbers[edges[0]]) if len(edges) else -1
+        order = np.argsort(costs, kind="stable")
+        room = max(1, int(np.searchsorted(np.cumsum(counts[order]), limit, side="right")))
+        kept = np.zeros(len(alive), dtype=np.bool_)
+        kept[order[:room]] = True
+        self._drop(partial.bounds[alive & ~kept], limited=True)
+        return np.asarray(alive & kept)
 
 
 class _SubtreeReaches:

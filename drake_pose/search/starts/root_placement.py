@@ -15,6 +15,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from scipy.ndimage import distance_transform_edt
 
@@ -22,9 +23,9 @@ from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.camera.models import Camera, ParallelCamera
 from drake_pose.errors import SettingsError
 from drake_pose.search.estimates import View
+from drake_pose.search.grid.node_poses import Pictures
 from drake_pose.search.grid.sampled_body import SampledBody
 from drake_pose.silhouette.areas.scoring import score_bodies
-from drake_pose.silhouette.bits.bit_kernel import WORD, draw_bits, make_bit_view
 
 # The picture in which random poses are measured [pixel], and how many.
 _SIDE, _POSES = 240, 100
@@ -159,16 +160,14 @@ def place_body(body: SampledBody, positions: np.ndarray, chosen: np.ndarray) -> 
     ``chosen``: (m,) the samples that it has: i is rotation i % r at position i // r.
     """
     placed, sampled = copy.copy(body), copy.copy(body.sampled)
-    X_WR = sampled.X_PN[0]
-    places, turns = np.divmod(chosen, len(X_WR))
-    shifts = positions[places] - X_WR[0, :3, 3]
-    X = X_WR[turns]
-    X[:, :3, 3] += shifts
-    sampled.X_PN = [X, *sampled.X_PN[1:]]
+    places, turns = np.divmod(chosen, len(sampled.X_PN[0]))
+    shifts = positions[places] - sampled.X_PN[0][0, :3, 3]
+    X_WR = sampled.X_PN[0][turns]
+    X_WR[:, :3, 3] += shifts
+    sampled.X_PN = [X_WR, *sampled.X_PN[1:]]
     sampled.values = [sampled.values[0][turns], *sampled.values[1:]]
-    band = sampled.bands[0]
-    if band is not None:
-        sampled.bands = [band[turns], *sampled.bands[1:]]
+    if sampled.bands[0] is not None:
+        sampled.bands = [sampled.bands[0][turns], *sampled.bands[1:]]
     placed.sampled = sampled
     placed.p_PB = [np.ascontiguousarray(body.p_PB[0][turns] + shifts[:, None]), *body.p_PB[1:]]
     return placed
@@ -224,8 +223,7 @@ def _draw_root(
     if not isinstance(camera, ParallelCamera):
         scale /= max(depth - reach, 0.2 * depth)
     half = min(_FARTHEST, math.ceil(scale * reach) + 1)
-    side = 2 * half + 1
-    inner = side - 2
+    side, inner = 2 * half + 1, 2 * half - 1
     window = dataclasses.replace(
         camera,
         width=side,
@@ -233,23 +231,12 @@ def _draw_root(
         center_x=camera.center_x - float(place[0]) + half,
         center_y=camera.center_y - float(place[1]) + half,
     )
-    everywhere = np.zeros((side, side), dtype=np.bool_)
-    everywhere[1:-1, 1:-1] = True
+    everywhere = np.pad(np.ones((inner, inner), dtype=np.bool_), 1)
     placed = place_body(body, p_WR[None], np.arange(rotations))
-    pairs = np.column_stack([np.zeros(rotations), np.arange(rotations)]).astype(np.int32)
-    _, _, runs, words = draw_bits(
-        placed.celled_outline(0, camera, coarse=True),
-        make_bit_view(everywhere, window.kernel_parameters(), camera.X_CW, 0),
-        np.eye(4)[None],
-        placed.sampled.X_PN[0],
-        pairs,
-        np.inf,
-    )
-    bits = np.zeros((rotations, -(-(inner**2) // WORD) * WORD // 8), dtype=np.uint8)
-    data = words.view(np.uint8).reshape(-1, 8)
-    for row, (first, length, start) in zip(bits.reshape(rotations, -1, 8), runs[:, 0], strict=True):
-        row[first : first + length] = data[start : start + length]
-    pixels = np.unpackbits(bits, axis=1, count=inner**2, bitorder="little")
+    bits = Pictures(placed, [View(window, everywhere)], band=1)
+    masks = np.zeros((rotations, int(bits.part_starts[-1])), dtype=np.uint64)
+    bits.draw_node(0, np.arange(rotations), placed.sampled.X_PN[0], masks)
+    pixels = np.unpackbits(masks.view(np.uint8), axis=1, count=inner**2, bitorder="little")
     pictures = np.zeros((rotations, side, side), dtype=np.float32)
     pictures[:, 1:-1, 1:-1] = pixels.reshape(rotations, inner, inner)
     return pictures
@@ -272,16 +259,10 @@ def _pixel_sizes(body: SampledBody, view: View) -> np.ndarray:
 
 def _random_areas(body: SampledBody, camera: Camera) -> np.ndarray:
     """Areas of parallel projections of random poses of the grid, seen along the camera's axis."""
-    generator = np.random.default_rng(1)
-    sampled, nodes = body.sampled, body.sampled.tree.nodes
-    X_WN = np.empty((_POSES, len(nodes), 4, 4))
-    samples = np.empty((_POSES, len(nodes)), dtype=np.int64)
-    for i, node in enumerate(nodes):
-        samples[:, i] = generator.integers(len(sampled.X_PN[i]), size=_POSES)
-        X_PN = sampled.X_PN[i][samples[:, i]]
-        X_WN[:, i] = X_PN if node.parent < 0 else X_WN[:, node.parent] @ X_PN
+    generator, sampled = np.random.default_rng(1), body.sampled
+    samples = np.column_stack([generator.integers(len(X_PN), size=_POSES) for X_PN in sampled.X_PN])
     balls = np.array([outline.ball for outline in sampled.outlines])
-    X_CN = camera.X_CW @ X_WN
+    X_CN = camera.X_CW @ sampled.poses(samples)
     centers = np.einsum("nkij,kj->nki", X_CN[..., :3, :3], balls[:, :3]) + X_CN[..., :3, 3]
     low = (centers - balls[:, 3:]).min(axis=1)
     high = (centers + balls[:, 3:]).max(axis=1)
@@ -291,7 +272,7 @@ def _random_areas(body: SampledBody, camera: Camera) -> np.ndarray:
     measuring = ParallelCamera("", _SIDE, _SIDE, scale, middle, middle, np.eye(4))
     nothing = np.zeros((0, _SIDE, _SIDE + 1), dtype=np.int32)
     areas = score_bodies(
-        sampled.outlines_at(range(len(nodes)), samples[0]), X_CN, measuring, nothing
+        sampled.outlines_at(range(samples.shape[1]), samples[0]), X_CN, measuring, nothing
     )
     return np.asarray(areas[:, 0] / scale**2)
 
@@ -302,8 +283,9 @@ def _touches_edge(mask: np.ndarray) -> bool:
 
 def _box(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The least and greatest u and v of a silhouette, (2,) each."""
-    v, u = np.nonzero(mask)
-    return np.array([u.min(), v.min()], float), np.array([u.max(), v.max()], float)
+    left, top, width, height = cv2.boundingRect(mask.astype(np.uint8))
+    low = np.array([left, top], float)
+    return low, low + np.array([width - 1, height - 1])
 
 
 def _extent(mask: np.ndarray) -> float:
@@ -323,16 +305,18 @@ def _picture_grid(view: View) -> np.ndarray:
     high = np.where(high > size - 2, size - 1 + beyond, high + 0.5 * spacing)
     axes = [low[k] + spacing * np.arange(int((high[k] - low[k]) / spacing) + 1) for k in range(2)]
     places = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
-    return places[_near(view, places, 0.75 * spacing, beyond)]
+    return places[_near(view, places)]
 
 
-def _near(view: View, places: np.ndarray, spacing: float, beyond: float) -> np.ndarray:
+def _near(view: View, places: np.ndarray) -> np.ndarray:
     """Which places (n, 2) [pixel] lie at the silhouette, or beyond it out of the picture."""
+    extent = _extent(view.mask)
     distances = distance_transform_edt(~view.mask)
     inside = np.clip(places, 0, np.array(view.mask.shape)[::-1] - 1)
     column, row = np.rint(inside).astype(np.int64).T
+    near = distances[row, column] <= 0.75 * extent / _POSITIONS_ACROSS
     over = np.linalg.norm(places - inside, axis=1)
-    return np.asarray((distances[row, column] <= spacing) & (over <= beyond))
+    return np.asarray(near & (over <= (_CUT_OFF - 1.0) * extent))
 
 
 def _lift(camera: Camera, places: np.ndarray, depth: float) -> np.ndarray:
@@ -383,8 +367,6 @@ def _space_layer(views: Sequence[View], middle: np.ndarray, sizes: np.ndarray) -
         seen = np.ones(len(points), dtype=np.bool_)
         if not isinstance(view.camera, ParallelCamera):
             seen = depth > view.camera.near
-        wide = _extent(view.mask) / _POSITIONS_ACROSS
-        beyond = (_CUT_OFF - 1.0) * _extent(view.mask)
-        seen[seen] = _near(view, places[seen], 0.75 * wide, beyond)
+        seen[seen] = _near(view, places[seen])
         points = points[seen]
     return Layer(tuple(views), points, 1.0)

@@ -36,9 +36,9 @@ _SPARE = 4
 # Placements whose nodes' middles are all nearer than this are one [node radii].
 _ALIKE = 0.35
 _LONGEST_PART = 3
-# Steps of Gauss and Newton's method that bring nodes to given places, and that hold a node; each no
+# How Gauss and Newton's method brings nodes to given places, and holds a node: so many steps, each no
 # longer than so much, and damped by a share of a square metre.
-_MOVES, _HOLDS, _LONGEST, _DAMPING = 8, 4, 0.5, 1e-4
+_MOVE, _HOLD = (8, 0.5, 1e-4), (4, 1.0, 0.0)
 # Steps smaller than this end it [rad or m].
 _STANDSTILL = 2e-3
 
@@ -229,41 +229,46 @@ class PartSearch:
         away = (middles - X_WN[part.nodes[0], :3, 3]) @ depth
         wanted, nodes = middles - 2.0 * np.outer(away, depth), list(part.nodes)
         columns = np.concatenate([self._columns[node] for node in nodes])
-        moved = parameters.copy()
-        for _ in range(_MOVES):
-            placed = self.body.place(moved, bent=False)
-            p_W = self._middles(placed.X_WN[nodes], nodes)
-            A = _velocities(placed, nodes, columns, p_W)
-            square = A.T @ A + _DAMPING * np.eye(len(columns))
-            step = np.linalg.solve(square, A.T @ (wanted - p_W).ravel())
-            if self._stand_still(moved, columns, np.clip(step, -_LONGEST, _LONGEST)):
-                break
+        p_N = self._balls[nodes, :3]
+        moved = self._bring(parameters, nodes, p_N, wanted, columns, _MOVE)
         return self._hold(moved, X_WN, part.held)
 
     def _hold(self, parameters: np.ndarray, X_WN: np.ndarray, nodes: Sequence[int]) -> np.ndarray:
         """The parameters with nodes brought back to about X_WN by their own values."""
-        held = parameters.copy()
         for node in nodes:
-            columns = self._columns[node]
             radius = max(float(self._balls[node, 3]), 1e-6)
             p_N = radius * np.vstack([np.zeros(3), np.eye(3), -np.eye(3)])
             wanted = p_N @ X_WN[node, :3, :3].T + X_WN[node, :3, 3]
-            for _ in range(_HOLDS):
-                placed = self.body.place(held, bent=False)
-                X = placed.X_WN[node]
-                p_W = p_N @ X[:3, :3].T + X[:3, 3]
-                A = _velocities(placed, [node] * len(p_N), columns, p_W)
-                step = np.linalg.lstsq(A, (wanted - p_W).ravel(), rcond=1e-6)[0]
-                if self._stand_still(held, columns, np.clip(step, -1.0, 1.0)):
-                    break
-        return held
+            columns, points = self._columns[node], [node] * len(p_N)
+            parameters = self._bring(parameters, points, p_N, wanted, columns, _HOLD)
+        return parameters
 
-    def _stand_still(self, parameters: np.ndarray, columns: np.ndarray, step: np.ndarray) -> bool:
-        """Whether parameters, which are changed, hardly move by a step inside their limits."""
-        before = parameters[columns]
+    def _bring(
+        self,
+        parameters: np.ndarray,
+        nodes: Sequence[int],
+        p_N: np.ndarray,
+        wanted: np.ndarray,
+        columns: np.ndarray,
+        how: tuple[int, float, float],
+    ) -> np.ndarray:
+        """The parameters, some columns changed so that points (n, 3) of nodes come to places."""
         lower, upper = self.body.lower[columns], self.body.upper[columns]
-        parameters[columns] = np.clip(before + step, lower, upper)
-        return bool(np.abs(parameters[columns] - before).max(initial=0.0) < _STANDSTILL)
+        (steps, longest, damping), moved = how, parameters.copy()
+        for _ in range(steps):
+            placed = self.body.place(moved, bent=False)
+            X = placed.X_WN[list(nodes)]
+            p_W = np.einsum("kij,kj->ki", X[:, :3, :3], p_N) + X[:, :3, 3]
+            A, off = _velocities(placed, nodes, columns, p_W), (wanted - p_W).ravel()
+            if damping:
+                step = np.linalg.solve(A.T @ A + damping * np.eye(len(columns)), A.T @ off)
+            else:
+                step = np.linalg.lstsq(A, off, rcond=1e-6)[0]
+            before = moved[columns]
+            moved[columns] = np.clip(before + np.clip(step, -longest, longest), lower, upper)
+            if np.abs(moved[columns] - before).max(initial=0.0) < _STANDSTILL:
+                break
+        return moved
 
     def _middles(self, X_WN: np.ndarray, nodes: Sequence[int]) -> np.ndarray:
         """The middles (..., k, 3) of some nodes at X_WN (..., k, 4, 4) in the world [m]."""

@@ -36,8 +36,8 @@ _SPARE = 4
 # Placements whose nodes' middles are all nearer than this are one [node radii].
 _ALIKE = 0.35
 _LONGEST_PART = 3
-# How Gauss and Newton's method brings nodes to given places, and holds a node: so many steps, each no
-# longer than so much, and damped by a share of a square metre.
+# How Gauss and Newton's method brings nodes to given places, and holds a node: so many steps, each
+# no longer than so much, and damped by a share of a square metre.
 _MOVE, _HOLD = (8, 0.5, 1e-4), (4, 1.0, 0.0)
 # Steps smaller than this end it [rad or m].
 _STANDSTILL = 2e-3

@@ -11,6 +11,7 @@ import yaml
 from drake_pose.body.model import ArticulatedModel
 from drake_pose.camera.camera_files import save_cameras
 from drake_pose.camera.models import circle_of_cameras
+from drake_pose.silhouette.pictures.masks import write_mask
 from drake_pose.systems.pictures.camera_rig import build_camera_rig
 
 SIZE = (240, 180)
@@ -56,29 +57,26 @@ def write_studio(
         seen = rig.picture(context, name) + generator.normal(0.0, 2.0, (size[1], size[0], 3))
         return cv2.cvtColor(np.clip(seen, 0, 255).astype(np.uint8), cv2.COLOR_RGB2BGR)
 
-    entries = {}
-    writers = {}
+    entries, writers = {}, {}
     rig.set_positions(context, absent(person))
     for name in placed:
         if kind == "masks":
             (folder / "masks" / name).mkdir(parents=True)
-            entries[name] = {"kind": "folder", "location": f"masks/{name}", "rate_hz": RATE_HZ}
-            entries[name]["masks"] = True
+            entries[name] = {"kind": "folder", "location": f"masks/{name}", "rate_hz": RATE_HZ,
+                             "masks": True}  # fmt: skip
             continue
         (folder / "empty" / name).mkdir(parents=True)
         for k in range(3):
             cv2.imwrite(str(folder / "empty" / name / f"{k}.png"), picture(name))
-        place = f"{name}.avi"
-        entries[name] = {"kind": "video", "location": place, "background": f"empty/{name}"}
-        fourcc = cv2.VideoWriter_fourcc(*"MJPG")
-        writers[name] = cv2.VideoWriter(str(folder / place), fourcc, RATE_HZ, size)
+        entries[name] = {"kind": "video", "location": f"{name}.avi", "background": f"empty/{name}"}
+        code = cv2.VideoWriter_fourcc(*"MJPG")
+        writers[name] = cv2.VideoWriter(str(folder / f"{name}.avi"), code, RATE_HZ, size)
     (folder / "sources.yaml").write_text(yaml.safe_dump(entries))
     for k, q in enumerate(poses):
         rig.set_positions(context, q)
         for name in placed:
             if kind == "masks":
-                mask = rig.mask(context, name).astype(np.uint8) * 255
-                cv2.imwrite(str(folder / "masks" / name / f"{k:04d}.png"), mask)
+                write_mask(folder / "masks" / name / f"{k:04d}.png", rig.mask(context, name))
             else:
                 writers[name].write(picture(name))
     for writer in writers.values():

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from drake_pose.errors import MaskError
-from drake_pose.silhouette.pictures.masks import read_mask, write_mask
+from drake_pose.silhouette.pictures.masks import read_mask, signed_distances, write_mask
 
 MASK = np.zeros((20, 30), dtype=bool)
 MASK[4:9, 3:20] = True
@@ -102,3 +102,14 @@ def test_unreadable_files_are_refused(tmp_path: Path) -> None:
     picture.write_bytes((tmp_path / "photo.jpg").read_bytes())
     with pytest.raises(MaskError, match="not a PNG"):
         read_mask(picture)
+
+
+def test_signed_distances_are_those_to_the_nearest_pixel_of_the_other_kind() -> None:
+    mask = np.random.default_rng(4).random((14, 17)) < 0.6
+    found = signed_distances(mask)
+    inside, outside = np.argwhere(mask), np.argwhere(~mask)
+    for row, column in np.ndindex(mask.shape):
+        others = outside if mask[row, column] else inside
+        nearest = np.linalg.norm(others - [row, column], axis=1).min() - 0.5
+        expected = -nearest if mask[row, column] else nearest
+        assert found[row, column] == pytest.approx(expected, abs=1e-4)

@@ -9,7 +9,7 @@ import numpy as np
 import trimesh
 
 from drake_pose.body.model import ArticulatedModel
-from drake_pose.camera.models import ParallelCamera
+from drake_pose.camera.models import ParallelCamera, look_at
 from drake_pose.silhouette.areas.outline import outline_from_mesh
 from drake_pose.silhouette.areas.scoring import draw_mask
 
@@ -92,12 +92,7 @@ class Silhouettes:
         self, q: np.ndarray, towards: np.ndarray, target: np.ndarray, size: float, pixels: int = 400
     ) -> np.ndarray:
         """(pixels, pixels) bool, seen from direction towards (3,); size [m] fills the picture."""
-        z = -np.asarray(towards, dtype=float) / np.linalg.norm(towards)
-        x = np.cross(z, [0.0, 0.0, 1.0])
-        x /= np.linalg.norm(x)
-        X_WC = np.eye(4)
-        X_WC[:3, :3] = np.column_stack([x, np.cross(z, x), z])
-        X_WC[:3, 3] = target - 10.0 * z
+        X_WC = look_at(target + 10.0 * np.asarray(towards) / np.linalg.norm(towards), target)
         middle = 0.5 * (pixels - 1)
         camera = ParallelCamera("side", pixels, pixels, pixels / size, middle, middle, X_WC)
         X_WN = self.tree.node_poses(self.tree.values_from_positions(q))

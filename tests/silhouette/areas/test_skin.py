@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from drake_pose.body.model import ArticulatedModel
 from drake_pose.body.surfaces.meshes import TriangleMesh
-from drake_pose.camera.models import Camera, ParallelCamera, PinholeCamera
+from drake_pose.camera.models import Camera, ParallelCamera, PinholeCamera, look_at
 from drake_pose.silhouette.areas.bending import BendingOutline, TreeSurfaces
 from drake_pose.silhouette.areas.outline import outline_from_mesh
 from drake_pose.silhouette.areas.scoring import draw_mask, prefix_sums, score_bodies, subtract_body
@@ -25,12 +25,8 @@ SIDE = 160
 def looking_along(direction: np.ndarray, distance: float) -> np.ndarray:
     """A camera's pose (4, 4) in the limb's world, its middle in view."""
     z = np.asarray(direction, dtype=float) / np.linalg.norm(direction)
-    x = np.cross(z, [0.0, 0.0, 1.0]) if abs(z[2]) < 0.9 else np.cross(z, [0.0, 1.0, 0.0])
-    x /= np.linalg.norm(x)
-    X = np.eye(4)
-    X[:3, :3] = np.column_stack([x, np.cross(z, x), z])
-    X[:3, 3] = np.array([0.0, 0.0, 0.1]) - distance * z
-    return X
+    middle, up = np.array([0.0, 0.0, 0.1]), (0, 0, 1) if abs(z[2]) < 0.9 else (0, 1, 0)
+    return look_at(middle - distance * z, middle, up)
 
 
 def cameras(rng: np.random.Generator) -> list[Camera]:

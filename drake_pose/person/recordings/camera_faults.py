@@ -95,40 +95,146 @@ class CameraFault:
     is_left_out: bool = False
 
 
-def fit_without(
-    fit: ContourFit,
-    cameras: Mapping[str, Camera],
-    frame: FrameView,
-    left_out: str,
-    held: Mask | None = None,
-) -> tuple[Array, float]:
-    """A frame's pose (m,) by all cameras but one, and what share of their contours fits."""
-    names = [name for name in frame.edges if name != left_out]
-    information = np.where(fit.kinematics.is_angle, 1.0, 4.0) / _ANGLE_DEVIATION**2
-    found = fit.fit(
-        pack_views([cameras[name] for name in names], [frame.edges[name] for name in names]),
-        frame.values,
-        _POSE_ROUNDS,
-        Prior(frame.values, information),
-        held,
-    )
-    return found.values, found.inlier_ratio
+class CameraJudge:
+    """Compares cameras with each other by a person whom they see.
 
+    Args:
+        fit: of the person.
+        held: (m,) values that stay.
+    """
 
-def camera_motion(
-    fit: ContourFit, camera: Camera, edges: Sequence[EdgePoints], poses: Sequence[Array]
-) -> CameraMotion:
-    """The motion of a camera that explains its edges best, by poses (m,) found without it."""
-    places = np.array([fit.kinematics.poses(values)[:, :3, 3] for values in poses])
-    pairs = list(zip(edges, poses, strict=True))
-    found = []
-    for start in (np.zeros(3), _way_to_regions(camera, edges, places)):
-        moved = _moved_camera(fit, camera, pairs, places.reshape(-1, 3).mean(axis=0), start)
-        found.append(_describe(fit, camera, moved, pairs, places.reshape(-1, 3)))
-        # What is far off may be drawn to the wrong side of the body; else one start is enough.
-        if found[0].share_after > _EXPLAINED:
-            break
-    return max(found, key=lambda one: one.share_after)
+    def __init__(
+        self, fit: ContourFit, cameras: Mapping[str, Camera], held: Mask | None = None
+    ) -> None:
+        self._fit, self._cameras, self._held = fit, cameras, held
+
+    def pose_without(self, frame: FrameView, left_out: str) -> tuple[Array, float]:
+        """A frame's pose (m,) by all cameras but one, and what share of their contours fits."""
+        names = [name for name in frame.edges if name != left_out]
+        views = pack_views(
+            [self._cameras[name] for name in names], [frame.edges[name] for name in names]
+        )
+        is_angle = self._fit.kinematics.is_angle
+        prior = Prior(frame.values, np.where(is_angle, 1.0, 4.0) / _ANGLE_DEVIATION**2)
+        found = self._fit.fit(views, frame.values, _POSE_ROUNDS, prior, self._held)
+        return found.values, found.inlier_ratio
+
+    def share(self, camera: Camera, edge: EdgePoints, values: Array) -> float:
+        """What share of the contours' lengths fits in one picture."""
+        return self._fit.compare(pack_views([camera], [edge]), values, _JUDGED).inlier_ratio
+
+    def motion(
+        self, name: str, edges: Sequence[EdgePoints], poses: Sequence[Array]
+    ) -> CameraMotion:
+        """The motion of a camera that explains its edges best, by poses (m,) found without it."""
+        camera, pairs = self._cameras[name], list(zip(edges, poses, strict=True))
+        places = np.array([self._fit.kinematics.poses(values)[:, :3, 3] for values in poses])
+        found = []
+        for start in (np.zeros(3), _way_to_regions(camera, edges, places)):
+            moved = self._moved(camera, pairs, places.reshape(-1, 3).mean(axis=0), start)
+            found.append(self._describe(camera, moved, pairs, places.reshape(-1, 3)))
+            # What is far off may be drawn to the wrong side of the body; else one start is enough.
+            if found[0].share_after > _EXPLAINED:
+                break
+        return max(found, key=lambda one: one.share_after)
+
+    def _moved(
+        self,
+        camera: Camera,
+        pairs: Sequence[tuple[EdgePoints, Array]],
+        middle: Array,
+        start: Array,
+    ) -> Camera:
+        """A camera moved to fit its regions to bodies about middle (3,), first by (3,) [m]."""
+        fit, reach = self._fit, float(np.linalg.norm(camera.X_WC[:3, 3] - middle))
+        names = [f"{camera.name}.{name}" for name in CAMERA_NAMES]
+        # What the pictures see of a turn about the camera is the person's way about it.
+        deviations = np.array([_TURN] * 3 + [_SHIFT + _TURN * reach] * 3)
+        unknowns = choose([*fit.body.names, *names], names[:6], shared=True, deviation=deviations)
+        nothing = np.zeros((len(pairs), 0))
+        found = FramesFit(
+            fit.body, [camera], unknowns, pivot=middle, noise=fit.noise, steps=_CAMERA_STEPS
+        ).fit(
+            [pack_evidence([edge]) for edge, _ in pairs],
+            np.array([values for _, values in pairs]),
+            nothing,
+            np.concatenate([np.zeros(3), camera.X_CW[:3, :3] @ start]),
+            _CAMERA_ROUNDS,
+            expected=(nothing, np.zeros(6)),
+        )
+        X_CW = CameraParameters([camera], middle).place(np.append(found.shared, 0.0))[0][0]
+        return camera.with_pose(np.linalg.inv(X_CW))
+
+    def _describe(
+        self,
+        camera: Camera,
+        moved: Camera,
+        pairs: Sequence[tuple[EdgePoints, Array]],
+        points: Array,
+    ) -> CameraMotion:
+        """What a camera's motion does to its pictures, and to points (n, 3) in them [m]."""
+        before, after = camera.project(points)[0], moved.project(points)[0]
+        pixels = float(np.sqrt(((after - before) ** 2).sum(axis=1).mean()))
+        arms, ends = before - before.mean(axis=0), after - after.mean(axis=0)
+        sine = (arms[:, 0] * ends[:, 1] - arms[:, 1] * ends[:, 0]).sum()
+        shares = [np.mean([self.share(one, *pair) for pair in pairs]) for one in (camera, moved)]
+        return CameraMotion(
+            moved.X_WC,
+            (after - before).mean(axis=0),
+            pixels,
+            pixels / pixels_per_metre(camera, points.mean(axis=0)),
+            float(np.arctan2(sine, (arms * ends).sum())),
+            float(shares[0]),
+            float(shares[1]),
+        )
+
+    def find_fault(self, frames: Sequence[FrameView]) -> CameraFault | None:
+        """The camera that contradicts the others most, if one does.
+
+        Of the frames those count that three cameras see or more.
+        """
+        frames = [frame for frame in frames if len(frame.edges) >= 3]
+        names = [name for name in self._cameras if any(name in frame.edges for frame in frames)]
+        with_all = [self.pose_without(frame, "")[1] for frame in frames]
+        misfits, found = {}, {}
+        for name in names:
+            own = [frame for frame in frames if name in frame.edges]
+            shares = [s for s, f in zip(with_all, frames, strict=True) if name in f.edges]
+            without = [self.pose_without(frame, name) for frame in own]
+            motion = self.motion(
+                name, [frame.edges[name] for frame in own], [values for values, _ in without]
+            )
+            share = float(np.mean([others for _, others in without]))
+            count = float(np.mean([len(frame.edges) for frame in own]))
+            best = ((count - 1.0) * share + max(motion.share_after, motion.share_before)) / count
+            misfits[name] = (1.0 - best) / max(1.0 - float(np.mean(shares)), 1e-3)
+            found[name] = motion, share
+        suspects = sorted(misfits, key=lambda one: misfits[one])
+        if not suspects or misfits[suspects[0]] > _LOWERED:
+            return None
+        # Any two cameras agree more or less: two alone predict a third one's picture half as well,
+        # and of three nobody can tell which one contradicts the others.
+        few = len(names) <= 3
+        metres = (2.0 if few else 1.0) * _LEAST_METRES
+        # Of those that lower the misfit alike, one that has not moved is not at fault.
+        moved = [
+            one
+            for one in suspects
+            if misfits[one] <= _ALIKE * misfits[suspects[0]]
+            and found[one][0].metres >= metres
+            and found[one][0].pixels >= _LEAST_PIXELS
+        ]
+        if not moved:
+            return None
+        first, alike = moved[0], np.inf if few else _ALIKE * misfits[moved[0]]
+        motion, share = found[first]
+        rivals = [
+            one
+            for one in suspects
+            if one != first and misfits[one] < alike and found[one][0].metres > _LEAST_METRES
+        ]
+        explained = not few and is_explained(motion, share)
+        return CameraFault(first, motion, explained, tuple(rivals), share)
 
 
 def _way_to_regions(camera: Camera, edges: Sequence[EdgePoints], places: Array) -> Array:
@@ -140,118 +246,6 @@ def _way_to_regions(camera: Camera, edges: Sequence[EdgePoints], places: Array) 
             across = origin[0] - own.mean(axis=0)
             ways.append(across - (across @ direction[0]) * direction[0])
     return np.asarray(np.sum(ways, axis=0) / max(len(ways) - 1, 1))
-
-
-def _moved_camera(
-    fit: ContourFit,
-    camera: Camera,
-    pairs: Sequence[tuple[EdgePoints, Array]],
-    middle: Array,
-    start: Array,
-) -> Camera:
-    """A camera moved to fit its regions to bodies about middle (3,), first by a shift (3,) [m]."""
-    reach = float(np.linalg.norm(camera.X_WC[:3, 3] - middle))
-    names = [f"{camera.name}.{name}" for name in CAMERA_NAMES]
-    # What the pictures see of a turn about the camera is the person's way about it.
-    deviations = np.array([_TURN] * 3 + [_SHIFT + _TURN * reach] * 3)
-    unknowns = choose([*fit.body.names, *names], names[:6], shared=True, deviation=deviations)
-    frames = FramesFit(
-        fit.body, [camera], unknowns, pivot=middle, noise=fit.noise, steps=_CAMERA_STEPS
-    )
-    found = frames.fit(
-        [pack_evidence([edge]) for edge, _ in pairs],
-        np.array([values for _, values in pairs]),
-        np.zeros((len(pairs), 0)),
-        np.concatenate([np.zeros(3), camera.X_CW[:3, :3] @ start]),
-        _CAMERA_ROUNDS,
-        expected=(np.zeros((len(pairs), 0)), np.zeros(6)),
-    )
-    X_CW = CameraParameters([camera], middle).place(np.append(found.shared, 0.0))[0][0]
-    return camera.with_pose(np.linalg.inv(X_CW))
-
-
-def share_of(fit: ContourFit, camera: Camera, edge: EdgePoints, values: Array) -> float:
-    """What share of the contours' lengths fits in one picture."""
-    return fit.compare(pack_views([camera], [edge]), values, _JUDGED).inlier_ratio
-
-
-def _describe(
-    fit: ContourFit,
-    camera: Camera,
-    moved: Camera,
-    pairs: Sequence[tuple[EdgePoints, Array]],
-    points: Array,
-) -> CameraMotion:
-    """What a camera's motion does to its pictures, and to points (n, 3) in them [m]."""
-    before, _ = camera.project(points)
-    after, _ = moved.project(points)
-    pixels = float(np.sqrt(((after - before) ** 2).sum(axis=1).mean()))
-    arms, ends = before - before.mean(axis=0), after - after.mean(axis=0)
-    sine = (arms[:, 0] * ends[:, 1] - arms[:, 1] * ends[:, 0]).sum()
-    shares = [np.mean([share_of(fit, one, e, q) for e, q in pairs]) for one in (camera, moved)]
-    return CameraMotion(
-        moved.X_WC,
-        (after - before).mean(axis=0),
-        pixels,
-        pixels / pixels_per_metre(camera, points.mean(axis=0)),
-        float(np.arctan2(sine, (arms * ends).sum())),
-        float(shares[0]),
-        float(shares[1]),
-    )
-
-
-def find_fault(
-    fit: ContourFit,
-    cameras: Mapping[str, Camera],
-    frames: Sequence[FrameView],
-    held: Mask | None = None,
-) -> CameraFault | None:
-    """The camera that contradicts the others most, if one does; `held` (m,) values stay.
-
-    Of the frames those count that three cameras see or more.
-    """
-    frames = [frame for frame in frames if len(frame.edges) >= 3]
-    names = [name for name in cameras if any(name in frame.edges for frame in frames)]
-    with_all = [fit_without(fit, cameras, frame, "", held)[1] for frame in frames]
-    misfits, found = {}, {}
-    for name in names:
-        own = [frame for frame in frames if name in frame.edges]
-        together = np.mean([s for s, f in zip(with_all, frames, strict=True) if name in f.edges])
-        without = [fit_without(fit, cameras, frame, name, held) for frame in own]
-        edges, poses = [frame.edges[name] for frame in own], [values for values, _ in without]
-        motion = camera_motion(fit, cameras[name], edges, poses)
-        share = float(np.mean([others for _, others in without]))
-        count = float(np.mean([len(frame.edges) for frame in own]))
-        best = ((count - 1.0) * share + max(motion.share_after, motion.share_before)) / count
-        misfits[name] = (1.0 - best) / max(1.0 - float(together), 1e-3)
-        found[name] = motion, share
-    suspects = sorted(misfits, key=lambda one: misfits[one])
-    if not suspects or misfits[suspects[0]] > _LOWERED:
-        return None
-    # Any two cameras agree more or less: two alone predict a third one's picture half as well, and
-    # of three nobody can tell which one contradicts the others.
-    few = len(names) <= 3
-    metres = (2.0 if few else 1.0) * _LEAST_METRES
-    # Of those that lower the misfit alike, one that has not moved is not at fault.
-    moved = [
-        one
-        for one in suspects
-        if misfits[one] <= _ALIKE * misfits[suspects[0]]
-        and found[one][0].metres >= metres
-        and found[one][0].pixels >= _LEAST_PIXELS
-    ]
-    if not moved:
-        return None
-    first = moved[0]
-    motion, share = found[first]
-    alike = np.inf if few else _ALIKE * misfits[first]
-    rivals = [
-        one
-        for one in suspects
-        if one != first and misfits[one] < alike and found[one][0].metres > _LEAST_METRES
-    ]
-    explained = not few and is_explained(motion, share)
-    return CameraFault(first, motion, explained, tuple(rivals), share)
 
 
 def is_explained(motion: CameraMotion, others_share: float) -> bool:

@@ -20,13 +20,10 @@ from drake_pose.fit.evidence import EdgePoints, find_edge_points
 from drake_pose.person.pose_tracker import PersonPoseTracker
 from drake_pose.person.recordings.camera_faults import (
     CameraFault,
+    CameraJudge,
     FrameView,
-    camera_motion,
-    find_fault,
-    fit_without,
     is_explained,
     moved_since,
-    share_of,
 )
 from drake_pose.person.recordings.figures import RigFault, find_rig_fault
 from drake_pose.person.recordings.person_capture import PersonCapture, capture_person, spread_over
@@ -132,7 +129,7 @@ def _record(
     return recording
 
 
-class _Judge:
+class _Judge(CameraJudge):
     """Compares the cameras with each other by what was captured."""
 
     def __init__(
@@ -142,10 +139,10 @@ class _Judge:
         recording: PersonRecording,
         captured: PersonCapture,
     ) -> None:
-        self._cameras, self._recording = cameras, recording
-        self._held = shape_values(tree)
-        self._fit = ContourFit(tree, captured.outlines, None if captured.shape is None else NOISE)
-        tracker = PersonPoseTracker(self._fit, held=self._held)
+        held, noise = shape_values(tree), None if captured.shape is None else NOISE
+        super().__init__(ContourFit(tree, captured.outlines, noise), cameras, held)
+        self._recording = recording
+        tracker = PersonPoseTracker(self._fit, held=held)
         found = np.flatnonzero(np.isfinite(captured.q).all(axis=1)).tolist()
         self._values = {k: tracker.values(captured.q[k]) for k in found}
 
@@ -154,20 +151,17 @@ class _Judge:
         picked = spread_over(list(self._values), _COMPARED)
         views = []
         for frame in picked:
-            masks = self._recording.read(frame)
-            edges = {name: self._edge(name, mask) for name, mask in masks.items()}
+            masks = self._recording.read(frame).items()
+            edges = {name: self._edge(name, mask) for name, mask in masks}
             views.append(FrameView(edges, self._values[frame]))
-        fault = find_fault(self._fit, self._cameras, views, self._held)
+        fault = self.find_fault(views)
         if fault is None or not fault.is_explained:
             # A camera that moved in the middle is another one before and after that.
-            late = views[-(len(views) + 2) // 3 :]
-            fault = find_fault(self._fit, self._cameras, late, self._held) or fault
+            fault = self.find_fault(views[-(len(views) + 2) // 3 :]) or fault
         if fault is None:
             return None
         own = [k for k, view in enumerate(views) if fault.name in view.edges]
-        poses = [
-            fit_without(self._fit, self._cameras, views[k], fault.name, self._held)[0] for k in own
-        ]
+        poses = [self.pose_without(views[k], fault.name)[0] for k in own]
         since = self._since(fault, [views[k].edges[fault.name] for k in own], poses)
         # Between two compared frames it may have moved at any time.
         first = 0 if since == 0 else picked[own[min(since, len(own)) - 1]] + 1
@@ -175,22 +169,16 @@ class _Judge:
 
     def dated(self, fault: CameraFault) -> CameraFault:
         """A camera that was left out, measured once more by what the others captured without it."""
-        name = fault.name
-        edges, frames = [], []
-        for frame in self._values:
-            mask = self._recording.read(frame, with_all=True).get(name)
-            if mask is not None:
-                edges.append(self._edge(name, mask))
-                frames.append(frame)
+        seen = {k: self._recording.read(k, with_all=True).get(fault.name) for k in self._values}
+        frames = [k for k, mask in seen.items() if mask is not None]
+        edges = [self._edge(fault.name, mask) for mask in seen.values() if mask is not None]
         poses = [self._values[frame] for frame in frames]
         # The first guess may be some frames too early, which blurs the motion.
         for _ in range(2):
             late = [k for k, frame in enumerate(frames) if frame >= fault.first]
             if not late:
                 break
-            motion = camera_motion(
-                self._fit, self._cameras[name], [edges[k] for k in late], [poses[k] for k in late]
-            )
+            motion = self.motion(fault.name, [edges[k] for k in late], [poses[k] for k in late])
             explained = is_explained(motion, fault.others_share)
             fault = replace(fault, motion=motion, is_explained=explained)
             since = min(self._since(fault, edges, poses), len(frames) - 1)
@@ -203,7 +191,7 @@ class _Judge:
         """Since which of some pictures a camera is at fault."""
         camera = self._cameras[fault.name]
         before, after = (
-            [share_of(self._fit, one, e, values) for e, values in zip(edges, poses, strict=True)]
+            [self.share(one, e, values) for e, values in zip(edges, poses, strict=True)]
             for one in (camera, camera.with_pose(fault.motion.X_WC))
         )
         least = _AGREES * fault.others_share

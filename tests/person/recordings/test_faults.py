@@ -15,9 +15,8 @@ from drake_pose.fit.evidence import find_edge_points
 from drake_pose.person.pose_tracker import PersonPoseTracker
 from drake_pose.person.recordings.camera_faults import (
     CameraFault,
+    CameraJudge,
     FrameView,
-    camera_motion,
-    find_fault,
     moved_since,
 )
 from drake_pose.person.recordings.figures import (
@@ -49,7 +48,7 @@ class Stage:
         ]
 
     def find(self, masks: Masks) -> CameraFault | None:
-        return find_fault(self.fit, self.cameras, self.frames(masks))
+        return CameraJudge(self.fit, self.cameras).find_fault(self.frames(masks))
 
     def seen_by_moved(self, name: str, turn: float, shift: tuple[float, float, float]) -> Masks:
         """What the rig sees where a camera was turned about the vertical [deg] and shifted [m]."""
@@ -127,7 +126,8 @@ class TestMovedCamera:
         frames = four.frames(four.masks)
         camera = four.cameras["camera_0"]
         edges = [frame.edges["camera_0"] for frame in frames]
-        motion = camera_motion(four.fit, camera, edges, [frame.values for frame in frames])
+        judge = CameraJudge(four.fit, four.cameras)
+        motion = judge.motion("camera_0", edges, [frame.values for frame in frames])
         assert motion.pixels < 0.5
         np.testing.assert_allclose(motion.X_WC[:3, 3], camera.X_WC[:3, 3], atol=0.05)
 

@@ -97,13 +97,12 @@ def reach(
     Returns:
         (nq,) positions, and the distance that is left [m].
     """
-    values = np.argsort(skeleton.order)[index]
-    limits = skeleton.lower[index], skeleton.upper[index]
-    packed = skeleton.kinematics.packed
-    moved, distance = np.array(q), np.inf
-    moved[skeleton.order], distance = _reach(
-        packed, q[skeleton.order], values, part[0], part[1], limits, target, steps
-    )
+    node, point = part
+    packed, order = skeleton.chains[node]
+    place = np.zeros(len(q), dtype=np.int64)
+    place[order] = np.arange(len(order))
+    limits, moved = (skeleton.lower[index], skeleton.upper[index]), np.array(q)
+    moved[order], distance = _reach(packed, q[order], place[index], point, limits, target, steps)
     return moved, distance
 
 
@@ -112,22 +111,21 @@ def _reach(
     packed: PackedTree,
     values: Array,
     index: Integers,
-    node: int,
     point: Array,
     limits: tuple[Array, Array],
     target: Array,
     steps: int,
 ) -> tuple[Array, float]:
-    """As reach, of a pose tree's values (m,)."""
+    """As reach, of the values (m,) of a chain whose last node moves the point."""
     n, distance = len(index), np.inf
     tip, J, M = np.empty(3), np.empty((n, 3)), np.empty((3, 4))
     for step in range(steps + 1):
         X_WN, twists = find_motions(packed, values)
         M[:] = 0.0
         for r in range(3):
-            tip[r] = X_WN[node, r, 3]
+            tip[r] = X_WN[-1, r, 3]
             for c in range(3):
-                tip[r] += X_WN[node, r, c] * point[c]
+                tip[r] += X_WN[-1, r, c] * point[c]
             M[r, r], M[r, 3] = _DAMPING, target[r] - tip[r]
         distance = math.sqrt(M[0, 3] ** 2 + M[1, 3] ** 2 + M[2, 3] ** 2)
         if distance < _CLOSE_ENOUGH or step == steps:

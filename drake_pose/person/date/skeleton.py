@@ -14,7 +14,8 @@ from drake_pose.arrays import Array, Integers
 from drake_pose.body.model import ArticulatedModel
 from drake_pose.body.parsed_model import ParsedModel
 from drake_pose.body.surfaces.meshes import TriangleMesh
-from drake_pose.body.tree.tree_kinematics import TreeKinematics
+from drake_pose.body.tree.joint_kernel import PackedSteps
+from drake_pose.body.tree.tree_kinematics import PackedTree, TreeKinematics
 from drake_pose.errors import ModelError
 
 LIMBS = ("left_arm", "right_arm", "left_leg", "right_leg")
@@ -77,6 +78,7 @@ class Skeleton:
         head_positions: (3,) where the head's place stands in q.
         head_angles, neck_angles: (2,) where they stand in q.
         order: (m,) where the pose tree's values stand in q.
+        chains: of each node, what it hangs on packed by itself, and where its values stand in q.
         lower, upper: (nq,) limits [rad or m].
     """
 
@@ -88,6 +90,7 @@ class Skeleton:
     head_angles: Integers
     neck_angles: Integers
     order: Integers
+    chains: Sequence[tuple[PackedTree, Integers]]
     limbs: Mapping[str, Limb]
     lower: Array
     upper: Array
@@ -162,6 +165,8 @@ def load_skeleton(model: ArticulatedModel) -> Skeleton:
                 f"on '{parent}'; it has {', '.join(nodes)}"
             )
     head = tree.nodes[nodes["head"]]
+    order = np.array([model.position_index(name) for name in kinematics.names])
+    chains = [_chain(kinematics.packed, node) for node in range(len(nodes))]
     is_angle = [model.position_kinds[i] == "angle" for i in head.positions]
     return Skeleton(
         model=model,
@@ -171,7 +176,8 @@ def load_skeleton(model: ArticulatedModel) -> Skeleton:
         head_positions=np.array(head.positions)[np.invert(is_angle)],
         head_angles=np.array(head.positions)[is_angle],
         neck_angles=np.array(tree.nodes[nodes["trunk"]].positions),
-        order=np.array([model.position_index(name) for name in kinematics.names]),
+        order=order,
+        chains=[(packed, order[values]) for packed, values in chains],
         limbs={name: _limb(kinematics, nodes, name) for name in LIMBS},
         lower=model.lower,
         upper=model.upper,
@@ -188,6 +194,26 @@ def rotation(axes: Integers, angles: Array) -> Array:
         step[i, i], step[i, j], step[j, i], step[j, j] = c, -s, s, c
         R = R @ step
     return R
+
+
+def _chain(packed: PackedTree, node: int) -> tuple[PackedTree, Integers]:
+    """A node and those that it hangs on by themselves, and which values are theirs."""
+    path: list[int] = []
+    while node >= 0:
+        path, node = [node, *path], int(packed.parents[node])
+    values, joints = (
+        np.concatenate([np.arange(starts[n], starts[n + 1]) for n in path])
+        for starts in (packed.value_starts, packed.step_starts)
+    )
+    sizes, inverted, starts, coefficients = packed.steps
+    return PackedTree(
+        parents=np.arange(len(path)) - 1,
+        X_PA=packed.X_PA[path],
+        value_starts=np.cumsum([0, *np.diff(packed.value_starts)[path]]),
+        free=packed.free[path],
+        step_starts=np.cumsum([0, *np.diff(packed.step_starts)[path]]),
+        steps=PackedSteps(sizes[joints], inverted[joints], starts[joints], coefficients),
+    ), values
 
 
 def _segments(limb: str) -> tuple[str, str, str]:

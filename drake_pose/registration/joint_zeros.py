@@ -155,10 +155,8 @@ def calibrate_joints(
             f"{len(names)} joints' zeros and {len(lengths)} links' lengths need as many frames of "
             f"differing poses, and two or more; there are {count}: give more frames, or name fewer"
         )
-    seen = [
-        PosedFrames(body.kinematics, body.all, one.camera, own)
-        for one, own in zip(cameras, frames, strict=True)
-    ]
+    own = zip(cameras, frames, strict=True)
+    seen = [PosedFrames(body.kinematics, body.all, one.camera, each) for one, each in own]
     X_CW = [one.camera.X_CW for one in cameras]
     offsets = lengthened_joints(body.tree, lengths)
     sought = [*names, *(length_name(link) for link in lengths)]
@@ -166,8 +164,12 @@ def calibrate_joints(
     told: dict[str, KinematicParameter] = {}
     while True:
         fit = SharedFit(seen, X_CW, [*standing, *sought], offsets=offsets, focal=focal)
-        fit, found, covariance, pictures = _fitted(fit)
-        values = _constants(fit, found, pictures, covariance, sought)
+        # Constants that are off let good frames contradict, so all count at first.
+        fit, found = fit.from_found(fit.fit(ROUNDS_WITH_CONSTANTS))
+        which = fit.agreeing(fit.inlier_ratios(found))
+        fit, found = fit.from_found(fit.fit(ROUNDS_WITH_CONSTANTS, found, which))
+        covariance = _as_the_cost_bends(fit, found, which, fit.covariance(found, which))
+        values = _constants(fit, found, int(np.count_nonzero(which)), covariance, sought)
         told |= values
         # The cameras shall fit what is answered: nothing is added where it cannot be told.
         sought = [name for name in sought if values[name].determined]
@@ -185,16 +187,6 @@ def calibrate_joints(
         found.shared[stands],
         covariance[stands, stands],
     )
-
-
-def _fitted(fit: SharedFit) -> tuple[SharedFit, Shared, Array, int]:
-    """What was found, its covariance (u, u), and how many pictures counted."""
-    # Constants that are off let good frames contradict, so all count at first.
-    fit, found = fit.from_found(fit.fit(ROUNDS_WITH_CONSTANTS))
-    which = fit.agreeing(fit.inlier_ratios(found))
-    fit, found = fit.from_found(fit.fit(ROUNDS_WITH_CONSTANTS, found, which))
-    covariance = _as_the_cost_bends(fit, found, which, fit.covariance(found, which))
-    return fit, found, covariance, int(np.count_nonzero(which))
 
 
 def _as_the_cost_bends(fit: SharedFit, found: Shared, which: Mask, covariance: Array) -> Array:

@@ -30,18 +30,15 @@ Array = NDArray[np.float64]
 # A frame contradicts of which less than this share fits of what usually fits.
 _CONTRADICTS = 0.7
 # A bump turns the camera by no more [rad], and shifts it by no more [its distance from the body]:
-# from there a fit leads to the same look of the body. Farther away, all poses are searched, since
-# another one may look the same.
+# from there a fit leads to the same look of the body. Farther away, all poses are searched.
 _BUMP = 0.2
 # Before anything differed, the covariance is trusted as if so many numbers had borne it out; sets
 # of the newest keyframes overlap, so that each new one adds fewer numbers than a pose has.
 _TRUST = 4.0
 # A frame is a keyframe where the body's points are this far from where they are in all keyframes,
-# root mean square [the body's own extent, root mean square].
-_NOVELTY = 0.15
-# A frame near a keyframe says nothing new where the area in which body and mask differ is larger by
-# no more than this [the mask's area].
-_TOLERANCE = 0.04
+# root mean square [the body's own extent]; else it says nothing new unless body and mask differ by
+# so much more [the mask's area].
+_NOVELTY, _TOLERANCE = 0.15, 0.04
 # Mean intersection over union, below which no camera is believed to be found; and how improbable by
 # chance a difference is that counts as a moved camera.
 _LOWEST_IOU, _FALSE_ALARM = 0.5, 1e-6
@@ -147,12 +144,12 @@ class OnlineRegistration:
             return self._follow(state, state.registered, frame, near)
         if near is not None:
             return state
-        keyframes = self._kept(state.keyframes, frame, None)
-        if len(keyframes) >= self.settings.least_frames:
-            found = self._find(keyframes)
-            if found is not None:
-                return _registered(state, found, keyframes)
-        return replace(state, keyframes=keyframes)
+        keyframes = self._kept(state.keyframes, frame)
+        enough = len(keyframes) >= self.settings.least_frames
+        found = self._find(keyframes) if enough else None
+        if found is None:
+            return replace(state, keyframes=keyframes)
+        return _registered(state, found, keyframes)
 
     def _follow(
         self, state: OnlineState, registered: RegisteredCamera, frame: PosedFrame, near: int | None
@@ -160,29 +157,52 @@ class OnlineRegistration:
         """After the camera was found; near: the keyframe in which the body stands alike."""
         if near is not None:
             posed = PosedFrames(self.body.kinematics, self.body.few, registered.camera, [frame])
-            found = areas(posed, registered.camera.X_CW[None], np.inf)
-            usual = registered.frames[near].E_total
-            if float(E_total(found)[0, 0]) <= usual + _TOLERANCE:
+            left = E_total(areas(posed, registered.camera.X_CW[None], np.inf))[0, 0]
+            if left <= registered.frames[near].E_total + _TOLERANCE:
                 return replace(state, contradicting=(), contradictions=0)
         keyframes = self._kept(state.keyframes, frame, near)
         again = self._search.refine(registered.camera, keyframes)
         newest = again.frames[-1]
-        if newest.agrees and newest.inlier_ratio >= _least_inlier_ratio(registered):
-            return self._settle(_registered(state, again, keyframes), again)
-        return self._contradict(state, registered, frame)
-
-    def _settle(self, state: OnlineState, registered: RegisteredCamera) -> OnlineState:
-        """The state, or that of the newest keyframes alone where they say otherwise."""
-        newest = state.keyframes[-self.settings.newest :]
-        if len(state.keyframes) <= len(newest):
+        if not (newest.agrees and newest.inlier_ratio >= _least_inlier_ratio(registered)):
+            return self._contradict(state, registered, frame)
+        # The pose, or that of the newest keyframes alone where they say otherwise.
+        state = _registered(state, again, keyframes)
+        last = state.keyframes[-self.settings.newest :]
+        if len(state.keyframes) <= len(last):
             return state
-        alone = self._search.refine(registered.camera, newest)
+        alone = self._search.refine(again.camera, last)
         if alone.contradictions:
             return state
-        if self._is_elsewhere(state, alone, registered):
-            return _registered(state, alone, newest, moved=True)
-        distances = (*state.distances, _distance(alone, registered))
+        if self._is_elsewhere(state, alone, again):
+            return _registered(state, alone, last, moved=True)
+        distances = (*state.distances, _distance(alone, again))
         return replace(state, distances=distances[-2 * self.settings.most_frames :])
+
+    def _contradict(
+        self, state: OnlineState, registered: RegisteredCamera, frame: PosedFrame
+    ) -> OnlineState:
+        """Another frame contradicts; the camera elsewhere, where they agree with one another."""
+        near, settings = self._nearest(frame, state.contradicting), self.settings
+        frames = self._kept(state.contradicting, frame, near)
+        state = replace(state, contradicting=frames, contradictions=state.contradictions + 1)
+        if near is not None or len(frames) < settings.newest:
+            return state
+        least, X_WC = _least_inlier_ratio(registered), registered.camera.X_WC
+        found: RegisteredCamera | None = self._search.refine(registered.camera, frames)
+        assert found is not None
+        off = pose_difference(found.camera.X_WC, X_WC)
+        distance = np.linalg.norm(X_WC[:3, 3] - self._points(frame).mean(axis=0))
+        is_bump = max(np.linalg.norm(off[:3]), np.linalg.norm(off[3:]) / distance) <= _BUMP
+        if not (is_bump and self._is_found(found, settings.newest, least)):
+            enough = len(frames) >= settings.least_frames
+            found = self._find(frames, least) if enough else None
+        if found is None:
+            return state
+        if self._is_elsewhere(state, found, registered):
+            return _registered(state, found, frames, moved=True)
+        # What is known of the pose was not worth as much as it seemed.
+        frames = (*state.keyframes, *frames)[-settings.most_frames :]
+        return _registered(state, self._search.refine(found.camera, frames), frames)
 
     def _is_elsewhere(
         self, state: OnlineState, found: RegisteredCamera, registered: RegisteredCamera
@@ -195,39 +215,6 @@ class OnlineRegistration:
         scale = (_TRUST + told / 6.0 * sum(usual) / max(1, len(usual))) / (_TRUST + told)
         limit = 6.0 * float(fdtri(6.0, _TRUST + told, 1.0 - _FALSE_ALARM))
         return _distance(found, registered) > limit * max(1.0, scale)
-
-    def _contradict(
-        self, state: OnlineState, registered: RegisteredCamera, frame: PosedFrame
-    ) -> OnlineState:
-        """Another frame contradicts; the camera elsewhere, where they agree with one another."""
-        near = self._nearest(frame, state.contradicting)
-        frames = self._kept(state.contradicting, frame, near)
-        state = replace(state, contradicting=frames, contradictions=state.contradictions + 1)
-        if near is not None or len(frames) < self.settings.newest:
-            return state
-        least = _least_inlier_ratio(registered)
-        found: RegisteredCamera | None = self._search.refine(registered.camera, frames)
-        assert found is not None
-        if not (
-            self._is_bump(registered.camera, found.camera, frame)
-            and self._is_found(found, self.settings.newest, least)
-        ):
-            enough = len(frames) >= self.settings.least_frames
-            found = self._find(frames, least) if enough else None
-        if found is None:
-            return state
-        if self._is_elsewhere(state, found, registered):
-            return _registered(state, found, frames, moved=True)
-        # What is known of the pose was not worth as much as it seemed.
-        frames = (*state.keyframes, *frames)[-self.settings.most_frames :]
-        return _registered(state, self._search.refine(found.camera, frames), frames)
-
-    def _is_bump(self, camera: PinholeCamera, moved: PinholeCamera, frame: PosedFrame) -> bool:
-        """Whether a camera is still near to where it was."""
-        off = pose_difference(moved.X_WC, camera.X_WC)
-        distance = np.linalg.norm(camera.X_WC[:3, 3] - self._points(frame).mean(axis=0))
-        shift = float(np.linalg.norm(off[3:]) / distance)
-        return max(float(np.linalg.norm(off[:3])), shift) <= _BUMP
 
     def _find(self, frames: Sequence[PosedFrame], least: float = 0.0) -> RegisteredCamera | None:
         """The camera without a guess; None where it is not determined."""
@@ -248,7 +235,7 @@ class OnlineRegistration:
         )
 
     def _kept(
-        self, frames: Sequence[PosedFrame], frame: PosedFrame, instead_of: int | None
+        self, frames: Sequence[PosedFrame], frame: PosedFrame, instead_of: int | None = None
     ) -> tuple[PosedFrame, ...]:
         """The newest of some frames and another one, which may stand for one of them."""
         others = [one for k, one in enumerate(frames) if k != instead_of]

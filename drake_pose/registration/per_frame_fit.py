@@ -95,11 +95,11 @@ class PerFrameFit:
         self.joints = tuple(kinematics.names[k] for k in joints)
         looks = tuple(f"{camera.name}.{name}" for camera in cameras for name in POSE_NAMES)
         self.names = (*self.joints, *looks)
+        turns = np.tile([name.startswith("turn") for name in POSE_NAMES], len(cameras))
+        self.is_angle = np.concatenate([kinematics.is_angle[joints], turns])
         of_joints = np.where(kinematics.is_angle[joints], _ANGLE, _SHIFT)
-        turns = [name.startswith("turn") for name in POSE_NAMES]
-        self.is_angle = np.concatenate([kinematics.is_angle[joints], *([turns] * len(cameras))])
-        of_camera = [_CAMERA_TURN] * 3 + [_CAMERA_SHIFT] * 3
-        self.deviations = np.concatenate([of_joints, *([of_camera] * len(cameras))])
+        of_cameras = np.where(turns, _CAMERA_TURN, _CAMERA_SHIFT)
+        self.deviations = np.concatenate([of_joints, of_cameras])
         worth = _POINT_ERROR * np.sqrt(_ERROR_LENGTH)
         bodies = [BodyParameters(kinematics, one) for one in outlines]
         unknowns = choose(
@@ -132,7 +132,8 @@ class PerFrameFit:
         held = self._with_widths(evidence, held)
         before, after = (self._all.compare(evidence, one, TOLD_APART)[0] for one in (held, theta))
         told = after
-        if _cost(before) <= _FITS_ALREADY * _cost(after):
+        costs = [float(one.sums[:, :, COST].sum()) for one in (before, after)]
+        if costs[0] <= _FITS_ALREADY * costs[1]:
             theta, told, change = held, before, given[0]
         return FrameFit(
             frame.name,
@@ -145,11 +146,8 @@ class PerFrameFit:
         )
 
     def _inlier_ratios(self, compared: Comparison, frame: SeenFrame) -> dict[str, float]:
-        return {
-            name: inlier_ratio_of(sums)
-            for name, sums in zip(self.camera_names, compared.sums, strict=True)
-            if name in frame.masks
-        }
+        sums = zip(self.camera_names, compared.sums, strict=True)
+        return {name: inlier_ratio_of(one) for name, one in sums if name in frame.masks}
 
     def _with_widths(self, evidence: Evidence, theta: Array) -> Array:
         """All parameters (n,), the silhouettes as much wider on all sides as fits best [pixel]."""
@@ -178,10 +176,6 @@ class PerFrameFit:
             moves[first : first + 3, :3] = R_CW
             moves[first + 3 : first + 6, 3:] = R_CW
         return np.asarray(moves / self.deviations[:, None])
-
-
-def _cost(compared: Comparison) -> float:
-    return float(compared.sums[:, :, COST].sum())
 
 
 def _weights(compared: Comparison) -> Array:

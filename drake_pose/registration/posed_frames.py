@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -67,9 +68,8 @@ class PosedFrames:
         for frame in frames:
             require_size(camera, frame.name, frame.mask)
             if not frame.mask.any():
-                raise MaskError(
-                    f"camera '{camera.name}', frame '{frame.name}': the mask does not show the body"
-                )
+                where = f"camera '{camera.name}', frame '{frame.name}'"
+                raise MaskError(f"{where}: the mask does not show the body")
         self.kinematics, self.outlines = kinematics, tuple(outlines)
         self.camera, self.frames, self.spacing = camera, tuple(frames), spacing
         self.intrinsics = (
@@ -83,7 +83,14 @@ class PosedFrames:
     @cached_property
     def points(self) -> list[Array]:
         """Corners (n, 3) of the body's convex hull in each frame, in the world [m]."""
-        return [self._hull(X) for X in self.X_WN]
+        found = []
+        for X_WN in self.X_WN:
+            points = placed_points(self.outlines, X_WN)
+            # A flat body has no hull.
+            with suppress(QhullError):
+                points = points[ConvexHull(points).vertices]
+            found.append(points)
+        return found
 
     @cached_property
     def middle(self) -> Array:
@@ -95,14 +102,6 @@ class PosedFrames:
         """How far the bodies' points are from their middle, root mean square [m]."""
         off = np.concatenate(self.points) - self.middle
         return float(np.sqrt((off**2).sum(axis=1).mean()))
-
-    def _hull(self, X_WN: Array) -> Array:
-        points = placed_points(self.outlines, X_WN)
-        try:
-            return np.asarray(points[ConvexHull(points).vertices])
-        except QhullError:
-            # A flat body has no hull.
-            return np.asarray(points)
 
     @cached_property
     def edges(self) -> list[EdgePoints]:
@@ -157,14 +156,15 @@ class SeenFrame:
         Raises:
             MaskError: a mask of another size than its camera's picture.
         """
-        masks = [self.masks.get(camera.name) for camera in cameras]
-        for camera, mask in zip(cameras, masks, strict=True):
+        edges = []
+        for camera in cameras:
+            mask = self.masks.get(camera.name)
             if mask is not None:
                 require_size(camera, self.name, mask)
-        spacing = max(1.0, round(spacing))
-        return pack_evidence(
-            [NO_EDGE if mask is None else find_edge_points(mask, spacing) for mask in masks]
-        )
+            edges.append(
+                NO_EDGE if mask is None else find_edge_points(mask, max(1.0, round(spacing)))
+            )
+        return pack_evidence(edges)
 
 
 def require_size(camera: Camera, frame: str, mask: Mask) -> None:
@@ -184,10 +184,9 @@ def common_size(cameras: Sequence[Camera], frames: Sequence[SeenFrame]) -> float
     """
     areas = []
     for frame in frames:
-        for camera in cameras:
-            if camera.name in frame.masks:
-                require_size(camera, frame.name, frame.masks[camera.name])
-                areas.append(np.count_nonzero(frame.masks[camera.name]))
+        for camera in (one for one in cameras if one.name in frame.masks):
+            require_size(camera, frame.name, frame.masks[camera.name])
+            areas.append(np.count_nonzero(frame.masks[camera.name]))
     if not any(areas):
         raise MaskError("no mask shows the body; give masks in which it is white")
     return float(np.sqrt(np.median([area for area in areas if area])))

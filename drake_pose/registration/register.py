@@ -104,11 +104,9 @@ class RegistrationBody:
             surfaces = surfaces.with_rigid(with_girths(surfaces.rigid, girths))
         if seen is not None:
             nothing = outline_from_mesh(TriangleMesh(np.zeros((0, 3)), np.zeros((0, 3), np.int64)))
+            own = zip(tree.nodes, surfaces.rigid, strict=True)
             surfaces = surfaces.with_rigid(
-                [
-                    surface if node.name in seen else nothing
-                    for node, surface in zip(tree.nodes, surfaces.rigid, strict=True)
-                ]
+                [surface if node.name in seen else nothing for node, surface in own]
             )
         self.very_few = few_triangles(surfaces, fewest)
         self.few = few_triangles(surfaces, FEW)
@@ -266,12 +264,9 @@ def describe_fitted(
     ratios = fit.inlier_ratios(best)
     agree = fit.agreeing(ratios)
     found = areas(seen, camera.X_CW[None], np.inf)[0]
-    iou = intersection_over_union(found)
-    rows = zip(seen.frames, E_total(found), iou, ratios, agree, strict=True)
-    misfits = [
-        FrameMisfit(frame.name, float(off), float(one), float(ratio), bool(agrees))
-        for frame, off, one, ratio, agrees in rows
-    ]
+    told = (E_total(found), intersection_over_union(found), ratios, agree)
+    rows = zip(seen.frames, *(one.tolist() for one in told), strict=True)
+    misfits = tuple(FrameMisfit(frame.name, *row) for frame, *row in rows)
     # A frame that contradicts fits no pose, so it tells none from another.
     counted = [one[agree] for one in pieces]
     as_good = [int(k) for k in order if excess(counted[k], counted[order[0]]) <= _SIGNIFICANCE]
@@ -282,7 +277,7 @@ def describe_fitted(
     registered = RegisteredCamera(
         camera,
         fit.camera_covariances(best, covariance)[0],
-        tuple(misfits),
+        misfits,
         np.array([np.linalg.inv(X) for X in alike[1:]]).reshape(-1, 4, 4),
     )
     return registered, covariance, as_good

@@ -139,14 +139,12 @@ class SharedFit:
         looks = CAMERA_NAMES[: self.per_camera]
         names = [f"{camera.name}.{name}" for camera in cameras for name in looks]
         self.names = (*names, *constants)
-        known = [
-            _OBJECT_DEVIATION if n in OBJECT_POSITIONS else CONSTANT_DEVIATION for n in constants
-        ]
-        deviations = [
-            FOCAL_DEVIATION if n == CAMERA_NAMES[6] else np.inf for _ in cameras for n in looks
-        ]
+        deviations = {one: CONSTANT_DEVIATION for one in constants}
+        deviations |= dict.fromkeys(OBJECT_POSITIONS, _OBJECT_DEVIATION)
+        deviations |= {f"{one.name}.{CAMERA_NAMES[6]}": FOCAL_DEVIATION for one in cameras}
+        known = np.array([deviations.get(name, np.inf) for name in self.names])
         every = parameter_names(body, cameras)
-        unknowns = choose(every, self.names, shared=True, deviation=np.array([*deviations, *known]))
+        unknowns = choose(every, self.names, shared=True, deviation=known)
         if widths:
             own = choose(every, every[-len(cameras) :], lower=-_WIDEST, upper=_WIDEST)
             unknowns = join(own, unknowns)
@@ -168,8 +166,8 @@ class SharedFit:
         which: Mask | None = None,
     ) -> Shared:
         """Fits all from where it starts to those of the masks (rows,) that count."""
-        start, which = start or self.start, self._every(which)
-        found = self._fit.fit(*self._at(start, which), rounds, expected=self._known(which))
+        given, expected, which = self._at(start or self.start, which)
+        found = self._fit.fit(*given, rounds, expected=expected)
         widths = np.zeros(len(self.rows))
         widths[which] = found.own.sum(axis=1)
         return Shared(found.shared, widths)
@@ -185,8 +183,8 @@ class SharedFit:
 
     def equations(self, at: Shared, step: AnnealingStage, which: Mask | None = None) -> Equations:
         """The normal equations of the masks (rows,) that count, own unknowns first."""
-        which = self._every(which)
-        return self._fit.equations(*self._at(at, which), step, self._known(which))
+        given, expected, _ = self._at(at, which)
+        return self._fit.equations(*given, step, expected)
 
     def bend(
         self, found: Shared, by: Array, step: AnnealingStage, which: Mask | None = None
@@ -257,20 +255,17 @@ class SharedFit:
             ]
         )
 
-    def _every(self, which: Mask | None) -> Mask:
-        return np.ones(len(self.rows), bool) if which is None else which
+    def _at(
+        self, at: Shared, which: Mask | None
+    ) -> tuple[tuple[list[Evidence], Array, Array, Array], tuple[Array, Array], Mask]:
+        """Masks that count as ``FramesFit`` takes them: what is seen and held, both unknowns.
 
-    def _chosen(self, which: Mask) -> list[Evidence]:
-        return [self._evidence[k] for k in np.flatnonzero(which)]
-
-    def _at(self, at: Shared, which: Mask) -> tuple[list[Evidence], Array, Array, Array]:
-        """Masks that count, as ``FramesFit`` takes them: edges, what is held, both unknowns."""
-        return self._chosen(which), self._values[which], self._own(at)[which], at.shared
-
-    def _known(self, which: Mask) -> tuple[Array, Array]:
-        """What own and shared unknowns are expected to be."""
-        own = np.zeros((np.count_nonzero(which), self._fit.unknowns.own_count))
-        return own, np.zeros(len(self.names))
+        Then what these are expected to be, and which masks (rows,) those are.
+        """
+        which = np.ones(len(self.rows), bool) if which is None else which
+        own, evidence = self._own(at)[which], [self._evidence[k] for k in np.flatnonzero(which)]
+        expected = np.zeros_like(own), np.zeros(len(self.names))
+        return (evidence, self._values[which], own, at.shared), expected, which
 
     def _own(self, at: Shared) -> Array:
         """(rows, own unknowns): of each mask the width of its camera's."""
@@ -288,8 +283,8 @@ class SharedFit:
 
     def _distances(self, found: Shared, step: AnnealingStage, which: Mask | None) -> Distances:
         """The distances in all masks that count; values are what is shared, then the widths."""
-        which = self._every(which)
-        pictures = self._fit.pictures(self._chosen(which), self._parameters(found)[which], step)
+        (evidence, *_), _, which = self._at(found, which)
+        pictures = self._fit.pictures(evidence, self._parameters(found)[which], step)
         outlines = self._fit.body.outlines
         return distances_in_pictures(outlines, with_widths(outlines, pictures))
 

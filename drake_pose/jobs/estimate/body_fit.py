@@ -51,17 +51,10 @@ _INTERVALS = (
 _FEWEST = 3
 
 
-class FittedBody(NamedTuple):
-    """What is found out about a body, with what the summary says of it.
-
-    Attributes:
-        inputs: with the fitted model, and a search that knows the first frame's pose.
-        shapes: (h, w, 3) uint8, the corrected shape over the file's (Shimada's figure 18), or None.
-    """
-
-    inputs: Inputs
-    summary: dict[str, Any]
-    shapes: np.ndarray | None
+FittedBody = tuple[Inputs, dict[str, Any], np.ndarray | None]
+"""What is found out about a body: inputs with the fitted model and a search that knows the first
+frame's pose; what the summary says of it; and a picture (h, w, 3) uint8 of the corrected shape over
+the file's (Shimada's figure 18), or None."""
 
 
 class _Fitted(NamedTuple):
@@ -95,11 +88,10 @@ def fit_body(inputs: Inputs, settings: EstimateSettings, on_stage: OnStage | Non
         tracking is None
         or not tracking.scale_unknown
         or not isinstance(search, RootPlacementSearch)
-        or not inputs.model.changes_shape
-        or not search.tree.turns_root_freely
+        or not (inputs.model.changes_shape and search.tree.turns_root_freely)
         or len(inputs.frames) < 2
     ):
-        return FittedBody(inputs, {}, None)
+        return inputs, {}, None
     if on_stage is not None:
         on_stage("fitting the body to the sequence", 0, None)
     return _BodyFit(inputs, settings, tracking).run(search)
@@ -123,7 +115,7 @@ class _BodyFit:
         begin = time.perf_counter()
         first = search.match([View(self._camera, self._masks[0])])
         if not first.found:
-            return FittedBody(self._inputs, {}, None)
+            return self._inputs, {}, None
         search, first = self._without_hidden(search, first)
         tracker = self._tracker(search)
         own = tracker.observation
@@ -143,13 +135,11 @@ class _BodyFit:
         started.first = known[max(known)]
         frames, warnings = self._inputs.frames, self._inputs.warnings
         inputs = replace(
-            self._inputs,
-            model=body.model,
-            search=started,
+            self._inputs, model=body.model, search=started,
             known={frames[k]: one for k, one in known.items()},
             warnings=warnings if fitted is None else (*warnings, _INTERVALS),
-        )
-        return FittedBody(inputs, self._more, shapes)
+        )  # fmt: skip
+        return inputs, self._more, shapes
 
     def _fit(self, tracker: ContourTracker, starts: Sequence[FollowedStart]) -> _Fitted | None:
         """The sequence fitted as a whole; None where that explains it no better."""
@@ -237,21 +227,17 @@ class _BodyFit:
         x = observation.state(match.q, match.X_WB, match.scale)
         outlines = TreeSurfaces(search.tree).at(match.node_values)
         X_CN = self._camera.X_CW @ observation.node_poses(x)
-        hidden = []
+        assert isinstance(self._camera, ParallelCamera)
+        pixels, hidden = match.scale * self._camera.pixels_per_metre, []
         for i, node in enumerate(search.tree.nodes):
             if node.parent != 0 or node.children or i == 0:
                 continue
             others = [k for k in range(len(outlines)) if k != i]
             own = draw_mask([outlines[i]], X_CN[[i]], self._camera)
             rest = draw_mask([outlines[k] for k in others], X_CN[others], self._camera)
-            shows = np.count_nonzero(own & ~rest & self._masks[0])
             # As large as it is, turned to the viewer, it has this area at least.
             _, *sides = np.sort(np.ptp(outlines[i].vertices, axis=0))
-            assert isinstance(self._camera, ParallelCamera)
-            if (
-                shows
-                < _HIDDEN * np.prod(sides) * (match.scale * self._camera.pixels_per_metre) ** 2
-            ):
+            if np.sum(own & ~rest & self._masks[0]) < _HIDDEN * np.prod(sides) * pixels**2:
                 hidden.append(node.name)
         return tuple(hidden)
 
@@ -260,13 +246,6 @@ class _BodyFit:
         q, X_WB = observation.positions(x)
         wrong, area = observation.difference(x, [(self._camera, self._masks[frame])])
         return PoseEstimate(
-            found=True,
-            q=q,
-            X_WB=X_WB,
-            node_values=observation.node_values(x),
-            J=float(wrong),
-            area=float(max(area, 1)),
-            stopped_by=TRACKED,
-            root_position=observation.root_position(x),
-            scale=observation.scale(x),
-        )
+            True, q, X_WB, observation.node_values(x), float(wrong), float(max(area, 1)), TRACKED,
+            root_position=observation.root_position(x), scale=observation.scale(x),
+        )  # fmt: skip

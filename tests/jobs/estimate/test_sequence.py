@@ -7,11 +7,13 @@ from drake_pose.body.model import load_model
 from drake_pose.files.settings import EstimateSettings
 from drake_pose.jobs.estimate.body_fit import _StartedSearch
 from drake_pose.jobs.estimate.inputs import Inputs
+from drake_pose.jobs.estimate.measurements import TrueAngles
 from drake_pose.jobs.estimate.scene import estimate_scene
 from drake_pose.search.continuous.root_placement_search import RootPlacementSearch
 from drake_pose.search.estimates import TRACKED
 from drake_pose.silhouette.pictures.scenes import load_scene
 from tests.jobs.scenes import TinyScene, write_scene
+from tests.search.turning import crane
 
 # A crane that swings, and stands otherwise after a cut.
 BEFORE = [(20 + 3 * k, -40 - 2 * k) for k in range(6)]
@@ -62,6 +64,18 @@ def test_how_a_scene_is_tracked(tiny_scene: TinyScene) -> None:
         assert tracking is not None
         assert tracking.root_moves is (search is not None)
         assert not tracking.scale_unknown
+
+
+def test_an_encoder_that_has_turned_once_more_is_no_error(
+    tiny_scene: TinyScene, tmp_path: Path
+) -> None:
+    """As a UR5: measured 331.5 degrees inside limits of 360, which looks like -28.5."""
+    model, scene = crane(tmp_path), load_scene(tiny_scene.folder)
+    truth = TrueAngles(tmp_path, model.position_names, {0: np.radians([178.0, 331.5])})
+    inputs = Inputs(scene, model, scene.frames, False, None, truth)
+    errors = inputs.joint_errors("0000", np.radians([177.0, -28.0]))
+    assert errors == pytest.approx({"swing": -1.0, "luff": 0.5})
+    assert inputs.joint_errors("0001", np.zeros(2)) == {}
 
 
 def test_a_track_goes_on_from_what_is_known_and_searches_after_a_loss() -> None:

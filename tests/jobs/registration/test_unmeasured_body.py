@@ -77,13 +77,6 @@ class TestFound:
         found = register_near(words, "left", own_arm.cameras["left"].X_WC, 15.0, 0.5, 4.0)
         assert "0006" not in found["frames"]
 
-    def test_a_recorded_arm_without_encoders(self, shared_data: Path, tmp_path: Path) -> None:
-        source = shared_data / "arm_two_views"
-        words = (source, source / "med7" / "med7.urdf", tmp_path / "out", "--camera", "right")
-        true = load_cameras(source / "cameras.yaml")["right"].X_WC
-        # The reference is good to about as much.
-        register_near(words, "right", true, 20.0, 0.7, 3.0)
-
     def test_a_recorded_person(self, shared_data: Path, tmp_path: Path) -> None:
         source = shared_data / "human_four_views"
         model = bundled_model("person").with_name("person_shape.urdf")

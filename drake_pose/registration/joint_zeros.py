@@ -113,8 +113,7 @@ def links_with_length(tree: PoseTree) -> tuple[str, ...]:
 def require_known(tree: PoseTree, names: Sequence[str], lengths: Sequence[str]) -> None:
     """Refuses names of which there is no position, or no link with a length.
 
-    Raises:
-        UnknownNameError: says which there are.
+    Raises UnknownNameError: says which there are.
     """
     own = [name for node in tree.nodes for name in node.value_names]
     positions = [name for name in own if name not in OBJECT_POSITIONS]

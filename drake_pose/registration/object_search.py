@@ -21,7 +21,6 @@ from drake_pose.body.model import OBJECT_POSITIONS
 from drake_pose.body.tree.link_graph import inverse_transforms
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import RegistrationError
-from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.registration.posed_frames import LAST_SPACING, PosedFrame, PosedFrames
 from drake_pose.registration.register import (
     COARSE,
@@ -51,8 +50,6 @@ _OF_A_PICTURE, _STARTS, _LOOKS = 8, 12, 4
 _APART = 0.15
 # A look whose mean E_total is larger by so much than so many times the best one's is none.
 _WORSE_BY, _WORSE_TIMES = 0.02, 2.0
-
-
 # The angles by which hand and object turn differ by no more [rad].
 _SAME_ANGLE = np.radians(20.0)
 # So many threes of pictures are looked at, and of each so many of the object's poses.
@@ -89,21 +86,21 @@ class ObjectSearch:
             (FINE, FINE_SPACING, "few"),
             (ROUNDS_WITH_CONSTANTS, LAST_SPACING, "all"),
         ):
+            fits = [self._fit(camera, frames, look, spacing, surfaces) for look in looks]
             fitted = [
-                self._fitted(self._fit(camera, frames, look, spacing, surfaces), rounds, look)
-                for look in looks
+                self._look(fit, fit.fit(rounds), look)
+                for fit, look in zip(fits, looks, strict=True)
             ]
             looks = self._distinct(fitted, frames)
-        fits = []
+        last = []
         for k, look in enumerate(looks):
             fit = self._fit(camera, frames, look)
             now = with_widths(fit)
             # Where it stands now is where a last fit finds it.
             looks[k] = self._look(fit, now, look)
-            fits.append(
-                (self._fit(camera, frames, looks[k]), now._replace(shared=0.0 * now.shared))
-            )
-        found, covariance, as_good = describe_fitted(fits)
+            at = now._replace(shared=0.0 * now.shared)
+            last.append((self._fit(camera, frames, looks[k]), at))
+        found, covariance, as_good = describe_fitted(last)
         X_LC, X_WT = looks[as_good[0]]
         others = [X_WT @ turn for turn in self._standing.symmetry.told_apart[1:]]
         # Where the camera would be elsewhere, too, that is told with the camera.
@@ -139,10 +136,10 @@ class ObjectSearch:
                 "rides on? Nothing was written"
             )
         order = np.argsort(self._misfits(camera, alone, X_WL, starts, FIRST_SIDE), kind="stable")
-        fitted = [
-            self._fitted(self._fit(camera, some, look, COARSE_SPACING, "very_few"), COARSE, look)
-            for look in self._distinct(starts[order[: 10 * _STARTS]], some)[:_STARTS]
-        ]
+        fitted = []
+        for look in self._distinct(starts[order[: 10 * _STARTS]], some)[:_STARTS]:
+            fit = self._fit(camera, some, look, COARSE_SPACING, "very_few")
+            fitted.append(self._look(fit, fit.fit(COARSE), look))
         off = self._misfits(camera, alone, X_WL, np.array(fitted), SECOND_SIDE)
         limit = _WORSE_BY + _WORSE_TIMES * float(off.min())
         order = np.argsort(off, kind="stable")
@@ -182,9 +179,6 @@ class ObjectSearch:
         """What was found from where a look has camera and object."""
         moved = self._standing.moved(look[1], found.shared[fit.per_camera :])
         return np.array([fit.cameras(found)[0].X_WC, moved])
-
-    def _fitted(self, fit: SharedFit, rounds: Sequence[AnnealingStage], look: Look) -> Look:
-        return self._look(fit, fit.fit(rounds), look)
 
     def _distinct(self, looks: Sequence[Look] | Array, frames: Sequence[PosedFrame]) -> list[Look]:
         """Those of some looks that see the object otherwise than all before them.

@@ -134,8 +134,7 @@ class OnlineRegistration:
 
         One without any pixel of the body says nothing; at first a state is ``OnlineState()``.
 
-        Raises:
-            MaskError: a mask of another size than the camera's picture.
+        Raises MaskError: a mask of another size than the camera's picture.
         """
         if not frame.mask.any():
             return state

@@ -116,8 +116,7 @@ class PerFrameFit:
     def fit(self, frame: SeenFrame) -> FrameFit:
         """Fits a frame.
 
-        Raises:
-            MaskError: a mask of another size than its camera's picture.
+        Raises MaskError: a mask of another size than its camera's picture.
         """
         evidence = frame.edges(self._cameras, _SPACING * self._size)
         held, change = np.zeros(len(self._all.names)), np.zeros((1, len(self.names)))

@@ -153,8 +153,7 @@ class SeenFrame:
     def edges(self, cameras: Sequence[Camera], spacing: float) -> Evidence:
         """Of the silhouettes, points so far apart [pixel].
 
-        Raises:
-            MaskError: a mask of another size than its camera's picture.
+        Raises MaskError: a mask of another size than its camera's picture.
         """
         edges = []
         for camera in cameras:
@@ -179,8 +178,7 @@ def require_size(camera: Camera, frame: str, mask: Mask) -> None:
 def common_size(cameras: Sequence[Camera], frames: Sequence[SeenFrame]) -> float:
     """The root of the silhouettes' median area [pixel].
 
-    Raises:
-        MaskError: a mask of another size than its camera's picture, or no mask shows the body.
+    Raises MaskError: a mask of another size than its camera's picture, or no mask shows the body.
     """
     areas = []
     for frame in frames:

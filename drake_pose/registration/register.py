@@ -217,8 +217,7 @@ class CameraSearch:
     def refine(self, camera: PinholeCamera, frames: Sequence[PosedFrame]) -> RegisteredCamera:
         """Finds the camera's pose within some pixels of that which it has, without alternatives.
 
-        Raises:
-            MaskError: a mask of another size than the camera's picture, or an empty one.
+        Raises MaskError: a mask of another size than the camera's picture, or an empty one.
         """
         return self._fitted(camera, frames, [camera.X_CW])
 

@@ -114,8 +114,7 @@ class StandingObject:
     def tree(self, X_WT: Array) -> PoseTree:
         """The tree from the link to the object, which stands at a pose (4, 4) in the world.
 
-        Raises:
-            SettingsError: no joint moves the link.
+        Raises SettingsError: no joint moves the link.
         """
         mesh = self._mesh.transformed(inverse_transforms(self._X_TO))
         model = self._robot.before_object(self._link, mesh, X_WT @ self._X_TO)
@@ -195,22 +194,22 @@ class StandingObject:
 
         rotations, axes = [np.eye(3)], []
         for axis in np.linalg.eigh(spread)[1].T:
-            if alike(Rotation.from_rotvec(_NO_PART * axis).as_matrix()):
+            if alike(_turn(_NO_PART * axis)):
                 axes.append(axis)
-                angles = 2.0 * np.pi / _ROUND * np.arange(1, _ROUND)
-                own = [Rotation.from_rotvec(angle * axis).as_matrix() for angle in angles]
+                found = [_ROUND]
             else:
-                own = []
-                for parts in _PARTS:
-                    R = Rotation.from_rotvec(2.0 * np.pi / parts * axis).as_matrix()
-                    if alike(R):
-                        own += [np.linalg.matrix_power(R, k) for k in range(1, parts)]
+                found = [one for one in _PARTS if alike(_turn(2.0 * np.pi / one * axis))]
+            own = [_turn(2.0 * np.pi * k / n * axis) for n in found for k in range(1, n)]
             rotations = _with_products(rotations, own)
         turns = np.tile(np.eye(4), (len(rotations), 1, 1))
         turns[:, :3, :3] = rotations
         return Symmetry(
             self._X_TO @ turns @ inverse_transforms(self._X_TO), np.array(axes).reshape(-1, 3)
         )
+
+
+def _turn(by: Array) -> Array:
+    return Rotation.from_rotvec(by).as_matrix()
 
 
 def _with_products(rotations: list[Array], own: list[Array]) -> list[Array]:
@@ -239,10 +238,9 @@ def require_turns(
 ) -> None:
     """Refuses frames from which a camera on a link cannot be told, whatever they show.
 
-    Raises:
-        RegistrationError: says about what the link must turn.
+    Raises RegistrationError: says about what the link must turn.
     """
-    values = np.array([one.values for one in frames])
+    what, values = "are too few", np.array([one.values for one in frames])
     if len(frames) >= 3:
         turns = np.degrees(turns_between(standing.hand_poses(values)[:, :3, :3]))
         if turns[1] >= np.degrees(_LEAST_TURN):
@@ -251,8 +249,6 @@ def require_turns(
             f"turn the link that it rides on by {turns[0]:.0f} degrees about one axis, and by "
             f"{turns[1]:.1f} about others"
         )
-    else:
-        what = "are too few"
     raise RegistrationError(
         f"camera '{camera}': its {len(frames)} frames {which}{what}: where it is on the link, and "
         "where the object stands, is not determined by them; take three or more, five better, "

@@ -207,8 +207,7 @@ def bundled_person() -> Path:
 def follows_person(scene: Scene, model: ArticulatedModel, settings: EstimateSettings) -> bool:
     """Whether the method is ``person``, by name or because ``auto`` chooses it.
 
-    Raises:
-        SceneError, ModelError: the method is asked for, but scene or model does not allow it.
+    Raises SceneError, ModelError: the method is asked for, but scene or model does not allow it.
     """
     wanted = settings.method == "person"
     if not wanted and (settings.method != "auto" or settings.search_settings):

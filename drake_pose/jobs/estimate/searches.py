@@ -57,8 +57,7 @@ def make_placement_search(
 
     Where joints turn the root freely, the tree begins at the node of most neighbours, coarsely.
 
-    Raises:
-        SettingsError: if the method is the paper's, or angles on the grid are wanted.
+    Raises SettingsError: if the method is the paper's, or angles on the grid are wanted.
     """
     if settings.method == "paper":
         raise SettingsError(

@@ -70,8 +70,7 @@ Find = Callable[[str, Picture], tuple[Mask, tuple[str, ...]]]
 def find_masks(source: Source, settings: MaskSettings) -> Iterator[FoundMask]:
     """The masks of a source, one by one, in the way that the settings choose.
 
-    Raises:
-        DrakePoseError: names the file, camera or frame at fault.
+    Raises DrakePoseError: names the file, camera or frame at fault.
     """
     background = settings.background
     if settings == MaskSettings(largest=settings.largest, cameras=settings.cameras):

@@ -24,8 +24,7 @@ _Colour = Annotated[tuple[float, ...], from_text(partial(parse_numbers, count=3)
 class MaskSettings:
     """How masks are found; where no way is given, the source holds masks of another tool.
 
-    Raises:
-        SettingsError: an unknown meaning, several ways at once, or options of another way.
+    Raises SettingsError: an unknown meaning, several ways at once, or options of another way.
     """
 
     cameras: Path | None = None

@@ -71,8 +71,7 @@ class Source:
     def read(self, camera: str) -> Iterator[tuple[str, str, Picture]]:
         """The frames of a camera: name, where it is from, and the picture (H, W, 3).
 
-        Raises:
-            SceneError: a picture that cannot be read, or has another size than its camera.
+        Raises SceneError: a picture that cannot be read, or has another size than its camera.
         """
         for frame, path in self.pictures.get(camera, {}).items():
             picture = read_picture(path, SceneError)
@@ -110,8 +109,7 @@ class Source:
         The camera is the last folder of the picture's path in the file that is a camera's name, or
         that in which the COCO file lies.
 
-        Raises:
-            SceneError: nothing tells the camera, or a frame is there twice.
+        Raises SceneError: nothing tells the camera, or a frame is there twice.
         """
         known = [] if self.cameras is None else list(self.cameras.cameras)
         listed = [(folder, coco, one) for folder, coco in self.annotated for one in coco.pictures]

@@ -317,8 +317,7 @@ def _spread_frames(inputs: Inputs, asked: Sequence[str]) -> tuple[str, ...]:
 def _look_at(inputs: Inputs) -> list[str]:
     """What of the cameras, the body, and how it moves, a user should know.
 
-    Raises:
-        RegistrationError: the link before an object does not turn enough.
+    Raises RegistrationError: the link before an object does not turn enough.
     """
     texts = [
         f"camera '{name}' has no X_WC and is not to be found, or has no masks in masks/{name}: it "

@@ -68,8 +68,7 @@ def require_explained(
 ) -> None:
     """Refuses a pose that does not explain even those frames that agree best.
 
-    Raises:
-        RegistrationError: says how much remains, what would fit, and what to look at.
+    Raises RegistrationError: says how much remains, what would fit, and what to look at.
     """
     misfit = find_misfit(found)
     if misfit is None:
@@ -96,8 +95,7 @@ def require_explained(
 def require_determined(found: RegisteredCamera) -> None:
     """Refuses a pose on a link that its frames hardly tell.
 
-    Raises:
-        RegistrationError: says how unsure it is.
+    Raises RegistrationError: says how unsure it is.
     """
     turn, shift = (
         math.sqrt(float(np.linalg.eigvalsh(part)[-1]))

@@ -63,8 +63,7 @@ class KnownPositions:
     def of(self, frame: str, camera: str) -> Array:
         """(m,) values of the pose tree in a frame that a camera sees [rad or m].
 
-        Raises:
-            SceneError: the table has no row of it.
+        Raises SceneError: the table has no row of it.
         """
         if not self.has(frame):
             raise SceneError(
@@ -82,8 +81,7 @@ class KnownPositions:
 def put_on_base(model: ArticulatedModel, table: TrueAngles) -> tuple[ArticulatedModel, TrueAngles]:
     """A model and its positions on BASE_JOINTS that move all of it as the table's bases say.
 
-    Raises:
-        ModelError: the file is no URDF.
+    Raises ModelError: the file is no URDF.
     """
     X_WB = {frame: base_pose(base) for frame, base in table.bases.items()}
     first = next(iter(X_WB.values()))

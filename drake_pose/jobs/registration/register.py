@@ -177,8 +177,7 @@ class _Registration:
 
         An object whose place is not known is found with the first camera, and then stands there.
 
-        Raises:
-            RegistrationError: no pose of a camera explains its masks.
+        Raises RegistrationError: no pose of a camera explains its masks.
         """
         inputs, standing, seen = self.inputs, self.inputs.standing, None
         search: Search = CameraSearch(self.body) if standing is None else ObjectSearch(standing)
@@ -231,8 +230,7 @@ class _Registration:
 
         Positions that were estimated are off, and so the cameras that were found by them.
 
-        Raises:
-            RegistrationError: no pose of a camera explains its masks.
+        Raises RegistrationError: no pose of a camera explains its masks.
         """
         inputs, registered = self.inputs, self.registered
         wrong = {name: found.contradictions for name, found in registered.items()}

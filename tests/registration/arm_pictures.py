@@ -1,5 +1,6 @@
 """Drake's pictures of a small arm at known positions, from cameras anywhere."""
 
+import cv2
 import numpy as np
 
 from drake_pose.body.model import ArticulatedModel
@@ -34,6 +35,20 @@ def see(
         q, X_WB = body.tree.positions_from(kinematics.split(values))
         frames.append(PosedFrame(f"{k:04d}", values, renderer.mask(q, X_WB)))
     return frames
+
+
+def damaged(
+    mask: np.ndarray, generator: np.random.Generator, radii: tuple[int, int] = (3, 9)
+) -> np.ndarray:
+    """A mask grown or worn by up to two pixels, with holes of 3 % of its area."""
+    by = int(generator.integers(-2, 3))
+    ball = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * abs(by) + 1,) * 2)
+    drawn = (cv2.dilate if by > 0 else cv2.erode)(mask.astype(np.uint8), ball)
+    at = np.argwhere(drawn)
+    while drawn.sum() > 0.97 * len(at):
+        v, u = at[generator.integers(len(at))].tolist()
+        cv2.circle(drawn, (u, v), int(generator.integers(*radii)), 0, -1)
+    return drawn > 0
 
 
 def errors(found: np.ndarray, true: np.ndarray) -> tuple[float, float]:

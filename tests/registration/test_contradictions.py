@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 
-import cv2
 import numpy as np
 import pytest
 
@@ -14,6 +13,7 @@ from drake_pose.registration.per_frame_fit import PerFrameFit
 from drake_pose.registration.posed_frames import SeenFrame
 from drake_pose.registration.register import RegistrationBody
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
+from tests.registration.arm_pictures import damaged
 from tests.search.arms import arm_cameras
 
 COUNT = 8
@@ -31,20 +31,6 @@ def poses(body: RegistrationBody) -> np.ndarray:
     generator = np.random.default_rng(5)
     middle = np.radians([0.0, 50.0, 20.0, 60.0, 40.0])
     return middle + np.radians(25.0) * generator.uniform(-1.0, 1.0, (COUNT, 5))
-
-
-def damaged(mask: np.ndarray, generator: np.random.Generator) -> np.ndarray:
-    """A mask grown or worn by up to two pixels, with holes of 3 % of its area."""
-    by = int(generator.integers(-2, 3))
-    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * abs(by) + 1,) * 2)
-    mask = mask.astype(np.uint8)
-    mask = (cv2.dilate if by > 0 else cv2.erode)(mask, kernel)
-    v, u = np.nonzero(mask)
-    least = 0.97 * len(v)
-    while mask.sum() > least:
-        k = int(generator.integers(len(v)))
-        cv2.circle(mask, (int(u[k]), int(v[k])), int(generator.integers(3, 9)), 0, -1)
-    return mask.astype(bool)
 
 
 def moved(camera: PinholeCamera, by: Sequence[float]) -> PinholeCamera:

@@ -105,15 +105,11 @@ def _follow_colours(
         checked = capture_checked(tree, scene.cameras, lambda k: reader(masked[k]), len(masked))
         faults = describe_faults(checked, [frames[k] for k in masked])
     captured, distances = capture_by_colour(
-        tree,
-        scene.cameras,
-        len(frames),
-        lambda index: read_pictures(scene, frames[index]),
+        tree, scene.cameras, len(frames), lambda index: read_pictures(scene, frames[index]),
         {frames.index(frame): q for frame, q in inputs.starts.items()},
         {} if checked is None else {k: checked.read(place) for place, k in enumerate(masked)},
-        None if checked is None else checked.captured,
-        reader.count_followed,
-    )
+        None if checked is None else checked.captured, reader.count_followed,
+    )  # fmt: skip
     lost = [frame for frame, q in zip(frames, captured.q, strict=True) if np.isnan(q).any()]
     if lost:
         text = (

@@ -234,12 +234,10 @@ class _Registration:
         """
         inputs, registered = self.inputs, self.registered
         wrong = {name: found.contradictions for name, found in registered.items()}
-        frames = [
-            replace(
-                one, masks={c: m for c, m in one.masks.items() if one.name not in wrong.get(c, ())}
-            )
-            for one in inputs.frames
-        ]
+        frames = []
+        for one in inputs.frames:
+            own = {c: m for c, m in one.masks.items() if one.name not in wrong.get(c, ())}
+            frames.append(replace(one, masks=own))
         cameras = [*self._held, *(found.camera for found in registered.values())]
         shape: tuple[Any, ...] = (np.zeros(len(self.body.kinematics.names), np.bool_),)
         if not missing_for_person(inputs.model):
@@ -268,13 +266,9 @@ class _Registration:
         """
         inputs, names, cameras = self.inputs, self.body.kinematics.names, self.registered
         found = calibrate_joints(
-            self.body,
-            list(cameras.values()),
-            [inputs.of(name) for name in cameras],
-            inputs.zeros,
-            self._settings.focal,
-            lengths=inputs.lengths,
-        )
+            self.body, list(cameras.values()), [inputs.of(name) for name in cameras],
+            inputs.zeros, self._settings.focal, lengths=inputs.lengths,
+        )  # fmt: skip
         self.parameters = describe_parameters(found, self.body.kinematics)
         self.warnings += _say_zeros(found)
         offsets = np.zeros(len(names))
@@ -380,15 +374,11 @@ def say_common(registered: Iterable[RegisteredCamera]) -> list[str]:
     for found in registered:
         for one in found.frames:
             agrees.setdefault(one.frame, {})[found.camera.name] = one.agrees
-    frames = list(agrees)
-    positions, masks = [], dict[str, list[str]]()
-    for frame, cameras in agrees.items():
-        wrong = [name for name, right in cameras.items() if not right]
-        if len(cameras) > 1 and len(wrong) == len(cameras):
-            positions.append(frame)
-        elif len(wrong) < len(cameras):
-            for name in wrong:
-                masks.setdefault(name, []).append(frame)
+    frames, masks = list(agrees), dict[str, list[str]]()
+    positions = [k for k, own in agrees.items() if len(own) > 1 and not any(own.values())]
+    for frame, own in agrees.items():
+        for name in (name for name, right in own.items() if any(own.values()) and not right):
+            masks.setdefault(name, []).append(frame)
     texts = []
     if positions:
         texts.append(

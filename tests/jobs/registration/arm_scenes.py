@@ -16,6 +16,7 @@ from drake_pose.camera.camera_files import load_cameras, save_cameras
 from drake_pose.camera.models import Camera
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from drake_pose.silhouette.pictures.masks import write_mask
+from tests.registration.arm_pictures import errors
 from tests.search.arms import LINKS, arm_cameras, arm_urdf
 
 JOINTS = tuple(f"{name}_turn" for name, *_ in LINKS)
@@ -82,6 +83,5 @@ def write_arm_scene(folder: Path, count: int = 5, seed: int = 4) -> ArmScene:
 
 def pose_errors(found: np.ndarray, true: np.ndarray) -> tuple[float, float]:
     """How far a pose (4, 4) is off [mm, deg]."""
-    cosine = 0.5 * (np.trace(found[:3, :3].T @ true[:3, :3]) - 1.0)
-    turn = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
-    return 1e3 * float(np.linalg.norm(found[:3, 3] - true[:3, 3])), float(turn)
+    metres, radians = errors(found, true)
+    return 1e3 * metres, float(np.degrees(radians))

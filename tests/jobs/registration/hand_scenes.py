@@ -17,6 +17,7 @@ from drake_pose.camera.models import PinholeCamera
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from drake_pose.silhouette.pictures.masks import write_mask
 from tests.jobs.registration.arm_scenes import ArmScene
+from tests.registration.arm_pictures import damaged
 from tests.search.arms import LINKS, arm_urdf
 
 # A step and a post on a plate: it looks different from all sides.
@@ -128,12 +129,5 @@ def damage_masks(folder: Path, seed: int, wrong: str) -> None:
     """Masks up to two pixels wider or narrower, with holes of 3 %; the wrong one mirrored."""
     rng = np.random.default_rng(seed)
     for path in sorted(folder.glob("*.png")):
-        mask = (cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) > 0).astype(np.uint8)
-        width = int(rng.integers(-2, 3))
-        ball = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * abs(width) + 1,) * 2)
-        mask = (cv2.dilate if width > 0 else cv2.erode)(mask, ball)
-        area, at = np.count_nonzero(mask), np.argwhere(mask)
-        while np.count_nonzero(mask) > 0.97 * area:
-            v, u = at[rng.integers(len(at))].tolist()
-            cv2.circle(mask, (u, v), int(rng.integers(2, 6)), 0, -1)
-        write_mask(path, (mask[::-1, ::-1] if path.name == wrong else mask) > 0)
+        mask = damaged(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) > 0, rng, (2, 6))
+        write_mask(path, mask[::-1, ::-1] if path.name == wrong else mask)

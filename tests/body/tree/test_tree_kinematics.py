@@ -2,9 +2,10 @@ import numpy as np
 import pytest
 
 from drake_pose.body.model import load_model
+from drake_pose.body.tree.link_graph import JointMap
 from drake_pose.body.tree.root import RootRotation
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
-from drake_pose.errors import SettingsError
+from drake_pose.errors import ModelError, SettingsError
 from tests.body.models import FLOATING_URDF, JOINTED_BASE_URDF, JOINTS_SDF, WELDED_URDF, write
 
 _TREES = {
@@ -125,3 +126,13 @@ def test_values_of_the_wrong_number_are_refused(kinematics):
         kinematics.motions(np.zeros(len(kinematics.names) + 1))
     with pytest.raises(SettingsError, match="numbers a node expected"):
         kinematics.flatten([np.zeros(9) for _ in kinematics.tree.nodes])
+
+
+def test_a_joint_that_moves_in_another_way_is_refused():
+    def pose(values):
+        X = np.eye(4)
+        X[0, 3] = 1e-3 * values[0] ** 2
+        return X
+
+    with pytest.raises(ModelError, match="joint 'odd' moves in a way"):
+        JointMap.measure(pose, 1, "odd")

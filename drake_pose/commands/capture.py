@@ -18,6 +18,7 @@ from drake_pose.commands.options import (
     Resume,
     Scheduler,
     Truth,
+    live_scene,
     within,
     workers_of,
 )
@@ -148,25 +149,16 @@ def _capture_live(
 ) -> LiveResult:
     """Captures as the pictures come, here or on workers, or by the paper's stages."""
     from drake_pose.jobs.live.capture import capture_live
-    from drake_pose.jobs.live.scene import hush_opencv, is_live_scene, load_live_scene
-    from drake_pose.systems.person.live_capture import LiveSensors
+    from drake_pose.jobs.live.scene import is_live_scene
 
     if method == "paper" and folder.is_dir() and not is_live_scene(folder):
         raise SceneError(
             f"{folder}: has no sources.yaml; the paper's method looks for skin in colour pictures, "
             "which masks do not show: name the pictures and those of the empty room there"
         )
-    hush_opencv()
     with FrameProgress() as progress:
-        # Workers may have another working folder.
-        scene = load_live_scene(folder if client is None else folder.absolute())
-
-        def sensors() -> LiveSensors:
-            if client is None:
-                return scene.open_sensors(tolerance=settings.tolerance)
-            from drake_pose.jobs.cluster.remote_views import ClusterSensors
-
-            return ClusterSensors(client, scene, tolerance=settings.tolerance)
+        tolerance = {"tolerance": settings.tolerance}
+        scene, sensors = live_scene(folder, client, tolerance, tolerance)
 
         def show(count: int, _: bool) -> None:
             progress.show_stage("frames", count, None)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
@@ -13,7 +13,12 @@ from drake_pose.commands.terminal import UsageError
 from drake_pose.files.options import within
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from distributed import Client
+
+    from drake_pose.jobs.live.scene import LiveScene
+    from drake_pose.systems.person.live_capture import LiveSensors
 
 
 SPREAD = Parameter("*")
@@ -87,3 +92,23 @@ def workers_of(
         if scheduler is not None:
             require_fit_workers(client, shared)
         yield client
+
+
+def live_scene(
+    folder: Path, client: Client | None, here: dict[str, Any], there: dict[str, Any]
+) -> tuple[LiveScene, Callable[[], LiveSensors]]:
+    """A scene of live cameras, and what opens them: in this process, or on workers."""
+    from drake_pose.jobs.live.scene import hush_opencv, load_live_scene
+
+    hush_opencv()
+    # Workers may have another working folder.
+    scene = load_live_scene(folder if client is None else folder.absolute())
+
+    def sensors() -> LiveSensors:
+        if client is None:
+            return scene.open_sensors(**here)
+        from drake_pose.jobs.cluster.remote_views import ClusterSensors
+
+        return ClusterSensors(client, scene, **there)
+
+    return scene, sensors

@@ -14,6 +14,7 @@ from drake_pose.commands.options import (
     CaptureWorkers,
     Json,
     Scheduler,
+    live_scene,
     within,
     workers_of,
 )
@@ -27,7 +28,6 @@ if TYPE_CHECKING:
     from pydrake.geometry import Meshcat
 
     from drake_pose.jobs.live.walk import Player
-    from drake_pose.systems.person.live_capture import LiveSensors
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -135,22 +135,11 @@ def walk(
 
 def _live_player(folder: Path, options: WalkOptions, client: Client | None) -> Player:
     """Walks with the cameras of a folder."""
-    from drake_pose.jobs.live.scene import hush_opencv, load_live_scene
     from drake_pose.jobs.live.walk import live_player
 
-    hush_opencv()
     settings = LiveSettings(shape=options.shape, packages=options.package)
-    # Workers may have another working folder.
-    scene = load_live_scene(folder if client is None else folder.absolute())
-
-    def sensors() -> LiveSensors:
-        if client is None:
-            return scene.open_sensors(live=True)
-        from drake_pose.jobs.cluster.remote_views import ClusterSensors
-
-        # A recording cannot be skipped from afar as fast as its moments pass: it is waited for.
-        return ClusterSensors(client, scene)
-
+    # A recording cannot be skipped from afar as fast as its moments pass: it is waited for.
+    scene, sensors = live_scene(folder, client, {"live": True}, {})
     return live_player(scene, options.model, settings, sensors)
 
 

@@ -66,18 +66,6 @@ _ABOUT = {
 }
 
 
-class JointPlot(NamedTuple):
-    """A joint's plot. unit: of its values; low, high, lower, upper: its range and its limits."""
-
-    name: str
-    unit: str
-    low: float
-    high: float
-    lower: float
-    upper: float
-    plot: Plot
-
-
 class Picture(NamedTuple):
     """An overlay. uri: of its data; link: of its file."""
 
@@ -103,7 +91,9 @@ def make_report(
         for name in scene.cameras
     ]
     joints = _joint_plots(model, estimate, joined)
-    stay = {one.name for one in joints if one.unit != "deg" and one.high - one.low < _STAYS}
+    stay = {
+        one["name"] for one in joints if one["unit"] != "deg" and one["high"] - one["low"] < _STAYS
+    }
     return template.render(
         summary=estimate.summary,
         title=Path(str(estimate.summary["scene"])).name or str(estimate.summary["scene"]),
@@ -116,8 +106,8 @@ def make_report(
         cameras=[_camera_row(scene, estimate, name) for name in scene.cameras],
         grid=draw_grid(frames, [*use, ("pose", found)]),
         lost=[row.frame for row in estimate.rows if not row.found],
-        moving=[one for one in joints if one.name not in stay],
-        still=[one for one in joints if one.name in stay],
+        moving=[one for one in joints if one["name"] not in stay],
+        still=[one for one in joints if one["name"] in stay],
         pictures=_pick_pictures(folder, scene, estimate),
         files=[(name, text) for name, text in _ABOUT.items() if (folder / name).is_file()],
     )
@@ -135,8 +125,10 @@ def page_template(package: str, name: str) -> Template:
     return environment.from_string(source.read_text(encoding="utf-8"))
 
 
-def _joint_plots(model: ArticulatedModel, estimate: SceneEstimate, joined: bool) -> list[JointPlot]:
-    """The plots of all positions that are known in a frame."""
+def _joint_plots(
+    model: ArticulatedModel, estimate: SceneEstimate, joined: bool
+) -> list[dict[str, Any]]:
+    """The plots of all positions that are known in a frame, with their ranges and limits."""
     frames, units = list(estimate.records), user_units(model)
     of_kind = {"angle": "deg", "length": "m", "quaternion": ""}
     q = np.array([row.q for row in estimate.rows]).reshape(len(frames), -1)
@@ -150,8 +142,8 @@ def _joint_plots(model: ArticulatedModel, estimate: SceneEstimate, joined: bool)
         intervals = None
         if any(known):
             nothing = JointRecord(False, np.nan, np.nan)
-            ends = [(one.low, one.high, one.determined) for one in (n or nothing for n in known)]
-            low, high, determined = np.array(ends).T
+            told = [(one.low, one.high, one.determined) for one in (n or nothing for n in known)]
+            low, high, determined = np.array(told).T
             intervals = low, high, determined > 0.0
         plot = plot_curves(
             frames,
@@ -160,8 +152,9 @@ def _joint_plots(model: ArticulatedModel, estimate: SceneEstimate, joined: bool)
             limits=(lower, upper),
             intervals=intervals,
         )
-        low, high = float(np.nanmin(values)), float(np.nanmax(values))
-        plots.append(JointPlot(name, of_kind[kind], low, high, lower, upper, plot))
+        ends = {"low": float(np.nanmin(values)), "high": float(np.nanmax(values))}
+        limits = {"lower": lower, "upper": upper}
+        plots.append({"name": name, "unit": of_kind[kind], **ends, **limits, "plot": plot})
     return plots
 
 

@@ -44,6 +44,9 @@ Truncation = Literal["joint", "sequential", "clip", "none"]
 Branch = tuple[Hypothesis, Updated]
 TRUNCATIONS: tuple[Truncation, ...] = get_args(Truncation)
 
+# Hypotheses closer than this in every element are one [deviations]; of the joint truncation.
+_TWIN_DISTANCE, _TOLERANCE = 0.3, 1e-3
+
 
 @dataclass(frozen=True)
 class FilterSettings:
@@ -56,7 +59,6 @@ class FilterSettings:
         hypothesis_cap: how many hypotheses are kept at most; 1 for none but the best.
         reject_below: a hypothesis beyond a row by more is given up: c_k (24) below this.
         smallest_weight: lighter hypotheses are given up.
-        twin_distance: hypotheses closer than this in every element are one [deviations].
         novelty: a measurement shows nothing new if noise alone would make it differ as much
             from the one that began the view with more than this probability, see ``views``. 0:
             every frame is new, as in the paper; so it is always with "sequential" and "clip".
@@ -70,8 +72,6 @@ class FilterSettings:
     hypothesis_cap: int = 4
     reject_below: float = -4.0
     smallest_weight: float = 1e-4
-    twin_distance: float = 0.3
-    tolerance: float = 1e-3
     novelty: float = 1e-9
 
     def __post_init__(self) -> None:
@@ -83,10 +83,8 @@ class FilterSettings:
             raise SettingsError("iterations and hypothesis_cap must be 1 or more")
         if not 0 <= self.novelty < 1:
             raise SettingsError(f"novelty must be in [0, 1), not {self.novelty}")
-        if not (self.reject_below < 0 and 0 <= self.smallest_weight < 1 and self.tolerance > 0):
-            raise SettingsError(
-                "reject_below must be negative, smallest_weight in [0, 1), tolerance positive"
-            )
+        if not (self.reject_below < 0 and 0 <= self.smallest_weight < 1):
+            raise SettingsError("reject_below must be negative, smallest_weight in [0, 1)")
 
 
 @dataclass(frozen=True, eq=False)
@@ -208,7 +206,7 @@ class TruncatedFilter:
             self._finish(h, done.belief, done.truncated, done.log_likelihood) for h, done in alive
         ]
         leader = max(range(len(finished)), key=lambda i: finished[i].log_weight)
-        merged, twins = merge_twins(normalise(finished), settings.twin_distance, step)
+        merged, twins = merge_twins(normalise(finished), _TWIN_DISTANCE, step)
         kept, pruned = prune(merged, settings.hypothesis_cap, settings.smallest_weight, step)
         best = alive[leader][1]
         return FilterState(
@@ -308,4 +306,4 @@ class TruncatedFilter:
             return truncate_sequential(belief, self.inequalities)
         if self.settings.truncation == "clip":
             return clip(belief, self.inequalities)
-        return truncate_joint(belief, self._rows, self.settings.tolerance, sites)
+        return truncate_joint(belief, self._rows, _TOLERANCE, sites)

@@ -57,10 +57,12 @@ def make_tracker(
 
 @dataclass(frozen=True, eq=False)
 class _Frame:
-    """What is given of a frame, and when its estimate began [s]."""
+    """What is given of a frame, by camera, the root where it is now, and when it began [s]."""
 
     views: Sequence[View]
     root_position: Array | None
+    observation: ContourObservation
+    masks: list[NDArray[np.bool_] | None]
     pictures: list[Picture | None] | None
     begin: float
 
@@ -112,7 +114,14 @@ class MatchAndTrack:
         Raises:
             SettingsError: masks or pictures that do not fit the cameras.
         """
-        frame = _Frame(views, root_position, self._pictures(pictures), time.perf_counter())
+        begin, observation = time.perf_counter(), self.tracker.observation
+        names = [camera.name for camera in observation.cameras]
+        seen = {view.camera.name: view.mask for view in views}
+        if root_position is not None:
+            observation = observation.with_root_position(root_position)
+        masks = [seen.get(name) for name in names]
+        shown = [pictures.get(name) for name in names] if pictures else None
+        frame = _Frame(views, root_position, observation, masks, shown, begin)
         tracked: tuple[Track, PoseEstimate] | None = None
         if last.track is not None:
             track = self._follow(last.track, frame, False)
@@ -126,7 +135,6 @@ class MatchAndTrack:
         matched = self._search.match(views, root_position)
         found = [] if tracked is None else [tracked]
         if matched.found:
-            observation = self._observation(root_position)
             x = observation.state(matched.q, matched.X_WB, matched.scale)
             if last.track is not None:
                 # A search does not know how often an angle has turned round.
@@ -142,9 +150,9 @@ class MatchAndTrack:
 
     def _begin(self, start: Array, last: Followed, frame: _Frame) -> tuple[Followed, PoseEstimate]:
         """A track that begins where the body is known to be."""
-        x = self._observation(frame.root_position).state(start)
+        x = frame.observation.state(start)
         if last.track is not None:
-            x = self._observation(frame.root_position).continued(x, last.track.state.best.mean)
+            x = frame.observation.continued(x, last.track.state.best.mean)
         track = self._follow(self.tracker.start(x), frame, True)
         result = self._result(track, frame)
         reference = result.E_total if frame.views else UNEXPLAINED
@@ -155,20 +163,15 @@ class MatchAndTrack:
     ) -> tuple[Followed, PoseEstimate]:
         """What is known where neither a track nor a mask nor a start says where the body is."""
         if tracked is None:
-            nowhere = self._observation(None).state(self._search.tree.model.default_positions)
+            default = self._search.tree.model.default_positions
+            nowhere = self.tracker.observation.state(default)
             result = self._result(self.tracker.start(nowhere), frame)
             return last, replace(result, found=False)
         return Followed(tracked[0], last.reference, last.matches), replace(tracked[1], found=False)
 
     def _follow(self, track: Track, frame: _Frame, first: bool) -> Track:
         """The tracker's next frame; first: it is the one that the track begins in."""
-        masks = self._masks(frame.views)
-        return self.tracker.follow(track, masks, first, frame.root_position, frame.pictures)
-
-    def _pictures(self, pictures: Mapping[str, Picture] | None) -> list[Picture | None] | None:
-        if not pictures:
-            return None
-        return [pictures.get(camera.name) for camera in self.tracker.observation.cameras]
+        return self.tracker.follow(track, frame.masks, first, frame.root_position, frame.pictures)
 
     def _turned(self, matched: PoseEstimate, node_values: Sequence[Array]) -> PoseEstimate:
         """A pose in the turns of a track that goes on."""
@@ -178,16 +181,6 @@ class MatchAndTrack:
         ]
         return matched.turned(self._search.tree, turns)
 
-    def _masks(self, views: Sequence[View]) -> list[NDArray[np.bool_] | None]:
-        seen = {view.camera.name: view.mask for view in views}
-        return [seen.get(camera.name) for camera in self.tracker.observation.cameras]
-
-    def _observation(self, root_position: Array | None) -> ContourObservation:
-        observation = self.tracker.observation
-        if root_position is None:
-            return observation
-        return observation.with_root_position(root_position)
-
     def _is_lost(
         self, track: Track, result: PoseEstimate, reference: float, has_masks: bool
     ) -> bool:
@@ -196,7 +189,7 @@ class MatchAndTrack:
 
     def _difference(self, track: Track, frame: _Frame) -> tuple[float, float]:
         """The area where the body differs from what is seen, and the body's [pixel]."""
-        observation, x = self._observation(frame.root_position), track.state.best.mean
+        observation, x = frame.observation, track.state.best.mean
         if frame.views:
             return observation.difference(x, [(view.camera, view.mask) for view in frame.views])
         J, area = 0.0, 0.0
@@ -210,8 +203,7 @@ class MatchAndTrack:
 
     def _result(self, track: Track, frame: _Frame) -> PoseEstimate:
         """The pose of a track, and how well it explains what is seen."""
-        observation = self._observation(frame.root_position)
-        x = track.state.best.mean
+        observation, x = frame.observation, track.state.best.mean
         q, X_WB = observation.positions(x)
         J, area = self._difference(track, frame)
         return PoseEstimate(

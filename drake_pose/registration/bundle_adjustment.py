@@ -163,9 +163,5 @@ def _covariances(
     whole = values_covariance(seen, sizes, np.arange(len(is_angle)), is_angle)
     X_CW, _, motions = fit.places(parameters[0])
     first = len(whole) - 6 * len(looks)
-    return np.array(
-        [
-            pose_covariance(X_CW[k], motions[k, :6], whole[at : at + 6, at : at + 6])
-            for at, k in zip(range(first, len(whole), 6), looks, strict=True)
-        ]
-    )
+    parts = [(k, slice(first + 6 * j, first + 6 * j + 6)) for j, k in enumerate(looks)]
+    return np.array([pose_covariance(X_CW[k], motions[k, :6], whole[at, at]) for k, at in parts])

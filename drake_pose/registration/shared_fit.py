@@ -202,11 +202,8 @@ class SharedFit:
 
     def inlier_ratios(self, found: Shared) -> Array:
         """(rows,) of both contours' lengths, what fits."""
-        compared = [
-            self._fit.compare(evidence, theta, TOLD_APART)[0]
-            for evidence, theta in zip(self._evidence, self._parameters(found), strict=True)
-        ]
-        return np.array([one.inlier_ratio for one in compared])
+        masks = zip(self._evidence, self._parameters(found), strict=True)
+        return np.array([self._fit.compare(*one, TOLD_APART)[0].inlier_ratio for one in masks])
 
     def agreeing(self, ratios: Array) -> Mask:
         """(rows,) which masks fit nearly as well as the two of their camera that fit best."""
@@ -215,11 +212,9 @@ class SharedFit:
 
     def piece_costs(self, found: Shared, side: float) -> Array:
         """(rows, k, k) costs by squares of the pictures of a side [pixel]."""
+        masks = zip(self._evidence, self._parameters(found), self.rows, strict=True)
         return np.array(
-            [
-                self._fit.piece_costs(self._evidence[k], theta, TOLD_APART, side)[self.rows[k]]
-                for k, theta in enumerate(self._parameters(found))
-            ]
+            [self._fit.piece_costs(one, at, TOLD_APART, side)[c] for one, at, c in masks]
         )
 
     def cameras(self, found: Shared) -> list[PinholeCamera]:
@@ -247,13 +242,9 @@ class SharedFit:
     def camera_covariances(self, found: Shared, covariance: Array) -> Array:
         """(cameras, 6, 6) of the poses' errors in the world, covariance being of what is shared."""
         X_CW, _, motions = self._fit.places(self._parameters(found)[0])
-        first = self.per_camera * np.arange(len(X_CW))
-        return np.array(
-            [
-                pose_covariance(X, moves[:6], covariance[k : k + 6, k : k + 6])
-                for k, X, moves in zip(first, X_CW, motions, strict=True)
-            ]
-        )
+        own = [slice(k, k + 6) for k in self.per_camera * np.arange(len(X_CW))]
+        several = zip(X_CW, motions, own, strict=True)
+        return np.array([pose_covariance(X, J[:6], covariance[k, k]) for X, J, k in several])
 
     def _at(
         self, at: Shared, which: Mask | None

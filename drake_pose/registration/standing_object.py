@@ -125,10 +125,7 @@ class StandingObject:
             held={**self._held, **dict.fromkeys(OBJECT_POSITIONS, 0.0)},
         )
         if len(tree.nodes) < 3:
-            raise SettingsError(
-                f"{self._robot.path}: no joint moves link '{self._link}', so a camera on it stands "
-                "still: leave --on out"
-            )
+            raise stands_still(self._robot, self._link)
         return tree
 
     def body(self, X_WT: Array) -> RegistrationBody:
@@ -206,6 +203,14 @@ class StandingObject:
         return Symmetry(
             self._X_TO @ turns @ inverse_transforms(self._X_TO), np.array(axes).reshape(-1, 3)
         )
+
+
+def stands_still(robot: ArticulatedModel, link: str) -> SettingsError:
+    """What is said of a link that no joint moves."""
+    return SettingsError(
+        f"{robot.path}: no joint moves link '{link}', so a camera on it stands still: leave "
+        "--on out"
+    )
 
 
 def _turn(by: Array) -> Array:

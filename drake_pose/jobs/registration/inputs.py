@@ -35,7 +35,7 @@ from drake_pose.jobs.registration.positions import (
 from drake_pose.jobs.registration.settings import ALL, RegistrationSettings
 from drake_pose.registration.joint_zeros import links_with_length, require_known
 from drake_pose.registration.posed_frames import PosedFrame, SeenFrame
-from drake_pose.registration.standing_object import StandingObject, require_turns
+from drake_pose.registration.standing_object import StandingObject, require_turns, stands_still
 from drake_pose.silhouette.pictures.scene_checks import check_scene
 from drake_pose.silhouette.pictures.scene_files import select_frames
 from drake_pose.silhouette.pictures.scenes import CAMERA_FILE, Scene, load_scene
@@ -231,10 +231,7 @@ def make_registration_tree(
         link, root_position=np.zeros(3), root_rotation=RootRotation.fixed(), held=held
     )
     if not {node.name for node in moved.nodes[1:]} & set(base):
-        raise SettingsError(
-            f"{model.path}: no joint moves link '{link}', so a camera on it stands still: leave "
-            "--on out"
-        )
+        raise stands_still(model, link)
     return moved, tuple(base)
 
 

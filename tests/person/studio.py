@@ -14,6 +14,7 @@ from drake_pose.person.date.skeleton import load_skeleton
 from drake_pose.silhouette.segmentation.background import learn_background
 from drake_pose.systems.date.preparation import see_person
 from drake_pose.systems.pictures.camera_rig import build_camera_rig
+from tests.person.persons_in_view import posed
 
 HEAD_HEIGHT = 1.55
 
@@ -30,11 +31,7 @@ class Studio:
         self.context = self.rig.diagram.CreateDefaultContext()
 
     def posed(self, **degrees):
-        q = np.array(self.model.default_positions)
-        q[self.skeleton.head_positions[2]] = HEAD_HEIGHT
-        for name, value in degrees.items():
-            q[self.model.position_index(name)] = np.radians(value)
-        return q
+        return posed(self.model, z=HEAD_HEIGHT, **degrees)
 
     def picture(self, q, name):
         self.rig.set_positions(self.context, q)

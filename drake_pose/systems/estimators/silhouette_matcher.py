@@ -92,6 +92,9 @@ class SilhouetteMatcher(BeliefSystem[Matched]):
             or the family limit is below 1.
     """
 
+    _first_memory: Any = None
+    """What the first update gets as its memory."""
+
     def __init__(
         self,
         search: PoseSearch,
@@ -115,7 +118,7 @@ class SilhouetteMatcher(BeliefSystem[Matched]):
         )
         self.add_input("root_position", 3)
         q = search.tree.model.default_positions
-        self.keep_belief(Matched(q, np.eye(4), None, self._first_memory()), period, offset)
+        self.keep_belief(Matched(q, np.eye(4), None, self._first_memory), period, offset)
         self._declare_outputs(search.tree.model.plant)
 
     def _declare_outputs(self, plant: MultibodyPlant) -> None:
@@ -149,10 +152,6 @@ class SilhouetteMatcher(BeliefSystem[Matched]):
         if estimate is None or not estimate.found:
             return Matched(last.q, last.X_WB, estimate, memory)
         return Matched(estimate.q, estimate.X_WB, estimate, memory)
-
-    def _first_memory(self) -> Any:
-        """What the first update gets as its memory."""
-        return None
 
     def _find(
         self, context: Context, memory: Any, views: Sequence[View]
@@ -245,6 +244,8 @@ class SilhouetteTracker(SilhouetteMatcher):
         UnknownNameError: a name of ``color_cameras`` is no camera's.
     """
 
+    _first_memory = _Memory(Followed(), (0.0, 0.0, 0.0), -np.inf)
+
     def __init__(
         self,
         search: PoseSearch,
@@ -272,9 +273,6 @@ class SilhouetteTracker(SilhouetteMatcher):
         self.show("position_deviations", nq, self._deviations)
         self.show("estimated_state", model.plant.num_multibody_states(), self._state)
         self.show("track", len(TRACK), lambda known: known.memory.track)
-
-    def _first_memory(self) -> _Memory:
-        return _Memory(Followed(), (0.0, 0.0, 0.0), -np.inf)
 
     def _find(
         self, context: Context, memory: _Memory, views: Sequence[View]

@@ -145,7 +145,7 @@ class RefinementProblem:
 
     def __init__(self, body: RefinementBody, views: Sequence[View]) -> None:
         if not views:
-            raise SettingsError("a refinement needs at least one view, but none was given")
+            raise SettingsError("a match needs at least one view, but none was given")
         self.body, self.views = body, tuple(views)
         self.area = float(sum(np.count_nonzero(view.mask) for view in views))
         self._silhouettes = [find_border(view.mask) for view in views]

@@ -191,8 +191,6 @@ def test_bad_input_is_refused(sliders):
         View(camera, np.zeros((100, 100), dtype=bool))
     with pytest.raises(MaskError, match=r"front.*\(80, 100\)"):
         View(camera, np.ones((100, 80), dtype=bool))
-    with pytest.raises(SettingsError, match="at least one view"):
-        slider_search(sliders).match([])
     for bad in ({"interval": 0.0}, {"candidate_limit": 0}, {"outside_limit": -1.0},
                 {"run_limit": 0}, {"interval": math.nan}, {"intervals": {"up": -1.0}}):  # fmt: skip
         with pytest.raises(SettingsError, match=next(iter(bad)).rstrip("s")):

@@ -8,7 +8,6 @@ import pytest
 from drake_pose.body.formats.packages import bundled_model
 from drake_pose.body.model import load_model
 from drake_pose.camera.models import ParallelCamera, PinholeCamera
-from drake_pose.errors import SettingsError
 from drake_pose.search.continuous.families import find_intervals
 from drake_pose.search.estimates import View
 from drake_pose.search.refinement import (
@@ -162,25 +161,6 @@ def test_a_part_in_the_wrong_place_is_found_again(body, search):
     np.testing.assert_array_equal(once, wrong)
 
 
-@pytest.mark.slow
-def test_others_are_as_good_and_differ(body, search):
-    """From a part mirrored in depth, which one camera hardly tells from the true one."""
-    camera = camera_of("parallel")
-    for seed in (41, 42, 43):
-        true = random_pose(body, seed, share=0.5)
-        problem = problem_of(body, true, [camera])
-        part = next(part for part in search.parts if len(part.nodes) == 2)
-        mirrored = search.mirror(true, part, problem.views[0])
-        start, _, _ = descend(problem, mirrored, body.freedom(), FINE_PASSES)
-        about = NeighbourhoodSearch(problem, search)
-        best, J = about.improve(start, 0.0, everywhere=True)
-        assert J == problem.J(best) <= problem.J(start)
-        limit = J + 0.03 * problem.border_length
-        for other in about.others(best, limit, 0.1):
-            assert problem.J(other) <= limit
-            assert np.abs(other - best).max() > 0.1
-
-
 def test_pixels_that_are_right_pull_little(body):
     """Refined to the end fewer pixels are wrong, and the pose is nearer, than by least squares."""
     camera = camera_of("parallel")
@@ -283,19 +263,3 @@ def test_intervals_hold_the_truth_and_say_what_is_free(body, search):
                 held += joint.holds(true[j])
     assert claimed > 60
     assert held / claimed > 0.9
-
-
-def test_a_body_of_other_size_and_place(body):
-    camera = camera_of("pinhole")
-    true = random_pose(body, 31, share=0.5)
-    true[-4:] = 0.03, -0.04, 0.02, 0.05
-    problem = problem_of(body, true, [camera, camera_of("pinhole", turned=True)])
-    start = true.copy()
-    start[-4:] = 0.0
-    found, _, _ = descend(problem, start, body.freedom(None, (0, 1, 2, 3)), FINE_PASSES)
-    np.testing.assert_allclose(found[-4:], true[-4:], atol=0.01)
-
-
-def test_no_view_is_refused(body):
-    with pytest.raises(SettingsError, match="view"):
-        RefinementProblem(body, [])

@@ -1,11 +1,9 @@
 """The multi-start search on arms drawn by the tests, clean and damaged, and on bad input."""
 
-import cv2
 import numpy as np
 import pytest
 
 from drake_pose.body.tree.pose_tree import PoseTree
-from drake_pose.errors import SettingsError
 from drake_pose.search.continuous.multi_start import MultiStartSearch
 from drake_pose.search.estimates import PoseEstimate, View
 from tests.search.arms import (
@@ -160,21 +158,6 @@ def test_body_cut_off_by_the_pictures_edge(
     assert worst_place(tree, result, pose) < 0.02
 
 
-def test_other_things_in_the_picture(
-    tree: PoseTree, search: MultiStartSearch, pose: np.ndarray
-) -> None:
-    views = clean_views(tree, pose)
-    for view, center in zip(views, ((40, 60), (280, 200)), strict=True):
-        blob = np.zeros(view.mask.shape, np.uint8)
-        cv2.circle(blob, center, 15, 1, -1)
-        assert not (view.mask & (blob > 0)).any()
-        view.mask[blob > 0] = True
-    result = search.match(views)
-    assert worst_place(tree, result, pose) < 0.02
-    blobs = 2 * np.pi * 15**2 / sum(view.mask.sum() for view in views)
-    assert blobs - 0.03 < result.E_total < blobs + 0.05
-
-
 def test_salt_noise(tree: PoseTree, search: MultiStartSearch, pose: np.ndarray) -> None:
     generator = np.random.default_rng(8)
     views = clean_views(tree, pose)
@@ -184,8 +167,3 @@ def test_salt_noise(tree: PoseTree, search: MultiStartSearch, pose: np.ndarray) 
     assert worst_place(tree, result, pose) < 0.02
     # J is still that of the silhouettes as they were given.
     assert result.J == recount(tree, result, views)
-
-
-def test_no_view(search: MultiStartSearch) -> None:
-    with pytest.raises(SettingsError, match="at least one view"):
-        search.match([])

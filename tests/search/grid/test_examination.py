@@ -63,20 +63,6 @@ def test_a_worse_pose_is_replaced(maker: ProblemMaker) -> None:
         assert tuple(samples.tolist()) in problem.within(mended.J)
 
 
-def test_without_time_nothing_is_proved_but_what_is_exact(maker: ProblemMaker) -> None:
-    hasty = search_of(maker, ExaminationSettings(proof_time_limit=0.0, family_time_limit=0.0))
-    generator = np.random.default_rng(6)
-    for noise in (0.0, 0.01) * 2:
-        problem = maker.make(generator, views=1, noise=noise, on_grid=noise == 0.0)
-        result = hasty.match(problem.views)
-        assert result.lower_bound <= problem.best[1] <= result.J
-        assert result.proved_optimal == (result.J == 0)
-        assert result.budget_spent
-        assert result.pose_set is not None
-        assert not result.pose_set.complete
-        assert not any(joint.determined for joint in result.pose_set.joints)
-
-
 def test_a_pose_between_the_samples_is_refused(maker: ProblemMaker) -> None:
     search = search_of(maker, None)
     problem = maker.make(np.random.default_rng(7), views=1, noise=0.0, on_grid=True)
@@ -87,7 +73,9 @@ def test_a_pose_between_the_samples_is_refused(maker: ProblemMaker) -> None:
         examine(search.body, problem.views, moved, ExaminationSettings())
 
 
-@pytest.mark.parametrize("limit", [{"proof_poses": 1}, {"memory": 8_000}])
+@pytest.mark.parametrize(
+    "limit", [{"proof_poses": 1}, {"memory": 8_000}, {"proof_time_limit": 0.0}]
+)
 def test_a_limit_leaves_a_true_bound_and_no_false_proof(
     maker: ProblemMaker, limit: dict[str, int]
 ) -> None:
@@ -104,6 +92,7 @@ def test_a_limit_leaves_a_true_bound_and_no_false_proof(
         assert proof.lower_bound <= problem.best[1] <= proof.J <= found.J
         assert proof.J in problem.Js
         assert proof.budget_spent or proof.proved_optimal
+        assert proof.pose_set.complete or not any(proof.pose_set.determined)
         proved.append(proof.proved_optimal)
     assert not all(proved)
 

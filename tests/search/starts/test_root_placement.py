@@ -128,30 +128,6 @@ def test_a_turned_over_tree_finds_as_good_a_pose(body):
     assert math.atan2(*turned.X_WB[[2, 1], 1]) == pytest.approx(TRUE_ANGLES["trunk_turn"], abs=0.1)
 
 
-def test_turned_over_trees_score_alike(body):
-    """A pose of one tree, put into another by the plant's positions, has the same silhouette."""
-    camera = front_camera(160, shift=0.3)
-    generator = np.random.default_rng(5)
-    tree = body.pose_tree()
-    outlines = RootPlacementSearch(tree, SETTINGS).sampled.outlines
-    for root in ("left", "right"):
-        rotation = RootRotation.free()
-        other = body.pose_tree(root, root_position=np.zeros(3), root_rotation=rotation)
-        other_outlines = RootPlacementSearch(other, SETTINGS).sampled.outlines
-        for _ in range(5):
-            q = np.array(body.default_positions)
-            bounds = np.clip(body.lower, -0.2, None), np.clip(body.upper, None, 0.2)
-            q[:] = generator.uniform(*bounds)
-            X_WN = tree.node_poses(tree.values_from_positions(q))
-            p_WR = X_WN[tree.node_index(root), :3, 3]
-            moved = other.with_root_position(p_WR)
-            X_WM = moved.node_poses(moved.values_from_positions(q))
-            one = draw_mask(outlines, camera.X_CW @ X_WN, camera)
-            two = draw_mask(other_outlines, camera.X_CW @ X_WM, camera)
-            assert one.any()
-            assert np.count_nonzero(one != two) <= 2
-
-
 def test_a_known_position_is_kept(body):
     camera = front_camera(160)
     position = np.array([0.0, 0.13, 0.31])

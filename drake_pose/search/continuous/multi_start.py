@@ -2,7 +2,7 @@
 
 Poses that are roughly right are found by places (``coarse_search``), drawn to the silhouettes'
 edges by saturating costs (``fit``), and about the best of them other explanations are sought: a
-limb searched again, joints flipped (``self_motions``).
+limb searched again, joints that turn against each other (``self_motions``).
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from drake_pose.search.starts.coarse_search import (
     CoarsePoses,
     CoarseSearch,
 )
-from drake_pose.search.starts.self_motions import flips
+from drake_pose.search.starts.self_motions import counter_turns, flips
 from drake_pose.silhouette.areas.scoring import draw_mask
 
 # Connected pixels, or holes, no larger than this are specks [pixel].
@@ -173,7 +173,7 @@ class _Run:
         """Other explanations near a pose, refined."""
         kinematics = self._kinematics
         flipped = [flip.values for flip in flips(kinematics, values)]
-        tried: list[np.ndarray] = []
+        tried = counter_turns(kinematics, values, INTERVAL)
         X_WN = kinematics.poses(values)
         # The subtrees of no more than half of the nodes.
         for nodes in (one for one in kinematics.tree.subtrees if 2 * len(one) <= len(X_WN)):

@@ -1,8 +1,9 @@
 """Other values of a chain's joints that leave most of the body where it is.
 
-Three joints whose first and last axes can be brought into line may be flipped (A1 + 180, -A2,
-A3 + 180): what hangs on the last joint stays where it is, or nearly so, and only the links between
-turn. A refinement does not find its way from one of these to another.
+Two joints whose axes are parallel can turn against each other, and three whose first and last axes
+can be brought into line may be flipped (A1 + 180, -A2, A3 + 180): what hangs on the last joint
+stays where it is, or nearly so, and only the links between turn. A refinement does not find its way
+from one of these to another.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import numpy as np
 
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
 
+_PARALLEL = 0.8
 # What a flip may move, as a share of the body's size.
 _STAYS = 1e-3
 # How far cosines are from where they are if all stays: wider than the above.
@@ -33,6 +35,28 @@ class Flip:
     values: np.ndarray
     changed: np.ndarray
     mirrored: np.ndarray
+
+
+def counter_turns(
+    kinematics: TreeKinematics, values: np.ndarray, interval: float
+) -> list[np.ndarray]:
+    """Values (m,) with pairs of joints of nearly parallel axes turned against each other."""
+    motions = kinematics.motions(values)
+    turns, moves = motions.twists[:, :3], motions.moves
+    steps = range(1, math.ceil(2.0 * math.pi / interval))
+    found = []
+    for first, second in _chained_pairs(kinematics, moves):
+        along = float(turns[first] @ turns[second])
+        if abs(along) < _PARALLEL:
+            continue
+        for step in steps:
+            turned = values.copy()
+            turned[first] += step * interval
+            turned[second] -= math.copysign(step * interval, along)
+            inside = _inside(kinematics, turned, (first, second))
+            if inside is not None:
+                found.append(inside)
+    return found
 
 
 def flips(kinematics: TreeKinematics, values: np.ndarray, count: int = 16) -> list[Flip]:

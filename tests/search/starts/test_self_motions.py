@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
-from drake_pose.search.starts.self_motions import flips
+from drake_pose.search.starts.self_motions import counter_turns, flips
 from tests.search.arms import arm_tree, split
 from tests.search.bodies import swinging_chain
 
@@ -52,6 +52,24 @@ def test_flips_outside_the_limits_are_left_out(kinematics: TreeKinematics) -> No
     assert flips(kinematics, values) == []
 
 
-def test_a_chain_in_a_plane_has_no_flips(tmp_path) -> None:
+def test_counter_turns_keep_the_direction_of_what_follows(kinematics: TreeKinematics) -> None:
+    # With the shoulder upright, turret and roll have one axis.
+    values = np.array([0.6, 0.0, -0.5, 0.9, 0.3])
+    found = counter_turns(kinematics, values, np.radians(30.0))
+    turned = [one for one in found if one[0] != values[0] and one[2] != values[2]]
+    assert turned
+    before = poses(kinematics, values)
+    for one in turned:
+        np.testing.assert_allclose(poses(kinematics, one)[-1], before[-1], atol=1e-9)
+    assert all(((one >= kinematics.lower) & (one <= kinematics.upper)).all() for one in found)
+
+
+def test_a_chain_in_a_plane_has_counter_turns_but_no_flips(tmp_path) -> None:
     kinematics = TreeKinematics(swinging_chain(tmp_path, 3).pose_tree())
-    assert flips(kinematics, np.array([0.3, -0.4, 0.5])) == []
+    values = np.array([0.3, -0.4, 0.5])
+    assert flips(kinematics, values) == []
+    for one in counter_turns(kinematics, values, 0.5):
+        changed = np.flatnonzero(one != values)
+        assert len(changed) == 2
+        # Parallel axes: a turn there and back again, but for full turns.
+        assert (one - values).sum() == pytest.approx(0.0, abs=1e-9)

@@ -26,9 +26,10 @@ from drake_pose.body.formats.parsing import ModelSource, limit_kinds
 from drake_pose.body.formats.safety import check_in_child
 from drake_pose.body.formats.urdf_shape import Vectors, reshaped, with_base_joints
 from drake_pose.body.parsed_model import ParsedModel, describe_positions, link_names
+from drake_pose.body.plant_source import PlantSource
 from drake_pose.body.surfaces.meshes import TriangleMesh
 from drake_pose.body.surfaces.skin_file import SkinBand, load_skin
-from drake_pose.body.surfaces.visual_geometry import body_mesh, make_drawable
+from drake_pose.body.surfaces.visual_geometry import body_mesh, labelled_meshes, make_drawable
 from drake_pose.body.tree.link_graph import PlantKinematics
 from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.body.tree.root import RootRotation
@@ -76,6 +77,53 @@ class ArticulatedModel(ParsedModel):
         """
         return build_pose_tree(self, root, root_position, root_rotation, held)
 
+    @classmethod
+    def from_plant(
+        cls,
+        plant: MultibodyPlant,
+        scene_graph: SceneGraph,
+        model_instances: Sequence[ModelInstanceIndex] | None = None,
+    ) -> "ArticulatedModel":
+        """The model of bodies in a finalized plant, as of a diagram: q is the plant's own.
+
+        Joints, limits, default positions, looks and render labels are the plant's. The bodies of
+        other model instances, and what stands in the world, are not the model's: they hide nothing,
+        and their positions stay at their defaults.
+
+        Args:
+            plant: finalized, and registered with the SceneGraph; do not change it afterwards.
+            model_instances: whose bodies are seen; None: all.
+
+        Raises ModelError: the plant is not finalized or not registered, an instance has no bodies
+        with visual geometry, or as for a file.
+        """
+        name = plant.get_name() or "the plant"
+        if not isinstance(plant, MultibodyPlant) or not plant.is_finalized():
+            raise ModelError(f"{name} is not finalized: call plant.Finalize() first")
+        source_id = plant.get_source_id()
+        if source_id is None or not scene_graph.model_inspector().SourceIsRegistered(source_id):
+            raise ModelError(f"{name} is not registered with the SceneGraph that was given")
+        every = [ModelInstanceIndex(k) for k in range(1, plant.num_model_instances())]
+        chosen = every if model_instances is None else list(model_instances)
+        seen = [body for instance in chosen for body in plant.GetBodyIndices(instance)]
+        path = Path(name)
+        with _naming(path):
+            positions, remarks = describe_positions(plant, {}, name)
+        meshes = _seen_meshes(path, plant, scene_graph, seen)
+        looks = [labelled_meshes(plant, scene_graph, plant.get_body(body)) for body in seen]
+        return cls(
+            path=path,
+            name=plant.GetModelInstanceName(chosen[-1]),
+            plant=plant,
+            scene_graph=scene_graph,
+            **vars(positions),
+            link_meshes=MappingProxyType(meshes),
+            skin=(),
+            warnings=tuple(limit_kinds(remarks)),
+            _source=PlantSource(plant, scene_graph, seen),
+            labels=frozenset(label for meshes in looks for label in meshes),
+        )
+
     def without(self, links: Collection[str]) -> "ArticulatedModel":
         """The same without the looks of some links, and the skin between them and others.
 
@@ -106,7 +154,7 @@ class ArticulatedModel(ParsedModel):
         for name in (*hidden, *factors, *moves):
             self.link_index(name)
         text = reshaped(
-            self._urdf_text(), hidden=hidden, factors=factors, moves=moves, shifts=shifts
+            self._urdf().text, hidden=hidden, factors=factors, moves=moves, shifts=shifts
         )
         kept = [band for band in self.skin if not {band.parent, band.child} & set(hidden)]
         # A band grows with the link in whose frame it is.
@@ -121,7 +169,7 @@ class ArticulatedModel(ParsedModel):
     def with_base_joints(self, X_WB: Array) -> "ArticulatedModel":
         """The same on BASE_JOINTS, which are 0 at X_WB (4, 4); ModelError for no URDF."""
         rpy = Rotation.from_matrix(X_WB[:3, :3]).as_euler("xyz")
-        text = with_base_joints(self._urdf_text(), X_WB[:3, 3].tolist(), rpy.tolist())
+        text = with_base_joints(self._urdf().text, X_WB[:3, 3].tolist(), rpy.tolist())
         moved = self._changed(text, self.skin)
         positions, _ = describe_positions(moved.plant, self._source.limits, str(self.path))
         return replace(moved, **vars(positions))
@@ -162,15 +210,15 @@ class ArticulatedModel(ParsedModel):
         """Whether the methods above can be called, which a URDF allows."""
         return self._source.kind == "urdf"
 
-    def _urdf_text(self) -> str:
+    def _urdf(self) -> ModelSource:
         """What Drake reads in the file's place."""
-        if not self.changes_shape:
+        if not isinstance(self._source, ModelSource) or not self.changes_shape:
             raise ModelError(f"{self.path}: only the shape of a URDF model can be changed")
-        return self._source.text
+        return self._source
 
     def _changed(self, text: str, skin: Sequence[SkinBand]) -> "ArticulatedModel":
         """The same read from another text."""
-        source = self._source.with_text(text)
+        source = self._urdf().with_text(text)
         plant, scene_graph, _, _ = _parse(self.path, source)
         plant.Finalize()
         return replace(
@@ -263,13 +311,17 @@ def _parse(
 
 
 def _seen_meshes(
-    path: Path, plant: MultibodyPlant, scene_graph: SceneGraph
+    path: Path,
+    plant: MultibodyPlant,
+    scene_graph: SceneGraph,
+    bodies: Sequence[BodyIndex] | None = None,
 ) -> dict[str, TriangleMesh]:
-    """The visual geometry of each link that has some."""
+    """The visual geometry of each link that has some; bodies: of these alone."""
+    names = link_names(plant)
+    chosen = [BodyIndex(k) for k in range(len(names))] if bodies is None else bodies
     with _naming(path):
         meshes = {
-            name: body_mesh(plant, scene_graph, plant.get_body(BodyIndex(index)))
-            for index, name in enumerate(link_names(plant))
+            names[int(body)]: body_mesh(plant, scene_graph, plant.get_body(body)) for body in chosen
         }
     meshes = {name: mesh for name, mesh in meshes.items() if not mesh.is_empty}
     if not meshes:

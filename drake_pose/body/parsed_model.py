@@ -13,6 +13,7 @@ from pydrake.multibody.tree import BodyIndex, Joint, ModelInstanceIndex
 
 from drake_pose.arrays import Array
 from drake_pose.body.formats.parsing import ModelSource
+from drake_pose.body.plant_source import PlantSource
 from drake_pose.body.surfaces.meshes import TriangleMesh
 from drake_pose.body.surfaces.skin_file import SkinBand
 from drake_pose.body.surfaces.visual_geometry import make_drawable
@@ -215,6 +216,7 @@ class ParsedModel(Positions):
         skin: the bands of surface that bend with the joints (``load_skin``); usually none.
         warnings: what is not read of the file or not enforced, which limits were not taken as they
             are written, and what Drake remarked.
+        labels: the render labels of what is seen, of a plant that somebody else made; else None.
     """
 
     path: Path
@@ -224,7 +226,8 @@ class ParsedModel(Positions):
     link_meshes: Mapping[str, TriangleMesh]
     skin: tuple[SkinBand, ...]
     warnings: tuple[str, ...]
-    _source: ModelSource = field(repr=False)
+    _source: ModelSource | PlantSource = field(repr=False)
+    labels: frozenset[int] | None = None
 
     def add_to(
         self, plant: MultibodyPlant, scene_graph: SceneGraph | None = None, *, prefix: str = ""

@@ -11,9 +11,11 @@ import numpy as np
 import yaml
 
 from drake_pose.camera.models import (
+    HALF_PIXEL,
     Camera,
     ParallelCamera,
     PinholeCamera,
+    camera_tuple,
     check_number,
     check_pose,
     write_file,
@@ -27,8 +29,8 @@ _REQUIRED = {
     "parallel": (*_COMMON, "pixels_per_metre"),
 }
 _OPTIONAL = {
-    "pinhole": ("X_WC", "link", "X_LC", "projection", "clipping_near"),
-    "parallel": ("X_WC", "projection"),
+    "pinhole": ("X_WC", "link", "X_LC", "projection", "clipping_near", "pixel_centers"),
+    "parallel": ("X_WC", "projection", "pixel_centers"),
 }
 # What both have; what only a CameraConfig has; and the name that Drake gives one without.
 _SHARED = {*_COMMON, "clipping_near"}
@@ -44,8 +46,9 @@ def load_cameras(path: str | Path) -> dict[str, Camera]:
     """Reads the cameras of a YAML file, in its order; CameraError names file, camera and field.
 
     A pinhole camera has `width height focal_x focal_y center_x center_y` [pixel, pixel centres at
-    integers] and `X_WC` (4 x 4) [m], and may have `projection: pinhole` and `clipping_near` [m]. A
-    parallel camera has `projection: parallel` and `pixels_per_metre` instead of focal lengths.
+    integers, or at i + 0.5 with `pixel_centers: drake`] and `X_WC` (4 x 4) [m], and may have
+    `projection: pinhole` and `clipping_near` [m]. A parallel camera has `projection: parallel` and
+    `pixels_per_metre` instead of focal lengths.
 
     A file of Drake's is known by its fields: a Scenario (``cameras:``, also below one name), a
     mapping of CameraConfigs, or a single one. Their principal points count from half a pixel less.
@@ -115,8 +118,7 @@ def dump_cameras(
     cameras: Mapping[str, Camera] | Iterable[Camera], links: Mapping[str, str] | None = None
 ) -> str:
     """The text of a camera file; links are those of CameraFile."""
-    listed = cameras.values() if isinstance(cameras, Mapping) else cameras
-    content = {camera.name: _write_camera(camera) for camera in listed}
+    content = {camera.name: _write_camera(camera) for camera in camera_tuple(cameras)}
     for name, link in (links or {}).items():
         content[name] |= {"link": link, "X_LC": content[name].pop("X_WC")}
     return yaml.safe_dump(content, sort_keys=False)
@@ -198,6 +200,15 @@ def _read_camera(name: str, entry: Any, path: Path) -> Camera:
     values: dict[str, Any] = {"name": name, "X_WC": entry.get(pose, np.eye(4))}
     values |= {field: entry[field] for field in required}
     check_pose(values["X_WC"], pose, where)
+    pixel_centers = entry.get("pixel_centers", "integers")
+    if pixel_centers not in ("integers", "drake"):
+        raise CameraError(
+            f"{where}: pixel_centers must be integers (OpenCV's, the default) or drake (at i + 0.5,"
+            f" as CameraInfo counts), not {pixel_centers!r}"
+        )
+    if pixel_centers == "drake":
+        for field in ("center_x", "center_y"):
+            values[field] = check_number(values[field], field, where) - HALF_PIXEL
     if "clipping_near" in entry:
         values["near"] = check_number(entry["clipping_near"], "clipping_near", where, positive=True)
     try:

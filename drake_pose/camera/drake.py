@@ -24,14 +24,11 @@ from pydrake.geometry import (
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.sensors import CameraConfig, CameraInfo
 
-from drake_pose.camera.models import Camera, PinholeCamera, write_file
+from drake_pose.camera.models import HALF_PIXEL, Camera, PinholeCamera, camera_tuple, write_file
 from drake_pose.errors import CameraError
 
 # What yaml_load_typed raises, and some values of CameraConfig end a process that does not ask.
 _BAD_CONFIG = (RuntimeError, ValueError, TypeError, KeyError, AttributeError, SystemExit)
-
-HALF_PIXEL = 0.5
-"""What Drake's principal point has more than ours [pixel]."""
 
 _FARTHEST = 1000.0
 _PARALLEL_DEPTHS = (-2.0, 2.0)
@@ -211,9 +208,8 @@ def dump_scenario(cameras: Mapping[str, Camera] | Iterable[Camera]) -> str:
 
     Raises CameraError: a parallel camera, or one whose principal point lies outside its picture.
     """
-    listed = cameras.values() if isinstance(cameras, Mapping) else cameras
     content = {}
-    for camera in listed:
+    for camera in camera_tuple(cameras):
         config = camera_to_config(camera)
         content[camera.name] = yaml_load(
             data=yaml_dump_typed(config, schema=CameraConfig, defaults=CameraConfig())

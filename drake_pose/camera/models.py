@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -52,12 +52,13 @@ def check_number(value: Any, field: str, where: str, *, positive: bool = False) 
 
 
 def check_pose(value: Any, field: str, where: str) -> np.ndarray:
-    """A rigid transform as a read-only (4, 4) float64 array.
+    """A rigid transform, Drake's or a matrix, as a read-only (4, 4) float64 array.
 
     A rounded rotation is replaced by the nearest exact one, on which Drake insists.
 
     Raises CameraError: not a finite 4 x 4 matrix, a last row that is not 0 0 0 1, or no rotation.
     """
+    value = value.GetAsMatrix4() if hasattr(value, "GetAsMatrix4") else value
     rows = value.tolist() if isinstance(value, np.ndarray) else value
     if not (
         isinstance(rows, list | tuple)
@@ -157,7 +158,8 @@ class PinholeCamera(_PosedCamera):
     Args:
         width, height, focal_x, focal_y: [pixel].
         center_x, center_y: the principal point [pixel], pixel centres at integers.
-        X_WC: (4, 4) the camera's pose in the world, x right, y down, z forward [m]; read-only.
+        X_WC: the camera's pose in the world, x right, y down, z forward [m]: a RigidTransform or a
+            matrix (4, 4), which it is kept as, read-only.
         near: the nearest visible depth [m].
 
     Raises CameraError: a parameter is not finite or out of its range, or X_WC is no rigid
@@ -231,8 +233,16 @@ class ParallelCamera(_PosedCamera):
         return np.array([*projection, self.width, self.height], dtype=np.float64)
 
 
+HALF_PIXEL = 0.5
+"""What Drake's principal point has more than ours [pixel]."""
+
 Camera = PinholeCamera | ParallelCamera
 """A camera of either kind."""
+
+
+def camera_tuple(cameras: Mapping[str, Camera] | Iterable[Camera]) -> tuple[Camera, ...]:
+    """Cameras in their order, by name as ``load_cameras`` gives them or one after another."""
+    return tuple(cameras.values() if isinstance(cameras, Mapping) else cameras)
 
 
 def inverse_pose(X_AB: np.ndarray) -> np.ndarray:

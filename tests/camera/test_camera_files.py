@@ -44,9 +44,17 @@ def test_projection_may_be_spelled_out(tmp_path: Path) -> None:
     assert camera.pixels_per_metre == 100.0
 
 
+def test_principal_points_may_be_counted_as_drake_does(tmp_path: Path) -> None:
+    for kind in ("focal_x: 60, focal_y: 61", "projection: parallel, pixels_per_metre: 9"):
+        text = f"{{{kind}, pixel_centers: drake, {SIDES}, X_WC: {EYE}}}"
+        camera = load_cameras(write(tmp_path, f"cam: {text}"))["cam"]
+        assert (camera.center_x, camera.center_y) == (31.0, 23.0)
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
+        (f"cam: {{{GOOD[1:-1]}, pixel_centers: middle}}", "'cam'.*integers.*drake.*'middle'"),
         ("", "mapping from camera names"),
         ("[1, 2]", "mapping from camera names"),
         ("cam: 3", "'cam'.*mapping from field names"),

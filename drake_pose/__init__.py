@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     )
     from drake_pose.systems.estimators.truncated_ekf import TruncatedEkf
     from drake_pose.systems.person.person_tracker import PersonTracker
+    from drake_pose.systems.pictures.camera_rig import cameras_from_drake
     from drake_pose.systems.pictures.silhouette_camera import SilhouetteCamera
 
 __version__ = VERSION
@@ -69,6 +70,7 @@ _HOMES = {
     "build_pose_tree": "body.tree.tree_builder",
     "bundled_model": "body.formats.packages",
     "camera_from_drake": "camera.drake",
+    "cameras_from_drake": "systems.pictures.camera_rig",
     "estimate_scene": "jobs.estimate.scene",
     "load_cameras": "camera.camera_files",
     "load_model": "body.model",

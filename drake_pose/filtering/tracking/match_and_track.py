@@ -104,7 +104,8 @@ class MatchAndTrack:
             root_position: (3,) where the root is known to be now [m].
             pictures: (H, W, 3 or 4) by camera; the colours along the contour stand in where a
                 camera has no mask.
-            start: (nq,) about where the body is now, if it is known: the search is not asked.
+            start: (nq,) about where the body is now, if it is known: the search is asked only where
+                masks contradict it.
 
         Returns:
             What is known now, and the pose. ``stopped_by`` is TRACKED where it was tracked. Where
@@ -129,17 +130,26 @@ class MatchAndTrack:
             if not self._is_lost(*tracked, last.reference, bool(views)):
                 return Followed(track, last.reference, last.matches), tracked[1]
         if start is not None:
-            return self._begin(start, last, frame)
+            begun = self._begin(start, last, frame)
+            # A start that the masks contradict is no better than none.
+            if begun[1].found or not views:
+                return begun
         if not views:
             return self._go_on(last, tracked, frame)
-        matched = self._search.match(views, root_position)
+        return self._match(last, tracked, frame)
+
+    def _match(
+        self, last: Followed, tracked: tuple[Track, PoseEstimate] | None, frame: _Frame
+    ) -> tuple[Followed, PoseEstimate]:
+        """The best of what was tracked, if anything, and of what the search finds."""
+        matched = self._search.match(frame.views, frame.root_position)
         found = [] if tracked is None else [tracked]
         if matched.found:
-            x = observation.state(matched.q, matched.X_WB, matched.scale)
+            x = frame.observation.state(matched.q, matched.X_WB, matched.scale)
             if last.track is not None:
                 # A search does not know how often an angle has turned round.
-                x = observation.continued(x, last.track.state.best.mean)
-                matched = self._turned(matched, observation.node_values(x))
+                x = frame.observation.continued(x, last.track.state.best.mean)
+                matched = self._turned(matched, frame.observation.node_values(x))
             first = self.tracker.start(x)
             followed = self._follow(first, frame, True)
             found += [(followed, self._result(followed, frame)), (first, matched)]
@@ -156,7 +166,8 @@ class MatchAndTrack:
         track = self._follow(self.tracker.start(x), frame, True)
         result = self._result(track, frame)
         reference = result.E_total if frame.views else UNEXPLAINED
-        return Followed(track, reference, last.matches), replace(result, found=not track.lost)
+        found = not self._is_lost(track, result, reference, bool(frame.views))
+        return Followed(track, reference, last.matches), replace(result, found=found)
 
     def _go_on(
         self, last: Followed, tracked: tuple[Track, PoseEstimate] | None, frame: _Frame

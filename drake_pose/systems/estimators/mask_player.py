@@ -8,7 +8,7 @@ import numpy as np
 from pydrake.systems.sensors import ImageLabel16I, ImageRgba8U
 
 from drake_pose.arrays import Array
-from drake_pose.camera.models import Camera
+from drake_pose.camera.models import Camera, camera_tuple
 from drake_pose.silhouette.pictures.label_images import mask_to_label_image
 from drake_pose.silhouette.pictures.scenes import Scene
 from drake_pose.systems.colour_images import picture_to_colour_image
@@ -48,13 +48,14 @@ class MaskPlayer(PortedSystem):
     def __init__(
         self,
         scene: Scene,
-        cameras: Sequence[Camera],
+        cameras: Sequence[Camera] | Mapping[str, Camera],
         frames: Sequence[str] | None = None,
         period: float | None = None,
         positions: Mapping[str, Array] | None = None,
         root_positions: Mapping[str, Array] | None = None,
     ) -> None:
         super().__init__()
+        cameras = camera_tuple(cameras)
         self._scene = scene
         self.frames = tuple(scene.frames if frames is None else frames)
         rate = scene.frame_rate_hz or DEFAULT_FRAME_RATE_HZ

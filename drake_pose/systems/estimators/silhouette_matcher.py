@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -13,7 +13,7 @@ from pydrake.systems.framework import Context
 from pydrake.systems.sensors import ImageLabel16I
 
 from drake_pose.arrays import Array
-from drake_pose.camera.models import Camera
+from drake_pose.camera.models import Camera, camera_tuple
 from drake_pose.errors import SettingsError
 from drake_pose.filtering.tracking.contour_tracker import TrackingSettings
 from drake_pose.filtering.tracking.match_and_track import Followed, MatchAndTrack
@@ -82,14 +82,15 @@ class SilhouetteMatcher(BeliefSystem[Matched]):
     first, one after another. All are NaN where the search does not say, as one without examination.
 
     Args:
-        cameras: the calibrated cameras, in the order of the input ports.
+        cameras: the calibrated cameras, in the order of the input ports, or by name.
         period, offset: time between two matches, and of the first one [s].
-        labels: the labels that belong to the body; None: all that are not reserved.
+        labels: the labels that belong to the body; None: those of its model where that was made of
+            a plant (``ArticulatedModel.from_plant``), else all that are not reserved.
         family_limit: how many families are given out at most.
 
     Raises:
-        SettingsError: if there is no camera, two cameras share a name, the period is not positive,
-            or the family limit is below 1.
+        SettingsError: if there is no search or no camera, two cameras share a name, the period is
+            not positive, or the family limit is below 1.
     """
 
     _first_memory: Any = None
@@ -98,18 +99,24 @@ class SilhouetteMatcher(BeliefSystem[Matched]):
     def __init__(
         self,
         search: PoseSearch,
-        cameras: Sequence[Camera],
+        cameras: Sequence[Camera] | Mapping[str, Camera],
         period: float,
         offset: float = 0.0,
         labels: Collection[int] | None = None,
         family_limit: int = 4,
     ) -> None:
         super().__init__()
+        if not hasattr(search, "match"):
+            raise SettingsError(
+                f"a matcher needs a search, as MultiStartSearch(tree): {type(search).__name__}"
+            )
+        cameras = camera_tuple(cameras)
         require_different(cameras, 1, "a matcher needs one or more cameras of different names")
         require_period("matcher", period)
         if family_limit < 1:
             raise SettingsError(f"the family limit must be 1 or more, not {family_limit}")
-        self._search, self._cameras, self._family_limit = search, tuple(cameras), family_limit
+        self._search, self._cameras, self._family_limit = search, cameras, family_limit
+        labels = search.tree.model.labels if labels is None else labels
         self._labels = None if labels is None else frozenset(labels)
         known = {camera.name: camera for camera in cameras}
         self._images = self.add_camera_inputs(
@@ -210,7 +217,7 @@ class SilhouetteTracker(SilhouetteMatcher):
 
         name: SilhouetteTracker
         input_ports: [label_image, root_position (optional), measured_positions (optional),
-          color_image (where asked for)]
+          first_positions (optional), color_image (where asked for)]
         output_ports: [estimated_positions, error, base_pose, body_poses, statistics,
           proved_optimal, determined, lower, upper, family_positions, pose_estimate,
           position_deviations, estimated_state, track]
@@ -221,8 +228,10 @@ class SilhouetteTracker(SilhouetteMatcher):
       named in ``color_cameras``: an ``ImageRgba8U``. The colours along the body's contour stand in
       where there is no label image, or one without any pixel of the body. So a label image of the
       first frame will do; or none, where measured positions say where the body is at first.
-    - ``measured_positions`` (nq): about where the body is, of encoders for example. The track
-      begins there, and again after a loss; the search is not asked. NaN: it is not known now.
+    - ``measured_positions`` (nq): about where the body is now, of encoders for example. The track
+      begins there, and again after a loss; the search is asked only where the masks contradict it.
+      NaN: it is not known now.
+    - ``first_positions`` (nq): about where the body is in the first image; ignored afterwards.
     - ``position_deviations`` (nq): the standard deviation of each position [rad or m]; NaN where a
       position is no part of what is tracked (held, or solved from the root's pose).
     - ``estimated_state`` (nq + nv): the estimated positions, then the plant's velocities [rad/s or
@@ -249,7 +258,7 @@ class SilhouetteTracker(SilhouetteMatcher):
     def __init__(
         self,
         search: PoseSearch,
-        cameras: Sequence[Camera],
+        cameras: Sequence[Camera] | Mapping[str, Camera],
         period: float,
         offset: float = 0.0,
         labels: Collection[int] | None = None,
@@ -257,6 +266,7 @@ class SilhouetteTracker(SilhouetteMatcher):
         color_cameras: Collection[str] = (),
     ) -> None:
         super().__init__(search, cameras, period, offset, labels)
+        cameras = self._cameras
         self._follower = MatchAndTrack(search, cameras, period, tracking)
         self._period, self._layout = period, self._follower.tracker.filter.layout
         model = search.tree.model
@@ -267,6 +277,7 @@ class SilhouetteTracker(SilhouetteMatcher):
             for some in (self._layout.moving, self._layout.constant)
         )
         self.add_input("measured_positions", nq)
+        self.add_input("first_positions", nq)
         self._colours = ColourPorts(
             self, cameras, color_cameras, lambda one: camera_port("color_image", one, cameras)
         )
@@ -281,10 +292,10 @@ class SilhouetteTracker(SilhouetteMatcher):
         if not views and not pictures:
             return None, memory
         require_time_forward(self, context, memory.time)
-        start = self.given(context, "measured_positions")
-        if start is not None and not np.all(np.isfinite(start)):
-            start = None
         last, root_position = memory.followed, self.given(context, "root_position")
+        ports = ["measured_positions", *(["first_positions"] if last.track is None else [])]
+        starts = (self.given(context, port) for port in ports)
+        start = next((q for q in starts if q is not None and np.isfinite(q).all()), None)
         now, result = self._follower.next(last, views, root_position, pictures, start)
         is_tracked = result.stopped_by == TRACKED and now.matches == last.matches
         measurement = None if now.track is None else now.track.measurement

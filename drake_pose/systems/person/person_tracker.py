@@ -11,7 +11,7 @@ from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context
 
 from drake_pose.arrays import Array
-from drake_pose.camera.models import Camera
+from drake_pose.camera.models import Camera, camera_tuple
 from drake_pose.fit.colour_lines import COLOURS
 from drake_pose.fit.contour_fit import inlier_ratio_of
 from drake_pose.person.pose_tracker import PersonPoseTracker, TrackState
@@ -75,15 +75,16 @@ class PersonTracker(MemorySystem):
     def __init__(
         self,
         tracker: PersonPoseTracker,
-        cameras: Sequence[Camera],
+        cameras: Sequence[Camera] | Mapping[str, Camera],
         period: float,
         with_deviations: bool = False,
         color_cameras: Collection[str] = (),
     ) -> None:
         super().__init__()
+        cameras = camera_tuple(cameras)
         require_different(cameras, 2, "a person is tracked by two or more different cameras")
         require_period("tracker", period)
-        self._tracker, self._cameras = tracker, tuple(cameras)
+        self._tracker, self._cameras = tracker, cameras
         self._with_deviations = with_deviations
         self._views = self.add_camera_inputs({c.name: f"silhouette_{c.name}" for c in cameras})
         self.add_input("time", 1)

@@ -1,12 +1,15 @@
-"""Several cameras around a moving body, as RgbdSensors in a ready diagram."""
+"""Several cameras around a moving body, as RgbdSensors in a ready diagram, or in yours."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
-from pydrake.geometry import MakeRenderEngineVtk, RenderEngineVtkParams, SceneGraph
+from pydrake.geometry import FrameId, MakeRenderEngineVtk, RenderEngineVtkParams, SceneGraph
+from pydrake.math import RigidTransform
+from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPort, System
 from pydrake.systems.primitives import PassThrough, TrajectorySource
 from pydrake.systems.sensors import RgbdSensor
@@ -14,7 +17,7 @@ from pydrake.trajectories import Trajectory
 
 from drake_pose.arrays import Array, Mask, Picture
 from drake_pose.body.parsed_model import ParsedModel
-from drake_pose.camera.drake import camera_to_drake
+from drake_pose.camera.drake import camera_from_drake, camera_to_drake
 from drake_pose.camera.models import Camera, PinholeCamera
 from drake_pose.errors import CameraError, UnknownNameError
 from drake_pose.silhouette.pictures.label_images import label_image_to_mask
@@ -24,6 +27,8 @@ from drake_pose.systems.colour_images import colour_image_to_picture
 _RENDERER = "rig_renderer"
 # What 16 bits of millimetres can hold; nothing of a room is farther away [m].
 _FARTHEST = 60.0
+
+_System = TypeVar("_System", bound=System)
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,3 +128,65 @@ def add_sensors(
         sensors[name] = builder.AddNamedSystem(f"camera_{name}", sensor)
         builder.Connect(scene_graph.get_query_output_port(), sensor.query_object_input_port())
     return sensors
+
+
+def cameras_from_drake(
+    diagram: Diagram | DiagramBuilder, names: Collection[str] | None = None
+) -> dict[str, PinholeCamera]:
+    """The cameras of the RgbdSensors in a diagram, by the systems' names, at their default poses.
+
+    A Scenario's cameras (``rgbd_sensor_<name>``) have the name that they have there.
+
+    Args:
+        diagram: looked through with all diagrams in it; or the builder of one.
+        names: the cameras to take; None: all.
+
+    Raises:
+        CameraError: there is none, or one rides on a link that moves, so that it is nowhere fixed.
+        UnknownNameError: there is no camera of a name.
+    """
+    found = {
+        sensor.get_name().removeprefix("rgbd_sensor_"): sensor
+        for sensor in _systems_of(diagram, RgbdSensor)
+    }
+    if not found:
+        raise CameraError("there is no RgbdSensor in the diagram whose cameras were asked for")
+    for name in names or ():
+        if name not in found:
+            raise UnknownNameError("camera", name, found, "the diagram")
+    plants = _systems_of(diagram, MultibodyPlant)
+    cameras = {}
+    for name in found if names is None else names:
+        sensor = found[name]
+        X_WP = _fixed_pose(plants, sensor.default_parent_frame_id(), name)
+        core = sensor.default_color_render_camera().core()
+        cameras[name] = camera_from_drake(name, core, X_WP @ sensor.default_X_PB())
+    return cameras
+
+
+def _systems_of(diagram: Diagram | DiagramBuilder, kind: type[_System]) -> list[_System]:
+    """All systems of a kind in a diagram and in those inside it."""
+    found: list[_System] = []
+    for system in diagram.GetSystems():
+        if isinstance(system, kind):
+            found.append(system)
+        elif isinstance(system, Diagram):
+            found += _systems_of(system, kind)
+    return found
+
+
+def _fixed_pose(plants: Sequence[MultibodyPlant], frame: FrameId, camera: str) -> RigidTransform:
+    """Where a frame is in the world, if it cannot move; CameraError: it can."""
+    if frame == SceneGraph.world_frame_id():
+        return RigidTransform()
+    for plant in plants:
+        body = plant.GetBodyFromFrameId(frame)
+        if body is None:
+            continue
+        if body not in plant.GetBodiesWeldedTo(plant.world_body()):
+            raise CameraError(
+                f"camera '{camera}' rides on link '{body.name()}', which moves, so that it stands "
+                "elsewhere at each time; names=[...] leaves it out"
+            )
+        return plant.EvalBodyPoseInWorld(plant.CreateDefaultContext(), body)
+    raise CameraError(f"camera '{camera}' rides on a frame of no plant in the diagram")

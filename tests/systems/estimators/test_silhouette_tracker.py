@@ -135,7 +135,7 @@ def room(scene_graph, folder):
 
 
 def test_colour_images_of_a_sensor_are_enough(body, search, tmp_path):
-    """In one diagram: RgbdSensors' colour images; measured positions in the first frame alone."""
+    """In one diagram: RgbdSensors' colour images, and where the body is in the first of them."""
     truth = motion()[:12]
     camera = pinhole("front", 3.0, side=480, focal=1000.0, height=0.05)
     builder = DiagramBuilder()
@@ -147,8 +147,8 @@ def test_colour_images_of_a_sensor_are_enough(body, search, tmp_path):
     )
     sensor = builder.GetSubsystemByName("camera_front")
     builder.Connect(sensor.color_image_output_port(), tracker.GetInputPort("color_image"))
-    builder.ExportInput(tracker.GetInputPort("measured_positions"), "measured")
-    errors, deviations, track = followed(builder.Build(), tracker, truth, measured=truth[0])
+    builder.ExportInput(tracker.GetInputPort("first_positions"), "first")
+    errors, deviations, track = followed(builder.Build(), tracker, truth, first=truth[0])
     np.testing.assert_array_equal(track["matches"], 0.0)
     np.testing.assert_array_equal(track["tracked"][1:], 1.0)
     assert np.degrees(np.median(np.abs(errors).max(axis=1))) < 2.0
@@ -168,6 +168,15 @@ def test_a_covered_lens_loses_the_track_and_a_measured_position_brings_it_back(b
     assert found == [True, False, True]
     # Nobody asked the search, for which there was no mask.
     assert run["track"][TRACK.index("matches")] == 0
+
+
+def test_measured_positions_that_masks_contradict_are_not_believed(body, search):
+    camera = front_camera(200, shift=0.2)
+    run, truth = Bench(SilhouetteTracker(search, [camera], PERIOD)), motion()[0]
+    image = mask_to_label_image(LabelRenderer(body, camera).mask(truth))
+    run.update(label_image=image, measured_positions=truth + 1.5)
+    assert run["error"][0] < 0.1
+    assert run["track"][TRACK.index("matches")] == 1
 
 
 def test_a_color_camera_that_is_none_is_named(search):

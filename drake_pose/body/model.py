@@ -66,14 +66,15 @@ class ArticulatedModel(ParsedModel):
         Args:
             root: the link to start from; None for the one nearest to the plant's world.
             root_position: (3,) where the origin of that link's frame is in the world [m].
-            root_rotation: how that link may be turned; None for the base joint's own limits, or
-                free where the link floats or the tree is turned over.
+            root_rotation: how that link may be turned; None for the base joint's own limits, as it
+                stands at the default positions where it floats, or free where the tree is turned
+                over.
             held: positions that are not searched, by name, with their value [rad or m].
 
         Raises:
             UnknownNameError: no such link or joint.
             ModelError: the link has no geometry, or the file's joints allow no pose tree.
-            SettingsError: a position or value that is not finite, or that is missing.
+            SettingsError: a position or value that is not finite or missing; or held beyond limits.
         """
         return build_pose_tree(self, root, root_position, root_rotation, held)
 

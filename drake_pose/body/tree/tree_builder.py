@@ -20,6 +20,8 @@ from drake_pose.body.tree.pose_tree import NodePlacement, PoseTree, PoseTreeNode
 from drake_pose.body.tree.root import BasePose, RootRotation, base_of_chain
 from drake_pose.errors import ModelError, SettingsError, UnknownNameError
 
+# Held values may lie outside their limits by this much [rad or m].
+_ROUNDING = 1e-6
 Roots = dict[int, tuple[Array, RootRotation | None]]
 """By branch that hangs on the world: X_WA (4, 4), and how it is turned there."""
 
@@ -54,6 +56,14 @@ def build_pose_tree(
     for name, value in held.items():
         if not np.isfinite(value):
             raise SettingsError(f"held joint '{name}' has the value {value}: give a finite number")
+    for index, value in held_values.items():
+        lower, upper = model.lower[index], model.upper[index]
+        inside = lower - _ROUNDING <= value <= upper + _ROUNDING
+        if not inside and not model.turns_freely[index]:
+            raise SettingsError(
+                f"joint '{model.position_names[index]}' is held at {value:g}, outside its limits, "
+                f"{lower:g} to {upper:g} [rad or m]"
+            )
     position = None if root_position is None else _checked_position(root_position)
     graph = build_link_graph(model, root)
     if root is not None and not graph.seen(graph.group_of(root)):
@@ -63,6 +73,10 @@ def build_pose_tree(
         )
     start = _choose_root(model, graph, root, root_rotation)
     rotation = root_rotation or RootRotation.free()
+    if start is not None and start[1] and root_rotation is None:
+        # What no joint holds stands as the file has it, unless its turns are asked for.
+        X_WR = PlantKinematics(model).pose(graph.groups[start[0]].body)
+        rotation = RootRotation.fixed(X_WR[:3, :3])
 
     def build(p_WR: Array | None) -> PoseTree:
         if start is None:

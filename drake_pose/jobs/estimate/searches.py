@@ -81,16 +81,10 @@ def make_placement_search(
 def make_tree(
     model: ArticulatedModel, settings: EstimateSettings, position: np.ndarray | None = None
 ) -> PoseTree:
-    """The pose tree, its root placed as the settings say.
-
-    A model without a joint in the world stays in place unless a root or rotation is asked for.
-    """
+    """The pose tree, its root placed as the settings say."""
     held = _in_plant_units(model, settings.hold)
     root, turns = settings.root, settings.root_rotation
     own = model.pose_tree(root_position=position, held=held)
-    floats = any(node.value_names != node.position_names for node in own.nodes)
-    if turns is None and floats and root in (None, own.root):
-        turns = "fixed"
     if turns is None:
         return own if root is None else model.pose_tree(root, root_position=position, held=held)
     root = root or own.root

@@ -108,11 +108,15 @@ def test_every_tree_agrees_with_drake(models, name, root, kind):
 
 
 def test_a_tree_without_a_place_hangs_where_the_file_says(models):
-    parents = {"welded": [-1, 0, 1], "all_joints": [-1, 0, 1, 2, 3, 4]}
+    parents = {
+        "floating": [-1, 0, 0, 1],
+        "welded": [-1, 0, 1],
+        "all_joints": [-1, 0, 1, 2, 3, 4],
+    }
     for name, wanted in parents.items():
         tree = models[name].pose_tree()
         assert [node.parent for node in tree.nodes] == wanted
-        assert tree.nodes[0].positions == ()
+        assert tree.nodes[0].value_names == ()
         assert largest_difference_from_drake(models[name], tree) < 1e-9
     assert [len(node.positions) for node in tree.nodes] == [0, 2, 3, 1, 1, 1]
 
@@ -266,6 +270,8 @@ def test_bad_arguments_name_what_exists(models):
         floating.pose_tree(root_position=[0, 0, np.nan])
     with pytest.raises(SettingsError, match="finite number"):
         floating.pose_tree(held={"slide": np.inf})
+    with pytest.raises(SettingsError, match=r"'slide' is held at 0\.4, outside its limits, -0\.2"):
+        floating.pose_tree(held={"slide": 0.4})
     with pytest.raises(SettingsError, match="cannot be held"):
         jointed.pose_tree("arm", root_position=[0, 0, 0], held={"head_y": 0.0})
     tree = floating.pose_tree()

@@ -113,7 +113,10 @@ class BeamSearchSettings(GridSettings):
     """Parameters of the beam search.
 
     Args:
-        stages: the passes, one after another until J = 0.
+        tolerance: a pose whose silhouettes differ by no more [pixel] counts as exact, and all of
+            them are looked for before the stages; None: what two renderers differ by
+            (``renderer_tolerance``).
+        stages: the passes, one after another until J is within the tolerance.
         research_hypotheses: kept while limbs of the winner are searched again; 0: they are not.
         time_limit: the search returns its best pose so far after this time [s]; None: no limit.
 
@@ -121,6 +124,7 @@ class BeamSearchSettings(GridSettings):
         SettingsError: if a value is out of its range.
     """
 
+    tolerance: float | None = None
     stages: tuple[Stage, ...] = EXACT_STAGES + TOLERANT_STAGES
     research_hypotheses: int = 30
     time_limit: float | None = None

@@ -16,17 +16,21 @@ from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.errors import SettingsError
 from drake_pose.search.estimates import PoseEstimate, SearchStatistics, View
 from drake_pose.search.grid.beam_stages import run_stage, search_limbs_again, turn_single_nodes
+from drake_pose.search.grid.branch_and_bound import PosesWithin, branch_and_bound
 from drake_pose.search.grid.distinct_poses import choose_distinct
 from drake_pose.search.grid.examination import ExaminationSettings, examine
 from drake_pose.search.grid.node_poses import BAND, Pictures, PoseStore, coarsen
 from drake_pose.search.grid.partial_poses import Expansion, PartialPoses
+from drake_pose.search.grid.pose_families import renderer_tolerance
 from drake_pose.search.grid.sampled_body import SampledBody
 from drake_pose.search.scoring import Scoring
-from drake_pose.search.settings import BeamSearchSettings, Stage
+from drake_pose.search.settings import BeamSearchSettings, BoundLimits, Stage
 
 # Stages that let something lie outside see the silhouettes no finer than with about so many pixels;
 # the best pose is then judged in full.
 _COARSE_PIXELS = 6000
+# The search for all poses within the tolerance ends after drawing so many poses of nodes.
+_POSES = 1_000_000
 
 
 class BeamSearch:
@@ -48,7 +52,8 @@ class BeamSearch:
         """Estimate the pose that the views show; see ``PoseSearch``.
 
         Returns:
-            The best pose found; ``stopped_by`` is "exact" (J = 0), "end" or "time_limit".
+            The best pose found; ``stopped_by`` is "exact" (J is within the tolerance), "end" or
+            "time_limit".
 
         Raises:
             SettingsError: if there is no view.
@@ -58,7 +63,7 @@ class BeamSearch:
         run.search()
         result = run.result()
         if self.examination is not None:
-            result = examine(self.body, views, result, self.examination, root_position)
+            result = examine(self.body, views, result, self.examination, root_position, run.within)
         return replace(result, seconds=time.perf_counter() - start)
 
     def without_alternatives(self) -> "BeamSearch":
@@ -113,6 +118,8 @@ class _Run:
         self._deadline = np.inf if limit is None else time.perf_counter() + limit
         self._body = body if root_position is None else body.with_root_position(root_position)
         self._views, self._settings, self._gathers = views, settings, gathers
+        given = settings.tolerance
+        self._tolerance = renderer_tolerance(views) if given is None else given
         self.scoring = Scoring(self._body.sampled, views)
         self._gathered: list[tuple[np.ndarray, np.ndarray]] = []
         self._pictures: dict[bool, Pictures] = {}
@@ -120,16 +127,21 @@ class _Run:
         self._samples: np.ndarray | None = None
         self._J, self._first_J = np.inf, np.nan
         self._runs, self._stopped_by = 0, ""
+        # All poses within the tolerance, where there are any.
+        self.within: PosesWithin | None = None
 
     def search(self) -> None:
         """Run stage after stage until J = 0 or a limit is reached; then polish the answer."""
+        if self._tolerance > 0.0 and not self._gathers and self._search_within():
+            self._stopped_by = "exact"
+            return
         skip_exact = False
         for stage in self._settings.stages:
             exact = stage.outside_share == 0.0
             if exact and skip_exact:
                 continue
             complete = self._run_stage(self._expansion(stage.outside_share), stage)
-            if self._stopped_by or (self._J == 0 and not (self._gathers and exact)):
+            if self._stopped_by or (self._J <= self._tolerance and not (self._gathers and exact)):
                 break
             skip_exact = skip_exact or complete or self._J == 0
         if self._samples is None:
@@ -147,7 +159,19 @@ class _Run:
             self._keep_if_better(
                 turn_single_nodes(self.scoring, pictures, self._samples, self._proceed)
             )
-        self._stopped_by = "exact" if self._J == 0 else self._stopped_by or "end"
+        exact = self._J <= self._tolerance
+        self._stopped_by = "exact" if exact else self._stopped_by or "end"
+
+    def _search_within(self) -> bool:
+        """Look for all poses within the tolerance, and keep the best; whether there is one."""
+        left = self._deadline - time.perf_counter()
+        limits = BoundLimits(poses=_POSES, time_limit=max(left, 0.0) if left < np.inf else None)
+        found = branch_and_bound(self._body, self._views, self._tolerance, limits)
+        if not found.graph.size:
+            return False
+        self.within = found
+        self._keep_if_better(found.graph.central())
+        return True
 
     def pictures(self, exact: bool) -> Pictures:
         """The silhouettes as bits: coarse ones with a band for stages that are not exact."""

@@ -35,12 +35,14 @@ class PosesWithin:
     """What a branch and bound found.
 
     Attributes:
+        J_limit: the limit [pixel].
         graph: the poses; every one is within the limit.
         complete: whether it holds all poses within the limit.
         limited: whether a limit of the search left some out.
         lower_bound: no pose of the grid that is not in the graph has a smaller objective [pixel].
     """
 
+    J_limit: float
     graph: PartialPoseGraph
     complete: bool
     limited: bool
@@ -103,13 +105,13 @@ class _BranchAndBound:
                 nothing = np.zeros(0, dtype=np.int64)
                 layers = [Layer(i, nothing, nothing, nothing) for i in range(len(self.nodes))]
                 graph = PartialPoseGraph(layers, np.zeros(0))
-                return PosesWithin(graph, False, True, bound)
+                return PosesWithin(self.J_limit, graph, False, True, bound)
         # All nodes are placed: the bounds are the objectives, but for what is beyond the bands.
         highs = partial.bounds + partial.far[:, 1] - partial.far[:, 0]
         graph = PartialPoseGraph(self._layers, highs).up_to(self.J_limit)
         self._drop(partial.bounds[highs > self.J_limit])
         bound = min(self._lower_bound, float(np.floor(self.J_limit)) + 1.0)
-        return PosesWithin(graph, self._complete, self._limited, bound)
+        return PosesWithin(self.J_limit, graph, self._complete, self._limited, bound)
 
     def _drop(self, bounds: np.ndarray, limited: bool = False) -> None:
         """Note that partial poses with these bounds are dropped though they might lead to poses."""

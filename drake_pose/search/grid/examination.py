@@ -11,7 +11,7 @@ import numpy as np
 
 from drake_pose.errors import SettingsError
 from drake_pose.search.estimates import PoseEstimate, View
-from drake_pose.search.grid.branch_and_bound import branch_and_bound
+from drake_pose.search.grid.branch_and_bound import PosesWithin, branch_and_bound
 from drake_pose.search.grid.pose_families import find_families, samples_at
 from drake_pose.search.grid.sampled_body import SampledBody
 from drake_pose.search.settings import BoundLimits
@@ -64,8 +64,11 @@ def examine(
     result: PoseEstimate,
     settings: ExaminationSettings,
     root_position: np.ndarray | None = None,
+    within: PosesWithin | None = None,
 ) -> PoseEstimate:
     """The result, or a better pose, with ``lower_bound``, ``budget_spent`` and ``pose_set``.
+
+    ``within``: all poses within a tolerance of exactness, where the search has found them.
 
     Raises:
         SettingsError: if the result is not of the body's grid.
@@ -78,14 +81,15 @@ def examine(
     if samples is None:
         raise SettingsError("the pose to be examined is not on the body's sampling grid")
     J, lower_bound, spent = result.J, 0.0, result.J > 0.0
-    if J > 0.0 and settings.proof_time_limit != 0.0:
+    if within is None and J > 0.0 and settings.proof_time_limit != 0.0:
         better = branch_and_bound(body, views, J - 1.0, settings.limits("proof"))
         if better.graph.best_J < J:
             J, samples = better.graph.best_J, better.graph.central()
         lower_bound, spent = J if better.complete else better.lower_bound, better.limited
     answer = find_families(
-        body, views, samples, J, settings.tolerance, settings.families, settings.limits("family")
-    )
+        body, views, samples, J, settings.tolerance, settings.families, settings.limits("family"),
+        within if settings.tolerance is None else None,
+    )  # fmt: skip
     best = answer.families[0]
     J = min(J, best.J)
     if J < result.J:

@@ -7,11 +7,14 @@ import pytest
 
 from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.body.tree.root import RootRotation
-from drake_pose.camera.models import ParallelCamera
+from drake_pose.camera.models import ParallelCamera, PinholeCamera
 from drake_pose.errors import SettingsError
+from drake_pose.search.estimates import View
 from drake_pose.search.grid.beam_search import BeamSearch
-from drake_pose.search.grid.pose_families import samples_at
+from drake_pose.search.grid.examination import ExaminationSettings
+from drake_pose.search.grid.pose_families import renderer_tolerance, samples_at
 from drake_pose.search.settings import BeamSearchSettings, Stage
+from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from tests.search.bodies import (
     box_link,
     front_camera,
@@ -115,3 +118,46 @@ def test_a_limit_still_answers_and_says_so(maker: ProblemMaker) -> None:
 def test_settings_out_of_range_are_refused(kind: type, values: dict[str, object]) -> None:
     with pytest.raises(SettingsError):
         kind(**values)
+
+
+@pytest.mark.parametrize("side", [60, 240, 480])
+def test_what_drake_draws_is_matched_within_what_renderers_differ_by(
+    tmp_path: Path, side: int
+) -> None:
+    """Label images of Drake's VTK renderer; the areas that are scored are drawn otherwise."""
+    model = swinging_chain(tmp_path, 4)
+    matcher = BeamSearch(
+        model.pose_tree(), BeamSearchSettings(interval=INTERVAL), ExaminationSettings()
+    )
+    eye = front_camera().X_WC
+    camera = PinholeCamera(
+        "front", side, side, 10.0 * side, 10.0 * side, 0.4 * side, 0.5 * side, eye
+    )
+    renderer, generator, differ = LabelRenderer(model, camera), np.random.default_rng(3), 0
+    for _ in range(8):
+        values = [grid[generator.integers(len(grid))] for grid in matcher.sampled.values]
+        view = View(camera, renderer.mask(np.concatenate(values)))
+        own = show_pose(matcher.sampled, values, camera)
+        apart = np.count_nonzero(own.mask != view.mask)
+        differ += apart > 0
+        assert apart <= renderer_tolerance([view])
+        result = matcher.match([view])
+        assert result.stopped_by == "exact"
+        assert result.J <= apart
+        assert result.lower_bound == result.J
+        assert result.pose_set is not None
+        assert result.pose_set.complete
+        assert result.pose_set.contains(values)
+    assert differ or side < 480
+
+
+def test_without_a_tolerance_only_equal_pixels_are_exact(tmp_path: Path) -> None:
+    matcher = search(swinging_chain(tmp_path, 3).pose_tree(), tolerance=0.0)
+    camera = front_camera(100, shift=0.137)
+    view = show_pose(matcher.sampled, [grid[1] for grid in matcher.sampled.values], camera)
+    assert matcher.match([view]).stopped_by == "exact"
+    view.mask[5, 5] = True
+    result = matcher.match([view])
+    assert result.stopped_by == "end"
+    assert result.J == 1.0
+    assert search(matcher.tree, tolerance=1.0).match([view]).stopped_by == "exact"

@@ -14,6 +14,7 @@ from drake_pose.search.grid.pose_families import (
     estimate_joints,
     find_families,
     grid_steps,
+    renderer_tolerance,
     samples_at,
 )
 from drake_pose.search.settings import BoundLimits
@@ -52,7 +53,7 @@ def test_towards_and_away_from_the_camera_are_two_families(flipping_body: Proble
     problem = flipping_body.show(values)
     answer = found_families(problem)
     assert answer.complete
-    assert answer.tolerance == 0.0
+    assert answer.tolerance == renderer_tolerance(problem.views)
     assert answer.contains(values)
     assert answer.family_count == 2
     assert [family.size for family in answer.families] == [7.0, 7.0]

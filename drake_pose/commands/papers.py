@@ -64,6 +64,9 @@ class KamedaOptions:
     edge_noise: Annotated[float | None, within(0.0, 0.9)] = None
     """With --edges: this share of them is missing, the others are a pixel off, and a quarter as
     many are wrong. Default: 0."""
+    renderer: Literal["drake", "own"] | None = None
+    """Who draws the silhouettes. drake: Drake's renderer, and they count as equal within what two
+    renderers differ by; own: the code that scores them, to the pixel. Default: drake."""
     out: Pictures = None
 
 
@@ -124,6 +127,7 @@ def _kameda_grid(images: int, options: KamedaOptions, json: bool) -> None:
         from drake_pose.search.scoring import PoseSearch
 
         interval, first = options.interval or 20.0, options.seed or 0
+        renderer = options.renderer or "drake"
         limit = 200.0 if options.outside_limit is None else options.outside_limit
         paper = (limit, options.candidates or 5, interval)
         searches: dict[str, PoseSearch] = {"paper_method": experiment_search(*paper)}
@@ -131,14 +135,16 @@ def _kameda_grid(images: int, options: KamedaOptions, json: bool) -> None:
             weighted = experiment_search(*paper, options.outside_weight)
             searches["outside_weight_method"] = weighted
         if options.method == "beam":
-            searches["beam"] = beam_experiment_search(interval)
+            searches["beam"] = beam_experiment_search(interval, renderer)
         results = {}
         for name, search in searches.items():
             # The paper's search beside ours makes no more than the paper's own images.
             fewer = options.method == "beam" and name != "beam"
             number = min(images, PAPER_IMAGES) if fewer else images
             seeds = range(first, first + (options.seeds or 1))
-            results[name] = [run_experiment(search, number, seed, count) for seed in seeds]
+            results[name] = [
+                run_experiment(search, number, seed, count, renderer=renderer) for seed in seeds
+            ]
         *beside, leading = results
         asked, settled = results[leading][0], {}
         if options.edges:
@@ -159,7 +165,10 @@ def _kameda_continuous(images: int, options: KamedaOptions, json: bool) -> None:
         from drake_pose.papers.kameda_figures import continuous_figures, continuous_table
 
         search, seed, views = continuous_search(), options.seed or 0, options.views or 1
-        results = {"the model itself": run_experiment(search, images, seed, count, views)}
+        own = run_experiment(
+            search, images, seed, count, views, renderer=options.renderer or "drake"
+        )
+        results = {"the model itself": own}
         figures = continuous_figures(results["the model itself"])
         if options.mismatch:
             other = run_experiment(search, images, seed, count, views, mismatch=True)

@@ -137,6 +137,23 @@ class HandObservation:
         return found
 
 
+def plant_positions(x: Array, names: tuple[str, ...], pixels_per_metre: float) -> Array:
+    """(nq,) positions of ``urdf/two_finger_hand`` for a state (n,) as in ``HAND_STATE``.
+
+    The palm's quaternion is normalised; its position is the wrist's pixel at scale 1, its depth 0.
+    """
+    value = dict(zip(HAND_STATE.names, x, strict=True))
+    quaternion = np.array([value[name] for name in QUATERNION])
+    value.update(zip(QUATERNION, quaternion / np.linalg.norm(quaternion), strict=True))
+    value["palm_x"] = value["wrist_x"] / pixels_per_metre
+    value["palm_y"] = value["wrist_y"] / pixels_per_metre
+    value["palm_z"] = 0.0
+    for i in FINGERS:
+        value[f"base_height_{i}"] = value["palm_height"]
+        value[f"base_side_{i}"] = 0.25 * value["palm_width"]
+    return np.array([value[name] for name in names])
+
+
 @compiled
 def scaled_rotation(q: Array) -> tuple[Array, Array]:
     """The matrix ``|q|^2 R(q)`` (3, 3) of a quaternion (w, x, y, z), and its derivatives (4, 3, 3).

@@ -6,9 +6,8 @@ from pydrake.multibody.plant import MultibodyPlant
 
 from drake_pose.body.formats.packages import bundled_model
 from drake_pose.errors import SettingsError
-from drake_pose.filtering.hand import HAND_STATE, HandObservation, scaled_rotation
+from drake_pose.filtering.hand import HAND_STATE, HandObservation, plant_positions, scaled_rotation
 from drake_pose.filtering.state import Belief
-from tests.filtering.hands import plant_positions
 
 OBSERVATION = HandObservation()
 

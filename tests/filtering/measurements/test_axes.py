@@ -15,6 +15,7 @@ from drake_pose.filtering.hand import (
     HAND_STATE,
     MEASURED,
     HandObservation,
+    plant_positions,
 )
 from drake_pose.filtering.kalman.update import make_evidence, update
 from drake_pose.filtering.measurements.axes import (
@@ -25,7 +26,6 @@ from drake_pose.filtering.measurements.axes import (
 from drake_pose.filtering.measurements.contour import ContourObservation
 from drake_pose.filtering.state import Belief
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
-from tests.filtering.hands import plant_positions
 
 SIDE = 400
 CENTRE = 199.5

@@ -17,9 +17,8 @@ from rich.text import Text
 from drake_pose.commands.batch import batch
 from drake_pose.commands.capture import capture, empty_room
 from drake_pose.commands.estimate import demo, estimate
-from drake_pose.commands.masks import masks
 from drake_pose.commands.papers import date, kameda, reproduce_all, shimada
-from drake_pose.commands.prepare import calibrate, check, undistort
+from drake_pose.commands.prepare import calibrate, check, masks, undistort
 from drake_pose.commands.register import audit, register
 from drake_pose.commands.terminal import UsageError, say
 from drake_pose.commands.walk import walk

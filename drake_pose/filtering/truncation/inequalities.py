@@ -1,7 +1,7 @@
 """Linear inequalities phi^T x <= b on a state, each with a name: (14) to (18) of Shimada et al."""
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -37,6 +37,12 @@ class Inequalities:
     def margins(self, x: ArrayLike) -> NDArray[np.float64]:
         """(K,) b - phi x: how far x (n,) is from each bound, negative where it is beyond."""
         return self.b - self.phi @ np.asarray(x, dtype=np.float64)
+
+    def take(self, indices: Iterable[int]) -> "Inequalities":
+        """The rows of these indices, in that order."""
+        chosen = list(indices)
+        rows = [self.rows[index] for index in chosen]
+        return make_inequalities(self.columns, rows, self.phi[chosen], self.b[chosen])
 
     def for_columns(self, columns: Sequence[str]) -> "Inequalities":
         """The same rows for a state with these elements, for example one with rates too.

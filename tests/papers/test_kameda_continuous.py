@@ -55,7 +55,7 @@ def test_figures_come_from_the_trials(result):
     assert figures["determined"] == pytest.approx(len(known) / len(errors))
     assert np.median(known) < 0.5
     assert figures["interval_coverage"] > 0.8
-    assert continuous_table({"one": result, "other": result}).row_count == 11
+    assert continuous_table({"one": result, "other": result}).row_count == 12
 
 
 def test_another_body_has_other_measures():

@@ -58,7 +58,8 @@ class BeamSearch:
             SettingsError: if there is no view.
         """
         start = time.perf_counter()
-        run = _Run(self.body, views, self.settings, root_position)
+        examined = self.examination is not None
+        run = _Run(self.body, views, self.settings, root_position, all_within=examined)
         run.search()
         result = run.result()
         if self.examination is not None:
@@ -101,7 +102,7 @@ class BeamSearch:
 
 
 class _Run:
-    """One match; it may gather all whole poses that it comes by."""
+    """One match; it may gather all whole poses that it comes by, or all within the tolerance."""
 
     def __init__(
         self,
@@ -110,6 +111,7 @@ class _Run:
         settings: BeamSearchSettings,
         root_position: np.ndarray | None,
         gathers: bool = False,
+        all_within: bool = False,
     ) -> None:
         if not views:
             raise SettingsError("a match needs at least one view, but none was given")
@@ -117,6 +119,7 @@ class _Run:
         self._deadline = np.inf if limit is None else time.perf_counter() + limit
         self._body = body if root_position is None else body.with_root_position(root_position)
         self._views, self._settings, self._gathers = views, settings, gathers
+        self._all = all_within
         given = settings.tolerance
         self._tolerance = renderer_tolerance(views) if given is None else given
         self.scoring = Scoring(self._body.sampled, views)
@@ -126,14 +129,17 @@ class _Run:
         self._samples: np.ndarray | None = None
         self._J, self._first_J = np.inf, np.nan
         self._runs, self._stopped_by = 0, ""
-        # All poses within the tolerance, where there are any.
+        # All poses within the tolerance, where they are asked for and there are any.
         self.within: PosesWithin | None = None
 
     def search(self) -> None:
         """Run stage after stage until J = 0 or a limit is reached; then polish the answer."""
-        if self._tolerance > 0.0 and not self._gathers and self._search_within():
-            self._stopped_by = "exact"
-            return
+        if self._tolerance > 0.0 and not self._gathers:
+            # Most silhouettes differ by much less than the tolerance, and less is found faster.
+            limits = (self._tolerance,) if self._all else (self._tolerance // 3.0, self._tolerance)
+            if any(self._search_within(J_limit) for J_limit in limits):
+                self._stopped_by = "exact"
+                return
         skip_exact = False
         for stage in self._settings.stages:
             exact = stage.outside_share == 0.0
@@ -161,14 +167,15 @@ class _Run:
         exact = self._J <= self._tolerance
         self._stopped_by = "exact" if exact else self._stopped_by or "end"
 
-    def _search_within(self) -> bool:
-        """Look for all poses within the tolerance, and keep the best; whether there is one."""
+    def _search_within(self, J_limit: float) -> bool:
+        """Look for all poses within a limit, and keep the best; whether there is one."""
         left = self._deadline - time.perf_counter()
         limits = BoundLimits(poses=_POSES, time_limit=max(left, 0.0) if left < np.inf else None)
-        found = branch_and_bound(self._body, self._views, self._tolerance, limits)
+        found = branch_and_bound(self._body, self._views, J_limit, limits)
         if not found.graph.size:
             return False
-        self.within = found
+        if self._all:
+            self.within = found
         self._keep_if_better(found.graph.central())
         return True
 

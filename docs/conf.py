@@ -59,7 +59,7 @@ nitpick_ignore_regex = [
     ("py:.*", r"cyclopts\..*"),
     # An argument that is raised; names of types, and what is imported for type checkers alone.
     ("py:exc", "error_type"),
-    ("py:class", r"[A-Z]\w*|threading\.Event"),
+    ("py:class", r"[A-Z]\w*|threading\.Event|contextlib\.ExitStack"),
 ]
 
 

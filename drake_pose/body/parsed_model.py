@@ -1,6 +1,6 @@
 """What a model file says: names, kinds and limits of positions, links, looks, as plain values."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -13,7 +13,7 @@ from pydrake.multibody.tree import BodyIndex, Joint, ModelInstanceIndex
 
 from drake_pose.arrays import Array
 from drake_pose.body.formats.parsing import ModelSource
-from drake_pose.body.plant_source import PlantSource
+from drake_pose.body.plant_source import Coupling, PlantSource, read_couplings
 from drake_pose.body.surfaces.meshes import TriangleMesh
 from drake_pose.body.surfaces.skin_file import SkinBand
 from drake_pose.body.surfaces.visual_geometry import make_drawable
@@ -56,6 +56,7 @@ class Positions:
         default_positions: Drake's default positions moved inside the limits.
         periodic: angles that look the same after a full turn: all but those of screws.
         turns_freely: angles without limits, or with limits so wide that they mean none.
+        couplings: which positions follow others; no leader follows another one.
     """
 
     position_names: tuple[str, ...]
@@ -65,6 +66,7 @@ class Positions:
     default_positions: Array
     periodic: NDArray[np.bool_]
     turns_freely: NDArray[np.bool_]
+    couplings: tuple[Coupling, ...]
 
 
 def turns_around(lower: Array, upper: Array, periodic: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -133,12 +135,69 @@ def describe_positions(
                 lower[i], upper[i] = (-np.inf, np.inf) if free[i] else (low, high)
             elif not free[i]:
                 lower[i], upper[i] = low, high
+    couplings = _resolved(read_couplings(plant), names)
+    warnings += _share_limits(couplings, names, (lower, upper, periodic, free))
     free &= periodic
     defaults = np.clip(defaults, lower, upper)
+    for follower, leader, multiplier, offset in couplings:
+        defaults[follower] = multiplier * defaults[leader] + offset
     for array in (lower, upper, defaults, periodic, free):
         array.setflags(write=False)
-    positions = Positions(tuple(names), tuple(kinds), lower, upper, defaults, periodic, free)
-    return positions, warnings
+    told = (lower, upper, defaults, periodic, free, couplings)
+    return Positions(tuple(names), tuple(kinds), *told), warnings
+
+
+def _resolved(found: Sequence[Coupling], names: Sequence[str]) -> tuple[Coupling, ...]:
+    """Couplings whose leaders follow no other position."""
+    of = {k: Coupling(k, k, 1.0, 0.0) for one in found for k in one[:2]}
+    for one in found:
+        own, other = of[one.follower], of[one.leader]
+        scale = one.multiplier * other.multiplier / own.multiplier
+        shift = (one.multiplier * other.offset + one.offset - own.offset) / own.multiplier
+        if own.leader == other.leader:
+            raise ModelError(
+                f"joints '{names[one.follower]}' and '{names[one.leader]}' follow each other in "
+                "two ways (<mimic>): leave one of them out"
+            )
+        for k, known in of.items():
+            if known.leader == own.leader:
+                m = known.multiplier
+                of[k] = Coupling(k, other.leader, m * scale, m * shift + known.offset)
+    return tuple(one for k, one in sorted(of.items()) if one.leader != k)
+
+
+def _share_limits(
+    couplings: Sequence[Coupling],
+    names: Sequence[str],
+    arrays: tuple[Array, Array, NDArray[np.bool_], NDArray[np.bool_]],
+) -> list[str]:
+    """Lets positions that follow one another have the same limits; warnings.
+
+    ``arrays``: lower, upper, periodic and turns_freely of Positions, which are changed. Limits of a
+    follower that leave one value alone were copied without a thought (PR2's have the wrong sign).
+    """
+    lower, upper, periodic, free = arrays
+    warnings = []
+    for follower, leader, multiplier, offset in couplings:
+        periodic[leader] &= multiplier.is_integer()
+        if free[follower]:
+            continue
+        ends = np.sort((np.array([lower[follower], upper[follower]]) - offset) / multiplier)
+        whole = [-np.inf, np.inf] if free[leader] else [lower[leader], upper[leader]]
+        low, high = max(ends[0], whole[0]), min(ends[1], whole[1])
+        told = f"joint '{names[follower]}' follows joint '{names[leader]}' (<mimic>: "
+        told += f"{multiplier:g} x {offset:+g}), but their limits leave "
+        if low > high + _ROUNDING:
+            raise ModelError(f"{told}no value for both; widen them")
+        if high - low <= _ROUNDING < whole[1] - whole[0]:
+            warnings.append(f"{told}{low:g} alone: the first one's are not taken")
+            continue
+        lower[leader], upper[leader], free[leader] = low, max(low, high), False
+    for follower, leader, multiplier, offset in couplings:
+        ends = multiplier * np.array([lower[leader], upper[leader]]) + offset
+        lower[follower], upper[follower] = ends.min(), ends.max()
+        free[follower] &= free[leader]
+    return warnings
 
 
 def _written_limits(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from pydrake.geometry import (
@@ -60,6 +60,33 @@ _JOINTS: dict[str, _Make] = {
 }
 
 
+class Coupling(NamedTuple):
+    """A position that follows another one: q[follower] = multiplier * q[leader] + offset."""
+
+    follower: int
+    leader: int
+    multiplier: float
+    offset: float
+
+
+def read_couplings(plant: MultibodyPlant) -> list[Coupling]:
+    """The couplers of a finalized plant, which its Python tells through InverseKinematics alone."""
+    if plant.num_constraints() == 0:
+        return []
+    from pydrake.multibody.inverse_kinematics import InverseKinematics  # It imports the solvers.
+
+    program = InverseKinematics(plant, with_joint_limits=False).prog()
+    found = []
+    for binding in program.linear_equality_constraints():
+        index = program.FindDecisionVariableIndices(binding.variables())
+        (row,), (offset,) = binding.evaluator().GetDenseA(), binding.evaluator().lower_bound()
+        if np.count_nonzero(row) == 2:
+            # The follower's factor is 1; where both could be it, the later one is.
+            k = int(row[1] == 1.0)
+            found.append(Coupling(index[k], index[1 - k], -row[1 - k] / row[k], offset / row[k]))
+    return found
+
+
 class PlantSource:
     """A plant that somebody else made, in place of a model file (``ModelSource``).
 
@@ -106,7 +133,8 @@ class PlantSource:
             if index in self.seen and plant.geometry_source_is_registered():
                 for geometry in old.GetVisualGeometriesForBody(body):
                     plant.RegisterVisualGeometry(bodies[index], self._copied(geometry))
-        for joint in (old.get_joint(index) for index in old.GetJointIndices()):
+        joints = [old.get_joint(index) for index in old.GetJointIndices()]
+        for joint in joints:
             if joint.type_name() not in _JOINTS:
                 raise ModelError(f"joint '{joint.name()}' of type '{joint.type_name()}': no copy")
             instance = instances[joint.model_instance()]
@@ -120,6 +148,13 @@ class PlantSource:
                 limits = joint.position_lower_limits(), joint.position_upper_limits()
                 copy.set_position_limits(*limits)
                 copy.set_default_positions(joint.default_positions())
+        moving = {joint.position_start(): joint for joint in joints if joint.num_positions()}
+        for one in read_couplings(old):
+            pair = (
+                plant.GetJointByName(moving[k].name(), instances[moving[k].model_instance()])
+                for k in (one.follower, one.leader)
+            )
+            plant.AddCouplerConstraint(*pair, one.multiplier, one.offset)
         return list(instances.values()), []
 
     def _copied(self, geometry: GeometryId) -> GeometryInstance:

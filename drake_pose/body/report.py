@@ -13,7 +13,7 @@ from drake_pose.body.formats.parsing import limit_kinds
 from drake_pose.body.model import ArticulatedModel, load_model
 from drake_pose.body.surfaces.meshes import TriangleMesh, is_watertight
 from drake_pose.body.tree.link_graph import build_link_graph
-from drake_pose.body.tree.pose_tree import PoseTree, PoseTreeNode
+from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.errors import DrakePoseError
 
 _SYMMETRY_TOLERANCE = 0.03
@@ -24,12 +24,16 @@ _SECTORS = 7
 
 @dataclass(frozen=True)
 class JointReport:
-    """One position: its name, kind, and limits in degrees (angles) or metres (lengths)."""
+    """One position: its name, kind, and limits in degrees (angles) or metres (lengths).
+
+    ``follows``: the joint that it follows, and how in rad and m; empty: none.
+    """
 
     name: str
     kind: str
     lower: float
     upper: float
+    follows: str = ""
 
 
 @dataclass(frozen=True)
@@ -72,21 +76,29 @@ def describe_model(
     return ModelReport(
         path=path,
         name=model.name,
-        nodes=tuple(_node_report(tree, node) for node in tree.nodes),
+        nodes=tuple(_node_report(tree, index) for index in range(len(tree.nodes))),
         warnings=model_warnings(model, tree),
         errors=(),
     )
 
 
-def _node_report(tree: PoseTree, node: PoseTreeNode) -> NodeReport:
+def _node_report(tree: PoseTree, index: int) -> NodeReport:
     """The facts of one node."""
-    model = tree.model
+    model, node = tree.model, tree.nodes[index]
+    led = {one.follower for one in tree.placements[index].follows}
+    follows = {
+        one.follower: f"{one.multiplier:g} {model.position_names[one.leader]} {one.offset:+g}"
+        for one in tree.followers
+        if one.follower in led
+    }
     joints = []
-    for position, name in zip(node.positions, node.position_names, strict=True):
+    for position in (*node.positions, *follows):
+        name = model.position_names[position]
         kind = model.position_kinds[position]
         scale = 180.0 / math.pi if kind == "angle" else 1.0
         lower, upper = model.lower[position] * scale, model.upper[position] * scale
-        joints.append(JointReport(name, kind, float(lower), float(upper)))
+        limits = float(lower), float(upper)
+        joints.append(JointReport(name, kind, *limits, follows.get(position, "")))
     return NodeReport(
         name=node.name,
         parent=tree.nodes[node.parent].name if node.parent >= 0 else "world",
@@ -104,12 +116,20 @@ def model_warnings(
     ``given`` names the positions that are held as the user wants.
     """
     warnings = list(model.warnings)
-    constraints = model.plant.num_constraints()
+    constraints = model.plant.num_constraints() - len(model.couplings)
     if constraints:
         warnings.append(
             f"{constraints} constraints between joints or links are written in the file; they are "
             "not enforced: every joint is searched by itself"
         )
+    searched = {position for node in tree.nodes for position in node.positions} - {*tree.held}
+    for follower, leader, *_ in model.couplings:
+        if {follower, leader} <= searched:
+            one, other = (model.position_names[k] for k in (follower, leader))
+            warnings.append(
+                f"joint '{one}' is written to follow joint '{other}' (<mimic>): not enforced, it "
+                "is searched by itself, because other joints move their links, too"
+            )
     if tree.unobserved_positions and tree.root == "world":
         warnings.append(
             "these joints move nothing that is seen and keep their default values: "

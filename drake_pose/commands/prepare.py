@@ -37,8 +37,9 @@ def check(file: Path, /, *, package: Packages | None = None, json: Json = False)
     them in the order of rotation with their limits, and the link's number of triangles. Exit
     status 1: not fit.
 
-    Collision geometry, transmissions and plugins are not read. Mimic joints and other couplings
-    are named in a warning and not enforced. Expand xacro macros first.
+    Collision geometry, transmissions and plugins are not read. Joints that follow others (mimic)
+    are one unknown with them; loops and gearboxes are named in a warning and not enforced. Expand
+    xacro macros first.
 
         drake-pose check urdf/woman/woman.urdf
         drake-pose check arm.urdf --package arm_description=ros/arm_description
@@ -70,6 +71,7 @@ def _segments(report: ModelReport) -> Table:
     for node in report.nodes:
         joints = [
             f"{joint.name}  {joint.lower:g} .. {joint.upper:g}{units.get(joint.kind, '')}"
+            + (f"  (= {joint.follows})" if joint.follows else "")
             for joint in node.joints
         ]
         closed = "yes" if node.watertight else "no"

@@ -16,10 +16,11 @@ from pydrake.common.eigen_geometry import Quaternion
 from pydrake.math import RigidTransform, RotationMatrix
 
 from drake_pose.body.model import ArticulatedModel
+from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.csv_files import csv_text, read_csv
 from drake_pose.errors import OutputError
 from drake_pose.files.folder import POSES, cannot_write, write_file
-from drake_pose.search.estimates import JointEstimate, PoseSet
+from drake_pose.search.estimates import JointEstimate, PoseSet, following_joints
 
 BASE_COLUMNS = ("base_x", "base_y", "base_z", "base_qw", "base_qx", "base_qy", "base_qz")
 """Columns of the plant's world in the scene's world: position [m] and unit quaternion."""
@@ -231,16 +232,18 @@ def user_units(model: ArticulatedModel) -> np.ndarray:
     return np.array([math.degrees(1.0) if k == "angle" else 1.0 for k in model.position_kinds])
 
 
-def record_pose_set(pose_set: PoseSet | None, model: ArticulatedModel) -> dict[str, Any]:
+def record_pose_set(pose_set: PoseSet | None, tree: PoseTree) -> dict[str, Any]:
     """FrameRecord's fields of what is known of each joint, over all families and in each."""
     if pose_set is None:
         return {}
+    model = tree.model
     kinds = dict(zip(model.position_names, model.position_kinds, strict=True))
 
     def record(
         joints: Sequence[JointEstimate], values: Sequence[float | None]
     ) -> dict[str, JointRecord]:
         records = {}
+        joints = (*joints, *following_joints(tree, joints))
         for joint, value in zip(joints, values, strict=True):
             unit = 1.0 if kinds.get(joint.name) == "length" else math.degrees(1.0)
             records[joint.name] = JointRecord(
@@ -251,12 +254,17 @@ def record_pose_set(pose_set: PoseSet | None, model: ArticulatedModel) -> dict[s
             )
         return records
 
+    followers = [one.follower for one in tree.followers]
     families = [
-        record(one.joints, [float(value) for node in one.node_values for value in node])
+        record(
+            one.joints,
+            [*np.concatenate(one.node_values).tolist(), *one.q[followers].tolist()],
+        )
         for one in pose_set.families
     ]
+    count = len(pose_set.joints) + len(followers)
     return {
-        "joints": record(pose_set.joints, [None] * len(pose_set.joints)),
+        "joints": record(pose_set.joints, [None] * count),
         "families": tuple(families),
         "family_count": pose_set.family_count,
     }

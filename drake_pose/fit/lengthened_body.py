@@ -49,19 +49,17 @@ class LengthenedBody(BodyParameters):
                 self._behind[i] = self._behind[node.parent]
             self._behind[i] |= [one.node == i for one in offsets]
         # A joint whose origin is shifted turns about another axis.
-        self._shifted = np.zeros((count, len(offsets)), dtype=np.bool_)
-        first = 0
+        self._shifted = np.zeros((len(kinematics.parameters), len(offsets)), dtype=np.bool_)
         for i, placement in enumerate(kinematics.tree.placements):
-            turned = first + len(nodes[i].value_names)
+            first = kinematics.packed.value_starts[i]
             for k, step in enumerate(placement.steps):
                 last = first + step.joint_map.position_count
                 # Walked inwards, a joint comes before its offset.
                 before = [one.node != i or one.step + one.inverted <= k for one in offsets]
                 self._shifted[first:last] = self._behind[i] & before
                 first = last
-            first = turned
         moves = kinematics.motions(kinematics.flatten(kinematics.tree.default_values())).moves
-        parameters = np.concatenate([np.arange(count), count + self._lengths])
+        parameters = np.concatenate([kinematics.parameters, count + self._lengths])
         self._owners = owners_of(np.hstack([moves, self._behind]), parameters)
 
     def place(self, theta: Array) -> Placement:
@@ -89,9 +87,9 @@ class LengthenedBody(BodyParameters):
             placement, parent = tree.placements[one.node], tree.nodes[one.node].parent
             R_WA = placement.X_PA[:3, :3] if parent < 0 else X_WN[parent, :3, :3]
             if one.step + one.inverted > 0:
+                values = tree.step_values(one.node, split[tree.source(one.node)][None])
                 steps = placement.steps[: one.step + one.inverted]
-                X = chain_transforms(steps, split[one.node][None])[0]
-                R_WA = R_WA @ X[:3, :3]
+                R_WA = R_WA @ chain_transforms(steps, values)[0, :3, :3]
             found[k] = R_WA @ one.p_A
         return found
 

@@ -88,6 +88,7 @@ class BodyParameters:
         self._bending = PackedSurfaces(surfaces) if surfaces is not None and bends else None
         self.kinematics, self.outlines = kinematics, tuple(outlines)
         nodes, count = len(self.outlines), len(kinematics.names) + len(ROOT_NAMES)
+        made_by = kinematics.parameters
         self.groups = np.full(nodes, -1) if groups is None else np.array(groups)
         girths = tuple(f"{GIRTH_PREFIX}{name}" for name in girth_names)
         self.names = (*kinematics.names, *ROOT_NAMES, *girths)
@@ -95,12 +96,12 @@ class BodyParameters:
         values = kinematics.flatten(kinematics.tree.default_values())
         moves = kinematics.motions(values, translation=True, scale=True).moves
         self._rooted = moves[:, -1]
-        self._of_root = kinematics.value_nodes == 0
-        self._values_only = owners_of(moves[:, :-4], np.arange(count - 4))
+        self._of_root = np.arange(len(made_by)) < np.count_nonzero(kinematics.value_nodes == 0)
+        self._values_only = owners_of(moves[:, :-4], made_by)
         self._wide = np.flatnonzero(self.groups >= 0)
         self._all = owners_of(
             np.hstack([moves, np.eye(nodes, dtype=np.bool_)[:, self._wide]]),
-            np.concatenate([np.arange(count), count + self.groups[self._wide]]),
+            np.concatenate([made_by, np.arange(count - 4, count), count + self.groups[self._wide]]),
         )
 
     def place(self, theta: Array) -> Placement:

@@ -19,6 +19,7 @@ from scipy.sparse import csr_array, diags_array, eye_array, kron, vstack
 from drake_pose.body.model import ArticulatedModel
 from drake_pose.body.tree.tree_kinematics import Motions, TreeKinematics, joint_offsets
 from drake_pose.camera.models import Camera
+from drake_pose.errors import ModelError
 from drake_pose.fit.contour_fit import Noise
 from drake_pose.fit.evidence import EdgePoints, pack_evidence
 from drake_pose.fit.frames_fit import FramesFit
@@ -62,11 +63,19 @@ class ProportionedBody(BodyParameters):
     Args:
         kinematics: the pose tree's.
         surfaces: the pose tree's.
+
+    Raises ModelError: joints follow others.
     """
 
     def __init__(self, kinematics: TreeKinematics, surfaces: TreeSurfaces) -> None:
         super().__init__(kinematics, surfaces.rigid, surfaces=surfaces)
-        nodes = kinematics.tree.nodes
+        nodes, model = kinematics.tree.nodes, kinematics.tree.model
+        if len(kinematics.parameters) > len(kinematics.names):
+            name = model.position_names[kinematics.tree.followers[0].leader]
+            raise ModelError(
+                f"{model.path}: joints follow '{name}' (<mimic>): the lengths of such a body "
+                f"cannot be estimated; hold it: --hold {name}=VALUE [deg or m]"
+            )
         self.limbs = np.zeros(len(nodes), dtype=np.int64)
         firsts: list[str] = []
         for i, node in enumerate(nodes):

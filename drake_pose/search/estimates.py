@@ -84,6 +84,17 @@ def joint_estimates(
     )
 
 
+def following_joints(tree: PoseTree, joints: Sequence[JointEstimate]) -> tuple[JointEstimate, ...]:
+    """What is known of the positions that follow a pose tree's values, of which joints tell."""
+    known, names = {joint.name: joint for joint in joints}, tree.model.position_names
+    found = []
+    for follower, leader, multiplier, offset in tree.followers:
+        one = known[names[leader]]
+        low, high = sorted(multiplier * end + offset for end in (one.low, one.high))
+        found.append(replace(one, name=names[follower], low=low, high=high))
+    return tuple(found)
+
+
 @dataclass(frozen=True)
 class PoseFamily:
     """Poses that differ by small steps, with one that stands for all.
@@ -141,9 +152,11 @@ class PoseSet:
         """For each value of the pose tree whether it is determined."""
         return tuple(joint.determined for joint in self.joints)
 
-    def position_intervals(self, names: Sequence[str]) -> np.ndarray:
+    def position_intervals(self, tree: PoseTree) -> np.ndarray:
         """``determined``, ``low`` and ``high``, (3, nq), of positions; NaN: not in the tree."""
-        known = {joint.name: (joint.determined, joint.low, joint.high) for joint in self.joints}
+        joints = (*self.joints, *following_joints(tree, self.joints))
+        known = {joint.name: (joint.determined, joint.low, joint.high) for joint in joints}
+        names = tree.model.position_names
         return np.array([known.get(name, (np.nan,) * 3) for name in names], dtype=float).T
 
 

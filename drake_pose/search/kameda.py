@@ -144,18 +144,21 @@ class _Run:
         X_WN = self.scoring.candidate_poses(
             node, np.eye(4) if parent < 0 else self._adopted()[1][parent]
         )
-        everything = np.arange(len(X_WN))
-        outside, covered = self.scoring.candidate_areas(node, everything, X_WN, uncovered)
+        samples = np.arange(len(X_WN))
+        if self.scoring.sampled.tree.source(node) != node:
+            samples = self._adopted()[0][[parent]]
+            X_WN = X_WN[samples]
+        outside, covered = self.scoring.candidate_areas(node, samples, X_WN, uncovered)
         limits = np.array(self.outside_limit)[:, None]
         inside = np.flatnonzero((outside <= limits).all(axis=0))
         if len(inside) == 0:
             return None
         # A stable sort: equal scores keep the grid's order, which begins nearest to zero.
         worth = covered[inside] - self.settings.outside_weight * outside[:, inside].sum(axis=0)
-        samples = inside[np.argsort(-worth, kind="stable")]
+        best = inside[np.argsort(-worth, kind="stable")]
         if len(self.nodes[node].mesh.triangles):
-            samples = samples[: self.settings.candidate_limit]
-        return NodeList(samples, X_WN[samples])
+            best = best[: self.settings.candidate_limit]
+        return NodeList(samples[best], X_WN[best])
 
     def _backtrack(self, node: int) -> bool:
         """Step 6: the nearest node towards the root with an untried candidate adopts it."""

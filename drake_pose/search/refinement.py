@@ -56,7 +56,9 @@ class RefinementBody:
         self.surfaces = surfaces = TreeSurfaces(tree)
         self._parameters = BodyParameters(self.kinematics, surfaces.rigid)
         middle = np.clip(0.0, self.kinematics.lower, self.kinematics.upper)
-        self._moves = self.kinematics.motions(middle, translation=True, scale=True).moves
+        moves = self.kinematics.motions(middle, translation=True, scale=True).moves
+        # What follows a value hangs on what the value moves.
+        self._moves = np.hstack([moves[:, : len(middle)], moves[:, -_EXTRA:]])
         self._packed = PackedSurfaces(surfaces)
         shares = []
         for rigid, skin in zip(surfaces.rigid, surfaces.skins, strict=True):

@@ -23,7 +23,8 @@ class SampledTree:
 
     Attributes:
         values: for each node (n, k) its values at its samples [rad or m].
-        X_PN: for each node (n, 4, 4) its poses in its parent at its samples.
+        X_PN: for each node (n, 4, 4) its poses in its parent at its samples: at the parent's where
+            its joints follow the parent's, so that it takes the sample that the parent takes.
         outlines: the rigid part of each node's surface: all of it where the model has no skin.
         bands: for each node (n, v, 3) the vertices of its band of skin at its samples, in the
             node's frame [m]; None for a node without one.
@@ -93,7 +94,7 @@ class SampledTree:
         """X_WN (n, nodes, 4, 4) at samples (n, nodes)."""
         X_WN = np.empty((*samples.shape, 4, 4))
         for i, node in enumerate(self.tree.nodes):
-            X_PN = self.X_PN[i][samples[:, i]]
+            X_PN = self.X_PN[i][samples[:, self.tree.source(i)]]
             X_WN[:, i] = X_PN if node.parent < 0 else X_WN[:, node.parent] @ X_PN
         return X_WN
 
@@ -102,11 +103,12 @@ class SampledTree:
         return [grid[t] for grid, t in zip(self.values, samples, strict=True)]
 
     def _sample(self, node: int) -> tuple[np.ndarray, np.ndarray]:
-        settings = self._settings
+        settings, source = self._settings, self.tree.source(node)
         values = self.tree.grid(
-            node, settings.interval, settings.intervals, settings.length_interval
+            source, settings.interval, settings.intervals, settings.length_interval
         )
-        return values, self.tree.relative_transforms(node, values)
+        own = values if source == node else values[:, :0]
+        return own, self.tree.relative_transforms(node, values)
 
 
 class Scoring:

@@ -132,6 +132,8 @@ def random_positions(model: ArticulatedModel, random: np.random.Generator) -> ND
     for start in quaternions[::4]:
         q[start : start + 4] = random.normal(size=4)
         q[start : start + 4] /= np.linalg.norm(q[start : start + 4])
+    for follower, leader, multiplier, offset in model.couplings:
+        q[follower] = multiplier * q[leader] + offset
     return q
 
 
@@ -184,6 +186,10 @@ def check_limits(model: ArticulatedModel, reference: Reference) -> None:
         index = model.position_index(name)
         if lower == upper or upper - lower > 8.0 * np.pi:
             continue
+        if any(index == one.follower for one in model.couplings):
+            continue
+        if any(index == one.leader for one in model.couplings):
+            lower, upper = max(lower, model.lower[index]), min(upper, model.upper[index])
         np.testing.assert_allclose(
             (model.lower[index], model.upper[index]), (lower, upper), atol=1e-9, err_msg=name
         )

@@ -7,7 +7,7 @@ by the link's name; the positions are those of Drake's plant.
   "world": a floating base becomes pinocchio's free flyer (x y z, then the quaternion x y z w).
 - pinocchio joins welded links into one body; every link is still a frame of type BODY.
 - pinocchio describes a joint that turns without limits by cosine and sine. ``mimic`` is off: every
-  joint has its own value.
+  joint has its own value, which the positions that are asked for give it.
 - MuJoCo's free joint is x y z, then the quaternion w x y z; Drake has the quaternion first. A hinge
   or slide has the same value in both. Drake's ball joint has roll, pitch and yaw, MuJoCo's a
   quaternion w x y z. An unnamed free joint is known by its body.

@@ -12,11 +12,11 @@ from pathlib import Path
 
 from drake_pose.body.formats.packages import FileFinder
 from drake_pose.body.formats.xml_files import (
+    FOLLOWING,
     OLD_XACRO_ELEMENTS,
     Warn,
     colour_text,
     leave_out,
-    leave_out_mimics,
     open_loops,
     read_limits,
     read_numbers,
@@ -24,6 +24,7 @@ from drake_pose.body.formats.xml_files import (
     refuse_macros,
     require_scale,
     require_size,
+    take_mimic,
     xml_text,
 )
 from drake_pose.errors import ModelError
@@ -97,8 +98,14 @@ def cure_urdf(path: Path, finder: FileFinder, warn: Warn) -> str:
     joints = _joints(root)
     ends = [[_end(joint, end) for end in ("parent", "child")] for joint in joints]
     open_loops(root, joints, ends, warn)
+    leaders = [
+        one.get("name", "") for one in root.iterfind("joint") if one.get("type") in FOLLOWING
+    ]
     for joint in _joints(root):
-        _check_urdf_joint(joint, warn)
+        _check_urdf_joint(joint)
+        name = joint.get("name", "")
+        if said := take_mimic(joint, name, leaders if name in leaders else (), warn):
+            ElementTree.SubElement(joint, "mimic", said)
     return xml_text(root)
 
 
@@ -177,7 +184,7 @@ def _check_urdf_mesh(mesh: ElementTree.Element, where: str, path: Path, finder: 
     mesh.set("scale", " ".join(text.split() * (3 // count)))
 
 
-def _check_urdf_joint(joint: ElementTree.Element, warn: Warn) -> None:
+def _check_urdf_joint(joint: ElementTree.Element) -> None:
     """Refuse limits that end Drake, and leave out those that do not count."""
     name = joint.get("name", "")
     _check_origin(joint, f"joint '{name}'")
@@ -195,7 +202,6 @@ def _check_urdf_joint(joint: ElementTree.Element, warn: Warn) -> None:
         for name_of_rate in ("effort", "drake:acceleration"):
             limit.attrib.pop(name_of_rate, None)
         _check_velocity(limit, name)
-    leave_out_mimics(joint, name, warn)
 
 
 def _check_velocity(limit: ElementTree.Element, name: str) -> None:
@@ -280,9 +286,10 @@ def cure_sdf(
             _check_sdf_visual(visual, where, path, finder)
     for model in [*root.iter("model"), *root.iter("world")]:
         _leave_out_constraints(model, warn)
+        _keep_mimics(model, warn)
     limits: Limits = {}
     for joint in root.iter("joint"):
-        limits.update(_check_sdf_joint(joint, warn))
+        limits.update(_check_sdf_joint(joint))
     return xml_text(root), limits
 
 
@@ -364,7 +371,18 @@ def _leave_out_constraints(model: ElementTree.Element, warn: Warn) -> None:
     open_loops(model, joints, ends, warn)
 
 
-def _check_sdf_joint(joint: ElementTree.Element, warn: Warn) -> Limits:
+def _keep_mimics(model: ElementTree.Element, warn: Warn) -> None:
+    """Let joints of a model follow others of it, in Drake's own words."""
+    joints = model.findall("joint")
+    leaders = [one.get("name", "") for one in joints if one.get("type") in FOLLOWING]
+    for joint in joints:
+        name = joint.get("name", "")
+        for axis in [*joint.findall("axis"), *joint.findall("axis2")]:
+            if said := take_mimic(axis, name, leaders if name in leaders else (), warn):
+                ElementTree.SubElement(joint, "drake:mimic", said)
+
+
+def _check_sdf_joint(joint: ElementTree.Element) -> Limits:
     """Refuse limits that Drake refuses; returns those that its parser passes over."""
     name, kind = joint.get("name", "(unnamed)"), joint.get("type", "")
     _check_poses(joint, f"joint '{name}'")
@@ -376,7 +394,6 @@ def _check_sdf_joint(joint: ElementTree.Element, warn: Warn) -> Limits:
                 numbers = read_numbers(axis.findtext("xyz"), 3, f"joint '{name}': its <xyz>")
                 if not any(numbers):
                     raise ModelError(f"joint '{name}': its axis is zero")
-            leave_out_mimics(axis, name, warn)
             texts = [axis.findtext(f"limit/{side}") for side in ("lower", "upper")]
             lower, upper = read_limits(texts[0], texts[1], name)
             if tag in suffixes.get(kind, {}) and lower is not None and upper is not None:

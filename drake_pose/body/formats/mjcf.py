@@ -28,8 +28,15 @@ _NO_COLOUR = (0.5, 0.5, 0.5, 1.0)
 _SIZES = {"plane": 3, "sphere": 1, "capsule": 2, "ellipsoid": 3, "cylinder": 2, "box": 3, "mesh": 0}
 
 
-def cure_mjcf(path: Path, warn: Warn) -> str:
+Couple = tuple[str, str, float, float]
+"""A joint, the one that it follows, multiplier and offset [rad or m]."""
+
+
+def cure_mjcf(path: Path, warn: Warn) -> tuple[str, list[Couple]]:
     """The text of an MJCF file, paths absolute, that Drake reads as MuJoCo does.
+
+    Returns:
+        The text, and which joints follow others, which Drake's parser passes over.
 
     Raises ModelError: no MJCF, or MuJoCo refuses it; the message names the file, and says why.
     """
@@ -40,7 +47,7 @@ def cure_mjcf(path: Path, warn: Warn) -> str:
             f"{path}: the outermost element is <{root.tag}>, not <mujoco>; "
             f"{hint.get(root.tag, 'is it a model file?')}"
         )
-    model = _compile(path, warn)
+    model, couples = _compile(path, warn)
     text = ElementTree.Element("mujoco", model=root.get("model") or path.stem)
     ElementTree.SubElement(text, "compiler", angle="radian")
     asset = ElementTree.SubElement(text, "asset")
@@ -53,19 +60,24 @@ def cure_mjcf(path: Path, warn: Warn) -> str:
         ElementTree.SubElement(asset, "mesh", name=f"mesh{mesh}", file=str(file))
     for geom in drawn:
         _add_geom(model, geom, bodies[model.geom_bodyid[geom]])
-    return xml_text(text)
+    return xml_text(text), couples
 
 
-def _compile(path: Path, warn: Warn) -> Any:
-    """MuJoCo's model, without what neither moves nor is seen."""
+def _compile(path: Path, warn: Warn) -> tuple[Any, list[Couple]]:
+    """MuJoCo's model, without what neither moves nor is seen, and which joints follow others."""
     import mujoco  # Slow to import, and needed for MJCF alone.
 
     try:
         spec = mujoco.MjSpec.from_file(str(path))
         if spec.flexes:
             raise ModelError(f"{path}: <flex> '{spec.flexes[0].name}' is not rigid: not read")
-        if spec.equalities:
-            count = len(spec.equalities)
+        couples = [
+            (one.name1, one.name2, float(one.data[1]), float(one.data[0]))
+            for one in spec.equalities
+            if one.type == mujoco.mjtEq.mjEQ_JOINT and one.active and one.name2
+            if one.data[1] != 0.0 and not np.any(one.data[2:5])
+        ]
+        if count := len(spec.equalities) - len(couples):
             warn(f"{count} <equality> constraint{'s' * (count > 1)} of the file: not enforced")
         # Some of it names files that a package of looks lacks.
         for element in (
@@ -96,7 +108,11 @@ def _compile(path: Path, warn: Warn) -> Any:
         spec.compiler.balanceinertia = True
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # What is old in a file still counts.
-            return spec.compile()
+            model = spec.compile()
+        # It couples how far both are from where the file has them.
+        places = zip(model.name_jntadr, model.jnt_qposadr, strict=True)
+        start = {_name(model, name): float(model.qpos0[place]) for name, place in places}
+        return model, [(a, b, k, c + start[a] - k * start[b]) for a, b, k, c in couples]
     except (ValueError, RuntimeError, mujoco.FatalError) as error:
         raise ModelError(f"{path}: {' '.join(str(error).split())}") from error
 

@@ -15,7 +15,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import ModelInstanceIndex
 
 from drake_pose.body.formats.link_files import Limits, cure_sdf, cure_urdf
-from drake_pose.body.formats.mjcf import cure_mjcf
+from drake_pose.body.formats.mjcf import Couple, cure_mjcf
 from drake_pose.body.formats.packages import FileFinder
 from drake_pose.body.surfaces.meshes import workspace
 from drake_pose.errors import ModelError
@@ -59,6 +59,7 @@ class ModelSource:
         self.path = path
         self.warnings: list[str] = []
         self.limits: Limits = {}
+        self._couples: list[Couple] = []
         self._finder = FileFinder(package_paths)
         self._stand_ins: dict[Path, Path] = {}
         self._under_way: list[Path] = []
@@ -89,6 +90,9 @@ class ModelSource:
         with captured_warnings() as warnings:
             try:
                 instances = parser.AddModelsFromString(self.text, self.kind)
+                for one, other, multiplier, offset in self._couples:
+                    pair = (plant.GetJointByName(name, instances[0]) for name in (one, other))
+                    plant.AddCouplerConstraint(*pair, multiplier, offset)
             # Drake ends the process, which Python sees as SystemExit, at some values.
             except (RuntimeError, ValueError, SystemExit) as error:
                 raise ModelError(self._explain(str(error), warnings)) from error
@@ -117,7 +121,11 @@ class ModelSource:
             if kind == "urdf":
                 text = cure_urdf(path, self._finder, self._warn)
             elif kind == "xml":
-                text = cure_mjcf(path, self._warn)
+                text, couples = cure_mjcf(path, self._warn)
+                if len(self._under_way) == 1:
+                    self._couples = couples
+                elif couples:
+                    self._warn(f"{path}: joints of an included MJCF follow no others")
             elif kind == "sdf":
                 text, limits = cure_sdf(path, self._finder, self._warn, self._stand_in)
                 if len(self._under_way) == 1:

@@ -17,6 +17,7 @@ Warn = Callable[[str], None]
 """Takes what of a file is not read, or not enforced."""
 
 _MACRO_MARKS = ("${", "$(")
+_MIMIC = {"multiplier": "1", "offset": "0", "reference": "0"}
 _COMMENT = re.compile(r"<!--.*?-->", re.DOTALL)
 _BARE_AMPERSAND = re.compile(r"&(?!(?:#\d+|#x[0-9a-fA-F]+|lt|gt|amp|quot|apos);)")
 _DECLARED_ENCODING = re.compile(rb"<\?xml[^>]*?\bencoding\s*=\s*[\"']([\w.:-]+)")
@@ -191,14 +192,35 @@ def open_loops(
         )
 
 
-def leave_out_mimics(joint: ElementTree.Element, name: str, warn: Warn) -> None:
-    """Remove what lets a joint follow another one."""
-    for mimic in joint.findall("mimic"):
-        joint.remove(mimic)
-        warn(
-            f"joint '{name}' is written to follow joint '{mimic.get('joint', '')}' (<mimic>): not "
-            "enforced, it is searched by itself"
+FOLLOWING = ("revolute", "continuous", "prismatic")
+"""The types of joints that can follow one another."""
+
+
+def take_mimic(
+    parent: ElementTree.Element, name: str, leaders: Collection[str], warn: Warn
+) -> dict[str, str] | None:
+    """Remove a joint's <mimic>, of attributes or elements; what Drake's has in its place.
+
+    ``leaders``: the joints that can be followed; ``warn`` is told of others.
+    """
+    found = None
+    for mimic in parent.findall("mimic"):
+        parent.remove(mimic)
+        said = {key: mimic.get(key, mimic.findtext(key)) for key in _MIMIC}
+        multiplier, offset, reference = (
+            read_numbers(said[key] or text, 1, f"joint '{name}': {key} of its <mimic>")[0]
+            for key, text in _MIMIC.items()
         )
+        leader = mimic.get("joint", "")
+        if leader in leaders and leader != name and multiplier:
+            offset -= multiplier * reference
+            found = {"joint": leader, "multiplier": repr(multiplier), "offset": repr(offset)}
+        else:
+            warn(
+                f"joint '{name}' is written to follow joint '{leader}' (<mimic>): not enforced, it "
+                "is searched by itself"
+            )
+    return found
 
 
 def refuse_macros(root: ElementTree.Element) -> None:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from drake_pose.arrays import Array
 from drake_pose.body.parsed_model import ParsedModel, one_turn, turns_around
+from drake_pose.body.plant_source import Coupling
 from drake_pose.body.surfaces.meshes import TriangleMesh
 from drake_pose.body.tree.link_graph import ChainStep, PlantKinematics, chain_transforms
 from drake_pose.body.tree.node_skin import NodeSkin
@@ -70,6 +71,8 @@ class PoseTreeNode:
 class NodePlacement:
     """How a node's values place it: X_PN = X_PA R(rotation values) step(values) step(values) ...
 
+    A node whose joints follow its parent's has no values of its own.
+
     Attributes:
         X_PA: (4, 4), the identity but for roots.
         rotation: turns a root that has a RootRotation.
@@ -78,6 +81,8 @@ class NodePlacement:
         is_angle: (k,) bool, angles, else lengths.
         periodic: (k,) bool, angles that look the same after a full turn.
         turns_freely: (k,) bool, angles without limits that are searched.
+        follows: for each value of the steps its position in q, which of the parent's values it
+            follows, and how; (): the node has values of its own.
     """
 
     X_PA: Array
@@ -89,6 +94,7 @@ class NodePlacement:
     is_angle: NDArray[np.bool_]
     periodic: NDArray[np.bool_]
     turns_freely: NDArray[np.bool_]
+    follows: tuple[Coupling, ...] = ()
 
 
 def place_node(
@@ -98,6 +104,7 @@ def place_node(
     X_PA: Array,
     rotation: RootRotation | None,
     steps: tuple[ChainStep, ...],
+    follows: tuple[Coupling, ...] = (),
 ) -> NodePlacement:
     """The placement of a node with these positions in q, or of a root that a rotation turns."""
     if rotation is not None:
@@ -115,7 +122,8 @@ def place_node(
     is_angle = np.array([model.position_kinds[i] != "length" for i in index], dtype=np.bool_)
     free = model.turns_freely[index] & (lower < upper)
     periodic = model.periodic[index]
-    return NodePlacement(X_PA, None, steps, lower, upper, defaults, is_angle, periodic, free)
+    told = (lower, upper, defaults, is_angle, periodic, free)
+    return NodePlacement(X_PA, None, steps, *told, follows)
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,6 +136,7 @@ class PoseTree:
         held: values of positions that are not searched, by index into q.
         unobserved_positions: names of positions that move nothing that is seen, or that the root's
             pose replaces; they keep their default values.
+        followers: the positions that follow those that are searched.
         root: name of the root node; "world" where the plant's own roots are kept.
     """
 
@@ -136,6 +145,7 @@ class PoseTree:
     leaves: tuple[int, ...]
     held: Mapping[int, float]
     unobserved_positions: tuple[str, ...]
+    followers: tuple[Coupling, ...]
     root: str
     placements: tuple[NodePlacement, ...] = field(repr=False)
     _base: BasePose = field(repr=False)
@@ -167,6 +177,10 @@ class PoseTree:
         if self._rebuild is None:
             raise SettingsError("only a tree made by ArticulatedModel.pose_tree can be moved")
         return self._rebuild(root_position)
+
+    def source(self, node: int) -> int:
+        """The node whose values place a node: itself, or its parent where its joints follow."""
+        return self.nodes[node].parent if self.placements[node].follows else node
 
     def node_index(self, name: str) -> int:
         """The node of a link; UnknownNameError where no node has that name."""
@@ -232,21 +246,31 @@ class PoseTree:
         return turns_around(given.lower, given.upper, given.periodic)
 
     def relative_transforms(self, node: int, values: Array) -> Array:
-        """X_PN (n, 4, 4) in the parent (or W) at values (n, k); SettingsError for a wrong width."""
+        """X_PN (n, 4, 4) in the parent (or W) at values (n, k) of the node that is its source.
+
+        Raises SettingsError for a wrong width.
+        """
         values = np.asarray(values, dtype=np.float64)
-        width = len(self.nodes[node].value_names)
-        if values.ndim != 2 or values.shape[1] != width:
+        names = self.nodes[self.source(node)].value_names
+        if values.ndim != 2 or values.shape[1] != len(names):
             raise SettingsError(
-                f"node '{self.nodes[node].name}': values of shape (n, {width}) expected for "
-                f"{self.nodes[node].value_names}, got {values.shape}"
+                f"node '{self.nodes[node].name}': values of shape (n, {len(names)}) expected for "
+                f"{names}, got {values.shape}"
             )
         placement = self.placements[node]
         X = np.broadcast_to(placement.X_PA, (len(values), 4, 4)).copy()
         if placement.rotation is not None:
             X[:, :3, :3] = X[:, :3, :3] @ placement.rotation.rotations(values)
         if placement.steps:
-            X = X @ chain_transforms(placement.steps, values)
+            X = X @ chain_transforms(placement.steps, self.step_values(node, values))
         return X
+
+    def step_values(self, node: int, values: Array) -> Array:
+        """Of a node's joints (n, j), at values (n, k) of the node that is its source."""
+        if not self.placements[node].follows:
+            return values
+        _, columns, multipliers, offsets = zip(*self.placements[node].follows, strict=True)
+        return np.asarray(values[:, list(columns)] * multipliers + offsets)
 
     def node_poses(self, values: Sequence[Array]) -> Array:
         """X_WN (n_nodes, 4, 4), given each node's values (k_i,)."""
@@ -258,7 +282,7 @@ class PoseTree:
             raise SettingsError(f"{len(self.nodes)} arrays of values expected, got {len(values)}")
         X_WN = np.empty((len(values[0]), len(self.nodes), 4, 4))
         for index, node in enumerate(self.nodes):
-            X_PN = self.relative_transforms(index, values[index])
+            X_PN = self.relative_transforms(index, values[self.source(index)])
             X_WN[:, index] = X_PN if node.parent < 0 else X_WN[:, node.parent] @ X_PN
         return X_WN
 
@@ -301,6 +325,8 @@ class PoseTree:
         for node, node_values in zip(self.nodes, values, strict=True):
             if node.positions:
                 q[list(node.positions)] = node_values
+        for follower, leader, multiplier, offset in self.followers:
+            q[follower] = multiplier * q[leader] + offset
         return q
 
     def values_from_positions(self, q: Array, X_WB: Array | None = None) -> list[Array]:

@@ -1,12 +1,13 @@
 """Builds a PoseTree: chooses the root, cuts what is not seen, turns joints over where needed."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from drake_pose.arrays import Array
 from drake_pose.body.parsed_model import ParsedModel
+from drake_pose.body.plant_source import Coupling
 from drake_pose.body.tree.link_graph import (
     ChainStep,
     JointEdge,
@@ -16,7 +17,12 @@ from drake_pose.body.tree.link_graph import (
     chain_transforms,
 )
 from drake_pose.body.tree.node_skin import find_skin, require_placed
-from drake_pose.body.tree.pose_tree import NodePlacement, PoseTree, PoseTreeNode, place_node
+from drake_pose.body.tree.pose_tree import (
+    NodePlacement,
+    PoseTree,
+    PoseTreeNode,
+    place_node,
+)
 from drake_pose.body.tree.root import BasePose, RootRotation, base_of_chain
 from drake_pose.errors import ModelError, SettingsError, UnknownNameError
 
@@ -31,7 +37,7 @@ class Branch:
     """One node to be: its group, its parent's branch (-1: the world), and the joints between.
 
     ``depth``: steps to the root; ``steps`` and ``positions``: the joints in the order walked, and
-    their indices into q.
+    their indices into q; ``follows``: what they follow of the parent's values, without positions.
     """
 
     group: int
@@ -39,6 +45,7 @@ class Branch:
     depth: int
     steps: tuple[ChainStep, ...] = ()
     positions: tuple[int, ...] = ()
+    follows: tuple[Coupling, ...] = ()
 
 
 def build_pose_tree(
@@ -53,6 +60,7 @@ def build_pose_tree(
     if root is not None and root not in model.link_names:
         raise UnknownNameError("link", root, model.link_names, str(model.path))
     held_values = {model.position_index(name): float(value) for name, value in held.items()}
+    _hold_alike(model, held_values)
     for name, value in held.items():
         if not np.isfinite(value):
             raise SettingsError(f"held joint '{name}' has the value {value}: give a finite number")
@@ -86,6 +94,22 @@ def build_pose_tree(
         return replace(tree, _rebuild=lambda moved: build(_checked_position(moved)))
 
     return build(position)
+
+
+def _hold_alike(model: ParsedModel, held: dict[int, float]) -> None:
+    """Hold what follows, or is followed by, what is held; SettingsError for values that differ."""
+    for follower, leader, multiplier, offset in model.couplings:
+        if follower in held:
+            held.setdefault(leader, (held[follower] - offset) / multiplier)
+    for follower, leader, multiplier, offset in model.couplings:
+        if leader in held:
+            wanted = multiplier * held[leader] + offset
+            if abs(held.setdefault(follower, wanted) - wanted) > _ROUNDING:
+                one, other = (model.position_names[k] for k in (follower, leader))
+                raise SettingsError(
+                    f"joint '{one}' is held at {held[follower]:g}, but it follows joint '{other}' "
+                    f"(<mimic>): {wanted:g} [rad or m]; hold one of them alone"
+                )
 
 
 def _checked_position(position: Sequence[float] | Array) -> Array:
@@ -173,6 +197,11 @@ def _branches(graph: LinkGraph, start: int) -> list[Branch]:
                 step = ChainStep(edge.joint_map, inverted=edge.outer == group)
                 walked = (*after.steps, step), (*after.positions, *edge.positions)
                 queue.append((Branch(edge.other(group), after.parent, after.depth, *walked), edge))
+    return _ordered(graph, found)
+
+
+def _ordered(graph: LinkGraph, found: list[Branch]) -> list[Branch]:
+    """Branches, parents before children, by depth, then by body."""
     bodies = [graph.groups[branch.group].body for branch in found]
     order = sorted(range(len(found)), key=lambda i: (found[i].depth, bodies[i]))
     return [
@@ -181,11 +210,77 @@ def _branches(graph: LinkGraph, start: int) -> list[Branch]:
     ]
 
 
+def _let_follow(
+    model: ParsedModel, graph: LinkGraph, branches: list[Branch], held: Collection[int]
+) -> list[Branch]:
+    """Hang branches on the one whose values all their joints follow, where nothing else moves them.
+
+    So the pose of a node in its parent is told by its own values, or by its parent's.
+    """
+    alike = _alike(model)
+    bent = {graph.group_of(link) for band in model.skin for link in (band.parent, band.child)}
+    leaders: dict[int, tuple[int, int]] = {}
+    found: list[Branch] = []
+    for i, branch in enumerate(branches):
+        known = [alike.get(p) if p not in held else None for p in branch.positions]
+        leads = {leaders[one.leader][0] if one and one.leader in leaders else -1 for one in known}
+        above, lead = branch.parent, min(leads, default=-1)
+        hangs_on = found[above] if above >= 0 else branch
+        beside = lead >= 0 and above == branches[lead].parent
+        below = above == lead or (hangs_on.parent == lead and hangs_on.follows)
+        if lead < 0 or len(leads) > 1 or branch.group in bent or not (beside or below):
+            for one, position in zip(known, branch.positions, strict=True):
+                if one:
+                    leaders.setdefault(one.leader, (i, position))
+            found.append(replace(branch, depth=hangs_on.depth + (above >= 0)))
+            continue
+        first, steps, follows = found[lead], branch.steps, list[Coupling]()
+        if beside:
+            last = len(first.positions)
+            for step in first.steps[::-1]:
+                last -= step.joint_map.position_count
+                own = first.positions[last : last + step.joint_map.position_count]
+                follows += [Coupling(p, last + k, 1.0, 0.0) for k, p in enumerate(own)]
+            steps = *(replace(s, inverted=not s.inverted) for s in first.steps[::-1]), *steps
+        elif above != lead:
+            steps, follows = hangs_on.steps + steps, list(hangs_on.follows)
+        for one in (one for one in known if one):
+            told = _relation(alike, one.follower, leaders[one.leader][1])
+            follows.append(told._replace(leader=first.positions.index(told.leader)))
+        found.append(Branch(branch.group, lead, first.depth + 1, steps, (), tuple(follows)))
+    return _ordered(graph, found)
+
+
+def _alike(model: ParsedModel) -> dict[int, Coupling]:
+    """All positions that follow others or are followed, leaders by themselves."""
+    own = {one.leader: Coupling(one.leader, one.leader, 1.0, 0.0) for one in model.couplings}
+    return own | {one.follower: one for one in model.couplings}
+
+
+def _relation(alike: Mapping[int, Coupling], follower: int, leader: int) -> Coupling:
+    """How one of two positions that follow the same one follows the other."""
+    one, other = alike[follower], alike[leader]
+    multiplier = one.multiplier / other.multiplier
+    return Coupling(follower, leader, multiplier, one.offset - multiplier * other.offset)
+
+
+def _followers(
+    model: ParsedModel, searched: Sequence[int], known: Collection[int]
+) -> tuple[Coupling, ...]:
+    """Which positions, that are not known, follow those that are searched."""
+    alike, found = _alike(model), []
+    for follower, one in alike.items():
+        own = [p for p in searched if p in alike and alike[p].leader == one.leader]
+        if own and follower not in known:
+            found.append(_relation(alike, follower, own[0]))
+    return tuple(found)
+
+
 def _plant_rooted(
     model: ParsedModel, graph: LinkGraph, position: Array | None, held: dict[int, float]
 ) -> PoseTree:
     """The tree that hangs on the plant's world as the file says."""
-    branches = _branches(graph, 0)
+    branches = _let_follow(model, graph, _branches(graph, 0), held)
     # The world is a branch itself where it is seen.
     on_world = 0 if branches and branches[0].group == 0 else -1
     objects = [branch.positions for branch in branches if branch.parent == on_world]
@@ -246,7 +341,7 @@ def _turned_over(
                 f"root '{root.name}': give root_position, where its origin is in the world [m]"
             )
         position = PlantKinematics(model).pose(root.body)[:3, 3]
-    branches = _branches(graph, start)
+    branches = _let_follow(model, graph, _branches(graph, start), held)
     X_WA = np.eye(4)
     X_WA[:3, 3] = position
     roots: Roots = {0: (X_WA, rotation)}
@@ -299,7 +394,8 @@ def _assemble(
     for index, branch in enumerate(branches):
         X_PA, rotation = roots.get(index, (np.eye(4), None))
         positions, steps = branch.positions, branch.steps
-        placements.append(place_node(model, positions, held, X_PA, rotation, steps))
+        follows = branch.follows
+        placements.append(place_node(model, positions, held, X_PA, rotation, steps, follows))
         names = tuple(model.position_names[position] for position in positions)
         inner = branches[branch.parent].group if branch.parent >= 0 else None
         nodes.append(
@@ -322,7 +418,8 @@ def _assemble(
     require_placed(
         model, graph, {(branches[b.parent].group, b.group) for b in branches if b.parent >= 0}
     )
-    moved = {*searched, *base.positions}
+    followers = _followers(model, searched, {*searched, *base.positions, *held})
+    moved = {*searched, *base.positions, *(one.follower for one in followers)}
     return PoseTree(
         model=model,
         nodes=tuple(nodes),
@@ -331,6 +428,7 @@ def _assemble(
         unobserved_positions=tuple(
             name for index, name in enumerate(model.position_names) if index not in moved
         ),
+        followers=followers,
         root=root,
         placements=tuple(placements),
         _base=base,

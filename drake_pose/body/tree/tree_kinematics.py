@@ -28,8 +28,8 @@ class PackedTree(NamedTuple):
     """A pose tree in the arrays that the kernel walks.
 
     parents: (n,); X_PA: (n, 4, 4) constant parts, R_W0 of turned roots included; value_starts:
-    (n + 1,); free: (n,) bool which begin with a rotation vector; step_starts: (n + 1,); steps: all
-    joints.
+    (n + 1,) where each node's values begin, what follows others behind all values; free: (n,) bool
+    which begin with a rotation vector; step_starts: (n + 1,); steps: all joints.
     """
 
     parents: np.ndarray
@@ -46,8 +46,9 @@ class Motions:
 
     The parameters are the tree's values and, after them, what ``TreeKinematics.motions`` was asked
     to add. A point of node i at p_W moves with parameter j by ``omega x p_W + v + sigma p_W`` where
-    ``moves[i, j]`` (nodes, m), else not at all. X_WN: (nodes, 4, 4); twists: (m, 7) omega, v,
-    sigma, in the world and about its origin.
+    ``moves[i, j]`` (nodes, m), else not at all; between both there are the motions of joints that
+    follow others, those of ``TreeKinematics.parameters``. X_WN: (nodes, 4, 4); twists: (m, 7)
+    omega, v, sigma, in the world and about its origin.
     """
 
     X_WN: np.ndarray
@@ -63,6 +64,7 @@ class TreeKinematics:
             that can take every direction.
         is_angle: whether a value is an angle [rad], else a length [m].
         turns_around: whether it is an angle that can take every direction.
+        parameters: (e,) the value that makes each motion: each one its own, then those that follow.
         packed: the tree as ``find_motions`` takes it.
     """
 
@@ -71,6 +73,17 @@ class TreeKinematics:
         self.names = tuple(name for node in tree.nodes for name in node.value_names)
         counts = [len(node.value_names) for node in tree.nodes]
         self.value_nodes = np.repeat(np.arange(len(counts)), counts)
+        firsts = np.cumsum([0, *counts])
+        self._splits = firsts.tolist()
+        led = [
+            (firsts[tree.nodes[i].parent] + one.leader, i, one.multiplier, one.offset)
+            for i, placement in enumerate(tree.placements)
+            for one in placement.follows
+        ]
+        values, nodes, scale, offset = np.array(led, dtype=np.float64).reshape(-1, 4).T
+        self.parameters = np.append(np.arange(firsts[-1]), values.astype(np.int64))
+        self._motion_nodes = np.append(self.value_nodes, nodes.astype(np.int64))
+        self._scale, self._offset = scale, offset
         bounds = [tree.value_bounds(i) for i in range(len(counts))]
         lower, upper = np.hstack([np.zeros((2, 0)), *bounds])
         self._middle = 0.5 * (lower + upper)
@@ -78,17 +91,17 @@ class TreeKinematics:
         self.lower = np.where(self.turns_around, -np.inf, lower)
         self.upper = np.where(self.turns_around, np.inf, upper)
         self.is_angle = np.concatenate([placement.is_angle for placement in tree.placements])
-        self.packed = _pack_tree(tree)
+        self.packed = _pack_tree(tree, firsts)
         self._moves = self._find_moves()
 
     def _find_moves(self) -> np.ndarray:
-        """(nodes, m + 4) which nodes each value moves, and the root's shift and growth."""
+        """(nodes, e + 4) which nodes each motion moves, and the root's shift and growth."""
         nodes = self.tree.nodes
-        moves = np.zeros((len(nodes), len(self.names) + 4), dtype=np.bool_)
+        moves = np.zeros((len(nodes), len(self.parameters) + 4), dtype=np.bool_)
         for i, node in enumerate(nodes):
             if node.parent >= 0:
                 moves[i] = moves[node.parent]
-            moves[i, :-4] |= self.value_nodes == i
+            moves[i, :-4] |= self._motion_nodes == i
             moves[i, -4:] = i == 0 or (node.parent >= 0 and moves[node.parent, -1])
         return moves
 
@@ -102,8 +115,7 @@ class TreeKinematics:
 
     def split(self, values: np.ndarray) -> tuple[np.ndarray, ...]:
         """Each node's values (k_i,) of all values (m,)."""
-        starts = self.packed.value_starts.tolist()
-        return tuple(np.asarray(values)[a:b] for a, b in pairwise(starts))
+        return tuple(np.asarray(values)[a:b] for a, b in pairwise(self._splits))
 
     def nearest_turns(self, values: np.ndarray, near: np.ndarray | None = None) -> np.ndarray:
         """The same pose's values (m,), angles that turn around in the turn nearest to ``near``.
@@ -142,8 +154,13 @@ class TreeKinematics:
         values = np.ascontiguousarray(values, dtype=np.float64)
         if values.shape != (len(self.names),):
             raise SettingsError(f"{len(self.names)} values expected, got shape {values.shape}")
-        X_WN, turns = find_motions(self.packed, values)
-        count = len(values)
+        count = len(self.parameters)
+        if count > len(values):
+            led = self._scale * values[self.parameters[len(values) :]] + self._offset
+            X_WN, turns = find_motions(self.packed, np.append(values, led))
+            turns[len(values) :] *= self._scale[:, None]
+        else:
+            X_WN, turns = find_motions(self.packed, values)
         added = 3 * translation + scale
         twists = np.zeros((count + added, 7))
         twists[:count, :6] = turns
@@ -155,8 +172,13 @@ class TreeKinematics:
         return Motions(X_WN, twists, self._moves[:, : count + added])
 
 
-def _pack_tree(tree: PoseTree) -> PackedTree:
+def _pack_tree(tree: PoseTree, firsts: np.ndarray) -> PackedTree:
     """The tree in arrays; turns of a root about its axes are joints like others."""
+    starts, end = firsts.copy(), firsts[-1]
+    for i, placement in enumerate(tree.placements):
+        if placement.follows:
+            starts[i], end = end, end + len(placement.follows)
+    starts[-1] = end
     X_PA, free, chains = [], [], []
     for placement in tree.placements:
         X, rotation = np.array(placement.X_PA), placement.rotation
@@ -170,7 +192,7 @@ def _pack_tree(tree: PoseTree) -> PackedTree:
     return PackedTree(
         parents=np.array([node.parent for node in tree.nodes], dtype=np.int64),
         X_PA=np.array(X_PA),
-        value_starts=np.cumsum([0, *(len(node.value_names) for node in tree.nodes)]),
+        value_starts=starts,
         free=np.array(free, dtype=np.bool_),
         step_starts=np.cumsum([0, *(len(chain) for chain in chains)]),
         steps=pack_steps([step for chain in chains for step in chain]),
@@ -305,12 +327,15 @@ def joint_offsets(tree: PoseTree) -> tuple[JointOffset, ...]:
     inboard = {int(joint.child_body().index()): joint for joint in joints}
     found = []
     for i, (node, placement) in enumerate(zip(tree.nodes, tree.placements, strict=True)):
-        X_BA, values, at = np.eye(4), tree.default_values()[i], 0
+        X_BA, at = np.eye(4), 0
+        follows = placement.follows
+        positions = [one.follower for one in follows] if follows else list(node.positions)
+        values = model.default_positions[positions] if follows else placement.defaults
         if node.parent >= 0:
             parent = model.link_index(tree.nodes[node.parent].name)
             X_BA = kinematics.pose(parent, tree.held)
         for k, step in enumerate(placement.steps):
-            joint = moving[node.positions[at]]
+            joint = moving[positions[at]]
             p_B = _offset(joint, inboard, pose)
             end = at + step.joint_map.position_count
             X_BC = X_BA @ chain_transforms([step], values[None, at:end])[0]

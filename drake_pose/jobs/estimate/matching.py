@@ -94,7 +94,7 @@ def match_frames(
             inputs, frame, pose, masks, parts, shown, **more,
             first_E_total=pose.first_E_total if pose.found else None,
             runs=pose.statistics.runs, outside_limit=pose.statistics.outside_limit,
-            explained=pose.explained, **record_pose_set(pose.pose_set, model),
+            explained=pose.explained, **record_pose_set(pose.pose_set, search.tree),
         )  # fmt: skip
 
 

@@ -109,7 +109,14 @@ def leave_out_links(
     centre = model.pose_tree(
         hub(model.pose_tree()), root_position=np.zeros(3), root_rotation=RootRotation.free()
     )
-    names = [k for node in centre.nodes if node.name in settings.unseen for k in node.value_names]
+    # What a link that is seen follows is not held.
+    led = {
+        centre.source(i) for i, one in enumerate(centre.nodes) if one.name not in settings.unseen
+    }
+    unseen = [
+        one for i, one in enumerate(centre.nodes) if one.name in settings.unseen and i not in led
+    ]
+    names = [name for node in unseen for name in node.value_names]
     usual = user_units(model) * model.default_positions
     held = {name: float(usual[model.position_index(name)]) for name in names}
     return model.without(settings.unseen), replace(settings, hold={**held, **settings.hold})

@@ -128,6 +128,7 @@ def read_known_positions(
         )
     # What moves nothing that is seen may be there.
     known = {*asked, *kinematics.tree.unobserved_positions} if unobserved else set(asked)
+    known |= {model.position_names[one.follower] for one in kinematics.tree.followers}
     if table.is_estimate:
         known |= _as_they_are(table, kinematics.tree)
     unused = [name for name in table.names if name not in known]

@@ -175,8 +175,10 @@ class _Run:
         flipped = [flip.values for flip in flips(kinematics, values)]
         tried = counter_turns(kinematics, values, INTERVAL)
         X_WN = kinematics.poses(values)
-        # The subtrees of no more than half of the nodes.
-        for nodes in (one for one in kinematics.tree.subtrees if 2 * len(one) <= len(X_WN)):
+        # The subtrees of no more than half of the nodes, which follow no node before them.
+        tree = kinematics.tree
+        below = [one for one in tree.subtrees if tree.source(one[0]) == one[0]]
+        for nodes in (one for one in below if 2 * len(one) <= len(X_WN)):
             again = self._coarse.find_again(X_WN, nodes)
             tried += self._values(self._coarse.choose_distinct(again, _TRIED, _APART), values)
         look = AnnealingStage(MEDIUM[0].scale, COARSE[0].spacing)

@@ -154,11 +154,14 @@ def turn_single_nodes(
     current = samples.copy()
     J = float(scoring.J(current[None])[0])
     unchanged = 0
-    for node in itertools.cycle(range(len(current))):
+    tree = scoring.sampled.tree
+    nodes = [i for i in range(len(current)) if tree.source(i) == i]
+    for node in itertools.cycle(nodes):
         if not proceed():
             break
         tried = np.repeat(current[None], len(scoring.sampled.values[node]), axis=0)
-        tried[:, node] = np.arange(len(tried))
+        together = [i for i in range(len(current)) if tree.source(i) == node]
+        tried[:, together] = np.arange(len(tried))[:, None]
         approximate = _J_by_bits(scoring, pictures, tried, node)
         tried = tried[np.argsort(approximate, kind="stable")[:_JUDGED]]
         Js = scoring.J(tried)
@@ -166,7 +169,7 @@ def turn_single_nodes(
         unchanged += 1
         if Js[best] < J:
             J, current, unchanged = float(Js[best]), tried[best], 1
-        if unchanged >= len(current):
+        if unchanged >= len(nodes):
             break
     return current
 

@@ -272,6 +272,9 @@ class PoseStore:
         pairs = np.empty((len(X_WP) * len(X_PN), 2), dtype=np.int32)
         pairs[:, 0] = np.repeat(np.arange(len(X_WP)), len(X_PN))
         pairs[:, 1] = np.tile(np.arange(len(X_PN)), len(X_WP))
+        if self.body.sampled.tree.source(node) != node:
+            taken = self.nodes[self.tree_nodes[node].parent].samples[parents]
+            pairs = pairs[pairs[:, 1] == taken[pairs[:, 0]]]
         views, limit = self.pictures.bit_views, self._limit(node)
         for view in views:
             left = prune_by_balls(

@@ -240,6 +240,8 @@ def samples_at(sampled: SampledTree, node_values: Sequence[np.ndarray]) -> np.nd
     samples = np.zeros(len(sampled.values), dtype=np.int64)
     for i, (grid, values) in enumerate(zip(sampled.values, node_values, strict=True)):
         if grid.shape[1] == 0:
+            # Where its joints follow its parent's it takes the parent's sample.
+            samples[i] = samples[sampled.tree.source(i)]
             continue
         gaps = np.abs(grid - np.asarray(values)).max(axis=1)
         samples[i] = int(np.argmin(gaps))

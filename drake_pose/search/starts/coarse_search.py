@@ -181,14 +181,17 @@ class CoarseSearch:
         for view, X_CP, mask in zip(self._views, X_CPs, masks, strict=True):
             score_samples(view, X_CP, balls, mask, _OUTSIDE_WEIGHT, added)
         costs = (poses.costs[:, None] + added).ravel()
+        parent = self._nodes[node].parent
+        if self.body.sampled.tree.source(node) == parent:
+            # No other sample than its parent's.
+            costs[(np.arange(len(X_PN)) != poses.samples[:, parent, None]).ravel()] = np.inf
         following = [i for i in self.body.limb_order if i not in placed]
         widest = len(self.body.sampled.X_PN[following[0]]) if following else 1
         width = min(hypotheses, max(_LEAST_HYPOTHESES, _EVALUATIONS // widest))
-        pool = min(len(costs), _SPARE * width)
+        pool = min(int(np.count_nonzero(costs < np.inf)), _SPARE * width)
         best = np.argpartition(costs, pool - 1)[:pool]
         best = best[np.lexsort((best, costs[best]))]
         X_WN = poses.X_WN[best // len(X_PN)]
-        parent = self._nodes[node].parent
         X_WP = np.eye(4) if parent < 0 else X_WN[:, parent]
         X_WN[:, node] = X_WP @ X_PN[best % len(X_PN)]
         kept = self._unlike(X_WN, placed)[:width]

@@ -69,13 +69,14 @@ def find_parts(tree: PoseTree) -> tuple[Part, ...]:
     for leaf in tree.leaves:
         chain = [leaf]
         while len(chain) <= _LONGEST_PART:
-            chains.append(tuple(reversed(chain)))
+            if tree.source(chain[-1]) == chain[-1]:
+                chains.append(tuple(reversed(chain)))
             parent = tree.nodes[chain[-1]].parent
             if parent < 0 or len(tree.nodes[parent].children) > 1:
                 break
             chain.append(parent)
     moved = {node for chain in chains for node in chain}
-    trunk = [i for i in range(len(tree.nodes)) if i not in moved]
+    trunk = [i for i in range(len(tree.nodes)) if i not in moved and tree.source(i) == i]
     parts = [Part(chain, chain) for chain in chains]
     return (*parts, *(Part((i,), (i,), tuple(tree.nodes[i].children)) for i in trunk))
 
@@ -117,7 +118,8 @@ class PartSearch:
         self.body = body
         self.parts, self.reflections = find_parts(body.tree), find_reflections(body.tree)
         self._grids = list(grids)
-        self._X_PN = [body.tree.relative_transforms(i, grid) for i, grid in enumerate(grids)]
+        sources = [grids[body.tree.source(i)] for i in range(len(grids))]
+        self._X_PN = [body.tree.relative_transforms(i, grid) for i, grid in enumerate(sources)]
         # Bands of skin are small, and where they are depends on the sample.
         self._outlines = few_rigid_triangles(body.surfaces, _TRIANGLES).rigid
         nodes = body.kinematics.value_nodes
@@ -146,6 +148,9 @@ class PartSearch:
             width = _WIDTHS[min(place, len(_WIDTHS) - 1)]
             kept = np.repeat(np.arange(len(samples)), len(tried))
             which = np.tile(np.arange(len(tried)), len(samples))
+            if self.body.tree.source(node) != node:
+                same = which == samples[kept, -1]
+                kept, which, X_new = kept[same], which[same], X_new[same]
             scores = gains[kept] + self._score(regions, [node], X_new[:, None])
             if place > 0:
                 best = np.argsort(-scores, kind="stable")[: _SPARE * width]

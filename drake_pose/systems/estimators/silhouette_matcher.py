@@ -176,7 +176,7 @@ class SilhouetteMatcher(BeliefSystem[Matched]):
         families = np.full((self._family_limit, len(names)), np.nan)
         found = [family.q for family in estimate.pose_set.families[: self._family_limit]]
         families[: len(found)] = found
-        determined, lower, upper = estimate.pose_set.position_intervals(names)
+        determined, lower, upper = estimate.pose_set.position_intervals(self._search.tree)
         return {
             "proved_optimal": np.array([float(estimate.proved_optimal)]),
             "determined": determined,
@@ -309,6 +309,8 @@ class SilhouetteTracker(SilhouetteMatcher):
             seen = [*self._moving, *self._still]
             found = track.state.best.deviations()[self._layout.indices(seen)]
             deviations[self._indices(seen)] = found
+            for follower, leader, multiplier, _ in self._search.tree.followers:
+                deviations[follower] = abs(multiplier) * deviations[leader]
         return deviations
 
     def _state(self, known: Matched) -> Array:
@@ -318,6 +320,8 @@ class SilhouetteTracker(SilhouetteMatcher):
             rates = self._layout.indices([f"rate_{name}" for name in self._moving])
             qdot[self._indices(self._still)] = 0.0
             qdot[self._indices(self._moving)] = track.state.best.mean[rates] / self._period
+            for follower, leader, multiplier, _ in self._search.tree.followers:
+                qdot[follower] = multiplier * qdot[leader]
         plant_context = plant.CreateDefaultContext()
         plant.SetPositions(plant_context, known.q)
         return np.concatenate([known.q, plant.MapQDotToVelocity(plant_context, qdot)])

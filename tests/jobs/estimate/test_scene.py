@@ -231,7 +231,7 @@ def test_what_the_model_does_not_enforce_is_told(
     joint = text.index('<joint name="luff"')
     end = text.index("</joint>", joint)
     model, out = tmp_path / "loose.urdf", tmp_path / "out"
-    model.write_text(f'{text[:end]}<mimic joint="lift"/>{text[end:]}')
+    model.write_text(f'{text[:end]}<mimic joint="gone"/>{text[end:]}')
     scene, options = replace(tiny_scene, model=model), ("--frame", "0", "--no-replay")
     result, summary = estimate(runner, scene, out, "--method", "paper", *options)
     checked = runner.invoke(app, ["check", str(model), "--json"])

@@ -20,7 +20,9 @@ from drake_pose.systems.estimators.diagrams import add_simulated_cameras, build_
 from drake_pose.systems.estimators.silhouette_matcher import TRACK, SilhouetteTracker
 from drake_pose.systems.pictures.silhouette_camera import SilhouetteCamera
 from tests.filtering.measurements.test_contour import pinhole
+from tests.search.arms import arm_cameras
 from tests.search.bodies import forked_body, front_camera
+from tests.search.gripper import gripper
 from tests.systems.bench import Bench
 
 PERIOD = 1 / 30
@@ -182,3 +184,20 @@ def test_measured_positions_that_masks_contradict_are_not_believed(body, search)
 def test_a_color_camera_that_is_none_is_named(search):
     with pytest.raises(UnknownNameError, match=r"side.*front"):
         SilhouetteTracker(search, [front_camera()], PERIOD, color_cameras=["side"])
+
+
+def test_fingers_that_follow_one_another_are_tracked_as_one(tmp_path):
+    model = gripper(tmp_path, follows=True)
+    t = np.arange(12) / 12
+    fingers = 0.04 + 0.03 * np.sin(2 * np.pi * t)
+    truth = np.column_stack([0.3 * t, -0.5 + 0.2 * t, fingers, fingers])
+    search = PaperSearch(model.pose_tree(), PaperSearchSettings(interval=math.radians(10)))
+    built = build_simulated_matching(
+        search, arm_cameras(), played(truth), PERIOD, tracking=TrackingSettings()
+    )
+    errors, deviations, track = followed(built.diagram, built.matcher, truth)
+    np.testing.assert_array_equal(track["tracked"][1:], 1.0)
+    np.testing.assert_array_equal(errors[:, 2], errors[:, 3])
+    np.testing.assert_array_equal(deviations[:, 2], deviations[:, 3])
+    # Half a pixel is 3.5 mm.
+    assert np.abs(errors[3:, 2:]).max() < 3e-3

@@ -1,0 +1,175 @@
+"""Joints that follow others, against Drake's plant and parser."""
+
+import numpy as np
+import pytest
+from pydrake.geometry import SceneGraph
+from pydrake.multibody.parsing import Parser
+from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, MultibodyPlant
+from pydrake.multibody.tree import BodyIndex
+from pydrake.systems.framework import DiagramBuilder
+
+from drake_pose.body.model import ArticulatedModel, load_model
+from drake_pose.body.report import describe_model, model_warnings
+from drake_pose.body.tree.tree_kinematics import TreeKinematics, joint_offsets
+from drake_pose.errors import ModelError, SettingsError
+from drake_pose.fit.lengthened_body import LengthenedBody
+from drake_pose.fit.surfaces import VERY_FEW, few_triangles
+from drake_pose.silhouette.areas.bending import TreeSurfaces
+
+from ..models import joint, link, urdf, write
+
+LIMITS = 'lower="0" upper="0.8"'
+# A finger that is driven, one that follows it, its tip, which follows by half, and what the tip
+# carries; a joint whose leader is moved by others between.
+HAND = urdf(
+    link("world", ""),
+    *map(link, ("palm", "one", "two", "tip", "nail", "far")),
+    joint("wrist", "revolute", "world", "palm", axis="0 1 0"),
+    joint("lead", "revolute", "palm", "one", axis="1 0 0", limits=LIMITS),
+    joint("mirror", "revolute", "palm", "two", axis="1 1 0", limits='lower="-0.6" upper="0.1"',
+          more='<mimic joint="lead" multiplier="-1" offset="0.1"/>'),
+    joint("bend", "revolute", "two", "tip", axis="0 1 0",
+          more='<mimic joint="mirror" multiplier="0.5" offset="-0.05"/>'),
+    joint("scratch", "revolute", "tip", "nail", axis="0 0 1"),
+    joint("far", "prismatic", "nail", "far", axis="0 0 1", more='<mimic joint="lead"/>'),
+)  # fmt: skip
+
+
+def tree_of(folder, text=HAND, **options):
+    return load_model(write(folder, text), check=False).pose_tree(**options)
+
+
+def drawn(tree, generator):
+    kinematics = TreeKinematics(tree)
+    low, high = np.maximum(kinematics.lower, -1.0), np.minimum(kinematics.upper, 1.0)
+    return kinematics, generator.uniform(low, high)
+
+
+@pytest.mark.parametrize("root", [None, "tip", "one"])
+def test_nodes_are_where_the_plant_has_them_and_one_value_moves_all(tmp_path, root):
+    tree = tree_of(tmp_path, root=root, root_position=None if root is None else [0.1, 0.2, 0.3])
+    model, plant = tree.model, tree.model.plant
+    kinematics = TreeKinematics(tree)
+    if root is None:
+        assert kinematics.names == ("wrist", "lead", "scratch", "far")
+        assert [tree.nodes[tree.source(i)].name for i in range(6)] == [
+            "palm", "one", "one", "one", "nail", "far"
+        ]  # fmt: skip
+    generator = np.random.default_rng(3)
+    for _ in range(5):
+        _, values = drawn(tree, generator)
+        q, X_WB = tree.positions_from(kinematics.split(values))
+        told = dict(zip(model.position_names, q, strict=True))
+        np.testing.assert_allclose(told["mirror"], 0.1 - told["lead"], atol=1e-9)
+        np.testing.assert_allclose(told["bend"], -0.5 * told["lead"], atol=1e-9)
+        context = plant.CreateDefaultContext()
+        plant.SetPositions(context, q)
+        for node, X_WN in zip(tree.nodes, kinematics.poses(values), strict=True):
+            body = plant.get_body(BodyIndex(model.link_index(node.name)))
+            X_BN = plant.EvalBodyPoseInWorld(context, body).GetAsMatrix4()
+            np.testing.assert_allclose(X_WN, X_WB @ X_BN, atol=1e-9)
+        back = kinematics.flatten(tree.values_from_positions(q, X_WB))
+        np.testing.assert_allclose(kinematics.poses(back), kinematics.poses(values), atol=1e-9)
+
+
+def test_what_is_not_enforced_is_told_and_what_is_stands_in_the_report(tmp_path):
+    tree = tree_of(tmp_path)
+    (told,) = model_warnings(tree.model, tree)
+    assert "'far' is written to follow joint 'lead'" in told
+    nodes = {node.name: node.joints for node in describe_model(write(tmp_path, HAND)).nodes}
+    assert [joint.follows for name in ("one", "two") for joint in nodes[name]] == [
+        "", "-1 lead +0.1"
+    ]  # fmt: skip
+
+
+def test_motions_against_finite_differences(tmp_path):
+    kinematics, values = drawn(tree_of(tmp_path), np.random.default_rng(1))
+    surfaces = few_triangles(TreeSurfaces(kinematics.tree), VERY_FEW)
+    body = LengthenedBody(kinematics, surfaces, joint_offsets(kinematics.tree))
+    theta = np.append(values, np.linspace(0.1, 0.2, len(body.links)))
+    p_N, step = np.array([0.1, 0.2, 0.3, 1.0]), 1e-6
+    for lengthened in (False, True):
+        at = theta if lengthened else values
+        placed = body.place(at)
+        dense = placed.dense(len(at)).reshape(len(placed.X_WN), len(at), 3, 4)
+        for k in range(len(at)):
+            ends = [at + sign * step * np.eye(len(at))[k] for sign in (1.0, -1.0)]
+            above, below = (body.place(end).X_WN @ p_N for end in ends)
+            found = np.einsum("nij,nj->ni", dense[:, k], placed.X_WN @ p_N)
+            np.testing.assert_allclose(found, (above - below)[:, :3] / (2 * step), atol=1e-7)
+
+
+def test_limits_are_shared_and_what_is_held_holds_the_others(tmp_path):
+    model = load_model(write(tmp_path, HAND), check=False)
+    lead, mirror = model.position_index("lead"), model.position_index("mirror")
+    np.testing.assert_allclose([model.lower[lead], model.upper[lead]], [0.0, 0.7])
+    np.testing.assert_allclose([model.lower[mirror], model.upper[mirror]], [-0.6, 0.1])
+    tree = model.pose_tree(held={"mirror": -0.3})
+    assert tree.held[lead] == pytest.approx(0.4)
+    np.testing.assert_allclose(tree.held[model.position_index("bend")], -0.2)
+    with pytest.raises(SettingsError, match=r"'mirror' is held at -0.3, but it follows .* 'lead'"):
+        model.pose_tree(held={"mirror": -0.3, "lead": 0.1})
+    apart = HAND.replace('lower="-0.6" upper="0.1"', 'lower="0.5" upper="0.9"')
+    with pytest.raises(ModelError, match=r"'mirror' follows joint 'lead'.*leave no value"):
+        tree_of(tmp_path, apart)
+    sign = HAND.replace('lower="-0.6" upper="0.1"', 'lower="0.1" upper="0.9"')
+    model = load_model(write(tmp_path, sign), check=False)
+    assert model.upper[lead] == 0.8
+    assert any(
+        "'mirror' follows joint 'lead' (<mimic>: -1 x +0.1)" in one for one in model.warnings
+    )
+    again = urdf(
+        *map(link, "ab"), joint("again", "revolute", "a", "b", more='<mimic joint="again"/>')
+    )
+    (told,) = load_model(write(tmp_path, again), check=False).warnings
+    assert "'again' is written to follow joint 'again' (<mimic>): not enforced" in told
+
+
+def sdf_text() -> str:
+    links = "".join(
+        f'<link name="{name}"><visual name="v"><geometry><box><size>.1 .1 .1</size></box>'
+        "</geometry></visual></link>" for name in "abc"
+    )  # fmt: skip
+    joints = "".join(
+        f'<joint name="{name}" type="prismatic"><parent>a</parent><child>{child}</child><axis>'
+        f"<xyz>0 1 0</xyz><limit><lower>-1</lower><upper>1</upper></limit>{mimic}</axis></joint>"
+        for name, child, mimic in (
+            ("lead", "b", ""),
+            ("follow", "c", '<mimic joint="lead"><multiplier>-2</multiplier><offset>.1</offset>'
+             "<reference>.2</reference></mimic>"),
+        )
+    )  # fmt: skip
+    return f'<sdf version="1.11"><model name="m">{links}{joints}</model></sdf>'
+
+
+MJCF = """<mujoco model="m"><worldbody><body name="a"><geom type="box" size=".1 .1 .1"/>
+<body name="b"><joint name="lead" type="slide" axis="0 1 0" ref=".05"/>
+<geom type="box" size=".1 .1 .1"/></body>
+<body name="c"><joint name="follow" type="slide" axis="0 1 0" range="-9 9"/>
+<geom type="box" size=".1 .1 .1"/></body></body></worldbody>
+<equality><joint joint1="follow" joint2="lead" polycoef=".4 -2 0 0 0"/></equality></mujoco>"""
+
+
+@pytest.mark.parametrize(
+    ("text", "name"), [(sdf_text(), "m.sdf"), (MJCF, "m.xml")], ids=["sdf", "mjcf"]
+)
+def test_every_format_couples_alike(tmp_path, text, name):
+    model = load_model(write(tmp_path, text, name), check=False)
+    (one,) = model.couplings
+    assert [model.position_names[k] for k in one[:2]] == ["follow", "lead"]
+    np.testing.assert_allclose(one[2:], (-2.0, 0.5), atol=1e-12)
+
+
+def test_a_plant_says_what_follows_as_its_file_does(tmp_path):
+    path = write(tmp_path, HAND)
+    builder = DiagramBuilder()
+    plant, scene_graph = AddMultibodyPlantSceneGraph(builder, 0.001)
+    Parser(plant).AddModels(str(path))
+    plant.Finalize()
+    own = ArticulatedModel.from_plant(plant, scene_graph)
+    assert plant.num_constraints() == 3
+    assert own.couplings == load_model(path, check=False).couplings
+    other, scene_graph = MultibodyPlant(0.0), SceneGraph()
+    own.add_to(other, scene_graph)
+    other.Finalize()
+    assert other.num_constraints() == 3

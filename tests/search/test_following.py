@@ -1,0 +1,70 @@
+"""A gripper whose fingers follow one another: one unknown in every search, the right answer."""
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+
+from drake_pose.search.continuous.multi_start import MultiStartSearch
+from drake_pose.search.continuous.search import ContinuousSearch
+from drake_pose.search.grid.beam_search import BeamSearch
+from drake_pose.search.grid.branch_and_bound import branch_and_bound
+from drake_pose.search.grid.examination import ExaminationSettings
+from drake_pose.search.grid.sampled_body import SampledBody
+from drake_pose.search.kameda import PaperSearch
+from drake_pose.search.scoring import Scoring
+from drake_pose.search.settings import BeamSearchSettings, PaperSearchSettings
+
+from .gripper import gripper, gripper_views
+
+GRID = {"interval": math.radians(15.0), "length_interval": 0.02}
+ON_GRID = np.array([math.radians(15.0), math.radians(-30.0), 0.04, 0.04])
+
+
+@pytest.fixture(scope="module")
+def models(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("gripper")
+    return {follows: gripper(folder, follows=follows) for follows in (True, False)}
+
+
+@pytest.mark.parametrize("search", [MultiStartSearch, ContinuousSearch])
+def test_continuous_searches_find_one_value_for_both_fingers(models, search):
+    matcher = search(models[True].pose_tree())
+    for q in ([0.3, -0.5, 0.04, 0.04], [-0.4, 0.7, 0.01, 0.01]):
+        found = matcher.match(gripper_views(models[True], np.array(q)))
+        np.testing.assert_allclose(found.q, q, atol=0.02)
+        np.testing.assert_allclose(found.q[2:], q[2:], atol=1e-3)
+        assert found.q[2] == found.q[3]
+        told = found.pose_set.position_intervals(matcher.tree)
+        np.testing.assert_array_equal(told[:, 2], told[:, 3])
+        names = [joint.name for joint in found.pose_set.joints]
+        assert names == ["mast_joint", "hand_joint", "left_joint"]
+
+
+def test_searches_on_grids_find_it_and_prove_it(models):
+    for follows, model in models.items():
+        tree, views = model.pose_tree(), gripper_views(model, ON_GRID)
+        for search in (
+            PaperSearch(tree, PaperSearchSettings(**GRID)),
+            BeamSearch(tree, BeamSearchSettings(**GRID), ExaminationSettings()),
+        ):
+            found = search.match(views)
+            np.testing.assert_allclose(found.q, ON_GRID, atol=1e-9)
+        assert found.proved_optimal
+        assert found.pose_set.complete
+        assert len(found.pose_set.joints) == (3 if follows else 4)
+
+
+def test_all_poses_within_a_limit_are_those_of_brute_force(models):
+    body = SampledBody(models[True].pose_tree(), BeamSearchSettings(**GRID))
+    tree = body.sampled.tree
+    assert [tree.nodes[tree.source(i)].name for i in range(4)] == ["mast", "hand", "left", "left"]
+    views = gripper_views(models[False], np.array([0.2, -0.4, 0.05, 0.03]))
+    grids = [range(len(values)) for values in body.sampled.values]
+    samples = np.array([pose for pose in itertools.product(*grids) if pose[2] == pose[3]])
+    Js = Scoring(body.sampled, views).J(samples)
+    limit = float(np.sort(Js)[40])
+    found = branch_and_bound(body, views, limit)
+    assert found.complete
+    assert set(map(tuple, found.graph.members())) == set(map(tuple, samples[Js <= limit]))

@@ -191,12 +191,15 @@ def _kameda_pictures(experiment: str, images: int, out: Path | None, json: bool)
 
 def shimada(
     *,
-    runs: Annotated[int, within(1)] = 50,
+    runs: Annotated[int | None, within(1)] = None,
     seed: Seed = 0,
     truncation: Literal["sequential", "joint", "clip", "none", "all"] | None = None,
-    observed: Literal["lines", "full"] = "lines",
+    observed: Literal["lines", "lines_wrist", "full"] | None = None,
     iterations: Annotated[int | None, within(1)] = None,
     hypotheses: bool = False,
+    pictures: bool = False,
+    noise: float = 1.0,
+    acceleration: float = 1.0,
     out: Pictures = None,
     json: Json = False,
 ) -> None:
@@ -204,47 +207,69 @@ def shimada(
 
     A two-finger hand moves, turns and flexes for 55 frames, measured with noise. A Kalman filter
     starts from wrong angles and lengths and corrects both, its belief truncated by the limits and
-    couplings of the paper's table 1.
+    couplings of the paper's table 1. The paper's own experiment is one of numbers (section 6); with
+    --pictures Drake's renderer shows the hand, and silhouettes are all that is seen (figure 17).
 
         drake-pose reproduce shimada --runs 20 --out results/shimada
+        drake-pose reproduce shimada --pictures --out results/figure_17
 
     Args:
-        runs: Number of sequences for each of r_13 = 35 and 40.
-        truncation: sequential (the paper's), joint, clip, none; or all of these. Default: joint;
-            with --hypotheses sequential.
-        observed: What is measured. lines: the knuckles are hidden, as in the paper; full: all
-            points.
-        iterations: Linearisations of an update at most; the paper's filter has 1. Default: 20,
-            fewer where the update stands still before; with --hypotheses 1.
+        runs: Number of sequences for each of r_13 = 35 and 40. Default: 50; with --pictures 10.
+        truncation: sequential is the paper's, default with --hypotheses; else joint; or all.
+        observed: What is measured. lines: axes of segments, fingertips and the palm's outline, as
+            in the paper; lines_wrist: the wrist's place, too; full: all points. Default: lines.
+        iterations: Linearisations of an update at most; the paper's filter has 1. Default: 20;
+            with --hypotheses 1.
         hypotheses: Another experiment, figure 9: fingers bend through the image plane; which
             hypotheses are made, and what rejects the wrong ones.
+        pictures: Silhouettes by Drake's renderer instead of numbers with noise.
+        noise: So many times the noise of the numbers, which the filter is told.
+        acceleration: So many times the accelerations that the filter expects.
     """
     if truncation == "all" and (hypotheses or out is not None):
         raise UsageError("--truncation all goes without --hypotheses and --out")
-    figures: Mapping[str, Any]
+    if pictures and (hypotheses or observed or noise != 1.0):
+        raise UsageError("--pictures goes without --hypotheses, --observed and --noise")
+    if hypotheses and (noise, acceleration) != (1.0, 1.0):
+        raise UsageError("--hypotheses goes without --noise and --acceleration")
+    runs, seen = runs or (10 if pictures else 50), observed or "lines"
+    if hypotheses:
+        _shimada_hypotheses(runs, seed, truncation or "sequential", seen, iterations, out, json)
+        return
     with _experiment(out) as count:
         from drake_pose.filtering.kalman.truncated_filter import TRUNCATIONS
-        from drake_pose.papers.shimada import result_table, run_experiment
-        from drake_pose.papers.shimada_hypotheses import run_hypotheses_experiment
-        from drake_pose.papers.shimada_pictures import save_hypotheses, save_pictures
+        from drake_pose.papers.shimada import PICTURES, result_table, run_experiment
+        from drake_pose.papers.shimada_pictures import save_pictures
 
-        if hypotheses:
-            filtered = (truncation or "sequential", observed, count, iterations or 1)
-            fates = run_hypotheses_experiment(runs, seed, *filtered)
-            figures, table = fates.as_json(), fates.table()
-            if out is not None and not save_hypotheses(fates, out):
-                say(
-                    "drake-pose: no wrong hypothesis was rejected by an inequality: nothing to draw"
-                )
-        else:
-            names = TRUNCATIONS if truncation == "all" else (truncation or "joint",)
-            results = [run_experiment(runs, seed, n, observed, count, iterations) for n in names]
-            every = [one.as_json() for one in results]
-            figures = dict(zip(names, every, strict=True)) if truncation == "all" else every[0]
-            table = result_table(*results)
-            if out is not None:
-                save_pictures(results[0], out)
-    _show(figures, [table], json)
+        names = TRUNCATIONS if truncation == "all" else (truncation or "joint",)
+        filtered = (PICTURES if pictures else seen, count, iterations, noise, acceleration)
+        results = [run_experiment(runs, seed, name, *filtered) for name in names]
+        every = [one.as_json() for one in results]
+        if out is not None:
+            save_pictures(results[0], out)
+    by_name: dict[str, Any] = dict(zip(names, every, strict=True))
+    _show(by_name if truncation == "all" else every[0], [result_table(*results)], json)
+
+
+def _shimada_hypotheses(
+    runs: int,
+    seed: int,
+    truncation: str,
+    observed: str,
+    iterations: int | None,
+    out: Path | None,
+    json: bool,
+) -> None:
+    """Figure 9."""
+    with _experiment(out) as count:
+        from drake_pose.papers.shimada_hypotheses import run_hypotheses_experiment
+        from drake_pose.papers.shimada_pictures import save_hypotheses
+
+        filtered = (truncation, observed, count, iterations or 1)
+        fates = run_hypotheses_experiment(runs, seed, *filtered)
+        if out is not None and not save_hypotheses(fates, out):
+            say("drake-pose: no wrong hypothesis was rejected by an inequality: nothing to draw")
+    _show(fates.as_json(), [fates.table()], json)
 
 
 def date(

@@ -24,6 +24,7 @@ LENGTHS = tuple(f"length_{i}{j}" for i in FINGERS for j in JOINTS)
 PALM = ("palm_width", "palm_height", "palm_thickness")
 WRIST = ("wrist_x", "wrist_y")
 QUATERNION = ("palm_qw", "palm_qx", "palm_qy", "palm_qz")
+PALM_EDGES = ("left", "right", "top", "bottom")
 
 HAND_STATE = StateLayout((*WRIST, *QUATERNION, *SPREADS, *FLEXIONS), (*LENGTHS, *PALM))
 """The state (5): wrist in the image [pixel], quaternion, angles [rad]; rates; lengths [m]."""
@@ -32,7 +33,7 @@ MEASURED = (
     *WRIST,
     *(f"point_{i}{j}_{axis}" for i in FINGERS for j in (0, *JOINTS) for axis in "xy"),
     *(f"{kind}_{i}{j}" for i in FINGERS for j in JOINTS for kind in ("alpha", "rho")),
-    *(f"{kind}_palm_{edge}" for edge in ("left", "right", "top") for kind in ("alpha", "rho")),
+    *(f"{kind}_palm_{edge}" for edge in PALM_EDGES for kind in ("alpha", "rho")),
     "scale",
 )
 """What is measured (13): points [pixel]; lines by angle [rad] and distance [pixel]; the scale."""
@@ -43,9 +44,11 @@ _SEEN = HAND_STATE.indices((*WRIST, *QUATERNION, *SPREADS, *FLEXIONS, *LENGTHS, 
 _QUATERNION, _SPREAD, _FLEXION, _LENGTH, _PALM = 2, 6, 8, 14, 20
 # A mirrored angle closer than this is the same [rad].
 _SMALLEST_CHANGE = math.radians(8)
-# Where lines and the scale stand among MEASURED, and between which of the points drawn lines are.
+# Where lines and the scale stand among MEASURED.
 _LINES, _SCALE = MEASURED.index("alpha_11"), MEASURED.index("scale")
-_STARTS, _ENDS = np.array([0, 1, 2, 4, 5, 6, 8, 10, 12]), np.array([1, 2, 3, 5, 6, 7, 9, 11, 13])
+LINE_STARTS = np.array([0, 1, 2, 4, 5, 6, 8, 10, 12, 14])
+LINE_ENDS = np.array([1, 2, 3, 5, 6, 7, 9, 11, 13, 15])
+"""Between which of the points drawn the lines are: six of fingers, four of the palm."""
 
 
 @dataclass(frozen=True)
@@ -87,7 +90,7 @@ class HandObservation:
 
     @cached_property
     def variances(self) -> Array:
-        """(37,) of the noise."""
+        """(39,) of the noise."""
         deviations = np.full(len(MEASURED), self.point_deviation)
         deviations[_LINES:_SCALE:2] = self.angle_deviation
         deviations[_LINES + 1 : _SCALE : 2] = self.distance_deviation
@@ -96,18 +99,18 @@ class HandObservation:
 
     @cached_property
     def wraps(self) -> NDArray[np.bool_]:
-        """(37,) true for the angles."""
+        """(39,) true for the angles."""
         return np.array([name.startswith("alpha") for name in MEASURED])
 
     def predict(self, x: Array) -> tuple[Array, Array]:
-        """Features (37,) of (13) and the scale ``|q|^2``, NaN for short axes; Jacobian (37, n)."""
+        """Features (39,) of (13) and the scale ``|q|^2``, NaN for short axes; Jacobian (39, n)."""
         h, seen, _ = project_hand(x[_SEEN], self.pixels_per_metre, self.shortest)
         H = np.zeros((len(MEASURED), len(HAND_STATE)))
         H[:, _SEEN] = seen
         return h, H
 
     def drawing(self, x: Array) -> Array:
-        """(14, 2) pixels: base, knuckles, tip of each finger; ends of the palm's three edges."""
+        """(16, 2) pixels: base, knuckles, tip of each finger; ends of the palm's four edges."""
         return project_hand(x[_SEEN], self.pixels_per_metre, self.shortest)[2]
 
     def mirrors(self, belief: Belief) -> list[Array]:
@@ -137,17 +140,21 @@ class HandObservation:
         return found
 
 
-def plant_positions(x: Array, names: tuple[str, ...], pixels_per_metre: float) -> Array:
+def plant_positions(
+    x: Array, names: tuple[str, ...], pixels_per_metre: float, distance: float | None = None
+) -> Array:
     """(nq,) positions of ``urdf/two_finger_hand`` for a state (n,) as in ``HAND_STATE``.
 
-    The palm's quaternion is normalised; its position is the wrist's pixel at scale 1, its depth 0.
+    The palm's quaternion is normalised; its position is the wrist's pixel at scale 1, its depth 0:
+    or, before a pinhole so far away on the z axis [m], where its scale and the wrist are seen.
     """
     value = dict(zip(HAND_STATE.names, x, strict=True))
     quaternion = np.array([value[name] for name in QUATERNION])
     value.update(zip(QUATERNION, quaternion / np.linalg.norm(quaternion), strict=True))
-    value["palm_x"] = value["wrist_x"] / pixels_per_metre
-    value["palm_y"] = value["wrist_y"] / pixels_per_metre
-    value["palm_z"] = 0.0
+    scale = 1.0 if distance is None else float(quaternion @ quaternion)
+    value["palm_x"] = value["wrist_x"] / (scale * pixels_per_metre)
+    value["palm_y"] = value["wrist_y"] / (scale * pixels_per_metre)
+    value["palm_z"] = 0.0 if distance is None else distance * (1.0 / scale - 1.0)
     for i in FINGERS:
         value[f"base_height_{i}"] = value["palm_height"]
         value[f"base_side_{i}"] = 0.25 * value["palm_width"]
@@ -195,7 +202,7 @@ def _place_finger(x: Array, i: int, count: int, p: Array, dp: Array) -> None:
 
 @compiled
 def _palm_ends(M: Array) -> Array:
-    """(6, 3) ends of the outer edges of the palm's box, two sides and top, as shares of its size.
+    """(8, 3) ends of the outer edges of the palm's box, PALM_EDGES, as shares of its size.
 
     Of height, thickness and width, along the hand's x, y and z.
     """
@@ -212,6 +219,8 @@ def _palm_ends(M: Array) -> Array:
             [1.0, -side, -0.5],
             [1.0, top, 0.5],
             [1.0, top, -0.5],
+            [0.0, -top, 0.5],
+            [0.0, -top, -0.5],
         ]
     )
 
@@ -226,14 +235,14 @@ def project_hand(x: Array, scale: float, shortest: float) -> tuple[Array, Array,
         shortest: a line shorter than this in the image has no axis [pixel].
 
     Returns:
-        h (37,) of (13), NaN for lines too short; H (37, 23); and the points drawn (14, 2): base,
-        knuckles, tip of both fingers, and the ends of the palm's three edges.
+        h (39,) of (13), NaN for lines too short; H (39, 23); and the points drawn (16, 2): base,
+        knuckles, tip of both fingers, and the ends of the palm's four edges.
     """
     n = len(x)
     M, D = scaled_rotation(x[_QUATERNION:_SPREAD])
     ends = _palm_ends(M)
-    points, J = np.zeros((14, 2)), np.zeros((14, 2, n))
-    for k in range(14):
+    points, J = np.zeros((16, 2)), np.zeros((16, 2, n))
+    for k in range(16):
         p, dp = np.zeros(3), np.zeros((3, n))
         if k < 8:
             _place_finger(x, k // 4, k % 4, p, dp)
@@ -256,9 +265,9 @@ def project_hand(x: Array, scale: float, shortest: float) -> tuple[Array, Array,
         for k in range(8):
             h[2 + 2 * k + a] = points[k, a]
             copy_into(H[2 + 2 * k + a], J[k, a])
-    for line in range(len(_STARTS)):
+    for line in range(len(LINE_STARTS)):
         # Angle and signed distance from the origin: (11) and (12).
-        row, start, end = _LINES + 2 * line, _STARTS[line], _ENDS[line]
+        row, start, end = _LINES + 2 * line, LINE_STARTS[line], LINE_ENDS[line]
         u, v = points[start]
         dx, dy = points[end, 0] - u, points[end, 1] - v
         length = math.sqrt(dx * dx + dy * dy)

@@ -22,10 +22,11 @@ from drake_pose.filtering.state import Belief
 Array = NDArray[np.float64]
 
 FRAMES = 55
-OBSERVED = ("full", "lines")
-"""What is seen: everything, or all but the knuckles."""
-# Knuckles: hidden in the setting "lines".
+# What is hidden, by what is observed.
 _KNUCKLES = tuple(f"point_{i}{j}_{axis}" for i in (1, 2) for j in (0, 1, 2) for axis in "xy")
+_HIDDEN = {"full": (), "lines": (*_KNUCKLES, *WRIST), "lines_wrist": _KNUCKLES}
+OBSERVED = tuple(_HIDDEN)
+"""What is seen: everything; the fingers' axes and tips and the palm's outline; the wrist, too."""
 
 ACCELERATIONS = {
     **dict.fromkeys(WRIST, 0.8),
@@ -93,7 +94,7 @@ def make_sequence(
 ) -> SyntheticSequence:
     """Draw a sequence: its motion's phases, its noise, and table 2's first guess.
 
-    `observed` is "full", or "lines": the knuckles are hidden; the rest as for ``true_states``.
+    `observed` is one of ``OBSERVED``; the rest as for ``true_states``.
     """
     states = true_states(r_13, generator.uniform(-0.6, 0.6, 6), yaw_middle)
     deviations = np.sqrt(observation.variances)
@@ -102,9 +103,7 @@ def make_sequence(
     # Table 2 gives the scale of the first frame, and of no other.
     measurements[1:, MEASURED.index("scale")] = np.nan
     measurements[0, MEASURED.index("scale")] = 1.0
-    if observed == "lines":
-        hidden = [MEASURED.index(name) for name in _KNUCKLES]
-        measurements[:, hidden] = np.nan
+    measurements[:, [MEASURED.index(name) for name in _HIDDEN[observed]]] = np.nan
     return SyntheticSequence(states, measurements, first_guess(states[0], generator))
 
 

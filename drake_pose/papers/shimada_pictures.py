@@ -1,4 +1,4 @@
-"""Pictures of Shimada's synthetic experiment in the manner of the paper's figures 9 to 16."""
+"""Pictures of Shimada's experiments in the manner of the paper's figures 9 to 18."""
 
 from pathlib import Path
 
@@ -11,12 +11,13 @@ from drake_pose.filtering.hand import (
     FLEXIONS,
     HAND_STATE,
     LENGTHS,
+    MEASURED,
     PALM,
     QUATERNION,
     SPREADS,
     HandObservation,
 )
-from drake_pose.papers.shimada import CASES, PIXELS_PER_METRE, ExperimentResult, Trial
+from drake_pose.papers.shimada import CASES, PICTURES, PIXELS_PER_METRE, ExperimentResult, Trial
 from drake_pose.papers.shimada_hypotheses import HypothesesResult
 from drake_pose.papers.shimada_motion import FRAMES
 from drake_pose.papers.tables import save_figure
@@ -40,11 +41,13 @@ def save_pictures(result: ExperimentResult, folder: Path) -> list[Path]:
         ("figure_15_length_r13_35", "length_13", first["r13_35"], PIXELS_PER_METRE, "r_13 [pixel]"),
         ("figure_16_length_r13_40", "length_13", first["r13_40"], PIXELS_PER_METRE, "r_13 [pixel]"),
     )
-    figures = {
-        "figure_10_sequence": _draw_sequence(trial),
-        "figure_11_shapes": _draw_shapes(first),
-        "figure_12_scale": _draw_scale(trial),
-    }
+    figures = {"figure_12_scale": _draw_scale(trial)}
+    if result.observed == PICTURES:
+        figures["figure_17_pictures"] = _draw_matches(trial)
+        figures["figure_18_shapes"] = _draw_shapes(first)
+    else:
+        figures["figure_10_sequence"] = _draw_sequence(trial)
+        figures["figure_11_shapes"] = _draw_shapes(first)
     for name, element, shown, factor, label in curves:
         index = HAND_STATE.index(element)
         values = shown.sequence.states, shown.means, shown.deviations
@@ -112,7 +115,7 @@ def _draw_hand(axes: Axes, state: Array, colour: str) -> None:
     points = HandObservation(pixels_per_metre=PIXELS_PER_METRE).drawing(state)
     for finger in (points[:4], points[4:8]):
         axes.plot(finger[:, 0], finger[:, 1], "-o", color=colour, markersize=3, linewidth=2)
-    for edge in (points[8:10], points[10:12], points[12:14]):
+    for edge in points[8:].reshape(-1, 2, 2):
         axes.plot(edge[:, 0], edge[:, 1], color=colour, linewidth=1)
     axes.set_aspect("equal")
 
@@ -128,6 +131,43 @@ def _draw_sequence(trial: Trial) -> Figure:
     # Pixels count downwards.
     grid[0, 0].invert_yaxis()
     return figure
+
+
+def _draw_matches(trial: Trial) -> Figure:
+    """Figure 17: silhouettes, the rough pose matched, the axes and tips measured, the estimate."""
+    figure = Figure(figsize=(3.6 * len(trial.kept), 11))
+    grid = figure.subplots(4, len(trial.kept))
+    axis_rows, tips = _rows_of("alpha_", "rho_"), _rows_of("_x", "_y")[:, 4::4]
+    for column, (frame, (mask, y, rough)) in zip(grid.T, trial.kept.items(), strict=True):
+        rows, cols = np.nonzero(mask)
+        height, width = mask.shape
+        # The state's origin is the picture's middle.
+        extent = (-0.5 * width, 0.5 * width, 0.5 * height, -0.5 * height)
+        u, v = cols - 0.5 * (width - 1), rows - 0.5 * (height - 1)
+        for axes in column:
+            axes.imshow(mask, cmap="gray_r", alpha=0.35, extent=extent, vmin=0, vmax=1)
+            axes.set(xlim=(u.min() - 15, u.max() + 15), ylim=(v.max() + 15, v.min() - 15))
+            axes.set(xticks=[], yticks=[])
+        column[0].set_title(f"t = {frame + 1}", fontsize=9)
+        _draw_hand(column[1], rough, _REJECTED)
+        for alpha, rho in y[axis_rows].T:
+            direction = np.array([np.cos(alpha), np.sin(alpha)])
+            foot, reach = rho * np.array([-direction[1], direction[0]]), 1e3
+            ends = foot + np.outer((-reach, reach), direction)
+            column[2].plot(ends[:, 0], ends[:, 1], color=_REJECTED, linewidth=0.8)
+        column[2].plot(*y[tips], "o", color=_ESTIMATE, markersize=4)
+        _draw_hand(column[3], trial.means[frame], _ESTIMATE)
+    for axes, label in zip(
+        grid[:, 0], ("picture", "rough pose", "measured", "estimate"), strict=True
+    ):
+        axes.set_ylabel(label)
+    return figure
+
+
+def _rows_of(first: str, second: str) -> NDArray[np.intp]:
+    """(2, k) where two kinds of number stand among what is measured."""
+    kinds = [[k for k, name in enumerate(MEASURED) if part in name] for part in (first, second)]
+    return np.array(kinds, dtype=np.intp)
 
 
 def _draw_shapes(first: dict[str, Trial]) -> Figure:

@@ -10,6 +10,7 @@ from drake_pose.filtering.hand import HAND_STATE, LENGTHS, MEASURED, HandObserva
 from drake_pose.filtering.kalman.truncated_filter import TRUNCATIONS
 from drake_pose.papers.shimada import (
     CASES,
+    PICTURES,
     experiment_filter,
     result_table,
     run_experiment,
@@ -94,14 +95,47 @@ def test_the_noise_is_what_the_filter_is_told():
     assert np.nanstd(seen) == pytest.approx(1.0, abs=0.02)
 
 
-def test_lines_hides_the_knuckles_and_nothing_else():
-    sequence = make_sequence(35.0, "lines", HandObservation(), np.random.default_rng(2))
+@pytest.mark.parametrize(("observed", "more"), [("lines", {"wrist_x", "wrist_y"}),
+                                                ("lines_wrist", set())])  # fmt: skip
+def test_lines_hides_the_knuckles_and_the_wrist(observed, more):
+    sequence = make_sequence(35.0, observed, HandObservation(), np.random.default_rng(2))
     hidden = np.isnan(sequence.measurements).all(axis=0)
     names = {name for name, gone in zip(MEASURED, hidden, strict=True) if gone}
-    assert names == {f"point_{i}{j}_{a}" for i in (1, 2) for j in (0, 1, 2) for a in "xy"}
+    assert names == more | {f"point_{i}{j}_{a}" for i in (1, 2) for j in (0, 1, 2) for a in "xy"}
     scale = sequence.measurements[:, MEASURED.index("scale")]
     assert scale[0] == 1.0
     assert np.isnan(scale[1:]).all()
+
+
+@pytest.mark.slow
+def test_lengths_are_learned_from_drakes_pictures(tmp_path):
+    """Plant, renderer, sensor, filter; the silhouette alone, and no part of it named."""
+    result = run_experiment(runs=2, seed=5, observed=PICTURES)
+    for key, figures in ((key, result.as_json()[key]) for key in CASES):
+        assert figures["lost"] == 0
+        assert figures["length_error_largest"] < 0.05
+        assert figures["inside_2sigma_all"] > 0.9
+        assert figures["angle_rmse"] < 3.0
+        assert figures["silhouette_difference"] < 0.045
+        assert figures["mirrored"] > 0
+        guess, truth = (
+            getattr(result.trials[key][0], name) for name in ("sequence", "means")
+        )  # fmt: skip
+        first = np.abs(guess.guess.mean - guess.states[0])[LENGTH].mean()
+        assert np.abs(truth[-1] - guess.states[-1])[LENGTH].mean() < 0.2 * first
+    files = {file.name for file in save_pictures(result, tmp_path)}
+    assert {"figure_17_pictures.png", "figure_18_shapes.png"} <= files
+
+
+def test_more_noise_and_less_acceleration_than_there_is_cost_accuracy():
+    usual = run_experiment(runs=3, truncation="sequential", iterations=1)
+    noisy = run_experiment(runs=3, truncation="sequential", iterations=1, noise=4.0)
+    stiff = run_experiment(runs=3, acceleration=0.1)
+    angles = [np.mean([one.as_json()[key]["angle_rmse"] for key in CASES])
+              for one in (usual, noisy, run_experiment(runs=3), stiff)]  # fmt: skip
+    assert angles[1] > angles[0]
+    assert angles[3] > 1.5 * angles[2]
+    assert (noisy.as_json()["noise"], stiff.as_json()["acceleration"]) == (4.0, 0.1)
 
 
 def test_each_case_converges_to_its_own_truth_inside_table_1(result):
@@ -144,7 +178,14 @@ def test_pictures_are_written(result, tmp_path):
 def test_bad_arguments_are_named(run, bad, word):
     with pytest.raises(SettingsError, match=word):
         run(**bad)
-    assert OBSERVED == ("full", "lines")
+    assert OBSERVED == ("full", "lines", "lines_wrist")
+
+
+@pytest.mark.parametrize("bad", [{"noise": 0.0}, {"acceleration": -1.0},
+                                 {"observed": PICTURES, "noise": 2.0}])  # fmt: skip
+def test_bad_factors_are_named(bad):
+    with pytest.raises(SettingsError, match="acceleration" if "acceleration" in bad else "noise"):
+        run_experiment(runs=1, **bad)
 
 
 def test_all_truncations_side_by_side():
@@ -175,6 +216,11 @@ def test_the_papers_own_filter_can_be_asked_for():
 @pytest.mark.parametrize("other", [("--hypotheses",), ("--out", "somewhere")])
 def test_all_truncations_go_alone(other):
     assert "--truncation" in reproduce("--truncation", "all", *other, code=2)
+
+
+@pytest.mark.parametrize("other", [("--hypotheses",), ("--observed", "full"), ("--noise", "2")])
+def test_pictures_go_alone(other):
+    assert "--pictures" in reproduce("--pictures", *other, code=2)
 
 
 def test_a_hypothesis_is_born_lives_and_dies_once(fates):

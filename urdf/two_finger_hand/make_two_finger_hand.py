@@ -14,7 +14,6 @@ ANGLE_LIMITS = {"spread_1": (-20, 0), "spread_2": (0, 20), "flexion": (0, 90)}  
 LENGTH_LIMITS = {1: (55, 70), 2: (30, 50), 3: (25, 50)}  # r_i1, r_i2, r_i3 [mm]
 # Table 1 does not bound the palm; these only keep it positive and hand-sized.
 PALM_LIMITS = {"palm_width": (40, 120), "palm_height": (50, 130), "palm_thickness": (10, 50)}
-DEFAULT_LENGTHS = {1: 0.062, 2: 0.040, 3: 0.036}
 FINGER_RADIUS = 0.008
 DIFFERENCES = (
     ("flexion_12", "flexion_13", "within: 10, unit: deg"),
@@ -68,11 +67,15 @@ def metres(limits: tuple[float, float]) -> tuple[float, float]:
     return (limits[0] / 1000, limits[1] / 1000)
 
 
-def cylinder(length: float) -> str:
-    """A finger segment along +x: drawn with its default length."""
+def half_segment(j: int, sign: int) -> str:
+    """A capsule of segment j's least length from its joint along x, or back from its end.
+
+    The two slide over each other: no length is twice the least, so that they show every length.
+    """
+    length = LENGTH_LIMITS[j][0] / 1000
     return (
-        f'    <visual><origin xyz="{length / 2:.6g} 0 0" rpy="0 {math.pi / 2:.12g} 0"/><geometry>'
-        f'<cylinder radius="{FINGER_RADIUS}" length="{length}"/></geometry></visual>'
+        f'    <visual><origin xyz="{sign * length / 2:.6g} 0 0" rpy="0 {math.pi / 2:.12g} 0"/>'
+        f'<geometry><drake:capsule radius="{FINGER_RADIUS}" length="{length}"/></geometry></visual>'
     )
 
 
@@ -98,11 +101,11 @@ def finger(i: int) -> list[str]:
     parent = f"base_side_{i}"
     for j in (1, 2, 3):
         child = f"segment_{i}{j}"
-        lines += link(child, cylinder(DEFAULT_LENGTHS[j]))
+        lines += link(child, half_segment(j, 1))
         limits = radians(ANGLE_LIMITS["flexion"])
         lines += joint("revolute", f"flexion_{i}{j}", parent, child, "0 0 1", limits)
         parent = f"end_{i}{j}"
-        lines += link(parent)
+        lines += link(parent, half_segment(j, -1))
         limits = metres(LENGTH_LIMITS[j])
         lines += joint("prismatic", f"length_{i}{j}", child, parent, "1 0 0", limits)
     return lines
@@ -132,7 +135,8 @@ def main() -> None:
     folder = parser.parse_args().out
     folder.mkdir(parents=True, exist_ok=True)
     lines = ['<?xml version="1.0"?>', "<!-- Written by make_two_finger_hand.py. -->"]
-    lines += [f'<robot name="{NAME}">', *palm(), *finger(1), *finger(2), "</robot>"]
+    lines.append(f'<robot name="{NAME}" xmlns:drake="http://drake.mit.edu">')
+    lines += [*palm(), *finger(1), *finger(2), "</robot>"]
     (folder / f"{NAME}.urdf").write_text("\n".join(lines) + "\n")
     rows = [f"  - {{first: {a}, second: {b}, {bounds}}}" for a, b, bounds in DIFFERENCES]
     header = ["# Table 1's couplings; written by make_two_finger_hand.py.", "differences:"]

@@ -15,6 +15,8 @@ Vectors = Mapping[str, Sequence[float]]
 """(3,) by the name of a link or joint."""
 
 _NOTHING: Vectors = {}
+# Drake's own elements keep the prefix that Drake looks for.
+ElementTree.register_namespace("drake", "http://drake.mit.edu")
 
 
 def reshaped(

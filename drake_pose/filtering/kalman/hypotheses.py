@@ -53,7 +53,7 @@ def next_view(view: View | None, seen: Evidence, significance: float) -> View:
     new_rows = np.isfinite(y) & ~np.isfinite(view.reference)
     if new_rows.any() or not both.any():
         return View(y, 1)
-    size = float(np.sum(change[both] ** 2 / (2.0 * seen.variances[both])))
+    size = float(np.sum(change[both] ** 2 / (2.0 * np.diag(seen.covariance)[both])))
     is_new = size > _largest_change(significance, int(np.count_nonzero(both)))
     return View(y, 1) if is_new else View(view.reference, view.count + 1)
 

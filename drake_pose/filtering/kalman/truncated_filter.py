@@ -46,6 +46,7 @@ TRUNCATIONS: tuple[Truncation, ...] = get_args(Truncation)
 
 # Hypotheses closer than this in every element are one [deviations]; of the joint truncation.
 _TWIN_DISTANCE, _TOLERANCE = 0.3, 1e-3
+_ROUGH_ITERATIONS = 3
 
 
 @dataclass(frozen=True)
@@ -172,10 +173,24 @@ class TruncatedFilter:
         moved = []
         for h in state.hypotheses:
             repeated = h.repeated.moved(self._A, self._U) if h.repeated else None
-            free = repeated.state() if repeated else h.free.moved(self._A, self._U)
-            belief = h.belief.moved(self._A, self._U)
+            free = repeated.state() if repeated else self.predicted(h.free)
+            belief = self.predicted(h.belief)
             moved.append(replace(h, belief=belief, free=free, repeated=repeated))
         return replace(state, hypotheses=tuple(moved), rejections=())
+
+    def predicted(self, belief: Belief) -> Belief:
+        """A belief after one step at constant velocity: (6)."""
+        return belief.moved(self._A, self._U)
+
+    def corrected(self, prediction: Belief, y: Array, variances: Array, start: Array) -> Array:
+        """(n,) the mean of a prediction after a measurement, without hypotheses: a rough state.
+
+        Args:
+            start: (n,) where to linearise first; y (m,) and variances as for ``update``.
+        """
+        seen = make_evidence(self.observation, y, variances)
+        few = min(self.settings.iterations, _ROUGH_ITERATIONS)
+        return update(prediction, seen, few, start, False, self._limits).truncated.mean
 
     def update(
         self,
@@ -188,7 +203,8 @@ class TruncatedFilter:
 
         Args:
             observation: what is measured, if not what the filter was made for.
-            variances: (m,) of this measurement's noise, finite where it is; None: the model's.
+            variances: (m,) of this measurement's noise, or its covariance (m, m), finite where it
+                is; None: the model's.
 
         Raises:
             SettingsError: the measurement does not fit.

@@ -77,11 +77,11 @@ class LinearObservation:
 
 
 class Evidence(NamedTuple):
-    """A measurement y (m,), NaN where occluded, of a model, with this one's noise (m,)."""
+    """A measurement y (m,), NaN where occluded, of a model, with its noise's covariance (m, m)."""
 
     model: ObservationModel
     y: Array
-    variances: Array
+    covariance: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,34 +105,42 @@ class Updated:
 
 
 def make_evidence(model: ObservationModel, y: Array, variances: Array | None = None) -> Evidence:
-    """A measurement y (m,), NaN where occluded, and its variances (m,), else the model's.
+    """A measurement y (m,), NaN where occluded, and its noise, else the model's.
+
+    Args:
+        variances: (m,) of its noise, or the noise's covariance (m, m); finite where y is.
 
     Raises:
         SettingsError: a wrong size, infinity, or a variance of something measured that is not
             positive.
     """
-    for values in (y,) if variances is None else (y, variances):
-        if np.shape(values) != (len(model.names),):
+    m = len(model.names)
+    for values, shapes in ((y, [(m,)]), (variances, [(m,), (m, m)])):
+        if values is None:
+            continue
+        if np.shape(values) not in shapes:
             raise SettingsError(
                 f"a measurement has the shape {np.shape(values)}; the model measures "
-                f"{len(model.names)} numbers (NaN where occluded)"
+                f"{m} numbers (NaN where occluded)"
             )
-        infinite = np.flatnonzero(np.isinf(values))
+        infinite = np.argwhere(np.isinf(values))
         if len(infinite):
             raise SettingsError(
-                f"measurement '{model.names[infinite[0]]}' is infinite; give NaN where it is "
+                f"measurement '{model.names[infinite[0, 0]]}' is infinite; give NaN where it is "
                 "occluded"
             )
+    own = np.diag(model.variances)
     if variances is None:
-        return Evidence(model, np.asarray(y, dtype=np.float64), model.variances)
-    bad = np.flatnonzero(np.isfinite(y) & ~(variances > 0))
+        return Evidence(model, np.asarray(y, dtype=np.float64), own)
+    noise = variances if np.ndim(variances) == 2 else np.diag(variances)
+    bad = np.flatnonzero(np.isfinite(y) & ~(np.diag(noise) > 0))
     if len(bad):
         raise SettingsError(f"the variance of measurement '{model.names[bad[0]]}' must be positive")
-    return Evidence(model, y, np.where(np.isfinite(variances), variances, model.variances))
+    return Evidence(model, y, np.where(np.isfinite(noise), noise, own))
 
 
 class _Line(NamedTuple):
-    """A measurement made linear at x: innovation = H (x - prediction) + noise of these variances.
+    """A measurement made linear at x: innovation = H (x - prediction) + noise (k, k).
 
     misfit: squared distance of what was measured from what is expected at x, over its count.
     """
@@ -147,8 +155,8 @@ def _linearise(prediction: Belief, seen: Evidence, x: Array) -> _Line:
     h, H = seen.model.predict(x)
     rows = np.isfinite(seen.y) & np.isfinite(h)
     residual = difference(seen.y[rows], h[rows], seen.model.wraps[rows])
-    H, noise = H[rows], seen.variances[rows]
-    misfit = float(np.sum(residual**2 / noise)) / max(len(residual), 1)
+    H, noise = H[rows], seen.covariance[np.ix_(rows, rows)]
+    misfit = float(residual @ np.linalg.solve(noise, residual)) / max(len(residual), 1)
     return _Line(H, noise, residual + H @ (x - prediction.mean), misfit)
 
 
@@ -163,8 +171,7 @@ def _fuse(prediction: Belief, line: _Line, temperature: float = 1.0) -> tuple[Be
         return prediction, 0.0, 0.0
     noise = temperature * line.noise
     HP = line.H @ P
-    S = HP @ line.H.T
-    S[np.diag_indices_from(S)] += noise
+    S = HP @ line.H.T + noise
     root, failed = dpotrf(S, lower=1)
     if failed:
         raise SettingsError(
@@ -177,7 +184,7 @@ def _fuse(prediction: Belief, line: _Line, temperature: float = 1.0) -> tuple[Be
     log_likelihood = -0.5 * (distance + log_determinant + count * math.log(2 * math.pi))
     gain = dpotrs(root, HP, lower=1)[0].T
     rest = prediction.root - gain @ (line.H @ prediction.root)
-    covariance = rest @ rest.T + (gain * noise) @ gain.T
+    covariance = rest @ rest.T + gain @ noise @ gain.T
     mean = prediction.mean + P @ (line.H.T @ weighed)
     return Belief(mean, 0.5 * (covariance + covariance.T)), log_likelihood, distance
 

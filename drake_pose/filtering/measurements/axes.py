@@ -1,94 +1,227 @@
-"""The axes of segments from label images, and as an observation of a pose: (11) and (12)."""
+"""The axes of segments in a silhouette, matched to a rough pose, and as an observation of it.
+
+Shimada et al., (11), (12) and figure 17: no picture says which part of it shows which segment. A
+rough pose does: each point of the silhouette's edge goes to the side of a segment that is nearest.
+"""
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.camera.models import Camera
-from drake_pose.errors import MaskError, SettingsError
-from drake_pose.filtering.kalman.update import difference
+from drake_pose.errors import MaskError, ModelError, SettingsError
+from drake_pose.filtering.kalman.update import difference, make_evidence, update
 from drake_pose.filtering.measurements.contour import ContourObservation
 from drake_pose.filtering.state import Belief
-from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
+from drake_pose.fit.evidence import EdgePoints, find_edge_points
 
 Array = NDArray[np.float64]
-Labels = NDArray[np.int16]
+Mask = NDArray[np.bool_]
 Ends = tuple[Array, Array]
 
-_FEWEST_PIXELS = 12
-# How far a segment's edge in the image is from where it belongs, and how much of an edge errs
-# together [pixel]. A segment of whose area less than the last share is seen, in the picture or at
-# the rough pose, is occluded: it is left out.
-_EDGE_DEVIATION, _CORRELATION, _SMALLEST_SHARE = 0.7, 3.0, 0.7
+SPACING = 2.0
+"""The spacing of the silhouette's edge points that are matched [pixel]."""
+
+GATES = (14.0, 9.0, 6.0, 4.0)
+"""How far from a rough side edge points may be, from match to match [pixel]."""
+
+# A point's error; how much of an edge errs together, more as the next frame errs alike; how far a
+# side lies from where a width says; what no edge is surer than: of a line's place and direction,
+# and of a tip [pixel, rad].
+_EDGE_DEVIATION, _CORRELATION, _WIDTH_DEVIATION = 0.35, 8.0, 0.4
+_SUREST, _SUREST_ANGLE, _SUREST_TIP = 0.1, math.radians(0.2), 0.15
+# A line or a tip that is less sure is not measured [rad, pixel].
+_LEAST_SURE_ANGLE, _LEAST_SURE_TIP = math.radians(10.0), 3.0
+# A point's normal must agree with the side's to this cosine; ends of sides are not matched.
+_FACING, _FACING_TIP, _END = 0.85, 0.7, 0.08
+# So far outside a side the rough body must show nothing: else the side is hidden [pixel].
+_BESIDE = 2.0
+_ROUNDS = 4
 # A segment that points at the camera shows no axis [pixel].
 _SHORTEST = 5.0
 _STEP = 1e-5
+_SMALLEST_MIRROR, _MIRROR_SLOPE, _MIRROR_REACH = math.radians(8.0), 0.35, 3.0
+# A match corrects its own rough pose, which is about so far off [rad].
+_ROUGH, _ITERATIONS = math.radians(15.0), 3
 
 
-@dataclass(frozen=True, eq=False)
-class Axis:
-    """A segment's axis in the image: points with rho = v cos(alpha) - u sin(alpha).
+class RoughBody(NamedTuple):
+    """What a rough pose shows in one picture [pixel].
 
     Attributes:
-        alpha: angle of the axis from the u axis towards v, from its start to its end [rad].
-        rho: distance from the origin, signed [pixel].
-        covariance: (2, 2) of alpha and rho.
-        share: how much of the segment's area was seen.
+        ends: (L, 2, 2) start and end of each segment's axis, or of an edge.
+        widths: (L,) half the width of a segment; 0 for an edge.
+        sides: (L, 2) whether a side may be seen: that of the normal (-y, x), and the other.
+        tips: (T,) the lines that end in a round tip of their width.
+        drawn: (H, W) the body.
     """
 
-    alpha: float
-    rho: float
-    covariance: Array
-    share: float
+    ends: Array
+    widths: Array
+    sides: NDArray[np.bool_]
+    tips: NDArray[np.intp]
+    drawn: NDArray[np.uint8] | Mask
 
 
-@dataclass(frozen=True, eq=False)
-class _Fit:
-    """The principal axis of a region: its centre, direction, length and how sure these are."""
+class Axes(NamedTuple):
+    """Lines and tips, NaN where not seen.
 
-    centre: Array
-    direction: Array
-    length: float
-    angle_variance: float
-    sideways_variance: float
-    count: int
+    Attributes:
+        lines: (L, 2) alpha, the angle from start to end [rad], and rho [pixel]: points (u, v) of a
+            line have rho = v cos(alpha) - u sin(alpha).
+        line_covariances: (L, 2, 2).
+        tips: (T, 2) [pixel]; tip_covariances: (T, 2, 2).
+    """
+
+    lines: Array
+    line_covariances: Array
+    tips: Array
+    tip_covariances: Array
 
 
-def _correct(uv: Array, seen: _Fit, drawn: _Fit) -> Axis:
-    """The axis of the rough pose, from uv[0] to uv[1], moved as the region moved."""
-    along = uv[1] - uv[0]
-    alpha = math.atan2(along[1], along[0])
-    turn = math.atan2(seen.direction[1], seen.direction[0]) - math.atan2(
-        drawn.direction[1], drawn.direction[0]
-    )
-    # The direction of a region has no sign.
-    turn = math.remainder(turn, math.pi)
-    shift = seen.centre - drawn.centre
-    # The axis' point beside the region's centre moves with the region.
-    unit = along / float(np.linalg.norm(along))
-    foot = uv[0] + unit * float(unit @ (drawn.centre - uv[0])) + shift
-    alpha = math.remainder(alpha + turn, 2 * math.pi)
-    c, s = math.cos(alpha), math.sin(alpha)
-    rho = c * foot[1] - s * foot[0]
+class _Matched(NamedTuple):
+    """Edge points by the feature they were matched to: offset = slope @ (its two unknowns)."""
+
+    feature: NDArray[np.intp]
+    side: NDArray[np.intp]
+    slope: Array
+    offset: Array
+    weight: Array
+
+
+def match_axes(
+    edge: EdgePoints, rough: RoughBody, gate: float, origin: tuple[float, float] = (0.0, 0.0)
+) -> Axes:
+    """The axes of segments that a silhouette's edge shows, both sides or one.
+
+    Args:
+        gate: how far from the rough side an edge point may be [pixel].
+        origin: where the picture's point (0, 0) of the lines and tips is [pixel].
+    """
+    count = len(rough.ends)
+    along = rough.ends[:, 1] - rough.ends[:, 0]
+    size = np.linalg.norm(along, axis=1)
+    along = along / np.maximum(size, 1e-9)[:, None]
+    normal = np.column_stack([-along[:, 1], along[:, 0]])
+    matched = _match(edge, rough, gate, along, normal, size)
+    solution, covariance, sides = _solve(matched, count + len(rough.tips), gate)
+    one_sided = (rough.widths > 0) & (sides[:count].min(axis=1) < 0.3 * sides[:count].max(axis=1))
+    shift, turn = solution[:count].T
+    C = covariance[:count]
+    C[:, 0, 0] += np.where(one_sided, _WIDTH_DEVIATION**2, 0.0) + _SUREST**2
+    C[:, 1, 1] += _SUREST_ANGLE**2
+    middle = rough.ends.mean(axis=1) - origin + shift[:, None] * normal
+    alpha = np.arctan2(along[:, 1], along[:, 0]) + np.arctan(turn)
+    alpha = np.remainder(alpha + np.pi, 2 * np.pi) - np.pi
+    c, s = np.cos(alpha), np.sin(alpha)
+    lines = np.column_stack([alpha, c * middle[:, 1] - s * middle[:, 0]])
     # rho changes with alpha by minus the distance along the axis.
-    reach = -(c * foot[0] + s * foot[1])
-    a, b = seen.angle_variance, seen.sideways_variance
-    covariance = np.array([[a, reach * a], [reach * a, b + reach**2 * a]])
-    return Axis(alpha, float(rho), covariance, seen.count / drawn.count)
+    J = np.zeros((count, 2, 2))
+    J[:, 0, 1], J[:, 1, 0], J[:, 1, 1] = 1.0, 1.0, -(c * middle[:, 0] + s * middle[:, 1])
+    lines[(C[:, 1, 1] > _LEAST_SURE_ANGLE**2) | (size < _SHORTEST)] = np.nan
+    tips = rough.ends[rough.tips, 1] - origin + solution[count:]
+    tip_covariances = covariance[count:] + _SUREST_TIP**2 * np.eye(2)
+    # The end of a segment that points at the camera may be its joint.
+    unsure = np.linalg.eigvalsh(tip_covariances)[:, 1] > _LEAST_SURE_TIP**2
+    tips[unsure | (size < rough.widths)[rough.tips]] = np.nan
+    return Axes(lines, J @ C @ J.transpose(0, 2, 1), tips, tip_covariances)
+
+
+def _match(
+    edge: EdgePoints, rough: RoughBody, gate: float, along: Array, normal: Array, size: Array
+) -> _Matched:
+    """Gives each edge point to the visible side or tip that is nearest, within the gate."""
+    line, side = np.nonzero(rough.sides)
+    sign, uv = 1.0 - 2.0 * side, edge.uv
+    relative = uv - rough.ends[line, :1]
+    place = np.einsum("cnk,ck->cn", relative, along[line])
+    across = np.einsum("cnk,ck->cn", relative, normal[line])
+    outside = sign[:, None] * across - rough.widths[line, None]
+    facing = sign[:, None] * (normal[line] @ edge.normals.T)
+    share = place / np.maximum(size[line], 1e-9)[:, None]
+    beside = uv + (sign[:, None] * (_BESIDE - outside))[..., None] * normal[line, None]
+    can = (np.abs(outside) < gate) & (facing > _FACING) & (np.abs(share - 0.5) < 0.5 - _END)
+    can &= _is_empty(rough.drawn, beside)
+    ends, widths = rough.ends[rough.tips, 1], rough.widths[rough.tips]
+    radial = uv - ends[:, None]
+    distance = np.linalg.norm(radial, axis=2)
+    radial = radial / np.maximum(distance, 1e-9)[..., None]
+    beyond = distance - widths[:, None]
+    beside = ends[:, None] + (widths[:, None, None] + _BESIDE) * radial
+    round_tip = (np.abs(beyond) < gate) & _is_empty(rough.drawn, beside)
+    round_tip &= np.einsum("tnk,nk->tn", radial, edge.normals) > _FACING_TIP
+    round_tip &= np.einsum("tnk,tk->tn", radial, along[rough.tips]) > 0.1
+    cost = np.abs(np.vstack([outside, beyond]))
+    cost[~np.vstack([can, round_tip])] = np.inf
+    nearest = np.argmin(cost, axis=0)
+    points = np.flatnonzero(np.isfinite(cost[nearest, np.arange(len(uv))]))
+    own = nearest[points]
+    is_tip = own >= len(line)
+    k, t = np.where(is_tip, 0, own), np.where(is_tip, own - len(line), 0)
+    lever = (share[k, points] - 0.5) * size[line[k]]
+    on_line = np.column_stack([np.ones(len(points)), lever])
+    slope = on_line
+    offset = sign[k] * outside[k, points]
+    feature = line[k]
+    if len(rough.tips):
+        slope = np.where(is_tip[:, None], radial[t, points], on_line)
+        offset = np.where(is_tip, beyond[t, points], offset)
+        feature = np.where(is_tip, len(rough.ends) + t, feature)
+    return _Matched(feature, side[k], slope, offset, edge.lengths[points])
+
+
+def _is_empty(drawn: NDArray[np.uint8] | Mask, uv: Array) -> Mask:
+    """Whether a picture shows nothing at points (..., 2), the nearest ones inside of it."""
+    size = (drawn.shape[1] - 1, drawn.shape[0] - 1)
+    u, v = np.moveaxis(np.clip(np.rint(uv).astype(np.intp), 0, size), -1, 0)
+    return np.asarray(drawn[v, u] == 0)
+
+
+def _solve(matched: _Matched, count: int, gate: float) -> tuple[Array, Array, Array]:
+    """Each feature's unknowns (F, 2), their covariance (F, 2, 2), weight of its sides (F, 2)."""
+    f, g, e = matched.feature, matched.slope, matched.offset
+
+    def total(values: Array) -> Array:
+        return np.asarray(np.bincount(f, values, count), dtype=np.float64)
+
+    solution = np.zeros((count, 2))
+    for k in range(_ROUNDS):
+        residual = e - np.einsum("nk,nk->n", g, solution[f])
+        # Geman and McClure's weight, of a scale that shrinks to a pixel.
+        w = matched.weight / (1.0 + (residual / max(2.0, gate / 3.0**k)) ** 2) ** 2
+        N = np.empty((count, 2, 2))
+        N[:, 0, 0], N[:, 1, 1] = total(w * g[:, 0] ** 2) + 1e-9, total(w * g[:, 1] ** 2) + 1e-9
+        N[:, 0, 1] = N[:, 1, 0] = total(w * g[:, 0] * g[:, 1])
+        right = np.column_stack([total(w * e * g[:, 0]), total(w * e * g[:, 1])])
+        solution[:] = np.linalg.solve(N, right[..., None])[..., 0]
+    residual = e - np.einsum("nk,nk->n", g, solution[f])
+    variance = total(w * residual**2) / np.maximum(total(w), 1e-9)
+    noise = np.maximum(variance, _EDGE_DEVIATION**2) * _CORRELATION
+    sides = np.column_stack([total(w * (matched.side == side)) for side in range(2)])
+    return solution, noise[:, None, None] * np.linalg.inv(N), sides
+
+
+def block_covariance(blocks: Array) -> Array:
+    """(2 k, 2 k) with the blocks (k, 2, 2) on the diagonal, else 0."""
+    count = len(blocks)
+    R = np.zeros((count, 2, count, 2))
+    R[np.arange(count), :, np.arange(count)] = blocks
+    return R.reshape(2 * count, 2 * count)
 
 
 class AxisObservation:
     """What a camera sees of segments' axes: alpha [rad] and rho [pixel] of each.
 
+    A segment's width is that of its link's mesh, at the widest between the axis' ends.
+
     Args:
         body: turns a state into a pose; its tree's root stays where the tree holds it.
         axes: start and end of each segment's axis (3,), (3,) in its link's frame, by name [m].
-        origin: (2,) where the image's origin is for rho [pixel]; the nearer to the segments, the
-            more rho tells.
+        origin: (2,) where the image's origin is for rho [pixel].
 
     Attributes:
         names: (m) ``alpha_<link>`` and ``rho_<link>`` of each segment.
@@ -98,6 +231,7 @@ class AxisObservation:
     Raises:
         SettingsError: no axis; or the root moves beside the plant's own positions.
         UnknownNameError: there is no segment of such a name.
+        ModelError: a segment's link shows nothing between the ends of its axis.
     """
 
     def __init__(
@@ -113,12 +247,24 @@ class AxisObservation:
         _, X_WB = tree.positions_from(tree.default_values())
         if not np.allclose(X_WB, np.eye(4), atol=1e-9):
             raise SettingsError(f"{tree.model.path}: the root moves beside the plant's positions")
-        self.body, self._renderer = body, LabelRenderer(tree.model, camera)
-        self._camera, self._origin = camera, np.array(origin, dtype=np.float64)
+        self.body, self._camera, self._origin = body, camera, origin
         self._kinematics = TreeKinematics(tree)
         self._nodes = [tree.node_index(name) for name in axes]
         self._ends = np.array([axes[name] for name in axes], dtype=np.float64)
         self.links = tuple(axes)
+        meshes = tree.model.link_meshes
+        self._widths = np.array(
+            [
+                _half_width(meshes[name].vertices if name in meshes else np.zeros((0, 3)), *ends)
+                for name, ends in zip(axes, self._ends, strict=True)
+            ]
+        )
+        for name, width in zip(axes, self._widths, strict=True):
+            if width <= 0:
+                raise ModelError(
+                    f"{tree.model.path}: link '{name}' shows nothing between the ends of its axis; "
+                    "give the ends in the link's frame"
+                )
         self.names = tuple(f"{kind}_{name}" for name in axes for kind in ("alpha", "rho"))
         self.variances = np.tile([math.radians(2.0) ** 2, 2.0**2], len(axes))
         self.wraps = np.tile([True, False], len(axes))
@@ -133,83 +279,78 @@ class AxisObservation:
         return h, H
 
     def mirrors(self, belief: Belief) -> list[Array]:
-        """None."""
-        return []
-
-    def measure(self, labels: Labels, x: Array) -> tuple[Array, Array]:
-        """Measure the axes in a label image (H, W) beside a rough state (n,).
-
-        An axis' alpha and rho err together. Their variances are given out so large that two
-        independent errors of these sizes cover the joint one.
-
-        Returns:
-            The measurement (m,) and its variances (m,); NaN where a segment is occluded.
-
-        Raises:
-            MaskError: an image that is not of the camera's size.
-        """
-        y = np.full((len(self.links), 2), np.nan)
-        variances = y.copy()
-        found = self.measure_labels(labels, self.body.positions(x)[0])
-        for k, name in enumerate(self.links):
-            if name in found:
-                y[k] = found[name].alpha, found[name].rho
-                variances[k] = _independent(found[name])
-        return y.ravel(), variances.ravel()
-
-    def measure_labels(self, labels: Labels, q: Array) -> dict[str, Axis]:
-        """Axes of segments seen well enough in a label image (H, W) of links, -1 for none.
-
-        The principal axis of a segment's pixels is not its axis where a neighbour covers one end
-        of it obliquely. So a rough pose q (nq,), within some degrees, is drawn and measured in the
-        same way: how much the picture differs from the drawing corrects the axis of that pose.
-
-        Raises:
-            MaskError: an image that is not of the camera's size.
-        """
-        size = (self._camera.height, self._camera.width)
-        if labels.shape != size:
-            raise MaskError(
-                f"camera '{self._camera.name}': an image of {labels.shape[::-1]} pixels, "
-                f"{size[::-1]} expected"
-            )
-        rough, poses = self._renderer.segments(q), self._renderer.link_poses(q)
-        found = {}
-        for name, ends in zip(self.links, self._ends, strict=True):
-            link = self.body.tree.model.link_index(name)
-            X = poses[link]
-            uv = self._camera.project(ends @ X[:3, :3].T + X[:3, 3])[0] - self._origin
-            seen, drawn = (self._fit(image == link) for image in (labels, rough))
-            if seen is None or drawn is None:
-                continue
-            share = seen.count / drawn.count
-            if not _SMALLEST_SHARE < share < 1 / _SMALLEST_SHARE:
-                continue
-            # A segment that another covers at the rough pose is much shorter than its axis.
-            if drawn.length < _SMALLEST_SHARE * float(np.linalg.norm(uv[1] - uv[0])):
-                continue
-            found[name] = _correct(uv, seen, drawn)
+        """Predictions (n,) mirrored at the image plane in the joint of one segment: (30)."""
+        x, deviations, found = belief.mean, belief.deviations(), []
+        kinematics, moving = self._kinematics, self.body.layout.moving
+        values = self.body.parameters(x)[: len(kinematics.names)]
+        for k, node in enumerate(self._nodes):
+            for value in np.flatnonzero((kinematics.value_nodes == node) & kinematics.is_angle):
+                if kinematics.names[value] not in moving:
+                    continue
+                turn = 0.5 * np.pi * np.eye(len(values))[value]
+                # About the joint's axis the segment is middle + a cos(change) + b sin(change).
+                here, quarter, half = (self._in_camera(values + i * turn, k) for i in range(3))
+                a, b = here - 0.5 * (here + half), quarter - 0.5 * (here + half)
+                moved = np.linalg.norm(b[:2]) / max(float(np.linalg.norm(a)), 1e-9)
+                change = math.remainder(2.0 * math.atan2(b[2], a[2]) + math.pi, 2.0 * math.pi)
+                index = moving.index(kinematics.names[value])
+                reach = _MIRROR_REACH * deviations[index]
+                if moved <= _MIRROR_SLOPE and _SMALLEST_MIRROR < abs(change) < reach:
+                    found.append(x.copy())
+                    found[-1][index] += change
         return found
 
-    def _fit(self, pixels: NDArray[np.bool_]) -> "_Fit | None":
-        v, u = np.nonzero(pixels)
-        if len(u) < _FEWEST_PIXELS:
-            return None
-        points = np.column_stack([u, v]) - self._origin
-        centre = points.mean(axis=0)
-        values, vectors = np.linalg.eigh(np.cov(points.T))
-        # A rectangle's standard deviation is its length over the root of 12.
-        length, width = math.sqrt(12 * values[1]), math.sqrt(12 * max(values[0], 1e-12))
-        if length < 1.3 * width:
-            return None
-        # The middle between two edges, at length / correlation independent places.
-        sideways = 0.5 * _EDGE_DEVIATION**2 * _CORRELATION / length
-        return _Fit(centre, vectors[:, 1], length, 12 * sideways / length**2, sideways, len(u))
+    def measure(self, mask: Mask, x: Array) -> tuple[Array, Array]:
+        """Measure the axes in a silhouette (H, W) beside a rough state (n,).
+
+        Returns:
+            The measurement (m,), NaN where a segment is hidden, and its noise's covariance (m, m).
+
+        Raises:
+            MaskError: a mask that is not of the camera's size.
+        """
+        size = (self._camera.height, self._camera.width)
+        if mask.shape != size:
+            raise MaskError(
+                f"camera '{self._camera.name}': a mask of {mask.shape[::-1]} pixels, "
+                f"{size[::-1]} expected"
+            )
+        edge = find_edge_points(mask, SPACING)
+        around = Belief(x, np.diag(np.full(len(x), _ROUGH**2)))
+        for gate in GATES:
+            axes = match_axes(edge, self._rough(x), gate, self._origin)
+            y, R = axes.lines.ravel(), block_covariance(axes.line_covariances)
+            x = update(around, make_evidence(self, y, R), _ITERATIONS).belief.mean
+        return y, R
+
+    def _rough(self, x: Array) -> RoughBody:
+        """What is seen at a state (n,)."""
+        p_W = self._segments(self.body.node_values(x))
+        ends = self._camera.project(p_W.reshape(-1, 3))[0].reshape(-1, 2, 2)
+        # A width is seen as it is across the viewing ray.
+        middle = p_W.mean(axis=1)
+        beside = middle + self._widths[:, None] * self._camera.X_WC[:3, 0]
+        widths = self._camera.project(beside)[0] - self._camera.project(middle)[0]
+        return RoughBody(
+            ends,
+            np.linalg.norm(widths, axis=1),
+            np.ones((len(ends), 2), dtype=np.bool_),
+            np.zeros(0, dtype=np.intp),
+            self.body.draw(x, self._camera),
+        )
+
+    def _segments(self, values: Sequence[Array]) -> Array:
+        """(k, 2, 3) ends of the axes in the world."""
+        X_WN = self._kinematics.poses(self._kinematics.flatten(values))[self._nodes]
+        return np.einsum("kij,kej->kei", X_WN[:, :3, :3], self._ends) + X_WN[:, None, :3, 3]
+
+    def _in_camera(self, values: Array, k: int) -> Array:
+        """(3,) a segment from its start to its end, in the camera."""
+        start, end = self._segments(self._kinematics.split(values))[k]
+        return np.asarray(self._camera.X_CW[:3, :3] @ (end - start))
 
     def _axes_at(self, x: Array) -> Array:
-        values = self._kinematics.flatten(self.body.node_values(x))
-        X_WN = self._kinematics.poses(values)[self._nodes]
-        p_W = np.einsum("kij,kej->kei", X_WN[:, :3, :3], self._ends) + X_WN[:, None, :3, 3]
+        p_W = self._segments(self.body.node_values(x))
         uv = self._camera.project(p_W.reshape(-1, 3))[0].reshape(-1, 2, 2) - self._origin
         along = uv[:, 1] - uv[:, 0]
         alpha = np.arctan2(along[:, 1], along[:, 0])
@@ -219,7 +360,10 @@ class AxisObservation:
         return h.ravel()
 
 
-def _independent(axis: Axis) -> Array:
-    """(2,) variances whose diagonal matrix is no smaller than the axis' covariance."""
-    a, c, d = axis.covariance[0, 0], axis.covariance[0, 1], axis.covariance[1, 1]
-    return np.array([2 * a, d + c**2 / a])
+def _half_width(vertices: Array, start: Array, end: Array) -> float:
+    """How far the vertices (v, 3) between an axis' ends are from it at most [m]."""
+    along = (end - start) / np.linalg.norm(end - start)
+    place = (vertices - start) @ along
+    across = np.linalg.norm(vertices - start - place[:, None] * along, axis=1)
+    between = (place > -1e-9) & (place < np.linalg.norm(end - start) + 1e-9)
+    return float(across[between].max(initial=0.0))

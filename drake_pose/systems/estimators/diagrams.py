@@ -39,6 +39,8 @@ from drake_pose.systems.estimators.silhouette_matcher import (
 from drake_pose.systems.pictures.camera_rig import add_sensors
 from drake_pose.systems.ports import connect_same
 
+# Where a pinhole's pictures end at least [m].
+_FARTHEST = 60.0
 ESTIMATE_COLOUR = Rgba(0.0, 0.45, 0.70, 0.6)
 
 
@@ -157,11 +159,13 @@ def add_simulated_cameras(
     add_posed_plant(builder, scene_graph, model, truth, "true_geometry_pose", "true")
     labels = {name: label for label, name in enumerate(model.link_names)}
     add_skin(builder, scene_graph, model, truth, "true", labels)
-    ranges = {
-        camera.name: _depth_range(camera, model, true_positions)
-        for camera in cameras
-        if not isinstance(camera, PinholeCamera)
-    }
+    ranges = {}
+    for camera in cameras:
+        nearest, farthest = _depth_range(camera, model, true_positions)
+        if isinstance(camera, PinholeCamera):
+            # Beyond the body there is nothing; a farther plane than this is a warning of Drake's.
+            nearest, farthest = camera.near, max(_FARTHEST, farthest)
+        ranges[camera.name] = nearest, farthest
     sensors = add_sensors(
         builder, scene_graph, {one.name: one for one in cameras}, ranges, RenderEngineVtkParams()
     )

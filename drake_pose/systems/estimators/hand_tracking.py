@@ -1,6 +1,6 @@
-"""Tracking by segments' axes: a camera, the matcher at first and after a loss, the filter.
+"""Tracking by segments' axes in silhouettes: a camera, what measures, the filter.
 
-label image -> AxisSensor <-> TruncatedEkf; AxisSensor -> logs.
+label image -> AxisSensor or HandSensor <-> TruncatedEkf; AxisSensor -> logs.
 """
 
 from __future__ import annotations
@@ -10,25 +10,26 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.geometry import Meshcat, SceneGraph
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPort
 from pydrake.systems.primitives import LogVectorOutput, VectorLogSink
 from pydrake.systems.sensors import ImageLabel16I
 from pydrake.trajectories import Trajectory
 
-from drake_pose.arrays import Array
+from drake_pose.arrays import Array, Mask
+from drake_pose.body.parsed_model import ParsedModel
 from drake_pose.camera.models import Camera
 from drake_pose.errors import SettingsError
 from drake_pose.filtering.kalman.truncated_filter import FilterSettings, TruncatedFilter
 from drake_pose.filtering.measurements.axes import AxisObservation, Ends
 from drake_pose.filtering.measurements.contour import ContourObservation
+from drake_pose.filtering.measurements.hand_silhouette import HandMeasurement, HandSilhouette
 from drake_pose.filtering.state import Belief
 from drake_pose.filtering.tracking.contour_tracker import ContourTracker, TrackingSettings
 from drake_pose.filtering.truncation.couplings import model_inequalities
 from drake_pose.search.estimates import View
 from drake_pose.search.scoring import PoseSearch
-from drake_pose.silhouette.pictures.label_images import EMPTY, label_data, label_image_to_mask
+from drake_pose.silhouette.pictures.label_images import label_image_to_mask
 from drake_pose.systems.estimators.diagrams import (
     ESTIMATE_COLOUR,
     add_simulated_cameras,
@@ -37,27 +38,26 @@ from drake_pose.systems.estimators.diagrams import (
 from drake_pose.systems.estimators.truncated_ekf import STATISTICS, TruncatedEkf
 from drake_pose.systems.ports import PortedSystem, connect_same
 
-# A segment of fewer pixels in the picture is not missed.
-_FEWEST_PIXELS = 30
+# The body is not where it was predicted if so large a share of the silhouette differs.
+_ASTRAY = 0.3
 
 
 class AxisSensor(PortedSystem):
-    """Measures segments' axes in a label image, beside the prediction of the filter that uses them.
+    """Measures segments' axes in a silhouette, beside the prediction of the filter that uses them.
 
     .. pydrake_system::
 
         name: AxisSensor
         input_ports: [label_image, estimated_state, covariance, statistics]
-        output_ports: [measurement, measurement_variances, restart, matched_state,
+        output_ports: [measurement, measurement_covariance, restart, matched_state,
           estimated_positions, position_deviations]
 
     The inputs but the image come from the ``TruncatedEkf`` that takes the first four outputs, the
-    last of them as its ``reset_state``. The label image's labels are the indices of the links, as
-    Drake's renderer gives them to a plant that holds the body alone; an image that is not connected
-    shows nothing.
+    last of them as its ``reset_state``. Of the label image only the silhouette is used, all that
+    has a label; an image that is not connected shows nothing.
 
     ``restart`` is 1 at the filter's first step, while it says that the track is lost, and where
-    fewer than half of the segments in the picture are where they were predicted. Then the axes are
+    the silhouette differs by a third from the predicted one. Then the axes are
     measured beside ``matched_state`` (n), a state at rest that the search finds, NaN where it finds
     none; the search is asked at no other time. Where the first pictures are blank, the filter
     begins with its own start instead, and asks when that proves wrong; a gap later is bridged by
@@ -84,7 +84,6 @@ class AxisSensor(PortedSystem):
             raise SettingsError("the search and the observation must share one pose tree")
         self._observation, self._transition = observation, transition
         self._search, self._camera = search, camera
-        self._labels = [body.tree.model.link_index(link) for link in observation.links]
         image = self.add_input("label_image", ImageLabel16I(camera.width, camera.height))
         state = self.add_input("estimated_state", n)
         covariance = self.add_input("covariance", n * n)
@@ -94,7 +93,7 @@ class AxisSensor(PortedSystem):
         def row(k: int) -> Callable[[Context], Array]:
             return lambda context: measured.Eval(context)[k]
 
-        sizes = {"measurement": m, "measurement_variances": m, "restart": 1}
+        sizes = {"measurement": m, "measurement_covariance": m * m, "restart": 1}
         for k, (name, size) in enumerate(sizes.items()):
             self.add_output(name, size, row(k))
         self._matched = self.add_output("matched_state", n, self._match, {image.ticket()})
@@ -109,34 +108,29 @@ class AxisSensor(PortedSystem):
         self.add_output("position_deviations", nq, self._deviations, {covariance.ticket()})
 
     def _measure(self, context: Context) -> tuple[Array, Array, Array]:
-        nothing = np.full(len(self._observation.names), np.nan)
-        labels = self._see(context)
-        if labels is None:
-            return nothing, nothing, np.zeros(1)
+        mask, m = self._see(context), len(self._observation.names)
+        if mask is None:
+            return np.full(m, np.nan), np.full(m * m, np.nan), np.zeros(1)
         statistics = dict(zip(STATISTICS, self.given(context, "statistics"), strict=True))
         x = self._transition @ self.given(context, "estimated_state")
-        y, variances = self._observation.measure(labels, x)
-        visible = sum(np.count_nonzero(labels == k) >= _FEWEST_PIXELS for k in self._labels)
-        astray = 2 * np.count_nonzero(np.isfinite(y[::2])) < visible
-        restart = statistics["step"] == 0 or statistics["lost"] > 0 or astray
+        wrong, area = self._body.difference(x, [(self._camera, mask)])
+        restart = statistics["step"] == 0 or statistics["lost"] > 0 or wrong > _ASTRAY * area
         matched = self._matched.Eval(context) if restart else None
         if matched is not None and np.isfinite(matched).all():
-            y, variances = self._observation.measure(labels, matched)
-        return y, variances, np.array([float(restart)])
+            x = matched
+        y, covariance = self._observation.measure(mask, x)
+        return y, covariance.ravel(), np.array([float(restart)])
 
-    def _see(self, context: Context) -> NDArray[np.int16] | None:
-        """(H, W) the label image; None where there is none, or none of the body."""
+    def _see(self, context: Context) -> Mask | None:
+        """(H, W) the silhouette; None where there is no image, or nothing in it."""
         image = self.given(context, "label_image")
-        labels = None if image is None else label_data(image)
-        if labels is None or not np.isin(labels, self._labels).any():
-            return None
-        return np.where(labels == EMPTY, np.int16(-1), labels)
+        mask = None if image is None else label_image_to_mask(image)
+        return mask if mask is not None and mask.any() else None
 
     def _match(self, context: Context) -> Array:
         """The state at rest (n,) that the search finds."""
-        image = self.given(context, "label_image")
-        mask = None if image is None else label_image_to_mask(image)
-        if mask is not None and mask.any():
+        mask = self._see(context)
+        if mask is not None:
             result = self._search.match([View(self._camera, mask)])
             if result.found:
                 return self._body.state(result.q, result.X_WB)
@@ -150,6 +144,85 @@ class AxisSensor(PortedSystem):
         own = [model.position_index(name) for name in seen]
         deviations[own] = np.sqrt(np.diag(P)[layout.indices(seen)])
         return deviations
+
+
+class HandSensor(PortedSystem):
+    """Measures the two-finger hand's axes and tips in a silhouette, lengths unknown: figure 17.
+
+    .. pydrake_system::
+
+        name: HandSensor
+        input_ports: [label_image, estimated_state, covariance, statistics]
+        output_ports: [measurement, measurement_covariance, rough_state, difference]
+
+    The inputs but the image come from the ``TruncatedEkf`` that takes the first two outputs. Of the
+    label image only the silhouette is used; an image that is not connected, or blank, shows
+    nothing. ``rough_state`` (n) and ``difference`` (1) are as of ``HandMeasurement``.
+
+    Args:
+        silhouette: measures; its filter is the ``TruncatedEkf``'s.
+        scale: of the first frame, if it is known.
+    """
+
+    def __init__(self, silhouette: HandSilhouette, scale: float | None = 1.0) -> None:
+        super().__init__()
+        self._silhouette, self._scale = silhouette, scale
+        n = len(silhouette.belief_filter.layout)
+        m = len(silhouette.belief_filter.observation.names)
+        self.add_input("label_image", ImageLabel16I(silhouette.width, silhouette.height))
+        self.add_input("estimated_state", n)
+        self.add_input("covariance", n * n)
+        self.add_input("statistics", len(STATISTICS))
+        measured = self.add_cache("measured", self._measure)
+
+        def show(name: str, size: int, read: Callable[[HandMeasurement], Array]) -> None:
+            self.add_output(name, size, lambda context: read(measured.Eval(context)))
+
+        show("measurement", m, lambda one: one.y)
+        show("measurement_covariance", m * m, lambda one: one.covariance.ravel())
+        show("rough_state", n, lambda one: one.rough)
+        show("difference", 1, lambda one: np.array([one.difference]))
+
+    def _measure(self, context: Context) -> HandMeasurement:
+        image, mean = self.given(context, "label_image"), self.given(context, "estimated_state")
+        covariance = self.given(context, "covariance").reshape(len(mean), len(mean))
+        begun = self.given(context, "statistics")[STATISTICS.index("step")] > 0
+        belief = Belief(mean, covariance)
+        silhouette = self._silhouette
+        if image is None:
+            mask = np.zeros((silhouette.height, silhouette.width), dtype=np.bool_)
+        else:
+            mask = label_image_to_mask(image)
+        if begun:
+            return silhouette.measure(mask, silhouette.belief_filter.predicted(belief))
+        return silhouette.measure(mask, belief, self._scale)
+
+
+def build_hand_estimation(
+    model: ParsedModel,
+    camera: Camera,
+    silhouette: HandSilhouette,
+    start: Belief,
+    true_positions: Trajectory,
+    period: float,
+) -> tuple[Diagram, TruncatedEkf, HandSensor]:
+    """Plant, Drake's renderer, ``HandSensor``, ``TruncatedEkf``: angles, lengths from pictures.
+
+    Args:
+        model: the hand that is seen, in the plant's positions over time.
+        start: the belief before the first picture.
+        period: time between two pictures [s].
+    """
+    builder = DiagramBuilder()
+    scene_graph = builder.AddNamedSystem("scene_graph", SceneGraph())
+    _, images = add_simulated_cameras(builder, scene_graph, model, [camera], true_positions)
+    ekf = TruncatedEkf(silhouette.belief_filter, start, period)
+    builder.AddNamedSystem("truncated_ekf", ekf)
+    sensor = builder.AddNamedSystem("hand_sensor", HandSensor(silhouette))
+    builder.Connect(images[0], sensor.GetInputPort("label_image"))
+    connect_same(builder, sensor, ekf)
+    connect_same(builder, ekf, sensor)
+    return builder.Build(), ekf, sensor
 
 
 @dataclass(frozen=True)

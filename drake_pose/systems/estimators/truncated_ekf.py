@@ -41,15 +41,15 @@ class TruncatedEkf(BeliefSystem[_Known]):
     .. pydrake_system::
 
         name: TruncatedEkf
-        input_ports: [measurement (optional), measurement_variances (optional), reset_state
+        input_ports: [measurement (optional), measurement_covariance (optional), reset_state
           (optional), restart (optional)]
         output_ports: [estimated_state, covariance, hypothesis_weights, hypothesis_states,
           active_limits, statistics]
 
     A periodic update predicts and uses the measurement: NaN where something is occluded; all NaN,
     or an unconnected port, where a camera is late or missing, which leaves the prediction.
-    ``measurement_variances`` are those of this one's noise, finite where it is; the observation
-    model's own where the port is not connected.
+    ``measurement_covariance`` (m x m, row by row) is that of this one's noise, finite where it is;
+    the observation model's own where the port is not connected.
 
     - ``estimated_state`` (n), ``covariance`` (n x n, row by row): of the heaviest hypothesis.
     - ``hypothesis_weights`` (cap), ``hypothesis_states`` (cap x n, row by row): the heaviest first,
@@ -89,7 +89,7 @@ class TruncatedEkf(BeliefSystem[_Known]):
         n, cap = len(belief_filter.layout), belief_filter.settings.hypothesis_cap
         self._measured = len(belief_filter.observation.names)
         self.add_input("measurement", self._measured)
-        self.add_input("measurement_variances", self._measured)
+        self.add_input("measurement_covariance", self._measured**2)
         self.add_input("reset_state", n)
         self.add_input("restart", 1)
         self.keep_belief(_Known(belief_filter.start(self._start)), period, offset)
@@ -130,12 +130,14 @@ class TruncatedEkf(BeliefSystem[_Known]):
                 is_fresh, unlikely = True, 0
         if not is_fresh:
             now = self.filter.predict(now)
-        y, variances = self.given(context, "measurement"), None
+        y, noise = self.given(context, "measurement"), None
         if y is None:
             y = np.full(self._measured, np.nan)
         else:
-            variances = self.given(context, "measurement_variances")
-        now = self.filter.update(now, y, variances=variances)
+            noise = self.given(context, "measurement_covariance")
+        if noise is not None:
+            noise = noise.reshape(self._measured, self._measured)
+        now = self.filter.update(now, y, variances=noise)
         if now.count:
             is_unlikely = now.distance > chdtri(now.count, _LOSS_PROBABILITY)
             unlikely = unlikely + 1 if is_unlikely else 0

@@ -80,6 +80,16 @@ def test_a_linear_measurement_gives_bayes_rule_in_information_form(iterations):
         assert result.log_likelihood == pytest.approx(expected)
 
 
+def test_noise_that_errs_together_is_weighed_as_its_covariance_says():
+    prior = Belief(np.array([0.3, -0.2, 0.1]), np.diag([0.5, 0.1, 0.4]) + 0.05)
+    y, R = np.array([1.0, 0.4]), np.array([[0.3, 0.25], [0.25, 0.3]])
+    result = update(prior, make_evidence(Linear(), y, R)).belief
+    information = np.linalg.inv(prior.covariance) + Linear.H.T @ np.linalg.inv(R) @ Linear.H
+    np.testing.assert_allclose(result.covariance, np.linalg.inv(information))
+    weighed = np.linalg.solve(prior.covariance, prior.mean) + Linear.H.T @ np.linalg.solve(R, y)
+    np.testing.assert_allclose(result.mean, np.linalg.solve(information, weighed))
+
+
 def test_what_is_occluded_is_left_out():
     prior = random_belief(1)
     one = update(prior, make_evidence(Linear(), np.array([1.0, np.nan])))

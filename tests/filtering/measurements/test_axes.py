@@ -1,4 +1,4 @@
-"""Axes of segments in label images, and as an observation of a pose."""
+"""Axes of segments in silhouettes, and as an observation of a pose."""
 
 import math
 
@@ -9,7 +9,7 @@ from drake_pose.body.formats.packages import bundled_model
 from drake_pose.body.model import load_model
 from drake_pose.body.tree.root import RootRotation
 from drake_pose.camera.models import ParallelCamera
-from drake_pose.errors import MaskError, SettingsError, UnknownNameError
+from drake_pose.errors import MaskError, ModelError, SettingsError, UnknownNameError
 from drake_pose.filtering.hand import (
     FLEXIONS,
     HAND_STATE,
@@ -18,11 +18,7 @@ from drake_pose.filtering.hand import (
     plant_positions,
 )
 from drake_pose.filtering.kalman.update import make_evidence, update
-from drake_pose.filtering.measurements.axes import (
-    Axis,
-    AxisObservation,
-    _independent,
-)
+from drake_pose.filtering.measurements.axes import AxisObservation
 from drake_pose.filtering.measurements.contour import ContourObservation
 from drake_pose.filtering.state import Belief
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
@@ -69,29 +65,27 @@ def expected(x):
     }
 
 
-def compare(axes, x):
+def mask_of(hand, camera, x):
+    """What Drake's renderer shows: one label."""
+    return LabelRenderer(hand, camera).mask(plant_positions(x, hand.position_names, 1000.0))
+
+
+def compare(observation, y, R, x):
     """(k, 2) errors of alpha [deg] and rho [pixel], and (k,) their squared distances."""
-    truth = expected(x)
-    errors, distances = [], []
-    for name, axis in axes.items():
-        error = np.array([axis.alpha, axis.rho]) - truth[name]
-        error[0] = math.remainder(error[0], 2 * math.pi)
-        distances.append(error @ np.linalg.solve(axis.covariance, error))
-        errors.append([math.degrees(error[0]), error[1]])
-    return np.abs(np.array(errors)), np.array(distances)
+    truth = np.concatenate([expected(x)[name] for name in observation.links])
+    errors = y - truth
+    errors[::2] = np.remainder(errors[::2] + np.pi, 2 * np.pi) - np.pi
+    pairs = [slice(k, k + 2) for k in range(0, len(y), 2)]
+    distances = [errors[k] @ np.linalg.solve(R[k, k], errors[k]) for k in pairs]
+    return np.abs(errors.reshape(-1, 2)) * (180 / np.pi, 1), np.array(distances)
 
 
 TRUE = [30, 20, 15, 55, 10, 8]
 ROUGH = [35, 15, 20, 50, 14, 3]
 
 
-@pytest.fixture(scope="module")
-def observation(hand, camera):
-    x = state(TRUE)
-    q = plant_positions(x, hand.position_names, 1000.0)
-    turn = math.radians(25.0)
-    c, s = math.cos(turn), math.sin(turn)
-    rotation = np.array([[1, 0, 0], [0, c, -s], [0, s, c]])
+def observe(hand, camera, q, rotation):
+    """All segments' axes of a hand turned so, whose angles alone are free."""
     held = {
         name: value
         for name, value in zip(hand.position_names, q, strict=True)
@@ -100,32 +94,74 @@ def observation(hand, camera):
     tree = hand.pose_tree(
         root_position=(-0.12, -0.04, 0.0), root_rotation=RootRotation.fixed(rotation), held=held
     )
-    body = ContourObservation(tree, [camera])
-    return AxisObservation(body, camera, SEGMENTS, (CENTRE, CENTRE))
+    return AxisObservation(ContourObservation(tree, [camera]), camera, SEGMENTS, (CENTRE, CENTRE))
 
 
-def test_what_is_occluded_is_left_out(hand, camera, observation):
+@pytest.fixture(scope="module")
+def observation(hand, camera):
+    q = plant_positions(state(TRUE), hand.position_names, 1000.0)
+    turn = math.radians(25.0)
+    c, s = math.cos(turn), math.sin(turn)
+    return observe(hand, camera, q, np.array([[1, 0, 0], [0, c, -s], [0, s, c]]))
+
+
+def test_a_side_that_is_hidden_is_not_used_and_a_covered_segment_left_out(
+    hand, camera, observation
+):
     x = state(TRUE)
-    q = plant_positions(x, hand.position_names, 1000.0)
-    labels = LabelRenderer(hand, camera).segments(q)
-    link = hand.link_index("segment_12")
-    v, u = np.nonzero(labels == link)
-    assert "segment_12" in observation.measure_labels(labels, q)
-    covered = labels.copy()
-    covered[v[u > np.median(u)], u[u > np.median(u)]] = -1
-    assert "segment_12" not in observation.measure_labels(covered, q)
-    covered[labels == link] = -1
-    assert "segment_12" not in observation.measure_labels(covered, q)
+    mask = mask_of(hand, camera, x)
+    rough = small_state(observation, hand, TRUE)
+    k = observation.names.index("alpha_segment_12")
+    assert np.isfinite(observation.measure(mask, rough)[0]).all()
+    alpha, rho = expected(x)["segment_12"]
+    v, u = np.mgrid[:SIDE, :SIDE] - CENTRE
+    across = np.cos(alpha) * v - np.sin(alpha) * u - rho
+    along = np.cos(alpha) * u + np.sin(alpha) * v
+    start, end = HandObservation().drawing(x)[1:3] @ (np.cos(alpha), np.sin(alpha))
+    beside = (along > start) & (along < end) & (np.abs(across) < 40)
+    one_side, both_sides = mask | (beside & (across > 0)), mask | beside
+    y, R = observation.measure(one_side, rough)
+    assert y[k : k + 2] == pytest.approx([alpha, rho], abs=0.5)
+    assert R[k, k] > observation.measure(mask, rough)[1][k, k]
+    assert np.isnan(observation.measure(both_sides, rough)[0][k])
 
 
-def test_at_the_rough_pose_the_axis_is_that_of_the_model(hand, camera, observation):
+@pytest.mark.parametrize("rough", [TRUE, ROUGH])
+def test_the_axes_are_those_of_the_hand_that_was_rendered(hand, camera, observation, rough):
     x = state(TRUE)
+    beside = small_state(observation, hand, rough)
+    y, R = observation.measure(mask_of(hand, camera, x), beside)
+    errors, distances = compare(observation, y, R, x)
+    assert np.isfinite(y).all()
+    assert errors[:, 0].max() < 1.5
+    assert np.median(distances) < 2.0
+    assert distances.max() < 12.0
+
+
+def test_a_mirrored_prediction_looks_the_same(hand, camera):
+    """Seen with the plane of flexion on edge: bent towards the camera or away from it."""
+    x, roll = state([10, 5, 5, 12, 4, 4], 90.0), math.radians(90.0)
     q = plant_positions(x, hand.position_names, 1000.0)
-    errors, distances = compare(
-        observation.measure_labels(LabelRenderer(hand, camera).segments(q), q), x
-    )
-    assert errors.max() < 1e-6
-    assert distances.max() < 1e-6
+    c, s = math.cos(roll), math.sin(roll)
+    rotation = np.array([[1, 0, 0], [0, c, -s], [0, s, c]])
+    observation = observe(hand, camera, q, rotation)
+    small = observation.body.state(q)
+    n = len(small)
+    unsure = Belief(small, np.diag(np.full(n, 1.0)))
+    found = observation.mirrors(unsure)
+    assert found
+    for other in found:
+        (changed,) = np.flatnonzero(other != small)
+        row = observation.names.index("alpha_" + observation.body.layout.names[changed].replace(
+            "flexion", "segment"))  # fmt: skip
+        before, after = (observation.predict(one)[0][row] for one in (small, other))
+        assert math.remainder(after - before, 2 * math.pi) == pytest.approx(0.0, abs=1e-6)
+        analytic = HandObservation(mirror_slope=0.35).mirrors(
+            Belief(x, np.diag(np.full(len(x), 1.0)))
+        )
+        index = HAND_STATE.index(observation.body.layout.names[changed])
+        assert any(one[index] == pytest.approx(other[changed], abs=1e-6) for one in analytic)
+    assert not observation.mirrors(Belief(small, np.diag(np.full(n, 1e-6))))
 
 
 def small_state(observation, hand, flexions):
@@ -152,8 +188,7 @@ def test_axes_and_slopes_are_those_of_the_analytic_hand(observation, hand):
 def test_one_picture_corrects_a_rough_pose(observation, hand, camera):
     x, rough = (small_state(observation, hand, f) for f in (TRUE, ROUGH))
     q = observation.body.positions(x)[0]
-    y, variances = observation.measure(LabelRenderer(hand, camera).segments(q), rough)
-    assert np.isfinite(y).all()
+    y, variances = observation.measure(LabelRenderer(hand, camera).mask(q), rough)
     n = len(x)
     prediction = Belief(rough, np.diag(np.full(n, 0.15**2)))
     updated = update(prediction, make_evidence(observation, y, variances), 10)
@@ -162,22 +197,13 @@ def test_one_picture_corrects_a_rough_pose(observation, hand, camera):
     assert (np.abs(error) < 3 * updated.belief.deviations())[: n // 2].all()
 
 
-def test_independent_errors_cover_the_joint_one():
-    generator = np.random.default_rng(0)
-    for _ in range(20):
-        a, b = generator.uniform(0.1, 2.0, 2)
-        reach = generator.normal(scale=30.0)
-        covariance = np.array([[a, reach * a], [reach * a, b + reach**2 * a]])
-        bound = np.diag(_independent(Axis(0.0, 0.0, covariance, 1.0)))
-        assert np.linalg.eigvalsh(bound - covariance).min() > -1e-9
-        assert bound[1, 1] <= b + 2 * reach**2 * a + 1e-9
-
-
 def test_bad_arguments_are_named(hand, camera, observation):
-    q = hand.default_positions
-    with pytest.raises(MaskError, match="'top'"):
-        observation.measure_labels(np.zeros((3, 3), dtype=np.int16), q)
     body = observation.body
+    with pytest.raises(MaskError, match="'top'"):
+        observation.measure(np.zeros((3, 3), dtype=np.bool_), np.zeros(len(body.layout)))
+    beyond = (np.array([1.0, 0.0, 0.0]), np.array([2.0, 0.0, 0.0]))
+    with pytest.raises(ModelError, match="'segment_11' shows nothing"):
+        AxisObservation(body, camera, {"segment_11": beyond})
     with pytest.raises(SettingsError, match="one segment or more"):
         AxisObservation(body, camera, {})
     with pytest.raises(UnknownNameError, match="thumb"):

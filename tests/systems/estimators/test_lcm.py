@@ -15,7 +15,7 @@ from drake_pose.search.kameda import PaperSearch
 from drake_pose.search.settings import PaperSearchSettings
 from drake_pose.silhouette.pictures.label_images import mask_to_label_image
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
-from drake_pose.systems.estimators.robot_state import RobotStateMessage
+from drake_pose.systems.bodies import RobotStateMessage
 from drake_pose.systems.estimators.silhouette_matcher import SilhouetteTracker
 from tests.search.bodies import forked_body, front_camera
 

@@ -93,7 +93,7 @@ def test_a_frame_can_bring_its_own_noise(sequence):
     for factor in (None, 1.0, 100.0):
         run = Bench(TruncatedEkf(f, sequence.guess, PERIOD))
         if factor is not None:
-            run.give(measurement_variances=factor * observation.variances)
+            run.give(measurement_covariance=np.diag(factor * observation.variances).ravel())
         run.update(measurement=sequence.measurements[0])
         deviations.append(np.sqrt(np.diag(run["covariance"].reshape(len(HAND_STATE), -1))))
     np.testing.assert_array_equal(deviations[0], deviations[1])

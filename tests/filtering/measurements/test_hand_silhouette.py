@@ -1,0 +1,139 @@
+"""The two-finger hand measured in Drake's silhouettes, of which nothing says the parts."""
+
+import math
+
+import numpy as np
+import pytest
+
+from drake_pose.body.formats.packages import bundled_model
+from drake_pose.body.model import load_model
+from drake_pose.camera.models import ParallelCamera
+from drake_pose.errors import MaskError
+from drake_pose.filtering.hand import (
+    FLEXIONS,
+    HAND_STATE,
+    LENGTHS,
+    MEASURED,
+    SPREADS,
+    plant_positions,
+)
+from drake_pose.filtering.kalman.update import difference
+from drake_pose.filtering.measurements.hand_silhouette import HandSilhouette
+from drake_pose.filtering.state import Belief
+from drake_pose.papers.shimada import experiment_filter
+from drake_pose.papers.shimada_motion import first_guess, true_states
+from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
+
+WIDTH, HEIGHT = 480, 400
+CENTER = (239.5, 199.5)
+FILTER, OBSERVATION = experiment_filter()
+SILHOUETTE = HandSilhouette(FILTER, WIDTH, HEIGHT, CENTER)
+SEEN = np.r_[HAND_STATE.indices((*SPREADS, *FLEXIONS)), HAND_STATE.indices(LENGTHS)]
+
+
+@pytest.fixture(scope="module")
+def render():
+    """The mask of a state at scale 1, by Drake's renderer."""
+    model = load_model(bundled_model("two_finger_hand"), check=False)
+    model = model.reshaped(factors={"palm": (1.0, 1.1, 1.0)})
+    X_WC = np.eye(4)
+    X_WC[2, 3] = -1.0
+    renderer = LabelRenderer(model, ParallelCamera("top", WIDTH, HEIGHT, 1000.0, *CENTER, X_WC))
+    return lambda x: renderer.mask(plant_positions(x, model.position_names, 1000.0))
+
+
+def hand(t, r_13=35.0, phase=0.0):
+    """A true state at scale 1."""
+    x = true_states(r_13, np.full(6, phase))[t]
+    x[2:6] /= np.linalg.norm(x[2:6])
+    return x
+
+
+def sure_of(x):
+    """A belief close around a state."""
+    guess = first_guess(x, np.random.default_rng(0))
+    return Belief(x, 1e-6 * guess.covariance)
+
+
+def normalised(found, x):
+    """(39,) errors in deviations, NaN where hidden."""
+    error = difference(found.y, OBSERVATION.predict(x)[0], OBSERVATION.wraps)
+    return error / np.sqrt(np.maximum(np.diag(found.covariance), 1e-12))
+
+
+@pytest.mark.parametrize("name", ["length_11", "length_22", "length_13"])
+def test_a_longer_segment_is_seen_longer(render, name):
+    x = hand(24)
+    longer = x.copy()
+    longer[HAND_STATE.index(name)] += 0.008
+    mask, grown = render(x), render(longer)
+    # The part of the finger beyond moves by eight pixels at most, as it is foreshortened.
+    assert np.count_nonzero(mask != grown) > 40
+    for one in (mask, grown):
+        others = [SILHOUETTE.draw(state).astype(bool) for state in (x, longer)]
+        wrong = [np.count_nonzero(other != one) for other in others]
+        assert np.argmin(wrong) == (one is grown)
+        assert min(wrong) < 0.045 * np.count_nonzero(one)
+
+
+@pytest.mark.parametrize("length", [0.025, 0.05])
+def test_segments_of_every_length_have_no_gap(render, length):
+    x = hand(24)
+    x[HAND_STATE.indices(("length_13", "length_23"))] = length
+    assert np.mean(SILHOUETTE.draw(x).astype(bool) != render(x)) < 0.005
+
+
+@pytest.mark.parametrize("seed", [0, 3])
+def test_lines_and_tips_are_those_of_the_hand_from_table_2s_guess(render, seed):
+    x = hand(20 + 10 * seed, 40.0)
+    guess = FILTER.start(first_guess(x, np.random.default_rng(seed))).best
+    mask = render(x)
+    found = SILHOUETTE.measure(mask, guess, 1.0)
+    off = normalised(found, x)
+    told = off[np.isfinite(off)]
+    assert len(told) >= 15
+    # A segment that points at the camera may be taken for another's end.
+    assert np.mean(np.abs(told) < 3) > 0.9
+    assert found.difference < 0.045
+    assert np.count_nonzero(SILHOUETTE.draw(guess.mean) != mask) > 0.1 * np.count_nonzero(mask)
+    again = SILHOUETTE.measure(mask, guess, 1.0)
+    np.testing.assert_array_equal(found.y, again.y)
+
+
+def test_noise_is_no_smaller_than_errors_are(render):
+    """Beside the truth, over pictures of many poses; hidden knuckles and the wrist are not told."""
+    off = []
+    for t in range(0, 55, 3):
+        x = hand(t, 35.0, 0.3 * math.sin(t))
+        off.append(normalised(SILHOUETTE.measure(render(x), sure_of(x)), x))
+    off = np.array(off)
+    told = np.isfinite(off).any(axis=0)
+    names = {name for name, seen in zip(MEASURED, told, strict=True) if not seen}
+    knuckles = {f"point_{i}{j}_{a}" for i in (1, 2) for j in (0, 1, 2) for a in "xy"}
+    assert names == {"wrist_x", "wrist_y", "scale", *knuckles}
+    assert 0.2 < np.sqrt(np.nanmean(off**2)) < 1.0
+    assert np.nanmax(np.abs(off)) < 4
+
+
+def test_what_another_part_hides_is_not_measured(render):
+    """A finger bent over the palm: its tip and last segment leave no edge."""
+    x = hand(24)
+    x[HAND_STATE.indices(FLEXIONS[3:])] = np.radians((80.0, 85.0, 80.0))
+    x[2:6] = np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0
+    y = SILHOUETTE.measure(render(x), sure_of(x)).y
+    hidden = ("alpha_23", "rho_23", "point_23_x", "point_23_y")
+    assert np.isnan(y[[MEASURED.index(name) for name in hidden]]).all()
+    assert np.isfinite(y[[MEASURED.index(name) for name in ("alpha_11", "alpha_palm_left")]]).all()
+
+
+def test_nothing_is_measured_in_a_blank_picture_or_one_of_something_else(render):
+    x = hand(24)
+    blank = np.zeros((HEIGHT, WIDTH), dtype=np.bool_)
+    other = blank.copy()
+    other[20:380, 30:450] = True
+    for mask in (blank, other):
+        found = SILHOUETTE.measure(mask, sure_of(x))
+        assert np.isnan(found.y).all()
+        assert found.difference > 0.25
+    with pytest.raises(MaskError, match="480"):
+        SILHOUETTE.measure(np.zeros((3, 3), dtype=np.bool_), sure_of(x))

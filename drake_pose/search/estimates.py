@@ -71,6 +71,18 @@ class JointEstimate:
             value -= 2.0 * math.pi * round((value - 0.5 * (self.low + self.high)) / (2.0 * math.pi))
         return self.low - margin <= value <= self.high + margin
 
+    def widened(self, other: JointEstimate, moved: float) -> JointEstimate:
+        """What both say, the other one of an instant from which the value has moved by so much."""
+        if self.turns_around:
+            middle = 0.5 * (self.low + self.high - other.low - other.high) - moved
+            moved += 2.0 * math.pi * round(middle / (2.0 * math.pi))
+        return replace(
+            self,
+            determined=self.determined and other.determined,
+            low=min(self.low, other.low + moved),
+            high=max(self.high, other.high + moved),
+        )
+
 
 def joint_estimates(
     kinematics: TreeKinematics, low: np.ndarray, high: np.ndarray, determined: np.ndarray

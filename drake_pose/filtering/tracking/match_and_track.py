@@ -152,7 +152,9 @@ class MatchAndTrack:
                 matched = self._turned(matched, frame.observation.node_values(x))
             first = self.tracker.start(x)
             followed = self._follow(first, frame, True)
-            found += [(followed, self._result(followed, frame)), (first, matched)]
+            # The first look of a track is at what the search found, whose families are its own.
+            looked = replace(self._result(followed, frame), pose_set=matched.pose_set)
+            found += [(followed, looked), (first, matched)]
         if not found:
             return Followed(None, 0.0, last.matches + 1), matched
         track, result = min(found, key=lambda pair: pair[1].E_total)

@@ -78,8 +78,15 @@ def match_frames(
 ) -> Iterator[FinishedFrame]:
     """The missing frames, matched or tracked, compared with their masks and drawn."""
     scene, model, renderers = inputs.scene, inputs.model, dict[str, LabelRenderer]()
+    begun: PoseEstimate | None = None
     for frame, pose in estimate_frames(inputs, search, missing):
         masks = {name: scene.read(name, frame) for name in scene.cameras_of(frame)}
+        if pose.pose_set is not None:
+            begun = pose
+        elif pose.found and masks and isinstance(search, MultiStartSearch):
+            views = [View(scene.cameras[name], mask) for name, mask in masks.items()]
+            root_position = (inputs.root_positions or {}).get(frame)
+            pose = search.with_intervals(pose, views, root_position, begun)
         shown: dict[str, np.ndarray] = {**read_pictures(scene, frame), **masks} if overlay else {}
         parts, more = {}, dict[str, Any]()
         for name in {**masks, **shown} if pose.found else ():

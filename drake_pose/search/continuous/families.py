@@ -197,7 +197,6 @@ class RobustFamilies:
         """The poses that fit as well as the best of some, the answer first; J (1) of values."""
         pieces = [self._fit.piece_costs(pose.values, _LOOK) for pose in poses]
         self._pieces = min(pieces, key=lambda one: float(one.sum()))
-        broken = float(self._pieces.sum()) > _BREAKDOWN * 2.0 * self._fit.edge_length
         good = [
             pose.values for pose, one in zip(poses, pieces, strict=True) if self._is_as_good(one)
         ]
@@ -206,7 +205,16 @@ class RobustFamilies:
             if not self._is_in(families, values) and self._has_room(families):
                 families.append(self._spread(values))
                 self._add_flipped(families, families[-1])
-        tree, Js = self._kinematics.tree, [J(one.values) for one in families]
+        return self._described(families, [J(one.values) for one in families])
+
+    def around(self, values: np.ndarray, J: float) -> PoseSet:
+        """What the silhouettes say about one pose (m,), where no other is looked for."""
+        self._pieces = self._fit.piece_costs(values, _LOOK)
+        return self._described([self._spread(values, moves=False)], [J])
+
+    def _described(self, families: Sequence[_Family], Js: Sequence[float]) -> PoseSet:
+        broken = float(self._pieces.sum()) > _BREAKDOWN * 2.0 * self._fit.edge_length
+        tree = self._kinematics.tree
         return _describe(self._kinematics, tree, families, Js, self._tolerance, not broken)
 
     def _is_as_good(self, pieces: np.ndarray) -> bool:
@@ -257,8 +265,8 @@ class RobustFamilies:
         low, high = values - swapped[0], values + swapped[1]
         return _Family(values, np.maximum(low, lower), np.minimum(high, upper))
 
-    def _spread(self, values: np.ndarray) -> _Family:
-        """What the values (m,) may be about a pose."""
+    def _spread(self, values: np.ndarray, moves: bool = True) -> _Family:
+        """What the values (m,) may be about a pose; unless it moves them, by covariance alone."""
         kinematics = self._kinematics
         lower, upper = kinematics.reach(values)
         free = np.flatnonzero(upper > lower)
@@ -272,7 +280,7 @@ class RobustFamilies:
         low[free], high[free] = values[free] - widths, values[free] + widths
         wide = widths > np.where(kinematics.is_angle[free], *_MOVED)
         found = [values]
-        for column in np.flatnonzero(wide):
+        for column in np.flatnonzero(wide) if moves else ():
             along = np.zeros(len(values))
             along[free] = covariance[:, column] / covariance[column, column]
             for way in (-along, along):

@@ -95,16 +95,53 @@ class MultiStartSearch:
         if not views:
             raise SettingsError("a match needs at least one view, but none was given")
         start = time.perf_counter()
+        body, fit, clean = self._fit(views, root_position)
+        deadline = np.inf if self._time_limit is None else start + self._time_limit
+        run = _Run(body, fit, clean, views, deadline)
+        result = run.search(_ROUNDS if self._alternatives else 0, self._alternatives)
+        return replace(result, seconds=time.perf_counter() - start)
+
+    def with_intervals(
+        self,
+        tracked: PoseEstimate,
+        views: Sequence[View],
+        root_position: np.ndarray | None = None,
+        begun: PoseEstimate | None = None,
+    ) -> PoseEstimate:
+        """A pose that was tracked, with what its silhouettes say of each joint; no other is sought.
+
+        As sure as if each instant stood alone: what masks and cameras err by stays from one to the
+        next, so that many of them tell little more.
+
+        Args:
+            begun: the answer that the track began with. Where it had several families, they move
+                along: a joint that it left open stays open.
+        """
+        _, fit, _ = self._fit(views, root_position)
+        values = self._kinematics.flatten(tracked.node_values)
+        found = RobustFamilies(fit, lambda: True).around(values, tracked.J)
+        before = None if begun is None else begun.pose_set
+        if begun is not None and before is not None and before.family_count > 1:
+            first = self._kinematics.flatten(begun.node_values)
+            joints = tuple(
+                now.widened(then, float(moved))
+                for now, then, moved in zip(
+                    found.joints, before.joints, values - first, strict=True
+                )
+            )
+            found = replace(found, joints=joints, family_count=before.family_count)
+        return replace(tracked, pose_set=found)
+
+    def _fit(
+        self, views: Sequence[View], root_position: np.ndarray | None
+    ) -> tuple[SampledBody, ViewsFit, list[View]]:
+        """The body with its root where it is, its fit, and the views without specks."""
         clean = [View(view.camera, without_specks(view.mask)) for view in views]
         body, kinematics = self._body, self._kinematics
         if root_position is not None:
             body = body.with_root_position(root_position)
             kinematics = TreeKinematics(body.sampled.tree)
-        deadline = np.inf if self._time_limit is None else start + self._time_limit
-        fit = ViewsFit(kinematics, self._outlines, clean)
-        run = _Run(body, fit, clean, views, deadline)
-        result = run.search(_ROUNDS if self._alternatives else 0, self._alternatives)
-        return replace(result, seconds=time.perf_counter() - start)
+        return body, ViewsFit(kinematics, self._outlines, clean), clean
 
 
 class _Run:

@@ -95,14 +95,9 @@ class Stage:
             raise SettingsError(f"outside_weight must be 1 or more, not {self.outside_weight}")
 
 
-EXACT_STAGES = (
-    Stage(40),
-    Stage(160),
-    Stage(640, limb_by_limb=True),
-    Stage(2000),
-    Stage(5000, limb_by_limb=True),
-)
-"""For a body that is the object itself: nothing lies outside. They end at once where it is not."""
+EXACT_STAGES = (Stage(20), Stage(160))
+"""For a body that is the object itself. They end at once where it is not; where they fail, one
+branch and bound looks for all poses within the tolerance."""
 
 TOLERANT_STAGES = (Stage(80, 0.3, 5), Stage(300, 1.0, 2))
 """For a body that fits badly."""
@@ -113,10 +108,10 @@ class BeamSearchSettings(GridSettings):
     """Parameters of the beam search.
 
     Args:
-        tolerance: a pose whose silhouettes differ by no more [pixel] counts as exact, and all of
-            them are looked for before the stages; None: what two renderers differ by
-            (``renderer_tolerance``).
-        stages: the passes, one after another until J is within the tolerance.
+        tolerance: a pose whose silhouettes differ by no more [pixel] counts as exact; None: what
+            two renderers differ by (``renderer_tolerance``).
+        stages: the passes, one after another until J is within the tolerance. Of those with no
+            outside share the tolerance is the limit; after them all poses within it are looked for.
         research_hypotheses: kept while limbs of the winner are searched again; 0: they are not.
         time_limit: the search returns its best pose so far after this time [s]; None: no limit.
 

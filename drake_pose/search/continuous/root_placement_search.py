@@ -194,7 +194,7 @@ class RootPlacementSearch:
             if hypotheses is None:
                 break
             spare = _SPARE * factor * width
-            grown, _ = grow(expansion, hypotheses, node, spare, _OUTSIDE_WEIGHT, False)
+            grown, _ = grow(expansion, hypotheses, node, spare, _OUTSIDE_WEIGHT, np.inf)
             hypotheses = None
             if grown is not None:
                 roots = expansion.store.nodes[0].samples[grown.poses[:, 0]]

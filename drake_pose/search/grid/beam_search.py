@@ -1,7 +1,8 @@
 """The beam search: many hypotheses at once, ranked by what the whole objective will be.
 
-Its first stages let nothing lie outside the silhouette and end at J = 0, which certifies itself;
-later ones let more and more, weighed against what is covered newly (5).
+Its first stages let the tolerance lie outside the silhouette and end at a J within it, which
+certifies itself; where they fail, a branch and bound looks for all such poses. Later stages let
+more and more lie outside, weighed against what is covered newly (5).
 """
 
 import copy
@@ -133,45 +134,46 @@ class _Run:
         self.within: PosesWithin | None = None
 
     def search(self) -> None:
-        """Run stage after stage until J = 0 or a limit is reached; then polish the answer."""
-        if self._tolerance > 0.0 and not self._gathers:
-            # Most silhouettes differ by much less than the tolerance, and less is found faster.
-            limits = (self._tolerance,) if self._all else (self._tolerance // 3.0, self._tolerance)
-            if any(self._search_within(J_limit) for J_limit in limits):
-                self._stopped_by = "exact"
-                return
-        skip_exact = False
-        for stage in self._settings.stages:
-            exact = stage.outside_share == 0.0
-            if exact and skip_exact:
-                continue
-            complete = self._run_stage(self._expansion(stage.outside_share), stage)
-            if self._stopped_by or (self._J <= self._tolerance and not (self._gathers and exact)):
+        """Run stage after stage until J is within the tolerance or time is up; then polish it."""
+        if self._all and self._search_within():
+            self._stopped_by = "exact"
+            return
+        exact = [stage for stage in self._settings.stages if stage.outside_share == 0.0]
+        for stage in exact:
+            if self._run_stage(stage) or self._stopped_by or self._J <= self._tolerance:
                 break
-            skip_exact = skip_exact or complete or self._J == 0
+        if not (self._all or self._gathers or self._stopped_by or self._J <= self._tolerance):
+            self._search_within()
+        for k, stage in enumerate(self._settings.stages[len(exact) :]):
+            enough = self._J <= self._tolerance and not (self._gathers and k == 0)
+            if self._stopped_by or enough:
+                break
+            self._run_stage(stage)
         if self._samples is None:
             # A pose whatever lies outside; found by one hypothesis alone if a limit was reached.
             width = 1 if self._stopped_by else self._settings.stages[-1].hypotheses
             expansion = self._expansion(np.inf)
             last, _ = run_stage(
-                expansion, expansion.start(), self._body.order, width, 2, False, lambda: True
+                expansion, expansion.start(), self._body.order, width, 2, np.inf, lambda: True
             )
             if last is not None:
                 best = int(np.argmin(self._gather(expansion, last)))
                 self._keep_if_better(expansion.store.samples(last.poses[best]))
-        elif self._J > 0 and self._settings.research_hypotheses and not self._stopped_by:
+        elif self._settings.research_hypotheses and not (
+            self._stopped_by or self._J <= self._tolerance
+        ):
             pictures = self.pictures(exact=False)
             self._keep_if_better(
                 turn_single_nodes(self.scoring, pictures, self._samples, self._proceed)
             )
-        exact = self._J <= self._tolerance
-        self._stopped_by = "exact" if exact else self._stopped_by or "end"
+        matched = self._J <= self._tolerance
+        self._stopped_by = "exact" if matched else self._stopped_by or "end"
 
-    def _search_within(self, J_limit: float) -> bool:
-        """Look for all poses within a limit, and keep the best; whether there is one."""
+    def _search_within(self) -> bool:
+        """Look for all poses within the tolerance, and keep the best; whether there is one."""
         left = self._deadline - time.perf_counter()
         limits = BoundLimits(poses=_POSES, time_limit=max(left, 0.0) if left < np.inf else None)
-        found = branch_and_bound(self._body, self._views, J_limit, limits)
+        found = branch_and_bound(self._body, self._views, self._tolerance, limits)
         if not found.graph.size:
             return False
         if self._all:
@@ -182,16 +184,18 @@ class _Run:
     def pictures(self, exact: bool) -> Pictures:
         """The silhouettes as bits: coarse ones with a band for stages that are not exact."""
         if exact not in self._pictures:
-            views, band = self._views, 0
+            views, band = self._views, int(self._tolerance)
             if not exact:
                 views = tuple(coarsen(view, _COARSE_PIXELS) for view in views)
                 band = BAND
-            self._pictures[exact] = Pictures(self._body, views, band)
+            self._pictures[exact] = Pictures(self._body, views, band, in_full=exact)
         return self._pictures[exact]
 
     def _expansion(self, outside_share: float) -> Expansion:
         if outside_share not in self._expansions:
-            store = PoseStore(self._body, self.pictures(outside_share == 0.0), outside_share)
+            exact = outside_share == 0.0
+            limit = self._tolerance if exact else None
+            store = PoseStore(self._body, self.pictures(exact), outside_share, limit)
             self._expansions[outside_share] = Expansion(store)
         return self._expansions[outside_share]
 
@@ -202,13 +206,14 @@ class _Run:
             self._stopped_by = "time_limit"
         return not self._stopped_by
 
-    def _run_stage(self, expansion: Expansion, stage: Stage) -> bool:
+    def _run_stage(self, stage: Stage) -> bool:
         """Returns whether the stage lost no hypothesis."""
         exact = stage.outside_share == 0.0
+        expansion = self._expansion(stage.outside_share)
         order = self._body.limb_order if stage.limb_by_limb else self._body.order
         last, complete = run_stage(
-            expansion, expansion.start(), order, stage.hypotheses, stage.outside_weight, exact,
-            self._proceed,
+            expansion, expansion.start(), order, stage.hypotheses, stage.outside_weight,
+            self._tolerance if exact else np.inf, self._proceed,
         )  # fmt: skip
         if last is None:
             return complete
@@ -216,7 +221,7 @@ class _Run:
         best = int(np.argmin(Js))
         self._keep_if_better(expansion.store.samples(last.poses[best]))
         width = self._settings.research_hypotheses
-        if width and (self._J > 0 or (self._gathers and not exact)):
+        if width and (self._J > self._tolerance or (self._gathers and not exact)):
             better = search_limbs_again(
                 expansion,
                 order,

@@ -23,13 +23,13 @@ def grow(
     node: int,
     width: int,
     outside_weight: int,
-    exact: bool,
+    limit: float,
 ) -> tuple[PartialPoses | None, bool]:
     """Place one more node in every partial pose and keep the best.
 
     Args:
         outside_weight: what a pixel outside counts; one newly covered counts one.
-        exact: drop what cannot cover the whole silhouettes any more.
+        limit: drop what cannot come to so small an objective any more [pixel].
 
     Returns:
         The new ones, best first, None where none stays inside the limit; and whether some were
@@ -52,10 +52,10 @@ def grow(
     made = expansion.make(partial, node, pairs[ordered], (areas[ordered], added[ordered]))
     pairs, lost = pairs[ordered], len(ordered) < len(pairs)
     # What is out of reach is known after growing only: grow more and rank again.
-    grown = width if exact else 2 * width
-    chosen, made, looked_at = expansion.choose(partial, made, node, pairs, grown, exact)
+    grown = width if limit < np.inf else 2 * width
+    chosen, made, looked_at = expansion.choose(partial, made, node, pairs, grown, limit)
     lost = lost or len(looked_at) < len(pairs)
-    if not exact:
+    if limit == np.inf:
         best = np.argsort(made.costs(outside_weight), kind="stable")[:width]
         lost = lost or len(best) < len(made)
         chosen, made = chosen[best], made.chosen(best)
@@ -78,7 +78,7 @@ def run_stage(
     order: Sequence[int],
     width: int,
     outside_weight: int,
-    exact: bool,
+    limit: float,
     proceed: Callable[[], bool],
 ) -> tuple[PartialPoses | None, bool]:
     """Place nodes one after another, asking after each whether to go on.
@@ -88,7 +88,7 @@ def run_stage(
     """
     partial, complete = start, True
     for node in order:
-        grown, lost = grow(expansion, partial, node, width, outside_weight, exact)
+        grown, lost = grow(expansion, partial, node, width, outside_weight, limit)
         complete = complete and not lost
         if grown is None:
             return None, complete
@@ -118,7 +118,7 @@ def search_limbs_again(
         nodes = frozenset().union(*choice)
         start = expansion.without(poses, nodes)
         part = [node for node in order if node in nodes]
-        last, _ = run_stage(expansion, start, part, width, _OUTSIDE_WEIGHT, False, proceed)
+        last, _ = run_stage(expansion, start, part, width, _OUTSIDE_WEIGHT, np.inf, proceed)
         if last is None:
             return poses
         Js = found(last)

@@ -108,6 +108,8 @@ def choose_pairs(
     width: int,
     codes: np.ndarray,
     openings: np.ndarray,
+    outside: np.ndarray,
+    limit: float,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The first pairs that are not equal, and what no later node can cover after each.
 
@@ -118,8 +120,10 @@ def choose_pairs(
         width: at most so many are chosen.
         codes: (p,) uint64 the same where pairs are equal in what matters later.
         openings: (p,) uint64 equal where the nodes with children to come stand alike; then only
-            pairs that leave nothing are chosen, and of those alike none that covers a part of what
-            another before it covers. Or (0,): all are chosen.
+            pairs within the limit are chosen, and of those alike none that covers a part of what
+            another before it covers, which has no more outside. Or (0,): all are chosen.
+        outside: (p,) int64 the area outside [pixel].
+        limit: of what is outside and what no later node can cover together [pixel].
 
     Returns:
         (n,) int64 the pairs chosen; (n,) int64 pixels of the silhouettes that each leaves; and of
@@ -166,15 +170,15 @@ def choose_pairs(
         lost = np.uint64(0)
         for k in range(everything.shape[0]):
             lost += count_bits(rest[k])
-        useless = exact and lost > np.uint64(0)
+        useless = exact and outside[i] + np.int64(lost) > limit
         for other in range(count if exact else 0):
             if useless:
                 break
-            if openings[chosen[other]] == openings[i]:
+            if openings[chosen[other]] == openings[i] and outside[chosen[other]] <= outside[i]:
                 k = 0
-                while k < own.shape[0] and own[k] & ~covered[other, k] == np.uint64(0):
+                while k < everything.shape[0] and own[k] & ~covered[other, k] == np.uint64(0):
                     k += 1
-                useless = k == own.shape[0]
+                useless = k == everything.shape[0]
         if not useless:
             chosen[count], left[count], numbers[i] = i, np.int64(lost), count
             count += 1

@@ -151,14 +151,15 @@ class Expansion:
         node: int,
         pairs: np.ndarray,
         width: int,
-        exact: bool = False,
+        limit: float = np.inf,
         far_matters: bool = False,
     ) -> tuple[np.ndarray, PartialPoses, np.ndarray]:
         """The first of what pairs (p, 2) made that are not equal, at most ``width``.
 
         Args:
-            exact: nothing may be left that no later node can reach; and where the nodes with
-                children to come stand alike, none is chosen that covers less than another.
+            limit: where it is finite, what is outside and what no later node can reach may come to
+                so much [pixel]; and where the nodes with children to come stand alike, none is
+                chosen that covers less than another.
             far_matters: those are not equal that differ beyond the bands.
 
         Returns:
@@ -174,7 +175,7 @@ class Expansion:
         chosen, lost, places = choose_pairs(
             partial.masks, pairs, stored.runs, stored.words, self.store.pictures.everything,
             self.store.reaches(partial.poses, node, pairs), width, codes,
-            openings if exact else openings[:0],
+            openings if limit < np.inf else openings[:0], made.least_outside, limit,
         )  # fmt: skip
         return chosen, replace(made.chosen(chosen), lost=lost), places
 

@@ -1,12 +1,17 @@
-"""Kameda's experiment A: random poses of the female body, matched by their silhouettes."""
+"""Kameda's experiment A: random poses of the female body, matched by their silhouettes.
+
+In a diagram: positions -> plant -> RgbdSensor (Drake's VTK renderer) -> SilhouetteMatcher.
+"""
 
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple
 
 import numpy as np
+from pydrake.systems.analysis import Simulator
+from pydrake.trajectories import PiecewisePolynomial
 
 from drake_pose.body.formats.packages import bundled_model
 from drake_pose.body.model import load_model
@@ -23,7 +28,10 @@ from drake_pose.search.scoring import PoseSearch, SampledTree
 from drake_pose.search.settings import BeamSearchSettings, PaperSearchSettings
 from drake_pose.silhouette.areas.outline import Outline
 from drake_pose.silhouette.areas.scoring import draw_labels, draw_mask
+from drake_pose.silhouette.pictures.label_images import label_image_to_mask
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
+from drake_pose.systems.estimators.diagrams import build_simulated_matching
+from drake_pose.systems.estimators.silhouette_matcher import camera_port
 
 Renderer = Literal["drake", "own"]
 """Who draws the silhouettes: Drake's VTK renderer, or the code that scores them."""
@@ -112,7 +120,11 @@ class ExperimentResult:
 
     def view(self, trial: Trial) -> View:
         """The silhouette that the first camera sees of the true pose."""
-        return _drawing(self.search, self.cameras[:1], self.renderer)(trial.true_values)[0]
+        if self.renderer == "own":
+            return _draw_views(self.search, self.cameras[:1], trial.true_values)[0]
+        tree, camera = self.search.tree, self.cameras[0]
+        pose = tree.positions_from(trial.true_values)
+        return View(camera, LabelRenderer(tree.model, camera).mask(*pose))
 
 
 def experiment_camera(angle: float = 0.0) -> ParallelCamera:
@@ -214,57 +226,99 @@ def run_experiment(
     name = "paper" if isinstance(search, PaperSearch) else angles
     advance = count(f"silhouettes, {name}{', another body' if mismatch else ''}", images)
     renderer = "own" if mismatch else renderer
-    draw = _drawing(search, cameras, renderer)
+    drawn = [draw_values(search, angles, generator) for _ in range(images)]
+    wide = replace(
+        cameras[0],
+        width=3 * _SIDE,
+        height=3 * _SIDE,
+        center_x=cameras[0].center_x + _SIDE,
+        center_y=cameras[0].center_y + _SIDE,
+    )
+    timed = _TimedSearch(search)
+    simulated = _simulate(timed, cameras, drawn) if renderer == "drake" else None
     trials = []
-    for done in range(1, images + 1):
-        values = draw_values(search, angles, generator)
-        X_WN, outlines = search.tree.node_poses(values), search.sampled.surfaces.at(values)
-        seen = draw(values)
-        if mismatch:
-            X_WN, outlines = change_body(search.tree, X_WN, outlines, other_generator)
-            seen = [View(one, draw_mask(outlines, one.X_CW @ X_WN, one)) for one in cameras]
-        wide = replace(
-            cameras[0],
-            width=3 * _SIDE,
-            height=3 * _SIDE,
-            center_x=cameras[0].center_x + _SIDE,
-            center_y=cameras[0].center_y + _SIDE,
+    for values in drawn:
+        changed = other_generator if mismatch else None
+        *seen, whole = _draw_views(search, (*cameras, wide), values, changed)
+        if simulated is None:
+            tolerance, answer = 0.0, timed.match(seen)
+        else:
+            seen, answer = next(simulated)
+            tolerance = renderer_tolerance(seen)
+        lost = np.count_nonzero(whole.mask) - np.count_nonzero(seen[0].mask)
+        trials.append(
+            _judge(timed, seen, tuple(values), answer, bool(lost <= tolerance), tolerance)
         )
-        whole = draw_mask(outlines, wide.X_CW @ X_WN, wide)
-        tolerance = renderer_tolerance(seen) if renderer == "drake" else 0.0
-        lost = np.count_nonzero(whole) - np.count_nonzero(seen[0].mask)
-        trials.append(_match(search, seen, tuple(values), bool(lost <= tolerance), tolerance))
-        advance(done)
+        advance(len(trials))
     return ExperimentResult(tuple(trials), cameras, search, seed, mismatch, renderer)
 
 
-def _drawing(
-    search: PoseSearch, cameras: Sequence[Camera], renderer: Renderer
-) -> Callable[[Sequence[np.ndarray]], list[View]]:
-    """A function that draws what the cameras see of a pose, the values of each node."""
-    renderers = [LabelRenderer(search.tree.model, c) for c in cameras if renderer == "drake"]
+class _TimedSearch:
+    """A search that keeps how long its last match took; of the processor [s]."""
 
-    def draw(values: Sequence[np.ndarray]) -> list[View]:
-        if renderers:
-            pose = search.tree.positions_from(values)
-            pairs = zip(cameras, renderers, strict=True)
-            return [View(camera, one.mask(*pose)) for camera, one in pairs]
-        X_WN, outlines = search.tree.node_poses(values), search.sampled.surfaces.at(values)
-        return [View(one, draw_mask(outlines, one.X_CW @ X_WN, one)) for one in cameras]
+    def __init__(self, search: PoseSearch) -> None:
+        self.search, self.tree, self.sampled, self.seconds = (
+            search,
+            search.tree,
+            search.sampled,
+            0.0,
+        )
 
-    return draw
+    def match(self, views: Sequence[View], root_position: np.ndarray | None = None) -> PoseEstimate:
+        """As the search's own."""
+        start = time.process_time()
+        result = self.search.match(views, root_position)
+        self.seconds = time.process_time() - start
+        return result
 
 
-def _match(
+def _draw_views(
     search: PoseSearch,
+    cameras: Sequence[Camera],
+    values: Sequence[np.ndarray],
+    mismatch: np.random.Generator | None = None,
+) -> list[View]:
+    """What the code that scores draws of a pose, the values of each node; of a changed body."""
+    X_WN, outlines = search.tree.node_poses(values), search.sampled.surfaces.at(values)
+    if mismatch is not None:
+        X_WN, outlines = change_body(search.tree, X_WN, outlines, mismatch)
+    return [View(one, draw_mask(outlines, one.X_CW @ X_WN, one)) for one in cameras]
+
+
+def _simulate(
+    search: PoseSearch, cameras: Sequence[Camera], drawn: Sequence[Sequence[np.ndarray]]
+) -> Iterator[tuple[list[View], PoseEstimate]]:
+    """What Drake's sensors see of poses, one a second, and what the matcher answers."""
+    q = np.array([search.tree.positions_from(values)[0] for values in drawn])
+    times = np.arange(len(q) + 1) - 0.5
+    moving = PiecewisePolynomial.ZeroOrderHold(times, np.vstack([q, q[-1:]]).T)
+    simulated = build_simulated_matching(search, cameras, moving, period=1.0)
+    simulator = Simulator(simulated.diagram)
+    matcher = simulated.matcher
+    ports = [matcher.GetInputPort(camera_port("label_image", one, cameras)) for one in cameras]
+    for k in range(len(q)):
+        simulator.AdvanceTo(float(k))
+        # The images of this time, which the next update uses.
+        context = matcher.GetMyContextFromRoot(simulator.get_context())
+        views = [
+            View(camera, label_image_to_mask(port.Eval(context)))
+            for camera, port in zip(cameras, ports, strict=True)
+        ]
+        simulator.AdvanceTo(k + 0.25)
+        answer = simulated.estimate(simulator.get_context())
+        assert answer is not None, "the head is in every picture"
+        yield views, answer
+
+
+def _judge(
+    timed: _TimedSearch,
     views: Sequence[View],
     values: tuple[np.ndarray, ...],
+    result: PoseEstimate,
     inside: bool,
     tolerance: float,
 ) -> Trial:
-    start = time.process_time()
-    result = search.match(views)
-    seconds = time.process_time() - start
+    search, seconds = timed.search, timed.seconds
     if isinstance(search, ContinuousSearch):
         more = result.statistics.interval_seconds
         more *= seconds / max(result.seconds + more, 1e-9)

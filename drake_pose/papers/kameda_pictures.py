@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from drake_pose.body.parsed_model import ParsedModel
 from drake_pose.files.overlay import paint_agreement
-from drake_pose.papers.kameda import ExperimentResult, Trial, experiment_camera
+from drake_pose.papers.kameda import Causes, ExperimentResult, Trial, experiment_camera
 from drake_pose.papers.tables import draw_panels, save_figure
 from drake_pose.search.estimates import PoseFamily, PoseSet, View
 from drake_pose.search.grid.pose_families import samples_at
@@ -32,9 +32,13 @@ _KINDS: dict[str, tuple[str, Callable[[Trial], bool]]] = {
         "silhouette matched exactly, every angle right (figure 7)",
         lambda trial: trial.pose_equal,
     ),
-    "figure_08_09_exact_but_another_pose": (
-        "silhouette matched exactly by another pose (figures 8 and 9)",
-        lambda trial: trial.exact and not trial.pose_equal,
+    "figure_08_hidden": (
+        "silhouette matched exactly by another pose: a wrong segment is hidden (figure 8)",
+        lambda trial: trial.causes is not None and trial.causes.hidden,
+    ),
+    "figure_09_inner_edges": (
+        "silhouette matched exactly by another pose: edges inside it differ (figure 9)",
+        lambda trial: trial.causes == Causes(hidden=False, inner_edges=True),
     ),
     "figure_10_improved_by_re_estimation": (
         "improved by re-estimation (figure 10)",

@@ -16,6 +16,7 @@ from pydrake.systems.sensors import RgbdSensor
 from pydrake.trajectories import Trajectory
 
 from drake_pose.arrays import Array, Mask, Picture
+from drake_pose.body.formats.parsing import captured_warnings
 from drake_pose.body.parsed_model import ParsedModel
 from drake_pose.camera.drake import camera_from_drake, camera_to_drake
 from drake_pose.camera.models import Camera, PinholeCamera
@@ -124,7 +125,9 @@ def add_sensors(
         color, depth, X_WC = camera_to_drake(
             camera, renderer_name=_RENDERER, depth_range=depth_ranges.get(name)
         )
-        sensor = RgbdSensor(scene_graph.world_frame_id(), X_WC, color, depth)
+        # A parallel camera is a tele camera far beyond what depth images hold, which nobody reads.
+        with captured_warnings():
+            sensor = RgbdSensor(scene_graph.world_frame_id(), X_WC, color, depth)
         sensors[name] = builder.AddNamedSystem(f"camera_{name}", sensor)
         builder.Connect(scene_graph.get_query_output_port(), sensor.query_object_input_port())
     return sensors

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 # What is about the grid of angles, which continuous ones have none of.
 _OF_GRID = (
     "seeds", "method", "outside_limit", "outside_weight", "candidates", "interval", "edges",
-    "edge_noise", "out",
+    "edge_noise", "body_scale", "out",
 )  # fmt: skip
 
 
@@ -56,6 +56,8 @@ class KamedaOptions:
     """Sampling interval [deg]. Default: 20."""
     views: Annotated[int | None, within(1)] = None
     """With --angles continuous: number of cameras. Default: 1."""
+    body_scale: Annotated[float | None, within(0.1, 1.0)] = None
+    """Scale of the body. With 0.84 its segments have the mean area of the paper's. Default: 1."""
     mismatch: bool | None = None
     """With --angles continuous: also a body whose widths and joints differ from the model's."""
     edges: bool | None = None
@@ -127,7 +129,7 @@ def _kameda_grid(images: int, options: KamedaOptions, json: bool) -> None:
         from drake_pose.search.scoring import PoseSearch
 
         interval, first = options.interval or 20.0, options.seed or 0
-        renderer = options.renderer or "drake"
+        renderer, scale = options.renderer or "drake", options.body_scale or 1.0
         limit = 200.0 if options.outside_limit is None else options.outside_limit
         paper = (limit, options.candidates or 5, interval)
         searches: dict[str, PoseSearch] = {"paper_method": experiment_search(*paper)}
@@ -143,7 +145,8 @@ def _kameda_grid(images: int, options: KamedaOptions, json: bool) -> None:
             number = min(images, PAPER_IMAGES) if fewer else images
             seeds = range(first, first + (options.seeds or 1))
             results[name] = [
-                run_experiment(search, number, seed, count, renderer=renderer) for seed in seeds
+                run_experiment(search, number, seed, count, renderer=renderer, body_scale=scale)
+                for seed in seeds
             ]
         *beside, leading = results
         asked, settled = results[leading][0], {}

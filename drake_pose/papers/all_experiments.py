@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, get_args
 
 from rich.console import Console, RenderableType
 
@@ -21,7 +21,12 @@ from drake_pose.files.report_page import page_template
 from drake_pose.filtering.kalman.truncated_filter import FilterSettings
 from drake_pose.papers.date import run_experiment as run_date
 from drake_pose.papers.date_pictures import save_pictures as save_date
-from drake_pose.papers.kameda import beam_experiment_search, continuous_search, experiment_search
+from drake_pose.papers.kameda import (
+    Renderer,
+    beam_experiment_search,
+    continuous_search,
+    experiment_search,
+)
 from drake_pose.papers.kameda import run_experiment as run_kameda
 from drake_pose.papers.kameda_figures import (
     PAPER,
@@ -72,13 +77,15 @@ class Experiment(NamedTuple):
 
 
 def _kameda(short: bool, folder: Path, count: Count) -> Outcome:
-    searches: dict[str, PoseSearch] = {
-        "paper": experiment_search(),
-        "outside_weight": experiment_search(outside_weight=_OUTSIDE_WEIGHT),
-        "beam": beam_experiment_search(),
+    searches: dict[str, tuple[PoseSearch, Renderer]] = {
+        "paper": (experiment_search(), "drake"),
+        "outside_weight": (experiment_search(outside_weight=_OUTSIDE_WEIGHT), "drake"),
+        "beam": (beam_experiment_search(), "drake"),
+        "beam_own_drawing": (beam_experiment_search(renderer="own"), "own"),
     }
     results = {
-        name: run_kameda(search, 3 if short else 219, 0, count) for name, search in searches.items()
+        name: run_kameda(search, 3 if short else 219, 0, count, renderer=renderer)
+        for name, (search, renderer) in searches.items()
     }
     for name, result in results.items():
         save_kameda(result, folder / name)
@@ -96,8 +103,15 @@ def _kameda(short: bool, folder: Path, count: Count) -> Outcome:
 
 
 def _kameda_continuous(short: bool, _folder: Path, count: Count) -> Outcome:
-    result = run_kameda(continuous_search(), 1 if short else 30, 77, count)
-    return Outcome(continuous_figures(result), [continuous_table({"one view": result})])
+    results = {
+        f"drawn by {renderer}": run_kameda(
+            continuous_search(), 1 if short else 30, 77, count, renderer=renderer
+        )
+        for renderer in get_args(Renderer)
+    }
+    drake, own = results.values()
+    figures = {**continuous_figures(drake), "own_drawing": continuous_figures(own)}
+    return Outcome(figures, [continuous_table(results)])
 
 
 def _kameda_pictures(experiment: str, short: bool, folder: Path, count: Count) -> Outcome:

@@ -127,17 +127,19 @@ class ExperimentResult:
         return View(camera, LabelRenderer(tree.model, camera).mask(*pose))
 
 
-def experiment_camera(angle: float = 0.0) -> ParallelCamera:
+def experiment_camera(angle: float = 0.0, body_scale: float = 1.0) -> ParallelCamera:
     """The paper's camera: 700 x 700, parallel, 2.26 pixels a centimetre, the head right above.
 
-    The angle [rad] turns the camera about the body's upright axis, to the body's left.
+    The angle [rad] turns the camera about the body's upright axis, to the body's left. A body of
+    another scale is seen by a camera of that scale.
     """
     turn, X_WC = np.eye(4), np.eye(4)
     turn[:2, :2] = [[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]]
     X_WC[:3, :3] = _R_WC
     X_WC[:3, 3] = [_DISTANCE, 0.0, 0.0]
     name = f"turned_{round(math.degrees(angle))}"
-    return ParallelCamera(name, _SIDE, _SIDE, _PIXELS_PER_METRE, *_ROOT_PIXEL, turn @ X_WC)
+    scale = body_scale * _PIXELS_PER_METRE
+    return ParallelCamera(name, _SIDE, _SIDE, scale, *_ROOT_PIXEL, turn @ X_WC)
 
 
 def experiment_search(
@@ -188,7 +190,7 @@ def draw_values(
         if angles == "continuous":
             # A position with one grid value only is known, not searched.
             moving = np.ptp(grid, axis=0) > 0
-            indices = np.array(node.positions)
+            indices = np.array(node.positions, dtype=np.int64)
             uniform = generator.uniform(lower[indices], upper[indices])
             drawn[moving] = uniform[moving]
         values.append(drawn)
@@ -203,6 +205,7 @@ def run_experiment(
     views: int = 1,
     mismatch: bool = False,
     renderer: Renderer = "drake",
+    body_scale: float = 1.0,
 ) -> ExperimentResult:
     """Draw poses, on the grid as the paper's or for a continuous search between, and match them.
 
@@ -215,12 +218,13 @@ def run_experiment(
         mismatch: whether the body in the pictures has other widths and joints than the model; such
             a body is drawn by the code that scores it.
         renderer: who draws the silhouettes.
+        body_scale: of the body; with 0.84 its segments have the mean area of the paper's.
 
     Raises:
         SettingsError: if ``images`` or ``views`` is below 1.
     """
     require_counts(images=images, views=views)
-    cameras = tuple(experiment_camera(math.pi * k / views) for k in range(views))
+    cameras = tuple(experiment_camera(math.pi * k / views, body_scale) for k in range(views))
     angles = "continuous" if isinstance(search, ContinuousSearch) else "grid"
     generator, other_generator = np.random.default_rng(seed), np.random.default_rng([seed, 1])
     name = "paper" if isinstance(search, PaperSearch) else angles

@@ -144,7 +144,8 @@ def grid_table(columns: Sequence[Sequence[ExperimentResult]]) -> Table:
     for runs in columns:
         figures = [_grid_figures(run) for run in runs]
         if figures[0]["method"] == "beam":
-            shown["beam search"] = [
+            own = figures[0]["renderer"] == "own"
+            shown["beam search" + (", own drawing" if own else "")] = [
                 {key: value for key, value in one.items() if key not in _OF_RUNS} for one in figures
             ]
         elif weight := figures[0]["outside_weight"]:

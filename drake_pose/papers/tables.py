@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -119,7 +120,8 @@ def draw_panels(
     for axis, text in zip(axes[:, 0], labels, strict=False):
         axis.set_ylabel(text)
     if title:
-        figure.suptitle(title, fontsize=10)
+        lines = [textwrap.fill(line, 40 * len(columns)) for line in title.split("\n")]
+        figure.suptitle("\n".join(lines), fontsize=10)
     return figure
 
 

@@ -213,6 +213,7 @@ class MemorySystem(PortedSystem):
         for name in shown:
             self.DeclareStateOutputPort(name, self._vectors[name])
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._renew)
+        self.DeclareForcedDiscreteUpdateEvent(self._renew)
 
     def vectors(self, context: Context) -> dict[str, Array]:
         """Copies of what is known in a context."""

@@ -129,6 +129,7 @@ class PictureCapture(PortedSystem):
         self.DeclareStateOutputPort("time", self._time)
         self.DeclareStateOutputPort("fresh", self._fresh)
         self.DeclarePeriodicUnrestrictedUpdateEvent(self.period, 0.0, self._look)
+        self.DeclareForcedUnrestrictedUpdateEvent(self._look)
 
     def _declare_outputs(self, cameras: Mapping[str, Camera], ticket: DependencyTicket) -> None:
         """One output a camera."""

@@ -14,6 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import chi2
 from scipy.stats import f as fisher
 
 from drake_pose.fit.covariance import (
@@ -53,6 +54,8 @@ _UNKNOWN_SIZES = ErrorSizes(1.0, 0.0, 1.0, 1.0, 1.0)
 _WIDTH_SD = 2.0
 # What is right is named by chance this often, and not where it moves outlines by less [pixel].
 _SIGNIFICANCE, _LEAST_PIXELS = 1e-4, 1.0
+# What is nearer to half a pixel than this is that [pixel].
+_NEAR_HALF = 0.25
 # Joints, or sliding ones and the base, may be off by so much in each frame by itself [rad; m].
 _ANGLE_SD, _SHIFT_SD = np.radians(0.1), 0.001
 
@@ -102,13 +105,37 @@ class FrameAudit:
     finding: Finding | None
 
 
+class HalfPixel(NamedTuple):
+    """By how much principal points are off, half a pixel along x and y, and standard deviations."""
+
+    offset: list[float]
+    sd: list[float]
+
+
+def half_pixel(offset: Array, covariance: Array) -> HalfPixel | None:
+    """What is off by half a pixel along both axes, and not by chance; None: nothing is.
+
+    Args:
+        offset: (2,) by how much principal points are off [pixel]; covariance: (2, 2).
+    """
+    half = np.copysign(0.5, offset.sum())
+    T = float(offset @ np.linalg.solve(covariance, offset))
+    if chi2.sf(T, 2) > _SIGNIFICANCE or np.abs(offset - half).max() > _NEAR_HALF:
+        return None
+    return HalfPixel(offset.tolist(), np.sqrt(np.diag(covariance)).tolist())
+
+
 @dataclass(frozen=True)
 class Audit:
-    """What contradicts the rest: of each frame; in all that agree; sizes of errors [pixel]."""
+    """What contradicts the rest: of each frame; in all that agree; sizes of errors [pixel].
+
+    ``center``: all principal points are off by half a pixel; None: they are not.
+    """
 
     frames: tuple[FrameAudit, ...]
     common: tuple[Finding, ...]
     sizes: ErrorSizes
+    center: HalfPixel | None = None
 
     @property
     def contradicting(self) -> tuple[str, ...]:
@@ -235,7 +262,7 @@ class _Auditor:
             for k, info in enumerate(self._info)
         )
         kept = np.array([one.finding is None for one in frames])
-        return Audit(frames, self._common_findings(kept), sizes)
+        return Audit(frames, *self._common_findings(kept, sizes))
 
     def _pooled_sizes(self, which: NDArray[np.intp], together: int) -> ErrorSizes:
         """How large errors are, by groups of some frames, spread over all of them."""
@@ -400,14 +427,22 @@ class _Auditor:
         named = {names[k]: float(joints[k]) for k in sure}
         return Finding(kind, "", angle, shift, 0.0, 0.0, pixels, p_value, (), named)
 
-    def _common_findings(self, kept: Mask) -> tuple[Finding, ...]:
-        """What is off in all frames that agree."""
+    def _common_findings(
+        self, kept: Mask, sizes: ErrorSizes
+    ) -> tuple[tuple[Finding, ...], ErrorSizes, HalfPixel | None]:
+        """What is off in all frames that agree, as Audit has it."""
         if not kept.any():
-            return ()
+            return (), sizes, None
         info, count = self._sum(kept), np.count_nonzero(kept)
         Q = self._covariance(info) + info.N @ self._tolerance @ info.N / count
         residual = _Residual(info, info.N, info.h, Q)
         causes, findings = self._causes(None), list[Finding]()
+        shifted = residual.test(_Cause("center", "", self._fit.center_moves(), np.ones(2)))
+        center = half_pixel(shifted.amount, shifted.covariance)
+        if center and shifted.gain > max(residual.test(cause).gain for cause in causes):
+            residual = residual.without(shifted.cause)
+        else:
+            center = None
         while causes:
             tests = [residual.test(cause) for cause in causes]
             sufficient = residual.sufficient(tests) or [max(tests, key=lambda one: one.gain)]
@@ -417,7 +452,7 @@ class _Auditor:
             findings.append(self._finding(sufficient, pixels))
             residual = residual.without(best.cause)
             causes = [one for one in causes if one is not best.cause]
-        return tuple(findings)
+        return tuple(findings), sizes, center
 
 
 def _add(total: _Information, info: _Information, sign: float) -> _Information:

@@ -102,12 +102,13 @@ class PerFrameFit:
         self.deviations = np.concatenate([of_joints, of_cameras])
         worth = _POINT_ERROR * np.sqrt(_ERROR_LENGTH)
         bodies = [BodyParameters(kinematics, one) for one in outlines]
+        self._middle = middle_of(kinematics, frames)
         unknowns = choose(
             parameter_names(bodies[0], cameras), self.names, deviation=self.deviations / worth
         )
         self._few, self._all = (
             FramesFit(
-                body, cameras, unknowns, pivot=middle_of(kinematics, frames),
+                body, cameras, unknowns, pivot=self._middle,
                 noise=Noise.of_a_pixel(self._size), steps=_STEPS, pixels=self._size,
             )
             for body in bodies
@@ -174,6 +175,22 @@ class PerFrameFit:
             R_CW = camera.X_CW[:3, :3]
             moves[first : first + 3, :3] = R_CW
             moves[first + 3 : first + 6, 3:] = R_CW
+        return np.asarray(moves / self.deviations[:, None])
+
+    def center_moves(self) -> Array:
+        """(p, 2) as base_moves, of a pixel by which all principal points are shifted along x and y.
+
+        At depth z a body is seen shifted by z over the focal length: a shift, and a turn, but for
+        what the turn changes of the depth.
+        """
+        moves = np.zeros((len(self.names), 2))
+        for c, camera in enumerate(self._cameras):
+            first = len(self.joints) + 6 * c
+            kind, focal_x, focal_y = camera.kernel_parameters()[:3]
+            z = float(camera.X_CW[2, :3] @ self._middle + camera.X_CW[2, 3])
+            of_x, of_y = moves[first : first + 6].T
+            of_x[3], of_y[4] = ((1.0 if kind == 1.0 else z) / focal for focal in (focal_x, focal_y))
+            of_x[1], of_y[0] = (0.0, 0.0) if kind == 1.0 else (1.0 / focal_x, -1.0 / focal_y)
         return np.asarray(moves / self.deviations[:, None])
 
 

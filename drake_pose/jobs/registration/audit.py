@@ -86,7 +86,7 @@ def audit_scene(
     begin, warnings = time.perf_counter(), list(inputs.warnings)
     found, unseen = _audit(inputs, frames, on_frame)
     seconds = time.perf_counter() - begin
-    warnings += _doubts(inputs, found, unseen)
+    warnings += _doubts(inputs, found, unseen, files["cameras"])
     names = [camera.name for camera in inputs.held]
     summary = {
         "contradictions": _describe_contradictions(found),
@@ -102,6 +102,7 @@ def audit_scene(
             }
             for one in found.frames
         },
+        "principal_point_px": found.center and found.center._asdict(),
         "error_sizes_px": {name: float(getattr(found.sizes, name)) for name in _SIZES},
         **describe_run(Path(scene), files, settings, warnings, seconds),
         "unseen": unseen,
@@ -157,9 +158,20 @@ def _audit(
     return audit_frames(fit, fitted), unseen
 
 
-def _doubts(inputs: Inputs, found: Audit, unseen: Sequence[str]) -> list[str]:
-    """What a user should know of the frames."""
+def _doubts(inputs: Inputs, found: Audit, unseen: Sequence[str], cameras: Path) -> list[str]:
+    """What a user should know of the frames, and of the file of cameras."""
     warnings = []
+    if found.center is not None:
+        (x, y), (x_sd, y_sd) = found.center
+        advice = (
+            "does the file have a CameraInfo's numbers? Write pixel_centers: drake beside them"
+            if x < 0.0
+            else "does it say pixel_centers: drake of numbers that count pixel centres at integers?"
+        )
+        warnings.append(
+            f"{cameras}: the principal points are off by ({x:.2f}, {y:.2f}) +- ({x_sd:.2f}, "
+            f"{y_sd:.2f}) pixels, half a pixel: {advice}"
+        )
     if unseen:
         named = frame_ranges(unseen, inputs.scene.frames)
         warnings.append(f"frame {named}: the masks show nothing: there is nothing to compare")

@@ -1,6 +1,7 @@
 """`drake-pose audit`: what contradicts the rest, from masks, cameras and joint positions."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -50,6 +51,7 @@ class TestAudit:
         assert "'0002'" in summary["contradictions"][0]["text"]
         assert (summary["frame_count"], summary["agreeing_count"]) == (8, 7)
         assert summary["frames"]["0003"]["agrees"]
+        assert summary["principal_point_px"] is None
         assert summary == json.loads((out / "summary.json").read_text())
 
     def test_only_what_contradicts_is_drawn(self, found) -> None:
@@ -74,6 +76,23 @@ class TestAudit:
         assert named == [("camera", "left"), ("frame", "0002")]
         assert result.summary["contradictions"][0]["shift_mm"] == pytest.approx(20.0, abs=5.0)
         assert result.folder is None
+
+    @pytest.mark.parametrize("half", [0.5, pytest.param(-0.5, marks=pytest.mark.slow)])
+    def test_half_a_pixel_of_the_principal_points_is_named(
+        self, audited, tmp_path: Path, half: float
+    ) -> None:
+        path = tmp_path / "cameras.yaml"
+        moved = {
+            name: replace(one, center_x=one.center_x + half, center_y=one.center_y + half)
+            for name, one in audited.cameras.items()
+        }
+        save_cameras(path, moved)
+        result = audit_scene(audited.folder, audited.model, audited.joints, cameras=path)
+        told, warnings = result.summary["principal_point_px"], "\n".join(result.warnings)
+        assert [one["name"] for one in result.summary["contradictions"]] == ["0002"]
+        np.testing.assert_allclose(told["offset"], -half, atol=0.15)
+        assert "half a pixel" in warnings
+        assert ("CameraInfo's numbers" in warnings) == (half > 0.0)
 
     def test_a_joint_without_a_column_is_named(self, audited, tmp_path: Path) -> None:
         own = audited.copy(tmp_path)

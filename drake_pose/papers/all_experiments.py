@@ -37,7 +37,7 @@ from drake_pose.papers.kameda_figures import (
 )
 from drake_pose.papers.kameda_pictures import save_pictures as save_kameda
 from drake_pose.papers.kameda_real_pictures import real_table, run_real_experiment
-from drake_pose.papers.shimada import result_table
+from drake_pose.papers.shimada import PICTURES, result_table
 from drake_pose.papers.shimada import run_experiment as run_shimada
 from drake_pose.papers.shimada_hypotheses import run_hypotheses_experiment
 from drake_pose.papers.shimada_pictures import save_hypotheses
@@ -126,11 +126,11 @@ def _kameda_pictures(experiment: str, short: bool, folder: Path, count: Count) -
     return Outcome(figures, [real_table(figures), *warnings], rows)
 
 
-def _shimada(short: bool, folder: Path, count: Count) -> Outcome:
+def _shimada(observed: str, runs: int, short: bool, folder: Path, count: Count) -> Outcome:
     figures: dict[str, dict[str, Any]] = {}
     shown = []
     for name, truncation, iterations in _FILTERS:
-        result = run_shimada(1 if short else 50, 0, truncation, "lines", count, iterations)
+        result = run_shimada(1 if short else runs, 0, truncation, observed, count, iterations)
         save_shimada(result, folder / name)
         figures[name] = result.as_json()
         shown.append(result_table(result))
@@ -149,6 +149,7 @@ def _shimada(short: bool, folder: Path, count: Count) -> Outcome:
         ("truths within two deviations", *inside, *first),
         (angles, "{angle_rmse_at_end:.1f}", "right (figure 14)", *first),
         ("sequences lost", "", "none of two", *lost),
+        ("milliseconds a frame, median, without drawing", "{ms_per_update:.1f}", _NONE, *first),
     )
     return Outcome(figures, shown, rows)
 
@@ -223,7 +224,13 @@ EXPERIMENTS = (
         "shimada",
         "Shimada, Shirai, Kuno, Miura: angles and lengths of a hand; the paper's filter, then ours",
         "drake-pose reproduce shimada --iterations 1 --truncation sequential",
-        _shimada,
+        partial(_shimada, "lines", 50),
+    ),
+    Experiment(
+        "shimada_pictures",
+        "The same from silhouettes by Drake's renderer: its figures 17 and 18",
+        "drake-pose reproduce shimada --pictures --iterations 1 --truncation sequential",
+        partial(_shimada, PICTURES, 10),
     ),
     Experiment(
         "shimada_hypotheses",

@@ -17,11 +17,15 @@ from drake_pose.camera.models import ParallelCamera
 from drake_pose.errors import SettingsError
 from drake_pose.filtering.measurements.axes import AxisObservation
 from drake_pose.filtering.measurements.contour import ContourObservation
+from drake_pose.filtering.measurements.hand_silhouette import HandSilhouette
+from drake_pose.filtering.state import Belief
 from drake_pose.filtering.truncation.couplings import model_inequalities
+from drake_pose.papers.shimada import experiment_filter
+from drake_pose.papers.shimada_motion import true_states
 from drake_pose.search.grid.beam_search import BeamSearch
 from drake_pose.search.settings import BeamSearchSettings
-from drake_pose.silhouette.pictures.label_images import EMPTY
-from drake_pose.systems.estimators.hand_tracking import AxisSensor, build_hand_tracking
+from drake_pose.silhouette.pictures.label_images import EMPTY, mask_to_label_image
+from drake_pose.systems.estimators.hand_tracking import AxisSensor, HandSensor, build_hand_tracking
 from drake_pose.systems.estimators.truncated_ekf import STATISTICS
 from tests.systems.bench import Bench
 
@@ -162,3 +166,23 @@ def test_without_a_hand_there_is_nothing_to_start_from(camera, search):
     image.mutable_data[:] = EMPTY
     assert np.isnan(sensor.give(label_image=image)["matched_state"]).all()
     assert search.count == 0
+
+
+def test_the_hand_sensor_measures_the_silhouette_beside_the_prediction():
+    belief_filter = experiment_filter()[0]
+    truth = true_states(35.0, np.zeros(6))[24]
+    silhouette = HandSilhouette(belief_filter, 480, 400, (239.5, 199.5))
+    belief = Belief(truth, np.diag(np.full(len(truth), 1e-8)))
+    sensor = Bench(HandSensor(silhouette))
+    state = {"estimated_state": belief.mean, "covariance": belief.covariance.ravel()}
+    for step, image in ((0.0, None), (3.0, silhouette.draw(truth) > 0)):
+        sensor.give(statistics=[step, 1.0, 0.0, 0.0, 0.0], **state)
+        if image is None:
+            assert np.isnan(sensor["measurement"]).all()
+            assert sensor["difference"] == 1.0
+            continue
+        sensor.give(label_image=mask_to_label_image(image))
+        found = silhouette.measure(image, belief_filter.predicted(belief))
+        np.testing.assert_array_equal(sensor["measurement"], found.y)
+        np.testing.assert_array_equal(sensor["rough_state"], found.rough)
+        assert np.count_nonzero(np.isfinite(found.y)) > 15

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 from drake_pose.commands.estimate import estimate, print_estimate
 from drake_pose.commands.options import (
@@ -32,7 +32,7 @@ from drake_pose.commands.terminal import (
 )
 from drake_pose.errors import SceneError
 from drake_pose.files.settings import CaptureSettings, EstimateSettings, changed
-from drake_pose.jobs.live.settings import LiveSettings
+from drake_pose.jobs.live.settings import CaptureMethod, LiveSettings
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -47,7 +47,7 @@ def capture(
     *,
     out: Out,
     model: Path | None = None,
-    method: Literal["person", "paper"] = "person",
+    method: CaptureMethod = "person",
     settings: Annotated[CaptureSettings | None, SPREAD] = None,
     live: Annotated[LiveSettings | None, SPREAD] = None,
     workers: CaptureWorkers = 0,
@@ -71,7 +71,8 @@ def capture(
         scene: Folder with cameras.yaml and masks, pictures or videos; or with a sources.yaml.
         model: A person with landmarks.yaml beside it. Default: the bundled one.
         method: person: by all silhouettes at once; paper: by skin seen in colour pictures, and a
-            search for elbows and knees, as Date et al. published it.
+            search for elbows and knees, all as Date et al. print it; stages: the same stages with
+            a search by the limbs' surfaces, and a waist and feet that err less.
     """
     settings, live = settings or CaptureSettings(), live or LiveSettings()
     of_masks = bool(truth or resume or set(changed(settings)) - {"packages"})
@@ -96,7 +97,7 @@ def capture(
 
 def _check(
     scene: Path,
-    method: str,
+    method: CaptureMethod,
     of_masks: bool,
     has_sources: bool,
     live: LiveSettings,
@@ -104,13 +105,13 @@ def _check(
 ) -> None:
     """Refuses options that do not go together."""
     of_person = bool(live.shape or not live.fit_shape or on_workers)
-    if method == "paper" and (of_masks or of_person):
+    if method != "person" and (of_masks or of_person):
         raise UsageError(
             "--camera, --frame, --truth, --start, --no-track, --resume, --shape, --no-fit-shape, "
             "--workers and --scheduler are for --method person"
         )
     if method == "person" and live.faces is not None:
-        raise UsageError("--face-camera and --faces are for --method paper")
+        raise UsageError("--face-camera and --faces are for --method stages and paper")
     if has_sources and of_masks:
         raise UsageError(
             "--camera, --frame, --truth, --start, --no-track and --resume are for a folder of "
@@ -143,7 +144,7 @@ def _capture_live(
     folder: Path,
     out: Path,
     model: Path | None,
-    method: str,
+    method: CaptureMethod,
     settings: LiveSettings,
     client: Client | None,
 ) -> LiveResult:
@@ -151,9 +152,9 @@ def _capture_live(
     from drake_pose.jobs.live.capture import capture_live
     from drake_pose.jobs.live.scene import is_live_scene
 
-    if method == "paper" and folder.is_dir() and not is_live_scene(folder):
+    if method != "person" and folder.is_dir() and not is_live_scene(folder):
         raise SceneError(
-            f"{folder}: has no sources.yaml; the paper's method looks for skin in colour pictures, "
+            f"{folder}: has no sources.yaml; the paper's stages look for skin in colour pictures, "
             "which masks do not show: name the pictures and those of the empty room there"
         )
     with FrameProgress() as progress:
@@ -163,10 +164,9 @@ def _capture_live(
         def show(count: int, _: bool) -> None:
             progress.show_stage("frames", count, None)
 
-        by_stages = method == "paper"
-        if by_stages and any(one.live for one in scene.specifications.values()):
+        if method != "person" and any(one.live for one in scene.specifications.values()):
             say("drake-pose: stand upright before the cameras, both arms spread to the sides")
-        return capture_live(scene, out, model, settings, sensors, warn, show, by_stages)
+        return capture_live(scene, out, model, settings, sensors, warn, show, method)
 
 
 def _print_result(result: LiveResult, json: bool) -> None:

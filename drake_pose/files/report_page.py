@@ -51,6 +51,7 @@ _METHODS = {
     "paper": "searched as published",
     "person": "one person followed by all silhouettes at once",
     "paper_capture": "one person followed by skin-coloured features, as published",
+    "stages_capture": "one person followed by skin-coloured features and limbs' surfaces",
 }
 _ABOUT = {
     "poses.csv": "every position of every frame [rad or m]",

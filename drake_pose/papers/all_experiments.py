@@ -21,6 +21,7 @@ from drake_pose.files.report_page import page_template
 from drake_pose.filtering.kalman.truncated_filter import FilterSettings
 from drake_pose.papers.date import run_experiment as run_date
 from drake_pose.papers.date_pictures import save_pictures as save_date
+from drake_pose.papers.date_walk import run_walk_through
 from drake_pose.papers.kameda import (
     Renderer,
     beam_experiment_search,
@@ -43,6 +44,7 @@ from drake_pose.papers.shimada_hypotheses import run_hypotheses_experiment
 from drake_pose.papers.shimada_pictures import save_hypotheses
 from drake_pose.papers.shimada_pictures import save_pictures as save_shimada
 from drake_pose.papers.tables import Count, Figures
+from drake_pose.person.date.walking import COMMANDS, REGISTERED
 from drake_pose.search.scoring import PoseSearch
 from drake_pose.version import VERSION
 
@@ -182,17 +184,39 @@ def _date(short: bool, folder: Path, count: Count) -> Outcome:
     rows: list[tuple[Any, ...]] = []
     for joint in ("elbow", "knee"):
         what = f"{joint}s, upright: by inverse kinematics alone, then with the search [mm]"
-        found = f"{figures[f'{joint}_ik_mm']:.0f} to {figures[f'{joint}_mm']:.0f}"
-        all_at_once = f"{figures[f'{joint}s']['silhouette_mm']:.1f} (all motions)"
+        found, own = (
+            f"{figures[f'{way}{joint}_ik_mm']:.0f} to {figures[f'{way}{joint}_mm']:.0f}"
+            for way in ("", "stages_")
+        )
+        all_at_once = f"{own}; all silhouettes {figures[f'{joint}s']['silhouette_mm']:.1f}"
         rows.append((what, "", "wrong, then right (figure 7)", found, all_at_once))
-    whole = f"{figures['ms_per_frame']['all']:.0f} ms, one core"
-    back = figures["frames_to_recover_registered"]
-    shown = "not" if back is None else str(back)
+    both = ("paper", "silhouette")
+    whole = [f"{result.milliseconds(way)['all']:.0f} ms, one core" for way in both]
+    backs = [result.recoveries(way).get(REGISTERED) for way in both]
     rows += [
-        ("a frame", "", "real time, a cluster (15 ms for the face)", _NONE, whole),
-        ("frames until right when the registered pose is shown", "", "that frame", _NONE, shown),
+        ("a frame", "", "real time, a cluster (15 ms for the face)", *whole),
+        ("frames until the registered pose, shown, is right", "", "that frame", *map(str, backs)),
     ]
     return Outcome(figures, [*result.tables(), result.costs()], rows)
+
+
+def _date_walk(short: bool, folder: Path, count: Count) -> Outcome:
+    cameras, size = (4, (320, 240)) if short else (9, (640, 480))
+    walks = {name: run_walk_through(cameras, 0, name, count, size) for name in ("paper", "stages")}
+    for name, walk in walks.items():
+        walk.save(folder / name)
+    figures = {name: walk.figures for name, walk in walks.items()}
+    both, followed = list(figures.values()), "{captured_s:.1f} s ({wrongly_s:.1f} s wrongly)"
+    rows: list[tuple[Any, ...]] = []
+    for name in COMMANDS:
+        true, *seen = (
+            both[0]["commands"][name]["true_s"],
+            *(one["commands"][name] for one in both),
+        )
+        rows.append((f"{name} (true: {true:.1f} s)", followed, "works (figure 8)", *seen))
+    end = "{place_error_m:.2f} m, {heading_error_deg:.0f} degrees"
+    rows.append(("off at the walk's end", end, _NONE, *both))
+    return Outcome(figures, [walk.table() for walk in walks.values()], rows)
 
 
 EXPERIMENTS = (
@@ -243,6 +267,12 @@ EXPERIMENTS = (
         "Date, Yoshimatsu, Arita, Taniguchi: a person before many cameras",
         "drake-pose reproduce date",
         _date,
+    ),
+    Experiment(
+        "date_walk",
+        "Its application: walking on the spot through a place, figure 8",
+        "drake-pose reproduce date --walk --method paper",
+        _date_walk,
     ),
 )
 

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
-from typing import NamedTuple, cast
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -18,23 +17,22 @@ from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.errors import SettingsError
 from drake_pose.papers.date_capture import PaperTrack, Seen, SilhouetteTrack, Studio, Track
 from drake_pose.papers.tables import Count, figure_table, require_choice, uncounted
-from drake_pose.person.date.body_pose import Waist
-from drake_pose.person.date.limb_search import Search
 from drake_pose.person.date.skeleton import LIMBS
-from drake_pose.person.date.walking_motion import REGISTERED, UPRIGHT, Motion, make_motion
+from drake_pose.person.date.walking import REGISTERED, UPRIGHT, Motion, make_motion
 from drake_pose.systems.colour_images import picture_to_colour_image
 
 Array = NDArray[np.float64]
 Picture = NDArray[np.uint8]
 
-METHODS = ("silhouette", "paper")
-WAISTS = ("reach", "person", "paper")
-SEARCHES: tuple[Search, ...] = ("surfaces", "rectangles")
+METHODS = ("silhouette", "stages", "paper")
+RENDERERS = ("drake", "own")
 FEWEST_CAMERAS = 3
 SHOWN_CAMERA = "camera_0"
 TITLES = {
-    "ik_only": "inverse kinematics alone",
-    "paper": "with the search",
+    "ik_only": "the paper's inverse kinematics alone",
+    "paper": "the paper's search",
+    "stages_ik_only": "our inverse kinematics alone",
+    "stages": "our search",
     "silhouette": "all silhouettes",
 }
 """What the ways of capturing are called."""
@@ -60,6 +58,7 @@ class Moment(NamedTuple):
 class DestroyedTrack(NamedTuple):
     """A track that lost the person during a motion. errors: mean of each frame since [mm]."""
 
+    way: str
     motion: str
     track: Track
     errors: list[float]
@@ -71,7 +70,7 @@ class DateResult:
     Attributes:
         names: (n,) motion of each frame.
         errors: by way of capturing, of the joint centres in each frame (k,) [mm].
-        found_errors: of "paper" and "ik_only", elbows and knees as found, before the model with its
+        found_errors: of the paper's stages, elbows and knees as found, before the model with its
             stiff trunk is laid through them, in each frame (4,) in the order of LIMBS [mm]; nan
             where the registered pose was recognised instead.
         face_errors: angle between true and estimated direction of the head in each frame [deg].
@@ -79,18 +78,19 @@ class DateResult:
         moments: by motion, what pictures show.
     """
 
-    def __init__(
-        self, studio: Studio, motion: Motion, method: str, waist: str, search: str, seed: int
-    ) -> None:
+    def __init__(self, studio: Studio, motion: Motion, method: str, seed: int) -> None:
         self.studio, self.names = studio, motion.names
         self._motion, self._method = motion, method
-        self._settings = {"seed": seed, "method": method, "waist": waist, "search": search}
-        self._tracks = _tracks(studio, motion.q[0], method, waist, search)
+        renderer = "drake" if studio.own_drawing is None else "own"
+        self._settings = {"seed": seed, "method": method, "renderer": renderer}
+        self._tracks = _tracks(studio, motion.q[0], method)
         self._generator = np.random.default_rng([seed, 2])
         self._destroyed_at = frames_of_destruction(motion)
         self._joints = _JointCentres(studio.model)
         self.errors: dict[str, list[Array]] = {way: [] for way in self._tracks}
-        self.found_errors: dict[str, list[Array]] = {"paper": [], "ik_only": []}
+        self.found_errors: dict[str, list[Array]] = {
+            way: [] for way, track in self._tracks.items() if isinstance(track, PaperTrack)
+        }
         self.face_errors: list[float] = []
         self.destroyed: list[DestroyedTrack] = []
         self.moments: dict[str, Moment] = {}
@@ -101,8 +101,9 @@ class DateResult:
         shots = studio.pictures(q)
         images = {name: picture_to_colour_image(shot) for name, shot in shots.items()}
         if k in self._destroyed_at:
-            lost = self._tracks[self._method].destroyed(self._motion.q[k - 1], self._generator)
-            self.destroyed.append(DestroyedTrack(self._destroyed_at[k], lost, []))
+            for way in dict.fromkeys((self._method, "paper")):
+                lost = self._tracks[way].destroyed(self._motion.q[k - 1], self._generator)
+                self.destroyed.append(DestroyedTrack(way, self._destroyed_at[k], lost, []))
         estimates = {}
         for way, track in self._tracks.items():
             estimates[way] = track.step(images)
@@ -131,25 +132,24 @@ class DateResult:
         """Those that were shown."""
         return tuple(name for name in dict.fromkeys(self.names) if name != REGISTERED)
 
-    @property
-    def recoveries(self) -> dict[str, int | None]:
+    def recoveries(self, way: str) -> dict[str, int | None]:
         """Frames until a destroyed track was right again, by motion; None: not within _WATCHED."""
-        right = max(_RIGHT_MM, _RIGHT_AGAIN * _mean(self.errors[self._method]))
+        right = max(_RIGHT_MM, _RIGHT_AGAIN * _mean(self.errors[way]))
         return {
             one.motion: next((k for k, off in enumerate(one.errors, 1) if off <= right), None)
             for one in self.destroyed
+            if one.way == way
         }
 
     @property
     def slowest_recovery(self) -> float:
         """The longest that a frame's pose took on the way back [ms]."""
-        laps = [lap["pose"] for one in self.destroyed for lap in one.track.milliseconds]
-        return max(laps, default=0.0)
+        own = [one.track for one in self.destroyed if one.way == self._method]
+        return max((lap["pose"] for track in own for lap in track.milliseconds), default=0.0)
 
-    @property
-    def milliseconds(self) -> dict[str, float]:
+    def milliseconds(self, way: str) -> dict[str, float]:
         """Processor time by stage, a frame, all cameras together; "all": of all stages."""
-        laps = self._tracks[self._method].milliseconds
+        laps = self._tracks[way].milliseconds
         names = dict.fromkeys(name for lap in laps for name in lap)
         stages = {name: float(np.median([lap.get(name, 0.0) for lap in laps])) for name in names}
         return {**stages, "all": sum(stages.values())}
@@ -158,13 +158,15 @@ class DateResult:
         """The figures; the registered pose's frames do not count."""
         own = np.array(self.errors[self._method])[np.isin(self.names, self.motions)]
         all_motions = self._of_motions(self.motions)
-        recoveries, spent, cameras = self.recoveries, self.milliseconds, len(self.studio.cameras)
+        recoveries, spent = self.recoveries(self._method), self.milliseconds(self._method)
+        cameras = len(self.studio.cameras)
         anywhere = [n for motion, n in recoveries.items() if motion != REGISTERED]
         return {
             "joint_error_mm": _mean(own),
             "joint_error_p95_mm": float(np.percentile(own, 95)),
             "ik_only_mm": all_motions["ik_only_mm"],
             "paper_mm": all_motions["paper_mm"],
+            **({"stages_mm": all_motions["stages_mm"]} if "stages" in self.errors else {}),
             "elbows_and_knees": self._of_joints(("elbow", "knee")),
             "elbows": self._of_joints(("elbow",)),
             "knees": self._of_joints(("knee",)),
@@ -187,11 +189,13 @@ class DateResult:
         """Mean errors of elbows and knees as found, with the search and without [mm]."""
         chosen = np.isin(self.names, motions)
         figures = {}
-        for way, ending in (("paper", "mm"), ("ik_only", "ik_mm")):
-            errors = np.array(self.found_errors[way])[chosen]
+        for way, found in self.found_errors.items():
+            errors = np.array(found)[chosen]
             errors = errors[np.isfinite(errors).all(axis=1)]
+            before, ending = way.removesuffix("ik_only"), "ik_mm" if "ik" in way else "mm"
             for joint, limbs in (("elbow", errors[:, :2]), ("knee", errors[:, 2:])):
-                figures[f"{joint}_{ending}"] = _mean(limbs) if len(limbs) else math.nan
+                key = f"{'stages_' if 'stages' in before else ''}{joint}_{ending}"
+                figures[key] = _mean(limbs) if len(limbs) else math.nan
         return figures
 
     def _of_motions(self, motions: Sequence[str]) -> dict[str, float]:
@@ -214,12 +218,12 @@ class DateResult:
         found = {motion: self._as_found((motion,)) for motion in self.motions}
         headings = {f"{way}_mm": f"{TITLES[way]} [mm]" for way in self.errors}
         found_headings = {
-            "elbow_mm": "elbows [mm]",
-            "elbow_ik_mm": "elbows by IK alone",
-            "knee_mm": "knees [mm]",
-            "knee_ik_mm": "knees by IK alone",
+            f"{before}{joint}_{ending}": f"{joint}s, {whose} {how}"
+            for before, whose in (("", "the paper's"), ("stages_", "our"))
+            if f"{before}elbow_mm" in found[self.motions[0]]
+            for joint in ("elbow", "knee")
+            for ending, how in (("ik_mm", "IK alone"), ("mm", "search"))
         }
-        one = self._settings
         return (
             _table_of_motions(
                 f"Date: {len(self.studio.cameras)} cameras, {len(self.names)} frames",
@@ -228,7 +232,7 @@ class DateResult:
                 "{:.1f}",
             ),
             _table_of_motions(
-                f"Elbows and knees as found, --waist {one['waist']} --search {one['search']}",
+                f"Elbows and knees as found [mm], drawn by: {self._settings['renderer']}",
                 {**found, "upright": self._as_found(UPRIGHT)},
                 found_headings,
                 "{:.0f}",
@@ -237,10 +241,11 @@ class DateResult:
 
     def costs(self) -> str:
         """What a frame costs, and how soon a destroyed track is right again."""
-        *stages, (_, whole) = self.milliseconds.items()
+        *stages, (_, whole) = self.milliseconds(self._method).items()
         parts = ", ".join(f"{name} {spent:.1f}" for name, spent in stages)
         soon = ", ".join(
-            f"{motion} {'not' if n is None else n}" for motion, n in self.recoveries.items()
+            f"{motion} {'not' if n is None else n}"
+            for motion, n in self.recoveries(self._method).items()
         )
         return (
             f"One core, {TITLES[self._method]}: {whole:.1f} ms a frame ({parts}), "
@@ -257,35 +262,32 @@ def run_experiment(
     method: str = "silhouette",
     count: Count = uncounted,
     size: tuple[int, int] = (640, 480),
-    waist: str = "reach",
-    search: str = "surfaces",
+    renderer: str = "drake",
 ) -> DateResult:
     """Captures a simulated person, by one core.
 
     Args:
         cameras: how many, the face camera included.
         seed: another one draws other motions.
-        method: "silhouette" for all silhouettes at once, "paper" for the paper's way alone; its
-            figures lead.
+        method: whose figures lead: "paper", all as it prints it, alone; "stages", its stages with
+            our search, waist and feet beside it; "silhouette", all silhouettes at once, too.
         size: width and height of the pictures [pixel].
-        waist: of the paper's formula: "person" with this person's constants, "paper" with 0.55,
-            0.225, 0.225; "reach" as "person", then lowered until both feet are in reach.
-        search: of elbows and knees: "rectangles" as in the paper, or "surfaces".
+        renderer: who draws the person, "drake", or "own", the code of the label images; the face
+            camera's pictures are Drake's.
 
     Raises:
         SettingsError: an argument is out of its range.
     """
     require_choice("method", method, METHODS)
-    require_choice("waist", waist, WAISTS)
-    require_choice("search", search, SEARCHES)
+    require_choice("renderer", renderer, RENDERERS)
     if cameras < FEWEST_CAMERAS:
         raise SettingsError(f"cameras must be {FEWEST_CAMERAS} or more, not {cameras}")
     threads = cv2.getNumThreads()
     cv2.setNumThreads(1)
     try:
-        studio = Studio.build(cameras, size, np.random.default_rng([seed, 1]))
+        studio = Studio.build(cameras, size, np.random.default_rng([seed, 1]), renderer)
         motion = make_motion(studio.skeleton, frames, seed)
-        result = DateResult(studio, motion, method, waist, search, seed)
+        result = DateResult(studio, motion, method, seed)
         advance = count("frames", frames)
         for k in range(len(motion.q)):
             result.step(k)
@@ -295,16 +297,12 @@ def run_experiment(
     return result
 
 
-def _tracks(studio: Studio, q: Array, method: str, waist: str, search: str) -> dict[str, Track]:
+def _tracks(studio: Studio, q: Array, method: str) -> dict[str, Track]:
     """The ways of capturing that are compared; q (nq,) is the registered pose."""
-    setup = studio.prepare(q)
-    settings = replace(setup.settings, search=cast(Search, search))
-    if waist != "reach":
-        own = replace(settings.waist, in_reach=False)
-        settings = replace(settings, waist=Waist() if waist == "paper" else own)
     tracks: dict[str, Track] = {
-        "ik_only": PaperTrack.build(replace(setup, settings=replace(settings, search="none"))),
-        "paper": PaperTrack.build(replace(setup, settings=settings)),
+        way: PaperTrack.build(setup)
+        for way, setup in studio.prepare(q).items()
+        if method != "paper" or "stages" not in way
     }
     if method == "silhouette":
         tracks[method] = SilhouetteTrack.build(studio.model, studio.cameras, studio.backgrounds)

@@ -24,10 +24,13 @@ from drake_pose.person.date.faces import FACE_HEIGHT, FACE_WIDTH, cut_face, face
 from drake_pose.person.date.features import Features, SkinColour
 from drake_pose.person.date.skeleton import LIMBS, Skeleton, load_skeleton
 from drake_pose.person.pose_tracker import PersonPoseTracker, TrackState
+from drake_pose.silhouette.areas.outline import outline_from_mesh
+from drake_pose.silhouette.areas.scoring import draw_labels
 from drake_pose.silhouette.segmentation.background import Background, learn_background
 from drake_pose.systems.colour_images import colour_image_to_picture
 from drake_pose.systems.date.capture import PaperCapture, build_paper_capture
 from drake_pose.systems.date.preparation import (
+    CAPTURE_METHODS,
     CaptureSetup,
     PersonView,
     prepare_paper_capture,
@@ -45,10 +48,13 @@ Images = Mapping[str, ImageRgba8U]
 _NOISE = 3.0
 _EMPTY_PICTURES = 5
 _FAR_AWAY = -9.0
+# Of the bundled person [red, green, blue].
+_SKIN, _CLOTHES = (217, 166, 135), (31, 88, 106)
 # An edge point every 8 pixels of 640 x 480 pictures.
 _EDGE_POINTS = 60.0
 # A power of two: the time from frame to frame is exactly the same, and so is the motion expected.
-_PERIOD = 1.0 / 32.0
+PERIOD = 1.0 / 32.0
+"""From frame to frame [s]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,10 +68,16 @@ class Studio:
     context: Context
     backgrounds: Mapping[str, Background]
     generator: np.random.Generator
+    own_drawing: _OwnDrawing | None = None
 
     @staticmethod
-    def build(cameras: int, size: tuple[int, int], generator: np.random.Generator) -> Studio:
-        """A studio of this many cameras, face camera included, pictures of one size [pixel]."""
+    def build(
+        cameras: int, size: tuple[int, int], generator: np.random.Generator, renderer: str = "drake"
+    ) -> Studio:
+        """A studio of this many cameras, face camera included, pictures of one size [pixel].
+
+        renderer: who draws the pictures of the cameras on the circle, "drake" or "own".
+        """
         model = load_model(bundled_model("person"), check=False)
         placed = circle_of_cameras(cameras - 1, size=size)
         rig = build_camera_rig(model, placed)
@@ -73,27 +85,37 @@ class Studio:
         away = np.array(model.default_positions)
         away[model.position_index("position_z")] = _FAR_AWAY
         rig.set_positions(context, away)
-        backgrounds = {}
-        for name in placed:
-            empty = rig.picture(context, name)
-            shots = [noisy(empty, generator) for _ in range(_EMPTY_PICTURES)]
-            backgrounds[name] = learn_background(shots)
+        rooms = {name: rig.picture(context, name) for name in placed}
+        backgrounds = {
+            name: learn_background([noisy(room, generator) for _ in range(_EMPTY_PICTURES)])
+            for name, room in rooms.items()
+        }
+        own = _OwnDrawing(model, rooms) if renderer == "own" else None
         skeleton = load_skeleton(model)
-        return Studio(model, skeleton, placed, rig, context, backgrounds, generator)
+        return Studio(model, skeleton, placed, rig, context, backgrounds, generator, own)
 
     def pictures(self, q: Array) -> dict[str, Picture]:
         """What all cameras see of a person at q (nq,), noise included."""
         self.rig.set_positions(self.context, q)
-        return {
-            name: noisy(self.rig.picture(self.context, name), self.generator)
-            for name in self.cameras
-        }
+        return {name: noisy(self._drawn(name, q), self.generator) for name in self.cameras}
 
-    def prepare(self, q: Array) -> CaptureSetup:
-        """What must be known before: faces, skin, and q (nq,), the registered pose, shown once."""
-        return prepare_paper_capture(
+    def _drawn(self, name: str, q: Array) -> Picture:
+        """What a camera sees of the person, who is at q (nq,) in the rig, too."""
+        if self.own_drawing is None or name == FACE_CAMERA:
+            return self.rig.picture(self.context, name)
+        return self.own_drawing.picture(self.cameras[name], q)
+
+    def prepare(self, q: Array) -> dict[str, CaptureSetup]:
+        """What must be known before, by way of capturing: faces, skin, and q (nq,), registered."""
+        setup = prepare_paper_capture(
             self.model, self.cameras, FACE_CAMERA, q, self.pictures(q), self.backgrounds
         )
+        paper, stages = CAPTURE_METHODS["paper"], CAPTURE_METHODS["stages"]
+        ways = {
+            "ik_only": replace(paper, search="none"), "paper": paper,
+            "stages_ik_only": replace(stages, search="none"), "stages": stages,
+        }  # fmt: skip
+        return {way: replace(setup, settings=settings) for way, settings in ways.items()}
 
     def side_by_side(self, poses: Sequence[Array], name: str) -> Picture:
         """The person in poses (nq,) as a camera sees it, side by side (H, n W, 3)."""
@@ -109,6 +131,28 @@ class Studio:
         picture = self.rig.picture(self.context, FACE_CAMERA)
         mask = self.rig.mask(self.context, FACE_CAMERA)
         return cut_face(picture, see_person(picture, mask, SkinColour()).blobs)
+
+
+class _OwnDrawing:
+    """The person as the kernel of label images draws it, skin and clothes of one colour each."""
+
+    def __init__(self, model: ArticulatedModel, rooms: Mapping[str, Picture]) -> None:
+        self._plant, self._rooms = model.plant, rooms
+        self._context = model.plant.CreateDefaultContext()
+        self._links = [model.plant.GetBodyByName(name) for name in model.link_meshes]
+        self._outlines = [outline_from_mesh(mesh) for mesh in model.link_meshes.values()]
+        bare = [name.endswith(("head", "hand", "foot")) for name in model.link_meshes]
+        self._colours = np.where(np.array(bare)[:, None], _SKIN, _CLOTHES).astype(np.uint8)
+
+    def picture(self, camera: Camera, q: Array) -> Picture:
+        """The person at q (nq,) before the empty room."""
+        self._plant.SetPositions(self._context, q)
+        X_WL = [link.EvalPoseInWorld(self._context).GetAsMatrix4() for link in self._links]
+        numbers = np.arange(1, len(X_WL) + 1)
+        labels = draw_labels(self._outlines, numbers, camera.X_CW @ X_WL, camera)
+        picture, person = np.array(self._rooms[camera.name]), labels > 0
+        picture[person] = self._colours[labels[person] - 1]
+        return picture
 
 
 def noisy(picture: Picture, generator: np.random.Generator) -> Picture:
@@ -148,7 +192,7 @@ class _StagedRun:
     def _begin_frame(self) -> None:
         """Goes to just before the next frame's update, which so sees the images that follow."""
         if self._frames:
-            self._simulator.AdvanceTo(_PERIOD * self._frames)
+            self._simulator.AdvanceTo(PERIOD * self._frames)
         self._frames += 1
 
     def _fix(self, images: Images) -> None:
@@ -179,7 +223,7 @@ class PaperTrack(_StagedRun):
     @staticmethod
     def build(setup: CaptureSetup) -> PaperTrack:
         """A track that knows nothing yet."""
-        return PaperTrack(build_paper_capture(setup, period=_PERIOD))
+        return PaperTrack(build_paper_capture(setup, period=PERIOD))
 
     def step(self, images: Images) -> Array:
         """The positions (nq,) of one more frame.
@@ -260,7 +304,7 @@ class SilhouetteTrack(_StagedRun):
     ) -> SilhouetteTrack:
         """A track that knows nothing yet."""
         tracker = PersonPoseTracker(ContourFit(model.pose_tree()))
-        capture = build_silhouette_capture(tracker, cameras, backgrounds, _PERIOD, _EDGE_POINTS)
+        capture = build_silhouette_capture(tracker, cameras, backgrounds, PERIOD, _EDGE_POINTS)
         return SilhouetteTrack(capture, tracker)
 
     def place(self, q: Array) -> None:

@@ -23,7 +23,7 @@ from pydrake.trajectories import Trajectory
 from drake_pose.arrays import Array
 from drake_pose.body.model import ArticulatedModel
 from drake_pose.errors import SettingsError, UnknownNameError
-from drake_pose.person.date.walk_commands import (
+from drake_pose.person.date.walking import (
     NO_COMMAND,
     NO_STEPS,
     follow_command,
@@ -237,7 +237,7 @@ class WalkView(LeafSystem):
         pose, rest = self._pose.Eval(context), self._rest.Eval(context)
         if np.isfinite(rest).all():
             self._meshcat.SetTransform(_WALKER, walker_transform(pose, rest))
-        look_over_shoulder(self._meshcat, pose)
+        self._meshcat.SetCameraPose(*view_from_behind(pose))
         return EventStatus.Succeeded()
 
 
@@ -374,13 +374,13 @@ def draw_garden(meshcat: Meshcat) -> None:
     meshcat.SetProperty("/Background", "bottom_color", [0.85, 0.92, 0.98])
 
 
-def look_over_shoulder(meshcat: Meshcat, pose: Array) -> None:
-    """Point the view as the walker at x, y [m] and heading [rad] looks, from behind and above."""
+def view_from_behind(pose: Array) -> tuple[Array, Array]:
+    """Eye and target (3,) [m] of who looks at x, y [m] and heading [rad] from behind and above."""
     forward = np.array([math.cos(pose[2]), math.sin(pose[2]), 0.0])
     ground = np.array([pose[0], pose[1], 0.0])
     eye = np.clip(ground - 3.2 * forward, 0.3 - HALF_SIZE, HALF_SIZE - 0.3)
     eye[2], target = 2.1, ground + 1.5 * forward + (0.0, 0.0, 1.1)
-    meshcat.SetCameraPose(eye, target)
+    return eye, target
 
 
 def walker_transform(pose: Array, rest: Array) -> RigidTransform:

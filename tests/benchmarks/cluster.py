@@ -32,7 +32,7 @@ from drake_pose.jobs.live.run import run_live
 from drake_pose.jobs.live.scene import LiveScene, load_live_scene
 from drake_pose.papers.date_capture import Studio
 from drake_pose.papers.kameda import experiment_camera
-from drake_pose.person.date.walking_motion import make_motion
+from drake_pose.person.date.walking import make_motion
 from drake_pose.person.shape import tracker_of_person
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from drake_pose.silhouette.pictures.masks import write_mask

@@ -1,3 +1,5 @@
+import math
+
 import cv2
 import numpy as np
 import pytest
@@ -6,9 +8,22 @@ from drake_pose.body.formats.packages import bundled_model
 from drake_pose.body.model import load_model
 from drake_pose.errors import SettingsError
 from drake_pose.papers.date import frames_of_destruction, run_experiment
+from drake_pose.papers.date_capture import PERIOD, Studio
 from drake_pose.papers.date_pictures import save_pictures
+from drake_pose.papers.date_walk import draw_walk, run_walk_through, walk_by
+from drake_pose.person.date.features import SkinColour, skin_blobs
 from drake_pose.person.date.skeleton import load_skeleton
-from drake_pose.person.date.walking_motion import MOTIONS, REGISTERED, make_motion
+from drake_pose.person.date.walking import (
+    COMMANDS,
+    MOTIONS,
+    REGISTERED,
+    SPEED,
+    TURN_RATE,
+    make_gestures,
+    make_motion,
+)
+from drake_pose.silhouette.segmentation.background import person_region
+from drake_pose.systems.walk import START
 
 KEYS = {
     "joint_error_mm",
@@ -70,9 +85,15 @@ class TestExperiment:
         assert figures["joint_error_mm"] < 40.0
         assert figures["face_error_deg"] < 6.0
         assert figures["paper_mm"] < figures["ik_only_mm"]
+        assert figures["stages_mm"] < figures["paper_mm"]
+        assert (figures["method"], figures["renderer"]) == ("silhouette", "drake")
         # The search moves elbows and knees alone; the paper's waist holds the knees back.
         assert figures["elbows"]["paper_mm"] < 0.7 * figures["elbows"]["ik_only_mm"]
-        assert set(figures["knees"]) == {"ik_only_mm", "paper_mm", "silhouette_mm"}
+        both = {"ik_only_mm", "paper_mm", "stages_ik_only_mm", "stages_mm"}
+        assert set(figures["knees"]) == {*both, "silhouette_mm"}
+        for found in figures["as_found"].values():
+            for joint in ("elbow", "knee"):
+                assert found[f"stages_{joint}_mm"] <= found[f"stages_{joint}_ik_mm"]
         assert figures["frames_to_recover"] is not None
         assert figures["frames_to_recover"] <= 15
         assert figures["fps"] == pytest.approx(1e3 / figures["ms_per_frame"]["all"])
@@ -87,19 +108,68 @@ class TestExperiment:
             "errors.png",
         }
         walk = cv2.imread(str(tmp_path / "new" / "figure_07_walk.png"))
-        # The input and three estimates, all of which show a person before the same background.
-        parts = np.split(walk, 4, axis=1)
+        # The input and five estimates, all of which show a person before the same background.
+        parts = np.split(walk, 6, axis=1)
         for part in parts:
             assert (np.abs(part.astype(int) - part[0, 0]).max(axis=2) > 30).mean() > 0.01
-        assert np.abs(parts[0].astype(int) - parts[3]).mean() < 3.0
+        assert np.abs(parts[0].astype(int) - parts[5]).mean() < 3.0
+
+
+class TestWalkThrough:
+    def test_each_gesture_gives_its_command_and_no_other(self, skeleton):
+        """By the true poses; the walk is that of table 1's rates along the frames commanded."""
+        motion = make_gestures(skeleton)
+        walked, names = walk_by(skeleton.model, motion.q), np.array(motion.names)
+        for name in COMMANDS:
+            followed = walked.follows()[name]
+            assert set(names[followed]) == {name}
+            assert followed.sum() > 0.4 * (names == name).sum()
+        turns, ways = walked.commands.sum(axis=0)
+        assert math.isclose(walked.poses[-1, 2], turns * TURN_RATE * PERIOD, abs_tol=1e-9)
+        np.testing.assert_allclose(walked.poses[-1, 0] - START[0], ways * SPEED * PERIOD, atol=0.01)
+
+    def test_the_view_follows_the_walker(self, skeleton):
+        """The avatar is seen in the picture's middle from behind, wherever and however he walks."""
+        q, rest = make_motion(skeleton, 40, 0).q[30], np.zeros(5)
+        there, elsewhere = (
+            draw_walk(skeleton.model, q, pose, rest)
+            for pose in (np.zeros(3), np.array([2.0, 3, 2]))
+        )
+        same = (np.abs(there.astype(int) - elsewhere) <= 8).all(axis=2)[:, 190:290]
+        assert 0.1 < same.mean() < 0.9
+        assert (skin_blobs(there, np.ones(there.shape[:2], bool), SkinColour()).areas > 20).any()
+
+    @pytest.mark.slow
+    def test_captured_gestures_walk_as_the_true_ones(self, tmp_path):
+        walk = run_walk_through(5, method="stages", size=(320, 240))
+        figures = walk.figures
+        assert figures["same_command"] > 0.97
+        assert figures["place_error_m"] < 0.15
+        assert all(one["captured_s"] > 1.0 for one in figures["commands"].values())
+        assert walk.save(tmp_path).name == "figure_08.png"
+
+
+def test_own_drawing_is_drakes_but_for_edges(skeleton):
+    """The person's region in its pictures is that of Drake's label images."""
+    studio = Studio.build(3, (320, 240), np.random.default_rng(0), "own")
+    q = make_motion(skeleton, 40, 0).q[30]
+    pictures = studio.pictures(q)
+    for name in ("camera_0", "camera_1"):
+        seen = studio.rig.mask(studio.context, name)
+        region = person_region(pictures[name], studio.backgrounds[name])
+        assert np.count_nonzero(region ^ seen) < 0.02 * np.count_nonzero(seen)
+        drawn = skin_blobs(pictures[name], seen, SkinColour()).centroids
+        rendered = studio.rig.picture(studio.context, name)
+        true = skin_blobs(rendered, seen, SkinColour()).centroids
+        off = np.linalg.norm(drawn[:, None] - true, axis=2).min(axis=1)
+        assert (off < 2.0).all()
 
 
 @pytest.mark.parametrize(
     ("bad", "word"),
     [
-        ({"method": "magic"}, "silhouette, paper"),
-        ({"waist": "magic"}, "reach, person, paper"),
-        ({"search": "magic"}, "surfaces, rectangles"),
+        ({"method": "magic"}, "silhouette, stages, paper"),
+        ({"renderer": "magic"}, "drake, own"),
         ({"cameras": 2}, "3 or more"),
     ],
 )

@@ -17,10 +17,10 @@ from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import CameraError, OutputError, SceneError, SettingsError, UnknownNameError
 from drake_pose.files.folder import read_summary, require_empty
 from drake_pose.jobs.estimate.inputs import bundled_person
-from drake_pose.jobs.live.frame_results import PAPER, PERSON, LiveResult, LiveWriter
+from drake_pose.jobs.live.frame_results import LiveResult, LiveWriter
 from drake_pose.jobs.live.run import look_until
 from drake_pose.jobs.live.scene import LiveScene
-from drake_pose.jobs.live.settings import LiveSettings
+from drake_pose.jobs.live.settings import CaptureMethod, LiveSettings
 from drake_pose.person.date.faces import learn_recorded_faces
 from drake_pose.person.date.recognition import (
     Recognition,
@@ -36,6 +36,8 @@ from drake_pose.person.views import shows_somebody
 from drake_pose.systems.colour_images import colour_image_to_picture
 from drake_pose.systems.date.capture import build_paper_capture
 from drake_pose.systems.date.preparation import (
+    CAPTURE_METHODS,
+    CaptureSettings,
     CaptureSetup,
     prepare_paper_capture,
     render_registered_pose,
@@ -55,7 +57,7 @@ def capture_live(
     open_sensors: Callable[[], LiveSensors] | None = None,
     on_report: Callable[[str], None] = lambda _: None,
     on_frame: Callable[[int, bool], None] = lambda _, __: None,
-    by_stages: bool = False,
+    method: CaptureMethod = "person",
 ) -> LiveResult:
     """Captures a person as the pictures come, and writes the result's folder.
 
@@ -64,13 +66,13 @@ def capture_live(
     Args:
         out: the result's folder, empty or not there.
         model_path: a person with landmarks.yaml beside it; the bundled one, with shape joints
-            unless ``by_stages``, where not given.
+            for the method "person", where not given.
         open_sensors: opens the sensors; where not given the scene's, in this process. Called once
             more for the frames that give the person's shape, or show the registered pose.
         on_report: called at once when cameras stop and return, and with bad pictures.
         on_frame: called with each frame: how many there are, and whether a person was found.
-        by_stages: captures by the stages of Date et al.: skin, rays, inverse kinematics, search;
-            see find_registered_pose.
+        method: "person" by all silhouettes at once; the others by the stages of Date et al. (skin,
+            rays, inverse kinematics, search; see find_registered_pose): see CAPTURE_METHODS.
 
     Raises:
         SceneError, CameraError, ModelError, SettingsError, UnknownNameError: what was given cannot
@@ -78,20 +80,21 @@ def capture_live(
         OutputError: the result cannot be written.
     """
     settings, opener = settings or LiveSettings(), open_sensors or scene.open_sensors
-    usual = bundled_model("person") if by_stages else bundled_person()
+    usual = bundled_person() if method == "person" else bundled_model("person")
     model = load_model(model_path or usual, package_paths=settings.packages)
     # A folder that cannot be written is refused before a camera is opened.
     require_empty(out)
     setup = shape = None
-    if by_stages:
-        setup = find_registered_pose(scene, model, settings, opener, on_report)
+    if method != "person":
+        how = CAPTURE_METHODS[method]
+        setup = find_registered_pose(scene, model, settings, opener, on_report, how)
     elif settings.shape is not None:
         shape = shape_of_result(settings.shape)
     elif settings.fit_shape:
         shape = _fit_first_frames(scene, opener(), model.pose_tree(), on_report)
     tracker = tracker_of_person(model.pose_tree(), shape)
     found = {} if shape is None else {"lengths_m": shape.lengths, "girths": shape.girths}
-    more = {"method": PAPER if by_stages else PERSON, **found}
+    more = {"method": "person" if setup is None else f"{method}_capture", **found}
     with closing(opener()) as sensors:
         if setup is None:
             kind, cameras = "silhouette", scene.cameras
@@ -172,6 +175,7 @@ def find_registered_pose(
     settings: LiveSettings,
     open_sensors: Callable[[], LiveSensors],
     on_report: Callable[[str], None],
+    how: CaptureSettings,
 ) -> CaptureSetup:
     """What capture needs, from the pictures in which a person shows the registered pose.
 
@@ -180,13 +184,14 @@ def find_registered_pose(
         settings: no shape can be given; without a camera before the face, and templates as of
             learn_recorded_faces, its direction is found by inverse kinematics alone.
         open_sensors: opens the sensors, which are used up.
+        how: settings of the stages.
 
     Raises:
         SceneError, CameraError, ModelError, SettingsError, UnknownNameError: what was given cannot
             be captured so, or nobody showed the registered pose.
     """
     if settings.shape is not None:
-        raise SettingsError("the paper's method takes the model's measures: give no shape")
+        raise SettingsError("the paper's stages take the model's measures: give no shape")
     faces = None if settings.faces is None else learn_recorded_faces(settings.faces)
     cameras, path, face = _require_colour(scene), scene.path, settings.face_camera
     if face is not None and face not in cameras:
@@ -199,7 +204,7 @@ def find_registered_pose(
             f"{path}: two cameras never saw a person whole at the same time: compare the "
             "pictures with those of the empty room"
         )
-    needed = blank.settings.recognition
+    needed = how.recognition
     if best.similarity < needed:
         raise SettingsError(
             f"{path}: nobody showed the registered pose, upright with both arms spread: the "
@@ -211,9 +216,7 @@ def find_registered_pose(
     for name in cameras:
         if name not in known:
             on_report(f"camera '{name}' gave no picture of the registered pose: left out")
-    return prepare_paper_capture(
-        model, known, face, best.q, shown, scene.backgrounds, blank.settings, faces
-    )
+    return prepare_paper_capture(model, known, face, best.q, shown, scene.backgrounds, how, faces)
 
 
 def _best_moment(
@@ -265,10 +268,10 @@ def _require_colour(scene: LiveScene) -> dict[str, PinholeCamera]:
     for name, camera in scene.cameras.items():
         if scene.specifications[name].gives_masks:
             raise SceneError(
-                f"{scene.path}: camera '{name}' delivers masks; the paper's method looks for skin "
+                f"{scene.path}: camera '{name}' delivers masks; the paper's stages look for skin "
                 "in colour pictures: give these, and a background of the empty room"
             )
         if not isinstance(camera, PinholeCamera):
-            raise CameraError(f"camera '{name}': the paper's method needs a pinhole camera")
+            raise CameraError(f"camera '{name}': the paper's stages need a pinhole camera")
         cameras[name] = camera
     return cameras

@@ -35,9 +35,6 @@ from drake_pose.systems.date.preparation import PersonView
 from drake_pose.systems.person.live_capture import LiveSensors
 from drake_pose.systems.pictures.picture_capture import CameraCount
 
-PERSON, PAPER = "person", "paper_capture"
-"""What summary.json calls capture by all silhouettes, and by the stages of Date et al."""
-
 # A choice: of simulated persons who are followed the mean IoU is about 0.8 and more.
 _LEAST_IOU = 0.6
 
@@ -134,7 +131,8 @@ class LiveWriter:
         )
         self._writer.add(row, record)
         self._times[name] = moment
-        for text in self._doubts_of(context, ious) if self._writer.more["method"] == PAPER else ():
+        of_person = self._writer.more["method"] == "person"
+        for text in () if of_person else self._doubts_of(context, ious):
             self._doubts.setdefault(text, []).append(name)
         self._on_frame(len(self._times), row.found)
         self._begin = time.perf_counter()
@@ -191,7 +189,7 @@ class LiveWriter:
         return agreement.E_total, agreement.ious
 
     def _doubts_of(self, context: Context, ious: Mapping[str, float]) -> Iterator[str]:
-        """Why one should not trust the paper's method in a frame."""
+        """Why one should not trust the paper's stages in a frame."""
         if not np.isfinite(self._value(context, "estimated_positions")).all():
             yield "before the registered pose; no pose"
             return
@@ -203,7 +201,7 @@ class LiveWriter:
         if np.mean(list(ious.values()) or [0.0]) < _LEAST_IOU:
             yield (
                 f"the body and the silhouettes hardly agree (mean IoU below {_LEAST_IOU}); the "
-                "paper's method does not notice when it has lost the person, until the registered "
+                "paper's stages do not notice when they have lost the person, until the registered "
                 "pose is shown again"
             )
 

@@ -29,7 +29,7 @@ from drake_pose.jobs.live.run import run_live
 from drake_pose.jobs.live.scene import LiveScene
 from drake_pose.jobs.live.settings import LiveSettings
 from drake_pose.person.date.skeleton import load_skeleton
-from drake_pose.person.date.walking_motion import make_motion
+from drake_pose.person.date.walking import COMMANDS, make_motion
 from drake_pose.person.shape import tracker_of_person
 from drake_pose.systems.person.live_capture import LiveSensors, add_person_tracker
 from drake_pose.systems.ports import evaluate
@@ -40,8 +40,6 @@ RATE_HZ = 30.0
 
 REPLAY, _REPLAY_KEY = "play again", "Space"
 """The page's button at the end of a recording, and the key that presses it."""
-
-COMMANDS = ("turn left", "turn right", "walk ahead", "walk behind")
 
 SETTLE = 1.0
 """Whoever comes before the cameras commands after standing still for this long [s]."""

@@ -26,6 +26,8 @@ _STALLED = 1e-4
 _DAMPING = 0.05**2
 _ROUNDS = 25
 _STEPS_A_ROUND = 4
+# How far the left foot may be to the right of the right one [m].
+_CROSSED = 0.05
 
 
 def upper_body(skeleton: Skeleton, q: Array, features: Array, *, face_known: bool) -> Array:
@@ -253,6 +255,16 @@ def estimate_pose(
         aimed = move_limb(skeleton, aimed, name, found[2])
         limbs[name] = found
     return PaperPose(skeleton.clip(aimed), limbs, place)
+
+
+def uncross_feet(skeleton: Skeleton, last: Array, features: Array) -> Integers:
+    """The order (5,) in which features (5, 3) [m] have the feet not crossed, by the last q (nq,).
+
+    Feet that pass each other are exchanged where one is taken for the other, which then lasts.
+    """
+    left_W = skeleton.trunk_pose(last)[0][:, 0]
+    is_crossed = (features[3] - features[4]) @ left_W < -_CROSSED
+    return np.array([0, 1, 2, 4, 3] if is_crossed else [0, 1, 2, 3, 4])
 
 
 def _lowered(skeleton: Skeleton, R_WT: Array, place: Array, feet: Array) -> Array:

@@ -17,6 +17,8 @@ _FIRST_FOOT = FEATURES.index("left_foot")
 # Two rays show the same skin where they pass each other by less than the first; the radius of the
 # dense part of a feature's points [m]; how far outside a silhouette a point may be seen [pixel].
 _THRESHOLD, _DENSE, _MARGIN = 0.05, 0.08, 2
+# Rays that meet by chance: so far nothing moves from one frame to the next [m].
+_FARTHEST = 0.5
 
 
 @dataclass(frozen=True)
@@ -160,12 +162,16 @@ def find_features(
         centroids: (n_k, 2) the skin blobs' centroids in each camera [pixel].
         regions: (H, W) the person in each camera's picture.
         last: (k, 3) the last frame's features [m].
-        expected: (k, 3) where they are expected in this frame [m]; None, as in the paper: `last`.
+        expected: (k, 3) where they are expected in this frame [m], points farther than half a metre
+            from all being nobody's; None, as in the paper: `last`, the nearest's however far.
     """
     points = meeting_points(cameras, centroids, _THRESHOLD)
     points = points[inside_silhouettes(points, cameras, regions, _MARGIN)]
     near = last if expected is None else expected
-    owners = np.linalg.norm(points[:, None] - near[None], axis=2).argmin(axis=1)
+    distances = np.linalg.norm(points[:, None] - near[None], axis=2)
+    owners = distances.argmin(axis=1)
+    if expected is not None:
+        owners[distances.min(axis=1) > _FARTHEST] = -1
     places, support = np.array(last, dtype=np.float64), np.zeros(len(last), dtype=np.int64)
     for k in range(len(last)):
         mine = points[owners == k]

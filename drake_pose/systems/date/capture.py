@@ -18,7 +18,7 @@ from pydrake.systems.framework import (
 
 from drake_pose.arrays import Array
 from drake_pose.errors import SettingsError
-from drake_pose.person.date.body_pose import estimate_pose
+from drake_pose.person.date.body_pose import estimate_pose, uncross_feet, waist_of
 from drake_pose.person.date.faces import head_angles
 from drake_pose.person.date.features import expect_features
 from drake_pose.person.date.skeleton import FEATURES, LIMBS
@@ -72,6 +72,7 @@ class PaperPoseEstimator(MemorySystem):
         super().__init__()
         require_period("estimator", period)
         self.setup = setup
+        self._waist = setup.settings.waist or waist_of(setup.skeleton)
         nq, places = len(setup.skeleton.lower), 3 * len(FEATURES)
         self._seen = add_views(self, list(setup.cameras.values()))
         inputs = {
@@ -115,6 +116,10 @@ class PaperPoseEstimator(MemorySystem):
         if features is None or not np.isfinite(known["estimated_positions"]).all():
             return {}
         features = features.reshape(-1, 3)
+        support = self.GetInputPort("support").Eval(context).astype(np.int64)
+        if self.setup.settings.track_feet:
+            order = uncross_feet(self.setup.skeleton, known["estimated_positions"], features)
+            features, support = features[order], support[order]
         cameras, views = self._seen(context)
         pose = estimate_pose(
             self.setup.skeleton,
@@ -124,9 +129,8 @@ class PaperPoseEstimator(MemorySystem):
             cameras,
             [view.region for view in views],
             search=self.setup.settings.search,
-            waist=self.setup.settings.waist,
+            waist=self._waist,
         )
-        support = self.GetInputPort("support").Eval(context).astype(np.int64)
         before = known["last_features"].reshape(-1, 3)
         support_before = known["last_support"].astype(np.int64)
         return {
@@ -242,7 +246,7 @@ def _parts(setup: CaptureSetup) -> dict[str, tuple[System, tuple[str, ...]]]:
     if setup.registered is not None:
         recogniser = PoseRecogniser(setup.skeleton, setup.registered, cameras, settings.recognition)
         parts["recognition"] = recogniser, ("recognised_positions", "similarity")
-    parts["features"] = FeatureFinder(cameras), ("features",)
+    parts["features"] = FeatureFinder(cameras, settings.track_feet), ("features",)
     if setup.face_camera is not None and setup.faces is not None:
         face = FaceDirectionFinder(setup.face_camera, setup.faces, settings.farthest_face)
         parts["face"] = face, ("face_direction",)

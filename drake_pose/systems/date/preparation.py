@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -12,7 +12,7 @@ from drake_pose.arrays import Array, Mask, Picture
 from drake_pose.body.model import ArticulatedModel
 from drake_pose.camera.models import Camera, PinholeCamera, circle_of_cameras
 from drake_pose.errors import SettingsError, UnknownNameError
-from drake_pose.person.date.body_pose import Waist, waist_of
+from drake_pose.person.date.body_pose import Waist
 from drake_pose.person.date.faces import FaceTemplates, cut_face, learn_faces
 from drake_pose.person.date.features import Blobs, SkinColour, find_features, skin_blobs
 from drake_pose.person.date.limb_search import Search
@@ -33,15 +33,26 @@ class CaptureSettings:
 
     Args:
         search: how elbows and knees are searched on their circles; see estimate_pose.
+        waist: constants of the waist formula; None: this person's, lowered into the legs' reach.
+        track_feet: whether feet are expected a step on, and never crossed; else they are looked for
+            where they were in the last frame.
         recognition: similarity from which the registered pose overwrites the state.
         farthest_face: how far from the eigenspace a face may be [grey levels].
     """
 
     skin: SkinColour = field(default_factory=SkinColour)
     search: Search = "surfaces"
+    waist: Waist | None = None
+    track_feet: bool = True
     recognition: float = 0.93
-    waist: Waist = field(default_factory=Waist)
     farthest_face: float = 30.0
+
+
+CAPTURE_METHODS: Mapping[str, CaptureSettings] = {
+    "stages": CaptureSettings(),
+    "paper": CaptureSettings(search="rectangles", waist=Waist(), track_feet=False),
+}
+"""By name: the paper's stages with our search, waist and feet; and all as the paper prints it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,7 +131,7 @@ def prepare_paper_capture(
         q: (nq,) where the person stands, in the registered pose [rad or m].
         pictures: (H, W, 3) that the cameras on the circle take of it, red, green, blue.
         backgrounds: by camera.
-        settings: how to capture; the waist's constants become those of this person.
+        settings: how to capture.
         faces: templates of the person's face; rendered ones where not given.
 
     Raises:
@@ -144,7 +155,7 @@ def prepare_paper_capture(
         faces,
         registered,
         backgrounds,
-        replace(settings, waist=waist_of(skeleton)),
+        settings,
     )
 
 

@@ -79,7 +79,8 @@ class FeatureFinder(PortedSystem):
     The first part of the paper's 3-D module (3.1.2). A camera that is unconnected or gives None is
     left out. ``last_features`` (15) are the last frame's: head, left hand, right hand, left foot,
     right foot [m]; while they are nan nothing is found. ``expected_features`` (15) are where they
-    are expected in this frame [m]; the last frame's places where unconnected. Outputs: ``features``
+    are expected in this frame [m]; where unconnected, or feet are not tracked, as in the paper, the
+    last frame's places count. Outputs: ``features``
     (15), the last frame's where nothing was measured [m]; ``support`` (5), from how many 3-D points
     each was taken, 0: not measured; and both with all 3-D points as ``found``, a
     ``person.date.features.Features`` or None. Cameras are in the order of the input ports.
@@ -88,9 +89,9 @@ class FeatureFinder(PortedSystem):
         SettingsError: fewer than two cameras, or two of one name.
     """
 
-    def __init__(self, cameras: Sequence[Camera]) -> None:
+    def __init__(self, cameras: Sequence[Camera], track_feet: bool = True) -> None:
         super().__init__()
-        size = 3 * len(FEATURES)
+        self._track_feet, size = track_feet, 3 * len(FEATURES)
         self._seen = add_views(self, cameras)
         self.add_input("last_features", size)
         self.add_input("expected_features", size)
@@ -112,7 +113,7 @@ class FeatureFinder(PortedSystem):
         if not np.isfinite(last).all():
             return None
         cameras, views = self._seen(context)
-        expected = self.given(context, "expected_features")
+        expected = self.given(context, "expected_features") if self._track_feet else None
         return find_features(
             cameras,
             [view.blobs.centroids for view in views],

@@ -8,7 +8,7 @@ from drake_pose.jobs.live.local_proxy import open_page
 from drake_pose.jobs.live.run import run_live
 from drake_pose.jobs.live.scene import load_live_scene
 from drake_pose.jobs.live.walk import SETTLE, live_player, walk
-from drake_pose.person.date.walk_commands import SPEED
+from drake_pose.person.date.walking import SPEED
 from drake_pose.systems.walk import START
 from tests.cli import run_command
 from tests.jobs.live_scenes import RATE_HZ, absent, standing, write_studio

@@ -8,7 +8,6 @@ import pytest
 
 from drake_pose.errors import SceneError, SettingsError
 from drake_pose.jobs.live.capture import capture_live
-from drake_pose.jobs.live.frame_results import PAPER
 from drake_pose.jobs.live.scene import load_live_scene
 from drake_pose.jobs.live.settings import LiveSettings
 from drake_pose.person.date.recognition import registered_positions
@@ -54,7 +53,7 @@ def test_person_is_followed_from_the_registered_pose_on(studio, person, skeleton
     done = run_command([*words, "--out", str(out)])
     assert done.exit_code == 0, done.output
     summary = json.loads(done.stdout)
-    assert summary["method"] == PAPER
+    assert summary["method"] == "paper_capture"
     assert "before the registered pose" in done.stderr
     with (out / "poses.csv").open(newline="") as stream:
         rows = list(csv.DictReader(stream))
@@ -79,7 +78,7 @@ def test_person_is_followed_from_the_registered_pose_on(studio, person, skeleton
 def test_whoever_never_shows_the_registered_pose_is_refused(tmp_path, person):
     write_studio(tmp_path, person, [standing(person)] * 3, "videos", cameras=3)
     with pytest.raises(SettingsError, match=r"registered pose.*likest silhouettes"):
-        capture_live(load_live_scene(tmp_path), tmp_path / "out", person.path, by_stages=True)
+        capture_live(load_live_scene(tmp_path), tmp_path / "out", person.path, method="paper")
     assert not (tmp_path / "out").exists()
 
 
@@ -87,9 +86,9 @@ def test_what_cannot_be_captured_so_is_refused_before(tmp_path, person):
     write_studio(tmp_path, person, [standing(person)], "masks")
     scene, out = load_live_scene(tmp_path), tmp_path / "out"
     with pytest.raises(SceneError, match="'camera_0' delivers masks"):
-        capture_live(scene, out, by_stages=True)
+        capture_live(scene, out, method="paper")
     with pytest.raises(SettingsError, match="give no shape"):
-        capture_live(scene, out, None, LiveSettings(shape=tmp_path), by_stages=True)
+        capture_live(scene, out, None, LiveSettings(shape=tmp_path), method="paper")
     words = ["capture", str(tmp_path), "--out", str(tmp_path / "out"), "--method", "paper"]
     for more in (["--no-track"], ["--face-camera", "camera_0"]):
         assert run_command([*words, *more]).exit_code == 2

@@ -25,7 +25,7 @@ from drake_pose.jobs.live.walk import (
     wait_for_replay,
     walk,
 )
-from drake_pose.person.date.walk_commands import SPEED
+from drake_pose.person.date.walking import SPEED
 from drake_pose.systems.walk import START
 from tests.cli import run_command
 from tests.jobs.live.browsers import UPGRADE, ask, connected

@@ -16,6 +16,7 @@ from drake_pose.person.date.body_pose import (
     estimate_pose,
     move_limb,
     reach,
+    uncross_feet,
     upper_body,
     waist_of,
 )
@@ -209,6 +210,14 @@ class TestPose:
         features = np.array([[0.1, 0.2, 1.6], [0, 0, 0], [0, 0, 0], [0, 0, 0.04], [0, 0, 0.2]])
         expected = [0.1, 0.2, 0.55 * 1.6 + 0.225 * 0.2 + 0.225 * 0.04]
         np.testing.assert_allclose(Waist().place(features, 0.7), expected)
+
+    def test_feet_are_uncrossed_across_the_trunk(self, person, skeleton):
+        for turned in (0.0, 2.5):
+            q = posed(person, left_thigh_x=-30, right_thigh_x=20)
+            q[skeleton.head_angles[0]] = turned
+            right, wrong = skeleton.features(q), skeleton.features(q)[[0, 1, 2, 4, 3]]
+            np.testing.assert_array_equal(wrong[uncross_feet(skeleton, q, wrong)], right)
+            np.testing.assert_array_equal(right[uncross_feet(skeleton, q, right)], right)
 
     def test_a_lifted_foot_does_not_lift_the_waist_out_of_the_legs_reach(
         self, person, skeleton, seen

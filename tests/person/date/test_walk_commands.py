@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from drake_pose.person.date.walk_commands import (
+from drake_pose.person.date.walking import (
     BODY_RADIUS,
     NO_COMMAND,
     NO_STEPS,

@@ -1,5 +1,7 @@
 """The paper's ready diagram, before a person that Drake renders."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from pydrake.geometry import Meshcat, MeshcatParams
@@ -8,15 +10,15 @@ from pydrake.trajectories import PiecewisePolynomial
 
 from drake_pose.camera.models import FACE_CAMERA
 from drake_pose.errors import SettingsError
-from drake_pose.person.date.body_pose import estimate_pose, waist_of
+from drake_pose.person.date.body_pose import estimate_pose, uncross_feet, waist_of
 from drake_pose.person.date.faces import find_face, head_angles
-from drake_pose.person.date.features import find_features
+from drake_pose.person.date.features import expect_features, find_features
 from drake_pose.person.date.recognition import recognise
 from drake_pose.person.date.skeleton import LIMBS
 from drake_pose.silhouette.segmentation.background import person_region
 from drake_pose.systems.colour_images import picture_to_colour_image
 from drake_pose.systems.date.capture import PaperPoseEstimator, build_paper_capture
-from drake_pose.systems.date.preparation import CaptureSettings, CaptureSetup, see_person
+from drake_pose.systems.date.preparation import CAPTURE_METHODS, CaptureSetup, see_person
 from drake_pose.systems.pictures.camera_rig import build_camera_rig
 from tests.person.studio import shared_studio
 from tests.systems.bench import Bench
@@ -38,7 +40,6 @@ def setup(studio):
         studio.templates,
         studio.registered,
         studio.backgrounds,
-        CaptureSettings(waist=waist_of(studio.calibrated)),
     )
 
 
@@ -74,7 +75,8 @@ class Core:
     """The same by the plain functions alone, one after the other."""
 
     def __init__(self, setup):
-        self.setup, self.q, self.features = setup, None, None
+        self.setup, self.q, self.features, self.seen = setup, None, None, None
+        self.waist = setup.settings.waist or waist_of(setup.skeleton)
 
     def step(self, pictures):
         setup, settings = self.setup, self.setup.settings
@@ -91,10 +93,18 @@ class Core:
         )  # fmt: skip
         if found is not None:
             self.q, self.features = found.q, setup.skeleton.features(found.q)
+            self.seen, self.expected = np.zeros(5, int), self.features
             return self.q
         regions = [view.region for view in seen]
         centroids = [view.blobs.centroids for view in seen]
-        self.features = find_features(cameras, centroids, regions, self.features).places
+        before, expected = self.features, self.expected if settings.track_feet else None
+        measured = find_features(cameras, centroids, regions, before, expected)
+        self.features, support = measured.places, measured.support
+        if settings.track_feet:
+            order = uncross_feet(setup.skeleton, self.q, self.features)
+            self.features, support = self.features[order], support[order]
+        self.expected = expect_features(self.features, support, before, self.seen)
+        self.seen = support
         angles = None
         if FACE_CAMERA in views:
             blobs = views[FACE_CAMERA].blobs
@@ -102,14 +112,17 @@ class Core:
             if np.isfinite(direction).all():
                 angles = head_angles(direction, self.features[0], setup.face_camera)
         pose = estimate_pose(
-            setup.skeleton, self.q, self.features, angles, cameras, regions, waist=settings.waist
-        )
+            setup.skeleton, self.q, self.features, angles, cameras, regions,
+            search=settings.search, waist=self.waist,
+        )  # fmt: skip
         self.q = pose.q
         return self.q
 
 
 class TestPaperCapture:
-    def test_diagram_is_the_core_bit_for_bit_and_near_the_truth(self, setup, film):
+    @pytest.mark.parametrize("method", CAPTURE_METHODS)
+    def test_diagram_is_the_core_bit_for_bit_and_near_the_truth(self, setup, film, method):
+        setup = replace(setup, settings=CAPTURE_METHODS[method])
         capture = build_paper_capture(setup, period=PERIOD)
         assert list(capture.stages) == ["region", "skin", "recognition", "features", "face"]
         run, core = Run(capture), Core(setup)

@@ -10,7 +10,7 @@ from pydrake.trajectories import PiecewisePolynomial
 from drake_pose.body.formats.packages import bundled_model
 from drake_pose.body.model import load_model
 from drake_pose.errors import SettingsError, UnknownNameError
-from drake_pose.person.date.walk_commands import BODY_RADIUS, SPEED, TURN_RATE
+from drake_pose.person.date.walking import BODY_RADIUS, SPEED, TURN_RATE
 from drake_pose.systems.walk import (
     HALF_SIZE,
     KEYS,

@@ -1,0 +1,169 @@
+"""Date's application (section 6.2): a captured person walks through a place; its figure 8."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+from pydrake.geometry import (
+    GeometryInstance,
+    PerceptionProperties,
+    RenderEngineVtkParams,
+    RenderLabel,
+    Rgba,
+    SceneGraph,
+)
+from pydrake.math import RigidTransform
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.primitives import ConstantVectorSource, LogVectorOutput, TrajectorySource
+from pydrake.trajectories import PiecewisePolynomial
+from rich.table import Table
+
+from drake_pose.arrays import Array, Mask, Picture
+from drake_pose.body.model import ArticulatedModel
+from drake_pose.camera.models import PinholeCamera, look_at
+from drake_pose.papers.date_capture import PERIOD, PaperTrack, Studio
+from drake_pose.papers.tables import Count, draw_panels, figure_table, save_figure, uncounted
+from drake_pose.person.date.walking import COMMANDS, make_gestures
+from drake_pose.systems.bodies import add_posed_plant
+from drake_pose.systems.colour_images import colour_image_to_picture, picture_to_colour_image
+from drake_pose.systems.pictures.camera_rig import add_sensors
+from drake_pose.systems.walk import Walker, garden_objects, view_from_behind, walker_transform
+
+_SHOWN = "camera_0"
+_SKY = (0.65, 0.78, 0.94)
+_VIEW, _FOCAL = (480, 360), 384.0
+
+
+class Walked(NamedTuple):
+    """What Walker made of n frames: commands (n, 2), poses (n, 3) and rests (n, 5)."""
+
+    commands: Array
+    poses: Array
+    rests: Array
+
+    def follows(self) -> dict[str, Mask]:
+        """(n,) in which frames each of COMMANDS is followed."""
+        turn, walk = self.commands.T
+        return dict(zip(COMMANDS, (turn > 0, turn < 0, walk > 0, walk < 0), strict=True))
+
+
+class WalkThrough(NamedTuple):
+    """Captured gestures beside the true poses: figures, and figure 8's pictures by command."""
+
+    figures: dict[str, Any]
+    pictures: Mapping[str, tuple[Picture, Picture]]
+
+    def table(self) -> Table:
+        """How long each command was followed."""
+        columns = {
+            key: {name: one[f"{key}_s"] for name, one in self.figures["commands"].items()}
+            for key in ("true", "captured", "wrongly")
+        }
+        end = "{same_command:.1%} of frames alike, {place_error_m:.2f} m off at the end"
+        title = f"Walking through [s]: {end.format(**self.figures)}"
+        return figure_table(title, {k: (k, "{:.2f}") for k in COMMANDS}, columns, "command")
+
+    def save(self, folder: Path) -> Path:
+        """Draws figure 8: the input, and the walk through the place."""
+        columns = list(self.pictures.values())
+        figure = draw_panels(columns, list(self.pictures), ("input", "virtual walk"))
+        return save_figure(figure, folder / "figure_08.png")
+
+
+def run_walk_through(
+    cameras: int = 9,
+    seed: int = 0,
+    method: str = "paper",
+    count: Count = uncounted,
+    size: tuple[int, int] = (640, 480),
+    renderer: str = "drake",
+) -> WalkThrough:
+    """Captures table 1's gestures by the stages, and lets them walk on the spot through the place.
+
+    Arguments are those of papers.date.run_experiment; method is "paper" or "stages".
+    """
+    threads = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    try:
+        studio = Studio.build(cameras, size, np.random.default_rng([seed, 1]), renderer)
+        motion = make_gestures(studio.skeleton)
+        names, model = np.array(motion.names), studio.model
+        track = PaperTrack.build(studio.prepare(motion.q[0])[method])
+        advance, q, shots = count("frames", len(names)), np.empty_like(motion.q), []
+        for k, true_q in enumerate(motion.q):
+            seen = studio.pictures(true_q)
+            q[k] = track.step({name: picture_to_colour_image(one) for name, one in seen.items()})
+            shots.append(seen[_SHOWN])
+            advance(k + 1)
+    finally:
+        cv2.setNumThreads(threads)
+    true, found = walk_by(model, motion.q), walk_by(model, q)
+    followed = true.follows(), found.follows()
+    seconds = {
+        name: {
+            "true_s": PERIOD * float(followed[0][name].sum()),
+            "captured_s": PERIOD * float(followed[1][name].sum()),
+            "wrongly_s": PERIOD * float((followed[1][name] & ~followed[0][name]).sum()),
+        }
+        for name in COMMANDS
+    }
+    off = found.poses[-1] - true.poses[-1]
+    figures = {
+        "same_command": float((true.commands == found.commands).all(axis=1).mean()),
+        "commands": seconds,
+        "place_error_m": float(np.linalg.norm(off[:2])),
+        "heading_error_deg": abs(math.degrees(math.remainder(off[2], 2.0 * math.pi))),
+        "frames": len(names), "cameras": cameras, "seed": seed, "method": method,
+        "renderer": renderer,
+    }  # fmt: skip
+    middles = {name: int(np.median(np.flatnonzero(names == name))) for name in COMMANDS}
+    pictures = {
+        name: (shots[k], draw_walk(model, q[k], found.poses[k], found.rests[k]))
+        for name, k in middles.items()
+    }
+    return WalkThrough(figures, pictures)
+
+
+def walk_by(model: ArticulatedModel, q: Array) -> Walked:
+    """The walk by positions (n, nq), a frame each PERIOD; commands need walking on the spot."""
+    builder, times = DiagramBuilder(), PERIOD * np.arange(len(q) + 1)
+    path = PiecewisePolynomial.ZeroOrderHold(times, np.vstack([q, q[-1:]]).T)
+    source = builder.AddSystem(TrajectorySource(path))
+    walker = builder.AddSystem(Walker(model, q[0], PERIOD, on_spot=True))
+    builder.Connect(source.get_output_port(), walker.GetInputPort("positions"))
+    ports = [walker.GetOutputPort(name) for name in ("command", "walker_pose", "rest")]
+    logs = [LogVectorOutput(port, builder, PERIOD) for port in ports]
+    simulator = Simulator(builder.Build())
+    simulator.AdvanceTo(times[-1])
+    # What is logged at a time was known before the update at that time.
+    return Walked(*(log.FindLog(simulator.get_context()).data()[:, 1:].T for log in logs))
+
+
+def draw_walk(model: ArticulatedModel, q: Array, pose: Array, rest: Array) -> Picture:
+    """The place (H, W, 3) from behind the avatar at q (nq,), by Drake; pose, rest: of Walker."""
+    X_RP = walker_transform(pose, rest).inverse()
+    builder = DiagramBuilder()
+    scene_graph = builder.AddNamedSystem("scene_graph", SceneGraph())
+    garden = scene_graph.RegisterSource("garden")
+    for one in garden_objects():
+        X_RG, properties = X_RP @ RigidTransform(one.position), PerceptionProperties()
+        properties.AddProperty("phong", "diffuse", Rgba(*one.colour))
+        properties.AddProperty("label", "id", RenderLabel(1))
+        geometry = GeometryInstance(X_RG, one.shape, one.name)
+        geometry.set_perception_properties(properties)
+        scene_graph.RegisterAnchoredGeometry(garden, geometry)
+    positions = builder.AddSystem(ConstantVectorSource(q)).get_output_port()
+    add_posed_plant(builder, scene_graph, model, positions, "geometry_pose")
+    X_RC = X_RP.GetAsMatrix4() @ look_at(*view_from_behind(pose))
+    camera = PinholeCamera("view", *_VIEW, _FOCAL, _FOCAL, 0.5 * _VIEW[0], 0.5 * _VIEW[1], X_RC)
+    sky = RenderEngineVtkParams(default_clear_color=np.array(_SKY))
+    sensor = add_sensors(builder, scene_graph, {"view": camera}, {"view": (0.1, 60.0)}, sky)["view"]
+    context = builder.Build().CreateDefaultContext()
+    image = sensor.color_image_output_port().Eval(sensor.GetMyContextFromRoot(context))
+    return colour_image_to_picture(image)

@@ -1,0 +1,289 @@
+"""Walking through a place by gestures (Date, table 1), and a simulated person's known motions.
+
+Facing right or left turns the view, standing ahead of or behind the rest place walks.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from drake_pose.arrays import Array
+from drake_pose.errors import SettingsError
+from drake_pose.person.date.recognition import registered_positions
+from drake_pose.person.date.skeleton import Skeleton
+
+NO_COMMAND = (0, 0)
+
+TURN_RATE, SPEED, BODY_RADIUS = math.radians(40.0), 0.9, 0.3
+"""How fast the view turns [rad/s] and one walks [m/s], and how near one comes to walls [m]."""
+# A command begins at one threshold and ends at a lower one, so that noise does not toggle it: how
+# far the face is turned away from the rest direction [rad], and how far one stands from the rest
+# place [m].
+_TURN, _STEP = (math.radians(25.0), math.radians(15.0)), (0.18, 0.10)
+# How much higher than the other a lifted foot is [m]; without another step for so long nobody walks
+# on the spot any more [s].
+_LIFT, _PAUSE = 0.05, 1.0
+
+
+def stance_of(left_W: Array, head_W: Array, feet_W: Array) -> Array:
+    """How a person stands: (5,) the face's heading [rad], head's and feet's x and y [m].
+
+    Args:
+        left_W: (3,) the direction to the face's left, level also where the person looks down.
+        head_W, feet_W: (3,) and (2, 3) where they are [m]; midway between the feet counts.
+    """
+    heading = math.atan2(-left_W[0], left_W[1])
+    return np.array([heading, *head_W[:2], *np.asarray(feet_W)[:, :2].mean(axis=0)])
+
+
+def offsets_from_rest(stance: Array, rest: Array) -> tuple[float, float]:
+    """How far a stance (5,) is from the one at rest: turned to the left [rad], and ahead [m].
+
+    Ahead is the lesser of the head's and the feet's way, 0 if they differ: leaning is no step.
+    """
+    turned = stance[0] - rest[0]
+    turned = math.atan2(math.sin(turned), math.cos(turned))
+    forward = np.array([math.cos(rest[0]), math.sin(rest[0])])
+    head, feet = (stance[1:] - rest[1:]).reshape(2, 2) @ forward
+    ahead = math.copysign(min(abs(head), abs(feet)), head) if head * feet > 0.0 else 0.0
+    return turned, ahead
+
+
+def recognise_command(stance: Array, rest: Array, last: tuple[int, int]) -> tuple[int, int]:
+    """Table 1: the command that a stance gives; whoever is lost from sight stops.
+
+    Args:
+        stance, rest: (5,) from stance_of.
+        last: the command before.
+
+    Returns:
+        Turning: 1 left, -1 right, 0 not; walking: 1 forward, -1 backward, 0 not.
+    """
+    if not np.isfinite(stance).all():
+        return NO_COMMAND
+    turned, ahead = offsets_from_rest(stance, rest)
+    return _switch(turned, last[0], *_TURN), _switch(ahead, last[1], *_STEP)
+
+
+NO_STEPS = (0.0, 0.0, 0.0)
+
+
+def follow_steps(lift: float, steps: Array, seconds: float) -> Array:
+    """Counts the steps of somebody who may be walking on the spot; one foot held up is one step.
+
+    Args:
+        lift: how much higher the left foot is than the right one [m]; nan: not seen.
+        steps: (3,) the foot lifted last (1 left, -1 right, 0 none), since when it was [s], and how
+            many steps, each with the other foot, were taken without a pause.
+        seconds: since the last frame.
+    """
+    foot, since, count = steps[0], steps[1] + seconds, steps[2]
+    if since > _PAUSE:
+        count = 0.0
+    if abs(lift) >= _LIFT and math.copysign(1.0, lift) != foot:
+        return np.array([math.copysign(1.0, lift), 0.0, count + 1.0])
+    return np.array([foot, since, count])
+
+
+def walks_on_spot(steps: Array) -> bool:
+    """Whether steps (3,) of follow_steps are walking on the spot: one foot, then the other."""
+    return bool(steps[2] >= 2.0)
+
+
+def follow_command(
+    pose: Array,
+    command: tuple[int, int],
+    seconds: float,
+    half_size: float = math.inf,
+    obstacles: Array | None = None,
+) -> Array:
+    """The walker's pose (3,), its heading in -pi..pi, after a command was followed for a while.
+
+    Turning and walking at once is an exact arc; the walker slides along walls and obstacles.
+
+    Args:
+        pose: (3,) x, y [m] and heading [rad].
+        command: from recognise_command.
+        half_size: the place is a square about the origin; half its side [m].
+        obstacles: (n, 3) x, y and radius of round obstacles [m].
+    """
+    turn = command[0] * TURN_RATE * seconds
+    middle = pose[2] + 0.5 * turn
+    chord = command[1] * SPEED * seconds * float(np.sinc(0.5 * turn / math.pi))
+    place = pose[:2] + chord * np.array([math.cos(middle), math.sin(middle)])
+    for x, y, radius in np.empty((0, 3)) if obstacles is None else obstacles:
+        away = place - (x, y)
+        distance, allowed = float(np.linalg.norm(away)), radius + BODY_RADIUS
+        if 0.0 < distance < allowed:
+            place = place + away * (allowed / distance - 1.0)
+    limit = half_size - BODY_RADIUS
+    heading = math.atan2(math.sin(pose[2] + turn), math.cos(pose[2] + turn))
+    return np.array([*np.clip(place, -limit, limit), heading])
+
+
+def _switch(value: float, last: int, begin: float, end: float) -> int:
+    """1, -1 or 0: a value beyond a threshold, the lower one where it was so before."""
+    if last and value * last > end:
+        return last
+    return int(math.copysign(1, value)) if abs(value) >= begin else 0
+
+
+KeyPose = dict[str, float]
+
+MOTIONS = ("walk", "reach", "lean", "crouch", "turn", "cross")
+"""The motions, in their order; before the first and after the last the registered pose is shown."""
+
+UPRIGHT = ("walk", "reach", "turn", "cross")
+"""Those with an upright trunk, which the paper asks for."""
+
+REGISTERED = "registered"
+FEWEST_FRAMES = 40
+
+# In fewer frames the motions would be faster than people are; so they are not all shown.
+_WHOLE = 120
+_FOOT_HEIGHT = 0.04
+
+
+def _sides(left: float = 1.0, right: float = 1.0, **degrees: float) -> KeyPose:
+    """Angles [deg] of joints on both sides, times what is theirs."""
+    sides = {"left": left, "right": right}
+    return {f"{side}_{joint}": k * a for joint, a in degrees.items() for side, k in sides.items()}
+
+
+_RELAXED: KeyPose = _sides(forearm_x=-10.0) | _sides(right=-1.0, upper_arm_z=8.0)
+
+
+def _stride(side: float) -> KeyPose:
+    swung = _sides(side, -side, upper_arm_x=28.0, thigh_x=-25.0)
+    bent = {"left_shin_x": 18.0 - 12.0 * side, "right_shin_x": 18.0 + 12.0 * side}
+    return swung | bent | _sides(forearm_x=-25.0)
+
+
+# Angles [deg] that differ from the relaxed pose; a motion goes from one to the next and back.
+_KEY_POSES: Mapping[str, tuple[KeyPose, ...]] = {
+    "walk": (_stride(1.0), _stride(-1.0)),
+    "reach": (
+        {"left_upper_arm_x": -85.0, "left_forearm_x": -35.0},
+        {"left_upper_arm_x": -140.0, "right_upper_arm_z": -75.0, "right_forearm_x": -85.0},
+        _sides(right=-1.0, upper_arm_z=80.0) | {"left_forearm_x": -95.0, "left_upper_arm_y": -35.0},
+    ),
+    "lean": ({"neck_base_x": 35.0} | _sides(thigh_x=-35.0),),
+    "crouch": (
+        {"neck_base_x": 12.0}
+        | _sides(thigh_x=-75.0, shin_x=110.0)
+        | _sides(right=-1.0, thigh_z=15.0),
+    ),
+    "turn": ({"head_y": 45.0}, {"head_y": -45.0}),
+    "cross": (
+        {"left_upper_arm_x": -45.0, "left_forearm_x": -85.0}
+        | {"right_upper_arm_x": -55.0, "right_forearm_x": -75.0}
+        | _sides(right=-1.0, upper_arm_y=-45.0),
+    ),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """Positions q (n, nq) [rad or m], and each frame's motion: of MOTIONS, or REGISTERED."""
+
+    q: Array
+    names: tuple[str, ...]
+
+
+def make_motion(skeleton: Skeleton, frames: int, seed: int) -> Motion:
+    """The registered pose, then all motions of a person whose lower foot stands, then it again.
+
+    All takes 120 frames or more; of fewer the first are given. The seed draws how far motions go
+    (85 to 115 per cent) and where the person stands.
+
+    Raises SettingsError below FEWEST_FRAMES frames.
+    """
+    if frames < FEWEST_FRAMES:
+        raise SettingsError(f"Date's experiment needs {FEWEST_FRAMES} frames or more, not {frames}")
+    generator = np.random.default_rng(seed)
+    registered = registered_positions(skeleton)
+    relaxed = _positions(skeleton, {}, 1.0)
+    whole = max(frames, _WHOLE)
+    still = whole // 20
+    # From key pose to key pose it always takes about as long.
+    steps = np.cumsum([0, *(len(_KEY_POSES[motion]) + 1 for motion in MOTIONS)])
+    lengths = np.diff(np.rint((whole - 2 * still) * steps / steps[-1]).astype(int))
+    rows, names = [registered] * still, [REGISTERED] * still
+    before = registered
+    for motion, length in zip(MOTIONS, lengths, strict=True):
+        size = generator.uniform(0.85, 1.15)
+        after = registered if motion == MOTIONS[-1] else relaxed
+        keys = [before, *(_positions(skeleton, key, size) for key in _KEY_POSES[motion]), after]
+        rows += list(_through(keys, int(length)))
+        names += [motion] * int(length)
+        before = relaxed
+    rows += [registered] * still
+    names += [REGISTERED] * still
+    q = np.array(rows)
+    q[:, skeleton.head_positions[:2]] = _path(whole, generator)
+    for row in q:
+        _stand_on_floor(skeleton, row)
+    return Motion(q[:frames], tuple(names[:frames]))
+
+
+COMMANDS = ("turn left", "turn right", "walk ahead", "walk behind")
+"""What table 1 has gestures for."""
+
+
+def make_gestures(skeleton: Skeleton, frames: int = 84) -> Motion:
+    """The registered pose, rest, then each of COMMANDS by its gesture for some frames, and rest.
+
+    Who walks stands 30 cm ahead or behind, and walks on the spot. A frame's name is the gesture.
+    """
+    registered, rest = registered_positions(skeleton), _positions(skeleton, {}, 1.0)
+    rows, names = list(_through([registered, registered, rest], 24)), [REGISTERED] * 24
+    lifted = [{f"{side}_thigh_x": -50.0, f"{side}_shin_x": 75.0} for side in ("left", "right")]
+    for name, size in zip(COMMANDS, (1.0, -1.0, 1.0, -1.0), strict=True):
+        if name.startswith("turn"):
+            gesture = [_positions(skeleton, {"head_y": 45.0 * size}, 1.0)] * 4
+        else:
+            gesture = [_positions(skeleton, key, 1.0) for key in [{}, *2 * lifted, {}]]
+            for q in gesture:
+                q[skeleton.head_positions[0]] = 0.3 * size
+        rows += [*_through([rest, *gesture, rest], frames)]
+        names += [name] * frames
+    for q in rows:
+        _stand_on_floor(skeleton, q)
+    return Motion(np.array(rows), tuple(names))
+
+
+def _positions(skeleton: Skeleton, key: KeyPose, size: float) -> Array:
+    """Positions of a key pose, its angles times a size."""
+    q = np.zeros(len(skeleton.lower))
+    for name, degrees in {**_RELAXED, **{n: size * d for n, d in key.items()}}.items():
+        q[skeleton.model.position_index(name)] = math.radians(degrees)
+    return skeleton.clip(q)
+
+
+def _through(keys: list[Array], count: int) -> Array:
+    """(count, nq) positions from key to key, resting at each for a moment."""
+    place = np.linspace(0.0, len(keys) - 1.0, count + 1)[1:]
+    index = np.minimum(place.astype(int), len(keys) - 2)
+    share = 0.5 - 0.5 * np.cos(np.pi * (place - index))
+    poses = np.array(keys)
+    return np.asarray(poses[index] + share[:, None] * (poses[index + 1] - poses[index]))
+
+
+def _path(frames: int, generator: np.random.Generator) -> Array:
+    """(frames, 2) where the person stands on the floor: a slow loop of 20 cm [m]."""
+    phase, along = generator.uniform(0, 2 * np.pi), np.linspace(0, 2 * np.pi, frames)
+    loop = np.column_stack([np.cos(along + phase), np.sin(2 * along + phase)])
+    return np.asarray(0.2 * loop + generator.uniform(-0.1, 0.1, 2))
+
+
+def _stand_on_floor(skeleton: Skeleton, q: Array) -> None:
+    """Moves the head up or down so that the lower foot is where a standing person's are."""
+    standing = skeleton.features(np.zeros(len(q)))
+    head = float(-standing[3:, 2].mean()) + _FOOT_HEIGHT
+    q[skeleton.head_positions[2]] = 0.0
+    lowest = float(skeleton.features(q)[3:, 2].min())
+    q[skeleton.head_positions[2]] = min(head + 0.2, _FOOT_HEIGHT - lowest)

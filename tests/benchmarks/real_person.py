@@ -1,0 +1,101 @@
+"""Date's search on a real person: python -m tests.benchmarks.real_person SCENE MODEL OUT.
+
+SCENE has masks and joint_centres.csv, whose head, wrists and ankles stand for the skin that masks
+do not show; MODEL is a person of their lengths (urdf/person/make_person.py). OUT gets a picture.
+"""
+
+import csv
+import json
+import sys
+from collections import defaultdict
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from drake_pose.body.landmarks import landmark_positions, load_landmarks
+from drake_pose.body.model import load_model
+from drake_pose.papers.tables import draw_panels, save_figure
+from drake_pose.person.date.body_pose import Waist, estimate_pose, waist_of
+from drake_pose.person.date.skeleton import LIMBS, load_skeleton
+from drake_pose.silhouette.pictures.scenes import load_scene
+
+ENDS = ("left_wrist", "right_wrist", "left_ankle", "right_ankle")
+MIDDLES = ("left_elbow", "right_elbow", "left_knee", "right_knee")
+COLOURS = {"none": (220, 60, 40), "rectangles": (40, 110, 230), "surfaces": (20, 150, 60)}
+SHOWN = "0020"
+
+
+class TrueWaist(Waist):
+    middle = None
+
+    def place(self, features, heading):
+        return self.middle
+
+
+def skeleton_of(path):
+    """The skeleton of a person whose limbs end at wrists and ankles, the head at its joints."""
+    model = load_model(path, check=False)
+    skeleton, names = load_skeleton(model), load_landmarks(model.path)
+    q = np.zeros(len(skeleton.lower))
+    marks = dict(zip(names, landmark_positions(model, names, q), strict=True))
+    X_WN = skeleton.poses(q)
+
+    def inside(node, place):
+        return X_WN[node, :3, :3].T @ (place - X_WN[node, :3, 3])
+
+    limbs = {
+        name: replace(limb, end_L=inside(limb.lower_node, marks[end]))
+        for (name, limb), end in zip(skeleton.limbs.items(), ENDS, strict=True)
+    }
+    face = inside(skeleton.nodes["head"], 0.5 * (marks["head_top"] + marks["neck"]))
+    return replace(skeleton, limbs=limbs, face_H=face)
+
+
+def main(folder, model, out):
+    truth, scene = defaultdict(lambda: defaultdict(lambda: np.full(3, np.nan))), load_scene(folder)
+    with (folder / "joint_centres.csv").open(newline="") as stream:
+        for row in csv.DictReader(stream):
+            truth[int(row["frame"])][row["joint"]] = np.array([float(row[k]) for k in "xyz"])
+    skeleton, cameras = skeleton_of(model), list(scene.cameras.values())
+    ways = {"paper's waist": Waist(), "our waist": waist_of(skeleton), "true waist": TrueWaist()}
+    states, errors = {}, defaultdict(list)
+    for name in scene.frames:
+        at = truth[int(name)]
+        features = np.array([0.5 * (at["head_top"] + at["neck"]), *(at[end] for end in ENDS)])
+        if np.isnan(features).any():
+            continue
+        TrueWaist.middle = 0.5 * (at["left_hip"] + at["right_hip"])
+        masks = [scene.read(camera.name, name) for camera in cameras]
+        drawn = [np.where(one[..., None], (255,) * 3, (120,) * 3).astype(np.uint8) for one in masks]
+        for way in ((waist, search) for waist in ways for search in COLOURS):
+            if way not in states:
+                # Upright, facing as the shoulders say.
+                across, states[way] = (
+                    at["left_shoulder"] - at["right_shoulder"],
+                    np.zeros(len(skeleton.lower)),
+                )
+                states[way][skeleton.head_angles[0]] = np.arctan2(-across[0], across[1])
+            seen = (features, None, cameras, masks)
+            pose = estimate_pose(skeleton, states[way], *seen, search=way[1], waist=ways[way[0]])
+            states[way], found = pose.q, np.array([pose.limbs[limb][1] for limb in LIMBS])
+            errors[way].append(np.linalg.norm(found - [at[one] for one in MIDDLES], axis=1))
+            for camera, picture in (
+                zip(cameras, drawn, strict=True) if way[0] == "true waist" else ()
+            ):
+                lines = [
+                    np.rint(camera.project(one)[0]).astype(np.int32) for one in pose.limbs.values()
+                ]
+                cv2.polylines(picture, lines, False, COLOURS[way[1]], 7)
+        if name == SHOWN:
+            save_figure(
+                draw_panels([[one] for one in drawn], list(scene.cameras)), out / "limbs.png"
+            )
+    for way, rows in errors.items():
+        elbows, knees = 1e3 * np.nanmean(np.reshape(rows, (-1, 2, 2)), axis=(0, 2))
+        print(json.dumps({"way": way, "elbows_mm": round(elbows), "knees_mm": round(knees)}))
+
+
+if __name__ == "__main__":
+    main(*map(Path, sys.argv[1:4]))

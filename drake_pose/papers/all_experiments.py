@@ -192,7 +192,7 @@ def _date(short: bool, folder: Path, count: Count) -> Outcome:
         rows.append((what, "", "wrong, then right (figure 7)", found, all_at_once))
     both = ("paper", "silhouette")
     whole = [f"{result.milliseconds(way)['all']:.0f} ms, one core" for way in both]
-    backs = [result.recoveries(way).get(REGISTERED) for way in both]
+    backs = [result.recoveries(way).get(REGISTERED) or "not" for way in both]
     rows += [
         ("a frame", "", "real time, a cluster (15 ms for the face)", *whole),
         ("frames until the registered pose, shown, is right", "", "that frame", *map(str, backs)),

@@ -166,7 +166,6 @@ class DateResult:
             "joint_error_p95_mm": float(np.percentile(own, 95)),
             "ik_only_mm": all_motions["ik_only_mm"],
             "paper_mm": all_motions["paper_mm"],
-            **({"stages_mm": all_motions["stages_mm"]} if "stages" in self.errors else {}),
             "elbows_and_knees": self._of_joints(("elbow", "knee")),
             "elbows": self._of_joints(("elbow",)),
             "knees": self._of_joints(("knee",)),

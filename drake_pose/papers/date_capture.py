@@ -307,10 +307,6 @@ class SilhouetteTrack(_StagedRun):
         capture = build_silhouette_capture(tracker, cameras, backgrounds, PERIOD, _EDGE_POINTS)
         return SilhouetteTrack(capture, tracker)
 
-    def place(self, q: Array) -> None:
-        """Has the person be known to be at q (nq,)."""
-        self._set_state(self._tracker.start(self._tracker.values(q)))
-
     def step(self, images: Images) -> Array:
         """The positions (nq,) of one more frame, even where the person is lost.
 

@@ -104,15 +104,15 @@ def run_walk_through(
     finally:
         cv2.setNumThreads(threads)
     true, found = walk_by(model, motion.q), walk_by(model, q)
-    followed = true.follows(), found.follows()
-    seconds = {
-        name: {
-            "true_s": PERIOD * float(followed[0][name].sum()),
-            "captured_s": PERIOD * float(followed[1][name].sum()),
-            "wrongly_s": PERIOD * float((followed[1][name] & ~followed[0][name]).sum()),
+    seconds = {}
+    for name, right in true.follows().items():
+        captured = found.follows()[name]
+        counts = {
+            "true": right.sum(),
+            "captured": captured.sum(),
+            "wrongly": captured[~right].sum(),
         }
-        for name in COMMANDS
-    }
+        seconds[name] = {f"{key}_s": PERIOD * float(number) for key, number in counts.items()}
     off = found.poses[-1] - true.poses[-1]
     figures = {
         "same_command": float((true.commands == found.commands).all(axis=1).mean()),

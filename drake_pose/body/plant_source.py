@@ -13,7 +13,7 @@ from pydrake.geometry import (
     PerceptionProperties,
     SceneGraph,
 )
-from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.plant import DiscreteContactSolver, MultibodyPlant
 from pydrake.multibody.tree import (
     BallRpyJoint,
     BodyIndex,
@@ -70,12 +70,19 @@ class Coupling(NamedTuple):
 
 
 def read_couplings(plant: MultibodyPlant) -> list[Coupling]:
-    """The couplers of a finalized plant, which its Python tells through InverseKinematics alone."""
+    """The couplers of a finalized plant, which its Python tells through InverseKinematics alone.
+
+    None of a plant with tendons, which InverseKinematics refuses: all its constraints are counted
+    as not enforced then.
+    """
     if plant.num_constraints() == 0:
         return []
     from pydrake.multibody.inverse_kinematics import InverseKinematics  # It imports the solvers.
 
-    program = InverseKinematics(plant, with_joint_limits=False).prog()
+    try:
+        program = InverseKinematics(plant, with_joint_limits=False).prog()
+    except RuntimeError:
+        return []
     found = []
     for binding in program.linear_equality_constraints():
         index = program.FindDecisionVariableIndices(binding.variables())
@@ -85,6 +92,14 @@ def read_couplings(plant: MultibodyPlant) -> list[Coupling]:
             k = int(row[1] == 1.0)
             found.append(Coupling(index[k], index[1 - k], -row[1 - k] / row[k], offset / row[k]))
     return found
+
+
+def add_coupler(
+    plant: MultibodyPlant, follower: Joint, leader: Joint, multiplier: float, offset: float
+) -> None:
+    """Let a joint follow another one, as Drake's parser does: not where its solver cannot."""
+    if plant.get_discrete_contact_solver() == DiscreteContactSolver.kSap:
+        plant.AddCouplerConstraint(follower, leader, multiplier, offset)
 
 
 class PlantSource:
@@ -150,11 +165,11 @@ class PlantSource:
                 copy.set_default_positions(joint.default_positions())
         moving = {joint.position_start(): joint for joint in joints if joint.num_positions()}
         for one in read_couplings(old):
-            pair = (
+            follower, leader = (
                 plant.GetJointByName(moving[k].name(), instances[moving[k].model_instance()])
                 for k in (one.follower, one.leader)
             )
-            plant.AddCouplerConstraint(*pair, one.multiplier, one.offset)
+            add_coupler(plant, follower, leader, one.multiplier, one.offset)
         return list(instances.values()), []
 
     def _copied(self, geometry: GeometryId) -> GeometryInstance:

@@ -17,6 +17,7 @@ from pydrake.multibody.tree import ModelInstanceIndex
 from drake_pose.body.formats.link_files import Limits, cure_sdf, cure_urdf
 from drake_pose.body.formats.mjcf import Couple, cure_mjcf
 from drake_pose.body.formats.packages import FileFinder
+from drake_pose.body.plant_source import add_coupler
 from drake_pose.body.surfaces.meshes import workspace
 from drake_pose.errors import ModelError
 
@@ -90,9 +91,11 @@ class ModelSource:
         with captured_warnings() as warnings:
             try:
                 instances = parser.AddModelsFromString(self.text, self.kind)
-                for one, other, multiplier, offset in self._couples:
-                    pair = (plant.GetJointByName(name, instances[0]) for name in (one, other))
-                    plant.AddCouplerConstraint(*pair, multiplier, offset)
+                for one, other, *how in self._couples:
+                    follower, leader = (
+                        plant.GetJointByName(name, instances[0]) for name in (one, other)
+                    )
+                    add_coupler(plant, follower, leader, *how)
             # Drake ends the process, which Python sees as SystemExit, at some values.
             except (RuntimeError, ValueError, SystemExit) as error:
                 raise ModelError(self._explain(str(error), warnings)) from error

@@ -17,12 +17,7 @@ from drake_pose.body.tree.link_graph import (
     chain_transforms,
 )
 from drake_pose.body.tree.node_skin import find_skin, require_placed
-from drake_pose.body.tree.pose_tree import (
-    NodePlacement,
-    PoseTree,
-    PoseTreeNode,
-    place_node,
-)
+from drake_pose.body.tree.pose_tree import NodePlacement, PoseTree, PoseTreeNode, place_node
 from drake_pose.body.tree.root import BasePose, RootRotation, base_of_chain
 from drake_pose.errors import ModelError, SettingsError, UnknownNameError
 

@@ -4,7 +4,11 @@ import numpy as np
 import pytest
 from pydrake.geometry import SceneGraph
 from pydrake.multibody.parsing import Parser
-from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, MultibodyPlant
+from pydrake.multibody.plant import (
+    AddMultibodyPlantSceneGraph,
+    DiscreteContactApproximation,
+    MultibodyPlant,
+)
 from pydrake.multibody.tree import BodyIndex
 from pydrake.systems.framework import DiagramBuilder
 
@@ -82,6 +86,28 @@ def test_what_is_not_enforced_is_told_and_what_is_stands_in_the_report(tmp_path)
     ]  # fmt: skip
 
 
+def test_beside_tendons_nothing_is_enforced_and_that_is_told(tmp_path):
+    ends = "".join(
+        f'<drake:tendon_constraint_{name} value="{value}"/>'
+        for name, value in (
+            ("offset", 0),
+            ("stiffness", 1),
+            ("damping", 0),
+            ("lower_limit", -1),
+            ("upper_limit", 1),
+        )
+    )
+    tendon = (
+        '<drake:tendon_constraint><drake:tendon_constraint_joint name="wrist" a="1"/>'
+        f"{ends}</drake:tendon_constraint></robot>"
+    )
+    text = HAND.replace("<robot ", '<robot xmlns:drake="http://drake.mit.edu" ')
+    tree = tree_of(tmp_path, text.replace("</robot>", tendon))
+    assert tree.followers == ()
+    (told,) = model_warnings(tree.model, tree)
+    assert told.startswith("4 constraints between joints or links are written in the file")
+
+
 def test_motions_against_finite_differences(tmp_path):
     kinematics, values = drawn(tree_of(tmp_path), np.random.default_rng(1))
     surfaces = few_triangles(TreeSurfaces(kinematics.tree), VERY_FEW)
@@ -156,6 +182,9 @@ MJCF = """<mujoco model="m"><worldbody><body name="a"><geom type="box" size=".1 
 def test_every_format_couples_alike(tmp_path, text, name):
     model = load_model(write(tmp_path, text, name), check=False)
     (one,) = model.couplings
+    plant = MultibodyPlant(0.001)
+    plant.set_discrete_contact_approximation(DiscreteContactApproximation.kTamsi)
+    model.add_to(plant)
     assert [model.position_names[k] for k in one[:2]] == ["follow", "lead"]
     np.testing.assert_allclose(one[2:], (-2.0, 0.5), atol=1e-12)
 

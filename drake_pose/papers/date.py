@@ -29,9 +29,9 @@ RENDERERS = ("drake", "own")
 FEWEST_CAMERAS = 3
 SHOWN_CAMERA = "camera_0"
 TITLES = {
-    "ik_only": "the paper's inverse kinematics alone",
+    "ik_only": "the paper's IK alone",
     "paper": "the paper's search",
-    "stages_ik_only": "our inverse kinematics alone",
+    "stages_ik_only": "our IK alone",
     "stages": "our search",
     "silhouette": "all silhouettes",
 }
@@ -231,7 +231,7 @@ class DateResult:
                 "{:.1f}",
             ),
             _table_of_motions(
-                f"Elbows and knees as found [mm], drawn by: {self._settings['renderer']}",
+                f"Elbows and knees as found, in mm, drawn by: {self._settings['renderer']}",
                 {**found, "upright": self._as_found(UPRIGHT)},
                 found_headings,
                 "{:.0f}",

@@ -150,6 +150,11 @@ class PortedSystem(LeafSystem):
 
         return given
 
+    def add_parameter(self, first: Any) -> Callable[[Context], Any]:
+        """An abstract parameter of the context, the next by index; what reads it."""
+        index = self.DeclareAbstractParameter(AbstractValue.Make(first))
+        return lambda context: context.get_abstract_parameter(int(index)).get_value()
+
     def given(self, context: Context, name: str) -> Any:
         """What comes in at a port, a vector as a copy; None: it is not connected."""
         port = self.GetInputPort(name)

@@ -85,7 +85,8 @@ class SilhouetteMatcher(BeliefSystem[Matched]):
         cameras: the calibrated cameras, in the order of the input ports, or by name.
         period, offset: time between two matches, and of the first one [s].
         labels: the labels that belong to the body; None: those of its model where that was made of
-            a plant (``ArticulatedModel.from_plant``), else all that are not reserved.
+            a plant (``ArticulatedModel.from_plant``), else all that are not reserved. A frozenset,
+            or None for all, is abstract parameter 0 of the context, where they can be varied.
         family_limit: how many families are given out at most.
 
     Raises:
@@ -117,7 +118,7 @@ class SilhouetteMatcher(BeliefSystem[Matched]):
             raise SettingsError(f"the family limit must be 1 or more, not {family_limit}")
         self._search, self._cameras, self._family_limit = search, cameras, family_limit
         labels = search.tree.model.labels if labels is None else labels
-        self._labels = None if labels is None else frozenset(labels)
+        self._labels = self.add_parameter(None if labels is None else frozenset(labels))
         known = {camera.name: camera for camera in cameras}
         self._images = self.add_camera_inputs(
             {one.name: camera_port("label_image", one, cameras) for one in cameras},
@@ -148,8 +149,8 @@ class SilhouetteMatcher(BeliefSystem[Matched]):
 
     def next_belief(self, context: Context, last: Matched) -> Matched:
         """The match of what the cameras see now."""
-        images = self._images(context)
-        masks = {name: label_image_to_mask(image, self._labels) for name, image in images.items()}
+        images, labels = self._images(context), self._labels(context)
+        masks = {name: label_image_to_mask(image, labels) for name, image in images.items()}
         views = [
             View(camera, masks[camera.name])
             for camera in self._cameras
@@ -245,11 +246,13 @@ class SilhouetteTracker(SilhouetteMatcher):
     All that is known is state of the context. Arguments are those of ``SilhouetteMatcher``, and:
 
     Args:
-        tracking: how the body may move, and when its track is lost.
+        tracking: how the body may move, and when its track is lost: abstract parameter 1 of the
+            context, but for ``root_moves`` and ``scale_unknown``, on which the state depends.
         color_cameras: names of the cameras that have a port for a colour image.
 
     Raises:
-        SettingsError: as for ``SilhouetteMatcher``; and in a simulation, when time runs backwards.
+        SettingsError: as for ``SilhouetteMatcher``; and in a simulation, when time runs backwards,
+            or the context's settings have another state.
         UnknownNameError: a name of ``color_cameras`` is no camera's.
     """
 
@@ -267,8 +270,10 @@ class SilhouetteTracker(SilhouetteMatcher):
     ) -> None:
         super().__init__(search, cameras, period, offset, labels)
         cameras = self._cameras
-        self._follower = MatchAndTrack(search, cameras, period, tracking)
-        self._period, self._layout = period, self._follower.tracker.filter.layout
+        tracking = tracking or TrackingSettings()
+        follower = MatchAndTrack(search, cameras, period, tracking)
+        self._tracking, self._followers = self.add_parameter(tracking), {tracking: follower}
+        self._period, self._layout = period, follower.tracker.filter.layout
         model = search.tree.model
         nq = len(model.position_names)
         # Elements of the state that are positions, and which; the others are the root's.
@@ -296,12 +301,25 @@ class SilhouetteTracker(SilhouetteMatcher):
         ports = ["measured_positions", *(["first_positions"] if last.track is None else [])]
         starts = (self.given(context, port) for port in ports)
         start = next((q for q in starts if q is not None and np.isfinite(q).all()), None)
-        now, result = self._follower.next(last, views, root_position, pictures, start)
+        follower = self._follower(self._tracking(context))
+        now, result = follower.next(last, views, root_position, pictures, start)
         is_tracked = result.stopped_by == TRACKED and now.matches == last.matches
         measurement = None if now.track is None else now.track.measurement
         distance = np.nan if measurement is None else measurement.distance
         track = float(result.found and is_tracked), float(now.matches), distance
         return result, _Memory(now, track, context.get_time())
+
+    def _follower(self, tracking: TrackingSettings) -> MatchAndTrack:
+        """What follows as a context's settings say; made of them once."""
+        if tracking not in self._followers:
+            made = MatchAndTrack(self._search, self._cameras, self._period, tracking)
+            if made.tracker.filter.layout.names != self._layout.names:
+                raise SettingsError(
+                    f"{self.get_name()}: root_moves and scale_unknown cannot be varied in a "
+                    "context, whose state depends on them; make another system with them"
+                )
+            self._followers[tracking] = made
+        return self._followers[tracking]
 
     def _deviations(self, known: Matched) -> Array:
         deviations, track = np.full(len(known.q), np.nan), known.memory.followed.track

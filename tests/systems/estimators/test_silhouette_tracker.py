@@ -9,11 +9,15 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.trajectories import PiecewisePolynomial
 
-from drake_pose.errors import UnknownNameError
+from drake_pose.errors import SettingsError, UnknownNameError
 from drake_pose.filtering.tracking.contour_tracker import TrackingSettings
 from drake_pose.search.kameda import PaperSearch
 from drake_pose.search.settings import PaperSearchSettings
-from drake_pose.silhouette.pictures.label_images import label_image_to_mask, mask_to_label_image
+from drake_pose.silhouette.pictures.label_images import (
+    EMPTY,
+    label_image_to_mask,
+    mask_to_label_image,
+)
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from drake_pose.systems.colour_images import picture_to_colour_image
 from drake_pose.systems.estimators.diagrams import add_simulated_cameras, build_simulated_matching
@@ -104,6 +108,39 @@ def test_velocities_and_body_poses_are_those_of_the_plant(body, search):
     seen = Bench(SilhouetteCamera(body.plant, body.scene_graph, camera)).give(body_poses=poses)
     mask = label_image_to_mask(seen["label_image"])
     assert np.count_nonzero(mask != renderer.mask(found)) <= 0.002 * mask.sum()
+
+
+def test_contexts_of_one_tracker_have_labels_and_settings_of_their_own(body, search):
+    """Parameters varied in a context, against systems that were made with them."""
+    camera = front_camera(200, shift=0.2)
+    renderer = LabelRenderer(body, camera)
+    stiff = TrackingSettings(angle_acceleration=2.0)
+    system = SilhouetteTracker(search, [camera], PERIOD)
+    ways = [
+        (SilhouetteTracker(search, [camera], PERIOD, tracking=one, labels=labels), one, labels)
+        for one, labels in ((stiff, None), (TrackingSettings(), {7}))
+    ]
+    ends = []
+    for made, settings, labels in ways:
+        varied, plain = Bench(system), Bench(made)
+        parameters = None if labels is None else frozenset(labels)
+        varied.context.get_mutable_abstract_parameter(0).set_value(parameters)
+        varied.context.get_mutable_abstract_parameter(1).set_value(settings)
+        for q in motion()[:6]:
+            image = mask_to_label_image(renderer.mask(q))
+            if labels is not None:
+                data = image.mutable_data
+                data[:40] = np.where(data[:40] != EMPTY, 7, data[:40])
+            for run in (varied, plain):
+                run.update(label_image=image)
+        for port in ("estimated_positions", "position_deviations", "track"):
+            np.testing.assert_allclose(varied[port], plain[port], atol=1e-12)
+        ends.append(varied["estimated_positions"])
+    assert np.abs(ends[0] - ends[1]).max() > 1e-3
+    wrong = Bench(system)
+    wrong.context.get_mutable_abstract_parameter(1).set_value(TrackingSettings(root_moves=True))
+    with pytest.raises(SettingsError, match="root_moves"):
+        wrong.update(label_image=mask_to_label_image(renderer.mask(motion()[0])))
 
 
 def test_a_copied_context_goes_on_as_the_first_did(body, search):

@@ -26,7 +26,8 @@ def read_csv(
     whole_lines: what follows the last line break is a row that an interruption cut off.
 
     Raises:
-        error_type: names the file; it cannot be read, or a line has more or fewer cells.
+        error_type: names the file; it cannot be read, its columns are separated otherwise, or a
+            line has more or fewer cells.
     """
     try:
         text = read_regular(path).decode("utf-8-sig")
@@ -39,6 +40,13 @@ def read_csv(
     if not lines:
         raise error_type(f"{path}: is empty")
     (_, header), *rows = lines
+    named = {";": "semicolons", "\t": "tabs"}
+    others = [name for sign, name in named.items() if any(sign in cell for cell in header)]
+    if others:
+        raise error_type(
+            f"{path}: its first line has {others[0]}; columns are separated by commas, and "
+            "decimals begin with a point: save it as CSV with commas"
+        )
     for line, row in rows:
         if len(row) != len(header):
             raise error_type(

@@ -256,7 +256,7 @@ def _annotations(content: Mapping[str, Any], path: Path) -> Annotations:
             without += 1
     pictures = tuple(
         AnnotatedPicture(
-            str(entry["file_name"]),
+            _file_name(entry["file_name"]),
             _side(entry["width"]),
             _side(entry["height"]),
             of_image[entry["id"]],
@@ -266,6 +266,12 @@ def _annotations(content: Mapping[str, Any], path: Path) -> Annotations:
     text = f"{path}: {without} annotations have a box, but no segmentation: left out"
     numbers = {str(key): name for key, name in names.items()}
     return Annotations(path, pictures, numbers, (text,) if without else ())
+
+
+def _file_name(value: Any) -> str:
+    if not isinstance(value, str) or not value.isprintable():
+        raise ValueError(f"{value!r} is no name of a picture's file")
+    return value
 
 
 def _side(value: Any) -> int:

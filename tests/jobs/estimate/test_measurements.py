@@ -2,6 +2,7 @@ from pathlib import Path
 
 import pytest
 
+from drake_pose.csv_files import read_csv
 from drake_pose.errors import SceneError, UnknownNameError
 from drake_pose.jobs.estimate.measurements import read_joint_centres, read_true_angles
 
@@ -59,3 +60,13 @@ def test_true_angles(tmp_path: Path) -> None:
     path = written(tmp_path / "angles.csv", "frame,b,d\n3,0.5,-1\n")
     with pytest.raises(UnknownNameError, match=r"angles.csv.*'d'.*a, b, c"):
         read_true_angles(path, ["a", "b", "c"])
+
+
+@pytest.mark.parametrize(("sign", "name"), [(";", "semicolons"), ("\t", "tabs")])
+def test_tables_with_other_separators_are_refused_by_name(
+    tmp_path: Path, sign: str, name: str
+) -> None:
+    file = tmp_path / "joint_angles.csv"
+    file.write_text(f"frame{sign}A1\n0000{sign}0,5\n")
+    with pytest.raises(SceneError, match=f"{name}; columns are separated by commas"):
+        read_csv(file, SceneError)

@@ -1,6 +1,7 @@
 """Masks found in pictures: by the empty room, by a box, by a network."""
 
 import shutil
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -195,6 +196,12 @@ def test_networks_that_do_not_fit_are_refused(still, tmp_path, change, words):
     values["network"] = tmp_path / values["network"]
     with pytest.raises(DrakePoseError, match=words):
         make_masks(path, tmp_path / "out", MaskSettings(network_size=(80, 60), **values))
+
+
+def test_a_network_of_no_size_or_too_large_a_one_is_refused():
+    for size in ((0, 60), (1_000_000, 1_000_000)):
+        with pytest.raises(SettingsError, match="--network-size must be 1 to"):
+            MaskSettings(network=Path("net.onnx"), network_size=size)
 
 
 def test_masks_of_nothing_of_all_and_of_two_objects_are_judged():

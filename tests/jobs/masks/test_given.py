@@ -124,6 +124,11 @@ def test_damaged_coco_files_are_refused(tmp_path, two_views, change, words):
     file.write_text(json.dumps(content))
     with pytest.raises(MaskError, match=rf"a\.json.*{words}"):
         make_masks(file, tmp_path / "out")
+    for name in ("a\0.png", 3):
+        content["images"][0]["file_name"] = name
+        file.write_text(json.dumps(content))
+        with pytest.raises(MaskError, match=r"a\.json.*no name of a picture"):
+            make_masks(file, tmp_path / "out")
     for text in ("{", "[]", "{}", '{"images": 3, "annotations": [], "categories": []}'):
         file.write_text(text)
         with pytest.raises(MaskError, match=r"a\.json"):

@@ -95,6 +95,6 @@ def test_all_of_it_short(tmp_path):
         for row in beside["figures"]:
             assert html.escape(row["paper"]) in page
         assert json.loads((tmp_path / "all" / experiment.name / FIGURES).read_text())
-        assert experiment.title.split(":")[0] in page
+        assert experiment.title.split(":")[0] in html.unescape(page)
     assert "Short" in page
     assert page.count("data:image/png") >= 10

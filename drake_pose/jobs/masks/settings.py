@@ -9,7 +9,6 @@ from typing import Annotated, Any, Literal
 
 from cyclopts import Parameter
 
-from drake_pose.camera.models import LARGEST_SIDE
 from drake_pose.errors import SettingsError
 from drake_pose.files.options import from_text, parse_numbers, parse_size
 from drake_pose.files.settings import Packages, Positions, changed, plain, require_choices
@@ -72,8 +71,6 @@ class MaskSettings:
             values = getattr(self, name)
             if values is not None and (len(values) != count or not all(map(math.isfinite, values))):
                 raise SettingsError(f"{name} must be {count} numbers, not {values}")
-        if self.network_size and not all(1 <= side <= LARGEST_SIDE for side in self.network_size):
-            raise SettingsError(f"--network-size must be 1 to {LARGEST_SIDE} pixels a side")
         ways = [name for name in _WAYS if getattr(self, name) is not None]
         if len(ways) > 1:
             raise SettingsError(f"--{ways[0]} and --{ways[1]} are two ways to find masks: give one")

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_pose.arrays import Mask, Picture
+from drake_pose.camera.models import LARGEST_SIDE
 from drake_pose.errors import SettingsError
 from drake_pose.silhouette.segmentation.mask_pictures import ALL
 
@@ -30,7 +31,7 @@ class SegmentationNetwork:
         bgr: whether it takes blue, green, red.
 
     Raises SettingsError: OpenCV cannot read the file, a class is no number, or a size or standard
-    deviation is not positive.
+    deviation is out of its range.
     """
 
     def __init__(
@@ -44,8 +45,10 @@ class SegmentationNetwork:
     ) -> None:
         self._file, self._classes = file, tuple(classes)
         self._size, self._mean, self._std, self._bgr = size, mean, std, bgr
-        if size is not None and min(size) < 1:
-            raise SettingsError("a network's size needs a width and a height of one pixel or more")
+        if size is not None and not all(1 <= side <= LARGEST_SIDE for side in size):
+            raise SettingsError(
+                f"a network's size needs a width and a height of 1 to {LARGEST_SIDE} pixels"
+            )
         if min(std) <= 0.0:
             raise SettingsError("standard deviations of a network's input must be positive")
         for name in classes:

@@ -1,7 +1,6 @@
 """Masks found in pictures: by the empty room, by a box, by a network."""
 
 import shutil
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -186,22 +185,18 @@ def test_network_takes_the_colours_that_are_said(still, tmp_path):
         ({"classes": ("robot",)}, "numbers, not 'robot'"),
         ({"classes": ("0", "1", "2")}, "all of its 3 classes"),
         ({"network": "none.onnx"}, "no such network"),
+        ({"network_size": (0, 60)}, "width and a height of 1 to"),
+        ({"network_size": (1_000_000, 1_000_000)}, "width and a height of 1 to"),
         ({"network": "still.png"}, "still.png"),
     ],
 )
 def test_networks_that_do_not_fit_are_refused(still, tmp_path, change, words):
     path, _ = still
     network(tmp_path / "net.onnx", "three")
-    values = {"network": "net.onnx", "classes": ("2",)} | change
+    values = {"network": "net.onnx", "classes": ("2",), "network_size": (80, 60)} | change
     values["network"] = tmp_path / values["network"]
     with pytest.raises(DrakePoseError, match=words):
-        make_masks(path, tmp_path / "out", MaskSettings(network_size=(80, 60), **values))
-
-
-def test_a_network_of_no_size_or_too_large_a_one_is_refused():
-    for size in ((0, 60), (1_000_000, 1_000_000)):
-        with pytest.raises(SettingsError, match="--network-size must be 1 to"):
-            MaskSettings(network=Path("net.onnx"), network_size=size)
+        make_masks(path, tmp_path / "out", MaskSettings(**values))
 
 
 def test_masks_of_nothing_of_all_and_of_two_objects_are_judged():

@@ -124,6 +124,7 @@ def test_damaged_coco_files_are_refused(tmp_path, two_views, change, words):
     file.write_text(json.dumps(content))
     with pytest.raises(MaskError, match=rf"a\.json.*{words}"):
         make_masks(file, tmp_path / "out")
+    content["annotations"] = []
     for name in ("a\0.png", 3):
         content["images"][0]["file_name"] = name
         file.write_text(json.dumps(content))

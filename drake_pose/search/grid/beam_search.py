@@ -138,14 +138,17 @@ class _Run:
         if self._all and self._search_within():
             self._stopped_by = "exact"
             return
-        exact = [stage for stage in self._settings.stages if stage.outside_share == 0.0]
+        exact, tolerant = (
+            [stage for stage in self._settings.stages if (stage.outside_share == 0.0) == is_exact]
+            for is_exact in (True, False)
+        )
         for stage in exact:
-            if self._run_stage(stage) or self._stopped_by or self._J <= self._tolerance:
+            if self._run_stage(stage) or self._stopped_by or self._is_matched:
                 break
-        if not (self._all or self._gathers or self._stopped_by or self._J <= self._tolerance):
+        if not (self._all or self._gathers or self._stopped_by or self._is_matched):
             self._search_within()
-        for k, stage in enumerate(self._settings.stages[len(exact) :]):
-            enough = self._J <= self._tolerance and not (self._gathers and k == 0)
+        for k, stage in enumerate(tolerant):
+            enough = self._is_matched and not (self._gathers and k == 0)
             if self._stopped_by or enough:
                 break
             self._run_stage(stage)
@@ -159,15 +162,17 @@ class _Run:
             if last is not None:
                 best = int(np.argmin(self._gather(expansion, last)))
                 self._keep_if_better(expansion.store.samples(last.poses[best]))
-        elif self._settings.research_hypotheses and not (
-            self._stopped_by or self._J <= self._tolerance
-        ):
+        elif self._settings.research_hypotheses and not (self._stopped_by or self._is_matched):
             pictures = self.pictures(exact=False)
             self._keep_if_better(
                 turn_single_nodes(self.scoring, pictures, self._samples, self._proceed)
             )
-        matched = self._J <= self._tolerance
-        self._stopped_by = "exact" if matched else self._stopped_by or "end"
+        self._stopped_by = "exact" if self._is_matched else self._stopped_by or "end"
+
+    @property
+    def _is_matched(self) -> bool:
+        """Whether the best pose counts as exact."""
+        return self._J <= self._tolerance
 
     def _search_within(self) -> bool:
         """Look for all poses within the tolerance, and keep the best; whether there is one."""
@@ -221,7 +226,7 @@ class _Run:
         best = int(np.argmin(Js))
         self._keep_if_better(expansion.store.samples(last.poses[best]))
         width = self._settings.research_hypotheses
-        if width and (self._J > self._tolerance or (self._gathers and not exact)):
+        if width and (not self._is_matched or (self._gathers and not exact)):
             better = search_limbs_again(
                 expansion,
                 order,

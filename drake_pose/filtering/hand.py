@@ -40,7 +40,7 @@ MEASURED = (
 
 _FLEXIONS = HAND_STATE.indices(FLEXIONS).reshape(len(FINGERS), len(JOINTS))
 # What is seen, in the kernel's own order, and where its parts begin there.
-_SEEN = HAND_STATE.indices((*WRIST, *QUATERNION, *SPREADS, *FLEXIONS, *LENGTHS, *PALM))
+SEEN = HAND_STATE.indices((*WRIST, *QUATERNION, *SPREADS, *FLEXIONS, *LENGTHS, *PALM))
 _QUATERNION, _SPREAD, _FLEXION, _LENGTH, _PALM = 2, 6, 8, 14, 20
 # A mirrored angle closer than this is the same [rad].
 _SMALLEST_CHANGE = math.radians(8)
@@ -104,14 +104,14 @@ class HandObservation:
 
     def predict(self, x: Array) -> tuple[Array, Array]:
         """Features (39,) of (13) and the scale ``|q|^2``, NaN for short axes; Jacobian (39, n)."""
-        h, seen, _ = project_hand(x[_SEEN], self.pixels_per_metre, self.shortest)
+        h, seen, _ = project_hand(x[SEEN], self.pixels_per_metre, self.shortest)
         H = np.zeros((len(MEASURED), len(HAND_STATE)))
-        H[:, _SEEN] = seen
+        H[:, SEEN] = seen
         return h, H
 
     def drawing(self, x: Array) -> Array:
         """(16, 2) pixels: base, knuckles, tip of each finger; ends of the palm's four edges."""
-        return project_hand(x[_SEEN], self.pixels_per_metre, self.shortest)[2]
+        return project_hand(x[SEEN], self.pixels_per_metre, self.shortest)[2]
 
     def mirrors(self, belief: Belief) -> list[Array]:
         """Predictions (n,) mirrored at the image plane in one joint, where (30) holds.
@@ -120,7 +120,7 @@ class HandObservation:
         from it. Only the angle at its root is changed.
         """
         x, found = belief.mean, []
-        quaternion, spreads = x[_SEEN[_QUATERNION:_SPREAD]], x[_SEEN[_SPREAD:_FLEXION]].tolist()
+        quaternion, spreads = x[SEEN[_QUATERNION:_SPREAD]], x[SEEN[_SPREAD:_FLEXION]].tolist()
         M = scaled_rotation(quaternion)[0] / (quaternion @ quaternion)
         reaches = self.mirror_reach * np.sqrt(np.diag(belief.covariance)[_FLEXIONS])
         normal = M[:, 1].tolist()

@@ -6,7 +6,6 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from rich.table import Table
@@ -14,8 +13,14 @@ from rich.table import Table
 from drake_pose.body.landmarks import landmarks_of_nodes, load_landmarks
 from drake_pose.body.model import ArticulatedModel
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
-from drake_pose.errors import SettingsError
-from drake_pose.papers.date_capture import PaperTrack, Seen, SilhouetteTrack, Studio, Track
+from drake_pose.papers.date_capture import (
+    PaperTrack,
+    Seen,
+    SilhouetteTrack,
+    Studio,
+    Track,
+    one_core,
+)
 from drake_pose.papers.tables import Count, figure_table, require_choice, uncounted
 from drake_pose.person.date.skeleton import LIMBS
 from drake_pose.person.date.walking import REGISTERED, UPRIGHT, Motion, make_motion
@@ -25,8 +30,6 @@ Array = NDArray[np.float64]
 Picture = NDArray[np.uint8]
 
 METHODS = ("silhouette", "stages", "paper")
-RENDERERS = ("drake", "own")
-FEWEST_CAMERAS = 3
 SHOWN_CAMERA = "camera_0"
 TITLES = {
     "ik_only": "the paper's IK alone",
@@ -278,12 +281,7 @@ def run_experiment(
         SettingsError: an argument is out of its range.
     """
     require_choice("method", method, METHODS)
-    require_choice("renderer", renderer, RENDERERS)
-    if cameras < FEWEST_CAMERAS:
-        raise SettingsError(f"cameras must be {FEWEST_CAMERAS} or more, not {cameras}")
-    threads = cv2.getNumThreads()
-    cv2.setNumThreads(1)
-    try:
+    with one_core():
         studio = Studio.build(cameras, size, np.random.default_rng([seed, 1]), renderer)
         motion = make_motion(studio.skeleton, frames, seed)
         result = DateResult(studio, motion, method, seed)
@@ -291,8 +289,6 @@ def run_experiment(
         for k in range(len(motion.q)):
             result.step(k)
             advance(k + 1)
-    finally:
-        cv2.setNumThreads(threads)
     return result
 
 

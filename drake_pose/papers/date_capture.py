@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -20,6 +21,7 @@ from drake_pose.body.model import ArticulatedModel, load_model
 from drake_pose.camera.models import FACE_CAMERA, Camera, PinholeCamera, circle_of_cameras
 from drake_pose.errors import SettingsError
 from drake_pose.fit.contour_fit import ContourFit
+from drake_pose.papers.tables import require_choice
 from drake_pose.person.date.faces import FACE_HEIGHT, FACE_WIDTH, cut_face, face_direction
 from drake_pose.person.date.features import Features, SkinColour
 from drake_pose.person.date.skeleton import LIMBS, Skeleton, load_skeleton
@@ -52,9 +54,21 @@ _FAR_AWAY = -9.0
 _SKIN, _CLOTHES = (217, 166, 135), (31, 88, 106)
 # An edge point every 8 pixels of 640 x 480 pictures.
 _EDGE_POINTS = 60.0
+_FEWEST_CAMERAS = 3
 # A power of two: the time from frame to frame is exactly the same, and so is the motion expected.
 PERIOD = 1.0 / 32.0
 """From frame to frame [s]."""
+
+
+@contextmanager
+def one_core() -> Iterator[None]:
+    """Have OpenCV use one core meanwhile, as all else does that is measured."""
+    threads = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    try:
+        yield
+    finally:
+        cv2.setNumThreads(threads)
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,7 +91,12 @@ class Studio:
         """A studio of this many cameras, face camera included, pictures of one size [pixel].
 
         renderer: who draws the pictures of the cameras on the circle, "drake" or "own".
+
+        Raises SettingsError: neither of them, or too few cameras.
         """
+        require_choice("renderer", renderer, ("drake", "own"))
+        if cameras < _FEWEST_CAMERAS:
+            raise SettingsError(f"cameras must be {_FEWEST_CAMERAS} or more, not {cameras}")
         model = load_model(bundled_model("person"), check=False)
         placed = circle_of_cameras(cameras - 1, size=size)
         rig = build_camera_rig(model, placed)
@@ -339,6 +358,10 @@ class SilhouetteTrack(_StagedRun):
         track = SilhouetteTrack(self._capture, self._tracker, self)
         track._set_state(replace(state, values=values, step=np.zeros(len(values))))
         return track
+
+    def place(self, q: Array) -> None:
+        """Has the person be known to be at q (nq,)."""
+        self._set_state(self._tracker.start(self._tracker.values(q)))
 
     def _state(self) -> TrackState:
         person = self._capture.person

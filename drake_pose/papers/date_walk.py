@@ -7,7 +7,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import cv2
 import numpy as np
 from pydrake.geometry import (
     GeometryInstance,
@@ -21,16 +20,15 @@ from pydrake.math import RigidTransform
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource, LogVectorOutput, TrajectorySource
-from pydrake.trajectories import PiecewisePolynomial
 from rich.table import Table
 
 from drake_pose.arrays import Array, Mask, Picture
 from drake_pose.body.model import ArticulatedModel
 from drake_pose.camera.models import PinholeCamera, look_at
-from drake_pose.papers.date_capture import PERIOD, PaperTrack, Studio
+from drake_pose.papers.date_capture import PERIOD, PaperTrack, Studio, one_core
 from drake_pose.papers.tables import Count, draw_panels, figure_table, save_figure, uncounted
 from drake_pose.person.date.walking import COMMANDS, make_gestures
-from drake_pose.systems.bodies import add_posed_plant
+from drake_pose.systems.bodies import add_posed_plant, held_positions
 from drake_pose.systems.colour_images import colour_image_to_picture, picture_to_colour_image
 from drake_pose.systems.pictures.camera_rig import add_sensors
 from drake_pose.systems.walk import Walker, garden_objects, view_from_behind, walker_transform
@@ -88,9 +86,7 @@ def run_walk_through(
 
     Arguments are those of papers.date.run_experiment; method is "paper" or "stages".
     """
-    threads = cv2.getNumThreads()
-    cv2.setNumThreads(1)
-    try:
+    with one_core():
         studio = Studio.build(cameras, size, np.random.default_rng([seed, 1]), renderer)
         motion = make_gestures(studio.skeleton)
         names, model = np.array(motion.names), studio.model
@@ -101,8 +97,6 @@ def run_walk_through(
             q[k] = track.step({name: picture_to_colour_image(one) for name, one in seen.items()})
             shots.append(seen[_SHOWN])
             advance(k + 1)
-    finally:
-        cv2.setNumThreads(threads)
     true, found = walk_by(model, motion.q), walk_by(model, q)
     seconds = {}
     for name, right in true.follows().items():
@@ -132,15 +126,14 @@ def run_walk_through(
 
 def walk_by(model: ArticulatedModel, q: Array) -> Walked:
     """The walk by positions (n, nq), a frame each PERIOD; commands need walking on the spot."""
-    builder, times = DiagramBuilder(), PERIOD * np.arange(len(q) + 1)
-    path = PiecewisePolynomial.ZeroOrderHold(times, np.vstack([q, q[-1:]]).T)
-    source = builder.AddSystem(TrajectorySource(path))
+    builder = DiagramBuilder()
+    source = builder.AddSystem(TrajectorySource(held_positions(q, PERIOD)))
     walker = builder.AddSystem(Walker(model, q[0], PERIOD, on_spot=True))
     builder.Connect(source.get_output_port(), walker.GetInputPort("positions"))
     ports = [walker.GetOutputPort(name) for name in ("command", "walker_pose", "rest")]
     logs = [LogVectorOutput(port, builder, PERIOD) for port in ports]
     simulator = Simulator(builder.Build())
-    simulator.AdvanceTo(times[-1])
+    simulator.AdvanceTo(PERIOD * len(q))
     # What is logged at a time was known before the update at that time.
     return Walked(*(log.FindLog(simulator.get_context()).data()[:, 1:].T for log in logs))
 

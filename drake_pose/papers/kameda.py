@@ -11,7 +11,6 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 from pydrake.systems.analysis import Simulator
-from pydrake.trajectories import PiecewisePolynomial
 
 from drake_pose.body.formats.packages import bundled_model
 from drake_pose.body.model import load_model
@@ -30,6 +29,7 @@ from drake_pose.silhouette.areas.outline import Outline
 from drake_pose.silhouette.areas.scoring import draw_labels, draw_mask
 from drake_pose.silhouette.pictures.label_images import label_image_to_mask
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
+from drake_pose.systems.bodies import held_positions
 from drake_pose.systems.estimators.diagrams import build_simulated_matching
 from drake_pose.systems.estimators.silhouette_matcher import camera_port
 
@@ -243,7 +243,8 @@ def run_experiment(
     trials = []
     for values in drawn:
         changed = other_generator if mismatch else None
-        *seen, whole = _draw_views(search, (*cameras, wide), values, changed)
+        drawn_for = (wide,) if simulated else (*cameras, wide)
+        *seen, whole = _draw_views(search, drawn_for, values, changed)
         if simulated is None:
             tolerance, answer = 0.0, timed.match(seen)
         else:
@@ -294,9 +295,7 @@ def _simulate(
 ) -> Iterator[tuple[list[View], PoseEstimate]]:
     """What Drake's sensors see of poses, one a second, and what the matcher answers."""
     q = np.array([search.tree.positions_from(values)[0] for values in drawn])
-    times = np.arange(len(q) + 1) - 0.5
-    moving = PiecewisePolynomial.ZeroOrderHold(times, np.vstack([q, q[-1:]]).T)
-    simulated = build_simulated_matching(search, cameras, moving, period=1.0)
+    simulated = build_simulated_matching(search, cameras, held_positions(q, 1.0), period=1.0)
     simulator = Simulator(simulated.diagram)
     matcher = simulated.matcher
     ports = [matcher.GetInputPort(camera_port("label_image", one, cameras)) for one in cameras]

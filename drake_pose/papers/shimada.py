@@ -13,7 +13,6 @@ from typing import NamedTuple, cast
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.systems.analysis import Simulator
-from pydrake.trajectories import PiecewisePolynomial
 from rich.table import Table
 from scipy.special import chdtri
 
@@ -47,6 +46,7 @@ from drake_pose.papers.shimada_motion import (
 )
 from drake_pose.papers.tables import Count, figure_table, require_choice, require_counts, uncounted
 from drake_pose.silhouette.pictures.label_images import label_image_to_mask
+from drake_pose.systems.bodies import held_positions
 from drake_pose.systems.estimators.hand_tracking import build_hand_estimation
 
 Array = NDArray[np.float64]
@@ -285,8 +285,7 @@ def _filter_pictures(hand_filter: TruncatedFilter, sequence: SyntheticSequence) 
         plant_positions(x, model.position_names, PIXELS_PER_METRE, _DISTANCE)
         for x in sequence.states
     ]
-    breaks = _PERIOD * (np.arange(FRAMES + 1) - 0.3)
-    positions = PiecewisePolynomial.ZeroOrderHold(breaks, np.array([*q, q[-1]]).T)
+    positions = held_positions(np.array(q), _PERIOD)
     silhouette = HandSilhouette(hand_filter, _WIDTH, _HEIGHT, center)
     diagram, ekf, sensor = build_hand_estimation(
         model, camera, silhouette, sequence.guess, positions, _PERIOD
@@ -336,12 +335,10 @@ class _Track:
 
 def _bound(hand_filter: TruncatedFilter, sequence: SyntheticSequence) -> Array:
     """(n,) what a filter believes at the end that linearises at the truth, without limits."""
-    A = HAND_STATE.transition()
-    U = HAND_STATE.process_noise(ACCELERATIONS)
     belief = sequence.guess
     for t, (truth, y) in enumerate(zip(sequence.states, sequence.measurements, strict=True)):
         if t:
-            belief = belief.moved(A, U)
+            belief = hand_filter.predicted(belief)
         belief = update(belief, make_evidence(hand_filter.observation, y), 1, truth).belief
     return belief.mean
 

@@ -20,6 +20,7 @@ from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.framework import Context, DiagramBuilder, EventStatus, LeafSystem, OutputPort
 from pydrake.systems.rendering import MultibodyPositionToGeometryPose
+from pydrake.trajectories import PiecewisePolynomial, Trajectory
 
 from drake_pose.arrays import Array
 from drake_pose.body.parsed_model import ParsedModel
@@ -246,6 +247,12 @@ def add_meshcat_skin(
         ),
     )
     builder.Connect(positions, drawer.get_input_port())
+
+
+def held_positions(q: Array, period: float) -> Trajectory:
+    """Positions (n, nq), the k-th held from half a period before k periods to half a one after."""
+    times = period * (np.arange(len(q) + 1) - 0.5)
+    return PiecewisePolynomial.ZeroOrderHold(times, np.vstack([q, q[-1:]]).T)
 
 
 class RobotStateMessage(PortedSystem):

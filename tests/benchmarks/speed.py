@@ -9,7 +9,6 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 import trimesh
 from rich.console import Console
@@ -19,7 +18,7 @@ from drake_pose.body.formats.packages import bundled_model
 from drake_pose.body.model import load_model
 from drake_pose.body.surfaces.meshes import TriangleMesh
 from drake_pose.camera.models import ParallelCamera, PinholeCamera
-from drake_pose.papers.date_capture import SilhouetteTrack, Studio
+from drake_pose.papers.date_capture import SilhouetteTrack, Studio, one_core
 from drake_pose.papers.kameda import experiment_camera, experiment_search, run_experiment
 from drake_pose.papers.kameda_figures import grid_table
 from drake_pose.person.date.walking import FEWEST_FRAMES, MOTIONS, make_motion
@@ -109,14 +108,10 @@ def measure_cost(cameras: int, size: tuple[int, int] = (640, 480), seed: int = 0
     begin = motion.names.index(MOTIONS[0])
     track = SilhouetteTrack.build(studio.model, studio.cameras, studio.backgrounds)
     track.place(motion.q[begin])
-    threads = cv2.getNumThreads()
-    cv2.setNumThreads(1)
-    try:
+    with one_core():
         for q in motion.q[begin : begin + _FRAMES]:
             shots = studio.pictures(q)
             track.step({name: picture_to_colour_image(one) for name, one in shots.items()})
-    finally:
-        cv2.setNumThreads(threads)
     laps = [(lap["region"] + lap["edge"], lap["pose"]) for lap in track.milliseconds]
     return np.asarray(np.median(laps, axis=0))
 

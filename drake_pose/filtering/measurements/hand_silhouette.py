@@ -14,13 +14,12 @@ from drake_pose.filtering.hand import (
     FINGERS,
     FLEXIONS,
     HAND_STATE,
-    LENGTHS,
     LINE_ENDS,
     LINE_STARTS,
     MEASURED,
     PALM,
     QUATERNION,
-    SPREADS,
+    SEEN,
     WRIST,
     HandObservation,
     scaled_rotation,
@@ -42,9 +41,8 @@ Mask = NDArray[np.bool_]
 FINGER_RADIUS = 0.008
 """Of the bundled hand's fingers [m]."""
 
-# What a pose is searched over, in the state; lines and tips among MEASURED; how many lines are
+# Parts of the state; lines and tips among MEASURED; how many lines are
 # fingers', and those that end in a tip.
-_SEEN = HAND_STATE.indices((*WRIST, *QUATERNION, *SPREADS, *FLEXIONS, *LENGTHS, *PALM))
 _WRIST, _QUATERNION, _PALM = (HAND_STATE.indices(names) for names in (WRIST, QUATERNION, PALM))
 _SCALE = MEASURED.index("scale")
 _AXES, _FINGER_LINES = slice(MEASURED.index("alpha_11"), _SCALE), len(FLEXIONS)
@@ -199,12 +197,12 @@ class HandSilhouette:
         small = cv2.resize(mask.view(np.uint8), size, interpolation=cv2.INTER_NEAREST)
         generator, mean = np.random.default_rng(seed), prediction.mean
         rows = self.belief_filter.inequalities
-        narrowed = np.minimum(1.0, _WIDEST / np.maximum(prediction.deviations()[_SEEN], 1e-12))
-        P = prediction.covariance[np.ix_(_SEEN, _SEEN)] * np.outer(narrowed, narrowed)
+        narrowed = np.minimum(1.0, _WIDEST / np.maximum(prediction.deviations()[SEEN], 1e-12))
+        P = prediction.covariance[np.ix_(SEEN, SEEN)] * np.outer(narrowed, narrowed)
         spread, elite = np.sqrt(np.diag(P)), mean[None]
         for k in range(_SEARCH_ROUNDS):
             poses = np.tile(mean, (_POSES, 1))
-            poses[:, _SEEN] += generator.normal(size=(_POSES, len(_SEEN))) @ factor_of(P).T
+            poses[:, SEEN] += generator.normal(size=(_POSES, len(SEEN))) @ factor_of(P).T
             poses[: len(elite)] = elite
             norms = np.linalg.norm(poses[:, _QUATERNION], axis=1, keepdims=True)
             poses[:, _QUATERNION] *= np.linalg.norm(prediction.mean[_QUATERNION]) / norms
@@ -214,6 +212,6 @@ class HandSilhouette:
             wrong = [np.count_nonzero(self.draw(x, _ZOOM) != small) for x in poses]
             elite = poses[np.argsort(wrong)[:_ELITE]]
             mean = elite.mean(axis=0)
-            off = (elite - mean)[:, _SEEN]
+            off = (elite - mean)[:, SEEN]
             P = off.T @ off / len(off) + np.diag((0.15 * spread) ** 2) * 0.5**k
         return elite[:_FOLLOWED]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -335,7 +335,7 @@ def reproduce_all(*, out: Out, short: bool = False, resume: Resume = False) -> N
     Args:
         short: A few images and runs only, to see that it works.
     """
-    with _experiment(None if resume else out) as count:
+    with _experiment(out, resume) as count:
         from drake_pose.papers.all_experiments import reproduce_all as run
 
         page = run(out, short, count, lambda text: say(f"drake-pose: {text}"))
@@ -343,13 +343,11 @@ def reproduce_all(*, out: Out, short: bool = False, resume: Resume = False) -> N
 
 
 @contextmanager
-def _experiment(out: Path | None) -> Iterator[Count]:
-    """Requires an empty folder for results; the value begins a progress bar, ending the last."""
-    from drake_pose.files.folder import require_empty
+def _experiment(out: Path | None, resume: bool = False) -> Iterator[Count]:
+    """Claims an empty folder for results; the value begins a progress bar, ending the last."""
+    from drake_pose.files.folder import claimed
 
-    if out is not None:
-        require_empty(out)
-    with ExitStack() as bars:
+    with ExitStack() as bars, nullcontext() if out is None else claimed(out, resume):
 
         def count(what: str, total: int) -> Callable[[int], None]:
             bars.close()

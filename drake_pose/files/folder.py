@@ -5,11 +5,15 @@ Files are moved into place: none is ever half there.
 
 from __future__ import annotations
 
+import fcntl
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from functools import wraps
+from inspect import signature
 from pathlib import Path
-from typing import Any
+from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
 
@@ -23,6 +27,9 @@ REPLAY, REPORT = "replay.html", "report.html"
 JOINT_CENTRES = "joint_centres.csv"
 TRC, MOT, BVH = "joint_centres.trc", "positions.mot", "motion.bvh"
 OVERLAY, SHAPES = "overlay", "shapes.png"
+
+_P = ParamSpec("_P")
+_T = TypeVar("_T")
 
 RESULT_FILES = (
     POSES, JOINTS, FAMILIES, SUMMARY, REPLAY, REPORT, JOINT_CENTRES, TRC, MOT, BVH, SHAPES
@@ -52,10 +59,59 @@ def write_summary(folder: Path, summary: Mapping[str, Any]) -> None:
     write_file(folder, SUMMARY, text + "\n")
 
 
-def require_empty(path: Path) -> None:
-    """Refuses (OutputError) a folder that holds something, and a place where none can be."""
+@contextmanager
+def claimed(path: Path, resume: bool = False) -> Iterator[None]:
+    """Keeps other runs out of a result's folder, which is made; only to resume may it hold files.
+
+    The lock is the system's, on the folder itself: it ends with the process, whatever ends that.
+
+    Raises:
+        OutputError: another run is writing there, it is not empty, or there cannot be a folder.
+    """
     require_no_file(path)
-    if path.is_dir() and any(path.iterdir()):
+    made = [place for place in (path, *path.parents) if not place.exists()]
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        folder = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
+    except OSError as error:
+        raise cannot_write(path, error) from error
+    try:
+        fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        os.close(folder)
+        raise OutputError(
+            f"{path}: another run is writing its result there; wait for it, or name another folder "
+            "with --out"
+        ) from None
+    except OSError:
+        pass  # Some disks that computers share know no locks.
+    try:
+        if not resume:
+            _require_empty(path)
+        yield
+    finally:
+        with suppress(OSError):
+            for place in made:
+                place.rmdir()  # Where nothing was written nothing is left.
+        os.close(folder)
+
+
+def writes_folder(job: Callable[_P, _T]) -> Callable[_P, _T]:
+    """A job whose argument ``out`` names a folder, if any, that is claimed while it runs."""
+
+    @wraps(job)
+    def run(*args: _P.args, **kwargs: _P.kwargs) -> _T:
+        given = signature(job).bind(*args, **kwargs).arguments
+        if given.get("out") is None:
+            return job(*args, **kwargs)
+        with claimed(Path(given["out"]), given.get("resume", False)):
+            return job(*args, **kwargs)
+
+    return run
+
+
+def _require_empty(path: Path) -> None:
+    if any(path.iterdir()):
         raise OutputError(
             f"{path}: the output folder exists and is not empty; name another one with --out, or "
             "go on with an interrupted result in it with --resume"

@@ -14,7 +14,7 @@ import numpy as np
 
 from drake_pose.body.model import ArticulatedModel
 from drake_pose.errors import OutputError, SettingsError
-from drake_pose.files.folder import read_summary, require_empty
+from drake_pose.files.folder import read_summary
 from drake_pose.files.options import percent
 from drake_pose.files.records import FrameRecord, PoseRow
 from drake_pose.files.settings import EstimateSettings
@@ -60,20 +60,16 @@ def mask_digests(scene: Scene, cameras: Iterable[str], frame: str) -> dict[str, 
 
 
 def open_job(folder: Path | None, job: Mapping[str, Any], resume: bool) -> Mapping[str, Any] | None:
-    """The summary of the job that is resumed; None where it is a new one, for an empty folder.
+    """The summary of the job that is resumed; None where it is a new one.
 
     Raises:
         SettingsError: nothing says which job is to be resumed.
-        OutputError: that one had other files or settings, but for the frames; or the folder of a
-            new one is not empty.
+        OutputError: that one had other files or settings, but for the frames.
     """
-    if folder is None:
-        if resume:
-            raise SettingsError("resume needs the folder of the result that is to be resumed")
-        return None
     if not resume:
-        require_empty(folder)
         return None
+    if folder is None:
+        raise SettingsError("resume needs the folder of the result that is to be resumed")
     recorded = read_summary(folder)
     for name in ("model", "cameras"):
         if recorded.get("sha256", {}).get(name) != job["sha256"][name]:

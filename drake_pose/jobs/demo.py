@@ -7,7 +7,7 @@ from pathlib import Path
 
 from drake_pose.body.formats.packages import bundled_model
 from drake_pose.errors import OutputError, SceneError
-from drake_pose.files.folder import OVERLAY, RESULT_FILES, SUMMARY, require_empty
+from drake_pose.files.folder import OVERLAY, RESULT_FILES, SUMMARY, claimed
 from drake_pose.files.records import SceneEstimate
 from drake_pose.files.settings import EstimateSettings
 from drake_pose.files.writer import OnFrame
@@ -61,7 +61,8 @@ def run_demo(out: Path, on_frame: OnFrame | None = None) -> SceneEstimate:
         OutputError: if the folder holds something else.
     """
     scene = demo_scene()
-    _clear_earlier_demo(out, scene)
+    with claimed(out, resume=True):
+        _clear_earlier_demo(out, scene)
     return estimate_scene(scene, bundled_model(MODEL), out, demo_settings(scene), on_frame=on_frame)
 
 
@@ -73,7 +74,6 @@ def _clear_earlier_demo(out: Path, scene: Path) -> None:
     except (OSError, ValueError, TypeError, KeyError):
         is_demo = False
     if not is_demo or {file.name for file in out.iterdir()} - {*RESULT_FILES, OVERLAY}:
-        require_empty(out)
         return
     try:
         for file in (*(out / name for name in RESULT_FILES), *(out / OVERLAY).glob("*/*.png")):

@@ -1,12 +1,19 @@
+import inspect
 import json
+import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from drake_pose.errors import OutputError
-from drake_pose.files.folder import read_summary, require_empty, write_file, write_summary
+from drake_pose import audit_scene, estimate_scene, make_masks, register_scene
+from drake_pose.errors import OutputError, SceneError
+from drake_pose.files.folder import claimed, read_summary, write_file, write_summary
 from drake_pose.files.records import PoseRow, PoseTable
+from drake_pose.jobs.batch.batch import run_batch
+from drake_pose.jobs.live.capture import capture_live
 
 NAMES = ("a", "b")
 
@@ -68,9 +75,44 @@ def test_a_folder_that_holds_something_or_cannot_be_is_refused(tmp_path: Path) -
         (tmp_path / "out" / "deeper", "out: is a file"),
         (tmp_path / ("a" * 300), "aaa: cannot be written: File name too long"),
     ):
-        with pytest.raises(OutputError, match=message):
-            require_empty(place)
+        with pytest.raises(OutputError, match=message), claimed(place):
+            pass
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
+
+
+HOLD = """
+import sys
+from pathlib import Path
+from drake_pose.files.folder import claimed
+with claimed(Path(sys.argv[1])):
+    print("held", flush=True)
+    sys.stdin.read()
+"""
+
+
+def test_a_folder_belongs_to_one_run_until_that_ends_however_it_ends(tmp_path: Path) -> None:
+    place = tmp_path / "new" / "out"
+    jobs = (estimate_scene, register_scene, audit_scene, make_masks, run_batch, capture_live)
+    command = [sys.executable, "-c", HOLD, str(place)]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as other:
+        assert other.stdout is not None
+        assert other.stdout.readline() == b"held\n"
+        for job in jobs:
+            given = dict.fromkeys(inspect.signature(job).parameters)
+            for resume in (False, True):
+                arguments = {**given, "out": place, "resume": resume}
+                arguments = {name: value for name, value in arguments.items() if name in given}
+                with pytest.raises(OutputError, match="another run is writing its result there"):
+                    job(**arguments)
+        other.kill()
+    # Nothing was written, by any: no file is left, and the folders only as the one was killed.
+    assert not list(place.iterdir())
+    with claimed(place):
+        pass
+    shutil.rmtree(tmp_path / "new")
+    with pytest.raises(SceneError), claimed(place):
+        raise SceneError("nothing came of it")
+    assert not list(tmp_path.iterdir())
 
 
 def test_files_appear_whole_or_not_at_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 from drake_pose.csv_files import csv_text
 from drake_pose.errors import ClusterError, DrakePoseError, OutputError
-from drake_pose.files.folder import require_empty, without_nan, write_file
+from drake_pose.files.folder import without_nan, write_file, writes_folder
 from drake_pose.jobs.batch.job import SceneJob
 from drake_pose.jobs.batch.tasks import (
     Outcome,
@@ -108,6 +108,7 @@ class SceneState:
         }
 
 
+@writes_folder
 def run_batch(
     jobs: Sequence[SceneJob],
     out: Path,
@@ -132,8 +133,6 @@ def run_batch(
     out = out.absolute()
     if resume:
         _check_same_batch(jobs, out)
-    else:
-        require_empty(out)
     batch = Batch(jobs, out, on_progress)
     try:
         batch.write()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from drake_pose.files.folder import SHAPES
+from drake_pose.files.folder import SHAPES, writes_folder
 from drake_pose.files.overlay import encode_png
 from drake_pose.files.records import SceneEstimate
 from drake_pose.files.settings import EstimateSettings
@@ -16,6 +16,7 @@ from drake_pose.jobs.estimate.matching import compare_cameras, match_frames
 from drake_pose.jobs.estimate.person import follow_person
 
 
+@writes_folder
 def estimate_scene(
     scene: Path | str,
     model: Path | str,

@@ -15,7 +15,7 @@ from drake_pose.body.model import ArticulatedModel, load_model
 from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import CameraError, OutputError, SceneError, SettingsError, UnknownNameError
-from drake_pose.files.folder import read_summary, require_empty
+from drake_pose.files.folder import read_summary, writes_folder
 from drake_pose.jobs.estimate.inputs import bundled_person
 from drake_pose.jobs.live.frame_results import LiveResult, LiveWriter
 from drake_pose.jobs.live.run import look_until
@@ -49,6 +49,7 @@ from drake_pose.systems.ports import evaluate
 _FRAMES = 40
 
 
+@writes_folder
 def capture_live(
     scene: LiveScene,
     out: Path,
@@ -82,8 +83,6 @@ def capture_live(
     settings, opener = settings or LiveSettings(), open_sensors or scene.open_sensors
     usual = bundled_person() if method == "person" else bundled_model("person")
     model = load_model(model_path or usual, package_paths=settings.packages)
-    # A folder that cannot be written is refused before a camera is opened.
-    require_empty(out)
     setup = shape = None
     if method != "person":
         how = CAPTURE_METHODS[method]

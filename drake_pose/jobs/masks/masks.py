@@ -14,7 +14,7 @@ import yaml
 
 from drake_pose.camera.picture_files import Picture
 from drake_pose.errors import DrakePoseError, MaskError, OutputError
-from drake_pose.files.folder import OVERLAY, require_empty, write_file, write_summary
+from drake_pose.files.folder import OVERLAY, write_file, write_summary, writes_folder
 from drake_pose.jobs.masks.finding import find_masks
 from drake_pose.jobs.masks.settings import MaskSettings
 from drake_pose.jobs.masks.sources import UNNAMED, Source, open_source
@@ -53,6 +53,7 @@ class SceneMasks:
         return tuple(self.summary["warnings"])
 
 
+@writes_folder
 def make_masks(
     source: str | Path,
     out: str | Path,
@@ -77,7 +78,6 @@ def make_masks(
         DrakePoseError: names the file, camera or frame at fault; no picture has a good mask.
     """
     settings, folder = settings or MaskSettings(), Path(out)
-    require_empty(folder)
     opened = open_source(Path(source), settings.cameras)
     cameras: dict[str, dict[str, Any]] = {}
     doubts: list[str] = []

@@ -14,7 +14,7 @@ from drake_pose.body.model import load_model
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.camera.camera_files import load_cameras
 from drake_pose.errors import MaskError, SceneError
-from drake_pose.files.folder import require_empty, write_summary
+from drake_pose.files.folder import write_summary, writes_folder
 from drake_pose.files.options import percent
 from drake_pose.files.settings import EstimateSettings
 from drake_pose.files.summary import mask_digests
@@ -51,6 +51,7 @@ class SceneAudit:
     folder: Path | None
 
 
+@writes_folder
 def audit_scene(
     scene: Path | str,
     model: Path | str,
@@ -75,8 +76,6 @@ def audit_scene(
         DrakePoseError: names the file, camera, frame or joint at fault.
     """
     settings, folder = settings or AuditSettings(), None if out is None else Path(out)
-    if folder is not None:
-        require_empty(folder)
     files = {
         "model": Path(model),
         "cameras": Path(cameras or Path(scene) / CAMERA_FILE),

@@ -18,7 +18,7 @@ from drake_pose.body.model import OBJECT_POSITIONS
 from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.camera.models import Camera, PinholeCamera
-from drake_pose.files.folder import require_empty
+from drake_pose.files.folder import writes_folder
 from drake_pose.files.options import percent
 from drake_pose.files.summary import BADLY_EXPLAINED
 from drake_pose.jobs.estimate.inputs import missing_for_person
@@ -77,6 +77,7 @@ class SceneRegistration:
     folder: Path | None
 
 
+@writes_folder
 def register_scene(
     scene: Path | str,
     model: Path | str,
@@ -107,8 +108,6 @@ def register_scene(
         "cameras": Path(scene) / CAMERA_FILE,
         "joints": None if joints is None else Path(joints),
     }
-    if folder is not None:
-        require_empty(folder)
     work = _Registration(read_inputs(Path(scene), Path(model), files["joints"], settings), settings)
     work.check_held()
     work.find_each(on_camera)

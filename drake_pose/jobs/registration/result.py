@@ -17,7 +17,6 @@ from drake_pose.camera.models import Camera
 from drake_pose.files.folder import (
     OVERLAY,
     REPORT,
-    require_empty,
     without_nan,
     write_file,
     write_summary,
@@ -164,9 +163,8 @@ def write_result(
         urdf: the robot with the zeros and lengths that were found.
 
     Raises:
-        OutputError: the folder is not empty, or cannot be written.
+        OutputError: the folder cannot be written.
     """
-    require_empty(path)
     parts = summary["cameras"]
     for name, found in registered.items() if overlay else ():
         titles = [

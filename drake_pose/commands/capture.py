@@ -61,9 +61,10 @@ def capture(
     """Capture the motion of one person before several calibrated cameras, from masks or live.
 
     Nothing need be known of the person: lengths and girths are fitted to the first frames. This is
-    estimate with the bundled person as the model. Pictures or videos need masks of the first frame
-    alone, in two cameras or more; with --start no mask. If the folder has sources.yaml beside
-    cameras.yaml, frames are captured as they come, from live cameras in real time, until Ctrl-C.
+    estimate with the bundled person as the model, of a sequence of frames unless scene.yaml has
+    sequence: false. Pictures or videos need masks of the first frame alone, in two cameras or more;
+    with --start no mask. If the folder has sources.yaml beside cameras.yaml, frames are captured as
+    they come, from live cameras in real time, until Ctrl-C.
 
         drake-pose capture STUDIO --out results/person --seconds 60
 

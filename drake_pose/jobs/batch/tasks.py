@@ -176,7 +176,7 @@ def _require_same_masks(task: Task) -> None:
 def _load(job: SceneJob) -> Scene:
     """A job's scene."""
     cameras = None if job.camera_file is None else load_cameras(job.camera_file)
-    return load_scene(job.scene, cameras)
+    return load_scene(job.scene, cameras, sequence=job.settings.method == "person")
 
 
 def _note_attempt(task: Task) -> None:

@@ -105,7 +105,10 @@ def read_inputs(
 
     Raises DrakePoseError naming the file, camera, frame, link or joint at fault.
     """
-    scene, frames = read_scene(scene_path, settings.cameras, settings.frames)
+    # Who is captured moves.
+    scene, frames = read_scene(
+        scene_path, settings.cameras, settings.frames, sequence=settings.method == "person"
+    )
     model = load_model(model_path, package_paths=settings.packages)
     if settings.unseen:
         model, settings = leave_out_links(model, settings)

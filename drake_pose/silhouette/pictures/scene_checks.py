@@ -30,14 +30,15 @@ def read_scene(
     wanted: Sequence[str] = (),
     frames: Sequence[str] = (),
     cameras: Mapping[str, Camera] | None = None,
+    sequence: bool = False,
 ) -> tuple[Scene, tuple[str, ...]]:
     """A checked scene of the wanted cameras, and its wanted frames; none named: all.
 
-    Given ``cameras`` are used instead of the folder's.
+    Given ``cameras`` are used instead of the folder's; ``sequence`` as of ``load_scene``.
 
     Raises DrakePoseError: names the file, camera or frame that is wrong or not there.
     """
-    scene = check_scene(load_scene(path, cameras, wanted)).of_cameras(wanted)
+    scene = check_scene(load_scene(path, cameras, wanted, sequence)).of_cameras(wanted)
     return scene, scene.seen_frames(frames)
 
 

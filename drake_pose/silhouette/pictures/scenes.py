@@ -149,7 +149,10 @@ class Scene:
 
 
 def load_scene(
-    path: str | Path, cameras: Mapping[str, Camera] | None = None, wanted: Sequence[str] = ()
+    path: str | Path,
+    cameras: Mapping[str, Camera] | None = None,
+    wanted: Sequence[str] = (),
+    sequence: bool = False,
 ) -> Scene:
     """Reads what a scene's folder holds; masks are read when they are asked for.
 
@@ -159,7 +162,7 @@ def load_scene(
     masks. A single camera's masks may lie in ``masks/<frame>.png``; without a camera file they were
     taken by an uncalibrated camera, or by several where the pictures' sizes differ. Given
     ``cameras`` are used instead of the folder's. Where all the ``wanted`` ones have an X_WC, others
-    may lack it.
+    may lack it. ``sequence``: whether it is one where scene.yaml does not say.
 
     Raises:
         SceneError: names the folder and what is missing or wrong in it.
@@ -168,7 +171,7 @@ def load_scene(
     folder = Path(path)
     if not folder.is_dir():
         raise SceneError(f"{folder}: no such folder; a scene has cameras.yaml and masks")
-    sequence, frame_rate_hz = _read_settings(folder / SCENE_FILE)
+    sequence, frame_rate_hz = _read_settings(folder / SCENE_FILE, sequence)
     if cameras is None:
         if not os.path.lexists(folder / CAMERA_FILE):
             cameras, masks = _unknown_cameras(folder)
@@ -230,10 +233,10 @@ def _unknown_cameras(folder: Path) -> tuple[dict[str, Camera], dict[tuple[str, s
     return cameras, {(names[frame], frame): file for (_, frame), file in found.items()}
 
 
-def _read_settings(path: Path) -> tuple[bool, float | None]:
-    """Returns sequence and frame_rate_hz of a scene.yaml, which may be missing."""
+def _read_settings(path: Path, sequence: bool) -> tuple[bool, float | None]:
+    """Returns sequence, and frame_rate_hz, of a scene.yaml, which may be missing."""
     if not path.exists():
-        return False, None
+        return sequence, None
     content = read_yaml(path, SceneError)
     if not isinstance(content, dict):
         raise SceneError(f"{path}: expected a mapping with {', '.join(_FIELDS)}")
@@ -242,7 +245,7 @@ def _read_settings(path: Path) -> tuple[bool, float | None]:
         raise SceneError(
             f"{path}: unknown field {', '.join(unknown)}; a scene has: {', '.join(_FIELDS)}"
         )
-    sequence = content.get("sequence", False)
+    sequence = content.get("sequence", sequence)
     if not isinstance(sequence, bool):
         raise SceneError(f"{path}: sequence must be true or false")
     rate = content.get("frame_rate_hz")

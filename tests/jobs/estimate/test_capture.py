@@ -121,6 +121,19 @@ def test_stills_cameras_and_frames_are_chosen_like_an_estimates(
     assert len(read_rows(out / "joint_centres.csv")) == 2 * 14
 
 
+def test_a_capture_is_of_a_sequence_unless_the_scene_says_otherwise(
+    own_recording: PersonScene, known: list[int], runner: CliRunner, tmp_path: Path
+) -> None:
+    given = ["capture", str(own_recording.folder), "--model", str(own_recording.person.path)]
+    own_recording.folder.joinpath("scene.yaml").unlink()
+    for said in ("motion", "stills"):
+        out = tmp_path / said
+        done = runner.invoke(app, [*given, "--out", str(out), "--no-replay", "--no-overlay"])
+        assert done.exit_code == 0, done.output
+        assert (out / "motion.bvh").exists() == (said == "motion")
+        own_recording.folder.joinpath("scene.yaml").write_text("sequence: false\n")
+
+
 def test_the_command_capture_takes_the_bundled_person(
     recording: PersonScene,
     runner: CliRunner,

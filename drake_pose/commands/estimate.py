@@ -173,7 +173,8 @@ def _print_totals(console: Console, result: SceneEstimate) -> None:
     console.print(f"E_total        {percent(summary['mean_E_total'])} in the mean")
     console.print(f"seconds        {summary['median_seconds']:.2f} a frame in the median")
     if summary["mean_iou"] is not None:
-        console.print(f"IoU            {percent(summary['mean_iou'])} in the mean")
+        frames = f"{summary['compared_count']} of {len(result.records)} frames"
+        console.print(f"IoU            {percent(summary['mean_iou'])} in the mean of {frames}")
     for label, file in (("poses", POSES), ("report", REPORT), ("replay", REPLAY)):
         if result.folder is not None and (result.folder / file).is_file():
             console.print(f"{label:<14} {escape(str(result.folder / file))}", soft_wrap=True)

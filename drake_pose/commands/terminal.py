@@ -14,8 +14,6 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 if TYPE_CHECKING:
     from drake_pose.files.records import FrameRecord
 
-_LIMITS = {"run_limit": "run limit", "time_limit": "time limit"}
-
 
 class UsageError(Exception):
     """Options that do not go together; exit status 2."""
@@ -76,11 +74,11 @@ def count_progress(what: str, total: int | None) -> Iterator[Callable[[int], Non
 
 
 class FrameProgress:
-    """A progress bar over frames that also says where no pose was found."""
+    """A progress bar over frames that also counts those without a pose."""
 
     def __init__(self) -> None:
         self._progress = progress_bar()
-        self._stage = "reading"
+        self._stage, self._lost = "reading", 0
         self._task = self._progress.add_task(self._stage, total=None)
 
     def __enter__(self) -> FrameProgress:
@@ -102,17 +100,7 @@ class FrameProgress:
 
     def __call__(self, finished: int, total: int, frame: str, record: FrameRecord | None) -> None:
         """Show that a frame is finished."""
-        from drake_pose.files.options import percent
-
         self.show_stage("frames", finished, total)
-        if record is None:
-            return
-        if not record.found:
-            warn(f"frame '{frame}': no pose was found")
-        elif not record.explained:
-            warn(
-                f"frame '{frame}': no pose explains the silhouettes: E_total is "
-                f"{percent(record.E_total)} at best"
-            )
-        elif record.stopped_by in _LIMITS:
-            warn(f"frame '{frame}': the search was stopped by the {_LIMITS[record.stopped_by]}")
+        if record is not None and not record.found:
+            self._lost += 1
+            self._progress.update(self._task, description=f"frames ({self._lost} without a pose)")

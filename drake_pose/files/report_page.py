@@ -106,7 +106,6 @@ def make_report(
         ious=plot_curves(frames, ious, joined=joined),
         cameras=[_camera_row(scene, estimate, name) for name in scene.cameras],
         grid=draw_grid(frames, [*use, ("pose", found)]),
-        lost=[row.frame for row in estimate.rows if not row.found],
         moving=[one for one in joints if one["name"] not in stay],
         still=[one for one in joints if one["name"] in stay],
         pictures=_pick_pictures(folder, scene, estimate),

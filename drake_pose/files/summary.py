@@ -32,6 +32,7 @@ _AT_LIMIT = 1e-3
 _SUSPICIOUS = 0.15
 # Of a mask's digest this many digits are kept.
 _DIGITS = 16
+_LIMITS = {"run_limit": "run limit", "time_limit": "time limit"}
 _PACKAGES = ("drake", "numpy", "numba", "opencv-python-headless")
 
 
@@ -103,6 +104,7 @@ def summarize(
         "found_count": sum(record.found for record in records.values()),
         "mean_E_total": float(np.mean(errors)) if errors else None,
         "mean_iou": float(np.mean(ious)) if ious else None,
+        "compared_count": sum(bool(record.ious) for record in records.values()),
         "median_seconds": float(np.median(seconds)) if seconds else None,
         "joint_errors": _joint_errors(records),
         "cameras": describe_cameras(records),
@@ -138,6 +140,23 @@ def camera_warnings(
         "since it was calibrated, or are its masks poor?"
         for name, mean in means.items()
         if mean < usual - _SUSPICIOUS and not any(f"'{name}'" in text for text in known)
+    )
+
+
+def frame_warnings(records: Mapping[str, FrameRecord]) -> tuple[str, ...]:
+    """One warning of all frames without a pose, and of all whose search was stopped."""
+    found: dict[str, list[str]] = {}
+    for frame, record in records.items():
+        # Why a person is not found is said where one is followed.
+        if not record.found and record.share is None:
+            found.setdefault("no pose was found", []).append(frame)
+        elif record.found and record.stopped_by in _LIMITS:
+            text = f"the search was stopped by the {_LIMITS[record.stopped_by]}"
+            found.setdefault(text, []).append(frame)
+    known = list(records)
+    return tuple(
+        f"frame {frame_ranges(frames, known)} ({len(frames)} of {len(known)}): {text}"
+        for text, frames in found.items()
     )
 
 

@@ -37,6 +37,7 @@ from drake_pose.files.replay import make_replay
 from drake_pose.files.report_page import make_report
 from drake_pose.files.summary import (
     camera_warnings,
+    frame_warnings,
     mask_digests,
     poor_fit_warnings,
     summarize,
@@ -190,6 +191,7 @@ class ResultWriter:
     def finish(self, replay: bool) -> None:
         """Write what is made of all frames; then the result is complete."""
         done = self.result()
+        self.warnings += frame_warnings(done.records)
         self.warnings += camera_warnings(done.records, self.warnings)
         held = self._job.get("settings", {}).get("hold", {})
         self.warnings += poor_fit_warnings(done.rows, done.records, self.model, held)

@@ -123,8 +123,10 @@ def finish_frame(
         shown: the masks and pictures over which the body is drawn.
         more: fields of FrameRecord.
     """
-    base = base_cells(pose.X_WB) if inputs.base_moves and pose.found else None
-    row = PoseRow(frame, pose.q, base, pose.E_total, pose.seconds)
+    row = PoseRow(frame, np.full(len(pose.q), np.nan), None, math.nan, pose.seconds)
+    if pose.found:
+        base = base_cells(pose.X_WB) if inputs.base_moves else None
+        row = PoseRow(frame, pose.q, base, pose.E_total, pose.seconds)
     more["stopped_by"] = pose.stopped_by
     if row.found:
         more["joint_errors"] = inputs.joint_errors(frame, pose.q)

@@ -191,7 +191,7 @@ class LiveWriter:
     def _doubts_of(self, context: Context, ious: Mapping[str, float]) -> Iterator[str]:
         """Why one should not trust the paper's stages in a frame."""
         if not np.isfinite(self._value(context, "estimated_positions")).all():
-            yield "before the registered pose; no pose"
+            yield "before the registered pose"
             return
         # Where a pose was recognised no feature need be measured.
         if np.isfinite(self._value(context, "limb_points")).all():

@@ -271,7 +271,7 @@ def test_a_mask_that_no_pose_explains(own_scene: TinyScene, runner: CliRunner) -
     mask(np.vstack([np.full((6, 200), 255, np.uint8), 0 * GREY[6:]]))(own_scene.folder)
     result = run(runner, own_scene)
     assert result.exit_code == 0, result.output
-    assert "frame '0000': no pose explains the silhouettes" in result.stderr
+    assert "the pose explains the pictures badly" in result.stderr
     summary = json.loads((own_scene.folder.parent / "out" / "summary.json").read_text())
     assert summary["frames"]["0000"]["explained"] is False
     assert summary["frames"]["0000"]["E_total"] > 0.5

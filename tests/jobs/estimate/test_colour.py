@@ -152,6 +152,30 @@ def test_an_interrupted_sequence_of_pictures_goes_on_as_if_it_had_not_been(recor
     assert np.mean([tuple(one) in colours for one in inside]) > 0.9
 
 
+def test_where_the_body_is_lost_no_pose_is_written(recording, tmp_path):
+    scene, model, _, start = recording
+    copy, out = shutil.copytree(scene, tmp_path / "scene"), tmp_path / "out"
+    picture = cv2.imread(str(copy / "images" / "front" / "0003.png"))
+    for k, grey in ((3, 128), (4, None)):
+        # Without any colours, and with those of a room that the body has left.
+        seen = np.full_like(picture, 128) if grey else np.roll(picture, 150, axis=1)
+        cv2.imwrite(str(copy / "images" / "front" / f"{k:04d}.png"), seen)
+    (copy / "masks" / "front").mkdir(parents=True)
+    shutil.copy(scene.parent / "first.png", copy / "masks" / "front" / "0000.png")
+    found = estimate_scene(copy, model, out, EstimateSettings(start=start))
+    lost = [row for row in found.rows if not row.found]
+    assert [row.frame for row in lost] == ["0003", "0004"]
+    assert np.isnan([row.q for row in lost]).all()
+    assert "frame 0003-0004 (2 of 8): no pose was found" in found.summary["warnings"]
+    assert found.summary["compared_count"] == 1
+    rows = (out / "poses.csv").read_text().splitlines()[1:]
+    assert [k for k, row in enumerate(rows) if ",,,," in row] == [3, 4]
+    times = [line.split()[0] for line in (out / "positions.mot").read_text().splitlines()[7:]]
+    assert times == [f"{k / 30:.6f}" for k in range(FRAMES) if k not in (3, 4)]
+    page = (out / "report.html").read_text()
+    assert "0003-0004 (2 of 8): no pose was found" in page
+
+
 def test_stills_have_no_pictures_and_full_masks_need_none(recording, tmp_path):
     scene, _, _, _ = recording
     copy = shutil.copytree(scene, tmp_path / "scene")

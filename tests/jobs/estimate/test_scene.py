@@ -183,7 +183,9 @@ def test_a_frame_without_a_pose(own_scene: TinyScene, runner: CliRunner) -> None
     out = own_scene.folder.parent / "out"
     options = ["--method", "paper", "--no-replay", "--outside-limit", "0", "--hold", "lift=-90"]
     lost, summary = estimate(runner, own_scene, out, *options, status=1)
-    assert "frame '0001': no pose was found" in lost.stderr
+    assert lost.stderr.count("no pose was found\n") == 1
+    assert "frame 0000-0002 (3 of 3): no pose was found" in lost.stderr
+    assert summary["warnings"] == ["frame 0000-0002 (3 of 3): no pose was found"]
     assert "no pose was found in any frame" in lost.stderr
     rows = read_rows(out / "poses.csv")
     assert [row["frame"] for row in rows] == ["0000", "0001", "0002"]

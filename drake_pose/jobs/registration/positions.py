@@ -28,8 +28,8 @@ Array = NDArray[np.float64]
 
 # A value is outside its limits from so much on [rad], or from this share of a length's range.
 _OUTSIDE, _OUTSIDE_SHARE = 0.1, 0.1
-# An angle of more than a full turn, of a joint whose limits allow none, is one in degrees; a length
-# of so many times what its limits allow is one in millimetres.
+# An angle of more than a full turn beyond its limits is one in degrees; a length of so many times
+# what its limits allow is one in millimetres.
 _FULL_TURN, _MANY = 2.0 * math.pi, 20.0
 # Poses are one whose joints differ by less [rad or m].
 _SAME_ANGLE, _SAME_LENGTH = math.radians(1.0), 0.005
@@ -170,7 +170,7 @@ def _check_units(
         slack, most = _OUTSIDE_SHARE * (upper - lower), _MANY * max(abs(lower), abs(upper))
         if kinematics.is_angle[k]:
             what, unit, other, scale = "angle", "rad", "radians", math.pi / 180.0
-            slack, most = _OUTSIDE, _FULL_TURN
+            slack, most = _OUTSIDE, max(abs(lower), abs(upper)) + _FULL_TURN + _OUTSIDE
         off = np.maximum(lower - values, values - upper)
         worst = int(np.argmax(off))
         if off[worst] <= slack:
@@ -187,9 +187,14 @@ def _check_units(
                 f"{text}, but not in {wrong}: the file seems to be in {wrong}; write every {what} "
                 f"in {other}"
             )
-        warnings.append(
-            f"{text}: is its column another joint's, its zero or sign another, its unit another?"
-        )
+        why = ": is its column another joint's, its zero or sign another, its unit another?"
+        turn = math.copysign(_FULL_TURN, values[worst])
+        if kinematics.is_angle[k] and lower - slack <= values[worst] - turn <= upper + slack:
+            why = (
+                f"; a full turn off, {values[worst] - turn:.4g} rad, it would not: did the encoder "
+                "count a turn too many, or are the column's angles in degrees?"
+            )
+        warnings.append(f"{text}{why}")
     return tuple(warnings)
 
 

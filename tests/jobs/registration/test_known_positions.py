@@ -110,6 +110,9 @@ def test_what_is_refused(tmp_path: Path, text: str, message: str) -> None:
 def test_a_position_outside_its_limits_is_warned_of(tmp_path: Path) -> None:
     (text,) = read(tmp_path, "frame,swing,rail\n0,0.5,0.1\n4,2.6,0.5\n").warnings
     assert "column 'swing', frame 4: 2.6 rad lies outside the joint's limits, -2 to 2 rad" in text
+    for value, turned in ((0.5 + 2.0 * np.pi, 0.5), (-1.9 - 2.0 * np.pi, -1.9)):
+        (text,) = read(tmp_path, f"frame,swing,rail\n0,0.5,0.1\n4,{value},0.5\n").warnings
+        assert f"a full turn off, {turned} rad, it would not" in text
     # An encoder's own error is none of ours.
     assert read(tmp_path, "frame,swing,rail\n0,2.05,-0.01\n").warnings == ()
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import cv2
@@ -12,9 +12,22 @@ from numpy.typing import NDArray
 from drake_pose.arrays import Mask, Picture
 from drake_pose.camera.models import LARGEST_SIDE
 from drake_pose.errors import SettingsError
+from drake_pose.regular_files import read_regular
 from drake_pose.silhouette.segmentation.mask_pictures import ALL
 
 Array = NDArray[np.float32]
+
+# Where an ONNX file's messages hold others, by field: from its model down to what is told of data
+# in other files (onnx.proto).
+_HELD = {
+    "model": {7: "graph", 25: "function"},
+    "graph": {1: "node", 5: "tensor", 15: "sparse"},
+    "function": {7: "node", 11: "attribute"},
+    "node": {5: "attribute"},
+    "attribute": {5: "tensor", 6: "graph", 10: "tensor", 11: "graph", 22: "sparse", 23: "sparse"},
+    "sparse": {1: "tensor", 2: "tensor"},
+    "tensor": {13: "entry"},
+}
 
 
 class SegmentationNetwork:
@@ -56,6 +69,16 @@ class SegmentationNetwork:
                 raise SettingsError(f"{file}: a network's classes are numbers, not '{name}'")
         if not file.is_file():
             raise SettingsError(f"{file}: there is no such network")
+        try:
+            others = _other_files(read_regular(file))
+        except (OSError, LookupError, UnicodeDecodeError) as error:
+            raise SettingsError(f"{file}: cannot be read, or is no ONNX file: {error}") from error
+        for name in others:
+            if not (file.parent / name).resolve().is_relative_to(file.parent.resolve()):
+                raise SettingsError(
+                    f"{file}: its weights are in another folder, '{name}'; a network may read "
+                    "files beside it alone: put them there, and save it anew"
+                )
         try:
             self._network = cv2.dnn.readNetFromONNX(str(file))
         except cv2.error as error:
@@ -123,3 +146,40 @@ class SegmentationNetwork:
                 f"{self._file}: has the classes 0 to {count - 1}, not {max(numbers)}"
             )
         return numbers
+
+
+def _other_files(content: bytes) -> set[str]:
+    """The files that an ONNX file's tensors name as theirs; LookupError, UnicodeDecodeError."""
+    names, waiting = set(), [("model", memoryview(content))]
+    while waiting:
+        kind, message = waiting.pop()
+        held, known = list(_messages(message)), _HELD.get(kind, {})
+        if kind == "entry" and (1, b"location") in held:
+            names.add(bytes(dict(held).get(2, b"")).decode())
+        waiting += [(known[field], one) for field, one in held if field in known]
+    return names
+
+
+def _messages(message: memoryview) -> Iterator[tuple[int, memoryview]]:
+    """A Protocol Buffers message's fields of bytes, by number; LookupError: it is none."""
+    place = 0
+
+    def number() -> int:
+        nonlocal place
+        value = shift = 0
+        while True:
+            byte = message[place]
+            value, shift, place = value | (byte & 127) << shift, shift + 7, place + 1
+            if byte < 128:
+                return value
+
+    while place < len(message):
+        field, wire = divmod(number(), 8)
+        if wire == 2:
+            size = number()
+            yield field, message[place : place + size]
+            place += size
+        elif wire == 0:
+            number()
+        else:
+            place += {1: 8, 5: 4}[wire]

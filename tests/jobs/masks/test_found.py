@@ -177,6 +177,32 @@ def test_network_takes_the_colours_that_are_said(still, tmp_path):
         make_masks(path, tmp_path / "none", moved)
 
 
+@pytest.mark.parametrize("held", ["beside", "outside", "outside, in a node's graph"])
+def test_a_network_reads_no_file_of_another_folder(still, tmp_path, held):
+    path, true = still
+    (tmp_path / "net").mkdir()
+    file = network(tmp_path / "net" / "net.onnx", "scores")
+    model = onnx.load(str(file))
+    (tensor,) = model.graph.initializer
+    location = "weights.bin" if held == "beside" else "../weights.bin"
+    (file.parent / location).write_bytes(tensor.raw_data)
+    tensor.ClearField("raw_data")
+    tensor.data_location = TensorProto.EXTERNAL
+    tensor.external_data.add(key="location", value=location)
+    if "node" in held:
+        hidden = helper.make_graph([], "hidden", [], [], [tensor])
+        model.graph.node.append(helper.make_node("If", ["x"], ["z"], then_branch=hidden))
+        model.graph.ClearField("initializer")
+    file.write_bytes(model.SerializeToString())
+    settings = MaskSettings(network=file, network_size=(80, 60))
+    if held == "beside":
+        make_masks(path, tmp_path / "out", settings)
+        assert iou(load_scene(tmp_path / "out").read("camera", "still"), true) > 0.95
+    else:
+        with pytest.raises(SettingsError, match=r"net\.onnx.*another folder, '\.\./weights\.bin'"):
+            make_masks(path, tmp_path / "out", settings)
+
+
 @pytest.mark.parametrize(
     ("change", "words"),
     [

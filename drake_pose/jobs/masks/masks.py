@@ -19,6 +19,7 @@ from drake_pose.jobs.masks.finding import find_masks
 from drake_pose.jobs.masks.settings import MaskSettings
 from drake_pose.jobs.masks.sources import UNNAMED, Source, open_source
 from drake_pose.silhouette.pictures.masks import encode_mask
+from drake_pose.silhouette.pictures.scene_files import common_rate
 from drake_pose.silhouette.pictures.scenes import CAMERA_FILE, SCENE_FILE
 
 _PARTIAL = "masks.part"
@@ -123,6 +124,7 @@ def _summarize(
         first, *more = refused or [f"{source.path}: has no picture"]
         raise MaskError(first + (f" (and {len(more)} more)" if more else ""))
     warnings = [*(f"{text}; no mask is written" for text in refused), *doubts]
+    warnings += common_rate(source.videos)[1]
     if source.cameras is None and set(cameras) != {UNNAMED}:
         warnings.append(
             f"{folder}: its cameras {', '.join(cameras)} have no {CAMERA_FILE}, which estimate "
@@ -144,7 +146,7 @@ def _write_scene(source: Source, folder: Path, summary: Mapping[str, Any]) -> No
         if source.path.is_dir() and own.is_file():
             shutil.copyfile(own, folder / SCENE_FILE)
         elif source.videos:
-            rate = source.frame_rate_hz()
+            rate, _ = common_rate(source.videos)
             content = {"sequence": True} | ({} if rate is None else {"frame_rate_hz": rate})
             write_file(folder, SCENE_FILE, yaml.safe_dump(content))
         if source.camera_file is not None:

@@ -98,11 +98,6 @@ class Source:
                 f"'{camera}' of {self.camera_file} has {own.width} x {own.height}"
             )
 
-    def frame_rate_hz(self) -> float | None:
-        """Of the videos, where there are any that say so."""
-        rates = (VideoPictures(path).rate_hz for path in self.videos.values())
-        return next(filter(None, rates), None)
-
     def annotated_pictures(self) -> Iterator[tuple[str, str, Annotations, AnnotatedPicture]]:
         """Of each picture of the COCO files: camera, frame, the file and the picture.
 

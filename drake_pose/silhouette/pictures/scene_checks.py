@@ -44,13 +44,13 @@ def read_scene(
 
 def check_scene(scene: Scene) -> Scene:
     """A scene with what its files' faults are, without masks of cameras that stood still alone."""
-    if scene.scale_unknown or scene.images:
+    if scene.scale_unknown:
         return scene
     warnings = list(scene.warnings)
     several = len(scene.cameras) > 1
     if several:
         warnings += _check_counts(scene)
-    if scene.sequence:
+    if scene.sequence and not scene.images:
         warnings += _check_gaps(scene.frames)
         if several:
             frozen, repeated = _find_repeats(scene)
@@ -189,9 +189,9 @@ def _describe_repeats(
 
 def _check_counts(scene: Scene) -> list[str]:
     """Cameras that lack frames which others have."""
-    found = []
+    found, seen = [], {*scene.masks, *scene.images}
     for name in scene.cameras:
-        lacking = [frame for frame in scene.frames if (name, frame) not in scene.masks]
+        lacking = [frame for frame in scene.frames if (name, frame) not in seen]
         if count := (len(scene.frames) - len(lacking)) * bool(lacking):
             found.append(
                 f"camera '{name}' has {count} of {len(scene.frames)} frames; it lacks "

@@ -19,6 +19,8 @@ from drake_pose.errors import SceneError, SettingsError, UnknownNameError
 _NUMBER = re.compile("([0-9]+)")
 VIDEOS = (".mp4", ".avi", ".mkv", ".mov", ".webm", ".m4v", ".mpg", ".mpeg")
 """How names of videos end."""
+# Rates of videos that differ by more were not meant to be one.
+_RATES = 1.01
 
 
 class MaskFiles(NamedTuple):
@@ -58,9 +60,36 @@ class VideoPictures:
             self._next += 1
         found, picture = self._capture.read()
         if self._next < number or not found:
-            raise SceneError(f"{self._path}: ends after {self._next} pictures, {number} asked for")
+            what = f"is cut short: it ends after {self._next} pictures, but says {self.count}"
+            what = what if number < self.count else f"has no picture {number}"
+            raise SceneError(
+                f"{self._path}: {what}; leave the rest out (--frame), or make it whole: ffmpeg -i "
+                f"{self._path.name} -c copy NEW"
+            )
         self._next += 1
         return np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB), dtype=np.uint8)
+
+
+def common_rate(videos: Mapping[str, Path]) -> tuple[float | None, tuple[str, ...]]:
+    """Pictures a second of cameras' videos, if one says so; a warning where they drift apart.
+
+    Raises SceneError: a video cannot be read, or their rates are others.
+    """
+    opened = {name: VideoPictures(path) for name, path in videos.items()}
+    rates = {name: one.rate_hz for name, one in opened.items() if one.rate_hz is not None}
+    if not rates:
+        return None, ()
+    slow, fast = min(rates, key=lambda one: rates[one]), max(rates, key=lambda one: rates[one])
+    ratio = rates[fast] / rates[slow]
+    off = min(one.count for one in opened.values()) * (ratio - 1.0)
+    text = (
+        f"{videos[slow]} has {rates[slow]:.5g} pictures a second, {videos[fast]} {rates[fast]:.5g}:"
+        f" pictures of one number must be of one moment, but at the end they are {off:.0f} "
+        "pictures apart; bring the videos to one rate (ffmpeg -i VIDEO -r RATE NEW)"
+    )
+    if ratio > _RATES:
+        raise SceneError(text)
+    return next(iter(rates.values())), (text,) if off >= 1.0 else ()
 
 
 def natural_key(name: str) -> tuple[tuple[str, int], ...]:

@@ -19,6 +19,7 @@ from drake_pose.silhouette.pictures.scene_files import (
     VIDEOS,
     MaskFiles,
     VideoPictures,
+    common_rate,
     find_images,
     find_masks,
     in_order,
@@ -185,9 +186,8 @@ def load_scene(
         images = find_images(folder, cameras, in_order(frame for _, frame in files.masks))
     if not (images or has_masks):
         files = find_masks(folder, cameras)
-    videos = [file for file in images.values() if file.suffix.lower() in VIDEOS]
-    if videos and frame_rate_hz is None:
-        frame_rate_hz = VideoPictures(videos[0]).rate_hz
+    is_video = {name: file for (name, _), file in images.items() if file.suffix.lower() in VIDEOS}
+    rate_hz, drifts = common_rate(is_video)
     if all(key in files.masks for key in images):
         images = {}
     return Scene(
@@ -196,11 +196,11 @@ def load_scene(
         in_order(frame for _, frame in (*files.masks, *images)),
         files.masks,
         sequence,
-        frame_rate_hz,
+        frame_rate_hz or rate_hz,
         images=images,
         strangers=files.strangers,
         # Of pictures with few masks it is no fault that masks are missing.
-        warnings=() if images else files.warnings,
+        warnings=drifts if images else files.warnings,
     )
 
 

@@ -3,12 +3,13 @@
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
 from drake_pose.camera.camera_files import save_cameras
 from drake_pose.camera.models import Camera, ParallelCamera, circle_of_cameras
-from drake_pose.errors import MaskError
+from drake_pose.errors import MaskError, SceneError
 from drake_pose.silhouette.pictures.masks import write_mask
 from drake_pose.silhouette.pictures.scene_checks import (
     check_scene,
@@ -34,6 +35,43 @@ def record(folder: Path, frames: list[str], still: tuple[str, ...] = ()) -> Scen
             mask[10:30, 5 + at : 25 + at] = True
             write_mask(folder / "masks" / name / f"{frame}.png", mask)
     return load_scene(folder)
+
+
+def film(folder: Path, rates: dict[str, float], counts: dict[str, int]) -> None:
+    """Videos of grey pictures beside cameras.yaml."""
+    (folder / "scene.yaml").write_text("sequence: true\n")
+    (folder / "videos").mkdir(exist_ok=True)
+    kind = cv2.VideoWriter.fourcc(*"MJPG")
+    for name, rate in rates.items():
+        path = str(folder / "videos" / f"{name}.avi")
+        writer = cv2.VideoWriter(path, kind, rate, (60, 40))
+        for k in range(counts.get(name, 60)):
+            writer.write(np.full((40, 60, 3), k, np.uint8))
+        writer.release()
+
+
+def test_videos_that_do_not_fit_together_are_named(tmp_path: Path) -> None:
+    record(tmp_path, ["000000"])
+    film(tmp_path, dict.fromkeys(NAMES, 30.0), {})
+    assert check_scene(load_scene(tmp_path)).warnings == ()
+    film(
+        tmp_path, {name: 29.8 + 0.2 * (name == "left") for name in NAMES}, dict.fromkeys(NAMES, 200)
+    )
+    (drift,) = check_scene(load_scene(tmp_path)).warnings
+    assert "has 29.8 pictures a second" in drift
+    assert "they are 1 pictures apart" in drift
+    film(tmp_path, dict.fromkeys(NAMES, 30.0), {})
+    film(tmp_path, {NAMES[1]: 25.0}, {})
+    words = rf"{NAMES[1]}\.avi has 25 pictures a second, .* 30: .*12 pictures apart.*-r RATE"
+    with pytest.raises(SceneError, match=words):
+        load_scene(tmp_path)
+    film(tmp_path, dict.fromkeys(NAMES, 30.0), {NAMES[1]: 45})
+    (text,) = check_scene(load_scene(tmp_path)).warnings
+    assert f"'{NAMES[1]}' has 45 of 60 frames; it lacks 000045-000059" in text
+    video = tmp_path / "videos" / f"{NAMES[0]}.avi"
+    video.write_bytes(video.read_bytes()[: video.stat().st_size // 2])
+    with pytest.raises(SceneError, match=r"cut short: it ends after \d+ .* says 60; .*--frame"):
+        load_scene(tmp_path).read_image(NAMES[0], "000059")
 
 
 def test_sound_scene_has_no_fault(tmp_path: Path) -> None:

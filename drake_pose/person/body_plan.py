@@ -42,7 +42,6 @@ class PlannedLimb:
         nodes, values: those that move it alone; k values.
         joints: (3,) its root, middle joint and end among the landmarks.
         poses: (n, k) values all over its limits; the first is at rest.
-        stretched: (s,) in which of them the limb is stretched out.
         samples_T, weights: (n, m, 3) points along it in the trunk's frame [m], and theirs (n, m).
         length: from its root to its end, stretched out [m].
     """
@@ -51,7 +50,6 @@ class PlannedLimb:
     values: NDArray[np.intp]
     joints: NDArray[np.intp]
     poses: Array
-    stretched: NDArray[np.intp]
     samples_T: Array
     weights: Array
     length: float
@@ -124,9 +122,8 @@ class BodyPlan:
         samples_T = np.einsum("nji,nmj->nmi", R_WT, samples_W - p_WT[:, None])
         a, b, c = self.landmarks.positions(X_WN[0])[joints]
         length = float(np.linalg.norm(b - a) + np.linalg.norm(c - b))
-        return PlannedLimb(
-            nodes, values, joints, poses, chosen, samples_T, crowding(samples_T), length
-        )
+        weights = crowding(samples_T)
+        return PlannedLimb(nodes, values, joints, poses, samples_T, weights, length)
 
     def samples(self, limb: PlannedLimb, X_WN: Array) -> Array:
         """(m, 3) points along a limb in the world [m] where the nodes are at X_WN."""

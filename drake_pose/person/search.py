@@ -35,10 +35,8 @@ _LIMB_FITS, _LIMB_GAIN, _LIMB_SHOWS = 0.8, 0.15, 0.5
 # The share of the fresh starts, the most promising ones, that is fitted; and where nothing is known
 # yet, for how many of these all doubtful limbs are searched.
 _FITTED, _MENDED = 0.5, 3
-# Limbs whose tips are farther apart are not alike, and tips that are nearer about the same [m].
+# Limbs whose tips are farther apart are not alike, and limbs that are nearer about the same [m].
 _UNALIKE, _NEAR = 0.25, 0.15
-# How much of its length a nearly stretched limb reaches.
-_NEARLY = 0.9
 # How much of a fit tells which guess is promising.
 _JUDGED, _ROUGHER = 3, 1.5
 
@@ -128,7 +126,7 @@ class PersonSearch:
         """A fit whose limbs were searched again, until enough of the contours fits."""
         for limb in limbs:
             guesses = self._placed(best.values, limb, frame)
-            for pose in (limb.poses[0], *self._stretched(best.values, limb)):
+            for pose in (limb.poses[0], *self._relaxed(best.values, limb)):
                 guesses.append(best.values.copy())
                 guesses[-1][limb.values] = pose
             for values in guesses:
@@ -163,7 +161,12 @@ class PersonSearch:
             return self.mended(found[0], frame, enough, limbs=LIMBS_A_FRAME)
         mended = [self.mended(one, frame) for one in found[:_MENDED]]
         best = max(mended, key=lambda one: one.closeness)
-        return self._searched(best, self._plan.limbs.values(), frame, math.inf)
+        while True:
+            others = [self._refine(values, frame) for values in self._exchanged(best.values)]
+            other = max(others, key=lambda one: one.closeness)
+            if other.closeness <= best.closeness:
+                return self._searched(best, self._plan.limbs.values(), frame, math.inf)
+            best = self.mended(other, frame)
 
     def _guess(
         self, frame: FrameViews, heading: int, middle: Array, known: Array | None
@@ -249,18 +252,35 @@ class PersonSearch:
                     break
         return found
 
-    def _stretched(self, values: Array, limb: PlannedLimb) -> list[Array]:
-        """A nearly stretched limb's most relaxed stretched values: it may be bent the wrong way."""
-        X_WN = self._fit.kinematics.poses(values)
-        root, _, end = self._plan.landmarks.positions(X_WN)[limb.joints]
-        if np.linalg.norm(end - root) < _NEARLY * limb.length:
-            return []
-        X_WT = X_WN[self._plan.trunk]
-        tip = (self._plan.samples(limb, X_WN)[-1] - X_WT[:3, 3]) @ X_WT[:3, :3]
-        off = np.linalg.norm(limb.samples_T[limb.stretched, -1] - tip, axis=1)
-        poses = limb.poses[limb.stretched[off < _NEAR]]
+    def _relaxed(self, values: Array, limb: PlannedLimb) -> list[Array]:
+        """The most relaxed values of a limb about where it is: it may be bent the wrong way."""
+        off = self._off(values, limb, self._plan.samples(limb, self._fit.kinematics.poses(values)))
+        poses = limb.poses[off < _NEAR]
         effort = np.abs(poses - limb.poses[0]).sum(axis=1)
         return [] if not len(poses) else [poses[np.argmin(effort)]]
+
+    def _exchanged(self, values: Array) -> list[Array]:
+        """Values (m,) that look much alike: both arms or legs exchanged; turned about."""
+        plan, found = self._plan, []
+        X_WN = self._fit.kinematics.poses(values)
+        for turn, parts in ((0.0, ("arm",)), (0.0, ("leg",)), (math.pi, ("arm", "leg"))):
+            other = values.copy()
+            if turn and plan.heading is not None:
+                other[plan.heading] += turn
+                other = self._stand_at(other, plan.trunk_middle(X_WN))
+            for part in parts:
+                for side, its in (("left", "right"), ("right", "left")):
+                    limb, there = plan.limbs[f"{side}_{part}"], plan.limbs[f"{its}_{part}"]
+                    off = self._off(other, limb, plan.samples(there, X_WN))
+                    other[limb.values] = limb.poses[np.argmin(off)]
+            found.append(other)
+        return found
+
+    def _off(self, values: Array, limb: PlannedLimb, samples_W: Array) -> Array:
+        """(n,) how far each pose of a limb is from points (m, 3) along one, at most [m]."""
+        X_WT = self._fit.kinematics.poses(values)[self._plan.trunk]
+        samples_T = (samples_W - X_WT[:3, 3]) @ X_WT[:3, :3]
+        return np.asarray(np.linalg.norm(limb.samples_T - samples_T, axis=2).max(axis=1))
 
     def _stand_at(self, values: Array, middle: Array) -> Array:
         """Values (m,) with the trunk's middle at a place (3,) [m]."""

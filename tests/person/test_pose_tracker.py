@@ -9,9 +9,13 @@ from drake_pose.camera.models import circle_of_cameras
 from drake_pose.errors import ModelError, SettingsError
 from drake_pose.fit.contour_fit import ContourFit
 from drake_pose.person.body_plan import crowding
+from drake_pose.person.date.skeleton import load_skeleton
+from drake_pose.person.date.walking import make_motion
 from drake_pose.person.pose_tracker import PersonPoseTracker
-from drake_pose.person.search import EXACT, headings_of
+from drake_pose.person.search import EXACT, LENIENT, headings_of
+from drake_pose.person.shape import NOISE
 from drake_pose.person.views import FrameViews, see_silhouette
+from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from tests.person.persons_in_view import posed, see
 
 
@@ -66,6 +70,21 @@ class TestTracker:
             q = world.pose(**{name: (1 - 0.2 * k) * a for name, a in WALKING.items()}, head_y=5 * k)
             state = world.tracker.follow(state, world.frame(q, left_out=int(k >= 3)))
             assert world.off(state.values, q) < 30.0, k
+
+    @pytest.mark.parametrize("frame", [30, 54], ids=["legs exchanged", "turned about"])
+    def test_person_is_not_taken_for_one_who_looks_much_alike(self, person, frame):
+        """Walking, before nine cameras: seen so, another pose fits nearly as well."""
+        q = make_motion(load_skeleton(person), 120, 0).q[frame]
+        ring = circle_of_cameras(9, face_camera=False)
+        masks = [LabelRenderer(person, camera).mask(q) for camera in ring.values()]
+        tracker = PersonPoseTracker(ContourFit(person.pose_tree(), noise=NOISE), LENIENT)
+        seen = FrameViews([*ring.values()], [see_silhouette(mask, 4.0) for mask in masks])
+        values, plan = tracker.follow(None, seen).values, tracker.plan
+        places = [
+            plan.landmarks.positions(plan.kinematics.poses(one))
+            for one in (values, tracker.values(q))
+        ]
+        assert np.linalg.norm(places[0] - places[1], axis=1).max() < 0.03
 
     def test_destroyed_track_is_right_again_without_a_registered_pose(self, world):
         q = world.pose(**WALKING, head_y=-70)
@@ -135,8 +154,8 @@ class TestPlan:
             middle = [
                 n for n, v in enumerate(limb.values) if "forearm" in names[v] or "shin" in names[v]
             ]
-            assert (limb.poses[limb.stretched][:, middle] == 0.0).all()
-            assert 0 < len(limb.stretched) < len(limb.poses)
+            stretched = (limb.poses[:, middle] == 0.0).all(axis=1)
+            assert 0.1 < stretched.mean() < 0.2
             assert (limb.poses >= plan.kinematics.lower[limb.values]).all()
             assert (limb.poses <= plan.kinematics.upper[limb.values]).all()
 

@@ -55,8 +55,9 @@ def estimate(
     Files in DIR: report.html, which shows all of it; poses.csv (a row a frame: every joint's
     position in rad or m, E_total, seconds); joints.csv (which joints the silhouettes determine,
     and their 95 % intervals); families.csv (poses that look the same); summary.json; overlay/;
-    replay.html; of a sequence also TRC, MOT and BVH files. E_total is the area where body and
-    silhouettes differ, over the silhouettes' area. Ctrl-C keeps the finished frames.
+    replay.html; of a sequence also a MOT file, and of a person or hand TRC and BVH files. E_total
+    is the area where body and silhouettes differ, over the silhouettes' area. Ctrl-C keeps the
+    finished frames.
 
     A robot arm whose base is at the world's origin, seen by two cameras:
 

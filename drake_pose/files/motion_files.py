@@ -53,8 +53,8 @@ def write_motion(
 ) -> list[str]:
     """Writes joint_centres.csv; of a sequence TRC, MOT and BVH files too; returns warnings.
 
-    Joint centres need a landmarks.yaml beside the model. The files of a sequence hold every frame
-    from the first to the last of the rows.
+    Joint centres need a landmarks.yaml beside the model; a BVH file, that or a skin: robots have no
+    readers of it. The files of a sequence hold every frame from the first to the last of the rows.
 
     Args:
         frames: the scene's, in order.
@@ -83,6 +83,8 @@ def write_motion(
     if rate_hz is None:
         return []
     write_file(folder, MOT, positions_as_mot(model, q, rate_hz, X_WB))
+    if not (landmarks or model.skin):
+        return []
     text, filled = motion_as_bvh(model, q, X_WB, rate_hz)
     write_file(folder, BVH, text)
     if not filled:

@@ -95,6 +95,10 @@ def test_a_results_files_honour_the_base_and_leave_out_what_is_not_known(tmp_pat
     header = mot[mot.index("endheader") + 1].split("\t")
     assert header[-7:] == list(BASE_COLUMNS)
     assert [float(cell) for cell in mot[-1].split("\t")[-7:]] == pytest.approx(base, abs=1e-5)
+    # A robot is no character: without landmarks or a skin there is no skeleton to animate.
+    (scene.model.parent / "landmarks.yaml").unlink()
+    assert not write_motion(tmp_path / "robot", model, ("0001", "0002", "0003"), rows, 25.0)
+    assert {file.name for file in (tmp_path / "robot").iterdir()} == {"positions.mot"}
 
 
 def test_mot_is_in_degrees(person, q):

@@ -49,14 +49,14 @@ def draw_overlay(
         title: the text above the picture.
 
     Returns:
-        (h, w, 3) uint8: the surroundings, all of the picture where nothing is shown; a small
-        silhouette is enlarged by a whole number, and has a legend below.
+        (h, w, 3) uint8: the surroundings, all of the picture where nothing is shown, enlarged by a
+        whole number where they are small; below a silhouette is a legend.
     """
     if seen.ndim == 3:
         painted = seen.copy()
         _draw_contour(painted, body, EXCESS_RGB, max(1, len(seen) // 500))
         _draw_borders(painted, body, segments)
-        return _framed(painted[_surroundings(body)], title)
+        return _framed(_enlarged(painted[_surroundings(body)]), title)
     window = _surroundings(seen | body)
     picture = _enlarged(paint_agreement(seen, body, segments)[window])
     area = max(1, int(seen.sum()))

@@ -16,6 +16,7 @@ from pydrake.common.eigen_geometry import Quaternion
 from pydrake.math import RigidTransform, RotationMatrix
 
 from drake_pose.body.model import ArticulatedModel
+from drake_pose.body.parsed_model import nearest_turn
 from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.csv_files import csv_text, read_csv
 from drake_pose.errors import OutputError
@@ -230,6 +231,19 @@ class SceneEstimate:
 def user_units(model: ArticulatedModel) -> np.ndarray:
     """What each position (nq,) is multiplied by to be told: radians become degrees."""
     return np.array([math.degrees(1.0) if k == "angle" else 1.0 for k in model.position_kinds])
+
+
+def measured_positions(
+    model: ArticulatedModel, q: np.ndarray, records: Iterable[FrameRecord]
+) -> np.ndarray:
+    """What was measured (frames, nq) [rad or m] where q was found; nan where nothing was."""
+    names = model.position_names
+    errors = [[record.joint_errors.get(name, np.nan) for name in names] for record in records]
+    measured = q - np.array(errors).reshape(q.shape) / user_units(model)
+    # Errors are of the nearest turn, which may lie beyond the limits.
+    middle = 0.5 * (model.lower + model.upper)
+    limited = model.periodic & ~model.turns_freely & np.isfinite(middle)
+    return nearest_turn(measured, np.where(limited, middle, 0.0), limited)
 
 
 def record_pose_set(pose_set: PoseSet | None, tree: PoseTree) -> dict[str, Any]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
+from itertools import product
 
 import numpy as np
 from pydrake.geometry import Meshcat, MeshcatParams, MeshcatVisualizer, Rgba, SceneGraph
@@ -12,14 +13,17 @@ from pydrake.systems.framework import Diagram, DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource
 
 from drake_pose.body.model import ArticulatedModel
-from drake_pose.body.tree.link_graph import PlantKinematics
-from drake_pose.camera.models import Camera, PinholeCamera
-from drake_pose.systems.bodies import add_meshcat_skin, add_posed_plant
+from drake_pose.camera.models import Camera, ParallelCamera
+from drake_pose.systems.bodies import add_meshcat_skin, add_posed_plant, body_poses
 
-_BODY_PATH = "visualizer"
+_BODY_PATH, _MEASURED_PATH = "visualizer", "measured"
 _CAMERA_COLOUR = Rgba(0.0, 0.45, 0.70, 1.0)
-_CAMERA_SIZE = 0.15
-_BESIDE = np.radians(20.0)
+_MEASURED_COLOUR = Rgba(0.0, 0.62, 0.45, 0.4)
+# A frustum's depth, and how far the view stands off, in the object's radii: in Meshcat's window of
+# 75 degrees one radius above and below the middle is seen from 1.3.
+_FRUSTUM, _DISTANCE = 0.25, 1.35
+# From here the first camera is seen behind the object, wherever between it and infinity it stands.
+_BESIDE = np.radians(125.0)
 
 
 def make_replay(
@@ -28,6 +32,7 @@ def make_replay(
     X_WB: np.ndarray,
     cameras: Sequence[Camera],
     period: float,
+    measured: np.ndarray | None = None,
 ) -> str:
     """The page that Meshcat records of poses of a body, and where the cameras are.
 
@@ -35,6 +40,7 @@ def make_replay(
         positions: (frames, nq) its positions [rad or m].
         X_WB: (frames, 4, 4) poses of the plant's world in the scene's world.
         period: time between two frames [s]; those a second or more apart stand still.
+        measured: (frames, nq) positions at which the body is shown as a ghost, too.
     """
     # Port 0: any free one. The server lives for a moment only, and listens on this machine alone.
     logger = logging.getLogger("drake")
@@ -52,10 +58,14 @@ def make_replay(
     add_meshcat_skin(
         builder, meshcat, model, source.get_output_port(), "body", prefix=_BODY_PATH, recorded=True
     )
+    for link, mesh in model.link_meshes.items() if measured is not None else ():
+        surface = mesh.vertices.T, mesh.triangles.T
+        meshcat.SetTriangleMesh(f"{_MEASURED_PATH}/{link}", *surface, _MEASURED_COLOUR)
+    p_WO, radius = _extent(model, positions, X_WB)
     for camera in cameras:
-        _draw_camera(meshcat, camera)
-    _look_from(meshcat, cameras[0], _middle_of(model, positions[0], X_WB[0]))
-    _record(meshcat, builder.Build(), source, positions, X_WB, period)
+        _draw_camera(meshcat, camera, p_WO, radius)
+    _look_from(meshcat, cameras[0], p_WO, _DISTANCE * radius)
+    _record(meshcat, builder.Build(), source, positions, X_WB, period, model, measured)
     return meshcat.StaticHtml()
 
 
@@ -66,6 +76,8 @@ def _record(
     positions: np.ndarray,
     X_WB: np.ndarray,
     period: float,
+    model: ArticulatedModel,
+    measured: np.ndarray | None,
 ) -> None:
     """Publishes every frame at its time; stills once more just before the next."""
     context = diagram.CreateDefaultContext()
@@ -75,37 +87,64 @@ def _record(
     meshcat.StartRecording(frames_per_second=10.0 / period if still else 1.0 / period)
     for index, (q, X) in enumerate(zip(positions, X_WB, strict=True)):
         value.SetFromVector(q)
+        poses = {_BODY_PATH: RigidTransform(X)}
+        if measured is not None:
+            of_bodies = body_poses(model.plant, measured[index], X)
+            poses |= {
+                f"{_MEASURED_PATH}/{link}": of_bodies[model.link_index(link)]
+                for link in model.link_meshes
+            }
         for offset in offsets:
             time = index * period + offset
             context.SetTime(time)
             diagram.ForcedPublish(context)
-            meshcat.SetTransform(_BODY_PATH, RigidTransform(X), time)
+            for path, pose in poses.items():
+                meshcat.SetTransform(path, pose, time)
     meshcat.StopRecording()
     meshcat.PublishRecording()
 
 
-def _middle_of(model: ArticulatedModel, q: np.ndarray, X_WB: np.ndarray) -> np.ndarray:
-    """Returns the mean position (3,) of the body's links in the scene's world."""
-    kinematics = PlantKinematics(model)
-    poses = [kinematics.pose_at(body, q) for body in range(1, model.plant.num_bodies())]
-    return np.asarray((X_WB @ np.mean(poses, axis=0))[:3, 3])
+def _extent(
+    model: ArticulatedModel, positions: np.ndarray, X_WB: np.ndarray
+) -> tuple[np.ndarray, float]:
+    """The middle (3,) and radius [m] of what the body takes up in the scene's world."""
+    boxes = {
+        model.link_index(link): np.array(
+            [*product(*np.c_[mesh.vertices.min(0), mesh.vertices.max(0)])]
+        ).T
+        for link, mesh in model.link_meshes.items()
+    }
+    corners = []
+    for q, X in zip(positions, X_WB, strict=True):
+        poses = body_poses(model.plant, q, X)
+        corners += [poses[body].multiply(box) for body, box in boxes.items()]
+    low, high = np.hstack(corners).min(axis=1), np.hstack(corners).max(axis=1)
+    return 0.5 * (low + high), 0.5 * float(np.linalg.norm(high - low))
 
 
-def _draw_camera(meshcat: Meshcat, camera: Camera) -> None:
-    """Draws a small pyramid that opens in the viewing direction."""
-    corners = [(-1.0, -0.6), (1.0, -0.6), (1.0, 0.6), (-1.0, 0.6)]
-    p_C = _CAMERA_SIZE * np.array([(0.0, 0.0, 0.0), *((x / 2, y / 2, 1.0) for x, y in corners)])
-    p_W = p_C @ camera.X_WC[:3, :3].T + camera.X_WC[:3, 3]
-    lines = [(0, k) for k in (1, 2, 3, 4)] + [(1, 2), (2, 3), (3, 4), (4, 1)]
+def _draw_camera(meshcat: Meshcat, camera: Camera, p_WO: np.ndarray, radius: float) -> None:
+    """Draws the frustum of what a camera sees; a parallel one's begins outside the object."""
+    parallel, f_x, f_y, c_x, c_y, *_ = camera.kernel_parameters()
+    across, down = np.array([0, 1, 1, 0]), np.array([0, 0, 1, 1])
+    x, y = (camera.width * across - 0.5 - c_x) / f_x, (camera.height * down - 0.5 - c_y) / f_y
+    depth, (*_, z_WC, p_WC) = _FRUSTUM * radius, camera.X_WC[:3].T
+    far = np.column_stack([x, y, np.ones(4)]) * [1.0, 1.0, depth]
+    near = far * [1.0, 1.0, 0.0]
+    if parallel:
+        p_WC = p_WC + z_WC * (z_WC @ (p_WO - p_WC) - 2.0 * radius)
+    else:
+        far[:, :2] *= depth
+        near *= 0.0
+    p_W = np.concatenate([near, far]) @ camera.X_WC[:3, :3].T + p_WC
+    lines = [(k, 4 + k) for k in range(4)] + [(4 + k, 4 + (k + 1) % 4) for k in range(4)]
     start, end = (p_W[[line[side] for line in lines]].T for side in (0, 1))
     meshcat.SetLineSegments(f"cameras/{camera.name}", start, end, 2.0, _CAMERA_COLOUR)
 
 
-def _look_from(meshcat: Meshcat, camera: Camera, p_WT: np.ndarray) -> None:
-    """Points the browser's view at a target, from beside a camera (or in its direction)."""
-    p_TC_W = -3.0 * camera.X_WC[:3, 2]
-    if isinstance(camera, PinholeCamera):
-        p_TC_W = camera.X_WC[:3, 3] - p_WT
-    # Exactly where the camera stands, its own drawing would be in the way.
-    beside = RotationMatrix.MakeZRotation(_BESIDE).multiply(p_TC_W)
-    meshcat.SetCameraPose(p_WT + 1.1 * beside, p_WT)
+def _look_from(meshcat: Meshcat, camera: Camera, p_WO: np.ndarray, distance: float) -> None:
+    """Points the browser's view at the object, with a camera behind it."""
+    p_OC_W = camera.X_WC[:3, 3] - p_WO
+    if isinstance(camera, ParallelCamera):
+        p_OC_W = -camera.X_WC[:3, 2]
+    beside = RotationMatrix.MakeZRotation(_BESIDE).multiply(p_OC_W)
+    meshcat.SetCameraPose(p_WO + distance * beside / np.linalg.norm(beside), p_WO)

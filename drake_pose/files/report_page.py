@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from drake_pose.body.model import ArticulatedModel
 from drake_pose.files.folder import OVERLAY
-from drake_pose.files.records import JointRecord, SceneEstimate, user_units
+from drake_pose.files.records import JointRecord, SceneEstimate, measured_positions, user_units
 from drake_pose.silhouette.pictures.scenes import Scene
 
 Array = NDArray[np.float64]
@@ -42,7 +42,7 @@ _POINTS = 600
 _SHARE = 0.2
 # Half the width of the area about a frame that stands alone.
 _DOT = 2.5
-# A position that changes by less is said in a table.
+# A position that changes by less over the frames is said in a table.
 _STAYS = 1e-9
 _PICTURES = 6
 _PICTURE_SIZE = 300
@@ -50,6 +50,7 @@ _METHODS = {
     "beam": "searched by many hypotheses side by side",
     "paper": "searched as published",
     "person": "one person followed by all silhouettes at once",
+    "person_by_colour": "one person followed by colour",
     "paper_capture": "one person followed by skin-coloured features, as published",
     "stages_capture": "one person followed by skin-coloured features and limbs' surfaces",
 }
@@ -85,32 +86,45 @@ def make_report(
     frames = [row.frame for row in estimate.rows]
     records, joined = list(estimate.records.values()), scene.sequence
     found = ["found" if record.found else "not-found" for record in records]
-    use = [(name, _use(scene, estimate, name)) for name in scene.cameras]
+    use = {name: _use(scene, estimate, name) for name in scene.cameras}
     errors = np.array([100.0 * row.error for row in estimate.rows])
     ious = [
         (name, np.array([100.0 * record.ious.get(name, np.nan) for record in records]))
         for name in scene.cameras
     ]
-    joints = _joint_plots(model, estimate, joined)
-    stay = {
-        one["name"] for one in joints if one["unit"] != "deg" and one["high"] - one["low"] < _STAYS
-    }
+    told = {*found}.union(*use.values()) != {"found", "used"}
+    pictures = _pick_pictures(folder, scene, estimate)
     return template.render(
         summary=estimate.summary,
         title=Path(str(estimate.summary["scene"])).name or str(estimate.summary["scene"]),
         model=model.path.name,
-        method=_METHODS[str(estimate.summary["method"])],
+        method=_describe_method(scene, estimate),
+        by_colour=bool(scene.images),
         rows=list(zip(frames, records, strict=True)),
         box=BOX,
         errors=plot_curves(frames, [("E_total", errors)], joined=joined, least=0.0),
         ious=plot_curves(frames, ious, joined=joined),
-        cameras=[_camera_row(scene, estimate, name) for name in scene.cameras],
-        grid=draw_grid(frames, [*use, ("pose", found)]),
-        moving=[one for one in joints if one["name"] not in stay],
-        still=[one for one in joints if one["name"] in stay],
-        pictures=_pick_pictures(folder, scene, estimate),
+        compared=sum(bool(record.ious) for record in records),
+        cameras=[_camera_row(estimate, name, states) for name, states in use.items()],
+        grid=draw_grid(frames, [*use.items(), ("pose", found)]) if told else None,
+        joints=_describe_joints(model, estimate, joined),
+        pictures=pictures,
+        compared_pictures={(one.camera, one.frame) in scene.masks for one in pictures},
         files=[(name, text) for name, text in _ABOUT.items() if (folder / name).is_file()],
     )
+
+
+def _describe_method(scene: Scene, estimate: SceneEstimate) -> str:
+    """How the poses were found: searched, or tracked from frame to frame."""
+    method, states = str(estimate.summary["method"]), estimate.records.values()
+    if method == "person" and scene.images:
+        method = "person_by_colour"
+    tracked = sum(record.found and record.stopped_by == "tracked" for record in states)
+    others = estimate.found_count - tracked
+    if not tracked:
+        return _METHODS[method]
+    how = f"tracked {'by colour ' if scene.images else ''}in {tracked} frames"
+    return f"{how}, {others} {_METHODS[method]}" if others else how
 
 
 def page_template(package: str, name: str) -> Template:
@@ -118,55 +132,60 @@ def page_template(package: str, name: str) -> Template:
     environment = Environment(
         autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
-    environment.tests["infinite"] = math.isinf
+    environment.tests |= {"infinite": math.isinf, "nan": math.isnan}
     style = files("drake_pose.files").joinpath("report_style.css")
     environment.globals["style"] = Markup(style.read_text(encoding="utf-8").rstrip())
     source = files(package).joinpath(name)
     return environment.from_string(source.read_text(encoding="utf-8"))
 
 
-def _joint_plots(
+def _describe_joints(
     model: ArticulatedModel, estimate: SceneEstimate, joined: bool
 ) -> list[dict[str, Any]]:
-    """The plots of all positions that are known in a frame, with their ranges and limits."""
-    frames, units = list(estimate.records), user_units(model)
+    """All positions that are known in a frame; a plot of each that changes from frame to frame."""
+    frames, records, unit = list(estimate.records), estimate.records.values(), user_units(model)
     of_kind = {"angle": "deg", "length": "m", "quaternion": ""}
     q = np.array([row.q for row in estimate.rows]).reshape(len(frames), -1)
-    plots = []
+    measured, limits = measured_positions(model, q, records), unit * [model.lower, model.upper]
+    q, measured = unit * q, unit * measured
+    nothing, joints = JointRecord(False, np.nan, np.nan), []
     for k, (name, kind) in enumerate(zip(model.position_names, model.position_kinds, strict=True)):
-        values = units[k] * q[:, k]
-        if not np.isfinite(values).any():
+        ends, own, plot = _ends(q[:, k]), (float(limits[0, k]), float(limits[1, k])), None
+        told = [record.joints.get(name, nothing) for record in records]
+        low, high = np.array([(one.low, one.high) for one in told]).T
+        determined = np.array([one.determined for one in told])
+        if ends[1] - ends[0] >= _STAYS:
+            plot = plot_curves(
+                frames, [(name, q[:, k]), ("measured", measured[:, k])], joined=joined,
+                limits=own, intervals=(low, high, determined),
+            )  # fmt: skip
+        # Of a base that stands nothing is asked.
+        elif np.isnan(ends[0]) or (np.isnan(low).all() and math.isinf(own[0])):
             continue
-        lower, upper = float(units[k] * model.lower[k]), float(units[k] * model.upper[k])
-        known = [record.joints.get(name) for record in estimate.records.values()]
-        intervals = None
-        if any(known):
-            nothing = JointRecord(False, np.nan, np.nan)
-            told = [(one.low, one.high, one.determined) for one in (n or nothing for n in known)]
-            low, high, determined = np.array(told).T
-            intervals = low, high, determined > 0.0
-        plot = plot_curves(
-            frames,
-            [(name, values)],
-            joined=joined,
-            limits=(lower, upper),
-            intervals=intervals,
-        )
-        ends = {"low": float(np.nanmin(values)), "high": float(np.nanmax(values))}
-        limits = {"lower": lower, "upper": upper}
-        plots.append({"name": name, "unit": of_kind[kind], **ends, **limits, "plot": plot})
-    return plots
+        joints.append({
+            "name": name, "unit": of_kind[kind], "ends": ends, "interval": _ends(low, high),
+            "determined": determined[np.isfinite(low)].all(), "measured": _ends(measured[:, k]),
+            "limits": own, "plot": plot,
+        })  # fmt: skip
+    return joints
 
 
-def _camera_row(scene: Scene, estimate: SceneEstimate, camera: str) -> dict[str, Any]:
+def _ends(*values: Array) -> tuple[float, float]:
+    """The least and the greatest of what is known; nan where nothing is."""
+    known = np.concatenate(values)
+    known = known[np.isfinite(known)]
+    return (float(known.min()), float(known.max())) if len(known) else (np.nan, np.nan)
+
+
+def _camera_row(estimate: SceneEstimate, camera: str, states: Sequence[str]) -> dict[str, Any]:
     """What the table of cameras says: pictures, those used, IoU, and whether it is suspicious."""
     records = estimate.records
     ious = {f: one.ious[camera] for f, one in records.items() if camera in one.ious}
     worst = min(ious, key=lambda frame: ious[frame], default=None)
     return {
         "name": camera,
-        "pictures": sum((camera, frame) in scene.masks for frame in records),
-        "used": len(ious),
+        "pictures": len(states) - states.count("no-picture"),
+        "used": states.count("used"),
         "mean": float(np.mean(list(ious.values()))) if ious else None,
         "least": None if worst is None else ious[worst],
         "worst": worst,
@@ -178,8 +197,9 @@ def _use(scene: Scene, estimate: SceneEstimate, camera: str) -> list[str]:
     """In which frames a camera was used, or was there."""
     states = []
     for frame, record in estimate.records.items():
-        is_used, is_there = camera in record.ious, (camera, frame) in scene.masks
-        states.append("used" if is_used else "left-out" if is_there else "no-picture")
+        has_mask, has_image = (camera, frame) in scene.masks, (camera, frame) in scene.images
+        is_used = camera in record.ious or (has_image and not has_mask and record.found)
+        states.append("used" if is_used else "left-out" if has_mask or has_image else "no-picture")
     return states
 
 

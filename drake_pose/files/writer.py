@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from drake_pose.body.model import ArticulatedModel
+from drake_pose.camera.models import ParallelCamera
 from drake_pose.errors import OutputError
 from drake_pose.files.folder import (
     FAMILIES,
@@ -32,6 +33,7 @@ from drake_pose.files.records import (
     base_pose,
     family_table,
     joint_table,
+    measured_positions,
 )
 from drake_pose.files.replay import make_replay
 from drake_pose.files.report_page import make_report
@@ -203,13 +205,25 @@ class ResultWriter:
             self.warnings += write_motion(self.folder, self.model, frames, done.rows, rate)
             found = [row for row in done.rows if row.found]
             if replay and found:
-                cameras, period = tuple(self.scene.cameras.values()), 1.0 / (rate or 1.0)
-                q = np.array([row.q for row in found])
-                X_WB = np.array([base_pose(row.base) for row in found])
-                self.write(REPLAY, make_replay(self.model, q, X_WB, cameras, period))
+                self.write(REPLAY, self._replay(found, 1.0 / (rate or 1.0)))
             page = make_report(self.folder, self.model, self.scene, self.result())
             self.write(REPORT, page)
         self._complete = True
+
+    def _replay(self, found: Sequence[PoseRow], period: float) -> str:
+        """The replay of the frames with a pose; positions that were measured stand as a ghost."""
+        q = np.array([row.q for row in found])
+        measured = measured_positions(self.model, q, [self.records[one.frame] for one in found])
+        ghost = None if np.isnan(measured).all() else np.where(np.isnan(measured), q, measured)
+        scale = self.records[found[0].frame].camera_scale
+        cameras = [
+            replace(one, pixels_per_metre=scale)
+            if scale and isinstance(one, ParallelCamera)
+            else one
+            for one in self.scene.cameras.values()
+        ]
+        X_WB = np.array([base_pose(row.base) for row in found])
+        return make_replay(self.model, q, X_WB, cameras, period, ghost)
 
     def result(self) -> SceneEstimate:
         """What came out, in the scene's order, the frames of an earlier job among it."""

@@ -1,14 +1,20 @@
+import base64
 import re
+from contextlib import suppress
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
+from typing import Any
 
+import msgpack
 import numpy as np
 import pytest
 
 from drake_pose.body.formats.packages import bundled_model
 from drake_pose.body.model import ArticulatedModel, load_model
+from drake_pose.camera.models import ParallelCamera, PinholeCamera, look_at
 from drake_pose.files.records import FrameRecord, JointRecord, PoseRow, SceneEstimate
+from drake_pose.files.replay import make_replay
 from drake_pose.files.report_page import (
     BOX,
     HEIGHT,
@@ -39,6 +45,9 @@ class Page(HTMLParser):
         self.classes: list[str] = []
         self.tags: list[str] = []
         self.labels: list[str] = []
+        self.plots: dict[str, list[tuple[str, dict[str, str | None]]]] = {}
+        self.ticks: dict[str, list[tuple[float, float]]] = {}
+        self._plot = ""
         self._open: list[tuple[str, str | None]] = []
         self._joint: str | None = None
         self.feed(text)
@@ -62,8 +71,11 @@ class Page(HTMLParser):
             assert values["alt"]
         elif tag == "svg":
             assert values.get("aria-hidden") or values.get("aria-label")
-        if values.get("data-joint"):
-            self._joint = values["data-joint"]
+        if tag == "figure":
+            self._joint = values.get("data-joint")
+            self._plot = self._joint or ""
+        if tag in ("path", "text"):
+            self.plots.setdefault(self._plot, []).append((str(values.get("class")), values))
         if values.get("aria-label"):
             self.labels.append(str(values["aria-label"]))
         self.classes += (values.get("class") or "").split()
@@ -83,9 +95,19 @@ class Page(HTMLParser):
         tags = [tag for tag, _ in self._open]
         if {"td", "th"} & set(tags):
             self.tables[-1][-1][-1] += data
+        if tags[-1:] == ["text"] and self.plots[self._plot][-1][0] == "y":
+            height = float(str(self.plots[self._plot][-1][1]["y"])) - 4.0
+            self.ticks.setdefault(self._plot, []).append((height, float(data)))
         if "figcaption" in tags and self._joint:
             self.joints[self._joint] = data.strip()
             self._joint = None
+
+    def curve(self, joint: str, kind: str) -> np.ndarray:
+        """(n, 2) points of a curve: place [pixel], and value as the axis' ticks say."""
+        path = next(str(own["d"]) for name, own in self.plots[joint] if kind in name.split())
+        points, (height, value) = coordinates(path), np.array(self.ticks[joint]).T
+        points[:, 1] = np.polynomial.Polynomial.fit(height, value, 1)(points[:, 1])
+        return points
 
 
 @pytest.fixture(scope="module")
@@ -183,12 +205,61 @@ def test_a_thousand_frames_stay_small_and_names_are_shown_as_they_are(report) ->
     assert "camera '<b>left</b>' agrees badly" in page.by_id["warnings"]
 
 
-@pytest.mark.parametrize("k", [0, 100])
-def test_a_frame_or_none_is_enough(report, k: int) -> None:
+def test_measured_positions_are_drawn_where_they_were(report) -> None:
     model, scene, whole = report
-    records = {f"{k:04d}": whole.records[f"{k:04d}"]}
-    one = replace(whole, rows=whole.rows[k : k + 1], records=records)
-    assert bool(Page(make_report(Path("nowhere"), model, scene, one)).joints) is (k == 0)
+    name, k = "left_forearm_x", model.position_index("left_forearm_x")
+    rows, frames = whole.rows[:20], [f"{k:04d}" for k in range(20)]
+    # One frame was not measured; a full turn is none.
+    off = {frame: 3.0 + 360.0 * (frame == "0007") for frame in frames if frame != "0004"}
+    records = {
+        frame: replace(
+            whole.records[frame], joint_errors={name: off[frame]} if frame in off else {}
+        )
+        for frame in frames
+    }
+    summary = whole.summary | {"joint_errors": {name: {"mean": 3.0, "greatest": 3.0}}}
+    some = replace(whole, rows=rows, records=records, summary=summary)
+    text = make_report(Path("nowhere"), model, scene, some)
+    drawn = Page(text)
+    estimate = np.degrees([row.q[k] for row in rows])
+    np.testing.assert_allclose(drawn.curve(name, "c0")[:, 1], estimate, atol=0.05)
+    measured = np.delete(estimate, 4) - 3.0
+    np.testing.assert_allclose(drawn.curve(name, "measured")[:, 1], measured, atol=0.05)
+    assert "green: measured" in text
+    some = replace(some, summary=whole.summary)
+    assert "green: measured" not in make_report(Path("nowhere"), model, scene, some)
+
+
+def test_bands_are_explained_where_there_are_some(report) -> None:
+    model, scene, whole = report
+    whole = replace(whole, rows=whole.rows[:9], records=dict(list(whole.records.items())[:9]))
+    assert "Blue band" in make_report(Path("nowhere"), model, scene, whole)
+    bare = {frame: replace(one, joints={}) for frame, one in whole.records.items()}
+    page = make_report(Path("nowhere"), model, scene, replace(whole, records=bare))
+    assert " band" not in page
+    assert not {"known", "open"} & set(Page(page).classes)
+
+
+@pytest.mark.parametrize("k", [0, 100])
+def test_a_frame_is_a_table_without_plots(report, k: int) -> None:
+    model, scene, whole = report
+    name = "left_forearm_x"
+    record = replace(whole.records[f"{k:04d}"], joint_errors={name: -4.0} if k == 0 else {})
+    summary = whole.summary | {"joint_errors": {name: {}} if k == 0 else {}}
+    one = replace(whole, rows=whole.rows[k : k + 1], records={f"{k:04d}": record}, summary=summary)
+    page = Page(make_report(Path("nowhere"), model, scene, one))
+    assert not page.ticks
+    tables = [table for table in page.tables if table[0][0] == "joint"]
+    assert bool(tables) is (k == 0)
+    if tables:
+        value = np.degrees(whole.rows[0].q[model.position_index(name)])
+        row = next(row for row in tables[0] if row[0] == name)
+        numbers = [float(number) for number in re.findall(r"-?\d+\.\d+", " ".join(row[1:5]))]
+        # The estimate, its interval, and what was measured.
+        unit = np.degrees(0.02)
+        expected = [value, value - unit, value + unit, value + 4.0]
+        np.testing.assert_allclose(numbers, expected, atol=0.006)
+        assert "not determined" in row[3]
 
 
 def coordinates(path: str) -> np.ndarray:
@@ -238,3 +309,64 @@ def test_grid_joins_neighbours_of_one_state() -> None:
     runs = grid.rows[0][2]
     assert [run[2] for run in runs] == ["used", "no-picture", "used"]
     assert runs[0][1] == pytest.approx(2 * runs[1][1], abs=0.02)
+
+
+def played(page: str) -> dict[tuple[str, str | None], dict[str, Any]]:
+    """What a replay tells Meshcat, by what is told and of which path."""
+    told = {}
+    for text in re.findall(r"base64,([\w+/=]+)", page):
+        with suppress(ValueError):
+            command = msgpack.unpackb(base64.b64decode(text), strict_map_key=False)
+            if isinstance(command, dict) and "type" in command:
+                told[command["type"], command.get("path")] = command
+    return told
+
+
+def test_a_replay_shows_all_of_the_body_the_cameras_and_what_was_measured(
+    tiny_scene: TinyScene,
+) -> None:
+    model = load_model(tiny_scene.model, check=False)
+    q, off = np.array([*tiny_scene.truth.values()]), np.array([0.3, -0.1])
+    X_WB = np.repeat(np.eye(4)[None], len(q), axis=0)
+    X_WB[:, :3, 3] = (0.5, -0.2, 0.1)
+    left = replace(camera("left"), center_x=60.0)
+    flat = ParallelCamera("flat", 200, 160, 100.0, 99.5, 79.5, camera("flat", 60.0).X_WC)
+    told = played(make_replay(model, q, X_WB, [left, flat], 1.0, q + off))
+    corners = {(u - 0.5, v - 0.5) for u in (0, 200) for v in (0, 160)}
+    for one in (left, flat):
+        geometry = told["set_object", f"/drake/cameras/{one.name}"]["object"]["geometries"][0]
+        data = geometry["data"]["attributes"]["position"]["array"].data
+        p_W = np.frombuffer(data, np.float32).reshape(-1, 3).astype(float)
+        pixels, depth = one.project(p_W[np.linalg.norm(p_W - one.X_WC[:3, 3], axis=1) > 1e-6])
+        assert {tuple(row) for row in np.round(pixels, 2).tolist()} == corners
+        assert 0.0 < depth.max() < 2.5
+    # Meshcat's y is up. Of its window of 75 degrees the body takes up a good part.
+    view = told["set_property", "/Cameras/default/rotated/<object>"]["value"]
+    eye, target = (np.array([x, -z, y]) for x, y, z in (view, told["set_target", None]["value"]))
+    pinhole = PinholeCamera(
+        "view", 1000, 1000, *[500.0 / np.tan(np.radians(37.5))] * 2, 499.5, 499.5,
+        look_at(eye, target),
+    )  # fmt: skip
+    context, plant, seen = model.plant.CreateDefaultContext(), model.plant, []
+    tracks = {
+        one["path"]: {track["name"]: track["keys"] for track in one["clip"]["tracks"]}
+        for one in told["set_animation", None]["animations"]
+    }
+    for k, row in enumerate(q):
+        for positions, measured in ((row, False), (row + off, True)):
+            plant.SetPositions(context, positions)
+            for link, mesh in model.link_meshes.items():
+                pose = plant.GetBodyByName(link).EvalPoseInWorld(context).GetAsMatrix4()
+                X_WL = X_WB[k] @ pose
+                if not measured:
+                    seen += [mesh.vertices @ X_WL[:3, :3].T + X_WL[:3, 3]]
+                    continue
+                keys = tracks[f"/drake/measured/{link}"][".position"]
+                near = min(keys, key=lambda key, k=k: abs(key["time"] - 10 * k))
+                np.testing.assert_allclose(near["value"], X_WL[:3, 3], atol=1e-9)
+    pixels, depth = pinhole.project(np.concatenate(seen))
+    assert depth.min() > 0.0
+    assert (pixels >= -0.5).all()
+    assert (pixels <= 999.5).all()
+    assert np.ptp(pixels, axis=0).max() > 400.0
+    assert pinhole.project(left.X_WC[:3, 3])[1] > 0.0

@@ -12,6 +12,7 @@ from drake_pose.files.settings import EstimateSettings
 from drake_pose.jobs.estimate.scene import estimate_scene
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from drake_pose.silhouette.pictures.scenes import load_scene
+from tests.files.test_report_page import Page
 from tests.filtering.tracking.test_colours import painted, room
 from tests.filtering.tracking.test_match_and_track import swings
 from tests.search.bodies import forked_body, near_camera
@@ -172,8 +173,17 @@ def test_where_the_body_is_lost_no_pose_is_written(recording, tmp_path):
     assert [k for k, row in enumerate(rows) if ",,,," in row] == [3, 4]
     times = [line.split()[0] for line in (out / "positions.mot").read_text().splitlines()[7:]]
     assert times == [f"{k / 30:.6f}" for k in range(FRAMES) if k not in (3, 4)]
-    page = (out / "report.html").read_text()
-    assert "0003-0004 (2 of 8): no pose was found" in page
+    text = (out / "report.html").read_text()
+    assert "0003-0004 (2 of 8): no pose was found" in text
+    # The page counts pictures, not the only mask, whose IoU makes no plot.
+    page = Page(text)
+    cameras = next(table for table in page.tables if table[0][0] == "camera")
+    assert cameras[1][:3] == ["front", "8", "6"]
+    assert "tracked by colour in " in text
+    assert "IoU of each camera" not in text
+    # One bar, and its place in the legend; there is no frame without a picture.
+    assert [page.classes.count(name) for name in ("left-out", "no-picture")] == [2, 1]
+    assert not (out / "motion.bvh").exists()
 
 
 def test_stills_have_no_pictures_and_full_masks_need_none(recording, tmp_path):

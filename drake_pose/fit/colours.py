@@ -6,18 +6,21 @@ Nothing is kept here between frames: who follows a body keeps the histograms, an
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from drake_pose.camera.models import Camera
 from drake_pose.errors import SettingsError
-from drake_pose.fit.colour_lines import COLOURS, compare_lines, learn_colours
+from drake_pose.fit.colour_lines import COLOURS, ON, compare_lines, learn_colours
 from drake_pose.fit.contour_fit import Comparison, Noise, camera_weights, pack_cameras
 from drake_pose.fit.kernel import COMPARED, SQUARES, WEIGHT
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.fit.parameters import Placement
+from drake_pose.silhouette.areas.outline import Outline
+from drake_pose.silhouette.areas.scoring import draw_labels
 
 Array = NDArray[np.float64]
 Histograms = NDArray[np.float32]
@@ -28,6 +31,8 @@ Picture = NDArray[np.uint8]
 NO_REGION = np.zeros((0, 0), dtype=np.bool_)
 """Where nobody knows where the body is seen: as `learn_colours` takes it."""
 
+# Rarer colours are not a part's own [a share of all]; fewer pixels say nothing of a part.
+_RARE, _FEW = 4e-4, 100
 # A part is no closer to a contour than this [pixel], and is judged by no less of it [pixel].
 _CLOSE, _TELLING = 0.7, 20.0
 # What a part's lines say of their own noise is trusted no further than this [pixel]: of a part that
@@ -46,6 +51,56 @@ _WIDTHS = (16.0, 30.0)
 # The share of a frame's colours in what is known after it. Lines on which the edge seems to be
 # further from the contour [pixel] teach nothing: something else is there.
 _RATE, _AGREEING = 0.1, 2.5
+
+
+def colour_numbers(pixels: Picture) -> NDArray[np.intp]:
+    """(...) the colours of pixels (..., 3 or 4), as histograms count them."""
+    red, green, blue = np.moveaxis(pixels[..., :3].astype(np.intp) >> 4, -1, 0)
+    return (red * 16 + green) * 16 + blue
+
+
+@dataclass(frozen=True, eq=False)
+class OwnColours:
+    """What parts look like to whichever camera, learned where the body is known to be.
+
+    Args:
+        known: (nodes, COLOURS) which colours are a part's own.
+        usual: (nodes,) the share of its pixels that had them there; nan: it was not seen.
+    """
+
+    known: NDArray[np.bool_]
+    usual: Array
+
+    @staticmethod
+    def learned(
+        histograms: Iterable[NDArray[np.float32]],
+        outlines: Sequence[Outline],
+        X_WN: Array,
+        views: Iterable[tuple[Camera, Picture]],
+    ) -> OwnColours:
+        """Those of cameras' histograms, of a body of these surfaces at X_WN (nodes, 4, 4)."""
+        known = np.any([one[:, ON] > _RARE for one in histograms], axis=0)
+        own = OwnColours(known, np.ones(len(known)))
+        return OwnColours(known, own._shares(outlines, X_WN, views))
+
+    def shown(
+        self, outlines: Sequence[Outline], X_WN: Array, views: Iterable[tuple[Camera, Picture]]
+    ) -> Array:
+        """(nodes,) how many times the usual share shows: of the median, as light changes all."""
+        shares = self._shares(outlines, X_WN, views) / self.usual
+        return np.asarray(shares / max(float(np.nanmedian([*shares, 1.0])), 1e-9))
+
+    def _shares(
+        self, outlines: Sequence[Outline], X_WN: Array, views: Iterable[tuple[Camera, Picture]]
+    ) -> Array:
+        counts = np.zeros((2, len(outlines)))
+        for camera, picture in views:
+            labels = draw_labels(outlines, range(1, 1 + len(outlines)), camera.X_CW @ X_WN, camera)
+            seen = labels > 0
+            parts = labels[seen] - 1
+            np.add.at(counts[0], parts, self.known[parts, colour_numbers(picture[seen])])
+            np.add.at(counts[1], parts, 1.0)
+        return np.where(counts[1] < _FEW, np.nan, counts[0] / np.maximum(counts[1], 1.0))
 
 
 def step_of_lines(number: int) -> int:

@@ -32,6 +32,8 @@ _APART = 0.08
 # Where points are put on a limb: so far from root to middle joint, and on to the end; a hand's or
 # foot's middle lies farther.
 _ALONG = np.array([0.4, 0.6, 0.8, 1.0, 1.2, 1.4, 1.6, 1.8, 2.0, 2.25])
+UPPER_SAMPLES = int(np.count_nonzero(_ALONG <= 1.0))
+"""How many of a limb's points are on its first half; the others follow."""
 
 
 @dataclass(frozen=True, eq=False)

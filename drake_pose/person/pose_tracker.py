@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from drake_pose.arrays import Array, Mask
 from drake_pose.fit.camera_sums import AddUp
+from drake_pose.fit.colours import OwnColours
 from drake_pose.fit.contour_fit import Comparison, ContourFit, PoseFit, Prior, pack_views
 from drake_pose.fit.covariance import surface_deformations
 from drake_pose.fit.kernel import COMPARED, FITTING, SQUARES, WEIGHT
@@ -311,13 +312,45 @@ class PersonPoseTracker:
         hopeless = due and fitted.inlier_ratio < enough and last.troubled > 0
         return self._restarted(state, last, frame) if lost or doubted or hopeless else state
 
-    def follow_by_colour(self, last: TrackState, colours: ColourViews) -> TrackState:
-        """The next frame, where pictures say where the person's edge is; no limb is searched."""
-        fitted = self._fitted(last, colours.add_up(self.fit))
+    def follow_by_colour(
+        self, last: TrackState, colours: ColourViews, own: OwnColours | None = None
+    ) -> TrackState:
+        """The next frame, where pictures say where the person's edge is.
+
+        A limb that does not show its own colours is searched again; if it does not then, either,
+        the person is lost.
+        """
+        fitted, shown = self._fitted(last, colours.add_up(self.fit)), 1.0
+        if own is not None:
+            fitted, shown = self._recoloured(fitted, colours, own)
         step = fitted.values - last.values
         lengths, fitting = fitted.sums[:-1, [COMPARED, FITTING]].T
-        worst = np.min(fitting / np.maximum(lengths, 1e-9), where=lengths >= _TELLING, initial=1.0)
+        worst = np.min(
+            fitting / np.maximum(lengths, 1e-9), where=lengths >= _TELLING, initial=shown
+        )
         return TrackState(fitted.values, step, fitted.inlier_ratio, last.usual, worst=float(worst))
+
+    def _recoloured(
+        self, fitted: PoseFit, colours: ColourViews, own: OwnColours
+    ) -> tuple[PoseFit, float]:
+        """A fit whose limbs show their own colours, where that is found; what the worst shows."""
+
+        def shown(values: Array) -> Array:
+            seen = zip(colours.cameras, colours.pictures, strict=True)
+            return own.shown(self.fit.outlines, self.fit.kinematics.poses(values), seen)
+
+        shares, least = shown(fitted.values), 1.0
+        for limb in self.plan.limbs.values():
+            worst = float(np.nanmin([*shares[limb.nodes], 1.0]))
+            if worst < _PART_LOST_BELOW:
+                placed = self._search.placed_by_colour(fitted.values, limb, colours, own.known)
+                told = [(one, np.nan_to_num(shown(one.values))) for one in placed]
+                right = [one for one in told if one[1][limb.nodes].min() >= _PART_LOST_BELOW]
+                if right:
+                    fitted, shares = max(right, key=lambda one: one[0].closeness)
+                    worst = 1.0
+            least = min(least, worst)
+        return fitted, least
 
     def distance_by_colour(self, values: Array, colours: ColourViews) -> float:
         """RMS distance [pixel] of the contour at values (m,) to the colours'; nan: none is seen."""

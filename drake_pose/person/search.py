@@ -13,12 +13,13 @@ import numpy as np
 
 from drake_pose.arrays import Array, Mask
 from drake_pose.errors import SettingsError
+from drake_pose.fit.colours import colour_numbers
 from drake_pose.fit.contour_fit import ContourFit, PoseFit, Prior
 from drake_pose.fit.kernel import COMPARED, FITTING
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
-from drake_pose.person.body_plan import BodyPlan, PlannedLimb, crowding
+from drake_pose.person.body_plan import UPPER_SAMPLES, BodyPlan, PlannedLimb, crowding
 from drake_pose.person.rays import sum_at_points
-from drake_pose.person.views import FrameViews
+from drake_pose.person.views import ColourViews, FrameViews
 from drake_pose.silhouette.areas.scoring import draw_mask
 
 HEADINGS = 12
@@ -35,6 +36,8 @@ _LIMB_FITS, _LIMB_GAIN, _LIMB_SHOWS = 0.8, 0.15, 0.5
 # The share of the fresh starts, the most promising ones, that is fitted; and where nothing is known
 # yet, for how many of these all doubtful limbs are searched.
 _FITTED, _MENDED = 0.5, 3
+# In how many ways a limb is placed by its colours.
+_RECOLOURED = 3
 # Limbs whose tips are farther apart are not alike, and limbs that are nearer about the same [m].
 _UNALIKE, _NEAR = 0.25, 0.15
 # How much of a fit tells which guess is promising.
@@ -189,7 +192,7 @@ class PersonSearch:
         prior = Prior(values, 0.1 * self._information)
         return self._fit.fit(frame.coarse, values, self._coarse, prior, self._held)
 
-    def _refine(self, values: Array, frame: FrameViews) -> PoseFit:
+    def _refine(self, values: Array, frame: FrameViews | ColourViews) -> PoseFit:
         """A fit from a coarse guess, which is trusted little."""
         prior = Prior(values, 0.1 * self._information)
         add_up = frame.add_up(self._fit)
@@ -240,6 +243,11 @@ class PersonSearch:
     ) -> list[Array]:
         """Values (m,) with a limb where it fills most, in a few ways that are not alike."""
         scores, _ = self._scores(values, limb, frame, placed)
+        return self._unalike(values, limb, scores, count)
+
+    @staticmethod
+    def _unalike(values: Array, limb: PlannedLimb, scores: Array, count: int) -> list[Array]:
+        """Values (m,) with the limb's best poses by scores (n,) that are not alike."""
         found: list[Array] = []
         tips: list[Array] = []
         for index in np.argsort(-scores):
@@ -258,6 +266,27 @@ class PersonSearch:
         poses = limb.poses[off < _NEAR]
         effort = np.abs(poses - limb.poses[0]).sum(axis=1)
         return [] if not len(poses) else [poses[np.argmin(effort)]]
+
+    def placed_by_colour(
+        self, values: Array, limb: PlannedLimb, views: ColourViews, own: Mask
+    ) -> list[PoseFit]:
+        """Fits whose limb was placed where its own colours (nodes, COLOURS) are seen most."""
+        X_WT = self._fit.kinematics.poses(values)[self._plan.trunk]
+        places = limb.samples_T @ X_WT[:3, :3].T + X_WT[:3, 3]
+        half, scores = len(limb.nodes) // 2, np.zeros(len(places))
+        for camera, picture in zip(views.cameras, views.pictures, strict=True):
+            colours = colour_numbers(picture)
+            for nodes, points in (
+                (limb.nodes[:half], np.s_[:, :UPPER_SAMPLES]),
+                (limb.nodes[half:], np.s_[:, UPPER_SAMPLES:]),
+            ):
+                worth = np.where(own[nodes].any(axis=0), 1, -1).astype(np.int8)[colours]
+                weights = np.ascontiguousarray(limb.weights[points])
+                scores += sum_at_points(
+                    camera, worth, np.ascontiguousarray(places[points]), weights
+                )[0]
+        chosen = self._unalike(values, limb, scores, _RECOLOURED)
+        return [self._refine(one, views) for one in chosen]
 
     def _exchanged(self, values: Array) -> list[Array]:
         """Values (m,) that look much alike: both arms or legs exchanged; turned about."""

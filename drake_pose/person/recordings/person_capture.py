@@ -15,6 +15,7 @@ from drake_pose.arrays import Array, Mask, Picture
 from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.camera.models import Camera
 from drake_pose.errors import SettingsError
+from drake_pose.fit.colours import OwnColours
 from drake_pose.fit.contour_fit import ContourFit
 from drake_pose.person.pose_tracker import PersonPoseTracker, TrackState
 from drake_pose.person.recordings.persons_in_view import ReadFrame
@@ -237,6 +238,7 @@ def capture_by_colour(
     captured, distances = PersonCapture.begun(count, shape, fit), np.full(count, np.nan)
     state: TrackState | None = None
     colours: KnownColours = {}
+    own: OwnColours | None = None
     for frame in range(count):
         seen = pictures(frame)
         views = ColourViews([cameras[name] for name in seen], list(seen.values()), colours)
@@ -249,8 +251,11 @@ def capture_by_colour(
             captured.q[frame], captured.shares[frame] = known.q[place], known.shares[place]
             captured.deviations[frame] = known.deviations[place]
             colours = views.learned(fit, values, masked[frame])
+            shown = zip(views.cameras, views.pictures, strict=True)
+            X_WN = fit.kinematics.poses(values)
+            own = OwnColours.learned(colours.values(), fit.outlines, X_WN, shown)
         else:
-            state, views = _followed(tracker, state, views, starts.get(frame))
+            state, views = _followed(tracker, state, views, starts.get(frame), own)
             if state is not None and state.is_lost:
                 captured.shares[frame] = state.share
                 state = replace(state, step=np.zeros(len(state.values)))
@@ -264,11 +269,15 @@ def capture_by_colour(
 
 
 def _followed(
-    tracker: PersonPoseTracker, state: TrackState | None, views: ColourViews, start: Array | None
+    tracker: PersonPoseTracker,
+    state: TrackState | None,
+    views: ColourViews,
+    start: Array | None,
+    own: OwnColours | None,
 ) -> tuple[TrackState | None, ColourViews]:
     """The next frame by its pictures, or from a start (nq,) where the person is lost."""
     if state is not None:
-        state = tracker.follow_by_colour(state, views)
+        state = tracker.follow_by_colour(state, views, own)
     if start is not None and (state is None or state.is_lost):
         began = tracker.start(tracker.values(start))
         if not views.known:

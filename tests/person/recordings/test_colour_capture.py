@@ -1,11 +1,14 @@
 """A person in clothes of several colours before a room of patches: the truth is known."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from drake_pose.body.landmarks import landmark_positions, load_landmarks
 from drake_pose.camera.models import circle_of_cameras
 from drake_pose.fit.colour_lines import BESIDE, ON
+from drake_pose.fit.colours import OwnColours
 from drake_pose.fit.contour_fit import ContourFit
 from drake_pose.person.pose_tracker import PersonPoseTracker
 from drake_pose.person.recordings.person_capture import capture_by_colour
@@ -86,6 +89,30 @@ def test_a_loss_is_said_and_a_start_goes_on(person, cameras, recording):
     assert lost.tolist() == [False] * 3 + [True] * 2 + [False] * 3
     assert np.isnan(found.deviations[lost]).all()
     assert np.mean(joint_errors(person, found.q[-1], truth[-1])) < 20.0
+
+
+def test_a_limb_without_its_own_colours_is_searched_again_or_said_to_be_lost(
+    person, cameras, recording
+):
+    pictures, masks, q = (one[0] for one in recording)
+    tracker = PersonPoseTracker(ContourFit(person.pose_tree(), noise=NOISE))
+    fit, values, seen = tracker.fit, tracker.values(q), list(pictures.values())
+    known = ColourViews(list(cameras.values()), seen, {}).learned(fit, values, masks)
+    views = ColourViews(list(cameras.values()), seen, known)
+    pairs = list(zip(views.cameras, seen, strict=True))
+    X_WN = fit.kinematics.poses(values)
+    own = OwnColours.learned(known.values(), fit.outlines, X_WN, pairs)
+    np.testing.assert_allclose(own.shown(fit.outlines, X_WN, pairs), 1.0)
+    wrong, limb = values.copy(), tracker.plan.limbs["left_arm"]
+    wrong[limb.values] = limb.poses[7]
+    assert joint_errors(person, tracker.positions(wrong), q).max() > 300.0
+    blind = tracker.follow_by_colour(tracker.start(wrong), views)
+    assert joint_errors(person, tracker.positions(blind.values), q).max() > 150.0
+    state = tracker.follow_by_colour(tracker.start(wrong), views, own)
+    assert not state.is_lost
+    assert joint_errors(person, tracker.positions(state.values), q).max() < 60.0
+    other = own.known & ~np.isin(np.arange(len(own.known)), limb.nodes)[:, None]
+    assert tracker.follow_by_colour(tracker.start(values), views, replace(own, known=other)).is_lost
 
 
 class TestLearning:

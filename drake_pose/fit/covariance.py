@@ -54,6 +54,7 @@ class ErrorSizes(NamedTuple):
         repeated: the same of what noise repeats in all pictures of a part that stands still before
             a camera; 0 where no part does.
         surface, mask, camera: how far they move contours [the unit of the distances].
+        doubts: of each group of what is doubted [its own unit].
     """
 
     noise: float
@@ -61,6 +62,7 @@ class ErrorSizes(NamedTuple):
     surface: float
     mask: float
     camera: float
+    doubts: tuple[float, ...] = ()
 
 
 class ErrorEffects(NamedTuple):
@@ -83,6 +85,8 @@ class Distances(NamedTuple):
         information: (m, m) what all distances tell of the values where each errs by itself.
         bends: (n, 12 nodes) how they follow the parts' surfaces, which all pictures see alike.
         pictures: (n,) which of the pictures each is of.
+        doubts: groups (n, k) of how they follow what may be off alike in all pictures and is not
+            among the values, such as joints' zeros; each by a unit of its group.
     """
 
     y: Array
@@ -91,6 +95,7 @@ class Distances(NamedTuple):
     information: Array
     bends: Array
     pictures: NDArray[np.intp]
+    doubts: tuple[Array, ...] = ()
 
 
 class Picture(NamedTuple):
@@ -268,8 +273,9 @@ def estimate_sizes(
     n = len(seen.y)
     stands_still = np.abs(seen.effects.repeated - seen.effects.noise).max(initial=0.0) > _SETTLED
     # Of parts that move, noise is noise.
-    told = [k for k, name in enumerate(ErrorSizes._fields) if name != "repeated" or stands_still]
-    effects = [seen.effects[k] for k in told]
+    named = ErrorEffects._fields
+    told = [k for k, name in enumerate(named) if name != "repeated" or stands_still]
+    effects = [seen.effects[k] for k in told] + [Z @ Z.T for Z in seen.doubts]
     apriori = _apriori(is_angle)
 
     def likelihood(t: Array) -> tuple[float, Array, Array]:
@@ -300,10 +306,11 @@ def estimate_sizes(
         t, (value, P, Py) = t + step, trial
         if np.abs(step).max() < _SETTLED:
             break
-    sizes = np.zeros(len(ErrorSizes._fields))
-    sizes[told] = np.exp(t)
-    found = ErrorSizes(*sizes.tolist())
-    return found._replace(camera=max(found.camera, least_camera))
+    sizes = np.zeros(len(named))
+    sizes[told] = np.exp(t[: len(told)])
+    noise, repeated, surface, mask, camera = sizes.tolist()
+    doubts = tuple(np.exp(t[len(told) :]).tolist())
+    return ErrorSizes(noise, repeated, surface, mask, max(camera, least_camera), doubts)
 
 
 def values_covariance(
@@ -325,9 +332,32 @@ def values_covariance(
 
 
 def distances_covariance(seen: Distances, sizes: ErrorSizes) -> Array:
-    """(n, n) of the distances."""
-    parts = zip(sizes, seen.effects, strict=True)
+    """(n, n) of the distances, without what is doubted."""
+    named = sizes.noise, sizes.repeated, sizes.surface, sizes.mask, sizes.camera
+    parts = zip(named, seen.effects, strict=True)
     return sum((size**2 * W for size, W in parts), np.zeros((len(seen.y), len(seen.y))))
+
+
+def doubted_covariance(
+    seen: Distances, sizes: ErrorSizes, is_angle: NDArray[np.bool_]
+) -> tuple[Array, Distances]:
+    """What the doubts add to the covariance (m, m) of the values, and the distances without them.
+
+    They were not fitted, so the values are off by what they follow them: the doubts' variance, and
+    the square of what is likeliest of them by what is left (best linear unbiased prediction,
+    Henderson 1975), for what is off has not the mean 0 once it is seen.
+    """
+    white = sizes.noise**2 + sizes.repeated**2
+    A = np.concatenate(seen.doubts, axis=1)
+    variances = np.repeat(np.square(sizes.doubts), [Z.shape[1] for Z in seen.doubts])
+    inverse = np.linalg.inv(distances_covariance(seen, sizes) + (A * variances) @ A.T)
+    VX, apriori = inverse @ seen.X, _apriori(is_angle)
+    left = inverse @ seen.y - VX @ np.linalg.solve(seen.X.T @ VX + apriori, VX.T @ seen.y)
+    likeliest = variances * (A.T @ left)
+    follow = np.linalg.solve(seen.information + white * apriori, seen.X.T @ A)
+    off = follow @ likeliest
+    without = seen._replace(y=seen.y - A @ likeliest, doubts=())
+    return (follow * variances) @ follow.T + np.outer(off, off), without
 
 
 def _apriori(is_angle: NDArray[np.bool_]) -> Array:

@@ -6,13 +6,15 @@ offsets from it; its surface stays what it is. All behind such a joint is shifte
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
+from drake_pose.body.model import OBJECT_POSITIONS
 from drake_pose.body.tree.link_graph import chain_transforms
-from drake_pose.body.tree.tree_kinematics import JointOffset, TreeKinematics
+from drake_pose.body.tree.pose_tree import PoseTree
+from drake_pose.body.tree.tree_kinematics import JointOffset, TreeKinematics, joint_offsets
 from drake_pose.fit.parameters import BodyParameters, Placement, affine_motions, owners_of
 from drake_pose.silhouette.areas.outline import Outline
 
@@ -97,3 +99,12 @@ class LengthenedBody(BodyParameters):
 def length_name(link: str) -> str:
     """The name of a link's length among the parameters."""
     return f"length of {link}"
+
+
+def lengthened_joints(tree: PoseTree, links: Collection[str] | None = None) -> list[JointOffset]:
+    """The robot's joints that links, all where None, carry at a distance from their own."""
+    return [
+        one
+        for one in joint_offsets(tree)
+        if (links is None or one.link in links) and one.joint not in OBJECT_POSITIONS
+    ]

@@ -28,10 +28,13 @@ all behind it about its origin."""
 GIRTH_PREFIX = "log_girth_"
 """Begins the names of girths: the logarithm of how wide a part is across its y axis."""
 
-CAMERA_NAMES = ("turn_x", "turn_y", "turn_z", "shift_x", "shift_y", "shift_z", "log_focal")
-"""A camera's parameters: the rotation vector [rad] by which, and the shift [m] along its axes by
-which it sees everything moved about its pivot; and the logarithm of its focal length's growth, or
-of a parallel camera's scale."""
+POSE_NAMES = ("turn_x", "turn_y", "turn_z", "shift_x", "shift_y", "shift_z")
+"""The rotation vector [rad] by which, and the shift [m] along its axes by which a camera sees
+everything moved about its pivot."""
+
+CAMERA_NAMES = (*POSE_NAMES, "log_focal", "center_x", "center_y")
+"""A camera's parameters: POSE_NAMES, the logarithm of its focal length's growth, or of a parallel
+camera's scale, and by how much its principal point is shifted [pixel]."""
 
 
 class Placement(NamedTuple):
@@ -159,10 +162,10 @@ class CameraParameters:
         self._pivots = turned + self._X_CW[:, :3, 3]
 
     def place(self, theta: Array) -> tuple[Array, Array, Array]:
-        """The cameras at all parameters (7 c,).
+        """The cameras at all parameters (9 c,).
 
         Returns:
-            X_CW (c, 4, 4), kernel parameters (c, 8), and the affine motions (c, 7, 12) of all nodes
+            X_CW (c, 4, 4), kernel parameters (c, 8), and the affine motions (c, 9, 12) of all nodes
             that each parameter amounts to.
         """
         parts = theta.reshape(-1, len(CAMERA_NAMES))
@@ -175,14 +178,18 @@ class CameraParameters:
             p_CW = R @ (X_CW[c, :3, 3] - self._pivots[c]) + pivot
             X_CW[c, :3, :3], X_CW[c, :3, 3] = R_CW, p_CW
             kernel[c, 1:3] *= np.exp(part[6])
+            kernel[c, 3:5] += part[7:9]
             twists = np.zeros((6, 7))
             twists[:3, :3], twists[3:, 3:6] = omegas.T, np.eye(3)
-            in_camera = np.zeros((7, 3, 4))
+            in_camera = np.zeros((len(CAMERA_NAMES), 3, 4))
             in_camera[:6] = affine_motions(twists).reshape(6, 3, 4)
             in_camera[:3, :, 3] = -in_camera[:3, :, :3] @ pivot
             in_camera[6, 0, 0] = in_camera[6, 1, 1] = 1.0
+            # A pixel is so far at the depth of a metre, or of parallel rays everywhere.
+            depth = 3 if kernel[c, 0] == 1.0 else 2
+            in_camera[7, 0, depth], in_camera[8, 1, depth] = 1.0 / kernel[c, 1:3]
             # What is affine in the camera's frame is so in the world's.
-            motions[c] = (R_CW.T @ in_camera @ X_CW[c]).reshape(7, 12)
+            motions[c] = (R_CW.T @ in_camera @ X_CW[c]).reshape(-1, 12)
         return X_CW, kernel, motions
 
 

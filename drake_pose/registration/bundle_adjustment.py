@@ -20,11 +20,10 @@ from drake_pose.fit.covariance import distances_in_pictures, estimate_sizes, val
 from drake_pose.fit.evidence import Evidence
 from drake_pose.fit.frames_fit import FramesFit, parameter_names
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
-from drake_pose.fit.parameters import CAMERA_NAMES, GIRTH_PREFIX, BodyParameters
+from drake_pose.fit.parameters import CAMERA_NAMES, GIRTH_PREFIX, POSE_NAMES, BodyParameters
 from drake_pose.fit.unknowns import Unknowns, choose, join
 from drake_pose.registration.posed_frames import SeenFrame, common_size, middle_of
 from drake_pose.registration.shared_fit import (
-    POSE_NAMES,
     PRIOR_DEVIATION,
     STEPS,
     pose_covariance,

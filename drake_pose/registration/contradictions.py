@@ -26,8 +26,9 @@ from drake_pose.fit.covariance import (
     estimate_sizes,
     with_widths,
 )
+from drake_pose.fit.parameters import POSE_NAMES
 from drake_pose.registration.per_frame_fit import FrameFit, PerFrameFit
-from drake_pose.registration.shared_fit import KNOWN_BEFOREHAND, POSE_NAMES
+from drake_pose.registration.shared_fit import KNOWN_BEFOREHAND
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -276,7 +277,7 @@ class _Auditor:
             pictures = [one for i in spread[k::groups] for one in self._frames[i].pictures]
             seen = self._distances(pictures)
             is_angle = np.append(self._fit.is_angle, np.zeros(len(pictures), bool))
-            sizes.append(estimate_sizes(seen, is_angle, least_camera=0.0))
+            sizes.append(estimate_sizes(seen, is_angle, least_camera=0.0)[:5])
         return ErrorSizes(*np.median(np.array(sizes), axis=0).tolist())
 
     def _distances(self, pictures: Sequence[Picture]) -> Distances:
@@ -285,6 +286,12 @@ class _Auditor:
         return distances_in_pictures(outlines, with_widths(outlines, pictures))
 
     def _info_of(self, fitted: FrameFit, sizes: ErrorSizes) -> _Information:
+        if not fitted.pictures:
+            p, nodes = len(self._fit.names), len(self._fit.outlines)
+            return _Information(
+                np.zeros((p, p)), np.zeros(p), np.zeros((p, 12 * nodes)),
+                np.zeros((nodes, p, p)), fitted.weights, 1.0, float(KNOWN_BEFOREHAND),
+            )  # fmt: skip
         seen = self._distances(fitted.pictures)
         own, widths = np.split(seen.X, [len(self._fit.names)], axis=1)
         X = own * self._fit.deviations

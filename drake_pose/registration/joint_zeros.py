@@ -9,7 +9,7 @@ guessed.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,10 +18,10 @@ from scipy.special import stdtr, stdtrit
 
 from drake_pose.body.model import OBJECT_POSITIONS
 from drake_pose.body.tree.pose_tree import PoseTree
-from drake_pose.body.tree.tree_kinematics import JointOffset, joint_offsets
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import RegistrationError, UnknownNameError
-from drake_pose.fit.lengthened_body import length_name
+from drake_pose.fit.lengthened_body import length_name, lengthened_joints
+from drake_pose.fit.parameters import POSE_NAMES
 from drake_pose.registration.posed_frames import PosedFrame, PosedFrames
 from drake_pose.registration.register import RegisteredCamera, RegistrationBody
 from drake_pose.registration.shared_fit import (
@@ -96,15 +96,6 @@ class JointCalibration:
     object_covariance: Array
 
 
-def lengthened_joints(tree: PoseTree, links: Collection[str] | None = None) -> list[JointOffset]:
-    """The robot's joints that links, all where None, carry at a distance from their own."""
-    return [
-        one
-        for one in joint_offsets(tree)
-        if (links is None or one.link in links) and one.joint not in OBJECT_POSITIONS
-    ]
-
-
 def links_with_length(tree: PoseTree) -> tuple[str, ...]:
     """The links that carry a joint at a distance from their own."""
     return tuple(dict.fromkeys(one.link for one in lengthened_joints(tree)))
@@ -126,6 +117,18 @@ def require_known(tree: PoseTree, names: Sequence[str], lengths: Sequence[str]) 
                 raise UnknownNameError(what, name, known, str(tree.model.path))
 
 
+def require_enough(count: int, zeros: int, lengths: int) -> None:
+    """Refuses fewer frames than so many zeros and lengths need.
+
+    Raises RegistrationError: says how many there are.
+    """
+    if count < max(2, zeros + lengths):
+        raise RegistrationError(
+            f"{zeros} joints' zeros and {lengths} links' lengths need as many frames of "
+            f"differing poses, and two or more; there are {count}: give more frames, or name fewer"
+        )
+
+
 def calibrate_joints(
     body: RegistrationBody,
     cameras: Sequence[RegisteredCamera],
@@ -145,24 +148,19 @@ def calibrate_joints(
 
     Raises:
         UnknownNameError: a name that is no position of the body's, or no link with a length.
-        RegistrationError: no camera, or fewer frames than zeros and lengths.
+        RegistrationError: fewer frames than zeros and lengths.
     """
     require_known(body.tree, names, lengths)
-    count = sum(len(one) for one in frames)
-    if not cameras or count < 2 or count < len(names) + len(lengths):
-        raise RegistrationError(
-            f"{len(names)} joints' zeros and {len(lengths)} links' lengths need as many frames of "
-            f"differing poses, and two or more; there are {count}: give more frames, or name fewer"
-        )
+    require_enough(sum(len(one) for one in frames), len(names), len(lengths))
     own = zip(cameras, frames, strict=True)
     seen = [PosedFrames(body.kinematics, body.all, one.camera, each) for one, each in own]
     X_CW = [one.camera.X_CW for one in cameras]
     offsets = lengthened_joints(body.tree, lengths)
-    sought = [*names, *(length_name(link) for link in lengths)]
+    sought, looks = [*names, *map(length_name, lengths)], len(POSE_NAMES) + focal
     standing = [name for name in body.kinematics.names if name in OBJECT_POSITIONS]
     told: dict[str, KinematicParameter] = {}
     while True:
-        fit = SharedFit(seen, X_CW, [*standing, *sought], offsets=offsets, focal=focal)
+        fit = SharedFit(seen, X_CW, [*standing, *sought], offsets=offsets, looks=looks)
         # Constants that are off let good frames contradict, so all count at first.
         fit, found = fit.from_found(fit.fit(ROUNDS_WITH_CONSTANTS))
         which = fit.agreeing(fit.inlier_ratios(found))

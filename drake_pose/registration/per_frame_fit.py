@@ -20,10 +20,10 @@ from drake_pose.fit.evidence import Evidence
 from drake_pose.fit.frames_fit import FramesFit, parameter_names
 from drake_pose.fit.kernel import COST, WEIGHT
 from drake_pose.fit.levenberg_marquardt import AnnealingStage, StepSettings
-from drake_pose.fit.parameters import BodyParameters
+from drake_pose.fit.parameters import POSE_NAMES, BodyParameters
 from drake_pose.fit.unknowns import choose
 from drake_pose.registration.posed_frames import SeenFrame, common_size, middle_of
-from drake_pose.registration.shared_fit import POSE_NAMES, TOLD_APART
+from drake_pose.registration.shared_fit import TOLD_APART
 from drake_pose.silhouette.areas.outline import Outline
 
 Array = NDArray[np.float64]

@@ -6,13 +6,15 @@ thin links and their distances from one another tell the two apart.
 How sure what is shared is: contours do not err point by point. There are the noise of points, the
 surface of a part in all frames alike, its edge in one mask, and each frame as a whole
 (``fit.covariance``). How large these are is told by what is left of the distances at the scale of
-the fit; frames' pulls scatter as these say, or by a factor more.
+the fit; frames' pulls scatter as these say, or by a factor more. What is off alike in all frames
+and is not fitted, zeros, lengths and lenses, moves what is fitted: its size is told so, too.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -27,23 +29,21 @@ from drake_pose.fit.covariance import (
     ErrorSizes,
     distances_covariance,
     distances_in_pictures,
+    doubted_covariance,
     estimate_sizes,
     values_covariance,
     with_widths,
 )
 from drake_pose.fit.evidence import NO_EDGE, Evidence, pack_evidence
 from drake_pose.fit.frames_fit import FramesFit, parameter_names
-from drake_pose.fit.lengthened_body import LengthenedBody
+from drake_pose.fit.lengthened_body import LengthenedBody, length_name, lengthened_joints
 from drake_pose.fit.levenberg_marquardt import AnnealingStage, Equations, StepSettings
-from drake_pose.fit.parameters import CAMERA_NAMES
+from drake_pose.fit.parameters import CAMERA_NAMES, POSE_NAMES
 from drake_pose.fit.unknowns import choose, join
 from drake_pose.registration.posed_frames import PosedFrames
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
-
-POSE_NAMES = CAMERA_NAMES[:6]
-"""A camera's turn [rad] and shift [m] along its axes about the middle of the bodies."""
 
 ROUNDS_WITH_CONSTANTS = (
     *(AnnealingStage(scale, 0.02) for scale in (0.12, 0.09, 0.07, 0.05, 0.03, 0.02)),
@@ -78,6 +78,9 @@ _FITTED = AnnealingStage(0.005, 0.005)
 PRIOR_DEVIATION = 3.0
 # What a picture tells of a direction is nothing below this share of what it tells best.
 _TOLD = 1e-3
+# What may be off, and is not fitted: groups, and units [rad, m, 1, 1, share of the focal length].
+_ZEROS, _LENGTHS, _LENSES = "zeros", "lengths", "lenses"
+_ZERO, _SLID, _LENGTH, _FOCAL, _CENTER = np.radians(0.5), 0.002, 0.01, 0.01, 0.005
 # Where parts err by so much [pixel], a calibration is no better than this [pixel].
 _PARTS_ERR, _NO_BETTER = 0.2, 1.0
 
@@ -106,7 +109,7 @@ class SharedFit:
     Args:
         X_CW: (4, 4) for each camera, where a fit begins.
         offsets: joints whose places on their links are unknown.
-        focal: whether the cameras' focal lengths are unknown.
+        looks: so many of CAMERA_NAMES are unknown of each camera, its pose among them.
         widths: whether the masks' are.
     """
 
@@ -117,11 +120,11 @@ class SharedFit:
         constants: Sequence[str] = (),
         *,
         offsets: Sequence[JointOffset] = (),
-        focal: bool = False,
+        looks: int = len(POSE_NAMES),
         widths: bool = True,
     ) -> None:
-        self.seen, self.constants = tuple(seen), tuple(constants)
-        self._options: dict[str, Any] = {"offsets": offsets, "focal": focal, "widths": widths}
+        self.seen, self.constants, self._X_CW = tuple(seen), tuple(constants), tuple(X_CW)
+        self._options: dict[str, Any] = {"offsets": offsets, "looks": looks, "widths": widths}
         first, body = seen[0], seen[0].body
         if offsets:
             body = LengthenedBody(first.kinematics, first.outlines, offsets)
@@ -135,9 +138,8 @@ class SharedFit:
         cameras = [
             one.camera.with_pose(np.linalg.inv(X)) for one, X in zip(seen, X_CW, strict=True)
         ]
-        self.per_camera = len(POSE_NAMES) + focal
-        looks = CAMERA_NAMES[: self.per_camera]
-        names = [f"{camera.name}.{name}" for camera in cameras for name in looks]
+        self.per_camera = looks
+        names = [f"{camera.name}.{name}" for camera in cameras for name in CAMERA_NAMES[:looks]]
         self.names = (*names, *constants)
         deviations = {one: CONSTANT_DEVIATION for one in constants}
         deviations |= dict.fromkeys(OBJECT_POSITIONS, _OBJECT_DEVIATION)
@@ -227,12 +229,13 @@ class SharedFit:
 
     def covariance(self, found: Shared, which: Mask | None = None) -> Array:
         """(u, u) of the errors of what is shared, told by the masks (rows,) that count."""
-        seen = self._distances(found, _FITTED, which)
+        seen = self._doubted_distances(found, _FITTED, which)
         is_angle = np.zeros(seen.X.shape[1], bool)
         sizes = estimate_sizes(seen, is_angle, 0.0, PRIOR_DEVIATION)
+        doubted, seen = doubted_covariance(seen, sizes, is_angle)
         covariance = values_covariance(seen, sizes, np.arange(len(is_angle)), is_angle)
-        covariance *= _scatter(seen, sizes, len(self.names))
-        trusted = _calibration_error(self._distances(found, TOLD_APART, which))
+        covariance = covariance * _scatter(seen, sizes, len(self.names)) + doubted
+        trusted = _calibration_error(self._doubted_distances(found, TOLD_APART, which))
         for c, camera in enumerate(self.cameras(found)):
             unseen = _unseen_errors(self.seen[c], camera.X_CW, trusted)[: self.per_camera]
             at = np.arange(len(unseen)) + c * len(unseen)
@@ -271,6 +274,54 @@ class SharedFit:
         held[:, : self._values.shape[1]] = self._values
         rows = zip(held, self._own(at), strict=True)
         return np.array([self._fit.unknowns.parameters(one, own, at.shared) for one, own in rows])
+
+    def _doubted_distances(
+        self, found: Shared, step: AnnealingStage, which: Mask | None
+    ) -> Distances:
+        """The distances in all masks that count; values are what is shared, then the widths.
+
+        Doubted are, where they are not among it: zeros, lengths, each and all alike, and lenses.
+        """
+        whole, names = self._doubting, self._doubting.names
+        shared = np.zeros(len(names))
+        own = [names.index(name) for name in self.names]
+        shared[own] = found.shared
+        seen = whole._distances(Shared(shared, found.widths), step, which)
+        units, groups = whole._doubt_units(), []
+        for kind in (_ZEROS, _LENGTHS, _LENSES):
+            doubted = [k for k, name in enumerate(names) if k not in own and units[name][0] == kind]
+            Z = seen.X[:, doubted] * [units[names[k]][1] for k in doubted]
+            # Lengths may all be off alike, too.
+            alike = kind == _LENGTHS
+            groups.append(np.column_stack([Z, Z.sum(axis=1)]) if alike else Z)
+        values = np.array([*own, *range(len(names), seen.X.shape[1])])
+        return seen._replace(
+            X=seen.X[:, values],
+            information=seen.information[np.ix_(values, values)],
+            doubts=tuple(Z for Z in groups if Z.any()),
+        )
+
+    @cached_property
+    def _doubting(self) -> SharedFit:
+        """The same fit, all unknown that is doubted."""
+        kinematics = self.seen[0].kinematics
+        offsets = lengthened_joints(kinematics.tree)
+        free = np.flatnonzero(kinematics.lower < kinematics.upper)
+        zeros = [name for name in (kinematics.names[k] for k in free) if name not in self.constants]
+        lengths = dict.fromkeys(length_name(one.link) for one in offsets)
+        names = [*self.constants, *zeros, *(one for one in lengths if one not in self.constants)]
+        options = self._options | {"offsets": offsets, "looks": len(CAMERA_NAMES)}
+        return SharedFit(self.seen, self._X_CW, names, **options)
+
+    def _doubt_units(self) -> dict[str, tuple[str, float]]:
+        """Of each name the group in which it is doubted, "" where not, and by how much."""
+        kinematics, units = self.seen[0].kinematics, dict.fromkeys(self.names, (_LENGTHS, _LENGTH))
+        for name, is_angle in zip(kinematics.names, kinematics.is_angle, strict=True):
+            units[name] = "" if name in OBJECT_POSITIONS else _ZEROS, _ZERO if is_angle else _SLID
+        for camera in (one.camera for one in self.seen):
+            own = [("", 1.0)] * 6 + [(_LENSES, _FOCAL)] + [(_LENSES, _CENTER * camera.focal_x)] * 2
+            units |= zip((f"{camera.name}.{name}" for name in CAMERA_NAMES), own, strict=True)
+        return units
 
     def _distances(self, found: Shared, step: AnnealingStage, which: Mask | None) -> Distances:
         """The distances in all masks that count; values are what is shared, then the widths."""

@@ -27,9 +27,11 @@ from drake_pose.body.model import load_model
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import RegistrationError
 from drake_pose.files.settings import EstimateSettings
+from drake_pose.fit.lengthened_body import lengthened_joints
 from drake_pose.jobs.estimate.searches import make_tree
 from drake_pose.jobs.registration.inputs import read_inputs
 from drake_pose.jobs.registration.settings import RegistrationSettings
+from drake_pose.registration.joint_zeros import links_with_length
 from drake_pose.registration.posed_frames import PosedFrame, PosedFrames
 from drake_pose.registration.register import CameraSearch, RegistrationBody
 from drake_pose.registration.start_poses import areas
@@ -47,6 +49,8 @@ _MIDDLE, _MIDDLE_SD = np.array([0.0, 0.0, 0.35]), 0.1
 # A silhouette of fewer pixels is of an arm that is hardly in the picture: another pose is drawn,
 # and after so many such poses another camera.
 _LEAST_PIXELS, _TRIES = 3000, 30
+# By how much a model and a lens are off: zeros [rad], lengths, focal length, and centre [pixel].
+_ZERO_SD, _LENGTH_SD, _FOCAL_SD, _CENTER_SD = np.radians(0.3), 0.01, 0.01, 3.0
 _MOST_MORPHED, _HOLES, _HOLE_RADII = 2, 0.03, (3, 9)
 _LBR, _PANDA = "arm_two_views/med7/med7.urdf", "franka_one_view/panda/panda.urdf"
 _XARM = "cmeel.prefix/share/example-robot-data/robots/xarm_description/urdf/xarm7.urdf"
@@ -164,11 +168,27 @@ def damaged(mask: Mask, rng: np.random.Generator) -> Mask:
     return drawn.astype(np.bool_)
 
 
-def measure_camera(body: RegistrationBody, seed: int, worn: bool) -> CameraOutcome:
-    """Draws an arm and finds its camera; worn: masks are damaged, one frame's positions wrong."""
+def measure_camera(
+    body: RegistrationBody, seed: int, worn: bool, misfit: bool = False
+) -> CameraOutcome:
+    """Draws an arm and finds its camera.
+
+    Args:
+        worn: masks are damaged, one frame's positions wrong.
+        misfit: zeros, lengths of links and the lens are a little off that the search is told.
+    """
     rng = np.random.default_rng(seed)
-    camera, frames = draw_arm(body, _FRAMES, rng)
+    true = _with_other_lengths(body, rng) if misfit else body
+    camera, frames = draw_arm(true, _FRAMES, rng)
     wrong: tuple[str, ...] = ()
+    if misfit:
+        zeros = rng.normal(0.0, _ZERO_SD, len(body.kinematics.names)) * body.kinematics.is_angle
+        frames = [replace(one, values=one.values + zeros) for one in frames]
+        growth, (x, y) = np.exp(rng.normal(0.0, _FOCAL_SD)), rng.normal(0.0, _CENTER_SD, 2)
+        camera = replace(
+            camera, focal_x=camera.focal_x * growth, focal_y=camera.focal_y * growth,
+            center_x=camera.center_x + x, center_y=camera.center_y + y,
+        )  # fmt: skip
     if worn:
         frames = [replace(frame, mask=damaged(frame.mask, rng)) for frame in frames]
         k = int(rng.integers(len(frames)))
@@ -186,6 +206,14 @@ def measure_camera(body: RegistrationBody, seed: int, worn: bool) -> CameraOutco
     return CameraOutcome(*_sizes(error), int(np.count_nonzero(inside)), named, seconds)
 
 
+def _with_other_lengths(body: RegistrationBody, rng: np.random.Generator) -> RegistrationBody:
+    """The arm whose links are a little longer or shorter."""
+    tree, settings = body.tree, EstimateSettings()
+    by = {link: rng.normal(0.0, _LENGTH_SD) for link in links_with_length(tree)}
+    shifts = {one.joint: (by[one.link] * one.p_L).tolist() for one in lengthened_joints(tree)}
+    return body.with_tree(make_tree(tree.model.reshaped(shifts=shifts), settings, None))
+
+
 def pose_error(X_WC: Array, true: Array) -> Array:
     """(6,) by what rotation vector [rad] and shift [m] in the world a pose (4, 4) is off."""
     turn = Rotation.from_matrix(true[:3, :3] @ X_WC[:3, :3].T).as_rotvec()
@@ -199,9 +227,13 @@ def _sizes(error: Array) -> tuple[float, float]:
 
 def _camera_rows(arms: dict[str, RegistrationBody], cases: int) -> Iterator[list[str]]:
     """Simulated cameras, for each arm and all together."""
-    for worn, masks in ((False, "exact"), (True, "damaged, one frame wrong")):
+    for worn, misfit, masks in (
+        (False, False, "exact"),
+        (True, False, "damaged, one frame wrong"),
+        (False, True, "exact, model and lens off"),
+    ):
         own = {
-            name: [measure_camera(body, _SEED + k, worn) for k in range(cases)]
+            name: [measure_camera(body, _SEED + k, worn, misfit) for k in range(cases)]
             for name, body in arms.items()
         }
         for name, outcomes in {**own, "all": [*chain(*own.values())]}.items():

@@ -8,6 +8,7 @@ from drake_pose.fit.covariance import (
     Distances,
     ErrorEffects,
     ErrorSizes,
+    doubted_covariance,
     estimate_sizes,
     values_covariance,
 )
@@ -34,11 +35,12 @@ def drawn_distances(
     # The second half repeats some noise of the first.
     again = np.tile(np.eye(count // 2), (2, 1))
     kinds = [again, *kinds]
-    for size, kind in zip(sizes[1:], kinds, strict=True):
+    doubts = tuple(generator.normal(0.0, 2.0, (count, 4)) for _ in sizes.doubts)
+    for size, kind in zip((*sizes[1:5], *sizes.doubts), (*kinds, *doubts), strict=True):
         y += size * kind @ generator.standard_normal(kind.shape[1])
     effects = ErrorEffects(np.eye(count), *(kind @ kind.T for kind in kinds))
     which = np.arange(count) // (count // 2)
-    seen = Distances(y, X, effects, X.T @ X, kinds[1], which)
+    seen = Distances(y, X, effects, X.T @ X, kinds[1], which, doubts)
     return seen, np.linalg.solve(X.T @ X, X.T @ y)
 
 
@@ -46,7 +48,7 @@ def test_sizes_are_those_that_were_drawn() -> None:
     generator = np.random.default_rng(1)
     sizes = ErrorSizes(1.5, 1.2, 0.4, 1.0, 2.0)
     found = [estimate_sizes(drawn_distances(generator, sizes)[0], ANGLES) for _ in range(4)]
-    np.testing.assert_allclose(np.median(found, axis=0), sizes, rtol=0.4)
+    np.testing.assert_allclose(np.median([one[:5] for one in found], axis=0), sizes[:5], rtol=0.4)
 
 
 def test_a_calibration_is_not_trusted_beyond_a_pixel() -> None:
@@ -64,6 +66,24 @@ def test_covariance_is_that_of_many_fits() -> None:
         ratios.append(errors @ np.linalg.solve(covariance, errors))
     # The mean of chi squared with three degrees of freedom.
     assert np.mean(ratios) == pytest.approx(3.0, rel=0.15)
+
+
+@pytest.mark.parametrize("size", [0.0, 1.0, 5.0])
+def test_what_is_doubted_widens_what_leans_on_it(size: float) -> None:
+    """Of values whose fit knew nothing of it, as many are inside as is claimed, however large."""
+    generator, inside, widths = np.random.default_rng(4), [], []
+    for _ in range(12):
+        sizes = ErrorSizes(1.0, 0.0, 0.1, 0.1, 0.1, (size,))
+        seen, errors = drawn_distances(generator, sizes, 60)
+        found = estimate_sizes(seen, ANGLES, 0.0, 3.0)
+        doubted, without = doubted_covariance(seen, found, ANGLES)
+        own = values_covariance(without, found, ALL, ANGLES)
+        deviations = np.sqrt(np.diag(own + doubted))
+        inside += (np.abs(errors) < 1.96 * deviations).tolist()
+        widths.append(np.median(deviations) / np.median(np.abs(errors)))
+    assert np.mean(inside) >= 0.85
+    # And not by being told nothing: the usual error is about a deviation.
+    assert np.median(widths) < 4.0
 
 
 def test_values_that_do_not_show_are_as_unsure_as_a_full_turn() -> None:

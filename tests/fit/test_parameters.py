@@ -105,7 +105,7 @@ def test_camera_parameters_against_finite_differences():
 
 def test_cameras_where_nothing_is_changed():
     rig = list(circle_of_cameras(3).values())
-    X_CW, kernel, _ = CameraParameters(rig, np.ones(3)).place(np.zeros(21))
+    X_CW, kernel, _ = CameraParameters(rig, np.ones(3)).place(np.zeros(27))
     for c, camera in enumerate(rig):
         np.testing.assert_allclose(X_CW[c], camera.X_CW, atol=1e-12)
         np.testing.assert_allclose(kernel[c], camera.kernel_parameters())

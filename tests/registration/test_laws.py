@@ -44,7 +44,7 @@ def posed(model: ArticulatedModel, body: RegistrationBody) -> PosedFrames:
 
 def with_zero(posed: PosedFrames) -> SharedFit:
     """A fit of a camera, its focal length and a joint's zero."""
-    return SharedFit([posed], [posed.camera.X_CW], posed.kinematics.names[3:4], focal=True)
+    return SharedFit([posed], [posed.camera.X_CW], posed.kinematics.names[3:4], looks=7)
 
 
 def test_what_is_known_beforehand_pulls_by_what_it_says(posed: PosedFrames) -> None:

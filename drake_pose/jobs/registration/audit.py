@@ -13,7 +13,7 @@ import numpy as np
 from drake_pose.body.model import load_model
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.camera.camera_files import load_cameras
-from drake_pose.errors import MaskError, SceneError
+from drake_pose.errors import CameraError, MaskError, SceneError
 from drake_pose.files.folder import write_summary, writes_folder
 from drake_pose.files.options import percent
 from drake_pose.files.settings import EstimateSettings
@@ -25,8 +25,9 @@ from drake_pose.jobs.registration.result import describe_run, write_overlays
 from drake_pose.jobs.registration.settings import AuditSettings
 from drake_pose.registration.contradictions import Audit, Finding, FrameAudit, audit_frames
 from drake_pose.registration.per_frame_fit import PerFrameFit
-from drake_pose.registration.posed_frames import PosedFrame
+from drake_pose.registration.posed_frames import PosedFrame, SeenFrame
 from drake_pose.registration.register import RegistrationBody
+from drake_pose.silhouette.areas.scoring import require_visible
 from drake_pose.silhouette.pictures.scene_checks import frame_ranges, read_scene
 from drake_pose.silhouette.pictures.scenes import CAMERA_FILE
 
@@ -142,6 +143,7 @@ def _audit(
     body = RegistrationBody(inputs.tree)
     picks = np.linspace(0, len(frames) - 1, min(len(frames), _SAMPLE)).round()
     sample = [inputs.read(frames[int(k)]) for k in picks]
+    _require_seen(body, inputs, sample)
     fit = PerFrameFit(body.kinematics, (body.few, body.all), inputs.held, sample)
     fitted, unseen = [], []
     for done, frame in enumerate(frames, 1):
@@ -155,6 +157,26 @@ def _audit(
     if not fitted:
         raise MaskError(f"{inputs.scene.path}: no mask shows the body; it must be white in them")
     return audit_frames(fit, fitted), unseen
+
+
+def _require_seen(body: RegistrationBody, inputs: Inputs, frames: Sequence[SeenFrame]) -> None:
+    """Refuses a camera that cannot show the robot in any of some frames that it has masks of.
+
+    Raises CameraError: as an estimate does.
+    """
+    for camera in inputs.held:
+        refused: CameraError | None = None
+        for frame in (one for one in frames if camera.name in one.masks):
+            X_CN = camera.X_CW @ body.kinematics.poses(frame.values)
+            try:
+                require_visible(body.very_few, X_CN, camera)
+            except CameraError as error:
+                refused = refused or error
+            else:
+                break
+        else:
+            if refused is not None:
+                raise refused
 
 
 def _doubts(inputs: Inputs, found: Audit, unseen: Sequence[str], cameras: Path) -> list[str]:

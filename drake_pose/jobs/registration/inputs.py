@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -33,7 +34,11 @@ from drake_pose.jobs.registration.positions import (
     read_known_positions,
 )
 from drake_pose.jobs.registration.settings import ALL, RegistrationSettings
-from drake_pose.registration.joint_zeros import links_with_length, require_known
+from drake_pose.registration.joint_zeros import (
+    links_with_length,
+    require_enough,
+    require_known,
+)
 from drake_pose.registration.posed_frames import PosedFrame, SeenFrame
 from drake_pose.registration.standing_object import StandingObject, require_turns, stands_still
 from drake_pose.silhouette.pictures.scene_checks import check_scene
@@ -47,6 +52,8 @@ Array = NDArray[np.float64]
 _MOST_FRAMES = 12
 # And estimated poses differ that do so by more times what measured ones do.
 _ESTIMATES_DIFFER = 5.0
+# A picture shows so many degrees along its sides, at least and at most.
+_VIEWS = (1.0, 170.0)
 _OF_A_PERSON = (
     "a person's clothes and hair are not the model's surface, which turns a camera about the "
     "person: on a real recording cameras were off by up to three of their standard deviations"
@@ -151,6 +158,8 @@ def read_inputs(
         zeros, lengths, tuple(k for k in (*file.unplaced, *file.links) if k not in found),
     )  # fmt: skip
     inputs = replace(inputs, frames=_read_frames(inputs, settings.frames))
+    if zeros or lengths or settings.focal:
+        require_enough(sum(len(inputs.of(name)) for name in found), len(zeros), len(lengths))
     return replace(inputs, warnings=(*inputs.warnings, *_look_at(inputs)))
 
 
@@ -184,10 +193,24 @@ def _select_cameras(
                 "pinhole)"
             )
         if isinstance(camera, PinholeCamera) and is_wanted:
+            _require_angle_of_view(camera, path / CAMERA_FILE)
             searched.append(camera)
         elif isinstance(camera, PinholeCamera) and name not in unplaced and settings.on is None:
             held.append(camera)
     return tuple(searched), tuple(held)
+
+
+def _require_angle_of_view(camera: PinholeCamera, path: Path) -> None:
+    """Refuses (CameraError) a focal length with which no robot is seen near enough to be found."""
+    for focal, side in ((camera.focal_x, camera.width), (camera.focal_y, camera.height)):
+        angle = math.degrees(2.0 * math.atan(0.5 * side / focal))
+        if not _VIEWS[0] < angle < _VIEWS[1]:
+            raise CameraError(
+                f"{path}: camera '{camera.name}': with a focal length of {focal:g} pixels a "
+                f"picture of {side} pixels shows {angle:.3g} degrees; {_VIEWS[0]:g} to "
+                f"{_VIEWS[1]:g} are expected: give the focal length in pixels, of pictures of "
+                "this size"
+            )
 
 
 def _read_target(model: ArticulatedModel, settings: RegistrationSettings) -> StandingObject | None:

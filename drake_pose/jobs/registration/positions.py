@@ -31,6 +31,8 @@ _OUTSIDE, _OUTSIDE_SHARE = 0.1, 0.1
 # An angle of more than a full turn beyond its limits is one in degrees; a length of so many times
 # what its limits allow is one in millimetres.
 _FULL_TURN, _MANY = 2.0 * math.pi, 20.0
+# And none is larger than this [rad or m].
+_MOST = 1e6
 # Poses are one whose joints differ by less [rad or m].
 _SAME_ANGLE, _SAME_LENGTH = math.radians(1.0), 0.005
 # Values are one that differ by less, as written in a table.
@@ -162,6 +164,12 @@ def _check_units(
 ) -> tuple[str, ...]:
     """Refuses degrees and millimetres; warns of values outside the limits."""
     warnings = []
+    for frame, row in known.items():
+        for k in np.flatnonzero(np.abs(row) > _MOST):
+            raise SceneError(
+                f"{path}: column '{kinematics.names[k]}', frame {frame}: {row[k]:g} is no joint's "
+                "position; give it in rad or m"
+            )
     bounded = np.isfinite(kinematics.lower) & np.isfinite(kinematics.upper)
     for k in np.flatnonzero(bounded) if known else ():
         name, lower, upper = kinematics.names[k], kinematics.lower[k], kinematics.upper[k]

@@ -21,6 +21,7 @@ from drake_pose.camera.models import Camera, PinholeCamera
 from drake_pose.files.folder import writes_folder
 from drake_pose.files.options import percent
 from drake_pose.files.summary import BADLY_EXPLAINED
+from drake_pose.fit.lengthened_body import lengthened_joints
 from drake_pose.jobs.estimate.inputs import missing_for_person
 from drake_pose.jobs.registration.inputs import Inputs, make_registration_tree, read_inputs
 from drake_pose.jobs.registration.misfit import (
@@ -38,11 +39,7 @@ from drake_pose.jobs.registration.result import (
 from drake_pose.jobs.registration.settings import RegistrationSettings
 from drake_pose.person.shape import shape_parts, shape_values
 from drake_pose.registration.bundle_adjustment import adjust_bundle
-from drake_pose.registration.joint_zeros import (
-    JointCalibration,
-    calibrate_joints,
-    lengthened_joints,
-)
+from drake_pose.registration.joint_zeros import JointCalibration, calibrate_joints
 from drake_pose.registration.object_search import ObjectSearch
 from drake_pose.registration.posed_frames import PosedFrames
 from drake_pose.registration.register import (

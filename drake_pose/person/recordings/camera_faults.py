@@ -162,7 +162,8 @@ class CameraJudge:
             _CAMERA_ROUNDS,
             expected=(nothing, np.zeros(6)),
         )
-        X_CW = CameraParameters([camera], middle).place(np.append(found.shared, 0.0))[0][0]
+        theta = np.append(found.shared, np.zeros(len(names) - 6))
+        X_CW = CameraParameters([camera], middle).place(theta)[0][0]
         return camera.with_pose(np.linalg.inv(X_CW))
 
     def _describe(

@@ -106,6 +106,34 @@ class TestAudit:
         with pytest.raises(CameraError, match=r"'left'.*drake-pose register"):
             audit_scene(own.folder, own.model, own.joints)
 
+    @pytest.mark.parametrize(
+        ("spoil", "match"),
+        [
+            (lambda X: X @ np.diag([1.0, -1.0, -1.0, 1.0]), "body behind it"),
+            (lambda X: X * np.array([1.0, 1.0, 1.0, 1e3]), "check X_WC"),
+        ],
+    )
+    def test_a_camera_that_cannot_show_the_robot(self, audited, tmp_path, spoil, match) -> None:
+        cameras = {
+            name: one.with_pose(np.vstack([spoil(one.X_WC)[:3], [0.0, 0.0, 0.0, 1.0]]))
+            for name, one in audited.cameras.items()
+        }
+        save_cameras(tmp_path / "cameras.yaml", cameras)
+        with pytest.raises(CameraError, match=match):
+            audit_scene(
+                audited.folder, audited.model, audited.joints, cameras=tmp_path / "cameras.yaml"
+            )
+
+    def test_a_frame_of_which_nothing_is_near(self, audited, tmp_path: Path) -> None:
+        own = audited.copy(tmp_path)
+        corner = np.zeros((240, 320), bool)
+        corner[:12, :12] = True
+        for name in own.cameras:
+            write_mask(own.folder / "masks" / name / "0001.png", corner)
+        result = audit_scene(own.folder, own.model, own.joints)
+        kinds = {one["name"]: one["cause"] for one in result.summary["contradictions"]}
+        assert kinds["0001"] == "unexplained"
+
     def test_masks_that_show_nothing(self, audited, tmp_path: Path) -> None:
         own = audited.copy(tmp_path)
         for name in own.cameras:

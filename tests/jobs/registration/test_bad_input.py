@@ -71,6 +71,14 @@ BEFORE_WORK: dict[str, tuple[Spoil, list[str]]] = {
              clipping_near=None),
         ["camera 'left' is a parallel camera", "focal length"],
     ),
+    "a focal length in other units": (
+        edit("left", focal_x=1e5, focal_y=1e5),
+        ["camera 'left'", "focal length of 100000 pixels", "degrees"],
+    ),
+    "a position that is none": (
+        change_rows(lambda rows: rows[2].__setitem__(2, "1e308")),
+        ["joints.csv", "frame 1", "no joint's position"],
+    ),
     "no focal length": (edit("left", focal_x=None), ["camera 'left'", "needs focal_x"]),
     "all cameras stand": (
         edit("left", X_WC=np.eye(4).tolist()),

@@ -16,7 +16,7 @@ from drake_pose.camera.camera_files import load_cameras
 from drake_pose.files.overlay import EXCESS_RGB, MISSING_RGB
 from drake_pose.jobs.registration.register import register_scene, say_common
 from drake_pose.jobs.registration.settings import RegistrationSettings
-from drake_pose.registration.register import FrameMisfit, RegisteredCamera
+from drake_pose.registration.register import CameraSearch, FrameMisfit, RegisteredCamera
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from drake_pose.silhouette.pictures.scenes import load_scene
 from tests.cli import Result, run_command
@@ -278,7 +278,11 @@ def test_zeros_and_lengths_are_found_and_written_to_a_urdf(
     np.testing.assert_allclose(shift, moved["shoulder"] + moved["roll"], atol=1e-9)
 
 
-def test_too_few_frames_for_all_zeros(own_arm: ArmScene, tmp_path: Path) -> None:
+def test_too_few_frames_for_all_zeros(
+    own_arm: ArmScene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """And nothing is searched for first."""
+    monkeypatch.setattr(CameraSearch, "register", None)
     result = run(own_arm, tmp_path / "out", "--zeros", "all", "--frame", "0000")
     assert result.exit_code == 1
     assert "more frames" in result.stderr

@@ -13,7 +13,7 @@ from contextlib import contextmanager, suppress
 from functools import wraps
 from inspect import signature
 from pathlib import Path
-from typing import Any, ParamSpec, TypeVar
+from typing import Any, TypeVar, cast
 
 import numpy as np
 
@@ -28,8 +28,7 @@ JOINT_CENTRES = "joint_centres.csv"
 TRC, MOT, BVH = "joint_centres.trc", "positions.mot", "motion.bvh"
 OVERLAY, SHAPES = "overlay", "shapes.png"
 
-_P = ParamSpec("_P")
-_T = TypeVar("_T")
+_Job = TypeVar("_Job", bound=Callable[..., Any])
 
 RESULT_FILES = (
     POSES, JOINTS, FAMILIES, SUMMARY, REPLAY, REPORT, JOINT_CENTRES, TRC, MOT, BVH, SHAPES
@@ -96,18 +95,18 @@ def claimed(path: Path, resume: bool = False) -> Iterator[None]:
         os.close(folder)
 
 
-def writes_folder(job: Callable[_P, _T]) -> Callable[_P, _T]:
+def writes_folder(job: _Job) -> _Job:
     """A job whose argument ``out`` names a folder, if any, that is claimed while it runs."""
 
     @wraps(job)
-    def run(*args: _P.args, **kwargs: _P.kwargs) -> _T:
+    def run(*args: Any, **kwargs: Any) -> Any:
         given = signature(job).bind(*args, **kwargs).arguments
         if given.get("out") is None:
             return job(*args, **kwargs)
         with claimed(Path(given["out"]), given.get("resume", False)):
             return job(*args, **kwargs)
 
-    return run
+    return cast(_Job, run)
 
 
 def _require_empty(path: Path) -> None:

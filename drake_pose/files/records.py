@@ -241,9 +241,9 @@ def measured_positions(
     errors = [[record.joint_errors.get(name, np.nan) for name in names] for record in records]
     measured = q - np.array(errors).reshape(q.shape) / user_units(model)
     # Errors are of the nearest turn, which may lie beyond the limits.
-    middle = 0.5 * (model.lower + model.upper)
-    limited = model.periodic & ~model.turns_freely & np.isfinite(middle)
-    return nearest_turn(measured, np.where(limited, middle, 0.0), limited)
+    limited = model.periodic & ~model.turns_freely & np.isfinite(model.upper - model.lower)
+    middle = 0.5 * np.add(model.lower, model.upper, where=limited, out=np.zeros(len(names)))
+    return nearest_turn(measured, middle, limited)
 
 
 def record_pose_set(pose_set: PoseSet | None, tree: PoseTree) -> dict[str, Any]:

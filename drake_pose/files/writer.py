@@ -213,12 +213,18 @@ class ResultWriter:
     def _replay(self, found: Sequence[PoseRow], period: float) -> str:
         """The replay of the frames with a pose; positions that were measured stand as a ghost."""
         q = np.array([row.q for row in found])
-        measured = measured_positions(self.model, q, [self.records[one.frame] for one in found])
+        records = [self.records[row.frame] for row in found]
+        measured = measured_positions(self.model, q, records)
         ghost = None if np.isnan(measured).all() else np.where(np.isnan(measured), q, measured)
-        scale = self.records[found[0].frame].camera_scale
+        scales = {
+            name: one.camera_scale
+            for one in reversed(records)
+            for name in one.ious
+            if one.camera_scale
+        }
         cameras = [
-            replace(one, pixels_per_metre=scale)
-            if scale and isinstance(one, ParallelCamera)
+            replace(one, pixels_per_metre=scales.get(one.name, one.pixels_per_metre))
+            if isinstance(one, ParallelCamera)
             else one
             for one in self.scene.cameras.values()
         ]

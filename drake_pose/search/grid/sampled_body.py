@@ -136,7 +136,7 @@ class SampledBody:
             p_CF = _fixed_points(X_NC, self.sampled.outlines[child].ball)
             if len(p_CF):
                 radii = hulls[child].radii(p_CF)
-                best = int(np.argmax(radii))
+                best = int(np.argmax(np.round(radii, 9)))
                 if radii[best] > 0.0:
                     p_N = X_NC[0, :3, :3] @ p_CF[best] + X_NC[0, :3, 3]
                     balls.append(np.append(p_N, radii[best])[None])

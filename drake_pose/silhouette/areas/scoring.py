@@ -163,7 +163,9 @@ class VisualHull:
             return np.zeros(len(p_N))
         smallest = np.full(len(p_N), np.inf)
         for rows, distances in self._views:
-            uv = np.rint((p_N - self._center) @ rows.T + 0.5 * (_SIDE - 1)).astype(int)
+            uv = (p_N - self._center) @ rows.T + 0.5 * (_SIDE - 1)
+            # Which side of a pixel's edge a point falls is not left to the last digit.
+            uv = np.rint(np.round(uv, 6)).astype(int)
             inside = np.all((uv >= 0) & (uv < _SIDE), axis=1)
             u, v = np.clip(uv, 0, _SIDE - 1).T
             smallest = np.minimum(smallest, np.where(inside, distances[v, u], 0.0))
@@ -180,14 +182,15 @@ class VisualHull:
         points, radii = points[radii > 0.0], radii[radii > 0.0]
         if len(points) == 0:
             return np.zeros((0, 4))
-        chosen = [int(np.argmax(radii))]
+        # Symmetric bodies have equals, of which the first is taken whatever the last digit says.
+        chosen = [int(np.argmax(np.round(radii, 9)))]
         beyond = np.full(len(points), np.inf)
         while len(chosen) < min(count, len(points)):
             last = chosen[-1]
             gap = np.linalg.norm(points - points[last], axis=1) - radii[last]
             beyond = np.minimum(beyond, gap)
             # How far the ball reaches beyond all those chosen before.
-            chosen.append(int(np.argmax(beyond + radii)))
+            chosen.append(int(np.argmax(np.round(beyond + radii, 9))))
         return np.column_stack([points, radii])[chosen]
 
 
@@ -211,7 +214,8 @@ def _look(outline: Outline, R_CN: np.ndarray, scale: float) -> tuple[np.ndarray,
     X_CN[:3, 3] = -R_CN @ outline.ball[:3]
     mask = draw_mask([outline], X_CN[None], camera)
     distances = cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-    return scale * R_CN[:2], distances
+    # Squares are whole numbers, but OpenCV's last digit depends on where a picture lies in memory.
+    return scale * R_CN[:2], np.sqrt(np.rint(np.square(distances, dtype=np.float64)))
 
 
 # A body that is as large as this many pictures is not what they show.

@@ -20,7 +20,7 @@ from tests.silhouettes.stored import (
 
 # An error may be so much larger than the stored one, which may be almost nothing.
 _TENTH, _LEAST = 1.1, 0.001
-# Of twenty silhouettes as many may end in another optimum (one of a hundred did).
+# Of twenty silhouettes as many may end in another optimum, as on another processor.
 _BY_CHANCE = 2
 
 
@@ -47,7 +47,6 @@ def test_the_default_search_is_as_good_as_stored(body: str) -> None:
     errors = np.array([estimate(tree, view).E_total for view in views])
     stored = np.array([row["E_total"] for row in rows])
     worse = {k: (errors[k], stored[k]) for k in np.flatnonzero(errors > _TENTH * stored + _LEAST)}
-    # Which of two optima is met may hang on the last digit, as where arrays lie in memory.
     assert len(worse) <= _BY_CHANCE, worse
     assert np.median(errors) <= _TENTH * np.median(stored) + _LEAST
 

@@ -2,15 +2,18 @@
 
 Poses that are roughly right are found by places (``coarse_search``), drawn to the silhouettes'
 edges by saturating costs (``fit``), and about the best of them other explanations are sought: a
-limb searched again, joints that turn against each other (``self_motions``).
+limb searched again, joints that turn against each other (``self_motions``). Where a piece as thick
+as a limb is left unexplained, a beam search by areas gives other starts.
 """
 
 from __future__ import annotations
 
 import copy
+import math
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from functools import cached_property, partial
 
 import cv2
 import numpy as np
@@ -28,8 +31,9 @@ from drake_pose.search.continuous.views_fit import (
     refine_best,
 )
 from drake_pose.search.estimates import PoseEstimate, SearchStatistics, View
+from drake_pose.search.grid.beam_search import BeamSearch
 from drake_pose.search.grid.sampled_body import SampledBody
-from drake_pose.search.settings import BeamSearchSettings
+from drake_pose.search.settings import TOLERANT_STAGES, BeamSearchSettings
 from drake_pose.search.starts.coarse_search import (
     HYPOTHESES,
     INTERVAL,
@@ -49,8 +53,6 @@ _WINDOW = 5
 COARSE = (AnnealingStage(0.1, 0.04, 3), AnnealingStage(0.05, 0.04, 3))
 MEDIUM = (AnnealingStage(0.05, 0.026, 4), AnnealingStage(0.025, 0.026, 4))
 FINAL = (AnnealingStage(0.0125, 0.0125, 6),)
-
-
 # How many coarse poses are fitted, how many go on, and how many are fitted to the end.
 _STARTS, _SURVIVORS, _FINALISTS = 40, 12, 4
 # Coarse poses differ where some part of the body is seen so far away, as a share of the root of the
@@ -59,10 +61,17 @@ _APART = 0.13
 # About how many of the best poses others are sought; of each so many are fitted, and so many more
 # that are made by flips of its joints.
 _SOUGHT_ABOUT, _TRIED, _FLIPPED = 3, 6, 3
-
-
 # How often other explanations are sought about the best poses.
 _ROUNDS = 2
+# A disc of this radius, as a share of the root of the silhouettes' mean area, is as thick as a
+# limb: where one fits into what is wrong, so many starts of the beam search below are fitted, too,
+# by the masks of so many views at most. One of its orders of nodes finds what the other misses.
+_LIMB, _BEAM_STARTS, _BEAM_VIEWS = 0.03, 10, 2
+_BEAM = BeamSearchSettings(
+    interval=math.radians(20.0),
+    length_interval=LENGTH_INTERVAL,
+    stages=TOLERANT_STAGES,
+)
 
 
 class MultiStartSearch:
@@ -76,6 +85,10 @@ class MultiStartSearch:
         self.sampled = self._body.sampled
         self._outlines = few_triangles(self.sampled.surfaces)
         self._kinematics = TreeKinematics(tree)
+
+    @cached_property
+    def _beam(self) -> BeamSearch:
+        return BeamSearch(self.tree, _BEAM)
 
     def without_alternatives(self) -> MultiStartSearch:
         """The same search where only E_total is wanted: one round, and no set of poses."""
@@ -97,7 +110,8 @@ class MultiStartSearch:
         start = time.perf_counter()
         body, fit, clean = self._fit(views, root_position)
         deadline = np.inf if self._time_limit is None else start + self._time_limit
-        run = _Run(body, fit, clean, views, deadline)
+        beam_starts = partial(self._beam_starts, root_position, deadline)
+        run = _Run(body, fit, clean, views, deadline, beam_starts)
         result = run.search(_ROUNDS if self._alternatives else 0, self._alternatives)
         return replace(result, seconds=time.perf_counter() - start)
 
@@ -132,6 +146,14 @@ class MultiStartSearch:
             found = replace(found, joints=joints, family_count=before.family_count)
         return replace(tracked, pose_set=found)
 
+    def _beam_starts(
+        self, root_position: np.ndarray | None, deadline: float, views: Sequence[View]
+    ) -> list[np.ndarray]:
+        """Values (m,) of other starts, by areas."""
+        limit = max(0.0, deadline - time.perf_counter())
+        found = self._beam.best_poses(views, root_position, _BEAM_STARTS, time_limit=limit)
+        return [self._kinematics.flatten(values) for values in found]
+
     def _fit(
         self, views: Sequence[View], root_position: np.ndarray | None
     ) -> tuple[SampledBody, ViewsFit, list[View]]:
@@ -157,9 +179,12 @@ class _Run:
         clean: Sequence[View],
         views: Sequence[View],
         deadline: float,
+        beam_starts: Callable[[Sequence[View]], list[np.ndarray]],
     ) -> None:
         self._body, self._fit, self._kinematics = body, fit, fit.kinematics
         self._views, self._deadline, self._stopped_by = views, deadline, "end"
+        self._clean, self._beam_starts = clean, beam_starts
+        self._done: list[np.ndarray] = []
         self._coarse = CoarseSearch(body, clean, HYPOTHESES if self._proceed() else 1)
 
     def search(self, rounds: int, as_set: bool) -> PoseEstimate:
@@ -168,21 +193,15 @@ class _Run:
         passes = [(COARSE, _SURVIVORS), (MEDIUM, _SURVIVORS)]
         pool = refine_best(self._fit, self._values(starts), passes, self._proceed)
         first_J = self._J(pool[0].values)
-        done: list[np.ndarray] = []
-        for _ in range(rounds):
-            found = []
-            for pose in pool[:_SOUGHT_ABOUT]:
-                if any(pose.values is values for values in done) or not self._proceed():
-                    continue
-                done.append(pose.values)
-                found += self._others(pose.values)
-            pool = distinct([*pool, *found], _SURVIVORS, self._kinematics.turns_around)
-        refined = refine_best(
-            self._fit,
-            [pose.values for pose in pool[:_FINALISTS]],
-            [(FINAL, _FINALISTS)],
-            self._proceed,
-        )
+        pool = self._explore(pool, rounds)
+        refined = self._finish(pool)
+        contradicting = self._contradicting(refined[0].values)
+        if contradicting and self._proceed():
+            starts = self._beam_starts(contradicting[:_BEAM_VIEWS])
+            others = refine_best(self._fit, starts, passes, self._proceed)
+            pool = distinct([*pool, *others], _SURVIVORS, self._kinematics.turns_around)
+            refined += self._finish(self._explore(pool, min(1, rounds)))
+            refined = distinct(refined, _FINALISTS, self._kinematics.turns_around)
         poses = [
             replace(pose, values=self._kinematics.nearest_turns(pose.values)) for pose in refined
         ]
@@ -199,6 +218,39 @@ class _Run:
             statistics=statistics,
             pose_set=pose_set,
         )
+
+    def _explore(self, pool: list[FittedPose], rounds: int) -> list[FittedPose]:
+        """The best poses, with other explanations sought about them in some rounds."""
+        for _ in range(rounds):
+            found = []
+            for pose in pool[:_SOUGHT_ABOUT]:
+                if any(pose.values is values for values in self._done) or not self._proceed():
+                    continue
+                self._done.append(pose.values)
+                found += self._others(pose.values)
+            pool = distinct([*pool, *found], _SURVIVORS, self._kinematics.turns_around)
+        return pool
+
+    def _finish(self, pool: Sequence[FittedPose]) -> list[FittedPose]:
+        """The best poses, refined to the end."""
+        values = [pose.values for pose in pool[:_FINALISTS]]
+        return refine_best(self._fit, values, [(FINAL, _FINALISTS)], self._proceed)
+
+    def _contradicting(self, values: np.ndarray) -> list[View]:
+        """The views, worst first, where a disc as thick as a limb fits into what is wrong at (m,).
+
+        Of several views one at least shows where a limb is and should not be, and one where it is
+        not; in a single one other parts may hide either. What masks lack, or have besides, is not
+        mended by another start: then there is none.
+        """
+        radius, thick, wrongs = max(1.0, _LIMB * self._fit.size), np.zeros(2, dtype=bool), []
+        for mask, view in self._drawn(values, self._clean):
+            for side, wrong in enumerate((mask & ~view.mask, view.mask & ~mask)):
+                distances = cv2.distanceTransform(wrong.astype(np.uint8), cv2.DIST_L2, 5)
+                thick[side] |= distances.max() > radius
+            wrongs.append(np.count_nonzero(mask != view.mask))
+        is_wrong = thick.any() if len(self._clean) == 1 else thick.all()
+        return [self._clean[k] for k in np.argsort(wrongs)[::-1]] if is_wrong else []
 
     def _proceed(self) -> bool:
         if time.perf_counter() < self._deadline:
@@ -240,16 +292,21 @@ class _Run:
 
     def _J(self, values: np.ndarray) -> float:
         """The objective (1) at values (m,), skin included [pixel]."""
-        outlines = self._body.sampled.surfaces.at(self._kinematics.split(values))
-        X_WN = self._kinematics.poses(values)
         return float(
             sum(
-                np.count_nonzero(
-                    draw_mask(outlines, view.camera.X_CW @ X_WN, view.camera) != view.mask
-                )
-                for view in self._views
+                np.count_nonzero(mask != view.mask)
+                for mask, view in self._drawn(values, self._views)
             )
         )
+
+    def _drawn(
+        self, values: np.ndarray, views: Sequence[View]
+    ) -> Iterator[tuple[np.ndarray, View]]:
+        """The body's masks (H, W), skin included, at values (m,), each with its view."""
+        outlines = self._body.sampled.surfaces.at(self._kinematics.split(values))
+        X_WN = self._kinematics.poses(values)
+        for view in views:
+            yield draw_mask(outlines, view.camera.X_CW @ X_WN, view.camera), view
 
 
 def without_specks(mask: np.ndarray) -> np.ndarray:

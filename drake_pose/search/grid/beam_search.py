@@ -79,6 +79,7 @@ class BeamSearch:
         root_position: np.ndarray | None = None,
         count: int = 30,
         alike: float = 0.7,
+        time_limit: float = np.inf,
     ) -> list[list[np.ndarray]]:
         """Each node's values in the best whole poses met that do not look alike, best first.
 
@@ -90,11 +91,14 @@ class BeamSearch:
             alike: two poses look alike if each node's pictures in both have so much of their union
                 in common in all views, or it is hidden in both, covering nothing that other nodes
                 do not cover. Above 1: all poses of the grid differ.
+            time_limit: after this time [s], or the settings', no more poses are looked for.
 
         Raises:
             SettingsError: if there is no view.
         """
-        run = _Run(self.body, views, self.settings, root_position, gathers=True)
+        limits = [one for one in (time_limit, self.settings.time_limit) if one is not None]
+        settings = replace(self.settings, time_limit=min(limits))
+        run = _Run(self.body, views, settings, root_position, gathers=True)
         run.search()
         chosen = choose_distinct(
             run.scoring, run.pictures(exact=False), run.gathered(), count, alike

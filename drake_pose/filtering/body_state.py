@@ -140,9 +140,8 @@ class BodyState:
             ModelError: the couplings file cannot be read.
         """
         kinematics, names, model = self._kinematics, self._seen_names, self.tree.model
-        free = kinematics.is_angle & (kinematics.upper - kinematics.lower >= 2 * np.pi - 1e-9)
         lower, upper = (
-            np.r_[np.where(free, end, limits), np.full(len(_ROOT), end)][self._parameter_index]
+            np.r_[limits, np.full(len(_ROOT), end)][self._parameter_index]
             for end, limits in ((-np.inf, kinematics.lower), (np.inf, kinematics.upper))
         )
         parts = [from_bounds(names, lower, upper)]

@@ -22,6 +22,7 @@ from drake_pose.filtering.measurements.axes import AxisObservation
 from drake_pose.filtering.measurements.contour import ContourObservation
 from drake_pose.filtering.state import Belief
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
+from tests.body.models import joint, link, urdf, write
 
 SIDE = 400
 CENTRE = 199.5
@@ -162,6 +163,22 @@ def test_a_mirrored_prediction_looks_the_same(hand, camera):
         index = HAND_STATE.index(observation.body.layout.names[changed])
         assert any(one[index] == pytest.approx(other[changed], abs=1e-6) for one in analytic)
     assert not observation.mirrors(Belief(small, np.diag(np.full(n, 1e-6))))
+
+
+def test_a_segment_oblique_to_its_joint_is_mirrored_at_the_image_plane(tmp_path, camera):
+    """Turned out of the image about an axis in it, it looks as turned into it as far."""
+    arm = '<visual><origin xyz="0.1 0 0"/><geometry><box size="0.2 0.02 0.02"/></geometry></visual>'
+    turn = joint("turn", "revolute", "base", "arm", axis="0.6 0.8 0", origin="")
+    weld = joint("weld", "fixed", "world", "base", origin="", limits=None)
+    text = urdf(link("base"), link("arm", arm), weld, turn)
+    tree = load_model(write(tmp_path, text), check=False).pose_tree()
+    ends = {"arm": (np.zeros(3), np.array([0.2, 0.0, 0.0]))}
+    observation = AxisObservation(ContourObservation(tree, [camera]), camera, ends)
+    x = observation.body.state(np.array([0.2]))
+    (mirrored,) = observation.mirrors(Belief(x, np.eye(len(x))))
+    np.testing.assert_allclose(mirrored, -x, atol=1e-9)
+    seen = [observation.predict(one)[0] for one in (x, mirrored)]
+    np.testing.assert_allclose(seen[1], seen[0], atol=1e-9)
 
 
 def small_state(observation, hand, flexions):

@@ -1,12 +1,14 @@
 import numpy as np
 import pytest
 
+from drake_pose.body.model import load_model
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import SettingsError
 from drake_pose.filtering.body_state import ROOT_SHIFT
 from drake_pose.filtering.measurements import contour
 from drake_pose.filtering.measurements.contour import ContourObservation
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
+from tests.body.models import joint, link, urdf, write
 from tests.search.bodies import forked_body, front_camera
 
 
@@ -100,3 +102,21 @@ def test_nothing_seen_and_bad_arguments(tmp_path):
         observation.look([np.zeros((50, 50), dtype=bool)])
     with pytest.raises(SettingsError, match="one camera"):
         ContourObservation(model.pose_tree(), [])
+
+
+def test_limits_are_rows_but_of_angles_that_take_every_direction(tmp_path):
+    angles = {"arm_turn": (4.0, 6.0), "slant": (-np.pi, np.pi), "bend": (-0.4, 0.1)}
+    parts = [link("base"), *(link(f"to_{name}") for name in angles)]
+    for name, (lower, upper) in angles.items():
+        limits = f'lower="{lower}" upper="{upper}"'
+        parts.append(joint(name, "revolute", "base", f"to_{name}", limits=limits))
+    model = load_model(write(tmp_path, urdf(*parts)), check=False)
+    tree = model.pose_tree(root_position=np.zeros(3))
+    rows = ContourObservation(tree, [front_camera(200)]).inequalities()
+    for name, (lower, upper) in angles.items():
+        phi = rows.phi[:, rows.columns.index(name)]
+        told = {row: b for row, b, one in zip(rows.rows, rows.b, phi, strict=True) if one}
+        if name == "slant":
+            assert not told
+        else:
+            assert sorted(told.values()) == pytest.approx(sorted([upper, -lower]))

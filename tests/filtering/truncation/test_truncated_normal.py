@@ -263,6 +263,11 @@ def test_an_element_without_variance_stays_where_it_is(method):
     assert 0.5 < result.mean[0] < 2
     with pytest.raises(SettingsError, match="'b <= 1'"):
         METHODS[method](make_belief(np.array([0.0, 3.0]), covariance), rows)
+    # What rounding takes it beyond is not beyond, whatever the signs.
+    for sign in (1.0, -1.0):
+        at = from_bounds(["a", "b"], [0.5, -0.3], [2, 0.3])
+        result = METHODS[method](make_belief(np.array([0.0, sign * (0.1 + 0.2)]), covariance), at)
+        assert result.mean[1] == pytest.approx(0.3 * sign)
 
 
 @pytest.mark.parametrize("method", [*METHODS.values(), clip])

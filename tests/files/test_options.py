@@ -45,6 +45,12 @@ def test_bad_texts_name_the_option_in_one_line(option: str, text: str) -> None:
     assert done.output.count("\n") == 1
 
 
+@pytest.mark.parametrize("text", ["640", "640.5,480", "0,480", "640,480,3"])
+def test_sizes_are_two_whole_numbers_from_one_on(text: str) -> None:
+    with pytest.raises(SettingsError, match=text):
+        parse_size(text)
+
+
 def test_a_name_given_twice_is_refused() -> None:
     with pytest.raises(SettingsError, match="'a' is given twice"):
         parse_assignments(["a=1", "a=2"])

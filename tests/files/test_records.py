@@ -1,0 +1,161 @@
+"""What is known of frames, told in numbers that a table of one's own gives."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from drake_pose.body.model import ArticulatedModel, load_model
+from drake_pose.files import overlay
+from drake_pose.files.records import (
+    FrameRecord,
+    PoseRow,
+    PoseTable,
+    base_cells,
+    base_pose,
+    measured_positions,
+    record_deviations,
+)
+from drake_pose.files.summary import (
+    camera_warnings,
+    frame_warnings,
+    poor_fit_warnings,
+    summarize,
+)
+from tests.body.models import joint, link, urdf, write
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory: pytest.TempPathFactory) -> ArticulatedModel:
+    """Angles from 1 to 2 and all around, and a length from 3 to 3.4."""
+    parts = [link(name) for name in ("base", "arm", "slide", "wheel")]
+    parts += [
+        joint("weld", "fixed", "world", "base", limits=None),
+        joint("bend", "revolute", "base", "arm", limits='lower="1" upper="2"'),
+        joint("reach", "prismatic", "arm", "slide", limits='lower="3" upper="3.4"'),
+        joint("turn", "continuous", "slide", "wheel", limits=None),
+    ]
+    path = write(tmp_path_factory.mktemp("model"), urdf(*parts))
+    return load_model(path, check=False)
+
+
+def record(E_total: float | None = 0.1, **more: object) -> FrameRecord:
+    return FrameRecord(E_total is not None, E_total, 2.0, **more)  # type: ignore[arg-type]
+
+
+def test_an_interval_ends_at_the_limits_and_determines_below_half_the_range(
+    model: ArticulatedModel,
+) -> None:
+    q = np.array([1.9, 3.2, 3.0])
+    told = record_deviations(model, q, np.array([0.1, 0.06, 0.5]))
+    assert told["bend"].determined
+    assert told["bend"].low == pytest.approx(math.degrees(1.9 - 0.196))
+    assert told["bend"].high == pytest.approx(math.degrees(2.0))
+    # 2 * 1.96 * .06 is more than half of .4.
+    assert not told["reach"].determined
+    assert (told["reach"].low, told["reach"].high) == pytest.approx((3.2 - 0.1176, 3.2 + 0.1176))
+    assert told["turn"].determined
+    # Beyond half a turn it goes on.
+    assert told["turn"].high == pytest.approx(math.degrees(3.98))
+    unknown = record_deviations(model, q, np.full(3, np.nan))
+    assert not any(one.determined for one in unknown.values())
+    assert unknown["bend"].low == pytest.approx(math.degrees(1.0))
+    assert unknown["turn"].high - unknown["turn"].low == pytest.approx(360.0)
+    assert record_deviations(model, np.full(3, np.nan), np.zeros(3)) == {}
+
+
+def test_what_was_measured_is_the_pose_less_its_error_inside_the_limits(
+    model: ArticulatedModel,
+) -> None:
+    q = np.array([[1.9, 3.2, 3.0]])
+    errors = {"bend": math.degrees(0.2), "reach": -0.1}
+    measured = measured_positions(model, q, [record(joint_errors=errors)])
+    assert measured[0, :2] == pytest.approx([1.7, 3.3])
+    assert np.isnan(measured[0, 2])
+    a_turn_off = {"bend": math.degrees(0.2) + 360.0}
+    again = measured_positions(model, q, [record(joint_errors=a_turn_off)])
+    assert again[0, 0] == pytest.approx(1.7)
+
+
+def test_a_table_gives_back_its_rows(tmp_path: Path, model: ArticulatedModel) -> None:
+    X_WB = np.eye(4)
+    X_WB[:3, :3] = [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
+    X_WB[:3, 3] = [0.1, -0.2, 0.3]
+    table = PoseTable(tmp_path, model.position_names, with_base=True)
+    rows = [
+        PoseRow("a", np.array([1.5, 3.1, -2.0]), base_cells(X_WB), 0.25, 1.5),
+        PoseRow("b", np.full(3, np.nan), None, np.nan, 0.5),
+    ]
+    table.write(rows[:1])
+    table.append(rows[1])
+    found, lost = table.read()
+    np.testing.assert_allclose(found.q, rows[0].q)
+    np.testing.assert_allclose(base_pose(found.base), X_WB, atol=1e-8)
+    assert (found.error, found.seconds, found.found) == (0.25, 1.5, True)
+    assert (lost.frame, lost.base, lost.seconds, lost.found) == ("b", None, 0.5, False)
+    np.testing.assert_array_equal(base_pose(None), np.eye(4))
+
+
+def test_a_summary_counts_and_averages_what_was_found() -> None:
+    records = {
+        "a": record(0.1, ious={"left": 0.9, "right": 0.7}, joint_errors={"bend": -3.0}),
+        "b": record(0.3, ious={"left": 0.5}, joint_errors={"bend": 1.0}),
+        "c": record(None),
+    }
+    told = summarize({"scene": "s"}, records, complete=False)
+    assert (told["frame_count"], told["found_count"], told["compared_count"]) == (3, 2, 2)
+    assert told["mean_E_total"] == pytest.approx(0.2)
+    assert told["mean_iou"] == pytest.approx(0.7)
+    assert told["joint_errors"] == {"bend": {"mean": 2.0, "greatest": 3.0}}
+    left, right = told["cameras"]["left"], told["cameras"]["right"]
+    assert (left["frames"], right["frames"]) == (2, 1)
+    assert (left["mean_iou"], right["mean_iou"]) == pytest.approx((0.7, 0.7))
+    assert FrameRecord.from_json(told["frames"]["a"]) == records["a"]
+
+
+def test_a_camera_that_agrees_less_than_the_others_is_named_once() -> None:
+    records = {"a": record(ious={"left": 0.9, "right": 0.6, "top": 0.92, "back": 0.8})}
+    (text,) = camera_warnings(records)
+    assert "'right'" in text
+    assert "0.60" in text
+    assert not camera_warnings(records, ["camera 'right': it moved"])
+    assert not camera_warnings({"a": record(ious={"left": 0.9, "right": 0.1})})
+
+
+def test_frames_without_a_pose_share_a_line() -> None:
+    records = {name: record() for name in ("0", "1", "2", "3", "4")}
+    records |= {"1": record(None), "2": record(None), "4": record(stopped_by="time_limit")}
+    # Of a person that is followed it is said elsewhere.
+    records["3"] = record(None, share=0.2)
+    lost, stopped = frame_warnings(records)
+    assert lost.startswith("frame 1-2 (2 of 5): ")
+    assert stopped.startswith("frame 4 (1 of 5): ")
+    assert "time limit" in stopped
+
+
+def test_a_bad_fit_says_what_stands_at_a_limit_and_what_was_held(model: ArticulatedModel) -> None:
+    def told(bend: float, error: float) -> tuple[str, ...]:
+        row = PoseRow("a", np.array([bend, 3.2, -np.pi]), None, error, 1.0)
+        return poor_fit_warnings([row], {"a": record(error)}, model, ["reach"])
+
+    assert not told(2.0, 0.249)
+    assert "(bend at a limit)" in told(2.0, 0.25)[0]
+    assert "(bend at a limit)" in told(1.0005, 0.4)[0]
+    assert "at a limit" not in told(1.5, 0.4)[0]
+    assert "what is held (reach)" in told(1.5, 0.4)[0]
+
+
+def test_an_overlay_gives_shares_of_the_silhouette(monkeypatch: pytest.MonkeyPatch) -> None:
+    seen, body = np.zeros((20, 20), dtype=bool), np.zeros((20, 20), dtype=bool)
+    seen[2:12, 2:12], body[4:14, 2:12] = True, True
+    legends = []
+
+    def framed(picture: np.ndarray, title: str, legend: object = ()) -> np.ndarray:
+        legends.append(legend)
+        return picture
+
+    monkeypatch.setattr(overlay, "_framed", framed)
+    overlay.draw_overlay(seen, body, None, "title")
+    texts = [text for _, text in legends[0]]
+    assert texts == ["agreement 80.0 %", "missing 20.0 %", "excess 20.0 %"]

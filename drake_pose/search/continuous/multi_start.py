@@ -197,8 +197,8 @@ class _Run:
         refined = self._finish(pool)
         contradicting = self._contradicting(refined[0].values)
         if contradicting and self._proceed():
-            starts = self._beam_starts(contradicting[:_BEAM_VIEWS])
-            others = refine_best(self._fit, starts, passes, self._proceed)
+            by_areas = self._beam_starts(contradicting[:_BEAM_VIEWS])
+            others = refine_best(self._fit, by_areas, passes, self._proceed)
             pool = distinct([*pool, *others], _SURVIVORS, self._kinematics.turns_around)
             refined += self._finish(self._explore(pool, min(1, rounds)))
             refined = distinct(refined, _FINALISTS, self._kinematics.turns_around)

@@ -52,7 +52,8 @@ class KinematicParameter:
     """What is added to an encoder's positions, or by what share of it a link is longer.
 
     Args:
-        value: what is to be added [rad, m or 1]; 0 where it is not determined.
+        value: what is to be added [rad, m or 1], 0 where it is not determined; held at 0 in the
+            calibration where it is not significant.
         deviation: its standard deviation; infinite where it is not determined.
         low, high: the ends of its 95 % interval.
         significant: whether it is not 0: by chance one or more of all that were asked for would
@@ -83,6 +84,7 @@ class JointCalibration:
         cameras: with the poses and focal lengths that fit these.
         covariances: (cameras, 6, 6), see ``RegisteredCamera``.
         focal_deviations: (cameras,) standard deviations over the focal lengths; 0: held.
+        inlier_ratios, agrees: of each camera (frames,), judged with all that was found.
         object_values: (6,) by how much an object stands elsewhere whose place is not known,
             OBJECT_POSITIONS, and object_covariance: (6, 6); empty where there is none.
     """
@@ -94,6 +96,8 @@ class JointCalibration:
     focal_deviations: Array
     object_values: Array
     object_covariance: Array
+    inlier_ratios: tuple[Array, ...]
+    agrees: tuple[Mask, ...]
 
 
 def links_with_length(tree: PoseTree) -> tuple[str, ...]:
@@ -156,25 +160,22 @@ def calibrate_joints(
     seen = [PosedFrames(body.kinematics, body.all, one.camera, each) for one, each in own]
     X_CW = [one.camera.X_CW for one in cameras]
     offsets = lengthened_joints(body.tree, lengths)
-    sought, looks = [*names, *map(length_name, lengths)], len(POSE_NAMES) + focal
+    asked, looks = [*names, *map(length_name, lengths)], len(POSE_NAMES) + focal
     standing = [name for name in body.kinematics.names if name in OBJECT_POSITIONS]
     told: dict[str, KinematicParameter] = {}
-    while True:
+    sought: list[str] | None = None
+    kept = asked
+    while kept != sought:
+        sought = kept
         fit = SharedFit(seen, X_CW, [*standing, *sought], offsets=offsets, looks=looks)
-        # Constants that are off let good frames contradict, so all count at first.
-        fit, found = fit.from_found(fit.fit(ROUNDS_WITH_CONSTANTS))
-        which = fit.agreeing(fit.inlier_ratios(found))
-        fit, found = fit.from_found(fit.fit(ROUNDS_WITH_CONSTANTS, found, which))
-        covariance = _as_the_cost_bends(fit, found, which, fit.covariance(found, which))
-        values = _constants(fit, found, int(np.count_nonzero(which)), covariance, sought)
+        fit, found, covariance, values = _fit_constants(fit, _LEVEL / max(1, len(asked)), sought)
         told |= values
-        # The cameras shall fit what is answered: nothing is added where it cannot be told.
-        sought = [name for name in sought if values[name].determined]
-        if len(sought) == len(values):
-            break
+        kept = [name for name in sought if values[name].determined]
+        if kept == sought:
+            kept = [name for name in sought if values[name].significant]
     deviations = np.sqrt(np.diag(covariance))[: len(seen) * fit.per_camera]
     first = len(fit.names) - len(fit.constants)
-    stands = slice(first, first + len(standing))
+    stands, ratios = slice(first, first + len(standing)), fit.inlier_ratios(found)
     return JointCalibration(
         tuple(told[name] for name in names),
         tuple(replace(told[length_name(link)], name=link) for link in lengths),
@@ -183,7 +184,55 @@ def calibrate_joints(
         deviations[fit.per_camera - 1 :: fit.per_camera] if focal else np.zeros(len(seen)),
         found.shared[stands],
         covariance[stands, stands],
+        tuple(ratios[fit.rows == c] for c in range(len(seen))),
+        tuple(fit.agreeing(ratios)[fit.rows == c] for c in range(len(seen))),
     )
+
+
+def _fit_constants(
+    fit: SharedFit, level: float, names: Sequence[str]
+) -> tuple[SharedFit, Shared, Array, dict[str, KinematicParameter]]:
+    """Some constants with the cameras: the fit, what it found, its covariance, and each of them.
+
+    Significant is at a level what is so beside the others, once all can be told.
+    """
+    # Constants that are off let good frames contradict, so all count at first.
+    fit, found = fit.from_found(fit.fit(ROUNDS_WITH_CONSTANTS))
+    which = fit.agreeing(fit.inlier_ratios(found))
+    fit, found = fit.from_found(fit.fit(ROUNDS_WITH_CONSTANTS, found, which))
+    freedom = max(1, _PICTURE_MOTIONS * int(np.count_nonzero(which)) - len(fit.names))
+    own, shared = fit.covariances(found, which)
+    covariance = own + shared
+    values = _constants(fit, found, freedom, level, covariance, names)
+    if all(one.determined for one in values.values()):
+        covariance = _as_the_cost_bends(fit, found, which, own) + shared
+        values = _constants(fit, found, freedom, level, covariance, names)
+        if all(one.determined for one in values.values()):
+            most = float(stdtrit(freedom, 1.0 - 0.5 * level))
+            kept = _significant(fit, found, covariance, names, most)
+            values = {k: replace(one, significant=k in kept) for k, one in values.items()}
+    return fit, found, covariance, values
+
+
+def _significant(
+    fit: SharedFit, found: Shared, covariance: Array, names: Sequence[str], most: float
+) -> list[str]:
+    """Those of some constants that are off by more deviations once the others are held at 0.
+
+    The least significant one is held first, and the others follow it (backward elimination).
+    """
+    rows, kept = [fit.names.index(name) for name in names], list(names)
+    x, C = found.shared[rows], covariance[np.ix_(rows, rows)]
+    while kept:
+        off = np.abs(x) / np.sqrt(np.diag(C))
+        k = int(np.argmin(off))
+        if off[k] >= most:
+            break
+        follow = C[:, k] / C[k, k]
+        rest = np.arange(len(kept)) != k
+        x, C = (x - follow * x[k])[rest], (C - np.outer(follow, C[k]))[np.ix_(rest, rest)]
+        del kept[k]
+    return kept
 
 
 def _as_the_cost_bends(fit: SharedFit, found: Shared, which: Mask, covariance: Array) -> Array:
@@ -202,10 +251,14 @@ def _as_the_cost_bends(fit: SharedFit, found: Shared, which: Mask, covariance: A
 
 
 def _constants(
-    fit: SharedFit, found: Shared, pictures: int, covariance: Array, names: Sequence[str]
+    fit: SharedFit,
+    found: Shared,
+    freedom: int,
+    level: float,
+    covariance: Array,
+    names: Sequence[str],
 ) -> dict[str, KinematicParameter]:
     """Some constants by name, each with its interval, or what it goes with where that is all."""
-    freedom = max(1, _PICTURE_MOTIONS * pictures - len(fit.names))
     deviations = np.sqrt(np.diag(covariance))
     told = {}
     for name in names:
@@ -218,11 +271,11 @@ def _constants(
             told[name] = KinematicParameter(name, 0.0, math.inf, *ends, False, gauge)
             continue
         width = float(stdtrit(freedom, 1.0 - 0.5 * _LEVEL)) * deviation
-        p_value = 2.0 * float(stdtr(freedom, -abs(value) / deviation)) * len(names)
+        p_value = 2.0 * float(stdtr(freedom, -abs(value) / deviation))
         low, middle, high = value - width, value, value + width
         if name not in fit.seen[0].kinematics.names:
             # A length was fitted as a logarithm.
             deviation *= math.exp(value)
             low, middle, high = math.expm1(low), math.expm1(middle), math.expm1(high)
-        told[name] = KinematicParameter(name, middle, deviation, low, high, p_value < _LEVEL)
+        told[name] = KinematicParameter(name, middle, deviation, low, high, p_value < level)
     return told

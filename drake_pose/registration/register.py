@@ -272,7 +272,7 @@ def describe_fitted(
     # Fits that began apart may have ended in one pose.
     looks = [fitted[k][0].cameras(fitted[k][1])[0].X_CW for k in as_good]
     alike = distinct(seen, looks)
-    covariance = fit.covariance(best, agree)
+    covariance = sum(fit.covariances(best, agree))
     registered = RegisteredCamera(
         camera,
         fit.camera_covariances(best, covariance)[0],

@@ -227,20 +227,24 @@ class SharedFit:
             for one, X, k in zip(self.seen, X_CW, kernel, strict=True)
         ]
 
-    def covariance(self, found: Shared, which: Mask | None = None) -> Array:
-        """(u, u) of the errors of what is shared, told by the masks (rows,) that count."""
+    def covariances(self, found: Shared, which: Mask | None = None) -> tuple[Array, Array]:
+        """(u, u) each: of the errors of what is shared, told by the masks (rows,) that count.
+
+        Of contours that err, and what is off alike in all frames adds.
+        """
         seen = self._doubted_distances(found, _FITTED, which)
         is_angle = np.zeros(seen.X.shape[1], bool)
         sizes = estimate_sizes(seen, is_angle, 0.0, PRIOR_DEVIATION)
         doubted, seen = doubted_covariance(seen, sizes, is_angle)
         covariance = values_covariance(seen, sizes, np.arange(len(is_angle)), is_angle)
-        covariance = covariance * _scatter(seen, sizes, len(self.names)) + doubted
+        covariance *= _scatter(seen, sizes, len(self.names))
         trusted = _calibration_error(self._doubted_distances(found, TOLD_APART, which))
         for c, camera in enumerate(self.cameras(found)):
             unseen = _unseen_errors(self.seen[c], camera.X_CW, trusted)[: self.per_camera]
             at = np.arange(len(unseen)) + c * len(unseen)
-            covariance[at, at] += unseen**2
-        return covariance[: len(self.names), : len(self.names)]
+            doubted[at, at] += unseen**2
+        own = slice(len(self.names))
+        return covariance[own, own], doubted[own, own]
 
     def camera_covariances(self, found: Shared, covariance: Array) -> Array:
         """(cameras, 6, 6) of the poses' errors in the world, covariance being of what is shared."""

@@ -15,6 +15,7 @@ from drake_pose.files.options import percent
 from drake_pose.files.summary import BADLY_EXPLAINED
 from drake_pose.registration.joint_zeros import calibrate_joints
 from drake_pose.registration.object_search import ObjectSearch
+from drake_pose.registration.online_registration import pose_difference
 from drake_pose.registration.posed_frames import PosedFrame
 from drake_pose.registration.register import (
     CameraSearch,
@@ -112,23 +113,24 @@ def require_determined(found: RegisteredCamera) -> None:
 
 def check_focal_length(
     body: RegistrationBody, found: RegisteredCamera, frames: Sequence[PosedFrame]
-) -> tuple[str, ...]:
+) -> tuple[RegisteredCamera, tuple[str, ...]]:
     """Compares a camera's focal length with that which the masks themselves tell.
 
     Returns:
-        A warning where it may be a little off.
+        The camera, and a warning where it may be a little off: then it may as well stand where it
+        would with the other one, and its covariance says so.
 
     Raises:
         RegistrationError: it is wrong, and with it the camera's distance.
     """
     counted = [frame for frame, fit in zip(frames, found.frames, strict=True) if fit.agrees]
     if len(counted) < 2:
-        return ()
+        return found, ()
     told = calibrate_joints(body, [found], [counted], (), focal=True)
     camera, deviation = told.cameras[0], float(told.focal_deviations[0])
     off = math.log(camera.focal_x / found.camera.focal_x)
     if abs(off) < max(_FOCAL_OFF, _FOCAL_DEVIATIONS * deviation):
-        return ()
+        return found, ()
     text = (
         f"camera '{found.camera.name}': its masks tell a focal length of {camera.focal_x:.0f} "
         f"pixels (standard deviation {deviation * camera.focal_x:.0f}), but it is given as "
@@ -137,7 +139,8 @@ def check_focal_length(
     )
     if abs(off) > _FOCAL_WRONG:
         raise RegistrationError(f"{text}. Nothing was written")
-    return (text,)
+    by = pose_difference(camera.X_WC, found.camera.X_WC)
+    return replace(found, covariance=told.covariances[0] + np.outer(by, by)), (text,)
 
 
 def _others(

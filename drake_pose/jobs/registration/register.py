@@ -115,6 +115,7 @@ def register_scene(
     several = work.inputs.standing is not None and len(work.registered) > 1
     if settings.zeros or settings.lengths or settings.focal or several:
         urdf = work.find_zeros(folder)
+    work.judge()
     described = work.describe((time.perf_counter() - start) / len(work.registered))
     cameras = {
         name: work.registered[name].camera if name in work.registered else camera
@@ -184,22 +185,34 @@ class _Registration:
             if measured:
                 require_explained(search, found, frames)
             if standing is not None:
-                require_determined(found)
                 if found.seen_object is not None:
                     seen, self.body = found.seen_object, standing.body(found.seen_object.X_WT)
                     search = CameraSearch(self.body)
                     self.warnings += _say_object(seen)
                 found = replace(found, seen_object=seen)
-            if measured:
-                self.warnings += check_focal_length(self.body, found, frames)
             self.registered[camera.name] = found
             self.suggestions[camera.name] = self._suggestion(found)
             self.seconds[camera.name] = time.perf_counter() - start
-            self.warnings += _warnings_of(found)
             if on_camera is not None:
                 on_camera(len(self.registered))
-        self.warnings += say_common(self.registered.values())
         self.inputs = replace(inputs, tree=self.body.tree)
+
+    def judge(self) -> None:
+        """Says what a user should know of the cameras with all that was found.
+
+        Raises RegistrationError: a focal length is wrong, and with it a camera's distance; or its
+            frames do not tell where it is on a link.
+        """
+        body = self.body.with_tree(self.inputs.tree)
+        for name, found in self.registered.items():
+            if self.inputs.standing is not None:
+                require_determined(found)
+            texts: tuple[str, ...] = ()
+            if not (self.inputs.positions.is_estimate or self._settings.focal):
+                found, texts = check_focal_length(body, found, self.inputs.of(name))
+            self.registered[name] = found
+            self.warnings += [*texts, *_warnings_of(found)]
+        self.warnings += say_common(self.registered.values())
 
     def describe(self, more: float) -> dict[str, dict[str, Any]]:
         """The cameras' parts of the summary, each of which took so long more [s]."""
@@ -268,7 +281,7 @@ class _Registration:
         self.parameters = describe_parameters(found, self.body.kinematics)
         self.warnings += _say_zeros(found)
         offsets = np.zeros(len(names))
-        for zero in found.zeros:
+        for zero in (one for one in found.zeros if one.significant):
             offsets[names.index(zero.name)] = zero.value
         model, tree, standing = inputs.model, inputs.tree, inputs.standing
         seen = next(iter(cameras.values())).seen_object
@@ -284,7 +297,13 @@ class _Registration:
         values = {one.name: one.values + offsets for one in inputs.frames}
         self.inputs = replace(inputs, model=model, tree=tree, frames=inputs.moved(values))
         kinematics = TreeKinematics(tree)
-        for camera, covariance in zip(found.cameras, found.covariances, strict=True):
+        judged = zip(found.inlier_ratios, found.agrees, strict=True)
+        told = zip(found.cameras, found.covariances, judged, strict=True)
+        for camera, covariance, (ratios, agrees) in told:
+            before = self.registered[camera.name]
+            rows = zip(before.frames, ratios.tolist(), agrees.tolist(), strict=True)
+            again = [replace(one, inlier_ratio=ratio, agrees=own) for one, ratio, own in rows]
+            self.registered[camera.name] = replace(before, frames=tuple(again))
             self._found_again(kinematics, camera, covariance, seen)
         return None if folder is None else _corrected_urdf(inputs, found, shifts, folder)
 
@@ -295,7 +314,7 @@ class _Registration:
         covariance: NDArray[np.float64],
         seen: ObjectPose | None = None,
     ) -> None:
-        """A camera where it was found now, with its frames' misfits; which agree is as it was."""
+        """A camera where it was found now, with its frames' misfits; which agree is known."""
         before = self.registered[camera.name]
         frames = PosedFrames(kinematics, self.body.all, camera, self.inputs.of(camera.name))
         found = areas(frames, camera.X_CW[None], np.inf)[0]
@@ -308,7 +327,7 @@ class _Registration:
 
 def _joint_shifts(tree: PoseTree, found: JointCalibration) -> dict[str, list[float]]:
     """By how much joints stand elsewhere on their links (3,), by name [m]; empty: none does."""
-    longer = {one.name: one.value for one in found.lengths if one.determined}
+    longer = {one.name: one.value for one in found.lengths if one.significant}
     offsets = lengthened_joints(tree, longer)
     return {one.joint: (longer[one.link] * one.p_L).tolist() for one in offsets}
 
@@ -318,12 +337,12 @@ def _corrected_urdf(
 ) -> bytes | None:
     """The URDF with zeros and lengths in its joints' origins; its meshes as seen from a folder.
 
-    None where nothing was asked for, or the model is no URDF.
+    None where nothing is significant, or the model is no URDF.
     """
     model = inputs.model.path
-    if not inputs.model.changes_shape or not (found.zeros or found.lengths):
+    zeros = {zero.name: zero.value for zero in found.zeros if zero.significant}
+    if not inputs.model.changes_shape or not (zeros or shifts):
         return None
-    zeros = {zero.name: zero.value for zero in found.zeros if zero.determined}
     text = model.read_text(encoding="utf-8")
     root = ElementTree.fromstring(reshaped(text, zeros=zeros, shifts=shifts))
     for mesh in root.iter("mesh"):
@@ -337,6 +356,11 @@ def _say_zeros(found: JointCalibration) -> list[str]:
     """What a user should know of zeros and lengths."""
     asked = [(f"joint '{one.name}': its zero", one) for one in found.zeros]
     asked += [(f"link '{one.name}': its length", one) for one in found.lengths]
+    if asked and not any(one.significant for _, one in asked):
+        return [
+            "none of the zeros and lengths that were asked for is significant beside what else may "
+            "be off (the others, focal length, principal point, masks): all were left as they are"
+        ]
     return [
         f"{what} is not determined by these silhouettes and was left as it is;"
         + (f" it goes with {', '.join(one.gauge)};" if one.gauge else "")

@@ -201,7 +201,8 @@ def parameter_rows(parameters: Mapping[str, Mapping[str, Any]]) -> list[tuple[st
         unit = key.removeprefix("value_")
         value = f"{one[key]:.3f} {'%' if unit == 'percent' else unit}"
         interval = f"{one[f'low_{unit}']:.3f} to {one[f'high_{unit}']:.3f}"
-        word = "significant" if one["significant"] else "as good as 0"
+        word = "as good as 0" if one[f"low_{unit}"] <= 0.0 <= one[f"high_{unit}"] else "doubtful"
+        word = "significant" if one["significant"] else f"{word}: held at 0"
         rows.append((name, value, interval, word))
     return rows
 

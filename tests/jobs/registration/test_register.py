@@ -257,8 +257,10 @@ def test_zeros_and_lengths_are_found_and_written_to_a_urdf(
     # The shorter robot at the truth, its joints shifted by the lengths that were found.
     right, corrected = load_model(short), load_model(out / "short_calibrated.urdf")
     read = np.array([float(one) for one in rows[0][1:]])
-    shifts = np.radians([zeros[name]["value_deg"] if name in zeros else 0.0 for name in header[1:]])
-    longer = {name: 0.01 * found["value_percent"] for name, found in lengths.items()}
+    # What is not significant was held where it was.
+    written = {name: one["value_deg"] for name, one in zeros.items() if one["significant"]}
+    shifts = np.radians([written.get(name, 0.0) for name in header[1:]])
+    longer = {k: 0.01 * one["value_percent"] for k, one in lengths.items() if one["significant"]}
     np.testing.assert_allclose(corrected.lower + shifts, right.lower)
     places = []
     for model, q in ((right, read + shifts), (corrected, read)):
@@ -270,7 +272,7 @@ def test_zeros_and_lengths_are_found_and_written_to_a_urdf(
         }
         places.append(frames)
     moved = {
-        "shoulder": 0.2 * longer["turret"] * places[0]["turret"][:3, 2],
+        "shoulder": 0.2 * longer.get("turret", 0.0) * places[0]["turret"][:3, 2],
         "roll": 0.34 * longer["shoulder"] * places[0]["shoulder"][:3, 2],
     }
     np.testing.assert_allclose(places[1]["hand"][:3, :3], places[0]["hand"][:3, :3], atol=1e-9)

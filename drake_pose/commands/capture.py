@@ -108,15 +108,15 @@ def _check(
     of_person = bool(live.shape or not live.fit_shape or on_workers)
     if method != "person" and (of_masks or of_person):
         raise UsageError(
-            "--camera, --frame, --truth, --start, --no-track, --resume, --shape, --no-fit-shape, "
-            "--workers and --scheduler are for --method person"
+            "--camera, --frame, --every, --truth, --start, --no-track, --resume, --shape, "
+            "--no-fit-shape, --workers and --scheduler are for --method person"
         )
     if method == "person" and live.faces is not None:
         raise UsageError("--face-camera and --faces are for --method stages and paper")
     if has_sources and of_masks:
         raise UsageError(
-            "--camera, --frame, --truth, --start, --no-track and --resume are for a folder of "
-            f"masks or pictures; {scene} has a sources.yaml"
+            "--camera, --frame, --every, --truth, --start, --no-track and --resume are for a "
+            f"folder of masks or pictures; {scene} has a sources.yaml"
         )
     if method == "person" and not has_sources and (on_workers or live != LiveSettings()):
         raise UsageError(f"{scene} has no sources.yaml, which that option is for")

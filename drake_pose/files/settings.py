@@ -43,6 +43,9 @@ class SceneSettings:
     """Use this camera; repeat for several. Default: all, used together."""
     frames: Annotated[Names, Parameter("--frame")] = ()
     """Use this frame, or frames FIRST:LAST; repeat for several. Default: all."""
+    every: Annotated[int, Parameter(metavar="N")] = 1
+    """Use every Nth frame alone, from the first one on; of a sequence the time between frames is N
+    times as long."""
     packages: Packages = field(default_factory=dict)
 
     def as_json(self) -> dict[str, Any]:

@@ -45,14 +45,12 @@ from drake_pose.files.summary import (
     summarize,
 )
 from drake_pose.silhouette.pictures.scene_checks import frame_ranges
-from drake_pose.silhouette.pictures.scenes import Scene
+from drake_pose.silhouette.pictures.scenes import USUAL_RATE_HZ, Scene
 
 # Whatever ends the job writes the summary; this is for a job that is killed [s]. It takes a while
 # where the recording is long: this many times as long is spent on frames.
 _SUMMARY_PERIOD = 2.0
 _SUMMARY_SHARE = 20.0
-USUAL_RATE_HZ = 30.0
-"""Frames a second of a sequence that does not say."""
 
 # What a method says of a whole recording, in summary.json.
 _OF_THE_METHOD = ("lengths_m", "girths", "unseen", "proportions", "body_fit_seconds")

@@ -96,7 +96,8 @@ def plan_scene(job: SceneJob, out: Path) -> tuple[Task, ...]:
         DrakePoseError: the scene cannot be read.
     """
     scene = _load(job).of_cameras(job.settings.cameras)
-    frames = scene.seen_frames(job.settings.frames)
+    scene, asked = scene.every(job.settings.every, job.settings.frames)
+    frames = scene.seen_frames(asked)
     is_whole = job.audit is not None
     # A model is read only where it may be a person's: that takes seconds.
     if landmarks_file(job.model).is_file() or job.settings.method == "person":

@@ -18,7 +18,7 @@ from drake_pose.camera.models import ParallelCamera
 from drake_pose.files.overlay import draw_shapes
 from drake_pose.files.records import user_units
 from drake_pose.files.settings import EstimateSettings
-from drake_pose.files.writer import USUAL_RATE_HZ, OnStage
+from drake_pose.files.writer import OnStage
 from drake_pose.filtering.measurements.contour import ContourObservation
 from drake_pose.filtering.tracking.contour_tracker import ContourTracker, TrackingSettings
 from drake_pose.filtering.tracking.match_and_track import make_tracker
@@ -36,6 +36,7 @@ from drake_pose.search.continuous.root_placement_search import RootPlacementSear
 from drake_pose.search.estimates import TRACKED, PoseEstimate, View
 from drake_pose.silhouette.areas.bending import TreeSurfaces
 from drake_pose.silhouette.areas.scoring import draw_mask
+from drake_pose.silhouette.pictures.scenes import USUAL_RATE_HZ
 
 # A part that shows by itself with less than this share of its own area may not be there.
 _HIDDEN = 0.1

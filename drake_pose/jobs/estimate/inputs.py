@@ -107,7 +107,11 @@ def read_inputs(
     """
     # Who is captured moves.
     scene, frames = read_scene(
-        scene_path, settings.cameras, settings.frames, sequence=settings.method == "person"
+        scene_path,
+        settings.cameras,
+        settings.frames,
+        sequence=settings.method == "person",
+        every=settings.every,
     )
     model = load_model(model_path, package_paths=settings.packages)
     if settings.unseen:

@@ -16,7 +16,7 @@ from drake_pose.errors import SettingsError
 from drake_pose.files.options import percent
 from drake_pose.files.records import FrameRecord, PoseRow, base_cells, record_pose_set
 from drake_pose.files.summary import BADLY_EXPLAINED
-from drake_pose.files.writer import USUAL_RATE_HZ, Drawn, FinishedFrame, OnStage
+from drake_pose.files.writer import Drawn, FinishedFrame, OnStage
 from drake_pose.jobs.estimate.inputs import Inputs
 from drake_pose.search.continuous.multi_start import MultiStartSearch
 from drake_pose.search.estimates import PoseEstimate, View
@@ -25,7 +25,7 @@ from drake_pose.search.scoring import PoseSearch
 from drake_pose.search.starts.root_placement import scale_camera
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from drake_pose.silhouette.pictures.masks import compare_masks
-from drake_pose.silhouette.pictures.scenes import Scene
+from drake_pose.silhouette.pictures.scenes import USUAL_RATE_HZ, Scene
 from drake_pose.systems.estimators.diagrams import build_recorded_matching
 
 # From this E_total on (median of the frames), two cameras that are matched together are compared.

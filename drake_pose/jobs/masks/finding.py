@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import suppress
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from drake_pose.body.model import load_model
@@ -31,6 +34,7 @@ from drake_pose.search.pose_and_mask import (
     PoseAndMask,
     PoseAndMaskSettings,
 )
+from drake_pose.silhouette.pictures.masks import intersection_over_union
 from drake_pose.silhouette.pictures.scene_files import in_order
 from drake_pose.silhouette.pictures.scenes import CAMERA_FILE
 from drake_pose.silhouette.segmentation.background import (
@@ -58,13 +62,21 @@ _DOUBTFUL = 0.5
 _CHANGED = 0.6
 # A mask that is nearly all of its box, or nearly none, was not told from its surroundings.
 _ALL_OF_BOX, _NONE_OF_BOX = 0.95, 0.03
-# Pose and colours that overlap less do not agree, or hardly.
-_REFUSED, _DOUBTED = 0.85, 0.9
+REFUSED = 0.85
+"""A mask and what else its picture tells that overlap less (IoU) do not agree."""
+_DOUBTED = 0.9
 # A value so many standard deviations from its start is suspicious.
 _FAR = 3.0
 
-Find = Callable[[str, Picture], tuple[Mask, tuple[str, ...]]]
-"""The mask of a camera's picture, and what its user should look at."""
+# What a picture tells well is found with a box so much smaller or larger, as a share of its side,
+# and with thresholds so many times as large, too.
+_BOX_SHARES, _THRESHOLDS = (-0.05, 0.05), (0.7, 1.4)
+# A body that is within a share of its size of one place in so many of a recording's pictures stays
+# there: 0.8 and more of simulated arms, 0.3 of who walks by.
+_ABOUT, _STAYS = 0.3, 0.6
+
+Find = Callable[[str, Picture], tuple[Mask, float, tuple[str, ...]]]
+"""The mask of a camera's picture, how well that tells it, and what its user should look at."""
 
 
 def find_masks(source: Source, settings: MaskSettings) -> Iterator[FoundMask]:
@@ -94,7 +106,7 @@ def find_masks(source: Source, settings: MaskSettings) -> Iterator[FoundMask]:
         settings.network, settings.classes, settings.network_size, settings.network_mean,
         settings.network_std, settings.network_bgr,
     )  # fmt: skip
-    return _find_each(source, lambda _, picture: (network.find(picture), ()))
+    return _find_each(source, lambda _, picture: (network.find(picture), math.nan, ()))
 
 
 def _find_each(source: Source, find: Find) -> Iterator[FoundMask]:
@@ -102,10 +114,10 @@ def _find_each(source: Source, find: Find) -> Iterator[FoundMask]:
     for camera in source.names:
         for frame, where, picture in source.read(camera):
             try:
-                mask, warnings = find(camera, picture)
+                mask, agreement, warnings = find(camera, picture)
             except (SceneError, SettingsError) as error:
                 raise type(error)(f"{where}: {error}") from error
-            yield FoundMask(camera, frame, where, mask, picture, "", warnings)
+            yield FoundMask(camera, frame, where, mask, picture, "", warnings, agreement)
 
 
 def _read_given(source: Source, settings: MaskSettings) -> Iterator[FoundMask]:
@@ -147,27 +159,43 @@ def _read_annotated(source: Source, wanted: Sequence[str]) -> Iterator[FoundMask
         yield FoundMask(camera, frame, where, mask, warnings=warnings)
 
 
-def _by_box(box: Sequence[float], _: str, picture: Picture) -> tuple[Mask, tuple[str, ...]]:
+def _by_box(box: Sequence[float], _: str, picture: Picture) -> tuple[Mask, float, tuple[str, ...]]:
     """GrabCut within x, y, width and height [pixel]."""
-    mask = cut_box(picture, box)
-    part = mask.sum() / (box[2] * box[3])
+    mask, (x, y, w, h) = cut_box(picture, box), box
+    part = mask.sum() / (w * h)
     is_good = part == 0.0 or _NONE_OF_BOX <= part <= _ALL_OF_BOX
-    return mask, () if is_good else (f"the mask is {part:.1%} of its box: find it another way",)
+    again = []
+    for share in _BOX_SHARES:
+        # Around a larger one there may be nothing left.
+        with suppress(SettingsError):
+            other = (x - share * w, y - share * h, w + 2.0 * share * w, h + 2.0 * share * h)
+            again.append(cut_box(picture, other))
+    warnings = () if is_good else (f"the mask is {part:.1%} of its box: find it another way",)
+    return mask, _agreement(mask, again), warnings
+
+
+def _agreement(mask: Mask, again: Iterable[Mask]) -> float:
+    """The least IoU of a mask and those that were found otherwise; nan where there is none."""
+    return min((intersection_over_union(mask, one) for one in again), default=math.nan)
 
 
 def _by_empty_room(source: Source, background: Path | str) -> Find:
     """What differs from the background, as of ``MaskSettings.background``."""
-    rooms = {name: _background(source, name, background) for name in source.names}
-    doubts = {name: told for name, (_, told) in rooms.items()}
+    known = {name: _background(source, name, background) for name in source.names}
+    doubts = {name: told for name, (_, told) in known.items()}
+    rooms = {
+        name: [replace(room, deviation=times * room.deviation) for times in (1.0, *_THRESHOLDS)]
+        for name, (room, _) in known.items()
+    }
 
-    def find(camera: str, picture: Picture) -> tuple[Mask, tuple[str, ...]]:
-        room, _ = rooms[camera]
+    def find(camera: str, picture: Picture) -> tuple[Mask, float, tuple[str, ...]]:
+        room = rooms[camera][0]
         if picture.shape != room.mean.shape:
             height, width = room.mean.shape[:2]
             raise SceneError(
                 f"is not of the background's size, {width} x {height} (width x height)"
             )
-        mask = person_region(picture, room)
+        mask, *again = (person_region(picture, one) for one in rooms[camera])
         # A bad background is told of once.
         warnings = doubts.pop(camera, ())
         if mask.mean() > _CHANGED:
@@ -175,7 +203,7 @@ def _by_empty_room(source: Source, background: Path | str) -> Find:
                 f"{mask.mean():.0%} of it differ from the background: did the light change, or "
                 "the camera move?",
             )
-        return mask, warnings
+        return mask, _agreement(mask, again), warnings
 
     return find
 
@@ -237,7 +265,19 @@ def _doubt(room: Background, recording: Sequence[Picture]) -> tuple[str, ...]:
         "pictures, so the body may stand in it; give pictures of the empty room, or a longer "
         "recording in which the body leaves every place"
     )
-    return (text,) if part > _DOUBTFUL else ()
+    texts: tuple[str, ...] = (text,) if part > _DOUBTFUL else ()
+    seen = [mask.astype(np.uint8) for mask in masks if mask.any()]
+    size = math.sqrt(float(np.median([mask.sum() for mask in seen] or [0])))
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * round(_ABOUT * size) + 1,) * 2)
+    about = sum((cv2.dilate(mask, disc).astype(np.float32) for mask in seen), np.zeros((1, 1)))
+    if about.max() > _STAYS * len(masks):
+        y, x = np.unravel_index(int(np.argmax(about)), about.shape)
+        texts += (
+            f"this camera's pictures show what moves about one place, ({x}, {y}): what of it "
+            "stands still there, as an arm's base does, is taken for the empty room and is not in "
+            "the masks; give pictures of the empty room",
+        )
+    return texts
 
 
 def _find_by_model(source: Source, model: Path, settings: MaskSettings) -> Iterator[FoundMask]:
@@ -263,7 +303,9 @@ def _find_by_model(source: Source, model: Path, settings: MaskSettings) -> Itera
             if mask is not None:
                 where, picture = own[frame]
                 refusal, warnings = _judge(pose, c, kinematics.names)
-                yield FoundMask(name, frame, where, mask, picture, refusal, (*warned, *warnings))
+                told = (*warned, *warnings)
+                agreed = pose.agreements[c]
+                yield FoundMask(name, frame, where, mask, picture, refusal, told, agreed)
                 warned = ()
 
 
@@ -290,7 +332,7 @@ def _placed_cameras(source: Source) -> list[Camera]:
 def _judge(pose: FoundPose, camera: int, names: Sequence[str]) -> tuple[str, tuple[str, ...]]:
     """Why a mask is not good, and what is suspicious of it."""
     agreement = pose.agreements[camera]
-    if agreement < _REFUSED:
+    if agreement < REFUSED:
         return (
             "pose and colours do not agree: the model's silhouette and what colours tell from the "
             f"background overlap by {agreement:.0%} (IoU); is the start too far off, the object "

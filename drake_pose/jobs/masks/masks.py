@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import shutil
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,10 +16,11 @@ import yaml
 from drake_pose.camera.picture_files import Picture
 from drake_pose.errors import DrakePoseError, MaskError, OutputError
 from drake_pose.files.folder import OVERLAY, write_file, write_summary, writes_folder
-from drake_pose.jobs.masks.finding import find_masks
+from drake_pose.jobs.masks.finding import REFUSED, find_masks
 from drake_pose.jobs.masks.settings import MaskSettings
 from drake_pose.jobs.masks.sources import UNNAMED, Source, open_source
 from drake_pose.silhouette.pictures.masks import encode_mask
+from drake_pose.silhouette.pictures.scene_checks import frame_ranges
 from drake_pose.silhouette.pictures.scene_files import common_rate
 from drake_pose.silhouette.pictures.scenes import CAMERA_FILE, SCENE_FILE
 
@@ -90,6 +92,7 @@ def make_masks(
             warnings = [*found.warnings, *([] if refusal else doubt_mask(mask))]
             entry: dict[str, Any] = {"refusal": refusal} if refusal else {"area": int(mask.sum())}
             entry |= {"warnings": warnings} if warnings else {}
+            entry |= {} if math.isnan(found.agreement) else {"agreement": found.agreement}
             cameras.setdefault(found.camera, {})[found.frame] = entry
             doubts += [f"{found.where}: {text}" for text in warnings]
             place = f"{found.camera}/{found.frame}".lstrip("/")
@@ -125,6 +128,8 @@ def _summarize(
         raise MaskError(first + (f" (and {len(more)} more)" if more else ""))
     warnings = [*(f"{text}; no mask is written" for text in refused), *doubts]
     warnings += common_rate(source.videos)[1]
+    if settings.model is None:
+        warnings += [text for name, own in cameras.items() for text in _doubt_camera(name, own)]
     if source.cameras is None and set(cameras) != {UNNAMED}:
         warnings.append(
             f"{folder}: its cameras {', '.join(cameras)} have no {CAMERA_FILE}, which estimate "
@@ -137,6 +142,19 @@ def _summarize(
         "cameras": cameras,
         "warnings": warnings,
     }
+
+
+def _doubt_camera(name: str, frames: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:
+    """A warning of the masks that a camera's pictures do not tell."""
+    known = {frame: one["agreement"] for frame, one in frames.items() if "agreement" in one}
+    bad = [frame for frame, agreement in known.items() if agreement < REFUSED]
+    if bad:
+        usual = float(np.median([known[frame] for frame in bad]))
+        yield (
+            f"camera '{name or 'camera'}', frame {frame_ranges(bad, list(frames))} ({len(bad)} of "
+            f"{len(frames)}): masks and pictures hardly agree: by a box or threshold that is a "
+            f"little other, the masks are others (IoU {usual:.0%}); look at the overlays"
+        )
 
 
 def _write_scene(source: Source, folder: Path, summary: Mapping[str, Any]) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
@@ -35,6 +36,8 @@ class FoundMask:
         picture: (H, W, 3) red, green, blue; None where only the mask is known.
         refusal: why the mask is not good; "" where it is.
         warnings: what its user should look at.
+        agreement: how well the picture tells it: its IoU with what is found there otherwise; nan
+            where nobody knows.
     """
 
     camera: str
@@ -44,6 +47,7 @@ class FoundMask:
     picture: Picture | None = None
     refusal: str = ""
     warnings: tuple[str, ...] = ()
+    agreement: float = math.nan
 
 
 @dataclass(frozen=True)
@@ -62,6 +66,7 @@ class Source:
     pictures: Mapping[str, Mapping[str, Path]] = field(default_factory=dict)
     videos: Mapping[str, Path] = field(default_factory=dict)
     annotated: Sequence[tuple[str, Annotations]] = ()
+    _sizes: dict[str, tuple[int, ...]] = field(default_factory=dict, repr=False, compare=False)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -90,12 +95,20 @@ class Source:
                 yield f"{number:06d}", f"{self.videos[camera]}: frame {number:06d}", picture
 
     def check_size(self, camera: str, shape: tuple[int, ...], where: str) -> None:
-        """SceneError where a camera is calibrated for another (height, width)."""
+        """SceneError where a camera is calibrated for, or gave before, another (height, width).
+
+        Pictures that nothing says to be of one camera may have any sizes.
+        """
         own = None if self.cameras is None else self.cameras.cameras[camera]
-        if own is not None and shape[:2] != (own.height, own.width):
+        size, whose = shape[:2], f"camera '{camera}' had before"
+        if own is not None:
+            size, whose = (own.height, own.width), f"camera '{camera}' of {self.camera_file} has"
+        elif camera != UNNAMED:
+            size = self._sizes.setdefault(camera, size)
+        if shape[:2] != size:
             raise SceneError(
-                f"{where}: has {shape[1]} x {shape[0]} pixels (width x height), but camera "
-                f"'{camera}' of {self.camera_file} has {own.width} x {own.height}"
+                f"{where}: has {shape[1]} x {shape[0]} pixels (width x height), but {whose} "
+                f"{size[1]} x {size[0]}"
             )
 
     def annotated_pictures(self) -> Iterator[tuple[str, str, Annotations, AnnotatedPicture]]:

@@ -117,7 +117,9 @@ def _read_inputs(
 ) -> tuple[Inputs, tuple[str, ...]]:
     """What is audited, and its frames, checked; own: whether it has a camera file of its own."""
     given = load_cameras(files["cameras"]) if own else None
-    scene, frames = read_scene(scene_path, settings.cameras, settings.frames, given)
+    scene, frames = read_scene(
+        scene_path, settings.cameras, settings.frames, given, every=settings.every
+    )
     if scene.scale_unknown:
         raise SceneError(
             f"{scene_path}: has no cameras.yaml; an audit needs to know where the cameras are: "

@@ -125,6 +125,7 @@ def read_inputs(
         raise SceneError(f"{scene_path}: no such folder; a scene has {CAMERA_FILE} and masks")
     file = load_camera_file(scene_path / CAMERA_FILE)
     scene = check_scene(load_scene(scene_path, file.cameras))
+    scene, frames = scene.every(settings.every, settings.frames)
     searched, held = _select_cameras(scene, file, settings)
     model = load_model(model_path, package_paths=settings.packages)
     table, standing = None, _read_target(model, settings)
@@ -145,7 +146,7 @@ def read_inputs(
     zeros, lengths = _select_parameters(model, kinematics, settings)
     if joints_path is None:
         asked = EstimateSettings(
-            frames=settings.frames, hold=settings.hold, packages=settings.packages
+            frames=frames, every=settings.every, hold=settings.hold, packages=settings.packages
         )
         positions = estimate_positions(scene_path, model, kinematics, held, asked)
     else:
@@ -157,7 +158,7 @@ def read_inputs(
         (*scene.warnings, *model.warnings, *positions.warnings), (), searched, seen, standing,
         zeros, lengths, tuple(k for k in (*file.unplaced, *file.links) if k not in found),
     )  # fmt: skip
-    inputs = replace(inputs, frames=_read_frames(inputs, settings.frames))
+    inputs = replace(inputs, frames=_read_frames(inputs, frames))
     if zeros or lengths or settings.focal:
         require_enough(sum(len(inputs.of(name)) for name in found), len(zeros), len(lengths))
     return replace(inputs, warnings=(*inputs.warnings, *_look_at(inputs)))

@@ -31,14 +31,17 @@ def read_scene(
     frames: Sequence[str] = (),
     cameras: Mapping[str, Camera] | None = None,
     sequence: bool = False,
+    every: int = 1,
 ) -> tuple[Scene, tuple[str, ...]]:
     """A checked scene of the wanted cameras, and its wanted frames; none named: all.
 
-    Given ``cameras`` are used instead of the folder's; ``sequence`` as of ``load_scene``.
+    Given ``cameras`` are used instead of the folder's; ``sequence`` as of ``load_scene``, ``every``
+    of ``Scene.every``.
 
     Raises DrakePoseError: names the file, camera or frame that is wrong or not there.
     """
     scene = check_scene(load_scene(path, cameras, wanted, sequence)).of_cameras(wanted)
+    scene, frames = scene.every(every, frames)
     return scene, scene.seen_frames(frames)
 
 

@@ -120,19 +120,20 @@ def select_frames(known: Sequence[str], wanted: Sequence[str], where: str) -> tu
         UnknownNameError: there is no such frame.
         SettingsError: a range ends before it begins.
     """
+    places = {frame: k for k, frame in enumerate(known)}
 
     def place(name: str) -> int:
+        if name in places:
+            return places[name]
         number = frame_number(name)
         same = [k for k, frame in enumerate(known) if frame_number(frame) == number]
-        if name in known:
-            return known.index(name)
         if number is None or len(same) != 1:
             raise UnknownNameError("frame", name, known, where)
         return same[0]
 
     chosen: set[int] = set()
     for text in wanted:
-        first, colon, last = (text, "", "") if text in known else text.partition(":")
+        first, colon, last = (text, "", "") if text in places else text.partition(":")
         ends = place(first), place(last if colon else first)
         if ends[1] < ends[0]:
             raise SettingsError(f"--frame: the range '{text}' ends before it begins")

@@ -13,7 +13,7 @@ import numpy as np
 from drake_pose.camera.camera_files import load_camera_file, load_cameras
 from drake_pose.camera.models import Camera, ParallelCamera
 from drake_pose.camera.picture_files import read_picture
-from drake_pose.errors import SceneError, UnknownNameError
+from drake_pose.errors import SceneError, SettingsError, UnknownNameError
 from drake_pose.silhouette.pictures.masks import read_mask
 from drake_pose.silhouette.pictures.scene_files import (
     VIDEOS,
@@ -29,6 +29,8 @@ from drake_pose.yaml_files import read_yaml
 
 _FIELDS = ("sequence", "frame_rate_hz")
 CAMERA_FILE, SCENE_FILE = "cameras.yaml", "scene.yaml"
+USUAL_RATE_HZ = 30.0
+"""Frames a second of a sequence that does not say."""
 
 # An uncalibrated camera looks along the world's -x: the picture's right is y, its up is z.
 _LOOKING_BACK = np.array(
@@ -104,6 +106,28 @@ class Scene:
             names = ", ".join(self.cameras)
             raise SceneError(f"{self.path}: no mask of camera {names} in those frames")
         return tuple(frame for frame in asked if frame in seen)
+
+    def every(self, step: int, wanted: Sequence[str]) -> tuple[Scene, tuple[str, ...]]:
+        """Every step-th frame alone, from the first wanted one on, and which of these are wanted.
+
+        Its frames follow each other at the true period, step times as long. Raises SettingsError
+        for a step below 1, UnknownNameError where there is no such frame.
+        """
+        if step < 1:
+            raise SettingsError(f"every must be 1 or more, not {step}")
+        asked = select_frames(self.frames, wanted, str(self.path))
+        if step == 1 or not asked:
+            return self, tuple(wanted)
+        kept = self.frames[self.frames.index(asked[0]) % step :: step]
+        known, rate = set(kept), (self.frame_rate_hz or USUAL_RATE_HZ) / step
+        scene = replace(
+            self,
+            frames=kept,
+            masks={key: file for key, file in self.masks.items() if key[1] in known},
+            images={key: file for key, file in self.images.items() if key[1] in known},
+            frame_rate_hz=rate if self.sequence else self.frame_rate_hz,
+        )
+        return scene, tuple(frame for frame in asked if frame in known)
 
     def mask_path(self, camera: str, frame: str) -> Path:
         """The mask file of a camera's frame; UnknownNameError where there is none."""

@@ -68,6 +68,16 @@ def test_median_of_a_recording_finds_what_moves_alone(filmed, pictures, tmp_path
     still = write_pictures(tmp_path / "scene", angles)
     result = make_masks(still.folder / "images", tmp_path / "still", settings)
     assert sum("no good background" in text for text in result.warnings) == 1
+    assert sum("hardly agree" in text for text in result.warnings) == 1
+
+
+def test_pictures_of_two_sizes_are_refused(pictures, tmp_path):
+    (pictures / "cameras.yaml").unlink()
+    shutil.rmtree(pictures / "background")
+    file = sorted((pictures / "images" / "front").iterdir())[4]
+    cv2.imwrite(str(file), cv2.imread(str(file))[:-10])
+    with pytest.raises(SceneError, match=r"200 x 150.*'front' had before 200 x 160"):
+        make_masks(pictures, tmp_path / "out", MaskSettings(background="median"))
 
 
 def test_light_that_changed_and_pictures_of_another_size_are_named(pictures, tmp_path):

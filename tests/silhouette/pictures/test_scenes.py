@@ -5,7 +5,7 @@ import pytest
 
 from drake_pose.camera.camera_files import save_cameras
 from drake_pose.camera.models import ParallelCamera
-from drake_pose.errors import CameraError, MaskError, SceneError, UnknownNameError
+from drake_pose.errors import CameraError, MaskError, SceneError, SettingsError, UnknownNameError
 from drake_pose.silhouette.pictures.masks import write_mask
 from drake_pose.silhouette.pictures.scenes import load_scene
 
@@ -52,6 +52,24 @@ def test_settings(tmp_path: Path) -> None:
     (tmp_path / "scene.yaml").write_text("sequence: true\nframe_rate_hz: 60\n")
     scene = load_scene(tmp_path)
     assert (scene.sequence, scene.frame_rate_hz) == (True, 60.0)
+
+
+def test_every_other_frame_of_a_sequence_is_twice_as_long(tmp_path: Path) -> None:
+    save_cameras(tmp_path / "cameras.yaml", [camera("left")])
+    (tmp_path / "masks" / "left").mkdir(parents=True)
+    for k in range(7):
+        write_mask(tmp_path / "masks" / "left" / f"{k:04d}.png", MASK)
+    (tmp_path / "scene.yaml").write_text("sequence: true\nframe_rate_hz: 60\n")
+    whole = load_scene(tmp_path)
+    scene, asked = whole.every(2, ["1:5"])
+    assert asked == ("0001", "0003", "0005")
+    assert scene.frames == asked
+    assert {frame for _, frame in scene.masks} == set(asked)
+    assert scene.frame_rate_hz == 30.0
+    assert whole.every(3, [])[0].frames == ("0000", "0003", "0006")
+    assert whole.every(1, ["2"]) == (whole, ("2",))
+    with pytest.raises(SettingsError, match="not 0"):
+        whole.every(0, [])
 
 
 @pytest.mark.parametrize(

@@ -313,4 +313,4 @@ def pixels_per_metre(cameras: tuple[Array, Array], place: Array) -> Array:
     X_CW, parameters = cameras
     kind, focal, near = parameters[:, 0], parameters[:, 1], parameters[:, 5]
     depth = np.maximum(X_CW[:, 2, :3] @ place + X_CW[:, 2, 3], near)
-    return np.asarray(np.where(kind == 0.0, focal / depth, focal))
+    return np.asarray(focal / np.where(kind == 0.0, depth, 1.0))

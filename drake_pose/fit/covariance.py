@@ -22,8 +22,6 @@ from numpy.typing import NDArray
 
 from drake_pose.fit.contour_fit import (
     Comparison,
-    ContourFit,
-    Views,
     pixels_per_metre,
     symmetric,
 )
@@ -42,6 +40,8 @@ _MOST_DISTANCES = 400
 # A part stands still from one picture to another that moves by less [of the unit].
 _STILL = 0.5
 _ITERATIONS, _SETTLED = 20, 0.03
+# Errors of masks and cameras are about a pixel, or this share of the silhouettes' size.
+_UNIT = 1.0 / 200.0
 # A place is known to about as much, and an angle to a full turn [m, rad].
 _PLACE = 10.0
 
@@ -119,23 +119,34 @@ class Picture(NamedTuple):
     camera: int = 0
 
 
-def distances(fit: ContourFit, views: Views, compared: Comparison, unit: float) -> Distances:
+def error_unit(size: float) -> float:
+    """What errors are measured in, of silhouettes of a size, the root of their area [pixel]."""
+    return max(1.0, _UNIT * size)
+
+
+def distances(
+    outlines: Sequence[Outline],
+    cameras: tuple[Array, Array],
+    compared: Comparison,
+    moves: Array,
+    unit: float,
+) -> Distances:
     """The distances at a pose that was fitted.
 
     Args:
-        fit: what fitted it.
-        views: what the cameras say.
+        outlines: the nodes' surfaces.
+        cameras: packed, see ``pack_cameras``.
         compared: the comparison at the pose.
+        moves: (nodes, m, 12) the affine motions that the values give to the nodes.
         unit: in which errors are measured [pixel].
     """
     X_WN = compared.placement.X_WN
-    moves = compared.placement.dense(len(fit.kinematics.names))
-    size = unit / pixels_per_metre(views.cameras, X_WN[:, :3, 3].mean(axis=0))
+    size = unit / pixels_per_metre(cameras, X_WN[:, :3, 3].mean(axis=0))
     pictures = [
         Picture(A, b, X_WN, X_CW, moves, float(one))
-        for A, b, X_CW, one in zip(compared.A, compared.b, views.cameras[0], size, strict=True)
+        for A, b, X_CW, one in zip(compared.A, compared.b, cameras[0], size, strict=True)
     ]
-    return distances_in_pictures(fit.outlines, pictures)
+    return distances_in_pictures(outlines, pictures)
 
 
 def distances_in_pictures(

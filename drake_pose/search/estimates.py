@@ -266,6 +266,19 @@ class PoseEstimate:
         """Whether it is proved that no pose of the search's grid has a smaller J."""
         return bool(self.found and self.lower_bound >= self.J)
 
+    def widened(self, begun: PoseEstimate | None) -> PoseEstimate:
+        """A tracked pose whose joints are as open as the families that its track began with."""
+        before = None if begun is None else begun.pose_set
+        if begun is None or before is None or self.pose_set is None or before.family_count < 2:
+            return self
+        values = np.concatenate(self.node_values) - np.concatenate(begun.node_values)
+        joints = tuple(
+            now.widened(then, float(moved))
+            for now, then, moved in zip(self.pose_set.joints, before.joints, values, strict=True)
+        )
+        known = replace(self.pose_set, joints=joints, family_count=before.family_count)
+        return replace(self, pose_set=known)
+
     def turned(self, tree: PoseTree, turns: Sequence[np.ndarray]) -> PoseEstimate:
         """The same pose with full turns (k_i,) [rad] added to each node's values."""
 

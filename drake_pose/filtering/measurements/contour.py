@@ -31,8 +31,10 @@ from drake_pose.fit.contour_fit import (
     camera_weights,
     compare_views,
     normal_equations,
+    pack_cameras,
     pack_views,
 )
+from drake_pose.fit.covariance import distances, error_unit, estimate_sizes, values_covariance
 from drake_pose.fit.evidence import NO_EDGE, find_edge_points
 from drake_pose.fit.kernel import COMPARED, FITTING, REACH, SQUARES, WEIGHT
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
@@ -80,12 +82,14 @@ class ContourMeasurement(LinearObservation):
         share: of the contour that the model shows, what has an edge beside it.
         distance: root mean square of their distances, robustly weighted [pixel].
         part_distances: (nodes,) of each part in the pictures [pixel]; 0 where they say too little.
+        compared: the contours, as they were compared at ``at``.
     """
 
     y: Array
     share: float
     distance: float
     part_distances: Array
+    compared: Comparison
 
 
 class ContourObservation(BodyState):
@@ -242,4 +246,23 @@ class ContourObservation(BodyState):
             share=float(contour[FITTING] / max(contour[COMPARED], 1e-9)),
             distance=distance,
             part_distances=parts,
+            compared=compared,
         )
+
+    def covariance(self, measured: ContourMeasurement, area: float) -> Array:
+        """(m, m) of the tree's values where they were measured, as if the instant stood alone.
+
+        Surfaces, masks and cameras err together, see ``fit.covariance``; area: of all silhouettes.
+        """
+        unit = error_unit(math.sqrt(area / len(self.cameras)))
+        index, size = self._parameter_index, len(self._body.names)
+        is_angle = np.array([self.is_angle(name) for name in self._seen_names])
+        moves = measured.compared.placement.dense(size)[:, index]
+        cameras = pack_cameras(self.cameras)
+        seen = distances(self._body.outlines, cameras, measured.compared, moves, unit)
+        sizes = estimate_sizes(seen, is_angle)
+        covariance, count = np.zeros((size, size)), len(self._kinematics.names)
+        covariance[np.ix_(index, index)] = values_covariance(
+            seen, sizes, np.arange(len(index)), is_angle
+        )
+        return covariance[:count, :count]

@@ -15,6 +15,7 @@ from drake_pose.camera.models import Camera
 from drake_pose.filtering.measurements.contour import ContourObservation
 from drake_pose.filtering.tracking.contour_tracker import ContourTracker, Track, TrackingSettings
 from drake_pose.fit.colours import Picture
+from drake_pose.search.continuous.families import spread
 from drake_pose.search.estimates import TRACKED, UNEXPLAINED, PoseEstimate, View
 from drake_pose.search.scoring import PoseSearch
 from drake_pose.silhouette.pictures.masks import edge_area
@@ -137,6 +138,16 @@ class MatchAndTrack:
         if not views:
             return self._go_on(last, tracked, frame)
         return self._match(last, tracked, frame)
+
+    def with_intervals(self, followed: Followed, pose: PoseEstimate) -> PoseEstimate:
+        """A frame's pose that was tracked, with what its contours alone say of each joint."""
+        track = followed.track
+        if track is None or track.measurement is None:
+            return pose
+        observation = self.tracker.observation
+        own = observation.covariance(track.measurement, pose.area)
+        pictures = len(observation.cameras)
+        return replace(pose, pose_set=spread(self._search.tree, pose, own, pictures))
 
     def _match(
         self, last: Followed, tracked: tuple[Track, PoseEstimate] | None, frame: _Frame

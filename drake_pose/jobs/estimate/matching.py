@@ -14,7 +14,13 @@ from pydrake.systems.analysis import Simulator
 from drake_pose.camera.models import Camera, ParallelCamera
 from drake_pose.errors import SettingsError
 from drake_pose.files.options import percent
-from drake_pose.files.records import FrameRecord, PoseRow, base_cells, record_pose_set
+from drake_pose.files.records import (
+    FrameRecord,
+    PoseRow,
+    base_cells,
+    record_deviations,
+    record_pose_set,
+)
 from drake_pose.files.summary import BADLY_EXPLAINED
 from drake_pose.files.writer import Drawn, FinishedFrame, OnStage
 from drake_pose.jobs.estimate.inputs import Inputs
@@ -49,7 +55,10 @@ def estimate_frames(
 
     Raises SettingsError where a frame has no picture.
     """
-    yield from ((frame, pose) for frame, pose in inputs.known.items() if frame in missing)
+    begun: PoseEstimate | None = None
+    for frame, begun in inputs.known.items():
+        if frame in missing:
+            yield frame, begun
     left = [frame for frame in missing if frame not in inputs.known]
     if not left:
         return
@@ -67,10 +76,35 @@ def estimate_frames(
         # The frame is matched at index periods; half a period later the answer surely stands.
         simulator.AdvanceTo((index + 0.5) / rate_hz)
         if frame in left:
-            pose = matching.estimate(simulator.get_context())
+            context = simulator.get_context()
+            pose = matching.estimate(context)
             if pose is None:
                 raise SettingsError(f"frame '{frame}': the matcher got no picture")
+            was_tracked = matching.was_tracked(context)
+            if pose.found and pose.pose_set is None and isinstance(search, MultiStartSearch):
+                own = matching.with_intervals(context) if was_tracked else pose
+                pose = _with_intervals(inputs, search, frame, own, begun if was_tracked else None)
+            begun = begun if was_tracked else pose
             yield frame, pose
+
+
+def _with_intervals(
+    inputs: Inputs,
+    search: MultiStartSearch,
+    frame: str,
+    pose: PoseEstimate,
+    begun: PoseEstimate | None,
+) -> PoseEstimate:
+    """A pose with what its masks say of each joint; where it has none, as its contours said.
+
+    begun: what its track began with; None: it was searched.
+    """
+    scene, root_position = inputs.scene, (inputs.root_positions or {}).get(frame)
+    masks = {name: scene.read(name, frame) for name in scene.cameras_of(frame)}
+    if not masks:
+        return pose.widened(begun)
+    views = [View(scene.cameras[name], mask) for name, mask in masks.items()]
+    return search.with_intervals(pose, views, root_position, begun)
 
 
 def match_frames(
@@ -78,15 +112,8 @@ def match_frames(
 ) -> Iterator[FinishedFrame]:
     """The missing frames, matched or tracked, compared with their masks and drawn."""
     scene, model, renderers = inputs.scene, inputs.model, dict[str, LabelRenderer]()
-    begun: PoseEstimate | None = None
     for frame, pose in estimate_frames(inputs, search, missing):
         masks = {name: scene.read(name, frame) for name in scene.cameras_of(frame)}
-        if pose.pose_set is not None:
-            begun = pose
-        elif pose.found and masks and isinstance(search, MultiStartSearch):
-            views = [View(scene.cameras[name], mask) for name, mask in masks.items()]
-            root_position = (inputs.root_positions or {}).get(frame)
-            pose = search.with_intervals(pose, views, root_position, begun)
         shown: dict[str, np.ndarray] = {**read_pictures(scene, frame), **masks} if overlay else {}
         parts, more = {}, dict[str, Any]()
         for name in {**masks, **shown} if pose.found else ():
@@ -97,11 +124,16 @@ def match_frames(
                 if scene.scale_unknown and name in masks:
                     more["camera_scale"] = own.camera.pixels_per_metre
             parts[name] = own.segments(pose.q, pose.X_WB)
+        # A search that does not say how sure it is knows nothing of any joint.
+        nothing = np.full(len(pose.q), np.nan)
+        known = record_pose_set(pose.pose_set, search.tree) or {
+            "joints": record_deviations(model, pose.q, nothing)
+        }
         yield finish_frame(
-            inputs, frame, pose, masks, parts, shown, **more,
+            inputs, frame, pose, masks, parts, shown, **more, **known,
             first_E_total=pose.first_E_total if pose.found else None,
             runs=pose.statistics.runs, outside_limit=pose.statistics.outside_limit,
-            explained=pose.explained, **record_pose_set(pose.pose_set, search.tree),
+            explained=pose.explained,
         )  # fmt: skip
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -20,7 +21,13 @@ from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.fit.covariance import ErrorSizes, estimate_sizes, excess, values_covariance
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.search.continuous.views_fit import FittedPose, ViewsFit
-from drake_pose.search.estimates import JointEstimate, PoseFamily, PoseSet, joint_estimates
+from drake_pose.search.estimates import (
+    JointEstimate,
+    PoseEstimate,
+    PoseFamily,
+    PoseSet,
+    joint_estimates,
+)
 from drake_pose.search.refinement import FINE_PASSES, RefinementProblem
 from drake_pose.search.starts.self_motions import Flip, flips
 
@@ -67,6 +74,22 @@ def _describe(
         for one, J in zip(families, Js, strict=True)
     )
     return PoseSet(described, joints(families), tolerance, False, len(described))
+
+
+def spread(tree: PoseTree, pose: PoseEstimate, covariance: np.ndarray, pictures: int) -> PoseSet:
+    """What the covariance (m, m) of the tree's values says about a pose, where no other is sought.
+
+    How large errors are was told by so many pictures.
+    """
+    kinematics = TreeKinematics(tree)
+    values = kinematics.flatten(pose.node_values)
+    widths = stdtrit(_CAMERA_MOTIONS * pictures, _ONE_SIDED) * np.sqrt(np.diag(covariance))
+    lower, upper = kinematics.reach(values)
+    family = _Family(values, np.maximum(values - widths, lower), np.minimum(values + widths, upper))
+    described = _describe(kinematics, tree, [family], [pose.J], 0.0, True)
+    # The tree may hold its root elsewhere.
+    own = replace(described.families[0], q=pose.q, X_WB=pose.X_WB)
+    return replace(described, families=(own,))
 
 
 # Of exact masks.

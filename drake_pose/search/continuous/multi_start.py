@@ -134,17 +134,7 @@ class MultiStartSearch:
         _, fit, _ = self._fit(views, root_position)
         values = self._kinematics.flatten(tracked.node_values)
         found = RobustFamilies(fit, lambda: True).around(values, tracked.J)
-        before = None if begun is None else begun.pose_set
-        if begun is not None and before is not None and before.family_count > 1:
-            first = self._kinematics.flatten(begun.node_values)
-            joints = tuple(
-                now.widened(then, float(moved))
-                for now, then, moved in zip(
-                    found.joints, before.joints, values - first, strict=True
-                )
-            )
-            found = replace(found, joints=joints, family_count=before.family_count)
-        return replace(tracked, pose_set=found)
+        return replace(tracked, pose_set=found).widened(begun)
 
     def _beam_starts(
         self, root_position: np.ndarray | None, deadline: float, views: Sequence[View]

@@ -20,7 +20,7 @@ from drake_pose.fit.contour_fit import (
     Noise,
     pack_views,
 )
-from drake_pose.fit.covariance import Distances, distances
+from drake_pose.fit.covariance import Distances, distances, error_unit
 from drake_pose.fit.evidence import find_edge_points
 from drake_pose.fit.kernel import COST
 from drake_pose.fit.levenberg_marquardt import AnnealingStage, StepSettings
@@ -30,8 +30,6 @@ from drake_pose.silhouette.areas.outline import Outline
 _STEPS = StepSettings(longest=0.3, damping=1e-2, even_damping=1e-3)
 # From one point of a silhouette's edge to the next, as a share of its size.
 _EDGE_SPACING = 1.0 / 80.0
-# Errors of masks and cameras are about a pixel, or this share of the silhouettes' size.
-_ERROR_UNIT = 1.0 / 200.0
 # What is missing or too much is about as large, as a share of the silhouettes' size.
 _PIECE = 0.2
 
@@ -83,8 +81,8 @@ class ViewsFit:
         """What is left of the contours' distances at values (m,)."""
         self.evaluations += 1
         compared = self._fit.compare(self._views, values, step)
-        unit = max(1.0, _ERROR_UNIT * self.size)
-        return distances(self._fit, self._views, compared, unit)
+        moves, unit = compared.placement.dense(len(values)), error_unit(self.size)
+        return distances(self._fit.outlines, self._views.cameras, compared, moves, unit)
 
     def piece_costs(self, values: np.ndarray, step: AnnealingStage) -> np.ndarray:
         """What does not fit at values (m,), by pieces of the pictures that err on their own."""

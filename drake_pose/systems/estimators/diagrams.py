@@ -65,6 +65,17 @@ class MatchingDiagram:
         estimate: PoseEstimate | None = self.matcher.GetOutputPort("pose_estimate").Eval(own)
         return estimate
 
+    def was_tracked(self, context: Context) -> bool:
+        """Whether the last update's pose was tracked, no search asked. context: the diagram's."""
+        own = self.matcher.GetMyContextFromRoot(context)
+        tracks = isinstance(self.matcher, SilhouetteTracker)
+        return tracks and bool(self.matcher.GetOutputPort("track").Eval(own)[0])
+
+    def with_intervals(self, context: Context) -> PoseEstimate:
+        """The last update's pose, which was tracked, with what its contours say of each joint."""
+        assert isinstance(self.matcher, SilhouetteTracker)
+        return self.matcher.with_intervals(self.matcher.GetMyContextFromRoot(context))
+
 
 def build_recorded_matching(
     scene: Scene,

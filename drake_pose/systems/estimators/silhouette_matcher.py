@@ -309,6 +309,16 @@ class SilhouetteTracker(SilhouetteMatcher):
         track = float(result.found and is_tracked), float(now.matches), distance
         return result, _Memory(now, track, context.get_time())
 
+    def with_intervals(self, context: Context) -> PoseEstimate:
+        """The pose of the last update, which was tracked, with intervals; see ``MatchAndTrack``.
+
+        They cost about as much as the update, so no port has them.
+        """
+        known = self.belief(context)
+        assert known.estimate is not None, "nothing was tracked"
+        follower = self._follower(self._tracking(context))
+        return follower.with_intervals(known.memory.followed, known.estimate)
+
     def _follower(self, tracking: TrackingSettings) -> MatchAndTrack:
         """What follows as a context's settings say; made of them once."""
         if tracking not in self._followers:

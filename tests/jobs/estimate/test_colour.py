@@ -83,6 +83,17 @@ def test_a_video_stands_for_pictures(recording, filmed):
     assert np.median(errors(estimate, truth)) < 3.0
 
 
+def test_every_frame_by_colour_has_intervals_that_hold_the_truth(recording):
+    scene, model, truth, start = recording
+    records = estimate_scene(scene, model, None, EstimateSettings(start=start)).records
+    assert len(records) == FRAMES
+    for record, q in zip(records.values(), truth, strict=True):
+        told = zip(record.joints.values(), np.degrees(q), strict=True)
+        assert all(joint.low < value < joint.high for joint, value in told)
+        assert all(joint.determined for joint in record.joints.values())
+        assert max(joint.high - joint.low for joint in record.joints.values()) < 12.0
+
+
 def test_frames_of_a_video_are_named_as_its_masks_are(recording, filmed, tmp_path):
     copy = shutil.copytree(filmed, tmp_path / "scene")
     (copy / "masks" / "front").mkdir(parents=True)

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from drake_pose.body.model import load_model
 from drake_pose.commands.main import app
 from drake_pose.errors import SettingsError
 from drake_pose.files.settings import EstimateSettings
@@ -48,6 +49,12 @@ def test_masks_alone(bare_scene: TinyScene, runner: CliRunner, tmp_path: Path) -
     depth = np.linalg.norm(true_camera.X_WC[:2, 3])
     assert record["camera_scale"] == pytest.approx(true_camera.focal_x / depth, rel=0.06)
     assert (tmp_path / "out" / "overlay" / "camera" / "0000.png").is_file()
+    # Nothing says how sure it is: each joint may be anywhere inside its limits.
+    limits = load_model(bare_scene.model, check=False)
+    for k, joint in enumerate(record["joints"].values()):
+        ends = np.degrees([limits.lower[k], limits.upper[k]])
+        assert not joint["determined"]
+        assert [joint["low"], joint["high"]] == pytest.approx(ends)
 
 
 def test_a_root_position_that_is_not_known(

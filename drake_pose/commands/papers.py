@@ -123,8 +123,12 @@ def _kameda_grid(images: int, options: KamedaOptions, json: bool) -> None:
             experiment_search,
             run_experiment,
         )
-        from drake_pose.papers.kameda_edges import edge_lines, settle_by_edges
-        from drake_pose.papers.kameda_figures import grid_figures, grid_table
+        from drake_pose.papers.kameda_figures import (
+            edge_lines,
+            grid_figures,
+            grid_table,
+            settle_by_edges,
+        )
         from drake_pose.papers.kameda_pictures import save_pictures
         from drake_pose.search.scoring import PoseSearch
 
@@ -201,6 +205,7 @@ def shimada(
     iterations: Annotated[int | None, within(1)] = None,
     hypotheses: bool = False,
     pictures: bool = False,
+    sequence: tuple[Path, ...] = (),
     noise: float = 1.0,
     acceleration: float = 1.0,
     out: Pictures = None,
@@ -215,6 +220,7 @@ def shimada(
 
         drake-pose reproduce shimada --runs 20 --out results/shimada
         drake-pose reproduce shimada --pictures --out results/figure_17
+        drake-pose reproduce shimada --pictures --sequence SCENE --out results/figure_17_hand
 
     Args:
         runs: Number of sequences for each of r_13 = 35 and 40. Default: 50; with --pictures 10.
@@ -226,6 +232,8 @@ def shimada(
         hypotheses: Another experiment, figure 9: fingers bend through the image plane; which
             hypotheses are made, and what rejects the wrong ones.
         pictures: Silhouettes by Drake's renderer instead of numbers with noise.
+        sequence: With --pictures: recorded silhouettes of a right hand, cut off at the wrist, in
+            one view of unknown scale, instead (a scene with sequence: true); repeat for several.
         noise: So many times the noise of the numbers, which the filter is told.
         acceleration: So many times the accelerations that the filter expects.
     """
@@ -235,23 +243,66 @@ def shimada(
         raise UsageError("--pictures goes without --hypotheses, --observed and --noise")
     if hypotheses and (noise, acceleration) != (1.0, 1.0):
         raise UsageError("--hypotheses goes without --noise and --acceleration")
+    if sequence and (not pictures or runs or truncation == "all"):
+        raise UsageError("--sequence goes with --pictures, without --runs or truncation all")
+    if sequence:
+        _shimada_sequences(sequence, truncation or "joint", iterations, acceleration, out, json)
+        return
     runs, seen = runs or (10 if pictures else 50), observed or "lines"
     if hypotheses:
         _shimada_hypotheses(runs, seed, truncation or "sequential", seen, iterations, out, json)
         return
+    names = (truncation or "joint",) if truncation != "all" else ()
+    _shimada_moving(names, runs, seed, seen, pictures, (iterations, noise, acceleration), out, json)
+
+
+def _shimada_moving(
+    truncations: tuple[str, ...],
+    runs: int,
+    seed: int,
+    seen: str,
+    pictures: bool,
+    filtered: tuple[int | None, float, float],
+    out: Path | None,
+    json: bool,
+) -> None:
+    """The paper's moving hands, once for each truncation; none named: for all."""
     with _experiment(out) as count:
         from drake_pose.filtering.kalman.truncated_filter import TRUNCATIONS
         from drake_pose.papers.shimada import PICTURES, result_table, run_experiment
         from drake_pose.papers.shimada_pictures import save_pictures
 
-        names = TRUNCATIONS if truncation == "all" else (truncation or "joint",)
-        filtered = (PICTURES if pictures else seen, count, iterations, noise, acceleration)
-        results = [run_experiment(runs, seed, name, *filtered) for name in names]
+        names, measured = truncations or TRUNCATIONS, PICTURES if pictures else seen
+        results = [run_experiment(runs, seed, one, measured, count, *filtered) for one in names]
         every = [one.as_json() for one in results]
         if out is not None:
             save_pictures(results[0], out)
     by_name: dict[str, Any] = dict(zip(names, every, strict=True))
-    _show(by_name if truncation == "all" else every[0], [result_table(*results)], json)
+    _show(every[0] if truncations else by_name, [result_table(*results)], json)
+
+
+def _shimada_sequences(
+    folders: Sequence[Path],
+    truncation: str,
+    iterations: int | None,
+    acceleration: float,
+    out: Path | None,
+    json: bool,
+) -> None:
+    """Figures 17 and 18 of recorded hands."""
+    with _experiment(out) as count:
+        from drake_pose.papers.shimada import experiment_settings
+        from drake_pose.papers.shimada_pictures import save_sequence
+        from drake_pose.papers.shimada_sequences import run_sequence, sequence_table
+
+        settings, results = experiment_settings(truncation, iterations), []
+        for folder in folders:
+            results.append(run_sequence(folder, settings, acceleration, count))
+            if out is not None:
+                save_sequence(results[-1], out)
+    for one in results:
+        warn(one.warning())
+    _show({one.name: one.as_json() for one in results}, [sequence_table(results)], json)
 
 
 def _shimada_hypotheses(
@@ -309,8 +360,7 @@ def date(
     """
     with _experiment(out) as count:
         from drake_pose.papers.date import run_experiment
-        from drake_pose.papers.date_pictures import save_pictures
-        from drake_pose.papers.date_walk import run_walk_through
+        from drake_pose.papers.date_walk import run_walk_through, save_pictures
 
         if walk:
             stages = "paper" if method == "paper" else "stages"

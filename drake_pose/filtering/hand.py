@@ -1,11 +1,12 @@
-"""Observing Shimada's two-finger hand in weak perspective, with the Jacobian: (9) to (13).
+"""Observing a hand in weak perspective, with the Jacobian: (9) to (13) of Shimada et al.
 
-A point p of the hand's frame is seen at wrist + s (M(q) p)_xy, where M = ``|q|^2`` R(q) is a
+A point p of the palm's frame is seen at wrist + s (M(q) p)_xy, where M = ``|q|^2`` R(q) is a
 polynomial of second degree: the quaternion's squared norm is the scale.
 """
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -13,47 +14,30 @@ from numpy.typing import NDArray
 
 from drake_pose.compiled import compiled, copy_into
 from drake_pose.errors import SettingsError
-from drake_pose.filtering.state import Belief, StateLayout
+from drake_pose.filtering.hand_model import (
+    QUATERNION,
+    SEGMENT,
+    TURN,
+    TWO_FINGERS,
+    Chains,
+    HandModel,
+)
+from drake_pose.filtering.state import Belief
 
 Array = NDArray[np.float64]
 
-FINGERS, JOINTS = (1, 2), (1, 2, 3)
-SPREADS = tuple(f"spread_{i}" for i in FINGERS)
-FLEXIONS = tuple(f"flexion_{i}{j}" for i in FINGERS for j in JOINTS)
-LENGTHS = tuple(f"length_{i}{j}" for i in FINGERS for j in JOINTS)
-PALM = ("palm_width", "palm_height", "palm_thickness")
-WRIST = ("wrist_x", "wrist_y")
-QUATERNION = ("palm_qw", "palm_qx", "palm_qy", "palm_qz")
-PALM_EDGES = ("left", "right", "top", "bottom")
+HAND_STATE, MEASURED = TWO_FINGERS.layout, TWO_FINGERS.measured
+"""The two-finger hand's state, and what is measured of it."""
+SPREADS, FLEXIONS, LENGTHS = TWO_FINGERS.spreads, TWO_FINGERS.flexions, TWO_FINGERS.lengths
 
-HAND_STATE = StateLayout((*WRIST, *QUATERNION, *SPREADS, *FLEXIONS), (*LENGTHS, *PALM))
-"""The state (5): wrist in the image [pixel], quaternion, angles [rad]; rates; lengths [m]."""
-
-MEASURED = (
-    *WRIST,
-    *(f"point_{i}{j}_{axis}" for i in FINGERS for j in (0, *JOINTS) for axis in "xy"),
-    *(f"{kind}_{i}{j}" for i in FINGERS for j in JOINTS for kind in ("alpha", "rho")),
-    *(f"{kind}_palm_{edge}" for edge in PALM_EDGES for kind in ("alpha", "rho")),
-    "scale",
-)
-"""What is measured (13): points [pixel]; lines by angle [rad] and distance [pixel]; the scale."""
-
-_FLEXIONS = HAND_STATE.indices(FLEXIONS).reshape(len(FINGERS), len(JOINTS))
-# What is seen, in the kernel's own order, and where its parts begin there.
-SEEN = HAND_STATE.indices((*WRIST, *QUATERNION, *SPREADS, *FLEXIONS, *LENGTHS, *PALM))
-_QUATERNION, _SPREAD, _FLEXION, _LENGTH, _PALM = 2, 6, 8, 14, 20
 # A mirrored angle closer than this is the same [rad].
 _SMALLEST_CHANGE = math.radians(8)
-# Where lines and the scale stand among MEASURED.
-_LINES, _SCALE = MEASURED.index("alpha_11"), MEASURED.index("scale")
-LINE_STARTS = np.array([0, 1, 2, 4, 5, 6, 8, 10, 12, 14])
-LINE_ENDS = np.array([1, 2, 3, 5, 6, 7, 9, 11, 13, 15])
-"""Between which of the points drawn the lines are: six of fingers, four of the palm."""
+_QUATERNION, _ANGLES = 2, 6
 
 
 @dataclass(frozen=True)
 class HandObservation:
-    """The observation h of (13) for the state ``HAND_STATE``.
+    """The observation h of (13) for the state ``hand.layout``.
 
     Args:
         pixels_per_metre: of the image, for scale 1.
@@ -64,6 +48,8 @@ class HandObservation:
         mirror_slope: (30) holds where a joint's turn moves its segment's end by less than this
             fraction of what it would move it in the image plane.
         mirror_reach: mirrored angles further from the prediction are not tried [deviations].
+        rest: in so many frames, how joints are usually held is told once.
+        hand: which one.
 
     Raises:
         SettingsError: a number that is not positive.
@@ -77,41 +63,55 @@ class HandObservation:
     shortest: float = 5.0
     mirror_slope: float = 0.35
     mirror_reach: float = 3.0
+    rest: float = 30.0
+    hand: HandModel = field(default=TWO_FINGERS, repr=False)
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
-            if not 0 < value < math.inf:
+            if name != "hand" and not 0 < value < math.inf:
                 raise SettingsError(f"{name} must be positive, not {value}")
 
     @cached_property
     def names(self) -> tuple[str, ...]:
-        """What is measured."""
-        return MEASURED
+        """What is measured (m)."""
+        return self.hand.measured
 
     @cached_property
     def variances(self) -> Array:
-        """(39,) of the noise."""
-        deviations = np.full(len(MEASURED), self.point_deviation)
-        deviations[_LINES:_SCALE:2] = self.angle_deviation
-        deviations[_LINES + 1 : _SCALE : 2] = self.distance_deviation
-        deviations[_SCALE] = self.scale_deviation
+        """(m,) of the noise."""
+        scale, usual = self.names.index("scale"), self.hand.usual
+        lines = scale - 2 * len(self.hand.line_ends)
+        deviations = np.full(len(self.names), self.point_deviation)
+        deviations[lines:scale:2] = self.angle_deviation
+        deviations[lines + 1 : scale : 2] = self.distance_deviation
+        deviations[scale] = self.scale_deviation
+        if usual is not None:
+            deviations[scale + 1 :] = math.sqrt(self.rest) * usual.deviation
         return deviations**2
 
     @cached_property
     def wraps(self) -> NDArray[np.bool_]:
-        """(39,) true for the angles."""
-        return np.array([name.startswith("alpha") for name in MEASURED])
+        """(m,) true for the angles."""
+        return np.array([name.startswith("alpha") for name in self.names])
 
     def predict(self, x: Array) -> tuple[Array, Array]:
-        """Features (39,) of (13) and the scale ``|q|^2``, NaN for short axes; Jacobian (39, n)."""
-        h, seen, _ = project_hand(x[SEEN], self.pixels_per_metre, self.shortest)
-        H = np.zeros((len(MEASURED), len(HAND_STATE)))
-        H[:, SEEN] = seen
+        """Features (m,) of (13) and the scale ``|q|^2``, NaN for short axes; Jacobian (m, n)."""
+        hand = self.hand
+        h, seen, *_ = self._project(x)
+        H = np.zeros((len(self.names), len(x)))
+        H[: len(h), hand.seen] = seen
+        if hand.usual is not None:
+            H[len(h) :, hand.layout.indices(hand.angles)] = hand.usual.phi
+            h = np.r_[h, H[len(h) :] @ x]
         return h, H
 
     def drawing(self, x: Array) -> Array:
-        """(16, 2) pixels: base, knuckles, tip of each finger; ends of the palm's four edges."""
-        return project_hand(x[SEEN], self.pixels_per_metre, self.shortest)[2]
+        """(p, 2) pixels: base, joints, tip of each finger; ends of the palm's four edges."""
+        return np.asarray(self._project(x)[2][:, :2])
+
+    def _project(self, x: Array) -> tuple[Array, Array, Array, Array]:
+        hand = self.hand
+        return project_hand(x[hand.seen], hand.chains, self.pixels_per_metre, self.shortest)
 
     def mirrors(self, belief: Belief) -> list[Array]:
         """Predictions (n,) mirrored at the image plane in one joint, where (30) holds.
@@ -119,29 +119,26 @@ class HandObservation:
         A segment that points a little towards the camera looks like one that points as much away
         from it. Only the angle at its root is changed.
         """
-        x, found = belief.mean, []
-        quaternion, spreads = x[SEEN[_QUATERNION:_SPREAD]], x[SEEN[_SPREAD:_FLEXION]].tolist()
-        M = scaled_rotation(quaternion)[0] / (quaternion @ quaternion)
-        reaches = self.mirror_reach * np.sqrt(np.diag(belief.covariance)[_FLEXIONS])
-        normal = M[:, 1].tolist()
-        for spread, flexions, own in zip(spreads, _FLEXIONS, reaches.tolist(), strict=True):
-            # Where the finger's plane points in the camera at flexions of 0 and of 90 degrees.
-            forward = (math.cos(spread) * M[:, 0] - math.sin(spread) * M[:, 2]).tolist()
-            direction = 0.0
-            for index, reach in zip(flexions.tolist(), own, strict=True):
-                direction += float(x[index])
-                u, v = math.cos(direction), math.sin(direction)
-                moved = math.hypot(*(u * normal[k] - v * forward[k] for k in range(2)))
-                change = 2.0 * (math.atan2(normal[2], forward[2]) - direction) + math.pi
-                change -= 2.0 * math.pi * round(change / (2.0 * math.pi))
-                if moved <= self.mirror_slope and _SMALLEST_CHANGE < abs(change) < reach:
-                    found.append(x.copy())
-                    found[-1][index] += change
+        hand, x, found = self.hand, belief.mean, []
+        _, _, points, J = self._project(x)
+        flexions = hand.layout.indices(hand.flexions)
+        reaches = self.mirror_reach * belief.deviations()[flexions]
+        starts, ends = hand.line_ends[: len(flexions)].T
+        own = np.searchsorted(hand.seen, flexions)
+        a = points[ends] - points[starts]
+        b = J[ends, :, own] - J[starts, :, own]
+        slopes = np.linalg.norm(b[:, :2], axis=1) / np.maximum(np.linalg.norm(b, axis=1), 1e-9)
+        changes = 2.0 * np.arctan2(b[:, 2], a[:, 2]) + np.pi
+        changes -= 2.0 * np.pi * np.round(changes / (2.0 * np.pi))
+        can = (slopes <= self.mirror_slope) & (np.abs(changes) > _SMALLEST_CHANGE)
+        for k in np.flatnonzero(can & (np.abs(changes) < reaches)):
+            found.append(x.copy())
+            found[-1][flexions[k]] += changes[k]
         return found
 
 
 def plant_positions(
-    x: Array, names: tuple[str, ...], pixels_per_metre: float, distance: float | None = None
+    x: Array, names: Sequence[str], pixels_per_metre: float, distance: float | None = None
 ) -> Array:
     """(nq,) positions of ``urdf/two_finger_hand`` for a state (n,) as in ``HAND_STATE``.
 
@@ -155,7 +152,7 @@ def plant_positions(
     value["palm_x"] = value["wrist_x"] / (scale * pixels_per_metre)
     value["palm_y"] = value["wrist_y"] / (scale * pixels_per_metre)
     value["palm_z"] = 0.0 if distance is None else distance * (1.0 / scale - 1.0)
-    for i in FINGERS:
+    for i in TWO_FINGERS.fingers:
         value[f"base_height_{i}"] = value["palm_height"]
         value[f"base_side_{i}"] = 0.25 * value["palm_width"]
     return np.array([value[name] for name in names])
@@ -177,98 +174,136 @@ def scaled_rotation(q: Array) -> tuple[Array, Array]:
 
 
 @compiled
-def _place_finger(x: Array, i: int, count: int, p: Array, dp: Array) -> None:
-    """The end p (3,) of so many joints of finger i (0 or 1), and derivatives (3, 23): (9), (10)."""
-    c, s = math.cos(x[_SPREAD + i]), math.sin(x[_SPREAD + i])
-    width, height, side = x[_PALM], x[_PALM + 1], 0.25 - 0.5 * i
-    p[0], p[2] = c * height + s * side * width, c * side * width - s * height
-    dp[0, _PALM], dp[2, _PALM] = s * side, c * side
-    dp[0, _PALM + 1], dp[2, _PALM + 1] = c, -s
-    psi = 0.0
-    for j in range(3 * i, 3 * i + count):
-        psi += x[_FLEXION + j]
-        u, v, r = math.cos(psi), math.sin(psi), x[_LENGTH + j]
-        p[0] += r * u * c
-        p[1] += r * v
-        p[2] -= r * u * s
-        dp[0, _LENGTH + j], dp[1, _LENGTH + j], dp[2, _LENGTH + j] = u * c, v, -u * s
-        for k in range(_FLEXION + 3 * i, _FLEXION + j + 1):
-            dp[0, k] -= r * v * c
-            dp[1, k] += r * u
-            dp[2, k] += r * v * s
-    # The spread turns all about the palm's y axis.
-    dp[0, _SPREAD + i], dp[2, _SPREAD + i] = p[2], -p[0]
+def _place_finger(x: Array, chains: Chains, finger: int, p: Array, dp: Array) -> None:
+    """The base and all ends of a finger's segments p (k, 3), derivatives (k, 3, n): (9), (10)."""
+    first, last = chains.firsts[finger], chains.firsts[finger + 1]
+    R, place, point = np.eye(3), np.zeros(3), 0
+    axes, places = np.zeros((last - first, 3)), np.zeros((last - first, 3))
+    for s in range(first, last):
+        kind, value, own = chains.kinds[s], x[chains.elements[s]], chains.vectors[s]
+        v = np.zeros(3)
+        for a in range(3):
+            for b in range(3):
+                v[a] += R[a, b] * own[b]
+        copy_into(axes[s - first], v)
+        copy_into(places[s - first], place)
+        if kind == TURN:
+            c, i = math.cos(value), math.sin(value)
+            for b in range(3):
+                # Rodrigues' formula, column by column.
+                along = (1.0 - c) * (v[0] * R[0, b] + v[1] * R[1, b] + v[2] * R[2, b])
+                r0, r1, r2 = R[0, b], R[1, b], R[2, b]
+                R[0, b] = c * r0 + i * (v[1] * r2 - v[2] * r1) + along * v[0]
+                R[1, b] = c * r1 + i * (v[2] * r0 - v[0] * r2) + along * v[1]
+                R[2, b] = c * r2 + i * (v[0] * r1 - v[1] * r0) + along * v[2]
+            continue
+        for moved in range(2):
+            if moved:
+                place += value * v
+            elif point > 0:
+                continue
+            if kind != SEGMENT:
+                continue
+            # A point is noted: it depends on all steps up to here.
+            copy_into(p[point], place)
+            for k in range(first, s + moved):
+                e, axis = chains.elements[k], axes[k - first]
+                d0, d1, d2 = place - places[k - first]
+                if chains.kinds[k] == TURN:
+                    dp[point, 0, e] += axis[1] * d2 - axis[2] * d1
+                    dp[point, 1, e] += axis[2] * d0 - axis[0] * d2
+                    dp[point, 2, e] += axis[0] * d1 - axis[1] * d0
+                else:
+                    dp[point, :, e] += axis
+            point += 1
 
 
 @compiled
-def _palm_ends(M: Array) -> Array:
-    """(8, 3) ends of the outer edges of the palm's box, PALM_EDGES, as shares of its size.
-
-    Of height, thickness and width, along the hand's x, y and z.
-    """
-    # Across the palm's axis in the image, and along it: which face's edge lies outside.
-    wide = M[0, 0] * M[1, 2] - M[1, 0] * M[0, 2]
-    deep = M[0, 0] * M[1, 1] - M[1, 0] * M[0, 1]
-    side = 0.5 if wide * deep >= 0.0 else -0.5
-    top = 0.5 if M[0, 0] * M[0, 1] + M[1, 0] * M[1, 1] >= 0.0 else -0.5
-    return np.array(
-        [
-            [0.0, side, 0.5],
-            [1.0, side, 0.5],
-            [0.0, -side, -0.5],
-            [1.0, -side, -0.5],
-            [1.0, top, 0.5],
-            [1.0, top, -0.5],
-            [0.0, -top, 0.5],
-            [0.0, -top, -0.5],
-        ]
-    )
+def _palm_ends(M: Array, chains: Chains, sizes: Array) -> Array:
+    """(8, 3) ends of the palm's outer edges, PALM_EDGES, as shares of its sizes (3,)."""
+    ends = np.zeros((8, 3))
+    x, y = M[0, 0], M[1, 0]
+    # Across the palm's axis in the image; the left edge is on the side of positive z.
+    turned = 1.0 if x * M[1, 2] - y * M[0, 2] >= 0.0 else -1.0
+    for k in range(4):
+        side = turned if k < 2 else -turned
+        best = -np.inf
+        for share in chains.rings[k % 2]:
+            across = 0.0
+            for c in range(3):
+                across += side * (x * M[1, c] - y * M[0, c]) * share[c] * sizes[c]
+            if across > best:
+                best = across
+                copy_into(ends[k], share)
+    for k in range(2):
+        best, sign = -np.inf, 1.0 - 2.0 * k
+        for row in chains.rows[k]:
+            along = 0.0
+            for c in range(3):
+                middle = 0.5 * (row[0, c] + row[1, c]) * sizes[c]
+                along += sign * (x * M[0, c] + y * M[1, c]) * middle
+            if along > best:
+                best = along
+                copy_into(ends[4 + 2 * k], row[0])
+                copy_into(ends[5 + 2 * k], row[1])
+    return ends
 
 
 @compiled
-def project_hand(x: Array, scale: float, shortest: float) -> tuple[Array, Array, Array]:
+def project_hand(
+    x: Array, chains: Chains, scale: float, shortest: float
+) -> tuple[Array, Array, Array, Array]:
     """All features of the hand.
 
     Args:
-        x: (23,) wrist [pixel], quaternion, spreads, flexions [rad], lengths, palm sizes [m].
+        x: (n,) what is seen of the state, in the order of ``HandModel.seen``.
+        chains: the hand.
         scale: pixels per metre for a quaternion of norm 1.
         shortest: a line shorter than this in the image has no axis [pixel].
 
     Returns:
-        h (39,) of (13), NaN for lines too short; H (39, 23); and the points drawn (16, 2): base,
-        knuckles, tip of both fingers, and the ends of the palm's four edges.
+        h (m,) of (13), NaN for lines too short; H (m, n); the points drawn (p, 3), z towards what
+        is beyond the picture, and their derivatives (p, 3, n): base, joints, tip of the fingers,
+        and the ends of the palm's four edges.
     """
-    n = len(x)
-    M, D = scaled_rotation(x[_QUATERNION:_SPREAD])
-    ends = _palm_ends(M)
-    points, J = np.zeros((16, 2)), np.zeros((16, 2, n))
-    for k in range(16):
-        p, dp = np.zeros(3), np.zeros((3, n))
-        if k < 8:
-            _place_finger(x, k // 4, k % 4, p, dp)
-        for c in range(3):
-            if k >= 8:
-                size = _PALM + (c + 1) % 3
-                p[c], dp[c, size] = ends[k - 8, c] * x[size], ends[k - 8, c]
-            for a in range(2):
-                points[k, a] += scale * M[a, c] * p[c]
+    n, fingers, lines = len(x), len(chains.firsts) - 1, chains.lines
+    M, D = scaled_rotation(x[_QUATERNION:_ANGLES])
+    sizes = x[chains.palm]
+    ends = _palm_ends(M, chains, sizes)
+    on_fingers = lines[len(lines) - 4, 0]
+    each = on_fingers // fingers
+    p, dp = np.zeros((on_fingers + 8, 3)), np.zeros((on_fingers + 8, 3, n))
+    for f in range(fingers):
+        own = slice(f * each, (f + 1) * each)
+        _place_finger(x, chains, f, p[own], dp[own])
+    points, J = np.zeros(p.shape), np.zeros(dp.shape)
+    for k in range(len(p)):
+        if k >= on_fingers:
+            for c in range(3):
+                p[k, c] = ends[k - on_fingers, c] * sizes[c]
+                dp[k, c, chains.palm[c]] = ends[k - on_fingers, c]
+        for a in range(3):
+            for c in range(3):
+                points[k, a] += scale * M[a, c] * p[k, c]
                 for e in range(n):
-                    J[k, a, e] += scale * M[a, c] * dp[c, e]
+                    J[k, a, e] += scale * M[a, c] * dp[k, c, e]
                 for q in range(4):
-                    J[k, a, _QUATERNION + q] += scale * D[q, a, c] * p[c]
+                    J[k, a, _QUATERNION + q] += scale * D[q, a, c] * p[k, c]
         for a in range(2):
             points[k, a] += x[a]
             J[k, a, a] += 1.0
-    h, H = np.zeros(_SCALE + 1), np.zeros((_SCALE + 1, n))
+    first = 2 + 2 * on_fingers
+    h = np.zeros(first + 2 * len(lines) + 1)
+    H = np.zeros((len(h), n))
     for a in range(2):
         h[a], H[a, a] = x[a], 1.0
-        for k in range(8):
+        for k in range(on_fingers):
             h[2 + 2 * k + a] = points[k, a]
             copy_into(H[2 + 2 * k + a], J[k, a])
-    for line in range(len(LINE_STARTS)):
+    for line in range(len(lines)):
         # Angle and signed distance from the origin: (11) and (12).
-        row, start, end = _LINES + 2 * line, LINE_STARTS[line], LINE_ENDS[line]
-        u, v = points[start]
+        row, start, end = first + 2 * line, lines[line, 0], lines[line, 1]
+        u, v = points[start, 0], points[start, 1]
         dx, dy = points[end, 0] - u, points[end, 1] - v
         length = math.sqrt(dx * dx + dy * dy)
         if length < shortest:
@@ -281,7 +316,7 @@ def project_hand(x: Array, scale: float, shortest: float) -> tuple[Array, Array,
             turn = (dx * (J[end, 1, e] - dv) - dy * (J[end, 0, e] - du)) / length
             H[row, e] = turn
             H[row + 1, e] = dx * dv - dy * du - (dx * u + dy * v) * turn
-    for q in range(_QUATERNION, _SPREAD):
-        h[_SCALE] += x[q] ** 2
-        H[_SCALE, q] = 2.0 * x[q]
-    return h, H, points
+    for q in range(_QUATERNION, _ANGLES):
+        h[-1] += x[q] ** 2
+        H[-1, q] = 2.0 * x[q]
+    return h, H, points, J

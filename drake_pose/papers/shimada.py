@@ -7,12 +7,10 @@ import math
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from types import MappingProxyType
 from typing import NamedTuple, cast
 
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.systems.analysis import Simulator
 from rich.table import Table
 from scipy.special import chdtri
 
@@ -28,9 +26,9 @@ from drake_pose.filtering.hand import (
     HandObservation,
     plant_positions,
 )
+from drake_pose.filtering.hand_model import TWO_FINGERS
 from drake_pose.filtering.kalman.truncated_filter import (
     FilterSettings,
-    FilterState,
     TruncatedFilter,
     Truncation,
 )
@@ -44,8 +42,8 @@ from drake_pose.papers.shimada_motion import (
     SyntheticSequence,
     make_sequence,
 )
+from drake_pose.papers.shimada_sequences import Track, follow_pictures, track_of
 from drake_pose.papers.tables import Count, figure_table, require_choice, require_counts, uncounted
-from drake_pose.silhouette.pictures.label_images import label_image_to_mask
 from drake_pose.systems.bodies import held_positions
 from drake_pose.systems.estimators.hand_tracking import build_hand_estimation
 
@@ -68,9 +66,9 @@ PICTURES = "pictures"
 # A lens so long that perspective is weak: half the picture's width is .3 degrees.
 _WIDTH, _HEIGHT, _DISTANCE = 480, 400, 50.0
 _PERIOD = 1.0 / 30.0
-# Pictures that are kept, frames from 0; the palm's size as it is drawn [m].
+# Pictures that are kept, frames from 0; and the palm's sizes along its axes.
 _KEPT = (7, 23, 39)
-_DRAWN_PALM = {"palm_height": 0.08, "palm_thickness": 0.02, "palm_width": 0.07}
+_PALM_AXES = ("palm_height", "palm_thickness", "palm_width")
 _ROWS = {
     "length_error_mean": ("length error, mean [pixel]", "{:.2f}"),
     "length_error_p95": ("  95th percentile", "{:.2f}"),
@@ -94,26 +92,12 @@ class Trial(NamedTuple):
     """One sequence, filtered.
 
     Attributes:
-        means, deviations: (55, n) of the best hypothesis after each frame.
-        covariance: (n, n) of the last.
-        milliseconds: (55,) of the processor for prediction and update, and for measuring where
-            there is a picture, without drawing it; nan once it broke down.
         bound: (n,) at the end of a filter linearised at the truth, without limits; nan: pictures.
-        differences: (55,) of a silhouette and the pose that it was matched to; () without pictures.
-        mirrored, rejected: hypotheses made by mirroring, and rejected by an inequality.
-        kept: of pictures, a mask, its measurement (39,) and the rough pose (n,), by frame from 0.
     """
 
     sequence: SyntheticSequence
-    means: Array
-    deviations: Array
-    covariance: Array
-    milliseconds: Array
+    track: Track
     bound: Array
-    differences: Array = np.zeros(0)
-    mirrored: int = 0
-    rejected: int = 0
-    kept: Mapping[int, tuple[NDArray[np.bool_], Array, Array]] = MappingProxyType({})
 
 
 @dataclass(frozen=True)
@@ -203,8 +187,7 @@ def run_experiment(
         case = []
         for run in range(runs):
             sequence = make_sequence(r_13, seen, observation, _generator(seed, run, r_13))
-            trial = follow(hand_filter, sequence)
-            case.append(trial if run == 0 else trial._replace(kept={}))
+            case.append(follow(hand_filter, sequence))
             advance(place * runs + run + 1)
         trials[key] = tuple(case)
     return ExperimentResult(trials, seed, settings, observed, noise, acceleration)
@@ -254,7 +237,7 @@ def _generator(seed: int, run: int, r_13: float) -> np.random.Generator:
 
 def _filter_sequence(hand_filter: TruncatedFilter, sequence: SyntheticSequence) -> Trial:
     """Filter a sequence; a filter that breaks down keeps its last belief."""
-    track, broken = _Track(), False
+    states, times, broken = [], [], False
     state = hand_filter.start(sequence.guess)
     for t, y in enumerate(sequence.measurements):
         begin = time.thread_time()
@@ -266,8 +249,9 @@ def _filter_sequence(hand_filter: TruncatedFilter, sequence: SyntheticSequence) 
             except SettingsError:
                 # A plain filter that has run away has no covariance any more: it is lost.
                 broken = True
-        track.add(state, milliseconds)
-    return track.trial(sequence)._replace(bound=_bound(hand_filter, sequence))
+        states.append(state)
+        times.append(milliseconds)
+    return Trial(sequence, track_of(states, times), _bound(hand_filter, sequence))
 
 
 def _filter_pictures(hand_filter: TruncatedFilter, sequence: SyntheticSequence) -> Trial:
@@ -278,8 +262,8 @@ def _filter_pictures(hand_filter: TruncatedFilter, sequence: SyntheticSequence) 
     camera = PinholeCamera(
         "camera", _WIDTH, _HEIGHT, focal, focal, *center, X_WC, near=0.5 * _DISTANCE
     )
-    sizes = {name: sequence.states[0, HAND_STATE.index(name)] for name in _DRAWN_PALM}
-    factors = [sizes[name] / drawn for name, drawn in _DRAWN_PALM.items()]
+    sizes = sequence.states[0, HAND_STATE.indices(_PALM_AXES)]
+    factors = sizes / [TWO_FINGERS.sizes[name] for name in _PALM_AXES]
     model = _hand().reshaped(factors={"palm": factors})
     q = [
         plant_positions(x, model.position_names, PIXELS_PER_METRE, _DISTANCE)
@@ -287,50 +271,9 @@ def _filter_pictures(hand_filter: TruncatedFilter, sequence: SyntheticSequence) 
     ]
     positions = held_positions(np.array(q), _PERIOD)
     silhouette = HandSilhouette(hand_filter, _WIDTH, _HEIGHT, center)
-    diagram, ekf, sensor = build_hand_estimation(
-        model, camera, silhouette, sequence.guess, positions, _PERIOD
-    )
-    simulator, track = Simulator(diagram), _Track()
-    own, its = (one.GetMyContextFromRoot(simulator.get_context()) for one in (sensor, ekf))
-    image, measured = sensor.GetInputPort("label_image"), sensor.GetOutputPort("measurement")
-    differences, kept = [], {}
-    for t in range(FRAMES):
-        mask = label_image_to_mask(image.Eval(own))
-        begin = time.thread_time()
-        y = np.array(measured.Eval(own))
-        differences.append(sensor.GetOutputPort("difference").Eval(own)[0])
-        if t in _KEPT:
-            kept[t] = (mask.copy(), y, np.array(sensor.GetOutputPort("rough_state").Eval(own)))
-        simulator.AdvanceTo((t + 1) * _PERIOD)
-        track.add(ekf.filter_state(its), 1e3 * (time.thread_time() - begin))
-    return track.trial(sequence)._replace(differences=np.array(differences), kept=kept)
-
-
-class _Track:
-    """What a filter believed after each frame."""
-
-    def __init__(self) -> None:
-        self._states: list[FilterState] = []
-        self._milliseconds: list[float] = []
-
-    def add(self, state: FilterState, milliseconds: float) -> None:
-        self._states.append(state)
-        self._milliseconds.append(milliseconds)
-
-    def trial(self, sequence: SyntheticSequence) -> Trial:
-        """All of it, but for what only one of the experiments has."""
-        states, best = self._states, [state.best for state in self._states]
-        ends = [end.reason for state in states for end in state.rejections]
-        return Trial(
-            sequence,
-            np.array([one.mean for one in best]),
-            np.array([one.deviations() for one in best]),
-            best[-1].covariance,
-            np.array(self._milliseconds),
-            np.full(len(HAND_STATE), math.nan),
-            mirrored=len(ends) + len(states[-1].hypotheses) - 1,
-            rejected=ends.count("constraint"),
-        )
+    parts = build_hand_estimation(model, camera, silhouette, sequence.guess, positions, _PERIOD)
+    track = follow_pictures(parts, _PERIOD, FRAMES, _KEPT)
+    return Trial(sequence, track, np.full(len(HAND_STATE), math.nan))
 
 
 def _bound(hand_filter: TruncatedFilter, sequence: SyntheticSequence) -> Array:
@@ -346,7 +289,8 @@ def _bound(hand_filter: TruncatedFilter, sequence: SyntheticSequence) -> Array:
 def _figures(trials: Sequence[Trial]) -> dict[str, float | int]:
     """Figures of a case; a run's NEES of the six lengths is 6 on average if it is honest."""
     truths = np.array([trial.sequence.states for trial in trials])
-    means = np.array([trial.means for trial in trials])
+    tracks = [trial.track for trial in trials]
+    means = np.array([track.means for track in tracks])
     errors = (means - truths)[:, -1]
     lengths, bounds = (
         PIXELS_PER_METRE * np.mean(np.abs(off[:, _LENGTHS]), axis=1)
@@ -356,19 +300,19 @@ def _figures(trials: Sequence[Trial]) -> dict[str, float | int]:
     watched = np.concatenate([_LENGTHS, _ANGLES])
     nees = np.array(
         [
-            off @ np.linalg.pinv(trial.covariance[np.ix_(_LENGTHS, _LENGTHS)], hermitian=True) @ off
-            for trial, off in zip(trials, errors[:, _LENGTHS], strict=True)
+            off @ np.linalg.pinv(track.covariance[np.ix_(_LENGTHS, _LENGTHS)], hermitian=True) @ off
+            for track, off in zip(tracks, errors[:, _LENGTHS], strict=True)
         ]
     )
     low, high = chdtri(len(LENGTHS), [0.975, 0.025])
     r_13 = PIXELS_PER_METRE * np.array([means[:, -1, _R_13], truths[:, -1, _R_13]])
     lost = ~((lengths < _LOST_LENGTH_ERROR) & (angles[:, -1] < LOST_ANGLE_ERROR))
-    milliseconds = np.array([trial.milliseconds for trial in trials])
-    inside = np.abs(means - truths) < 2 * np.array([trial.deviations for trial in trials])
+    milliseconds = np.array([track.milliseconds for track in tracks])
+    inside = np.abs(means - truths) < 2 * np.array([track.deviations for track in tracks])
     shares = np.abs(errors[:, _LENGTHS]) / truths[:, -1, _LENGTHS]
     own: dict[str, float | int] = {}
-    if len(trials[0].differences):
-        own["silhouette_difference"] = float(np.median([trial.differences for trial in trials]))
+    if len(tracks[0].differences):
+        own["silhouette_difference"] = float(np.median([track.differences for track in tracks]))
     else:
         own["bound_length_error_mean"] = float(bounds.mean())
     return {
@@ -381,8 +325,8 @@ def _figures(trials: Sequence[Trial]) -> dict[str, float | int]:
         "length_error_largest": float(shares.max()),
         "ms_per_update": float(np.nanmedian(milliseconds)),
         "ms_per_update_p95": float(np.nanpercentile(milliseconds, 95)),
-        "mirrored": sum(trial.mirrored for trial in trials),
-        "rejected_by_an_inequality": sum(trial.rejected for trial in trials),
+        "mirrored": sum(track.mirrored for track in tracks),
+        "rejected_by_an_inequality": sum(track.rejected for track in tracks),
         "lost": int(np.count_nonzero(lost)),
         "angle_rmse_at_end": float(np.sqrt(np.mean(angles[:, -1] ** 2))),
         "r_13_mean": float(r_13[0].mean()),

@@ -11,12 +11,10 @@ from drake_pose.filtering.hand import (
     HAND_STATE,
     LENGTHS,
     MEASURED,
-    PALM,
-    QUATERNION,
     SPREADS,
-    WRIST,
     HandObservation,
 )
+from drake_pose.filtering.hand_model import PALM, QUATERNION, WRIST
 from drake_pose.filtering.state import Belief
 
 Array = NDArray[np.float64]

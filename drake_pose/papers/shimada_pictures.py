@@ -10,20 +10,19 @@ from numpy.typing import NDArray
 from drake_pose.filtering.hand import (
     FLEXIONS,
     HAND_STATE,
-    LENGTHS,
-    MEASURED,
-    PALM,
-    QUATERNION,
     SPREADS,
     HandObservation,
 )
+from drake_pose.filtering.hand_model import QUATERNION, TWO_FINGERS, HandModel
 from drake_pose.papers.shimada import CASES, PICTURES, PIXELS_PER_METRE, ExperimentResult, Trial
 from drake_pose.papers.shimada_hypotheses import HypothesesResult
 from drake_pose.papers.shimada_motion import FRAMES
+from drake_pose.papers.shimada_sequences import SequenceResult, Track
 from drake_pose.papers.tables import save_figure
 
 Array = NDArray[np.float64]
 
+_OBSERVATION = HandObservation(pixels_per_metre=PIXELS_PER_METRE)
 _SHOWN_FRAMES = (1, 8, 16, 32, 40, 55)
 _TRUE, _ESTIMATE, _REJECTED = "0.35", "#0072b2", "#d55e00"
 # So many frames are drawn after a hypothesis is rejected.
@@ -43,14 +42,14 @@ def save_pictures(result: ExperimentResult, folder: Path) -> list[Path]:
     )
     figures = {"figure_12_scale": _draw_scale(trial)}
     if result.observed == PICTURES:
-        figures["figure_17_pictures"] = _draw_matches(trial)
+        figures["figure_17_pictures"] = _draw_matches(trial.track)
         figures["figure_18_shapes"] = _draw_shapes(first)
     else:
         figures["figure_10_sequence"] = _draw_sequence(trial)
         figures["figure_11_shapes"] = _draw_shapes(first)
     for name, element, shown, factor, label in curves:
         index = HAND_STATE.index(element)
-        values = shown.sequence.states, shown.means, shown.deviations
+        values = shown.sequence.states, shown.track.means, shown.track.deviations
         figures[name] = _draw_curve(label, *(factor * one[:, index] for one in values))
     return [save_figure(figure, folder / f"{name}.png") for name, figure in figures.items()]
 
@@ -111,11 +110,13 @@ def save_hypotheses(result: HypothesesResult, folder: Path) -> list[Path]:
     return [save_figure(figure, folder / "figure_9_hypotheses.png")]
 
 
-def _draw_hand(axes: Axes, state: Array, colour: str) -> None:
-    points = HandObservation(pixels_per_metre=PIXELS_PER_METRE).drawing(state)
-    for finger in (points[:4], points[4:8]):
+def _draw_hand(
+    axes: Axes, state: Array, colour: str, observation: HandObservation = _OBSERVATION
+) -> None:
+    points, shape = observation.drawing(state), observation.hand.radii.shape
+    for finger in points[: shape[0] * shape[1]].reshape(*shape, 2):
         axes.plot(finger[:, 0], finger[:, 1], "-o", color=colour, markersize=3, linewidth=2)
-    for edge in points[8:].reshape(-1, 2, 2):
+    for edge in points[-8:].reshape(-1, 2, 2):
         axes.plot(edge[:, 0], edge[:, 1], color=colour, linewidth=1)
     axes.set_aspect("equal")
 
@@ -123,7 +124,7 @@ def _draw_hand(axes: Axes, state: Array, colour: str) -> None:
 def _draw_sequence(trial: Trial) -> Figure:
     figure = Figure(figsize=(15, 5.2))
     grid = figure.subplots(2, len(_SHOWN_FRAMES), sharex=True, sharey=True)
-    rows = (("true", trial.sequence.states, _TRUE), ("estimate", trial.means, _ESTIMATE))
+    rows = (("true", trial.sequence.states, _TRUE), ("estimate", trial.track.means, _ESTIMATE))
     for line, (label, states, colour) in zip(grid, rows, strict=True):
         for axes, frame in zip(line, _SHOWN_FRAMES, strict=True):
             _draw_hand(axes, states[frame - 1], colour)
@@ -133,12 +134,14 @@ def _draw_sequence(trial: Trial) -> Figure:
     return figure
 
 
-def _draw_matches(trial: Trial) -> Figure:
+def _draw_matches(track: Track, observation: HandObservation = _OBSERVATION) -> Figure:
     """Figure 17: silhouettes, the rough pose matched, the axes and tips measured, the estimate."""
-    figure = Figure(figsize=(3.6 * len(trial.kept), 11))
-    grid = figure.subplots(4, len(trial.kept))
-    axis_rows, tips = _rows_of("alpha_", "rho_"), _rows_of("_x", "_y")[:, 4::4]
-    for column, (frame, (mask, y, rough)) in zip(grid.T, trial.kept.items(), strict=True):
+    kept = track.kept
+    figure = Figure(figsize=(3.6 * len(kept), 11))
+    grid = figure.subplots(4, len(kept))
+    axis_rows = _rows_of(observation, "alpha_", "rho_")
+    tips = _rows_of(observation, "_x", "_y")[:, 4::4]
+    for column, (frame, (mask, y, rough)) in zip(grid.T, kept.items(), strict=True):
         rows, cols = np.nonzero(mask)
         height, width = mask.shape
         # The state's origin is the picture's middle.
@@ -149,14 +152,14 @@ def _draw_matches(trial: Trial) -> Figure:
             axes.set(xlim=(u.min() - 15, u.max() + 15), ylim=(v.max() + 15, v.min() - 15))
             axes.set(xticks=[], yticks=[])
         column[0].set_title(f"t = {frame + 1}", fontsize=9)
-        _draw_hand(column[1], rough, _REJECTED)
+        _draw_hand(column[1], rough, _REJECTED, observation)
         for alpha, rho in y[axis_rows].T:
             direction = np.array([np.cos(alpha), np.sin(alpha)])
             foot, reach = rho * np.array([-direction[1], direction[0]]), 1e3
             ends = foot + np.outer((-reach, reach), direction)
             column[2].plot(ends[:, 0], ends[:, 1], color=_REJECTED, linewidth=0.8)
         column[2].plot(*y[tips], "o", color=_ESTIMATE, markersize=4)
-        _draw_hand(column[3], trial.means[frame], _ESTIMATE)
+        _draw_hand(column[3], track.means[frame], _ESTIMATE, observation)
     for axes, label in zip(
         grid[:, 0], ("picture", "rough pose", "measured", "estimate"), strict=True
     ):
@@ -164,10 +167,29 @@ def _draw_matches(trial: Trial) -> Figure:
     return figure
 
 
-def _rows_of(first: str, second: str) -> NDArray[np.intp]:
+def _rows_of(observation: HandObservation, first: str, second: str) -> NDArray[np.intp]:
     """(2, k) where two kinds of number stand among what is measured."""
-    kinds = [[k for k, name in enumerate(MEASURED) if part in name] for part in (first, second)]
+    names = list(enumerate(observation.names))
+    kinds = [[k for k, name in names if part in name] for part in (first, second)]
     return np.array(kinds, dtype=np.intp)
+
+
+def save_sequence(result: SequenceResult, folder: Path) -> list[Path]:
+    """Figures 17 and 18 of a recorded sequence; returns the PNG files written."""
+    observation = result.observation
+    figures = {
+        "figure_17": _draw_matches(result.track, observation),
+        "figure_18": Figure(figsize=(11, 5)),
+    }
+    grid = figures["figure_18"].subplots(1, 2, sharex=True, sharey=True)
+    panels = ("(a) first guess", result.guess.mean), ("(b) estimate", result.track.means[-1])
+    for axes, (title, state) in zip(grid, panels, strict=True):
+        _draw_hand(axes, _flat(state, observation.hand), _ESTIMATE, observation)
+        axes.set_title(f"{title}, pixels at the first frame's scale", fontsize=9)
+    return [
+        save_figure(figure, folder / f"{name}_{result.name}.png")
+        for name, figure in figures.items()
+    ]
 
 
 def _draw_shapes(first: dict[str, Trial]) -> Figure:
@@ -178,7 +200,7 @@ def _draw_shapes(first: dict[str, Trial]) -> Figure:
     panels = [("(a) first guess", sequence.states[0], sequence.guess.mean)]
     for label, (key, shown) in zip("bc", first.items(), strict=True):
         title = f"({label}) at t = {FRAMES}, r_13 = {CASES[key]:.0f}"
-        panels.append((title, shown.sequence.states[-1], shown.means[-1]))
+        panels.append((title, shown.sequence.states[-1], shown.track.means[-1]))
     for axes, (title, true, estimate) in zip(grid, panels, strict=True):
         _draw_hand(axes, _flat(true), _TRUE)
         _draw_hand(axes, _flat(estimate), _ESTIMATE)
@@ -187,12 +209,12 @@ def _draw_shapes(first: dict[str, Trial]) -> Figure:
     return figure
 
 
-def _flat(state: Array) -> Array:
+def _flat(state: Array, hand: HandModel = TWO_FINGERS) -> Array:
     flat = np.zeros_like(state)
-    shape = HAND_STATE.indices((*LENGTHS, *PALM))
+    shape = hand.layout.indices(hand.layout.constant)
     flat[shape] = state[shape]
     # A quarter turn about the fingers' axis: the palm faces the camera.
-    flat[HAND_STATE.indices(QUATERNION)] = np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0
+    flat[hand.layout.indices(QUATERNION)] = np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0
     return flat
 
 
@@ -200,10 +222,10 @@ def _draw_scale(trial: Trial) -> Figure:
     """The scale is the quaternion's squared norm; its deviation by linear propagation."""
     indices = HAND_STATE.indices(QUATERNION)
     true, estimate = (
-        np.sum(one[:, indices] ** 2, axis=1) for one in (trial.sequence.states, trial.means)
+        np.sum(one[:, indices] ** 2, axis=1) for one in (trial.sequence.states, trial.track.means)
     )
     # Elements taken as independent: an upper bound where errors of rotation dominate.
-    slopes = 2 * trial.means[:, indices] * trial.deviations[:, indices]
+    slopes = 2 * trial.track.means[:, indices] * trial.track.deviations[:, indices]
     return _draw_curve("scale", true, estimate, np.linalg.norm(slopes, axis=1))
 
 

@@ -5,8 +5,10 @@ from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
 
 from drake_pose.body.formats.packages import bundled_model
+from drake_pose.body.model import load_model
 from drake_pose.errors import SettingsError
 from drake_pose.filtering.hand import HAND_STATE, HandObservation, plant_positions, scaled_rotation
+from drake_pose.filtering.hand_model import read_hand
 from drake_pose.filtering.state import Belief
 
 OBSERVATION = HandObservation()
@@ -26,22 +28,71 @@ def random_state(seed):
     return x
 
 
+@pytest.fixture(scope="module")
+def right_hand():
+    """The bundled right hand: its model, and what is read of it."""
+    model = load_model(bundled_model("hand").with_name("right_hand.urdf"), check=False)
+    return model, read_hand(model)
+
+
+def five_fingers(hand, seed):
+    """A state of a hand of five fingers, of the model's sizes."""
+    generator, layout = np.random.default_rng(seed), hand.layout
+    x = np.zeros(len(layout))
+    quaternion = generator.normal(size=4)
+    x[:2] = generator.uniform(-60, 60, 2)
+    x[2:6] = quaternion / np.linalg.norm(quaternion) * generator.uniform(0.8, 1.2)
+    x[layout.indices(hand.angles)] = generator.uniform(-0.1, 0.8, len(hand.angles))
+    x[layout.indices(layout.constant)] = [hand.sizes[name] for name in layout.constant]
+    return x
+
+
 @pytest.mark.parametrize("seed", range(20))
-def test_jacobian_against_central_differences(seed):
-    x = random_state(seed)
-    h, H = OBSERVATION.predict(x)
-    step = 1e-6
-    for e in range(len(x)):
-        d = np.zeros_like(x)
-        d[e] = step
-        forward, backward = OBSERVATION.predict(x + d)[0], OBSERVATION.predict(x - d)[0]
-        change = forward - backward
-        change[OBSERVATION.wraps] = (
-            np.remainder(change[OBSERVATION.wraps] + np.pi, 2 * np.pi) - np.pi
-        )
-        numeric = change / (2 * step)
-        defined = np.isfinite(h)
-        np.testing.assert_allclose(H[defined, e], numeric[defined], rtol=1e-5, atol=2e-4)
+def test_jacobian_against_central_differences(seed, right_hand):
+    own = HandObservation(hand=right_hand[1])
+    for observation, x in (
+        (OBSERVATION, random_state(seed)),
+        (own, five_fingers(right_hand[1], seed)),
+    ):
+        h, H = observation.predict(x)
+        step, wraps = 1e-6, observation.wraps
+        for e in range(len(x)):
+            d = np.zeros_like(x)
+            d[e] = step
+            change = observation.predict(x + d)[0] - observation.predict(x - d)[0]
+            change[wraps] = np.remainder(change[wraps] + np.pi, 2 * np.pi) - np.pi
+            numeric = change / (2 * step)
+            defined = np.isfinite(h)
+            np.testing.assert_allclose(H[defined, e], numeric[defined], rtol=1e-5, atol=3e-4)
+
+
+def test_five_fingers_are_where_drake_has_them(right_hand):
+    """Joints of the bundled hand at the angles of a state, and tips a radius before their end."""
+    model, hand = right_hand
+    plant, context = model.plant, model.plant.CreateDefaultContext()
+    observation, fingers = HandObservation(hand=hand), len(hand.fingers)
+    assert hand.fingers == ("thumb", "index", "middle", "ring", "little")
+    for seed in range(5):
+        x = five_fingers(hand, seed)
+        q = plant.GetPositions(context).copy()
+        angles = dict(zip(hand.angles, x[hand.layout.indices(hand.angles)], strict=True))
+        for name, angle in angles.items():
+            q[model.position_index(name)] = angle
+        plant.SetPositions(context, q)
+        palm, M = plant.GetFrameByName("palm"), scaled_rotation(x[2:6])[0]
+        drawn = observation.drawing(x)[: 4 * fingers].reshape(fingers, 4, 2)
+        for finger, points in zip(hand.fingers, drawn, strict=True):
+            links = [f"{finger}_{part}" for part in ("proximal", "middle", "distal")]
+            if finger == "thumb":
+                links = ["thumb_metacarpal", "thumb_proximal", "thumb_distal"]
+            length = x[hand.layout.index(f"length_{links[2]}")]
+            ends = [(link, np.zeros(3)) for link in links] + [(links[2], [0.0, length, 0.0])]
+            for (link, p), point in zip(ends, points, strict=True):
+                frame = plant.GetFrameByName(link)
+                p_P = plant.CalcPointsPositions(context, frame, p, palm)[:, 0]
+                # The palm's y leads to the fingers, its z out of it.
+                expected = x[:2] + 1000.0 * (M @ p_P[[1, 2, 0]])[:2]
+                np.testing.assert_allclose(point, expected, atol=1e-6)
 
 
 @pytest.mark.parametrize("seed", range(5))

@@ -9,8 +9,7 @@ from drake_pose.body.model import load_model
 from drake_pose.errors import SettingsError
 from drake_pose.papers.date import frames_of_destruction, run_experiment
 from drake_pose.papers.date_capture import PERIOD, Studio
-from drake_pose.papers.date_pictures import save_pictures
-from drake_pose.papers.date_walk import draw_walk, run_walk_through, walk_by
+from drake_pose.papers.date_walk import draw_walk, run_walk_through, save_pictures, walk_by
 from drake_pose.person.date.features import SkinColour, skin_blobs
 from drake_pose.person.date.skeleton import load_skeleton
 from drake_pose.person.date.walking import (

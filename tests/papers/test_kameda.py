@@ -14,8 +14,14 @@ from drake_pose.papers.kameda import (
     experiment_search,
     run_experiment,
 )
-from drake_pose.papers.kameda_edges import edge_lines, noisy_edges, settle_by_edges
-from drake_pose.papers.kameda_figures import PAPER, grid_figures, grid_table
+from drake_pose.papers.kameda_figures import (
+    PAPER,
+    edge_lines,
+    grid_figures,
+    grid_table,
+    noisy_edges,
+    settle_by_edges,
+)
 from drake_pose.papers.kameda_pictures import (
     chest_ranks,
     ratio_within,

@@ -1,4 +1,4 @@
-"""The two-finger hand measured in a silhouette that does not say which part of it is which."""
+"""A hand measured in a silhouette that does not say which part of it is which."""
 
 import math
 from collections.abc import Sequence
@@ -10,20 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_pose.errors import MaskError
-from drake_pose.filtering.hand import (
-    FINGERS,
-    FLEXIONS,
-    HAND_STATE,
-    LINE_ENDS,
-    LINE_STARTS,
-    MEASURED,
-    PALM,
-    QUATERNION,
-    SEEN,
-    WRIST,
-    HandObservation,
-    scaled_rotation,
-)
+from drake_pose.filtering.hand import HandObservation, scaled_rotation
+from drake_pose.filtering.hand_model import PALM, QUATERNION, WRIST, HandModel
 from drake_pose.filtering.kalman.truncated_filter import TruncatedFilter
 from drake_pose.filtering.measurements.axes import (
     GATES,
@@ -38,32 +26,26 @@ from drake_pose.fit.evidence import EdgePoints, find_edge_points
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-FINGER_RADIUS = 0.008
-"""Of the bundled hand's fingers [m]."""
-
-# Parts of the state; lines and tips among MEASURED; how many lines are
-# fingers', and those that end in a tip.
-_WRIST, _QUATERNION, _PALM = (HAND_STATE.indices(names) for names in (WRIST, QUATERNION, PALM))
-_SCALE = MEASURED.index("scale")
-_AXES, _FINGER_LINES = slice(MEASURED.index("alpha_11"), _SCALE), len(FLEXIONS)
-_TIPS = np.array([[MEASURED.index(f"point_{i}3_{axis}") for axis in "xy"] for i in FINGERS])
-_TIP_LINES = np.array([2, 5])
 # Searches at most; a search's poses in a round, those that the next is drawn about, rounds, those
 # that are followed.
 _SEARCHES, _POSES, _ELITE, _SEARCH_ROUNDS, _FOLLOWED = 3, 120, 15, 5, 4
 # Its widest deviations: wrist [pixel], quaternion, angles [rad], lengths [m]; and how much finer
 # than the picture it draws.
-_WIDEST = np.r_[[8.0] * 2, [0.14] * 4, [math.radians(18.0)] * 8, [0.012] * 9]
+_WIDEST_WRIST, _WIDEST_TURN, _WIDEST_ANGLE, _WIDEST_LENGTH = 8.0, 0.14, math.radians(18.0), 0.012
 _ZOOM = 0.5
-# Eight corners of the palm's box, as shares of its height, thickness and width.
-_CORNERS = np.array([[a, b, c] for a in (0.0, 1.0) for b in (-0.5, 0.5) for c in (-0.5, 0.5)])
+# How surely a joint or a tip lies inside the silhouette, and along its edge [radii].
+_INSIDE, _ALONG = 0.5, 10.0
+# A round end, drawn as a polygon.
+_RIM = np.array([[math.cos(k * math.pi / 12), math.sin(k * math.pi / 12)] for k in range(24)])
+# Gates and the wrist's search are for fingers of this radius [pixel].
+_USUAL_RADIUS = 8.0
 
 
 class HandMeasurement(NamedTuple):
     """What a silhouette shows of the hand.
 
     Attributes:
-        y: (39,) as of ``HandObservation``, NaN where hidden; covariance: (39, 39) of its noise.
+        y: (m,) as of ``HandObservation``, NaN where hidden; covariance: (m, m) of its noise.
         rough: (n,) the pose that the edge was matched to.
         difference: share of the silhouette by which it differs from that pose's.
     """
@@ -82,9 +64,8 @@ class HandSilhouette:
     which segment; where its own silhouette is another, poses around the prediction are searched.
 
     Args:
-        belief_filter: of ``HAND_STATE`` and a ``HandObservation``.
+        belief_filter: of a ``HandObservation`` and its hand's state.
         width, height: of the picture; center: (2,) where the state has its origin [pixel].
-        radius: of a finger [m].
         well_matched: a rough pose whose silhouette differs by more of it is searched for.
         unmatched: one that differs by more says nothing: nothing is measured.
     """
@@ -93,27 +74,21 @@ class HandSilhouette:
     width: int
     height: int
     center: tuple[float, float]
-    radius: float = FINGER_RADIUS
     well_matched: float = 0.045
     unmatched: float = 0.25
 
     def draw(self, x: Array, zoom: float = 1.0) -> NDArray[np.uint8]:
-        """(zoom H, zoom W) 1 where the hand of a state (n,) is seen: a box and round rods."""
+        """(zoom H, zoom W) 1 where the hand of a state (n,) is seen: a hull, and round rods."""
         picture = np.zeros((round(zoom * self.height), round(zoom * self.width)), dtype=np.uint8)
-        *outline, radius = self._outline(x)
-        # OpenCV takes sixteenths of pixels.
-        box, points = (np.round(16 * (zoom * (uv + 0.5) - 0.5)).astype(np.int32) for uv in outline)
-        thick = 16 * zoom * (radius - 0.25)
-        cv2.fillConvexPoly(picture, cv2.convexHull(box), 1, shift=4)
-        for finger in (points[:4], points[4:8]):
-            along = np.diff(finger, axis=0).astype(np.float64)
-            along *= thick / np.maximum(np.linalg.norm(along, axis=1), 1e-9)[:, None]
-            across = np.round(along[:, ::-1] * (-1, 1)).astype(np.int32)
-            a, b = finger[:-1], finger[1:]
-            for rod in np.stack([a + across, b + across, b - across, a - across], axis=1):
-                cv2.fillConvexPoly(picture, rod, 1, shift=4)
-            for u, v in finger.tolist():
-                cv2.circle(picture, (u, v), round(thick), 1, -1, shift=4)
+        palm, points, radii = self._outline(x)
+        # OpenCV takes sixteenths of pixels, and draws a quarter of a pixel more.
+        palm, points = (16 * (zoom * (uv + 0.5) - 0.5) for uv in (palm, points))
+        rims = 16 * zoom * (radii - 0.25)[..., None, None] * _RIM
+        rims += points[: radii.size].reshape(*radii.shape, 1, 2)
+        rods = np.concatenate([rims[:, :-1], rims[:, 1:]], axis=2).reshape(-1, 2 * len(_RIM), 2)
+        for part in (palm, *rods):
+            hull = cv2.convexHull(np.round(part).astype(np.int32))
+            cv2.fillConvexPoly(picture, hull, 1, shift=4)
         return picture
 
     def measure(
@@ -130,7 +105,7 @@ class HandSilhouette:
             )
         edge = find_edge_points(mask, SPACING)
         if not len(edge.uv):
-            nothing = np.full(len(MEASURED), np.nan)
+            nothing = np.full(len(self._observation.names), np.nan)
             return HandMeasurement(nothing, np.diag(nothing), prediction.mean, 1.0)
         found = self._follow(mask, edge, prediction, prediction.mean, GATES[2:], scale)
         if found.difference > self.well_matched:
@@ -141,17 +116,23 @@ class HandSilhouette:
                 if found.difference <= self.well_matched:
                     break
         if found.difference > self.unmatched:
-            return found._replace(y=np.full(len(MEASURED), np.nan))
+            return found._replace(y=np.full(len(found.y), np.nan))
         return found
 
-    def _outline(self, x: Array) -> tuple[Array, Array, float]:
-        """The palm's corners (8, 2), what is drawn (16, 2), a finger's radius, in the picture."""
-        observation, (width, height, thickness) = self._observation, x[_PALM]
-        M = observation.pixels_per_metre * scaled_rotation(x[_QUATERNION])[0]
-        # Along the hand's x, y and z.
-        corners = (_CORNERS * (height, thickness, width)) @ M[:2].T + x[_WRIST]
-        size = observation.pixels_per_metre * float(np.sum(x[_QUATERNION] ** 2))
-        return corners + self.center, observation.drawing(x) + self.center, size * self.radius
+    def _outline(self, x: Array) -> tuple[Array, Array, Array]:
+        """The palm (2 K, 2), what is drawn (p, 2), the fingers' radii (F, J + 1), as seen."""
+        observation, hand = self._observation, self._hand
+        width, height, thickness = x[hand.layout.indices(PALM)]
+        quaternion, center = x[hand.layout.indices(QUATERNION)], np.array(self.center)
+        M = observation.pixels_per_metre * scaled_rotation(quaternion)[0]
+        palm = (hand.rings.reshape(-1, 3) * (height, thickness, width)) @ M[:2].T
+        size = observation.pixels_per_metre * float(np.sum(quaternion**2))
+        wrist = x[hand.layout.indices(WRIST)] + center
+        return palm + wrist, observation.drawing(x) + center, size * hand.radii
+
+    @property
+    def _hand(self) -> HandModel:
+        return self._observation.hand
 
     @property
     def _observation(self) -> HandObservation:
@@ -159,14 +140,22 @@ class HandSilhouette:
         assert isinstance(observation, HandObservation)
         return observation
 
+    @property
+    def _unit(self) -> float:
+        """The thickness of fingers, over that which the widths of searches are made for."""
+        return float(np.mean(self._hand.radii)) * self._observation.pixels_per_metre / _USUAL_RADIUS
+
     def _rough(self, x: Array) -> RoughBody:
-        box, points, radius = self._outline(x)
-        ends = np.stack([points[LINE_STARTS], points[LINE_ENDS]], axis=1)
+        palm, points, radii = self._outline(x)
+        ends = points[self._hand.line_ends]
+        count = len(self._hand.lengths)
         along = ends[:, 1] - ends[:, 0]
-        side = np.einsum("ij,ij->i", ends[:, 0] - box.mean(axis=0), along[:, ::-1] * (-1, 1)) > 0
-        is_finger = np.arange(len(ends)) < _FINGER_LINES
+        side = np.einsum("ij,ij->i", ends[:, 0] - palm.mean(axis=0), along[:, ::-1] * (-1, 1)) > 0
+        is_finger = np.arange(len(ends)) < count
         sides = np.column_stack([side | is_finger, ~side | is_finger])
-        return RoughBody(ends, np.where(is_finger, radius, 0.0), sides, _TIP_LINES, self.draw(x))
+        widths = np.r_[0.5 * (radii[:, :-1] + radii[:, 1:]).ravel(), np.zeros(len(ends) - count)]
+        tips = len(self._hand.joints) * np.arange(1, len(radii) + 1) - 1
+        return RoughBody(ends, widths, sides, tips, self.draw(x))
 
     def _follow(
         self,
@@ -178,18 +167,43 @@ class HandSilhouette:
         scale: float | None,
     ) -> HandMeasurement:
         """Measure beside a rough state (n,), which what is measured corrects, again and again."""
+        observation, names = self._observation, self._observation.names
+        at, usual = names.index("scale"), self._hand.usual
+        lines = slice(at - 2 * len(self._hand.line_ends), at)
+        tips = [
+            [names.index(f"point_{i}{self._hand.joints[-1]}_{axis}") for axis in "xy"]
+            for i in self._hand.fingers
+        ]
         for k, gate in enumerate(gates):
-            axes = match_axes(edge, self._rough(x), gate, self.center)
-            y, R = np.full(len(MEASURED), np.nan), np.zeros((len(MEASURED), len(MEASURED)))
-            y[_AXES], R[_AXES, _AXES] = axes.lines.ravel(), block_covariance(axes.line_covariances)
-            for rows, tip, covariance in zip(_TIPS, axes.tips, axes.tip_covariances, strict=True):
+            axes = match_axes(edge, self._rough(x), self._unit * gate, self.center)
+            y, R = np.full(len(names), np.nan), np.diag(observation.variances)
+            y[lines], R[lines, lines] = axes.lines.ravel(), block_covariance(axes.line_covariances)
+            for rows, tip, covariance in zip(tips, axes.tips, axes.tip_covariances, strict=True):
                 y[rows], R[np.ix_(rows, rows)] = tip, covariance
-            if scale is not None:
-                y[_SCALE], R[_SCALE, _SCALE] = scale, self._observation.scale_deviation**2
+            y[[names.index(name) for name in self._hand.hidden]] = np.nan
+            self._draw_in(x, mask, edge, y, R)
+            y[at] = math.nan if scale is None else scale
+            if usual is not None:
+                y[at + 1 :] = usual.mean
             if k < len(gates) - 1:
                 x = self.belief_filter.corrected(prediction, y, R, x)
         wrong = np.count_nonzero(self.draw(x) != mask)
         return HandMeasurement(y, R, x, wrong / np.count_nonzero(mask))
+
+    def _draw_in(self, x: Array, mask: Mask, edge: EdgePoints, y: Array, R: Array) -> None:
+        """Adds that a finger's joints and tips which are not measured lie in the silhouette."""
+        _, points, radii = self._outline(x)
+        for k, (point, radius) in enumerate(zip(points, radii.ravel(), strict=False)):
+            rows = slice(2 + 2 * k, 4 + 2 * k)
+            u, v = np.clip(np.rint(point), 0, (self.width - 1, self.height - 1)).astype(int)
+            if mask[v, u] or np.isfinite(y[rows]).any():
+                continue
+            nearest = edge.uv[np.argmin(np.sum((edge.uv - point) ** 2, axis=1))]
+            away = (point - nearest) / max(float(np.linalg.norm(point - nearest)), 1.0)
+            y[rows] = nearest - 0.5 * radius * away - self.center
+            # Nothing is known of where along the edge.
+            along = _ALONG**2 * np.eye(2) + (_INSIDE**2 - _ALONG**2) * np.outer(away, away)
+            R[rows, rows] = radius**2 * along
 
     def _search(self, mask: Mask, prediction: Belief, seed: int) -> Array:
         """(k, n) poses around a prediction whose silhouettes are the most alike: cross-entropy."""
@@ -197,21 +211,27 @@ class HandSilhouette:
         small = cv2.resize(mask.view(np.uint8), size, interpolation=cv2.INTER_NEAREST)
         generator, mean = np.random.default_rng(seed), prediction.mean
         rows = self.belief_filter.inequalities
-        narrowed = np.minimum(1.0, _WIDEST / np.maximum(prediction.deviations()[SEEN], 1e-12))
-        P = prediction.covariance[np.ix_(SEEN, SEEN)] * np.outer(narrowed, narrowed)
+        seen, hand = self._hand.seen, self._hand
+        turn = hand.layout.indices(QUATERNION)
+        widest = np.repeat(
+            (self._unit * _WIDEST_WRIST, _WIDEST_TURN, _WIDEST_ANGLE, _WIDEST_LENGTH),
+            (2, 4, len(hand.angles), len(hand.layout.constant)),
+        )
+        narrowed = np.minimum(1.0, widest / np.maximum(prediction.deviations()[seen], 1e-12))
+        P = prediction.covariance[np.ix_(seen, seen)] * np.outer(narrowed, narrowed)
         spread, elite = np.sqrt(np.diag(P)), mean[None]
         for k in range(_SEARCH_ROUNDS):
             poses = np.tile(mean, (_POSES, 1))
-            poses[:, SEEN] += generator.normal(size=(_POSES, len(SEEN))) @ factor_of(P).T
+            poses[:, seen] += generator.normal(size=(_POSES, len(seen))) @ factor_of(P).T
             poses[: len(elite)] = elite
-            norms = np.linalg.norm(poses[:, _QUATERNION], axis=1, keepdims=True)
-            poses[:, _QUATERNION] *= np.linalg.norm(prediction.mean[_QUATERNION]) / norms
+            norms = np.linalg.norm(poses[:, turn], axis=1, keepdims=True)
+            poses[:, turn] *= np.linalg.norm(prediction.mean[turn]) / norms
             for phi, b in zip(rows.phi, rows.b, strict=True):
                 beyond = np.maximum(poses @ phi - b, 0.0)
                 poses -= np.outer(beyond, phi / (phi @ phi))
             wrong = [np.count_nonzero(self.draw(x, _ZOOM) != small) for x in poses]
             elite = poses[np.argsort(wrong)[:_ELITE]]
             mean = elite.mean(axis=0)
-            off = (elite - mean)[:, SEEN]
+            off = (elite - mean)[:, seen]
             P = off.T @ off / len(off) + np.diag((0.15 * spread) ** 2) * 0.5**k
         return elite[:_FOLLOWED]

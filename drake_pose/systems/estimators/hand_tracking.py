@@ -30,11 +30,13 @@ from drake_pose.filtering.truncation.couplings import model_inequalities
 from drake_pose.search.estimates import View
 from drake_pose.search.scoring import PoseSearch
 from drake_pose.silhouette.pictures.label_images import label_image_to_mask
+from drake_pose.silhouette.pictures.scenes import Scene
 from drake_pose.systems.estimators.diagrams import (
     ESTIMATE_COLOUR,
     add_simulated_cameras,
     show_estimate,
 )
+from drake_pose.systems.estimators.mask_player import MaskPlayer
 from drake_pose.systems.estimators.truncated_ekf import STATISTICS, TruncatedEkf
 from drake_pose.systems.ports import PortedSystem, connect_same
 
@@ -147,7 +149,7 @@ class AxisSensor(PortedSystem):
 
 
 class HandSensor(PortedSystem):
-    """Measures the two-finger hand's axes and tips in a silhouette, lengths unknown: figure 17.
+    """Measures a hand's axes and tips in a silhouette, lengths unknown: figure 17.
 
     .. pydrake_system::
 
@@ -216,10 +218,32 @@ def build_hand_estimation(
     builder = DiagramBuilder()
     scene_graph = builder.AddNamedSystem("scene_graph", SceneGraph())
     _, images = add_simulated_cameras(builder, scene_graph, model, [camera], true_positions)
+    return _add_hand_filter(builder, images[0], silhouette, start, period)
+
+
+def build_recorded_hand_estimation(
+    scene: Scene, silhouette: HandSilhouette, start: Belief
+) -> tuple[Diagram, TruncatedEkf, HandSensor]:
+    """The same of a scene's recorded silhouettes: ``MaskPlayer``, ``HandSensor``, ``TruncatedEkf``.
+
+    Args:
+        scene: of one camera.
+        start: the belief before the first picture.
+    """
+    builder, player = DiagramBuilder(), MaskPlayer(scene, scene.cameras)
+    builder.AddNamedSystem("mask_player", player)
+    image = player.GetOutputPort("label_image")
+    return _add_hand_filter(builder, image, silhouette, start, player.period)
+
+
+def _add_hand_filter(
+    builder: DiagramBuilder, image: OutputPort, silhouette: HandSilhouette, start: Belief,
+    period: float,
+) -> tuple[Diagram, TruncatedEkf, HandSensor]:  # fmt: skip
     ekf = TruncatedEkf(silhouette.belief_filter, start, period)
     builder.AddNamedSystem("truncated_ekf", ekf)
     sensor = builder.AddNamedSystem("hand_sensor", HandSensor(silhouette))
-    builder.Connect(images[0], sensor.GetInputPort("label_image"))
+    builder.Connect(image, sensor.GetInputPort("label_image"))
     connect_same(builder, sensor, ekf)
     connect_same(builder, ekf, sensor)
     return builder.Build(), ekf, sensor

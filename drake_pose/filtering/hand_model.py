@@ -1,0 +1,303 @@
+"""A hand as Shimada et al. see it: a palm, and fingers that are chains of hinges and segments.
+
+The palm's frame has x towards the fingers, y where they bend to, z across; its origin is the wrist.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.multibody.tree import Joint, RevoluteJoint
+
+from drake_pose.body.model import ArticulatedModel
+from drake_pose.errors import ModelError
+from drake_pose.filtering.state import StateLayout
+from drake_pose.filtering.truncation.couplings import UsualPose, couplings_file, load_usual_pose
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.intp]
+
+TURN, BASE, SEGMENT = 0, 1, 2
+"""A step along a finger turns what is beyond it, leads to the finger's base, or along a segment."""
+
+PALM = ("palm_width", "palm_height", "palm_thickness")
+WRIST = ("wrist_x", "wrist_y")
+QUATERNION = ("palm_qw", "palm_qx", "palm_qy", "palm_qz")
+PALM_EDGES = ("left", "right", "top", "bottom")
+
+# The axes of a hand's palm, y along the fingers and z out of the palm, as those of the state.
+_FROM_LINK = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])
+# Where a palm's outlines are taken, over its height: at the wrist, and before the knuckles.
+_WRIST_BAND, _KNUCKLE_BAND, _KNUCKLES, _DIRECTIONS = 0.07, (0.78, 0.84), 0.85, 16
+# A finger's thickness is measured so far about a joint, and so far from its end [m].
+_ABOUT_JOINT, _FROM_END = 0.003, (0.004, 0.010)
+
+
+class Chains(NamedTuple):
+    """A hand for the kernel; elements are of what is seen of the state, ``HandModel.seen``.
+
+    Attributes:
+        firsts: (F + 1,) each finger's first step; kinds, elements: (S,), vectors: (S, 3) of steps.
+        rings, rows: as of ``HandModel``; palm: (3,) elements of its height, thickness and width.
+        lines: (L, 2) between which of the points drawn the lines are.
+    """
+
+    firsts: Indices
+    kinds: Indices
+    elements: Indices
+    vectors: Array
+    rings: Array
+    rows: Array
+    palm: Indices
+    lines: Indices
+
+
+class Step(NamedTuple):
+    """A step outwards along a finger, all joints at 0.
+
+    Attributes:
+        element: of the state: an angle [rad], a length, or a size of the palm [m].
+        kind: TURN, BASE or SEGMENT.
+        vector: the axis of a turn, or the way for an element of 1, in the palm's frame.
+    """
+
+    element: str
+    kind: int
+    vector: tuple[float, float, float]
+
+
+@dataclass(frozen=True, eq=False)
+class HandModel:
+    """A palm that is a convex body, and fingers on it: chains of as many segments each.
+
+    Args:
+        fingers: names.
+        steps: of each finger, from the palm's origin to the tip's middle.
+        radii: (F, J + 1) of the fingers at their bases, joints and tips [m].
+        rings: (2, K, 3) the palm's outlines at the wrist and at the fingers, whose convex hull it
+            is, as shares of its height, thickness and width along x, y and z.
+        rows: (2, R, 2, 3) where its far and its near edge may be seen: ends, in such shares.
+        sizes: lengths and the palm's sizes as the model's file says [m].
+        hidden: names of what pictures do not show, among ``measured``.
+        usual: how joints are usually held, over ``angles``; None: nothing is known.
+    """
+
+    fingers: tuple[str, ...]
+    steps: tuple[tuple[Step, ...], ...]
+    radii: Array
+    rings: Array
+    rows: Array
+    sizes: Mapping[str, float]
+    hidden: tuple[str, ...] = ()
+    usual: UsualPose | None = None
+
+    @cached_property
+    def flexions(self) -> tuple[str, ...]:
+        """The angle at each segment's root, finger by finger."""
+        return tuple(turns[-1] for turns in self._turns())
+
+    @cached_property
+    def spreads(self) -> tuple[str, ...]:
+        """All other angles."""
+        return tuple(name for turns in self._turns() for name in turns[:-1])
+
+    @cached_property
+    def lengths(self) -> tuple[str, ...]:
+        """Of the segments, finger by finger."""
+        return tuple(s.element for steps in self.steps for s in steps if s.kind == SEGMENT)
+
+    @property
+    def angles(self) -> tuple[str, ...]:
+        """All angles."""
+        return (*self.spreads, *self.flexions)
+
+    @property
+    def joints(self) -> range:
+        """Segments of a finger, from 1."""
+        return range(1, self.radii.shape[1])
+
+    def _turns(self) -> list[list[str]]:
+        """The turns before each segment."""
+        found: list[list[str]] = [[]]
+        for step in (step for steps in self.steps for step in steps):
+            if step.kind == TURN:
+                found[-1].append(step.element)
+            elif step.kind == SEGMENT:
+                found.append([])
+        return found[:-1]
+
+    @cached_property
+    def layout(self) -> StateLayout:
+        """The state (5): wrist in the image [pixel], quaternion, angles; rates; lengths, palm."""
+        return StateLayout((*WRIST, *QUATERNION, *self.angles), (*self.lengths, *PALM))
+
+    @cached_property
+    def measured(self) -> tuple[str, ...]:
+        """(13): points [pixel]; lines by angle [rad] and distance [pixel]; the scale; the usual."""
+        points = [f"{i}{j}" for i in self.fingers for j in (0, *self.joints)]
+        lines = [f"{i}{j}" for i in self.fingers for j in self.joints]
+        lines += [f"palm_{edge}" for edge in PALM_EDGES]
+        return (
+            *WRIST,
+            *(f"point_{point}_{axis}" for point in points for axis in "xy"),
+            *(f"{kind}_{line}" for line in lines for kind in ("alpha", "rho")),
+            "scale",
+            *(f"usual_{k}" for k in range(0 if self.usual is None else len(self.usual.mean))),
+        )
+
+    @cached_property
+    def seen(self) -> Indices:
+        """What the picture depends on, in the state: wrist, quaternion, angles, lengths, palm."""
+        return self.layout.indices((*WRIST, *QUATERNION, *self.angles, *self.lengths, *PALM))
+
+    @cached_property
+    def line_ends(self) -> Indices:
+        """(L, 2) between which of the points drawn the lines are: fingers', then the palm's."""
+        count = len(self.fingers)
+        bases = np.arange(count * len(self.joints)) + np.repeat(np.arange(count), len(self.joints))
+        starts = np.r_[bases, self.radii.size + np.arange(0, 8, 2)]
+        return np.column_stack([starts, starts + 1])
+
+    @cached_property
+    def chains(self) -> Chains:
+        """The same as arrays."""
+        names = (*WRIST, *QUATERNION, *self.angles, *self.lengths, *PALM)
+        steps = [step for one in self.steps for step in one]
+        return Chains(
+            np.cumsum([0, *(len(one) for one in self.steps)]),
+            np.array([step.kind for step in steps]),
+            np.array([names.index(step.element) for step in steps]),
+            np.array([step.vector for step in steps]),
+            self.rings,
+            self.rows,
+            np.array([names.index(PALM[k]) for k in (1, 2, 0)]),
+            self.line_ends,
+        )
+
+
+def _two_fingers() -> HandModel:
+    """Shimada's hand, figure 5: a box, and two fingers of three segments of one thickness."""
+    steps = []
+    for i, side in ((1, 0.25), (2, -0.25)):
+        own = [
+            Step(f"spread_{i}", TURN, (0.0, 1.0, 0.0)),
+            Step("palm_height", BASE, (1.0, 0.0, 0.0)),
+            Step("palm_width", BASE, (0.0, 0.0, side)),
+        ]
+        for j in (1, 2, 3):
+            own.append(Step(f"flexion_{i}{j}", TURN, (0.0, 0.0, 1.0)))
+            own.append(Step(f"length_{i}{j}", SEGMENT, (1.0, 0.0, 0.0)))
+        steps.append(tuple(own))
+    box = np.array([[[x, y, z] for y in (-0.5, 0.5) for z in (0.5, -0.5)] for x in (0.0, 1.0)])
+    rows = box[::-1].reshape(2, 2, 2, 3)
+    drawn = {"1": 0.055, "2": 0.03, "3": 0.025}
+    sizes = {f"length_{i}{j}": length for i in (1, 2) for j, length in drawn.items()}
+    sizes |= {"palm_width": 0.07, "palm_height": 0.08, "palm_thickness": 0.02}
+    return HandModel(("1", "2"), tuple(steps), np.full((2, 4), 0.008), box, rows, sizes)
+
+
+TWO_FINGERS = _two_fingers()
+"""The hand of ``urdf/two_finger_hand``."""
+
+
+def palm_rotation(R_CL: Array) -> Array:
+    """(3, 3) how the palm's frame is turned, of its link's in a model for ``read_hand``."""
+    return np.asarray(R_CL @ _FROM_LINK.T)
+
+
+def read_hand(model: ArticulatedModel, palm: str = "palm") -> HandModel:
+    """A hand from a model of one, as ``urdf/hand``: what turns on its palm, and where.
+
+    The palm's link has its origin at the wrist, y along the fingers, and z out of the palm.
+
+    Raises:
+        UnknownNameError: no such link.
+        ModelError: joints on the palm that are no fingers: chains of as many hinges and segments.
+    """
+    model.link_index(palm)
+    plant, context = model.plant, model.plant.CreateDefaultContext()
+    plant.SetPositions(context, np.zeros(plant.num_positions()))
+    X_PW = plant.GetFrameByName(palm).CalcPoseInWorld(context).inverse()
+    beyond: dict[str, list[Joint]] = {}
+    for joint in map(plant.get_joint, plant.GetJointIndices()):
+        beyond.setdefault(joint.parent_body().name(), []).append(joint)
+    chains, places = [], []
+    for first in beyond.get(palm, []):
+        chain = [first]
+        while found := beyond.get(chain[-1].child_body().name()):
+            chain += found
+        if not all(isinstance(joint, RevoluteJoint) for joint in chain):
+            raise ModelError(f"{model.path}: '{first.name()}' on '{palm}' begins no finger")
+        poses = [X_PW @ j.frame_on_parent().CalcPoseInWorld(context) for j in chain]
+        chains.append(chain)
+        places.append([(X.translation(), X.rotation().matrix()) for X in poses])
+    vertices = model.link_meshes[palm].vertices @ _FROM_LINK.T
+    size = np.ptp(vertices, axis=0)
+    size[0] = max(float(one[0][0][1]) for one in places)
+    sizes = dict(zip(("palm_height", "palm_thickness", "palm_width"), size.tolist(), strict=True))
+    read = [_read_finger(model, *one, size, sizes) for one in zip(chains, places, strict=True)]
+    if len({len(radii) for _, radii in read}) != 1:
+        raise ModelError(f"{model.path}: the fingers on '{palm}' have not as many segments each")
+    rings = _palm_rings(vertices, size[0]) / size
+    low, side = rings[0].min(axis=0), 0.8 * np.ptp(rings[0, :, 2]) * np.array([0.5, -0.5])
+    depths = 0.5 * np.array([rings[0, :, 1].min(), rings[0, :, 1].max()])
+    rows = np.array([[[[x, y, z] for z in side] for y in depths] for x in (1.0, low[0])])
+    names = tuple(chain[0].name().split("_")[0] for chain in chains)
+    hidden = ("alpha_palm_top", "rho_palm_top")
+    steps, radii = tuple(steps for steps, _ in read), np.array([radii for _, radii in read])
+    hand, file = (
+        HandModel(names, steps, radii, rings, rows, sizes, hidden),
+        couplings_file(model.path),
+    )
+    return replace(hand, usual=load_usual_pose(file, hand.angles)) if file.is_file() else hand
+
+
+def _read_finger(
+    model: ArticulatedModel,
+    chain: Sequence[Joint],
+    places: Sequence[tuple[Array, Array]],
+    size: Array,
+    sizes: dict[str, float],
+) -> tuple[tuple[Step, ...], list[float]]:
+    """A finger's steps, and its radii [m]; lengths are added to the sizes."""
+    base = _FROM_LINK @ places[0][0] / size
+    elements = ("palm_height", "palm_thickness", "palm_width")
+    steps = [
+        Step(name, BASE, tuple(row)) for name, row in zip(elements, np.diag(base), strict=True)
+    ]
+    radii, last = [], ""
+    for k, (joint, (place, R)) in enumerate(zip(chain, places, strict=True)):
+        way = place - places[max(k - 1, 0)][0]
+        length = float(np.linalg.norm(way))
+        if length > 1e-6:
+            steps.append(Step(f"length_{last}", SEGMENT, tuple(_FROM_LINK @ way / length)))
+            sizes[f"length_{last}"] = length
+        axis = _FROM_LINK @ R @ joint.revolute_axis()
+        steps.append(Step(joint.name(), TURN, tuple(axis)))
+        last = joint.child_body().name()
+        if last in model.link_meshes:
+            vertices = model.link_meshes[last].vertices
+            radii.append(0.5 * np.ptp(vertices[np.abs(vertices[:, 1]) < _ABOUT_JOINT, 0]))
+    end = vertices[:, 1].max()
+    near = (vertices[:, 1] < end - _FROM_END[0]) & (vertices[:, 1] > end - _FROM_END[1])
+    radii.append(0.5 * np.ptp(vertices[near, 0]))
+    steps.append(Step(f"length_{last}", SEGMENT, tuple(_FROM_LINK @ R[:, 1])))
+    sizes[f"length_{last}"] = float(end - radii[-1])
+    return tuple(steps), radii
+
+
+def _palm_rings(vertices: Array, height: float) -> Array:
+    """(2, K, 3) a palm's outlines at the wrist and before the knuckles [m]."""
+    low = float(vertices[:, 0].min())
+    angles = 2.0 * np.pi * np.arange(_DIRECTIONS) / _DIRECTIONS
+    directions = np.column_stack([np.cos(angles), np.sin(angles)])
+    bands = ((low, low + _WRIST_BAND * height), [share * height for share in _KNUCKLE_BAND])
+    rings = np.zeros((2, _DIRECTIONS, 3))
+    for ring, (begin, end), x in zip(rings, bands, (low, _KNUCKLES * height), strict=True):
+        band = vertices[(vertices[:, 0] >= begin) & (vertices[:, 0] <= end)]
+        ring[:] = band[np.argmax(band[:, 1:] @ directions.T, axis=0)]
+        ring[:, 0] = x
+    return rings

@@ -1,0 +1,298 @@
+"""Figures 17 and 18 of Shimada et al.: recorded silhouettes of a hand, one camera nobody knows."""
+
+import math
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import MappingProxyType
+from typing import NamedTuple
+
+import numpy as np
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import Diagram
+from rich.table import Table
+from scipy.spatial.transform import Rotation
+
+from drake_pose.arrays import Array, Mask
+from drake_pose.body.formats.packages import bundled_model
+from drake_pose.body.tree.link_graph import PlantKinematics
+from drake_pose.camera.models import ParallelCamera
+from drake_pose.csv_files import read_csv
+from drake_pose.errors import SceneError
+from drake_pose.files.settings import EstimateSettings
+from drake_pose.filtering.hand import HandObservation
+from drake_pose.filtering.hand_model import PALM, HandModel, palm_rotation, read_hand
+from drake_pose.filtering.kalman.truncated_filter import (
+    FilterSettings,
+    FilterState,
+    TruncatedFilter,
+)
+from drake_pose.filtering.measurements.hand_silhouette import HandSilhouette
+from drake_pose.filtering.state import Belief
+from drake_pose.filtering.truncation.couplings import model_inequalities
+from drake_pose.filtering.truncation.inequalities import from_bounds, stack
+from drake_pose.jobs.estimate.inputs import TRUTH_FILE, Inputs, read_inputs
+from drake_pose.papers.tables import Advance, Count, figure_table, uncounted
+from drake_pose.search.estimates import View
+from drake_pose.silhouette.pictures.label_images import label_image_to_mask
+from drake_pose.systems.estimators.hand_tracking import HandSensor, build_recorded_hand_estimation
+from drake_pose.systems.estimators.truncated_ekf import TruncatedEkf
+
+# Deviations of the wrist [pixel], the quaternion and angles [rad]: of the rough pose, of its rates
+# a frame, of accelerations per frame^2 at 30 Hz; of lengths and the palm's sizes, and limits of
+# both, over the model's.
+_START = 10.0, 0.5 * math.radians(20.0), math.radians(25.0)
+_RATES = 5.0, 0.03, math.radians(4.0)
+_ACCELERATIONS = 2.0, 0.008, math.radians(1.5)
+_LENGTH, _SIZE, _LIMIT = 0.2, 0.15, 0.5
+# A rate that is not seen fades, and how a hand is usually held is told once, in such a time [s].
+_MEMORY, _REST_TIME = 0.15, 1.0
+# Silhouettes of a rough model of somebody else differ by more than those of a hand's own.
+_WELL_MATCHED, _UNMATCHED = 0.12, 0.4
+# What was seen of the deviations; so many frames are shown.
+_INSIDE, _SHOWN = "20 to 26 %", 4
+_ROWS = {
+    "frames": ("frames", "{}"),
+    "flexion_error_median": ("flexions of the four fingers off, median [deg]", "{:.1f}"),
+    "flexion_error_mean": ("  mean", "{:.1f}"),
+    "inside_2sigma": ("  within 2 sigma", "{:.0%}"),
+    "silhouette_difference": ("silhouette and matched pose differ by, median", "{:.1%}"),
+    "badly_matched": ("  frames in which by more than 12 %", "{}"),
+    "lost": ("  by more than 40 %: lost", "{}"),
+    "mirrored": ("hypotheses made by mirroring", "{}"),
+    "rejected_by_an_inequality": ("  rejected by an inequality", "{}"),
+    "ms_per_update": ("milliseconds a frame, median", "{:.0f}"),
+}
+
+
+class Track(NamedTuple):
+    """What a filter believed after each frame.
+
+    Attributes:
+        means, deviations: (frames, n) of the best hypothesis.
+        covariance: (n, n) of the last.
+        milliseconds: (frames,) of the processor for prediction and update, and for measuring where
+            there is a picture, without drawing it; nan once it broke down.
+        mirrored, rejected: hypotheses made by mirroring, and rejected by an inequality.
+        differences: (frames,) of a silhouette and the pose it was matched to; () without pictures.
+        kept: of pictures, a mask, its measurement (m,) and the rough pose (n,), by frame from 0.
+    """
+
+    means: Array
+    deviations: Array
+    covariance: Array
+    milliseconds: Array
+    mirrored: int
+    rejected: int
+    differences: Array = np.zeros(0)
+    kept: Mapping[int, tuple[Mask, Array, Array]] = MappingProxyType({})
+
+
+def track_of(states: Sequence[FilterState], milliseconds: Sequence[float]) -> Track:
+    """The track of a filter's states after each frame."""
+    best = [state.best for state in states]
+    ends = [end.reason for state in states for end in state.rejections]
+    return Track(
+        np.array([one.mean for one in best]),
+        np.array([one.deviations() for one in best]),
+        best[-1].covariance,
+        np.array(milliseconds),
+        mirrored=len(ends) + len(states[-1].hypotheses) - 1,
+        rejected=ends.count("constraint"),
+    )
+
+
+def follow_pictures(
+    parts: tuple[Diagram, TruncatedEkf, HandSensor],
+    period: float,
+    frames: int,
+    shown: Sequence[int],
+    advance: Advance = lambda _done: None,
+) -> Track:
+    """Run a diagram of ``build_hand_estimation``, or of recorded pictures; keep what is shown."""
+    diagram, ekf, sensor = parts
+    simulator = Simulator(diagram)
+    own, its = (one.GetMyContextFromRoot(simulator.get_context()) for one in (sensor, ekf))
+    states, milliseconds, differences, kept = [], [], [], {}
+    for t in range(frames):
+        mask = label_image_to_mask(sensor.GetInputPort("label_image").Eval(own))
+        begin = time.thread_time()
+        y, difference, rough = (
+            np.array(sensor.GetOutputPort(name).Eval(own))
+            for name in ("measurement", "difference", "rough_state")
+        )
+        differences.append(float(difference[0]))
+        if t in shown:
+            kept[t] = (mask.copy(), y, rough)
+        simulator.AdvanceTo((t + 1) * period)
+        states.append(ekf.filter_state(its))
+        milliseconds.append(1e3 * (time.thread_time() - begin))
+        advance(t + 1)
+    track = track_of(states, milliseconds)
+    return track._replace(differences=np.array(differences), kept=kept)
+
+
+@dataclass(frozen=True, eq=False)
+class SequenceResult:
+    """A recorded sequence, filtered.
+
+    Attributes:
+        observation: of the hand.
+        guess: the belief about the rough pose.
+        truth: (frames,) by angle [deg], as far as the sequence tells.
+    """
+
+    name: str
+    observation: HandObservation
+    guess: Belief
+    track: Track
+    truth: Mapping[str, Array]
+
+    def warning(self) -> str:
+        """What to say of the frames that were not matched, and of the deviations."""
+        bad, lost = self._frames_beyond(_WELL_MATCHED), self._frames_beyond(_UNMATCHED)
+        return (
+            f"{self.name}: a hand that nobody measured: deviations are too small, of the flexions "
+            f"in four such sequences {_INSIDE} lay within 2 sigma. In {bad} of "
+            f"{len(self.track.means)} frames pose and silhouette differ by more than "
+            f"{_WELL_MATCHED:.0%}: fingers may be exchanged or bent that are straight; in {lost} "
+            f"by more than {_UNMATCHED:.0%}: the track is lost, what is given is the prediction"
+        )
+
+    def _frames_beyond(self, difference: float) -> int:
+        return int(np.count_nonzero(self.track.differences > difference))
+
+    def as_json(self) -> dict[str, object]:
+        """Its figures; errors [deg] where the truth is known, lengths at the end [m]."""
+        layout, track = self.observation.hand.layout, self.track
+        figures: dict[str, object] = {
+            "frames": len(track.means),
+            "silhouette_difference": float(np.median(track.differences)),
+            "badly_matched": self._frames_beyond(_WELL_MATCHED),
+            "lost": self._frames_beyond(_UNMATCHED),
+            "mirrored": track.mirrored,
+            "rejected_by_an_inequality": track.rejected,
+            "ms_per_update": float(np.median(track.milliseconds)),
+        }
+        lengths = track.means[-1][layout.indices(layout.constant)].tolist()
+        figures["lengths"] = dict(zip(layout.constant, lengths, strict=True))
+        if names := [name for name in self.observation.hand.flexions if name in self.truth]:
+            means, deviations = (
+                np.degrees(one[:, layout.indices(names)]) for one in (track.means, track.deviations)
+            )
+            off = np.abs(means - np.column_stack([self.truth[name] for name in names]))
+            figures["flexion_error_median"] = float(np.median(off))
+            figures["flexion_error_mean"] = float(np.mean(off))
+            figures["inside_2sigma"] = float(np.mean(off < 2.0 * deviations))
+        return figures
+
+
+def sequence_table(results: Sequence[SequenceResult]) -> Table:
+    """The figures of sequences side by side."""
+    figures = {one.name: one.as_json() for one in results}
+    return figure_table("Shimada, figure 17: a recorded hand, camera unknown", _ROWS, figures)
+
+
+def run_sequence(
+    folder: Path,
+    settings: FilterSettings | None = None,
+    acceleration: float = 1.0,
+    count: Count = uncounted,
+) -> SequenceResult:
+    """Angles and lengths of a hand in recorded silhouettes of one parallel camera, scale unknown.
+
+    The first frame is matched by the default search; from there on there is the filter alone.
+
+    Args:
+        folder: a scene whose frames follow one another; its ``joint_angles.csv``, if there is one,
+            has true angles: in degrees, where it has columns that the bundled hand lacks.
+        acceleration: so many times the accelerations that the filter expects.
+
+    Raises:
+        DrakePoseError: the scene, which has several cameras, or no hand that can be matched.
+    """
+    file = bundled_model("hand").with_name("right_hand.urdf")
+    inputs = read_inputs(folder, file, EstimateSettings(unseen=("forearm",)), None)
+    scene, hand = inputs.scene, read_hand(inputs.model)
+    (camera, *others) = scene.cameras.values()
+    if others or not isinstance(camera, ParallelCamera) or not scene.sequence:
+        raise SceneError(
+            f"{folder}: a hand is filtered in frames of one parallel camera that follow each "
+            "other: sequence: true in scene.yaml, masks of one camera, no pinhole"
+        )
+    guess, scale = _rough_belief(inputs, hand, camera)
+    period = 1.0 / (scene.frame_rate_hz or 30.0)
+    observation = HandObservation(scale, rest=_REST_TIME / period, hand=hand)
+    silhouette = HandSilhouette(
+        _filter(inputs, observation, acceleration, period, settings),
+        camera.width,
+        camera.height,
+        (camera.center_x, camera.center_y),
+        _WELL_MATCHED,
+        _UNMATCHED,
+    )
+    frames = len(inputs.frames)
+    shown = np.linspace(0, frames, _SHOWN, endpoint=False).astype(int).tolist()
+    parts = build_recorded_hand_estimation(scene, silhouette, guess)
+    advance = count(f"frames of {folder.name}", frames)
+    track = follow_pictures(parts, period, frames, shown, advance)
+    return SequenceResult(folder.name, observation, guess, track, _truth(folder, inputs, hand))
+
+
+def _rough_belief(inputs: Inputs, hand: HandModel, camera: ParallelCamera) -> tuple[Belief, float]:
+    """What is believed of the first frame, where the search finds the model; pixels per metre."""
+    frame, model, search = inputs.frames[0], inputs.model, inputs.search
+    assert search is not None
+    found = search.match([View(camera, inputs.scene.read(camera.name, frame))])
+    if not found.found:
+        raise SceneError(f"{inputs.scene.path}: no pose explains the first frame, '{frame}'")
+    scale = camera.pixels_per_metre * found.scale
+    X_WP = found.X_WB @ PlantKinematics(model).pose_at(model.link_index("palm"), found.q)
+    X_CP = camera.X_CW @ X_WP
+    quaternion = Rotation.from_matrix(palm_rotation(X_CP[:3, :3])).as_quat(scalar_first=True)
+    angles = found.q[[model.position_index(name) for name in hand.angles]]
+    moving, constant = np.r_[scale * X_CP[:2, 3], quaternion, angles], hand.layout.constant
+    sizes = np.array([hand.sizes[name] for name in constant])
+    shares = [_SIZE if name in PALM else _LENGTH for name in constant]
+    deviations = np.r_[_of_kinds(hand, _START), _of_kinds(hand, _RATES), shares * sizes]
+    mean = np.r_[moving, np.zeros(len(moving)), sizes]
+    return Belief(mean, np.diag(deviations**2)), scale
+
+
+def _of_kinds(hand: HandModel, values: tuple[float, float, float]) -> Array:
+    """(moving,) of the wrist, the quaternion and angles, as in the state."""
+    return np.repeat(values, (2, 4, len(hand.angles)))
+
+
+def _filter(
+    inputs: Inputs,
+    observation: HandObservation,
+    acceleration: float,
+    period: float,
+    settings: FilterSettings | None,
+) -> TruncatedFilter:
+    hand, layout = observation.hand, observation.hand.layout
+    sizes = np.array([hand.sizes[name] for name in layout.constant])
+    limits = from_bounds(layout.constant, (1 - _LIMIT) * sizes, (1 + _LIMIT) * sizes, layout.names)
+    rows = stack([model_inequalities(inputs.model).only_of(layout.names), limits], layout.names)
+    noise = acceleration * (30.0 * period) ** 2 * _of_kinds(hand, _ACCELERATIONS)
+    U = layout.process_noise(dict(zip(layout.moving, noise.tolist(), strict=True)))
+    A = layout.transition(math.exp(-period / _MEMORY))
+    return TruncatedFilter(layout, observation, rows, U, settings, A)
+
+
+def _truth(folder: Path, inputs: Inputs, hand: HandModel) -> dict[str, Array]:
+    """True angles (frames,) [deg] of those that the sequence's file has columns of."""
+    file = folder / TRUTH_FILE
+    if not file.is_file():
+        return {}
+    header, lines = read_csv(file, SceneError)
+    rows = {int(row[0]): row for _, row in lines}
+    # A file of the model's positions alone is in radians, as everywhere.
+    unit = 1.0 if inputs.truth is None else 180.0 / math.pi
+    return {
+        name: np.array([unit * float(rows[int(k)][header.index(name)]) for k in inputs.frames])
+        for name in hand.angles
+        if name in header
+    }

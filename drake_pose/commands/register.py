@@ -188,5 +188,9 @@ def _print_audit(result: SceneAudit) -> None:
     console.print(f"{agree} of {count} frames agree")
     if not contradictions:
         say("drake-pose: nothing contradicts the rest")
+    if result.summary["noticed_from"]:
+        noticed = result.summary["noticed_from"].items()
+        told = ", ".join(f"{k} {'-' if one is None else f'{one:.2g}'}" for k, one in noticed)
+        console.print(f"not noticed    joints off by less than {told} (deg or m)", soft_wrap=True)
     if result.folder is not None:
         console.print(f"result         {escape(str(result.folder))}", soft_wrap=True)

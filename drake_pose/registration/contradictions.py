@@ -53,8 +53,11 @@ _NAMED_DEVIATIONS = 3.0
 _UNKNOWN_SIZES = ErrorSizes(1.0, 0.0, 1.0, 1.0, 1.0)
 # A silhouette's width was put right to within this [pixel].
 _WIDTH_SD = 2.0
-# What is right is named by chance this often, and not where it moves outlines by less [pixel].
-_SIGNIFICANCE, _LEAST_PIXELS = 1e-4, 1.0
+# What is right is named by chance this often, and not where it moves outlines by less [pixel]; of
+# joints in all frames that agree, whatever cameras are off by.
+_SIGNIFICANCE, _LEAST_PIXELS, _LEAST_OF_JOINTS = 1e-4, 1.0, 0.3
+# What is so many deviations more is named 19 times of 20.
+_NEARLY = 1.645
 # What is nearer to half a pixel than this is that [pixel].
 _NEAR_HALF = 0.25
 # Joints, or sliding ones and the base, may be off by so much in each frame by itself [rad; m].
@@ -66,10 +69,11 @@ class Finding:
     """By how much something is off.
 
     Args:
-        kind: "joint", "camera", "base", "joints" where several are off, or "unexplained" where
-            nothing within reach explains a frame.
-        name: of the joint or the camera; else "".
-        angle, shift: [rad, m]; of joints the largest.
+        kind: "joint", "camera", "base", "focal", "center", "joints" where several are off, or
+            "unexplained" where nothing within reach explains a frame.
+        name: of the joint, or the camera: "" where it is all of them.
+        angle, shift: [rad, m]; of joints the largest; of focal lengths the shift is their share, of
+            principal points [pixel].
         angle_sd, shift_sd: their standard deviations.
         pixels: how far it moves the outlines of the parts that it moves, root mean square.
         p_value: how often nothing would seem so much off by chance.
@@ -130,13 +134,15 @@ def half_pixel(offset: Array, covariance: Array) -> HalfPixel | None:
 class Audit:
     """What contradicts the rest: of each frame; in all that agree; sizes of errors [pixel].
 
-    ``center``: all principal points are off by half a pixel; None: they are not.
+    ``center``: all principal points are off by half a pixel; None: they are not. ``noticed_from``:
+    of each joint that is not named how far it must be off in all frames to be [rad or m].
     """
 
     frames: tuple[FrameAudit, ...]
     common: tuple[Finding, ...]
     sizes: ErrorSizes
     center: HalfPixel | None = None
+    noticed_from: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def contradicting(self) -> tuple[str, ...]:
@@ -169,16 +175,19 @@ class _Information(NamedTuple):
 
 
 class _Cause(NamedTuple):
-    """What may be off: a "joint", a "camera" or the "base", and its name.
+    """What may be off: a "joint", a "camera", the "base", "focal" or "center", and its name.
 
     moves: (p, d) how what was free follows it: a joint's position [rad or m], or a rotation vector
-    [rad] and a shift [m] of a camera along its axes, or of the base in the world; units: (d,).
+    [rad] and a shift [m] of a camera along its axes, or of the base in the world, a share of focal
+    lengths, or principal points [pixel]; units: (d,).
+    rank: of causes that explain alike those of a lower one are likelier.
     """
 
     kind: str
     name: str
     moves: Array
     units: Array
+    rank: float
 
 
 class _CauseTest(NamedTuple):
@@ -218,13 +227,13 @@ class _Residual(NamedTuple):
         # More numbers explain more by chance.
         return _CauseTest(cause, inverse @ r, inverse @ Q @ inverse, p_value, T - 2.0 * rank)
 
-    def sufficient(self, tests: Sequence[_CauseTest]) -> list[_CauseTest]:
-        """Causes that leave little of what is off, those of fewer numbers first."""
-        most = max(_LEAST_PIXELS, _SUFFICIENT_SHARE * self.info.pixels(self.solved(self.r)))
+    def sufficient(self, tests: Sequence[_CauseTest], least: float) -> list[_CauseTest]:
+        """Causes that leave little of what is off, likelier ones first; less than least [pixel]."""
+        most = max(least, _SUFFICIENT_SHARE * self.info.pixels(self.solved(self.r)))
         enough = [
             one for one in tests if self.info.pixels(self.solved(self.r - self.N @ one.x)) < most
         ]
-        return sorted(enough, key=lambda one: (len(one.amount), -one.gain))
+        return sorted(enough, key=lambda one: (one.cause.rank, -one.gain))
 
     def without(self, cause: _Cause) -> _Residual:
         """The residual once a cause was put right."""
@@ -378,7 +387,7 @@ class _Auditor:
         least = min(p_value, *(one.p_value for one in tests)) * (1 + len(tests))
         if least > _SIGNIFICANCE or pixels < _LEAST_PIXELS:
             return None
-        sufficient = residual.sufficient(tests)
+        sufficient = residual.sufficient(tests, _LEAST_PIXELS)
         if not sufficient:
             return self._joints_finding("joints", residual, p_value, pixels)
         return self._finding(sufficient, residual.info.pixels(sufficient[0].x))
@@ -389,15 +398,33 @@ class _Auditor:
         joints, six = len(self._fit.joints), len(POSE_NAMES)
         eye = np.eye(p)
         causes = [
-            _Cause("joint", name, eye[:, [k]], deviations[[k]])
+            _Cause("joint", name, eye[:, [k]], deviations[[k]], 1)
             for k, name in enumerate(self._fit.joints)
         ]
         for c, name in enumerate(self._fit.camera_names):
             if fitted is None or c in {one.camera for one in fitted.pictures}:
                 own = slice(joints + c * six, joints + (c + 1) * six)
-                causes.append(_Cause("camera", name, eye[:, own], deviations[own]))
+                causes.append(_Cause("camera", name, eye[:, own], deviations[own], six))
         if len(self._fit.camera_names) > 1:
-            causes.append(_Cause(BASE, BASE, self._fit.base_moves(), np.ones(six)))
+            causes.append(_Cause(BASE, BASE, self._fit.base_moves(), np.ones(six), six))
+        return causes if fitted is not None else causes + self._lens_causes()
+
+    def _lens_causes(self) -> list[_Cause]:
+        """Focal lengths and principal points that are off in all frames: of all cameras, of each.
+
+        A single camera was rather moved than has its principal point elsewhere.
+        """
+        names, causes = self._fit.camera_names, []
+        groups = [("", [*range(len(names))])] if len(names) > 1 else []
+        groups += [(f" of camera '{name}'", [c]) for c, name in enumerate(names)]
+        for where, group in groups:
+            many, rank = ("", 6.5) if where else ("s", 2.0)
+            focal, center = self._fit.focal_moves(group), self._fit.center_moves(group)
+            if focal.any():
+                text = f"focal length{many}{where}"
+                causes.append(_Cause("focal", text, focal, np.ones(1), 1))
+            text = f"principal point{many}{where}"
+            causes.append(_Cause("center", text, center, np.ones(2), rank))
         return causes
 
     def _finding(self, sufficient: Sequence[_CauseTest], pixels: float) -> Finding:
@@ -407,12 +434,14 @@ class _Auditor:
         seen_by_one = len(self._fit.camera_names) == 1
         if seen_by_one and any(one.cause.kind == "camera" for one in sufficient):
             rivals.append(BASE)
-        kind, name, _, units = best.cause
+        kind, name, _, units, _ = best.cause
         x, sd = best.amount * units, np.sqrt(np.diag(best.covariance)) * units
-        if kind != "joint":
-            turn, shift, turn_sd, shift_sd = (
-                float(np.linalg.norm(one)) for one in (x[:3], x[3:], sd[:3], sd[3:])
-            )
+        if kind == "focal":
+            turn, shift, turn_sd, shift_sd = 0.0, float(x[0]), 0.0, float(sd[0])
+        elif kind != "joint":
+            # Principal points have no turn.
+            parts = (x[:-3], x[-3:], sd[:-3], sd[-3:])
+            turn, shift, turn_sd, shift_sd = (float(np.linalg.norm(one)) for one in parts)
         elif self._fit.is_angle[self._fit.joints.index(name)]:
             turn, shift, turn_sd, shift_sd = float(x[0]), 0.0, float(sd[0]), 0.0
         else:
@@ -436,30 +465,74 @@ class _Auditor:
 
     def _common_findings(
         self, kept: Mask, sizes: ErrorSizes
-    ) -> tuple[tuple[Finding, ...], ErrorSizes, HalfPixel | None]:
-        """What is off in all frames that agree, as Audit has it."""
+    ) -> tuple[tuple[Finding, ...], ErrorSizes, HalfPixel | None, dict[str, float]]:
+        """What is off in all frames that agree, and what would be seen, as Audit has it."""
         if not kept.any():
-            return (), sizes, None
+            return (), sizes, None, {}
         info, count = self._sum(kept), np.count_nonzero(kept)
         Q = self._covariance(info) + info.N @ self._tolerance @ info.N / count
         residual = _Residual(info, info.N, info.h, Q)
-        causes, findings = self._causes(None), list[Finding]()
-        shifted = residual.test(_Cause("center", "", self._fit.center_moves(), np.ones(2)))
+        causes = self._causes(None)
+        every = range(len(self._fit.camera_names))
+        shifted = residual.test(_Cause("center", "", self._fit.center_moves(every), np.ones(2), 2))
         center = half_pixel(shifted.amount, shifted.covariance)
-        if center and shifted.gain > max(residual.test(cause).gain for cause in causes):
+        others = [residual.test(one).gain for one in causes if one.kind != "center"]
+        if center and shifted.gain > max(others):
             residual = residual.without(shifted.cause)
         else:
             center = None
-        while causes:
-            tests = [residual.test(cause) for cause in causes]
-            sufficient = residual.sufficient(tests) or [max(tests, key=lambda one: one.gain)]
-            best, pixels = sufficient[0], residual.info.pixels(sufficient[0].x)
-            if best.p_value * len(tests) > _SIGNIFICANCE or pixels < _LEAST_PIXELS:
+        residual, found = self._name(residual, causes, _LEAST_PIXELS)
+        # A joint's zero moves little beside what calibrations are off by: these are free now.
+        named, joints = {one.name for one in found}, list[_Cause]()
+        for cause in causes:
+            if cause.kind == "camera":
+                residual = residual.without(cause)
+            elif cause.kind == "joint" and cause.name not in named:
+                joints.append(cause)
+        residual, zeros = self._name(residual, joints, _LEAST_OF_JOINTS)
+        named = {one.name for one in zeros}
+        joints = [one for one in joints if one.name not in named]
+        return (*found, *zeros), sizes, center, self._noticed_from(residual, joints)
+
+    def _name(
+        self, residual: _Residual, causes: Sequence[_Cause], least: float
+    ) -> tuple[_Residual, list[Finding]]:
+        """What causes, one after the other, are off, and the residual without them.
+
+        least: how far they move outlines at least [pixel].
+        """
+        left, findings = list(causes), list[Finding]()
+        while left:
+            # What is named is off by itself, and so are its rivals.
+            tests = [
+                one
+                for one in map(residual.test, left)
+                if one.p_value * len(left) <= _SIGNIFICANCE and residual.info.pixels(one.x) >= least
+            ]
+            if not tests:
                 break
-            findings.append(self._finding(sufficient, pixels))
+            most = max(tests, key=lambda one: one.gain)
+            sufficient = residual.sufficient(tests, least) or [most]
+            best = sufficient[0]
+            findings.append(self._finding(sufficient, residual.info.pixels(best.x)))
             residual = residual.without(best.cause)
-            causes = [one for one in causes if one is not best.cause]
-        return tuple(findings), sizes, center
+            left = [one for one in left if one is not best.cause]
+        return residual, findings
+
+    def _noticed_from(self, residual: _Residual, causes: Sequence[_Cause]) -> dict[str, float]:
+        """How far joints must be off to be named nearly always [rad or m]; inf: never."""
+        critical = fisher.isf(_SIGNIFICANCE / max(1, len(causes)), 1, residual.info.freedom)
+        found = {}
+        for cause in causes:
+            along = cause.moves[:, 0]
+            sd = np.sqrt(max(float(along @ residual.Q @ along), 0.0))
+            information = max(float(along @ residual.N @ along), 1e-9)
+            amount = (np.sqrt(critical) + _NEARLY) * sd / information
+            pixels = max(residual.info.pixels(along), 1e-9)
+            is_told = information > _LEAST_INFORMATION
+            least = max(amount, _LEAST_OF_JOINTS / pixels) if is_told else np.inf
+            found[cause.name] = float(least * cause.units[0])
+        return found
 
 
 def _add(total: _Information, info: _Information, sign: float) -> _Information:

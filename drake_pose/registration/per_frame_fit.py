@@ -177,21 +177,37 @@ class PerFrameFit:
             moves[first + 3 : first + 6, 3:] = R_CW
         return np.asarray(moves / self.deviations[:, None])
 
-    def center_moves(self) -> Array:
-        """(p, 2) as base_moves, of a pixel by which all principal points are shifted along x and y.
+    def center_moves(self, cameras: Sequence[int]) -> Array:
+        """(p, 2) as base_moves, of a pixel by which principal points are shifted along x and y.
 
         At depth z a body is seen shifted by z over the focal length: a shift, and a turn, but for
         what the turn changes of the depth.
         """
         moves = np.zeros((len(self.names), 2))
-        for c, camera in enumerate(self._cameras):
-            first = len(self.joints) + 6 * c
-            kind, focal_x, focal_y = camera.kernel_parameters()[:3]
-            z = float(camera.X_CW[2, :3] @ self._middle + camera.X_CW[2, 3])
+        for c in cameras:
+            kind, focal_x, focal_y = self._cameras[c].kernel_parameters()[:3]
+            first, z = len(self.joints) + 6 * c, self._depth(c)
             of_x, of_y = moves[first : first + 6].T
             of_x[3], of_y[4] = ((1.0 if kind == 1.0 else z) / focal for focal in (focal_x, focal_y))
             of_x[1], of_y[0] = (0.0, 0.0) if kind == 1.0 else (1.0 / focal_x, -1.0 / focal_y)
         return np.asarray(moves / self.deviations[:, None])
+
+    def focal_moves(self, cameras: Sequence[int]) -> Array:
+        """(p, 1) as base_moves, of focal lengths that are larger by all of themselves.
+
+        A body is seen as it would be if it were nearer by that share of its depth; to a parallel
+        camera it is as near as ever.
+        """
+        moves = np.zeros((len(self.names), 1))
+        for c in cameras:
+            if self._cameras[c].kernel_parameters()[0] != 1.0:
+                moves[len(self.joints) + 6 * c + 5] = -self._depth(c)
+        return np.asarray(moves / self.deviations[:, None])
+
+    def _depth(self, camera: int) -> float:
+        """How far the body's middle is before a camera [m]."""
+        X_CW = self._cameras[camera].X_CW
+        return float(X_CW[2, :3] @ self._middle + X_CW[2, 3])
 
 
 def _weights(compared: Comparison) -> Array:

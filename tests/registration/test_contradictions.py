@@ -1,11 +1,13 @@
 """What contradicts the rest is named, in Drake's own pictures of an arm, damaged and changed."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from drake_pose.body.model import ArticulatedModel
+from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import MaskError
 from drake_pose.registration.contradictions import Audit, audit_frames
@@ -113,6 +115,31 @@ class TestAuditFrames:
             assert found.common[0].shift == pytest.approx(np.linalg.norm(by), abs=0.003)
         # Seen by one camera alone it may be the base.
         assert "base" in found.common[0].rivals
+
+    def test_lenses_that_are_told_wrongly(self, model, body, poses, cameras) -> None:
+        """Of both cameras, by what must be added to what is given."""
+        longer = [
+            replace(one, focal_x=1.04 * one.focal_x, focal_y=1.04 * one.focal_y) for one in cameras
+        ]
+        found = audit(model, body, poses, poses, cameras, longer)
+        assert found.contradicting == ()
+        (first, *_) = found.common
+        assert (first.kind, first.name) == ("focal", "focal lengths")
+        assert first.shift == pytest.approx(-0.04, abs=0.006)
+        aside = [replace(one, center_x=one.center_x + 5.0) for one in cameras]
+        found = audit(model, body, poses, poses, cameras, aside)
+        assert [one.kind for one in found.common] == ["center"]
+        assert found.common[0].shift == pytest.approx(5.0, abs=0.7)
+
+    def test_a_joint_is_named_from_where_it_is_said_to_be(
+        self, model, body, poses, cameras
+    ) -> None:
+        least = audit(model, body, poses, poses, cameras).noticed_from
+        assert least.keys() == {*TreeKinematics(body.tree).names}
+        assert 0.0 < least["elbow_turn"] < np.radians(1.0)
+        by = 1.2 * np.degrees(least["elbow_turn"])
+        found = audit(model, body, poses, joint_off(poses, 3, slice(None), by), cameras)
+        assert [(one.kind, one.name) for one in found.common] == [("joint", "elbow_turn")]
 
     def test_positions_of_another_frame(self, model, body, poses, cameras) -> None:
         given = poses.copy()

@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from drake_pose.body.model import load_model
+from drake_pose.body.model import ArticulatedModel, load_model
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.camera.camera_files import load_cameras
+from drake_pose.camera.models import Camera
 from drake_pose.errors import CameraError, MaskError, SceneError
 from drake_pose.files.folder import write_summary, writes_folder
 from drake_pose.files.options import percent
+from drake_pose.files.records import user_units
 from drake_pose.files.settings import EstimateSettings
 from drake_pose.files.summary import mask_digests
 from drake_pose.jobs.estimate.searches import make_tree
@@ -38,6 +42,12 @@ OnFrame = Callable[[int], None]
 _SAMPLE = 20
 # Sizes of errors that are told.
 _SIZES = ("surface", "mask", "camera")
+# In which shifts are told, and what they are multiplied by for that.
+_UNITS, _LENGTH = {"focal": ("percent", 100.0), "center": ("px", 1.0)}, ("mm", 1e3)
+# Where most frames contradict, other poses of cameras are tried on so many of them, of so many
+# pairs; they are named where so much of the contours fits, and less than this share of what does
+# not as given does not.
+_LOOKED_AT, _PAIRS, _FITS, _LEFT = 3, 10, 0.7, 0.5
 # As many joints are named in words.
 _NAMED = 3
 
@@ -84,9 +94,9 @@ def audit_scene(
     }
     inputs, frames = _read_inputs(Path(scene), files, cameras is not None, settings)
     begin, warnings = time.perf_counter(), list(inputs.warnings)
-    found, unseen = _audit(inputs, frames, on_frame)
+    found, unseen, misplaced = _audit(inputs, frames, on_frame)
     seconds = time.perf_counter() - begin
-    warnings += _doubts(inputs, found, unseen, files["cameras"])
+    warnings += [*misplaced, *_doubts(inputs, found, unseen, files["cameras"])]
     names = [camera.name for camera in inputs.held]
     summary = {
         "contradictions": _describe_contradictions(found),
@@ -102,6 +112,7 @@ def audit_scene(
             }
             for one in found.frames
         },
+        "noticed_from": _noticed_from(found, inputs.model),
         "principal_point_px": found.center and found.center._asdict(),
         "error_sizes_px": {name: float(getattr(found.sizes, name)) for name in _SIZES},
         **describe_run(Path(scene), files, settings, warnings, seconds),
@@ -110,6 +121,16 @@ def audit_scene(
     if folder is not None:
         _write_result(folder, inputs, found if overlay else None, summary)
     return SceneAudit(found, summary, tuple(warnings), folder)
+
+
+def _noticed_from(found: Audit, model: ArticulatedModel) -> dict[str, float | None]:
+    """How far joints must be off to be named [deg or m]; None: never."""
+    units = zip(model.position_names, user_units(model), strict=True)
+    return {
+        name: unit * least if math.isfinite(least) else None
+        for name, unit in units
+        if (least := found.noticed_from.get(name)) is not None
+    }
 
 
 def _read_inputs(
@@ -140,8 +161,8 @@ def _read_inputs(
 
 def _audit(
     inputs: Inputs, frames: Sequence[str], on_frame: OnFrame | None
-) -> tuple[Audit, list[str]]:
-    """What was found, and the frames of which no mask shows anything."""
+) -> tuple[Audit, list[str], list[str]]:
+    """What was found, the frames of which no mask shows anything, and what is wrong of cameras."""
     body = RegistrationBody(inputs.tree)
     picks = np.linspace(0, len(frames) - 1, min(len(frames), _SAMPLE)).round()
     sample = [inputs.read(frames[int(k)]) for k in picks]
@@ -158,7 +179,32 @@ def _audit(
             on_frame(done)
     if not fitted:
         raise MaskError(f"{inputs.scene.path}: no mask shows the body; it must be white in them")
-    return audit_frames(fit, fitted), unseen
+    found, misplaced = audit_frames(fit, fitted), list[str]()
+    if 2 * len(found.contradicting) > len(found.frames):
+        shown = [inputs.read(one) for one in found.contradicting[:_LOOKED_AT]]
+        misplaced = _misplaced(body, inputs, shown)
+    return found, unseen, misplaced
+
+
+def _misplaced(body: RegistrationBody, inputs: Inputs, frames: Sequence[SeenFrame]) -> list[str]:
+    """What would put cameras right that explain few frames: exchanged ones, inverses."""
+
+    def fits(cameras: Sequence[Camera]) -> float:
+        fit = PerFrameFit(body.kinematics, (body.few, body.all), cameras, frames)
+        ratios = [fit.fit(one).inlier_ratios[1] for one in frames]
+        return float(np.mean([value for one in ratios for value in one.values()]))
+
+    given, (held, names) = fits(inputs.held), (inputs.held, [one.name for one in inputs.held])
+    trials = [("every X_WC seems to be the inverse of the camera's pose in the world",
+               [one.with_pose(np.linalg.inv(one.X_WC)) for one in held])]  # fmt: skip
+    for a, b in list(combinations(range(len(held)), 2))[:_PAIRS]:
+        other = list(held)
+        other[a], other[b] = held[a].with_pose(held[b].X_WC), held[b].with_pose(held[a].X_WC)
+        trials.append((f"cameras '{names[a]}' and '{names[b]}' seem to be exchanged", other))
+    best, text = max((fits(cameras), text) for text, cameras in trials)
+    if best < _FITS or 1.0 - best > _LEFT * (1.0 - given):
+        return []
+    return [f"{text}; so {percent(best)} of the contours fit, as given {percent(given)}"]
 
 
 def _require_seen(body: RegistrationBody, inputs: Inputs, frames: Sequence[SeenFrame]) -> None:
@@ -243,8 +289,7 @@ def _describe_contradictions(found: Audit) -> list[dict[str, Any]]:
             "cause_name": one.name,
             "angle_deg": float(np.degrees(one.angle)),
             "angle_sd_deg": float(np.degrees(one.angle_sd)),
-            "shift_mm": 1e3 * one.shift,
-            "shift_sd_mm": 1e3 * one.shift_sd,
+            **_shift(one),
             "pixels": one.pixels,
             "chance": one.p_value,
             "rivals": list(one.rivals),
@@ -252,6 +297,12 @@ def _describe_contradictions(found: Audit) -> list[dict[str, Any]]:
         }
         for one, what, name, text in told
     ]
+
+
+def _shift(one: Finding) -> dict[str, float]:
+    """By how much something is shifted, in its own unit."""
+    unit, factor = _UNITS.get(one.kind, _LENGTH)
+    return {f"shift_{unit}": factor * one.shift, f"shift_sd_{unit}": factor * one.shift_sd}
 
 
 def _say_frame(one: FrameAudit, found: Finding) -> str:
@@ -273,13 +324,15 @@ def _say_frame(one: FrameAudit, found: Finding) -> str:
 def _off(one: Finding, verb: str) -> str:
     """What is off, and what explains it as well; by how much, with standard deviations."""
     name = "the base" if one.kind == "base" else f"{one.kind} '{one.name}'"
+    name = f"the {one.name}" if one.kind in _UNITS else name
     if one.rivals:
         name += f" (or {', '.join(one.rivals)}: the masks cannot tell)"
     parts = []
     if one.angle_sd > 0.0:
         parts.append(f"{np.degrees(one.angle):.2f} +- {np.degrees(one.angle_sd):.2f} degrees")
     if one.shift_sd > 0.0:
-        parts.append(f"{1e3 * one.shift:.1f} +- {1e3 * one.shift_sd:.1f} mm")
+        unit, factor = _UNITS.get(one.kind, _LENGTH)
+        parts.append(f"{factor * one.shift:.1f} +- {factor * one.shift_sd:.1f} {unit}")
     return f"{name}{':' if verb == 'off' else ''} {verb} by {' and '.join(parts)}"
 
 

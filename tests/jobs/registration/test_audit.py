@@ -77,6 +77,13 @@ class TestAudit:
         assert result.summary["contradictions"][0]["shift_mm"] == pytest.approx(20.0, abs=5.0)
         assert result.folder is None
 
+    def test_cameras_that_are_exchanged_are_named(self, audited, tmp_path: Path) -> None:
+        left, right = audited.cameras.values()
+        path = tmp_path / "cameras.yaml"
+        save_cameras(path, [left.with_pose(right.X_WC), right.with_pose(left.X_WC)])
+        result = audit_scene(audited.folder, audited.model, audited.joints, cameras=path)
+        assert any("'left' and 'right' seem to be ex" in text for text in result.warnings)
+
     @pytest.mark.parametrize("half", [0.5, pytest.param(-0.5, marks=pytest.mark.slow)])
     def test_half_a_pixel_of_the_principal_points_is_named(
         self, audited, tmp_path: Path, half: float

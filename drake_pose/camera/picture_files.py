@@ -1,8 +1,10 @@
-"""Pictures and masks in files: whole ones only, in one form."""
+"""Pictures and masks in files: whole ones only, in one form; and the order of frames' names."""
 
 from __future__ import annotations
 
 import io
+import re
+from collections.abc import Iterable
 from pathlib import Path
 
 import cv2
@@ -21,11 +23,38 @@ _PNG = b"\x89PNG\r\n\x1a\n"
 _JPEG, _JPEG_END = b"\xff\xd8", b"\xff\xd9"
 # A lossy picture of a mask is white from here on.
 _HALF = 128
+_NUMBER = re.compile("([0-9]+)")
+
+
+def natural_key(name: str) -> tuple[tuple[str, int], ...]:
+    """What names are sorted by: texts and the numbers in them in turn, so that 2 precedes 10."""
+    texts = _NUMBER.split(name)
+    return tuple(zip(texts[::2], [*map(int, texts[1::2]), -1], strict=True))
+
+
+def in_order(frames: Iterable[str]) -> tuple[str, ...]:
+    """Frames in natural order, each once."""
+    return tuple(sorted(set(frames), key=lambda name: (natural_key(name), name)))
+
+
+def frame_number(frame: str) -> int | None:
+    """Returns the number that a frame's name is, or None."""
+    return int(frame) if frame.isascii() and frame.isdigit() else None
+
+
+def frame_key(cell: str) -> int | str:
+    """A frame's number, which a table may have written as 3.0, or its name."""
+    number = frame_number(cell.removesuffix(".0"))
+    return cell if number is None else number
 
 
 def read_picture(path: Path, error_type: type[DrakePoseError]) -> Picture:
     """Reads a PNG or JPEG picture (H, W, 3) red, green, blue; the error names the file."""
-    data = read_picture_file(path, error_type)
+    return decode_colours(read_picture_file(path, error_type), path, error_type)
+
+
+def decode_colours(data: bytes, path: Path, error_type: type[DrakePoseError]) -> Picture:
+    """A picture (H, W, 3) red, green, blue of a PNG or JPEG file's content, as decode_picture."""
     picture = decode_picture(data, cv2.IMREAD_COLOR, path, error_type)
     return np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB), dtype=np.uint8)
 

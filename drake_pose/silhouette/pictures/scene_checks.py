@@ -12,9 +12,9 @@ from pathlib import Path
 import numpy as np
 
 from drake_pose.camera.models import Camera
+from drake_pose.camera.picture_files import natural_key
 from drake_pose.errors import MaskError, SceneError
 from drake_pose.regular_files import require_regular
-from drake_pose.silhouette.pictures.scene_files import natural_key
 from drake_pose.silhouette.pictures.scenes import Scene, load_scene
 
 # A camera that stands still while the others' silhouettes change by so much of their area.

@@ -3,22 +3,15 @@
 from __future__ import annotations
 
 import os
-import re
 from collections.abc import Iterable, Mapping, Sequence
 from difflib import get_close_matches
 from pathlib import Path
 from typing import NamedTuple
 
-import cv2
-import numpy as np
-from numpy.typing import NDArray
-
-from drake_pose.camera.picture_files import SUFFIXES
+from drake_pose.camera.picture_files import SUFFIXES, frame_number, in_order, natural_key
+from drake_pose.camera.video_files import VIDEOS, VideoPictures
 from drake_pose.errors import SceneError, SettingsError, UnknownNameError
 
-_NUMBER = re.compile("([0-9]+)")
-VIDEOS = (".mp4", ".avi", ".mkv", ".mov", ".webm", ".m4v", ".mpg", ".mpeg")
-"""How names of videos end."""
 # Rates of videos that differ by more were not meant to be one.
 _RATES = 1.01
 
@@ -29,45 +22,6 @@ class MaskFiles(NamedTuple):
     masks: dict[tuple[str, str], Path]
     strangers: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
-
-
-class VideoPictures:
-    """The pictures of a video, counted from 0; SceneError where OpenCV cannot read it."""
-
-    def __init__(self, path: Path) -> None:
-        self._path, self._capture, self._next = path, cv2.VideoCapture(str(path)), 0
-        if not self._capture.isOpened():
-            raise SceneError(f"{path}: not a video that OpenCV can read")
-
-    @property
-    def count(self) -> int:
-        """How many pictures there are, as the file says."""
-        return int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT))
-
-    @property
-    def rate_hz(self) -> float | None:
-        """Pictures a second, where the file says."""
-        rate = float(self._capture.get(cv2.CAP_PROP_FPS))
-        return rate if rate > 0.0 else None
-
-    def read(self, number: int) -> NDArray[np.uint8]:
-        """A picture (H, W, 3), red, green, blue; SceneError where the video ends before it."""
-        if number < self._next:
-            self._capture.release()
-            self._capture, self._next = cv2.VideoCapture(str(self._path)), 0
-        # Not every video can be wound to a picture: those between are passed over.
-        while self._next < number and self._capture.grab():
-            self._next += 1
-        found, picture = self._capture.read()
-        if self._next < number or not found:
-            what = f"is cut short: it ends after {self._next} pictures, but says {self.count}"
-            what = what if number < self.count else f"has no picture {number}"
-            raise SceneError(
-                f"{self._path}: {what}; leave the rest out (--frame), or make it whole: ffmpeg -i "
-                f"{self._path.name} -c copy NEW"
-            )
-        self._next += 1
-        return np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB), dtype=np.uint8)
 
 
 def common_rate(videos: Mapping[str, Path]) -> tuple[float | None, tuple[str, ...]]:
@@ -90,22 +44,6 @@ def common_rate(videos: Mapping[str, Path]) -> tuple[float | None, tuple[str, ..
     if ratio > _RATES:
         raise SceneError(text)
     return next(iter(rates.values())), (text,) if off >= 1.0 else ()
-
-
-def natural_key(name: str) -> tuple[tuple[str, int], ...]:
-    """What names are sorted by: texts and the numbers in them in turn, so that 2 precedes 10."""
-    texts = _NUMBER.split(name)
-    return tuple(zip(texts[::2], [*map(int, texts[1::2]), -1], strict=True))
-
-
-def in_order(frames: Iterable[str]) -> tuple[str, ...]:
-    """Frames in natural order, each once."""
-    return tuple(sorted(set(frames), key=lambda name: (natural_key(name), name)))
-
-
-def frame_number(frame: str) -> int | None:
-    """Returns the number that a frame's name is, or None."""
-    return int(frame) if frame.isascii() and frame.isdigit() else None
 
 
 def select_frames(known: Sequence[str], wanted: Sequence[str], where: str) -> tuple[str, ...]:

@@ -1,0 +1,70 @@
+"""Pictures that say their own numbers, and videos of them by the encoders of PyAV."""
+
+from collections.abc import Sequence
+from fractions import Fraction
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+SIDE, BITS = 64, 8
+LENS = "width: 64, height: 64, focal_x: 70, focal_y: 75, center_x: 31.5, center_y: 30"
+K = np.array([[70.0, 0.0, 31.5], [0.0, 75.0, 30.0], [0.0, 0.0, 1.0]])
+GRID = np.moveaxis(np.indices((SIDE, SIDE))[::-1], 0, -1).reshape(-1, 1, 2).astype(float)
+
+
+def numbered(k: int, width: int = SIDE) -> np.ndarray:
+    """A picture (64, width, 3) whose stripes are the bits of its number, red at the top."""
+    stripes = np.repeat([20 + 200 * (k >> b & 1) for b in range(BITS)], width // BITS)
+    picture = np.tile(stripes.astype(np.uint8)[None, :, None], (SIDE, 1, 3))
+    picture[: SIDE // 4] = 230, 20, 20
+    return picture
+
+
+def number_of(picture: np.ndarray) -> int:
+    """The number of a picture, which compression may have blurred; it must be upright and red."""
+    red, _, blue = picture[:8].reshape(-1, 3).mean(axis=0)
+    assert red > 150 > 100 > blue, "the top is not red"
+    row = picture[SIDE // 2, :, 1].reshape(BITS, -1).mean(axis=1)
+    return int(sum(1 << b for b in range(BITS) if row[b] > 120))
+
+
+def shade(rays: np.ndarray) -> np.ndarray:
+    """A smooth grey picture (64, 64) of the directions (x / z, y / z) that its pixels look in."""
+    x, y = rays.reshape(-1, 2).T
+    grey = 128 + 60 * np.sin(4 * x) + 60 * np.cos(3 * y)
+    return grey.reshape(SIDE, SIDE).round().astype(np.uint8)
+
+
+def distorted(D: Sequence[float], fisheye: bool = False) -> np.ndarray:
+    """What a lens shows of `shade`, by OpenCV's own way from pixels to directions."""
+    undistort = cv2.fisheye.undistortPoints if fisheye else cv2.undistortPoints
+    return shade(undistort(GRID, K, np.array(D)))
+
+
+def write_video(
+    path: Path,
+    numbers: Sequence[int],
+    times: Sequence[float] | None = None,
+    codec: str = "libx264",
+    width: int = SIDE,
+    **options: str,
+) -> Path:
+    """A video of numbered pictures at times [s], 10 a second where not given."""
+    import av
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    settings = {"g": "5"} | ({} if codec == "libsvtav1" else {"bf": "2"})
+    with av.open(str(path), "w", options={"movflags": "faststart", **options}) as container:
+        stream = container.add_stream(codec, rate=10, options=settings)
+        stream.width, stream.height, stream.pix_fmt = width, SIDE, "yuv420p"
+        stream.time_base = stream.codec_context.time_base = Fraction(1, 1000)
+        for k, number in enumerate(numbers):
+            frame = av.VideoFrame.from_ndarray(numbered(number, width), format="rgb24")
+            frame.pts, frame.time_base = (
+                round(100 * k if times is None else 1000 * times[k]),
+                Fraction(1, 1000),
+            )
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+    return path

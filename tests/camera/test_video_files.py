@@ -1,0 +1,72 @@
+"""Videos by number and by time; PyAV encodes them, OpenCV's decoder is the other opinion."""
+
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from drake_pose.camera.video_files import TimedVideo, VideoPictures
+from drake_pose.errors import SceneError
+from tests.camera.episodes.recordings import number_of, write_video
+
+
+@pytest.mark.parametrize("codec", ["libx264", "libsvtav1", "mpeg4"])
+def test_any_picture_is_read_in_any_order(tmp_path: Path, codec: str) -> None:
+    path = write_video(tmp_path / "a.mp4", range(23), codec=codec)
+    video, plain = TimedVideo(path), VideoPictures(path)
+    np.testing.assert_allclose(video.times, 0.1 * np.arange(23), atol=1e-9)
+    order = [*range(23), *np.random.default_rng(0).permutation(23).tolist(), 22, 22, 0]
+    assert [number_of(video.read(k)) for k in order] == order
+    assert (video.warnings, plain.count) == ([], 23)
+    for k in (3, 22, 0):
+        np.testing.assert_array_equal(plain.read(k), video.read(k))
+    with pytest.raises(SceneError, match=r"a\.mp4: has pictures 0 to 22 only"):
+        video.read(23)
+
+
+def test_times_are_those_of_the_file_where_its_rate_varies(tmp_path: Path) -> None:
+    times = [0.0, 0.04, 0.08, 0.3, 0.34, 1.5]
+    video = TimedVideo(write_video(tmp_path / "a.mkv", range(6), times))
+    np.testing.assert_allclose(video.times, times, atol=1e-3)
+    assert [number_of(video.read(k)) for k in (5, 0, 3)] == [5, 0, 3]
+
+
+def test_a_video_that_is_to_be_turned_is_turned_as_players_do(tmp_path: Path) -> None:
+    path = write_video(tmp_path / "a.mp4", range(3))
+    one, far, data = 1 << 16, 1 << 30, path.read_bytes()
+    upright = np.array([one, 0, 0, 0, one, 0, 0, 0, far], dtype=">i4").tobytes()
+    turned = np.array([0, one, 0, -one, 0, 0, 0, 0, far], dtype=">i4").tobytes()
+    where = data.index(upright, data.index(b"tkhd"))
+    path.write_bytes(data[:where] + turned + data[where + len(turned) :])
+    found, shown = TimedVideo(path).read(0), cv2.VideoCapture(str(path)).read()[1]
+    np.testing.assert_array_equal(found, shown[:, :, ::-1])
+    assert (found[:, -8:, 0].mean() > 150) & (found[:8, :32, 0].mean() < 100)
+
+
+def test_videos_that_are_cut_short(tmp_path: Path) -> None:
+    for name, flag in (("a.mp4", "faststart"), ("b.mp4", "disable_chpl")):
+        path = write_video(tmp_path / name, range(60), movflags=flag)
+        path.write_bytes(path.read_bytes()[: int(0.8 * path.stat().st_size)])
+    video = TimedVideo(tmp_path / "a.mp4")
+    last = len(video.times) - 1
+    assert 10 < last < 59
+    assert video.warnings[0].endswith(f"is cut short: it ends after {last + 1} of 60 pictures")
+    assert number_of(video.read(last)) == last
+    with pytest.raises(SceneError, match=f"is cut short: it has pictures 0 to {last} only"):
+        video.read(last + 1)
+    # Where the index is at the end, nothing is left.
+    for name in ("b.mp4", "none.mp4"):
+        with pytest.raises(SceneError, match=rf"{name}: not a video that PyAV can read"):
+            TimedVideo(tmp_path / name)
+
+
+def test_the_extra_is_named_where_its_library_is_missing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = write_video(tmp_path / "a.mp4", range(2), codec="libsvtav1")
+    monkeypatch.setitem(sys.modules, "av", None)
+    for reader in (TimedVideo, VideoPictures):
+        with pytest.raises(SceneError, match=r"a\.mp4: .* pip install 'drake_pose\[episodes\]'"):
+            reader(path)

@@ -24,7 +24,7 @@ class MaskError(DrakePoseError):
 
 
 class SceneError(DrakePoseError):
-    """A scene folder cannot be used."""
+    """A scene folder, or a recorded episode, cannot be used."""
 
 
 class SettingsError(DrakePoseError):

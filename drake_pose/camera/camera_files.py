@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import yaml
 
+from drake_pose.arrays import Array
 from drake_pose.camera.models import (
     HALF_PIXEL,
     Camera,
@@ -29,9 +30,18 @@ _REQUIRED = {
     "parallel": (*_COMMON, "pixels_per_metre"),
 }
 _OPTIONAL = {
-    "pinhole": ("X_WC", "link", "X_LC", "projection", "clipping_near", "pixel_centers"),
+    "pinhole": (
+        "X_WC",
+        "link",
+        "X_LC",
+        "projection",
+        "clipping_near",
+        "pixel_centers",
+        "distortion",
+    ),
     "parallel": ("X_WC", "projection", "pixel_centers"),
 }
+_COEFFICIENTS = (4, 5, 8, 12, 14)
 # What both have; what only a CameraConfig has; and the name that Drake gives one without.
 _SHARED = {*_COMMON, "clipping_near"}
 _CONFIG_ALONE = {
@@ -78,15 +88,20 @@ class CameraFile:
         cameras: by name, in the file's order; those without X_WC at the world's origin.
         unplaced: the names of these, but for those that ride on a link.
         links: by camera that rides on a link, the link; its X_WC holds X_LC, its pose in that.
+        distortions: of the pictures as taken, by camera that has any: OpenCV's coefficients.
     """
 
     cameras: dict[str, Camera]
     unplaced: tuple[str, ...]
     links: Mapping[str, str] = field(default_factory=dict)
+    distortions: Mapping[str, Array] = field(default_factory=dict)
 
 
-def load_camera_file(path: str | Path) -> CameraFile:
-    """Reads a camera file as load_cameras does, in which X_WC may be missing."""
+def load_camera_file(path: str | Path, *, distorted: bool = False) -> CameraFile:
+    """Reads a camera file as load_cameras does, in which X_WC may be missing.
+
+    distorted: whether cameras may have a `distortion`, which the caller takes out of pictures.
+    """
     path = Path(path)
     content = read_yaml(path, CameraError, tags=True)
     if not isinstance(content, dict) or not content:
@@ -106,7 +121,20 @@ def load_camera_file(path: str | Path) -> CameraFile:
         cameras[name] = _read_camera(name, entry, path)
     links = {str(key): entry["link"] for key, entry in content.items() if "link" in entry}
     placed = {str(key) for key, entry in content.items() if "X_WC" in entry}
-    return CameraFile(cameras, tuple(n for n in cameras if n not in {*placed, *links}), links)
+    distortions = {
+        str(key): _read_distortion(entry["distortion"], f"{path}: camera '{key}'")
+        for key, entry in content.items()
+        if "distortion" in entry
+    }
+    distortions = {name: found for name, found in distortions.items() if found.any()}
+    if distortions and not distorted:
+        raise CameraError(
+            f"{path}: camera '{next(iter(distortions))}' has distortion, of which pictures and "
+            "masks must be free here: take it out of them (drake-pose undistort), and leave it out "
+            "of the file"
+        )
+    unplaced = tuple(name for name in cameras if name not in {*placed, *links})
+    return CameraFile(cameras, unplaced, links, distortions)
 
 
 def save_cameras(path: str | Path, cameras: Mapping[str, Camera] | Iterable[Camera]) -> None:
@@ -215,6 +243,16 @@ def _read_camera(name: str, entry: Any, path: Path) -> Camera:
         return ParallelCamera(**values) if projection == "parallel" else PinholeCamera(**values)
     except CameraError as error:
         raise CameraError(f"{path}: {error}") from error
+
+
+def _read_distortion(value: Any, where: str) -> Array:
+    """Coefficients as OpenCV counts them, or CameraError."""
+    if not isinstance(value, list) or len(value) not in _COEFFICIENTS:
+        raise CameraError(
+            f"{where}: distortion must be a list of OpenCV's coefficients: k1, k2, p1, p2, then k3 "
+            f"and more ({', '.join(map(str, _COEFFICIENTS))} numbers in all)"
+        )
+    return np.array([check_number(one, "distortion", where) for one in value])
 
 
 def _write_camera(camera: Camera) -> dict[str, Any]:

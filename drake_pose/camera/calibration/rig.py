@@ -38,12 +38,14 @@ NUMBERS = ("focal_x", "focal_y", "center_x", "center_y", "k1", "k2", "p1", "p2",
 
 @dataclass(frozen=True, eq=False)
 class Lens:
-    """A pinhole with radial and tangential distortion, as OpenCV has it.
+    """A pinhole with radial and tangential distortion, or a fisheye, as OpenCV has them.
 
     Args:
         width, height, focal_x, focal_y: [pixel].
         center_x, center_y: the principal point [pixel], pixel centres at integers.
-        distortion: (5,) k1, k2, p1, p2, k3.
+        distortion: (5,) k1, k2, p1, p2, k3, or as many of OpenCV's as a recording gives; of a
+            fisheye (4,) k1, k2, k3, k4.
+        fisheye: whether it is OpenCV's fisheye, which ROS calls equidistant.
     """
 
     width: int
@@ -53,6 +55,7 @@ class Lens:
     center_x: float
     center_y: float
     distortion: Array
+    fisheye: bool = False
 
     @classmethod
     def from_numbers(cls, size: tuple[int, int], numbers: Sequence[float] | Array) -> Lens:
@@ -78,8 +81,22 @@ class Lens:
         if not self.distortion.any():
             return self.matrix
         size = (self.width, self.height)
-        straight, _ = cv2.getOptimalNewCameraMatrix(self.matrix, self.distortion, size, 0.0)
+        if self.fisheye:
+            straight = cv2.fisheye.estimateNewCameraMatrixForUndistortRectify(
+                self.matrix, self.distortion, size, np.eye(3), balance=0.0
+            )
+        else:
+            straight, _ = cv2.getOptimalNewCameraMatrix(self.matrix, self.distortion, size, 0.0)
         return np.asarray(straight, dtype=np.float64)
+
+    @cached_property
+    def _maps(self) -> tuple[np.ndarray, np.ndarray]:
+        """Where each pixel of an undistorted picture comes from, as cv2.remap takes it."""
+        maps = cv2.fisheye.initUndistortRectifyMap if self.fisheye else cv2.initUndistortRectifyMap
+        size = (self.width, self.height)
+        return maps(
+            self.matrix, self.distortion, np.eye(3), self.straight_matrix, size, cv2.CV_16SC2
+        )
 
     def camera(self, name: str, X_WC: Array) -> PinholeCamera:
         """The camera, free of distortion, that took the undistorted pictures from X_WC (4, 4)."""
@@ -93,8 +110,7 @@ class Lens:
                 f"a picture of {picture.shape[1]} x {picture.shape[0]} pixels (width x height) is "
                 f"not of the lens of {self.width} x {self.height}"
             )
-        straight = cv2.undistort(picture, self.matrix, self.distortion, None, self.straight_matrix)
-        return np.asarray(straight, dtype=np.uint8)
+        return np.asarray(cv2.remap(picture, *self._maps, cv2.INTER_LINEAR), dtype=np.uint8)
 
 
 def save_lenses(path: str | Path, lenses: Mapping[str, Lens]) -> None:

@@ -1,0 +1,292 @@
+"""Episodes in bags of ROS 1 and ROS 2 (sqlite3 and mcap), read by rosbags."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from drake_pose.arrays import Array, Integers, Picture
+from drake_pose.camera.calibration.rig import Lens
+from drake_pose.camera.episodes.episode import Episode, EpisodeCamera, JointLog, ascending
+from drake_pose.camera.picture_files import decode_colours
+from drake_pose.camera.video_files import import_reader
+from drake_pose.errors import DrakePoseError, SceneError
+
+BAGS = (".bag", ".mcap", ".db3")
+_IMAGE, _COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
+_JOINTS, _INFO = "sensor_msgs/msg/JointState", "sensor_msgs/msg/CameraInfo"
+_FRAMES, _STATIC = "tf2_msgs/msg/TFMessage", "/tf_static"
+_NANO = 1e-9
+# Bytes of a pixel, and how OpenCV turns it to red, green, blue.
+_ENCODINGS: dict[str, tuple[int, int | None]] = {
+    "rgb8": (3, None),
+    "bgr8": (3, cv2.COLOR_BGR2RGB),
+    "rgba8": (4, cv2.COLOR_RGBA2RGB),
+    "bgra8": (4, cv2.COLOR_BGRA2RGB),
+    "mono8": (1, cv2.COLOR_GRAY2RGB),
+    "bayer_rggb8": (1, cv2.COLOR_BayerRGGB2RGB),
+    "bayer_bggr8": (1, cv2.COLOR_BayerBGGR2RGB),
+    "bayer_gbrg8": (1, cv2.COLOR_BayerGBRG2RGB),
+    "bayer_grbg8": (1, cv2.COLOR_BayerGRBG2RGB),
+}
+_DEPTHS = ("16uc1", "32fc1", "mono16", "compresseddepth")
+# Whether a model of distortion is OpenCV's fisheye.
+_LENSES = {"plumb_bob": False, "rational_polynomial": False, "equidistant": True, "fisheye": True}
+
+# Of each message its time in the header and in the bag [ns], and what it holds.
+_Row = tuple[int, int, Any]
+
+
+def open_bag(path: Path, joints: JointLog | None) -> Episode:
+    """Opens a bag: a file of ROS 1, or a folder, mcap or db3 file of ROS 2.
+
+    A camera is called by its topic without slashes and `image_raw` (`/hand/image_raw` is hand); its
+    times, and those of joints, are those of the messages' headers. Joints that several publishers
+    or topics have are put on the clock of the one that has most rows. A camera whose frame hangs on
+    others by `/tf_static` rides on the last of them.
+
+    Args:
+        joints: in place of its own.
+
+    Raises SceneError: it cannot be read, is cut short, or has no pictures.
+    """
+    pictures, states, infos, parents, left_out = _scan(path)
+    warnings = [f"{topic} is left out: {why}" for topic, why in left_out.items() if why != "depths"]
+    if joints is None and states:
+        joints, said = _merge(states)
+        warnings += said
+    cameras: dict[str, EpisodeCamera] = {}
+    # Of a camera that is recorded twice, what nobody compressed comes first.
+    for topic in sorted(pictures, key=lambda topic: (topic.endswith("/compressed"), topic)):
+        if (name := _camera_name(topic)) not in cameras:
+            try:
+                camera = _of_topic(path, topic, pictures[topic], infos, warnings)
+                link, X_LC = _mount(parents, pictures[topic][0][2])
+                placed = camera.camera and camera.camera.with_pose(X_LC)
+                cameras[name] = replace(camera, name=name, camera=placed, link=link)
+            except SceneError as error:
+                warnings.append(f"camera '{name}' is left out: {error}")
+    return Episode.checked(path, cameras.values(), joints, warnings)
+
+
+def _scan(path: Path) -> tuple[Any, Any, Any, Any, Any]:
+    """What one pass through a bag finds.
+
+    Pictures (what they hold is their frame) by topic, joint positions by topic and names,
+    CameraInfos by topic, the parents and poses of static frames, and why topics are left out.
+    """
+    pictures, states = defaultdict[str, list[_Row]](list), defaultdict[Any, list[_Row]](list)
+    infos, parents, left_out = {}, {}, {}
+    used = {_IMAGE, _COMPRESSED, _JOINTS, _INFO}
+    with _faults(path), _unopened(path) as reader:
+        wanted = [
+            one
+            for one in reader.connections
+            if one.msgtype in used or (one.msgtype == _FRAMES and one.topic.endswith(_STATIC))
+        ]
+        kinds = {one.topic: one.msgtype for one in reader.connections}
+        for one, log_time, data in reader.messages(wanted) if wanted else ():
+            topic, kind, message = one.topic, one.msgtype, reader.deserialize(data, one.msgtype)
+            if kind == _FRAMES:
+                for frame in message.transforms:
+                    parent = frame.header.frame_id.strip("/")
+                    parents[frame.child_frame_id.strip("/")] = parent, _pose(frame.transform)
+                continue
+            stamp = message.header.stamp
+            stamps = stamp.sec * 10**9 + stamp.nanosec, log_time
+            if kind == _INFO:
+                infos[topic] = message
+            elif kind != _JOINTS:
+                coding = (message.encoding if kind == _IMAGE else message.format).lower()
+                if any(depth in coding for depth in _DEPTHS):
+                    left_out[topic] = "depths"
+                elif kind == _IMAGE and coding not in _ENCODINGS:
+                    left_out[topic] = f"{coding} is not one of {', '.join(_ENCODINGS)}"
+                else:
+                    pictures[topic].append((*stamps, message.header.frame_id.strip("/")))
+            elif len(message.name) and len(message.position) == len(message.name):
+                states[topic, tuple(message.name)].append((*stamps, np.array(message.position)))
+    if not pictures:
+        listed = ", ".join(f"{topic} ({kind})" for topic, kind in (kinds | left_out).items())
+        raise SceneError(f"{path}: has no pictures of cameras; its topics are: {listed or 'none'}")
+    return pictures, states, infos, parents, left_out
+
+
+def _unopened(path: Path) -> Any:
+    """The reader of a bag, whose messages have the usual types where it does not define them."""
+    types = import_reader("rosbags.typesys", path)
+    known = types.get_typestore(types.Stores.LATEST)
+    return import_reader("rosbags.highlevel", path).AnyReader([path], default_typestore=known)
+
+
+@contextmanager
+def _faults(path: Path) -> Iterator[None]:
+    """Makes a SceneError of whatever a bag that is cut short or damaged makes rosbags raise."""
+    try:
+        yield
+    except DrakePoseError:
+        raise
+    except Exception as error:  # Those of its decompressors have no common base.
+        raise SceneError(
+            f"{path}: not a whole bag of ROS 1 or 2 ({type(error).__name__}: {error}); 'rosbag "
+            "reindex' or 'ros2 bag reindex' mends one that was cut short"
+        ) from error
+
+
+def _camera_name(topic: str) -> str:
+    """What a topic's camera is called, fit for a file's name."""
+    parts = topic.strip("/").split("/")
+    while len(parts) > 1 and parts[-1] in ("compressed", "image_raw", "image"):
+        parts.pop()
+    return "_".join(parts)
+
+
+def _seconds(rows: Sequence[_Row], what: str, warnings: list[str]) -> tuple[Array, Integers]:
+    """The headers' times [s], or the bag's where they have none, and which rows are in order."""
+    stamps = np.array([row[:2] for row in rows])
+    clock = 0 if stamps[:, 0].any() else 1
+    if clock:
+        warnings.append(f"{what}: headers without time stamps: the times of recording are used")
+    kept, late = ascending(stamps[:, clock] * _NANO, what)
+    warnings += late
+    return stamps[kept, clock] * _NANO, kept
+
+
+def _merge(
+    groups: Mapping[tuple[str, tuple[str, ...]], Sequence[_Row]],
+) -> tuple[JointLog, list[str]]:
+    """All joints at the times of the publisher that has most rows, which also owns its joints."""
+    warnings: list[str] = []
+    base: JointLog | None = None
+    columns: dict[str, Array] = {}
+    owners: dict[str, str] = {}
+    for (topic, names), rows in sorted(groups.items(), key=lambda one: -len(one[1])):
+        times, kept = _seconds(rows, f"{topic}: rows of {names[0]}", warnings)
+        log = JointLog(names, times, np.array([row[2] for row in rows])[kept])
+        base = base or log
+        assert base.times is not None
+        if again := [name for name in names if owners.setdefault(name, topic) != topic]:
+            warnings.append(
+                f"{topic}: has joint {', '.join(again)} of {owners[again[0]]} again, which has "
+                "more rows and is used"
+            )
+        columns = dict(zip(names, log.at(base.times).T, strict=True)) | columns
+    assert base is not None
+    ordered = tuple(dict.fromkeys(name for _, names in groups for name in names))
+    positions = np.column_stack([columns[name] for name in ordered])
+    return JointLog(ordered, base.times, positions), warnings
+
+
+def _pose(transform: Any) -> Array:
+    """(4, 4) of a ROS transform."""
+    X, p, q = np.eye(4), transform.translation, transform.rotation
+    X[:3, :3] = Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix()
+    X[:3, 3] = p.x, p.y, p.z
+    return X
+
+
+def _mount(parents: Mapping[str, tuple[str, Array]], frame: str) -> tuple[str | None, Array]:
+    """The link that a frame is fixed to, over however many others, and its pose in it."""
+    link, X_LC, passed = None, np.eye(4), set[str]()
+    while frame in parents and frame not in passed:
+        passed.add(frame)
+        link, X_LF = parents[frame]
+        X_LC, frame = X_LF @ X_LC, link
+    return link, X_LC
+
+
+def _of_topic(
+    path: Path, topic: str, rows: Sequence[_Row], infos: Mapping[str, Any], warnings: list[str]
+) -> EpisodeCamera:
+    """The camera of a topic, which is called like that."""
+    times, kept = _seconds(rows, f"{topic}: pictures", warnings)
+    source = _TopicPictures(path, topic, np.array([row[1] for row in rows])[kept])
+    height, width = source.read(0).shape[:2]
+    base = topic.removesuffix("/compressed")
+    beside = f"{base.rpartition('/')[0]}/camera_info"
+    info, camera, lens = infos.get(beside, infos.get(f"{base}/camera_info")), None, None
+    if info is None or not np.any(_field(info, "k")):
+        warnings.append(f"{topic}: no calibration in {beside}: its lens is unknown")
+    elif (info.width, info.height) != (width, height):
+        warnings.append(
+            f"{topic}: its calibration is of {info.width} x {info.height} pixels, but its pictures "
+            f"have {width} x {height}: its lens is unknown"
+        )
+    else:
+        lens = _lens(info, is_rectified="rect" in base.rpartition("/")[2], where=topic)
+        camera = lens.camera(topic, np.eye(4))
+        lens = lens if lens.distortion.any() else None
+    return EpisodeCamera(topic, width, height, times, camera, None, source.read, (), lens)
+
+
+def _field(info: Any, name: str) -> Array:
+    """A field of a CameraInfo, whose names are capital in ROS 1."""
+    return np.asarray(getattr(info, name, getattr(info, name.upper(), None)), dtype=np.float64)
+
+
+def _lens(info: Any, *, is_rectified: bool, where: str) -> Lens:
+    """The lens of a CameraInfo; SceneError where its distortion is of a kind nobody knows.
+
+    The distortion is that of raw pictures: rectified ones have their camera matrix in P, and none.
+    """
+    size, K, D, P = (info.width, info.height), *(_field(info, one) for one in ("k", "d", "p"))
+    if is_rectified and P.any():
+        return Lens.from_numbers(size, [P[0], P[5], P[2], P[6], *np.zeros(4)])
+    is_fisheye = _LENSES.get(info.distortion_model)
+    if is_rectified or not D.any():
+        D, is_fisheye = np.zeros(4), False
+    if is_fisheye is None:
+        raise SceneError(
+            f"{where}: its distortion is of the kind '{info.distortion_model}', but these are "
+            f"known: {', '.join(_LENSES)}; record rectified pictures"
+        )
+    D = D[:4] if is_fisheye else D
+    return replace(Lens.from_numbers(size, [K[0], K[4], K[2], K[5], *D]), fisheye=is_fisheye)
+
+
+class _TopicPictures:
+    """The pictures of a topic: the next one costs nothing more, any other a look into the index."""
+
+    def __init__(self, path: Path, topic: str, log_times: Integers) -> None:
+        self._path, self._topic, self._log_times = path, topic, log_times
+        self._reader: Any = None
+        self._messages: Iterator[Any] = iter(())
+        self._next = -1
+
+    def read(self, k: int) -> Picture:
+        """Picture k (H, W, 3), red, green, blue; SceneError where it is damaged."""
+        wanted, where = int(self._log_times[k]), f"{self._path}: {self._topic}, picture {k}"
+        with _faults(self._path):
+            if self._reader is None:
+                self._reader = _unopened(self._path)
+                self._reader.open()
+            if k != self._next:
+                own = [one for one in self._reader.connections if one.topic == self._topic]
+                self._messages = self._reader.messages(own, start=wanted)
+            for one, log_time, data in self._messages:
+                if log_time == wanted:
+                    self._next = k + 1
+                    message = self._reader.deserialize(data, one.msgtype)
+                    if one.msgtype == _COMPRESSED:
+                        return decode_colours(bytes(message.data), Path(where), SceneError)
+                    return _decode(message, where)
+        raise SceneError(f"{where}: is not where the bag's index says; reindex the bag")
+
+
+def _decode(message: Any, where: str) -> Picture:
+    """The picture of an Image."""
+    size, how = _ENCODINGS[message.encoding.lower()]
+    height, width, step = message.height, message.width, message.step
+    if not (len(message.data) >= height * step > 0 and step >= width * size):
+        raise SceneError(f"{where}: has fewer bytes than {width} x {height} pixels need")
+    rows = np.frombuffer(message.data, np.uint8, height * step).reshape(height, step)
+    picture = rows[:, : width * size].reshape(height, width, size)
+    return np.ascontiguousarray(picture if how is None else cv2.cvtColor(picture, how))

@@ -1,0 +1,164 @@
+"""Episodes in folders: pictures or videos of cameras beside a table of joint positions."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from drake_pose.arrays import Array, Picture
+from drake_pose.camera.calibration.rig import Lens
+from drake_pose.camera.camera_files import CameraFile, load_camera_file
+from drake_pose.camera.episodes.episode import Episode, EpisodeCamera, JointLog, ascending
+from drake_pose.camera.models import PinholeCamera, check_number
+from drake_pose.camera.picture_files import frame_key, in_order, list_pictures, read_picture
+from drake_pose.camera.sources.source_files import CAMERAS, TIME_STAMPS, read_time_stamps
+from drake_pose.camera.video_files import VIDEOS, TimedVideo
+from drake_pose.csv_files import read_csv
+from drake_pose.errors import CameraError, SceneError
+from drake_pose.yaml_files import read_yaml
+
+JOINT_TABLE = "joint_angles.csv"
+
+
+def read_joint_table(path: Path) -> tuple[JointLog, list[str]]:
+    """A table with a column `time` [s] or `frame`, or both, and one for each joint; and warnings.
+
+    Raises SceneError: it cannot be read, has neither column, a cell that is no number, a frame
+    twice, or times that run backwards.
+    """
+    header, rows = read_csv(path, SceneError)
+    columns = dict(zip(header, zip(*(cells for _, cells in rows), strict=True), strict=False))
+    names = tuple(name for name in header if name not in ("time", "frame"))
+    if len(names) in (0, len(header)) or len(set(header)) < len(header) or not rows:
+        raise SceneError(
+            f"{path}: expected one column 'time' [s] or 'frame', one for each joint, and rows, but "
+            f"it has {len(rows)} rows of: {', '.join(header)}"
+        )
+    frames = columns.pop("frame", ())
+    if len(counts := Counter(map(frame_key, frames))) < len(frames):
+        raise SceneError(f"{path}: has frame {counts.most_common(1)[0][0]} more than once")
+    values = {name: np.empty(len(rows)) for name in columns}
+    for name, cells in columns.items():
+        for k, cell in enumerate(cells):
+            try:
+                values[name][k] = float(cell or "nan")
+            except ValueError:
+                raise SceneError(
+                    f"{path}: line {rows[k][0]}, column '{name}': '{cell[:40]}' is no number"
+                ) from None
+    positions = np.column_stack([values[name] for name in names])
+    if "time" not in values:
+        return JointLog(names, None, positions, frames), []
+    kept, warnings = ascending(values["time"], f"{path}: rows")
+    frames = tuple(frames[k] for k in kept) if frames else ()
+    return JointLog(names, values["time"][kept], positions[kept], frames), warnings
+
+
+def open_folder(path: Path, joints: JointLog | None) -> Episode:
+    """Opens `videos/<camera>.mp4` or `images/<camera>/<frame>.png`, and the table beside them.
+
+    Args:
+        joints: in place of the folder's `joint_angles.csv`.
+
+    Raises:
+        SceneError: pictures or the table cannot be used.
+        CameraError: the camera file cannot be used.
+    """
+    warnings: list[str] = []
+    if joints is None and (path / JOINT_TABLE).exists():
+        joints, warnings = read_joint_table(path / JOINT_TABLE)
+    known = CameraFile({}, ())
+    if (path / CAMERAS).exists():
+        known = load_camera_file(path / CAMERAS, distorted=True)
+    folders = {one.name: one for one in sorted(path.glob("images/*")) if one.is_dir()}
+    videos = {
+        one.stem: one for one in sorted(path.glob("videos/*")) if one.suffix.lower() in VIDEOS
+    }
+    cameras = []
+    for name in dict.fromkeys([*known.cameras, *folders, *videos]):
+        if name in folders:
+            camera, said = _of_images(name, folders[name], path / "scene.yaml", joints)
+        elif name in videos:
+            # Its pictures are called as a scene's are.
+            video = TimedVideo(videos[name])
+            frames = tuple(f"{k:06d}" for k in range(len(video.times)))
+            size, said = (video.width, video.height), video.warnings
+            camera = EpisodeCamera(name, *size, video.times, None, None, video.read, frames)
+        else:
+            warnings.append(f"camera '{name}' of {CAMERAS} has no pictures; it is left out")
+            continue
+        warnings += said
+        if name not in known.cameras:
+            warnings.append(f"camera '{name}' has no entry in {CAMERAS}: its lens is unknown")
+        cameras.append(_with_intrinsics(camera, known, path / CAMERAS))
+    return Episode.checked(path, cameras, joints, warnings)
+
+
+def _of_images(
+    name: str, folder: Path, scene: Path, joints: JointLog | None
+) -> tuple[EpisodeCamera, list[str]]:
+    """A camera whose pictures lie in a folder, and frames without picture or time."""
+    files, stamps, warnings = list_pictures(folder, SceneError), folder / TIME_STAMPS, list[str]()
+    frames = in_order(files)
+    if not frames:
+        raise SceneError(f"{folder}: holds no picture <frame>.png or .jpg of camera '{name}'")
+    times = np.full(len(frames), np.nan)
+    if stamps.is_file():
+        known = read_time_stamps(stamps)
+        if lacking := sorted(known.keys() ^ files.keys()):
+            warnings.append(
+                f"{stamps}: {len(lacking)} frames have no picture, or no time, and are left out; "
+                f"the first is {lacking[0]}"
+            )
+        common = [frame for frame in known if frame in files]
+        kept, late = ascending(np.array([known[frame] for frame in common]), str(stamps))
+        frames = tuple(common[k] for k in kept)
+        times, warnings = np.array([known[frame] for frame in frames]), warnings + late
+    elif joints is not None and joints.times is not None and joints.frames:
+        clock = JointLog(("time",), None, joints.times[:, None], joints.frames)
+        times = clock.of_frames(frames)[:, 0]
+    elif scene.is_file():
+        times = _by_rate(scene, len(frames))
+    pictures = [files[frame] for frame in frames]
+    height, width = read_picture(pictures[0], SceneError).shape[:2]
+
+    def recorded(k: int) -> Picture:
+        return read_picture(pictures[k], SceneError)
+
+    return EpisodeCamera(name, width, height, times, None, None, recorded, frames), warnings
+
+
+def _by_rate(scene: Path, count: int) -> Array:
+    """The times of a sequence's frames by its rate [s]; nan where it has none."""
+    content = read_yaml(scene, SceneError)
+    rate = content.get("frame_rate_hz") if isinstance(content, dict) else None
+    if rate is None:
+        return np.full(count, np.nan)
+    try:
+        return np.arange(count) / check_number(rate, "frame_rate_hz", str(scene), positive=True)
+    except CameraError as error:
+        raise SceneError(str(error)) from None
+
+
+def _with_intrinsics(camera: EpisodeCamera, known: CameraFile, path: Path) -> EpisodeCamera:
+    """The camera as its file has it; CameraError where the file is of other pictures."""
+    found, where = known.cameras.get(camera.name), f"{path}: camera '{camera.name}'"
+    if found is None:
+        return camera
+    if not isinstance(found, PinholeCamera):
+        raise CameraError(f"{where}: is parallel, but pictures are taken by pinholes")
+    if (found.width, found.height) != (camera.width, camera.height):
+        raise CameraError(
+            f"{where}: has {found.width} x {found.height} pixels (width x height), but its "
+            f"pictures {camera.width} x {camera.height}: give the numbers of these pictures"
+        )
+    link, lens = known.links.get(camera.name), None
+    if camera.name in known.distortions:
+        numbers = [found.focal_x, found.focal_y, found.center_x, found.center_y]
+        numbers += known.distortions[camera.name].tolist()
+        lens = Lens.from_numbers((found.width, found.height), numbers)
+        found = lens.camera(found.name, found.X_WC)
+    return replace(camera, camera=found, link=link, lens=lens)

@@ -1,0 +1,135 @@
+"""LeRobot data sets, written by pyarrow and PyAV as LeRobot 2.1 and 3.0 lay them out."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from drake_pose.camera.episodes.open import open_episode
+from drake_pose.errors import SceneError, UnknownNameError
+from tests.camera.episodes.recordings import number_of, numbered, write_video
+
+LENGTHS = {0: 8, 1: 6, 2: 9}
+TOP, WRIST, DEPTH = (f"observation.images.{name}" for name in ("top", "wrist", "depth"))
+V2 = "chunk-{episode_chunk:03d}/{video_key}/episode_{episode_index:06d}"
+V3 = "{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}"
+
+
+def write_info(folder: Path, version: str, template: str, names: Any) -> None:
+    features = {
+        "observation.state": {"dtype": "float32", "shape": [3], "names": names},
+        TOP: {"dtype": "video", "info": {"video.is_depth_map": False}},
+        DEPTH: {"dtype": "video", "info": {"video.is_depth_map": True}},
+        WRIST: {"dtype": "image"},
+        "timestamp": {"dtype": "float32", "shape": [1]},
+    }
+    paths = {"data_path": f"data/{template}.parquet", "video_path": f"videos/{template}.mp4"}
+    counts = {"total_episodes": 3, "chunks_size": 2, "fps": 10}
+    content = {"codebase_version": version, "features": features, **paths, **counts}
+    (folder / "meta").mkdir()
+    (folder / "meta" / "info.json").write_text(json.dumps(content))
+
+
+def write_rows(path: Path, episodes: list[int]) -> None:
+    import pyarrow.parquet
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    pairs = [(n, k) for n in episodes for k in range(LENGTHS[n])]
+    coded = [cv2.imencode(".png", numbered(50 + k)[:, :, ::-1])[1].tobytes() for _, k in pairs]
+    columns = {
+        "observation.state": [[0.1 * k, -1.0, 10.0 * n] for n, k in pairs],
+        WRIST: [{"bytes": data, "path": None} for data in coded],
+        "timestamp": [0.1 * k for _, k in pairs],
+        "episode_index": [n for n, _ in pairs],
+    }
+    pyarrow.parquet.write_table(pyarrow.table(columns), path)
+
+
+def write_v21(folder: Path, names: Any = (["pan", "lift", "grip"],)) -> None:
+    write_info(folder, "v2.1", V2, names)
+    for n, count in LENGTHS.items():
+        where = V2.format(episode_chunk=n // 2, video_key=TOP, episode_index=n)
+        numbers = [20 * n + k for k in range(count)]
+        write_video(folder / "videos" / f"{where}.mp4", numbers, codec="libsvtav1")
+        where = V2.format(episode_chunk=n // 2, video_key="", episode_index=n)
+        write_rows(folder / "data" / f"{where}.parquet", [n])
+
+
+def write_v30(folder: Path) -> None:
+    import pyarrow.parquet
+
+    write_info(folder, "v3.0", V3, {"motors": ["pan", "lift", "grip"]})
+    for file, own in enumerate(([0, 1], [2])):
+        where = V3.format(chunk_index=0, video_key="", file_index=file)
+        write_rows(folder / f"data/{where}.parquet", own)
+    numbers = [20 * n + k for n, count in LENGTHS.items() for k in range(count)]
+    write_video(
+        folder / f"videos/{V3.format(chunk_index=0, video_key=TOP, file_index=0)}.mp4", numbers
+    )
+    # LeRobot adds up durations, which are rounded.
+    begin = np.cumsum([0, *LENGTHS.values()]) * 0.1 + 1e-7
+    times = {"from_timestamp": begin[:-1], "to_timestamp": begin[1:]}
+    meta = {"chunk_index": [0, 0, 0], "file_index": [0, 0, 0], **times}
+    table = {"episode_index": [0, 1, 2], "data/chunk_index": [0] * 3, "data/file_index": [0, 0, 1]}
+    table |= {f"videos/{TOP}/{name}": values for name, values in meta.items()}
+    path = folder / "meta" / "episodes" / "chunk-000" / "file-000.parquet"
+    path.parent.mkdir(parents=True)
+    pyarrow.parquet.write_table(pyarrow.table(table | {"stats/max": [[9.0]] * 3}), path)
+
+
+@pytest.mark.parametrize("write", [write_v21, write_v30])
+def test_each_episode_has_its_own_pictures_and_rows(tmp_path: Path, write: Any) -> None:
+    write(tmp_path)
+    for n, count in LENGTHS.items():
+        episode = open_episode(tmp_path, episode=n)
+        assert (list(episode.cameras), episode.warnings) == (["top", "wrist"], ())
+        top, wrist, joints = episode.camera("top"), episode.camera("wrist"), episode.joints
+        for k in (count - 1, *range(count)):
+            assert (number_of(top.read(k)), number_of(wrist.read(k))) == (20 * n + k, 50 + k)
+        for times in (top.times, wrist.times, joints.times, joints.positions[:, 0]):
+            np.testing.assert_allclose(times, 0.1 * np.arange(count), atol=1e-6)
+        assert joints.names == ("pan", "lift", "grip")
+        assert (joints.positions[:, 2] == 10.0 * n).all()
+    with pytest.raises(UnknownNameError, match="has no episode '3'; it has: 0, 1, 2"):
+        open_episode(tmp_path, episode=3)
+    with pytest.raises(SceneError, match=r"--episode N\): of 3 these are here: 0, 1, 2"):
+        open_episode(tmp_path)
+
+
+def test_a_part_of_a_data_set_and_what_is_wrong_in_it(tmp_path: Path) -> None:
+    write_v21(tmp_path, names=None)
+    for n in (0, 1):
+        (tmp_path / f"data/chunk-000//episode_{n:06d}.parquet").unlink()
+    with pytest.raises(UnknownNameError, match="has no episode '1'; it has: 2"):
+        open_episode(tmp_path, episode=1)
+    assert open_episode(tmp_path).joints.names == ("joint_0", "joint_1", "joint_2")
+    video = write_video(tmp_path / f"videos/chunk-001/{TOP}/episode_000002.mp4", range(7))
+    assert "camera 'top': has 7 pictures of 9 rows" in open_episode(tmp_path).warnings[0]
+    video.unlink()
+    assert "camera 'top' is left out" in open_episode(tmp_path).warnings[0]
+    table, info = tmp_path / "data/chunk-001//episode_000002.parquet", tmp_path / "meta/info.json"
+    table.write_bytes(table.read_bytes()[:-40])
+    with pytest.raises(SceneError, match="a file of it is damaged"):
+        open_episode(tmp_path)
+    table.unlink()
+    with pytest.raises(SceneError, match="of 3 these are here: none"):
+        open_episode(tmp_path)
+    info.write_text(info.read_text().replace("v2.1", "v1.6"))
+    with pytest.raises(SceneError, match=r"version v1\.6, but 2\.0, 2\.1 and 3\.0 are read"):
+        open_episode(tmp_path)
+
+
+def test_a_recorded_data_set(shared_data: Path) -> None:
+    folder = shared_data / "humanoid_head_camera"
+    for n, count in ((10, 290), (20, 297)):
+        episode = open_episode(folder, episode=n)
+        one, joints = episode.camera("cam_high"), episode.joints
+        assert (one.width, one.height, len(one.times), episode.warnings) == (640, 480, count, ())
+        assert (len(joints.names), joints.names[3]) == (26, "kLeftElbow")
+        assert np.abs(joints.times - one.times).max() < 1e-5
+        np.testing.assert_array_equal(one.read(200), [one.read(k) for k in (199, 200)][1])
+    with pytest.raises(SceneError, match="of 100 these are here: 10, 20"):
+        open_episode(folder)

@@ -1,0 +1,321 @@
+"""Which column of a joint log is which joint of a model, and in which units it is."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from drake_pose.arrays import Array, Mask
+from drake_pose.camera.episodes.episode import JointLog
+from drake_pose.camera.models import check_number
+from drake_pose.errors import CameraError, SceneError, SettingsError, UnknownNameError
+from drake_pose.yaml_files import read_yaml
+
+UNITS = {"rad": 1.0, "deg": math.pi / 180.0}
+"""What one unit of an angle is [rad]."""
+
+_TABLE_UNITS = {**UNITS, "m": 1.0, "mm": 1e-3}
+# The fields that an entry may have beside its column.
+_WAYS = [{"from", "to"}, {"scale", "offset"}, {"scale"}, {"offset"}, {"unit"}, set[str]()]
+_WORDS = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+")
+_NUMBERED = re.compile(r"(\D*?)[_\-. ]?(\d+)")
+# Readings are inside limits up to this [rad], lengths up to this share of their range.
+_SLACK, _SLACK_SHARE = 0.1, 0.1
+# Nothing in radians is this far beyond its limits; a joint without limits turns so far at most.
+_FULL_TURN, _MOST_TURN = 2.0 * math.pi, 4.0 * math.pi
+# LeRobot's normalised readings end here, and are called so.
+_NORMALISED, _NORMALISED_NAME = (99.0, 100.001), ".pos"
+# A reading is at an end of its range within this share of it.
+_AT_END = 1e-6
+
+
+@dataclass(frozen=True)
+class Column:
+    """What makes a joint's positions of a column: position = scale reading + offset [rad or m].
+
+    Args:
+        ends: between which its readings are; one at an end says "here, or beyond".
+    """
+
+    name: str
+    scale: float = 1.0
+    offset: float = 0.0
+    ends: tuple[float, float] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class MappedJoints:
+    """A joint log in a model's terms.
+
+    Args:
+        log: by the model's names, in its order [rad or m]; nan where a joint is not logged.
+        clipped: (n, m) which readings are at an end of their range: the joint is there, or beyond.
+        not_logged: the model's joints that no column is of, to be held.
+        unused: the columns that are of no joint.
+        warnings: what was taken for what, and what is odd.
+    """
+
+    log: JointLog
+    clipped: Mask
+    not_logged: tuple[str, ...]
+    unused: tuple[str, ...]
+    warnings: tuple[str, ...]
+
+
+def map_joints(
+    log: JointLog,
+    names: Sequence[str],
+    lower: Array,
+    upper: Array,
+    is_angle: Mask,
+    *,
+    units: str | None = None,
+    table: Mapping[str, Column] | None = None,
+) -> MappedJoints:
+    """Puts a joint log in a model's names, order and units.
+
+    Args:
+        names: (m,) the model's joints.
+        lower, upper: (m,) their limits, infinite where they have none [rad or m].
+        is_angle: (m,) which of them turn.
+        units: of angles that the table does not have: "rad" or "deg"; None: what the limits say.
+        table: the columns of some joints, as `read_joint_map` gives them.
+
+    Raises:
+        SceneError: no column is a joint, or the readings look like neither radians nor degrees.
+        UnknownNameError: the table has a joint or a column that is not there.
+        SettingsError: other units.
+    """
+    if units not in (None, *UNITS):
+        raise SettingsError(f"units must be {' or '.join(UNITS)}, not {units!r}")
+    columns, warnings = _find_columns(log, names, lower, upper, is_angle, units, table or {})
+    positions = np.full((len(log.positions), len(names)), np.nan)
+    clipped = np.zeros(positions.shape, dtype=np.bool_)
+    for k, joint in enumerate(names):
+        if joint in columns:
+            column = columns[joint]
+            readings = log.positions[:, log.names.index(column.name)]
+            limits = float(lower[k]), float(upper[k])
+            positions[:, k], clipped[:, k], said = _positions(column, readings, limits, is_angle[k])
+            warnings += [f"joint '{joint}': column '{column.name}' {text}" for text in said]
+    missing = tuple(name for name in names if name not in columns)
+    taken = {column.name for column in columns.values()}
+    unused = tuple(name for name in log.names if name not in taken)
+    if missing:
+        warnings.append(f"joints that are not logged: {', '.join(missing)}")
+    if unused:
+        warnings.append(f"columns of the joint log that are no joint: {', '.join(unused)}")
+    mapped = JointLog(tuple(names), log.times, positions, log.frames)
+    return MappedJoints(mapped, clipped, missing, unused, tuple(warnings))
+
+
+def _find_columns(
+    log: JointLog,
+    names: Sequence[str],
+    lower: Array,
+    upper: Array,
+    is_angle: Mask,
+    units: str | None,
+    table: Mapping[str, Column],
+) -> tuple[dict[str, Column], list[str]]:
+    """The column of each joint that has one, and what was taken for what; as map_joints has it."""
+    columns = dict(table)
+    for joint, column in columns.items():
+        if joint not in names:
+            raise UnknownNameError("joint", joint, names, "the model, which the joint map is for,")
+        if column.name not in log.names:
+            raise UnknownNameError("column", column.name, log.names, "the joint log")
+    used = {column.name for column in columns.values()}
+    free = [name for name in names if name not in columns]
+    matched, warnings = match_names([name for name in log.names if name not in used], free)
+    if not (matched or columns):
+        raise SceneError(
+            f"no column of the joint log is a joint of the model: its columns are "
+            f"{', '.join(log.names)}, the joints {', '.join(names)}; give a joint map "
+            "(JOINT: {column: COLUMN})"
+        )
+    turning = {c: list(names).index(j) for c, j in matched.items()}
+    turning = {column: k for column, k in turning.items() if is_angle[k]}
+    if turning and units is None:
+        table_of = dict(zip(log.names, log.positions.T, strict=True))
+        angles, rows = {column: table_of[column] for column in turning}, list(turning.values())
+        others = np.array([one for name, one in table_of.items() if name not in used])
+        units, why = _find_unit(angles, others, lower[rows], upper[rows])
+        warnings.append(f"angles of the joint log are read in {units} (units): {why}")
+    scale = UNITS[units or "rad"]
+    columns |= {j: Column(c, scale if c in turning else 1.0) for c, j in matched.items()}
+    return columns, warnings
+
+
+def match_names(logged: Sequence[str], wanted: Sequence[str]) -> tuple[dict[str, str], list[str]]:
+    """Which logged name is which of the wanted ones, and what was taken for what.
+
+    Names are the same that differ in case, separators, a leading k or a last "joint"; then those of
+    which one ends as the other alone does. Where a log has only numbers that are not the model's,
+    they are its joints in order, if there are as many.
+    """
+    matched = {name: name for name in logged if name in wanted}
+    guesses: dict[str, str] = {}
+    for alike in (lambda a, b: a == b, _is_suffix):
+        left = [name for name in logged if name not in matched]
+        free = [name for name in wanted if name not in matched.values()]
+        pairs = [(a, b) for a in left for b in free if alike(_words(a), _words(b))]
+        for a, b in pairs:
+            if sum(a == c for c, _ in pairs) == 1 and sum(b == d for _, d in pairs) == 1:
+                matched[a] = b
+                guesses |= {a: b} if alike is _is_suffix else {}
+    series = [name for name in logged if _NUMBERED.fullmatch(name)]
+    starts = {_NUMBERED.sub(r"\1", name) for name in series}
+    if len(series) > 1 and len(starts) == 1 and any(name not in matched for name in series):
+        # joint_1 of joint_0 to joint_6 is not joint1 of joint1 to joint7.
+        matched = {a: b for a, b in matched.items() if a not in series}
+        guesses = {a: b for a, b in guesses.items() if a not in series}
+        free = [name for name in wanted if name not in matched.values()]
+        if len(free) == len(series):
+            inorder = sorted(series, key=lambda name: int(_words(name)[-1]))
+            guesses |= dict(zip(inorder, free, strict=True))
+            matched |= guesses
+    if not guesses:
+        return matched, []
+    taken = ", ".join(f"{a} for {b}" for a, b in guesses.items())
+    return matched, [f"columns of the joint log are taken by what their names are like: {taken}"]
+
+
+def _words(name: str) -> list[str]:
+    """The words and numbers of a name, without what says only that it is a joint."""
+    words = [word.lower() for word in _WORDS.findall(name)]
+    if len(words) > 1 and re.match("k[A-Z]", name):
+        words = words[1:]
+    while len(words) > 1 and words[-1] in ("joint", "pos"):
+        words = words[:-1]
+    return words
+
+
+def _is_suffix(a: Sequence[str], b: Sequence[str]) -> bool:
+    """Whether one of two names ends as the other, which is more than a number."""
+    short, long = sorted((a, b), key=len)
+    return any(word.isalpha() for word in short) and long[-len(short) :] == short
+
+
+def _find_unit(
+    readings: Mapping[str, Array], others: Array, lower: Array, upper: Array
+) -> tuple[str, str]:
+    """The unit of the columns (n,) of angles, and why.
+
+    Args:
+        others: all readings that nobody has told the units of.
+        lower, upper: limits of each column's joint [rad].
+
+    Raises SceneError: they look like neither radians nor degrees.
+    """
+    low, high = np.maximum(lower, -_MOST_TURN), np.minimum(upper, _MOST_TURN)
+    # These pass over readings that are missing.
+    least, most = (f.reduce(list(readings.values()), axis=1) for f in (np.fmin, np.fmax))
+    off = {k: np.fmax(low - one * least, one * most - high) for k, one in UNITS.items()}
+    worst = {unit: float(np.fmax.reduce(one)) for unit, one in off.items()}
+    reach = np.fmax.reduce(np.abs(others), axis=None)
+    k = int(np.argmax(np.nan_to_num(off["rad"])))
+    column = list(readings)[k]
+    reason = (
+        f"are not all within the joints' limits as radians ('{column}' is {least[k]:.4g} to "
+        f"{most[k]:.4g}), nor surely degrees"
+    )
+    is_named = any(name.endswith(_NORMALISED_NAME) for name in readings)
+    if is_named or _NORMALISED[0] <= reach <= _NORMALISED[1]:
+        reason = "look as if they were normalised to -100 ... 100, as LeRobot's are"
+    elif worst["rad"] <= _SLACK and worst["deg"] <= 0.0:
+        return "rad", "they would lie within the limits as degrees, too"
+    elif worst["rad"] <= _SLACK:
+        return "rad", "only as these all lie within the limits"
+    elif worst["deg"] <= _SLACK and worst["rad"] > _FULL_TURN:
+        return "deg", "only as these all lie within the limits"
+    raise SceneError(
+        f"the readings of the joint log ({', '.join(readings)}) {reason}: say units: rad or deg, "
+        "or give a joint map with the range of each: JOINT: {column: COLUMN, from: [-100, 100], "
+        "to: [LOWEST, HIGHEST]} in radians"
+    )
+
+
+def _positions(
+    column: Column, readings: Array, limits: tuple[float, float], is_angle: bool
+) -> tuple[Array, Mask, list[str]]:
+    """A joint's positions, which readings are at an end, and what is odd in the column."""
+    found, clipped, said = (
+        column.scale * readings + column.offset,
+        np.zeros(len(readings), bool),
+        list[str](),
+    )
+    if column.ends is not None:
+        low, high = sorted(column.ends)
+        slack = _AT_END * (high - low)
+        clipped = (np.abs(readings - low) <= slack) | (np.abs(readings - high) <= slack)
+        if beyond := int(((readings < low - slack) | (readings > high + slack)).sum()):
+            said.append(
+                f"has {beyond} of {len(readings)} readings beyond {low:g} ... {high:g}, between "
+                "which the joint map says that they are"
+            )
+    lower, upper = limits
+    if not math.isfinite(upper - lower):
+        # Between readings on either side of half a turn it is there, and not at 0.
+        is_known = np.isfinite(found)
+        found[is_known] = np.unwrap(found[is_known]) if is_angle else found[is_known]
+        return found, clipped, said
+    off = np.nan_to_num(np.maximum(lower - found, found - upper), nan=-np.inf)
+    row = int(np.argmax(off))
+    if off[row] > (_SLACK if is_angle else _SLACK_SHARE * (upper - lower)):
+        said.append(
+            f"puts it at {found[row]:.4g} in row {row}, outside its limits {lower:.4g} to "
+            f"{upper:.4g}: is it another joint's, its zero or sign another, its unit another?"
+        )
+    return found, clipped, said
+
+
+def read_joint_map(path: Path) -> dict[str, Column]:
+    """Reads the columns of joints; SceneError names the file, the joint and the field.
+
+    A joint has `column`, its own name where not given, and either `from` and `to` (the ends of the
+    readings, and the positions there [rad or m]), or `scale` and `offset` (position = scale reading
+    + offset), or `unit` (rad, deg, m, mm).
+    """
+    content = read_yaml(path, SceneError)
+    if not isinstance(content, dict) or not content:
+        raise SceneError(f"{path}: expected a mapping from joints to their columns")
+    found = {}
+    for joint, entry in content.items():
+        try:
+            found[str(joint)] = _read_column(str(joint), entry, f"{path}: joint '{joint}'")
+        except CameraError as error:
+            raise SceneError(str(error)) from None
+    return found
+
+
+def _read_column(joint: str, entry: Any, where: str) -> Column:
+    """The column of one entry of a joint map; CameraError where it is none."""
+    given = set(entry) - {"column"} if isinstance(entry, dict) else {None}
+    if given not in _WAYS:
+        ways = " or ".join("{" + ", ".join(sorted(map(str, way))) + "}" for way in _WAYS if way)
+        raise CameraError(f"{where}: expected {{column: NAME}} and one of {ways}")
+    name, unit = str(entry.get("column", joint)), entry.get("unit", "rad")
+    if unit not in _TABLE_UNITS:
+        raise CameraError(f"{where}: unit must be one of {', '.join(_TABLE_UNITS)}")
+    if "from" in given:
+        (a, b), (c, d) = (_pair(entry[end], end, where) for end in ("from", "to"))
+        scale = (d - c) / (b - a)
+        return Column(name, scale, c - scale * a, (a, b))
+    scale = check_number(entry.get("scale", _TABLE_UNITS[unit]), "scale", where)
+    return Column(name, scale, check_number(entry.get("offset", 0.0), "offset", where))
+
+
+def _pair(value: Any, field: str, where: str) -> tuple[float, float]:
+    """Two different numbers."""
+    low, high = value if isinstance(value, list) and len(value) == 2 else (0.0, 0.0)
+    low, high = (check_number(one, field, where) for one in (low, high))
+    if low == high:
+        raise CameraError(f"{where}: {field} must be two different numbers, [LOWEST, HIGHEST]")
+    return low, high

@@ -1,0 +1,201 @@
+"""Which column is which joint, in which unit: never assumed without a word."""
+
+import math
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+
+from drake_pose.camera.episodes.episode import JointLog
+from drake_pose.camera.episodes.joint_map import (
+    Column,
+    MappedJoints,
+    map_joints,
+    match_names,
+    read_joint_map,
+)
+from drake_pose.camera.episodes.open import open_episode
+from drake_pose.errors import SceneError, SettingsError, UnknownNameError
+
+LOW = np.array([-2.9, -1.8, -2.9, -3.1, -2.9, -0.1, -2.9])
+HIGH = np.array([2.9, 1.8, 2.9, -0.1, 2.9, 3.8, 2.9])
+ARM = {"names": tuple(f"panda_joint{k}" for k in range(1, 8)), "lower": LOW, "upper": HIGH}
+POSES = np.array([[0.1, -0.5, 0.3, -2.4, 0.2, 2.0, 0.7], [0.2, -0.4, 0.1, -2.0, 0.1, 1.5, 0.9]])
+
+
+def mapped(
+    logged: tuple[str, ...], readings: Any, model: dict[str, Any], **more: Any
+) -> MappedJoints:
+    readings = np.array(readings, dtype=float)
+    log = JointLog(logged, 0.1 * np.arange(len(readings)), readings)
+    is_angle = [not name.startswith("slide") for name in model["names"]]
+    return map_joints(log, **model, is_angle=np.array(is_angle), **more)
+
+
+@pytest.mark.parametrize(
+    ("logged", "wanted", "found"),
+    [
+        ("b a", "a b", [1, 0]),
+        ("Shoulder-Pan elbow.pos", "shoulder_pan elbow", [0, 1]),
+        ("kLeftElbow kRightElbow", "right_elbow_joint left_elbow_joint", [1, 0]),
+        ("joint1 joint2", "panda_joint1 panda_joint2", [0, 1]),
+        ("panda_joint1 main_elbow", "elbow joint1", [1, 0]),
+        # Not unique, from either side; and words end as words do: bow is no elbow, 1 is no 11.
+        ("elbow", "left_elbow right_elbow", [None]),
+        ("left_elbow right_elbow", "elbow", [None, None]),
+        ("bow joint1", "elbow joint11", [None, None]),
+        # Numbers alone, which do not begin where the model's do, are its joints in order.
+        ("joint_0 joint_2 joint_1", "j1 j2 j3", [0, 2, 1]),
+        ("joint_0 joint_1", "panda_joint1 panda_joint2", [0, 1]),
+        ("joint_0 joint_1", "panda_joint1 panda_joint2 finger", [None, None]),
+        ("m0 m1 finger", "a1 a2 finger", [0, 1, 2]),
+    ],
+)
+def test_names(logged: str, wanted: str, found: list[int | None]) -> None:
+    names, joints = logged.split(), wanted.split()
+    expected = {a: joints[k] for a, k in zip(names, found, strict=True) if k is not None}
+    matched, said = match_names(names, joints)
+    assert matched == expected
+    if "0" in logged and expected:
+        assert all(f"{a} for {b}" in said[0] for a, b in expected.items() if a != b)
+
+
+def test_positions_are_in_the_models_order_and_what_is_missing_is_named() -> None:
+    order = [6, 5, 3, 2, 1, 0]
+    names = ("gripper", *(f"joint{k + 1}" for k in order))
+    found = mapped(names, np.column_stack([[0.5, 0.6], POSES[:, order]]), ARM)
+    expected = np.where(np.arange(7) == 4, np.nan, POSES)
+    np.testing.assert_array_equal(found.log.positions, expected)
+    np.testing.assert_allclose(found.log.at(np.array([0.05]))[0, 0], 0.15)
+    assert (found.not_logged, found.unused) == (("panda_joint5",), ("gripper",))
+    assert found.warnings[-2:] == (
+        "joints that are not logged: panda_joint5",
+        "columns of the joint log that are no joint: gripper",
+    )
+    with pytest.raises(SceneError, match=r"its columns are x, y, the joints panda_joint1,"):
+        mapped(("x", "y"), np.zeros((2, 2)), ARM)
+
+
+def test_units_are_told_or_follow_from_the_limits() -> None:
+    names, degrees = ARM["names"], np.rad2deg(POSES)
+    wide = ARM | {"lower": np.full(7, -3.0), "upper": np.full(7, 3.0)}
+    holes = np.where(np.eye(2, 7, dtype=bool), np.nan, POSES)
+    for readings, model, units, words in (
+        (POSES, ARM, None, "read in rad (units): only as these"),
+        (holes, ARM, None, "read in rad (units): only as these"),
+        (degrees, ARM, None, "read in deg (units): only as these"),
+        (POSES, wide, None, "read in rad (units): they would lie within the limits as degrees"),
+        (POSES, ARM, "rad", None),
+        (degrees, ARM, "deg", None),
+    ):
+        found = mapped(names, readings, model, units=units)
+        expected = holes if readings is holes else POSES
+        np.testing.assert_allclose(found.log.positions, expected, atol=1e-12)
+        assert words in found.warnings[0] if words else found.warnings == ()
+    # 0.3 rad beyond a limit is no reason to take radians for degrees.
+    beyond = [[3.3, *np.zeros(6)]]
+    with pytest.raises(SceneError, match=r"'panda_joint1' is 3\.3 to 3\.3.*nor surely degrees"):
+        mapped(names, beyond, wide)
+    told = mapped(names, beyond, wide, units="rad").warnings[0]
+    assert "joint 'panda_joint1': column 'panda_joint1' puts it at 3.3 in row 0" in told
+    with pytest.raises(SettingsError, match="units must be rad or deg, not 'turns'"):
+        mapped(names, POSES, ARM, units="turns")
+
+
+def test_normalised_readings_ask_for_their_ranges() -> None:
+    limits = {"lower": np.full(2, -1.92), "upper": np.full(2, 1.92)}
+    model, names = {"names": ("pan", "lift"), **limits}, ("main_pan", "main_lift", "claw")
+    # As degrees they would all be within 110.
+    for columns, readings in (
+        (names, [[-99.5, 3.0, 1.0], [40.0, 9.0, 2.0]]),
+        (names, [[-60.0, 3.0, 1.0], [40.0, 9.0, 100.0]]),
+        (("pan.pos", "lift.pos"), [[-40.0, 3.0], [40.0, 9.5]]),
+    ):
+        with pytest.raises(SceneError, match=r"normalised.*say units.*from: \[-100, 100\]"):
+            mapped(columns, readings, model)
+    pan = Column("main_pan", 0.0192, 0.0, (-100.0, 100.0))
+    table = {"pan": pan, "lift": Column("main_lift", 0.01)}
+    found = mapped(names, [[-100.0, 3.0, 0], [50.0, 2.0, 0], [100.0, 0, 0]], model, table=table)
+    np.testing.assert_allclose(found.log.positions[:, 0], [-1.92, 0.96, 1.92])
+    np.testing.assert_array_equal(found.clipped, [[True, False], [False, False], [True, False]])
+    beside = mapped(names[:2], [[-100.0, 1.0]], {**model, "names": ("pan", "main_lift")},
+                    table={"pan": pan}).warnings[0]  # fmt: skip
+    assert "read in rad" in beside
+    said = mapped(names, [[-101.0, 3.0, 0.0]], model, table=table).warnings[0]
+    assert "joint 'pan': column 'main_pan' has 1 of 1 readings beyond -100 ... 100" in said
+
+
+def test_a_joint_without_limits_counts_on_over_a_turn() -> None:
+    turning = np.linspace(0.0, 9.0, 30)
+    read = np.arctan2(np.sin(turning), np.cos(turning))[:, None]
+    read[7] = turning[7] = np.nan
+    model = {"names": ("wheel",), "lower": np.array([-np.inf]), "upper": np.array([np.inf])}
+    found = mapped(("wheel",), read, model).log.positions[:, 0]
+    np.testing.assert_allclose(found, turning, atol=1e-12)
+
+
+def test_tables_of_joints(tmp_path: Path) -> None:
+    path = tmp_path / "joint_map.yaml"
+    path.write_text(
+        "shoulder_pan: {column: main_shoulder_pan, from: [100, -100], to: [-1.92, 1.92]}\n"
+        "finger_joint: {column: gripper_position, scale: 0.8, offset: 0.1}\n"
+        "wrist: {column: wrist_deg, unit: deg}\n"
+        "slide: {unit: mm}\n"
+    )
+    limits = {"lower": np.array([-2.0, 0.0, -2.0, 0.0]), "upper": np.array([2.0, 1.0, 2.0, 0.5])}
+    model = {"names": ("shoulder_pan", "finger_joint", "wrist", "slide"), **limits}
+    log = ("wrist_deg", "gripper_position", "main_shoulder_pan", "slide")
+    readings = [[90.0, 0.5, 50.0, 250.0], [-45.0, 1.0, 100.0, 0.0]]
+    found = mapped(log, readings, model, table=read_joint_map(path))
+    expected = [[-0.96, 0.5, math.pi / 2, 0.25], [-1.92, 0.9, -math.pi / 4, 0.0]]
+    np.testing.assert_allclose(found.log.positions, expected, atol=1e-12)
+    assert found.clipped.tolist() == [[False] * 4, [True, False, False, False]]
+    assert found.warnings == ()
+    for text, message in (
+        ("a: {from: [-1, 1]}", r"joint 'a': expected \{column: NAME\} and one of \{from, to\}"),
+        ("a: {unit: deg, scale: 2}", "joint 'a': expected"),
+        ("a: 3", "joint 'a': expected"),
+        ("a: {unit: turns}", "joint 'a': unit must be one of rad, deg, m, mm"),
+        ("a: {from: [1, 1], to: [0, 1]}", "joint 'a': from must be two different numbers"),
+        ("a: {scale: much}", "joint 'a': scale must be a finite number"),
+        ("[]", "a mapping from joints"),
+    ):
+        path.write_text(text)
+        with pytest.raises(SceneError, match=message):
+            read_joint_map(path)
+    for table, message in (
+        ({"b": Column("panda_joint1")}, r"the model.* has no joint 'b'; it has: panda"),
+        ({"panda_joint1": Column("b")}, "the joint log has no column 'b'; it has: panda"),
+    ):
+        with pytest.raises(UnknownNameError, match=message):
+            mapped(ARM["names"], POSES, ARM, table=table)
+
+
+def joints_of(urdf: Path) -> dict[str, Any]:
+    """The moving joints of a URDF that no other joint moves, and their limits."""
+    moving = [one for one in ElementTree.parse(urdf).iter("joint") if one.get("type") != "fixed"]
+    moving = [one for one in moving if one.find("mimic") is None]
+    sides = {
+        side: [float(one.find("limit").get(side)) for one in moving] for side in ("lower", "upper")
+    }
+    arrays = {side: np.array(values) for side, values in sides.items()}
+    return {"names": tuple(one.get("name") for one in moving), **arrays}
+
+
+def test_recorded_logs(shared_data: Path) -> None:
+    """A humanoid's fourteen arm joints are in its URDF's order, as its README says."""
+    folder = shared_data / "humanoid_head_camera"
+    log = open_episode(folder, episode=10).joints
+    model = joints_of(folder / "robot" / "g1_upper_body_from_torso.urdf")
+    found = mapped(log.names, log.positions, model)
+    arms = [k for k, name in enumerate(model["names"]) if name not in found.not_logged]
+    np.testing.assert_array_equal(found.log.positions[:, arms], log.positions[:, :14])
+    assert found.unused == log.names[14:]
+    robot = joints_of(shared_data / "droid_episodes" / "robot" / "panda_robotiq.urdf")
+    log = open_episode(shared_data / "droid_episodes" / "cloth").joints
+    table = {"finger_joint": Column("gripper_position", 0.8)}
+    found = mapped(log.names, log.positions, robot, table=table)
+    assert found.not_logged == ()
+    np.testing.assert_allclose(found.log.positions[:, -1], 0.8 * log.positions[:, -1])

@@ -28,10 +28,11 @@ def register(
     out: Out,
     joints: Annotated[Path | None, Parameter(alias="-j")] = None,
     settings: Annotated[RegistrationSettings | None, SPREAD] = None,
+    cameras: Path | None = None,
     overlay: Overlay = True,
     json: Json = False,
 ) -> None:
-    r"""Find where cameras stand, from masks of a robot or a person: no board, no guess.
+    r"""Find where cameras stand, from masks or a robot's recorded episode: no board, no guess.
 
     All rotations of a camera are tried; the best are fitted by the robot's contour, in the end only
     to what fits. The answer has a standard deviation for place and rotation, other poses that fit
@@ -44,27 +45,39 @@ def register(
     robot on its base, two for a person; then the poses and the missing cameras are fitted together.
     --joints may also be the poses.csv of an estimate, in which the base may move.
 
-    Files in DIR: cameras.yaml, which estimate reads; report.html, which shows all of it;
-    registration.yaml (6 x 6 covariance, other poses); summary.json; overlay/.
+    An episode needs no masks: pictures or videos beside joint positions by time or frame, a LeRobot
+    data set, a folder of DROID, a ROS bag. The camera must stand still, and the robot move in view
+    of it. By how much pictures and joints are out of step is found, too, and focal lengths that
+    nobody knows.
 
-    A robot arm whose camera nobody measured:
+    Files in DIR: cameras.yaml, which estimate reads; report.html, which shows all of it;
+    registration.yaml (6 x 6 covariance, other poses); summary.json; overlay/; of an episode masks/
+    and joint_angles.csv, a scene of the frames that were looked at.
+
+    A robot arm whose camera nobody measured, and an episode of DROID:
 
         drake-pose register ../shared/data/arm_one_view --out results/camera \
           --model ../shared/data/arm_two_views/med7/med7.urdf \
           --joints ../shared/data/arm_one_view/joint_angles.csv
 
+        drake-pose register ../shared/data/droid_episodes/short --out results/episode --focal \
+          --model ../shared/data/droid_episodes/robot/panda_robotiq.urdf
+
     Args:
         scene: Folder with cameras.yaml, in which X_WC may be missing, and
-            masks/<camera>/<frame>.png.
+            masks/<camera>/<frame>.png; or an episode: a folder or file.
         joints: Joint positions of every frame [rad or m]: a CSV file with the column frame and one
-            for each joint. Default: they are estimated from the cameras that have an X_WC.
+            for each joint; of an episode also by time. Default: an episode's own; of a scene they
+            are estimated from the cameras that have an X_WC.
+        cameras: Camera file in place of the scene's or episode's own.
     """
     from drake_pose.jobs.registration.register import register_scene
 
     with count_progress("cameras", None) as advance:
         result = register_scene(
-            scene, model, joints, out, settings, overlay=overlay, on_camera=advance
-        )
+            scene, model, joints, out, settings, cameras=cameras, overlay=overlay,
+            on_camera=advance,
+        )  # fmt: skip
     print_result(result, json, _print_registration)
 
 
@@ -146,6 +159,9 @@ def _print_registration(result: SceneRegistration) -> None:
         )
     console.print(frames)
     console.print(table)
+    for name, one in result.summary["cameras"].items():
+        if one["masks"] == "found":
+            console.print(escape(f"camera '{name}': {_say_clock(one)}"), soft_wrap=True)
     first = next(iter(result.summary["cameras"].values()))
     for key, title, of, what in PARAMETERS:
         if first[key]:
@@ -164,6 +180,21 @@ def _print_registration(result: SceneRegistration) -> None:
     if result.folder is not None:
         for label, file in (("cameras", CAMERA_FILE), ("report", REPORT)):
             console.print(f"{label:<14} {escape(str(result.folder / file))}", soft_wrap=True)
+
+
+def _say_clock(one: Mapping[str, Any]) -> str:
+    """How a camera's clock stands to the joints', and its focal length, where that was found."""
+    texts = []
+    if one["time_offset_s"] is not None:
+        value, deviation = 1e3 * one["time_offset_s"], 1e3 * one["time_offset_sd_s"]
+        word = "later" if value > 0.0 else "earlier"
+        texts.append(
+            f"its pictures show the joints of {abs(value):.0f} ms {word} by the joint log's clock "
+            f"(sd {deviation:.0f} ms)"
+        )
+    if one["focal_sd_px"] is not None:
+        texts.append(f"focal length {one['focal_px']:.1f} pixels (sd {one['focal_sd_px']:.1f})")
+    return "; ".join(texts) or "its clock is not told apart from the joints'"
 
 
 def _say_target(target: Mapping[str, Any]) -> str:

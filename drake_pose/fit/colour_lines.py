@@ -70,6 +70,7 @@ def compare_lines(
     A: Array,
     b: Array,
     sums: Array,
+    width: float = 0.0,
 ) -> None:
     """Adds what one camera's picture says of the nodes' affine motions.
 
@@ -83,16 +84,19 @@ def compare_lines(
         step: from offset to offset [pixel].
         A, b, sums: (nodes, 12, 12), (nodes, 12) and (nodes + 1, 6) added to, as of
             `compare_contours`; lengths are of lines that say something, by how much they do.
+        width: the body looks wider than it is by so much on all sides [pixel].
     """
     contour = sample_contour(packed, seen_from(camera[0], X_WN), camera[1], weights[2])
     uv, normals, lengths, nodes, p_N, clearances = contour
     noise = (weights[1] / 2.5) ** 2
     rows, p, w = np.empty((2, 3)), np.empty(3), np.empty(12)
-    scratch = np.empty((3, 2 * _BLOCKS + 2))
+    scratch, place = np.empty((3, 2 * _BLOCKS + 2)), np.empty(2)
     for i in range(len(uv)):
         node = nodes[i]
+        for k in range(2):
+            place[k] = uv[i, k] + width * normals[i, k]
         edge, variance = _find_edge(
-            picture, histograms[node], uv[i], normals[i], clearances[i], step, scratch
+            picture, histograms[node], place, normals[i], clearances[i], step, scratch
         )
         if variance > 0.0:
             add_residual(

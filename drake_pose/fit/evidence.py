@@ -54,6 +54,21 @@ class Evidence(NamedTuple):
     starts: NDArray[np.int64]
 
 
+class FrameEvidence(NamedTuple):
+    """All that a frame tells.
+
+    Attributes:
+        edges: of its silhouettes, camera after camera.
+        odds: of each camera a picture (H, W, 3) whose colours are odds (``fit.background``), or
+            None; empty: of none.
+        rates: (m,) how fast the pose tree's values change [rad/s or m/s]; None: nobody knows.
+    """
+
+    edges: Evidence
+    odds: tuple[NDArray[np.uint8] | None, ...] = ()
+    rates: Array | None = None
+
+
 def pack_evidence(edges: Sequence[EdgePoints]) -> Evidence:
     """The edges of each camera's silhouette in one; one without points says nothing."""
     return Evidence(

@@ -11,7 +11,9 @@ from scipy.linalg import block_diag
 
 from drake_pose.camera.models import Camera
 from drake_pose.errors import SettingsError
+from drake_pose.fit.background import odds_of_colours
 from drake_pose.fit.camera_sums import Views
+from drake_pose.fit.colour_lines import compare_lines
 from drake_pose.fit.contour_fit import (
     Comparison,
     ContourFit,
@@ -20,7 +22,7 @@ from drake_pose.fit.contour_fit import (
     symmetric,
 )
 from drake_pose.fit.covariance import Picture
-from drake_pose.fit.evidence import Evidence, widened
+from drake_pose.fit.evidence import Evidence, FrameEvidence, widened
 from drake_pose.fit.kernel import COMPARED, COST, FITTING, WEIGHT
 from drake_pose.fit.levenberg_marquardt import (
     AnnealingStage,
@@ -38,8 +40,13 @@ Array = NDArray[np.float64]
 WIDTH = "width"
 """By how much a silhouette is too wide on all sides [pixel]: a parameter of each camera."""
 
+TIME_OFFSET = "time_offset"
+"""By how much later than their positions pictures were taken [s]: a parameter of the frame."""
+
 # Of an unknown of which nothing is told: one over the variance.
 _LEAST_INFORMATION = 1e-4
+# From offset to offset of lines across contours in odds of pixels [scale].
+_OFFSET = 0.4
 # What follows a width is told by differences over so much to either side [pixel].
 _WIDTH_STEP = 0.25
 
@@ -85,9 +92,10 @@ class FittedFrames:
 
 
 def parameter_names(body: BodyParameters, cameras: Sequence[Camera]) -> tuple[str, ...]:
-    """All parameters of a frame: the body's, the cameras' CAMERA_NAMES, and their WIDTHs."""
+    """All parameters of a frame: the body's, TIME_OFFSET, CAMERA_NAMES of each camera, WIDTHs."""
     looks = [f"{camera.name}.{name}" for camera in cameras for name in CAMERA_NAMES]
-    return (*body.names, *looks, *(f"{camera.name}.{WIDTH}" for camera in cameras))
+    widths = [f"{camera.name}.{WIDTH}" for camera in cameras]
+    return (*body.names, TIME_OFFSET, *looks, *widths)
 
 
 class FramesFit:
@@ -127,8 +135,10 @@ class FramesFit:
         self.names = parameter_names(body, cameras)
         self.unknowns = unknowns
         self._contours = ContourFit(kinematics, body.outlines, noise, steps, pixels, body)
+        self._first_look = len(body.names) + 1
         self._first_width = len(self.names) - len(cameras)
-        self._fixed = not np.any(unknowns.entries >= len(body.names))
+        self._of_odds = odds_of_colours(len(body.outlines))
+        self._fixed = not np.any(unknowns.entries >= self._first_look)
         # A body is placed faster that neither grows nor is shifted.
         self._values = len(kinematics.names)
         places = (unknowns.entries >= self._values) & (unknowns.entries < len(body.names))
@@ -136,7 +146,7 @@ class FramesFit:
 
     def fit(
         self,
-        frames: Sequence[Evidence],
+        frames: Sequence[Evidence | FrameEvidence],
         held: Array,
         own: Array,
         shared: Array,
@@ -149,7 +159,7 @@ class FramesFit:
         """Fits the unknowns.
 
         Args:
-            frames: the edges that the cameras see in each.
+            frames: what the cameras see in each.
             held: (frames, n) each frame's parameters where all unknowns are 0, such as an encoder's
                 readings; or with fewer columns, those of the body's first parameters.
             own, shared: (frames, p) and (q,) where to start.
@@ -196,7 +206,7 @@ class FramesFit:
 
     def equations(
         self,
-        frames: Sequence[Evidence],
+        frames: Sequence[Evidence | FrameEvidence],
         held: Array,
         own: Array,
         shared: Array,
@@ -211,7 +221,7 @@ class FramesFit:
 
     def _equations(
         self,
-        frames: Sequence[Evidence],
+        frames: Sequence[Evidence | FrameEvidence],
         base: Array,
         at: tuple[Array, Array],
         about: tuple[Array, Array],
@@ -244,15 +254,17 @@ class FramesFit:
         return Equations(H, g, cost + float(off @ information @ off)), np.array(shares)
 
     def _frame(
-        self, evidence: Evidence, theta: Array, step: AnnealingStage
+        self, evidence: Evidence | FrameEvidence, theta: Array, step: AnnealingStage
     ) -> tuple[Array, Array, Array]:
         """A frame's equations of the unknowns, and its sums."""
         compared, (_, _, motions) = self.compare(evidence, theta, step)
+        rates = evidence.rates if isinstance(evidence, FrameEvidence) else None
         if self._fixed:
-            told = [(self._moves(compared, motions, 0), compared.total.A, compared.total.b)]
+            moves = self._moves(compared, motions, 0, rates)
+            told = [(moves, compared.total.A, compared.total.b)]
         else:
             told = [
-                (self._moves(compared, motions, c), A, b)
+                (self._moves(compared, motions, c, rates), A, b)
                 for c, (A, b) in enumerate(zip(compared.A, compared.b, strict=True))
             ]
         u = len(self.unknowns.entries)
@@ -277,27 +289,42 @@ class FramesFit:
         return H, g, compared.sums
 
     def compare(
-        self, evidence: Evidence, theta: Array, step: AnnealingStage
+        self, evidence: Evidence | FrameEvidence, theta: Array, step: AnnealingStage
     ) -> tuple[Comparison, tuple[Array, Array, Array]]:
         """A frame's contours compared with its silhouettes at all parameters (n,).
 
         Returns:
             the comparison, and the cameras as of ``CameraParameters.place``.
         """
-        places = self.places(theta)
-        views = self._views(evidence, theta, places)
-        return self._contours.compare(views, self._of_body(theta), step), places
+        places, seen = self.places(theta), _whole(evidence)
+        views = self._views(seen.edges, theta, places)
+        compared = self._contours.compare(views, self._of_body(theta, seen.rates), step)
+        placed = compared.placement
+        for c, picture in enumerate(seen.odds):
+            if picture is not None:
+                weights = self._contours.weights(places[:2], placed, step)[c]
+                offset, width = max(1, round(weights[1] * _OFFSET)), theta[self._first_width + c]
+                compare_lines(
+                    placed.packed, placed.X_WN, (places[0][c], places[1][c]), picture,
+                    self._of_odds, weights, offset, compared.A[c], compared.b[c],
+                    compared.sums[c], width,
+                )  # fmt: skip
+        return compared, places
 
     def piece_costs(
-        self, evidence: Evidence, theta: Array, step: AnnealingStage, side: float
+        self, evidence: Evidence | FrameEvidence, theta: Array, step: AnnealingStage, side: float
     ) -> Array:
         """(cameras, k, k) the costs at all parameters (n,) by squares of a side [pixel]."""
-        views = self._views(evidence, theta, self.places(theta))
-        return self._contours.piece_costs(views, self._of_body(theta), step, side)
+        seen = _whole(evidence)
+        views = self._views(seen.edges, theta, self.places(theta))
+        return self._contours.piece_costs(views, self._of_body(theta, seen.rates), step, side)
 
-    def _of_body(self, theta: Array) -> Array:
+    def _of_body(self, theta: Array, rates: Array | None) -> Array:
         """The body's parameters, the tree's values alone where all others are 0."""
         own = theta[: len(self.body.names)]
+        if rates is not None:
+            own = own.copy()
+            own[: self._values] += rates * theta[len(own)]
         return own[: self._values] if self._stays and not own[self._values :].any() else own
 
     def _views(self, evidence: Evidence, theta: Array, places: tuple[Array, Array, Array]) -> Views:
@@ -307,10 +334,10 @@ class FramesFit:
 
     def places(self, theta: Array) -> tuple[Array, Array, Array]:
         """The cameras at all parameters (n,), as of ``CameraParameters.place``."""
-        return self._cameras.place(theta[len(self.body.names) : self._first_width])
+        return self._cameras.place(theta[self._first_look : self._first_width])
 
     def pictures(
-        self, frames: Sequence[Evidence], parameters: Array, step: AnnealingStage
+        self, frames: Sequence[Evidence | FrameEvidence], parameters: Array, step: AnnealingStage
     ) -> list[Picture]:
         """What each silhouette says at all parameters (frames, n).
 
@@ -325,7 +352,9 @@ class FramesFit:
             X_WN = compared.placement.X_WN
             sizes = 1.0 / pixels_per_metre((X_CW, kernel), X_WN[:, :3, 3].mean(axis=0))
             for c in np.flatnonzero(compared.A.any(axis=(1, 2, 3))).tolist():
-                own, shared = np.split(self._moves(compared, motions, c)[:, chosen], [p], axis=1)
+                rates = evidence.rates if isinstance(evidence, FrameEvidence) else None
+                told = self._moves(compared, motions, c, rates)[:, chosen]
+                own, shared = np.split(told, [p], axis=1)
                 moves = np.zeros((len(X_WN), len(frames) * p + q, 12))
                 moves[:, k * p : (k + 1) * p], moves[:, len(frames) * p :] = own, shared
                 A = symmetric(compared.A[c])
@@ -333,21 +362,31 @@ class FramesFit:
         return found
 
     def _wider(
-        self, evidence: Evidence, theta: Array, step: AnnealingStage, by: float
+        self, evidence: Evidence | FrameEvidence, theta: Array, step: AnnealingStage, by: float
     ) -> Comparison:
         """As compare, all widths larger by so many steps."""
         theta = theta.copy()
         theta[self._first_width :] += by * _WIDTH_STEP
         return self.compare(evidence, theta, step)[0]
 
-    def _moves(self, compared: Comparison, motions: Array, camera: int) -> Array:
+    def _moves(
+        self, compared: Comparison, motions: Array, camera: int, rates: Array | None
+    ) -> Array:
         """(nodes, u, 12) how the unknowns move the nodes before a camera; widths move none."""
         entries, placement = self.unknowns.entries, compared.placement
         moves = np.zeros((len(placement.X_WN), len(entries), 12))
-        own = entries < len(self.body.names)
-        if own.any():
-            moves[:, own] = placement.dense(len(self.body.names))[:, entries[own]]
-        look = entries - len(self.body.names) - camera * len(CAMERA_NAMES)
+        own, late = entries < len(self.body.names), entries == len(self.body.names)
+        if own.any() or late.any():
+            dense = placement.dense(len(self.body.names))
+            moves[:, own] = dense[:, entries[own]]
+            if late.any() and rates is not None:
+                moves[:, late] = np.einsum("nmk,m->nk", dense[:, : len(rates)], rates)[:, None]
+        look = entries - self._first_look - camera * len(CAMERA_NAMES)
         turned = (look >= 0) & (look < len(CAMERA_NAMES)) & (entries < self._first_width)
         moves[:, turned] = motions[camera, look[turned]]
         return moves
+
+
+def _whole(evidence: Evidence | FrameEvidence) -> FrameEvidence:
+    """A frame's edges; of one that has no more it is not known how the body moves."""
+    return evidence if isinstance(evidence, FrameEvidence) else FrameEvidence(evidence)

@@ -55,6 +55,19 @@ def few_triangles(surfaces: TreeSurfaces, count: int = FEW) -> tuple[Outline, ..
     return tuple(outlines)
 
 
+def hull_of_few(outlines: Sequence[Outline], count: int) -> tuple[Outline, ...]:
+    """Surfaces with few triangles each; of one that will not simplify its convex hull."""
+    found = []
+    for outline in outlines:
+        few = _simplified(outline, count)
+        if len(few.triangles) > _MANY_TIMES * count:
+            hull = trimesh.convex.convex_hull(few.vertices)
+            mesh = TriangleMesh(np.array(hull.vertices), np.array(hull.faces))
+            few = _simplified(outline_from_mesh(mesh), count)
+        found.append(few)
+    return tuple(found)
+
+
 def with_girths(outlines: Sequence[Outline], girths: Array) -> tuple[Outline, ...]:
     """Surfaces, each as many times as wide across its y axis as girths (nodes,) say."""
     wider = []

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import cv2
@@ -15,7 +15,13 @@ from scipy.spatial import ConvexHull, QhullError
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.camera.models import Camera, PinholeCamera
 from drake_pose.errors import MaskError
-from drake_pose.fit.evidence import NO_EDGE, EdgePoints, Evidence, find_edge_points, pack_evidence
+from drake_pose.fit.evidence import (
+    NO_EDGE,
+    Evidence,
+    FrameEvidence,
+    find_edge_points,
+    pack_evidence,
+)
 from drake_pose.fit.parameters import BodyParameters
 from drake_pose.silhouette.areas.outline import Outline
 from drake_pose.silhouette.areas.scoring import prefix_sums
@@ -34,11 +40,16 @@ class PosedFrame:
     Args:
         values: (m,) of the body's pose tree [rad or m].
         mask: (H, W) the silhouette.
+        odds: (H, W, 3) of each pixel to show the body (``fit.background``): a fit looks at these
+            and not at the mask, where they are given.
+        rates: (m,) how fast the values change [rad/s or m/s], where that is known.
     """
 
     name: str
     values: Array
     mask: Mask
+    odds: NDArray[np.uint8] | None = None
+    rates: Array | None = None
 
 
 class PosedFrames:
@@ -103,11 +114,15 @@ class PosedFrames:
         off = np.concatenate(self.points) - self.middle
         return float(np.sqrt((off**2).sum(axis=1).mean()))
 
-    @cached_property
-    def edges(self) -> list[EdgePoints]:
-        """Of each frame's silhouette."""
-        spacing = max(1.0, round(self.spacing * self.size))
-        return [find_edge_points(frame.mask, spacing) for frame in self.frames]
+    def evidence(self, camera: int, count: int) -> list[FrameEvidence]:
+        """What each frame tells, where the camera is the how manieth of so many."""
+        spacing, found = max(1.0, round(self.spacing * self.size)), []
+        for frame in self.frames:
+            edge = NO_EDGE if frame.odds is not None else find_edge_points(frame.mask, spacing)
+            edges = pack_evidence([edge if c == camera else NO_EDGE for c in range(count)])
+            odds = tuple(frame.odds if c == camera else None for c in range(count))
+            found.append(FrameEvidence(edges, odds, frame.rates))
+        return found
 
     @cached_property
     def body(self) -> BodyParameters:
@@ -144,11 +159,23 @@ def placed_points(outlines: Sequence[Outline], X_WN: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class SeenFrame:
-    """A frame: values (m,) of the pose tree [rad or m], and the silhouettes (H, W) by camera."""
+    """A frame: values (m,) of the pose tree [rad or m], and the silhouettes (H, W) by camera.
+
+    Args:
+        odds: by camera, where silhouettes were found in pictures: as of ``PosedFrame``.
+        rates: (m,) as of ``PosedFrame``.
+    """
 
     name: str
     values: Array
     masks: Mapping[str, Mask]
+    odds: Mapping[str, NDArray[np.uint8]] = field(default_factory=dict)
+    rates: Array | None = None
+
+    def of(self, camera: str) -> PosedFrame:
+        """What a camera sees that has a mask."""
+        odds = self.odds.get(camera)
+        return PosedFrame(self.name, self.values, self.masks[camera], odds, self.rates)
 
     def edges(self, cameras: Sequence[Camera], spacing: float) -> Evidence:
         """Of the silhouettes, points so far apart [pixel].

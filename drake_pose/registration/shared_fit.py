@@ -34,7 +34,7 @@ from drake_pose.fit.covariance import (
     values_covariance,
     with_widths,
 )
-from drake_pose.fit.evidence import NO_EDGE, Evidence, pack_evidence
+from drake_pose.fit.evidence import FrameEvidence
 from drake_pose.fit.frames_fit import FramesFit, parameter_names
 from drake_pose.fit.lengthened_body import LengthenedBody, length_name, lengthened_joints
 from drake_pose.fit.levenberg_marquardt import AnnealingStage, Equations, StepSettings
@@ -130,11 +130,8 @@ class SharedFit:
             body = LengthenedBody(first.kinematics, first.outlines, offsets)
         self.rows = np.repeat(np.arange(len(seen)), [len(one.frames) for one in seen])
         self._values = np.array([frame.values for one in seen for frame in one.frames])
-        edges = [edge for one in seen for edge in one.edges]
-        self._evidence = [
-            pack_evidence([edge if k == c else NO_EDGE for k in range(len(seen))])
-            for c, edge in zip(self.rows, edges, strict=True)
-        ]
+        each = [one.evidence(c, len(seen)) for c, one in enumerate(seen)]
+        self._evidence = [evidence for own in each for evidence in own]
         cameras = [
             one.camera.with_pose(np.linalg.inv(X)) for one, X in zip(seen, X_CW, strict=True)
         ]
@@ -255,7 +252,7 @@ class SharedFit:
 
     def _at(
         self, at: Shared, which: Mask | None
-    ) -> tuple[tuple[list[Evidence], Array, Array, Array], tuple[Array, Array], Mask]:
+    ) -> tuple[tuple[list[FrameEvidence], Array, Array, Array], tuple[Array, Array], Mask]:
         """Masks that count as ``FramesFit`` takes them: what is seen and held, both unknowns.
 
         Then what these are expected to be, and which masks (rows,) those are.

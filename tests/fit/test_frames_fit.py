@@ -8,8 +8,8 @@ from drake_pose.body.surfaces.meshes import TriangleMesh
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.camera.models import ParallelCamera, PinholeCamera, circle_of_cameras
 from drake_pose.errors import SettingsError, UnknownNameError
-from drake_pose.fit.evidence import NO_EDGE, find_edge_points, pack_evidence
-from drake_pose.fit.frames_fit import FittedFrames, FramesFit
+from drake_pose.fit.evidence import NO_EDGE, FrameEvidence, find_edge_points, pack_evidence
+from drake_pose.fit.frames_fit import FittedFrames, FramesFit, parameter_names
 from drake_pose.fit.levenberg_marquardt import AnnealingStage, Coupling, Equations
 from drake_pose.fit.parameters import (
     CAMERA_NAMES,
@@ -111,7 +111,7 @@ class TestKnownAnswers:
         truth = poses(body, 3, 3)
         for camera in (rig[0], parallel(rig[0])):
             moved = np.array([0.0] * 6 + [0.08, 0.0, 0.0])
-            all_names = [*body.names, *names_of(camera)]
+            all_names = parameter_names(body, [camera])
             unknowns = choose(all_names, names_of(camera)[6:7], shared=True)
             frames = [draw(body, [camera], theta, moved) for theta in truth]
             found = FramesFit(body, [camera], unknowns).fit(
@@ -136,12 +136,14 @@ def test_equations_are_the_slope_of_the_cost(body, rig):
     camera = parallel(rig[0])
     cameras = [rig[1], camera]
     truth = poses(body, 1, 7)
-    all_names = [*body.names, *names_of(rig[1]), *names_of(camera)]
-    fit = FramesFit(body, cameras, choose(all_names, all_names))
-    evidence = [draw(body, cameras, truth[0])]
-    base = np.pad(truth, ((0, 0), (0, 18)))
-    step = AnnealingStage(0.1, 0.002)
+    every = parameter_names(body, cameras)
+    all_names = every[: -len(cameras)]
+    fit = FramesFit(body, cameras, choose(every, all_names))
     generator = np.random.default_rng(0)
+    rates = generator.uniform(-1.0, 1.0, len(body.kinematics.names))
+    evidence = [FrameEvidence(draw(body, cameras, truth[0]), rates=rates)]
+    base = np.pad(truth, ((0, 0), (0, len(all_names) - truth.shape[1])))
+    step = AnnealingStage(0.1, 0.002)
     base += 0.015 * generator.uniform(-1, 1, base.shape)
     none = np.zeros(0)
     at = fit.equations(evidence, base, np.zeros((1, len(all_names))), none, step)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -27,6 +27,7 @@ from drake_pose.files.settings import EstimateSettings
 from drake_pose.jobs.estimate.inputs import missing_for_person
 from drake_pose.jobs.estimate.measurements import read_true_angles
 from drake_pose.jobs.estimate.searches import make_tree
+from drake_pose.jobs.registration.episodes import EpisodeInputs
 from drake_pose.jobs.registration.positions import (
     KnownPositions,
     estimate_positions,
@@ -101,29 +102,57 @@ class Inputs:
 
     def of(self, camera: str) -> list[PosedFrame]:
         """What a camera sees."""
-        own = [one for one in self.frames if camera in one.masks]
-        return [PosedFrame(one.name, one.values, one.masks[camera]) for one in own]
+        return [one.of(camera) for one in self.frames if camera in one.masks]
 
-    def moved(self, values: Mapping[str, Array]) -> tuple[SeenFrame, ...]:
-        """The frames at other values (m,) of the tree, by name."""
-        return tuple(replace(one, values=values[one.name]) for one in self.frames)
+    def moved(self, values: Iterable[Array]) -> tuple[SeenFrame, ...]:
+        """The frames at other values (m,) of the tree."""
+        frames = zip(self.frames, values, strict=True)
+        return tuple(replace(one, values=own) for one, own in frames)
+
+
+def inputs_of_episode(episode: EpisodeInputs, settings: RegistrationSettings) -> Inputs:
+    """What a registration needs of an episode, whose frames are seen while cameras are found.
+
+    Raises:
+        SettingsError: an option that needs masks.
+        UnknownNameError: a joint or link that is not there.
+    """
+    for name in ("on", "target", "suggest"):
+        if getattr(settings, name):
+            raise SettingsError(
+                f"--{name} needs masks, but {episode.path} has pictures: make masks of them "
+                "(drake-pose masks), or leave it out"
+            )
+    kinematics = TreeKinematics(episode.tree)
+    zeros, lengths = _select_parameters(episode.model, kinematics, settings)
+    scene = Scene(episode.path, episode.cameras, (), {})
+    positions = KnownPositions(episode.path, kinematics, {})
+    return Inputs(
+        scene, episode.model, episode.tree, positions, (), episode.warnings,
+        searched=tuple(episode.cameras.values()), seen=episode.seen, zeros=zeros, lengths=lengths,
+    )  # fmt: skip
 
 
 def read_inputs(
-    scene_path: Path, model_path: Path, joints_path: Path | None, settings: RegistrationSettings
+    scene_path: Path,
+    model_path: Path,
+    joints_path: Path | None,
+    settings: RegistrationSettings,
+    camera_path: Path | None = None,
 ) -> Inputs:
     """Reads and checks everything.
 
     Args:
         joints_path: the table of joint positions; None: they are estimated from the cameras
             whose place is known.
+        camera_path: a camera file in place of the scene's own.
 
     Raises:
         DrakePoseError: names the file, camera, frame or joint at fault.
     """
     if not scene_path.is_dir():
         raise SceneError(f"{scene_path}: no such folder; a scene has {CAMERA_FILE} and masks")
-    file = load_camera_file(scene_path / CAMERA_FILE)
+    file = load_camera_file(camera_path or scene_path / CAMERA_FILE)
     scene = check_scene(load_scene(scene_path, file.cameras))
     scene, frames = scene.every(settings.every, settings.frames)
     searched, held = _select_cameras(scene, file, settings)

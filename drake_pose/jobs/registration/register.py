@@ -23,7 +23,13 @@ from drake_pose.files.options import percent
 from drake_pose.files.summary import BADLY_EXPLAINED
 from drake_pose.fit.lengthened_body import lengthened_joints
 from drake_pose.jobs.estimate.inputs import missing_for_person
-from drake_pose.jobs.registration.inputs import Inputs, make_registration_tree, read_inputs
+from drake_pose.jobs.registration.episodes import EpisodeInputs, is_episode, read_episode
+from drake_pose.jobs.registration.inputs import (
+    Inputs,
+    inputs_of_episode,
+    make_registration_tree,
+    read_inputs,
+)
 from drake_pose.jobs.registration.misfit import (
     Search,
     check_focal_length,
@@ -33,7 +39,9 @@ from drake_pose.jobs.registration.misfit import (
 from drake_pose.jobs.registration.result import (
     describe_camera,
     describe_parameters,
+    describe_pictures,
     describe_run,
+    say_pictures,
     write_result,
 )
 from drake_pose.jobs.registration.settings import RegistrationSettings
@@ -41,7 +49,8 @@ from drake_pose.person.shape import shape_parts, shape_values
 from drake_pose.registration.bundle_adjustment import adjust_bundle
 from drake_pose.registration.joint_zeros import JointCalibration, calibrate_joints
 from drake_pose.registration.object_search import ObjectSearch
-from drake_pose.registration.posed_frames import PosedFrames
+from drake_pose.registration.picture_registration import PictureRegistration, register_pictures
+from drake_pose.registration.posed_frames import PosedFrames, SeenFrame
 from drake_pose.registration.register import (
     CameraSearch,
     ObjectPose,
@@ -82,17 +91,21 @@ def register_scene(
     out: Path | str | None = None,
     settings: RegistrationSettings | None = None,
     *,
+    cameras: Path | str | None = None,
     overlay: bool = True,
     on_camera: OnCamera | None = None,
 ) -> SceneRegistration:
-    """Finds where a scene's cameras stand; no guess is needed.
+    """Finds where a scene's or an episode's cameras stand; no guess is needed.
 
     Args:
-        scene: the folder with cameras.yaml, in which X_WC may be missing, and masks.
+        scene: the folder with cameras.yaml, in which X_WC may be missing, and masks; or an episode
+            of pictures, or a file of one, as ``open_episode`` takes it.
         model: the robot's model file. It stands in the world as the file has it.
-        joints: joint positions by frame (CSV) [rad or m]. None: they are estimated from the cameras
-            whose X_WC is known, and fitted together with those that are found.
+        joints: joint positions by frame, or of an episode by time (CSV) [rad or m]. None: an
+            episode's own; in a scene they are estimated from the cameras whose X_WC is known, and
+            fitted together with those that are found.
         out: folder for the result, new or empty; None writes nothing.
+        cameras: a camera file in place of the scene's or episode's own.
         on_camera: called after each camera.
 
     Raises:
@@ -102,22 +115,19 @@ def register_scene(
     settings, folder = settings or RegistrationSettings(), None if out is None else Path(out)
     files = {
         "model": Path(model),
-        "cameras": Path(scene) / CAMERA_FILE,
+        "cameras": Path(cameras or Path(scene) / CAMERA_FILE),
         "joints": None if joints is None else Path(joints),
     }
-    work = _Registration(read_inputs(Path(scene), Path(model), files["joints"], settings), settings)
-    work.check_held()
-    work.find_each(on_camera)
+    own = None if cameras is None else Path(cameras)
+    work = _begun(Path(scene), Path(model), files["joints"], own, settings, on_camera)
     start, urdf = time.perf_counter(), None
     if work.inputs.positions.is_estimate:
         work.refit_poses()
-    # Cameras that see one object are found one after another, but it stands in one place.
-    several = work.inputs.standing is not None and len(work.registered) > 1
-    if settings.zeros or settings.lengths or settings.focal or several:
+    if work.has_constants:
         urdf = work.find_zeros(folder)
     work.judge()
     described = work.describe((time.perf_counter() - start) / len(work.registered))
-    cameras = {
+    placed = {
         name: work.registered[name].camera if name in work.registered else camera
         for name, camera in work.inputs.scene.cameras.items()
         if name not in work.inputs.left_out
@@ -130,8 +140,30 @@ def register_scene(
         "cameras": described,
     }
     if folder is not None:
-        write_result(folder, work.inputs, cameras, work.registered, summary, overlay, urdf)
-    return SceneRegistration(cameras, work.registered, summary, tuple(work.warnings), folder)
+        write_result(
+            folder, work.inputs, placed, work.registered, summary, overlay, urdf, work.pictures
+        )
+    return SceneRegistration(placed, work.registered, summary, tuple(work.warnings), folder)
+
+
+def _begun(
+    scene: Path,
+    model: Path,
+    joints: Path | None,
+    cameras: Path | None,
+    settings: RegistrationSettings,
+    on_camera: OnCamera | None,
+) -> _Registration:
+    """A registration that has found each camera by itself."""
+    if is_episode(scene, settings):
+        episode = read_episode(scene, model, joints, cameras, settings)
+        work = _Registration(inputs_of_episode(episode, settings), settings)
+        work.find_in_pictures(episode, on_camera)
+    else:
+        work = _Registration(read_inputs(scene, model, joints, settings, cameras), settings)
+        work.check_held()
+        work.find_each(on_camera)
+    return work
 
 
 class _Registration:
@@ -141,6 +173,7 @@ class _Registration:
         inputs, body: as they are known by now.
         registered, seconds, suggestions: of the cameras that were found, by name.
         parameters: what the summary says of zeros and lengths.
+        pictures: of cameras that were found in these, by name, with what was found in them.
     """
 
     def __init__(self, inputs: Inputs, settings: RegistrationSettings) -> None:
@@ -152,6 +185,16 @@ class _Registration:
         self.seconds = dict[str, float]()
         self.suggestions = dict[str, dict[str, Any] | None]()
         self.parameters: dict[str, Any] = {"zeros": {}, "lengths": {}}
+        self.pictures = dict[str, PictureRegistration]()
+
+    @property
+    def has_constants(self) -> bool:
+        """Whether there is more to find in all frames together."""
+        asked = self._settings
+        # Cameras that see one object are found one after another, but it stands in one place.
+        several = self.inputs.standing is not None and len(self.registered) > 1
+        focal = asked.focal and not self.pictures
+        return bool(asked.zeros or asked.lengths or focal or several)
 
     def check_held(self) -> None:
         """Says so where a camera whose X_WC is given does not see the robot where it stands."""
@@ -197,6 +240,30 @@ class _Registration:
                 on_camera(len(self.registered))
         self.inputs = replace(inputs, tree=self.body.tree)
 
+    def find_in_pictures(self, episode: EpisodeInputs, on_camera: OnCamera | None) -> None:
+        """Finds each camera of an episode in its pictures.
+
+        Raises RegistrationError: no pose of a camera explains its pictures.
+        """
+        frames: list[SeenFrame] = []
+        for name, camera in episode.cameras.items():
+            start, focal = time.perf_counter(), self._settings.focal or name in episode.assumed
+            one = register_pictures(self.body, camera, episode.recordings[name], focal)
+            frames += [
+                SeenFrame(
+                    frame.name, frame.values, {name: frame.mask},
+                    {} if frame.odds is None else {name: frame.odds}, frame.rates,
+                )
+                for frame in one.frames
+            ]  # fmt: skip
+            self.registered[name], self.pictures[name] = one.found, one
+            self.suggestions[name] = None
+            self.seconds[name] = time.perf_counter() - start
+            self.warnings += say_pictures(one, name in episode.assumed)
+            if on_camera is not None:
+                on_camera(len(self.registered))
+        self.inputs = replace(self.inputs, frames=tuple(frames))
+
     def judge(self) -> None:
         """Says what a user should know of the cameras with all that was found.
 
@@ -208,7 +275,8 @@ class _Registration:
             if self.inputs.standing is not None:
                 require_determined(found)
             texts: tuple[str, ...] = ()
-            if not (self.inputs.positions.is_estimate or self._settings.focal):
+            known = self._settings.focal or name in self.pictures
+            if not (self.inputs.positions.is_estimate or known):
                 found, texts = check_focal_length(body, found, self.inputs.of(name))
             self.registered[name] = found
             self.warnings += [*texts, *_warnings_of(found)]
@@ -218,7 +286,9 @@ class _Registration:
         """The cameras' parts of the summary, each of which took so long more [s]."""
         on, told = self._settings.on, self.suggestions
         return {
-            name: self.parameters | describe_camera(one, self.seconds[name] + more, told[name], on)
+            name: self.parameters
+            | describe_camera(one, self.seconds[name] + more, told[name], on)
+            | describe_pictures(self.pictures.get(name))
             for name, one in self.registered.items()
         }
 
@@ -254,8 +324,7 @@ class _Registration:
         fitted = adjust_bundle(
             self.body.kinematics, self.body.few, cameras, registered, frames, *shape
         )
-        values = {one.name: own for one, own in zip(frames, fitted.values, strict=True)}
-        self.inputs = replace(inputs, frames=inputs.moved(values))
+        self.inputs = replace(inputs, frames=inputs.moved(fitted.values))
         known = inputs.positions.girths
         girths = fitted.girths * (1.0 if known is None else known)
         self.body = RegistrationBody(inputs.tree, inputs.seen, girths=girths)
@@ -294,7 +363,7 @@ class _Registration:
             tree = standing.tree(seen.X_WT)
         elif shifts:
             tree, _ = make_registration_tree(model, self._settings)
-        values = {one.name: one.values + offsets for one in inputs.frames}
+        values = [one.values + offsets for one in inputs.frames]
         self.inputs = replace(inputs, model=model, tree=tree, frames=inputs.moved(values))
         kinematics = TreeKinematics(tree)
         judged = zip(found.inlier_ratios, found.agrees, strict=True)

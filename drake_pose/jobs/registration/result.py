@@ -14,6 +14,7 @@ from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.camera.camera_files import dump_cameras
 from drake_pose.camera.models import Camera
+from drake_pose.csv_files import csv_text
 from drake_pose.files.folder import (
     OVERLAY,
     REPORT,
@@ -28,6 +29,7 @@ from drake_pose.files.summary import file_digest, versions
 from drake_pose.jobs.registration.inputs import Inputs
 from drake_pose.jobs.registration.settings import AuditSettings
 from drake_pose.registration.joint_zeros import JointCalibration
+from drake_pose.registration.picture_registration import PictureRegistration
 from drake_pose.registration.posed_frames import PosedFrame
 from drake_pose.registration.register import ObjectPose, RegisteredCamera
 from drake_pose.silhouette.areas.outline import outline_from_mesh
@@ -104,6 +106,40 @@ def _describe_object(seen: ObjectPose) -> dict[str, Any]:
     }
 
 
+def describe_pictures(one: PictureRegistration | None) -> dict[str, Any]:
+    """What summary.json says of a camera that was found in pictures; None: it was in masks."""
+    if one is None:
+        return {"masks": "given", "time_offset_s": None, "time_offset_sd_s": None}
+    offset, focal = one.offset, one.found.camera.focal_x
+    told = offset is not None and offset.determined
+    return {
+        "masks": "found",
+        "time_offset_s": offset.value if offset is not None and told else None,
+        "time_offset_sd_s": offset.deviation if offset is not None and told else None,
+        "time_offset_scores": [] if offset is None else offset.scores.round(4).tolist(),
+        "focal_px": focal,
+        "focal_sd_px": one.focal_deviation * focal if one.focal_deviation else None,
+        "explained": one.fit.explained,
+        "contour": one.fit.contour,
+    }
+
+
+def say_pictures(one: PictureRegistration, assumed: bool) -> list[str]:
+    """What a user should know of a camera that was found in pictures."""
+    name, texts = one.found.camera.name, []
+    if assumed:
+        texts.append(
+            f"camera '{name}': nobody says its focal length: {one.found.camera.focal_x:.0f} pixels "
+            f"were found (standard deviation {one.focal_deviation * one.found.camera.focal_x:.0f})"
+        )
+    if one.offset is not None and not one.offset.determined:
+        texts.append(
+            f"camera '{name}': its pictures do not tell by how much its clock is off the joints', "
+            "as the robot moves too little or too slowly"
+        )
+    return texts
+
+
 def describe_parameters(
     found: JointCalibration, kinematics: TreeKinematics
 ) -> dict[str, dict[str, Any]]:
@@ -155,12 +191,15 @@ def write_result(
     summary: Mapping[str, Any],
     overlay: bool,
     urdf: bytes | None = None,
+    pictures: Mapping[str, PictureRegistration] | None = None,
 ) -> None:
     """Writes the result folder; the camera file comes last, when all else is there.
 
     Args:
         cameras: all that the camera file is to hold.
         urdf: the robot with the zeros and lengths that were found.
+        pictures: of cameras that were found in these, by name. The folder is then a scene of the
+            masks that follow from them, at their joint positions.
 
     Raises:
         OutputError: the folder cannot be written.
@@ -173,7 +212,10 @@ def write_result(
             for one in found.frames
         ]
         titled = zip(inputs.of(name), titles, strict=True)
-        write_overlays(path, inputs.tree, found.camera, titled, inputs.seen)
+        own = pictures[name].pictures if pictures else {}
+        write_overlays(path, inputs.tree, found.camera, titled, inputs.seen, own)
+    for name in pictures or ():
+        _write_frames(path, inputs, name, several=len(pictures or ()) > 1)
     if urdf is not None:
         write_file(path, f"{inputs.model.path.stem}_calibrated.urdf", urdf)
     described = {
@@ -184,6 +226,17 @@ def write_result(
     write_file(path, REPORT, make_registration_report(path, summary))
     links = {name: one["link"] for name, one in parts.items() if "link" in one}
     write_file(path, CAMERA_FILE, dump_cameras(cameras, links))
+
+
+def _write_frames(path: Path, inputs: Inputs, camera: str, several: bool) -> None:
+    """Masks of a camera's frames, and joint positions at their moments by its own clock."""
+    frames, names = inputs.of(camera), TreeKinematics(inputs.tree).names
+    for frame in frames:
+        picture = encode_png(255 * frame.mask.astype(np.uint8))
+        write_file(path, f"masks/{camera}/{frame.name}.png", picture)
+    rows = [["frame", *names], *([one.name, *map(repr, one.values.tolist())] for one in frames)]
+    file = f"joint_angles_{camera}.csv" if several else "joint_angles.csv"
+    write_file(path, file, csv_text(rows))
 
 
 def parameter_rows(parameters: Mapping[str, Mapping[str, Any]]) -> list[tuple[str, ...]]:
@@ -251,10 +304,11 @@ def write_overlays(
     camera: Camera,
     titled: Iterable[tuple[PosedFrame, str]],
     seen: Collection[str] | None = None,
+    pictures: Mapping[str, NDArray[np.uint8]] | None = None,
 ) -> None:
-    """Draws the robot over each mask of a camera, below a title.
+    """Draws the robot over each mask of a camera, or its picture, below a title.
 
-    seen: the nodes that are drawn; None: all.
+    seen: the nodes that are drawn; None: all. pictures: by frame.
     """
     kinematics = TreeKinematics(tree)
     shown = [k for k, node in enumerate(tree.nodes) if seen is None or node.name in seen]
@@ -262,5 +316,6 @@ def write_overlays(
     for frame, title in titled:
         X_CN = camera.X_CW @ kinematics.poses(frame.values)[shown]
         segments = draw_labels(outlines, np.arange(1, len(shown) + 1), X_CN, camera) - 1
-        picture = draw_overlay(frame.mask, segments >= 0, segments, title)
+        seen_there: NDArray[Any] = (pictures or {}).get(frame.name, frame.mask)
+        picture = draw_overlay(seen_there, segments >= 0, segments, title)
         write_file(folder, f"{OVERLAY}/{camera.name}/{frame.name}.png", encode_png(picture))

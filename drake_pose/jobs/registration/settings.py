@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from cyclopts import Parameter
 
@@ -19,6 +19,14 @@ class AuditSettings(SceneSettings):
 
     hold: Positions = field(default_factory=dict)
     """Hold this joint at a known position [deg or m]; repeat for several."""
+    pictures: Annotated[bool, Parameter(negative="")] = False
+    """Look at pictures and the joint log beside them, even where there are masks."""
+    episode: Annotated[int | None, Parameter(metavar="N")] = None
+    """The number of the episode in a LeRobot data set; default: the only one that is there."""
+    joint_map: Path | None = None
+    """Of an episode: which column of its joint log is which joint, in which unit (YAML)."""
+    units: Literal["rad", "deg"] | None = None
+    """The unit of angles in an episode's joint log; default: what the joints' limits say."""
 
 
 @dataclass(frozen=True, kw_only=True)

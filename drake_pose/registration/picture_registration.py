@@ -1,0 +1,294 @@
+"""A camera, and its clock, from pictures and a joint log: found, fitted, and as sure as it is.
+
+Frames in which the robot hardly moves carry the search, for there a clock that is off does little
+harm. Then the pictures' clock is tried against the log's, the pose held; and pose, offset and, if
+asked for, focal length are fitted together on those frames and the ones that move most.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_pose.camera.models import PinholeCamera
+from drake_pose.errors import RegistrationError
+from drake_pose.fit.background_kernel import GAIN
+from drake_pose.fit.covariance import excess
+from drake_pose.fit.frames_fit import TIME_OFFSET
+from drake_pose.registration.picture_search import (
+    SEARCHED,
+    PictureFit,
+    PictureSearch,
+    PosedPicture,
+    choose_frames,
+    node_places,
+)
+from drake_pose.registration.posed_frames import PosedFrame
+from drake_pose.registration.register import FrameMisfit, RegisteredCamera, RegistrationBody
+from drake_pose.registration.start_poses import E_total, areas, intersection_over_union
+
+Array = NDArray[np.float64]
+Picture = NDArray[np.uint8]
+
+# Rates are told by positions so much before and after [s].
+_RATE_STEP = 0.05
+# A robot whose parts move by less does not tell where a camera is [m].
+_LEAST_MOTION = 0.05
+# Frames that move most are fitted beside those of the search.
+_MOVING = 8
+# The slower share of all frames carries the search, if clocks may differ.
+_SLOW = 0.6
+# So many poses are fitted. A pose explains pictures in which so much of the contours fits, and
+# edges along them are so much stronger than by chance. Right ones have .5 and more, .19 and more;
+# the best wrong ones .3 and .13.
+_LOOKS, _LEAST_RATIO, _LEAST_CONTOUR = 3, 0.42, 0.16
+# Poses are as good that explain less by no more deviations.
+_SIGNIFICANCE = 1.96
+# Offsets of clocks that are tried [s]; one that was fitted is fitted again where it is larger.
+_OFFSETS, _AGAIN = np.linspace(-1.0, 1.0, 81), 0.02
+# An offset is not told whose standard deviation is larger [s].
+_UNTOLD = 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """Pictures of one camera, and the joints at their moments.
+
+    Args:
+        names: (n,) of the pictures.
+        values_at: (n, m) values of the pose tree at the pictures' times, so much later [s].
+        read: gives picture k (H, W, 3).
+        timed: whether the joints have times: else the values are the same whatever the offset.
+    """
+
+    names: tuple[str, ...]
+    values_at: Callable[[float], Array]
+    read: Callable[[int], Picture]
+    timed: bool
+
+    def rates_at(self, offset: float) -> Array | None:
+        """(n, m) how fast the values change [rad/s or m/s]; None: nobody knows."""
+        if not self.timed:
+            return None
+        ahead, behind = (self.values_at(offset + by) for by in (_RATE_STEP, -_RATE_STEP))
+        return np.asarray(np.nan_to_num((ahead - behind) / (2.0 * _RATE_STEP)))
+
+
+@dataclass(frozen=True, eq=False)
+class TimeOffset:
+    """By how much later than the pictures' times their joints are in the log.
+
+    Args:
+        value, deviation: [s]; the deviation is infinite where the pictures do not tell.
+        scores: (k, 2) offsets that were tried [s], and what they explain, over the best.
+    """
+
+    value: float
+    deviation: float
+    scores: Array
+
+    @property
+    def determined(self) -> bool:
+        """Whether the pictures tell it."""
+        return bool(np.isfinite(self.deviation))
+
+
+@dataclass(frozen=True, eq=False)
+class PictureRegistration:
+    """A camera that was found in its pictures.
+
+    Args:
+        found: the camera.
+        frames: its frames, with masks and odds, at the joints' values of their moments.
+        pictures: of these frames, by name.
+        fit: that found it.
+        offset: of its clock; None: the joints have no times.
+        focal_deviation: over the focal length; 0: it was held.
+    """
+
+    found: RegisteredCamera
+    frames: tuple[PosedFrame, ...]
+    pictures: dict[str, Picture]
+    fit: PictureFit
+    offset: TimeOffset | None
+    focal_deviation: float
+
+
+def register_pictures(
+    body: RegistrationBody, camera: PinholeCamera, recording: Recording, focal: bool = False
+) -> PictureRegistration:
+    """Finds where a camera stands that has seen a body move.
+
+    Args:
+        camera: its pose is not used.
+        focal: whether its focal length is only about known.
+
+    Raises RegistrationError: too few pictures with joint positions, a body that does not move, or
+        no pose that explains the pictures.
+    """
+    chosen, moving = _choose(body, camera, recording)
+    begin = _posed(recording, chosen, 0.0)
+    search = PictureSearch(body, camera, begin)
+    fits = [search.fit(camera.with_pose(np.linalg.inv(X))) for X in search.search()[:_LOOKS]]
+    fitted = [one for one in fits if one is not None]
+    if not fitted:
+        raise _unexplained(camera, "no pose shows the body in two pictures")
+    best = max(fitted, key=lambda one: one.explained)
+    pieces = search.compared.pieces(best.camera.X_CW)
+    alike = [
+        one.camera.X_CW for one in fitted
+        if one is not best
+        and excess(pieces, search.compared.pieces(one.camera.X_CW)) <= _SIGNIFICANCE
+    ]  # fmt: skip
+    alternatives = search.compared.distinct([best.camera.X_CW, *alike])[1:]
+    both, offset, scores = [*chosen, *moving], 0.0, np.zeros((0, 2))
+    if recording.timed:
+        offset, scores = _scan(body, best.camera, recording, both)
+    for _ in range(2):
+        last = PictureSearch(body, camera, _posed(recording, both, offset))
+        constants = (TIME_OFFSET,) if recording.timed else ()
+        again = last.fit(best.camera, constants, focal)
+        if again is None:
+            raise _unexplained(camera, "the body leaves the pictures")
+        best, by = again, _constant(again, TIME_OFFSET)
+        offset += by
+        if abs(by) < _AGAIN:
+            break
+    return _describe(camera, best, recording, alternatives, offset, scores, focal)
+
+
+def _choose(
+    body: RegistrationBody, camera: PinholeCamera, recording: Recording
+) -> tuple[list[int], list[int]]:
+    """The frames that carry the search, and those that move most beside them."""
+    values = recording.values_at(0.0)
+    known = np.flatnonzero(np.isfinite(values).all(axis=1))
+    if len(known) < 3:
+        raise RegistrationError(
+            f"camera '{camera.name}': {len(known)} of its {len(values)} pictures have joint "
+            "positions of their moments; three and more are needed, in which the robot stands "
+            "otherwise: are pictures and joints of one episode and of one clock?"
+        )
+    places = node_places(body, values[known])
+    spread = float(np.linalg.norm(np.ptp(places, axis=0), axis=1).max())
+    if spread < _LEAST_MOTION:
+        raise RegistrationError(
+            f"camera '{camera.name}': the robot hardly moves, by {1e3 * spread:.0f} mm at most, so "
+            "its pictures do not tell it from what is behind it; give an episode in which it moves"
+        )
+    rates = recording.rates_at(0.0)
+    if rates is None:
+        return known[choose_frames(places, SEARCHED)].tolist(), []
+    ahead = node_places(body, values[known] + _RATE_STEP * rates[known])
+    speed = np.linalg.norm(ahead - places, axis=2).mean(axis=1)
+    slow = np.flatnonzero(speed <= np.quantile(speed, _SLOW))
+    if len(slow) < SEARCHED:
+        slow = np.arange(len(known))
+    chosen = slow[choose_frames(places[slow], SEARCHED)]
+    rest = np.setdiff1d(np.argsort(-speed)[: max(_MOVING, len(known) // 4)], chosen)
+    moving = rest[choose_frames(places[rest], _MOVING)] if len(rest) else rest
+    return known[chosen].tolist(), known[moving].tolist()
+
+
+def _posed(recording: Recording, which: Sequence[int], offset: float) -> list[PosedPicture]:
+    """Some frames with their pictures; those whose joints are not logged are left out."""
+    values, rates = recording.values_at(offset), recording.rates_at(offset)
+    return [
+        PosedPicture(
+            recording.names[k], values[k], recording.read(k), None if rates is None else rates[k]
+        )
+        for k in which
+        if np.isfinite(values[k]).all()
+    ]
+
+
+def _scan(
+    body: RegistrationBody, camera: PinholeCamera, recording: Recording, which: Sequence[int]
+) -> tuple[float, Array]:
+    """The offset at which a camera explains its pictures best, and what all that were tried do."""
+    frames = _posed(recording, which, 0.0)
+    level = PictureSearch(body, camera, frames).compared
+    names = [one.name for one in frames]
+    rows = [recording.names.index(name) for name in names]
+    scores = np.full(len(_OFFSETS), np.nan)
+    for k, offset in enumerate(_OFFSETS):
+        values = recording.values_at(float(offset))[rows]
+        if np.isfinite(values).all():
+            X_WN = np.array([body.kinematics.poses(one) for one in values])
+            scores[k] = level.told(camera.X_CW, X_WN)[GAIN]
+    k = int(np.nanargmax(scores))
+    offset = float(_OFFSETS[k])
+    if 0 < k < len(scores) - 1 and np.isfinite(scores[k - 1 : k + 2]).all():
+        low, middle, high = scores[k - 1 : k + 2]
+        bend = low - 2.0 * middle + high
+        if bend < 0.0:
+            offset += 0.5 * float((low - high) / bend) * float(_OFFSETS[1] - _OFFSETS[0])
+    told = np.isfinite(scores)
+    return offset, np.column_stack([_OFFSETS[told], scores[told] / max(scores[k], 1e-9)])
+
+
+def _constant(fitted: PictureFit, name: str) -> float:
+    """A constant of all frames, 0 where it was not fitted."""
+    names = fitted.fit.names
+    return float(fitted.found.shared[names.index(name)]) if name in names else 0.0
+
+
+def _describe(
+    camera: PinholeCamera,
+    best: PictureFit,
+    recording: Recording,
+    alternatives: Sequence[Array],
+    offset: float,
+    scores: Array,
+    focal: bool,
+) -> PictureRegistration:
+    """What was found.
+
+    Raises RegistrationError: it does not explain the pictures.
+    """
+    fit, (seen,) = best.fit, best.fit.seen
+    ratios = fit.inlier_ratios(best.found)
+    agree = fit.agreeing(ratios)
+    ratio = float(ratios[agree].mean())
+    if ratio < _LEAST_RATIO or best.contour < _LEAST_CONTOUR or best.explained <= 0.0:
+        raise _unexplained(
+            camera,
+            f"at best {max(best.explained, 0.0):.0%} of what changes is explained, {ratio:.0%} of "
+            f"the contours fit ({_LEAST_RATIO:.0%} at least), and edges along them are stronger "
+            f"than elsewhere by {best.contour:.2f} ({_LEAST_CONTOUR} at least)",
+        )
+    own, doubted = fit.covariances(best.found, agree)
+    covariance = own + doubted
+    deviations = np.sqrt(np.diag(covariance))
+    told = None
+    if TIME_OFFSET in fit.names:
+        deviation = float(deviations[fit.names.index(TIME_OFFSET)])
+        told = TimeOffset(offset, deviation if deviation < _UNTOLD else np.inf, scores)
+    found = areas(seen, best.camera.X_CW[None], np.inf)[0]
+    misfits = (E_total(found), intersection_over_union(found), ratios, agree)
+    rows = zip(seen.frames, *(one.tolist() for one in misfits), strict=True)
+    return PictureRegistration(
+        RegisteredCamera(
+            best.camera,
+            fit.camera_covariances(best.found, covariance)[0],
+            tuple(FrameMisfit(frame.name, *row) for frame, *row in rows),
+            np.array([np.linalg.inv(X) for X in alternatives]).reshape(-1, 4, 4),
+        ),
+        seen.frames,
+        {one.name: recording.read(recording.names.index(one.name)) for one in seen.frames},
+        best,
+        told,
+        float(deviations[fit.per_camera - 1]) if focal else 0.0,
+    )
+
+
+def _unexplained(camera: PinholeCamera, why: str) -> RegistrationError:
+    return RegistrationError(
+        f"camera '{camera.name}': no pose explains its pictures: {why}. Does the camera stand "
+        "still, does the robot move much in view of it, are the joint positions of these pictures' "
+        "moments, in the model's zeros and signs, and is the focal length about right? Nothing was "
+        "written"
+    )

@@ -1,0 +1,242 @@
+"""Where a camera stands, told by its pictures alone: no masks, no guess.
+
+The body's positions are known in each picture, and the camera stands still: so a pose of the camera
+says in which frames the body covers each pixel, and the pixels' colours say how well that fits
+(``fit.background``). Rotations spread over all, and more of them near upright, are tried with the
+bodies where pictures change; the best are improved step by step, in larger and larger pictures, and
+in the end by the one fit, on lines across the contour in the odds of pixels to show the body.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_pose.camera.models import PinholeCamera
+from drake_pose.fit.background import KnownBackground, Light, mask_of_odds, odds_picture
+from drake_pose.fit.levenberg_marquardt import AnnealingStage
+from drake_pose.fit.parameters import POSE_NAMES
+from drake_pose.fit.surfaces import hull_of_few
+from drake_pose.registration.picture_levels import PictureLevel, SearchRound
+from drake_pose.registration.posed_frames import PosedFrame, PosedFrames
+from drake_pose.registration.register import RegistrationBody
+from drake_pose.registration.shared_fit import Shared, SharedFit
+from drake_pose.silhouette.areas.scoring import draw_mask
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+Picture = NDArray[np.uint8]
+
+SEARCHED = 12
+"""So many pictures carry a search."""
+
+# The first ones of them are its beginning.
+_BEGINNING = 6
+_ROUNDS = (
+    SearchRound(48, 400, 25, 0.25, 8.0),
+    SearchRound(48, 150, 30, 0.15, 8.0),
+    SearchRound(80, 50, 60, 0.1, 10.0),
+    SearchRound(80, 20, 90, 0.06, 10.0),
+    SearchRound(160, 6, 120, 0.04, 20.0),
+)
+# Triangles of a node, up to which width of pictures [pixel].
+_TRIANGLES, _WIDTHS = (12, 40, 100), (60, 120)
+# Poses are compared in pictures so wide, and backgrounds learned in these.
+_COMPARED, _LEARNED = 160, 320
+# Fits on lines: scales of steps [pixel of a picture _SCALED wide], and from line to line [scale];
+# backgrounds are learned anew before each row. What lines cost does not compare from place to
+# place, so each step is taken.
+_SCALED, _SPACING = 320.0, 0.5
+_LINES = (
+    (*(12.0,) * 4, *(8.0,) * 4, *(5.0,) * 4),
+    (*(6.0,) * 3, *(4.0,) * 3, *(3.0,) * 3),
+    (*(3.0,) * 2, *(2.0,) * 2, *(1.0,) * 2, *(0.75,) * 8),
+)
+
+
+@dataclass(frozen=True, eq=False)
+class PosedPicture:
+    """One picture of a body at known joint positions.
+
+    Args:
+        values: (m,) of the body's pose tree [rad or m].
+        picture: (H, W, 3) red, green, blue.
+        rates: (m,) how fast the values change [rad/s or m/s]; None: nobody knows.
+    """
+
+    name: str
+    values: Array
+    picture: Picture
+    rates: Array | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class PictureFit:
+    """A camera that was fitted to pictures.
+
+    Args:
+        fit: the fit of its frames, which have the odds of their pixels, and masks of these.
+        found: by it.
+        background: what is behind the body, by which odds of other pictures are told.
+        explained: share of what could be explained at most, that the pose explains.
+        contour: how strong edges are along the outlines, beyond chance.
+    """
+
+    fit: SharedFit
+    found: Shared
+    background: KnownBackground
+    explained: float
+    contour: float
+
+    @property
+    def camera(self) -> PinholeCamera:
+        """Where it was found."""
+        return self.fit.cameras(self.found)[0]
+
+
+def node_places(body: RegistrationBody, values: Array) -> Array:
+    """(f, n, 3) the middles of the nodes that show, in frames with values (f, m) [m]."""
+    shown = [k for k, one in enumerate(body.very_few) if len(one.vertices)]
+    X_WN = np.array([body.kinematics.poses(one)[shown] for one in values])
+    middles = np.array([body.very_few[k].ball[:3] for k in shown])
+    return np.asarray(np.einsum("fnij,nj->fni", X_WN[..., :3, :3], middles) + X_WN[..., :3, 3])
+
+
+def choose_frames(places: Array, count: int) -> list[int]:
+    """Which of frames differ most, best first (farthest point sampling).
+
+    Args:
+        places: (f, n, 3) as of ``node_places``.
+    """
+
+    def off(other: Array) -> Array:
+        return np.asarray(np.linalg.norm(places - other, axis=2).mean(axis=1))
+
+    chosen = [int(np.argmax(off(places.mean(axis=0))))]
+    nearest = off(places[chosen[0]])
+    while len(chosen) < min(count, len(places)):
+        chosen.append(int(np.argmax(nearest)))
+        nearest = np.minimum(nearest, off(places[chosen[-1]]))
+    return chosen
+
+
+class PictureSearch:
+    """Finds where a camera stands in some of its pictures.
+
+    Args:
+        camera: its pose is not used.
+        frames: those that tell most first.
+    """
+
+    def __init__(
+        self, body: RegistrationBody, camera: PinholeCamera, frames: Sequence[PosedPicture]
+    ) -> None:
+        self._body, self._camera, self.frames = body, camera, tuple(frames)
+        self._outlines = tuple(hull_of_few(body.very_few, count) for count in _TRIANGLES)
+        self._X_WN = np.array([body.kinematics.poses(one.values) for one in frames])
+        self._levels = dict[int, PictureLevel]()
+
+    @property
+    def compared(self) -> PictureLevel:
+        """In which poses are compared."""
+        return self._level(_COMPARED)
+
+    def search(self) -> list[Array]:
+        """Poses X_CW (4, 4) near which the camera's may be, best first."""
+        level = self._level(_ROUNDS[0].width)
+        starts = level.starts()
+        scores = np.array([level.score(X, _ROUNDS[0].contour) for X in starts])
+        found = [starts[k] for k in np.argsort(-scores, kind="stable")]
+        for step in _ROUNDS:
+            level = self._level(step.width)
+            improved = [level.improve(X, step, key) for key, X in enumerate(found[: step.kept])]
+            improved.sort(key=lambda one: -one[0])
+            found = level.distinct([X for _, X in improved])
+        return found
+
+    def fit(
+        self, camera: PinholeCamera, constants: Sequence[str] = (), focal: bool = False
+    ) -> PictureFit | None:
+        """A camera fitted on lines across the contour in the frames, from where it stands.
+
+        None where the body leaves the pictures.
+
+        Args:
+            constants: what else of all frames is fitted, as of ``SharedFit``.
+            focal: whether its focal length is, too.
+        """
+        pixel, looks = camera.width / _SCALED, len(POSE_NAMES) + focal
+        for k, rounds in enumerate(_LINES):
+            last = k == len(_LINES) - 1
+            known, covered = self._learn(camera)
+            seen = self._see(camera, known, covered, last)
+            if seen is None:
+                return None
+            fit = SharedFit([seen], [camera.X_CW], constants, looks=looks, widths=last)
+            sizes = np.array(rounds) * pixel / seen.size
+            stages = [AnnealingStage(one, _SPACING * one) for one in sizes.tolist()]
+            agree = fit.agreeing(fit.inlier_ratios(fit.start)) if last else None
+            found = fit.fit(stages, which=agree)
+            camera = fit.cameras(found)[0]
+        return PictureFit(fit, found, known, *self.compared.explained(camera.X_CW))
+
+    def _learn(self, camera: PinholeCamera) -> tuple[KnownBackground, Mask]:
+        """What is behind the body before a camera, and where that is (f, H, W)."""
+        level = self._level(_LEARNED)
+        small = camera.resized(level.camera.width, level.camera.height)
+        poses = camera.X_CW @ self._X_WN
+        both = [
+            np.array([draw_mask(self._outlines[-1], X_CN, one) for X_CN in poses])
+            for one in (small, camera)
+        ]
+        pictures, lights = [one.picture for one in self.frames], level.backgrounds.lights
+        showing = level.backgrounds.showing(both[0])
+        return KnownBackground.of(pictures, lights, showing, both[1]), both[1]
+
+    def _see(
+        self, camera: PinholeCamera, known: KnownBackground, covered: Mask, whole: bool
+    ) -> PosedFrames | None:
+        """Frames with the odds of their pixels and masks of these; None: fewer than two show it.
+
+        Args:
+            covered: (f, H, W) where the body is about; frames that do not show it tell nothing.
+            whole: whether the body's whole surfaces are compared.
+        """
+        posed, lights = [], self._level(_LEARNED).backgrounds.lights
+        for one, light, own in zip(self.frames, lights, covered, strict=True):
+            frame = see_picture(one, known, light, own)
+            if frame is not None:
+                posed.append(frame)
+        if len(posed) < 2:
+            return None
+        outlines = self._body.all if whole else self._outlines[-1]
+        return PosedFrames(self._body.kinematics, outlines, camera, posed)
+
+    def _level(self, width: int) -> PictureLevel:
+        if width not in self._levels:
+            k = sum(width > one for one in _WIDTHS)
+            count = (_BEGINNING, SEARCHED)[min(k, 1)] if width < _COMPARED else len(self.frames)
+            pictures = [one.picture for one in self.frames[:count]]
+            self._levels[width] = PictureLevel(
+                self._outlines[k], self._camera, pictures, self._X_WN[:count], width
+            )
+        return self._levels[width]
+
+
+def see_picture(
+    one: PosedPicture, known: KnownBackground, light: Light, covered: Mask
+) -> PosedFrame | None:
+    """A picture with the odds of its pixels and a mask of these; None where no body shows.
+
+    covered: (H, W) where the body is about.
+    """
+    if not covered.any():
+        return None
+    odds = known.odds(one.picture, light)
+    mask = mask_of_odds(odds, covered)
+    if not mask.any():
+        return None
+    return PosedFrame(one.name, one.values, mask, odds_picture(odds), one.rates)

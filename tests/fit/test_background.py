@@ -1,0 +1,127 @@
+"""Pictures as evidence: against sums over masks, and against what was painted."""
+
+import numpy as np
+import pytest
+
+from drake_pose.fit.background import (
+    Backgrounds,
+    KnownBackground,
+    Light,
+    mask_of_odds,
+    odds_of_colours,
+    odds_picture,
+)
+from drake_pose.fit.background_kernel import AREA, CONTOUR, GAIN, OUTLINE, explain
+from drake_pose.fit.colour_lines import COLOURS, ODDS
+from drake_pose.silhouette.areas.outline import pack
+from drake_pose.silhouette.areas.scoring import draw_mask
+from tests.registration.episodes import painted_episode
+
+
+@pytest.fixture(scope="module")
+def episode(tmp_path_factory):
+    return painted_episode(tmp_path_factory.mktemp("arm"), frames=6, size=(80, 60))
+
+
+def drawn(episode, X_CW):
+    """(f, H, W) masks of the body, and the kernel's arguments."""
+    outlines = episode.body.very_few
+    poses = [X_CW @ episode.body.kinematics.poses(values) for values in episode.values]
+    masks = np.array([draw_mask(outlines, X, episode.camera) for X in poses])
+    return masks, (pack(outlines), np.ascontiguousarray(np.array(poses)[:, :, :3]))
+
+
+def test_what_a_pose_explains_is_a_sum_over_pixels(episode):
+    backgrounds = Backgrounds.of(episode.pictures)
+    sums = backgrounds.sums
+    masks, (packed, X_CN) = drawn(episode, episode.camera.X_CW)
+    still = np.zeros(X_CN.shape[1], bool)
+    told, pieces = explain(packed, X_CN, still, episode.camera.kernel_parameters(), sums, 20.0, 4)
+    covered = np.moveaxis(masks, 0, -1)
+    each = sums.shown + np.where(covered[..., None], sums.more, 0.0).sum(axis=2)
+    gain = each.max(axis=-1) - sums.none
+    always = covered.all(axis=-1)
+    gain[always] = 0.3 * np.maximum(gain[always], 0.0)
+    gain[~covered.any(axis=-1)] = 0.0
+    assert told[AREA] == masks.sum()
+    np.testing.assert_allclose(told[GAIN], gain.sum(), rtol=1e-4)
+    by_square = np.add.reduceat(np.add.reduceat(gain, [0, 20, 40], 0), [0, 20, 40, 60], 1)
+    np.testing.assert_allclose(pieces[:3], by_square, rtol=1e-3, atol=1e-2)
+
+
+def test_outlines_are_where_neighbours_are_not_covered(episode):
+    sums = Backgrounds.of(episode.pictures).sums
+    masks, (packed, X_CN) = drawn(episode, episode.camera.X_CW)
+    parameters = episode.camera.kernel_parameters()
+    for still in (False, True):
+        stands = np.full(X_CN.shape[1], still)
+        told, _ = explain(packed, X_CN, stands, parameters, sums, 1.0, 0)
+        inner = np.pad(masks, ((0, 0), (1, 1), (1, 1)), mode="edge")
+        left, right = inner[:, 1:-1, :-2], inner[:, 1:-1, 2:]
+        above, below = inner[:, :-2, 1:-1], inner[:, 2:, 1:-1]
+        across_u, across_v = masks & ~(left & right), masks & ~(above & below)
+        assert told[OUTLINE] == (across_u | across_v).sum()
+        u, v = (
+            np.where(a, e, -np.inf) for a, e in zip((across_u, across_v), sums.edges, strict=True)
+        )
+        strongest = np.maximum(u, v)[across_u | across_v]
+        np.testing.assert_allclose(told[CONTOUR], strongest.sum(), rtol=1e-4)
+        # What stands still is its own background, and explains nothing else.
+        assert (told[GAIN] == 0.0) == still
+
+
+def test_the_true_pose_explains_most_of_those_near(episode):
+    sums = Backgrounds.of(episode.pictures).sums
+    parameters = episode.camera.kernel_parameters()
+
+    def gain(X_CW):
+        packed, X_CN = drawn(episode, X_CW)[1]
+        return explain(packed, X_CN, np.zeros(X_CN.shape[1], bool), parameters, sums, 1.0, 0)[0][
+            GAIN
+        ]
+
+    true = gain(episode.camera.X_CW)
+    for axis in range(3):
+        for by in (-0.08, 0.08):
+            moved = episode.camera.X_CW.copy()
+            moved[axis, 3] += by
+            assert gain(moved) < true
+
+
+def test_light_is_told_whatever_else_changes():
+    rng = np.random.default_rng(0)
+    reference = rng.uniform(40.0, 200.0, (40, 50, 3)).astype(np.float32)
+    gain, offset = np.array([0.8, 1.1, 1.2]), np.array([10.0, -5.0, 3.0])
+    picture = ((reference - offset) / gain).astype(np.float32)
+    picture[:15, :20] = 0.0
+    light = Light.between(picture, reference)
+    np.testing.assert_allclose(light.gain, gain, rtol=0.01)
+    np.testing.assert_allclose(light.offset, offset, atol=1.0)
+    np.testing.assert_allclose(light.evened(picture)[20:], reference[20:], atol=0.5)
+
+
+def test_odds_show_the_body_and_the_background_behind_it(episode):
+    """The background is told where a frame shows it; and odds are for the body where it is."""
+    covered, _ = drawn(episode, episode.camera.X_CW)
+    backgrounds = Backgrounds.of(episode.pictures)
+    showing = backgrounds.showing(covered)
+    assert not (showing & covered).any()
+    known = KnownBackground.of(list(episode.pictures), backgrounds.lights, showing, covered)
+    assert (known.unseen == ~showing.any(axis=0)).mean() > 0.99
+    seen = ~known.unseen
+    assert np.median(np.abs(known.colours - episode.background).max(axis=-1)[seen]) < 6.0
+    for picture, light, mask in zip(episode.pictures, backgrounds.lights, covered, strict=True):
+        odds = known.odds(picture, light)
+        assert ((odds > 0.0) == mask)[seen].mean() > 0.97
+        found = mask_of_odds(odds, mask)
+        assert (found & mask).sum() / (found | mask).sum() > 0.85
+
+
+def test_odds_pictures_are_read_as_they_were_written():
+    odds = np.linspace(-9.0, 9.0, 120, dtype=np.float32).reshape(10, 12)
+    picture = odds_picture(odds)
+    red, green, blue = np.moveaxis(picture.astype(np.intp) >> 4, -1, 0)
+    table = odds_of_colours(2)
+    assert table.shape == (2, 3, COLOURS)
+    read = table[1, ODDS][(red * 16 + green) * 16 + blue]
+    np.testing.assert_allclose(read, np.clip(odds, -8.0, 8.0), atol=0.01)

@@ -1,0 +1,180 @@
+"""Registrations of episodes: pictures and joints by time, no masks."""
+
+import csv
+import json
+
+import cv2
+import numpy as np
+import pytest
+
+from drake_pose.camera.camera_files import load_cameras, save_cameras
+from drake_pose.commands.main import app
+from drake_pose.errors import DrakePoseError
+from drake_pose.jobs.registration.episodes import is_episode, read_episode
+from drake_pose.jobs.registration.register import register_scene
+from drake_pose.jobs.registration.settings import RegistrationSettings
+from drake_pose.silhouette.pictures.scenes import load_scene
+from tests.benchmarks.registration import pose_error
+from tests.cli import CliRunner
+from tests.registration.episodes import painted_episode
+
+LATE = 0.04
+NAMES = tuple(f"joint{k}" for k in range(5))
+
+
+def write_log(path, times, values, names=NAMES):
+    with path.open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(["time", *names])
+        writer.writerows([t, *row] for t, row in zip(times, values, strict=True))
+
+
+@pytest.fixture(scope="module")
+def episode(tmp_path_factory):
+    """A folder of pictures with a joint log at another rate, and what is in it."""
+    folder = tmp_path_factory.mktemp("episode")
+    painted = painted_episode(folder, late=LATE)
+    scene = folder / "scene"
+    (scene / "images" / "camera").mkdir(parents=True)
+    for k, picture in enumerate(painted.pictures):
+        cv2.imwrite(str(scene / "images" / "camera" / f"{k:04d}.png"), picture[..., ::-1])
+    rows = [["frame", "time"], *([f"{k:04d}", t] for k, t in enumerate(painted.times))]
+    text = "\n".join(",".join(map(str, row)) for row in rows)
+    (scene / "images" / "camera" / "timestamps.csv").write_text(text)
+    save_cameras(scene / "cameras.yaml", [painted.camera])
+    times = np.arange(-0.5, painted.times[-1] + 0.5, 0.05)
+    write_log(scene / "joint_angles.csv", times, painted.values_at(times))
+    return scene, painted
+
+
+def test_what_is_an_episode(episode, tmp_path):
+    scene, _ = episode
+    settings = RegistrationSettings()
+    assert is_episode(scene, settings)
+    (tmp_path / "images").mkdir()
+    assert is_episode(tmp_path, settings)
+    (tmp_path / "masks").mkdir()
+    assert not is_episode(tmp_path, settings)
+    assert is_episode(tmp_path, RegistrationSettings(pictures=True))
+
+
+def test_joints_are_where_their_log_says_at_the_pictures_times(episode):
+    scene, painted = episode
+    read = read_episode(scene, painted.path, None, None, RegistrationSettings())
+    assert read.seen is None
+    assert not read.assumed
+    (recording,) = read.recordings.values()
+    for offset in (0.0, 0.07):
+        # Between rows of the log a swing is straight.
+        np.testing.assert_allclose(
+            recording.values_at(offset), painted.values_at(painted.times + offset), atol=2e-3
+        )
+    ahead, behind = (painted.values_at(painted.times + by) for by in (0.02, -0.02))
+    np.testing.assert_allclose(recording.rates_at(0.0), (ahead - behind) / 0.04, atol=0.05)
+    np.testing.assert_array_equal(recording.read(3), painted.pictures[3])
+    some = RegistrationSettings(every=4, frames=("0004:0015",))
+    (few,) = read_episode(scene, painted.path, None, None, some).recordings.values()
+    assert few.names == ("0004", "0008", "0012")
+    np.testing.assert_array_equal(few.read(1), painted.pictures[8])
+
+
+def test_parts_that_unlogged_joints_move_are_not_looked_at(episode, tmp_path):
+    scene, painted = episode
+    times = np.arange(0.0, 6.0, 0.1)
+    write_log(tmp_path / "some.csv", times, painted.values_at(times)[:, :3], NAMES[:3])
+    read = read_episode(scene, painted.path, tmp_path / "some.csv", None, RegistrationSettings())
+    assert read.seen == ("box0", "box1", "box2")
+    assert any("box3, box4" in text for text in read.warnings)
+    held = RegistrationSettings(hold={"joint3": 0.0, "joint4": 10.0})
+    read = read_episode(scene, painted.path, tmp_path / "some.csv", None, held)
+    assert read.seen is None
+
+
+def test_a_focal_length_that_nobody_knows_is_a_usual_one(episode, tmp_path):
+    scene, painted = episode
+    (tmp_path / "images").symlink_to(scene / "images")
+    (tmp_path / "joint_angles.csv").symlink_to(scene / "joint_angles.csv")
+    read = read_episode(tmp_path, painted.path, None, None, RegistrationSettings())
+    assert read.assumed == {"camera"}
+    given = read_episode(
+        tmp_path, painted.path, None, scene / "cameras.yaml", RegistrationSettings()
+    )
+    assert given.cameras["camera"].focal_x == painted.camera.focal_x
+    assert not given.assumed
+
+
+@pytest.mark.parametrize(
+    ("spoil", "words"),
+    [
+        (lambda scene: (scene / "joint_angles.csv").unlink(), "holds no joint positions"),
+        (
+            lambda scene: save_cameras(
+                scene / "cameras.yaml",
+                [load_cameras(scene / "cameras.yaml")["camera"].resized(320, 240)],
+            ),
+            "320 x 240 pixels .*but its pictures 160 x 120",
+        ),
+        (
+            lambda scene: write_log(
+                scene / "joint_angles.csv", [0.0, 1.0], np.zeros((2, 5)), [f"a{k}" for k in "vwxyz"]
+            ),
+            "no column of the joint log is a joint",
+        ),
+    ],
+)
+def test_what_cannot_be_used_is_named(episode, tmp_path, spoil, words):
+    scene, painted = episode
+    for file in ("joint_angles.csv", "cameras.yaml"):
+        (tmp_path / file).write_bytes((scene / file).read_bytes())
+    (tmp_path / "images").symlink_to(scene / "images")
+    spoil(tmp_path)
+    with pytest.raises(DrakePoseError, match=words):
+        read_episode(tmp_path, painted.path, None, None, RegistrationSettings())
+
+
+@pytest.mark.parametrize("name", ["on", "target", "suggest"])
+def test_options_that_need_masks_are_refused(episode, name, tmp_path):
+    scene, painted = episode
+    value = {"on": "box4", "target": tmp_path / "sheet.urdf", "suggest": True}[name]
+    with pytest.raises(DrakePoseError, match=f"--{name} needs masks"):
+        register_scene(scene, painted.path, settings=RegistrationSettings(**{name: value}))
+
+
+@pytest.mark.slow
+def test_an_episode_becomes_a_calibrated_scene(episode, tmp_path):
+    scene, painted = episode
+    out = tmp_path / "out"
+    arguments = ["register", str(scene), "--model", str(painted.path), "--out", str(out), "--json"]
+    result = CliRunner().invoke(app, arguments)
+    assert result.exit_code == 0, result.output
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["masks"] == "found"
+    deviation = summary["time_offset_sd_s"]
+    assert summary["time_offset_s"] == pytest.approx(LATE, abs=3.0 * deviation + 2e-3)
+    found = load_cameras(out / "cameras.yaml")["camera"]
+    error = pose_error(found.X_WC, painted.camera.X_WC)
+    assert np.linalg.norm(error[3:]) < 0.012
+    assert np.degrees(np.linalg.norm(error[:3])) < 0.4
+    # The result is a scene of masks, that other commands read.
+    masks = load_scene(out)
+    with (out / "joint_angles.csv").open(newline="") as file:
+        rows = {row["frame"]: row for row in csv.DictReader(file)}
+    assert set(rows) == set(masks.frames)
+    for frame in masks.frames:
+        k = int(frame)
+        told = [float(rows[frame][name]) for name in NAMES]
+        np.testing.assert_allclose(told, painted.values[k], atol=0.02)
+    assert (out / "overlay" / "camera" / f"{masks.frames[0]}.png").is_file()
+    again = register_scene(
+        out,
+        painted.path,
+        out / "joint_angles.csv",
+        settings=RegistrationSettings(cameras=("camera",)),
+    )
+    error = pose_error(again.registered["camera"].camera.X_WC, painted.camera.X_WC)
+    assert np.linalg.norm(error[3:]) < 0.02
+
+
+def test_a_folder_of_neither_masks_nor_pictures_is_refused(tmp_path, episode):
+    with pytest.raises(DrakePoseError, match=r"cameras\.yaml"):
+        register_scene(tmp_path, episode[1].path, tmp_path / "joints.csv")

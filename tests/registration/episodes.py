@@ -1,0 +1,74 @@
+"""Episodes of an arm of boxes, painted over Drake's label images."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from drake_pose.body.model import ArticulatedModel
+from drake_pose.camera.models import PinholeCamera
+from drake_pose.registration.register import RegistrationBody
+from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
+from tests.benchmarks.registration import load_arm, write_box_arm
+
+
+@dataclass(frozen=True, eq=False)
+class PaintedEpisode:
+    """An arm that swings before a picture: (f, H, W, 3) at times (f,) [s], values (f, m)."""
+
+    path: Path
+    model: ArticulatedModel
+    body: RegistrationBody
+    camera: PinholeCamera
+    times: np.ndarray
+    values: np.ndarray
+    pictures: np.ndarray
+    background: np.ndarray
+
+    def values_at(self, times: np.ndarray) -> np.ndarray:
+        """(n, m) where the arm truly is."""
+        return swinging(np.asarray(times), self.values.shape[1])
+
+
+def swinging(times: np.ndarray, count: int) -> np.ndarray:
+    """(n, count) positions of joints that swing, each at its own rate."""
+    k = np.arange(count)
+    return 0.9 * np.sin(2.0 * k + (1.1 + 0.25 * k) * times[:, None]) + 0.15 * (k - 2)
+
+
+def painted_episode(
+    folder: Path, frames: int = 16, size: tuple[int, int] = (160, 120), late: float = 0.0
+) -> PaintedEpisode:
+    """An episode; pictures show where the arm is so much later [s]."""
+    path = write_box_arm(folder / "boxes.urdf")
+    body = load_arm(path)
+    width, height = size
+    forward = np.array([-0.85, 0.35, -0.25])
+    forward /= np.linalg.norm(forward)
+    right = np.cross(forward, [0.1, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    X_WC = np.eye(4)
+    X_WC[:3, :3] = np.column_stack([right, np.cross(forward, right), forward])
+    X_WC[:3, 3] = np.array([0.0, 0.0, 0.45]) - 1.6 * forward
+    focal = 0.95 * width
+    camera = PinholeCamera(
+        "camera", width, height, focal, focal, 0.5 * (width - 1), 0.5 * (height - 1), X_WC
+    )
+    rng = np.random.default_rng(3)
+    patches = rng.uniform(20.0, 235.0, (9, 12, 3)).astype(np.float32)
+    background = cv2.resize(patches, size, interpolation=cv2.INTER_CUBIC).clip(0.0, 255.0)
+    times = np.arange(frames) * 0.4
+    values = swinging(times + late, len(body.kinematics.names))
+    renderer, pictures = LabelRenderer(body.tree.model, camera), []
+    colours = rng.uniform(30.0, 225.0, (20, 3))
+    for row in values:
+        segments = renderer.segments(*body.tree.positions_from(body.kinematics.split(row)))
+        painted = np.where((segments >= 0)[..., None], colours[segments], background)
+        noisy = painted + rng.normal(0.0, 2.0, painted.shape)
+        pictures.append(np.clip(noisy, 0.0, 255.0).astype(np.uint8))
+    return PaintedEpisode(
+        path, body.tree.model, body, camera, times, values, np.array(pictures), background
+    )

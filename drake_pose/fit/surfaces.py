@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import lru_cache
+from itertools import chain
 
 import fast_simplification
 import numpy as np
@@ -37,6 +38,8 @@ _ENOUGH = 1.1
 _GRIDS = 10.0, 20.0, 40.0
 # A process that estimates or audits many scenes of a body simplifies its surfaces once.
 _REMEMBERED = 256
+# Triangles are told apart by so many sizes, each a quarter of the one before.
+_SIZES = 6
 # Points of a surface whose distances from another are measured.
 _POINTS = 300
 
@@ -164,14 +167,23 @@ def _squared_distances(one: Outline, other: Outline) -> Array:
     centers = corners.mean(axis=1)
     radii = np.linalg.norm(corners - centers[:, None], axis=2).max(axis=1)
     nearest = cKDTree(other.vertices).query(points)[0]
-    # Nothing in the ball around a triangle is nearer than what was found.
-    about = cKDTree(centers).query_ball_point(points, nearest + radii.max())
-    pairs = []
-    for i, found in enumerate(about):
-        apart = np.linalg.norm(centers[found] - points[i], axis=1)
-        near = np.array(found, dtype=np.intp)[apart <= nearest[i] + radii[found]]
-        pairs.append(np.column_stack([np.full(len(near), i), near]))
-    owners, triangles = np.concatenate(pairs).T
+    pairs: list[tuple[NDArray[np.intp], NDArray[np.intp]]] = []
+    # Small triangles first: a few large ones would call for all the small ones around them.
+    size = float(radii.max())
+    sizes = size * 0.25 ** np.arange(_SIZES)
+    for least, most in zip((*sizes[1:], -1.0), sizes, strict=True):
+        own = np.flatnonzero((radii > least) & (radii <= most))
+        if not len(own):
+            continue
+        # Nothing in the ball around a triangle is nearer than what was found.
+        about = cKDTree(centers[own]).query_ball_point(points, nearest + most)
+        counts = [len(one) for one in about]
+        who = np.repeat(np.arange(len(points)), counts)
+        which = own[np.fromiter(chain.from_iterable(about), np.intp, sum(counts))]
+        apart = np.linalg.norm(centers[which] - points[who], axis=1)
+        near = apart <= nearest[who] + radii[which]
+        pairs.append((who[near], which[near]))
+    owners, triangles = (np.concatenate(one) for one in zip(*pairs, strict=True))
     closest = trimesh.triangles.closest_point(corners[triangles], points[owners])
     squares = nearest**2
     np.fmin.at(squares, owners, ((closest - points[owners]) ** 2).sum(axis=1))

@@ -14,7 +14,7 @@ from drake_pose.camera.models import PinholeCamera
 from drake_pose.fit.background import Backgrounds
 from drake_pose.fit.background_kernel import CONTOUR, GAIN, OUTLINE, explain
 from drake_pose.registration.posed_frames import placed_points
-from drake_pose.registration.start_poses import apart_from_before, spread_rotations
+from drake_pose.registration.start_poses import spread_rotations
 from drake_pose.silhouette.areas.outline import Outline, pack
 
 Array = NDArray[np.float64]
@@ -163,15 +163,19 @@ class PictureLevel:
         found = minimize(cost, np.zeros(6), method="Nelder-Mead", options=options)
         return -float(found.fun), self._moved(X_CW, found.x)
 
-    def distinct(self, X_CW: Sequence[Array]) -> list[Array]:
-        """Those of some poses that show the body elsewhere than all before them."""
+    def distinct(self, X_CW: Sequence[Array], most: int | None = None) -> list[Array]:
+        """Those of some poses that show the body elsewhere than all before; so many at most."""
         some = self._points[:: max(1, len(self._points) // 50)]
-
-        def differ(X: Array, other: Array) -> bool:
-            by = some @ (X - other)[:3, :3].T + (X - other)[:3, 3]
-            return bool(np.linalg.norm(by, axis=1).mean() > _APART * self._size)
-
-        return apart_from_before(X_CW, differ)
+        kept, places = list[Array](), np.zeros((0, *some.shape))
+        for X in X_CW:
+            p_C = some @ X[:3, :3].T + X[:3, 3]
+            apart = np.linalg.norm(places - p_C, axis=2).mean(axis=1)
+            if (apart > _APART * self._size).all():
+                kept.append(X)
+                places = np.concatenate([places, p_C[None]])
+            if len(kept) == most:
+                break
+        return kept
 
     def _moved(self, X_CW: Array, x: Array) -> Array:
         """A pose (4, 4) by a turn about the body's middle, its shift in the picture, log depth."""

@@ -132,28 +132,25 @@ def register_pictures(
     chosen, moving = _choose(body, camera, recording)
     begin = _posed(recording, chosen, 0.0)
     search = PictureSearch(body, camera, begin)
-    fits = [search.fit(camera.with_pose(np.linalg.inv(X))) for X in search.search()[:_LOOKS]]
-    fitted = [one for one in fits if one is not None]
-    if not fitted:
+    looks = [search.approach(camera.with_pose(np.linalg.inv(X))) for X in search.search()[:_LOOKS]]
+    near = sorted((one for one in looks if one is not None), key=lambda one: -one[1])
+    if not near:
         raise _unexplained(camera, "no pose shows the body in two pictures")
-    best = max(fitted, key=lambda one: one.explained)
-    pieces = search.compared.pieces(best.camera.X_CW)
+    level, start = search.compared, near[0][0]
+    pieces = level.pieces(start.X_CW)
     alike = [
-        one.camera.X_CW for one in fitted
-        if one is not best
-        and excess(pieces, search.compared.pieces(one.camera.X_CW)) <= _SIGNIFICANCE
-    ]  # fmt: skip
-    alternatives = search.compared.distinct([best.camera.X_CW, *alike])[1:]
+        one.X_CW for one, _ in near[1:] if excess(pieces, level.pieces(one.X_CW)) <= _SIGNIFICANCE
+    ]
+    alternatives = level.distinct([start.X_CW, *alike])[1:]
     both, offset, scores = [*chosen, *moving], 0.0, np.zeros((0, 2))
     if recording.timed:
-        offset, scores = _scan(body, best.camera, recording, both)
+        offset, scores = _scan(body, start, recording, both)
     for _ in range(2):
         last = PictureSearch(body, camera, _posed(recording, both, offset))
-        constants = (TIME_OFFSET,) if recording.timed else ()
-        again = last.fit(best.camera, constants, focal)
-        if again is None:
+        fitted = last.fit(start, (TIME_OFFSET,) if recording.timed else (), focal)
+        if fitted is None:
             raise _unexplained(camera, "the body leaves the pictures")
-        best, by = again, _constant(again, TIME_OFFSET)
+        best, start, by = fitted, fitted.camera, _constant(fitted, TIME_OFFSET)
         offset += by
         if abs(by) < _AGAIN:
             break

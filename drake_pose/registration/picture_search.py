@@ -24,6 +24,7 @@ from drake_pose.registration.picture_levels import PictureLevel, SearchRound
 from drake_pose.registration.posed_frames import PosedFrame, PosedFrames
 from drake_pose.registration.register import RegistrationBody
 from drake_pose.registration.shared_fit import Shared, SharedFit
+from drake_pose.silhouette.areas.outline import Outline
 from drake_pose.silhouette.areas.scoring import draw_mask
 
 Array = NDArray[np.float64]
@@ -36,11 +37,11 @@ SEARCHED = 12
 # The first ones of them are its beginning.
 _BEGINNING = 6
 _ROUNDS = (
-    SearchRound(48, 400, 25, 0.25, 8.0),
-    SearchRound(48, 150, 30, 0.15, 8.0),
-    SearchRound(80, 50, 60, 0.1, 10.0),
-    SearchRound(80, 20, 90, 0.06, 10.0),
-    SearchRound(160, 6, 120, 0.04, 20.0),
+    SearchRound(48, 350, 24, 0.25, 8.0),
+    SearchRound(48, 120, 30, 0.15, 8.0),
+    SearchRound(80, 40, 50, 0.1, 10.0),
+    SearchRound(80, 15, 80, 0.06, 10.0),
+    SearchRound(160, 5, 100, 0.04, 20.0),
 )
 # Triangles of a node, up to which width of pictures [pixel].
 _TRIANGLES, _WIDTHS = (12, 40, 100), (60, 120)
@@ -50,11 +51,9 @@ _COMPARED, _LEARNED = 160, 320
 # backgrounds are learned anew before each row. What lines cost does not compare from place to
 # place, so each step is taken.
 _SCALED, _SPACING = 320.0, 0.5
-_LINES = (
-    (*(12.0,) * 4, *(8.0,) * 4, *(5.0,) * 4),
-    (*(6.0,) * 3, *(4.0,) * 3, *(3.0,) * 3),
-    (*(3.0,) * 2, *(2.0,) * 2, *(1.0,) * 2, *(0.75,) * 8),
-)
+_ROUGH = ((*(12.0,) * 4, *(8.0,) * 4, *(5.0,) * 4), (*(6.0,) * 3, *(4.0,) * 3))
+_FINE = ((*(5.0,) * 4, *(3.0,) * 4), (*(3.0,) * 2, *(2.0,) * 3, *(1.0,) * 3))
+_LAST = (0.75,) * 7
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,17 +149,32 @@ class PictureSearch:
         starts = level.starts()
         scores = np.array([level.score(X, _ROUNDS[0].contour) for X in starts])
         found = [starts[k] for k in np.argsort(-scores, kind="stable")]
-        for step in _ROUNDS:
+        after = (*(one.kept for one in _ROUNDS[1:]), _ROUNDS[-1].kept)
+        for step, most in zip(_ROUNDS, after, strict=True):
             level = self._level(step.width)
             improved = [level.improve(X, step, key) for key, X in enumerate(found[: step.kept])]
             improved.sort(key=lambda one: -one[0])
-            found = level.distinct([X for _, X in improved])
+            found = level.distinct([X for _, X in improved], most)
         return found
+
+    def approach(self, camera: PinholeCamera) -> tuple[PinholeCamera, float] | None:
+        """A camera fitted roughly from where it stands, and the share that it explains.
+
+        None where the body leaves the pictures.
+        """
+        for scales in _ROUGH:
+            known, covered = self._learn(camera)
+            seen = self._see(camera, known, covered, self._outlines[-1])
+            if seen is None:
+                return None
+            fit = SharedFit([seen], [camera.X_CW], widths=False)
+            camera = fit.cameras(fit.fit(_stages(scales, seen)))[0]
+        return camera, self.compared.explained(camera.X_CW)[0]
 
     def fit(
         self, camera: PinholeCamera, constants: Sequence[str] = (), focal: bool = False
     ) -> PictureFit | None:
-        """A camera fitted on lines across the contour in the frames, from where it stands.
+        """A camera fitted on lines across the contour in the frames, from near where it stands.
 
         None where the body leaves the pictures.
 
@@ -168,19 +182,23 @@ class PictureSearch:
             constants: what else of all frames is fitted, as of ``SharedFit``.
             focal: whether its focal length is, too.
         """
-        pixel, looks = camera.width / _SCALED, len(POSE_NAMES) + focal
-        for k, rounds in enumerate(_LINES):
-            last = k == len(_LINES) - 1
+        looks, seen = len(POSE_NAMES) + focal, None
+        for scales, outlines in zip(_FINE, (self._outlines[-1], self._body.few), strict=True):
             known, covered = self._learn(camera)
-            seen = self._see(camera, known, covered, last)
+            seen = self._see(camera, known, covered, outlines)
             if seen is None:
                 return None
-            fit = SharedFit([seen], [camera.X_CW], constants, looks=looks, widths=last)
-            sizes = np.array(rounds) * pixel / seen.size
-            stages = [AnnealingStage(one, _SPACING * one) for one in sizes.tolist()]
-            agree = fit.agreeing(fit.inlier_ratios(fit.start)) if last else None
-            found = fit.fit(stages, which=agree)
+            fit = SharedFit([seen], [camera.X_CW], constants, looks=looks, widths=False)
+            which = fit.agreeing(fit.inlier_ratios(fit.start))
+            found = fit.fit(_stages(scales, seen), which=which)
             camera = fit.cameras(found)[0]
+        assert seen is not None
+        whole = PosedFrames(self._body.kinematics, self._body.all, camera, seen.frames)
+        fit = SharedFit([whole], [camera.X_CW], constants, looks=looks)
+        found = fit.start._replace(shared=_constants_of(fit, found))
+        which = fit.agreeing(fit.inlier_ratios(found))
+        found = fit.fit(_stages(_LAST, whole), found, which)
+        camera = fit.cameras(found)[0]
         return PictureFit(fit, found, known, *self.compared.explained(camera.X_CW))
 
     def _learn(self, camera: PinholeCamera) -> tuple[KnownBackground, Mask]:
@@ -197,13 +215,17 @@ class PictureSearch:
         return KnownBackground.of(pictures, lights, showing, both[1]), both[1]
 
     def _see(
-        self, camera: PinholeCamera, known: KnownBackground, covered: Mask, whole: bool
+        self,
+        camera: PinholeCamera,
+        known: KnownBackground,
+        covered: Mask,
+        outlines: Sequence[Outline],
     ) -> PosedFrames | None:
         """Frames with the odds of their pixels and masks of these; None: fewer than two show it.
 
         Args:
             covered: (f, H, W) where the body is about; frames that do not show it tell nothing.
-            whole: whether the body's whole surfaces are compared.
+            outlines: the surfaces that are compared.
         """
         posed, lights = [], self._level(_LEARNED).backgrounds.lights
         for one, light, own in zip(self.frames, lights, covered, strict=True):
@@ -212,7 +234,6 @@ class PictureSearch:
                 posed.append(frame)
         if len(posed) < 2:
             return None
-        outlines = self._body.all if whole else self._outlines[-1]
         return PosedFrames(self._body.kinematics, outlines, camera, posed)
 
     def _level(self, width: int) -> PictureLevel:
@@ -224,6 +245,19 @@ class PictureSearch:
                 self._outlines[k], self._camera, pictures, self._X_WN[:count], width
             )
         return self._levels[width]
+
+
+def _stages(scales: Sequence[float], seen: PosedFrames) -> list[AnnealingStage]:
+    """Steps at some scales, of pictures that are not so wide."""
+    sizes = np.array(scales) * seen.camera.width / _SCALED / seen.size
+    return [AnnealingStage(one, _SPACING * one) for one in sizes.tolist()]
+
+
+def _constants_of(fit: SharedFit, found: Shared) -> Array:
+    """(u,) what was found of all but the camera, which a fit has where it was found."""
+    shared = found.shared.copy()
+    shared[: fit.per_camera] = 0.0
+    return shared
 
 
 def see_picture(

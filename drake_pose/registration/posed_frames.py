@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import cv2
 import numpy as np
@@ -94,14 +94,12 @@ class PosedFrames:
     @cached_property
     def points(self) -> list[Array]:
         """Corners (n, 3) of the body's convex hull in each frame, in the world [m]."""
-        found = []
+        own = [hull_corners(outline) for outline in self.outlines]
+        placed = []
         for X_WN in self.X_WN:
-            points = placed_points(self.outlines, X_WN)
-            # A flat body has no hull.
-            with suppress(QhullError):
-                points = points[ConvexHull(points).vertices]
-            found.append(points)
-        return found
+            parts = zip(own, X_WN, strict=True)
+            placed.append(_hull(np.concatenate([p @ X[:3, :3].T + X[:3, 3] for p, X in parts])))
+        return placed
 
     @cached_property
     def middle(self) -> Array:
@@ -149,6 +147,19 @@ class PosedFrames:
             )
             sums.append(prefix_sums(shrunk > 0.5))
         return small, np.array(sums)
+
+
+@lru_cache(maxsize=512)
+def hull_corners(outline: Outline) -> Array:
+    """(n, 3) the corners of a surface's convex hull, in its frame [m]."""
+    return _hull(outline.vertices)
+
+
+def _hull(points: Array) -> Array:
+    """Those of points (n, 3) that are corners of their convex hull; a flat body's are all."""
+    with suppress(QhullError, ValueError):
+        return np.asarray(points[ConvexHull(points).vertices])
+    return points
 
 
 def placed_points(outlines: Sequence[Outline], X_WN: Array) -> Array:

@@ -54,7 +54,8 @@ def batch(
 
     Args:
         jobs: The job file (YAML).
-        workers: Number of worker processes on this machine; 0: none. Default: one for each core.
+        workers: Number of worker processes on this machine; 0: none. Default: one for each core, or
+            none where the extra cluster is not installed.
         chunk: Frames in a chunk. Default: that of the job file.
     """
     from drake_pose.jobs.batch.batch import run_batch

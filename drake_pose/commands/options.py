@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
-from drake_pose.commands.terminal import UsageError
+from drake_pose.commands.terminal import UsageError, warn
 from drake_pose.files.options import within
 
 if TYPE_CHECKING:
@@ -73,7 +73,7 @@ def workers_of(
     """The workers that were asked for; None: this process works.
 
     Args:
-        workers: how many on this machine; None: one for each core.
+        workers: how many on this machine; None: one for each core, or none without the extra.
         scheduler: address of a scheduler instead.
         shared: a folder that a scheduler's workers must see; None: none.
 
@@ -86,8 +86,12 @@ def workers_of(
     if workers == 0 and scheduler is None:
         yield None
         return
-    from drake_pose.jobs.cluster.scheduler import open_cluster, require_fit_workers
+    from drake_pose.jobs.cluster.scheduler import has_dask, open_cluster, require_fit_workers
 
+    if workers is None and scheduler is None and not has_dask():
+        warn('this process does all the work; for one a core: pip install "drake_pose[cluster]"')
+        yield None
+        return
     with open_cluster(workers, scheduler) as client:
         if scheduler is not None:
             require_fit_workers(client, shared)

@@ -37,6 +37,11 @@ _CONFIGURATION = {
 }
 
 
+def has_dask() -> bool:
+    """Whether the extra ``cluster`` is installed."""
+    return all(find_spec(name) for name in ("distributed", "zmq"))
+
+
 @contextmanager
 def open_cluster(workers: int | None = None, scheduler: str | None = None) -> Iterator[Client]:
     """Workers, for as long as the context lasts.
@@ -50,7 +55,7 @@ def open_cluster(workers: int | None = None, scheduler: str | None = None) -> It
         ClusterError: distributed is not installed, or the scheduler cannot be reached or has no
             workers, or these have another drake_pose.
     """
-    if not all(find_spec(name) for name in ("distributed", "zmq")):
+    if not has_dask():
         raise ClusterError(
             'workers need Dask distributed and pyzmq: pip install "drake_pose[cluster]"; or do '
             "without them: --workers 0"

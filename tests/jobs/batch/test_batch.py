@@ -255,11 +255,22 @@ def test_what_is_no_address_of_a_scheduler_is_named(address):
 
 
 @pytest.mark.parametrize("missing", ["distributed", "zmq"])
-def test_missing_extra_is_named(missing, jobs, scenes, tmp_path, monkeypatch):
+def test_without_the_extra_this_process_works_and_workers_are_refused(
+    missing, tmp_path, monkeypatch
+):
     monkeypatch.setitem(sys.modules, missing, None)
-    result = run_command(["batch", str(scenes / "jobs.yaml"), "--out", str(tmp_path / "out")])
-    assert result.exit_code == 1
-    assert 'pip install "drake_pose[cluster]"' in result.stderr
+    path = tmp_path / "jobs.yaml"
+    path.write_text("scenes: {gone: {scene: gone}}")
+    out = tmp_path / "out"
+    words = ["batch", str(path), "--out", str(out)]
+    refused = run_command([*words, "--workers", "2"])
+    assert refused.exit_code == 1
+    assert 'pip install "drake_pose[cluster]"' in refused.stderr
+    assert not out.exists()
+    done = run_command(words)
+    assert 'this process does all the work; for one a core: pip install "dr' in done.stderr
+    assert "scene 'gone'" in done.stderr
+    assert json.loads((out / "batch.json").read_text())["scenes"]["gone"]["state"] == "failed"
 
 
 def test_job_file_gives_the_settings(tmp_path):

@@ -8,6 +8,8 @@ import stat
 from pathlib import Path
 
 _END = 1 << 20
+# What is read whole is no larger [byte].
+_LARGEST = 1 << 31
 _KINDS = {
     stat.S_IFDIR: "folder",
     stat.S_IFIFO: "named pipe",
@@ -21,9 +23,10 @@ def read_regular(path: Path, limit: int = -1) -> bytes:
     """A file's content, or that of what a link leads to; at most ``limit`` bytes, if not negative.
 
     Raises:
-        OSError: it cannot be read, or is no regular file; strerror says which.
+        OSError: it cannot be read, is no regular file, or too large; strerror says which.
     """
-    require_regular(path)
+    if require_regular(path) > _LARGEST and limit < 0:
+        raise OSError(errno.EFBIG, f"it is larger than {_LARGEST >> 30} GiB", str(path))
     with path.open("rb") as file:
         return file.read(limit)
 

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import io
 import re
+import warnings
 from collections.abc import Iterable
 from pathlib import Path
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
+from PIL import Image, UnidentifiedImageError
 
 from drake_pose.arrays import Mask, Picture
 from drake_pose.camera.models import LARGEST_SIDE
@@ -21,9 +22,14 @@ SUFFIXES = (".png", ".jpg", ".jpeg")
 
 _PNG = b"\x89PNG\r\n\x1a\n"
 _JPEG, _JPEG_END = b"\xff\xd8", b"\xff\xd9"
+_DAMAGE = (
+    OSError, SyntaxError, ValueError, Image.DecompressionBombError, Image.DecompressionBombWarning
+)  # fmt: skip
 # A lossy picture of a mask is white from here on.
 _HALF = 128
 _NUMBER = re.compile("([0-9]+)")
+# No file's name is longer; Python refuses to read numbers of thousands of digits.
+_LONGEST_NAME = 256
 
 
 def natural_key(name: str) -> tuple[tuple[str, int], ...]:
@@ -39,7 +45,8 @@ def in_order(frames: Iterable[str]) -> tuple[str, ...]:
 
 def frame_number(frame: str) -> int | None:
     """Returns the number that a frame's name is, or None."""
-    return int(frame) if frame.isascii() and frame.isdigit() else None
+    is_number = frame.isascii() and frame.isdigit() and len(frame) < _LONGEST_NAME
+    return int(frame) if is_number else None
 
 
 def frame_key(cell: str) -> int | str:
@@ -50,11 +57,12 @@ def frame_key(cell: str) -> int | str:
 
 def read_picture(path: Path, error_type: type[DrakePoseError]) -> Picture:
     """Reads a PNG or JPEG picture (H, W, 3) red, green, blue; the error names the file."""
-    return decode_colours(read_picture_file(path, error_type), path, error_type)
+    return decode_colours(_read(path, error_type), path, error_type)
 
 
 def decode_colours(data: bytes, path: Path, error_type: type[DrakePoseError]) -> Picture:
-    """A picture (H, W, 3) red, green, blue of a PNG or JPEG file's content, as decode_picture."""
+    """A picture (H, W, 3) red, green, blue of a file's content; the error as read_picture_file."""
+    _check_content(data, path, error_type)
     picture = decode_picture(data, cv2.IMREAD_COLOR, path, error_type)
     return np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB), dtype=np.uint8)
 
@@ -137,39 +145,55 @@ def mask_of_picture(picture: Picture) -> Mask:
 def read_picture_file(
     path: Path, error_type: type[DrakePoseError], *, only_png: bool = False
 ) -> bytes:
-    """A whole PNG or JPEG file's content, as far as its frame tells; the error names the file."""
+    """A whole PNG or JPEG file's content, as far as its frame tells; the error names the file.
+
+    So are pictures refused whose pixels would fill the memory.
+    """
+    data = _read(path, error_type)
+    _check_content(data, path, error_type, only_png)
+    return data
+
+
+def _read(path: Path, error_type: type[DrakePoseError]) -> bytes:
     try:
-        data = read_regular(path)
+        return read_regular(path)
     except OSError as error:
         raise error_type(f"{path}: cannot read the picture: {error.strerror}") from error
-    if data.startswith(_JPEG) and not only_png:
-        if not data.rstrip(b"\0").endswith(_JPEG_END):
-            raise error_type(f"{path}: the JPEG picture is cut short")
-        return data
+
+
+def _check_content(
+    data: bytes, path: Path, error_type: type[DrakePoseError], only_png: bool = False
+) -> None:
+    """Raises what read_picture_file raises of a file's content."""
+    is_jpeg = data.startswith(_JPEG) and not only_png
+    if is_jpeg and not data.rstrip(b"\0").endswith(_JPEG_END):
+        raise error_type(f"{path}: the JPEG picture is cut short")
     # OpenCV's decoders differ from version to version in what they make of half a picture.
-    if not data.startswith(_PNG):
+    if not (is_jpeg or data.startswith(_PNG)):
         raise error_type(f"{path}: not a PNG picture")
     try:
-        with Image.open(io.BytesIO(data)) as picture:
-            width, height = picture.size
-            picture.verify()
-    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
-        raise error_type(
-            f"{path}: the PNG picture is cut short, damaged or too large: {error}"
-        ) from error
+        # Pillow warns of what it takes for a bomb, and raises at twice as many pixels alone.
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", Image.DecompressionBombWarning)
+            with Image.open(io.BytesIO(data)) as picture:
+                width, height = picture.size
+                picture.verify()
+    except _DAMAGE as error:
+        # What cannot be identified at all is told by its address in the memory.
+        why = "" if isinstance(error, UnidentifiedImageError) else f": {error}"
+        raise error_type(f"{path}: the picture is cut short, damaged or too large{why}") from error
     if max(width, height) > LARGEST_SIDE:
         raise error_type(
             f"{path}: {width} x {height} pixels are too many: at most {LARGEST_SIDE} a side"
         )
-    return data
 
 
 def decode_picture(data: bytes, how: int, path: Path, error_type: type[DrakePoseError]) -> Picture:
-    """A picture as OpenCV gives it; the error names a file that is no picture, or too large."""
+    """A picture as OpenCV gives it, of read_picture_file; the error names a file that is none."""
     try:
         picture = cv2.imdecode(np.frombuffer(data, np.uint8), how)
     except cv2.error:
         picture = None
-    if picture is None or max(picture.shape[:2]) > LARGEST_SIDE:
+    if picture is None:
         raise error_type(f"{path}: not a whole PNG or JPEG picture")
     return np.asarray(picture)

@@ -18,9 +18,8 @@ from numpy.typing import NDArray
 
 from drake_pose.arrays import Array, Integers
 from drake_pose.camera.models import check_number
-from drake_pose.camera.picture_files import decode_picture, list_pictures
+from drake_pose.camera.picture_files import decode_picture, list_pictures, read_picture_file
 from drake_pose.errors import CameraError
-from drake_pose.regular_files import read_regular
 from drake_pose.yaml_files import read_yaml
 
 Picture = tuple[str, str]
@@ -279,7 +278,4 @@ def find_boards(
 
 def read_board_picture(path: Path, how: int = cv2.IMREAD_COLOR) -> NDArray[np.uint8]:
     """A picture (H, W, 3) blue, green, red, or as a flag of OpenCV says; CameraError names it."""
-    try:
-        return decode_picture(read_regular(path), how, path, CameraError)
-    except OSError as error:
-        raise CameraError(f"{path}: cannot read the picture: {error.strerror}") from error
+    return decode_picture(read_picture_file(path, CameraError), how, path, CameraError)

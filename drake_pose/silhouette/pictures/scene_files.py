@@ -146,6 +146,12 @@ def find_images(
             found |= {(camera, name.stem): own / name for name in pictures}
         elif video := next((file for file in videos if file.is_file()), None):
             numbers = range(VideoPictures(video).count)
+            # No picture takes less than a byte. A recording that was not closed has no number.
+            if not 0 < len(numbers) <= video.stat().st_size:
+                raise SceneError(
+                    f"{video}: does not say how many pictures it has, or more than it can hold; "
+                    f"make it whole: ffmpeg -i {video.name} -c copy NEW"
+                )
             found |= {(camera, known.get(k, f"{k:06d}")): video for k in numbers}
     return found
 

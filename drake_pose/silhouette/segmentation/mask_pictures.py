@@ -97,8 +97,6 @@ def _open(path: Path) -> Image.Image:
     data = read_picture_file(path, MaskError)
     try:
         picture = Image.open(io.BytesIO(data))
-        if max(picture.size) > LARGEST_SIDE:
-            raise MaskError(f"{path}: has more than {LARGEST_SIDE} pixels a side")
         picture.load()
     except (OSError, SyntaxError, ValueError) as error:
         raise MaskError(f"{path}: not a whole PNG or JPEG picture") from error

@@ -6,8 +6,10 @@ import cv2
 import numpy as np
 import pytest
 
+from drake_pose.camera.picture_files import read_picture
 from drake_pose.errors import MaskError
 from drake_pose.silhouette.pictures.masks import read_mask, signed_distances, write_mask
+from drake_pose.silhouette.segmentation.mask_pictures import read_mask_picture
 
 MASK = np.zeros((20, 30), dtype=bool)
 MASK[4:9, 3:20] = True
@@ -80,8 +82,9 @@ def test_damaged_files_are_refused(tmp_path: Path) -> None:
             read_mask(path)
 
 
-def test_a_picture_that_would_fill_the_memory_is_refused(tmp_path: Path) -> None:
-    header = struct.pack(">IIBBBBB", 60_000, 60_000, 8, 0, 0, 0, 0)
+@pytest.mark.parametrize("side", [10_000, 60_000])
+def test_pictures_that_would_fill_the_memory_are_refused(tmp_path: Path, side: int) -> None:
+    header = struct.pack(">IIBBBBB", side, side, 8, 0, 0, 0, 0)
     data = b"\x89PNG\r\n\x1a\n"
     for kind, content in ((b"IHDR", header), (b"IEND", b"")):
         checksum = struct.pack(">I", zlib.crc32(kind + content))
@@ -89,6 +92,17 @@ def test_a_picture_that_would_fill_the_memory_is_refused(tmp_path: Path) -> None
     (tmp_path / "bomb.png").write_bytes(data)
     with pytest.raises(MaskError, match=r"bomb\.png.*too large"):
         read_mask(tmp_path / "bomb.png")
+    photo = bytearray(cv2.imencode(".jpg", np.zeros((20, 30, 3), np.uint8))[1].tobytes())
+    size = photo.index(b"\xff\xc0") + 5
+    photo[size : size + 4] = struct.pack(">HH", side, side)
+    (tmp_path / "bomb.jpg").write_bytes(photo)
+    for read in (read_mask_picture, lambda path: read_picture(path, MaskError)):
+        with pytest.raises(MaskError, match=r"bomb\.jpg.*too large"):
+            read(tmp_path / "bomb.jpg")
+    with (tmp_path / "sparse.png").open("wb") as file:
+        file.truncate(1 << 40)
+    with pytest.raises(MaskError, match=r"sparse\.png.*larger than 2 GiB"):
+        read_mask(tmp_path / "sparse.png")
 
 
 def test_unreadable_files_are_refused(tmp_path: Path) -> None:

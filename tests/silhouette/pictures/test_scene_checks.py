@@ -1,5 +1,7 @@
 """Faults of a scene's files, found without a capture."""
 
+import struct
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -72,6 +74,25 @@ def test_videos_that_do_not_fit_together_are_named(tmp_path: Path) -> None:
     video.write_bytes(video.read_bytes()[: video.stat().st_size // 2])
     with pytest.raises(SceneError, match=r"cut short: it ends after \d+ .* says 60; .*--frame"):
         load_scene(tmp_path).read_image(NAMES[0], "000059")
+
+
+@pytest.mark.parametrize("count", [0, 10**9])
+def test_a_video_that_lies_about_its_length_is_refused(tmp_path: Path, count: int) -> None:
+    record(tmp_path, ["000000"])
+    film(tmp_path, {NAMES[0]: 30.0}, {})
+    video = tmp_path / "videos" / f"{NAMES[0]}.avi"
+    data = bytearray(video.read_bytes())
+    # The number of pictures in AVI's headers of the file and of its stream.
+    for header, place in ((b"avih", 24), (b"strh", 40)):
+        begin = data.index(header) + place
+        assert data[begin : begin + 4] == struct.pack("<I", 60)
+        data[begin : begin + 4] = struct.pack("<I", count)
+    # Without its index nothing else tells the number.
+    video.write_bytes(data[: data.index(b"idx1")])
+    begin = time.process_time()
+    with pytest.raises(SceneError, match=rf"{NAMES[0]}\.avi: does not say how many .*ffmpeg"):
+        load_scene(tmp_path)
+    assert time.process_time() - begin < 1.0
 
 
 def test_sound_scene_has_no_fault(tmp_path: Path) -> None:

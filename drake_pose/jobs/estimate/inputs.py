@@ -17,7 +17,12 @@ from drake_pose.errors import ModelError, SceneError, SettingsError, UnknownName
 from drake_pose.files.records import user_units
 from drake_pose.files.settings import EstimateSettings
 from drake_pose.filtering.tracking.contour_tracker import TrackingSettings
-from drake_pose.jobs.estimate.measurements import TrueAngles, read_joint_centres, read_true_angles
+from drake_pose.jobs.estimate.measurements import (
+    TrueAngles,
+    check_units,
+    read_joint_centres,
+    read_true_angles,
+)
 from drake_pose.jobs.estimate.searches import leave_out_links, make_placement_search, make_search
 from drake_pose.person.body_plan import PERSON_LANDMARKS
 from drake_pose.search.continuous.root_placement_search import RootPlacementSearch
@@ -116,12 +121,13 @@ def read_inputs(
     model = load_model(model_path, package_paths=settings.packages)
     if settings.unseen:
         model, settings = leave_out_links(model, settings)
-    truth = _read_truth(scene_path, truth_path, model.position_names)
+    truth, of_truth = _read_truth(scene_path, truth_path, model, frames)
     starts = _read_starts(settings.start, frames, model)
     tracked = scene.sequence and settings.track
     _check_start(scene, frames, starts, settings.track)
     if (scene.images or not starts) and follows_person(scene, model, settings):
-        warnings = (*scene.warnings, *check_upright(scene.cameras.values()), *model.warnings)
+        upright = check_upright(scene.cameras.values())
+        warnings = (*scene.warnings, *of_truth, *upright, *model.warnings)
         return Inputs(scene, model, frames, tracked, None, truth, warnings, None, starts)
     centres: Mapping[str, np.ndarray] | None = None
     position, root = None, settings.root_position
@@ -139,20 +145,29 @@ def read_inputs(
         X_WN = search.tree.node_poses(search.tree.default_values())
         for camera in scene.cameras.values():
             require_visible(search.sampled.outlines, camera.X_CW @ X_WN, camera)
-    warnings = (*scene_as_used.warnings, *model_warnings(model, search.tree, settings.hold))
+    of_model = model_warnings(model, search.tree, settings.hold)
+    warnings = (*scene_as_used.warnings, *of_truth, *of_model)
     return Inputs(scene_as_used, model, frames, tracked, search, truth, warnings, centres, starts)
 
 
-def _read_truth(scene: Path, given: Path | None, names: Sequence[str]) -> TrueAngles | None:
-    if given is not None:
-        return read_true_angles(given, names)
-    if not os.path.lexists(scene / TRUTH_FILE):
-        return None
+def _read_truth(
+    scene: Path, given: Path | None, model: ArticulatedModel, frames: Sequence[str]
+) -> tuple[TrueAngles | None, tuple[str, ...]]:
+    """Measured positions, and what the user should know of them."""
+    path = given or scene / TRUTH_FILE
+    if given is None and not os.path.lexists(path):
+        return None, ()
     try:
-        return read_true_angles(scene / TRUTH_FILE, names)
+        truth = read_true_angles(path, model.position_names)
     except UnknownNameError:
+        if given is not None:
+            raise
         # The scene's truth is that of another model: nothing to compare with.
-        return None
+        return None, ()
+    warnings = check_units(path, model, truth.names, truth.values)
+    if all(truth.of(frame) is None for frame in frames):
+        warnings += (f"{path}: has no row of any frame that is estimated: nothing is compared",)
+    return truth, warnings
 
 
 def _read_starts(
@@ -162,6 +177,7 @@ def _read_starts(
     if file is None:
         return {}
     known = read_true_angles(file, model.position_names)
+    check_units(file, model, known.names, known.values)
     places = [model.position_index(name) for name in known.names]
     starts = {}
     for frame in frames:

@@ -20,19 +20,17 @@ from drake_pose.errors import SceneError
 from drake_pose.files.records import base_pose
 from drake_pose.files.settings import EstimateSettings
 from drake_pose.jobs.estimate.inputs import missing_for_person
-from drake_pose.jobs.estimate.measurements import TrueAngles, frame_key, read_true_angles
+from drake_pose.jobs.estimate.measurements import (
+    TrueAngles,
+    check_units,
+    frame_key,
+    read_true_angles,
+)
 from drake_pose.jobs.estimate.scene import estimate_scene
 from drake_pose.person.shape import shape_parts
 
 Array = NDArray[np.float64]
 
-# A value is outside its limits from so much on [rad], or from this share of a length's range.
-_OUTSIDE, _OUTSIDE_SHARE = 0.1, 0.1
-# An angle of more than a full turn beyond its limits is one in degrees; a length of so many times
-# what its limits allow is one in millimetres.
-_FULL_TURN, _MANY = 2.0 * math.pi, 20.0
-# And none is larger than this [rad or m].
-_MOST = 1e6
 # Poses are one whose joints differ by less [rad or m].
 _SAME_ANGLE, _SAME_LENGTH = math.radians(1.0), 0.005
 # Values are one that differ by less, as written in a table.
@@ -144,7 +142,7 @@ def read_known_positions(
     is_held = np.array(columns) < 0
     rows = table.values.items()
     values = {k: np.where(is_held, kinematics.lower, row[columns]) for k, row in rows}
-    warnings = _check_units(path, kinematics, values)
+    warnings = check_units(path, model, kinematics.names, values)
     return KnownPositions(path, kinematics, values, table.is_estimate, warnings)
 
 
@@ -157,53 +155,6 @@ def _as_they_are(table: TrueAngles, tree: PoseTree) -> set[str]:
         if all(abs(row[column] - usual) < _AS_WRITTEN for row in table.values.values()):
             found.add(name)
     return found
-
-
-def _check_units(
-    path: Path, kinematics: TreeKinematics, known: Mapping[int | str, Array]
-) -> tuple[str, ...]:
-    """Refuses degrees and millimetres; warns of values outside the limits."""
-    warnings = []
-    for frame, row in known.items():
-        for k in np.flatnonzero(np.abs(row) > _MOST):
-            raise SceneError(
-                f"{path}: column '{kinematics.names[k]}', frame {frame}: {row[k]:g} is no joint's "
-                "position; give it in rad or m"
-            )
-    bounded = np.isfinite(kinematics.lower) & np.isfinite(kinematics.upper)
-    for k in np.flatnonzero(bounded) if known else ():
-        name, lower, upper = kinematics.names[k], kinematics.lower[k], kinematics.upper[k]
-        values = np.array([row[k] for row in known.values()])
-        what, unit, other, scale = "length", "m", "metres", 1e-3
-        slack, most = _OUTSIDE_SHARE * (upper - lower), _MANY * max(abs(lower), abs(upper))
-        if kinematics.is_angle[k]:
-            what, unit, other, scale = "angle", "rad", "radians", math.pi / 180.0
-            slack, most = _OUTSIDE, max(abs(lower), abs(upper)) + _FULL_TURN + _OUTSIDE
-        off = np.maximum(lower - values, values - upper)
-        worst = int(np.argmax(off))
-        if off[worst] <= slack:
-            continue
-        text = (
-            f"{path}: column '{name}', frame {list(known)[worst]}: {values[worst]:g} {unit} lies "
-            f"outside the joint's limits, {lower:.4g} to {upper:.4g} {unit}"
-        )
-        scaled = scale * values
-        inside = (lower - slack <= scaled) & (scaled <= upper + slack)
-        if np.abs(values).max() > most and inside.all():
-            wrong = "degrees" if unit == "rad" else "millimetres"
-            raise SceneError(
-                f"{text}, but not in {wrong}: the file seems to be in {wrong}; write every {what} "
-                f"in {other}"
-            )
-        why = ": is its column another joint's, its zero or sign another, its unit another?"
-        turn = math.copysign(_FULL_TURN, values[worst])
-        if kinematics.is_angle[k] and lower - slack <= values[worst] - turn <= upper + slack:
-            why = (
-                f"; a full turn off, {values[worst] - turn:.4g} rad, it would not: did the encoder "
-                "count a turn too many, or are the column's angles in degrees?"
-            )
-        warnings.append(f"{text}{why}")
-    return tuple(warnings)
 
 
 def estimate_positions(

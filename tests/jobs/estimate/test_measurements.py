@@ -30,6 +30,8 @@ def test_joint_centres_compare_frames_as_numbers(tmp_path: Path) -> None:
         ("frame,joint,x,y,z\n0,ankle,1,2,here\n", "line 2"),
         ("frame,joint,x,y,z\n0,ankle,1,2,nan\n", "not finite"),
         ("frame,joint,x,y,z\n1,ankle,1,2,3\n", "'ankle'.*'0000'"),
+        ("frame,joint,x,y,z\n0.5,ankle,1,2,3\n", "'ankle'.*'0000'"),
+        ("frame,joint,x,y,z\n0,ankle,1,2,3\n00,ankle,1,2,3\n", "line 3: frame '00' .* twice"),
     ],
 )
 def test_damaged_joint_centres(tmp_path: Path, text: str, message: str) -> None:
@@ -57,6 +59,8 @@ def test_true_angles(tmp_path: Path) -> None:
     assert values.tolist() == [0.5, -1.0]
     assert truth.of("0004") is None
     assert truth.of("still") is None
+    # A number of so many digits is one to nobody.
+    assert read_true_angles(written(path, f"frame,b\n{'9' * 5000},0\n"), ["b"]).of("9") is None
     path = written(tmp_path / "angles.csv", "frame,b,d\n3,0.5,-1\n")
     with pytest.raises(UnknownNameError, match=r"angles.csv.*'d'.*a, b, c"):
         read_true_angles(path, ["a", "b", "c"])

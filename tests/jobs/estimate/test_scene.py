@@ -144,6 +144,11 @@ def test_truth_in_the_scene_is_compared_with(own_scene: TinyScene, runner: CliRu
     (own_scene.folder / "joint_angles.csv").write_text("frame,A1\n0,0.5\n")
     _, summary = estimate(runner, own_scene, folder / "other", *held)
     assert summary["joint_errors"] == {}
+    assert summary["warnings"] == []
+    (own_scene.folder / "joint_angles.csv").write_text("frame,lift\n1,0.5\n")
+    _, summary = estimate(runner, own_scene, folder / "another", *held)
+    assert summary["joint_errors"] == {}
+    assert "has no row of any frame that is estimated" in summary["warnings"][0]
 
 
 def jib_positions(scene: TinyScene) -> dict[str, np.ndarray]:

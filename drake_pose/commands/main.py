@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import os
 import re
+import signal
 import sys
 from collections.abc import Callable, Sequence
 from typing import Any, NoReturn
@@ -104,6 +105,10 @@ def main(words: Sequence[str] | None = None) -> None:
     # Read when numpy is first imported: of small matrices, threads that wait for each other cost up
     # to ten times the product where other processes want the cores, as a batch's do.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    # Whoever stops the program otherwise, such as a service's manager, means what Ctrl-C means.
+    for ending in (signal.SIGTERM, signal.SIGHUP):
+        if signal.getsignal(ending) is signal.SIG_DFL:
+            signal.signal(ending, signal.default_int_handler)
     try:
         command, bound, _ = app.parse_args(words, exit_on_error=False, print_error=False)
     except (CycloptsError, SettingsError) as error:
@@ -116,6 +121,12 @@ def main(words: Sequence[str] | None = None) -> None:
         _stop(str(error))
     except KeyboardInterrupt:
         _stop(_interrupted(command, bound.arguments))
+    except OSError as error:
+        # Where no command expects it, such as in a folder that may not be searched.
+        _stop(f"{error.filename or 'the system'}: {error.strerror or error}")
+    except UnicodeEncodeError as error:
+        near = error.object[max(0, error.start - 40) : error.end + 40]
+        _stop(f"{near!r}: the name of this file or folder is no UTF-8 text; rename it")
     except SystemExit as error:
         # Drake raises SystemExit where one of its C++ demands fails, and exits without a word.
         _stop(f"Drake stopped with a failed demand: {error}")

@@ -20,8 +20,9 @@ class UsageError(Exception):
 
 
 def say(message: str) -> None:
-    """Writes a line to stderr."""
-    print(message, file=sys.stderr, flush=True)
+    """Writes a line to stderr; what a file's name would do to the terminal is spelt out."""
+    safe = (c if c.isprintable() or c == "\n" else repr(c)[1:-1] for c in message)
+    print("".join(safe), file=sys.stderr, flush=True)
 
 
 def warn(message: str) -> None:

@@ -52,6 +52,34 @@ def test_help_teaches(command: list[str], words: list[str]) -> None:
         assert word in plain(result.stdout)
 
 
+@pytest.mark.parametrize(
+    ("ending", "message"),
+    [
+        (signal.SIGTERM, "interrupted before anything was written"),
+        (signal.SIGHUP, "interrupted before anything was written"),
+        (
+            PermissionError(13, "Permission denied", "a/\x1b[31mb"),
+            r"a/\x1b[31mb: Permission denied",
+        ),
+        (UnicodeEncodeError("utf-8", "a/\udcfc", 2, 3, "no"), r"'a/\udcfc': the name of this file"),
+    ],
+)
+def test_whatever_ends_a_command_is_said_in_a_line(
+    ending: signal.Signals | Exception, message: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def read_job(*_: object) -> None:
+        if isinstance(ending, Exception):
+            raise ending
+        os.kill(os.getpid(), ending)
+        time.sleep(10.0)
+
+    monkeypatch.setattr("drake_pose.jobs.batch.job.read_job", read_job)
+    result = run_command(["batch", "jobs.yaml", "--out", "nowhere"])
+    assert result.exit_code == 1
+    assert result.output.startswith(f"drake-pose: error: {message}")
+    assert result.output.count("\n") == 1
+
+
 def test_version() -> None:
     result = run_command(["--version"])
     assert result.stdout == f"drake-pose {drake_pose.__version__}\n"

@@ -192,8 +192,8 @@ class Batch:
         for state in self.scenes.values():
             try:
                 state.tasks = plan_scene(state.job, self.out)
-            except DrakePoseError as error:
-                self._fail(state, "", str(error))
+            except (DrakePoseError, OSError) as error:
+                self._fail(state, "", describe_failure(error))
                 continue
             whole = finishing_task(state.tasks)
             is_whole = whole.place.is_dir()

@@ -49,6 +49,8 @@ def write_file(folder: Path, name: str, content: bytes | str) -> None:
         temporary.write_bytes(content.encode() if isinstance(content, str) else content)
         os.replace(temporary, path)
     except OSError as error:
+        with suppress(OSError):
+            temporary.unlink()
         raise cannot_write(path, error) from error
 
 
@@ -68,7 +70,7 @@ def claimed(path: Path, resume: bool = False) -> Iterator[None]:
         OutputError: another run is writing there, it is not empty, or there cannot be a folder.
     """
     require_no_file(path)
-    made = [place for place in (path, *path.parents) if not place.exists()]
+    made = [place for place in (path, *path.parents) if not os.path.lexists(place)]
     try:
         path.mkdir(parents=True, exist_ok=True)
         folder = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
@@ -119,12 +121,10 @@ def _require_empty(path: Path) -> None:
 
 def require_no_file(path: Path) -> None:
     """Refuses a folder that cannot be, since it or what it would lie in is a file."""
-    try:
-        existing = next((place for place in (path, *path.parents) if place.exists()), None)
-    except OSError as error:
-        raise cannot_write(path, error) from error
+    existing = next((place for place in (path, *path.parents) if os.path.lexists(place)), None)
     if existing is not None and not existing.is_dir():
-        raise OutputError(f"{existing}: is a file, but the result is a folder; name another one")
+        what = "a file" if existing.exists() else "a link that leads nowhere"
+        raise OutputError(f"{existing}: is {what}, but the result is a folder; name another one")
 
 
 def read_summary(path: Path) -> dict[str, Any]:

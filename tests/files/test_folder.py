@@ -69,15 +69,17 @@ def test_what_cannot_be_resumed_is_refused(tmp_path: Path, text: str, message: s
 
 def test_a_folder_that_holds_something_or_cannot_be_is_refused(tmp_path: Path) -> None:
     (tmp_path / "out").write_text("mine")
+    (tmp_path / "link").symlink_to("nowhere")
     for place, message in (
         (tmp_path, "not empty.*--resume"),
         (tmp_path / "out", "out: is a file"),
         (tmp_path / "out" / "deeper", "out: is a file"),
+        (tmp_path / "link", "link: is a link that leads nowhere"),
         (tmp_path / ("a" * 300), "aaa: cannot be written: File name too long"),
     ):
         with pytest.raises(OutputError, match=message), claimed(place):
             pass
-    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+    assert {path.name for path in tmp_path.iterdir()} == {"link", "out"}
 
 
 HOLD = """
@@ -118,13 +120,15 @@ def test_a_folder_belongs_to_one_run_until_that_ends_however_it_ends(tmp_path: P
 def test_files_appear_whole_or_not_at_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_file(tmp_path / "out", "overlay/cam/1.png", b"first")
 
-    def full_disk(*_: object) -> None:
+    def full_disk(path: Path, data: bytes) -> None:
+        path.touch()
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(Path, "write_bytes", full_disk)
     with pytest.raises(OutputError, match=r"1\.png.*No space left"):
         write_file(tmp_path / "out", "overlay/cam/1.png", b"second")
     assert (tmp_path / "out" / "overlay" / "cam" / "1.png").read_bytes() == b"first"
+    assert [path.name for path in (tmp_path / "out" / "overlay" / "cam").iterdir()] == ["1.png"]
 
 
 def test_summary_has_no_nan(tmp_path: Path) -> None:

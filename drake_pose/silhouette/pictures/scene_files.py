@@ -192,6 +192,10 @@ def _visible(folder: Path) -> list[os.DirEntry[str]]:
             seen = [entry for entry in entries if not entry.name.startswith(".")]
     except OSError as error:
         raise SceneError(f"{folder}: cannot be read: {error.strerror}") from error
+    for entry in seen:
+        # Python stands in for the bytes of other encodings by what cannot be written to any file.
+        if any("\ud800" <= character <= "\udfff" for character in entry.name):
+            raise SceneError(f"{folder}: the name {entry.name!r} is no UTF-8 text; rename it")
     return sorted(seen, key=lambda entry: entry.name)
 
 

@@ -257,7 +257,7 @@ def _unknown_cameras(folder: Path) -> tuple[dict[str, Camera], dict[tuple[str, s
 
 def _read_settings(path: Path, sequence: bool) -> tuple[bool, float | None]:
     """Returns sequence, and frame_rate_hz, of a scene.yaml, which may be missing."""
-    if not path.exists():
+    if not os.path.lexists(path):
         return sequence, None
     content = read_yaml(path, SceneError)
     if not isinstance(content, dict):

@@ -90,6 +90,12 @@ SPOILT_SCENES = [
     (mask(0 * GREY + 255), ("0000.png", "full")),
     (mask(GREY), ("0000.png", "3 values")),
     (file("scene.yaml", "sequence: 3"), ("scene.yaml", "sequence")),
+    (file("scene.yaml", 'sequence: "\\0"'), ("scene.yaml", "NUL")),
+    (lambda folder: (folder / "scene.yaml").symlink_to("gone"), ("scene.yaml", "No such file")),
+    (
+        lambda folder: (folder / "masks/front" / os.fsdecode(b"\xfc.png")).touch(),
+        ("masks/front", r"'\udcfc.png' is no UTF-8 text"),
+    ),
     (file("joint_angles.csv", "frame,lift\n0,20\n2,60\n"), ("'lift', frame 2", "in degrees")),
     (file("joint_angles.csv", "frame,lift\n0,1e308\n"), ("'lift', frame 0", "no joint's position")),
 ]

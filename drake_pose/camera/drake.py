@@ -28,7 +28,9 @@ from drake_pose.camera.models import HALF_PIXEL, Camera, PinholeCamera, camera_t
 from drake_pose.errors import CameraError
 
 # What yaml_load_typed raises, and some values of CameraConfig end a process that does not ask.
-_BAD_CONFIG = (RuntimeError, ValueError, TypeError, KeyError, AttributeError, SystemExit)
+_BAD_CONFIG = (
+    RuntimeError, ValueError, TypeError, KeyError, AttributeError, AssertionError, SystemExit
+)  # fmt: skip
 
 _FARTHEST = 1000.0
 _PARALLEL_DEPTHS = (-2.0, 2.0)
@@ -187,16 +189,16 @@ def read_configs(entries: Mapping[str, Any], path: Path) -> dict[str, PinholeCam
             raise CameraError(f"{where}: expected the fields of a CameraConfig")
         try:
             config = yaml_load_typed(schema=CameraConfig, data=yaml_dump(content))
-        except (*_BAD_CONFIG, yaml.YAMLError) as error:
-            raise CameraError(
-                f"{where}: no CameraConfig: {' '.join(str(error).split())}"
-            ) from error
-        if "name" not in content:
-            config.name = str(key)
-        try:
+            if "name" not in content:
+                config.name = str(key)
             camera = camera_from_config(config)
         except CameraError as error:
             raise CameraError(f"{path}: {error}") from error
+        except (*_BAD_CONFIG, yaml.YAMLError) as error:
+            # Drake asserts that a field which has fields is a mapping, and says its value alone.
+            bare = "expected NAME: VALUE fields, not " if isinstance(error, AssertionError) else ""
+            why = " ".join(str(error).split())
+            raise CameraError(f"{where}: no CameraConfig: {bare}{why}") from error
         if camera.name in cameras:
             raise CameraError(f"{path}: camera '{camera.name}' is given twice")
         cameras[camera.name] = camera

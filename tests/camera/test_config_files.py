@@ -115,6 +115,8 @@ def test_round_trip(tmp_path: Path) -> None:
         ("width: 320", "width: -3", "width must be"),
         ("width: 320", "widht: 320", "no CameraConfig.*widht"),
         ("{y: 40}", "{y: 0}", "focal"),
+        ("!FovDegrees {y: 40}", "{}", "'front': no CameraConfig.*FocalLength"),
+        ("!FovDegrees {y: 40}", "[500]", r"'front': no CameraConfig: .*fields, not \[500\]"),
         ("[1, 2, 3]", "[1, 2]", "no CameraConfig"),
         ("[1, 2, 3]", "[1, .nan, 3]", "not finite"),
         ("clipping_near: 0.2", "clipping_near: 0", "near"),

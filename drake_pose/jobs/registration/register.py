@@ -299,6 +299,10 @@ class _Registration:
         poses = [found.camera.X_WC, *found.alternatives]
         told = suggest_pose(self.body, found.camera, poses, self._settings.keep_out)
         if told is None:
+            self.warnings.append(
+                f"camera '{found.camera.name}': of random joint positions none is seen from all "
+                "its poses and touches nothing: no picture is suggested; is --keep-out too large?"
+            )
             return None
         values = zip(self.body.kinematics.names, told[0].tolist(), strict=True)
         positions = {name: value for name, value in values if name not in OBJECT_POSITIONS}

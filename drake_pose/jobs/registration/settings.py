@@ -6,6 +6,7 @@ from typing import Annotated, Any, Literal
 
 from cyclopts import Parameter
 
+from drake_pose.errors import SettingsError
 from drake_pose.files.options import Corner, from_text, parse_boxes
 from drake_pose.files.settings import Names, Positions, SceneSettings
 
@@ -60,6 +61,10 @@ class RegistrationSettings(AuditSettings):
     ] = ()
     """With --suggest: the corners of a box in the world that the robot must not touch [m]; repeat
     for several."""
+
+    def __post_init__(self) -> None:
+        if self.keep_out and not self.suggest:
+            raise SettingsError("--keep-out is for --suggest; give both, or leave it out")
 
     def as_json(self) -> dict[str, Any]:
         """Returns the settings as plain JSON values."""

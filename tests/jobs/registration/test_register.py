@@ -21,6 +21,7 @@ from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from drake_pose.silhouette.pictures.scenes import load_scene
 from tests.cli import Result, run_command
 from tests.jobs.registration.arm_scenes import ArmScene, pose_errors
+from tests.jobs.scenes import TinyScene, write_truth
 from tests.search.arms import arm_cameras
 
 
@@ -289,3 +290,17 @@ def test_too_few_frames_for_all_zeros(
     assert result.exit_code == 1
     assert "more frames" in result.stderr
     assert not (tmp_path / "out").exists()
+
+
+def test_that_no_picture_can_be_suggested_is_said(tiny_scene: TinyScene, tmp_path: Path) -> None:
+    """An arm in a plane looks the same from two places, and is nowhere outside the box."""
+    joints = write_truth(tiny_scene, tmp_path / "joints.csv")
+    words = ["register", str(tiny_scene.folder), "--model", str(tiny_scene.model), "--no-overlay"]
+    words += ["--joints", str(joints), "--out", str(tmp_path / "out"), "--camera", "front"]
+    words += ["--keep-out", "-9,-9,-9:9,9,9"]
+    refused = run_command(words)
+    assert refused.exit_code == 2
+    assert "--keep-out is for --suggest" in refused.stderr
+    found = run_command([*words, "--suggest", "--json"])
+    assert len(json.loads(found.stdout)["families"]) > 1
+    assert "no picture is suggested; is --keep-out too large?" in found.stderr

@@ -19,14 +19,19 @@ from drake_pose.filtering.measurements.axes import AxisObservation
 from drake_pose.filtering.measurements.contour import ContourObservation
 from drake_pose.filtering.measurements.hand_silhouette import HandSilhouette
 from drake_pose.filtering.state import Belief
+from drake_pose.filtering.tracking.contour_tracker import TrackingSettings
 from drake_pose.filtering.truncation.couplings import model_inequalities
 from drake_pose.papers.shimada import experiment_filter
 from drake_pose.papers.shimada_motion import true_states
+from drake_pose.search.estimates import PoseEstimate
 from drake_pose.search.grid.beam_search import BeamSearch
 from drake_pose.search.settings import BeamSearchSettings
 from drake_pose.silhouette.pictures.label_images import EMPTY, mask_to_label_image
+from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from drake_pose.systems.estimators.hand_tracking import AxisSensor, HandSensor, build_hand_tracking
 from drake_pose.systems.estimators.truncated_ekf import STATISTICS
+from drake_pose.systems.ports import evaluate
+from tests.filtering.tracking.test_match_and_track import CountingSearch
 from tests.systems.bench import Bench
 
 PERIOD = 1 / 30
@@ -41,15 +46,18 @@ SHAPE |= {f"length_{i}{j}": LENGTHS[j] for i in "12" for j in "123"}
 ANGLES = tuple(name for i in "12" for name in (f"spread_{i}", *(f"flexion_{i}{j}" for j in "123")))
 
 
-class CountingSearch:
-    """A search that counts how often it is asked."""
+class KnownPose:
+    """A search that answers with these positions, or with nothing, and counts how often."""
 
-    def __init__(self, search):
-        self.search, self.tree, self.count = search, search.tree, 0
+    def __init__(self, tree, q=None):
+        self.tree, self.q, self.count = tree, q, 0
 
     def match(self, views, root_position=None):
         self.count += 1
-        return self.search.match(views, root_position)
+        if self.q is None:
+            return PoseEstimate.nothing(self.tree, stopped_by="end")
+        values = self.tree.values_from_positions(self.q, np.eye(4))
+        return PoseEstimate.of_values(self.tree, values, 0.0, 1.0, stopped_by="end")
 
 
 @pytest.fixture(scope="module")
@@ -64,13 +72,17 @@ def camera():
     return ParallelCamera("top", 320, 240, 800.0, 159.5, 119.5, X_WC)
 
 
-@pytest.fixture
-def search(hand):
+@pytest.fixture(scope="module")
+def tree(hand):
     rotation = RotationMatrix.MakeXRotation(math.radians(30)).matrix()
-    tree = hand.pose_tree(
+    return hand.pose_tree(
         root_position=(-0.12, -0.04, 0.0), root_rotation=RootRotation.fixed(rotation), held=SHAPE
     )
-    return CountingSearch(BeamSearch(tree, BeamSearchSettings(interval=math.radians(10))))
+
+
+@pytest.fixture(scope="module")
+def observation(tree, camera):
+    return AxisObservation(ContourObservation(tree, [camera]), camera, SEGMENTS)
 
 
 def true_angles(count=FRAMES):
@@ -84,9 +96,8 @@ def true_angles(count=FRAMES):
     return np.radians(np.hstack(rows))
 
 
-def positions(search, angles):
+def positions(tree, angles):
     """(count, nq) the plant's positions."""
-    tree = search.tree
     model = tree.model
     q, _ = tree.positions_from(tree.default_values())
     found = np.tile(q, (len(angles), 1))
@@ -97,11 +108,12 @@ def positions(search, angles):
 
 
 @pytest.mark.slow
-def test_a_moving_hand_is_matched_once_and_again_after_a_loss(hand, camera, search):
+def test_a_moving_hand_is_matched_once_and_again_after_a_loss(hand, camera, tree):
     """Plant and Drake's camera, end to end; the hand is bent otherwise after some frames."""
     cut, angles = 30, true_angles()
     angles[cut:] = angles[:10] + np.radians([-4, 25, 20, 20, 4, 25, 20, 20])
-    truth = positions(search, angles)
+    truth = positions(tree, angles)
+    search = CountingSearch(BeamSearch(tree, BeamSearchSettings(interval=math.radians(10))))
     breaks = PERIOD * (np.arange(FRAMES + 1) - 0.3)
     trajectory = PiecewisePolynomial.ZeroOrderHold(breaks, np.vstack([truth, truth[-1:]]).T)
     diagram, parts = build_hand_tracking(search, camera, SEGMENTS, trajectory, PERIOD)
@@ -113,7 +125,7 @@ def test_a_moving_hand_is_matched_once_and_again_after_a_loss(hand, camera, sear
         log.FindLog(simulator.get_context()).data().T[1 : FRAMES + 1] for log in logs
     )
     restart = parts.restart_log.FindLog(simulator.get_context()).data()[0, :FRAMES]
-    assert search.count == 2
+    assert search.calls == 2
     first, second = np.flatnonzero(restart)
     assert first == 0
     assert cut <= second < cut + 5
@@ -138,33 +150,91 @@ def test_a_moving_hand_is_matched_once_and_again_after_a_loss(hand, camera, sear
     assert np.isnan(deviations[:, held]).all()
 
 
-def test_meshcat_shows_both_hands(camera, search):
+def test_meshcat_shows_both_hands(camera, tree):
     meshcat = StartMeshcat()
-    truth = positions(search, true_angles(1))[0]
-    diagram, _ = build_hand_tracking(search, camera, SEGMENTS, truth, PERIOD, meshcat)
+    truth = positions(tree, true_angles(1))[0]
+    search = KnownPose(tree, truth)
+    diagram, parts = build_hand_tracking(search, camera, SEGMENTS, truth, PERIOD, meshcat)
     simulator = Simulator(diagram)
     simulator.AdvanceTo(1.5 * PERIOD)
     for name in ("true", "estimated"):
         assert meshcat.HasPath(f"/drake/visualizer/{name}/two_finger_hand/palm")
+    found = evaluate(parts.sensor.GetOutputPort("estimated_positions"), simulator.get_context())
+    np.testing.assert_allclose(found, truth, atol=math.radians(2.0))
+    assert search.count == 1
 
 
-def test_bad_arguments_are_named(hand, camera, search):
-    observation = AxisObservation(ContourObservation(search.tree, [camera]), camera, SEGMENTS)
+def test_noise_grows_with_the_time_and_the_acceleration_that_a_step_has(camera, tree):
+    """An angle changes by half the acceleration times the time squared."""
+    noise = []
+    for period, acceleration in ((PERIOD, 30.0), (2 * PERIOD, 30.0), (PERIOD, 60.0)):
+        settings = TrackingSettings(angle_acceleration=acceleration)
+        q = tree.model.default_positions
+        made = (KnownPose(tree), camera, SEGMENTS, q, period, None, settings)
+        belief_filter = build_hand_tracking(*made)[1].ekf.filter
+        n = len(belief_filter.layout)
+        noise.append(belief_filter.predicted(Belief(np.zeros(n), np.zeros((n, n)))).covariance)
+    np.testing.assert_allclose(noise[1:], [2**4 * noise[0], 2**2 * noise[0]])
+    turns = np.sqrt(np.diag(noise[0])[: len(ANGLES)])
+    np.testing.assert_allclose(turns, 0.5 * 30.0 * PERIOD**2)
+
+
+def test_the_axis_sensor_asks_the_search_where_its_filter_is_off(camera, tree, observation):
+    """At first, when lost, and where a third of the silhouette is not as predicted."""
+    truth, near, far = positions(tree, true_angles(1) + np.radians([[0.0], [2.0], [4.0]]))
+    body, renderer = observation.body, LabelRenderer(tree.model, camera)
+    mask = renderer.mask(truth)
+    shares = [np.count_nonzero(mask ^ renderer.mask(q)) / mask.sum() for q in (near, far)]
+    assert 0.2 < shares[0] < 0.28
+    assert shares[1] > 0.32
+    x_near, x_far = (body.state(q) for q in (near, far))
+    identity, image = np.eye(len(body.layout)), mask_to_label_image(mask)
+    covariance = np.diag(np.arange(1.0, len(identity) + 1.0))
+    for step, lost, x, answer, asked in (
+        (5.0, 0.0, x_near, truth, False),
+        (0.0, 0.0, x_near, truth, True),
+        (5.0, 1.0, x_near, truth, True),
+        (5.0, 0.0, x_far, truth, True),
+        (5.0, 0.0, x_far, None, True),
+    ):
+        search = KnownPose(tree, answer)
+        sensor = Bench(AxisSensor(observation, identity, search, camera))
+        sensor.give(estimated_state=x, covariance=covariance.ravel())
+        sensor.give(statistics=[step, 1.0, 0.0, 0.0, lost], label_image=image)
+        assert (sensor["restart"] == [1.0]) == asked == (search.count == 1)
+        beside = body.state(truth) if asked and answer is not None else x
+        y, noise = observation.measure(mask, beside)
+        np.testing.assert_array_equal(sensor["measurement"], y)
+        np.testing.assert_array_equal(sensor["measurement_covariance"], noise.ravel())
+        np.testing.assert_array_equal(sensor["estimated_positions"], body.positions(x)[0])
+        deviations = sensor["position_deviations"]
+        known = [tree.model.position_index(name) for name in body.layout.moving]
+        np.testing.assert_allclose(deviations[known] ** 2, np.diag(covariance)[: len(known)])
+        assert np.isnan(np.delete(deviations, known)).all()
+
+
+def test_bad_arguments_are_named(hand, camera, tree, observation):
     with pytest.raises(SettingsError, match="transition"):
-        AxisSensor(observation, np.eye(3), search, camera)
-    other = BeamSearch(hand.pose_tree(root_position=(0.0, 0.0, 0.0), held=SHAPE))
+        AxisSensor(observation, np.eye(3), KnownPose(tree), camera)
+    other = KnownPose(hand.pose_tree(root_position=(0.0, 0.0, 0.0), held=SHAPE))
     with pytest.raises(SettingsError, match="one pose tree"):
         AxisSensor(observation, np.eye(len(observation.body.layout)), other, camera)
 
 
-def test_without_a_hand_there_is_nothing_to_start_from(camera, search):
-    body = ContourObservation(search.tree, [camera])
-    observation = AxisObservation(body, camera, SEGMENTS)
-    sensor = Bench(AxisSensor(observation, np.eye(len(body.layout)), search, camera))
-    assert np.isnan(sensor["matched_state"]).all()
+def test_without_a_hand_there_is_nothing_to_start_from(camera, tree, observation):
+    n, search = len(observation.body.layout), KnownPose(tree)
+    sensor = Bench(AxisSensor(observation, np.eye(n), search, camera))
     image = ImageLabel16I(camera.width, camera.height)
     image.mutable_data[:] = EMPTY
-    assert np.isnan(sensor.give(label_image=image)["matched_state"]).all()
+    for given in ({}, {"label_image": image}):
+        sensor.give(**given)
+        for name, size in (
+            ("matched_state", n),
+            ("measurement", 12),
+            ("measurement_covariance", 144),
+        ):
+            np.testing.assert_array_equal(sensor[name], np.full(size, np.nan))
+        assert sensor["restart"] == [0.0]
     assert search.count == 0
 
 
@@ -184,5 +254,6 @@ def test_the_hand_sensor_measures_the_silhouette_beside_the_prediction():
         sensor.give(label_image=mask_to_label_image(image))
         found = silhouette.measure(image, belief_filter.predicted(belief))
         np.testing.assert_array_equal(sensor["measurement"], found.y)
+        np.testing.assert_array_equal(sensor["measurement_covariance"], found.covariance.ravel())
         np.testing.assert_array_equal(sensor["rough_state"], found.rough)
         assert np.count_nonzero(np.isfinite(found.y)) > 15

@@ -4,7 +4,6 @@ import math
 
 import numpy as np
 import pytest
-import yaml
 from pydrake.geometry import Box, MakeRenderEngineVtk, RenderEngineVtkParams
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
@@ -13,14 +12,9 @@ from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.sensors import CameraConfig, RgbdSensor
 
 from drake_pose.body.model import ArticulatedModel
-from drake_pose.camera.camera_files import load_cameras
 from drake_pose.errors import CameraError, SettingsError, UnknownNameError
 from drake_pose.search.kameda import PaperSearch
 from drake_pose.search.settings import PaperSearchSettings
-from drake_pose.silhouette.areas.bending import TreeSurfaces
-from drake_pose.silhouette.areas.scoring import draw_mask
-from drake_pose.silhouette.pictures.label_images import label_image_to_mask
-from drake_pose.silhouette.pictures.masks import read_mask, write_mask
 from drake_pose.systems.estimators.silhouette_matcher import SilhouetteMatcher, SilhouetteTracker
 from drake_pose.systems.pictures.camera_rig import cameras_from_drake
 from tests.search.bodies import front_camera, swinging_chain
@@ -94,40 +88,6 @@ def test_cameras_of_a_diagram_are_those_of_its_sensors(tmp_path):
     # Drake's middle of a picture: its pixel centres lie at i + 0.5.
     assert (camera.center_x, camera.center_y, camera.focal_x) == (99.0, 99.0, 900.0)
     np.testing.assert_allclose(camera.X_WC, X_WC.GetAsMatrix4(), atol=1e-12)
-
-
-@pytest.mark.parametrize(("pixel_centers", "agrees"), [("drake", True), ("integers", False)])
-def test_numbers_of_camera_info_in_a_file_say_how_pixels_are_counted(
-    tmp_path, pixel_centers, agrees
-):
-    """RgbdSensor, PNG, cameras.yaml: as a user without CameraConfig writes them."""
-    station = Station(tmp_path)
-    sensor = station.add_sensor("front", "world", X_WC)
-    diagram = station.builder.Build()
-    image = sensor.label_image_output_port().Eval(
-        sensor.GetMyContextFromRoot(diagram.CreateDefaultContext())
-    )
-    model = station.model()
-    info = sensor.default_color_render_camera().core().intrinsics()
-    write_mask(tmp_path / "mask.png", label_image_to_mask(image, model.labels))
-    entry = {
-        "width": info.width(),
-        "height": info.height(),
-        "focal_x": info.focal_x(),
-        "focal_y": info.focal_y(),
-        "center_x": info.center_x(),
-        "center_y": info.center_y(),
-        "pixel_centers": pixel_centers,
-        "X_WC": X_WC.GetAsMatrix4().tolist(),
-    }
-    (tmp_path / "cameras.yaml").write_text(yaml.safe_dump({"front": entry}))
-    camera = load_cameras(tmp_path / "cameras.yaml")["front"]
-    tree = model.pose_tree()
-    values = tree.default_values()
-    surfaces = TreeSurfaces(tree).at(values)
-    own = draw_mask(surfaces, camera.X_CW @ tree.node_poses(values), camera)
-    apart = np.count_nonzero(own != read_mask(tmp_path / "mask.png"))
-    assert (apart <= 8) == agrees
 
 
 def test_a_tree_in_place_of_a_search_is_refused(tmp_path):

@@ -1,12 +1,8 @@
 import math
 
-import cv2
 import numpy as np
 import pytest
-from pydrake.geometry import Box, GeometryInstance, PerceptionProperties, RenderLabel, SceneGraph
-from pydrake.math import RigidTransform
 from pydrake.systems.analysis import Simulator
-from pydrake.systems.framework import DiagramBuilder
 from pydrake.trajectories import PiecewisePolynomial
 
 from drake_pose.errors import SettingsError, UnknownNameError
@@ -20,10 +16,9 @@ from drake_pose.silhouette.pictures.label_images import (
 )
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from drake_pose.systems.colour_images import picture_to_colour_image
-from drake_pose.systems.estimators.diagrams import add_simulated_cameras, build_simulated_matching
+from drake_pose.systems.estimators.diagrams import build_simulated_matching
 from drake_pose.systems.estimators.silhouette_matcher import TRACK, SilhouetteTracker
 from drake_pose.systems.pictures.silhouette_camera import SilhouetteCamera
-from tests.filtering.measurements.test_contour import pinhole
 from tests.search.arms import arm_cameras
 from tests.search.bodies import forked_body, front_camera
 from tests.search.gripper import gripper
@@ -57,17 +52,16 @@ def played(truth):
     return PiecewisePolynomial.ZeroOrderHold(breaks, np.vstack([truth, truth[-1:]]).T)
 
 
-def followed(diagram, tracker, truth, **first):
-    """Errors and deviations (frames, nq) and TRACK by name; inputs of the first frame, then nan."""
-    simulator = Simulator(diagram)
+def followed(built, truth):
+    """Errors and deviations (T, n) of tracked positions, and TRACK by name (T,)."""
+    simulator = Simulator(built.diagram)
     root, rows = simulator.get_mutable_context(), []
     for k in range(len(truth)):
-        for name, value in first.items():
-            known = value if k == 0 else np.full(len(value), np.nan)
-            diagram.GetInputPort(name).FixValue(root, known)
         simulator.AdvanceTo((k + 0.5) * PERIOD)
-        own = Bench(tracker, tracker.GetMyContextFromRoot(root))
+        own = Bench(built.matcher, built.matcher.GetMyContextFromRoot(root))
         rows.append([own[n] for n in ("estimated_positions", "position_deviations", "track")])
+        assert built.was_tracked(root) == (own["track"][0] == 1.0)
+        np.testing.assert_array_equal(built.estimate(root).q, own["estimated_positions"])
     positions, deviations, tracks = (np.array(one) for one in zip(*rows, strict=True))
     return positions - truth, deviations, dict(zip(TRACK, tracks.T, strict=True))
 
@@ -78,7 +72,7 @@ def test_plant_and_camera_to_tracked_positions(search):
     built = build_simulated_matching(
         search, [camera], played(truth), PERIOD, tracking=TrackingSettings()
     )
-    errors, deviations, track = followed(built.diagram, built.matcher, truth)
+    errors, deviations, track = followed(built, truth)
     np.testing.assert_array_equal(track["tracked"][:13], [0.0] + 11 * [1.0] + [0.0])
     np.testing.assert_array_equal(track["matches"][:13], 12 * [1] + [2])
     assert track["matches"][-1] <= 3
@@ -160,40 +154,6 @@ def test_a_copied_context_goes_on_as_the_first_did(body, search):
         np.testing.assert_array_equal(run[name], copy[name])
 
 
-def room(scene_graph, folder):
-    """A wall of coloured patches behind the body."""
-    patches = np.random.default_rng(8).integers(0, 256, (32, 32, 3)).astype(np.uint8)
-    cv2.imwrite(str(folder / "wall.png"), patches.repeat(32, axis=0).repeat(32, axis=1))
-    source = scene_graph.RegisterSource("room")
-    wall = GeometryInstance(RigidTransform([-1.0, 0.0, 0.0]), Box(0.1, 6.0, 6.0), "wall")
-    properties = PerceptionProperties()
-    properties.AddProperty("phong", "diffuse_map", str(folder / "wall.png"))
-    properties.AddProperty("label", "id", RenderLabel.kDontCare)
-    wall.set_perception_properties(properties)
-    scene_graph.RegisterAnchoredGeometry(source, wall)
-
-
-def test_colour_images_of_a_sensor_are_enough(body, search, tmp_path):
-    """In one diagram: RgbdSensors' colour images, and where the body is in the first of them."""
-    truth = motion()[:12]
-    camera = pinhole("front", 3.0, side=480, focal=1000.0, height=0.05)
-    builder = DiagramBuilder()
-    scene_graph = builder.AddNamedSystem("scene_graph", SceneGraph())
-    add_simulated_cameras(builder, scene_graph, body, [camera], played(truth))
-    room(scene_graph, tmp_path)
-    tracker = builder.AddSystem(
-        SilhouetteTracker(search, [camera], PERIOD, color_cameras=["front"])
-    )
-    sensor = builder.GetSubsystemByName("camera_front")
-    builder.Connect(sensor.color_image_output_port(), tracker.GetInputPort("color_image"))
-    builder.ExportInput(tracker.GetInputPort("first_positions"), "first")
-    errors, deviations, track = followed(builder.Build(), tracker, truth, first=truth[0])
-    np.testing.assert_array_equal(track["matches"], 0.0)
-    np.testing.assert_array_equal(track["tracked"][1:], 1.0)
-    assert np.degrees(np.median(np.abs(errors).max(axis=1))) < 2.0
-    assert np.mean(np.abs(errors) < 2 * deviations) > 0.9
-
-
 def test_a_covered_lens_loses_the_track_and_a_measured_position_brings_it_back(body, search):
     camera = front_camera(200, shift=0.2)
     run = Bench(SilhouetteTracker(search, [camera], PERIOD, color_cameras=["front"]))
@@ -232,7 +192,7 @@ def test_fingers_that_follow_one_another_are_tracked_as_one(tmp_path):
     built = build_simulated_matching(
         search, arm_cameras(), played(truth), PERIOD, tracking=TrackingSettings()
     )
-    errors, deviations, track = followed(built.diagram, built.matcher, truth)
+    errors, deviations, track = followed(built, truth)
     np.testing.assert_array_equal(track["tracked"][1:], 1.0)
     np.testing.assert_array_equal(errors[:, 2], errors[:, 3])
     np.testing.assert_array_equal(deviations[:, 2], deviations[:, 3])

@@ -3,7 +3,7 @@ import struct
 
 import numpy as np
 import pytest
-from pydrake.geometry import Meshcat, MeshcatParams
+from pydrake.geometry import Box, Cylinder, Ellipsoid, Meshcat, MeshcatParams, Sphere
 from pydrake.systems.analysis import Simulator
 from pydrake.trajectories import PiecewisePolynomial
 
@@ -16,9 +16,11 @@ from drake_pose.systems.walk import (
     KEYS,
     START,
     Walker,
+    WalkKeys,
     build_walk,
     garden_objects,
     garden_obstacles,
+    view_from_behind,
     walker_transform,
 )
 from tests.person.persons_in_view import posed
@@ -138,6 +140,15 @@ def test_keys_walk_where_nobody_is_captured(person):
     assert 0.5 < np.hypot(x - START[0], y - START[1]) / SPEED < 0.7
     assert 0.5 < heading / TURN_RATE < 0.7
     assert y > 0.02
+    # Meanwhile a stride is shown, and brought to its end, which stands.
+    keys = Bench(WalkKeys(page, stride, PERIOD))
+    np.testing.assert_array_equal(keys["positions"], stride[-1])
+    press(page, "behind")
+    for k in range(30):
+        keys.update()
+        held = k < 0.55 / PERIOD
+        assert keys["keys"].tolist() == [0.0, -1.0 if held else 0.0]
+        np.testing.assert_array_equal(keys["positions"], stride[k % 4 if k < 20 else -1])
 
 
 def test_who_stands_at_rest_is_where_the_walker_is():
@@ -149,12 +160,53 @@ def test_who_stands_at_rest_is_where_the_walker_is():
 
 
 def test_place_lies_within_its_walls_and_the_start_is_free():
-    names = [one.name for one in garden_objects()]
-    assert len(set(names)) == len(names)
+    known = {one.name: one for one in garden_objects()}
+    assert len(known) == len(garden_objects())
     obstacles = garden_obstacles()
     assert np.abs(obstacles[:, :2]).max() < HALF_SIZE
     distance = np.linalg.norm(obstacles[:, :2] - START[:2], axis=1) - obstacles[:, 2]
     assert distance.min() > 2 * BODY_RADIUS
+    # What stops the walker is as wide as it is drawn, and nothing hangs in the air; between the
+    # posts of a gate one can walk, and its top reaches over them.
+    solid = [one for one in known.values() if one.radius]
+    assert len(solid) == len(obstacles)
+    assert all(one.shape.radius() == one.radius for one in solid)
+    heights = {Box: "height", Cylinder: "length", Sphere: "radius", Ellipsoid: "c"}
+    spans = {}
+    for name, one in known.items():
+        half = getattr(one.shape, heights[type(one.shape)])()
+        half *= 0.5 if isinstance(one.shape, Box | Cylinder) else 1.0
+        spans[name] = np.array([one.position[2] - half, one.position[2] + half])
+    for name, one in known.items():
+        carriers = [
+            spans[other]
+            for other, two in known.items()
+            if np.hypot(*np.subtract(one.position, two.position)[:2]) < 1.5
+        ]
+        bottom, top = spans[name]
+        if name == "lawn" or name.startswith("path"):
+            assert abs(top) < 0.02
+        assert bottom < 1e-9 or any(low < bottom <= high < top for low, high in carriers), name
+    for k in range(sum(name.endswith("_top") for name in known)):
+        left, right, top = (known[f"gate_{k}_{part}"] for part in ("left", "right", "top"))
+        gap = left.position[1] - right.position[1] - 2 * left.radius
+        assert 2 * BODY_RADIUS < gap < top.shape.depth() - 2 * left.radius
+        assert left.position[0] == right.position[0] == top.position[0]
+
+
+def test_the_view_is_from_behind_and_above_and_within_the_walls():
+    rng = np.random.default_rng(1)
+    for x, y, heading in rng.uniform(-1.0, 1.0, (200, 3)) * (HALF_SIZE, HALF_SIZE, math.pi):
+        eye, target = view_from_behind(np.array([x, y, heading]))
+        assert np.abs(eye[:2]).max() < HALF_SIZE
+        assert eye[2] > target[2] > 0.5
+        forward, ground = np.array([math.cos(heading), math.sin(heading)]), np.array([x, y])
+        ahead = target[:2] - ground
+        np.testing.assert_allclose(ahead, np.linalg.norm(ahead) * forward, atol=1e-12)
+        back = ground - eye[:2]
+        if np.abs([ground, ground - 4.0 * forward]).max() < HALF_SIZE - 0.5:
+            np.testing.assert_allclose(back, np.linalg.norm(back) * forward, atol=1e-12)
+            assert 2.0 < np.linalg.norm(back) < 4.0
 
 
 def test_wrong_period_and_body_are_refused(person):

@@ -9,11 +9,16 @@ import numpy as np
 import pytest
 
 from drake_pose import audit_scene, estimate_scene, make_masks, register_scene
-from drake_pose.errors import OutputError, SceneError
+from drake_pose.body.model import load_model
+from drake_pose.errors import OutputError, SceneError, SettingsError
 from drake_pose.files.folder import claimed, read_summary, write_file, write_summary
-from drake_pose.files.records import PoseRow, PoseTable
+from drake_pose.files.records import FrameRecord, PoseRow, PoseTable
+from drake_pose.files.summary import open_job
+from drake_pose.files.writer import ResultWriter
 from drake_pose.jobs.batch.batch import run_batch
 from drake_pose.jobs.live.capture import capture_live
+from drake_pose.silhouette.pictures.scenes import load_scene
+from tests.jobs.scenes import TinyScene
 
 NAMES = ("a", "b")
 
@@ -136,6 +141,49 @@ def test_summary_has_no_nan(tmp_path: Path) -> None:
     text = (tmp_path / "summary.json").read_text()
     assert json.loads(text) == {"a": None, "b": [1.5, None], "c": [0, 1]}
     assert read_summary(tmp_path) == json.loads(text)
+
+
+def test_the_same_job_is_resumed_and_no_other(tmp_path: Path) -> None:
+    settings = {"interval": 20.0, "frames": ["0000"]}
+    job = {"sha256": {"model": "m", "cameras": "c"}, "settings": settings}
+    assert open_job(tmp_path, job, resume=False) is None
+    with pytest.raises(SettingsError, match="needs the folder"):
+        open_job(None, job, resume=True)
+    write_summary(tmp_path, job)
+    assert open_job(tmp_path, job | {"settings": settings | {"frames": []}}, True) == job
+    for other, message in (
+        ({"sha256": {"model": "m", "cameras": "d"}}, "with another cameras file"),
+        ({"sha256": {"model": "n", "cameras": "c"}}, "with another model file"),
+        ({"settings": settings | {"interval": 9.0}}, r"with interval = 20\.0, not 9\.0"),
+    ):
+        with pytest.raises(OutputError, match=message):
+            open_job(tmp_path, job | other, resume=True)
+
+
+def test_finished_frames_whose_masks_were_replaced_are_forgotten(
+    own_scene: TinyScene, tmp_path: Path
+) -> None:
+    scene, model, out = load_scene(own_scene.folder), load_model(own_scene.model), tmp_path / "out"
+
+    def writer(**more: object) -> ResultWriter:
+        made = ResultWriter(scene, model, {"scene": "s", "settings": {}}, out, **more)
+        made.begin()
+        return made
+
+    first = writer()
+    for frame, q in own_scene.truth.items():
+        first.add(PoseRow(frame, q, None, 0.01, 1.0), FrameRecord(True, 0.01, 1.0))
+    first.write_summary()
+    path = scene.masks["front", "0001"]
+    path.write_bytes(path.read_bytes())
+    again = writer(earlier=read_summary(out), frames=["0000"])
+    assert (list(again.rows), again.warnings) == (list(own_scene.truth), [])
+    shutil.copy(scene.masks["front", "0000"], path)
+    with pytest.raises(OutputError, match=r"frame 0001: the masks were replaced"):
+        writer(earlier=read_summary(out), frames=["0000", "0002"])
+    again = writer(earlier=read_summary(out), frames=["0001", "0002"])
+    assert list(again.rows) == list(again.records) == ["0000", "0002"]
+    assert again.warnings[0].startswith("frame 0001: estimated again")
 
 
 @pytest.mark.parametrize("text", [None, "{", "[]"])

@@ -1,7 +1,6 @@
 """What is known of frames, told in numbers that a table of one's own gives."""
 
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,7 +10,6 @@ from drake_pose.files import overlay
 from drake_pose.files.records import (
     FrameRecord,
     PoseRow,
-    PoseTable,
     base_cells,
     base_pose,
     measured_positions,
@@ -78,22 +76,11 @@ def test_what_was_measured_is_the_pose_less_its_error_inside_the_limits(
     assert again[0, 0] == pytest.approx(1.7)
 
 
-def test_a_table_gives_back_its_rows(tmp_path: Path, model: ArticulatedModel) -> None:
+def test_a_base_is_told_in_seven_numbers_and_back() -> None:
     X_WB = np.eye(4)
     X_WB[:3, :3] = [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
     X_WB[:3, 3] = [0.1, -0.2, 0.3]
-    table = PoseTable(tmp_path, model.position_names, with_base=True)
-    rows = [
-        PoseRow("a", np.array([1.5, 3.1, -2.0]), base_cells(X_WB), 0.25, 1.5),
-        PoseRow("b", np.full(3, np.nan), None, np.nan, 0.5),
-    ]
-    table.write(rows[:1])
-    table.append(rows[1])
-    found, lost = table.read()
-    np.testing.assert_allclose(found.q, rows[0].q)
-    np.testing.assert_allclose(base_pose(found.base), X_WB, atol=1e-8)
-    assert (found.error, found.seconds, found.found) == (0.25, 1.5, True)
-    assert (lost.frame, lost.base, lost.seconds, lost.found) == ("b", None, 0.5, False)
+    np.testing.assert_allclose(base_pose(base_cells(X_WB)), X_WB, atol=1e-8)
     np.testing.assert_array_equal(base_pose(None), np.eye(4))
 
 

@@ -1,4 +1,5 @@
 import base64
+import json
 import re
 from contextlib import suppress
 from dataclasses import replace
@@ -6,6 +7,7 @@ from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
+import cv2
 import msgpack
 import numpy as np
 import pytest
@@ -71,6 +73,8 @@ class Page(HTMLParser):
             assert values["alt"]
         elif tag == "svg":
             assert values.get("aria-hidden") or values.get("aria-label")
+            if not self._plot:
+                self._plot = str(values.get("aria-label", "")).split(" by frame")[0]
         if tag == "figure":
             self._joint = values.get("data-joint")
             self._plot = self._joint or ""
@@ -118,6 +122,11 @@ def result(tiny_scene: TinyScene, tmp_path_factory: pytest.TempPathFactory) -> P
     return out
 
 
+def list_ious(result: Path) -> list[float]:
+    frames = json.loads((result / "summary.json").read_text())["frames"].values()
+    return [frame["ious"]["front"] for frame in frames]
+
+
 def test_page_says_what_the_tables_say(result: Path) -> None:
     page = Page((result / "report.html").read_text())
     poses = read_rows(result / "poses.csv")
@@ -131,6 +140,11 @@ def test_page_says_what_the_tables_say(result: Path) -> None:
         values = np.degrees([float(pose[name]) for pose in poses])
         numbers = [float(number) for number in re.findall(r"-?\d+\.?\d*(?:e-?\d+)?", text)]
         np.testing.assert_allclose(numbers[:2], [values.min(), values.max()], rtol=1e-3)
+    for curve, told in (
+        ("E_total", [float(pose["error"]) for pose in poses]),
+        ("Intersection over union of each camera", list_ious(result)),
+    ):
+        np.testing.assert_allclose(page.curve(curve, "c0")[:, 1], 100.0 * np.array(told), atol=0.01)
     assert page.by_id["found"] == "3 of 3"
     cameras = next(table for table in page.tables if table[0][0] == "camera")
     assert cameras[1][:3] == ["front", "3", "3"]
@@ -143,7 +157,11 @@ def test_page_needs_nothing_but_itself_and_its_links_lead_somewhere(result: Path
     assert "http" not in re.sub(r"data:image/jpeg;base64,[\w+/=]*", "", text)
     assert not {"script", "link", "iframe"} & set(page.tags)
     assert page.sources
-    assert all(source.startswith("data:image/jpeg;base64,") for source in page.sources)
+    for source in page.sources:
+        data = base64.b64decode(source.removeprefix("data:image/jpeg;base64,"))
+        small = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+        drawn = cv2.imread(str(next(result.glob("overlay/front/*.png"))))
+        assert small.shape[0] <= min(drawn.shape[0], 400)
     for link in page.links:
         assert link.removeprefix("#") in page.by_id or (result / link).is_file(), link
 
@@ -301,6 +319,11 @@ def test_stills_are_dots() -> None:
     plot = plot_curves(["a", "b"], [("one", np.array([1.0, np.nan]))], joined=False)
     assert plot.curves[0][1].count("h0") == 1
     assert plot.dots
+    # A single one stands in the middle, also where others would be joined to it.
+    left, _, width, _ = BOX
+    for joined in (False, True):
+        plot = plot_curves(["a"], [("one", np.array([1.0]))], joined=joined)
+        assert coordinates(plot.curves[0][1])[0, 0] == pytest.approx(left + 0.5 * width, abs=0.1)
 
 
 def test_grid_joins_neighbours_of_one_state() -> None:
@@ -331,7 +354,7 @@ def test_a_replay_shows_all_of_the_body_the_cameras_and_what_was_measured(
     X_WB[:, :3, 3] = (0.5, -0.2, 0.1)
     left = replace(camera("left"), center_x=60.0)
     flat = ParallelCamera("flat", 200, 160, 100.0, 99.5, 79.5, camera("flat", 60.0).X_WC)
-    told = played(make_replay(model, q, X_WB, [left, flat], 1.0, q + off))
+    told = played(make_replay(model, q, X_WB, [left, flat], 2.0, q + off))
     corners = {(u - 0.5, v - 0.5) for u in (0, 200) for v in (0, 160)}
     for one in (left, flat):
         geometry = told["set_object", f"/drake/cameras/{one.name}"]["object"]["geometries"][0]
@@ -361,9 +384,11 @@ def test_a_replay_shows_all_of_the_body_the_cameras_and_what_was_measured(
                 if not measured:
                     seen += [mesh.vertices @ X_WL[:3, :3].T + X_WL[:3, 3]]
                     continue
+                # Ten steps a frame; it stands still until just before the next.
                 keys = tracks[f"/drake/measured/{link}"][".position"]
-                near = min(keys, key=lambda key, k=k: abs(key["time"] - 10 * k))
-                np.testing.assert_allclose(near["value"], X_WL[:3, 3], atol=1e-9)
+                found = {key["time"]: key["value"] for key in keys}
+                for step in (10 * k, 10 * k + 9):
+                    np.testing.assert_allclose(found[step], X_WL[:3, 3], atol=1e-9)
     pixels, depth = pinhole.project(np.concatenate(seen))
     assert depth.min() > 0.0
     assert (pixels >= -0.5).all()

@@ -245,15 +245,6 @@ def test_output_in_the_place_of_something_else(own_scene: TinyScene, runner: Cli
     assert_refused(run(runner, own_scene, "--out", below), "mine.txt", "is a file")
 
 
-@pytest.mark.slow
-def test_resuming_another_job(own_scene: TinyScene, runner: CliRunner, tmp_path: Path) -> None:
-    assert run(runner, own_scene).exit_code == 0
-    assert_refused(run(runner, own_scene, "--resume", "--candidates", "4"), "candidates", "5")
-    other = tmp_path / "other.urdf"
-    other.write_text(URDF.replace("0.1 0.12 0.5", "0.1 0.13 0.5"))
-    assert_refused(run(runner, own_scene, "--resume", model=other), "model")
-
-
 def test_what_ends_a_job_is_said_but_bugs_stay_visible(
     own_scene: TinyScene, runner: CliRunner, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -7,15 +7,10 @@ import numpy as np
 import pytest
 import yaml
 
-from drake_pose.body.model import load_model
-from drake_pose.errors import OutputError
-from drake_pose.files.records import FrameRecord, SceneEstimate
+from drake_pose.files.records import FrameRecord
 from drake_pose.files.settings import EstimateSettings
 from drake_pose.jobs.estimate.matching import find_contradiction
 from drake_pose.jobs.estimate.scene import estimate_scene
-from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
-from drake_pose.silhouette.pictures.masks import write_mask
-from drake_pose.silhouette.pictures.scenes import load_scene
 from tests.jobs.scenes import URDF, TinyScene, camera, write_scene
 
 ANGLES = ((20.0, -40.0), (-40.0, -80.0))
@@ -66,33 +61,6 @@ def test_what_keeps_the_truth_out(scene: TinyScene, tmp_path: Path) -> None:
     model.write_text(URDF.replace('lower="-1.6" upper="1.6"', 'lower="1.2" upper="1.6"'))
     *_, text = warnings_of(scene, model)
     assert "its limits (lift" in text
-
-
-def test_masks_that_were_replaced_are_estimated_again(scene: TinyScene, tmp_path: Path) -> None:
-    def resume(frames: tuple[str, ...] = (), resume: bool = True) -> SceneEstimate:
-        settings = EstimateSettings(interval=20.0, frames=frames)
-        return estimate_scene(
-            scene.folder, scene.model, tmp_path / "out", settings, resume=resume, replay=False
-        )
-
-    first = resume(resume=False)
-    path = scene.folder / "masks" / "front" / "0000.png"
-    path.write_bytes(path.read_bytes())
-    before = resume()
-    assert before.warnings == ()
-    assert before.rows[0].seconds == pytest.approx(first.rows[0].seconds, abs=1e-4)
-    model = load_model(scene.model)
-    for name, one in load_scene(scene.folder).cameras.items():
-        mask = LabelRenderer(model, one).mask(np.radians((60.0, 0.0)))
-        write_mask(scene.folder / "masks" / name / "0001.png", mask)
-    with pytest.raises(OutputError, match=r"frame 0001: the masks were replaced"):
-        resume(("0000",))
-    after = resume()
-    assert [row.frame for row in after.rows] == ["0000", "0001"]
-    np.testing.assert_array_equal(after.rows[0].q, before.rows[0].q)
-    np.testing.assert_allclose(after.rows[1].q, np.radians((60.0, 0.0)), atol=np.radians(2.0))
-    (text,) = after.warnings
-    assert text.startswith("frame 0001: estimated again")
 
 
 @pytest.mark.parametrize(

@@ -215,11 +215,14 @@ def read_hand(model: ArticulatedModel, palm: str = "palm") -> HandModel:
 
     Raises:
         UnknownNameError: no such link.
-        ModelError: joints on the palm that are no fingers: chains of as many hinges and segments.
+        ModelError: joints on the palm that are no fingers, chains of as many hinges and segments;
+            or a mesh without vertices where a thickness is measured.
     """
     model.link_index(palm)
     plant, context = model.plant, model.plant.CreateDefaultContext()
-    plant.SetPositions(context, np.zeros(plant.num_positions()))
+    # No quaternion is zero: a palm that floats stands as by default.
+    floats = [kind == "quaternion" for kind in model.position_kinds]
+    plant.SetPositions(context, np.where(floats, model.default_positions, 0.0))
     X_PW = plant.GetFrameByName(palm).CalcPoseInWorld(context).inverse()
     beyond: dict[str, list[Joint]] = {}
     for joint in map(plant.get_joint, plant.GetJointIndices()):
@@ -229,19 +232,24 @@ def read_hand(model: ArticulatedModel, palm: str = "palm") -> HandModel:
         chain = [first]
         while found := beyond.get(chain[-1].child_body().name()):
             chain += found
-        if not all(isinstance(joint, RevoluteJoint) for joint in chain):
-            raise ModelError(f"{model.path}: '{first.name()}' on '{palm}' begins no finger")
+        is_seen = chain[-1].child_body().name() in model.link_meshes
+        if not is_seen or not all(isinstance(joint, RevoluteJoint) for joint in chain):
+            raise ModelError(
+                f"{model.path}: '{first.name()}' on '{palm}' begins no finger, which is a chain of "
+                "hinges whose last link is seen"
+            )
         poses = [X_PW @ j.frame_on_parent().CalcPoseInWorld(context) for j in chain]
         chains.append(chain)
         places.append([(X.translation(), X.rotation().matrix()) for X in poses])
-    vertices = model.link_meshes[palm].vertices @ _FROM_LINK.T
-    size = np.ptp(vertices, axis=0)
+    if not chains or palm not in model.link_meshes:
+        raise ModelError(f"{model.path}: '{palm}' has no fingers, or shows nothing")
+    size = np.ptp(model.link_meshes[palm].vertices @ _FROM_LINK.T, axis=0)
     size[0] = max(float(one[0][0][1]) for one in places)
     sizes = dict(zip(("palm_height", "palm_thickness", "palm_width"), size.tolist(), strict=True))
     read = [_read_finger(model, *one, size, sizes) for one in zip(chains, places, strict=True)]
     if len({len(radii) for _, radii in read}) != 1:
         raise ModelError(f"{model.path}: the fingers on '{palm}' have not as many segments each")
-    rings = _palm_rings(vertices, size[0]) / size
+    rings = _palm_rings(model, palm, size[0]) / size
     low, side = rings[0].min(axis=0), 0.8 * np.ptp(rings[0, :, 2]) * np.array([0.5, -0.5])
     depths = 0.5 * np.array([rings[0, :, 1].min(), rings[0, :, 1].max()])
     rows = np.array([[[[x, y, z] for z in side] for y in depths] for x in (1.0, low[0])])
@@ -279,25 +287,44 @@ def _read_finger(
         steps.append(Step(joint.name(), TURN, tuple(axis)))
         last = joint.child_body().name()
         if last in model.link_meshes:
-            vertices = model.link_meshes[last].vertices
-            radii.append(0.5 * np.ptp(vertices[np.abs(vertices[:, 1]) < _ABOUT_JOINT, 0]))
-    end = vertices[:, 1].max()
-    near = (vertices[:, 1] < end - _FROM_END[0]) & (vertices[:, 1] > end - _FROM_END[1])
-    radii.append(0.5 * np.ptp(vertices[near, 0]))
+            radii.append(_radius(model, last, -_ABOUT_JOINT, _ABOUT_JOINT))
+    end = model.link_meshes[last].vertices[:, 1].max()
+    radii.append(_radius(model, last, end - _FROM_END[1], end - _FROM_END[0]))
     steps.append(Step(f"length_{last}", SEGMENT, tuple(_FROM_LINK @ R[:, 1])))
     sizes[f"length_{last}"] = float(end - radii[-1])
     return tuple(steps), radii
 
 
-def _palm_rings(vertices: Array, height: float) -> Array:
+def _radius(model: ArticulatedModel, link: str, low: float, high: float) -> float:
+    """Half of how wide a link is along its x axis where it lies so far along its y axis [m]."""
+    return 0.5 * float(np.ptp(_band(model, link, low, high)[:, 0]))
+
+
+def _band(model: ArticulatedModel, link: str, low: float, high: float) -> Array:
+    """The vertices (n, 3) of a link that lie so far along its y axis [m].
+
+    Raises ModelError: there is none.
+    """
+    vertices = model.link_meshes[link].vertices
+    band = vertices[(vertices[:, 1] >= low) & (vertices[:, 1] <= high)]
+    if not len(band):
+        raise ModelError(
+            f"{model.path}: the mesh of link '{link}' has no vertex {1e3 * low:.0f} to "
+            f"{1e3 * high:.0f} mm along the link's y axis, where a hand's thickness is measured; "
+            "give it more vertices there"
+        )
+    return band
+
+
+def _palm_rings(model: ArticulatedModel, palm: str, height: float) -> Array:
     """(2, K, 3) a palm's outlines at the wrist and before the knuckles [m]."""
-    low = float(vertices[:, 0].min())
+    low = float(model.link_meshes[palm].vertices[:, 1].min())
     angles = 2.0 * np.pi * np.arange(_DIRECTIONS) / _DIRECTIONS
     directions = np.column_stack([np.cos(angles), np.sin(angles)])
     bands = ((low, low + _WRIST_BAND * height), [share * height for share in _KNUCKLE_BAND])
     rings = np.zeros((2, _DIRECTIONS, 3))
     for ring, (begin, end), x in zip(rings, bands, (low, _KNUCKLES * height), strict=True):
-        band = vertices[(vertices[:, 0] >= begin) & (vertices[:, 0] <= end)]
+        band = _band(model, palm, begin, end) @ _FROM_LINK.T
         ring[:] = band[np.argmax(band[:, 1:] @ directions.T, axis=0)]
         ring[:, 0] = x
     return rings

@@ -6,10 +6,11 @@ from pydrake.multibody.plant import MultibodyPlant
 
 from drake_pose.body.formats.packages import bundled_model
 from drake_pose.body.model import load_model
-from drake_pose.errors import SettingsError
+from drake_pose.errors import ModelError, SettingsError, UnknownNameError
 from drake_pose.filtering.hand import HAND_STATE, HandObservation, plant_positions, scaled_rotation
 from drake_pose.filtering.hand_model import read_hand
 from drake_pose.filtering.state import Belief
+from tests.body.models import joint, link, urdf, write
 
 OBSERVATION = HandObservation()
 
@@ -86,9 +87,9 @@ def test_five_fingers_are_where_drake_has_them(right_hand):
             if finger == "thumb":
                 links = ["thumb_metacarpal", "thumb_proximal", "thumb_distal"]
             length = x[hand.layout.index(f"length_{links[2]}")]
-            ends = [(link, np.zeros(3)) for link in links] + [(links[2], [0.0, length, 0.0])]
-            for (link, p), point in zip(ends, points, strict=True):
-                frame = plant.GetFrameByName(link)
+            ends = [(name, np.zeros(3)) for name in links] + [(links[2], [0.0, length, 0.0])]
+            for (name, p), point in zip(ends, points, strict=True):
+                frame = plant.GetFrameByName(name)
                 p_P = plant.CalcPointsPositions(context, frame, p, palm)[:, 0]
                 # The palm's y leads to the fingers, its z out of it.
                 expected = x[:2] + 1000.0 * (M @ p_P[[1, 2, 0]])[:2]
@@ -206,6 +207,25 @@ def test_the_mirrored_prediction_looks_the_same_and_changes_one_angle():
         np.testing.assert_allclose(OBSERVATION.predict(other)[0][end], h[end], atol=1e-9)
     sure = Belief(x, np.diag(np.full(len(x), 1e-4)))
     assert not HandObservation(mirror_slope=0.9).mirrors(sure)
+
+
+@pytest.mark.parametrize(
+    ("joints", "message"),
+    [
+        ([], "'palm' has no fingers"),
+        ([joint("slide", "prismatic", "palm", "one")], "'slide' on 'palm' begins no finger"),
+        ([joint("bend", "revolute", "palm", "unseen")], "'bend' on 'palm' begins no finger"),
+        ([joint("bend", "revolute", "palm", "one")], "link 'one' has no vertex -3 to 3 mm"),
+    ],
+)
+def test_what_is_no_hand_is_refused(tmp_path, joints, message):
+    """Whose palm floats, as do links that no joint holds."""
+    text = urdf(*(link(name) for name in ("palm", "one")), link("unseen", ""), *joints)
+    model = load_model(write(tmp_path, text), check=False)
+    with pytest.raises(ModelError, match=message):
+        read_hand(model)
+    with pytest.raises(UnknownNameError, match="'paw'"):
+        read_hand(model, "paw")
 
 
 def test_a_noise_of_zero_is_refused():

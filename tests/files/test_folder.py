@@ -11,7 +11,13 @@ import pytest
 from drake_pose import audit_scene, estimate_scene, make_masks, register_scene
 from drake_pose.body.model import load_model
 from drake_pose.errors import OutputError, SceneError, SettingsError
-from drake_pose.files.folder import claimed, read_summary, write_file, write_summary
+from drake_pose.files.folder import (
+    claimed,
+    read_summary,
+    write_file,
+    write_summary,
+    writes_folder,
+)
 from drake_pose.files.records import FrameRecord, PoseRow, PoseTable
 from drake_pose.files.summary import open_job
 from drake_pose.files.writer import ResultWriter
@@ -85,6 +91,13 @@ def test_a_folder_that_holds_something_or_cannot_be_is_refused(tmp_path: Path) -
         with pytest.raises(OutputError, match=message), claimed(place):
             pass
     assert {path.name for path in tmp_path.iterdir()} == {"link", "out"}
+
+    @writes_folder
+    def job(out: Path) -> None:
+        """Cannot be resumed."""
+
+    with pytest.raises(OutputError, match="not empty"):
+        job(out=tmp_path)
 
 
 HOLD = """
@@ -174,6 +187,7 @@ def test_finished_frames_whose_masks_were_replaced_are_forgotten(
     for frame, q in own_scene.truth.items():
         first.add(PoseRow(frame, q, None, 0.01, 1.0), FrameRecord(True, 0.01, 1.0))
     first.write_summary()
+    assert read_summary(out)["complete"] is False
     path = scene.masks["front", "0001"]
     path.write_bytes(path.read_bytes())
     again = writer(earlier=read_summary(out), frames=["0000"])

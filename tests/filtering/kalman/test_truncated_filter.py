@@ -121,6 +121,9 @@ def test_iteration_finds_the_posteriors_largest_density():
         for step in generator.normal(size=(200, 3)) * size:
             assert cost(result.belief.mean + step) > best - 1e-3
     assert cost(update(prior, seen).belief.mean) > best + 10
+    # More noise at first leads there by another way.
+    untempered = update(prior, seen, iterations=20, tempered=False)
+    np.testing.assert_allclose(untempered.belief.mean, result.belief.mean, atol=1e-6)
     assert result.distance == pytest.approx(best, rel=1e-3)
 
 

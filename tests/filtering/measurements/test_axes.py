@@ -18,7 +18,7 @@ from drake_pose.filtering.hand import (
     plant_positions,
 )
 from drake_pose.filtering.kalman.update import make_evidence, update
-from drake_pose.filtering.measurements.axes import AxisObservation
+from drake_pose.filtering.measurements.axes import AxisObservation, _half_width
 from drake_pose.filtering.measurements.contour import ContourObservation
 from drake_pose.filtering.state import Belief
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
@@ -179,6 +179,13 @@ def test_a_segment_oblique_to_its_joint_is_mirrored_at_the_image_plane(tmp_path,
     np.testing.assert_allclose(mirrored, -x, atol=1e-9)
     seen = [observation.predict(one)[0] for one in (x, mirrored)]
     np.testing.assert_allclose(seen[1], seen[0], atol=1e-9)
+
+
+def test_a_segment_is_as_wide_as_what_lies_between_its_ends():
+    shaft = np.array([[x, 0.01 * np.cos(a), 0.01 * np.sin(a)] for x in (0, 0.1) for a in range(6)])
+    head = np.array([[0.13, 0.05, 0.0], [-0.02, 0.0, 0.04]])
+    start, end = np.zeros(3), np.array([0.1, 0.0, 0.0])
+    assert _half_width(np.vstack([shaft, head]), start, end) == pytest.approx(0.01)
 
 
 def small_state(observation, hand, flexions):

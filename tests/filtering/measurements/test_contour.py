@@ -57,18 +57,20 @@ def test_it_leads_back_to_the_truth_that_drake_rendered(tmp_path):
 
 def test_a_root_that_is_known_elsewhere_and_one_that_is_estimated_there(tmp_path):
     model = forked_body(tmp_path)
-    tree = model.pose_tree("trunk", root_position=np.zeros(3))
+    home, shift = np.array([0.0, 0.05, 0.04]), np.array([0.0, 0.03, -0.02])
+    tree, there = model.pose_tree("trunk", root_position=home), home + shift
     camera = front_camera(200, shift=0.2)
     held, moves = ContourObservation(tree, [camera]), ContourObservation(tree, [camera], moves=True)
-    q, there = np.array([0.2, 0.9, -0.6]), np.array([0.0, 0.03, -0.02])
+    q = np.array([0.2, 0.9, -0.6])
     x = moves.state(q)
     at_home = moves.draw(x, camera)
-    x[moves.layout.indices(ROOT_SHIFT)] = there
+    x[moves.layout.indices(ROOT_SHIFT)] = shift
+    np.testing.assert_allclose(moves.root_position(x), there)
     seen = held.with_root_position(there).draw(held.state(q), camera)
     assert not np.array_equal(seen, at_home)
     np.testing.assert_array_equal(moves.draw(x, camera), seen)
     found, _ = descend(moves, moves.look([seen]), moves.state(q), steps=8)
-    np.testing.assert_allclose(found[moves.layout.indices(ROOT_SHIFT)][1:], there[1:], atol=0.004)
+    np.testing.assert_allclose(found[moves.layout.indices(ROOT_SHIFT)][1:], shift[1:], atol=0.004)
 
 
 def test_slopes_agree_with_finite_differences_of_the_contour(tmp_path, monkeypatch):

@@ -20,6 +20,7 @@ from drake_pose.filtering.hand import (
 from drake_pose.filtering.kalman.update import difference
 from drake_pose.filtering.measurements.hand_silhouette import HandSilhouette
 from drake_pose.filtering.state import Belief
+from drake_pose.fit.evidence import find_edge_points
 from drake_pose.papers.shimada import experiment_filter
 from drake_pose.papers.shimada_motion import first_guess, true_states
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
@@ -124,6 +125,36 @@ def test_what_another_part_hides_is_not_measured(render):
     hidden = ("alpha_23", "rho_23", "point_23_x", "point_23_y")
     assert np.isnan(y[[MEASURED.index(name) for name in hidden]]).all()
     assert np.isfinite(y[[MEASURED.index(name) for name in ("alpha_11", "alpha_palm_left")]]).all()
+
+
+def test_joints_that_are_drawn_outside_are_told_to_lie_half_a_radius_within(render):
+    """Those of a finger that is not in the picture; across the edge surely, along it hardly."""
+    x = hand(24)
+    mask = render(x)
+    bent = x.copy()
+    bent[HAND_STATE.index(SPREADS[0])] -= np.radians(40.0)
+    edge, y = find_edge_points(mask, 1.0), np.full(len(MEASURED), np.nan)
+    R = np.diag(OBSERVATION.variances)
+    SILHOUETTE._draw_in(bent, mask, edge, y, R)
+    told = np.flatnonzero(np.isfinite(y)).reshape(-1, 2)
+    assert 2 <= len(told) < 8
+    for rows in told:
+        u, v = np.rint(y[rows] + CENTER).astype(int)
+        assert mask[v, u]
+        point = OBSERVATION.drawing(bent)[(rows[0] - 2) // 2] + CENTER
+        way, beyond = point - y[rows] - CENTER, np.linalg.norm(edge.uv - point, axis=1).min()
+        # A radius is 8 mm, about as many pixels.
+        assert np.linalg.norm(way) - beyond == pytest.approx(0.5 * 8.0, abs=0.5)
+        block = R[np.ix_(rows, rows)]
+        assert way @ block @ way / (way @ way) < 0.02 * np.trace(block)
+
+
+def test_a_hand_that_reaches_out_of_the_picture_is_measured_where_it_shows(render):
+    x = hand(24)
+    for shift in ((0.0, -170.0), (0.0, 200.0), (260.0, 0.0)):
+        moved = x.copy()
+        moved[:2] += shift
+        assert np.isfinite(SILHOUETTE.measure(render(moved), sure_of(moved)).y).any()
 
 
 def test_nothing_is_measured_in_a_blank_picture_or_one_of_something_else(render):

@@ -58,9 +58,14 @@ def test_tracked_after_one_match_and_matched_again_after_a_jump(body):
     # Cut: the body stands otherwise in the next frame.
     second = swings(12, np.array([-0.3, 1.7, -1.7]), 0.25, generator)
     renderer = LabelRenderer(body, camera)
-    followed, errors, asked = Followed(), [], []
+    followed, errors, asked, held, widths = Followed(), [], [], [], []
     for q in np.vstack([first, second]):
         followed, result = follower.next(followed, [View(camera, renderer.mask(q))])
+        told = follower.with_intervals(followed, result)
+        np.testing.assert_array_equal(told.q, result.q)
+        for joint, value in zip(told.pose_set.joints, q, strict=True):
+            held.append(joint.holds(value))
+            widths.append(joint.high - joint.low)
         errors.append(np.degrees(np.abs(result.q - q)).max())
         asked.append(search.calls)
         assert followed.matches == search.calls
@@ -71,6 +76,9 @@ def test_tracked_after_one_match_and_matched_again_after_a_jump(body):
     assert np.median(errors[:12]) < 3.0
     assert np.median(errors[12:]) < 3.5
     assert result.stopped_by == TRACKED
+    # 95 % are claimed.
+    assert np.mean(held) > 0.9
+    assert np.median(widths) < np.radians(35.0)
 
 
 def test_no_pose_found_is_said_and_asked_again(body):

@@ -59,6 +59,12 @@ def test_the_true_start_is_among_those_followed_and_not_worse_than_what_was_give
 
 
 def test_a_root_that_does_not_turn_freely_is_refused(tmp_path):
-    observation = ContourObservation(forked_body(tmp_path).pose_tree(), [front_camera()])
-    with pytest.raises(SettingsError, match="freely"):
-        tilted(observation, np.zeros(len(observation.layout)), (0.1, 0.1))
+    body = forked_body(tmp_path)
+    limited = RootRotation.limited([("x", -30.0, 30.0)])
+    for tree in (
+        body.pose_tree(),
+        body.pose_tree("trunk", root_position=np.zeros(3), root_rotation=limited),
+    ):
+        observation = ContourObservation(tree, [front_camera()])
+        with pytest.raises(SettingsError, match="freely"):
+            tilted(observation, np.zeros(len(observation.layout)), (0.1, 0.1))

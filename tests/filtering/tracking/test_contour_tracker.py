@@ -1,0 +1,92 @@
+"""How a tracker thinks of what moves, and what it does with pictures alone."""
+
+import math
+
+import numpy as np
+import pytest
+
+from drake_pose.filtering.measurements.contour import ContourObservation
+from drake_pose.filtering.state import Belief
+from drake_pose.filtering.tracking.contour_tracker import ContourTracker, TrackingSettings
+from drake_pose.filtering.tracking.match_and_track import Followed, MatchAndTrack
+from drake_pose.search.estimates import View
+from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
+from tests.filtering.tracking.test_match_and_track import PERIOD
+from tests.filtering.tracking.test_unknown_scale import KnownPoses
+from tests.search.bodies import forked_body, front_camera
+
+CAMERA = front_camera(200, shift=0.2)
+
+
+@pytest.fixture
+def body(tmp_path):
+    return forked_body(tmp_path)
+
+
+def test_rates_fade_within_the_memory_and_change_by_the_acceleration_of_their_kind(body):
+    tree = body.pose_tree("trunk", root_position=np.zeros(3))
+    observation = ContourObservation(tree, [CAMERA], moves=True, grows=True)
+    settings = TrackingSettings(
+        angle_acceleration=2.0, length_acceleration=3.0, growth_acceleration=5.0, memory=0.2
+    )
+    tracker, n = ContourTracker(observation, 0.05, settings), len(observation.layout)
+    moving = observation.layout.moving
+    still = tracker.filter.predicted(Belief(np.zeros(n), np.zeros((n, n))))
+    for name, deviation in zip(moving, still.deviations()[len(moving) :], strict=True):
+        turn, shift = name.endswith("turn"), name.startswith("root_shift")
+        of_kind = 2.0 if turn else 3.0 if shift else 5.0
+        assert deviation == pytest.approx(0.05**2 * of_kind), name
+    belief = Belief(np.r_[np.zeros(len(moving)), np.ones(len(moving))], np.eye(n))
+    for _ in range(4):
+        belief = tracker.filter.predicted(belief)
+    np.testing.assert_allclose(belief.mean[len(moving) :], math.exp(-1.0))
+
+
+def test_a_start_is_surer_of_what_moves_less(body):
+    tree = body.pose_tree("trunk", root_position=np.zeros(3))
+    observation = ContourObservation(tree, [CAMERA], moves=True)
+    calm, wild = (
+        ContourTracker(observation, PERIOD, TrackingSettings(angle_acceleration=a)).start_belief(
+            np.zeros(len(observation.layout))
+        )
+        for a in (1.0, 10.0)
+    )
+    count = len(observation.layout.moving)
+    ratio = wild.deviations() / calm.deviations()
+    turns = [name.endswith("turn") for name in observation.layout.moving]
+    np.testing.assert_allclose(ratio[:count], 1.0)
+    np.testing.assert_allclose(ratio[count:], np.where(turns, 10.0, 1.0))
+
+
+@pytest.mark.parametrize(("share", "asked"), [(0.04, 1), (0.6, 2)])
+def test_a_search_is_asked_where_much_of_the_silhouette_is_not_explained(body, share, asked):
+    """Something else comes into the picture, which no contour of the body is near."""
+    tree, q = body.pose_tree(), np.array([0.1, 0.5, -0.5])
+    mask = LabelRenderer(body, CAMERA).mask(q)
+    search = KnownPoses(tree, [(q, np.eye(4), 1.0, None)])
+    follower = MatchAndTrack(search, [CAMERA], PERIOD)
+    followed, _ = follower.next(Followed(), [View(CAMERA, mask)])
+    with_other = mask.copy()
+    with_other[150:, : round(share * mask.sum() / 50)] = True
+    assert not (mask[150:] | mask[:, :60].any()).any()
+    follower.next(followed, [View(CAMERA, with_other)])
+    assert search.calls == asked
+
+
+def test_colours_alone_are_followed_from_where_the_body_is_said_to_be(body):
+    """Nobody is asked: at first nothing is known; a covered lens loses the track, not the body."""
+    q, search = np.array([0.2, 0.9, -0.6]), KnownPoses(body.pose_tree(), [])
+    mask = LabelRenderer(body, CAMERA).mask(q)
+    lit = np.where(mask[..., None], (230, 130, 40), (60, 140, 60)).astype(np.uint8)
+    follower, followed = MatchAndTrack(search, [CAMERA], PERIOD), Followed()
+    found = []
+    for picture, start in ((lit, None), (lit, q), (lit, None), (0 * lit, None), (lit, q)):
+        followed, pose = follower.next(followed, [], None, {"front": picture}, start)
+        found.append(pose.found)
+        if pose.found:
+            np.testing.assert_allclose(pose.q, q, atol=np.radians(3.0))
+            # Contours lie within a pixel of the edge: so much of the body's area, about.
+            assert 0.0 < pose.E_total < 0.2
+        assert (followed.track is None) == (len(found) == 1)
+    assert found == [False, True, True, False, True]
+    assert search.calls == followed.matches == 0

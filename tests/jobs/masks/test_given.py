@@ -104,38 +104,6 @@ def test_pictures_of_an_object_that_is_not_there_are_named(tmp_path, two_views):
     assert not (tmp_path / "none" / "masks").exists()
 
 
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        (
-            {"segmentation": {"size": [5, 5], "counts": [25]}},
-            "annotation 0 of image 0.*another size",
-        ),
-        ({"segmentation": {"size": [160, 200], "counts": [25]}}, "fill 25 pixels"),
-        ({"segmentation": [[1.0, 2.0, 3.0]]}, "annotation 0 of image 0"),
-        ({"segmentation": [["a", "b"] * 3]}, "annotation 0 of image 0"),
-        ({"image_id": 77}, "image 77, which is not there"),
-    ],
-)
-def test_damaged_coco_files_are_refused(tmp_path, two_views, change, words):
-    file = write_coco(tmp_path / "a.json", load_scene(two_views.folder), lambda _: [(3, [POLYGON])])
-    content = json.loads(file.read_text())
-    content["annotations"][0] |= change
-    file.write_text(json.dumps(content))
-    with pytest.raises(MaskError, match=rf"a\.json.*{words}"):
-        make_masks(file, tmp_path / "out")
-    content["annotations"] = []
-    for name in ("a\0.png", 3):
-        content["images"][0]["file_name"] = name
-        file.write_text(json.dumps(content))
-        with pytest.raises(MaskError, match=r"a\.json.*no name of a picture"):
-            make_masks(file, tmp_path / "out")
-    for text in ("{", "[]", "{}", '{"images": 3, "annotations": [], "categories": []}'):
-        file.write_text(text)
-        with pytest.raises(MaskError, match=r"a\.json"):
-            make_masks(file, tmp_path / "out")
-
-
 def test_annotations_of_another_size_or_camera_are_refused(tmp_path, two_views):
     scene = load_scene(two_views.folder)
     cameras = scene.path / "cameras.yaml"

@@ -9,9 +9,8 @@ import pytest
 from drake_pose import MaskSettings, load_scene, make_masks
 from drake_pose.commands.main import app
 from drake_pose.errors import CameraError, SceneError, SettingsError
-from drake_pose.silhouette.segmentation.background import tell_from_background
 from tests.cli import CliRunner
-from tests.jobs.masks.rooms import iou, moving, texture, write_pictures
+from tests.jobs.masks.rooms import iou, moving, write_pictures
 from tests.jobs.scenes import NAMES
 
 OFF = 5.0
@@ -95,30 +94,6 @@ def test_what_is_missing_is_named(filmed, tmp_path, runner: CliRunner):
     done = runner.invoke(app, [*command, "--start", str(start)])
     assert done.exit_code == 1
     assert "start.csv" in done.stderr
-
-
-def test_background_is_told_from_pictures_of_another_exposure():
-    """A square that moves before a room, half the pictures redder and darker."""
-    rng = np.random.default_rng(2)
-    room = texture(rng)
-    pictures, masks, probabilities = [], [], []
-    for k in range(8):
-        mask = np.zeros(room.shape[:2], bool)
-        mask[40:100, 15 * k : 15 * k + 40] = True
-        probability = cv2.GaussianBlur(mask.astype(np.float32), (0, 0), 5.0).clip(0.01, 0.99)
-        picture = np.where(mask[:, :, None], 255.0 - room, room)
-        picture = picture * ((0.9, 0.7, 0.6) if k % 2 else (1.0, 1.0, 1.0))
-        pictures.append(
-            (picture + 2.0 * rng.standard_normal(room.shape)).clip(0, 255).astype(np.uint8)
-        )
-        masks.append(mask)
-        probabilities.append(probability)
-    differs = np.abs(255.0 - 2.0 * room).max(axis=2) > 60.0
-    for ratio, mask in zip(tell_from_background(pictures, probabilities), masks, strict=True):
-        assert (ratio[~mask] < 0.0).mean() > 0.97
-        assert (ratio[mask & differs] > 0.0).mean() > 0.97
-    alone = tell_from_background(pictures[:1], probabilities[:1])
-    assert not alone[0].any()
 
 
 @pytest.mark.slow

@@ -1,11 +1,9 @@
-"""Regions, skin blobs, rays and features against scenes drawn by hand."""
+"""Skin blobs, rays and features against scenes drawn by hand."""
 
-import cv2
 import numpy as np
 import pytest
 
 from drake_pose.camera.models import ParallelCamera, circle_of_cameras, look_at
-from drake_pose.errors import SettingsError
 from drake_pose.person.date.features import (
     SkinColour,
     dense_mean,
@@ -15,11 +13,6 @@ from drake_pose.person.date.features import (
     skin_blobs,
 )
 from drake_pose.person.rays import meeting_points, nearest_points, viewing_rays
-from drake_pose.silhouette.segmentation.background import (
-    Background,
-    learn_background,
-    person_region,
-)
 
 SKIN = (217, 166, 135)
 SHIRT = (31, 115, 128)
@@ -28,54 +21,6 @@ SHIRT = (31, 115, 128)
 def disc(shape, center, radius):
     row, column = np.indices(shape)
     return (column - center[0]) ** 2 + (row - center[1]) ** 2 <= radius**2
-
-
-class TestRegion:
-    def test_person_before_a_noisy_wall(self):
-        generator = np.random.default_rng(0)
-        wall = generator.integers(60, 200, (120, 160, 3)).astype(float)
-        wall = cv2.GaussianBlur(wall, (0, 0), 8)
-
-        def taken(picture):
-            return np.clip(picture + generator.normal(0, 3, picture.shape), 0, 255).astype(np.uint8)
-
-        person, empty = disc((120, 160), (80, 60), 30), [taken(wall) for _ in range(8)]
-        wall[person] = (240, 20, 30)
-        region = person_region(taken(wall), learn_background(empty))
-        assert (region & person).sum() / (region | person).sum() > 0.97
-
-    @pytest.mark.parametrize("seed", range(40))
-    def test_region_is_what_its_definition_says(self, seed):
-        # Small pictures: patches meet the border, each other, and are missing altogether.
-        generator = np.random.default_rng(seed)
-        shape = tuple(generator.integers(3, 45, 2))
-        mean = generator.integers(0, 256, (*shape, 3)).astype(np.uint8)
-        deviation = generator.uniform(3.0, 70.0, shape).astype(np.float32)
-        noise = generator.normal(0.0, 1.5 * deviation[:, :, None], mean.shape)
-        picture = np.clip(mean + noise, 0, 255).astype(np.uint8)
-        for _ in range(seed % 7):
-            top, left = (int(generator.integers(0, n)) for n in shape)
-            patch = slice(top, top + 9), slice(left, left + 6)
-            picture[patch] = np.where(mean[patch] < 128, 255, 0)
-            deviation[patch] = 3.0
-        off = np.abs(picture.astype(int) - mean) > np.floor(5.0 * deviation)[:, :, None]
-        square = np.ones((3, 3), np.uint8)
-        expected = off.any(axis=2).astype(np.uint8)
-        for step in (cv2.MORPH_OPEN, cv2.MORPH_CLOSE):
-            expected = cv2.morphologyEx(expected, step, square)
-        _, labels = cv2.connectedComponents(expected, connectivity=8)
-        areas = np.bincount(labels.ravel())[1:]
-        kept = 1 + np.flatnonzero(areas >= 0.1 * areas.max(initial=0))
-        region = person_region(picture, Background(mean, deviation))
-        np.testing.assert_array_equal(region, np.isin(labels, kept))
-        assert region.any() == bool(expected.any())
-
-    def test_sizes_must_agree(self):
-        with pytest.raises(SettingsError):
-            learn_background([])
-        background = learn_background([np.zeros((4, 5, 3), np.uint8)])
-        with pytest.raises(SettingsError):
-            person_region(np.zeros((5, 4, 3), np.uint8), background)
 
 
 class TestSkin:

@@ -1,6 +1,7 @@
 """Masks of Pillow, OpenCV, and COCO (compared with its own library and matplotlib)."""
 
 import builtins
+import json
 
 import cv2
 import numpy as np
@@ -14,6 +15,7 @@ from drake_pose.silhouette.segmentation.mask_pictures import (
     decode_run_lengths,
     fill_polygon,
     mask_of_video_picture,
+    read_coco,
     read_mask_picture,
 )
 
@@ -182,3 +184,61 @@ def test_run_lengths_without_the_library_say_what_to_install(monkeypatch):
     monkeypatch.setattr(builtins, "__import__", without)
     with pytest.raises(MaskError, match=r"drake_pose\[coco\]"):
         decode_run_lengths([25], 5, 5)
+
+
+def annotations(path, **changes):
+    """A COCO file of two pictures, of which the first has two areas; changed at its first ones."""
+    image = {"id": 5, "file_name": "left/0001.jpg", "width": WIDTH, "height": HEIGHT}
+    box = [[10.0, 5.0, 30.0, 5.0, 30.0, 20.0, 10.0, 20.0]]
+    area = {"id": 0, "image_id": 5, "category_id": 3, "segmentation": box}
+    content = {
+        "images": [image | changes.get("image", {}), image | {"id": 6}],
+        "annotations": [
+            area | changes.get("area", {}),
+            area | {"id": 1, "category_id": 4, "segmentation": []},
+            area | {"id": 2, "category_id": 9, "segmentation": [[40, 25, 55, 25, 55, 35, 40, 35]]},
+        ],
+        "categories": [{"id": 3, "name": "arm"}, {"id": 4, "name": "tool"}],
+    }
+    path.write_text(json.dumps(content | changes.get("content", {})))
+    return path
+
+
+def test_annotations_are_drawn_by_class_and_picture(tmp_path, classes):
+    found = read_coco(annotations(tmp_path / "a.json"))
+    assert found.classes == ("arm", "9")
+    assert found.names == {"3": "arm", "4": "tool"}
+    assert found.warnings[0].endswith("1 annotations have a box, but no segmentation: left out")
+    first, second = found.pictures
+    assert (first.file, first.width, first.height) == ("left/0001.jpg", WIDTH, HEIGHT)
+    assert (first.draw(["arm"]) == (classes == 1)).all()
+    assert (first.draw(["arm", "9"]) == (classes > 0)).all()
+    assert not second.draw(["arm"]).any()
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"area": {"segmentation": {"size": [5, 5], "counts": [25]}}}, "0 of image 5.*another si"),
+        ({"area": {"segmentation": {"size": [HEIGHT, WIDTH], "counts": [25]}}}, "fill 25 pixels"),
+        ({"area": {"segmentation": [[1.0, 2.0, 3.0]]}}, "annotation 0 of image 5"),
+        ({"area": {"segmentation": [["a", "b"] * 3]}}, "annotation 0 of image 5"),
+        ({"area": {"image_id": 77}}, "image 77, which is not there"),
+        ({"image": {"id": 6}}, "image 6 is given twice"),
+        ({"image": {"width": True}}, "whole numbers of 1 to"),
+        ({"image": {"file_name": "a\0.png"}}, "no name of a picture"),
+        ({"image": {"file_name": 3}}, "no name of a picture"),
+        ({"content": {"images": 3}}, "no COCO file as it should be"),
+    ],
+)
+def test_damaged_annotations_are_refused(tmp_path, change, words):
+    file = annotations(tmp_path / "a.json", **change)
+    with pytest.raises((MaskError, ValueError), match=words):
+        read_coco(file).pictures[0].draw(["arm"])
+
+
+@pytest.mark.parametrize("text", ["{", "[]", "{}"])
+def test_what_is_no_coco_file_is_refused(tmp_path, text):
+    (tmp_path / "a.json").write_text(text)
+    with pytest.raises(MaskError, match=r"a\.json"):
+        read_coco(tmp_path / "a.json")

@@ -1,0 +1,134 @@
+"""An object by its background, learnt or beside it, or by a box, against scenes drawn by hand."""
+
+import cv2
+import numpy as np
+import pytest
+
+from drake_pose.errors import SettingsError
+from drake_pose.silhouette.pictures.masks import intersection_over_union
+from drake_pose.silhouette.segmentation.background import (
+    Background,
+    background_of_recording,
+    background_support,
+    cut_box,
+    learn_background,
+    person_region,
+    tell_from_background,
+)
+from tests.jobs.masks.rooms import texture
+
+
+def test_person_before_a_noisy_wall():
+    generator = np.random.default_rng(0)
+    wall = generator.integers(60, 200, (120, 160, 3)).astype(float)
+    wall = cv2.GaussianBlur(wall, (0, 0), 8)
+
+    def taken(picture):
+        return np.clip(picture + generator.normal(0, 3, picture.shape), 0, 255).astype(np.uint8)
+
+    row, column = np.indices((120, 160))
+    person = (column - 80) ** 2 + (row - 60) ** 2 <= 30**2
+    empty = [taken(wall) for _ in range(8)]
+    wall[person] = (240, 20, 30)
+    region = person_region(taken(wall), learn_background(empty))
+    assert (region & person).sum() / (region | person).sum() > 0.97
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_region_is_what_its_definition_says(seed):
+    # Small pictures: patches meet the border, each other, and are missing altogether.
+    generator = np.random.default_rng(seed)
+    shape = tuple(generator.integers(3, 45, 2))
+    mean = generator.integers(0, 256, (*shape, 3)).astype(np.uint8)
+    deviation = generator.uniform(3.0, 70.0, shape).astype(np.float32)
+    noise = generator.normal(0.0, 1.5 * deviation[:, :, None], mean.shape)
+    picture = np.clip(mean + noise, 0, 255).astype(np.uint8)
+    for _ in range(seed % 7):
+        top, left = (int(generator.integers(0, n)) for n in shape)
+        patch = slice(top, top + 9), slice(left, left + 6)
+        picture[patch] = np.where(mean[patch] < 128, 255, 0)
+        deviation[patch] = 3.0
+    off = np.abs(picture.astype(int) - mean) > np.floor(5.0 * deviation)[:, :, None]
+    square = np.ones((3, 3), np.uint8)
+    expected = off.any(axis=2).astype(np.uint8)
+    for step in (cv2.MORPH_OPEN, cv2.MORPH_CLOSE):
+        expected = cv2.morphologyEx(expected, step, square)
+    _, labels = cv2.connectedComponents(expected, connectivity=8)
+    areas = np.bincount(labels.ravel())[1:]
+    kept = 1 + np.flatnonzero(areas >= 0.1 * areas.max(initial=0))
+    region = person_region(picture, Background(mean, deviation))
+    np.testing.assert_array_equal(region, np.isin(labels, kept))
+    assert region.any() == bool(expected.any())
+
+
+def test_sizes_must_agree():
+    with pytest.raises(SettingsError):
+        learn_background([])
+    background = learn_background([np.zeros((4, 5, 3), np.uint8)])
+    with pytest.raises(SettingsError):
+        person_region(np.zeros((5, 4, 3), np.uint8), background)
+
+
+def passing(room):
+    """Pictures (9) of a room in which a white square passes, and where it is."""
+    rng, pictures, masks = np.random.default_rng(2), [], []
+    for k in range(9):
+        mask = np.zeros(room.shape[:2], bool)
+        mask[40:100, 15 * k : 15 * k + 40] = True
+        picture = np.where(mask[:, :, None], 255.0, room) + 2.0 * rng.standard_normal(room.shape)
+        pictures.append(picture.clip(0, 255).astype(np.uint8))
+        masks.append(mask)
+    return pictures, np.array(masks)
+
+
+def test_what_passes_is_not_in_the_median_and_hides_what_it_covers():
+    room = texture(np.random.default_rng(3))
+    pictures, masks = passing(room)
+    background = background_of_recording(pictures)
+    np.testing.assert_allclose(background.mean, room, atol=6.0)
+    np.testing.assert_allclose(background.deviation, 3.0, atol=0.1)
+    support = background_support(pictures, background)
+    # Where the wall is white, too, nothing is seen to pass.
+    differs = room.max(axis=2) < 220.0
+    hidden = 1.0 - masks.mean(axis=0)
+    np.testing.assert_allclose(support[differs], hidden[differs], atol=1e-6)
+    with pytest.raises(SettingsError, match="three or more"):
+        background_of_recording(pictures[:2])
+
+
+def test_background_is_told_from_pictures_of_another_exposure():
+    """A square that moves before a room, half the pictures redder and darker."""
+    rng = np.random.default_rng(2)
+    room = texture(rng)
+    pictures, masks, probabilities = [], [], []
+    for k in range(8):
+        mask = np.zeros(room.shape[:2], bool)
+        mask[40:100, 15 * k : 15 * k + 40] = True
+        probability = cv2.GaussianBlur(mask.astype(np.float32), (0, 0), 5.0).clip(0.01, 0.99)
+        picture = np.where(mask[:, :, None], 255.0 - room, room)
+        picture = picture * ((0.9, 0.7, 0.6) if k % 2 else (1.0, 1.0, 1.0))
+        pictures.append(
+            (picture + 2.0 * rng.standard_normal(room.shape)).clip(0, 255).astype(np.uint8)
+        )
+        masks.append(mask)
+        probabilities.append(probability)
+    differs = np.abs(255.0 - 2.0 * room).max(axis=2) > 60.0
+    for ratio, mask in zip(tell_from_background(pictures, probabilities), masks, strict=True):
+        assert (ratio[~mask] < 0.0).mean() > 0.97
+        assert (ratio[mask & differs] > 0.0).mean() > 0.97
+    alone = tell_from_background(pictures[:1], probabilities[:1])
+    assert not alone[0].any()
+
+
+def test_a_box_around_an_object_cuts_it_out():
+    rng, true = np.random.default_rng(3), np.zeros((120, 160), bool)
+    true[30:90, 40:110] = True
+    true[50:60, 60:80] = False
+    colours = np.where(true[:, :, None], (60, 80, 190), (200, 180, 70))
+    picture = (colours + 12.0 * rng.standard_normal(colours.shape)).clip(0, 255).astype(np.uint8)
+    assert intersection_over_union(cut_box(picture, (30, 20, 95, 85)), true) > 0.97
+    for box in ((300, 20, 95, 85), (30, 20, 95, 1), (30, 20, 1, 85)):
+        with pytest.raises(SettingsError, match="outside the picture, 160 x 120 pixels"):
+            cut_box(picture, box)
+    with pytest.raises(SettingsError, match="whole picture"):
+        cut_box(picture, (0, 0, 160, 120))

@@ -1,7 +1,8 @@
 """What contradicts the rest is named, in Drake's own pictures of an arm, damaged and changed."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -10,8 +11,8 @@ from drake_pose.body.model import ArticulatedModel
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import MaskError
-from drake_pose.registration.contradictions import Audit, audit_frames
-from drake_pose.registration.per_frame_fit import PerFrameFit
+from drake_pose.registration.contradictions import Audit, Finding, audit_frames
+from drake_pose.registration.per_frame_fit import FrameFit, PerFrameFit
 from drake_pose.registration.posed_frames import SeenFrame
 from drake_pose.registration.register import RegistrationBody
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
@@ -41,6 +42,21 @@ def moved(camera: PinholeCamera, by: Sequence[float]) -> PinholeCamera:
     return camera.with_pose(X_WC)
 
 
+Frames = Sequence[tuple[np.ndarray, np.ndarray, Sequence[PinholeCamera]]]
+
+
+def seen(model: ArticulatedModel, body: RegistrationBody, frames: Frames) -> list[SeenFrame]:
+    """Damaged pictures of frames: the pose, the values that are given, who takes the pictures."""
+    generator, found = np.random.default_rng(1), []
+    for k, (pose, values, taken) in enumerate(frames):
+        q, X_WB = body.tree.positions_from(body.kinematics.split(pose))
+        masks = {
+            one.name: damaged(LabelRenderer(model, one).mask(q, X_WB), generator) for one in taken
+        }
+        found.append(SeenFrame(f"{k:04d}", values, masks))
+    return found
+
+
 def audit(
     model: ArticulatedModel,
     body: RegistrationBody,
@@ -48,26 +64,39 @@ def audit(
     given: np.ndarray,
     taken: Sequence[PinholeCamera],
     told: Sequence[PinholeCamera] | None = None,
-    away: Sequence[PinholeCamera] | None = None,
 ) -> Audit:
-    """Pictures of poses by the cameras taken, audited with the positions and cameras given.
-
-    Args:
-        told: the cameras given; those taken where None.
-        away: the cameras that take frame WRONG.
-    """
-    generator = np.random.default_rng(1)
-    kinematics = body.kinematics
-    frames = []
-    for k, (pose, values) in enumerate(zip(poses, given, strict=True)):
-        q, X_WB = body.tree.positions_from(kinematics.split(pose))
-        here = taken if away is None or k != WRONG else away
-        masks = {
-            one.name: damaged(LabelRenderer(model, one).mask(q, X_WB), generator) for one in here
-        }
-        frames.append(SeenFrame(f"{k:04d}", values, masks))
-    fit = PerFrameFit(kinematics, (body.few, body.all), told or taken, frames)
+    """Pictures by the cameras taken, audited with the positions and cameras that are told."""
+    frames = seen(model, body, [(*one, taken) for one in zip(poses, given, strict=True)])
+    fit = PerFrameFit(body.kinematics, (body.few, body.all), told or taken, frames)
     return audit_frames(fit, [fit.fit(frame) for frame in frames])
+
+
+@pytest.fixture(scope="module")
+def right(model, body, poses, cameras) -> Callable[[int], tuple[PerFrameFit, list[FrameFit]]]:
+    """Frames of so many cameras in which everything is right, fitted once."""
+
+    @cache
+    def fitted(count: int) -> tuple[PerFrameFit, list[FrameFit]]:
+        frames = seen(model, body, [(pose, pose, cameras[:count]) for pose in poses])
+        fit = PerFrameFit(body.kinematics, (body.few, body.all), cameras[:count], frames)
+        return fit, [fit.fit(frame) for frame in frames]
+
+    return fitted
+
+
+@pytest.fixture
+def with_wrong(model, body, poses, right) -> Callable[..., Finding]:
+    """What is found where frame WRONG has other positions, or other cameras took its pictures."""
+
+    def wrong(values: np.ndarray, taken: Sequence[PinholeCamera]) -> Finding:
+        fit, fits = right(len(taken))
+        frames = seen(model, body, [(poses[WRONG], values, taken)] * (WRONG + 1))
+        found = audit_frames(fit, [*fits[:WRONG], fit.fit(frames[WRONG]), *fits[WRONG + 1 :]])
+        assert (found.contradicting, found.common) == ((f"{WRONG:04d}",), ())
+        assert found.frames[WRONG].finding is not None
+        return found.frames[WRONG].finding
+
+    return wrong
 
 
 def joint_off(poses: np.ndarray, joint: int, frames: slice, degrees: float) -> np.ndarray:
@@ -77,19 +106,34 @@ def joint_off(poses: np.ndarray, joint: int, frames: slice, degrees: float) -> n
 
 
 class TestAuditFrames:
-    def test_nothing_is_named_where_everything_is_right(self, model, body, poses, cameras) -> None:
-        found = audit(model, body, poses, poses, cameras[:1])
+    def test_nothing_is_named_where_all_is_right_and_a_joint_from_where_it_is_said_to_be(
+        self, model, body, poses, cameras, right
+    ) -> None:
+        found = audit_frames(*right(1))
         assert (found.contradicting, found.common) == ((), ())
+        least = found.noticed_from
+        assert least.keys() == {*TreeKinematics(body.tree).names}
+        assert 0.0 < least["elbow_turn"] < np.radians(1.0)
+        by = 1.2 * np.degrees(least["elbow_turn"])
+        found = audit(model, body, poses, joint_off(poses, 3, slice(None), by), cameras[:1])
+        assert [(one.kind, one.name) for one in found.common] == [("joint", "elbow_turn")]
 
-    def test_a_joint_that_is_off_in_one_frame(self, model, body, poses, cameras) -> None:
-        given = joint_off(poses, 1, slice(WRONG, WRONG + 1), 2.0)
-        found = audit(model, body, poses, given, cameras[:1])
-        assert (found.contradicting, found.common) == ((f"{WRONG:04d}",), ())
-        finding = found.frames[WRONG].finding
+    def test_a_joint_that_is_off_in_one_frame(self, poses, cameras, with_wrong) -> None:
+        finding = with_wrong(joint_off(poses, 1, slice(None), 2.0)[WRONG], cameras[:1])
         assert (finding.kind, finding.name) == ("joint", "shoulder_turn")
         # By what must be added to what is given.
         assert np.degrees(finding.angle) == pytest.approx(-2.0, abs=0.3)
         assert abs(finding.angle - np.radians(-2.0)) < 4.0 * finding.angle_sd
+
+    def test_positions_of_another_frame(self, poses, cameras, with_wrong) -> None:
+        assert with_wrong(poses[WRONG + 2], cameras[:1]).pixels > 5.0
+
+    def test_a_base_that_moved_in_one_frame(self, poses, cameras, with_wrong) -> None:
+        """Both cameras see it move; none of them has."""
+        away = [moved(camera, [0.0, -0.01, 0.0]) for camera in cameras]
+        finding = with_wrong(poses[WRONG], away)
+        assert finding.kind == "base"
+        assert finding.shift == pytest.approx(0.01, abs=0.002)
 
     def test_a_joint_whose_zero_is_off(self, model, body, poses, cameras) -> None:
         given = joint_off(poses, 3, slice(None), -2.0)
@@ -97,14 +141,6 @@ class TestAuditFrames:
         assert found.contradicting == ()
         assert [(one.kind, one.name) for one in found.common] == [("joint", "elbow_turn")]
         assert np.degrees(found.common[0].angle) == pytest.approx(2.0, abs=0.2)
-
-    def test_a_base_that_moved_in_one_frame(self, model, body, poses, cameras) -> None:
-        """Both cameras see it move; none of them has."""
-        away = [moved(camera, [0.0, -0.01, 0.0]) for camera in cameras]
-        found = audit(model, body, poses, poses, cameras, away=away)
-        assert (found.contradicting, found.common) == ((f"{WRONG:04d}",), ())
-        assert found.frames[WRONG].finding.kind == "base"
-        assert found.frames[WRONG].finding.shift == pytest.approx(0.01, abs=0.002)
 
     def test_a_camera_that_was_moved(self, model, body, poses, cameras) -> None:
         for count, by in ((2, [0.0, 0.0, 0.01]), (1, [0.0, 0.01, 0.005])):
@@ -130,23 +166,6 @@ class TestAuditFrames:
         found = audit(model, body, poses, poses, cameras, aside)
         assert [one.kind for one in found.common] == ["center"]
         assert found.common[0].shift == pytest.approx(5.0, abs=0.7)
-
-    def test_a_joint_is_named_from_where_it_is_said_to_be(
-        self, model, body, poses, cameras
-    ) -> None:
-        least = audit(model, body, poses, poses, cameras).noticed_from
-        assert least.keys() == {*TreeKinematics(body.tree).names}
-        assert 0.0 < least["elbow_turn"] < np.radians(1.0)
-        by = 1.2 * np.degrees(least["elbow_turn"])
-        found = audit(model, body, poses, joint_off(poses, 3, slice(None), by), cameras)
-        assert [(one.kind, one.name) for one in found.common] == [("joint", "elbow_turn")]
-
-    def test_positions_of_another_frame(self, model, body, poses, cameras) -> None:
-        given = poses.copy()
-        given[WRONG] = poses[WRONG + 2]
-        found = audit(model, body, poses, given, cameras[:1])
-        assert found.contradicting == (f"{WRONG:04d}",)
-        assert found.frames[WRONG].finding.pixels > 5.0
 
 
 def test_masks_of_another_size_and_empty_ones_are_refused(body, poses, cameras) -> None:

@@ -2,20 +2,26 @@
 
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
+from functools import cache
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from scipy.stats import t as scipy_t
 
 from drake_pose.body.model import ArticulatedModel, load_model
 from drake_pose.body.tree.root import RootRotation
+from drake_pose.camera.models import ParallelCamera
 from drake_pose.errors import MaskError
+from drake_pose.fit.covariance import estimate_sizes
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.registration import bundle_adjustment
+from drake_pose.registration.joint_zeros import _as_the_cost_bends, _constants, _significant
 from drake_pose.registration.object_search import ObjectSearch, hand_eye_starts
 from drake_pose.registration.online_registration import pose_difference
+from drake_pose.registration.per_frame_fit import PerFrameFit
 from drake_pose.registration.posed_frames import PosedFrame, PosedFrames, SeenFrame
 from drake_pose.registration.register import RegistrationBody
 from drake_pose.registration.shared_fit import (
@@ -23,9 +29,16 @@ from drake_pose.registration.shared_fit import (
     FOCAL_DEVIATION,
     Shared,
     SharedFit,
+    _scatter,
 )
 from drake_pose.registration.standing_object import StandingObject, Symmetry
-from drake_pose.registration.start_poses import add_bound_equations, place_by_bounds
+from drake_pose.registration.start_poses import (
+    E_total,
+    add_bound_equations,
+    intersection_over_union,
+    place_by_bounds,
+    spread_rotations,
+)
 from drake_pose.silhouette.areas.scoring import draw_mask
 from tests.registration.arm_pictures import errors, looking_at, see
 from tests.search.arms import arm_cameras
@@ -89,6 +102,26 @@ def test_a_camera_s_covariance_is_that_of_its_moves(posed: PosedFrames) -> None:
     np.testing.assert_allclose(found, (J / 1e-6) @ covariance @ (J / 1e-6).T, atol=1e-4)
 
 
+def test_what_frames_share_does_not_scatter_and_what_they_do_not_does(posed: PosedFrames) -> None:
+    fit = SharedFit([posed], [posed.camera.X_CW])
+    seen, rng = fit._distances(fit.start, STEP, None), np.random.default_rng(3)
+    sizes = estimate_sizes(seen, np.zeros(seen.X.shape[1], bool), 0.0)
+
+    def scatter(y: np.ndarray) -> float:
+        return _scatter(seen._replace(y=y), sizes, 6)
+
+    apart = seen.X[:, :6] @ rng.normal(0.0, 0.05, (6, 2))
+    apart = np.where(seen.pictures == seen.pictures[0], *apart.T)
+    assert scatter(0.0 * apart) == 1.0
+    assert scatter(apart) > 2.0
+    # Nor do their own widths, and twice as far apart is a variance of four times, but for what was
+    # known beforehand.
+    widths, alike = seen.X[:, 6:] @ [3.0, -2.0], seen.X[:, :6] @ rng.normal(0.0, 0.05, 6)
+    assert scatter(apart + widths + alike) == pytest.approx(scatter(apart), rel=1e-6)
+    first, twice, thrice = (scatter(k * apart) for k in (1.0, 2.0, 3.0))
+    assert (thrice - first) / (twice - first) == pytest.approx(8.0 / 3.0)
+
+
 def test_a_wider_mask_is_told_from_a_nearer_camera(posed: PosedFrames) -> None:
     """The width that is found is that of the mask, whatever the camera's distance takes of it."""
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (5, 5))
@@ -129,6 +162,19 @@ def test_a_body_is_placed_where_its_bounds_are_the_silhouettes(posed: PosedFrame
     camera = posed.camera
     p_CW = place_by_bounds(posed, camera.X_CW[None, :3, :3])[0]
     assert np.linalg.norm(p_CW - camera.X_CW[:3, 3]) < 0.03
+    # Before the camera it is whatever rotation is tried.
+    R_CW = spread_rotations(200)
+    depths = (place_by_bounds(posed, R_CW) + R_CW @ posed.middle)[:, 2]
+    assert depths.min() >= 0.5 * posed.extent - 1e-9
+
+
+def test_areas_in_one_or_the_other_alone_and_in_both() -> None:
+    rng = np.random.default_rng(4)
+    body, mask = rng.random((2, 30, 40)) < 0.4
+    found = np.array([np.count_nonzero(one) for one in (body, mask, body & mask)], float)
+    assert E_total(found) == np.count_nonzero(body ^ mask) / mask.sum()
+    iou = np.count_nonzero(body & mask) / np.count_nonzero(body | mask)
+    assert intersection_over_union(found) == iou
 
 
 SIDES = "0.2 0.12 0.08"
@@ -139,11 +185,15 @@ LOOKS = {
 }
 
 
-@pytest.fixture
-def standing(model: ArticulatedModel, tmp_path: Path) -> Callable[[str], StandingObject]:
-    def stand(looks: str) -> StandingObject:
-        path = tmp_path / "thing.urdf"
-        shape = f'<visual><origin xyz="0.3 0 0.1"/><geometry>{looks}</geometry></visual>'
+@pytest.fixture(scope="module")
+def standing(
+    model: ArticulatedModel, tmp_path_factory: pytest.TempPathFactory
+) -> Callable[[str], StandingObject]:
+    @cache
+    def stand(name: str) -> StandingObject:
+        path = tmp_path_factory.mktemp("thing") / "thing.urdf"
+        looks = f"<geometry>{LOOKS[name][0]}</geometry>"
+        shape = f'<visual><origin xyz="0.3 0 0.1"/>{looks}</visual>'
         path.write_text(f'<robot name="thing"><link name="thing">{shape}</link></robot>')
         tree = load_model(path, check=False).pose_tree(
             "thing", root_position=np.zeros(3), root_rotation=RootRotation.fixed()
@@ -157,12 +207,13 @@ def standing(model: ArticulatedModel, tmp_path: Path) -> Callable[[str], Standin
 def test_turns_after_which_an_object_looks_alike(
     name: str, standing: Callable[[str], StandingObject]
 ) -> None:
-    looks, turns, axes, apart = LOOKS[name]
-    thing = standing(looks)
+    _, turns, axes, apart = LOOKS[name]
+    thing = standing(name)
     found = thing.symmetry
     assert (len(found.turns), len(found.axes), len(found.told_apart)) == (turns, axes, apart)
     np.testing.assert_allclose(found.turns[0], np.eye(4), atol=1e-12)
     points = thing.alone.all[0].vertices
+    assert np.linalg.norm(points - [0.3, 0.0, 0.1], axis=1).max() == pytest.approx(thing.radius)
     corners = np.abs(points - thing.middle).max(axis=0)
     for X in found.turns:
         turned = points @ X[:3, :3].T + X[:3, 3] - thing.middle
@@ -182,9 +233,7 @@ def test_an_object_that_is_round_may_be_turned_about_its_axis_by_anything(
     standing: Callable[[str], StandingObject],
 ) -> None:
     X_WT = looking_at(PLACE, MIDDLE, 0.4).X_WC
-    box, can = (
-        standing(LOOKS[name][0]).pose_covariance(X_WT, 1e-6 * np.eye(6)) for name in ("box", "can")
-    )
+    box, can = (standing(name).pose_covariance(X_WT, 1e-6 * np.eye(6)) for name in ("box", "can"))
     axis = X_WT[:3, 2]
     assert axis @ box[:3, :3] @ axis == pytest.approx(1e-6)
     assert axis @ can[:3, :3] @ axis == pytest.approx(np.pi**2 / 3.0, rel=1e-3)
@@ -196,7 +245,7 @@ def test_an_object_s_covariance_is_that_of_its_moves(
     standing: Callable[[str], StandingObject],
 ) -> None:
     """J sigma J^T, J the derivative of the pose by OBJECT_POSITIONS."""
-    thing, X_WT = standing(LOOKS["box"][0]), looking_at(PLACE, MIDDLE, 0.4).X_WC
+    thing, X_WT = standing("box"), looking_at(PLACE, MIDDLE, 0.4).X_WC
     J = np.zeros((6, 6))
     for k in range(6):
         X = thing.moved(X_WT, 1e-6 * np.eye(6)[k])
@@ -220,14 +269,94 @@ def test_poses_of_an_object_are_one_that_show_it_alike(
     standing: Callable[[str], StandingObject],
 ) -> None:
     """Nearer to each other than a share of its radius, or turned as its looks repeat."""
-    thing = standing(LOOKS["box"][0])
+    thing = standing("box")
     search, X = ObjectSearch(thing), looking_at(PLACE, MIDDLE, 0.4).X_WC
     near, far = X.copy(), X.copy()
     near[0, 3] += 0.1 * thing.radius
     far[0, 3] += 0.3 * thing.radius
-    poses = [one[None] for one in (X, X, near, X @ thing.symmetry.turns[2], far)]
+    # Turned about its middle by so much, of which its points move by about 0.8.
+    little, much = (thing.moved(X, np.array([0, 0, 0, turn, 0, 0])) for turn in (0.12, 0.4))
+    poses = [one[None] for one in (X, X, near, X @ thing.symmetry.turns[2], far, little, much)]
     kept = search._apart(poses, thing.symmetry.turns)
-    np.testing.assert_array_equal(kept, [X[None], far[None]])
+    np.testing.assert_array_equal(kept, [X[None], far[None], much[None]])
+
+
+NAMED = SimpleNamespace(
+    names=("pose", "elbow", "length of arm"),
+    seen=[SimpleNamespace(kinematics=SimpleNamespace(names=("elbow",)))],
+    constants=("elbow", "length of arm"),
+)
+
+
+def shared(*values: float) -> Shared:
+    return Shared(np.array(values), np.zeros(0))
+
+
+@pytest.mark.parametrize("share", [0.99, 1.01])
+def test_an_interval_without_0_is_significant_and_a_length_s_is_that_of_its_logarithm(
+    share: float,
+) -> None:
+    covariance = np.diag([1.0, 0.01**2, 0.01**2])
+    value = share * 0.01 * float(scipy_t.ppf(0.975, 20))
+    told = _constants(NAMED, shared(0, value, value), 20, 0.05, covariance, NAMED.names[1:])
+    zero, length = told.values()
+    assert zero.value == value
+    assert (zero.low + zero.high) / 2 == pytest.approx(value)
+    assert zero.significant == length.significant == (zero.low > 0.0) == (share > 1.0)
+    for end in ("low", "value", "high"):
+        assert getattr(length, end) == pytest.approx(np.expm1(getattr(zero, end)))
+    assert (zero.deviation, length.deviation) == pytest.approx((0.01, 0.01 * np.exp(value)))
+
+
+def test_what_a_constant_cannot_be_told_from_is_its_gauge() -> None:
+    by = 0.5 * CONSTANT_DEVIATION
+    covariance = np.diag([1.0, by**2, 1e-8])
+    covariance[0, 1] = covariance[1, 0] = 0.95 * by
+    told = _constants(NAMED, shared(0, 0.1, 0.1), 20, 0.05, covariance, NAMED.names[1:])
+    assert not told["elbow"].determined
+    assert (told["elbow"].value, told["elbow"].gauge) == (0.0, ("pose",))
+    assert told["length of arm"].determined
+
+
+@pytest.mark.parametrize("elbow", [0.02, 0.035, 0.06])
+def test_constants_are_significant_beside_those_that_are_held(elbow: float) -> None:
+    """Backward elimination, against the conditional normal distribution by its information."""
+    x, limit = np.array([elbow, 0.045]), 3.0
+    C = np.array([[1.0, 0.8], [0.8, 1.0]]) * 0.01**2
+    covariance = np.zeros((3, 3))
+    covariance[1:, 1:] = C
+    kept = _significant(NAMED, shared(0, *x), covariance, NAMED.names[1:], limit)
+    off = np.abs(x) / 0.01
+    expected = list(NAMED.names[1:])
+    if off.min() < limit:
+        k = int(off.argmin())
+        P = np.linalg.inv(C)
+        rest = x[1 - k] + P[1 - k, k] / P[1 - k, 1 - k] * x[k]
+        is_off = abs(rest) * np.sqrt(P[1 - k, 1 - k]) >= limit
+        expected = [NAMED.names[2 - k]] if is_off else []
+    assert kept == expected
+
+
+@pytest.mark.parametrize(("share", "times"), [(1.0, 1.0), (2.0, 1.0), (0.25, 4.0)])
+def test_what_bends_the_cost_less_than_it_should_is_as_much_less_sure(
+    share: float, times: float
+) -> None:
+    rng = np.random.default_rng(1)
+    covariance = np.cov(rng.normal(size=(3, 9)))
+    asked: list[np.ndarray] = []
+
+    def bend(found, by, step, which):
+        asked.append(by)
+        return share * 7.0, 7.0
+
+    fit = SimpleNamespace(names=NAMED.names, constants=("length of arm",), bend=bend)
+    found = _as_the_cost_bends(fit, shared(0, 0, 0), np.ones(1, bool), covariance)
+    assert found[2, 2] == pytest.approx(times * covariance[2, 2])
+    # Along what goes with it; across it nothing changes.
+    (along,) = asked
+    assert along[2] ** 2 == pytest.approx(4.0 * covariance[2, 2])
+    across = np.linalg.svd(along[None])[2][1:]
+    np.testing.assert_allclose(across @ (found - covariance), 0.0, atol=1e-12)
 
 
 def random_poses(rng: np.random.Generator, count: int, turn: float = 1.0) -> np.ndarray:
@@ -286,3 +415,53 @@ def test_edges_are_as_fine_as_they_are_asked_for_and_a_pixel_at_most(posed: Pose
     counts = [len(frame.edges([camera], spacing).uv) for spacing in (0.2, 1.0, 2.0, 6.0)]
     assert counts[0] == counts[1]
     np.testing.assert_allclose(np.divide(counts[1], counts[2:]), [2.0, 6.0], rtol=0.05)
+
+
+@pytest.fixture
+def per_frame(body: RegistrationBody, posed: PosedFrames) -> tuple[PerFrameFit, list[SeenFrame]]:
+    """Of a pinhole and of a parallel camera at its place, and frames of the former."""
+    camera = posed.camera
+    flat = ParallelCamera("flat", 640, 480, 300.0, camera.center_x, camera.center_y, camera.X_WC)
+    frames = [SeenFrame(one.name, one.values, {"eye": one.mask}) for one in posed.frames]
+    surfaces = (body.few, body.all)
+    return PerFrameFit(body.kinematics, surfaces, [camera, flat], frames), frames
+
+
+@pytest.mark.parametrize("wider", [-2, 1, 2])
+def test_masks_are_as_much_wider_as_they_were_made(per_frame, wider: int) -> None:
+    fit, (frame, *_) = per_frame
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * abs(wider) + 1,) * 2)
+    widths = []
+    for by in (0, wider):
+        change = {0: lambda mask: mask, 1: cv2.dilate, -1: cv2.erode}[int(np.sign(by))]
+        mask = frame.masks["eye"].astype(np.uint8)
+        mask = (change(mask, disc) if by else mask).astype(bool)
+        made = replace(frame, masks={"eye": mask})
+        held = np.zeros(len(fit._all.names))
+        held[: len(frame.values)] = frame.values
+        edges = made.edges(fit._cameras, fit._size / 100.0)
+        widths.append(fit._with_widths(edges, held)[-2])
+    assert widths[1] - widths[0] == pytest.approx(wider, abs=0.35)
+
+
+def test_cameras_that_move_like_a_pixel_or_a_longer_lens_see_that(per_frame) -> None:
+    """Principal points and focal lengths told as motions, against projections."""
+    fit, _ = per_frame
+    for k, camera in enumerate(fit._cameras):
+        still = camera.with_pose(np.eye(4))
+        z = fit._depth(k)
+        p_C = np.array([[x, y, z] for x in (-0.1, 0.1) for y in (-0.1, 0.1)])
+        first = len(fit.joints) + 6 * k
+        rows = slice(first, first + 6)
+        for axis, moves in enumerate(fit.center_moves([k]).T):
+            turn, shift = np.split((moves * fit.deviations)[rows], 2)
+            pivot = np.array([0.0, 0.0, z])
+            moved = (p_C - pivot) @ Rotation.from_rotvec(turn).as_matrix().T + pivot + shift
+            off = still.project(moved)[0] - still.project(p_C)[0]
+            np.testing.assert_allclose(off.mean(axis=0), np.eye(2)[axis], atol=0.02)
+        shift = (fit.focal_moves([k])[:, 0] * fit.deviations)[rows][3:]
+        moved, larger = p_C + 1e-4 * shift, np.array([camera.center_x, camera.center_y])
+        off = (still.project(moved)[0] - still.project(p_C)[0]) / 1e-4
+        is_flat = isinstance(camera, ParallelCamera)
+        expected = 0.0 if is_flat else still.project(p_C)[0] - larger
+        np.testing.assert_allclose(off, expected + np.zeros((4, 2)), atol=0.05)

@@ -2,6 +2,7 @@
 
 import copy
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -205,6 +206,10 @@ class TestMovedCamera:
         assert state.moves == 1
         assert [one.name for one in state.keyframes] == ["a little off"] * 3
         assert registered_at(state, 1.62)
+        # Where poses have differed as much before, it is none.
+        restless = replace(known, distances=(5000.0,) * 12)
+        state, _ = follow(online, restless, [frame("a little off", t) for t in TURNS[5:]])
+        assert state.moves == 0
 
 
 def bumped(camera: PinholeCamera, degrees: float, metres: float) -> PinholeCamera:

@@ -15,7 +15,7 @@ from drake_pose.arrays import Array, Mask
 from drake_pose.camera.models import Camera
 from drake_pose.fit.contour_fit import ContourFit, Prior, pack_views
 from drake_pose.fit.evidence import EdgePoints, pack_evidence
-from drake_pose.fit.frames_fit import FramesFit
+from drake_pose.fit.frames_fit import FramesFit, parameter_names
 from drake_pose.fit.levenberg_marquardt import AnnealingStage, StepSettings
 from drake_pose.fit.parameters import CAMERA_NAMES, CameraParameters
 from drake_pose.fit.unknowns import choose
@@ -147,10 +147,11 @@ class CameraJudge:
     ) -> Camera:
         """A camera moved to fit its regions to bodies about middle (3,), first by (3,) [m]."""
         fit, reach = self._fit, float(np.linalg.norm(camera.X_WC[:3, 3] - middle))
-        names = [f"{camera.name}.{name}" for name in CAMERA_NAMES]
+        every, count = parameter_names(fit.body, [camera]), len(CAMERA_NAMES)
+        names = [f"{camera.name}.{name}" for name in CAMERA_NAMES[:6]]
         # What the pictures see of a turn about the camera is the person's way about it.
         deviations = np.array([_TURN] * 3 + [_SHIFT + _TURN * reach] * 3)
-        unknowns = choose([*fit.body.names, *names], names[:6], shared=True, deviation=deviations)
+        unknowns = choose(every, names, shared=True, deviation=deviations)
         nothing = np.zeros((len(pairs), 0))
         found = FramesFit(
             fit.body, [camera], unknowns, pivot=middle, noise=fit.noise, steps=_CAMERA_STEPS
@@ -162,7 +163,7 @@ class CameraJudge:
             _CAMERA_ROUNDS,
             expected=(nothing, np.zeros(6)),
         )
-        theta = np.append(found.shared, np.zeros(len(names) - 6))
+        theta = np.append(found.shared, np.zeros(count - len(names)))
         X_CW = CameraParameters([camera], middle).place(theta)[0][0]
         return camera.with_pose(np.linalg.inv(X_CW))
 

@@ -4,6 +4,8 @@ import os
 
 # Before pydrake is imported: without it a process that forks after a render hangs.
 os.environ.setdefault("LP_NUM_THREADS", "0")
+# And before numpy is: matrices are small, and threads wait for each other where cores are busy.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import shutil
 from pathlib import Path

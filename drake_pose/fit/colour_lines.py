@@ -70,6 +70,7 @@ def compare_lines(
     A: Array,
     b: Array,
     sums: Array,
+    wide: Array,
     width: float = 0.0,
 ) -> None:
     """Adds what one camera's picture says of the nodes' affine motions.
@@ -82,8 +83,8 @@ def compare_lines(
         histograms: (nodes, 3, COLOURS) what is known of the nodes' colours.
         weights: (4,) as of `compare_contours`.
         step: from offset to offset [pixel].
-        A, b, sums: (nodes, 12, 12), (nodes, 12) and (nodes + 1, 6) added to, as of
-            `compare_contours`; lengths are of lines that say something, by how much they do.
+        A, b, sums, wide: (nodes, 12, 12), (nodes, 12), (nodes + 1, 6) and (nodes, 13) added to, as
+            of `compare_contours`; lengths are of lines that say something, by how much they do.
         width: the body looks wider than it is by so much on all sides [pixel].
     """
     contour = sample_contour(packed, seen_from(camera[0], X_WN), camera[1], weights[2])
@@ -100,9 +101,9 @@ def compare_lines(
         )
         if variance > 0.0:
             add_residual(
-                A[node], b[node], sums[node], X_WN[node], p_N[i], camera, normals[i, 0],
-                normals[i, 1], edge, 2.0 * lengths[i] / (1.0 + variance / noise), weights,
-                (rows, p, w),
+                A[node], b[node], sums[node], wide[node], X_WN[node], p_N[i], camera,
+                normals[i, 0], normals[i, 1], edge, 1.0,
+                2.0 * lengths[i] / (1.0 + variance / noise), weights, (rows, p, w),
             )  # fmt: skip
 
 

@@ -161,6 +161,7 @@ def add_pictures(
             compare_lines(
                 placed.packed, placed.X_WN, (packed[0][c], packed[1][c]), picture, histograms[c],
                 weights[c], pixels, compared.A[c], compared.b[c], compared.sums[c],
+                compared.wide[c],
             )  # fmt: skip
 
 

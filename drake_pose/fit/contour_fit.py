@@ -22,7 +22,6 @@ from drake_pose.fit.camera_sums import (
     CameraSum,
     Views,
     add_cameras,
-    compare_placed,
 )
 from drake_pose.fit.evidence import EdgePoints, pack_evidence
 from drake_pose.fit.kernel import CLOSE, COMPARED, COST, FITTING, collect, compare_contours
@@ -81,12 +80,13 @@ class Comparison(NamedTuple):
     """What each camera says of each node's affine motion x (12,): x^T A x - 2 b^T x.
 
     A: (cameras, nodes, 12, 12), lower triangles; b: (cameras, nodes, 12); sums: (cameras,
-    nodes + 1, 6) as of `compare_contours`; placement: of the body.
+    nodes + 1, 6) and wide: (cameras, nodes, 13) as of `compare_contours`; placement: of the body.
     """
 
     A: Array
     b: Array
     sums: Array
+    wide: Array
     placement: Placement
 
     @property
@@ -263,7 +263,9 @@ class ContourFit:
 
 def compare_views(views: Views, placement: Placement, weights: Array) -> Comparison:
     """A body's contours, where it stands, compared with all cameras' edges."""
-    return Comparison(*compare_placed(placement.packed, placement.X_WN, views, weights), placement)
+    placed = placement.packed, placement.X_WN
+    A, b, sums, _, wide = compare_contours(*placed, *views, weights, 0, 1.0)
+    return Comparison(A, b, sums, wide, placement)
 
 
 def camera_weights(

@@ -47,8 +47,8 @@ TIME_OFFSET = "time_offset"
 _LEAST_INFORMATION = 1e-4
 # From offset to offset of lines across contours in odds of pixels [scale].
 _OFFSET = 0.4
-# What follows a width is told by differences over so much to either side [pixel].
-_WIDTH_STEP = 0.25
+# Lines nearer to each other than this say the same [pixel].
+_LINE_SPACING = 3.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -278,13 +278,13 @@ class FramesFit:
         widths = np.flatnonzero(self.unknowns.entries >= self._first_width)
         if not len(widths):
             return H, g, compared.sums
-        less, more = (self._wider(evidence, theta, step, off) for off in (-1.0, 1.0))
         for k in widths:
+            # Of a silhouette that is wider all distances are less.
             c = self.unknowns.entries[k] - self._first_width
-            slope = (more.sums[c] - less.sums[c])[:, COST].sum()
-            g[k] = slope / (4.0 * _WIDTH_STEP)
-            pulled = np.einsum("nux,nx->u", told[c][0], less.b[c] - more.b[c])
-            H[k] = H[:, k] = pulled / (2.0 * _WIDTH_STEP)
+            g[k] = -compared.wide[c, :, 12].sum()
+            H[k] = H[:, k] = np.einsum(
+                "nux,nx->u", told[0 if self._fixed else c][0], compared.wide[c, :, :12]
+            )
             H[k, k] = compared.sums[c][:, WEIGHT].sum()
         return H, g, compared.sums
 
@@ -303,11 +303,12 @@ class FramesFit:
         for c, picture in enumerate(seen.odds):
             if picture is not None:
                 weights = self._contours.weights(places[:2], placed, step)[c]
+                weights[2] = max(weights[2], _LINE_SPACING)
                 offset, width = max(1, round(weights[1] * _OFFSET)), theta[self._first_width + c]
                 compare_lines(
                     placed.packed, placed.X_WN, (places[0][c], places[1][c]), picture,
                     self._of_odds, weights, offset, compared.A[c], compared.b[c],
-                    compared.sums[c], width,
+                    compared.sums[c], compared.wide[c], width,
                 )  # fmt: skip
         return compared, places
 
@@ -360,14 +361,6 @@ class FramesFit:
                 A = symmetric(compared.A[c])
                 found.append(Picture(A, compared.b[c], X_WN, X_CW[c], moves, float(sizes[c]), c))
         return found
-
-    def _wider(
-        self, evidence: Evidence | FrameEvidence, theta: Array, step: AnnealingStage, by: float
-    ) -> Comparison:
-        """As compare, all widths larger by so many steps."""
-        theta = theta.copy()
-        theta[self._first_width :] += by * _WIDTH_STEP
-        return self.compare(evidence, theta, step)[0]
 
     def _moves(
         self, compared: Comparison, motions: Array, camera: int, rates: Array | None

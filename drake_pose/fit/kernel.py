@@ -82,7 +82,7 @@ def compare_contours(
     weights: Array,
     squares: int,
     side: float,
-) -> tuple[Array, Array, Array, Array]:
+) -> tuple[Array, Array, Array, Array, Array]:
     """What each camera says of the nodes' affine motions.
 
     The cost is x^T A x - 2 b^T x and what it is now, for x the rows of a node's affine motion
@@ -103,11 +103,13 @@ def compare_contours(
         node's contour, and of all edges in the last row: COMPARED, the length; FITTING, how much of
         it fits to within the scale; CLOSE, one minus the cost in squares of the scale, summed along
         it [all in units of length]; COST, and SQUARES of the distances, both as weighted in A and
-        b; WEIGHT, of these; and (c, k, k) the COST by squares of the picture.
+        b; WEIGHT, of these; (c, k, k) the COST by squares of the picture; and (c, nodes, 13)
+        by how much b grows as silhouettes grow by a pixel, then so much their cost, over two.
     """
     count, nodes = len(weights), len(X_WN)
     A, b = np.zeros((count, nodes, 12, 12)), np.zeros((count, nodes, 12))
     sums, pieces = np.zeros((count, nodes + 1, 6)), np.zeros((count, squares, squares))
+    wide = np.zeros((count, nodes, 13))
     rows, p, w = np.empty((2, 3)), np.empty(3), np.empty(12)
     for c in range(count):
         begin, end = edges.starts[c], edges.starts[c + 1]
@@ -135,15 +137,16 @@ def compare_contours(
                 size = math.sqrt(n0 * n0 + n1 * n1)
                 n0, n1 = n0 / size, n1 / size
                 r = (edge_uv[j, 0] - uv[i, 0]) * n0 + (edge_uv[j, 1] - uv[i, 1]) * n1
+                grows = edge_normals[j, 0] * n0 + edge_normals[j, 1] * n1
                 node = contour.nodes[i]
                 cost = add_residual(
-                    own_A[node], own_b[node], counted, X_WN[node], contour.p_N[i], camera,
-                    n0, n1, r, length, weights[c], (rows, p, w),
+                    own_A[node], own_b[node], counted, wide[c, node], X_WN[node], contour.p_N[i],
+                    camera, n0, n1, r, grows, length, weights[c], (rows, p, w),
                 )  # fmt: skip
             if squares > 0:
                 u, v = (uv[i, 0], uv[i, 1]) if pair < n else (edge_uv[j, 0], edge_uv[j, 1])
                 pieces[c, math.floor(v / side) % squares, math.floor(u / side) % squares] += cost
-    return A, b, sums, pieces
+    return A, b, sums, pieces, wide
 
 
 @compiled
@@ -178,12 +181,14 @@ def add_residual(
     A: Array,
     b: Array,
     sums: Array,
+    wide: Array,
     X_WN: Array,
     p_N: Array,
     camera: tuple[Array, Array],
     n0: float,
     n1: float,
     r: float,
+    grows: float,
     length: float,
     weights: Array,
     scratch: tuple[Array, Array, Array],
@@ -191,12 +196,13 @@ def add_residual(
     """Adds one distance in a picture to a node's A (12, 12), lower triangle, and b (12,).
 
     Args:
-        A, b, sums: added to, as of `compare_contours`.
+        A, b, sums, wide: added to, as of `compare_contours`.
         X_WN: (4, 4) of the node.
         p_N: (3,) its point.
         camera: X_CW (4, 4) and kernel parameters (8,).
         n0, n1: the direction along which the point is to move.
         r: by how much [pixel].
+        grows: by how much more as the silhouette grows by a pixel on all sides.
         length: of the contour that the point stands for [pixel].
         weights: (4,) as of `compare_contours`.
         scratch: (2, 3), (3,) and (12,).
@@ -216,6 +222,9 @@ def add_residual(
     sums[SQUARES] += weight * r * r
     sums[WEIGHT] += weight
     add_row(A, b, X_WN, p_N, camera, n0, n1, r, weight, scratch)
+    for k in range(12):
+        wide[k] += weight * grows * scratch[2][k]
+    wide[12] += weight * grows * r
     return cost
 
 

@@ -87,15 +87,15 @@ class ColourViews:
         count, nodes = len(self.cameras), len(placement.X_WN)
         weights = fit.weights(self._packed, placement, replace(step, spacing=_SPACING))
         A, b = np.zeros((count, nodes, 12, 12)), np.zeros((count, nodes, 12))
-        sums = np.zeros((count, nodes + 1, 6))
+        sums, wide = np.zeros((count, nodes + 1, 6)), np.zeros((count, nodes, 13))
         for c, camera in enumerate(self.cameras):
             if camera.name in self.known:
                 compare_lines(
                     placement.packed, placement.X_WN, self._camera(c), self.pictures[c],
                     self.known[camera.name], weights[c], max(1, round(_STEP * weights[c, 1])),
-                    A[c], b[c], sums[c],
+                    A[c], b[c], sums[c], wide[c],
                 )  # fmt: skip
-        return Comparison(A, b, sums, placement)
+        return Comparison(A, b, sums, wide, placement)
 
     def add_up(self, fit: ContourFit) -> AddUp:
         """What compares a body with all pictures and adds up."""

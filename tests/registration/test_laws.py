@@ -85,7 +85,7 @@ def test_slopes_of_the_cost_are_those_of_the_equations(posed: PosedFrames) -> No
         assert (more - less) / 8e-3 == pytest.approx(slope, abs=0.1 * np.abs(g).max()), k
     wider, narrower = (fit.equations(Shared(at, own + w), wide).cost for w in (0.25, -0.25))
     widths = fit.equations(Shared(at, own), wide).g[:, 0]
-    assert (wider - narrower) / 1.0 == pytest.approx(float(widths.sum()))
+    assert (wider - narrower) / 1.0 == pytest.approx(float(widths.sum()), rel=0.05)
 
 
 def test_a_camera_s_covariance_is_that_of_its_moves(posed: PosedFrames) -> None:

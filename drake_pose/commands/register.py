@@ -86,7 +86,7 @@ def audit(
     /,
     *,
     model: Model,
-    joints: Annotated[Path, Parameter(alias="-j")],
+    joints: Annotated[Path | None, Parameter(alias="-j")] = None,
     out: Annotated[Path | None, Parameter(alias="-o")] = None,
     settings: Annotated[AuditSettings | None, SPREAD] = None,
     cameras: Path | None = None,
@@ -101,6 +101,10 @@ def audit(
     counted, and moves outlines by a pixel or more. Of causes that explain the masks equally well
     all are told: with one camera, a base that has moved looks like a camera that has.
 
+    An episode, as register takes it, needs no masks: each camera is found in its pictures without
+    the given one, which is then compared with it; and by how much pictures and joints are out of
+    step is told.
+
     Files in DIR: summary.json; overlay/ of the frames that contradict the others.
 
     Whose positions are not those of the pictures:
@@ -111,11 +115,12 @@ def audit(
           --joints ../shared/data/franka_one_view/joint_angles.csv
 
     Args:
-        scene: Folder with cameras.yaml and masks/<camera>/<frame>.png.
+        scene: Folder with cameras.yaml and masks/<camera>/<frame>.png; or an episode: a folder or
+            file.
         joints: Joint positions of every frame [rad or m]: a CSV file with the column frame and one
-            for each joint.
+            for each joint; of an episode also by time. Default: an episode's own.
         out: Folder for the result; new or empty.
-        cameras: Camera file in place of the scene's cameras.yaml.
+        cameras: Camera file in place of the scene's or episode's own.
     """
     from drake_pose.jobs.registration.audit import audit_scene
 

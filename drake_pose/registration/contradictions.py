@@ -55,7 +55,7 @@ _UNKNOWN_SIZES = ErrorSizes(1.0, 0.0, 1.0, 1.0, 1.0)
 _WIDTH_SD = 2.0
 # What is right is named by chance this often, and not where it moves outlines by less [pixel]; of
 # joints in all frames that agree, whatever cameras are off by.
-_SIGNIFICANCE, _LEAST_PIXELS, _LEAST_OF_JOINTS = 1e-4, 1.0, 0.3
+SIGNIFICANCE, _LEAST_PIXELS, LEAST_OF_JOINTS = 1e-4, 1.0, 0.3
 # What is so many deviations more is named 19 times of 20.
 _NEARLY = 1.645
 # What is nearer to half a pixel than this is that [pixel].
@@ -69,11 +69,12 @@ class Finding:
     """By how much something is off.
 
     Args:
-        kind: "joint", "camera", "base", "focal", "center", "joints" where several are off, or
-            "unexplained" where nothing within reach explains a frame.
+        kind: "joint", "camera", "base", "focal", "center", "clock", "joints" where several are off,
+            or "unexplained" where nothing within reach explains a frame.
         name: of the joint, or the camera: "" where it is all of them.
         angle, shift: [rad, m]; of joints the largest; of focal lengths the shift is their share, of
-            principal points [pixel].
+            principal points [pixel], of a camera's clock by how much later its pictures'
+            joints are in the log [s].
         angle_sd, shift_sd: their standard deviations.
         pixels: how far it moves the outlines of the parts that it moves, root mean square.
         p_value: how often nothing would seem so much off by chance.
@@ -125,7 +126,7 @@ def half_pixel(offset: Array, covariance: Array) -> HalfPixel | None:
     """
     half = np.copysign(0.5, offset.sum())
     T = float(offset @ np.linalg.solve(covariance, offset))
-    if chi2.sf(T, 2) > _SIGNIFICANCE or np.abs(offset - half).max() > _NEAR_HALF:
+    if chi2.sf(T, 2) > SIGNIFICANCE or np.abs(offset - half).max() > _NEAR_HALF:
         return None
     return HalfPixel(offset.tolist(), np.sqrt(np.diag(covariance)).tolist())
 
@@ -329,7 +330,7 @@ class _Auditor:
             for _ in range(_MAX_ITERATIONS):
                 common = self._common(self._sum(kept))
                 residuals = [self._residual(info, *common) for info in self._info]
-                likely = [_residual_p_value(one) > _SIGNIFICANCE for one in residuals]
+                likely = [_residual_p_value(one) > SIGNIFICANCE for one in residuals]
                 now = self._explained & likely
                 if (now == kept).all():
                     break
@@ -385,7 +386,7 @@ class _Auditor:
         tests = [residual.test(cause) for cause in causes]
         # Each of the tests may find something by chance.
         least = min(p_value, *(one.p_value for one in tests)) * (1 + len(tests))
-        if least > _SIGNIFICANCE or pixels < _LEAST_PIXELS:
+        if least > SIGNIFICANCE or pixels < _LEAST_PIXELS:
             return None
         sufficient = residual.sufficient(tests, _LEAST_PIXELS)
         if not sufficient:
@@ -481,47 +482,70 @@ class _Auditor:
             residual = residual.without(shifted.cause)
         else:
             center = None
-        residual, found = self._name(residual, causes, _LEAST_PIXELS)
+        whole, (residual, found) = residual, self._name(residual, causes, _LEAST_PIXELS)
         # A joint's zero moves little beside what calibrations are off by: these are free now.
-        named, joints = {one.name for one in found}, list[_Cause]()
+        named, joints, freed = [one[0].cause.name for one in found], list[_Cause](), list[_Cause]()
         for cause in causes:
             if cause.kind == "camera":
                 residual = residual.without(cause)
+                freed.append(cause)
             elif cause.kind == "joint" and cause.name not in named:
                 joints.append(cause)
-        residual, zeros = self._name(residual, joints, _LEAST_OF_JOINTS)
-        named = {one.name for one in zeros}
+        residual, zeros = self._name(residual, joints, LEAST_OF_JOINTS)
+        named = [one[0].cause.name for one in zeros]
         joints = [one for one in joints if one.name not in named]
-        return (*found, *zeros), sizes, center, self._noticed_from(residual, joints)
+        findings = self._together(whole, [*found, *zeros], freed if zeros else [])
+        return findings, sizes, center, self._noticed_from(residual, joints)
 
     def _name(
         self, residual: _Residual, causes: Sequence[_Cause], least: float
-    ) -> tuple[_Residual, list[Finding]]:
+    ) -> tuple[_Residual, list[list[_CauseTest]]]:
         """What causes, one after the other, are off, and the residual without them.
 
-        least: how far they move outlines at least [pixel].
+        With each stand those that suffice in its place. least: how far they move outlines at least
+        [pixel].
         """
-        left, findings = list(causes), list[Finding]()
+        left, named = list(causes), list[list[_CauseTest]]()
         while left:
             # What is named is off by itself, and so are its rivals.
             tests = [
                 one
                 for one in map(residual.test, left)
-                if one.p_value * len(left) <= _SIGNIFICANCE and residual.info.pixels(one.x) >= least
+                if one.p_value * len(left) <= SIGNIFICANCE and residual.info.pixels(one.x) >= least
             ]
             if not tests:
                 break
             most = max(tests, key=lambda one: one.gain)
-            sufficient = residual.sufficient(tests, least) or [most]
+            named.append(residual.sufficient(tests, least) or [most])
+            best = named[-1][0].cause
+            residual = residual.without(best)
+            left = [one for one in left if one is not best]
+        return residual, named
+
+    def _together(
+        self, residual: _Residual, named: Sequence[list[_CauseTest]], freed: Sequence[_Cause]
+    ) -> tuple[Finding, ...]:
+        """Findings of causes, by how much they are off together; others that are free beside."""
+        own = [one[0].cause for one in named]
+        names = {(one.kind, one.name) for one in own}
+        others = [one for one in freed if (one.kind, one.name) not in names]
+        moves = [one.moves for one in (*own, *others)]
+        if not named:
+            return ()
+        found = residual.test(_Cause("", "", np.hstack(moves), np.ones(0), 0))
+        findings, first = [], 0
+        for sufficient in named:
             best = sufficient[0]
-            findings.append(self._finding(sufficient, residual.info.pixels(best.x)))
-            residual = residual.without(best.cause)
-            left = [one for one in left if one is not best.cause]
-        return residual, findings
+            k = slice(first, first + len(best.amount))
+            first = k.stop
+            better = best._replace(amount=found.amount[k], covariance=found.covariance[k, k])
+            pixels = residual.info.pixels(better.x)
+            findings.append(self._finding([better, *sufficient[1:]], pixels))
+        return tuple(findings)
 
     def _noticed_from(self, residual: _Residual, causes: Sequence[_Cause]) -> dict[str, float]:
         """How far joints must be off to be named nearly always [rad or m]; inf: never."""
-        critical = fisher.isf(_SIGNIFICANCE / max(1, len(causes)), 1, residual.info.freedom)
+        critical = fisher.isf(SIGNIFICANCE / max(1, len(causes)), 1, residual.info.freedom)
         found = {}
         for cause in causes:
             along = cause.moves[:, 0]
@@ -530,7 +554,7 @@ class _Auditor:
             amount = (np.sqrt(critical) + _NEARLY) * sd / information
             pixels = max(residual.info.pixels(along), 1e-9)
             is_told = information > _LEAST_INFORMATION
-            least = max(amount, _LEAST_OF_JOINTS / pixels) if is_told else np.inf
+            least = max(amount, LEAST_OF_JOINTS / pixels) if is_told else np.inf
             found[cause.name] = float(least * cause.units[0])
         return found
 

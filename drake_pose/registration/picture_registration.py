@@ -8,7 +8,8 @@ asked for, focal length are fitted together on those frames and the ones that mo
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,8 +48,9 @@ _SLOW = 0.6
 _LOOKS, _LEAST_RATIO, _LEAST_CONTOUR = 3, 0.42, 0.16
 # Poses are as good that explain less by no more deviations.
 _SIGNIFICANCE = 1.96
-# Offsets of clocks that are tried [s]; one that was fitted is fitted again where it is larger.
-_OFFSETS, _AGAIN = np.linspace(-1.0, 1.0, 81), 0.02
+# Offsets of clocks that are tried [s]; what was fitted is fitted again where an offset moved more
+# than so much, or a zero, so often at most.
+_OFFSETS, _AGAIN, _TURNED, _MOST_FITS = np.linspace(-1.0, 1.0, 81), 0.02, np.radians(0.3), 4
 # An offset is not told whose standard deviation is larger [s].
 _UNTOLD = 0.1
 
@@ -75,6 +77,14 @@ class Recording:
             return None
         ahead, behind = (self.values_at(offset + by) for by in (_RATE_STEP, -_RATE_STEP))
         return np.asarray(np.nan_to_num((ahead - behind) / (2.0 * _RATE_STEP)))
+
+    def picture(self, name: str) -> Picture:
+        """A picture (H, W, 3) by its name."""
+        return self.read(self.names.index(name))
+
+    def with_zeros(self, zeros: Array) -> Recording:
+        """The same with (m,) added to all values."""
+        return replace(self, values_at=lambda offset: self.values_at(offset) + zeros)
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,6 +117,7 @@ class PictureRegistration:
         fit: that found it.
         offset: of its clock; None: the joints have no times.
         focal_deviation: over the focal length; 0: it was held.
+        zeros: (m,) that were added to the frames' values where masks and odds were found.
     """
 
     found: RegisteredCamera
@@ -115,22 +126,29 @@ class PictureRegistration:
     fit: PictureFit
     offset: TimeOffset | None
     focal_deviation: float
+    zeros: Array
 
 
 def register_pictures(
-    body: RegistrationBody, camera: PinholeCamera, recording: Recording, focal: bool = False
+    body: RegistrationBody,
+    camera: PinholeCamera,
+    recording: Recording,
+    focal: bool = False,
+    zeros: Sequence[str] = (),
 ) -> PictureRegistration:
     """Finds where a camera stands that has seen a body move.
 
     Args:
         camera: its pose is not used.
         focal: whether its focal length is only about known.
+        zeros: joints whose zeros are only about known. What is found is not told apart from chance
+            here (``calibrate_joints`` does that), but masks follow it.
 
     Raises RegistrationError: too few pictures with joint positions, a body that does not move, or
         no pose that explains the pictures.
     """
     chosen, moving = _choose(body, camera, recording)
-    begin = _posed(recording, chosen, 0.0)
+    begin = posed_pictures(recording, chosen, 0.0)
     search = PictureSearch(body, camera, begin)
     looks = [search.approach(camera.with_pose(np.linalg.inv(X))) for X in search.search()[:_LOOKS]]
     near = sorted((one for one in looks if one is not None), key=lambda one: -one[1])
@@ -145,16 +163,57 @@ def register_pictures(
     both, offset, scores = [*chosen, *moving], 0.0, np.zeros((0, 2))
     if recording.timed:
         offset, scores = _scan(body, start, recording, both)
-    for _ in range(2):
-        last = PictureSearch(body, camera, _posed(recording, both, offset))
-        fitted = last.fit(start, (TIME_OFFSET,) if recording.timed else (), focal)
-        if fitted is None:
+    begun = _Begun(start, both, offset, alternatives, scores)
+    return _fit(body, begun, recording, focal, zeros)
+
+
+def refit_pictures(
+    body: RegistrationBody,
+    one: PictureRegistration,
+    recording: Recording,
+    focal: bool = False,
+    zeros: Sequence[str] = (),
+) -> PictureRegistration:
+    """As register_pictures, of a camera that was found already."""
+    both = [recording.names.index(frame.name) for frame in one.frames]
+    told = one.offset or TimeOffset(0.0, np.inf, np.zeros((0, 2)))
+    others = [np.linalg.inv(X) for X in one.found.alternatives]
+    begun = _Begun(one.found.camera, both, told.value, others, told.scores)
+    return _fit(body, begun, recording, focal, zeros)
+
+
+class _Begun(NamedTuple):
+    """A search that is done: the camera, frames that are fitted, the clock, other poses X_CW."""
+
+    camera: PinholeCamera
+    rows: Sequence[int]
+    offset: float
+    alternatives: Sequence[Array]
+    scores: Array
+
+
+def _fit(
+    body: RegistrationBody,
+    begun: _Begun,
+    recording: Recording,
+    focal: bool,
+    zeros: Sequence[str],
+) -> PictureRegistration:
+    """What a search has begun, fitted until clock and zeros move no more."""
+    camera, offset, names = begun.camera, begun.offset, body.kinematics.names
+    constants = ((TIME_OFFSET,) if recording.timed else ()) + tuple(zeros)
+    turned = np.zeros(len(names))
+    for _ in range(_MOST_FITS if zeros else 2):
+        frames = posed_pictures(recording.with_zeros(turned), begun.rows, offset)
+        best = PictureSearch(body, camera, frames).fit(camera, constants, focal)
+        if best is None:
             raise _unexplained(camera, "the body leaves the pictures")
-        best, start, by = fitted, fitted.camera, _constant(fitted, TIME_OFFSET)
-        offset += by
-        if abs(by) < _AGAIN:
+        camera, by = best.camera, _constant(best, TIME_OFFSET)
+        assumed, turn = turned, np.array([_constant(best, name) for name in names])
+        offset, turned = offset + by, turned + turn
+        if abs(by) < _AGAIN and np.abs(turn).max() < _TURNED:
             break
-    return _describe(camera, best, recording, alternatives, offset, scores, focal)
+    return _describe(best, recording, begun, offset, assumed, focal)
 
 
 def _choose(
@@ -190,7 +249,7 @@ def _choose(
     return known[chosen].tolist(), known[moving].tolist()
 
 
-def _posed(recording: Recording, which: Sequence[int], offset: float) -> list[PosedPicture]:
+def posed_pictures(recording: Recording, which: Sequence[int], offset: float) -> list[PosedPicture]:
     """Some frames with their pictures; those whose joints are not logged are left out."""
     values, rates = recording.values_at(offset), recording.rates_at(offset)
     return [
@@ -206,7 +265,7 @@ def _scan(
     body: RegistrationBody, camera: PinholeCamera, recording: Recording, which: Sequence[int]
 ) -> tuple[float, Array]:
     """The offset at which a camera explains its pictures best, and what all that were tried do."""
-    frames = _posed(recording, which, 0.0)
+    frames = posed_pictures(recording, which, 0.0)
     level = PictureSearch(body, camera, frames).compared
     names = [one.name for one in frames]
     rows = [recording.names.index(name) for name in names]
@@ -234,15 +293,16 @@ def _constant(fitted: PictureFit, name: str) -> float:
 
 
 def _describe(
-    camera: PinholeCamera,
     best: PictureFit,
     recording: Recording,
-    alternatives: Sequence[Array],
+    begun: _Begun,
     offset: float,
-    scores: Array,
+    zeros: Array,
     focal: bool,
 ) -> PictureRegistration:
     """What was found.
+
+    zeros: (m,) that were added to the frames' values.
 
     Raises RegistrationError: it does not explain the pictures.
     """
@@ -252,7 +312,7 @@ def _describe(
     ratio = float(ratios[agree].mean())
     if ratio < _LEAST_RATIO or best.contour < _LEAST_CONTOUR or best.explained <= 0.0:
         raise _unexplained(
-            camera,
+            begun.camera,
             f"at best {max(best.explained, 0.0):.0%} of what changes is explained, {ratio:.0%} of "
             f"the contours fit ({_LEAST_RATIO:.0%} at least), and edges along them are stronger "
             f"than elsewhere by {best.contour:.2f} ({_LEAST_CONTOUR} at least)",
@@ -263,7 +323,7 @@ def _describe(
     told = None
     if TIME_OFFSET in fit.names:
         deviation = float(deviations[fit.names.index(TIME_OFFSET)])
-        told = TimeOffset(offset, deviation if deviation < _UNTOLD else np.inf, scores)
+        told = TimeOffset(offset, deviation if deviation < _UNTOLD else np.inf, begun.scores)
     found = areas(seen, best.camera.X_CW[None], np.inf)[0]
     misfits = (E_total(found), intersection_over_union(found), ratios, agree)
     rows = zip(seen.frames, *(one.tolist() for one in misfits), strict=True)
@@ -272,13 +332,14 @@ def _describe(
             best.camera,
             fit.camera_covariances(best.found, covariance)[0],
             tuple(FrameMisfit(frame.name, *row) for frame, *row in rows),
-            np.array([np.linalg.inv(X) for X in alternatives]).reshape(-1, 4, 4),
+            np.array([np.linalg.inv(X) for X in begun.alternatives]).reshape(-1, 4, 4),
         ),
-        seen.frames,
-        {one.name: recording.read(recording.names.index(one.name)) for one in seen.frames},
+        tuple(replace(frame, values=frame.values - zeros) for frame in seen.frames),
+        {one.name: recording.picture(one.name) for one in seen.frames},
         best,
         told,
         float(deviations[fit.per_camera - 1]) if focal else 0.0,
+        zeros,
     )
 
 

@@ -43,8 +43,11 @@ _ROUNDS = (
     SearchRound(80, 15, 80, 0.06, 10.0),
     SearchRound(160, 5, 100, 0.04, 20.0),
 )
+ABOUT = 100
+"""Triangles of a node where a body is about."""
+
 # Triangles of a node, up to which width of pictures [pixel].
-_TRIANGLES, _WIDTHS = (12, 40, 100), (60, 120)
+_TRIANGLES, _WIDTHS = (12, 40, ABOUT), (60, 120)
 # Poses are compared in pictures so wide, and backgrounds learned in these.
 _COMPARED, _LEARNED = 160, 320
 # Fits on lines: scales of steps [pixel of a picture _SCALED wide], and from line to line [scale];

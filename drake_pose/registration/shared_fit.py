@@ -85,6 +85,11 @@ _ZERO, _SLID, _LENGTH, _FOCAL, _CENTER = np.radians(0.5), 0.002, 0.01, 0.01, 0.0
 _PARTS_ERR, _NO_BETTER = 0.2, 1.0
 
 
+def agreeing_share(ratios: Array) -> float:
+    """The least inlier ratio of a mask that agrees with the others of its camera, (n,) ratios."""
+    return float(_AGREES * np.sort(ratios)[-2:].mean())
+
+
 class Shared(NamedTuple):
     """What was found.
 
@@ -207,7 +212,7 @@ class SharedFit:
     def agreeing(self, ratios: Array) -> Mask:
         """(rows,) which masks fit nearly as well as the two of their camera that fit best."""
         own = [ratios[self.rows == c] for c in range(len(self.seen))]
-        return np.concatenate([one >= _AGREES * np.sort(one)[-2:].mean() for one in own])
+        return np.concatenate([one >= agreeing_share(one) for one in own])
 
     def piece_costs(self, found: Shared, side: float) -> Array:
         """(rows, k, k) costs by squares of the pictures of a side [pixel]."""

@@ -93,7 +93,7 @@ def open_folder(path: Path, joints: JointLog | None) -> Episode:
         warnings += said
         if name not in known.cameras:
             warnings.append(f"camera '{name}' has no entry in {CAMERAS}: its lens is unknown")
-        cameras.append(_with_intrinsics(camera, known, path / CAMERAS))
+        cameras.append(with_intrinsics(camera, known, path / CAMERAS))
     return Episode.checked(path, cameras, joints, warnings)
 
 
@@ -143,8 +143,8 @@ def _by_rate(scene: Path, count: int) -> Array:
         raise SceneError(str(error)) from None
 
 
-def _with_intrinsics(camera: EpisodeCamera, known: CameraFile, path: Path) -> EpisodeCamera:
-    """The camera as its file has it; CameraError where the file is of other pictures."""
+def with_intrinsics(camera: EpisodeCamera, known: CameraFile, path: Path) -> EpisodeCamera:
+    """A camera as its file has it, where that has it; CameraError: it is of other pictures."""
     found, where = known.cameras.get(camera.name), f"{path}: camera '{camera.name}'"
     if found is None:
         return camera

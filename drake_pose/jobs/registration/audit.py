@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -16,16 +16,18 @@ from drake_pose.body.model import ArticulatedModel, load_model
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.camera.camera_files import load_cameras
 from drake_pose.camera.models import Camera
-from drake_pose.errors import CameraError, MaskError, SceneError
+from drake_pose.errors import CameraError, MaskError, SceneError, SettingsError
 from drake_pose.files.folder import write_summary, writes_folder
 from drake_pose.files.options import percent
 from drake_pose.files.records import user_units
 from drake_pose.files.settings import EstimateSettings
 from drake_pose.files.summary import mask_digests
 from drake_pose.jobs.estimate.searches import make_tree
+from drake_pose.jobs.registration.episode_audit import EpisodeLook, look_at_episode
+from drake_pose.jobs.registration.episodes import is_episode, read_episode
 from drake_pose.jobs.registration.inputs import Inputs
 from drake_pose.jobs.registration.positions import read_known_positions
-from drake_pose.jobs.registration.result import describe_run, write_overlays
+from drake_pose.jobs.registration.result import describe_pictures, describe_run, write_overlays
 from drake_pose.jobs.registration.settings import AuditSettings
 from drake_pose.registration.contradictions import Audit, Finding, FrameAudit, audit_frames
 from drake_pose.registration.per_frame_fit import PerFrameFit
@@ -43,7 +45,8 @@ _SAMPLE = 20
 # Sizes of errors that are told.
 _SIZES = ("surface", "mask", "camera")
 # In which shifts are told, and what they are multiplied by for that.
-_UNITS, _LENGTH = {"focal": ("percent", 100.0), "center": ("px", 1.0)}, ("mm", 1e3)
+_UNITS = {"focal": ("percent", 100.0), "center": ("px", 1.0), "clock": ("ms", 1e3)}
+_LENGTH = ("mm", 1e3)
 # Where most frames contradict, other poses of cameras are tried on so many of them, of so many
 # pairs; they are named where so much of the contours fits, and less than this share of what does
 # not as given does not.
@@ -66,7 +69,7 @@ class SceneAudit:
 def audit_scene(
     scene: Path | str,
     model: Path | str,
-    joints: Path | str,
+    joints: Path | str | None = None,
     out: Path | str | None = None,
     settings: AuditSettings | None = None,
     *,
@@ -77,10 +80,13 @@ def audit_scene(
     """Finds which frames, cameras or joints contradict the rest, in time linear in the frames.
 
     Args:
+        scene: the folder with cameras.yaml and masks; or an episode of pictures, in which the
+            robot, and masks of it, are found without the cameras that are audited.
         model: the robot's model file. It stands in the world as the file has it.
-        joints: joint positions by frame (CSV) [rad or m].
+        joints: joint positions by frame, of an episode by time, too (CSV) [rad or m]. None: an
+            episode's own.
         out: folder for the result, new or empty; None writes nothing.
-        cameras: a camera file in place of the scene's own.
+        cameras: a camera file in place of the scene's or episode's own.
         on_frame: called after each frame.
 
     Raises:
@@ -90,11 +96,26 @@ def audit_scene(
     files = {
         "model": Path(model),
         "cameras": Path(cameras or Path(scene) / CAMERA_FILE),
-        "joints": Path(joints),
+        "joints": None if joints is None else Path(joints),
     }
-    inputs, frames = _read_inputs(Path(scene), files, cameras is not None, settings)
-    begin, warnings = time.perf_counter(), list(inputs.warnings)
+    begin, look = time.perf_counter(), None
+    if is_episode(Path(scene), settings):
+        own = None if cameras is None else Path(cameras)
+        episode = read_episode(Path(scene), Path(model), files["joints"], own, settings)
+        look = look_at_episode(episode)
+        # Masks lean on what is named here, so they are found anew without it.
+        inputs, frames = look.inputs, tuple(look.names)
+        first, _, _ = _audit(inputs, frames, None)
+        zeros = [one.name for one in first.common if one.kind == "joint"]
+        if zeros:
+            look = look_at_episode(episode, look, zeros)
+            inputs, frames = look.inputs, tuple(look.names)
+    else:
+        inputs, frames = _read_inputs(Path(scene), files, cameras is not None, settings)
+    warnings = list(inputs.warnings)
     found, unseen, misplaced = _audit(inputs, frames, on_frame)
+    if look is not None:
+        found = replace(found, common=(*look.findings, *found.common))
     seconds = time.perf_counter() - begin
     warnings += [*misplaced, *_doubts(inputs, found, unseen, files["cameras"])]
     names = [camera.name for camera in inputs.held]
@@ -112,6 +133,7 @@ def audit_scene(
             }
             for one in found.frames
         },
+        "cameras": {} if look is None else _describe_looks(look),
         "noticed_from": _noticed_from(found, inputs.model),
         "principal_point_px": found.center and found.center._asdict(),
         "error_sizes_px": {name: float(getattr(found.sizes, name)) for name in _SIZES},
@@ -121,6 +143,19 @@ def audit_scene(
     if folder is not None:
         _write_result(folder, inputs, found if overlay else None, summary)
     return SceneAudit(found, summary, tuple(warnings), folder)
+
+
+def _describe_looks(look: EpisodeLook) -> dict[str, Any]:
+    """Where cameras were found in pictures, how sure that is, and their clocks."""
+    return {
+        name: describe_pictures(one)
+        | {
+            "X_WC": one.found.camera.X_WC.tolist(),
+            "translation_sd_mm": 1e3 * one.found.translation_sd,
+            "rotation_sd_deg": float(np.degrees(one.found.rotation_sd)),
+        }
+        for name, one in look.pictures.items()
+    }
 
 
 def _noticed_from(found: Audit, model: ArticulatedModel) -> dict[str, float | None]:
@@ -134,9 +169,12 @@ def _noticed_from(found: Audit, model: ArticulatedModel) -> dict[str, float | No
 
 
 def _read_inputs(
-    scene_path: Path, files: Mapping[str, Path], own: bool, settings: AuditSettings
+    scene_path: Path, files: Mapping[str, Path | None], own: bool, settings: AuditSettings
 ) -> tuple[Inputs, tuple[str, ...]]:
     """What is audited, and its frames, checked; own: whether it has a camera file of its own."""
+    joints = files["joints"]
+    if joints is None:
+        raise SettingsError(f"{scene_path}: an audit of masks needs joint positions: --joints FILE")
     given = load_cameras(files["cameras"]) if own else None
     scene, frames = read_scene(
         scene_path, settings.cameras, settings.frames, given, every=settings.every
@@ -149,7 +187,7 @@ def _read_inputs(
     chosen = tuple(scene.cameras.values())
     model = load_model(files["model"], package_paths=settings.packages)
     tree = make_tree(model, EstimateSettings(hold=settings.hold))
-    positions = read_known_positions(files["joints"], TreeKinematics(tree))
+    positions = read_known_positions(joints, TreeKinematics(tree))
     warnings = [*scene.warnings, *model.warnings, *positions.warnings]
     if positions.are_one_pose(positions.of(frame, chosen[0].name) for frame in frames):
         warnings.append(
@@ -163,7 +201,7 @@ def _audit(
     inputs: Inputs, frames: Sequence[str], on_frame: OnFrame | None
 ) -> tuple[Audit, list[str], list[str]]:
     """What was found, the frames of which no mask shows anything, and what is wrong of cameras."""
-    body = RegistrationBody(inputs.tree)
+    body = RegistrationBody(inputs.tree, inputs.seen)
     picks = np.linspace(0, len(frames) - 1, min(len(frames), _SAMPLE)).round()
     sample = [inputs.read(frames[int(k)]) for k in picks]
     _require_seen(body, inputs, sample)
@@ -265,7 +303,7 @@ def _write_result(
                 fits = percent(summary["frames"][one.name]["fits"][name])
                 title = f"{name}  frame {one.name}  CONTRADICTS the others  {fits} fits"
                 titled.append((PosedFrame(one.name, one.values, one.masks[name]), title))
-        write_overlays(path, inputs.tree, camera, titled)
+        write_overlays(path, inputs.tree, camera, titled, inputs.seen)
     write_summary(path, summary)
 
 
@@ -323,6 +361,12 @@ def _say_frame(one: FrameAudit, found: Finding) -> str:
 
 def _off(one: Finding, verb: str) -> str:
     """What is off, and what explains it as well; by how much, with standard deviations."""
+    if one.kind == "clock":
+        word = "later" if one.shift > 0.0 else "earlier"
+        return (
+            f"camera '{one.name}': its pictures show the joints of {1e3 * abs(one.shift):.0f} +- "
+            f"{1e3 * one.shift_sd:.0f} ms {word} by the joint log's clock"
+        )
     name = "the base" if one.kind == "base" else f"{one.kind} '{one.name}'"
     name = f"the {one.name}" if one.kind in _UNITS else name
     if one.rivals:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -14,15 +15,17 @@ from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.camera.camera_files import load_camera_file
 from drake_pose.camera.episodes.episode import Episode, EpisodeCamera, JointLog
+from drake_pose.camera.episodes.folder import with_intrinsics
 from drake_pose.camera.episodes.joint_map import map_joints, read_joint_map
 from drake_pose.camera.episodes.open import open_episode
 from drake_pose.camera.models import PinholeCamera
-from drake_pose.errors import CameraError, SceneError, SettingsError, UnknownNameError
+from drake_pose.errors import SceneError, SettingsError, UnknownNameError
 from drake_pose.files.settings import EstimateSettings
 from drake_pose.jobs.estimate.searches import make_tree
 from drake_pose.jobs.registration.settings import AuditSettings
 from drake_pose.registration.picture_registration import Recording
 from drake_pose.silhouette.pictures.scene_files import select_frames
+from drake_pose.silhouette.pictures.scenes import CAMERA_FILE
 
 Array = NDArray[np.float64]
 
@@ -31,6 +34,8 @@ _OF_EPISODES = ("videos", "images", "meta/info.json", "trajectory.h5", "metadata
 _BAGS = ("*.mcap", "*.bag", "*.db3")
 # A camera of which nobody knows a focal length is taken to have this one [picture widths].
 _USUAL_FOCAL = 0.95
+# Some dozens of pictures are looked at, again and again.
+_REMEMBERED = 64
 
 
 @dataclass(frozen=True)
@@ -42,6 +47,7 @@ class EpisodeInputs:
         seen: the nodes whose place the joints tell; None: all.
         cameras: what is known of them; those in ``assumed`` have a usual focal length.
         recordings: of the same cameras.
+        placed: the names of those whose pose somebody says.
     """
 
     path: Path
@@ -52,6 +58,7 @@ class EpisodeInputs:
     assumed: frozenset[str]
     recordings: Mapping[str, Recording]
     warnings: tuple[str, ...]
+    placed: frozenset[str]
 
 
 def is_episode(path: Path, settings: AuditSettings) -> bool:
@@ -91,11 +98,17 @@ def read_episode(
     tree = make_tree(model, EstimateSettings(hold=settings.hold))
     log, asked, seen, warnings = _joints(path, episode.joints, tree, settings)
     chosen = _chosen_cameras(episode, settings)
-    cameras, assumed = _known_cameras(path, chosen, camera_path)
+    placed = frozenset[str]()
+    file = camera_path or path / CAMERA_FILE
+    if camera_path is not None or file.is_file():
+        given = load_camera_file(file)
+        chosen = [with_intrinsics(one, given, file) for one in chosen]
+        placed = frozenset(given.cameras) - {*given.unplaced, *given.links}
+    cameras, assumed = _known_cameras(chosen)
     default = TreeKinematics(tree).flatten(tree.default_values())
     recordings = {one.name: _recording(one, log, asked, default, settings) for one in chosen}
     said = (*episode.warnings, *model.warnings, *warnings)
-    return EpisodeInputs(path, model, tree, seen, cameras, assumed, recordings, said)
+    return EpisodeInputs(path, model, tree, seen, cameras, assumed, recordings, said, placed)
 
 
 def _joints(
@@ -167,13 +180,12 @@ def _chosen_cameras(episode: Episode, settings: AuditSettings) -> list[EpisodeCa
 
 
 def _known_cameras(
-    path: Path, chosen: Sequence[EpisodeCamera], camera_path: Path | None
+    chosen: Sequence[EpisodeCamera],
 ) -> tuple[dict[str, PinholeCamera], frozenset[str]]:
     """What is known of cameras, and which have a focal length that is only usual."""
-    given = None if camera_path is None else load_camera_file(camera_path).cameras
     cameras, assumed = dict[str, PinholeCamera](), set[str]()
     for one in chosen:
-        camera = one.camera if given is None else given.get(one.name, one.camera)
+        camera = one.camera
         if camera is None:
             focal = _USUAL_FOCAL * one.width
             centre = 0.5 * (one.width - 1), 0.5 * (one.height - 1)
@@ -181,17 +193,6 @@ def _known_cameras(
                 one.name, one.width, one.height, focal, focal, *centre, np.eye(4)
             )
             assumed.add(one.name)
-        if not isinstance(camera, PinholeCamera):
-            raise CameraError(
-                f"{camera_path or path}: camera '{one.name}' is a parallel camera, whose distance "
-                "no picture tells; give its focal lengths (projection: pinhole)"
-            )
-        if (camera.width, camera.height) != (one.width, one.height):
-            raise CameraError(
-                f"{camera_path or path}: camera '{one.name}' has {camera.width} x {camera.height} "
-                f"pixels, but its pictures {one.width} x {one.height}: give the focal length of "
-                "pictures of that size"
-            )
         cameras[one.name] = replace(camera, name=one.name)
     return cameras, frozenset(assumed)
 
@@ -214,19 +215,8 @@ def _recording(
         values[:, asked] = rows
         return values
 
+    @lru_cache(_REMEMBERED)
     def read(k: int) -> NDArray[np.uint8]:
         return camera.read(int(kept[k]))
 
-    return Recording(names, values_at, _remembered(read), timed)
-
-
-def _remembered(read: Callable[[int], NDArray[np.uint8]]) -> Callable[[int], NDArray[np.uint8]]:
-    """Reads each picture once: some dozens are looked at, again and again."""
-    known = dict[int, NDArray[np.uint8]]()
-
-    def once(k: int) -> NDArray[np.uint8]:
-        if k not in known:
-            known[k] = read(k)
-        return known[k]
-
-    return once
+    return Recording(names, values_at, read, timed)

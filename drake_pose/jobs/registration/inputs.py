@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -95,10 +96,16 @@ class Inputs:
 
     def read(self, frame: str) -> SeenFrame:
         """A frame's positions, and the held cameras' masks but for those that show nothing."""
+        if frame in self._known:
+            return self._known[frame]
         names = [one.name for one in self.held if (one.name, frame) in self.scene.masks]
         masks = {name: self.scene.read(name, frame, may_be_empty=True) for name in names}
         seen = {name: mask for name, mask in masks.items() if mask.any()}
         return SeenFrame(frame, self.positions.of(frame, next(iter(masks), "")), seen)
+
+    @cached_property
+    def _known(self) -> dict[str, SeenFrame]:
+        return {one.name: one for one in self.frames}
 
     def of(self, camera: str) -> list[PosedFrame]:
         """What a camera sees."""

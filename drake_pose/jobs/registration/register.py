@@ -49,7 +49,12 @@ from drake_pose.person.shape import shape_parts, shape_values
 from drake_pose.registration.bundle_adjustment import adjust_bundle
 from drake_pose.registration.joint_zeros import JointCalibration, calibrate_joints
 from drake_pose.registration.object_search import ObjectSearch
-from drake_pose.registration.picture_registration import PictureRegistration, register_pictures
+from drake_pose.registration.picture_frames import judge_pictures
+from drake_pose.registration.picture_registration import (
+    PictureRegistration,
+    Recording,
+    register_pictures,
+)
 from drake_pose.registration.posed_frames import PosedFrames, SeenFrame
 from drake_pose.registration.register import (
     CameraSearch,
@@ -64,6 +69,9 @@ from drake_pose.silhouette.pictures.scenes import CAMERA_FILE
 
 OnCamera = Callable[[int], None]
 """Called with the number of cameras that are done."""
+
+# So many pictures are shown of those that contradict.
+_SHOWN = 20
 
 
 @dataclass(frozen=True, eq=False)
@@ -186,6 +194,8 @@ class _Registration:
         self.suggestions = dict[str, dict[str, Any] | None]()
         self.parameters: dict[str, Any] = {"zeros": {}, "lengths": {}}
         self.pictures = dict[str, PictureRegistration]()
+        self._recordings: Mapping[str, Recording] = {}
+        self._zeros = np.zeros(len(self.body.kinematics.names))
 
     @property
     def has_constants(self) -> bool:
@@ -246,9 +256,12 @@ class _Registration:
         Raises RegistrationError: no pose of a camera explains its pictures.
         """
         frames: list[SeenFrame] = []
+        self._recordings = episode.recordings
         for name, camera in episode.cameras.items():
             start, focal = time.perf_counter(), self._settings.focal or name in episode.assumed
-            one = register_pictures(self.body, camera, episode.recordings[name], focal)
+            one = register_pictures(
+                self.body, camera, episode.recordings[name], focal, self.inputs.zeros
+            )
             frames += [
                 SeenFrame(
                     frame.name, frame.values, {name: frame.mask},
@@ -271,6 +284,7 @@ class _Registration:
             frames do not tell where it is on a link.
         """
         body = self.body.with_tree(self.inputs.tree)
+        self._judge_pictures(body)
         for name, found in self.registered.items():
             if self.inputs.standing is not None:
                 require_determined(found)
@@ -280,7 +294,31 @@ class _Registration:
                 found, texts = check_focal_length(body, found, self.inputs.of(name))
             self.registered[name] = found
             self.warnings += [*texts, *_warnings_of(found)]
-        self.warnings += say_common(self.registered.values())
+        self.warnings += say_common(self.registered.values(), of_pictures=bool(self.pictures))
+
+    def _judge_pictures(self, body: RegistrationBody) -> None:
+        """Looks at all pictures of cameras that were found in some of them."""
+        frames = list[SeenFrame]()
+        for name, one in self.pictures.items():
+            recording = self._recordings[name]
+            judged = judge_pictures(
+                body, replace(one, zeros=self._zeros), self.registered[name], recording
+            )
+            frames += [
+                SeenFrame(k.name, k.values + self._zeros, {name: k.mask}) for k in judged.frames
+            ]
+            found = replace(self.registered[name], frames=judged.misfits)
+            shown = {k: recording.picture(k) for k in found.contradictions[:_SHOWN]}
+            self.pictures[name] = replace(one, pictures={**one.pictures, **shown})
+            self.registered[name] = found
+            if judged.lost:
+                self.warnings.append(
+                    f"camera '{name}': nothing of the robot is seen where it should be in frames "
+                    f"{frame_ranges(judged.lost, recording.names)}: is something before it, or are "
+                    "the joint positions not those of the pictures?"
+                )
+        if frames:
+            self.inputs = replace(self.inputs, frames=tuple(frames))
 
     def describe(self, more: float) -> dict[str, dict[str, Any]]:
         """The cameras' parts of the summary, each of which took so long more [s]."""
@@ -356,6 +394,7 @@ class _Registration:
         offsets = np.zeros(len(names))
         for zero in (one for one in found.zeros if one.significant):
             offsets[names.index(zero.name)] = zero.value
+        self._zeros = offsets
         model, tree, standing = inputs.model, inputs.tree, inputs.standing
         seen = next(iter(cameras.values())).seen_object
         shifts = _joint_shifts(tree, found)
@@ -461,7 +500,7 @@ def _say_object(seen: ObjectPose) -> list[str]:
     return texts
 
 
-def say_common(registered: Iterable[RegisteredCamera]) -> list[str]:
+def say_common(registered: Iterable[RegisteredCamera], *, of_pictures: bool = False) -> list[str]:
     """Whose fault it is where several cameras see a frame that contradicts the others."""
     agrees: dict[str, dict[str, bool]] = {}
     for found in registered:
@@ -472,6 +511,7 @@ def say_common(registered: Iterable[RegisteredCamera]) -> list[str]:
     for frame, own in agrees.items():
         for name in (name for name, right in own.items() if any(own.values()) and not right):
             masks.setdefault(name, []).append(frame)
+    why = "something hides the robot there" if of_pictures else "their masks are not"
     texts = []
     if positions:
         texts.append(
@@ -480,7 +520,7 @@ def say_common(registered: Iterable[RegisteredCamera]) -> list[str]:
         )
     texts += [
         f"frames {frame_ranges(wrong, frames)} contradict the others in camera '{name}', but not "
-        "in another one that sees them: their joint positions are right, their masks are not"
+        f"in another one that sees them: their joint positions are right, {why}"
         for name, wrong in masks.items()
     ]
     return texts

@@ -211,8 +211,12 @@ def write_result(
             f"{'agrees' if one.agrees else 'CONTRADICTS the others'}"
             for one in found.frames
         ]
-        titled = zip(inputs.of(name), titles, strict=True)
         own = pictures[name].pictures if pictures else {}
+        titled = [
+            one
+            for one in zip(inputs.of(name), titles, strict=True)
+            if not own or one[0].name in own
+        ]
         write_overlays(path, inputs.tree, found.camera, titled, inputs.seen, own)
     for name in pictures or ():
         _write_frames(path, inputs, name, several=len(pictures or ()) > 1)
@@ -266,7 +270,11 @@ def make_registration_report(folder: Path, summary: Mapping[str, Any]) -> str:
     first, pictures = next(iter(summary["cameras"].values())), []
     for camera, one in summary["cameras"].items():
         # From the worst to the best, as far as they were written.
-        errors = {frame: float(told["E_total"]) for frame, told in one["frames"].items()}
+        errors = {
+            frame: float(told["E_total"])
+            for frame, told in one["frames"].items()
+            if (folder / OVERLAY / camera / f"{frame}.png").is_file()
+        }
         in_order = sorted(errors, key=lambda frame: -errors[frame])
         count = min(_PICTURES, len(in_order))
         for k in np.linspace(0, len(in_order) - 1, count).round().astype(int):

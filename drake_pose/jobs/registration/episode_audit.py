@@ -1,0 +1,176 @@
+"""What an audit looks at in an episode: masks that its pictures give without the given cameras.
+
+Each camera is found in its pictures as a registration finds it, and its clock. A given camera that
+stands far from there is named; frames are then compared with the one that was found. One that
+stands near is compared as a scene's is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from drake_pose.camera.models import Camera, PinholeCamera
+from drake_pose.errors import SceneError
+from drake_pose.jobs.registration.episodes import EpisodeInputs
+from drake_pose.jobs.registration.inputs import Inputs
+from drake_pose.jobs.registration.positions import KnownPositions
+from drake_pose.registration.contradictions import (
+    BASE,
+    LEAST_OF_JOINTS,
+    SIGNIFICANCE,
+    Finding,
+)
+from drake_pose.registration.picture_frames import judge_pictures
+from drake_pose.registration.picture_registration import (
+    PictureRegistration,
+    Recording,
+    refit_pictures,
+    register_pictures,
+)
+from drake_pose.registration.posed_frames import SeenFrame, placed_points
+from drake_pose.registration.register import RegisteredCamera, RegistrationBody
+from drake_pose.silhouette.pictures.scene_checks import frame_ranges
+from drake_pose.silhouette.pictures.scenes import Scene
+
+Array = NDArray[np.float64]
+
+# A camera is compared as it is given that shows the body nearer than this to where it is seen [root
+# of the silhouettes' area].
+_NEAR = 0.08
+# Clocks are as good as right that are off by about so much [s].
+_CLOCK_SD = 0.002
+
+
+@dataclass(frozen=True, eq=False)
+class EpisodeLook:
+    """An episode as an audit takes it.
+
+    Args:
+        inputs: the frames with masks that were found; cameras near those that are given.
+        findings: cameras that are far from where their pictures show them, and clocks.
+        pictures: by camera what was found in them.
+        names: by frame of the inputs, its camera and its name there.
+    """
+
+    inputs: Inputs
+    findings: tuple[Finding, ...]
+    pictures: Mapping[str, PictureRegistration]
+    names: Mapping[str, tuple[str, str]]
+
+
+def look_at_episode(
+    episode: EpisodeInputs, before: EpisodeLook | None = None, zeros: Sequence[str] = ()
+) -> EpisodeLook:
+    """Finds each camera of an episode in its pictures, and masks in all of these.
+
+    Args:
+        before: a look that found the cameras about.
+        zeros: joints whose zeros are not trusted.
+
+    Raises:
+        SceneError: nobody says where a camera stands.
+        RegistrationError: no pose of a camera explains its pictures.
+    """
+    placed = [name for name in episode.cameras if name in episode.placed]
+    if not placed:
+        raise SceneError(
+            f"{episode.path}: no camera has an X_WC that could be audited; give a camera file "
+            "(--cameras FILE), or find out where they stand: drake-pose register"
+        )
+    warnings = [
+        f"camera '{name}' has no X_WC: it is left out"
+        for name in episode.cameras
+        if name not in placed
+    ]
+    body = RegistrationBody(episode.tree, episode.seen)
+    held, findings, pictures = list[Camera](), list[Finding](), dict[str, PictureRegistration]()
+    names, frames = dict[str, tuple[str, str]](), list[SeenFrame]()
+    for name in placed:
+        given, recording = episode.cameras[name], episode.recordings[name]
+        if before is None:
+            one = register_pictures(body, given, recording, zeros=zeros)
+        else:
+            one = refit_pictures(body, before.pictures[name], recording, zeros=zeros)
+        pictures[name] = one
+        values = np.array([frame.values + one.zeros for frame in one.frames])
+        off = compare_camera(body, given, one.found, values, alone=len(placed) == 1)
+        near = off.pixels < _NEAR * one.fit.fit.seen[0].size
+        held.append(given if near else one.found.camera)
+        findings += [] if near or off.p_value > SIGNIFICANCE else [off]
+        findings += _clock(body, one, recording)
+        judged = judge_pictures(body, one, one.found, recording)
+        for frame in judged.frames:
+            known = frame.name if len(placed) == 1 else f"{name}-{frame.name}"
+            names[known] = name, frame.name
+            frames.append(SeenFrame(known, frame.values, {name: frame.mask}))
+        if judged.lost:
+            warnings.append(
+                f"camera '{name}': nothing of the robot is seen where it should be in frames "
+                f"{frame_ranges(judged.lost, recording.names)}"
+            )
+    inputs = Inputs(
+        Scene(episode.path, episode.cameras, tuple(names), {}), episode.model, episode.tree,
+        KnownPositions(episode.path, body.kinematics, {}), tuple(held),
+        (*episode.warnings, *warnings), tuple(frames), seen=episode.seen,
+    )  # fmt: skip
+    return EpisodeLook(inputs, tuple(findings), pictures, names)
+
+
+def compare_camera(
+    body: RegistrationBody,
+    given: PinholeCamera,
+    found: RegisteredCamera,
+    values: Array,
+    alone: bool,
+) -> Finding:
+    """By how much a camera stands elsewhere than it was found.
+
+    Args:
+        values: (f, m) where the body is in some frames.
+        alone: whether it is the only one, so that the base may have moved as well.
+    """
+    turn = cv2.Rodrigues(found.camera.X_WC[:3, :3] @ given.X_WC[:3, :3].T)[0].ravel()
+    shift = found.camera.X_WC[:3, 3] - given.X_WC[:3, 3]
+    error = np.concatenate([turn, shift])
+    p_value = float(chi2.sf(error @ np.linalg.solve(found.covariance, error), len(error)))
+    return Finding(
+        "camera", given.name, float(np.linalg.norm(turn)), float(np.linalg.norm(shift)),
+        found.rotation_sd, found.translation_sd,
+        _pixels(body, (given, values), (found.camera, values)), p_value, (BASE,) if alone else (),
+    )  # fmt: skip
+
+
+def _clock(body: RegistrationBody, one: PictureRegistration, recording: Recording) -> list[Finding]:
+    """Whether a camera's clock is off the joint log's."""
+    if one.offset is None or not one.offset.determined:
+        return []
+    value, deviation, camera = one.offset.value, one.offset.deviation, one.found.camera
+    p_value = float(chi2.sf(value**2 / (deviation**2 + _CLOCK_SD**2), 1))
+    rows = [recording.names.index(frame.name) for frame in one.frames]
+    given = recording.values_at(0.0)[rows]
+    known = np.isfinite(given).all(axis=1)
+    found = recording.values_at(value)[rows]
+    pixels = _pixels(body, (camera, given[known]), (camera, found[known]))
+    if p_value > SIGNIFICANCE or pixels < LEAST_OF_JOINTS:
+        return []
+    return [Finding("clock", camera.name, 0.0, value, 0.0, deviation, pixels, p_value)]
+
+
+def _pixels(
+    body: RegistrationBody, one: tuple[PinholeCamera, Array], other: tuple[PinholeCamera, Array]
+) -> float:
+    """How far points of a body are from each other in two pictures, root mean square [pixel].
+
+    one, other: the cameras, and values (f, m) of the body.
+    """
+    places = []
+    for camera, values in (one, other):
+        points = [placed_points(body.very_few, body.kinematics.poses(row)) for row in values]
+        places.append(camera.project(np.concatenate(points))[0])
+    return float(np.sqrt(np.nanmean(((places[0] - places[1]) ** 2).sum(axis=1))))

@@ -1,0 +1,109 @@
+"""All pictures of a camera that was found in some of them: their masks, and which contradict."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from drake_pose.fit.background import Light
+from drake_pose.fit.surfaces import hull_of_few
+from drake_pose.registration.picture_registration import (
+    PictureRegistration,
+    Recording,
+    posed_pictures,
+)
+from drake_pose.registration.picture_search import ABOUT, see_picture
+from drake_pose.registration.posed_frames import PosedFrame, PosedFrames
+from drake_pose.registration.register import FrameMisfit, RegisteredCamera, RegistrationBody
+from drake_pose.registration.shared_fit import SharedFit, agreeing_share
+from drake_pose.registration.start_poses import E_total, areas, intersection_over_union
+from drake_pose.silhouette.areas.scoring import draw_mask
+
+# At most so many pictures are judged, so many at once.
+_MOST, _AT_ONCE = 300, 20
+# A picture shows the body where it should cover this share of it.
+_SHOWN = 0.01
+# Light is told in pictures about so wide [pixel].
+_LIGHT_WIDTH = 160
+
+
+@dataclass(frozen=True, eq=False)
+class JudgedPictures:
+    """What all pictures show of a body whose camera was found in some of them.
+
+    Args:
+        frames: those that show it, with masks.
+        misfits: of these.
+        lost: frames in which nothing is seen of a body that should be.
+    """
+
+    frames: tuple[PosedFrame, ...]
+    misfits: tuple[FrameMisfit, ...]
+    lost: tuple[str, ...]
+
+
+def judge_pictures(
+    body: RegistrationBody, one: PictureRegistration, found: RegisteredCamera, recording: Recording
+) -> JudgedPictures:
+    """Which of a recording's pictures contradict the others; of many, some spread over all.
+
+    Args:
+        one: what was found in some of them.
+        found: the camera, where it is known to be by now.
+    """
+    count = len(recording.names)
+    rows = np.unique(np.linspace(0, count - 1, min(count, _MOST)).round().astype(int)).tolist()
+    fitted = one.fit.fit
+    least = agreeing_share(fitted.inlier_ratios(one.fit.found))
+    frames, misfits, lost = list[PosedFrame](), list[FrameMisfit](), list[str]()
+    for k in range(0, len(rows), _AT_ONCE):
+        seen = list[PosedFrame]()
+        for name, frame in _see(body, one, found, recording, rows[k : k + _AT_ONCE]):
+            if frame is None:
+                lost.append(name)
+            else:
+                seen.append(frame)
+        if seen:
+            misfits += _misfits(body, found, seen, least)
+            # Odds fill the memory.
+            frames += [
+                replace(frame, values=frame.values - one.zeros, odds=None, rates=None)
+                for frame in seen
+            ]
+    return JudgedPictures(tuple(frames), tuple(misfits), tuple(lost))
+
+
+def _see(
+    body: RegistrationBody,
+    one: PictureRegistration,
+    found: RegisteredCamera,
+    recording: Recording,
+    rows: Sequence[int],
+) -> Iterator[tuple[str, PosedFrame | None]]:
+    """Pictures that should show the body, with masks; None: nothing is seen of it."""
+    known, camera = one.fit.background, found.camera
+    outlines = hull_of_few(body.very_few, ABOUT)
+    step = max(1, camera.width // _LIGHT_WIDTH)
+    small = np.ascontiguousarray(known.colours[::step, ::step])
+    offset = 0.0 if one.offset is None else one.offset.value
+    for posed in posed_pictures(recording.with_zeros(one.zeros), rows, offset):
+        covered = draw_mask(outlines, camera.X_CW @ body.kinematics.poses(posed.values), camera)
+        if covered.mean() >= _SHOWN:
+            light = Light.between(posed.picture[::step, ::step].astype(np.float32), small)
+            yield posed.name, see_picture(posed, known, light, covered)
+
+
+def _misfits(
+    body: RegistrationBody, found: RegisteredCamera, seen: Sequence[PosedFrame], least: float
+) -> list[FrameMisfit]:
+    """How well frames fit; those agree of whose contours no less fits."""
+    whole = PosedFrames(body.kinematics, body.all, found.camera, seen)
+    fit = SharedFit([whole], [found.camera.X_CW], widths=False)
+    ratios, summed = fit.inlier_ratios(fit.start), areas(whole, found.camera.X_CW[None], np.inf)[0]
+    told = zip(seen, E_total(summed), intersection_over_union(summed), ratios, strict=True)
+    return [
+        FrameMisfit(frame.name, float(off), float(iou), float(ratio), bool(ratio >= least))
+        for frame, off, iou, ratio in told
+    ]

@@ -205,14 +205,20 @@ def read_configs(entries: Mapping[str, Any], path: Path) -> dict[str, PinholeCam
     return cameras
 
 
-def dump_scenario(cameras: Mapping[str, Camera] | Iterable[Camera]) -> str:
+def dump_scenario(
+    cameras: Mapping[str, Camera] | Iterable[Camera], links: Mapping[str, str] | None = None
+) -> str:
     """The text of a Scenario with these cameras and label images on, for ``LoadScenario``.
+
+    Args:
+        links: by name of a camera that rides on a link, the link in whose frame its pose is.
 
     Raises CameraError: a parallel camera, or one whose principal point lies outside its picture.
     """
     content = {}
     for camera in camera_tuple(cameras):
         config = camera_to_config(camera)
+        config.X_PB.base_frame = (links or {}).get(camera.name)
         content[camera.name] = yaml_load(
             data=yaml_dump_typed(config, schema=CameraConfig, defaults=CameraConfig())
         )

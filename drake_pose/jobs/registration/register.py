@@ -24,6 +24,7 @@ from drake_pose.files.summary import BADLY_EXPLAINED
 from drake_pose.fit.lengthened_body import lengthened_joints
 from drake_pose.jobs.estimate.inputs import missing_for_person
 from drake_pose.jobs.registration.episodes import EpisodeInputs, is_episode, read_episode
+from drake_pose.jobs.registration.exports import check_exports
 from drake_pose.jobs.registration.inputs import (
     Inputs,
     inputs_of_episode,
@@ -166,9 +167,11 @@ def _begun(
     if is_episode(scene, settings):
         episode = read_episode(scene, model, joints, cameras, settings)
         work = _Registration(inputs_of_episode(episode, settings), settings)
+        check_exports(settings.exports, episode.cameras.values())
         work.find_in_pictures(episode, on_camera)
     else:
         work = _Registration(read_inputs(scene, model, joints, settings, cameras), settings)
+        check_exports(settings.exports, [*work.inputs.held, *work.inputs.searched])
         work.check_held()
         work.find_each(on_camera)
     return work

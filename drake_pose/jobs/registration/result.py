@@ -26,6 +26,7 @@ from drake_pose.files.options import percent
 from drake_pose.files.overlay import draw_overlay, encode_png
 from drake_pose.files.report_page import overlay_picture, page_template
 from drake_pose.files.summary import file_digest, versions
+from drake_pose.jobs.registration.exports import write_exports
 from drake_pose.jobs.registration.inputs import Inputs
 from drake_pose.jobs.registration.settings import AuditSettings
 from drake_pose.registration.joint_zeros import JointCalibration
@@ -229,6 +230,9 @@ def write_result(
     write_summary(path, summary)
     write_file(path, REPORT, make_registration_report(path, summary))
     links = {name: one["link"] for name, one in parts.items() if "link" in one}
+    shown = {name: one.pictures for name, one in (pictures or {}).items()}
+    formats = summary["settings"]["exports"]
+    write_exports(path, formats, inputs, cameras.values(), links, shown)
     write_file(path, CAMERA_FILE, dump_cameras(cameras, links))
 
 

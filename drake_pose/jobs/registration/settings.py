@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 from cyclopts import Parameter
 
@@ -12,6 +12,9 @@ from drake_pose.files.settings import Names, Positions, SceneSettings
 
 ALL = "all"
 """In place of names: of every joint, or of every link."""
+
+Export = Literal["ros", "mujoco", "drake", "rerun"]
+"""Programs that cameras are written for."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,8 +64,15 @@ class RegistrationSettings(AuditSettings):
     ] = ()
     """With --suggest: the corners of a box in the world that the robot must not touch [m]; repeat
     for several."""
+    exports: Annotated[tuple[Export, ...], Parameter("--export")] = ()
+    """Write the cameras for this program, too; repeat for several. ros: camera_info and static
+    transforms; mujoco: <camera> elements; drake: CameraConfigs; rerun: a recording for its viewer,
+    with robot, pictures and masks."""
 
     def __post_init__(self) -> None:
+        for name in self.exports:
+            if name not in (known := get_args(Export)):
+                raise SettingsError(f"there is no export '{name}'; there is: {', '.join(known)}")
         if self.keep_out and not self.suggest:
             raise SettingsError("--keep-out is for --suggest; give both, or leave it out")
 

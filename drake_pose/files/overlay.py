@@ -69,15 +69,23 @@ def draw_overlay(
 
 
 def draw_shapes(
-    mask: np.ndarray, shapes: Sequence[np.ndarray], names: Sequence[str], title: str
+    seen: np.ndarray, shapes: Sequence[np.ndarray], names: Sequence[str], title: str
 ) -> np.ndarray:
-    """Draws the contours of one or two named bodies (H, W) over a silhouette; see draw_overlay."""
-    colours = (MISSING_RGB, EXCESS_RGB)[: len(shapes)]
-    window = _surroundings(np.logical_or.reduce([mask, *shapes]))
-    picture = _enlarged(np.where(mask[..., None], AGREEMENT_RGB, BACKGROUND_RGB)[window])
+    """Draws the contours of one or two named bodies (H, W) over a silhouette; see draw_overlay.
+
+    Args:
+        seen: (H, W) bool, or a picture (H, W, 3), which is shown as a whole.
+    """
+    colours, legend = (MISSING_RGB, EXCESS_RGB)[: len(shapes)], []
+    window, picture = (slice(None), slice(None)), seen
+    if seen.ndim == 2:
+        window = _surroundings(np.logical_or.reduce([seen, *shapes]))
+        picture = np.where(seen[..., None], AGREEMENT_RGB, BACKGROUND_RGB)
+        legend = [(AGREEMENT_RGB, "silhouette")]
+    picture = _enlarged(picture[window])
     for shape, colour in zip(shapes, colours, strict=True):
         _draw_contour(picture, _enlarged(shape[window]), colour, 2)
-    legend = [(AGREEMENT_RGB, "silhouette"), *zip(colours, names, strict=True)]
+    legend += zip(colours, names, strict=True)
     return _framed(picture, title, legend)
 
 

@@ -15,7 +15,7 @@ from urllib.parse import quote
 
 import cv2
 import numpy as np
-from jinja2 import Environment, StrictUndefined, Template
+from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 from markupsafe import Markup
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import ArrayLike, NDArray
@@ -101,7 +101,6 @@ def make_report(
         method=_describe_method(scene, estimate),
         by_colour=bool(scene.images),
         rows=list(zip(frames, records, strict=True)),
-        box=BOX,
         errors=plot_curves(frames, [("E_total", errors)], joined=joined, least=0.0),
         ious=plot_curves(frames, ious, joined=joined),
         compared=sum(bool(record.ious) for record in records),
@@ -128,12 +127,14 @@ def _describe_method(scene: Scene, estimate: SceneEstimate) -> str:
 
 
 def page_template(package: str, name: str) -> Template:
-    """A page's template, a file of a package, which may use the style of all pages."""
+    """A page's template, a file of a package, which may use the style and macros of all pages."""
     environment = Environment(
-        autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
-    )
+        autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True,
+        loader=PackageLoader("drake_pose.files", ""),
+    )  # fmt: skip
     environment.tests |= {"infinite": math.isinf, "nan": math.isnan}
     style = files("drake_pose.files").joinpath("report_style.css")
+    environment.globals["box"] = BOX
     environment.globals["style"] = Markup(style.read_text(encoding="utf-8").rstrip())
     source = files(package).joinpath(name)
     return environment.from_string(source.read_text(encoding="utf-8"))
@@ -221,9 +222,11 @@ def _pick_pictures(folder: Path, scene: Scene, estimate: SceneEstimate) -> list[
     return pictures
 
 
-def overlay_picture(folder: Path, camera: str, frame: str, E_total: float | None) -> Picture | None:
+def overlay_picture(
+    folder: Path, camera: str, frame: str, E_total: float | None, overlay: str = OVERLAY
+) -> Picture | None:
     """An overlay in a result's folder, made small; None where it is no picture any more."""
-    place = f"{OVERLAY}/{camera}/{frame}.png"
+    place = f"{overlay}/{camera}/{frame}.png"
     if not (folder / place).is_file():
         return None
     uri = _small_picture((folder / place).read_bytes())

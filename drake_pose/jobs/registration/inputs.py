@@ -78,6 +78,7 @@ class Inputs:
             is found it is at the world's origin in the tree.
         zeros, lengths: the joints and links whose zeros and lengths are to be found.
         left_out: cameras without X_WC that are not to be found.
+        given: of the cameras that are to be found those whose X_WC is given, as they are given.
     """
 
     scene: Scene
@@ -93,6 +94,7 @@ class Inputs:
     zeros: tuple[str, ...] = ()
     lengths: tuple[str, ...] = ()
     left_out: tuple[str, ...] = ()
+    given: tuple[PinholeCamera, ...] = ()
 
     def read(self, frame: str) -> SeenFrame:
         """A frame's positions, and the held cameras' masks but for those that show nothing."""
@@ -137,6 +139,7 @@ def inputs_of_episode(episode: EpisodeInputs, settings: RegistrationSettings) ->
     return Inputs(
         scene, episode.model, episode.tree, positions, (), episode.warnings,
         searched=tuple(episode.cameras.values()), seen=episode.seen, zeros=zeros, lengths=lengths,
+        given=tuple(one for name, one in episode.cameras.items() if name in episode.placed),
     )  # fmt: skip
 
 
@@ -188,11 +191,12 @@ def read_inputs(
     else:
         on_link = settings.on is not None
         positions = read_known_positions(joints_path, kinematics, on_link, table)
-    found = [camera.name for camera in searched]
+    found, unknown = [camera.name for camera in searched], {*file.unplaced, *file.links}
     inputs = Inputs(
         scene, model, tree, positions, held,
         (*scene.warnings, *model.warnings, *positions.warnings), (), searched, seen, standing,
         zeros, lengths, tuple(k for k in (*file.unplaced, *file.links) if k not in found),
+        tuple(one for one in searched if one.name not in unknown and settings.on is None),
     )  # fmt: skip
     inputs = replace(inputs, frames=_read_frames(inputs, frames))
     if zeros or lengths or settings.focal:

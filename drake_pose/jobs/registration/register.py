@@ -37,6 +37,7 @@ from drake_pose.jobs.registration.misfit import (
     require_determined,
     require_explained,
 )
+from drake_pose.jobs.registration.report import compared_frames
 from drake_pose.jobs.registration.result import (
     describe_camera,
     describe_parameters,
@@ -311,7 +312,9 @@ class _Registration:
                 SeenFrame(k.name, k.values + self._zeros, {name: k.mask}) for k in judged.frames
             ]
             found = replace(self.registered[name], frames=judged.misfits)
-            shown = {k: recording.picture(k) for k in found.contradictions[:_SHOWN]}
+            errors = {k.frame: k.E_total for k in found.frames}
+            wanted = (*found.contradictions[:_SHOWN], *compared_frames(errors))
+            shown = {k: recording.picture(k) for k in wanted}
             self.pictures[name] = replace(one, pictures={**one.pictures, **shown})
             self.registered[name] = found
             if judged.lost:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,11 +23,15 @@ from drake_pose.files.folder import (
     write_summary,
 )
 from drake_pose.files.options import percent
-from drake_pose.files.overlay import draw_overlay, encode_png
-from drake_pose.files.report_page import overlay_picture, page_template
+from drake_pose.files.overlay import draw_overlay, draw_shapes, encode_png
 from drake_pose.files.summary import file_digest, versions
 from drake_pose.jobs.registration.exports import write_exports
 from drake_pose.jobs.registration.inputs import Inputs
+from drake_pose.jobs.registration.report import (
+    AS_GIVEN,
+    compared_frames,
+    make_registration_report,
+)
 from drake_pose.jobs.registration.settings import AuditSettings
 from drake_pose.registration.joint_zeros import JointCalibration
 from drake_pose.registration.picture_registration import PictureRegistration
@@ -40,14 +44,6 @@ from drake_pose.silhouette.pictures.scenes import CAMERA_FILE
 Array = NDArray[np.float64]
 
 REGISTRATION = "registration.yaml"
-
-# So many pictures of each camera are shown: those that fit worst and best, and some between.
-_PICTURES = 6
-PARAMETERS = (
-    ("zeros", "Zeros, to be added to positions", "joint", "zero"),
-    ("lengths", "Lengths, by how much links are longer", "link", "length"),
-)
-"""Keys of the summary that hold parameters of the robot: title, what they are of, what they are."""
 
 
 def describe_camera(
@@ -219,6 +215,8 @@ def write_result(
             if not own or one[0].name in own
         ]
         write_overlays(path, inputs.tree, found.camera, titled, inputs.seen, own)
+        for given in (one for one in inputs.given if one.name == name):
+            _write_comparisons(path, inputs, given, found, own)
     for name in pictures or ():
         _write_frames(path, inputs, name, several=len(pictures or ()) > 1)
     if urdf is not None:
@@ -247,57 +245,6 @@ def _write_frames(path: Path, inputs: Inputs, camera: str, several: bool) -> Non
     write_file(path, file, csv_text(rows))
 
 
-def parameter_rows(parameters: Mapping[str, Mapping[str, Any]]) -> list[tuple[str, ...]]:
-    """Zeros or lengths of a camera's part of summary.json as they are shown.
-
-    Of each the name, the value with its unit, the interval, and what to make of it.
-    """
-    rows: list[tuple[str, ...]] = []
-    for name, one in parameters.items():
-        if not one["determined"]:
-            goes_with = f", goes with {', '.join(one['gauge'])}" if one["gauge"] else ""
-            rows.append((name, "", "", f"not determined{goes_with}"))
-            continue
-        key = next(key for key in one if key.startswith("value_"))
-        unit = key.removeprefix("value_")
-        value = f"{one[key]:.3f} {'%' if unit == 'percent' else unit}"
-        interval = f"{one[f'low_{unit}']:.3f} to {one[f'high_{unit}']:.3f}"
-        word = "as good as 0" if one[f"low_{unit}"] <= 0.0 <= one[f"high_{unit}"] else "doubtful"
-        word = "significant" if one["significant"] else f"{word}: held at 0"
-        rows.append((name, value, interval, word))
-    return rows
-
-
-def make_registration_report(folder: Path, summary: Mapping[str, Any]) -> str:
-    """The page report.html, with the overlays in the result's folder."""
-    # Cameras see one robot: its zeros and lengths are the same in all their parts.
-    first, pictures = next(iter(summary["cameras"].values())), []
-    for camera, one in summary["cameras"].items():
-        # From the worst to the best, as far as they were written.
-        errors = {
-            frame: float(told["E_total"])
-            for frame, told in one["frames"].items()
-            if (folder / OVERLAY / camera / f"{frame}.png").is_file()
-        }
-        in_order = sorted(errors, key=lambda frame: -errors[frame])
-        count = min(_PICTURES, len(in_order))
-        for k in np.linspace(0, len(in_order) - 1, count).round().astype(int):
-            frame = in_order[k]
-            pictures.append(overlay_picture(folder, camera, frame, errors[frame]))
-    return page_template("drake_pose.jobs.registration", "report_template.html.j2").render(
-        summary=summary,
-        title=Path(str(summary["scene"])).name or str(summary["scene"]),
-        model=Path(str(summary["model"])).name,
-        target=first.get("target"),
-        parameters=[
-            (title, of, what, parameter_rows(first[key]))
-            for key, title, of, what in PARAMETERS
-            if first[key]
-        ],
-        pictures=[picture for picture in pictures if picture is not None],
-    )
-
-
 def _uncertainty(found: RegisteredCamera, summary: Mapping[str, Any]) -> dict[str, Any]:
     """A camera's part of registration.yaml, given its part of summary.json."""
     return {
@@ -322,12 +269,43 @@ def write_overlays(
 
     seen: the nodes that are drawn; None: all. pictures: by frame.
     """
+    draw = _drawer(tree, seen)
+    for frame, title in titled:
+        segments = draw(camera, frame)
+        shown: NDArray[Any] = (pictures or {}).get(frame.name, frame.mask)
+        picture = draw_overlay(shown, segments >= 0, segments, title)
+        write_file(folder, f"{OVERLAY}/{camera.name}/{frame.name}.png", encode_png(picture))
+
+
+def _write_comparisons(
+    folder: Path,
+    inputs: Inputs,
+    given: Camera,
+    found: RegisteredCamera,
+    pictures: Mapping[str, NDArray[np.uint8]],
+) -> None:
+    """Draws the robot as a camera that was given would see it, and as the one that was found."""
+    draw, frames = _drawer(inputs.tree, inputs.seen), inputs.of(given.name)
+    errors = {one.frame: one.E_total for one in found.frames}
+    for frame in (one for one in frames if one.name in compared_frames(errors)):
+        shown: NDArray[Any] = pictures.get(frame.name, frame.mask)
+        bodies = [draw(camera, frame) >= 0 for camera in (given, found.camera)]
+        names = ("the camera as given", "as found")
+        picture = draw_shapes(shown, bodies, names, f"{given.name}  frame {frame.name}")
+        write_file(folder, f"{AS_GIVEN}/{given.name}/{frame.name}.png", encode_png(picture))
+
+
+def _drawer(
+    tree: PoseTree, seen: Collection[str] | None
+) -> Callable[[Camera, PosedFrame], NDArray[np.intp]]:
+    """What draws a camera's view (H, W) of a frame: which of the nodes is seen, or -1."""
     kinematics = TreeKinematics(tree)
     shown = [k for k, node in enumerate(tree.nodes) if seen is None or node.name in seen]
     outlines = [outline_from_mesh(tree.nodes[k].mesh) for k in shown]
-    for frame, title in titled:
+
+    def draw(camera: Camera, frame: PosedFrame) -> NDArray[np.intp]:
         X_CN = camera.X_CW @ kinematics.poses(frame.values)[shown]
-        segments = draw_labels(outlines, np.arange(1, len(shown) + 1), X_CN, camera) - 1
-        seen_there: NDArray[Any] = (pictures or {}).get(frame.name, frame.mask)
-        picture = draw_overlay(seen_there, segments >= 0, segments, title)
-        write_file(folder, f"{OVERLAY}/{camera.name}/{frame.name}.png", encode_png(picture))
+        labels = draw_labels(outlines, np.arange(1, len(shown) + 1), X_CN, camera)
+        return np.asarray(labels, np.intp) - 1
+
+    return draw

@@ -6,10 +6,12 @@ import json
 import cv2
 import numpy as np
 import pytest
+import yaml
 
 from drake_pose.camera.camera_files import load_cameras, save_cameras
 from drake_pose.commands.main import app
 from drake_pose.errors import DrakePoseError
+from drake_pose.files.overlay import EXCESS_RGB, MISSING_RGB
 from drake_pose.jobs.registration.episodes import is_episode, read_episode
 from drake_pose.jobs.registration.register import register_scene
 from drake_pose.jobs.registration.settings import RegistrationSettings
@@ -103,6 +105,17 @@ def test_a_focal_length_that_nobody_knows_is_a_usual_one(episode, tmp_path):
     assert not given.assumed
 
 
+def test_whether_a_camera_s_place_is_given(episode, tmp_path):
+    scene, painted = episode
+    content = yaml.safe_load((scene / "cameras.yaml").read_text())
+    del content["camera"]["X_WC"]
+    file = tmp_path / "cameras.yaml"
+    file.write_text(yaml.safe_dump(content))
+    for own, expected in ((None, {"camera"}), (scene / "cameras.yaml", {"camera"}), (file, set())):
+        read = read_episode(scene, painted.path, None, own, RegistrationSettings())
+        assert read.placed == expected
+
+
 @pytest.mark.parametrize(
     ("spoil", "words"),
     [
@@ -165,6 +178,24 @@ def test_an_episode_becomes_a_calibrated_scene(episode, tmp_path):
         told = [float(rows[frame][name]) for name in NAMES]
         np.testing.assert_allclose(told, painted.values[k], atol=0.02)
     assert (out / "overlay" / "camera" / f"{masks.frames[0]}.png").is_file()
+    # The camera file had the true place: as it was given the robot is seen where it was found.
+    errors = {frame: one["E_total"] for frame, one in summary["frames"].items()}
+    in_order = sorted(errors, key=lambda frame: -errors[frame])
+    given = sorted((out / "overlay_as_given" / "camera").glob("*.png"))
+    assert [one.stem for one in given] == sorted({in_order[0], in_order[len(in_order) // 2]})
+    picture = cv2.imread(str(given[0]))
+    legend = picture[-38:]
+    found, shown = (
+        cv2.dilate((part == EXCESS_RGB[::-1]).all(axis=2).astype(np.uint8), np.ones((25, 25)))
+        for part in (picture[:-38], legend)
+    )
+    blue = (picture[:-38] == MISSING_RGB[::-1]).all(axis=2)
+    assert shown.any()
+    assert found[blue].mean() > 0.95
+    page = (out / "report.html").read_text()
+    assert "from pictures and a log of joint positions" in page
+    assert f"Offset {1e3 * summary['time_offset_s']:.1f} ms" in page
+    assert "pixels, as given" in page
     again = register_scene(
         out,
         painted.path,

@@ -92,6 +92,8 @@ class TestRegister:
         assert page.count("<tr><td>000") == 5
         assert "contradicts" not in page
         assert "Zeros and lengths" not in page
+        assert "from masks and joint positions" in page
+        assert not (registered[0] / "overlay_as_given").exists()
         for name in ("cameras.yaml", "registration.yaml", "summary.json", "overlay/left/0003.png"):
             assert f'href="{name}"' in page
             assert (registered[0] / name).is_file()

@@ -1,0 +1,75 @@
+"""The page of a registration in pictures: clocks, focal lengths."""
+
+import re
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+
+from drake_pose.jobs.registration.report import make_registration_report
+
+
+class Paths(HTMLParser):
+    """The paths of a page's plots by class."""
+
+    def __init__(self):
+        super().__init__()
+        self.found = {}
+
+    def handle_starttag(self, tag, attrs):
+        given = dict(attrs)
+        if tag == "path":
+            self.found[given["class"]] = given["d"]
+
+
+def summary(**camera):
+    one = {
+        "X_WC": np.eye(4).tolist(), "translation_sd_mm": 1.0, "rotation_sd_deg": 0.1,
+        "families": [{}], "mean_iou": 0.9, "seconds": 1.0, "contradictions": [], "zeros": {},
+        "lengths": {}, "masks": "found", "focal_px": 500.0, "focal_sd_px": None,
+        "time_offset_s": None, "time_offset_sd_s": None, "time_offset_scores": [],
+        "frames": {"0000": {"agrees": True, "E_total": 0.1, "iou": 0.9, "share": 0.8}},
+    }  # fmt: skip
+    return {
+        "scene": "episode", "model": "arm.urdf", "warnings": [], "cameras": {"front": one | camera}
+    }  # fmt: skip
+
+
+def numbers(path):
+    return np.array(re.findall(r"[\d.]+", path), float)
+
+
+@pytest.mark.parametrize("late", [0.1, -0.35])
+def test_the_clock_s_offset_is_drawn_at_the_curve_s_peak(tmp_path, late):
+    offsets = np.linspace(-1.0, 1.0, 81)
+    # Two offsets were not tried.
+    scores = np.column_stack([offsets, 1.0 - 0.3 * np.abs(offsets - late)])[
+        [*range(5), *range(7, 81)]
+    ]
+    told = {"time_offset_s": late, "time_offset_sd_s": 0.02, "focal_sd_px": 5.0}
+    page = make_registration_report(tmp_path, summary(time_offset_scores=scores.tolist(), **told))
+    assert "from pictures and a log of joint positions" in page
+    assert (
+        f"Offset {1e3 * late:.1f} ms ({1e3 * late - 39.2:.1f} to {1e3 * late + 39.2:.1f})" in page
+    )
+    assert f"joints of {abs(1e3 * late):.0f} ms {'later' if late > 0 else 'earlier'}" in page
+    assert "Focal length 500.0 pixels (490.2 to 509.8)" in page
+    paths = Paths()
+    paths.feed(page)
+    curve = numbers(paths.found["curve c0"]).reshape(-1, 2)
+    assert paths.found["curve c0"].count("M") == 2
+    x, _, _ = numbers(paths.found["curve c1"])
+    assert x == pytest.approx(curve[curve[:, 1].argmin(), 0], abs=0.2)
+    left, _, right, *_ = numbers(paths.found["known"])
+    milliseconds = np.ptp(curve[:, 0]) / 2000.0
+    assert (right - left) == pytest.approx(2 * 39.2 * milliseconds, abs=0.2)
+
+
+def test_what_pictures_do_not_tell(tmp_path):
+    page = make_registration_report(tmp_path, summary())
+    assert "Its clock is not told apart" in page
+    assert "Focal length 500.0 pixels, as given" in page
+    assert "<svg" not in page
+    page = make_registration_report(tmp_path, summary(masks="given"))
+    assert "from masks and joint positions" in page
+    assert "Clocks" not in page

@@ -11,6 +11,7 @@ from drake_pose.body.model import ArticulatedModel
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import MaskError
+from drake_pose.jobs.registration.audit import say_off
 from drake_pose.registration.contradictions import Audit, Finding, audit_frames
 from drake_pose.registration.per_frame_fit import FrameFit, PerFrameFit
 from drake_pose.registration.posed_frames import SeenFrame
@@ -162,6 +163,9 @@ class TestAuditFrames:
         (first, *_) = found.common
         assert (first.kind, first.name) == ("focal", "focal lengths")
         assert first.shift == pytest.approx(-0.04, abs=0.006)
+        size = f"{-100.0 * first.shift:.1f} +- {100.0 * first.shift_sd:.1f}"
+        assert say_off(first, "off").startswith("the focal lengths")
+        assert say_off(first, "off").endswith(f"are {size} percent too long")
         aside = [replace(one, center_x=one.center_x + 5.0) for one in cameras]
         found = audit(model, body, poses, poses, cameras, aside)
         assert [one.kind for one in found.common] == ["center"]

@@ -27,6 +27,7 @@ from drake_pose.jobs.registration.episode_audit import EpisodeLook, look_at_epis
 from drake_pose.jobs.registration.episodes import is_episode, read_episode
 from drake_pose.jobs.registration.inputs import Inputs
 from drake_pose.jobs.registration.positions import read_known_positions
+from drake_pose.jobs.registration.report import say_reading
 from drake_pose.jobs.registration.result import describe_pictures, describe_run, write_overlays
 from drake_pose.jobs.registration.settings import AuditSettings
 from drake_pose.registration.contradictions import Audit, Finding, FrameAudit, audit_frames
@@ -310,7 +311,7 @@ def _write_result(
 def _describe_contradictions(found: Audit) -> list[dict[str, Any]]:
     """What contradicts the rest, worst first: joints, cameras and the base, then frames."""
     told = [
-        (one, one.kind, one.name, f"{_off(one, 'off')} in all frames that agree, {_pixels(one)}")
+        (one, one.kind, one.name, f"{say_off(one, 'off')} in all frames that agree, {_pixels(one)}")
         for one in found.common
     ]
     told += [
@@ -356,11 +357,14 @@ def _say_frame(one: FrameAudit, found: Finding) -> str:
         joints = ", ".join(name for name, _ in named[:_NAMED])
         more = f" ({joints} most)" if joints else ""
         return f"is of other positions: joints are off{more}, {_pixels(found)}"
-    return f"{_off(found, 'is off')}, {_pixels(found)}"
+    return f"{say_off(found, 'is off')}, {_pixels(found)}"
 
 
-def _off(one: Finding, verb: str) -> str:
-    """What is off, and what explains it as well; by how much, with standard deviations."""
+def say_off(one: Finding, verb: str) -> str:
+    """What is off, and what explains it as well; by how much, with standard deviations.
+
+    verb: `off` or `is off`, of what is neither too high nor too long.
+    """
     if one.kind == "clock":
         word = "later" if one.shift > 0.0 else "earlier"
         return (
@@ -371,12 +375,23 @@ def _off(one: Finding, verb: str) -> str:
     name = f"the {one.name}" if one.kind in _UNITS else name
     if one.rivals:
         name += f" (or {', '.join(one.rivals)}: the masks cannot tell)"
+    angle, angle_sd = np.degrees([one.angle, one.angle_sd]).tolist()
+    unit, factor = _UNITS.get(one.kind, _LENGTH)
+    shift, shift_sd = factor * one.shift, factor * one.shift_sd
+    if one.kind == "joint":
+        turns = one.angle_sd > 0.0
+        off = say_reading(angle, angle_sd, "deg") if turns else say_reading(shift, shift_sd, unit)
+        return f"{name} {off}"
+    if one.kind == "focal":
+        # As for readings, the shift is what must be added.
+        word, many = "short" if shift > 0.0 else "long", one.name.startswith("focal lengths")
+        verb = "are" if many else "is"
+        return f"{name} {verb} {abs(shift):.1f} +- {shift_sd:.1f} {unit} too {word}"
     parts = []
     if one.angle_sd > 0.0:
-        parts.append(f"{np.degrees(one.angle):.2f} +- {np.degrees(one.angle_sd):.2f} degrees")
+        parts.append(f"{angle:.2f} +- {angle_sd:.2f} degrees")
     if one.shift_sd > 0.0:
-        unit, factor = _UNITS.get(one.kind, _LENGTH)
-        parts.append(f"{factor * one.shift:.1f} +- {factor * one.shift_sd:.1f} {unit}")
+        parts.append(f"{shift:.1f} +- {shift_sd:.1f} {unit}")
     return f"{name}{':' if verb == 'off' else ''} {verb} by {' and '.join(parts)}"
 
 

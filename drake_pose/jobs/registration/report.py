@@ -51,8 +51,22 @@ def parameter_rows(parameters: Mapping[str, Mapping[str, Any]]) -> list[tuple[st
         interval = f"{one[f'low_{unit}']:.3f} to {one[f'high_{unit}']:.3f}"
         word = "as good as 0" if one[f"low_{unit}"] <= 0.0 <= one[f"high_{unit}"] else "doubtful"
         word = "significant" if one["significant"] else f"{word}: held at 0"
+        if one["significant"] and unit != "percent":
+            word += f": {say_reading(one[key], one[f'sd_{unit}'], unit)}"
         rows.append((name, value, interval, word))
     return rows
+
+
+def say_reading(value: float, deviation: float, unit: str) -> str:
+    """That a joint's encoder reads too high or too low.
+
+    Args:
+        value: what must be added to its readings, and deviation: its standard deviation, in
+            unit: `deg` or `mm`.
+    """
+    word, digits = "low" if value > 0.0 else "high", 2 if unit == "deg" else 1
+    size = f"{abs(value):.{digits}f} +- {deviation:.{digits}f}"
+    return f"reads {size} {'degrees' if unit == 'deg' else unit} too {word}"
 
 
 def make_registration_report(folder: Path, summary: Mapping[str, Any]) -> str:

@@ -1,6 +1,7 @@
 """`drake-pose audit`: what contradicts the rest, from masks, cameras and joint positions."""
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -76,6 +77,27 @@ class TestAudit:
         assert named == [("camera", "left"), ("frame", "0002")]
         assert result.summary["contradictions"][0]["shift_mm"] == pytest.approx(20.0, abs=5.0)
         assert result.folder is None
+
+    @pytest.mark.parametrize(("degrees", "word"), [(2.0, "high"), (-2.0, "low")])
+    def test_an_encoder_reads_too_high_or_too_low(
+        self, audited, tmp_path: Path, degrees: float, word: str
+    ) -> None:
+        """What it read is the truth, with which Drake drew the masks, and so many degrees more."""
+        own = audited.copy(tmp_path)
+        header, *rows = own.rows()
+        column = header.index("elbow_turn")
+        for row in rows:
+            row[column] = str(float(row[column]) + np.radians(degrees))
+        own.write_rows([header, *rows])
+        (found, *_) = audit_scene(own.folder, own.model, own.joints).summary["contradictions"]
+        text = (
+            r"joint 'elbow_turn' reads (\d\.\d\d) \+- 0\.\d\d degrees too (high|low) in all frames"
+        )
+        told = re.match(text, found["text"])
+        assert told
+        assert (float(told[1]), told[2]) == (pytest.approx(2.0, abs=0.3), word)
+        # To be added to the readings.
+        assert found["angle_deg"] == pytest.approx(-degrees, abs=0.3)
 
     def test_cameras_that_are_exchanged_are_named(self, audited, tmp_path: Path) -> None:
         left, right = audited.cameras.values()

@@ -256,6 +256,10 @@ def test_zeros_and_lengths_are_found_and_written_to_a_urdf(
     row = f"<td>shoulder</td><td>{value:.3f} %</td><td>{low:.3f} to {high:.3f}</td>"
     assert f"{row}<td>significant</td>" in page
     assert "<td>elbow_turn</td><td>3." in page or "<td>elbow_turn</td><td>2.9" in page
+    # What it read is the truth and three degrees less.
+    zero = zeros["elbow_turn"]
+    size = f"{zero['value_deg']:.2f} +- {zero['sd_deg']:.2f}"
+    assert f"<td>significant: reads {size} degrees too low</td>" in page
     assert "as good as 0" in page
     # The shorter robot at the truth, its joints shifted by the lengths that were found.
     right, corrected = load_model(short), load_model(out / "short_calibrated.urdf")

@@ -51,8 +51,9 @@ def register(
     nobody knows.
 
     Files in DIR: cameras.yaml, which estimate reads; report.html, which shows all of it;
-    registration.yaml (6 x 6 covariance, other poses); summary.json; overlay/; of an episode masks/
-    and joint_angles.csv, a scene of the frames that were looked at.
+    registration.yaml (6 x 6 covariance, other poses); summary.json; overlay/, overlay_as_given/; of
+    an episode masks/ and joint_angles.csv, a scene of the frames that were looked at; with --export
+    ros/, mujoco.xml, drake.yaml, rerun.rrd.
 
     A robot arm whose camera nobody measured, and an episode of DROID:
 

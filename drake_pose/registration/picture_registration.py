@@ -43,9 +43,12 @@ _MOVING = 8
 # The slower share of all frames carries the search, if clocks may differ.
 _SLOW = 0.6
 # So many poses are fitted. A pose explains pictures in which so much of the contours fits, and
-# edges along them are so much stronger than by chance. Right ones have .5 and more, .19 and more;
-# the best wrong ones .3 and .13.
+# edges along them are so much stronger than by chance. Right ones have .5 and more, .17 and more;
+# the best wrong ones .3 and .13, one with a free focal length .6 and .17.
 _LOOKS, _LEAST_RATIO, _LEAST_CONTOUR = 3, 0.42, 0.16
+# What is explained and so many times the contours together: right ones have 1.2 and more, the best
+# wrong ones .9.
+_CONTOURS, _LEAST_EVIDENCE = 4.0, 1.05
 # Poses are as good that explain less by no more deviations.
 _SIGNIFICANCE = 1.96
 # Offsets of clocks that are tried [s]; what was fitted is fitted again where an offset moved more
@@ -151,7 +154,7 @@ def register_pictures(
     begin = posed_pictures(recording, chosen, 0.0)
     search = PictureSearch(body, camera, begin)
     looks = [search.approach(camera.with_pose(np.linalg.inv(X))) for X in search.search()[:_LOOKS]]
-    near = sorted((one for one in looks if one is not None), key=lambda one: -one[1])
+    near = sorted((one for one in looks if one is not None), key=lambda one: -_evidence(*one[1]))
     if not near:
         raise _unexplained(camera, "no pose shows the body in two pictures")
     level, start = search.compared, near[0][0]
@@ -202,18 +205,22 @@ def _fit(
     """What a search has begun, fitted until clock and zeros move no more."""
     camera, offset, names = begun.camera, begun.offset, body.kinematics.names
     constants = ((TIME_OFFSET,) if recording.timed else ()) + tuple(zeros)
-    turned = np.zeros(len(names))
-    for _ in range(_MOST_FITS if zeros else 2):
-        frames = posed_pictures(recording.with_zeros(turned), begun.rows, offset)
+    turned, left = np.zeros(len(names)), _MOST_FITS if zeros else 2
+    while True:
+        frames, left = posed_pictures(recording.with_zeros(turned), begun.rows, offset), left - 1
         best = PictureSearch(body, camera, frames).fit(camera, constants, focal)
         if best is None:
             raise _unexplained(camera, "the body leaves the pictures")
         camera, by = best.camera, _constant(best, TIME_OFFSET)
         assumed, turn = turned, np.array([_constant(best, name) for name in names])
         offset, turned = offset + by, turned + turn
-        if abs(by) < _AGAIN and np.abs(turn).max() < _TURNED:
-            break
-    return _describe(best, recording, begun, offset, assumed, focal)
+        if not left or (abs(by) < _AGAIN and np.abs(turn).max() < _TURNED):
+            return _describe(best, recording, begun, offset, assumed, focal)
+
+
+def _evidence(explained: float, contour: float) -> float:
+    """How much speaks for a pose, of the share that it explains and its contours' edges."""
+    return explained + _CONTOURS * contour
 
 
 def _choose(
@@ -310,20 +317,22 @@ def _describe(
     ratios = fit.inlier_ratios(best.found)
     agree = fit.agreeing(ratios)
     ratio = float(ratios[agree].mean())
-    if ratio < _LEAST_RATIO or best.contour < _LEAST_CONTOUR or best.explained <= 0.0:
+    told = _evidence(best.explained, best.contour)
+    if ratio < _LEAST_RATIO or best.contour < _LEAST_CONTOUR or told < _LEAST_EVIDENCE:
         raise _unexplained(
             begun.camera,
             f"at best {max(best.explained, 0.0):.0%} of what changes is explained, {ratio:.0%} of "
             f"the contours fit ({_LEAST_RATIO:.0%} at least), and edges along them are stronger "
-            f"than elsewhere by {best.contour:.2f} ({_LEAST_CONTOUR} at least)",
+            f"than elsewhere by {best.contour:.2f} ({_LEAST_CONTOUR} at least); the first, and "
+            f"{_CONTOURS:g} times the last, are {told:.2f} together ({_LEAST_EVIDENCE} at least)",
         )
     own, doubted = fit.covariances(best.found, agree)
     covariance = own + doubted
     deviations = np.sqrt(np.diag(covariance))
-    told = None
+    clock = None
     if TIME_OFFSET in fit.names:
         deviation = float(deviations[fit.names.index(TIME_OFFSET)])
-        told = TimeOffset(offset, deviation if deviation < _UNTOLD else np.inf, begun.scores)
+        clock = TimeOffset(offset, deviation if deviation < _UNTOLD else np.inf, begun.scores)
     found = areas(seen, best.camera.X_CW[None], np.inf)[0]
     misfits = (E_total(found), intersection_over_union(found), ratios, agree)
     rows = zip(seen.frames, *(one.tolist() for one in misfits), strict=True)
@@ -337,7 +346,7 @@ def _describe(
         tuple(replace(frame, values=frame.values - zeros) for frame in seen.frames),
         {one.name: recording.picture(one.name) for one in seen.frames},
         best,
-        told,
+        clock,
         float(deviations[fit.per_camera - 1]) if focal else 0.0,
         zeros,
     )

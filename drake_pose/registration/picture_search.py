@@ -34,8 +34,6 @@ Picture = NDArray[np.uint8]
 SEARCHED = 12
 """So many pictures carry a search."""
 
-# The first ones of them are its beginning.
-_BEGINNING = 6
 _ROUNDS = (
     SearchRound(48, 350, 24, 0.25, 8.0),
     SearchRound(48, 120, 30, 0.15, 8.0),
@@ -160,8 +158,8 @@ class PictureSearch:
             found = level.distinct([X for _, X in improved], most)
         return found
 
-    def approach(self, camera: PinholeCamera) -> tuple[PinholeCamera, float] | None:
-        """A camera fitted roughly from where it stands, and the share that it explains.
+    def approach(self, camera: PinholeCamera) -> tuple[PinholeCamera, tuple[float, float]] | None:
+        """A camera fitted roughly from where it stands, and what it explains in `compared`.
 
         None where the body leaves the pictures.
         """
@@ -172,7 +170,7 @@ class PictureSearch:
                 return None
             fit = SharedFit([seen], [camera.X_CW], widths=False)
             camera = fit.cameras(fit.fit(_stages(scales, seen)))[0]
-        return camera, self.compared.explained(camera.X_CW)[0]
+        return camera, self.compared.explained(camera.X_CW)
 
     def fit(
         self, camera: PinholeCamera, constants: Sequence[str] = (), focal: bool = False
@@ -242,7 +240,7 @@ class PictureSearch:
     def _level(self, width: int) -> PictureLevel:
         if width not in self._levels:
             k = sum(width > one for one in _WIDTHS)
-            count = (_BEGINNING, SEARCHED)[min(k, 1)] if width < _COMPARED else len(self.frames)
+            count = SEARCHED if width < _COMPARED else len(self.frames)
             pictures = [one.picture for one in self.frames[:count]]
             self._levels[width] = PictureLevel(
                 self._outlines[k], self._camera, pictures, self._X_WN[:count], width

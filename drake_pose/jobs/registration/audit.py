@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -24,11 +24,16 @@ from drake_pose.files.settings import EstimateSettings
 from drake_pose.files.summary import mask_digests
 from drake_pose.jobs.estimate.searches import make_tree
 from drake_pose.jobs.registration.episode_audit import EpisodeLook, look_at_episode
-from drake_pose.jobs.registration.episodes import is_episode, read_episode
+from drake_pose.jobs.registration.episodes import EpisodeInputs, is_episode, read_episode
 from drake_pose.jobs.registration.inputs import Inputs
 from drake_pose.jobs.registration.positions import read_known_positions
 from drake_pose.jobs.registration.report import say_reading
-from drake_pose.jobs.registration.result import describe_pictures, describe_run, write_overlays
+from drake_pose.jobs.registration.result import (
+    describe_pictures,
+    describe_run,
+    write_comparisons,
+    write_overlays,
+)
 from drake_pose.jobs.registration.settings import AuditSettings
 from drake_pose.registration.contradictions import Audit, Finding, FrameAudit, audit_frames
 from drake_pose.registration.per_frame_fit import PerFrameFit
@@ -94,59 +99,85 @@ def audit_scene(
         DrakePoseError: names the file, camera, frame or joint at fault.
     """
     settings, folder = settings or AuditSettings(), None if out is None else Path(out)
+    file = Path(cameras or Path(scene) / CAMERA_FILE)
     files = {
         "model": Path(model),
-        "cameras": Path(cameras or Path(scene) / CAMERA_FILE),
+        "cameras": file,
         "joints": None if joints is None else Path(joints),
     }
-    begin, look = time.perf_counter(), None
+    begin = time.perf_counter()
     if is_episode(Path(scene), settings):
         own = None if cameras is None else Path(cameras)
         episode = read_episode(Path(scene), Path(model), files["joints"], own, settings)
-        look = look_at_episode(episode)
-        # Masks lean on what is named here, so they are found anew without it.
-        inputs, frames = look.inputs, tuple(look.names)
-        first, _, _ = _audit(inputs, frames, None)
-        zeros = [one.name for one in first.common if one.kind == "joint"]
-        if zeros:
-            look = look_at_episode(episode, look, zeros)
-            inputs, frames = look.inputs, tuple(look.names)
+        look = _look(episode, on_frame)
     else:
-        inputs, frames = _read_inputs(Path(scene), files, cameras is not None, settings)
-    warnings = list(inputs.warnings)
-    found, unseen, misplaced = _audit(inputs, frames, on_frame)
-    if look is not None:
-        found = replace(found, common=(*look.findings, *found.common))
+        inputs, frames = _read_inputs(Path(scene), model, joints, cameras, settings)
+        look = _Look(inputs, *_audit(inputs, frames, on_frame))
+    inputs, found = look.inputs, look.found
     seconds = time.perf_counter() - begin
-    warnings += [*misplaced, *_doubts(inputs, found, unseen, files["cameras"])]
-    names = [camera.name for camera in inputs.held]
+    warnings = [*inputs.warnings, *look.misplaced]
+    warnings += _doubts(inputs, found, look.unseen, file)
     summary = {
         "contradictions": _describe_contradictions(found),
         "frame_count": len(found.frames),
         "agreeing_count": len(found.frames) - len(found.contradicting),
-        "frames": {
-            one.frame: {
-                "agrees": one.finding is None,
-                "fits": dict(one.given),
-                "fits_when_freed": dict(one.fitted),
-                "pixels": one.pixels,
-                "masks": mask_digests(inputs.scene, names, one.frame),
-            }
-            for one in found.frames
-        },
-        "cameras": {} if look is None else _describe_looks(look),
+        "frames": _describe_frames(inputs, found),
+        "cameras": {} if look.episode is None else _describe_cameras(look.episode),
         "noticed_from": _noticed_from(found, inputs.model),
         "principal_point_px": found.center and found.center._asdict(),
         "error_sizes_px": {name: float(getattr(found.sizes, name)) for name in _SIZES},
         **describe_run(Path(scene), files, settings, warnings, seconds),
-        "unseen": unseen,
+        "unseen": look.unseen,
     }
     if folder is not None:
-        _write_result(folder, inputs, found if overlay else None, summary)
+        _write_result(folder, look, overlay, summary)
     return SceneAudit(found, summary, tuple(warnings), folder)
 
 
-def _describe_looks(look: EpisodeLook) -> dict[str, Any]:
+class _Look(NamedTuple):
+    """What was audited, and found: frames of which no mask shows anything, cameras' mistakes.
+
+    episode: of which it is; None: of a scene of masks.
+    """
+
+    inputs: Inputs
+    found: Audit
+    unseen: list[str]
+    misplaced: list[str]
+    episode: EpisodeLook | None = None
+
+
+def _look(episode: EpisodeInputs, on_frame: OnFrame | None) -> _Look:
+    """An audit of an episode."""
+    seen = look_at_episode(episode)
+    inputs, frames = seen.inputs, tuple(seen.names)
+    found, unseen, misplaced = _audit(inputs, frames, on_frame)
+    zeros = [one.name for one in found.common if one.kind == "joint"]
+    if zeros:
+        # Masks were found with these as they are, and lean on them.
+        seen = look_at_episode(episode, seen, zeros)
+        inputs, frames = seen.inputs, tuple(seen.names)
+        found, unseen, misplaced = _audit(inputs, frames, None)
+    found = replace(found, common=(*seen.findings, *found.common))
+    return _Look(inputs, found, unseen, misplaced, seen)
+
+
+def _describe_frames(inputs: Inputs, found: Audit) -> dict[str, Any]:
+    """How well frames fit, and of which masks that is told."""
+    names = [camera.name for camera in inputs.held]
+    return {
+        one.frame: {
+            "agrees": one.finding is None,
+            "fits": dict(one.given),
+            "fits_when_freed": dict(one.fitted),
+            "pixels": one.pixels,
+            "masks": mask_digests(inputs.scene, names, one.frame),
+        }
+        for one in found.frames
+    }
+
+
+def _describe_cameras(look: EpisodeLook) -> dict[str, Any]:
     """Where cameras were found in pictures, how sure that is, and their clocks."""
     return {
         name: describe_pictures(one)
@@ -170,13 +201,13 @@ def _noticed_from(found: Audit, model: ArticulatedModel) -> dict[str, float | No
 
 
 def _read_inputs(
-    scene_path: Path, files: Mapping[str, Path | None], own: bool, settings: AuditSettings
-) -> tuple[Inputs, tuple[str, ...]]:
-    """What is audited, and its frames, checked; own: whether it has a camera file of its own."""
-    joints = files["joints"]
+    scene_path: Path, model_path: Path | str, joints: Path | str | None,
+    cameras: Path | str | None, settings: AuditSettings,
+) -> tuple[Inputs, tuple[str, ...]]:  # fmt: skip
+    """What is audited, and its frames, checked; arguments as of audit_scene."""
     if joints is None:
         raise SettingsError(f"{scene_path}: an audit of masks needs joint positions: --joints FILE")
-    given = load_cameras(files["cameras"]) if own else None
+    given = None if cameras is None else load_cameras(cameras)
     scene, frames = read_scene(
         scene_path, settings.cameras, settings.frames, given, every=settings.every
     )
@@ -186,9 +217,9 @@ def _read_inputs(
             "drake-pose register finds that"
         )
     chosen = tuple(scene.cameras.values())
-    model = load_model(files["model"], package_paths=settings.packages)
+    model = load_model(model_path, package_paths=settings.packages)
     tree = make_tree(model, EstimateSettings(hold=settings.hold))
-    positions = read_known_positions(joints, TreeKinematics(tree))
+    positions = read_known_positions(Path(joints), TreeKinematics(tree))
     warnings = [*scene.warnings, *model.warnings, *positions.warnings]
     if positions.are_one_pose(positions.of(frame, chosen[0].name) for frame in frames):
         warnings.append(
@@ -292,11 +323,11 @@ def _doubts(inputs: Inputs, found: Audit, unseen: Sequence[str], cameras: Path) 
     return warnings
 
 
-def _write_result(
-    path: Path, inputs: Inputs, found: Audit | None, summary: Mapping[str, Any]
-) -> None:
-    """The summary, and the robot at its encoders' positions over the masks of frames at fault."""
-    named = () if found is None else found.contradicting
+def _write_result(path: Path, look: _Look, overlay: bool, summary: Mapping[str, Any]) -> None:
+    """The summary, and the robot at its encoders' positions over what is at fault."""
+    inputs, episode = look.inputs, look.episode
+    named = look.found.contradicting if overlay else ()
+    pictures = {} if episode is None else {frame: episode.picture(frame) for frame in named}
     for camera in inputs.held if named else ():
         name, titled = camera.name, []
         for one in map(inputs.read, named):
@@ -304,7 +335,11 @@ def _write_result(
                 fits = percent(summary["frames"][one.name]["fits"][name])
                 title = f"{name}  frame {one.name}  CONTRADICTS the others  {fits} fits"
                 titled.append((PosedFrame(one.name, one.values, one.masks[name]), title))
-        write_overlays(path, inputs.tree, camera, titled, inputs.seen)
+        write_overlays(path, inputs.tree, camera, titled, inputs.seen, pictures)
+    if episode is not None and overlay:
+        for given in episode.given:
+            own = episode.pictures[given.name]
+            write_comparisons(path, inputs, own.frames, given, own.found, own.pictures)
     write_summary(path, summary)
 
 

@@ -39,6 +39,7 @@ from drake_pose.silhouette.pictures.scene_checks import frame_ranges
 from drake_pose.silhouette.pictures.scenes import Scene
 
 Array = NDArray[np.float64]
+Picture = NDArray[np.uint8]
 
 # A camera is compared as it is given that shows the body nearer than this to where it is seen [root
 # of the silhouettes' area].
@@ -55,13 +56,22 @@ class EpisodeLook:
         inputs: the frames with masks that were found; cameras near those that are given.
         findings: cameras that are far from where their pictures show them, and clocks.
         pictures: by camera what was found in them.
+        recordings: of these cameras.
         names: by frame of the inputs, its camera and its name there.
+        given: cameras that are far from where they were found, as they are given.
     """
 
     inputs: Inputs
     findings: tuple[Finding, ...]
     pictures: Mapping[str, PictureRegistration]
+    recordings: Mapping[str, Recording]
     names: Mapping[str, tuple[str, str]]
+    given: tuple[PinholeCamera, ...]
+
+    def picture(self, frame: str) -> Picture:
+        """The picture (H, W, 3) of a frame of the inputs."""
+        camera, name = self.names[frame]
+        return self.recordings[camera].picture(name)
 
 
 def look_at_episode(
@@ -119,7 +129,8 @@ def look_at_episode(
         KnownPositions(episode.path, body.kinematics, {}), tuple(held),
         (*episode.warnings, *warnings), tuple(frames), seen=episode.seen,
     )  # fmt: skip
-    return EpisodeLook(inputs, tuple(findings), pictures, names)
+    far = tuple(episode.cameras[one.name] for one in findings if one.kind == "camera")
+    return EpisodeLook(inputs, tuple(findings), pictures, episode.recordings, names, far)
 
 
 def compare_camera(

@@ -216,7 +216,7 @@ def write_result(
         ]
         write_overlays(path, inputs.tree, found.camera, titled, inputs.seen, own)
         for given in (one for one in inputs.given if one.name == name):
-            _write_comparisons(path, inputs, given, found, own)
+            write_comparisons(path, inputs, inputs.of(name), given, found, own)
     for name in pictures or ():
         _write_frames(path, inputs, name, several=len(pictures or ()) > 1)
     if urdf is not None:
@@ -277,15 +277,16 @@ def write_overlays(
         write_file(folder, f"{OVERLAY}/{camera.name}/{frame.name}.png", encode_png(picture))
 
 
-def _write_comparisons(
+def write_comparisons(
     folder: Path,
     inputs: Inputs,
+    frames: Sequence[PosedFrame],
     given: Camera,
     found: RegisteredCamera,
     pictures: Mapping[str, NDArray[np.uint8]],
 ) -> None:
     """Draws the robot as a camera that was given would see it, and as the one that was found."""
-    draw, frames = _drawer(inputs.tree, inputs.seen), inputs.of(given.name)
+    draw = _drawer(inputs.tree, inputs.seen)
     errors = {one.frame: one.E_total for one in found.frames}
     for frame in (one for one in frames if one.name in compared_frames(errors)):
         shown: NDArray[Any] = pictures.get(frame.name, frame.mask)

@@ -12,6 +12,7 @@ from drake_pose.camera.camera_files import load_cameras, save_cameras
 from drake_pose.commands.main import app
 from drake_pose.errors import DrakePoseError
 from drake_pose.files.overlay import EXCESS_RGB, MISSING_RGB
+from drake_pose.jobs.registration.audit import audit_scene
 from drake_pose.jobs.registration.episodes import is_episode, read_episode
 from drake_pose.jobs.registration.register import register_scene
 from drake_pose.jobs.registration.settings import RegistrationSettings
@@ -209,3 +210,45 @@ def test_an_episode_becomes_a_calibrated_scene(episode, tmp_path):
 def test_a_folder_of_neither_masks_nor_pictures_is_refused(tmp_path, episode):
     with pytest.raises(DrakePoseError, match=r"cameras\.yaml"):
         register_scene(tmp_path, episode[1].path, tmp_path / "joints.csv")
+
+
+def audited(episode, tmp_path, *arguments):
+    scene, painted = episode
+    out = tmp_path / "audit"
+    command = ["audit", str(scene), "--model", str(painted.path), "--out", str(out), "--json"]
+    result = CliRunner().invoke(app, [*command, *map(str, arguments)])
+    assert result.exit_code == 0, result.output
+    return json.loads((out / "summary.json").read_text()), out
+
+
+@pytest.mark.slow
+def test_an_audit_of_an_episode_names_its_clock_and_a_camera_that_stands_elsewhere(
+    episode, tmp_path
+):
+    _scene, painted = episode
+    summary, out = audited(episode, tmp_path)
+    clock = next(one for one in summary["contradictions"] if one["cause"] == "clock")
+    assert clock["shift_ms"] == pytest.approx(1e3 * LATE, abs=5.0)
+    assert f"{1e3 * LATE:.0f}"[0] in clock["text"]
+    assert {one["cause"] for one in summary["contradictions"]} == {"clock"}
+    assert summary["agreeing_count"] == summary["frame_count"] == len(painted.times)
+    moved = painted.camera.X_WC.copy()
+    moved[:3, 3] += [0.15, -0.1, 0.05]
+    save_cameras(tmp_path / "moved.yaml", [painted.camera.with_pose(moved)])
+    (tmp_path / "again").mkdir()
+    summary, out = audited(episode, tmp_path / "again", "--cameras", tmp_path / "moved.yaml")
+    camera = next(one for one in summary["contradictions"] if one["cause"] == "camera")
+    assert camera["shift_mm"] == pytest.approx(1e3 * np.linalg.norm([0.15, 0.1, 0.05]), abs=15.0)
+    assert camera["rivals"] == ["base"]
+    assert any((out / "overlay_as_given" / "camera").glob("*.png"))
+
+
+def test_an_episode_whose_camera_nobody_places_cannot_be_audited(episode, tmp_path):
+    scene, painted = episode
+    text = yaml.safe_load((scene / "cameras.yaml").read_text())
+    del text["camera"]["X_WC"]
+    (tmp_path / "cameras.yaml").write_text(yaml.safe_dump(text))
+    with pytest.raises(DrakePoseError, match="no camera has an X_WC that could be audited"):
+        audit_scene(scene, painted.path, cameras=tmp_path / "cameras.yaml")
+    with pytest.raises(DrakePoseError, match="needs joint positions"):
+        audit_scene(tmp_path, painted.path)

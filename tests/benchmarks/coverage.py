@@ -1,0 +1,327 @@
+"""Benchmark of intervals: how many truths lie in what a user reads, and how wide that is.
+
+Run as ``python -m tests.benchmarks.coverage [DATA] [--draws N] [--only TEXT]``; DATA is a folder
+with ``franka_one_view/panda`` (sequences of this arm are drawn by Drake), ``arm_two_views`` and
+``hand_sequences``; sets whose files are not there are left out. Read are ``joints.csv`` and the
+warnings of ``summary.json``. A frame is wrong, and not said, where a joint lies outside its
+interval and is off by more than 10 degrees, or 5 cm.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import json
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_pose.body.formats.packages import bundled_model
+from drake_pose.body.model import ArticulatedModel, load_model
+from drake_pose.camera.camera_files import save_cameras
+from drake_pose.camera.models import PinholeCamera, circle_of_cameras
+from drake_pose.csv_files import csv_text
+from drake_pose.files.settings import EstimateSettings
+from drake_pose.jobs.estimate.scene import estimate_scene
+from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
+from drake_pose.silhouette.pictures.masks import write_mask
+from tests.benchmarks.tables import print_table
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+Damage = Callable[[Mask, np.random.Generator], Mask]
+
+_FRAMES, _RATE_HZ, _FASTEST = 24, 30.0, 2.0
+_WRONG_DEGREES, _WRONG_METRES = 10.0, 0.05
+_PANDA, _LBR = "franka_one_view/panda/panda.urdf", "arm_two_views"
+_ARM_JOINTS, _HAND_JOINTS = ("panda_joint", "A"), ("index_", "middle_", "ring_", "little_")
+# Cameras are turned by so much that pictures shift by so many pixels [pixel].
+_CAMERAS_OFF = 1.4
+
+
+class CoverageSet(NamedTuple):
+    """Scenes of one kind: where they are, by what they are estimated, and which joints count.
+
+    Args:
+        make: draws the n-th scene into a folder, or names one that is there.
+        joints: how the names of joints begin that count.
+        draws: so many scenes at most.
+        in_degrees: whether the true angles are.
+    """
+
+    name: str
+    model: Path
+    make: Callable[[Path, int], Path]
+    joints: tuple[str, ...]
+    settings: EstimateSettings = EstimateSettings()
+    draws: int | None = None
+    in_degrees: bool = False
+
+
+class Told(NamedTuple):
+    """Of all joints and frames: inside, determined, width [deg or m]; frames wrong and not said."""
+
+    inside: Array
+    determined: Array
+    width: Array
+    angles: NDArray[np.bool_]
+    wrong: int
+
+
+def coverage_sets(data: Path | None) -> Iterator[CoverageSet]:
+    """The sets whose files are there."""
+    person = bundled_model("person")
+    for name, damage in _damages():
+        yield CoverageSet(
+            f"person, sequence, four views, {name}", person, _draw_person(damage), ("",), draws=1
+        )
+    if data is None:
+        return
+    if (data / _PANDA).is_file():
+        panda = data / _PANDA
+        for name, damage in _damages():
+            make = _draw_arm(panda, damage)
+            yield CoverageSet(f"arm, sequence, {name}", panda, make, _ARM_JOINTS[:1])
+        make = _draw_arm(panda, cameras_off=_CAMERAS_OFF)
+        yield CoverageSet(f"arm, sequence, cameras {_CAMERAS_OFF} px off", panda, make, ("panda_",))
+        make = _draw_arm(panda, colours=True)
+        yield CoverageSet("arm, sequence by colour", panda, make, _ARM_JOINTS[:1])
+        stills = EstimateSettings(track=False, frames=("0000:0005",))
+        make = _draw_arm(panda, _ragged)
+        yield CoverageSet("arm, stills, edges 1.5 px off", panda, make, ("panda_",), stills)
+    if (data / _LBR).is_dir():
+        arm = data / _LBR
+        model = arm / "med7" / "med7.urdf"
+        yield CoverageSet("real arm, stills", model, lambda _, k: arm, _ARM_JOINTS[1:], draws=1)
+    for scene in sorted(data.glob("hand_sequences/*/scene.yaml")):
+        model = bundled_model("hand").with_name("right_hand.urdf")
+        make = _there(scene.parent)
+        yield CoverageSet(
+            f"hand, {scene.parent.name}", model, make, _HAND_JOINTS, draws=1, in_degrees=True
+        )
+
+
+def _there(scene: Path) -> Callable[[Path, int], Path]:
+    return lambda _, k: scene
+
+
+def _damages() -> Iterator[tuple[str, Damage]]:
+    yield "exact masks", lambda mask, rng: mask
+    yield "edges 1.5 px off", _ragged
+    yield "masks a pixel too wide", lambda mask, rng: _grown(mask)
+    yield "holes", _with_holes
+
+
+def _ragged(mask: Mask, rng: np.random.Generator) -> Mask:
+    """A mask whose edge wanders by one and a half pixels, eight pixels of it alike."""
+    noise = cv2.GaussianBlur(rng.normal(size=mask.shape), (0, 0), 8.0)
+    inside = cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, 5)
+    outside = cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, 5)
+    return inside - outside + 1.5 * noise / noise.std() > 0.0
+
+
+def _grown(mask: Mask) -> Mask:
+    return cv2.dilate(mask.astype(np.uint8), np.ones((3, 3), np.uint8)).astype(np.bool_)
+
+
+def _with_holes(mask: Mask, rng: np.random.Generator) -> Mask:
+    """A mask without 3 % of its area, in round holes."""
+    drawn = mask.astype(np.uint8)
+    rows, columns = np.nonzero(drawn)
+    while np.count_nonzero(drawn) > 0.97 * len(rows):
+        k = int(rng.integers(len(rows)))
+        cv2.circle(drawn, (int(columns[k]), int(rows[k])), int(rng.integers(3, 9)), 0, -1)
+    return drawn.astype(np.bool_)
+
+
+def swinging(
+    lower: Array, upper: Array, frames: int, rng: np.random.Generator, fastest: float = _FASTEST
+) -> Array:
+    """(frames, n) positions that swing inside limits, in full motion from the first frame on.
+
+    fastest: of any joint [rad or m a second].
+    """
+    middle, reach = 0.5 * (lower + upper), 0.4 * (upper - lower)
+    amplitude = reach * rng.uniform(0.3, 1.0, len(lower))
+    rate = fastest * rng.uniform(0.3, 1.0, len(lower)) / amplitude
+    phase = rng.uniform(-0.5, 0.5, len(lower))
+    t = np.arange(frames)[:, None] / _RATE_HZ
+    centre = middle + (reach - amplitude) * rng.uniform(-1.0, 1.0, len(lower))
+    return np.asarray(centre + amplitude * np.sin(phase + rate * t))
+
+
+def _draw_arm(
+    path: Path, damage: Damage | None = None, cameras_off: float = 0.0, colours: bool = False
+) -> Callable[[Path, int], Path]:
+    """Draws an arm that swings before two cameras 75 degrees apart."""
+
+    def make(folder: Path, draw: int) -> Path:
+        rng = np.random.default_rng([5, draw])
+        model = load_model(path, check=False)
+        around = circle_of_cameras(
+            5, radius=1.7, height=0.8, target=(0.0, 0.0, 0.4), face_camera=False
+        )
+        cameras = dict(list(around.items())[:2])
+        moving = np.array([name.startswith("panda_joint") for name in model.position_names])
+        moving &= model.upper - model.lower > 0.1
+        q = np.tile(model.default_positions, (_FRAMES, 1))
+        limits = model.lower[moving], model.upper[moving]
+        q[:, moving] = swinging(*limits, _FRAMES, rng)
+        return _draw(folder, model, cameras, q, rng, damage, cameras_off, colours)
+
+    return make
+
+
+def _draw_person(damage: Damage) -> Callable[[Path, int], Path]:
+    """Draws a person who turns, and swings arms and legs, before four cameras."""
+
+    def make(folder: Path, draw: int) -> Path:
+        rng = np.random.default_rng([6, draw])
+        model = load_model(bundled_model("person"), check=False)
+        cameras = circle_of_cameras(4, size=(480, 360), face_camera=False)
+        names = model.position_names
+        lower, upper = np.maximum(model.lower, -0.5), np.minimum(model.upper, 0.5)
+        placed = np.array([name.startswith("position_") for name in names])
+        swung = ~placed & (lower < upper)
+        q = np.tile(model.default_positions, (_FRAMES, 1))
+        q[:, swung] = swinging(lower[swung], upper[swung], _FRAMES, rng, 1.5)
+        q[:, model.position_index("position_z")] = 1.55
+        return _draw(folder, model, cameras, q, rng, damage)
+
+    return make
+
+
+def _draw(
+    folder: Path,
+    model: ArticulatedModel,
+    cameras: dict[str, PinholeCamera],
+    q: Array,
+    rng: np.random.Generator,
+    damage: Damage | None = None,
+    cameras_off: float = 0.0,
+    colours: bool = False,
+) -> Path:
+    """A scene of masks by Drake's renderer, of pictures where asked, and joint_angles.csv."""
+    folder.mkdir(parents=True)
+    told = {name: _turned(camera, cameras_off, rng) for name, camera in cameras.items()}
+    save_cameras(folder / "cameras.yaml", told)
+    (folder / "scene.yaml").write_text(f"sequence: true\nframe_rate_hz: {_RATE_HZ:.0f}\n")
+    rows = [["frame", *model.position_names], *([k, *row] for k, row in enumerate(q))]
+    (folder / "joint_angles.csv").write_text(csv_text(rows))
+    for name, camera in cameras.items():
+        renderer = LabelRenderer(model, camera)
+        room = cv2.resize(
+            rng.integers(0, 255, (24, 32, 3), np.uint8), (camera.width, camera.height)
+        )
+        paint = rng.integers(0, 255, (len(renderer.link_names) + 1, 3))
+        for kind in ("masks", *(["images"] if colours else [])):
+            (folder / kind / name).mkdir(parents=True)
+        for k, positions in enumerate(q):
+            segments = renderer.segments(positions)
+            mask = segments >= 0
+            if not colours or k == 0:
+                seen = mask if damage is None else damage(mask, rng)
+                write_mask(folder / "masks" / name / f"{k:04d}.png", seen)
+            if colours:
+                picture = np.where(mask[..., None], paint[segments], room)
+                picture = picture + rng.normal(0.0, 5.0, picture.shape)
+                file = folder / "images" / name / f"{k:04d}.png"
+                cv2.imwrite(str(file), np.clip(picture, 0, 255).astype(np.uint8))
+    return folder
+
+
+def _turned(camera: PinholeCamera, pixels: float, rng: np.random.Generator) -> PinholeCamera:
+    """A camera whose place is told wrongly, so that its picture is off by some pixels."""
+    if pixels == 0.0:
+        return camera
+    by = rng.normal(size=3) * pixels / camera.focal_x
+    X_WC = camera.X_WC.copy()
+    X_WC[:3, :3] = X_WC[:3, :3] @ cv2.Rodrigues(by)[0]
+    return replace(camera, X_WC=X_WC)
+
+
+def read_told(out: Path, scene: Path, joints: Sequence[str], in_degrees: bool) -> Told:
+    """What a result's files say, beside the truth of its scene."""
+    unit = 1.0 if in_degrees else np.degrees(1.0)
+    truth = {int(row["frame"]): row for row in _rows(scene / "joint_angles.csv")}
+    frames = json.loads((out / "summary.json").read_text())["frames"]
+    lost = {name for name, one in frames.items() if not one["found"]}
+    inside, determined, width, angles, wrong = [], [], [], [], set()
+    for row in _rows(out / "joints.csv"):
+        true = truth[int(row["frame"])].get(row["joint"])
+        if true is None or not row["joint"].startswith(tuple(joints)) or row["frame"] in lost:
+            continue
+        is_angle = "position_" not in row["joint"] and "finger" not in row["joint"][:12]
+        value = unit * float(true) if is_angle else float(true)
+        low, high = float(row["low"]), float(row["high"])
+        inside.append(low <= value <= high)
+        determined.append(row["determined"] == "yes")
+        width.append(high - low)
+        angles.append(is_angle)
+        off = max(low - value, value - high)
+        if off > (_WRONG_DEGREES if is_angle else _WRONG_METRES):
+            wrong.add(row["frame"])
+    told = (np.array(one) for one in (inside, determined, width, angles))
+    return Told(*told, len(wrong))
+
+
+def _rows(path: Path) -> Iterator[dict[str, str]]:
+    with path.open(newline="", encoding="utf-8") as file:
+        yield from csv.DictReader(file)
+
+
+def measure(one: CoverageSet, draws: int, folder: Path) -> list[Told]:
+    """What the files say of each scene of a set."""
+    told = []
+    for draw in range(one.draws or draws):
+        place = folder / f"{one.name} {draw}".replace("/", " ")
+        scene, out = one.make(place / "scene", draw), place / "out"
+        estimate_scene(scene, one.model, out, one.settings, replay=False, overlay=False)
+        told.append(read_told(out, scene, one.joints, one.in_degrees))
+    return told
+
+
+def _table(sets: Iterator[CoverageSet], draws: int, folder: Path) -> Iterator[tuple[str, ...]]:
+    for one in sets:
+        told = measure(one, draws, folder)
+        inside, determined, width, angles = (
+            np.concatenate([getattr(part, name) for part in told]) for name in Told._fields[:4]
+        )
+        half = 0.5 * np.median(width[angles]) if angles.any() else np.nan
+        sure = 0.5 * np.median(width[angles & determined]) if (angles & determined).any() else 0.0
+        yield (
+            one.name,
+            str(len(inside)),
+            f"{inside.mean():.1%}",
+            f"{determined.mean():.0%}",
+            f"{inside[determined].mean():.1%}" if determined.any() else "",
+            f"{half:.2f} ({sure:.2f})",
+            str(sum(part.wrong for part in told)),
+        )
+
+
+def main() -> None:
+    """Print how far intervals hold."""
+    parser = argparse.ArgumentParser(description="Whether intervals hold, and how wide they are.")
+    parser.add_argument("data", nargs="?", type=Path, help="a folder of recorded scenes")
+    parser.add_argument("--draws", type=int, default=2, help="scenes drawn for each set")
+    parser.add_argument("--only", default="", help="sets whose name holds this text")
+    asked = parser.parse_args()
+    headings = (
+        *("set", "truths", "inside 95 %", "determined", "of these inside"),
+        *("half width, median (determined) [deg]", "wrong frames, not said"),
+    )
+    sets = (one for one in coverage_sets(asked.data) if asked.only in one.name)
+    with tempfile.TemporaryDirectory() as folder:
+        rows = _table(sets, asked.draws, Path(folder))
+        print_table("Intervals that a user reads", headings, rows)
+
+
+if __name__ == "__main__":
+    main()

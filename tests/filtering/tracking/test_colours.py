@@ -188,7 +188,9 @@ def test_a_part_whose_lines_scatter_counts_less():
     # The last row is that of masks' edges.
     sums[0, :, SQUARES] = 0.25, 1.44, 100.0, 50.0
     sums[1, :, SQUARES] = 50.0
-    compared = Comparison(np.ones((2, 3, 12, 12)), np.ones((2, 3, 12)), sums, None)
+    compared = Comparison(
+        np.ones((2, 3, 12, 12)), np.ones((2, 3, 12)), sums, np.zeros((2, 3, 13)), None
+    )
     weigh_parts(compared, 0.7, [np.zeros((1, 1, 3), np.uint8), None])
     overall = (0.25 + 1.44 + 100.0) / 3.0
     expected = np.sqrt(overall / np.array([0.49, 1.44, 4.0]))

@@ -17,7 +17,7 @@ from drake_pose.errors import OutputError, SettingsError
 from drake_pose.files.folder import read_summary
 from drake_pose.files.options import percent
 from drake_pose.files.records import FrameRecord, PoseRow
-from drake_pose.files.settings import EstimateSettings
+from drake_pose.files.settings import SceneSettings
 from drake_pose.regular_files import digest, read_regular
 from drake_pose.silhouette.pictures.scene_checks import frame_ranges
 from drake_pose.silhouette.pictures.scenes import Scene
@@ -36,7 +36,7 @@ _LIMITS = {"run_limit": "run limit", "time_limit": "time limit"}
 _PACKAGES = ("drake", "numpy", "numba", "opencv-python-headless")
 
 
-def describe_job(scene: Path, model: Path, settings: EstimateSettings) -> dict[str, Any]:
+def describe_job(scene: Path, model: Path, settings: SceneSettings) -> dict[str, Any]:
     """What is estimated from what and how, as plain JSON values, with the files' SHA-256."""
     return {
         "scene": str(scene),

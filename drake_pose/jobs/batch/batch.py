@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 from drake_pose.csv_files import csv_text
 from drake_pose.errors import ClusterError, DrakePoseError, OutputError
 from drake_pose.files.folder import without_nan, write_file, writes_folder
+from drake_pose.jobs.batch.episodes_table import episodes_table
 from drake_pose.jobs.batch.job import SceneJob
 from drake_pose.jobs.batch.tasks import (
     Outcome,
@@ -38,7 +39,7 @@ from drake_pose.version import VERSION
 if TYPE_CHECKING:
     from distributed import Client, Future
 
-BATCH, CONTRADICTIONS = "batch.json", "contradictions.csv"
+BATCH, CONTRADICTIONS, EPISODES = "batch.json", "contradictions.csv", "episodes.csv"
 WAITING, FINISHED, FAILED = "waiting", "finished", "failed"
 
 # A scene of which this many chunks have failed is given up.
@@ -185,6 +186,9 @@ class Batch:
             ]
             table = csv_text([("scene", "what", "name", "text"), *rows])
             write_file(self.out, CONTRADICTIONS, table)
+        episodes = episodes_table({name: state.totals for name, state in self.scenes.items()})
+        if episodes is not None:
+            write_file(self.out, EPISODES, episodes)
 
     def plan(self) -> None:
         """Lists what is missing; what lies there is not done again."""

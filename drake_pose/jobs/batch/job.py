@@ -24,6 +24,8 @@ CHUNK = 100
 _OWN = ("scene", "model", "truth", "overlay", "replay", "audit", "camera_file")
 _SETTINGS = tuple(one.name for one in fields(EstimateSettings))
 _OF_AUDITS = tuple(one.name for one in fields(AuditSettings))
+OWN_JOINTS = True
+"""In place of a table of joint positions: those that an episode holds."""
 
 
 @dataclass(frozen=True)
@@ -34,19 +36,20 @@ class SceneJob:
         name: of the result's folder.
         truth: measured joint positions to compare with.
         chunk: frames in a chunk; a person's recording, and a scene that is audited, is never cut.
-        audit: joint positions that the scene is audited against; None: the scene is estimated.
+        audit: joint positions that the scene is audited against, or OWN_JOINTS; None: the scene is
+            estimated.
         camera_file: for an audit, in place of the scene's cameras.yaml.
     """
 
     name: str
     scene: Path
     model: Path
-    settings: EstimateSettings
+    settings: EstimateSettings | AuditSettings
     truth: Path | None = None
     overlay: bool = True
     replay: bool = True
     chunk: int = CHUNK
-    audit: Path | None = None
+    audit: Path | bool | None = None
     camera_file: Path | None = None
 
     def describe(self) -> dict[str, Any]:
@@ -55,7 +58,9 @@ class SceneJob:
         described = describe_job(self.scene, self.model, self.settings)
         files = {"audit": self.audit, "camera_file": self.camera_file}
         audited = {
-            name: None if file is None else {"file": str(file), "sha256": file_digest(file)}
+            name: {"file": str(file), "sha256": file_digest(file)}
+            if isinstance(file, Path)
+            else file
             for name, file in files.items()
             if self.audit is not None
         }
@@ -80,7 +85,7 @@ def read_job(path: Path, chunk: int | None = None) -> tuple[SceneJob, ...]:
     length = content.get("chunk", CHUNK) if chunk is None else chunk
     if not isinstance(length, int) or isinstance(length, bool) or length < 1:
         raise SettingsError(f"{path}: chunk: must be a whole number, 1 or more, not {length!r:.60}")
-    keys = (*_OWN, *_SETTINGS)
+    keys = tuple(dict.fromkeys((*_OWN, *_SETTINGS, *_OF_AUDITS)))
     defaults = _known(content.get("defaults") or {}, f"{path}: defaults", keys)
     jobs = []
     for name, entry in scenes.items():
@@ -110,28 +115,34 @@ def _known(value: Any, where: str, known: tuple[str, ...]) -> dict[str, Any]:
 def _scene_job(
     name: str, values: Mapping[str, Any], chunk: int, where: str, base: Path
 ) -> SceneJob:
+    is_audit = values.get("audit") is not None
+    kind, names = (AuditSettings, _OF_AUDITS) if is_audit else (EstimateSettings, _SETTINGS)
+    own = {"audit": OWN_JOINTS} if values.get("audit") is OWN_JOINTS else {}
     given, settings = (
         {
             key: _convert(values[key], hint, f"{where}: {key}", base)
             for key, hint in get_type_hints(known, include_extras=True).items()
-            if key in keys and values.get(key) is not None
+            if key in keys and key not in own and values.get(key) is not None
         }
-        for known, keys in ((SceneJob, _OWN), (EstimateSettings, _SETTINGS))
+        for known, keys in ((SceneJob, _OWN), (kind, names))
     )
+    given |= own
+    others = [key for key in values if key not in (*_OWN, *names) and values[key] is not None]
     if "scene" not in given:
         raise SettingsError(f"{where}: 'scene' is missing, the scene's folder")
     if "audit" in given:
-        others = [key for key in settings if key not in _OF_AUDITS]
         others += ["truth"] if "truth" in given else []
         if others:
             raise SettingsError(
                 f"{where}: an audit has no setting {', '.join(others)}; it has: camera_file, "
                 f"overlay, {', '.join(_OF_AUDITS)}"
             )
+    elif others:
+        raise SettingsError(f"{where}: {', '.join(others)}: for audits (audit: JOINTS.csv) alone")
     elif "camera_file" in given:
         raise SettingsError(f"{where}: camera_file is a setting of audits (audit: JOINTS.csv)")
     try:
-        checked = EstimateSettings(**settings)
+        checked = kind(**settings)
     except SettingsError as error:
         raise SettingsError(f"{where}: {error}") from error
     return SceneJob(

@@ -13,13 +13,15 @@ import shutil
 import time
 import uuid
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from drake_pose.body.landmarks import landmarks_file
 from drake_pose.body.model import load_model
 from drake_pose.camera.camera_files import load_cameras
+from drake_pose.camera.episodes.episode import Episode
+from drake_pose.camera.episodes.open import open_episode
 from drake_pose.errors import DrakePoseError, OutputError
 from drake_pose.files.folder import OVERLAY, POSES, read_summary, write_file, write_summary
 from drake_pose.files.records import FrameRecord
@@ -29,6 +31,7 @@ from drake_pose.jobs.batch.job import SceneJob
 from drake_pose.jobs.estimate.inputs import follows_person
 from drake_pose.jobs.estimate.scene import estimate_scene
 from drake_pose.jobs.registration.audit import audit_scene
+from drake_pose.jobs.registration.episodes import is_episode
 from drake_pose.jobs.registration.settings import AuditSettings
 from drake_pose.silhouette.pictures.scene_checks import frame_ranges
 from drake_pose.silhouette.pictures.scenes import Scene, load_scene
@@ -95,14 +98,19 @@ def plan_scene(job: SceneJob, out: Path) -> tuple[Task, ...]:
     Raises:
         DrakePoseError: the scene cannot be read.
     """
+    if (episode := _episode(job)) is not None:
+        most = max(len(one.times) for one in episode.cameras.values())
+        return (Task(job, out, None, tuple(map(str, range(0, most, job.settings.every)))),)
     scene = _load(job).of_cameras(job.settings.cameras)
     scene, asked = scene.every(job.settings.every, job.settings.frames)
     frames = scene.seen_frames(asked)
-    is_whole = job.audit is not None
+    settings, is_whole = job.settings, job.audit is not None
     # A model is read only where it may be a person's: that takes seconds.
-    if landmarks_file(job.model).is_file() or job.settings.method == "person":
-        model = load_model(job.model, package_paths=job.settings.packages)
-        is_whole = is_whole or follows_person(scene, model, job.settings)
+    if isinstance(settings, EstimateSettings) and (
+        landmarks_file(job.model).is_file() or settings.method == "person"
+    ):
+        model = load_model(job.model, package_paths=settings.packages)
+        is_whole = is_whole or follows_person(scene, model, settings)
     if is_whole:
         return (Task(job, out, None, frames),)
     cuts = range(0, len(frames), job.chunk)
@@ -159,7 +167,7 @@ def remove_parts(out: Path) -> None:
 
 def _require_same_masks(task: Task) -> None:
     """Refuses a finished scene whose masks were replaced; joining chunks sees to theirs."""
-    if task.index is not None:
+    if task.index is not None or _episode(task.job) is not None:
         return
     scene = _load(task.job)
     gone = []
@@ -177,7 +185,22 @@ def _require_same_masks(task: Task) -> None:
 def _load(job: SceneJob) -> Scene:
     """A job's scene."""
     cameras = None if job.camera_file is None else load_cameras(job.camera_file)
-    return load_scene(job.scene, cameras, sequence=job.settings.method == "person")
+    settings = job.settings
+    is_person = isinstance(settings, EstimateSettings) and settings.method == "person"
+    return load_scene(job.scene, cameras, sequence=is_person)
+
+
+def _episode(job: SceneJob) -> Episode | None:
+    """The episode that a job audits; None: it is of a scene of masks, or of none."""
+    settings = job.settings
+    if not isinstance(settings, AuditSettings) or not is_episode(job.scene, settings):
+        return None
+    return open_episode(job.scene, joints=_joints(job), episode=settings.episode)
+
+
+def _joints(job: SceneJob) -> Path | None:
+    """The table of joint positions of an audit; None: the episode's own."""
+    return job.audit if isinstance(job.audit, Path) else None
 
 
 def _note_attempt(task: Task) -> None:
@@ -194,15 +217,18 @@ def _make(task: Task) -> None:
     job = task.job
     part = work_folder(task.out, job) / f"{task.place.name}{_PART}{uuid.uuid4().hex[:12]}"
     try:
-        if job.audit is not None:
-            _audit(job, job.audit, part)
+        settings = job.settings
+        if isinstance(settings, AuditSettings):
+            audit_scene(
+                job.scene, job.model, _joints(job), part, settings, cameras=job.camera_file,
+                overlay=job.overlay,
+            )  # fmt: skip
         elif task.chunks:
-            _join_chunks(task, part)
+            _join_chunks(task, settings, part)
         else:
             of_chunk = task.index is not None
-            settings = replace(job.settings, frames=task.frames) if of_chunk else job.settings
-            replay = job.replay and not of_chunk
-            _estimate(job, part, settings, replay)
+            own = replace(settings, frames=task.frames) if of_chunk else settings
+            _estimate(job, part, own, job.replay and not of_chunk)
         try:
             os.replace(part, task.place)
         except OSError as error:
@@ -222,15 +248,7 @@ def _estimate(
     )  # fmt: skip
 
 
-def _audit(job: SceneJob, joints: Path, part: Path) -> None:
-    names = [one.name for one in fields(AuditSettings)]
-    settings = AuditSettings(**{name: getattr(job.settings, name) for name in names})
-    audit_scene(
-        job.scene, job.model, joints, part, settings, cameras=job.camera_file, overlay=job.overlay
-    )
-
-
-def _join_chunks(task: Task, part: Path) -> None:
+def _join_chunks(task: Task, settings: EstimateSettings, part: Path) -> None:
     """Puts a scene together as a result that lacks no frame; resuming it makes the rest."""
     job = task.job
     header, rows, records = "", [], {}
@@ -243,10 +261,10 @@ def _join_chunks(task: Task, part: Path) -> None:
                 chunk / OVERLAY, part / OVERLAY, copy_function=_link, dirs_exist_ok=True
             )
     write_file(part, POSES, "".join([header, *rows]))
-    described = describe_job(job.scene, job.model, job.settings)
+    described = describe_job(job.scene, job.model, settings)
     known = {name: FrameRecord.from_json(record) for name, record in records.items()}
     write_summary(part, summarize(described, known, False))
-    _estimate(job, part, job.settings, job.replay, resume=True)
+    _estimate(job, part, settings, job.replay, resume=True)
 
 
 def _link(source: str, target: str) -> None:
@@ -263,9 +281,16 @@ def _totals(task: Task) -> Mapping[str, Any] | None:
         return None
     summary = read_summary(task.place)
     if task.job.audit is not None:
-        names = ("what", "name", "text")
-        found = [{name: one[name] for name in names} for one in summary["contradictions"]]
+        names, told = ("what", "name", "text"), summary["contradictions"]
+        found = [{name: one[name] for name in names} for one in told]
+        off = {one["name"]: one for one in told if one["what"] == "camera"}
         return {
+            "cameras": {
+                name: one
+                | {"off_mm": off.get(name, {}).get("shift_mm")}
+                | {"off_deg": off.get(name, {}).get("angle_deg")}
+                for name, one in summary["found_cameras"].items()
+            },
             "frame_count": summary["frame_count"] + len(summary["unseen"]),
             "agreeing_count": summary["agreeing_count"],
             "contradictions": found,

@@ -122,7 +122,7 @@ def audit_scene(
         "frame_count": len(found.frames),
         "agreeing_count": len(found.frames) - len(found.contradicting),
         "frames": _describe_frames(inputs, found),
-        "cameras": {} if look.episode is None else _describe_cameras(look.episode),
+        "found_cameras": {} if look.episode is None else _describe_cameras(look.episode),
         "noticed_from": _noticed_from(found, inputs.model),
         "principal_point_px": found.center and found.center._asdict(),
         "error_sizes_px": {name: float(getattr(found.sizes, name)) for name in _SIZES},
@@ -185,6 +185,7 @@ def _describe_cameras(look: EpisodeLook) -> dict[str, Any]:
             "X_WC": one.found.camera.X_WC.tolist(),
             "translation_sd_mm": 1e3 * one.found.translation_sd,
             "rotation_sd_deg": float(np.degrees(one.found.rotation_sd)),
+            "covariance": one.found.covariance.tolist(),
         }
         for name, one in look.pictures.items()
     }

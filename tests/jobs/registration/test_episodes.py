@@ -20,16 +20,9 @@ from drake_pose.silhouette.pictures.scenes import load_scene
 from tests.benchmarks.registration import pose_error
 from tests.cli import CliRunner
 from tests.registration.episodes import painted_episode
+from tests.registration.recordings import NAMES, write_episode, write_log
 
 LATE = 0.04
-NAMES = tuple(f"joint{k}" for k in range(5))
-
-
-def write_log(path, times, values, names=NAMES):
-    with path.open("w", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow(["time", *names])
-        writer.writerows([t, *row] for t, row in zip(times, values, strict=True))
 
 
 @pytest.fixture(scope="module")
@@ -38,15 +31,7 @@ def episode(tmp_path_factory):
     folder = tmp_path_factory.mktemp("episode")
     painted = painted_episode(folder, late=LATE)
     scene = folder / "scene"
-    (scene / "images" / "camera").mkdir(parents=True)
-    for k, picture in enumerate(painted.pictures):
-        cv2.imwrite(str(scene / "images" / "camera" / f"{k:04d}.png"), picture[..., ::-1])
-    rows = [["frame", "time"], *([f"{k:04d}", t] for k, t in enumerate(painted.times))]
-    text = "\n".join(",".join(map(str, row)) for row in rows)
-    (scene / "images" / "camera" / "timestamps.csv").write_text(text)
-    save_cameras(scene / "cameras.yaml", [painted.camera])
-    times = np.arange(-0.5, painted.times[-1] + 0.5, 0.05)
-    write_log(scene / "joint_angles.csv", times, painted.values_at(times))
+    write_episode(scene, painted)
     return scene, painted
 
 

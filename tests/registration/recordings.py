@@ -1,0 +1,31 @@
+"""Painted episodes as folders of pictures with a joint log."""
+
+import csv
+
+import cv2
+import numpy as np
+
+from drake_pose.camera.camera_files import save_cameras
+
+NAMES = tuple(f"joint{k}" for k in range(5))
+
+
+def write_log(path, times, values, names=NAMES):
+    """Joint positions by time (CSV)."""
+    with path.open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(["time", *names])
+        writer.writerows([t, *row] for t, row in zip(times, values, strict=True))
+
+
+def write_episode(scene, painted):
+    """A folder of pictures with their times, a joint log at another rate, and the camera."""
+    images = scene / "images" / "camera"
+    images.mkdir(parents=True)
+    for k, picture in enumerate(painted.pictures):
+        cv2.imwrite(str(images / f"{k:04d}.png"), picture[..., ::-1])
+    rows = [["frame", "time"], *([f"{k:04d}", t] for k, t in enumerate(painted.times))]
+    (images / "timestamps.csv").write_text("\n".join(",".join(map(str, row)) for row in rows))
+    save_cameras(scene / "cameras.yaml", [painted.camera])
+    times = np.arange(-0.5, painted.times[-1] + 0.5, 0.05)
+    write_log(scene / "joint_angles.csv", times, painted.values_at(times))

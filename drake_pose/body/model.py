@@ -19,7 +19,6 @@ from pydrake.multibody.tree import (
     RevoluteJoint,
     SpatialInertia,
 )
-from scipy.spatial.transform import Rotation
 
 from drake_pose.arrays import Array
 from drake_pose.body.formats.parsing import ModelSource, limit_kinds
@@ -169,6 +168,8 @@ class ArticulatedModel(ParsedModel):
 
     def with_base_joints(self, X_WB: Array) -> "ArticulatedModel":
         """The same on BASE_JOINTS, which are 0 at X_WB (4, 4); ModelError for no URDF."""
+        from scipy.spatial.transform import Rotation  # Slow to import; reading needs none.
+
         rpy = Rotation.from_matrix(X_WB[:3, :3]).as_euler("xyz")
         text = with_base_joints(self._urdf().text, X_WB[:3, 3].tolist(), rpy.tolist())
         moved = self._changed(text, self.skin)
@@ -248,7 +249,8 @@ def load_model(
         limits: (lower, upper) [rad or m] by position name instead of the file's; the only way to
             limit planar joints, whose limits Drake's parser does not read.
         check: first read the file in a child process, so that a file that crashes or hangs Drake or
-            eats all memory does not do so here. About a second, once for each file's content.
+            eats all memory does not do so here. Once for each file's content; it takes as long as
+            reading, and half a second more in a process of several threads, which cannot be forked.
 
     Raises:
         ModelError: the file cannot be used; the message names the file and link or joint.
@@ -259,7 +261,7 @@ def load_model(
     file = Path(path)
     source_file = file if not file.exists() else file.resolve()
     if check and source_file.is_file():
-        check_in_child(source_file, packages, given)
+        check_in_child(read_model, source_file, packages, given)
     return read_model(source_file, packages, given)
 
 

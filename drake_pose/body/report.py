@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from drake_pose.arrays import Array
 from drake_pose.body.formats.parsing import limit_kinds
@@ -179,15 +178,13 @@ def _symmetry_warnings(model: ArticulatedModel) -> list[str]:
 
 def _is_symmetric(mesh: TriangleMesh, X_turn: Array) -> bool:
     """Whether a surface looks the same from all around the axis of a quarter turn X_turn."""
-    from trimesh import Trimesh  # Slow to import, and needed for checks alone.
-    from trimesh.sample import sample_surface
-
-    axis = Rotation.from_matrix(X_turn[:3, :3]).as_rotvec()
+    axis = np.array([X_turn[2, 1], X_turn[0, 2], X_turn[1, 0]])
+    axis -= (X_turn[1, 2], X_turn[2, 0], X_turn[0, 1])
     axis /= np.linalg.norm(axis)
     center = np.linalg.lstsq(np.eye(3) - X_turn[:3, :3], X_turn[:3, 3], rcond=None)[0]
     side = np.linalg.svd(axis[None])[2][1]
     # At each height the largest distance from the axis is the same in every direction.
-    points = sample_surface(Trimesh(mesh.vertices, mesh.triangles), 40_000, seed=0)[0] - center
+    points = _sample_surface(mesh, 40_000) - center
     height, x, y = points @ axis, points @ side, points @ np.cross(axis, side)
     radius = np.hypot(x, y)
     level = (height - height.min()) / max(float(np.ptp(height)), 1e-12) * _LEVELS
@@ -197,3 +194,16 @@ def _is_symmetric(mesh: TriangleMesh, X_turn: Array) -> bool:
     column = np.clip(sector.astype(int), 0, _SECTORS - 1)
     np.maximum.at(outline, (row, column), radius)
     return bool(np.ptp(outline, axis=1).max() < _SYMMETRY_TOLERANCE * radius.max())
+
+
+def _sample_surface(mesh: TriangleMesh, count: int) -> Array:
+    """Points (count, 3) [m] spread evenly at random over a surface, the same ones each time."""
+    corner, along, across = mesh.vertices[mesh.triangles].swapaxes(0, 1)
+    along, across = along - corner, across - corner
+    areas = np.cumsum(np.linalg.norm(np.cross(along, across), axis=1))
+    random = np.random.default_rng(0).random((count, 3))
+    hit = np.searchsorted(areas, random[:, 0] * areas[-1])
+    # Beyond the third side a parallelogram's half is folded back.
+    beyond = random[:, 1:].sum(axis=1) > 1.0
+    u, v = np.where(beyond, 1.0 - random[:, 1:].T, random[:, 1:].T)[..., None]
+    return np.asarray(corner[hit] + u * along[hit] + v * across[hit])

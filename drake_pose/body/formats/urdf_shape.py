@@ -6,7 +6,6 @@ import xml.etree.ElementTree as ElementTree
 from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from drake_pose.arrays import Array
 from drake_pose.body.formats.xml_files import xml_text
@@ -113,6 +112,8 @@ def _place(
 
 def _turn(joint: ElementTree.Element, zero: float) -> None:
     """Let a joint stand further by a constant [rad or m] where it reads the same."""
+    from scipy.spatial.transform import Rotation  # Slow to import; reading needs none.
+
     axis_element = joint.find("axis")
     axis = np.array(_numbers("1 0 0" if axis_element is None else axis_element.get("xyz", "")))
     axis /= np.linalg.norm(axis)

@@ -103,6 +103,11 @@ _STL_TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("at
 _R_DRAKE_GLTF = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 
 
+_MOST_KEPT = 64
+read_meshes: dict[Path, TriangleMesh] = {}
+"""The meshes of the files that were read last, at the files' own size."""
+
+
 def read_mesh_file(path: Path, scale: Array | None = None) -> TriangleMesh:
     """The triangles of an OBJ, glTF, GLB, STL or DAE file, duplicate vertices merged.
 
@@ -111,14 +116,18 @@ def read_mesh_file(path: Path, scale: Array | None = None) -> TriangleMesh:
     Raises ModelError: unknown extension, unreadable, no triangle, or a coordinate that is not
     finite.
     """
-    mesh = _read_unscaled(path.resolve())
+    path = path.resolve()
+    if path not in read_meshes:
+        read_meshes[path] = _read_unscaled(path)
+        for old in list(read_meshes)[:-_MOST_KEPT]:
+            del read_meshes[old]
+    mesh = read_meshes[path]
     if scale is None:
         return mesh
     triangles = mesh.triangles if np.prod(scale) > 0 else mesh.triangles[:, ::-1]
     return TriangleMesh(mesh.vertices * scale, triangles)
 
 
-@functools.lru_cache(maxsize=64)
 def _read_unscaled(path: Path) -> TriangleMesh:
     """As read_mesh_file, at the file's own size."""
     if not path.is_file():
@@ -149,8 +158,10 @@ def _read_unscaled(path: Path) -> TriangleMesh:
 
 def _read_obj(path: Path) -> TriangleMesh:
     """An OBJ file as Drake itself reads it."""
-    # Drake takes a coordinate that is not a number for zero.
-    if re.search(rb"^v\s[^\n]*(nan|inf)", path.read_bytes(), re.MULTILINE | re.IGNORECASE):
+    # Drake takes a coordinate that is not a number for zero. To look line by line takes long.
+    data = path.read_bytes().lower()
+    odd = b"nan" in data or b"inf" in data
+    if odd and re.search(rb"^v\s[^\n]*(nan|inf)", data, re.MULTILINE):
         raise ModelError(f"mesh file {path}: a vertex coordinate is not a finite number")
     try:
         surface = ReadObjToTriangleSurfaceMesh(path)

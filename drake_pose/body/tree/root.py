@@ -9,8 +9,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.math import RigidTransform
 from pydrake.multibody.tree import Frame, JointIndex
-from scipy.optimize import least_squares
-from scipy.spatial.transform import Rotation
 
 from drake_pose.arrays import Array
 from drake_pose.body.parsed_model import ParsedModel, nearest_turn, one_turn
@@ -104,6 +102,8 @@ class RootRotation:
 
     def rotations(self, values: Array) -> Array:
         """R_WR (n, 3, 3) at values (n, k) [rad]."""
+        from scipy.spatial.transform import Rotation  # Slow to import; reading needs none.
+
         if self.kind == "free":
             return self.R_W0 @ Rotation.from_rotvec(values).as_matrix()
         if self.kind == "limited":
@@ -112,6 +112,8 @@ class RootRotation:
 
     def values_from(self, R_WR: Array) -> Array:
         """The values (k,) [rad] of a rotation (3, 3), the nearest there are where it is limited."""
+        from scipy.spatial.transform import Rotation  # Slow to import; reading needs none.
+
         rotation = Rotation.from_matrix(self.R_W0.T @ R_WR)
         if self.kind == "fixed":
             return np.zeros(0)
@@ -153,6 +155,8 @@ def even_rotations(interval: float) -> Array:
     Rz(azimuth) Ry(polar) Rz(turn - azimuth), with directions on circles of latitude and turns that
     are multiples of the interval; the samples hold the identity.
     """
+    from scipy.spatial.transform import Rotation  # Slow to import; reading needs none.
+
     angles = []
     turns = _full_turn(2.0 * math.pi / interval)
     circles = max(1, round(math.pi / interval))
@@ -238,6 +242,8 @@ class BasePose:
 
     def _solve_joints(self, model: ParsedModel, q: Array, X_WA: Array) -> Array:
         """Base positions (n,) that put the anchor at X_WA, inside their limits if possible."""
+        from scipy.optimize import least_squares  # Slow to import; reading needs none.
+
         index = list(self.positions)
         periodic = model.periodic[index]
         lower, upper = model.lower[index], model.upper[index]

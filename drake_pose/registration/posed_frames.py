@@ -17,6 +17,7 @@ from drake_pose.camera.models import Camera, PinholeCamera
 from drake_pose.errors import MaskError
 from drake_pose.fit.evidence import (
     NO_EDGE,
+    EdgePoints,
     Evidence,
     FrameEvidence,
     find_edge_points,
@@ -114,13 +115,21 @@ class PosedFrames:
 
     def evidence(self, camera: int, count: int) -> list[FrameEvidence]:
         """What each frame tells, where the camera is the how manieth of so many."""
-        spacing, found = max(1.0, round(self.spacing * self.size)), []
-        for frame in self.frames:
-            edge = NO_EDGE if frame.odds is not None else find_edge_points(frame.mask, spacing)
+        found = []
+        for frame, edge in zip(self.frames, self._edges, strict=True):
             edges = pack_evidence([edge if c == camera else NO_EDGE for c in range(count)])
             odds = tuple(frame.odds if c == camera else None for c in range(count))
             found.append(FrameEvidence(edges, odds, frame.rates))
         return found
+
+    @cached_property
+    def _edges(self) -> list[EdgePoints]:
+        """Of the silhouettes that fits look at."""
+        spacing = max(1.0, round(self.spacing * self.size))
+        return [
+            NO_EDGE if frame.odds is not None else find_edge_points(frame.mask, spacing)
+            for frame in self.frames
+        ]
 
     @cached_property
     def body(self) -> BodyParameters:

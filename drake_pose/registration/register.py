@@ -70,6 +70,8 @@ _AGAIN = 2
 _PIECE = 0.2
 # A pose is worse whose cost is larger by more standard deviations of the difference.
 _SIGNIFICANCE = 1.96
+# And is not fitted to the end that is worse by so many when its fit is half done.
+_HOPELESS = 6.0
 # Silhouettes of suggested poses are compared in pictures about so wide [pixel].
 _WIDTH = 160
 
@@ -228,7 +230,8 @@ class CameraSearch:
         kinematics = self._body.kinematics
         fine = PosedFrames(kinematics, self._body.few, camera, frames, FINE_SPACING)
         last = PosedFrames(kinematics, self._body.all, camera, frames, LAST_SPACING)
-        fitted = [fit_pose(last, fit_pose(fine, X_CW, FINE), LAST) for X_CW in looks]
+        likely = _likely(fine, [fit_pose(fine, X_CW, FINE) for X_CW in looks])
+        fitted = [fit_pose(last, X_CW, LAST) for X_CW in likely]
         fits = [SharedFit([last], [X_CW]) for X_CW in distinct(last, fitted)]
         return describe_fitted([(fit, with_widths(fit)) for fit in fits])[0]
 
@@ -304,6 +307,17 @@ def distinct(frames: PosedFrames, X_CW: Sequence[Array]) -> list[Array]:
         return bool(np.sqrt((off**2).sum(axis=1).mean()) > _APART * frames.size)
 
     return [X_CW[k] for k in apart_from_before(range(len(X_CW)), differ)]
+
+
+def _likely(frames: PosedFrames, X_CW: Sequence[Array]) -> list[Array]:
+    """Those of some fitted poses (4, 4) that may be the best, one of those that look alike."""
+    fits = [SharedFit([frames], [X], widths=False) for X in X_CW]
+    side = max(1.0, _PIECE * frames.size)
+    pieces = [fit.piece_costs(fit.start, side) for fit in fits]
+    order = np.argsort([one.sum() for one in pieces], kind="stable")
+    best = pieces[order[0]]
+    near = [k for k in order if excess(pieces[k], best) <= _HOPELESS]
+    return distinct(frames, [X_CW[k] for k in near])
 
 
 def with_widths(fit: SharedFit) -> Shared:

@@ -13,16 +13,20 @@ from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import RegistrationError
 from drake_pose.files.options import percent
 from drake_pose.files.summary import BADLY_EXPLAINED
+from drake_pose.fit.parameters import POSE_NAMES
 from drake_pose.registration.joint_zeros import calibrate_joints
 from drake_pose.registration.object_search import ObjectSearch
 from drake_pose.registration.online_registration import pose_difference
-from drake_pose.registration.posed_frames import PosedFrame
+from drake_pose.registration.posed_frames import PosedFrame, PosedFrames
 from drake_pose.registration.register import (
+    FINE,
+    LAST,
     CameraSearch,
     RegisteredCamera,
     RegistrationBody,
     spread,
 )
+from drake_pose.registration.shared_fit import SharedFit
 
 # Of the contours in the two frames that fit best, this share fits at least. A robot that is the
 # masks' leaves 0.83 and more, with holes and tools; mirrored masks, another robot's or exchanged
@@ -34,6 +38,8 @@ _FOCALS = (0.5, 0.7, 1.4, 2.0)
 # standard deviations; and it is too wrong for a calibration where it differs by more. Published
 # focal lengths of recorded arms differ by 2 % at most.
 _FOCAL_OFF, _FOCAL_DEVIATIONS, _FOCAL_WRONG = 0.03, 4.0, 0.06
+# It need not be looked at closely that seems to differ by less than this share of that.
+_SURELY = 0.6
 # A camera on a link is not determined that is less sure [rad, m].
 _UNTOLD = 0.04
 # What else may be the case is tried roughly, in so many frames.
@@ -126,6 +132,8 @@ def check_focal_length(
     counted = [frame for frame, fit in zip(frames, found.frames, strict=True) if fit.agrees]
     if len(counted) < 2:
         return found, ()
+    if abs(_focal_length_off(body, found, counted)) < _SURELY * _FOCAL_OFF:
+        return found, ()
     told = calibrate_joints(body, [found], [counted], (), focal=True)
     camera, deviation = told.cameras[0], float(told.focal_deviations[0])
     off = math.log(camera.focal_x / found.camera.focal_x)
@@ -141,6 +149,16 @@ def check_focal_length(
         raise RegistrationError(f"{text}. Nothing was written")
     by = pose_difference(camera.X_WC, found.camera.X_WC)
     return replace(found, covariance=told.covariances[0] + np.outer(by, by)), (text,)
+
+
+def _focal_length_off(
+    body: RegistrationBody, found: RegisteredCamera, frames: Sequence[PosedFrame]
+) -> float:
+    """By how much a focal length seems to be off, in a hurry: the logarithm of a factor."""
+    seen = PosedFrames(body.kinematics, body.all, found.camera, frames)
+    fit = SharedFit([seen], [found.camera.X_CW], looks=len(POSE_NAMES) + 1)
+    camera = fit.cameras(fit.fit((*FINE, *LAST)))[0]
+    return math.log(camera.focal_x / found.camera.focal_x)
 
 
 def _others(

@@ -14,6 +14,7 @@ trusted beyond a pixel, however well everything fits.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -167,7 +168,7 @@ def distances_in_pictures(
         A = symmetric(A_lower)
         shakes = _camera_motions(outlines, X_CW, X_WN, size)
         for n in np.flatnonzero(np.einsum("nii->n", A) > 0.0).tolist():
-            D = surface_deformations(outlines[n].vertices, X_WN[n]) * mean_size
+            D = surface_deformations(outlines[n], X_WN[n]) * mean_size
             share, turns = np.linalg.eigh(D.T @ A[n] @ D)
             for known, turn in zip(share, turns.T, strict=True):
                 if known >= _LEAST_INFORMATION:
@@ -215,27 +216,24 @@ def _views(outlines: Sequence[Outline], pictures: Sequence[Picture]) -> NDArray[
     for n, outline in enumerate(outlines):
         if not len(outline.vertices):
             continue
-        points = np.column_stack([outline.vertices, np.ones(len(outline.vertices))])
-        moments = points.T @ points / len(points)
         for c, one in enumerate(pictures):
             by = X_CN[: c + 1, n] - X_CN[c, n]
-            still = np.einsum("kij,jl,kil->k", by, moments, by) < (_STILL * one.size) ** 2
+            still = np.einsum("kij,jl,kil->k", by, outline.moments, by) < (_STILL * one.size) ** 2
             found[c, n] = found[np.flatnonzero(still)[0], n]
     return found
 
 
-def surface_deformations(vertices: Array, X_WN: Array) -> Array:
+def surface_deformations(outline: Outline, X_WN: Array) -> Array:
     """(12, 12) affine motions, in columns, that each move a part's surface by about one metre."""
     R = X_WN[:3, :3]
-    middle = vertices.mean(axis=0)
-    sizes = np.maximum(np.sqrt(((vertices - middle) ** 2).mean(axis=0)), 1e-3)
+    middle = outline.moments[3, :3]
+    squares = np.diag(outline.moments)[:3] - middle**2
+    sizes = np.sqrt(np.maximum(squares, 1e-6))
+    stretches = np.einsum("xi,yj->ijxy", R, R / sizes)
+    shifts = -stretches @ (X_WN[:3, 3] + R @ middle)
     K = np.zeros((12, 12))
-    for i in range(3):
-        K[[3, 7, 11], i] = R[:, i]
-        for j in range(3):
-            M = np.outer(R[:, i], R[:, j]) / sizes[j]
-            v = -M @ (X_WN[:3, 3] + R @ middle)
-            K[:, 3 + 3 * i + j] = np.column_stack([M, v]).ravel()
+    K[[3, 7, 11], :3] = R
+    K[:, 3:] = np.concatenate([stretches, shifts[..., None]], axis=3).reshape(9, 12).T
     return K
 
 
@@ -247,7 +245,7 @@ def with_widths(outlines: Sequence[Outline], pictures: Sequence[Picture]) -> lis
         for n, (outline, X_WN) in enumerate(zip(outlines, one.X_WN, strict=True)):
             if len(outline.vertices):
                 # The part's surface is about a metre wider on all sides.
-                by = surface_deformations(outline.vertices, X_WN)[:, [3, 7, 11]].sum(axis=1)
+                by = surface_deformations(outline, X_WN)[:, [3, 7, 11]].sum(axis=1)
                 wider[n, k] = by * one.size
         found.append(one._replace(moves=np.concatenate([one.moves, wider], axis=1)))
     return found
@@ -256,9 +254,10 @@ def with_widths(outlines: Sequence[Outline], pictures: Sequence[Picture]) -> lis
 def _camera_motions(outlines: Sequence[Outline], X_CW: Array, X_WN: Array, size: float) -> Array:
     """(12, 6) the body's shifts along and turns about a camera's axes, by about a size [m]."""
     placed = zip(outlines, X_WN, strict=True)
-    points = np.vstack([one.vertices @ X[:3, :3].T + X[:3, 3] for one, X in placed])
-    middle = points.mean(axis=0)
-    extent = max(float(np.sqrt(((points - middle) ** 2).sum(axis=1).mean())), 1e-9)
+    moments = sum(len(one.vertices) * (X @ one.moments @ X.T) for one, X in placed)
+    moments = np.asarray(moments) / sum(len(one.vertices) for one in outlines)
+    middle = moments[3, :3]
+    extent = math.sqrt(max(float(np.trace(moments[:3, :3]) - middle @ middle), 1e-18))
     motions = np.zeros((12, 6))
     for k, axis in enumerate(X_CW[:3, :3]):
         M = np.cross(np.eye(3), axis).T / extent

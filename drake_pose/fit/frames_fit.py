@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -59,19 +60,27 @@ class FittedFrames:
         own: (frames, p) each frame's own unknowns.
         shared: (q,) those of all frames.
         parameters: (frames, n) all parameters of the frames.
-        inlier_ratios: (frames, cameras) of both contours' lengths, what fits.
         cost: of all frames at the end, with what is known without pictures.
-        equations: the normal equations at the end, priors included but for the coupling.
+        ending: tells the equations, and what fits, at the end; asked where that is asked for.
         coupling: what was known of the frames' own unknowns together.
     """
 
     own: Array
     shared: Array
     parameters: Array
-    inlier_ratios: Array
     cost: float
-    equations: Equations
+    ending: Callable[[], tuple[Equations, Array]]
     coupling: Coupling | None = None
+
+    @property
+    def equations(self) -> Equations:
+        """The normal equations at the end, priors included but for the coupling."""
+        return self.ending()[0]
+
+    @property
+    def inlier_ratios(self) -> Array:
+        """(frames, cameras) of both contours' lengths, what fits."""
+        return self.ending()[1]
 
     def own_deviations(self) -> Array:
         """(frames, p) standard deviations, with the coupling and what shared unknowns may be.
@@ -187,9 +196,7 @@ class FramesFit:
 
         limits = self.unknowns.lower, self.unknowns.upper
         found = minimise(evaluate, own, shared, limits, rounds, self._contours.steps, coupling)
-        equations, shares = self._equations(
-            frames, base, (found.own, found.shared), about, rounds[-1], shared_information
-        )
+        at = found.own, found.shared
         parameters = [
             self.unknowns.parameters(one, x, found.shared)
             for one, x in zip(base, found.own, strict=True)
@@ -198,9 +205,8 @@ class FramesFit:
             found.own,
             found.shared,
             np.array(parameters),
-            shares,
             found.cost,
-            equations,
+            cache(lambda: self._equations(frames, base, at, about, rounds[-1], shared_information)),
             coupling,
         )
 

@@ -139,7 +139,7 @@ def _parts(fit: ContourFit, compared: Comparison, A: Array) -> _Parts:
     """All parts, each free to shift, turn and stretch; A: (cameras, nodes, 12, 12), symmetric."""
     K = np.array(
         [
-            surface_deformations(outline.vertices, X_WN)
+            surface_deformations(outline, X_WN)
             for outline, X_WN in zip(fit.outlines, compared.placement.X_WN, strict=True)
         ]
     )

@@ -256,6 +256,7 @@ class _Auditor:
         tolerance = np.where(fit.is_angle, _ANGLE_SD, _SHIFT_SD)
         self._tolerance = np.diag((tolerance / fit.deviations) ** 2)
         self._explained = _explained(frames)
+        self._seen = dict[str, Distances]()
 
     def audit(self) -> Audit:
         """Does it."""
@@ -296,13 +297,15 @@ class _Auditor:
         return distances_in_pictures(outlines, with_widths(outlines, pictures))
 
     def _info_of(self, fitted: FrameFit, sizes: ErrorSizes) -> _Information:
+        if fitted.pictures and fitted.name not in self._seen:
+            self._seen[fitted.name] = self._distances(fitted.pictures)
         if not fitted.pictures:
             p, nodes = len(self._fit.names), len(self._fit.outlines)
             return _Information(
                 np.zeros((p, p)), np.zeros(p), np.zeros((p, 12 * nodes)),
                 np.zeros((nodes, p, p)), fitted.weights, 1.0, float(KNOWN_BEFOREHAND),
             )  # fmt: skip
-        seen = self._distances(fitted.pictures)
+        seen = self._seen[fitted.name]
         own, widths = np.split(seen.X, [len(self._fit.names)], axis=1)
         X = own * self._fit.deviations
         V = distances_covariance(seen, sizes) + _WIDTH_SD**2 * widths @ widths.T

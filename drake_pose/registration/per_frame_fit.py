@@ -151,11 +151,14 @@ class PerFrameFit:
 
     def _with_widths(self, evidence: Evidence, theta: Array) -> Array:
         """All parameters (n,), the silhouettes as much wider on all sides as fits best [pixel]."""
-        found, costs = theta.copy(), []
-        for one in _WIDTHS:
-            found[-len(self._cameras) :] = one
-            compared, _ = self._few.compare(evidence, found, TOLD_APART)
-            costs.append(compared.sums[:, :, COST].sum(axis=1))
+        found, costs = theta.copy(), np.full((len(_WIDTHS), len(self._cameras)), np.inf)
+        inner = range(1, len(_WIDTHS) - 1)
+        for k in (*inner, 0, len(_WIDTHS) - 1):
+            # The narrowest and the widest are looked at where it goes on falling that way.
+            if k in inner or (np.argmin(costs, axis=0) == min(max(k, 1), len(_WIDTHS) - 2)).any():
+                found[-len(self._cameras) :] = _WIDTHS[k]
+                compared, _ = self._few.compare(evidence, found, TOLD_APART)
+                costs[k] = compared.sums[:, :, COST].sum(axis=1)
         best = np.clip(np.argmin(costs, axis=0), 1, len(_WIDTHS) - 2)
         low, middle, high = (np.choose(best + k, costs) for k in (-1, 0, 1))
         bend = low - 2.0 * middle + high

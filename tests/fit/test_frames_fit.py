@@ -207,7 +207,9 @@ def test_deviations_of_frames_are_those_of_the_whole_system(couples):
     coupling = Coupling(csr_array(rows), np.zeros(5), information) if couples else None
     equations = Equations(H, np.zeros((frames, p + q)), 0.0)
     nothing = np.zeros((frames, p))
-    fitted = FittedFrames(nothing, np.zeros(q), nothing, nothing, 0.0, equations, coupling)
+    fitted = FittedFrames(
+        nothing, np.zeros(q), nothing, 0.0, lambda: (equations, nothing), coupling
+    )
     whole = np.zeros((frames * p + q, frames * p + q))
     for k in range(frames):
         at = np.r_[k * p : (k + 1) * p, frames * p : frames * p + q]
@@ -225,5 +227,7 @@ def test_what_nothing_tells_has_a_large_deviation():
     H[:, 1, 1] = 1.0
     nothing = np.zeros((2, 1))
     equations = Equations(H, np.zeros((2, 2)), 0.0)
-    fitted = FittedFrames(nothing, np.zeros(1), nothing, nothing, 0.0, equations, coupling)
+    fitted = FittedFrames(
+        nothing, np.zeros(1), nothing, 0.0, lambda: (equations, nothing), coupling
+    )
     assert (fitted.own_deviations() > 50.0).all()

@@ -36,6 +36,12 @@ class Outline:
     rest: Outline | None = None
 
     @cached_property
+    def moments(self) -> np.ndarray:
+        """(4, 4) means of the products of x, y, z and 1 over the vertices [m^2, m, 1]."""
+        points = np.column_stack([self.vertices, np.ones(len(self.vertices))])
+        return points.T @ points / max(len(points), 1)
+
+    @cached_property
     def planes(self) -> np.ndarray:
         """(m, 4) twice the area times the unit normal [m^2], and its product with a corner."""
         corners = self.vertices[self.triangles]

@@ -154,7 +154,9 @@ class VisualHull:
         self._views: list[tuple[np.ndarray, np.ndarray]] = []
         if self._size > 0.0 and len(outline.triangles):
             scale = 0.46 * _SIDE / self._size
-            self._views = [_look(outline, R_CN, scale) for R_CN in _rotations(_DIRECTIONS)]
+            middle = 0.5 * (_SIDE - 1)
+            camera = ParallelCamera("hull", _SIDE, _SIDE, scale, middle, middle, np.eye(4))
+            self._views = [_look(outline, R_CN, camera) for R_CN in _rotations(_DIRECTIONS)]
             self._scale = scale
 
     def radii(self, p_N: np.ndarray) -> np.ndarray:
@@ -205,17 +207,19 @@ def _rotations(count: int) -> np.ndarray:
     return np.stack([right, np.cross(forward, right), forward], axis=1)
 
 
-def _look(outline: Outline, R_CN: np.ndarray, scale: float) -> tuple[np.ndarray, np.ndarray]:
+def _look(
+    outline: Outline, R_CN: np.ndarray, camera: ParallelCamera
+) -> tuple[np.ndarray, np.ndarray]:
     """Returns the axes (2, 3) [pixel/m] of a picture and its pixels' distances to its edge."""
-    middle = 0.5 * (_SIDE - 1)
-    camera = ParallelCamera("hull", _SIDE, _SIDE, scale, middle, middle, np.eye(4))
     X_CN = np.eye(4)
     X_CN[:3, :3] = R_CN
     X_CN[:3, 3] = -R_CN @ outline.ball[:3]
     mask = draw_mask([outline], X_CN[None], camera)
     distances = cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
     # Squares are whole numbers, but OpenCV's last digit depends on where a picture lies in memory.
-    return scale * R_CN[:2], np.sqrt(np.rint(np.square(distances, dtype=np.float64)))
+    return camera.pixels_per_metre * R_CN[:2], np.sqrt(
+        np.rint(np.square(distances, dtype=np.float64))
+    )
 
 
 # A body that is as large as this many pictures is not what they show.

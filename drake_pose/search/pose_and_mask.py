@@ -13,13 +13,14 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
-from drake_pose.camera.models import Camera
+from drake_pose.camera.models import Camera, PinholeCamera
 from drake_pose.fit.contour_fit import ContourFit, Prior, pack_views
 from drake_pose.fit.evidence import NO_EDGE, find_edge_points
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
@@ -59,6 +60,8 @@ _SURE, _PROBABILITIES = 4.0, (0.01, 0.99)
 _CUTS, _SPECKS = 2, 5
 # The contour fit's first and last scale, as shares of the silhouette's size.
 _WIDE, _NARROW, _SPACING = 0.25, 0.03, 0.05
+# The first rounds look at pictures in which silhouettes are so large [root of the area, pixel].
+_COARSE_ROUNDS, _COARSE_SIDE = 3, 100.0
 # Silhouettes that overlap so much from round to round are settled.
 _SETTLED = 0.995
 
@@ -77,7 +80,7 @@ class PoseAndMaskSettings:
     angle: float = math.radians(5.0)
     length_share: float = 0.5
     length: float = 0.05
-    rounds: int = 6
+    rounds: int = 7
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,6 +99,47 @@ class FoundPose:
     masks: tuple[Mask | None, ...]
     agreements: tuple[float, ...]
     deviations: Array
+
+
+class _Level(NamedTuple):
+    """Cameras, and of each frame each one's picture (H, W, 3), or None."""
+
+    cameras: tuple[Camera, ...]
+    pictures: Sequence[Sequence[Picture | None]]
+
+    def smaller(self, share: float) -> _Level:
+        """The same with pictures smaller by a share; a parallel camera has them as they are."""
+        cameras = tuple(
+            camera.resized(
+                max(8, round(share * camera.width)), max(8, round(share * camera.height))
+            )
+            if isinstance(camera, PinholeCamera)
+            else camera
+            for camera in self.cameras
+        )
+        pictures = [
+            [
+                None if one is None else _resized(one, camera.width, camera.height)
+                for one, camera in zip(own, cameras, strict=True)
+            ]
+            for own in self.pictures
+        ]
+        return _Level(cameras, pictures)
+
+
+@dataclass(eq=False)
+class _Frame:
+    """A frame under way: what is known of it by now, as of ``FoundPose``."""
+
+    values: Array
+    start: Array
+    share: float = 1.0
+    chances: Sequence[Likelihood] = ()
+    cuts: Sequence[Mask | None] = ()
+    drawn: Sequence[Mask] = ()
+    agreements: tuple[float, ...] = ()
+    stays: bool = False
+    settled: bool = False
 
 
 class PoseAndMask:
@@ -136,51 +180,65 @@ class PoseAndMask:
             on_round: is told how many rounds are done.
         """
         values = [np.clip(one, self._kinematics.lower, self._kinematics.upper) for one in starts]
-        shares = np.ones(len(values))
-        last: list[list[Mask]] = []
+        whole = _Level(self._cameras, pictures)
+        level = self._coarse_level(whole, values)
+        frames = [_Frame(*one) for one in zip(values, starts, strict=True)]
         for k in range(self._settings.rounds):
-            chances = self._chances(values, shares)
-            ratios = self._ratios(pictures, chances)
-            if k < _SEARCHING:
-                values = [self._search(*one) for one in zip(values, shares, ratios, strict=True)]
-                shares = np.minimum(shares, _SEARCHED_SHARE)
-                chances = self._chances(values, shares)
-            cuts = [
-                [
-                    None if picture is None else cut_by_odds(picture, chance, ratio)
-                    for picture, chance, ratio in zip(*own, strict=True)
-                ]
-                for own in zip(pictures, chances, ratios, strict=True)
-            ]
-            values = [self._refine(*one) for one in zip(values, starts, cuts, shares, strict=True)]
-            drawn = [[self._draw(one, camera) for camera in self._cameras] for one in values]
-            agreements = [
-                tuple(
-                    math.nan if mask is None else intersection_over_union(silhouette, mask)
-                    for silhouette, mask in zip(*own, strict=True)
-                )
-                for own in zip(drawn, cuts, strict=True)
-            ]
-            shares = np.array([_narrowed(*one) for one in zip(shares, agreements, strict=True)])
+            if k >= min(_COARSE_ROUNDS, self._settings.rounds - 1):
+                level = whole
+            self._round(level, frames, searching=k < _SEARCHING)
             on_round(k + 1)
-            if last and (shares <= _FINEST_SHARE).all() and _settled(drawn, last):
+            for one in frames:
+                one.settled = level is whole and one.stays and one.share <= _FINEST_SHARE
+            if all(one.settled for one in frames):
                 break
-            last = drawn
         spread = np.where(self._spread > 0.0, self._spread, np.inf)
         return [
             FoundPose(
-                one,
+                one.values,
                 tuple(
                     None if mask is None else follow_colours(silhouette, mask)
-                    for silhouette, mask in zip(silhouettes, own, strict=True)
+                    for silhouette, mask in zip(one.drawn, one.cuts, strict=True)
                 ),
-                agreed,
-                (one - start) / spread,
+                one.agreements,
+                (one.values - one.start) / spread,
             )
-            for one, silhouettes, own, agreed, start in zip(
-                values, drawn, cuts, agreements, starts, strict=True
-            )
+            for one in frames
         ]
+
+    def _coarse_level(self, whole: _Level, values: Sequence[Array]) -> _Level:
+        """The pictures so small that silhouettes are about _COARSE_SIDE pixels wide."""
+        drawn = [self._draw(one, camera, few=True) for one in values for camera in self._cameras]
+        areas = [np.count_nonzero(one) for one in drawn]
+        share = _COARSE_SIDE / max(1.0, math.sqrt(float(np.mean(areas))))
+        return whole if share >= 1.0 else whole.smaller(share)
+
+    def _round(self, level: _Level, frames: Sequence[_Frame], searching: bool) -> None:
+        """Betters the frames that are not settled."""
+        for one in (one for one in frames if not one.settled):
+            one.chances = self._chances(level, one)
+        ratios = self._ratios(level, [one.chances for one in frames])
+        for one, pictures, ratio in zip(frames, level.pictures, ratios, strict=True):
+            if one.settled:
+                continue
+            if searching:
+                one.values = self._search(level, one.values, one.share, ratio)
+                one.share = min(one.share, _SEARCHED_SHARE)
+                one.chances = self._chances(level, one)
+            one.cuts = [
+                None if picture is None else cut_by_odds(picture, chance, told)
+                for picture, chance, told in zip(pictures, one.chances, ratio, strict=True)
+            ]
+            before = [self._draw(one.values, camera) for camera in level.cameras]
+            one.values = self._refine(level, one)
+            one.drawn = [self._draw(one.values, camera) for camera in level.cameras]
+            pairs = zip(one.drawn, before, strict=True)
+            one.stays = all(intersection_over_union(*pair) > _SETTLED for pair in pairs)
+            one.agreements = tuple(
+                math.nan if mask is None else intersection_over_union(silhouette, mask)
+                for silhouette, mask in zip(one.drawn, one.cuts, strict=True)
+            )
+            one.share = _narrowed(one.share, one.agreements)
 
     def _draw(self, values: Array, camera: Camera, few: bool = False) -> Mask:
         """The body's silhouette (H, W)."""
@@ -194,31 +252,25 @@ class PoseAndMask:
         drawn = values + spread * self._rng.standard_normal((count, len(values)))
         return np.clip(drawn, self._kinematics.lower, self._kinematics.upper)
 
-    def _chances(self, values: Sequence[Array], shares: Array) -> list[list[Likelihood]]:
-        """How likely the body is at each pixel, of each frame and camera."""
-        found = []
-        for one, share in zip(values, shares, strict=True):
-            poses = self._sample(one, share * self._spread, _SAMPLES)
-            own = []
-            for camera in self._cameras:
-                total = np.zeros((camera.height, camera.width), dtype=np.float32)
-                for pose in poses:
-                    total += self._draw(pose, camera, few=True)
-                blur = max(1.0, _SURFACE * math.sqrt(float(total.sum()) / _SAMPLES))
-                chance = cv2.GaussianBlur(total / _SAMPLES, (0, 0), blur)
-                own.append(np.clip(chance, *_PROBABILITIES).astype(np.float32))
-            found.append(own)
+    def _chances(self, level: _Level, frame: _Frame) -> list[Likelihood]:
+        """How likely the body is at each pixel, of each camera."""
+        poses, found = self._sample(frame.values, frame.share * self._spread, _SAMPLES), []
+        for camera in level.cameras:
+            total = np.zeros((camera.height, camera.width), dtype=np.float32)
+            for pose in poses:
+                total += self._draw(pose, camera, few=True)
+            blur = max(1.0, _SURFACE * math.sqrt(float(total.sum()) / _SAMPLES))
+            chance = cv2.GaussianBlur(total / _SAMPLES, (0, 0), blur)
+            found.append(np.clip(chance, *_PROBABILITIES).astype(np.float32))
         return found
 
     def _ratios(
-        self,
-        pictures: Sequence[Sequence[Picture | None]],
-        chances: Sequence[Sequence[Likelihood]],
+        self, level: _Level, chances: Sequence[Sequence[Likelihood]]
     ) -> list[list[Likelihood]]:
         """What the background says, of each frame and camera; nothing where there is no picture."""
         found = [[np.zeros_like(one) for one in own] for own in chances]
-        for c in range(len(self._cameras)):
-            seen = [(f, own[c]) for f, own in enumerate(pictures)]
+        for c in range(len(level.cameras)):
+            seen = [(f, own[c]) for f, own in enumerate(level.pictures)]
             there = [(f, picture) for f, picture in seen if picture is not None]
             told = tell_from_background(
                 [picture for _, picture in there], [chances[f][c] for f, _ in there]
@@ -227,9 +279,11 @@ class PoseAndMask:
                 found[f][c] = ratio
         return found
 
-    def _search(self, values: Array, share: float, ratios: Sequence[Likelihood]) -> Array:
+    def _search(
+        self, level: _Level, values: Array, share: float, ratios: Sequence[Likelihood]
+    ) -> Array:
         """The pose near some values that covers most of what is not background."""
-        told = [pair for pair in zip(self._cameras, ratios, strict=True) if pair[1].any()]
+        told = [pair for pair in zip(level.cameras, ratios, strict=True) if pair[1].any()]
         if not told:
             return values
         first = share * self._spread
@@ -250,23 +304,28 @@ class PoseAndMask:
             spread = np.maximum(_WIDENED * poses[order].std(axis=0), _LEAST_SPREAD * first)
         return best
 
-    def _refine(
-        self, values: Array, start: Array, masks: Sequence[Mask | None], share: float
-    ) -> Array:
+    def _refine(self, level: _Level, frame: _Frame) -> Array:
         """The pose whose contour lies along the masks' edges."""
+        masks = frame.cuts
         areas = [np.count_nonzero(mask) for mask in masks if mask is not None and mask.any()]
         if not areas:
-            return values
+            return frame.values
         size = math.sqrt(float(np.mean(areas)))
         edges = [NO_EDGE if mask is None else find_edge_points(mask, 2.0) for mask in masks]
         # Rounds are in hundreds of pixels.
         rounds = [
             AnnealingStage(one * size / 200.0, _SPACING, 8)
-            for one in np.geomspace(max(_SPACING, _WIDE * float(share)), _NARROW, 4)
+            for one in np.geomspace(max(_SPACING, _WIDE * frame.share), _NARROW, 4)
         ]
         held = self._spread <= 0.0
-        prior = Prior(start, np.where(held, 0.0, 1.0 / np.maximum(self._spread, 1e-9) ** 2))
-        return self._fit.fit(pack_views(self._cameras, edges), values, rounds, prior, held).values
+        prior = Prior(frame.start, np.where(held, 0.0, 1.0 / np.maximum(self._spread, 1e-9) ** 2))
+        views = pack_views(level.cameras, edges)
+        return self._fit.fit(views, frame.values, rounds, prior, held).values
+
+
+def _resized(picture: Picture, width: int, height: int) -> Picture:
+    """A picture (H, W, 3) in another size; where that is its own it stays as it is."""
+    return np.asarray(cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
 
 
 def cut_by_odds(picture: Picture, chance: Likelihood, ratio: Likelihood) -> Mask:
@@ -299,12 +358,3 @@ def _narrowed(share: float, agreements: Sequence[float]) -> float:
     if agreed > _GOOD:
         return max(0.5 * share, _FINEST_SHARE)
     return max(0.7 * share, _SEARCHED_SHARE) if agreed > _FAIR else share
-
-
-def _settled(drawn: Sequence[Sequence[Mask]], last: Sequence[Sequence[Mask]]) -> bool:
-    """Whether no silhouette changes any more."""
-    return all(
-        intersection_over_union(*pair) > _SETTLED
-        for own, other in zip(drawn, last, strict=True)
-        for pair in zip(own, other, strict=True)
-    )

@@ -25,6 +25,9 @@ from drake_pose.silhouette.areas.scoring import draw_mask
 _MOST, _AT_ONCE = 300, 20
 # A picture shows the body where it should cover this share of it.
 _SHOWN = 0.01
+# A frame contradicts the others whose contours fit less, and that overlaps less than so many times
+# what those of the fit do: dark and blurred contours fit badly where the body is right, too.
+_OVERLAPS = 0.9
 # Light is told in pictures about so wide [pixel].
 _LIGHT_WIDTH = 160
 
@@ -56,7 +59,8 @@ def judge_pictures(
     count = len(recording.names)
     rows = np.unique(np.linspace(0, count - 1, min(count, _MOST)).round().astype(int)).tolist()
     fitted = one.fit.fit
-    least = agreeing_share(fitted.inlier_ratios(one.fit.found))
+    overlaps = [frame.iou for frame in one.found.frames if frame.agrees]
+    least = agreeing_share(fitted.inlier_ratios(one.fit.found)), _OVERLAPS * np.median(overlaps)
     frames, misfits, lost = list[PosedFrame](), list[FrameMisfit](), list[str]()
     for k in range(0, len(rows), _AT_ONCE):
         seen = list[PosedFrame]()
@@ -96,14 +100,23 @@ def _see(
 
 
 def _misfits(
-    body: RegistrationBody, found: RegisteredCamera, seen: Sequence[PosedFrame], least: float
+    body: RegistrationBody,
+    found: RegisteredCamera,
+    seen: Sequence[PosedFrame],
+    least: tuple[float, float],
 ) -> list[FrameMisfit]:
-    """How well frames fit; those agree of whose contours no less fits."""
+    """How well frames fit; those agree that fit, or overlap, no less."""
     whole = PosedFrames(body.kinematics, body.all, found.camera, seen)
     fit = SharedFit([whole], [found.camera.X_CW], widths=False)
     ratios, summed = fit.inlier_ratios(fit.start), areas(whole, found.camera.X_CW[None], np.inf)[0]
     told = zip(seen, E_total(summed), intersection_over_union(summed), ratios, strict=True)
     return [
-        FrameMisfit(frame.name, float(off), float(iou), float(ratio), bool(ratio >= least))
+        FrameMisfit(
+            frame.name,
+            float(off),
+            float(iou),
+            float(ratio),
+            bool(ratio >= least[0] or iou >= least[1]),
+        )
         for frame, off, iou, ratio in told
     ]

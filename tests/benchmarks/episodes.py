@@ -34,6 +34,8 @@ _ARMS = {
     "Franka Panda": "franka_one_view/panda/panda.urdf",
     "Panda with Robotiq": "droid_episodes/robot/panda_robotiq.urdf",
 }
+# How joints of arms begin, not those of grippers.
+_JOINTS = ("A", "panda_joint", "lbr_")
 # Every how manieth room is grey on grey.
 _GREY = 5
 # Clocks are off by so much at most [s]; zeros by so much [degrees]; wrong rows last so long [s].
@@ -94,7 +96,7 @@ def measure_episode(path: Path, folder: Path, seed: int, kind: EpisodeSet) -> Ou
     moving = [
         name
         for name, low, high in zip(model.position_names, model.lower, model.upper, strict=True)
-        if np.isfinite(low) and high - low > 0.5
+        if np.isfinite(low) and high - low > 0.5 and name.startswith(_JOINTS)
     ]
     turned = {}
     if kind.zeros:

@@ -262,6 +262,11 @@ def pose_difference(X_WC: Array, from_X_WC: Array) -> Array:
     return np.concatenate([turn, X_WC[:3, 3] - from_X_WC[:3, 3]])
 
 
+def squared_distance(off: Array, covariance: Array) -> float:
+    """Squared Mahalanobis distance of a difference (6,) from 0, by its covariance (6, 6)."""
+    return float(off @ np.linalg.solve(covariance, off))
+
+
 def _registered(
     state: OnlineState, found: RegisteredCamera, frames: Sequence[PosedFrame], moved: bool = False
 ) -> OnlineState:
@@ -275,7 +280,7 @@ def _registered(
 def _distance(found: RegisteredCamera, registered: RegisteredCamera) -> float:
     """Squared Mahalanobis distance of a pose from another, by its own covariance."""
     off = pose_difference(found.camera.X_WC, registered.camera.X_WC)
-    return float(off @ np.linalg.solve(found.covariance, off))
+    return squared_distance(off, found.covariance)
 
 
 def _least_inlier_ratio(registered: RegisteredCamera) -> float:

@@ -16,9 +16,13 @@ from drake_pose.registration.picture_registration import (
 )
 from drake_pose.registration.picture_search import ABOUT, see_picture
 from drake_pose.registration.posed_frames import PosedFrame, PosedFrames
-from drake_pose.registration.register import FrameMisfit, RegisteredCamera, RegistrationBody
+from drake_pose.registration.register import (
+    FrameMisfit,
+    RegisteredCamera,
+    RegistrationBody,
+    frame_misfits,
+)
 from drake_pose.registration.shared_fit import SharedFit, agreeing_share
-from drake_pose.registration.start_poses import E_total, areas, intersection_over_union
 from drake_pose.silhouette.areas.scoring import draw_mask
 
 # At most so many pictures are judged, so many at once.
@@ -108,15 +112,6 @@ def _misfits(
     """How well frames fit; those agree that fit, or overlap, no less."""
     whole = PosedFrames(body.kinematics, body.all, found.camera, seen)
     fit = SharedFit([whole], [found.camera.X_CW], widths=False)
-    ratios, summed = fit.inlier_ratios(fit.start), areas(whole, found.camera.X_CW[None], np.inf)[0]
-    told = zip(seen, E_total(summed), intersection_over_union(summed), ratios, strict=True)
-    return [
-        FrameMisfit(
-            frame.name,
-            float(off),
-            float(iou),
-            float(ratio),
-            bool(ratio >= least[0] or iou >= least[1]),
-        )
-        for frame, off, iou, ratio in told
-    ]
+    ratios, X_CW = fit.inlier_ratios(fit.start), found.camera.X_CW
+    told = frame_misfits(whole, X_CW, ratios, ratios >= least[0])
+    return [replace(one, agrees=one.agrees or one.iou >= least[1]) for one in told]

@@ -28,8 +28,7 @@ from drake_pose.registration.picture_search import (
     node_places,
 )
 from drake_pose.registration.posed_frames import PosedFrame
-from drake_pose.registration.register import FrameMisfit, RegisteredCamera, RegistrationBody
-from drake_pose.registration.start_poses import E_total, areas, intersection_over_union
+from drake_pose.registration.register import RegisteredCamera, RegistrationBody, frame_misfits
 
 Array = NDArray[np.float64]
 Picture = NDArray[np.uint8]
@@ -333,14 +332,11 @@ def _describe(
     if TIME_OFFSET in fit.names:
         deviation = float(deviations[fit.names.index(TIME_OFFSET)])
         clock = TimeOffset(offset, deviation if deviation < _UNTOLD else np.inf, begun.scores)
-    found = areas(seen, best.camera.X_CW[None], np.inf)[0]
-    misfits = (E_total(found), intersection_over_union(found), ratios, agree)
-    rows = zip(seen.frames, *(one.tolist() for one in misfits), strict=True)
     return PictureRegistration(
         RegisteredCamera(
             best.camera,
             fit.camera_covariances(best.found, covariance)[0],
-            tuple(FrameMisfit(frame.name, *row) for frame, *row in rows),
+            frame_misfits(seen, best.camera.X_CW, ratios, agree),
             np.array([np.linalg.inv(X) for X in begun.alternatives]).reshape(-1, 4, 4),
         ),
         tuple(replace(frame, values=frame.values - zeros) for frame in seen.frames),

@@ -265,10 +265,7 @@ def describe_fitted(
     (seen,), (camera,) = fit.seen, fit.cameras(best)
     ratios = fit.inlier_ratios(best)
     agree = fit.agreeing(ratios)
-    found = areas(seen, camera.X_CW[None], np.inf)[0]
-    told = (E_total(found), intersection_over_union(found), ratios, agree)
-    rows = zip(seen.frames, *(one.tolist() for one in told), strict=True)
-    misfits = tuple(FrameMisfit(frame.name, *row) for frame, *row in rows)
+    misfits = frame_misfits(seen, camera.X_CW, ratios, agree)
     # A frame that contradicts fits no pose, so it tells none from another.
     counted = [one[agree] for one in pieces]
     as_good = [int(k) for k in order if excess(counted[k], counted[order[0]]) <= _SIGNIFICANCE]
@@ -283,6 +280,16 @@ def describe_fitted(
         np.array([np.linalg.inv(X) for X in alike[1:]]).reshape(-1, 4, 4),
     )
     return registered, covariance, as_good
+
+
+def frame_misfits(
+    seen: PosedFrames, X_CW: Array, ratios: Array, agrees: NDArray[np.bool_]
+) -> tuple[FrameMisfit, ...]:
+    """How well frames fit a camera's pose (4, 4); inlier ratios and which agree (frames,)."""
+    found = areas(seen, X_CW[None], np.inf)[0]
+    told = (E_total(found), intersection_over_union(found), ratios, agrees)
+    rows = zip(seen.frames, *(one.tolist() for one in told), strict=True)
+    return tuple(FrameMisfit(frame.name, *row) for frame, *row in rows)
 
 
 def spread(frames: Sequence[PosedFrame], most: int = 8) -> list[PosedFrame]:

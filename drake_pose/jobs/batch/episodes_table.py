@@ -5,15 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-import cv2
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from drake_pose.csv_files import csv_text
 from drake_pose.registration.contradictions import SIGNIFICANCE
-
-Array = NDArray[np.float64]
+from drake_pose.registration.online_registration import pose_difference, squared_distance
 
 COLUMNS = (
     "scene", "camera", "frames", "agreeing", "x", "y", "z", "sd_mm", "sd_deg", "off_mm", "off_deg",
@@ -47,9 +44,8 @@ def episodes_table(episodes: Mapping[str, Mapping[str, Any]]) -> str | None:
 def _moved(one: Mapping[str, Any], other: Mapping[str, Any]) -> tuple[float, float, str]:
     """How far a camera's pose is from another [mm, degrees], and whether it has moved."""
     X, Y = np.array(one["X_WC"]), np.array(other["X_WC"])
-    turn = cv2.Rodrigues(Y[:3, :3] @ X[:3, :3].T)[0].ravel()
-    error = np.concatenate([turn, Y[:3, 3] - X[:3, 3]])
+    off = pose_difference(Y, X)
     covariance = np.array(one["covariance"]) + np.array(other["covariance"])
-    p_value = float(chi2.sf(error @ np.linalg.solve(covariance, error), len(error)))
-    off = 1e3 * float(np.linalg.norm(error[3:])), float(np.degrees(np.linalg.norm(turn)))
-    return *off, "yes" if p_value < SIGNIFICANCE else "no"
+    p_value = float(chi2.sf(squared_distance(off, covariance), len(off)))
+    shift, turn = 1e3 * np.linalg.norm(off[3:]), np.degrees(np.linalg.norm(off[:3]))
+    return float(shift), float(turn), "yes" if p_value < SIGNIFICANCE else "no"

@@ -20,7 +20,6 @@ from typing import Any
 from drake_pose.body.landmarks import landmarks_file
 from drake_pose.body.model import load_model
 from drake_pose.camera.camera_files import load_cameras
-from drake_pose.camera.episodes.episode import Episode
 from drake_pose.camera.episodes.open import open_episode
 from drake_pose.errors import DrakePoseError, OutputError
 from drake_pose.files.folder import OVERLAY, POSES, read_summary, write_file, write_summary
@@ -98,9 +97,10 @@ def plan_scene(job: SceneJob, out: Path) -> tuple[Task, ...]:
     Raises:
         DrakePoseError: the scene cannot be read.
     """
-    if (episode := _episode(job)) is not None:
+    if (own := _of_episode(job)) is not None:
+        episode = open_episode(job.scene, joints=_joints(job), episode=own.episode)
         most = max(len(one.times) for one in episode.cameras.values())
-        return (Task(job, out, None, tuple(map(str, range(0, most, job.settings.every)))),)
+        return (Task(job, out, None, tuple(map(str, range(0, most, own.every)))),)
     scene = _load(job).of_cameras(job.settings.cameras)
     scene, asked = scene.every(job.settings.every, job.settings.frames)
     frames = scene.seen_frames(asked)
@@ -167,7 +167,7 @@ def remove_parts(out: Path) -> None:
 
 def _require_same_masks(task: Task) -> None:
     """Refuses a finished scene whose masks were replaced; joining chunks sees to theirs."""
-    if task.index is not None or _episode(task.job) is not None:
+    if task.index is not None or _of_episode(task.job) is not None:
         return
     scene = _load(task.job)
     gone = []
@@ -190,12 +190,12 @@ def _load(job: SceneJob) -> Scene:
     return load_scene(job.scene, cameras, sequence=is_person)
 
 
-def _episode(job: SceneJob) -> Episode | None:
-    """The episode that a job audits; None: it is of a scene of masks, or of none."""
+def _of_episode(job: SceneJob) -> AuditSettings | None:
+    """The settings of a job that audits an episode; None: it is of a scene of masks."""
     settings = job.settings
-    if not isinstance(settings, AuditSettings) or not is_episode(job.scene, settings):
-        return None
-    return open_episode(job.scene, joints=_joints(job), episode=settings.episode)
+    if isinstance(settings, AuditSettings) and is_episode(job.scene, settings):
+        return settings
+    return None
 
 
 def _joints(job: SceneJob) -> Path | None:

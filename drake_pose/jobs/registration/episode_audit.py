@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
@@ -20,12 +19,14 @@ from drake_pose.errors import SceneError
 from drake_pose.jobs.registration.episodes import EpisodeInputs
 from drake_pose.jobs.registration.inputs import Inputs
 from drake_pose.jobs.registration.positions import KnownPositions
+from drake_pose.jobs.registration.result import say_lost
 from drake_pose.registration.contradictions import (
     BASE,
     LEAST_OF_JOINTS,
     SIGNIFICANCE,
     Finding,
 )
+from drake_pose.registration.online_registration import pose_difference, squared_distance
 from drake_pose.registration.picture_frames import judge_pictures
 from drake_pose.registration.picture_registration import (
     PictureRegistration,
@@ -35,7 +36,6 @@ from drake_pose.registration.picture_registration import (
 )
 from drake_pose.registration.posed_frames import SeenFrame, placed_points
 from drake_pose.registration.register import RegisteredCamera, RegistrationBody
-from drake_pose.silhouette.pictures.scene_checks import frame_ranges
 from drake_pose.silhouette.pictures.scenes import Scene
 
 Array = NDArray[np.float64]
@@ -120,10 +120,7 @@ def look_at_episode(
             names[known] = name, frame.name
             frames.append(SeenFrame(known, frame.values, {name: frame.mask}))
         if judged.lost:
-            warnings.append(
-                f"camera '{name}': nothing of the robot is seen where it should be in frames "
-                f"{frame_ranges(judged.lost, recording.names)}"
-            )
+            warnings.append(say_lost(name, judged.lost, recording.names))
     inputs = Inputs(
         Scene(episode.path, episode.cameras, tuple(names), {}), episode.model, episode.tree,
         KnownPositions(episode.path, body.kinematics, {}), tuple(held),
@@ -146,12 +143,10 @@ def compare_camera(
         values: (f, m) where the body is in some frames.
         alone: whether it is the only one, so that the base may have moved as well.
     """
-    turn = cv2.Rodrigues(found.camera.X_WC[:3, :3] @ given.X_WC[:3, :3].T)[0].ravel()
-    shift = found.camera.X_WC[:3, 3] - given.X_WC[:3, 3]
-    error = np.concatenate([turn, shift])
-    p_value = float(chi2.sf(error @ np.linalg.solve(found.covariance, error), len(error)))
+    off = pose_difference(found.camera.X_WC, given.X_WC)
+    p_value = float(chi2.sf(squared_distance(off, found.covariance), len(off)))
     return Finding(
-        "camera", given.name, float(np.linalg.norm(turn)), float(np.linalg.norm(shift)),
+        "camera", given.name, float(np.linalg.norm(off[:3])), float(np.linalg.norm(off[3:])),
         found.rotation_sd, found.translation_sd,
         _pixels(body, (given, values), (found.camera, values)), p_value, (BASE,) if alone else (),
     )  # fmt: skip

@@ -43,6 +43,7 @@ from drake_pose.jobs.registration.result import (
     describe_parameters,
     describe_pictures,
     describe_run,
+    say_lost,
     say_pictures,
     write_result,
 )
@@ -318,11 +319,7 @@ class _Registration:
             self.pictures[name] = replace(one, pictures={**one.pictures, **shown})
             self.registered[name] = found
             if judged.lost:
-                self.warnings.append(
-                    f"camera '{name}': nothing of the robot is seen where it should be in frames "
-                    f"{frame_ranges(judged.lost, recording.names)}: is something before it, or are "
-                    "the joint positions not those of the pictures?"
-                )
+                self.warnings.append(say_lost(name, judged.lost, recording.names))
         if frames:
             self.inputs = replace(self.inputs, frames=tuple(frames))
 

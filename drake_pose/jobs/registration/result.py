@@ -39,6 +39,7 @@ from drake_pose.registration.posed_frames import PosedFrame
 from drake_pose.registration.register import ObjectPose, RegisteredCamera
 from drake_pose.silhouette.areas.outline import outline_from_mesh
 from drake_pose.silhouette.areas.scoring import draw_labels
+from drake_pose.silhouette.pictures.scene_checks import frame_ranges
 from drake_pose.silhouette.pictures.scenes import CAMERA_FILE
 
 Array = NDArray[np.float64]
@@ -135,6 +136,15 @@ def say_pictures(one: PictureRegistration, assumed: bool) -> list[str]:
             "as the robot moves too little or too slowly"
         )
     return texts
+
+
+def say_lost(camera: str, lost: Sequence[str], names: Sequence[str]) -> str:
+    """That pictures show nothing of a robot that they should; names: of all its pictures."""
+    return (
+        f"camera '{camera}': nothing of the robot is seen where it should be in frames "
+        f"{frame_ranges(lost, names)}: is something before it, or are the joint positions not "
+        "those of the pictures?"
+    )
 
 
 def describe_parameters(

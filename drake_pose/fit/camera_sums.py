@@ -85,7 +85,7 @@ def compare_placed(
     packed: PackedOutlines, X_WN: Array, views: Views, weights: Array
 ) -> tuple[Array, Array, Array]:
     """A, b and sums of each camera; arguments as of `compare_contours`."""
-    A, b, sums, *_ = compare_contours(packed, X_WN, *views, weights, 0, 1.0)
+    A, b, sums, *_ = compare_contours(packed, X_WN, *views, weights, 0, 1.0, False)
     return A, b, sums
 
 

@@ -241,18 +241,23 @@ class ContourFit:
         fitted[index] = found.own[0]
         return PoseFit(fitted, sums, found.cost, found.evaluations)
 
-    def compare(self, views: Views, theta: Array, step: AnnealingStage) -> Comparison:
-        """The contours at values (m,), or at all parameters, compared with all cameras' edges."""
+    def compare(
+        self, views: Views, theta: Array, step: AnnealingStage, widths: bool = False
+    ) -> Comparison:
+        """The contours at values (m,), or at all parameters, compared with all cameras' edges.
+
+        widths: as of compare_views.
+        """
         placement = self.body.place(theta)
         weights = self.weights(views.cameras, placement, step)
-        return compare_views(views, placement, weights)
+        return compare_views(views, placement, weights, widths)
 
     def piece_costs(self, views: Views, theta: Array, step: AnnealingStage, side: float) -> Array:
         """(cameras, k, k) the cost at values (m,) by squares of the pictures of a side [pixel]."""
         placement = self.body.place(theta)
         weights = self.weights(views.cameras, placement, step)
         placed = placement.packed, placement.X_WN
-        return np.asarray(compare_contours(*placed, *views, weights, _SQUARES, side)[3])
+        return np.asarray(compare_contours(*placed, *views, weights, _SQUARES, side, False)[3])
 
     def weights(
         self, cameras: tuple[Array, Array], placement: Placement, step: AnnealingStage
@@ -261,10 +266,15 @@ class ContourFit:
         return camera_weights(cameras, placement, step, self.noise, self._pixels)
 
 
-def compare_views(views: Views, placement: Placement, weights: Array) -> Comparison:
-    """A body's contours, where it stands, compared with all cameras' edges."""
+def compare_views(
+    views: Views, placement: Placement, weights: Array, widths: bool = False
+) -> Comparison:
+    """A body's contours, where it stands, compared with all cameras' edges.
+
+    widths: whether it is told what follows the silhouettes' widths.
+    """
     placed = placement.packed, placement.X_WN
-    A, b, sums, _, wide = compare_contours(*placed, *views, weights, 0, 1.0)
+    A, b, sums, _, wide = compare_contours(*placed, *views, weights, 0, 1.0, widths)
     return Comparison(A, b, sums, wide, placement)
 
 

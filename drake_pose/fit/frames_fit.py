@@ -146,6 +146,7 @@ class FramesFit:
         self._contours = ContourFit(kinematics, body.outlines, noise, steps, pixels, body)
         self._first_look = len(body.names) + 1
         self._first_width = len(self.names) - len(cameras)
+        self._widths = np.flatnonzero(unknowns.entries >= self._first_width)
         self._of_odds = odds_of_colours(len(body.outlines))
         self._fixed = not np.any(unknowns.entries >= self._first_look)
         # A body is placed faster that neither grows nor is shifted.
@@ -281,10 +282,7 @@ class FramesFit:
             )
             H += rows @ pulled.T
             g -= rows @ b.ravel()
-        widths = np.flatnonzero(self.unknowns.entries >= self._first_width)
-        if not len(widths):
-            return H, g, compared.sums
-        for k in widths:
+        for k in self._widths:
             # Of a silhouette that is wider all distances are less.
             c = self.unknowns.entries[k] - self._first_width
             g[k] = -compared.wide[c, :, 12].sum()
@@ -304,7 +302,9 @@ class FramesFit:
         """
         places, seen = self.places(theta), _whole(evidence)
         views = self._views(seen.edges, theta, places)
-        compared = self._contours.compare(views, self._of_body(theta, seen.rates), step)
+        compared = self._contours.compare(
+            views, self._of_body(theta, seen.rates), step, len(self._widths) > 0
+        )
         placed = compared.placement
         for c, picture in enumerate(seen.odds):
             if picture is not None:

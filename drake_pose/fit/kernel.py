@@ -82,6 +82,7 @@ def compare_contours(
     weights: Array,
     squares: int,
     side: float,
+    widths: bool,
 ) -> tuple[Array, Array, Array, Array, Array]:
     """What each camera says of the nodes' affine motions.
 
@@ -97,6 +98,7 @@ def compare_contours(
             the body's contour [pixel], and what a pixel of contour is worth.
         squares: k, so many squares of each picture's rows and columns are told apart; 0: none.
         side: of the squares [pixel]; beyond k they are counted from 0 again.
+        widths: whether it is told what follows the silhouettes' widths.
 
     Returns:
         A (c, nodes, 12, 12), lower triangles, and b (c, nodes, 12); sums (c, nodes + 1, 6) of each
@@ -104,7 +106,8 @@ def compare_contours(
         it fits to within the scale; CLOSE, one minus the cost in squares of the scale, summed along
         it [all in units of length]; COST, and SQUARES of the distances, both as weighted in A and
         b; WEIGHT, of these; (c, k, k) the COST by squares of the picture; and (c, nodes, 13)
-        by how much b grows as silhouettes grow by a pixel, then so much their cost, over two.
+        by how much b grows as silhouettes grow by a pixel, then so much their cost, over two;
+        0 where it is not told.
     """
     count, nodes = len(weights), len(X_WN)
     A, b = np.zeros((count, nodes, 12, 12)), np.zeros((count, nodes, 12))
@@ -137,7 +140,7 @@ def compare_contours(
                 size = math.sqrt(n0 * n0 + n1 * n1)
                 n0, n1 = n0 / size, n1 / size
                 r = (edge_uv[j, 0] - uv[i, 0]) * n0 + (edge_uv[j, 1] - uv[i, 1]) * n1
-                grows = edge_normals[j, 0] * n0 + edge_normals[j, 1] * n1
+                grows = edge_normals[j, 0] * n0 + edge_normals[j, 1] * n1 if widths else 0.0
                 node = contour.nodes[i]
                 cost = add_residual(
                     own_A[node], own_b[node], counted, wide[c, node], X_WN[node], contour.p_N[i],
@@ -202,7 +205,7 @@ def add_residual(
         camera: X_CW (4, 4) and kernel parameters (8,).
         n0, n1: the direction along which the point is to move.
         r: by how much [pixel].
-        grows: by how much more as the silhouette grows by a pixel on all sides.
+        grows: by how much more as the silhouette grows by a pixel on all sides; 0: not told.
         length: of the contour that the point stands for [pixel].
         weights: (4,) as of `compare_contours`.
         scratch: (2, 3), (3,) and (12,).
@@ -222,9 +225,10 @@ def add_residual(
     sums[SQUARES] += weight * r * r
     sums[WEIGHT] += weight
     add_row(A, b, X_WN, p_N, camera, n0, n1, r, weight, scratch)
-    for k in range(12):
-        wide[k] += weight * grows * scratch[2][k]
-    wide[12] += weight * grows * r
+    if grows != 0.0:
+        for k in range(12):
+            wide[k] += weight * grows * scratch[2][k]
+        wide[12] += weight * grows * r
     return cost
 
 

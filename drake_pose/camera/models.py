@@ -198,6 +198,10 @@ class PinholeCamera(_PosedCamera):
             center_y=y * (self.center_y + 0.5) - 0.5,
         )
 
+    def mirrored(self) -> PinholeCamera:
+        """The camera of the same pictures with left and right exchanged."""
+        return dataclasses.replace(self, center_x=self.width - 1 - self.center_x)
+
     def kernel_parameters(self) -> np.ndarray:
         """Returns (8,) kind (0: pinhole), f_x, f_y, c_x, c_y, near, width, height."""
         projection = [0.0, self.focal_x, self.focal_y, self.center_x, self.center_y, self.near]

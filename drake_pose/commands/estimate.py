@@ -38,6 +38,7 @@ def estimate(
     out: Out,
     settings: Annotated[EstimateSettings | None, SPREAD] = None,
     truth: Truth = None,
+    cameras: Path | None = None,
     resume: Resume = False,
     overlay: Overlay = True,
     replay: Replay = True,
@@ -68,15 +69,18 @@ def estimate(
         scene: Folder with cameras.yaml and masks/<camera>/<frame>.png; or with masks/<frame>.png
             alone, of a camera without calibration. A sequence may have
             images/<camera>/<frame>.png or .jpg, or videos/<camera>.mp4, and a mask of the first
-            frame only.
+            frame only. Or a robot's recorded episode: pictures or videos with a joint log, a
+            LeRobot data set, DROID's raw folder or a bag; the body is followed by colour from where
+            the log says that it begins.
+        cameras: Camera file in place of the scene's or episode's own, as register writes it.
     """
     from drake_pose.jobs.estimate.compile_ahead import compiling_ahead
     from drake_pose.jobs.estimate.scene import estimate_scene
 
     with compiling_ahead(), FrameProgress() as progress:
         result = estimate_scene(
-            scene, model, out, settings, truth=truth, resume=resume, replay=replay,
-            overlay=overlay, on_frame=progress, on_stage=progress.show_stage,
+            scene, model, out, settings, truth=truth, cameras=cameras, resume=resume,
+            replay=replay, overlay=overlay, on_frame=progress, on_stage=progress.show_stage,
         )  # fmt: skip
     print_result(result, json, print_estimate)
     if result.found_count == 0:

@@ -66,7 +66,19 @@ class CaptureSettings(SceneSettings):
 
 
 @dataclass(frozen=True, kw_only=True)
-class EstimateSettings(CaptureSettings):
+class EpisodeSettings(SceneSettings):
+    """How a robot's recorded episode is read."""
+
+    episode: Annotated[int | None, Parameter(metavar="N")] = None
+    """The number of the episode in a LeRobot data set; default: the only one that is there."""
+    joint_map: Path | None = None
+    """Of an episode: which column of its joint log is which joint, in which unit (YAML)."""
+    units: Literal["rad", "deg"] | None = None
+    """The unit of angles in an episode's joint log; default: what the joints' limits say."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class EstimateSettings(CaptureSettings, EpisodeSettings):
     """How a scene is estimated.
 
     Raises:

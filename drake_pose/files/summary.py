@@ -36,15 +36,21 @@ _LIMITS = {"run_limit": "run limit", "time_limit": "time limit"}
 _PACKAGES = ("drake", "numpy", "numba", "opencv-python-headless")
 
 
-def describe_job(scene: Path, model: Path, settings: SceneSettings) -> dict[str, Any]:
-    """What is estimated from what and how, as plain JSON values, with the files' SHA-256."""
+def describe_job(
+    scene: Path, model: Path, settings: SceneSettings, cameras: Path | None = None
+) -> dict[str, Any]:
+    """What is estimated from what and how, as plain JSON values, with the files' SHA-256.
+
+    Args:
+        cameras: a camera file in place of the scene's own.
+    """
     return {
         "scene": str(scene),
         "model": str(model),
         "settings": settings.as_json(),
         "sha256": {
             "model": file_digest(model),
-            "cameras": file_digest(scene / "cameras.yaml"),
+            "cameras": file_digest(cameras or scene / "cameras.yaml"),
         },
     }
 

@@ -69,12 +69,12 @@ class Finding:
     """By how much something is off.
 
     Args:
-        kind: "joint", "camera", "base", "focal", "center", "clock", "joints" where several are off,
-            or "unexplained" where nothing within reach explains a frame.
+        kind: "joint", "camera", "base", "focal", "center", "clock", "rate" of a clock, "joints"
+            where several are off, or "unexplained" where nothing within reach explains a frame.
         name: of the joint, or the camera: "" where it is all of them.
         angle, shift: [rad, m]; of joints the largest; of focal lengths the shift is their share, of
             principal points [pixel], of a camera's clock by how much later its pictures'
-            joints are in the log [s].
+            joints are in the log [s], of its rate how much faster the log's runs [s/s].
         angle_sd, shift_sd: their standard deviations.
         pixels: how far it moves the outlines of the parts that it moves, root mean square.
         p_value: how often nothing would seem so much off by chance.

@@ -11,7 +11,6 @@ from drake_pose.fit.background import Light
 from drake_pose.fit.surfaces import hull_of_few
 from drake_pose.registration.picture_registration import (
     PictureRegistration,
-    Recording,
     posed_pictures,
 )
 from drake_pose.registration.picture_search import ABOUT, see_picture
@@ -52,7 +51,7 @@ class JudgedPictures:
 
 
 def judge_pictures(
-    body: RegistrationBody, one: PictureRegistration, found: RegisteredCamera, recording: Recording
+    body: RegistrationBody, one: PictureRegistration, found: RegisteredCamera
 ) -> JudgedPictures:
     """Which of a recording's pictures contradict the others; of many, some spread over all.
 
@@ -60,7 +59,7 @@ def judge_pictures(
         one: what was found in some of them.
         found: the camera, where it is known to be by now.
     """
-    count = len(recording.names)
+    count = len(one.recording.names)
     rows = np.unique(np.linspace(0, count - 1, min(count, _MOST)).round().astype(int)).tolist()
     fitted = one.fit.fit
     overlaps = [frame.iou for frame in one.found.frames if frame.agrees]
@@ -68,7 +67,7 @@ def judge_pictures(
     frames, misfits, lost = list[PosedFrame](), list[FrameMisfit](), list[str]()
     for k in range(0, len(rows), _AT_ONCE):
         seen = list[PosedFrame]()
-        for name, frame in _see(body, one, found, recording, rows[k : k + _AT_ONCE]):
+        for name, frame in _see(body, one, found, rows[k : k + _AT_ONCE]):
             if frame is None:
                 lost.append(name)
             else:
@@ -87,7 +86,6 @@ def _see(
     body: RegistrationBody,
     one: PictureRegistration,
     found: RegisteredCamera,
-    recording: Recording,
     rows: Sequence[int],
 ) -> Iterator[tuple[str, PosedFrame | None]]:
     """Pictures that should show the body, with masks; None: nothing is seen of it."""
@@ -96,7 +94,7 @@ def _see(
     step = max(1, camera.width // _LIGHT_WIDTH)
     small = np.ascontiguousarray(known.colours[::step, ::step])
     offset = 0.0 if one.offset is None else one.offset.value
-    for posed in posed_pictures(recording.with_zeros(one.zeros), rows, offset):
+    for posed in posed_pictures(one.recording.with_zeros(one.zeros), rows, offset):
         covered = draw_mask(outlines, camera.X_CW @ body.kinematics.poses(posed.values), camera)
         if covered.mean() >= _SHOWN:
             light = Light.between(posed.picture[::step, ::step].astype(np.float32), small)

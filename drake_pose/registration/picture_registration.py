@@ -48,11 +48,18 @@ _LOOKS, _LEAST_RATIO, _LEAST_CONTOUR = 3, 0.42, 0.16
 # What is explained and so many times the contours together: right ones have 1.2 and more, the best
 # wrong ones .9.
 _CONTOURS, _LEAST_EVIDENCE = 4.0, 1.05
+# No pose is one of which less is known [of the distance; rad]. Right ones are known to a hundredth;
+# mirrored pictures are explained about as well from behind, known to a twentieth or a third.
+_MOST_SD = 0.04
 # Poses are as good that explain less by no more deviations.
 _SIGNIFICANCE = 1.96
 # Offsets of clocks that are tried [s]; what was fitted is fitted again where an offset moved more
 # than so much, or a zero, so often at most.
 _OFFSETS, _AGAIN, _TURNED, _MOST_FITS = np.linspace(-1.0, 1.0, 81), 0.02, np.radians(0.3), 4
+# A clock may drift that seems to by so many deviations, which what it spoils makes large, and by so
+# much over all pictures [s]: it is fitted anew, so often at most. It does that is then so many
+# deviations from going right.
+_LIKELY, _LEAST_DRIFT, _DRIFT_FITS, _DRIFTS = 1.0, 0.005, 5, 4.0
 # An offset is not told whose standard deviation is larger [s].
 _UNTOLD = 0.1
 
@@ -63,19 +70,21 @@ class Recording:
 
     Args:
         names: (n,) of the pictures.
-        values_at: (n, m) values of the pose tree at the pictures' times, so much later [s].
+        values_at: (n, m) values of the pose tree so much later [s] than the pictures' times; one
+            for all, or (n,).
         read: gives picture k (H, W, 3).
-        timed: whether the joints have times: else the values are the same whatever the offset.
+        times: (n,) of the pictures [s]; None: the joints have none, and the values are the same
+            whatever the offset.
     """
 
     names: tuple[str, ...]
-    values_at: Callable[[float], Array]
+    values_at: Callable[[float | Array], Array]
     read: Callable[[int], Picture]
-    timed: bool
+    times: Array | None
 
     def rates_at(self, offset: float) -> Array | None:
         """(n, m) how fast the values change [rad/s or m/s]; None: nobody knows."""
-        if not self.timed:
+        if self.times is None:
             return None
         ahead, behind = (self.values_at(offset + by) for by in (_RATE_STEP, -_RATE_STEP))
         return np.asarray(np.nan_to_num((ahead - behind) / (2.0 * _RATE_STEP)))
@@ -84,9 +93,20 @@ class Recording:
         """A picture (H, W, 3) by its name."""
         return self.read(self.names.index(name))
 
+    def mirrored(self) -> Recording:
+        """The same with left and right exchanged in all pictures."""
+        return replace(self, read=lambda k: np.ascontiguousarray(self.read(k)[:, ::-1]))
+
     def with_zeros(self, zeros: Array) -> Recording:
         """The same with (m,) added to all values."""
         return replace(self, values_at=lambda offset: self.values_at(offset) + zeros)
+
+    def with_drift(self, drift: float, since: float) -> Recording:
+        """The same where the joints' clock runs so much faster [s/s], and is right at a time."""
+        if not drift or self.times is None:
+            return self
+        later = drift * (self.times - since)
+        return replace(self, values_at=lambda offset: self.values_at(offset + later))
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,12 +115,16 @@ class TimeOffset:
 
     Args:
         value, deviation: [s]; the deviation is infinite where the pictures do not tell.
+        drift, drift_deviation: by how much more in each second [s/s]; 0 where that is not told from
+            chance. The value is that of the frames' mean time.
         scores: (k, 2) offsets that were tried [s], and what they explain, over the best.
     """
 
     value: float
     deviation: float
     scores: Array
+    drift: float = 0.0
+    drift_deviation: float = np.inf
 
     @property
     def determined(self) -> bool:
@@ -119,6 +143,7 @@ class PictureRegistration:
         fit: that found it.
         offset: of its clock; None: the joints have no times.
         focal_deviation: over the focal length; 0: it was held.
+        recording: it was found in, the joints' clock drifting no more.
         zeros: (m,) that were added to the frames' values where masks and odds were found.
     """
 
@@ -128,6 +153,7 @@ class PictureRegistration:
     fit: PictureFit
     offset: TimeOffset | None
     focal_deviation: float
+    recording: Recording
     zeros: Array
 
 
@@ -147,15 +173,36 @@ def register_pictures(
             here (``calibrate_joints`` does that), but masks follow it.
 
     Raises RegistrationError: too few pictures with joint positions, a body that does not move, or
-        no pose that explains the pictures.
+        no pose that explains the pictures; says so where one explains them mirrored.
     """
+    try:
+        return _register(body, camera, recording, focal, zeros)
+    except _Unexplained as error:
+        try:
+            _register(body, camera.mirrored(), recording.mirrored(), focal, zeros)
+        except RegistrationError:
+            raise error from None
+        raise RegistrationError(
+            f"camera '{camera.name}': its pictures are mirrored, left and right exchanged: a pose "
+            "explains them that way round only. Mirror them again. Nothing was written"
+        ) from error
+
+
+def _register(
+    body: RegistrationBody,
+    camera: PinholeCamera,
+    recording: Recording,
+    focal: bool,
+    zeros: Sequence[str],
+) -> PictureRegistration:
+    """As register_pictures, the pictures being as they are."""
     chosen, moving = _choose(body, camera, recording)
     begin = posed_pictures(recording, chosen, 0.0)
     search = PictureSearch(body, camera, begin)
     looks = [search.approach(camera.with_pose(np.linalg.inv(X))) for X in search.search()[:_LOOKS]]
     near = sorted((one for one in looks if one is not None), key=lambda one: -_evidence(*one[1]))
     if not near:
-        raise _unexplained(camera, "no pose shows the body in two pictures")
+        raise _Unexplained(camera, "no pose shows the body in two pictures")
     level, start = search.compared, near[0][0]
     pieces = level.pieces(start.X_CW)
     alike = [
@@ -163,9 +210,9 @@ def register_pictures(
     ]
     alternatives = level.distinct([start.X_CW, *alike])[1:]
     both, offset, scores = [*chosen, *moving], 0.0, np.zeros((0, 2))
-    if recording.timed:
+    if recording.times is not None:
         offset, scores = _scan(body, start, recording, both)
-    begun = _Begun(start, both, offset, alternatives, scores)
+    begun = _Begun(start, both, TimeOffset(offset, np.inf, scores), alternatives)
     return _fit(body, begun, recording, focal, zeros)
 
 
@@ -176,11 +223,14 @@ def refit_pictures(
     focal: bool = False,
     zeros: Sequence[str] = (),
 ) -> PictureRegistration:
-    """As register_pictures, of a camera that was found already."""
+    """As register_pictures, of a camera that was found already.
+
+    recording: as it is, whose joints' clock may drift.
+    """
     both = [recording.names.index(frame.name) for frame in one.frames]
     told = one.offset or TimeOffset(0.0, np.inf, np.zeros((0, 2)))
     others = [np.linalg.inv(X) for X in one.found.alternatives]
-    begun = _Begun(one.found.camera, both, told.value, others, told.scores)
+    begun = _Begun(one.found.camera, both, told, others)
     return _fit(body, begun, recording, focal, zeros)
 
 
@@ -189,9 +239,21 @@ class _Begun(NamedTuple):
 
     camera: PinholeCamera
     rows: Sequence[int]
-    offset: float
+    clock: TimeOffset
     alternatives: Sequence[Array]
-    scores: Array
+
+
+class _Settled(NamedTuple):
+    """A fit that moves no more.
+
+    recording: its joints' clock drifts no more; begun: with the camera and the clock that were
+    found, but for the offset's deviation; zeros: (m,) that were added to the frames' values.
+    """
+
+    best: PictureFit
+    recording: Recording
+    begun: _Begun
+    zeros: Array
 
 
 def _fit(
@@ -202,19 +264,63 @@ def _fit(
     zeros: Sequence[str],
 ) -> PictureRegistration:
     """What a search has begun, fitted until clock and zeros move no more."""
-    camera, offset, names = begun.camera, begun.offset, body.kinematics.names
-    constants = ((TIME_OFFSET,) if recording.timed else ()) + tuple(zeros)
+    steady = settled = _settle(body, begun, recording, focal, zeros)
+    if recording.times is None:
+        return _describe(settled, focal)
+    since, span = _mean_time(recording, begun.rows), float(np.ptp(recording.times))
+    for left in range(_DRIFT_FITS, -1, -1):
+        clock = settled.begun.clock
+        more, deviation = _drift(settled, since)
+        settled = settled._replace(
+            begun=settled.begun._replace(clock=replace(clock, drift_deviation=deviation))
+        )
+        if abs(more) < max(_LIKELY * deviation, _LEAST_DRIFT / span) or not left:
+            break
+        again = settled.begun._replace(clock=replace(clock, drift=clock.drift + more))
+        settled = _settle(body, again, recording, focal, zeros)
+    clock = settled.begun.clock
+    told = abs(clock.drift) > _DRIFTS * clock.drift_deviation
+    return _describe(settled if told else steady, focal)
+
+
+def _settle(
+    body: RegistrationBody,
+    begun: _Begun,
+    recording: Recording,
+    focal: bool,
+    zeros: Sequence[str],
+) -> _Settled:
+    """A fit with the drift of the clock that has begun."""
+    camera, offset, names = begun.camera, begun.clock.value, body.kinematics.names
+    constants = ((TIME_OFFSET,) if recording.times is not None else ()) + tuple(zeros)
     turned, left = np.zeros(len(names)), _MOST_FITS if zeros else 2
+    as_now = recording.with_drift(begun.clock.drift, _mean_time(recording, begun.rows))
     while True:
-        frames, left = posed_pictures(recording.with_zeros(turned), begun.rows, offset), left - 1
+        frames, left = posed_pictures(as_now.with_zeros(turned), begun.rows, offset), left - 1
         best = PictureSearch(body, camera, frames).fit(camera, constants, focal)
         if best is None:
-            raise _unexplained(camera, "the body leaves the pictures")
+            raise _Unexplained(camera, "the body leaves the pictures")
         camera, by = best.camera, _constant(best, TIME_OFFSET)
         assumed, turn = turned, np.array([_constant(best, name) for name in names])
         offset, turned = offset + by, turned + turn
         if not left or (abs(by) < _AGAIN and np.abs(turn).max() < _TURNED):
-            return _describe(best, recording, begun, offset, assumed, focal)
+            clock = replace(begun.clock, value=offset)
+            return _Settled(best, as_now, begun._replace(camera=camera, clock=clock), assumed)
+
+
+def _drift(settled: _Settled, since: float) -> tuple[float, float]:
+    """How much faster the joints' clock runs yet [s/s], and the standard deviation of that."""
+    fit, found, recording = settled.best.fit, settled.best.found, settled.recording
+    assert recording.times is not None
+    agree = fit.agreeing(fit.inlier_ratios(found))
+    rows = [recording.names.index(frame.name) for frame in fit.seen[0].frames]
+    later = (recording.times[rows] - since)[agree]
+    return fit.growth(found, TIME_OFFSET, later, agree)
+
+
+def _mean_time(recording: Recording, rows: Sequence[int]) -> float:
+    """Of some pictures [s]."""
+    return 0.0 if recording.times is None else float(recording.times[list(rows)].mean())
 
 
 def _evidence(explained: float, contour: float) -> float:
@@ -298,27 +404,16 @@ def _constant(fitted: PictureFit, name: str) -> float:
     return float(fitted.found.shared[names.index(name)]) if name in names else 0.0
 
 
-def _describe(
-    best: PictureFit,
-    recording: Recording,
-    begun: _Begun,
-    offset: float,
-    zeros: Array,
-    focal: bool,
-) -> PictureRegistration:
-    """What was found.
-
-    zeros: (m,) that were added to the frames' values.
-
-    Raises RegistrationError: it does not explain the pictures.
-    """
+def _describe(settled: _Settled, focal: bool) -> PictureRegistration:
+    """What was found; RegistrationError: it does not explain the pictures."""
+    best, recording, begun, zeros = settled
     fit, (seen,) = best.fit, best.fit.seen
     ratios = fit.inlier_ratios(best.found)
     agree = fit.agreeing(ratios)
     ratio = float(ratios[agree].mean())
     told = _evidence(best.explained, best.contour)
     if ratio < _LEAST_RATIO or best.contour < _LEAST_CONTOUR or told < _LEAST_EVIDENCE:
-        raise _unexplained(
+        raise _Unexplained(
             begun.camera,
             f"at best {max(best.explained, 0.0):.0%} of what changes is explained, {ratio:.0%} of "
             f"the contours fit ({_LEAST_RATIO:.0%} at least), and edges along them are stronger "
@@ -328,30 +423,41 @@ def _describe(
     own, doubted = fit.covariances(best.found, agree)
     covariance = own + doubted
     deviations = np.sqrt(np.diag(covariance))
+    pose = fit.camera_covariances(best.found, covariance)[0]
+    found = RegisteredCamera(
+        best.camera, pose, frame_misfits(seen, best.camera.X_CW, ratios, agree),
+        np.array([np.linalg.inv(X) for X in begun.alternatives]).reshape(-1, 4, 4),
+    )  # fmt: skip
+    distance = float((best.camera.X_CW @ [*seen.middle, 1.0])[2])
+    if found.translation_sd > _MOST_SD * distance or found.rotation_sd > _MOST_SD:
+        raise _Unexplained(
+            begun.camera,
+            f"the best, {distance:.1f} m away, has a standard deviation of "
+            f"{1e3 * found.translation_sd:.0f} mm and {np.degrees(found.rotation_sd):.1f} degrees",
+        )
     clock = None
     if TIME_OFFSET in fit.names:
         deviation = float(deviations[fit.names.index(TIME_OFFSET)])
-        clock = TimeOffset(offset, deviation if deviation < _UNTOLD else np.inf, begun.scores)
+        clock = replace(begun.clock, deviation=deviation if deviation < _UNTOLD else np.inf)
     return PictureRegistration(
-        RegisteredCamera(
-            best.camera,
-            fit.camera_covariances(best.found, covariance)[0],
-            frame_misfits(seen, best.camera.X_CW, ratios, agree),
-            np.array([np.linalg.inv(X) for X in begun.alternatives]).reshape(-1, 4, 4),
-        ),
+        found,
         tuple(replace(frame, values=frame.values - zeros) for frame in seen.frames),
         {one.name: recording.picture(one.name) for one in seen.frames},
         best,
         clock,
         float(deviations[fit.per_camera - 1]) if focal else 0.0,
+        recording,
         zeros,
     )
 
 
-def _unexplained(camera: PinholeCamera, why: str) -> RegistrationError:
-    return RegistrationError(
-        f"camera '{camera.name}': no pose explains its pictures: {why}. Does the camera stand "
-        "still, does the robot move much in view of it, are the joint positions of these pictures' "
-        "moments, in the model's zeros and signs, and is the focal length about right? Nothing was "
-        "written"
-    )
+class _Unexplained(RegistrationError):
+    """No pose explains a camera's pictures."""
+
+    def __init__(self, camera: PinholeCamera, why: str) -> None:
+        super().__init__(
+            f"camera '{camera.name}': no pose explains its pictures: {why}. Does the camera stand "
+            "still, does the robot move much in view of it, are the joint positions of these "
+            "pictures' moments (none dropped, none repeated), in the model's zeros and signs, and "
+            "is the focal length about right? Nothing was written"
+        )

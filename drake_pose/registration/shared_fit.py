@@ -81,6 +81,8 @@ _TOLD = 1e-3
 # What may be off, and is not fitted: groups, and units [rad, m, 1, 1, share of the focal length].
 _ZEROS, _LENGTHS, _LENSES = "zeros", "lengths", "lenses"
 _ZERO, _SLID, _LENGTH, _FOCAL, _CENTER = np.radians(0.5), 0.002, 0.01, 0.01, 0.005
+# What is known of anything at least, that equations can be solved.
+_LEAST = 1e-9
 # Where parts err by so much [pixel], a calibration is no better than this [pixel].
 _PARTS_ERR, _NO_BETTER = 0.2, 1.0
 
@@ -247,6 +249,32 @@ class SharedFit:
             doubted[at, at] += unseen**2
         own = slice(len(self.names))
         return covariance[own, own], doubted[own, own]
+
+    def growth(self, found: Shared, name: str, weights: Array, which: Mask) -> tuple[float, float]:
+        """How a constant grows with what the masks that count weigh, were it to grow.
+
+        One Gauss-Newton step of a further unknown, whose derivatives are in each mask the
+        constant's times the mask's weight, beside all others; and its standard deviation.
+
+        Args:
+            weights: of the masks that count.
+        """
+        p, at = self._fit.unknowns.own_count, self.names.index(name)
+        equations = self.equations(found, _FITTED, which)
+        H, g = equations.H, equations.g
+        more = np.einsum("f,fi->fi", weights, H[:, p + at])
+        own = weights**2 * H[:, p + at, p + at]
+        H = np.block([[H, more[:, :, None]], [more[:, None, :], own[:, None, None]]])
+        g = np.column_stack([g, weights * g[:, p + at]])
+        gains = np.linalg.solve(H[:, :p, :p] + _LEAST * np.eye(p), H[:, :p, p:])
+        S = (H[:, p:, p:] - np.einsum("fpi,fpj->fij", H[:, :p, p:], gains)).sum(axis=0)
+        S += _LEAST * np.eye(len(S))
+        left = (g[:, p:] - np.einsum("fpi,fp->fi", gains, g[:, :p])).sum(axis=0)
+        inverse = np.linalg.inv(S)
+        said = np.linalg.inv(S[:-1, :-1])[at, at]
+        own_told, doubted = self.covariances(found, which)
+        scale = (own_told + doubted)[at, at] / said
+        return -float(inverse[-1] @ left), float(np.sqrt(scale * inverse[-1, -1]))
 
     def camera_covariances(self, found: Shared, covariance: Array) -> Array:
         """(cameras, 6, 6) of the poses' errors in the world, covariance being of what is shared."""

@@ -40,9 +40,10 @@ def swinging(times: np.ndarray, count: int) -> np.ndarray:
 
 
 def painted_episode(
-    folder: Path, frames: int = 16, size: tuple[int, int] = (160, 120), late: float = 0.0
-) -> PaintedEpisode:
-    """An episode; pictures show where the arm is so much later [s]."""
+    folder: Path, frames: int = 16, size: tuple[int, int] = (160, 120), late: float = 0.0,
+    every: float = 0.4,
+) -> PaintedEpisode:  # fmt: skip
+    """An episode, a picture every so many seconds; they show where the arm is so much later [s]."""
     path = write_box_arm(folder / "boxes.urdf")
     body = load_arm(path)
     width, height = size
@@ -60,7 +61,7 @@ def painted_episode(
     rng = np.random.default_rng(3)
     patches = rng.uniform(20.0, 235.0, (9, 12, 3)).astype(np.float32)
     background = cv2.resize(patches, size, interpolation=cv2.INTER_CUBIC).clip(0.0, 255.0)
-    times = np.arange(frames) * 0.4
+    times = np.arange(frames) * every
     values = swinging(times + late, len(body.kinematics.names))
     renderer, pictures = LabelRenderer(body.tree.model, camera), []
     colours = rng.uniform(30.0, 225.0, (20, 3))

@@ -31,7 +31,7 @@ def recording(episode, **changes):
         "names": tuple(f"{k:04d}" for k in range(len(episode.times))),
         "values_at": lambda offset: episode.values_at(episode.times + offset),
         "read": lambda k: episode.pictures[k],
-        "timed": True,
+        "times": episode.times,
     }
     return Recording(**(given | changes))
 
@@ -71,6 +71,18 @@ def test_a_camera_and_its_clock_are_fitted_on_lines(episode):
     assert found.found.shared[k] == pytest.approx(0.015, abs=0.004)
     assert found.explained > 0.5
     assert min(found.fit.inlier_ratios(found.found)) > 0.7
+    # A clock that drifts is told by how offsets grow.
+    later = episode.times[:12] - episode.times[:12].mean()
+    drifting = episode.values_at(episode.times[:12] + LATE - 0.005 * later)
+    frames = [replace(one, values=row) for one, row in zip(frames, drifting, strict=True)]
+    fitted = PictureSearch(episode.body, episode.camera, frames).fit(
+        near(episode.camera, 0.5), (TIME_OFFSET,)
+    )
+    drift, deviation = fitted.fit.growth(
+        fitted.found, TIME_OFFSET, later, np.ones(len(later), bool)
+    )
+    assert drift == pytest.approx(0.005, abs=0.002)
+    assert 0.0 < deviation < 0.004
     # The wrong focal length is told, too.
     wide = replace(episode.camera, focal_x=1.04 * episode.camera.focal_x,
                    focal_y=1.04 * episode.camera.focal_y)  # fmt: skip
@@ -103,6 +115,25 @@ def test_a_camera_is_found_without_a_guess_and_as_sure_as_it_is(episode):
     # The best of all that were tried is next to what was fitted.
     offsets, scores = found.offset.scores.T
     assert offsets[scores.argmax()] == pytest.approx(LATE, abs=0.03)
+
+
+@pytest.mark.slow
+def test_a_clock_that_drifts_is_put_right(episode):
+    faster = recording(
+        episode, values_at=lambda offset: episode.values_at(0.97 * episode.times + offset)
+    )
+    found = register_pictures(episode.body, episode.camera, faster)
+    # Pictures show later moments, and later ones the later they are.
+    assert found.offset.drift == pytest.approx(0.03 / 0.97, abs=0.003)
+    assert found.offset.drift_deviation < 0.003
+    assert np.linalg.norm(pose_error(found.found.camera.X_WC, episode.camera.X_WC)[3:]) < 0.012
+
+
+@pytest.mark.slow
+def test_mirrored_pictures_are_told(episode):
+    mirrored = recording(episode, read=lambda k: np.ascontiguousarray(episode.pictures[k][:, ::-1]))
+    with pytest.raises(RegistrationError, match="its pictures are mirrored"):
+        register_pictures(episode.body, episode.camera, mirrored)
 
 
 @pytest.mark.slow

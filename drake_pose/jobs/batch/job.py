@@ -12,7 +12,7 @@ from cyclopts import Parameter
 
 from drake_pose.errors import SettingsError
 from drake_pose.files.options import FromText
-from drake_pose.files.settings import EstimateSettings
+from drake_pose.files.settings import EpisodeSettings, EstimateSettings
 from drake_pose.files.summary import describe_job, file_digest
 from drake_pose.jobs.estimate.inputs import bundled_person
 from drake_pose.jobs.registration.settings import AuditSettings
@@ -22,7 +22,10 @@ CHUNK = 100
 """Frames in a chunk where nobody says."""
 
 _OWN = ("scene", "model", "truth", "overlay", "replay", "audit", "camera_file")
-_SETTINGS = tuple(one.name for one in fields(EstimateSettings))
+# A batch estimates scenes; episodes it audits.
+_SETTINGS = tuple(
+    one.name for one in fields(EstimateSettings) if one.name not in EpisodeSettings.__annotations__
+)
 _OF_AUDITS = tuple(one.name for one in fields(AuditSettings))
 OWN_JOINTS = True
 """In place of a table of joint positions: those that an episode holds."""

@@ -13,17 +13,24 @@ from drake_pose.body.formats.packages import bundled_model
 from drake_pose.body.landmarks import landmarks_file, load_landmarks
 from drake_pose.body.model import ArticulatedModel, load_model
 from drake_pose.body.report import model_warnings
+from drake_pose.camera.camera_files import load_cameras
 from drake_pose.errors import ModelError, SceneError, SettingsError, UnknownNameError
 from drake_pose.files.records import user_units
 from drake_pose.files.settings import EstimateSettings
 from drake_pose.filtering.tracking.contour_tracker import TrackingSettings
+from drake_pose.jobs.estimate.episode import is_episode, logged_positions, read_episode_scene
 from drake_pose.jobs.estimate.measurements import (
     TrueAngles,
     check_units,
     read_joint_centres,
     read_true_angles,
 )
-from drake_pose.jobs.estimate.searches import leave_out_links, make_placement_search, make_search
+from drake_pose.jobs.estimate.searches import (
+    leave_out_links,
+    make_placement_search,
+    make_search,
+    make_tree,
+)
 from drake_pose.person.body_plan import PERSON_LANDMARKS
 from drake_pose.search.continuous.root_placement_search import RootPlacementSearch
 from drake_pose.search.estimates import PoseEstimate
@@ -34,7 +41,7 @@ from drake_pose.silhouette.pictures.scene_checks import (
     leave_out_unreadable,
     read_scene,
 )
-from drake_pose.silhouette.pictures.scenes import Scene
+from drake_pose.silhouette.pictures.scenes import SCENE_FILE, Scene, read_sequence
 
 TRUTH_FILE = "joint_angles.csv"
 _REST_TIME = 1.0
@@ -104,25 +111,39 @@ class Inputs:
 
 
 def read_inputs(
-    scene_path: Path, model_path: Path, settings: EstimateSettings, truth_path: Path | None
+    scene_path: Path,
+    model_path: Path,
+    settings: EstimateSettings,
+    truth_path: Path | None,
+    camera_path: Path | None = None,
 ) -> Inputs:
     """Read and check everything; without a truth path the scene's own joint_angles.csv is taken.
 
+    Args:
+        camera_path: a camera file in place of the scene's own.
+
     Raises DrakePoseError naming the file, camera, frame, link or joint at fault.
     """
-    # Who is captured moves.
-    scene, frames = read_scene(
-        scene_path,
-        settings.cameras,
-        settings.frames,
-        sequence=settings.method == "person",
-        every=settings.every,
-    )
     model = load_model(model_path, package_paths=settings.packages)
-    if settings.unseen:
-        model, settings = leave_out_links(model, settings)
-    truth, of_truth = _read_truth(scene_path, truth_path, model, frames)
-    starts = _read_starts(settings.start, frames, model)
+    if is_episode(scene_path, settings) and not read_sequence(scene_path / SCENE_FILE)[0]:
+        episode = read_episode_scene(scene_path, settings, truth_path, camera_path)
+        scene, frames = episode.scene, episode.scene.frames
+        if settings.unseen:
+            model, settings = leave_out_links(model, settings)
+        truth, starts, of_truth = logged_positions(episode, make_tree(model, settings), settings)
+    else:
+        # Who is captured moves.
+        is_person = settings.method == "person"
+        scene, frames = read_scene(
+            scene_path, settings.cameras, settings.frames,
+            cameras=None if camera_path is None else load_cameras(camera_path),
+            sequence=is_person, every=settings.every,
+        )  # fmt: skip
+        if settings.unseen:
+            model, settings = leave_out_links(model, settings)
+        truth, of_truth = _read_truth(scene_path, truth_path, model, frames)
+        starts = {}
+    starts = _read_starts(settings.start, frames, model) or starts
     tracked = scene.sequence and settings.track
     _check_start(scene, frames, starts, settings.track)
     if (scene.images or not starts) and follows_person(scene, model, settings):

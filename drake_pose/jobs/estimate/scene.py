@@ -24,6 +24,7 @@ def estimate_scene(
     settings: EstimateSettings | None = None,
     *,
     truth: Path | str | None = None,
+    cameras: Path | str | None = None,
     resume: bool = False,
     replay: bool = True,
     overlay: bool = True,
@@ -33,27 +34,26 @@ def estimate_scene(
     """Estimate the positions of a body in every frame of a scene.
 
     Args:
-        scene: the scene's folder: cameras.yaml, masks/<camera>/<frame>.png; or masks/<frame>.png
-            alone, of an uncalibrated camera.
+        scene: cameras.yaml and masks/<camera>/<frame>.png; or masks/<frame>.png alone, of a camera
+            nobody calibrated; or an episode (``open_episode``), followed from where its log begins.
         out: folder for the result; None writes nothing.
         settings: which cameras and frames, the root, the sampling.
-        truth: measured joint positions to compare with; None: the scene's own joint_angles.csv.
+        truth: measured joint positions to compare with; None: joint_angles.csv, the episode's log.
+        cameras: a camera file in place of the scene's own.
         resume: go on with an interrupted result in ``out``.
         replay, overlay: whether replay.html is made, and overlays are written.
-        on_frame: called after each frame.
-        on_stage: called with what is done before the first frame is finished.
+        on_frame, on_stage: called after each frame; with what is done before the first one.
 
     Returns:
-        The estimate. Interrupted (KeyboardInterrupt), the finished frames are in ``out``; a person
-        who is followed is followed again from the beginning when that is resumed.
+        The estimate. Interrupted (KeyboardInterrupt), the finished frames are in ``out``.
 
-    Raises:
-        DrakePoseError: names the file, camera, frame, link or joint at fault.
+    Raises DrakePoseError: names the file, camera, frame, link or joint at fault.
     """
     settings, folder = settings or EstimateSettings(), None if out is None else Path(out)
-    job = describe_job(Path(scene), Path(model), settings)
+    known, own = (None if one is None else Path(one) for one in (truth, cameras))
+    job = describe_job(Path(scene), Path(model), settings, own)
     earlier = open_job(folder, job, resume)
-    inputs = read_inputs(Path(scene), Path(model), settings, None if truth is None else Path(truth))
+    inputs = read_inputs(Path(scene), Path(model), settings, known, own)
     inputs, of_body, shapes = fit_body(inputs, settings, on_stage)
     result = ResultWriter(
         inputs.scene, inputs.model, job, folder, earlier=earlier, with_base=inputs.base_moves,

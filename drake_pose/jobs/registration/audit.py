@@ -22,15 +22,17 @@ from drake_pose.files.options import percent
 from drake_pose.files.records import user_units
 from drake_pose.files.settings import EstimateSettings
 from drake_pose.files.summary import mask_digests
+from drake_pose.jobs.estimate.episode import is_episode
 from drake_pose.jobs.estimate.searches import make_tree
 from drake_pose.jobs.registration.episode_audit import EpisodeLook, look_at_episode
-from drake_pose.jobs.registration.episodes import EpisodeInputs, is_episode, read_episode
+from drake_pose.jobs.registration.episodes import EpisodeInputs, read_episode
 from drake_pose.jobs.registration.inputs import Inputs
 from drake_pose.jobs.registration.positions import read_known_positions
 from drake_pose.jobs.registration.report import say_reading
 from drake_pose.jobs.registration.result import (
     describe_pictures,
     describe_run,
+    say_drift,
     write_comparisons,
     write_overlays,
 )
@@ -51,7 +53,12 @@ _SAMPLE = 20
 # Sizes of errors that are told.
 _SIZES = ("surface", "mask", "camera")
 # In which shifts are told, and what they are multiplied by for that.
-_UNITS = {"focal": ("percent", 100.0), "center": ("px", 1.0), "clock": ("ms", 1e3)}
+_UNITS = {
+    "focal": ("percent", 100.0),
+    "center": ("px", 1.0),
+    "clock": ("ms", 1e3),
+    "rate": ("percent", 100.0),
+}
 _LENGTH = ("mm", 1e3)
 # Where most frames contradict, other poses of cameras are tried on so many of them, of so many
 # pairs; they are named where so much of the contours fits, and less than this share of what does
@@ -106,7 +113,7 @@ def audit_scene(
         "joints": None if joints is None else Path(joints),
     }
     begin = time.perf_counter()
-    if is_episode(Path(scene), settings):
+    if settings.pictures or is_episode(Path(scene), settings):
         own = None if cameras is None else Path(cameras)
         episode = read_episode(Path(scene), Path(model), files["joints"], own, settings)
         look = _look(episode, on_frame)
@@ -407,6 +414,8 @@ def say_off(one: Finding, verb: str) -> str:
             f"camera '{one.name}': its pictures show the joints of {1e3 * abs(one.shift):.0f} +- "
             f"{1e3 * one.shift_sd:.0f} ms {word} by the joint log's clock"
         )
+    if one.kind == "rate":
+        return say_drift(one.name, one.shift, one.shift_sd)
     name = "the base" if one.kind == "base" else f"{one.kind} '{one.name}'"
     name = f"the {one.name}" if one.kind in _UNITS else name
     if one.rivals:

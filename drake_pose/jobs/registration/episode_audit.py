@@ -114,7 +114,7 @@ def look_at_episode(
         held.append(given if near else one.found.camera)
         findings += [] if near or off.p_value > SIGNIFICANCE else [off]
         findings += _clock(body, one, recording)
-        judged = judge_pictures(body, one, one.found, recording)
+        judged = judge_pictures(body, one, one.found)
         for frame in judged.frames:
             known = frame.name if len(placed) == 1 else f"{name}-{frame.name}"
             names[known] = name, frame.name
@@ -153,19 +153,32 @@ def compare_camera(
 
 
 def _clock(body: RegistrationBody, one: PictureRegistration, recording: Recording) -> list[Finding]:
-    """Whether a camera's clock is off the joint log's."""
-    if one.offset is None or not one.offset.determined:
+    """Whether a camera's clock is off the joint log's, or drifts.
+
+    recording: as it is.
+    """
+    clock, camera = one.offset, one.found.camera
+    if clock is None or not clock.determined:
         return []
-    value, deviation, camera = one.offset.value, one.offset.deviation, one.found.camera
-    p_value = float(chi2.sf(value**2 / (deviation**2 + _CLOCK_SD**2), 1))
     rows = [recording.names.index(frame.name) for frame in one.frames]
-    given = recording.values_at(0.0)[rows]
+    given, found = recording.values_at(0.0)[rows], one.recording.values_at(clock.value)[rows]
     known = np.isfinite(given).all(axis=1)
-    found = recording.values_at(value)[rows]
     pixels = _pixels(body, (camera, given[known]), (camera, found[known]))
-    if p_value > SIGNIFICANCE or pixels < LEAST_OF_JOINTS:
+    if pixels < LEAST_OF_JOINTS:
         return []
-    return [Finding("clock", camera.name, 0.0, value, 0.0, deviation, pixels, p_value)]
+    told = [
+        ("clock", clock.value, clock.deviation, _CLOCK_SD),
+        ("rate", clock.drift, clock.drift_deviation, 0.0),
+    ]
+    several = [
+        (kind, value, sd, float(chi2.sf(value**2 / (sd**2 + least**2), 1)))
+        for kind, value, sd, least in told
+    ]
+    return [
+        Finding(kind, camera.name, 0.0, value, 0.0, sd, pixels, p_value)
+        for kind, value, sd, p_value in several
+        if p_value < SIGNIFICANCE
+    ]
 
 
 def _pixels(

@@ -140,7 +140,7 @@ def check_focal_length(
     if abs(off) < max(_FOCAL_OFF, _FOCAL_DEVIATIONS * deviation):
         return found, ()
     text = (
-        f"camera '{found.camera.name}': its masks tell a focal length of {camera.focal_x:.0f} "
+        f"camera '{found.camera.name}': its pictures tell a focal length of {camera.focal_x:.0f} "
         f"pixels (standard deviation {deviation * camera.focal_x:.0f}), but it is given as "
         f"{found.camera.focal_x:.0f}; is it that of this camera, and of pictures of this size? "
         "With a wrong one the camera stands at a wrong distance; calibrate it"
@@ -174,7 +174,7 @@ def _others(
         "they fit when they are mirrored: turn the pictures back, or change the sign of all joint "
         "positions."
     )
-    yield text, replace(camera, center_x=camera.width - 1 - camera.center_x), turned
+    yield text, camera.mirrored(), turned
     if len(frames) > 2:
         pairs = list(pairwise(frames))[:_ROUGH_FRAMES]
         for which, moved in (

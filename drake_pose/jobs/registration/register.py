@@ -22,8 +22,9 @@ from drake_pose.files.folder import writes_folder
 from drake_pose.files.options import percent
 from drake_pose.files.summary import BADLY_EXPLAINED
 from drake_pose.fit.lengthened_body import lengthened_joints
+from drake_pose.jobs.estimate.episode import is_episode
 from drake_pose.jobs.estimate.inputs import missing_for_person
-from drake_pose.jobs.registration.episodes import EpisodeInputs, is_episode, read_episode
+from drake_pose.jobs.registration.episodes import EpisodeInputs, read_episode
 from drake_pose.jobs.registration.exports import check_exports
 from drake_pose.jobs.registration.inputs import (
     Inputs,
@@ -55,7 +56,6 @@ from drake_pose.registration.object_search import ObjectSearch
 from drake_pose.registration.picture_frames import judge_pictures
 from drake_pose.registration.picture_registration import (
     PictureRegistration,
-    Recording,
     register_pictures,
 )
 from drake_pose.registration.posed_frames import PosedFrames, SeenFrame
@@ -166,7 +166,7 @@ def _begun(
     on_camera: OnCamera | None,
 ) -> _Registration:
     """A registration that has found each camera by itself."""
-    if is_episode(scene, settings):
+    if settings.pictures or is_episode(scene, settings):
         episode = read_episode(scene, model, joints, cameras, settings)
         work = _Registration(inputs_of_episode(episode, settings), settings)
         check_exports(settings.exports, episode.cameras.values())
@@ -199,7 +199,6 @@ class _Registration:
         self.suggestions = dict[str, dict[str, Any] | None]()
         self.parameters: dict[str, Any] = {"zeros": {}, "lengths": {}}
         self.pictures = dict[str, PictureRegistration]()
-        self._recordings: Mapping[str, Recording] = {}
         self._zeros = np.zeros(len(self.body.kinematics.names))
 
     @property
@@ -261,7 +260,6 @@ class _Registration:
         Raises RegistrationError: no pose of a camera explains its pictures.
         """
         frames: list[SeenFrame] = []
-        self._recordings = episode.recordings
         for name, camera in episode.cameras.items():
             start, focal = time.perf_counter(), self._settings.focal or name in episode.assumed
             one = register_pictures(
@@ -294,25 +292,36 @@ class _Registration:
             if self.inputs.standing is not None:
                 require_determined(found)
             texts: tuple[str, ...] = ()
-            known = self._settings.focal or name in self.pictures
-            if not (self.inputs.positions.is_estimate or known):
-                found, texts = check_focal_length(body, found, self.inputs.of(name))
+            if not (self.inputs.positions.is_estimate or self._settings.focal):
+                found, texts = self._check_focal_length(body, found)
             self.registered[name] = found
             self.warnings += [*texts, *_warnings_of(found)]
         self.warnings += say_common(self.registered.values(), of_pictures=bool(self.pictures))
+
+    def _check_focal_length(
+        self, body: RegistrationBody, found: RegisteredCamera
+    ) -> tuple[RegisteredCamera, tuple[str, ...]]:
+        """As check_focal_length, of a camera's masks or of the pictures that it was fitted to."""
+        name, one = found.camera.name, self.pictures.get(found.camera.name)
+        if one is None:
+            return check_focal_length(body, found, self.inputs.of(name))
+        if one.focal_deviation:
+            return found, ()
+        fitted = replace(found, frames=one.found.frames)
+        frames = [replace(frame, values=frame.values + self._zeros) for frame in one.frames]
+        told, texts = check_focal_length(body, fitted, frames)
+        return replace(told, frames=found.frames), texts
 
     def _judge_pictures(self, body: RegistrationBody) -> None:
         """Looks at all pictures of cameras that were found in some of them."""
         frames = list[SeenFrame]()
         for name, one in self.pictures.items():
-            recording = self._recordings[name]
-            judged = judge_pictures(
-                body, replace(one, zeros=self._zeros), self.registered[name], recording
-            )
+            recording, found = one.recording, self.registered[name]
+            judged = judge_pictures(body, replace(one, zeros=self._zeros), found)
             frames += [
                 SeenFrame(k.name, k.values + self._zeros, {name: k.mask}) for k in judged.frames
             ]
-            found = replace(self.registered[name], frames=judged.misfits)
+            found = replace(found, frames=judged.misfits)
             errors = {k.frame: k.E_total for k in found.frames}
             wanted = (*found.contradictions[:_SHOWN], *compared_frames(errors))
             shown = {k: recording.picture(k) for k in wanted}

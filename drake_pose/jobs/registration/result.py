@@ -110,10 +110,13 @@ def describe_pictures(one: PictureRegistration | None) -> dict[str, Any]:
         return {"masks": "given", "time_offset_s": None, "time_offset_sd_s": None}
     offset, focal = one.offset, one.found.camera.focal_x
     told = offset is not None and offset.determined
+    drifts = offset is not None and bool(offset.drift)
     return {
         "masks": "found",
         "time_offset_s": offset.value if offset is not None and told else None,
         "time_offset_sd_s": offset.deviation if offset is not None and told else None,
+        "time_drift": offset.drift if offset is not None and drifts else None,
+        "time_drift_sd": offset.drift_deviation if offset is not None and drifts else None,
         "time_offset_scores": [] if offset is None else offset.scores.round(4).tolist(),
         "focal_px": focal,
         "focal_sd_px": one.focal_deviation * focal if one.focal_deviation else None,
@@ -130,12 +133,24 @@ def say_pictures(one: PictureRegistration, assumed: bool) -> list[str]:
             f"camera '{name}': nobody says its focal length: {one.found.camera.focal_x:.0f} pixels "
             f"were found (standard deviation {one.focal_deviation * one.found.camera.focal_x:.0f})"
         )
+    if one.offset is not None and one.offset.drift:
+        texts.append(say_drift(name, one.offset.drift, one.offset.drift_deviation))
     if one.offset is not None and not one.offset.determined:
         texts.append(
             f"camera '{name}': its pictures do not tell by how much its clock is off the joints', "
             "as the robot moves too little or too slowly"
         )
     return texts
+
+
+def say_drift(camera: str, drift: float, deviation: float) -> str:
+    """By how much the joint log's clock runs faster than a camera's [s/s]."""
+    word = "faster" if drift > 0.0 else "slower"
+    return (
+        f"camera '{camera}': the joint log's clock runs {100.0 * abs(drift):.2f} +- "
+        f"{100.0 * deviation:.2f} percent {word} than its pictures': is their rate as it is said, "
+        "and were none dropped?"
+    )
 
 
 def say_lost(camera: str, lost: Sequence[str], names: Sequence[str]) -> str:

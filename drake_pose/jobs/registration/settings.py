@@ -8,7 +8,7 @@ from cyclopts import Parameter
 
 from drake_pose.errors import SettingsError
 from drake_pose.files.options import Corner, from_text, parse_boxes
-from drake_pose.files.settings import Names, Positions, SceneSettings
+from drake_pose.files.settings import EpisodeSettings, Names, Positions
 
 ALL = "all"
 """In place of names: of every joint, or of every link."""
@@ -18,19 +18,13 @@ Export = Literal["ros", "mujoco", "drake", "rerun"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class AuditSettings(SceneSettings):
+class AuditSettings(EpisodeSettings):
     """How a scene is audited."""
 
     hold: Positions = field(default_factory=dict)
     """Hold this joint at a known position [deg or m]; repeat for several."""
     pictures: Annotated[bool, Parameter(negative="")] = False
     """Look at pictures and the joint log beside them, even where there are masks."""
-    episode: Annotated[int | None, Parameter(metavar="N")] = None
-    """The number of the episode in a LeRobot data set; default: the only one that is there."""
-    joint_map: Path | None = None
-    """Of an episode: which column of its joint log is which joint, in which unit (YAML)."""
-    units: Literal["rad", "deg"] | None = None
-    """The unit of angles in an episode's joint log; default: what the joints' limits say."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -52,6 +52,7 @@ class Scene:
         images: the files, pictures or videos, of (camera, frame) of a sequence that has masks of
             few frames, or none: where a camera has no mask the body is tracked by its colours.
             Empty where there is a mask for every picture.
+        readers: by camera what gives its pictures (H, W, 3) by frame, where no file of its own is.
         strangers: folders of masks that belong to no camera.
         warnings: what is wrong with the folder, but leaves enough to go on.
     """
@@ -66,6 +67,7 @@ class Scene:
     images: Mapping[tuple[str, str], Path] = field(default_factory=dict)
     strangers: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
+    readers: Mapping[str, Callable[[str], np.ndarray]] = field(default_factory=dict)
     _videos: dict[Path, VideoPictures] = field(default_factory=dict, repr=False, compare=False)
 
     def cameras_of(self, frame: str) -> tuple[str, ...]:
@@ -149,7 +151,9 @@ class Scene:
             SceneError: when the file is no picture of the camera's size.
         """
         file, size = self._file(self.images, camera, frame), self.cameras[camera]
-        if file.suffix.lower() in VIDEOS:
+        if camera in self.readers:
+            picture = self.readers[camera](frame)
+        elif file.suffix.lower() in VIDEOS:
             if file not in self._videos:
                 self._videos[file] = VideoPictures(file)
             picture = self._videos[file].read(int(frame))
@@ -194,7 +198,7 @@ def load_scene(
     folder = Path(path)
     if not folder.is_dir():
         raise SceneError(f"{folder}: no such folder; a scene has cameras.yaml and masks")
-    sequence, frame_rate_hz = _read_settings(folder / SCENE_FILE, sequence)
+    sequence, frame_rate_hz = read_sequence(folder / SCENE_FILE, sequence)
     if cameras is None:
         if not os.path.lexists(folder / CAMERA_FILE):
             cameras, masks = _unknown_cameras(folder)
@@ -255,8 +259,14 @@ def _unknown_cameras(folder: Path) -> tuple[dict[str, Camera], dict[tuple[str, s
     return cameras, {(names[frame], frame): file for (_, frame), file in found.items()}
 
 
-def _read_settings(path: Path, sequence: bool) -> tuple[bool, float | None]:
-    """Returns sequence, and frame_rate_hz, of a scene.yaml, which may be missing."""
+def read_sequence(path: Path, sequence: bool = False) -> tuple[bool, float | None]:
+    """Whether frames follow each other, and at what rate [Hz], by a scene.yaml that may be missing.
+
+    Args:
+        sequence: what holds where it does not say.
+
+    Raises SceneError: it cannot be read, or says something else.
+    """
     if not os.path.lexists(path):
         return sequence, None
     content = read_yaml(path, SceneError)

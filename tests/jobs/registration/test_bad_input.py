@@ -118,7 +118,7 @@ def test_a_focal_length_that_is_not_the_camera_s(
     true = own_arm.cameras["left"].focal_x
     own_arm.edit_cameras("left", focal_x=factor * true, focal_y=factor * true)
     result = run(own_arm, tmp_path / "out")
-    assert_refused(result, "camera 'left': its masks tell a focal length", "Nothing was written")
+    assert_refused(result, "camera 'left': its pictures tell a focal length", "Nothing was written")
     told = float(re.search(r"a focal length of (\d+) pixels", result.stderr)[1])
     assert told == pytest.approx(true, rel=0.03)
     assert not (tmp_path / "out").exists()

@@ -12,8 +12,9 @@ from drake_pose.camera.camera_files import load_cameras, save_cameras
 from drake_pose.commands.main import app
 from drake_pose.errors import DrakePoseError
 from drake_pose.files.overlay import EXCESS_RGB, MISSING_RGB
+from drake_pose.jobs.estimate.episode import is_episode
 from drake_pose.jobs.registration.audit import audit_scene
-from drake_pose.jobs.registration.episodes import is_episode, read_episode
+from drake_pose.jobs.registration.episodes import read_episode
 from drake_pose.jobs.registration.register import register_scene
 from drake_pose.jobs.registration.settings import RegistrationSettings
 from drake_pose.silhouette.pictures.scenes import load_scene
@@ -43,7 +44,6 @@ def test_what_is_an_episode(episode, tmp_path):
     assert is_episode(tmp_path, settings)
     (tmp_path / "masks").mkdir()
     assert not is_episode(tmp_path, settings)
-    assert is_episode(tmp_path, RegistrationSettings(pictures=True))
 
 
 def test_joints_are_where_their_log_says_at_the_pictures_times(episode):

@@ -146,7 +146,7 @@ def dump_cameras(
     cameras: Mapping[str, Camera] | Iterable[Camera], links: Mapping[str, str] | None = None
 ) -> str:
     """The text of a camera file; links are those of CameraFile."""
-    content = {camera.name: _write_camera(camera) for camera in camera_tuple(cameras)}
+    content = {camera.name: describe_camera(camera) for camera in camera_tuple(cameras)}
     for name, link in (links or {}).items():
         content[name] |= {"link": link, "X_LC": content[name].pop("X_WC")}
     return yaml.safe_dump(content, sort_keys=False)
@@ -255,8 +255,8 @@ def _read_distortion(value: Any, where: str) -> Array:
     return np.array([check_number(one, "distortion", where) for one in value])
 
 
-def _write_camera(camera: Camera) -> dict[str, Any]:
-    """Returns the entry of a camera in a file."""
+def describe_camera(camera: Camera) -> dict[str, Any]:
+    """The entry of a camera in a file: plain values."""
     is_parallel = isinstance(camera, ParallelCamera)
     focal = ("pixels_per_metre",) if is_parallel else ("focal_x", "focal_y")
     fields = ("width", "height", *focal, "center_x", "center_y")

@@ -188,7 +188,12 @@ class Batch:
             write_file(self.out, CONTRADICTIONS, table)
         episodes = episodes_table({name: state.totals for name, state in self.scenes.items()})
         if episodes is not None:
-            write_file(self.out, EPISODES, episodes)
+            write_file(self.out, EPISODES, episodes.text)
+            for name, text in episodes.camera_files.items():
+                write_file(self.out, name, text)
+            for path in self.out.glob("cameras_*.yaml"):
+                if path.name not in episodes.camera_files:
+                    path.unlink()
 
     def plan(self) -> None:
         """Lists what is missing; what lies there is not done again."""

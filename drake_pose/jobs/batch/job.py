@@ -27,6 +27,7 @@ _SETTINGS = tuple(
     one.name for one in fields(EstimateSettings) if one.name not in EpisodeSettings.__annotations__
 )
 _OF_AUDITS = tuple(one.name for one in fields(AuditSettings))
+_EPISODES = "episodes"
 OWN_JOINTS = True
 """In place of a table of joint positions: those that an episode holds."""
 
@@ -88,7 +89,7 @@ def read_job(path: Path, chunk: int | None = None) -> tuple[SceneJob, ...]:
     length = content.get("chunk", CHUNK) if chunk is None else chunk
     if not isinstance(length, int) or isinstance(length, bool) or length < 1:
         raise SettingsError(f"{path}: chunk: must be a whole number, 1 or more, not {length!r:.60}")
-    keys = tuple(dict.fromkeys((*_OWN, *_SETTINGS, *_OF_AUDITS)))
+    keys = tuple(dict.fromkeys((*_OWN, *_SETTINGS, *_OF_AUDITS, _EPISODES)))
     defaults = _known(content.get("defaults") or {}, f"{path}: defaults", keys)
     jobs = []
     for name, entry in scenes.items():
@@ -99,8 +100,21 @@ def read_job(path: Path, chunk: int | None = None) -> tuple[SceneJob, ...]:
                 "begin with a dot; put numbers in quotes"
             )
         values = {**defaults, **_known(entry or {}, where, keys)}
-        jobs.append(_scene_job(name, values, length, where, path.parent.absolute()))
+        for own, episode in _episodes(name, values.pop(_EPISODES, None), where):
+            jobs.append(_scene_job(own, values | episode, length, where, path.parent.absolute()))
     return tuple(jobs)
+
+
+def _episodes(name: str, numbers: Any, where: str) -> list[tuple[str, dict[str, int]]]:
+    """The names of a scene's jobs, and which episode each is of: one, or of a range each."""
+    if numbers is None:
+        return [(name, {})]
+    first, _, last = str(numbers).partition(":")
+    if not (first.isdecimal() and last.isdecimal() and int(first) <= int(last)):
+        raise SettingsError(
+            f'{where}: {_EPISODES}: a range like "0:99", with both ends, not {numbers!r:.60}'
+        )
+    return [(f"{name}_{k:06d}", {"episode": k}) for k in range(int(first), int(last) + 1)]
 
 
 def _known(value: Any, where: str, known: tuple[str, ...]) -> dict[str, Any]:

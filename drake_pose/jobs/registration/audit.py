@@ -14,7 +14,7 @@ import numpy as np
 
 from drake_pose.body.model import ArticulatedModel, load_model
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
-from drake_pose.camera.camera_files import load_cameras
+from drake_pose.camera.camera_files import describe_camera, load_cameras
 from drake_pose.camera.models import Camera
 from drake_pose.errors import CameraError, MaskError, SceneError, SettingsError
 from drake_pose.files.folder import write_summary, writes_folder
@@ -189,6 +189,7 @@ def _describe_cameras(look: EpisodeLook) -> dict[str, Any]:
     return {
         name: describe_pictures(one)
         | {
+            "camera": describe_camera(one.found.camera),
             "X_WC": one.found.camera.X_WC.tolist(),
             "translation_sd_mm": 1e3 * one.found.translation_sd,
             "rotation_sd_deg": float(np.degrees(one.found.rotation_sd)),

@@ -9,6 +9,8 @@ import pytest
 import yaml
 from scipy.spatial.transform import Rotation
 
+from drake_pose.camera.camera_files import describe_camera, load_cameras
+from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import SettingsError
 from drake_pose.jobs.batch.episodes_table import COLUMNS, episodes_table
 from drake_pose.jobs.batch.job import read_job
@@ -23,8 +25,10 @@ def totals(place, turn_deg=0.0, sd=0.001):
     X_WC = np.eye(4)
     X_WC[:3, :3] = Rotation.from_euler("z", turn_deg, degrees=True).as_matrix()
     X_WC[:3, 3] = place
+    entry = describe_camera(PinholeCamera("left", 640, 480, 500.0, 500.0, 320.0, 240.0, X_WC))
     camera = {
-        "X_WC": X_WC.tolist(), "covariance": (sd**2 * np.eye(6)).tolist(), "off_mm": None,
+        "camera": entry, "X_WC": X_WC.tolist(), "focal_sd_px": None,
+        "covariance": (sd**2 * np.eye(6)).tolist(), "off_mm": None,
         "off_deg": None, "translation_sd_mm": 1e3 * sd, "rotation_sd_deg": 0.1,
         "time_offset_s": 0.02, "time_offset_sd_s": 0.001,
     }  # fmt: skip
@@ -34,7 +38,7 @@ def totals(place, turn_deg=0.0, sd=0.001):
     }  # fmt: skip
 
 
-def test_a_camera_has_moved_that_differs_significantly_from_the_episode_before():
+def test_a_camera_has_moved_that_differs_significantly_from_the_episodes_before(tmp_path):
     episodes = {
         "first": totals([1.0, 0.0, 0.5]),
         # Within what two errors of a millimetre an axis make.
@@ -43,13 +47,36 @@ def test_a_camera_has_moved_that_differs_significantly_from_the_episode_before()
         "failed": {},
         "again": totals([1.0, 0.02, 0.5], 1.0),
     }
-    rows = list(csv.DictReader(io.StringIO(episodes_table(episodes))))
+    table = episodes_table(episodes)
+    rows = list(csv.DictReader(io.StringIO(table.text)))
     assert tuple(rows[0]) == COLUMNS
     assert [row["moved"] for row in rows] == ["", "no", "yes", "no"]
     assert float(rows[2]["moved_deg"]) == pytest.approx(1.0)
-    assert float(rows[2]["moved_mm"]) == pytest.approx(np.hypot(21.0, 1.0))
+    assert float(rows[2]["moved_mm"]) == pytest.approx(np.hypot(20.5, 0.5))
     assert (rows[0]["joints"], rows[0]["agreeing"]) == ("A4", "8")
+    files = [row["camera_file"] for row in rows]
+    assert files == ["cameras_1.yaml", "cameras_1.yaml", "cameras_2.yaml", "cameras_2.yaml"]
+    (tmp_path / "before.yaml").write_text(table.camera_files["cameras_1.yaml"])
+    before = load_cameras(tmp_path / "before.yaml")["left"]
+    np.testing.assert_allclose(before.X_WC[:3, 3], [1.0005, -0.0005, 0.5])
     assert episodes_table({"scene": {"frame_count": 3, "agreeing_count": 3}}) is None
+
+
+def test_a_camera_of_many_episodes_is_where_they_say_by_how_sure_they_are():
+    # Slow drift, each step of which is too small to be significant, is a move, too.
+    far = 5.0 * 0.001
+    table = episodes_table({str(k): totals([k * far, 0.0, 0.0], sd=0.002) for k in range(9)})
+    moved = [row["moved"] for row in csv.DictReader(io.StringIO(table.text))]
+    assert 0 < moved.count("yes") < 5
+    # A second camera stands where it stood, in the file of those before the first moved, too.
+    episodes = {str(k): totals([float(k), 0.0, 0.0]) for k in range(2)}
+    sds = (0.001, 0.002)
+    for one, x, sd in zip(episodes.values(), (0.0, 0.005), sds, strict=True):
+        one["cameras"]["right"] = totals([x, 0.0, 0.0], sd=sd)["cameras"]["left"]
+    files = [yaml.safe_load(text) for text in episodes_table(episodes).camera_files.values()]
+    assert [file["left"]["X_WC"][0][3] for file in files] == [0.0, 1.0]
+    weighted = np.average([0.0, 0.005], weights=np.power(sds, -2.0))
+    assert [file["right"]["X_WC"][0][3] for file in files] == pytest.approx([weighted] * 2)
 
 
 def test_an_episode_of_a_job_has_the_settings_of_audits(tmp_path):
@@ -62,6 +89,16 @@ def test_an_episode_of_a_job_has_the_settings_of_audits(tmp_path):
     assert (job.settings.every, job.settings.units, job.audit) == (2, "rad", True)
     (task,) = plan_scene(job, tmp_path / "out")
     assert len(task.frames) == 3
+    many = {"data": entry | {"episodes": "8:10"}}
+    (tmp_path / "jobs.yaml").write_text(yaml.safe_dump({"scenes": many}))
+    jobs = read_job(tmp_path / "jobs.yaml")
+    assert [job.name for job in jobs] == ["data_000008", "data_000009", "data_000010"]
+    assert [job.settings.episode for job in jobs] == [8, 9, 10]
+    for wrong in ("8", "9:8", 3):
+        many["data"]["episodes"] = wrong
+        (tmp_path / "jobs.yaml").write_text(yaml.safe_dump({"scenes": many}))
+        with pytest.raises(SettingsError, match="scene 'data': episodes"):
+            read_job(tmp_path / "jobs.yaml")
     del entry["audit"]
     (tmp_path / "jobs.yaml").write_text(yaml.safe_dump({"scenes": {"one": entry}}))
     with pytest.raises(SettingsError, match="units: for audits"):

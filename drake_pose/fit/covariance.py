@@ -20,6 +20,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import cho_solve
 
 from drake_pose.fit.contour_fit import (
     Comparison,
@@ -290,21 +291,25 @@ def estimate_sizes(
 
     def likelihood(t: Array) -> tuple[float, Array, Array]:
         V = sum((np.exp(2.0 * a) * W for a, W in zip(t, effects, strict=True)), np.zeros((n, n)))
-        inverse = np.linalg.inv(V)
+        L = np.linalg.cholesky(V)
+        inverse = cho_solve((L, True), np.eye(n), overwrite_b=True, check_finite=False)
         VX = inverse @ seen.X
         H = seen.X.T @ VX + apriori
         P = inverse - VX @ np.linalg.solve(H, VX.T)
         Py = P @ seen.y
-        freedom = np.linalg.slogdet(V)[1] + np.linalg.slogdet(H)[1]
+        freedom = 2.0 * np.log(np.diag(L)).sum() + np.linalg.slogdet(H)[1]
         return -0.5 * float(freedom + seen.y @ Py + (t @ t) / prior_deviation**2), P, Py
 
     t = np.zeros(len(effects))
     value, P, Py = likelihood(t)
     for _ in range(_ITERATIONS):
-        shares = [2.0 * np.exp(2.0 * a) * (P @ W) for a, W in zip(t, effects, strict=True)]
-        pulls = [2.0 * np.exp(2.0 * a) * (Py @ W @ Py) for a, W in zip(t, effects, strict=True)]
-        g = 0.5 * (np.array(pulls) - [np.trace(one) for one in shares]) - t / prior_deviation**2
-        fisher = np.array([[0.5 * np.sum(one * other.T) for one in shares] for other in shares])
+        # Noise, the first, is white, and of doubts there are few.
+        PW = [P, *(P @ W for W in effects[1 : len(told)]), *((P @ Z) @ Z.T for Z in seen.doubts)]
+        shares = [2.0 * np.exp(2.0 * a) * one for a, one in zip(t, PW, strict=True)]
+        pulls = 2.0 * np.exp(2.0 * t) * [Py @ W @ Py for W in effects]
+        g = 0.5 * (pulls - [np.trace(one) for one in shares]) - t / prior_deviation**2
+        turned = np.array([one.T for one in shares]).reshape(len(t), -1)
+        fisher = 0.5 * np.reshape(shares, (len(t), -1)) @ turned.T
         step = np.linalg.solve(fisher + np.eye(len(t)) / prior_deviation**2, g)
         step /= max(1.0, np.abs(step).max())
         trial = likelihood(t + step)

@@ -31,8 +31,6 @@ _SHOWN = 0.01
 # A frame contradicts the others whose contours fit less, and that overlaps less than so many times
 # what those of the fit do: dark and blurred contours fit badly where the body is right, too.
 _OVERLAPS = 0.9
-# Light is told in pictures about so wide [pixel].
-_LIGHT_WIDTH = 160
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,13 +89,11 @@ def _see(
     """Pictures that should show the body, with masks; None: nothing is seen of it."""
     known, camera = one.fit.background, found.camera
     outlines = hull_of_few(body.very_few, ABOUT)
-    step = max(1, camera.width // _LIGHT_WIDTH)
-    small = np.ascontiguousarray(known.colours[::step, ::step])
     offset = 0.0 if one.offset is None else one.offset.value
     for posed in posed_pictures(one.recording.with_zeros(one.zeros), rows, offset):
         covered = draw_mask(outlines, camera.X_CW @ body.kinematics.poses(posed.values), camera)
         if covered.mean() >= _SHOWN:
-            light = Light.between(posed.picture[::step, ::step].astype(np.float32), small)
+            light = Light.between(posed.picture, known.colours)
             yield posed.name, see_picture(posed, known, light, covered)
 
 

@@ -110,9 +110,12 @@ class PictureLevel:
         share = float(told[GAIN]) / max(self.backgrounds.possible, 1e-9)
         return share, float(told[CONTOUR]) / max(float(told[OUTLINE]), 1.0)
 
-    def score(self, X_CW: Array, contour: float) -> float:
-        """What is to be as large as it can be; contour: the weight of the outline's edges."""
-        told = self.told(X_CW)
+    def score(self, X_CW: Array, contour: float, frames: int | None = None) -> float:
+        """What is to be as large as it can be; contour: the weight of the outline's edges.
+
+        frames: so many count, the first ones; None: all.
+        """
+        told = self.told(X_CW, self._X_WN[:frames])
         return float(told[GAIN] + contour * told[CONTOUR])
 
     def pieces(self, X_CW: Array) -> Array:

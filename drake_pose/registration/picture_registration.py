@@ -48,8 +48,8 @@ _LOOKS, _LEAST_RATIO, _LEAST_CONTOUR = 3, 0.42, 0.16
 # What is explained and so many times the contours together: right ones have 1.2 and more, the best
 # wrong ones .9.
 _CONTOURS, _LEAST_EVIDENCE = 4.0, 1.05
-# No pose is one of which less is known [of the distance; rad]. Right ones are known to a hundredth;
-# mirrored pictures are explained about as well from behind, known to a twentieth or a third.
+# No pose is one of which less is known [of its distance from the body; rad]. Right ones are known
+# to a hundredth; mirrored pictures are explained about as well from behind, known to a twentieth.
 _MOST_SD = 0.04
 # Poses are as good that explain less by no more deviations.
 _SIGNIFICANCE = 1.96
@@ -199,7 +199,7 @@ def _register(
     chosen, moving = _choose(body, camera, recording)
     begin = posed_pictures(recording, chosen, 0.0)
     search = PictureSearch(body, camera, begin)
-    looks = [search.approach(camera.with_pose(np.linalg.inv(X))) for X in search.search()[:_LOOKS]]
+    looks = [search.approach(X_CW) for X_CW in search.search()[:_LOOKS]]
     near = sorted((one for one in looks if one is not None), key=lambda one: -_evidence(*one[1]))
     if not near:
         raise _Unexplained(camera, "no pose shows the body in two pictures")
@@ -247,13 +247,16 @@ class _Settled(NamedTuple):
     """A fit that moves no more.
 
     recording: its joints' clock drifts no more; begun: with the camera and the clock that were
-    found, but for the offset's deviation; zeros: (m,) that were added to the frames' values.
+    found, but for the offset's deviation; zeros: (m,) that were added to the frames' values;
+    agree: (frames,) those that do; covariance: (u, u) of all that they share.
     """
 
     best: PictureFit
     recording: Recording
     begun: _Begun
     zeros: Array
+    agree: NDArray[np.bool_]
+    covariance: Array
 
 
 def _fit(
@@ -304,18 +307,19 @@ def _settle(
         assumed, turn = turned, np.array([_constant(best, name) for name in names])
         offset, turned = offset + by, turned + turn
         if not left or (abs(by) < _AGAIN and np.abs(turn).max() < _TURNED):
-            clock = replace(begun.clock, value=offset)
-            return _Settled(best, as_now, begun._replace(camera=camera, clock=clock), assumed)
+            done = begun._replace(camera=camera, clock=replace(begun.clock, value=offset))
+            agree = best.fit.agreeing(best.fit.inlier_ratios(best.found))
+            covariance = np.sum(best.fit.covariances(best.found, agree), axis=0)
+            return _Settled(best, as_now, done, assumed, agree, covariance)
 
 
 def _drift(settled: _Settled, since: float) -> tuple[float, float]:
     """How much faster the joints' clock runs yet [s/s], and the standard deviation of that."""
-    fit, found, recording = settled.best.fit, settled.best.found, settled.recording
+    fit, recording, agree = settled.best.fit, settled.recording, settled.agree
     assert recording.times is not None
-    agree = fit.agreeing(fit.inlier_ratios(found))
     rows = [recording.names.index(frame.name) for frame in fit.seen[0].frames]
     later = (recording.times[rows] - since)[agree]
-    return fit.growth(found, TIME_OFFSET, later, agree)
+    return fit.growth(settled.best.found, TIME_OFFSET, later, agree, settled.covariance)
 
 
 def _mean_time(recording: Recording, rows: Sequence[int]) -> float:
@@ -406,10 +410,9 @@ def _constant(fitted: PictureFit, name: str) -> float:
 
 def _describe(settled: _Settled, focal: bool) -> PictureRegistration:
     """What was found; RegistrationError: it does not explain the pictures."""
-    best, recording, begun, zeros = settled
+    best, recording, begun, zeros, agree, covariance = settled
     fit, (seen,) = best.fit, best.fit.seen
     ratios = fit.inlier_ratios(best.found)
-    agree = fit.agreeing(ratios)
     ratio = float(ratios[agree].mean())
     told = _evidence(best.explained, best.contour)
     if ratio < _LEAST_RATIO or best.contour < _LEAST_CONTOUR or told < _LEAST_EVIDENCE:
@@ -420,15 +423,13 @@ def _describe(settled: _Settled, focal: bool) -> PictureRegistration:
             f"than elsewhere by {best.contour:.2f} ({_LEAST_CONTOUR} at least); the first, and "
             f"{_CONTOURS:g} times the last, are {told:.2f} together ({_LEAST_EVIDENCE} at least)",
         )
-    own, doubted = fit.covariances(best.found, agree)
-    covariance = own + doubted
     deviations = np.sqrt(np.diag(covariance))
     pose = fit.camera_covariances(best.found, covariance)[0]
     found = RegisteredCamera(
         best.camera, pose, frame_misfits(seen, best.camera.X_CW, ratios, agree),
         np.array([np.linalg.inv(X) for X in begun.alternatives]).reshape(-1, 4, 4),
     )  # fmt: skip
-    distance = float((best.camera.X_CW @ [*seen.middle, 1.0])[2])
+    distance = float(np.linalg.norm(best.camera.X_WC[:3, 3] - seen.middle))
     if found.translation_sd > _MOST_SD * distance or found.rotation_sd > _MOST_SD:
         raise _Unexplained(
             begun.camera,

@@ -9,9 +9,12 @@ in the end by the one fit, on lines across the contour in the odds of pixels to 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -41,6 +44,8 @@ _ROUNDS = (
     SearchRound(80, 15, 80, 0.06, 10.0),
     SearchRound(160, 5, 100, 0.04, 20.0),
 )
+# So many frames, those that differ most, say which share of the starts is looked at in all.
+_FIRST, _GOOD = 4, 0.25
 ABOUT = 100
 """Triangles of a node where a body is about."""
 
@@ -147,9 +152,11 @@ class PictureSearch:
     def search(self) -> list[Array]:
         """Poses X_CW (4, 4) near which the camera's may be, best first."""
         level = self._level(_ROUNDS[0].width)
-        starts = level.starts()
-        scores = np.array([level.score(X, _ROUNDS[0].contour) for X in starts])
-        found = [starts[k] for k in np.argsort(-scores, kind="stable")]
+        found = level.starts()
+        for frames, share in ((_FIRST, _GOOD), (len(self.frames), 1.0)):
+            scores = np.array([level.score(X, _ROUNDS[0].contour, frames) for X in found])
+            order = np.argsort(-scores, kind="stable")
+            found = [found[k] for k in order[: math.ceil(share * len(order))]]
         after = (*(one.kept for one in _ROUNDS[1:]), _ROUNDS[-1].kept)
         for step, most in zip(_ROUNDS, after, strict=True):
             level = self._level(step.width)
@@ -158,19 +165,21 @@ class PictureSearch:
             found = level.distinct([X for _, X in improved], most)
         return found
 
-    def approach(self, camera: PinholeCamera) -> tuple[PinholeCamera, tuple[float, float]] | None:
+    def approach(self, X_CW: Array) -> tuple[PinholeCamera, tuple[float, float]] | None:
         """A camera fitted roughly from where it stands, and what it explains in `compared`.
 
         None where the body leaves the pictures.
         """
+        frames, small = self._small
         for scales in _ROUGH:
-            known, covered = self._learn(camera)
-            seen = self._see(camera, known, covered, self._outlines[-1])
+            camera = small.with_pose(np.linalg.inv(X_CW))
+            known, covered = self._learn(camera, frames)
+            seen = self._see(camera, frames, known, covered, self._outlines[-1])
             if seen is None:
                 return None
-            fit = SharedFit([seen], [camera.X_CW], widths=False)
-            camera = fit.cameras(fit.fit(_stages(scales, seen)))[0]
-        return camera, self.compared.explained(camera.X_CW)
+            fit = SharedFit([seen], [X_CW], widths=False)
+            X_CW = fit.cameras(fit.fit(_stages(scales, seen)))[0].X_CW
+        return self._camera.with_pose(np.linalg.inv(X_CW)), self.compared.explained(X_CW)
 
     def fit(
         self, camera: PinholeCamera, constants: Sequence[str] = (), focal: bool = False
@@ -185,8 +194,8 @@ class PictureSearch:
         """
         looks, seen = len(POSE_NAMES) + focal, None
         for scales, outlines in zip(_FINE, (self._outlines[-1], self._body.few), strict=True):
-            known, covered = self._learn(camera)
-            seen = self._see(camera, known, covered, outlines)
+            known, covered = self._learn(camera, self.frames)
+            seen = self._see(camera, self.frames, known, covered, outlines)
             if seen is None:
                 return None
             fit = SharedFit([seen], [camera.X_CW], constants, looks=looks, widths=False)
@@ -202,7 +211,24 @@ class PictureSearch:
         camera = fit.cameras(found)[0]
         return PictureFit(fit, found, known, *self.compared.explained(camera.X_CW))
 
-    def _learn(self, camera: PinholeCamera) -> tuple[KnownBackground, Mask]:
+    @cached_property
+    def _small(self) -> tuple[list[PosedPicture], PinholeCamera]:
+        """The frames with pictures as backgrounds are learned in, and their camera."""
+        camera = self._level(_LEARNED).camera
+        size = camera.width, camera.height
+        return [
+            replace(
+                one,
+                picture=np.asarray(
+                    cv2.resize(one.picture, size, interpolation=cv2.INTER_AREA), np.uint8
+                ),
+            )
+            for one in self.frames
+        ], camera
+
+    def _learn(
+        self, camera: PinholeCamera, frames: Sequence[PosedPicture]
+    ) -> tuple[KnownBackground, Mask]:
         """What is behind the body before a camera, and where that is (f, H, W)."""
         level = self._level(_LEARNED)
         small = camera.resized(level.camera.width, level.camera.height)
@@ -211,13 +237,14 @@ class PictureSearch:
             np.array([draw_mask(self._outlines[-1], X_CN, one) for X_CN in poses])
             for one in (small, camera)
         ]
-        pictures, lights = [one.picture for one in self.frames], level.backgrounds.lights
+        pictures, lights = [one.picture for one in frames], level.backgrounds.lights
         showing = level.backgrounds.showing(both[0])
         return KnownBackground.of(pictures, lights, showing, both[1]), both[1]
 
     def _see(
         self,
         camera: PinholeCamera,
+        frames: Sequence[PosedPicture],
         known: KnownBackground,
         covered: Mask,
         outlines: Sequence[Outline],
@@ -229,7 +256,7 @@ class PictureSearch:
             outlines: the surfaces that are compared.
         """
         posed, lights = [], self._level(_LEARNED).backgrounds.lights
-        for one, light, own in zip(self.frames, lights, covered, strict=True):
+        for one, light, own in zip(frames, lights, covered, strict=True):
             frame = see_picture(one, known, light, own)
             if frame is not None:
                 posed.append(frame)

@@ -31,6 +31,8 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 LAST_SPACING = 1.0 / 300.0
+# Where bodies are is told from about so many frames.
+_SOME = 5
 """Of the points of silhouettes' edges in the last parts of a fit [root of the area]."""
 
 
@@ -95,9 +97,17 @@ class PosedFrames:
     @cached_property
     def points(self) -> list[Array]:
         """Corners (n, 3) of the body's convex hull in each frame, in the world [m]."""
+        return self._corners(self.X_WN)
+
+    @cached_property
+    def _some_points(self) -> Array:
+        """(n, 3) the points of all frames, or of some spread over many."""
+        return np.concatenate(self._corners(self.X_WN[:: max(1, len(self.X_WN) // _SOME)]))
+
+    def _corners(self, poses: Array) -> list[Array]:
         own = [hull_corners(outline) for outline in self.outlines]
         placed = []
-        for X_WN in self.X_WN:
+        for X_WN in poses:
             parts = zip(own, X_WN, strict=True)
             placed.append(_hull(np.concatenate([p @ X[:3, :3].T + X[:3, 3] for p, X in parts])))
         return placed
@@ -105,12 +115,12 @@ class PosedFrames:
     @cached_property
     def middle(self) -> Array:
         """(3,) of the bodies' points in the world [m]."""
-        return np.asarray(np.concatenate(self.points).mean(axis=0))
+        return np.asarray(self._some_points.mean(axis=0))
 
     @cached_property
     def extent(self) -> float:
         """How far the bodies' points are from their middle, root mean square [m]."""
-        off = np.concatenate(self.points) - self.middle
+        off = self._some_points - self.middle
         return float(np.sqrt((off**2).sum(axis=1).mean()))
 
     def evidence(self, camera: int, count: int) -> list[FrameEvidence]:

@@ -250,7 +250,9 @@ class SharedFit:
         own = slice(len(self.names))
         return covariance[own, own], doubted[own, own]
 
-    def growth(self, found: Shared, name: str, weights: Array, which: Mask) -> tuple[float, float]:
+    def growth(
+        self, found: Shared, name: str, weights: Array, which: Mask, covariance: Array
+    ) -> tuple[float, float]:
         """How a constant grows with what the masks that count weigh, were it to grow.
 
         One Gauss-Newton step of a further unknown, whose derivatives are in each mask the
@@ -258,6 +260,7 @@ class SharedFit:
 
         Args:
             weights: of the masks that count.
+            covariance: (u, u) of what is shared.
         """
         p, at = self._fit.unknowns.own_count, self.names.index(name)
         equations = self.equations(found, _FITTED, which)
@@ -272,8 +275,7 @@ class SharedFit:
         left = (g[:, p:] - np.einsum("fpi,fp->fi", gains, g[:, :p])).sum(axis=0)
         inverse = np.linalg.inv(S)
         said = np.linalg.inv(S[:-1, :-1])[at, at]
-        own_told, doubted = self.covariances(found, which)
-        scale = (own_told + doubted)[at, at] / said
+        scale = covariance[at, at] / said
         return -float(inverse[-1] @ left), float(np.sqrt(scale * inverse[-1, -1]))
 
     def camera_covariances(self, found: Shared, covariance: Array) -> Array:

@@ -78,9 +78,9 @@ def test_a_camera_and_its_clock_are_fitted_on_lines(episode):
     fitted = PictureSearch(episode.body, episode.camera, frames).fit(
         near(episode.camera, 0.5), (TIME_OFFSET,)
     )
-    drift, deviation = fitted.fit.growth(
-        fitted.found, TIME_OFFSET, later, np.ones(len(later), bool)
-    )
+    every = np.ones(len(later), bool)
+    covariance = sum(fitted.fit.covariances(fitted.found, every))
+    drift, deviation = fitted.fit.growth(fitted.found, TIME_OFFSET, later, every, covariance)
     assert drift == pytest.approx(0.005, abs=0.002)
     assert 0.0 < deviation < 0.004
     # The wrong focal length is told, too.

@@ -1,7 +1,5 @@
 """A finalized plant as the source of a model: copies of it are made in other plants."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection
 from typing import Any, NamedTuple
 

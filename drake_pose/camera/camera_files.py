@@ -1,7 +1,5 @@
 """Camera files: YAML, one entry a camera; or Drake's own, a CameraConfig or a Scenario."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path

@@ -3,8 +3,6 @@
 Drake puts pixel centres at i + 0.5, drake_pose at i: principal points differ by half a pixel.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Mapping
 from pathlib import Path

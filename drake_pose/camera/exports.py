@@ -5,8 +5,6 @@ and its optical frame is our camera frame. MuJoCo's principal point is an offset
 middle, and its camera looks along -z with y up.
 """
 
-from __future__ import annotations
-
 import re
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterable, Mapping

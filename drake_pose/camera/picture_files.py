@@ -1,7 +1,5 @@
 """Pictures and masks in files: whole ones only, in one form; and the order of frames' names."""
 
-from __future__ import annotations
-
 import io
 import re
 import warnings

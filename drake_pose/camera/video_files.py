@@ -1,7 +1,5 @@
 """The pictures of videos: by number, and with the time at which each was taken."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from importlib import import_module
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What the silhouette method knows of a body besides its surfaces: limbs, from landmarks."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property

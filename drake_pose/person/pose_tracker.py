@@ -9,8 +9,6 @@ maximum likelihood (Patterson and Thompson 1971). What silhouettes do not tell i
 limits let it.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 

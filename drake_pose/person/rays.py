@@ -1,7 +1,5 @@
 """Viewing rays of pixels, where they meet (Date et al., 3.1.2), and pictures at points in space."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from itertools import combinations
 

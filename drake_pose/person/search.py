@@ -3,8 +3,6 @@
 Guesses are judged in small pictures of a few cameras; only what is promising is fitted to all.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace

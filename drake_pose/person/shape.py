@@ -3,8 +3,6 @@
 All frames share them, each has its own pose; silhouettes of several frames tell.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 

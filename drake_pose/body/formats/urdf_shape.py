@@ -1,7 +1,5 @@
 """Changes of a URDF model's shape, made in its text: parts hidden, stretched, moved, re-zeroed."""
 
-from __future__ import annotations
-
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Collection, Mapping, Sequence
 

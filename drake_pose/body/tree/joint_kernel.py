@@ -1,7 +1,5 @@
 """Joints' transforms at their values, and the bands of skin that follow them, compiled."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import NamedTuple
 

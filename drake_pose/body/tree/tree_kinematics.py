@@ -4,8 +4,6 @@ A tree's values are taken as one flat array here, node after node. The motion th
 everything behind it is a twist in the world: dp/dvalue = omega x p + v for a point at p.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass

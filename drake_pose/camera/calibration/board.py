@@ -5,8 +5,6 @@ right, y up, z out of the printed side. A board that lies on the floor has z up.
 upright when its top left square is black; a ChArUco board when marker 0 is in its first row.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path

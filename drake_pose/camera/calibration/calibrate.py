@@ -1,7 +1,5 @@
 """Calibration of one camera or several from pictures of a board, and what spoils it."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field, replace

@@ -3,8 +3,6 @@
 What is wrong with one picture costs only that picture, and is said in `problems`.
 """
 
-from __future__ import annotations
-
 import abc
 import math
 import threading

@@ -1,7 +1,5 @@
 """Recorded pictures, a folder or a video, and `sources.yaml`, which says where pictures are."""
 
-from __future__ import annotations
-
 import math
 import re
 import time

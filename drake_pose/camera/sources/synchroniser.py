@@ -1,7 +1,5 @@
 """Pictures of several cameras, grouped to moments by their time stamps."""
 
-from __future__ import annotations
-
 import math
 from collections import deque
 from collections.abc import Iterable, Mapping

@@ -1,7 +1,5 @@
 """A body in a sequence: matched first, tracked by its contour, matched again after a loss."""
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Mapping, Sequence

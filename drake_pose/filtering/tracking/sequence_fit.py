@@ -6,8 +6,6 @@ sequence about as well as the best are kept: one parallel view cannot tell them 
 the same mirrored in depth. These starts are poses that explain the first frame, followed.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -3,8 +3,6 @@
 Inverse kinematics goes in small steps from the last frame's angles (4.1.1 and 4.2).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

@@ -3,8 +3,6 @@
 The nearest of 300 templates, in the space of their 60 leading eigenvectors, is the answer.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

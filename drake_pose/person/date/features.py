@@ -1,7 +1,5 @@
 """Skin-coloured blobs in views, and from them head, hands and feet in space (Date et al., 3.1)."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

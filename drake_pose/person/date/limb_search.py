@@ -1,7 +1,5 @@
 """Elbows and knees on their circles, by back-projection (Date et al., 4.1.2 and 4.2)."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -3,8 +3,6 @@
 Each camera's contour is compared with templates from all sides; all must be of one heading.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass

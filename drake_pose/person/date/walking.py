@@ -3,8 +3,6 @@
 Facing right or left turns the view, standing ahead of or behind the rest place walks.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -4,8 +4,6 @@ Each camera in turn is predicted by the others' pose. It has moved where one rig
 explains many frames; poor masks are off in another way each time.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 

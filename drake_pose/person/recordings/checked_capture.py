@@ -4,8 +4,6 @@ Others are cut out of the masks first. After the capture a camera that contradic
 left out, and all is captured once more.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 

@@ -5,8 +5,6 @@ hull (silhouette coherence, Hernandez, Schmitt and Cipolla 2007); a rig that onl
 exchanged picture mends is faulty.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import combinations

@@ -1,7 +1,5 @@
 """Several persons in view: which of them is followed, and which figures of the masks are his."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple

@@ -4,8 +4,6 @@ The surfaces' spans are painted one after the other; triangles are drawn with a 
 where two labels contend. Both see the same pixels, as they begin and end a row alike.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Packed surfaces seen by a camera: the arithmetic that all kernels share."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

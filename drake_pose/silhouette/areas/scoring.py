@@ -4,8 +4,6 @@ A ball is in the visual hull if every line that meets it meets the surface; a po
 the edges of pictures from many sides bounds it. The mesh may have holes and inner parts.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

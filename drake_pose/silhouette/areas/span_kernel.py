@@ -12,8 +12,6 @@ all surfaces in the same rows give the exact union.
 Numba pays for every slice and every array passed: arrays are passed whole, with an index.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

@@ -5,8 +5,6 @@ a span sets, and a mask of a body of 20,000 pixels is 300 words. Contour edges a
 the few that can be on the contour (direction_cells).
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

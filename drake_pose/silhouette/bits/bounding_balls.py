@@ -1,7 +1,5 @@
 """Balls inside and around a surface: they leave out poses undrawn, and tell what can be reached."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -10,8 +10,6 @@ have the same contour. An edge both of whose triangles turn clearly to one side 
 cell is on the contour for no direction in it; some tenth of the edges is left.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """Masks to and from Drake's label images, whose value type alone is from pydrake.systems."""
 
-from __future__ import annotations
-
 from collections.abc import Collection
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Mask files, two-valued PNG pictures, and how masks agree."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What is wrong with a scene of several cameras but leaves enough to go on: each fault is named."""
 
-from __future__ import annotations
-
 import filecmp
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress

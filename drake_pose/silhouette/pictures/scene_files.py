@@ -1,7 +1,5 @@
 """Which files of a scene's folder are masks, of which camera and frame, and which are left over."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from difflib import get_close_matches

@@ -1,7 +1,5 @@
 """An object by its background, learnt or beside it, or by a box (GrabCut, Rother et al., 2004)."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache

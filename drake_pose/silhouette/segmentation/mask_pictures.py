@@ -4,8 +4,6 @@ A polygon's corners lie between pixels (pixel 0 is 0..1), and a pixel belongs to
 lies in; OpenCV's ``fillPoly`` takes every pixel that the border touches, half a pixel too many.
 """
 
-from __future__ import annotations
-
 import io
 import json
 from collections.abc import Container, Mapping, Sequence

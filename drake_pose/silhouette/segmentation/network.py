@@ -1,7 +1,5 @@
 """An object in pictures by a user's segmentation network (ONNX), run by OpenCV."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 

@@ -6,8 +6,8 @@ from collections.abc import Iterable, Sequence
 from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from drake_pose.arrays import Array, Mask
 from drake_pose.body.tree.link_graph import PlantKinematics
 from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
@@ -32,8 +32,6 @@ from drake_pose.search.starts.root_placement import slide_root
 from drake_pose.silhouette.areas.bending import PackedSurfaces, TreeSurfaces
 from drake_pose.silhouette.areas.scoring import draw_packed
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 Self = TypeVar("Self", bound="BodyState")
 
 ROOT_SHIFT = ("root_shift_x", "root_shift_y", "root_shift_z")

@@ -10,8 +10,8 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from drake_pose.arrays import Array, Mask
 from drake_pose.compiled import compiled, copy_into
 from drake_pose.errors import SettingsError
 from drake_pose.filtering.hand_model import (
@@ -23,8 +23,6 @@ from drake_pose.filtering.hand_model import (
     HandModel,
 )
 from drake_pose.filtering.state import Belief
-
-Array = NDArray[np.float64]
 
 HAND_STATE, MEASURED = TWO_FINGERS.layout, TWO_FINGERS.measured
 """The two-finger hand's state, and what is measured of it."""
@@ -90,7 +88,7 @@ class HandObservation:
         return deviations**2
 
     @cached_property
-    def wraps(self) -> NDArray[np.bool_]:
+    def wraps(self) -> Mask:
         """(m,) true for the angles."""
         return np.array([name.startswith("alpha") for name in self.names])
 

@@ -12,12 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.multibody.tree import Joint, RevoluteJoint
 
+from drake_pose.arrays import Array
 from drake_pose.body.model import ArticulatedModel
 from drake_pose.errors import ModelError
 from drake_pose.filtering.state import StateLayout
 from drake_pose.filtering.truncation.couplings import UsualPose, couplings_file, load_usual_pose
 
-Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 
 TURN, BASE, SEGMENT = 0, 1, 2

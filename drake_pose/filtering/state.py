@@ -10,9 +10,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from drake_pose.arrays import Array
 from drake_pose.errors import SettingsError, UnknownNameError
-
-Array = NDArray[np.float64]
 
 
 def factor_of(covariance: Array, names: Sequence[str] = (), what: str = "the belief") -> Array:

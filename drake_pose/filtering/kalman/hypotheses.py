@@ -13,9 +13,9 @@ from dataclasses import dataclass, field, replace
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import chdtri
 
+from drake_pose.arrays import Array
 from drake_pose.filtering.kalman.update import (
     Evidence,
     LinearObservation,
@@ -23,8 +23,6 @@ from drake_pose.filtering.kalman.update import (
     difference,
 )
 from drake_pose.filtering.state import Belief, factor_of
-
-Array = NDArray[np.float64]
 
 # E[(b z^2)^2] = 3 b^2 for a standard normal z.
 _FOURTH_MOMENT = 3.0

@@ -6,8 +6,8 @@ from itertools import count
 from typing import Literal, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
+from drake_pose.arrays import Array
 from drake_pose.errors import SettingsError
 from drake_pose.filtering.kalman.hypotheses import (
     Hypothesis,
@@ -39,7 +39,6 @@ from drake_pose.filtering.truncation.truncated_normal import (
     unlimited,
 )
 
-Array = NDArray[np.float64]
 Truncation = Literal["joint", "sequential", "clip", "none"]
 Branch = tuple[Hypothesis, Updated]
 TRUNCATIONS: tuple[Truncation, ...] = get_args(Truncation)

@@ -10,14 +10,13 @@ from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg.lapack import dpotrf, dpotrs
 
+from drake_pose.arrays import Array, Mask
 from drake_pose.errors import SettingsError
 from drake_pose.filtering.state import Belief
 from drake_pose.filtering.truncation.truncated_normal import Truncated, unlimited
 
-Array = NDArray[np.float64]
 Truncate = Callable[[Belief, Array], Truncated]
 
 # A first guess far off is approached with more noise than there is, cooled from step to step:
@@ -43,7 +42,7 @@ class ObservationModel(Protocol):
         """(m,) of the measurement noise."""
 
     @property
-    def wraps(self) -> NDArray[np.bool_]:
+    def wraps(self) -> Mask:
         """(m,) which measurements are angles [rad], equal after a full turn."""
 
     def predict(self, x: Array) -> tuple[Array, Array]:
@@ -62,7 +61,7 @@ class LinearObservation:
 
     names: tuple[str, ...]
     variances: Array
-    wraps: NDArray[np.bool_]
+    wraps: Mask
     at: Array
     h: Array
     H: Array
@@ -235,7 +234,7 @@ def update(
     return Updated(belief, truncated, log_likelihood, distance, len(line.noise))
 
 
-def difference(values: Array, expected: Array, turning: NDArray[np.bool_]) -> Array:
+def difference(values: Array, expected: Array, turning: Mask) -> Array:
     """Measured minus expected, angles [rad] between -pi and pi."""
     residual = values - expected
     residual[..., turning] = np.remainder(residual[..., turning] + np.pi, 2 * np.pi) - np.pi

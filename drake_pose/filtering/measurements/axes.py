@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from drake_pose.arrays import Array, Mask
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.camera.models import Camera
 from drake_pose.errors import MaskError, ModelError, SettingsError
@@ -19,8 +20,6 @@ from drake_pose.filtering.measurements.contour import ContourObservation
 from drake_pose.filtering.state import Belief
 from drake_pose.fit.evidence import EdgePoints, find_edge_points
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 Ends = tuple[Array, Array]
 
 SPACING = 2.0
@@ -62,7 +61,7 @@ class RoughBody(NamedTuple):
 
     ends: Array
     widths: Array
-    sides: NDArray[np.bool_]
+    sides: Mask
     tips: NDArray[np.intp]
     drawn: NDArray[np.uint8] | Mask
 

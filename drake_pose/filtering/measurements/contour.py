@@ -6,17 +6,16 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from drake_pose.arrays import Array, Mask, Picture
 from drake_pose.errors import SettingsError
-from drake_pose.filtering.body_state import BodyState, Mask
+from drake_pose.filtering.body_state import BodyState
 from drake_pose.filtering.kalman.update import LinearObservation
 from drake_pose.fit.camera_sums import Views
 from drake_pose.fit.colours import (
     COLOUR_CORRELATION,
     COLOUR_SPACING,
     Histograms,
-    Picture,
     add_pictures,
     check_picture,
     learned,
@@ -38,8 +37,6 @@ from drake_pose.fit.covariance import distances, error_unit, estimate_sizes, val
 from drake_pose.fit.evidence import NO_EDGE, find_edge_points
 from drake_pose.fit.kernel import COMPARED, FITTING, REACH, SQUARES, WEIGHT
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
-
-Array = NDArray[np.float64]
 
 # How a contour is measured [pixel]: the spacing of its points; how far a mask's edge is from the
 # body's own contour at least; how much of it errs together: its points count as one; how far from

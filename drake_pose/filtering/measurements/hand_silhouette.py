@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from drake_pose.arrays import Array, Mask
 from drake_pose.errors import MaskError
 from drake_pose.filtering.hand import HandObservation, scaled_rotation
 from drake_pose.filtering.hand_model import PALM, QUATERNION, WRIST, HandModel
@@ -22,9 +23,6 @@ from drake_pose.filtering.measurements.axes import (
 )
 from drake_pose.filtering.state import Belief, factor_of
 from drake_pose.fit.evidence import EdgePoints, find_edge_points
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 # Searches at most; a search's poses in a round, those that the next is drawn about, rounds, those
 # that are followed.

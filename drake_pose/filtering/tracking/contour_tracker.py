@@ -5,10 +5,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from drake_pose.arrays import Array, Mask, Picture
 from drake_pose.errors import SettingsError
-from drake_pose.filtering.body_state import GROWTH, Mask
+from drake_pose.filtering.body_state import GROWTH
 from drake_pose.filtering.kalman.truncated_filter import (
     FilterSettings,
     FilterState,
@@ -17,9 +17,7 @@ from drake_pose.filtering.kalman.truncated_filter import (
 from drake_pose.filtering.kalman.update import LinearObservation
 from drake_pose.filtering.measurements.contour import ContourMeasurement, ContourObservation, Seen
 from drake_pose.filtering.state import Belief
-from drake_pose.fit.colours import Histograms, Picture
-
-Array = NDArray[np.float64]
+from drake_pose.fit.colours import Histograms
 
 # A frame's pose that changes by less is settled [rad, m].
 _STANDSTILL = 1e-3

@@ -6,19 +6,16 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from drake_pose.arrays import Array, Mask, Picture
 from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.camera.models import Camera
 from drake_pose.filtering.measurements.contour import ContourObservation
 from drake_pose.filtering.tracking.contour_tracker import ContourTracker, Track, TrackingSettings
-from drake_pose.fit.colours import Picture
 from drake_pose.search.continuous.families import spread
 from drake_pose.search.estimates import TRACKED, UNEXPLAINED, PoseEstimate, View
 from drake_pose.search.scoring import PoseSearch
 from drake_pose.silhouette.pictures.masks import edge_area
-
-Array = NDArray[np.float64]
 
 # A track is lost when E_total is this many times what it was after the last match, and this more.
 _LOST_GROWTH, _LOST_MARGIN = 1.5, 0.1
@@ -61,7 +58,7 @@ class _Frame:
     views: Sequence[View]
     root_position: Array | None
     observation: ContourObservation
-    masks: list[NDArray[np.bool_] | None]
+    masks: list[Mask | None]
     pictures: list[Picture | None] | None
     begin: float
 

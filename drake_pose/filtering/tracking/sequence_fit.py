@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from drake_pose.arrays import Array, Mask
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
-from drake_pose.filtering.body_state import Mask
 from drake_pose.filtering.measurements.contour import ContourObservation
 from drake_pose.filtering.tracking.contour_tracker import ContourTracker, Track
 from drake_pose.fit.contour_fit import Noise
@@ -30,7 +30,6 @@ from drake_pose.fit.surfaces import few_rigid_triangles
 from drake_pose.search.estimates import JointEstimate, PoseFamily, PoseSet, joint_estimates
 from drake_pose.silhouette.areas.bending import TreeSurfaces
 
-Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 
 # Of a normal distribution, 95 % lie within this many standard deviations.

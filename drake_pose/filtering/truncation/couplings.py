@@ -10,9 +10,9 @@ from pathlib import Path
 
 import numpy as np
 import yaml
-from numpy.typing import NDArray
 from pydrake.common.yaml import yaml_load_typed
 
+from drake_pose.arrays import Array
 from drake_pose.body.parsed_model import ParsedModel
 from drake_pose.errors import ModelError, SettingsError
 from drake_pose.filtering.truncation.inequalities import (
@@ -93,9 +93,9 @@ class Couplings:
 class UsualPose:
     """How a body is usually held: phi (k, n) times a state x is normal, mean and deviation (k,)."""
 
-    phi: NDArray[np.float64]
-    mean: NDArray[np.float64]
-    deviation: NDArray[np.float64]
+    phi: Array
+    mean: Array
+    deviation: Array
 
 
 def load_couplings(path: Path | str, columns: Sequence[str]) -> Inequalities:

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import linprog
 
+from drake_pose.arrays import Array
 from drake_pose.body.parsed_model import ParsedModel
 from drake_pose.errors import SettingsError, UnknownNameError
 
@@ -28,13 +29,13 @@ class Inequalities:
 
     columns: tuple[str, ...]
     rows: tuple[str, ...]
-    phi: NDArray[np.float64]
-    b: NDArray[np.float64]
+    phi: Array
+    b: Array
 
     def __len__(self) -> int:
         return len(self.rows)
 
-    def margins(self, x: ArrayLike) -> NDArray[np.float64]:
+    def margins(self, x: ArrayLike) -> Array:
         """(K,) b - phi x: how far x (n,) is from each bound, negative where it is beyond."""
         return self.b - self.phi @ np.asarray(x, dtype=np.float64)
 
@@ -194,7 +195,7 @@ def row_from_terms(columns: Sequence[str], terms: Mapping[str, float], where: st
     return row
 
 
-def inner_point(inequalities: Inequalities) -> NDArray[np.float64]:
+def inner_point(inequalities: Inequalities) -> Array:
     """(n,) a point inside all rows, far from each if that is possible.
 
     The linear program that finds the largest ball inside; where there is none its dual names the

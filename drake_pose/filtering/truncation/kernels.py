@@ -7,11 +7,9 @@ s = direction^T x, and changes mean and factor in place.
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from drake_pose.arrays import Array
 from drake_pose.compiled import compiled, copy_into
-
-Array = NDArray[np.float64]
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(64)
 # The density is followed down to exp(-40) of its largest value: 4e-18.

@@ -5,12 +5,11 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from drake_pose.arrays import Array, Mask
 from drake_pose.errors import SettingsError
 from drake_pose.filtering.state import Belief, covariance_from
 from drake_pose.filtering.truncation.inequalities import Inequalities
 from drake_pose.filtering.truncation.kernels import apply_sites, cut_one_by_one, propagate
-
-Array = NDArray[np.float64]
 
 SKIP_ABOVE = 5.0
 """Rows with a larger c_k are left out: they would move the mean by less than 2e-6 deviations."""
@@ -33,7 +32,7 @@ class Truncated(Belief):
     """
 
     c: Array
-    active: NDArray[np.bool_]
+    active: Mask
     log_probability: float
     sites: Array = field(default_factory=lambda: np.zeros((0, 2)))
 

@@ -28,8 +28,10 @@ HAND_STATE, MEASURED = TWO_FINGERS.layout, TWO_FINGERS.measured
 """The two-finger hand's state, and what is measured of it."""
 SPREADS, FLEXIONS, LENGTHS = TWO_FINGERS.spreads, TWO_FINGERS.flexions, TWO_FINGERS.lengths
 
-# A mirrored angle closer than this is the same [rad].
-_SMALLEST_CHANGE = math.radians(8)
+# A mirrored angle closer than this is the same [rad], one further from the prediction not tried
+# [deviations]; a segment shorter than this in the image shows no axis [pixel]; the noise of the
+# scale where it is known.
+_SMALLEST_CHANGE, _MIRROR_REACH, _SHORTEST, _SCALE_DEVIATION = math.radians(8), 3.0, 5.0, 1e-3
 _QUATERNION, _ANGLES = 2, 6
 
 
@@ -41,11 +43,8 @@ class HandObservation:
         pixels_per_metre: of the image, for scale 1.
         point_deviation: noise of a joint, a fingertip or the wrist [pixel].
         angle_deviation, distance_deviation: noise of a line's alpha [rad] and rho [pixel].
-        scale_deviation: of the scale, where it is known.
-        shortest: a segment shorter than this in the image shows no axis [pixel].
         mirror_slope: (30) holds where a joint's turn moves its segment's end by less than this
             fraction of what it would move it in the image plane.
-        mirror_reach: mirrored angles further from the prediction are not tried [deviations].
         rest: in so many frames, how joints are usually held is told once.
         hand: which one.
 
@@ -57,10 +56,7 @@ class HandObservation:
     point_deviation: float = 0.5
     angle_deviation: float = math.radians(1.0)
     distance_deviation: float = 1.0
-    scale_deviation: float = 1e-3
-    shortest: float = 5.0
     mirror_slope: float = 0.35
-    mirror_reach: float = 3.0
     rest: float = 30.0
     hand: HandModel = field(default=TWO_FINGERS, repr=False)
 
@@ -82,7 +78,7 @@ class HandObservation:
         deviations = np.full(len(self.names), self.point_deviation)
         deviations[lines:scale:2] = self.angle_deviation
         deviations[lines + 1 : scale : 2] = self.distance_deviation
-        deviations[scale] = self.scale_deviation
+        deviations[scale] = _SCALE_DEVIATION
         if usual is not None:
             deviations[scale + 1 :] = math.sqrt(self.rest) * usual.deviation
         return deviations**2
@@ -109,7 +105,7 @@ class HandObservation:
 
     def _project(self, x: Array) -> tuple[Array, Array, Array, Array]:
         hand = self.hand
-        return project_hand(x[hand.seen], hand.chains, self.pixels_per_metre, self.shortest)
+        return project_hand(x[hand.seen], hand.chains, self.pixels_per_metre, _SHORTEST)
 
     def mirrors(self, belief: Belief) -> list[Array]:
         """Predictions (n,) mirrored at the image plane in one joint, where (30) holds.
@@ -120,7 +116,7 @@ class HandObservation:
         hand, x, found = self.hand, belief.mean, []
         _, _, points, J = self._project(x)
         flexions = hand.layout.indices(hand.flexions)
-        reaches = self.mirror_reach * belief.deviations()[flexions]
+        reaches = _MIRROR_REACH * belief.deviations()[flexions]
         starts, ends = hand.line_ends[: len(flexions)].T
         own = np.searchsorted(hand.seen, flexions)
         a = points[ends] - points[starts]

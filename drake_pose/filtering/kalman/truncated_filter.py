@@ -46,6 +46,8 @@ TRUNCATIONS: tuple[Truncation, ...] = get_args(Truncation)
 # Hypotheses closer than this in every element are one [deviations]; of the joint truncation.
 _TWIN_DISTANCE, _TOLERANCE = 0.3, 1e-3
 _ROUGH_ITERATIONS = 3
+# A hypothesis is given up that lies beyond a row by more: whose c_k (24) is below this.
+_REJECT_BELOW = -4.0
 
 
 @dataclass(frozen=True)
@@ -57,7 +59,6 @@ class FilterSettings:
             is moved inside) or "none".
         iterations: linearisations of an update at most; 1 for the paper's.
         hypothesis_cap: how many hypotheses are kept at most; 1 for none but the best.
-        reject_below: a hypothesis beyond a row by more is given up: c_k (24) below this.
         smallest_weight: lighter hypotheses are given up.
         novelty: a measurement shows nothing new if noise alone would make it differ as much
             from the one that began the view with more than this probability, see ``views``. 0:
@@ -70,7 +71,6 @@ class FilterSettings:
     truncation: Truncation = "joint"
     iterations: int = 20
     hypothesis_cap: int = 4
-    reject_below: float = -4.0
     smallest_weight: float = 1e-4
     novelty: float = 1e-9
 
@@ -83,8 +83,8 @@ class FilterSettings:
             raise SettingsError("iterations and hypothesis_cap must be 1 or more")
         if not 0 <= self.novelty < 1:
             raise SettingsError(f"novelty must be in [0, 1), not {self.novelty}")
-        if not (self.reject_below < 0 and 0 <= self.smallest_weight < 1):
-            raise SettingsError("reject_below must be negative, smallest_weight in [0, 1)")
+        if not 0 <= self.smallest_weight < 1:
+            raise SettingsError(f"smallest_weight must be in [0, 1), not {self.smallest_weight}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -279,7 +279,7 @@ class TruncatedFilter:
             c = result.truncated.c
             k = int(np.argmin(c))
             worst_c.append(c[k])
-            if c[k] < self.settings.reject_below:
+            if c[k] < _REJECT_BELOW:
                 name = self.inequalities.rows[k]
                 gone = replace(hypothesis, belief=result.belief)
                 rejected.append(Rejection(step, gone, "constraint", name, float(c[k])))

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from drake_pose.arrays import Array, Mask
 from drake_pose.camera.models import Camera
-from drake_pose.person.date.skeleton import Limb, rotation
+from drake_pose.person.date.skeleton import Limb
 from drake_pose.person.rays import sum_at_points
 
 ELBOW_RANGE = (0.0, 120.0)
@@ -225,10 +225,10 @@ def place_limb(
     frames, off_line = _triads(towards, middles - root)
     # Stretched it does not tell how it is turned about itself: as in the last frame.
     stretched = off_line * distance < _STRETCHED * ((middles - root) ** 2).sum(axis=1)
-    R_last = R_WT @ rotation(limb.axes[:3], last[:3])
+    R_last = R_WT @ Rotation.from_euler(_letters(limb)[:3], last[:3]).as_matrix()
     options = []
     for bend in _middle_angles(limb, distance):
-        end_U = limb.middle_U + rotation(limb.axes[3:], np.array([bend])) @ limb.end_L
+        end_U = limb.middle_U + Rotation.from_euler(_letters(limb)[3], bend).apply(limb.end_L)
         own = _triads(_along(np.zeros(3), end_U)[0], limb.middle_U[None])[0][0]
         R_WU = frames @ own.T
         if stretched.any():

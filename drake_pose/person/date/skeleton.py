@@ -184,18 +184,6 @@ def load_skeleton(model: ArticulatedModel) -> Skeleton:
     )
 
 
-def rotation(axes: Integers, angles: Array) -> Array:
-    """(3, 3) the product of rotations about coordinate axes (n,) by angles (n,) [rad], in order."""
-    R = np.eye(3)
-    for axis, angle in zip(axes, angles, strict=True):
-        c, s = np.cos(angle), np.sin(angle)
-        i, j = (axis + 1) % 3, (axis + 2) % 3
-        step = np.eye(3)
-        step[i, i], step[i, j], step[j, i], step[j, j] = c, -s, s, c
-        R = R @ step
-    return R
-
-
 def _chain(packed: PackedTree, node: int) -> tuple[PackedTree, Integers]:
     """A node and those that it hangs on by themselves, and which values are theirs."""
     path: list[int] = []

@@ -185,7 +185,7 @@ def test_a_mirrored_prediction_beyond_a_limit_dies_of_it():
     state = f.update(f.predict(state), np.array([np.cos(0.4)]))
     (gone,) = state.rejections
     assert (gone.reason, gone.row, gone.hypothesis.born) == ("constraint", "angle >= 0", 1)
-    assert gone.c < f.settings.reject_below
+    assert gone.c < -4.0
     assert gone.hypothesis.belief.mean[0] == pytest.approx(-0.4, abs=0.05)
     assert state.best.mean[0] == pytest.approx(0.4, abs=0.05)
 
@@ -237,7 +237,7 @@ def test_transition_and_noise():
         (lambda: make_filter().start(Belief(np.ones(3), np.diag([1.0, 1, -1]))), "'length' has"),
         (lambda: make_filter(truncation="x"), "truncation"),
         (lambda: make_filter(iterations=0), "iterations"),
-        (lambda: make_filter(reject_below=1.0), "reject_below"),
+        (lambda: make_filter(smallest_weight=1.0), "smallest_weight"),
         (lambda: make_filter(novelty=1.0), "novelty"),
         (lambda: LAYOUT.process_noise({"angle": -1.0}), "'angle'"),
         (lambda: LAYOUT.process_noise({}), "'angle'"),

@@ -28,7 +28,7 @@ from drake_pose.person.date.limb_search import (
     rectangles,
     search_limb,
 )
-from drake_pose.person.date.skeleton import LIMBS, load_skeleton, rotation
+from drake_pose.person.date.skeleton import LIMBS, load_skeleton
 from tests.person.persons_in_view import SIDES, posed, see
 
 
@@ -185,8 +185,8 @@ class TestAngles:
         middle = root + (end - root) * limb.lengths[0] / sum(limb.lengths)
         R_WT, _ = skeleton.trunk_pose(q)
         found = limb_angles(limb, R_WT, root, middle, end, last)
-        R_before = rotation(limb.axes[:3], last[:3])
-        R_after = rotation(limb.axes[:3], found[:3])
+        axes = "".join("XYZ"[axis] for axis in limb.axes[:3])
+        R_before, R_after = Rotation.from_euler(axes, [last[:3], found[:3]]).as_matrix()
         # The shortest turn from the old direction of the arm to the new one, and no other.
         turned = np.arccos((np.trace(R_before.T @ R_after) - 1) / 2)
         old, new = R_WT @ R_before @ limb.middle_U, end - root

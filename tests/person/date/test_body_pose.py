@@ -260,7 +260,7 @@ class TestPose:
         assert errors["rectangles"] < min(0.07, 0.6 * errors["none"])
         assert errors["surfaces"] < 0.02
 
-    @pytest.mark.parametrize("along", [-0.012, -0.004, 0.004, 0.012])
+    @pytest.mark.parametrize("along", [-0.012, 0.012])
     def test_an_end_measured_a_little_off_hardly_moves_the_knee(
         self, person, skeleton, seen, along
     ):

@@ -63,7 +63,7 @@ class TestRecognition:
         registered = studio.registered
         generator = np.random.default_rng(0)
         cameras = list(studio.ring.values())
-        for _ in range(4):
+        for _ in range(2):
             q = np.array(registered.q)
             q[:3] += generator.uniform([-0.3, -0.3, 0.0], [0.3, 0.3, 0.0])
             heading = generator.uniform(-3.1, 3.1)
@@ -103,7 +103,7 @@ class TestFaces:
             return studio.skeleton.head_rotation(q)[:, 2]
 
         errors = []
-        for _ in range(25):
+        for _ in range(12):
             q = studio.posed()
             direction = np.radians(generator.uniform([-50, -20], [50, 30]))
             q[studio.skeleton.head_angles] = direction

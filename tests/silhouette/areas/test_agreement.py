@@ -94,7 +94,7 @@ def cameras(rng: np.random.Generator) -> list[Camera]:
 @pytest.mark.parametrize("shape", list(SHAPES))
 def test_every_shape_looks_as_drake_draws_it(tmp_path: Path, shape: str) -> None:
     model = model_of(tmp_path, [shape, shape])
-    for seed in range(3):
+    for seed in range(2):
         for camera in cameras(np.random.default_rng(seed)):
             share, whole, _ = measure_agreement(model, camera, 8, seed)
             assert share <= LARGEST_SHARE, (shape, camera.name, share)

@@ -49,7 +49,7 @@ def test_the_nearest_of_closed_bodies_is_seen(camera: Camera, inside_out: bool) 
     # They run into each other, and a part is cut by the near plane.
     rng = np.random.default_rng(5)
     shared = 0
-    for trial in range(20):
+    for trial in range(10):
         middle = 2.0 if trial % 2 else 0.4
         meshes = [box(float(rng.uniform(0.3, 0.9))) for _ in range(4)]
         if inside_out:

@@ -75,7 +75,7 @@ def test_scores_are_sums_over_masks(camera: Camera) -> None:
 def test_rows_with_very_many_crossings() -> None:
     rng = np.random.default_rng(5)
     for camera in CAMERAS[:2]:
-        for triangles in (60, 400, 3000):
+        for triangles in (60, 400):
             mesh = soup(rng, 300, triangles, 0.3)
             small = TriangleMesh(
                 (

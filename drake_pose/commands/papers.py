@@ -268,7 +268,7 @@ def _shimada_moving(
 ) -> None:
     """The paper's moving hands, once for each truncation; none named: for all."""
     with _experiment(out) as count:
-        from drake_pose.filtering.kalman.truncated_filter import TRUNCATIONS
+        from drake_pose.filtering.truncated_filter import TRUNCATIONS
         from drake_pose.papers.shimada import PICTURES, result_table, run_experiment
         from drake_pose.papers.shimada_pictures import save_pictures
 

@@ -109,7 +109,7 @@ def calibrate(
         leave_out: Leave out a camera, or a picture CAMERA/FRAME; repeat for several.
         drop_spoilt: Leave out pictures that spoil the calibration.
     """
-    from drake_pose.camera.calibration.calibrate import CalibrationSettings
+    from drake_pose.camera.calibrate import CalibrationSettings
     from drake_pose.jobs.calibrate import calibrate_folder
 
     settings = CalibrationSettings(
@@ -137,7 +137,7 @@ def undistort(
         lenses: The lens file that calibrate wrote.
         out: Folder for the pictures.
     """
-    from drake_pose.camera.calibration.rig import load_lenses
+    from drake_pose.camera.rig import load_lenses
     from drake_pose.jobs.calibrate import undistort_pictures
 
     written = undistort_pictures(folder, load_lenses(lenses), out)

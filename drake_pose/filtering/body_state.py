@@ -13,19 +13,19 @@ from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.camera.models import Camera, ParallelCamera
 from drake_pose.errors import SettingsError
-from drake_pose.filtering.state import StateLayout
-from drake_pose.filtering.truncation.couplings import (
+from drake_pose.filtering.couplings import (
     UsualPose,
     couplings_file,
     load_couplings,
     load_usual_pose,
 )
-from drake_pose.filtering.truncation.inequalities import (
+from drake_pose.filtering.inequalities import (
     Inequalities,
     from_bounds,
     say_if_unlimited,
     stack,
 )
+from drake_pose.filtering.state import StateLayout
 from drake_pose.fit.parameters import BodyParameters
 from drake_pose.fit.surfaces import MANY, few_rigid_triangles
 from drake_pose.search.starts.root_placement import slide_root

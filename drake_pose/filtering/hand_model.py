@@ -15,8 +15,8 @@ from pydrake.multibody.tree import Joint, RevoluteJoint
 from drake_pose.arrays import Array
 from drake_pose.body.model import ArticulatedModel
 from drake_pose.errors import ModelError
+from drake_pose.filtering.couplings import UsualPose, couplings_file, load_usual_pose
 from drake_pose.filtering.state import StateLayout
-from drake_pose.filtering.truncation.couplings import UsualPose, couplings_file, load_usual_pose
 
 Indices = NDArray[np.intp]
 

@@ -12,7 +12,7 @@ import numpy as np
 from rich.markup import escape
 from rich.table import Table
 
-from drake_pose.camera.calibration.board import (
+from drake_pose.camera.board import (
     BoardDetections,
     Picture,
     find_boards,
@@ -20,9 +20,9 @@ from drake_pose.camera.calibration.board import (
     load_board,
     read_board_picture,
 )
-from drake_pose.camera.calibration.calibrate import Calibration, CalibrationSettings, calibrate
-from drake_pose.camera.calibration.rig import Lens, save_lenses
+from drake_pose.camera.calibrate import Calibration, CalibrationSettings, calibrate
 from drake_pose.camera.camera_files import save_cameras
+from drake_pose.camera.rig import Lens, save_lenses
 from drake_pose.errors import CameraError, OutputError
 
 

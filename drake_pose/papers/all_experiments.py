@@ -18,7 +18,7 @@ from rich.console import Console, RenderableType
 from drake_pose.errors import OutputError
 from drake_pose.files.folder import without_nan
 from drake_pose.files.report_page import page_template
-from drake_pose.filtering.kalman.truncated_filter import FilterSettings
+from drake_pose.filtering.truncated_filter import FilterSettings
 from drake_pose.papers.date import run_experiment as run_date
 from drake_pose.papers.date_walk import run_walk_through
 from drake_pose.papers.date_walk import save_pictures as save_date

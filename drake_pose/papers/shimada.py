@@ -18,6 +18,7 @@ from drake_pose.body.formats.packages import bundled_model
 from drake_pose.body.model import ArticulatedModel, load_model
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import SettingsError
+from drake_pose.filtering.couplings import model_inequalities
 from drake_pose.filtering.hand import (
     FLEXIONS,
     HAND_STATE,
@@ -27,14 +28,13 @@ from drake_pose.filtering.hand import (
     plant_positions,
 )
 from drake_pose.filtering.hand_model import TWO_FINGERS
-from drake_pose.filtering.kalman.truncated_filter import (
+from drake_pose.filtering.hand_silhouette import HandSilhouette
+from drake_pose.filtering.truncated_filter import (
     FilterSettings,
     TruncatedFilter,
     Truncation,
 )
-from drake_pose.filtering.kalman.update import make_evidence, update
-from drake_pose.filtering.measurements.hand_silhouette import HandSilhouette
-from drake_pose.filtering.truncation.couplings import model_inequalities
+from drake_pose.filtering.update import make_evidence, update
 from drake_pose.papers.shimada_motion import (
     ACCELERATIONS,
     FRAMES,

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.table import Table
 
-from drake_pose.filtering.kalman.truncated_filter import FilterState
-from drake_pose.filtering.truncation.inequalities import Inequalities
+from drake_pose.filtering.inequalities import Inequalities
+from drake_pose.filtering.truncated_filter import FilterState
 from drake_pose.papers.shimada import (
     LOST_ANGLE_ERROR,
     angle_error,

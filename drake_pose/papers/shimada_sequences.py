@@ -21,17 +21,17 @@ from drake_pose.camera.models import ParallelCamera
 from drake_pose.csv_files import read_csv
 from drake_pose.errors import SceneError
 from drake_pose.files.settings import EstimateSettings
+from drake_pose.filtering.couplings import model_inequalities
 from drake_pose.filtering.hand import HandObservation
 from drake_pose.filtering.hand_model import PALM, HandModel, palm_rotation, read_hand
-from drake_pose.filtering.kalman.truncated_filter import (
+from drake_pose.filtering.hand_silhouette import HandSilhouette
+from drake_pose.filtering.inequalities import from_bounds, stack
+from drake_pose.filtering.state import Belief
+from drake_pose.filtering.truncated_filter import (
     FilterSettings,
     FilterState,
     TruncatedFilter,
 )
-from drake_pose.filtering.measurements.hand_silhouette import HandSilhouette
-from drake_pose.filtering.state import Belief
-from drake_pose.filtering.truncation.couplings import model_inequalities
-from drake_pose.filtering.truncation.inequalities import from_bounds, stack
 from drake_pose.jobs.estimate.inputs import TRUTH_FILE, Inputs, read_inputs
 from drake_pose.papers.tables import Advance, Count, figure_table, uncounted
 from drake_pose.search.estimates import View

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from drake_pose.camera.calibration.board import Board, BoardDetections, Detection
+from drake_pose.camera.board import Board, BoardDetections, Detection
 from drake_pose.camera.models import look_at
 
 CHECKERBOARD = Board("checkerboard", 8, 5, 0.12)

@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.special import ndtr, ndtri
 
-from drake_pose.filtering.truncation.inequalities import Inequalities, inner_point
+from drake_pose.filtering.inequalities import Inequalities, inner_point
 
 
 def sample_truncated(

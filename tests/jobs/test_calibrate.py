@@ -7,9 +7,9 @@ import cv2
 import numpy as np
 import pytest
 
-from drake_pose.camera.calibration.calibrate import CalibrationSettings
-from drake_pose.camera.calibration.rig import load_lenses
+from drake_pose.camera.calibrate import CalibrationSettings
 from drake_pose.camera.camera_files import load_cameras
+from drake_pose.camera.rig import load_lenses
 from drake_pose.errors import CameraError, UnknownNameError
 from drake_pose.jobs.calibrate import calibrate_folder, undistort_pictures
 from tests.camera.boards import CHECKERBOARD, facing, inside, photograph, poses_for_pairs, ring

@@ -7,7 +7,7 @@ import pytest
 
 from drake_pose.errors import SettingsError
 from drake_pose.filtering.hand import HAND_STATE, LENGTHS, MEASURED, HandObservation
-from drake_pose.filtering.kalman.truncated_filter import TRUNCATIONS
+from drake_pose.filtering.truncated_filter import TRUNCATIONS
 from drake_pose.papers.shimada import (
     CASES,
     PICTURES,

@@ -10,11 +10,11 @@ import pytest
 import yaml
 
 from drake_pose.body.landmarks import load_landmarks
-from drake_pose.camera.calibration.board import load_board
+from drake_pose.camera.board import load_board
 from drake_pose.camera.camera_files import load_cameras
-from drake_pose.camera.sources.source_files import load_sources
+from drake_pose.camera.source_files import load_sources
 from drake_pose.commands.main import app
-from drake_pose.filtering.truncation.couplings import load_couplings
+from drake_pose.filtering.couplings import load_couplings
 from drake_pose.jobs.batch.job import read_job
 from tests.cli import run_command
 

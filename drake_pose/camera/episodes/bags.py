@@ -14,9 +14,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from drake_pose.arrays import Array, Integers, Picture
-from drake_pose.camera.calibration.rig import Lens
 from drake_pose.camera.episodes.episode import Episode, EpisodeCamera, JointLog, ascending
 from drake_pose.camera.picture_files import decode_colours
+from drake_pose.camera.rig import Lens
 from drake_pose.camera.video_files import import_reader
 from drake_pose.errors import DrakePoseError, SceneError
 

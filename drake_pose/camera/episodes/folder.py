@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 
 from drake_pose.arrays import Array, Picture
-from drake_pose.camera.calibration.rig import Lens
 from drake_pose.camera.camera_files import CameraFile, load_camera_file
 from drake_pose.camera.episodes.episode import Episode, EpisodeCamera, JointLog, ascending
 from drake_pose.camera.models import PinholeCamera, check_number
 from drake_pose.camera.picture_files import frame_key, in_order, list_pictures, read_picture
-from drake_pose.camera.sources.source_files import CAMERAS, TIME_STAMPS, read_time_stamps
+from drake_pose.camera.rig import Lens
+from drake_pose.camera.source_files import CAMERAS, TIME_STAMPS, read_time_stamps
 from drake_pose.camera.video_files import VIDEOS, TimedVideo
 from drake_pose.csv_files import read_csv
 from drake_pose.errors import CameraError, SceneError

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from drake_pose.camera.sources.frame_source import FrameSource, SourceSpecification, TimedPicture
+from drake_pose.camera.frame_source import FrameSource, SourceSpecification, TimedPicture
 from drake_pose.errors import ClusterError
 from drake_pose.jobs.cluster.camera_worker import host_of
 

@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 from distributed import get_worker
 
-from drake_pose.camera.sources.frame_source import SourceSpecification
+from drake_pose.camera.frame_source import SourceSpecification
 from drake_pose.fit.camera_sums import (
     Views,
     answer_request,

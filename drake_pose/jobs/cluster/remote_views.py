@@ -18,8 +18,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from pydrake.systems.framework import Context, DependencyTicket, DiagramBuilder, OutputPort
 
+from drake_pose.camera.frame_source import Clock, FrameSource, TimedPicture
 from drake_pose.camera.models import Camera
-from drake_pose.camera.sources.frame_source import Clock, FrameSource, TimedPicture
 from drake_pose.errors import ClusterError, DrakePoseError
 from drake_pose.jobs.cluster import camera_worker
 from drake_pose.jobs.cluster.camera_groups import CameraAssignment, WatchedSource, assign_cameras

@@ -19,10 +19,10 @@ from drake_pose.files.overlay import draw_shapes
 from drake_pose.files.records import user_units
 from drake_pose.files.settings import EstimateSettings
 from drake_pose.files.writer import OnStage
-from drake_pose.filtering.measurements.contour import ContourObservation
-from drake_pose.filtering.tracking.contour_tracker import ContourTracker, TrackingSettings
-from drake_pose.filtering.tracking.match_and_track import make_tracker
-from drake_pose.filtering.tracking.sequence_fit import (
+from drake_pose.filtering.contour import ContourObservation
+from drake_pose.filtering.contour_tracker import ContourTracker, TrackingSettings
+from drake_pose.filtering.match_and_track import make_tracker
+from drake_pose.filtering.sequence_fit import (
     START_FRAMES,
     FittedSequence,
     FollowedStart,

@@ -17,7 +17,7 @@ from drake_pose.camera.camera_files import load_cameras
 from drake_pose.errors import ModelError, SceneError, SettingsError, UnknownNameError
 from drake_pose.files.records import user_units
 from drake_pose.files.settings import EstimateSettings
-from drake_pose.filtering.tracking.contour_tracker import TrackingSettings
+from drake_pose.filtering.contour_tracker import TrackingSettings
 from drake_pose.jobs.estimate.episode import is_episode, logged_positions, read_episode_scene
 from drake_pose.jobs.estimate.measurements import (
     TrueAngles,

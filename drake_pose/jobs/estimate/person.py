@@ -14,11 +14,11 @@ from drake_pose.files.records import record_deviations
 from drake_pose.files.writer import FinishedFrame, OnStage, ResultWriter
 from drake_pose.jobs.estimate.inputs import Inputs
 from drake_pose.jobs.estimate.matching import finish_frame, read_pictures
-from drake_pose.person.recordings.camera_faults import CameraFault
-from drake_pose.person.recordings.checked_capture import CheckedCapture, capture_checked
-from drake_pose.person.recordings.figures import RigFault
-from drake_pose.person.recordings.person_capture import PersonCapture, capture_by_colour
-from drake_pose.person.recordings.persons_in_view import ReadFrame, ViewFaults
+from drake_pose.person.camera_faults import CameraFault
+from drake_pose.person.checked_capture import CheckedCapture, capture_checked
+from drake_pose.person.figures import RigFault
+from drake_pose.person.person_capture import PersonCapture, capture_by_colour
+from drake_pose.person.persons_in_view import ReadFrame, ViewFaults
 from drake_pose.search.estimates import PoseEstimate
 from drake_pose.silhouette.areas.scoring import draw_labels
 from drake_pose.silhouette.pictures.masks import edge_area

@@ -29,8 +29,8 @@ from drake_pose.person.date.recognition import (
     stand_registered,
 )
 from drake_pose.person.date.skeleton import load_skeleton
-from drake_pose.person.recordings.person_capture import capture_person
-from drake_pose.person.recordings.persons_in_view import PersonRecording
+from drake_pose.person.person_capture import capture_person
+from drake_pose.person.persons_in_view import PersonRecording
 from drake_pose.person.shape import KnownShape, shape_values, tracker_of_person
 from drake_pose.person.views import shows_somebody
 from drake_pose.systems.colour_images import colour_image_to_picture

@@ -13,7 +13,7 @@ from pydrake.systems.framework import Context, Diagram, OutputPort
 
 from drake_pose.arrays import Array, Mask
 from drake_pose.body.model import ArticulatedModel
-from drake_pose.camera.sources.source_files import TIME_STAMPS
+from drake_pose.camera.source_files import TIME_STAMPS
 from drake_pose.csv_files import csv_text
 from drake_pose.files.records import FrameRecord, PoseRow, SceneEstimate, record_deviations
 from drake_pose.files.settings import EstimateSettings
@@ -24,8 +24,8 @@ from drake_pose.jobs.live.run import run_live
 from drake_pose.jobs.live.scene import LiveScene
 from drake_pose.jobs.live.settings import LiveSettings
 from drake_pose.person.date.skeleton import FEATURES
+from drake_pose.person.persons_in_view import keep_person
 from drake_pose.person.pose_tracker import PersonPoseTracker
-from drake_pose.person.recordings.persons_in_view import keep_person
 from drake_pose.person.views import SilhouetteView
 from drake_pose.silhouette.areas.scoring import draw_mask
 from drake_pose.silhouette.pictures.masks import compare_masks

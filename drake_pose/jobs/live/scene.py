@@ -12,9 +12,9 @@ from pathlib import Path
 import cv2
 
 from drake_pose.camera.camera_files import load_cameras
+from drake_pose.camera.frame_source import Clock, FrameSource, Picture, SourceSpecification
 from drake_pose.camera.models import Camera
-from drake_pose.camera.sources.frame_source import Clock, FrameSource, Picture, SourceSpecification
-from drake_pose.camera.sources.source_files import (
+from drake_pose.camera.source_files import (
     CAMERAS,
     SOURCES,
     load_background_pictures,

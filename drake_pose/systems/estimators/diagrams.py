@@ -23,7 +23,7 @@ from pydrake.trajectories import PiecewisePolynomial, Trajectory
 from drake_pose.body.parsed_model import ParsedModel
 from drake_pose.body.tree.tree_builder import build_pose_tree
 from drake_pose.camera.models import Camera, PinholeCamera
-from drake_pose.filtering.tracking.contour_tracker import TrackingSettings
+from drake_pose.filtering.contour_tracker import TrackingSettings
 from drake_pose.registration.online_registration import OnlineRegistration
 from drake_pose.search.estimates import PoseEstimate
 from drake_pose.search.scoring import PoseSearch

@@ -20,13 +20,13 @@ from drake_pose.arrays import Array, Mask
 from drake_pose.body.parsed_model import ParsedModel
 from drake_pose.camera.models import Camera
 from drake_pose.errors import SettingsError
-from drake_pose.filtering.kalman.truncated_filter import FilterSettings, TruncatedFilter
-from drake_pose.filtering.measurements.axes import AxisObservation, Ends
-from drake_pose.filtering.measurements.contour import ContourObservation
-from drake_pose.filtering.measurements.hand_silhouette import HandMeasurement, HandSilhouette
+from drake_pose.filtering.axes import AxisObservation, Ends
+from drake_pose.filtering.contour import ContourObservation
+from drake_pose.filtering.contour_tracker import ContourTracker, TrackingSettings
+from drake_pose.filtering.couplings import model_inequalities
+from drake_pose.filtering.hand_silhouette import HandMeasurement, HandSilhouette
 from drake_pose.filtering.state import Belief
-from drake_pose.filtering.tracking.contour_tracker import ContourTracker, TrackingSettings
-from drake_pose.filtering.truncation.couplings import model_inequalities
+from drake_pose.filtering.truncated_filter import FilterSettings, TruncatedFilter
 from drake_pose.search.estimates import View
 from drake_pose.search.scoring import PoseSearch
 from drake_pose.silhouette.pictures.label_images import label_image_to_mask

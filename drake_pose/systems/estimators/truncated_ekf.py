@@ -9,8 +9,8 @@ from scipy.special import chdtri
 
 from drake_pose.arrays import Array
 from drake_pose.errors import SettingsError
-from drake_pose.filtering.kalman.truncated_filter import FilterState, TruncatedFilter
 from drake_pose.filtering.state import Belief, make_belief
+from drake_pose.filtering.truncated_filter import FilterState, TruncatedFilter
 from drake_pose.systems.ports import BeliefSystem, SharedValue, require_period, require_time_forward
 
 STATISTICS = ("step", "hypotheses", "distance", "count", "lost")

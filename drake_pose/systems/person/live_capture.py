@@ -11,8 +11,8 @@ from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPo
 from pydrake.trajectories import Trajectory
 
 from drake_pose.body.model import ArticulatedModel
+from drake_pose.camera.frame_source import FrameSource
 from drake_pose.camera.models import Camera, PinholeCamera
-from drake_pose.camera.sources.frame_source import FrameSource
 from drake_pose.errors import SettingsError
 from drake_pose.fit.contour_fit import ContourFit
 from drake_pose.person.pose_tracker import PersonPoseTracker

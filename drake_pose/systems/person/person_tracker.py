@@ -14,8 +14,8 @@ from drake_pose.arrays import Array
 from drake_pose.camera.models import Camera, camera_tuple
 from drake_pose.fit.colour_lines import COLOURS
 from drake_pose.fit.contour_fit import inlier_ratio_of
+from drake_pose.person.persons_in_view import keep_views
 from drake_pose.person.pose_tracker import PersonPoseTracker, TrackState
-from drake_pose.person.recordings.persons_in_view import keep_views
 from drake_pose.person.views import ColourViews, FrameViews, shows_somebody
 from drake_pose.systems.bodies import body_poses
 from drake_pose.systems.colour_images import ColourPorts

@@ -14,9 +14,15 @@ from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import Context, DependencyTicket, EventStatus, State
 from pydrake.systems.sensors import ImageLabel16I, ImageRgba8U
 
+from drake_pose.camera.frame_source import (
+    CameraChange,
+    Clock,
+    FrameSource,
+    Moment,
+    Synchroniser,
+    TimedPicture,
+)
 from drake_pose.camera.models import Camera
-from drake_pose.camera.sources.frame_source import Clock, FrameSource, TimedPicture
-from drake_pose.camera.sources.synchroniser import CameraChange, Moment, Synchroniser
 from drake_pose.errors import SettingsError, UnknownNameError
 from drake_pose.silhouette.pictures.label_images import fill_label_image
 from drake_pose.systems.colour_images import fill_colour_image

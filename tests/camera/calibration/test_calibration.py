@@ -6,9 +6,9 @@ import cv2
 import numpy as np
 import pytest
 
-from drake_pose.camera.calibration.board import Board, Detection, find_boards, load_board
-from drake_pose.camera.calibration.calibrate import CalibrationSettings, calibrate
-from drake_pose.camera.calibration.rig import (
+from drake_pose.camera.board import Board, Detection, find_boards, load_board
+from drake_pose.camera.calibrate import CalibrationSettings, calibrate
+from drake_pose.camera.rig import (
     Lens,
     _vector,
     corner_residuals,

@@ -7,9 +7,9 @@ import pytest
 import yaml
 
 from drake_pose.camera.camera_files import save_cameras
+from drake_pose.camera.frame_source import SourceSpecification
 from drake_pose.camera.models import circle_of_cameras
-from drake_pose.camera.sources.frame_source import SourceSpecification
-from drake_pose.camera.sources.source_files import (
+from drake_pose.camera.source_files import (
     load_background_pictures,
     load_sources,
     open_source,
@@ -200,7 +200,7 @@ class TestDevice:
     def test_newest_picture_is_kept_and_the_camera_opened_again(self, monkeypatch):
         FakeCamera.opened = 0
         monkeypatch.setattr(cv2, "VideoCapture", FakeCamera)
-        monkeypatch.setattr("drake_pose.camera.sources.frame_source.FIRST_PAUSE", 0.02)
+        monkeypatch.setattr("drake_pose.camera.frame_source.FIRST_PAUSE", 0.02)
         source = open_source(specify("7", "device"))
         try:
             # It cannot be opened at first, then gives three pictures at a time, and fails again.

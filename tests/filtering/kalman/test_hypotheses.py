@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from drake_pose.filtering.kalman.hypotheses import Hypothesis, merge_twins, normalise, prune
+from drake_pose.filtering.hypotheses import Hypothesis, merge_twins, normalise, prune
 from drake_pose.filtering.state import Belief
 
 

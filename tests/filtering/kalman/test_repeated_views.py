@@ -2,15 +2,15 @@ import numpy as np
 import pytest
 
 from drake_pose.filtering.hand import HAND_STATE
-from drake_pose.filtering.kalman.hypotheses import (
+from drake_pose.filtering.hypotheses import (
     RepeatedView,
     anchored,
     begin_repeated_view,
     measure_curvature,
     next_view,
 )
-from drake_pose.filtering.kalman.update import make_evidence, update
 from drake_pose.filtering.state import Belief
+from drake_pose.filtering.update import make_evidence, update
 from drake_pose.papers.shimada import experiment_filter
 from drake_pose.papers.shimada_motion import make_sequence
 

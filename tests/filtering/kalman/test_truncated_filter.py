@@ -2,11 +2,11 @@ import numpy as np
 import pytest
 
 from drake_pose.errors import SettingsError, UnknownNameError
-from drake_pose.filtering.kalman.truncated_filter import FilterSettings, TruncatedFilter
-from drake_pose.filtering.kalman.update import make_evidence, update
+from drake_pose.filtering.inequalities import from_bounds, stack, two_sided
 from drake_pose.filtering.state import Belief, StateLayout, make_belief
-from drake_pose.filtering.truncation.inequalities import from_bounds, stack, two_sided
-from drake_pose.filtering.truncation.truncated_normal import truncate_joint
+from drake_pose.filtering.truncated_filter import FilterSettings, TruncatedFilter
+from drake_pose.filtering.truncated_normal import truncate_joint
+from drake_pose.filtering.update import make_evidence, update
 
 LAYOUT = StateLayout(("angle",), ("length",))
 NAMES = LAYOUT.names  # angle, rate_angle, length

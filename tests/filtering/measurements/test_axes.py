@@ -10,6 +10,8 @@ from drake_pose.body.model import load_model
 from drake_pose.body.tree.root import RootRotation
 from drake_pose.camera.models import ParallelCamera
 from drake_pose.errors import MaskError, ModelError, SettingsError, UnknownNameError
+from drake_pose.filtering.axes import AxisObservation, _half_width
+from drake_pose.filtering.contour import ContourObservation
 from drake_pose.filtering.hand import (
     FLEXIONS,
     HAND_STATE,
@@ -17,10 +19,8 @@ from drake_pose.filtering.hand import (
     HandObservation,
     plant_positions,
 )
-from drake_pose.filtering.kalman.update import make_evidence, update
-from drake_pose.filtering.measurements.axes import AxisObservation, _half_width
-from drake_pose.filtering.measurements.contour import ContourObservation
 from drake_pose.filtering.state import Belief
+from drake_pose.filtering.update import make_evidence, update
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from tests.body.models import joint, link, urdf, write
 

@@ -4,9 +4,9 @@ import pytest
 from drake_pose.body.model import load_model
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import SettingsError
+from drake_pose.filtering import contour
 from drake_pose.filtering.body_state import ROOT_SHIFT
-from drake_pose.filtering.measurements import contour
-from drake_pose.filtering.measurements.contour import ContourObservation
+from drake_pose.filtering.contour import ContourObservation
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from tests.body.models import joint, link, urdf, write
 from tests.search.bodies import forked_body, front_camera

@@ -17,9 +17,9 @@ from drake_pose.filtering.hand import (
     SPREADS,
     plant_positions,
 )
-from drake_pose.filtering.kalman.update import difference
-from drake_pose.filtering.measurements.hand_silhouette import HandSilhouette
+from drake_pose.filtering.hand_silhouette import HandSilhouette
 from drake_pose.filtering.state import Belief
+from drake_pose.filtering.update import difference
 from drake_pose.fit.evidence import find_edge_points
 from drake_pose.papers.shimada import experiment_filter
 from drake_pose.papers.shimada_motion import first_guess, true_states

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from drake_pose.errors import SettingsError
-from drake_pose.filtering.measurements.contour import ContourObservation
-from drake_pose.filtering.tracking.contour_tracker import LOST_COLOUR_DISTANCE, ContourTracker
+from drake_pose.filtering.contour import ContourObservation
+from drake_pose.filtering.contour_tracker import LOST_COLOUR_DISTANCE, ContourTracker
 from drake_pose.fit import colours
 from drake_pose.fit.colour_lines import BESIDE, COLOURS, ON
 from drake_pose.fit.colours import part_distances, weigh_parts

@@ -5,10 +5,10 @@ import math
 import numpy as np
 import pytest
 
-from drake_pose.filtering.measurements.contour import ContourObservation
+from drake_pose.filtering.contour import ContourObservation
+from drake_pose.filtering.contour_tracker import ContourTracker, TrackingSettings
+from drake_pose.filtering.match_and_track import Followed, MatchAndTrack
 from drake_pose.filtering.state import Belief
-from drake_pose.filtering.tracking.contour_tracker import ContourTracker, TrackingSettings
-from drake_pose.filtering.tracking.match_and_track import Followed, MatchAndTrack
 from drake_pose.search.estimates import View
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from tests.filtering.tracking.test_match_and_track import PERIOD

@@ -6,9 +6,9 @@ import pytest
 from drake_pose.body.formats.packages import bundled_model
 from drake_pose.body.model import load_model
 from drake_pose.errors import SettingsError
-from drake_pose.filtering.measurements.contour import ContourObservation
-from drake_pose.filtering.tracking.contour_tracker import ContourTracker, TrackingSettings
-from drake_pose.filtering.tracking.match_and_track import Followed, MatchAndTrack
+from drake_pose.filtering.contour import ContourObservation
+from drake_pose.filtering.contour_tracker import ContourTracker, TrackingSettings
+from drake_pose.filtering.match_and_track import Followed, MatchAndTrack
 from drake_pose.search.estimates import TRACKED, View
 from drake_pose.search.kameda import PaperSearch
 from drake_pose.search.settings import PaperSearchSettings

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from drake_pose.filtering.measurements.contour import ContourObservation
-from drake_pose.filtering.tracking.contour_tracker import ContourTracker, TrackingSettings
-from drake_pose.filtering.tracking.sequence_fit import fit_sequence, pose_set
+from drake_pose.filtering.contour import ContourObservation
+from drake_pose.filtering.contour_tracker import ContourTracker, TrackingSettings
+from drake_pose.filtering.sequence_fit import fit_sequence, pose_set
 from tests.filtering.tracking.test_match_and_track import PERIOD
 from tests.filtering.tracking.test_unknown_scale import drawn, moving_states
 from tests.search.bodies import forked_body, front_camera

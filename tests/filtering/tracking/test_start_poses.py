@@ -5,9 +5,9 @@ import pytest
 
 from drake_pose.body.tree.root import RootRotation
 from drake_pose.errors import SettingsError
-from drake_pose.filtering.measurements.contour import ContourObservation
-from drake_pose.filtering.tracking.contour_tracker import ContourTracker
-from drake_pose.filtering.tracking.sequence_fit import (
+from drake_pose.filtering.contour import ContourObservation
+from drake_pose.filtering.contour_tracker import ContourTracker
+from drake_pose.filtering.sequence_fit import (
     find_start,
     tilted,
 )

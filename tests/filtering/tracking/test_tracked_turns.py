@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from drake_pose.filtering.measurements.contour import ContourObservation
-from drake_pose.filtering.truncation.inequalities import from_model
+from drake_pose.filtering.contour import ContourObservation
+from drake_pose.filtering.inequalities import from_model
 from tests.jobs.scenes import camera
 from tests.search.turning import crane
 

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from drake_pose.errors import SettingsError
-from drake_pose.filtering.measurements.contour import ContourObservation
-from drake_pose.filtering.tracking.contour_tracker import ContourTracker, TrackingSettings
-from drake_pose.filtering.tracking.match_and_track import Followed, MatchAndTrack
+from drake_pose.filtering.contour import ContourObservation
+from drake_pose.filtering.contour_tracker import ContourTracker, TrackingSettings
+from drake_pose.filtering.match_and_track import Followed, MatchAndTrack
 from drake_pose.search.estimates import TRACKED, PoseEstimate, View
 from tests.filtering.measurements.test_contour import pinhole
 from tests.filtering.tracking.test_match_and_track import PERIOD, swings

@@ -7,12 +7,12 @@ import pytest
 from drake_pose.body.formats.packages import bundled_model
 from drake_pose.body.model import load_model
 from drake_pose.errors import ModelError, SettingsError, UnknownNameError
-from drake_pose.filtering.truncation.couplings import (
+from drake_pose.filtering.couplings import (
     load_couplings,
     load_usual_pose,
     model_inequalities,
 )
-from drake_pose.filtering.truncation.inequalities import (
+from drake_pose.filtering.inequalities import (
     from_bounds,
     from_model,
     inner_point,

@@ -8,21 +8,21 @@ from scipy.stats import multivariate_normal, truncnorm
 from drake_pose.body.formats.packages import bundled_model
 from drake_pose.body.model import load_model
 from drake_pose.errors import SettingsError
-from drake_pose.filtering.state import make_belief
-from drake_pose.filtering.truncation.couplings import model_inequalities
-from drake_pose.filtering.truncation.inequalities import (
+from drake_pose.filtering.couplings import model_inequalities
+from drake_pose.filtering.inequalities import (
     from_bounds,
     make_inequalities,
     stack,
     two_sided,
 )
-from drake_pose.filtering.truncation.kernels import interval_moments
-from drake_pose.filtering.truncation.truncated_normal import (
+from drake_pose.filtering.state import make_belief
+from drake_pose.filtering.truncated_normal import (
     clip,
     join_rows,
     truncate_joint,
     truncate_sequential,
 )
+from drake_pose.filtering.truncation_kernels import interval_moments
 from tests.filtering.sampling import sample_truncated
 
 METHODS = {"sequential": truncate_sequential, "joint": truncate_joint}

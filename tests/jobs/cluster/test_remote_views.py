@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from drake_pose.camera.sources.frame_source import SourceSpecification
+from drake_pose.camera.frame_source import SourceSpecification
 from drake_pose.errors import ClusterError, SceneError
 from drake_pose.jobs.cluster.camera_groups import assign_cameras
 from drake_pose.jobs.cluster.remote_views import ClusterSensors

@@ -24,9 +24,9 @@ from drake_pose.jobs.estimate.person import (
     describe_rig,
     describe_views,
 )
-from drake_pose.person.recordings.camera_faults import CameraFault, CameraMotion
-from drake_pose.person.recordings.figures import RigFault
-from drake_pose.person.recordings.persons_in_view import ViewFaults
+from drake_pose.person.camera_faults import CameraFault, CameraMotion
+from drake_pose.person.figures import RigFault
+from drake_pose.person.persons_in_view import ViewFaults
 from drake_pose.silhouette.pictures.masks import write_mask
 from tests.cli import CliRunner
 from tests.jobs.scenes import read_rows

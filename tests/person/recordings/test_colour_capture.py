@@ -10,8 +10,8 @@ from drake_pose.camera.models import circle_of_cameras
 from drake_pose.fit.colour_lines import BESIDE, ON
 from drake_pose.fit.colours import OwnColours
 from drake_pose.fit.contour_fit import ContourFit
+from drake_pose.person.person_capture import capture_by_colour
 from drake_pose.person.pose_tracker import PersonPoseTracker
-from drake_pose.person.recordings.person_capture import capture_by_colour
 from drake_pose.person.shape import NOISE
 from drake_pose.person.views import ColourViews
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer

@@ -12,20 +12,20 @@ from drake_pose.body.model import ArticulatedModel, load_model
 from drake_pose.camera.models import Camera, circle_of_cameras
 from drake_pose.fit.contour_fit import ContourFit
 from drake_pose.fit.evidence import find_edge_points
-from drake_pose.person.pose_tracker import PersonPoseTracker
-from drake_pose.person.recordings.camera_faults import (
+from drake_pose.person.camera_faults import (
     CameraFault,
     CameraJudge,
     FrameView,
     moved_since,
 )
-from drake_pose.person.recordings.figures import (
+from drake_pose.person.figures import (
     cut_figures,
     find_figures,
     find_persons,
     find_rig_fault,
 )
-from drake_pose.person.recordings.persons_in_view import PersonRecording, keep_person, keep_views
+from drake_pose.person.persons_in_view import PersonRecording, keep_person, keep_views
+from drake_pose.person.pose_tracker import PersonPoseTracker
 from drake_pose.person.views import FrameViews, see_silhouette
 from tests.person.persons_in_view import see, stepping
 

@@ -15,12 +15,12 @@ from drake_pose.body.model import load_model
 from drake_pose.body.tree.root import RootRotation
 from drake_pose.camera.models import ParallelCamera
 from drake_pose.errors import SettingsError
-from drake_pose.filtering.measurements.axes import AxisObservation
-from drake_pose.filtering.measurements.contour import ContourObservation
-from drake_pose.filtering.measurements.hand_silhouette import HandSilhouette
+from drake_pose.filtering.axes import AxisObservation
+from drake_pose.filtering.contour import ContourObservation
+from drake_pose.filtering.contour_tracker import TrackingSettings
+from drake_pose.filtering.couplings import model_inequalities
+from drake_pose.filtering.hand_silhouette import HandSilhouette
 from drake_pose.filtering.state import Belief
-from drake_pose.filtering.tracking.contour_tracker import TrackingSettings
-from drake_pose.filtering.truncation.couplings import model_inequalities
 from drake_pose.papers.shimada import experiment_filter
 from drake_pose.papers.shimada_motion import true_states
 from drake_pose.search.estimates import PoseEstimate

@@ -15,7 +15,7 @@ from pydrake.common.yaml import yaml_load_typed
 from drake_pose.arrays import Array
 from drake_pose.body.parsed_model import ParsedModel
 from drake_pose.errors import ModelError, SettingsError
-from drake_pose.filtering.truncation.inequalities import (
+from drake_pose.filtering.inequalities import (
     Inequalities,
     from_model,
     inner_point,

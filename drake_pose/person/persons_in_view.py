@@ -8,8 +8,7 @@ import numpy as np
 
 from drake_pose.arrays import Array, Mask
 from drake_pose.camera.models import Camera
-from drake_pose.person.rays import triangulate
-from drake_pose.person.recordings.figures import (
+from drake_pose.person.figures import (
     Figure,
     Person,
     cut_figures,
@@ -18,6 +17,7 @@ from drake_pose.person.recordings.figures import (
     metres_off,
     pixels_per_metre,
 )
+from drake_pose.person.rays import triangulate
 from drake_pose.person.views import FrameViews, edge_spacing, see_silhouette
 
 ReadFrame = Callable[[int], Mapping[str, Mask]]

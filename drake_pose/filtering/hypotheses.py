@@ -16,13 +16,13 @@ import numpy as np
 from scipy.special import chdtri
 
 from drake_pose.arrays import Array
-from drake_pose.filtering.kalman.update import (
+from drake_pose.filtering.state import Belief, factor_of
+from drake_pose.filtering.update import (
     Evidence,
     LinearObservation,
     ObservationModel,
     difference,
 )
-from drake_pose.filtering.state import Belief, factor_of
 
 # E[(b z^2)^2] = 3 b^2 for a standard normal z.
 _FOURTH_MOMENT = 3.0

@@ -17,8 +17,8 @@ from drake_pose.camera.models import Camera
 from drake_pose.errors import SettingsError
 from drake_pose.fit.colours import OwnColours
 from drake_pose.fit.contour_fit import ContourFit
+from drake_pose.person.persons_in_view import ReadFrame
 from drake_pose.person.pose_tracker import PersonPoseTracker, TrackState
-from drake_pose.person.recordings.persons_in_view import ReadFrame
 from drake_pose.person.search import LENIENT
 from drake_pose.person.shape import NOISE, PersonShape, fit_shape, shape_values
 from drake_pose.person.views import (

@@ -15,17 +15,17 @@ from drake_pose.camera.models import Camera
 from drake_pose.errors import CameraError, MaskError, SettingsError
 from drake_pose.fit.contour_fit import ContourFit
 from drake_pose.fit.evidence import EdgePoints, find_edge_points
-from drake_pose.person.pose_tracker import PersonPoseTracker
-from drake_pose.person.recordings.camera_faults import (
+from drake_pose.person.camera_faults import (
     CameraFault,
     CameraJudge,
     FrameView,
     is_explained,
     moved_since,
 )
-from drake_pose.person.recordings.figures import RigFault, find_rig_fault
-from drake_pose.person.recordings.person_capture import PersonCapture, capture_person, spread_over
-from drake_pose.person.recordings.persons_in_view import PersonRecording, ReadFrame, ViewFaults
+from drake_pose.person.figures import RigFault, find_rig_fault
+from drake_pose.person.person_capture import PersonCapture, capture_person, spread_over
+from drake_pose.person.persons_in_view import PersonRecording, ReadFrame, ViewFaults
+from drake_pose.person.pose_tracker import PersonPoseTracker
 from drake_pose.person.shape import NOISE, shape_values
 from drake_pose.person.views import edge_spacing
 

@@ -21,7 +21,7 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import breadth_first_order, connected_components, minimum_spanning_tree
 
 from drake_pose.arrays import Array
-from drake_pose.camera.calibration.board import BoardDetections, Detection, Picture
+from drake_pose.camera.board import BoardDetections, Detection, Picture
 from drake_pose.camera.models import (
     PinholeCamera,
     check_number,

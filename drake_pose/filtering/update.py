@@ -15,7 +15,7 @@ from scipy.linalg.lapack import dpotrf, dpotrs
 from drake_pose.arrays import Array, Mask
 from drake_pose.errors import SettingsError
 from drake_pose.filtering.state import Belief
-from drake_pose.filtering.truncation.truncated_normal import Truncated, unlimited
+from drake_pose.filtering.truncated_normal import Truncated, unlimited
 
 Truncate = Callable[[Belief, Array], Truncated]
 

@@ -17,8 +17,8 @@ from drake_pose.fit.frames_fit import FramesFit, parameter_names
 from drake_pose.fit.levenberg_marquardt import AnnealingStage, StepSettings
 from drake_pose.fit.parameters import CAMERA_NAMES, CameraParameters
 from drake_pose.fit.unknowns import choose
+from drake_pose.person.figures import pixels_per_metre
 from drake_pose.person.rays import viewing_rays
-from drake_pose.person.recordings.figures import pixels_per_metre
 
 # A camera that was pushed has turned and shifted by about this much [rad, m].
 _TURN, _SHIFT = 0.15, 0.3

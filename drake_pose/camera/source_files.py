@@ -12,6 +12,13 @@ import cv2
 import numpy as np
 
 from drake_pose.camera.camera_files import load_cameras
+from drake_pose.camera.frame_source import (
+    Clock,
+    DeviceSource,
+    FrameSource,
+    SourceSpecification,
+    TimedPicture,
+)
 from drake_pose.camera.models import Camera, check_number
 from drake_pose.camera.picture_files import (
     Mask,
@@ -19,13 +26,6 @@ from drake_pose.camera.picture_files import (
     list_pictures,
     read_picture,
     read_two_colours,
-)
-from drake_pose.camera.sources.frame_source import (
-    Clock,
-    DeviceSource,
-    FrameSource,
-    SourceSpecification,
-    TimedPicture,
 )
 from drake_pose.csv_files import read_csv
 from drake_pose.errors import CameraError, SceneError, SettingsError

@@ -15,9 +15,9 @@ from drake_pose.arrays import Array, Mask
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.camera.models import Camera
 from drake_pose.errors import MaskError, ModelError, SettingsError
-from drake_pose.filtering.kalman.update import difference, make_evidence, update
-from drake_pose.filtering.measurements.contour import ContourObservation
+from drake_pose.filtering.contour import ContourObservation
 from drake_pose.filtering.state import Belief
+from drake_pose.filtering.update import difference, make_evidence, update
 from drake_pose.fit.evidence import EdgePoints, find_edge_points
 
 Ends = tuple[Array, Array]

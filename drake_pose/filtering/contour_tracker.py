@@ -9,14 +9,14 @@ import numpy as np
 from drake_pose.arrays import Array, Mask, Picture
 from drake_pose.errors import SettingsError
 from drake_pose.filtering.body_state import GROWTH
-from drake_pose.filtering.kalman.truncated_filter import (
+from drake_pose.filtering.contour import ContourMeasurement, ContourObservation, Seen
+from drake_pose.filtering.state import Belief
+from drake_pose.filtering.truncated_filter import (
     FilterSettings,
     FilterState,
     TruncatedFilter,
 )
-from drake_pose.filtering.kalman.update import LinearObservation
-from drake_pose.filtering.measurements.contour import ContourMeasurement, ContourObservation, Seen
-from drake_pose.filtering.state import Belief
+from drake_pose.filtering.update import LinearObservation
 from drake_pose.fit.colours import Histograms
 
 # A frame's pose that changes by less is settled [rad, m].

@@ -9,7 +9,7 @@ import numpy as np
 
 from drake_pose.arrays import Array
 from drake_pose.errors import SettingsError
-from drake_pose.filtering.kalman.hypotheses import (
+from drake_pose.filtering.hypotheses import (
     Hypothesis,
     Rejection,
     View,
@@ -20,23 +20,23 @@ from drake_pose.filtering.kalman.hypotheses import (
     normalise,
     prune,
 )
-from drake_pose.filtering.kalman.update import (
-    Evidence,
-    ObservationModel,
-    Truncate,
-    Updated,
-    make_evidence,
-    update,
-)
+from drake_pose.filtering.inequalities import Inequalities, inner_point
 from drake_pose.filtering.state import Belief, StateLayout, make_belief
-from drake_pose.filtering.truncation.inequalities import Inequalities, inner_point
-from drake_pose.filtering.truncation.truncated_normal import (
+from drake_pose.filtering.truncated_normal import (
     Truncated,
     clip,
     join_rows,
     truncate_joint,
     truncate_sequential,
     unlimited,
+)
+from drake_pose.filtering.update import (
+    Evidence,
+    ObservationModel,
+    Truncate,
+    Updated,
+    make_evidence,
+    update,
 )
 
 Truncation = Literal["joint", "sequential", "clip", "none"]

@@ -7,9 +7,9 @@ from numpy.typing import NDArray
 
 from drake_pose.arrays import Array, Mask
 from drake_pose.errors import SettingsError
+from drake_pose.filtering.inequalities import Inequalities
 from drake_pose.filtering.state import Belief, covariance_from
-from drake_pose.filtering.truncation.inequalities import Inequalities
-from drake_pose.filtering.truncation.kernels import apply_sites, cut_one_by_one, propagate
+from drake_pose.filtering.truncation_kernels import apply_sites, cut_one_by_one, propagate
 
 SKIP_ABOVE = 5.0
 """Rows with a larger c_k are left out: they would move the mean by less than 2e-6 deviations."""

@@ -10,7 +10,7 @@ import numpy as np
 from drake_pose.arrays import Array, Mask, Picture
 from drake_pose.errors import SettingsError
 from drake_pose.filtering.body_state import BodyState
-from drake_pose.filtering.kalman.update import LinearObservation
+from drake_pose.filtering.update import LinearObservation
 from drake_pose.fit.camera_sums import Views
 from drake_pose.fit.colours import (
     COLOUR_CORRELATION,

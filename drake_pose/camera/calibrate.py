@@ -7,8 +7,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from drake_pose.arrays import Array
-from drake_pose.camera.calibration.board import BoardDetections, Detection, Picture
-from drake_pose.camera.calibration.rig import (
+from drake_pose.camera.board import BoardDetections, Detection, Picture
+from drake_pose.camera.models import PinholeCamera, inverse_pose
+from drake_pose.camera.rig import (
     FREE_COEFFICIENTS,
     Lens,
     Rig,
@@ -18,7 +19,6 @@ from drake_pose.camera.calibration.rig import (
     pair_pose,
     require_shared_pictures,
 )
-from drake_pose.camera.models import PinholeCamera, inverse_pose
 from drake_pose.errors import CameraError, UnknownNameError
 
 # A picture is spoilt whose error is above this many pixels, and times its camera's median.

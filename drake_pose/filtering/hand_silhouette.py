@@ -11,17 +11,17 @@ from numpy.typing import NDArray
 
 from drake_pose.arrays import Array, Mask
 from drake_pose.errors import MaskError
-from drake_pose.filtering.hand import HandObservation, scaled_rotation
-from drake_pose.filtering.hand_model import PALM, QUATERNION, WRIST, HandModel
-from drake_pose.filtering.kalman.truncated_filter import TruncatedFilter
-from drake_pose.filtering.measurements.axes import (
+from drake_pose.filtering.axes import (
     GATES,
     SPACING,
     RoughBody,
     block_covariance,
     match_axes,
 )
+from drake_pose.filtering.hand import HandObservation, scaled_rotation
+from drake_pose.filtering.hand_model import PALM, QUATERNION, WRIST, HandModel
 from drake_pose.filtering.state import Belief, factor_of
+from drake_pose.filtering.truncated_filter import TruncatedFilter
 from drake_pose.fit.evidence import EdgePoints, find_edge_points
 
 # Searches at most; a search's poses in a round, those that the next is drawn about, rounds, those

@@ -10,8 +10,8 @@ import numpy as np
 from drake_pose.arrays import Array, Mask, Picture
 from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.camera.models import Camera
-from drake_pose.filtering.measurements.contour import ContourObservation
-from drake_pose.filtering.tracking.contour_tracker import ContourTracker, Track, TrackingSettings
+from drake_pose.filtering.contour import ContourObservation
+from drake_pose.filtering.contour_tracker import ContourTracker, Track, TrackingSettings
 from drake_pose.search.continuous.families import spread
 from drake_pose.search.estimates import TRACKED, UNEXPLAINED, PoseEstimate, View
 from drake_pose.search.scoring import PoseSearch

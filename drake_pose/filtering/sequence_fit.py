@@ -15,8 +15,8 @@ from scipy.spatial.transform import Rotation
 
 from drake_pose.arrays import Array, Mask
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
-from drake_pose.filtering.measurements.contour import ContourObservation
-from drake_pose.filtering.tracking.contour_tracker import ContourTracker, Track
+from drake_pose.filtering.contour import ContourObservation
+from drake_pose.filtering.contour_tracker import ContourTracker, Track
 from drake_pose.fit.contour_fit import Noise
 from drake_pose.fit.evidence import find_edge_points
 from drake_pose.fit.levenberg_marquardt import AnnealingStage

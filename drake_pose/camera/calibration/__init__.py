@@ -1,1 +1,0 @@
-"""Calibration of cameras from pictures of a board."""

@@ -1,1 +1,0 @@
-"""Where pictures come from: folders, videos and live cameras, synchronised by their time stamps."""

@@ -1,1 +1,0 @@
-"""The Kalman filter: update, hypotheses, and truncation after each step."""

@@ -1,1 +1,0 @@
-"""What pictures measure of a pose: contours and axes of segments."""

@@ -1,1 +1,0 @@
-"""Following a body through a sequence of masks."""

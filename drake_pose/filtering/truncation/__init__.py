@@ -1,1 +1,0 @@
-"""Linear inequalities, and the part of a normal distribution inside them."""

@@ -1,1 +1,0 @@
-"""Whole recordings of a person, in spite of others in view, bad calibrations and moved cameras."""

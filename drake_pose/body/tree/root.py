@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pydrake.math import RigidTransform
+from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.tree import Frame, JointIndex
 
 from drake_pose.arrays import Array
@@ -235,8 +235,10 @@ class BasePose:
             joint.frame_on_parent()
         )
         X_WM = X_WA @ inverse_transforms(X_CA) @ _pose_in_body(joint.frame_on_child())
-        X_FM = _orthonormal(inverse_transforms(X_WF) @ X_WM)
-        joint.SetPose(kinematics.context, RigidTransform(X_FM))
+        X_FM = inverse_transforms(X_WF) @ X_WM
+        # Freed from rounding errors.
+        R_FM = RotationMatrix.ProjectToRotationMatrix(X_FM[:3, :3])
+        joint.SetPose(kinematics.context, RigidTransform(R_FM, X_FM[:3, 3]))
         solved = kinematics.plant.GetPositions(kinematics.context)
         q[list(self.positions)] = solved[list(self.positions)]
 
@@ -331,11 +333,3 @@ def base_of_chain(
 def _pose_in_body(frame: Frame) -> Array:
     """A fixed frame's pose (4, 4) in its body."""
     return np.asarray(frame.GetFixedPoseInBodyFrame().GetAsMatrix4())
-
-
-def _orthonormal(X: Array) -> Array:
-    """The transform with its rotation freed from rounding errors."""
-    u, _, vt = np.linalg.svd(X[:3, :3])
-    cleaned = np.array(X)
-    cleaned[:3, :3] = u @ vt
-    return cleaned

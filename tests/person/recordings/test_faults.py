@@ -131,6 +131,18 @@ class TestMovedCamera:
         assert motion.pixels < 0.5
         np.testing.assert_allclose(motion.X_WC[:3, 3], camera.X_WC[:3, 3], atol=0.05)
 
+    def test_a_camera_rolled_about_its_axis_turns_its_pictures_the_other_way(
+        self, four: Stage
+    ) -> None:
+        camera, view = four.cameras["camera_0"], four.frames(four.masks)[0]
+        X_WC = camera.X_WC.copy()
+        X_WC[:3, :3] = X_WC[:3, :3] @ Rotation.from_euler("z", 0.1).as_matrix()
+        points = four.fit.kinematics.poses(view.values)[:, :3, 3]
+        judge, pairs = CameraJudge(four.fit, four.cameras), [(view.edges["camera_0"], view.values)]
+        motion = judge._describe(camera, camera.with_pose(X_WC), pairs, points)
+        assert motion.turn == pytest.approx(-0.1)
+        assert motion.share_after < motion.share_before
+
     def test_since_when_it_has_moved(self) -> None:
         good, bad = [0.9, 0.95, 0.9], [0.2, 0.1, 0.3]
         assert moved_since([*good, *bad], [*bad, *good]) == 3

@@ -151,13 +151,19 @@ class TestMovedCamera:
         assert moved_since([0.9, 0.3, 0.9, 0.2, 0.1], [0.1, 0.4, 0.2, 0.9, 0.9]) == 3
 
 
-@pytest.mark.slow
 class TestRig:
+    @pytest.mark.slow
     def test_sound_rig_has_no_fault(self, four: Stage, nine: Stage) -> None:
         assert find_rig_fault(four.cameras, four.masks[:2]) is None
         assert find_rig_fault(nine.cameras, nine.masks[:1]) is None
 
-    @pytest.mark.parametrize("names", [("camera_1",), tuple(f"camera_{k}" for k in range(4))])
+    @pytest.mark.parametrize(
+        "names",
+        [
+            ("camera_1",),
+            pytest.param(tuple(f"camera_{k}" for k in range(4)), marks=pytest.mark.slow),
+        ],
+    )
     def test_mirrored_pictures_are_named(self, names: tuple[str, ...], four: Stage) -> None:
         good = four.masks[2:]
         spoilt = [{n: m[:, ::-1] if n in names else m for n, m in own.items()} for own in good]
@@ -167,6 +173,7 @@ class TestRig:
         for own, right in zip(spoilt, good, strict=True):
             np.testing.assert_equal(fault.undo(own), right)
 
+    @pytest.mark.slow
     def test_exchanged_cameras_are_named(self, four: Stage) -> None:
         one, two = "camera_1", "camera_2"
         spoilt = [{**own, one: own[two], two: own[one]} for own in four.masks[:2]]
@@ -175,6 +182,7 @@ class TestRig:
         assert (fault.mirrored, fault.exchanged) == ((), (one, two))
         np.testing.assert_equal(fault.undo(spoilt[0]), four.masks[0])
 
+    @pytest.mark.slow
     def test_moved_camera_is_not_taken_for_a_mirrored_one(self, four: Stage) -> None:
         fault = find_rig_fault(four.cameras, four.seen_by_moved("camera_2", 10.0, (0, 0, 0))[:2])
         assert fault is None or (fault.mirrored, fault.exchanged) == ((), ())

@@ -9,6 +9,7 @@ from drake_pose.body.formats.packages import bundled_model
 from drake_pose.body.model import load_model
 from drake_pose.camera.models import ParallelCamera
 from drake_pose.errors import MaskError
+from drake_pose.filtering.axes import GATES, SPACING, match_axes
 from drake_pose.filtering.hand import (
     FLEXIONS,
     HAND_STATE,
@@ -93,6 +94,13 @@ def test_lines_and_tips_are_those_of_the_hand_from_table_2s_guess(render, seed):
     off = normalised(found, x)
     told = off[np.isfinite(off)]
     assert len(told) >= 15
+    # What is told is what the rough pose was matched to in the end.
+    edge, gate = find_edge_points(mask, SPACING), SILHOUETTE._unit * GATES[-1]
+    lines = match_axes(edge, SILHOUETTE._rough(found.rough), gate, CENTER).lines.ravel()
+    end = MEASURED.index("scale")
+    measured = found.y[end - len(lines) : end]
+    shown = np.isfinite(measured)
+    np.testing.assert_array_equal(measured[shown], lines[shown])
     # A segment that points at the camera may be taken for another's end.
     assert np.mean(np.abs(told) < 3) > 0.9
     assert found.difference < 0.045

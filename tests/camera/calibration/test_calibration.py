@@ -6,7 +6,13 @@ import cv2
 import numpy as np
 import pytest
 
-from drake_pose.camera.board import Board, Detection, find_boards, load_board
+from drake_pose.camera.board import (
+    Board,
+    Detection,
+    find_boards,
+    find_pictures,
+    load_board,
+)
 from drake_pose.camera.calibrate import CalibrationSettings, calibrate
 from drake_pose.camera.rig import (
     Lens,
@@ -281,6 +287,13 @@ class TestPictures:
         seen = find_boards({"c": {"1": files["1"], "3": tmp_path / "3.png"}}, CHECKERBOARD)
         assert seen.sizes == {"c": (30, 20)}
         assert (seen.not_found, set(seen.unreadable)) == ((("c", "1"),), {("c", "3")})
+
+    def test_folders_without_pictures_are_named(self, tmp_path):
+        with pytest.raises(CameraError, match="no such folder"):
+            find_pictures(tmp_path / "gone")
+        (tmp_path / "images" / "left").mkdir(parents=True)
+        with pytest.raises(CameraError, match="holds no picture"):
+            find_pictures(tmp_path)
 
 
 class TestLens:

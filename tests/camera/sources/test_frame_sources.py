@@ -148,6 +148,16 @@ class TestVideo:
         found = read_all(open_source(specify(path, "video", rate_hz=50.0)))
         assert [one.time for one in found] == pytest.approx(0.02 * np.arange(6))
 
+    def test_what_is_cut_off_is_counted(self, tmp_path):
+        path = write_video(tmp_path / "v.avi", 10)
+        whole = path.read_bytes()
+        path.write_bytes(whole[: 9 * len(whole) // 10])
+        source = open_source(specify(path, "video"))
+        found = read_all(source)
+        assert 3 < len(found) < 10
+        assert source.dropped == 10 - len(found)
+        assert f"ends after {len(found)} of 10 pictures" in source.problems[0]
+
     def test_video_of_masks_is_what_is_light(self, tmp_path):
         path = write_video(tmp_path / "v.avi", 11)
         found = read_all(open_source(specify(path, "video", background=None)))

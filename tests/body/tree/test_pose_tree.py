@@ -172,7 +172,10 @@ def test_slides_without_limits_are_refused_where_they_must_be_searched(tmp_path)
     model = load_model(write(tmp_path, planar_robot(ball)), check=False)
     with pytest.raises(ModelError, match=r"'x', 'z', 'y' have no limits.*of 2 objects"):
         model.pose_tree()
-    model.pose_tree(held={"x": 0.0, "z": 0.1, "y": 0.2})
+    held = {"x": 0.0, "z": 0.1, "y": 0.2}
+    model.pose_tree(held=held)
+    with pytest.raises(SettingsError, match="several links hang on the world"):
+        model.pose_tree(root_position=[0.0, 0.0, 0.0], held=held)
     hand = link("hand") + joint("grip", "prismatic", "arm", "hand", limits=None)
     model = load_model(write(tmp_path, planar_robot(hand)), check=False)
     with pytest.raises(ModelError, match="joint 'grip' has no limits"):

@@ -196,20 +196,38 @@ def _kameda_pictures(experiment: str, images: int, out: Path | None, json: bool)
     _show({**figures["beam"], "paper_method": figures["paper"]}, [real_table(figures)], json)
 
 
+@dataclass(frozen=True, kw_only=True)
+class ShimadaOptions:
+    """Options of the experiments with hands, of which some go without others."""
+
+    runs: Annotated[int | None, within(1)] = None
+    """Number of sequences for each of r_13 = 35 and 40. Default: 50; with --pictures 10."""
+    seed: Seed = 0
+    truncation: Literal["sequential", "joint", "clip", "none", "all"] | None = None
+    """sequential is the paper's, default with --hypotheses; else joint; or all."""
+    observed: Literal["lines", "lines_wrist", "full"] | None = None
+    """What is measured. lines: axes of segments, fingertips and the palm's outline, as in the
+    paper; lines_wrist: the wrist's place, too; full: all points. Default: lines."""
+    iterations: Annotated[int | None, within(1)] = None
+    """Linearisations of an update at most; the paper's filter has 1. Default: 20; with --hypotheses
+    1."""
+    hypotheses: bool = False
+    """Another experiment, figure 9: fingers bend through the image plane; which hypotheses are
+    made, and what rejects the wrong ones."""
+    pictures: bool = False
+    """Silhouettes by Drake's renderer instead of numbers with noise."""
+    sequence: tuple[Path, ...] = ()
+    """With --pictures: recorded silhouettes of a right hand, cut off at the wrist, in one view of
+    unknown scale, instead (a scene with sequence: true); repeat for several."""
+    noise: float = 1.0
+    """So many times the noise of the numbers, which the filter is told."""
+    acceleration: float = 1.0
+    """So many times the accelerations that the filter expects."""
+    out: Pictures = None
+
+
 def shimada(
-    *,
-    runs: Annotated[int | None, within(1)] = None,
-    seed: Seed = 0,
-    truncation: Literal["sequential", "joint", "clip", "none", "all"] | None = None,
-    observed: Literal["lines", "lines_wrist", "full"] | None = None,
-    iterations: Annotated[int | None, within(1)] = None,
-    hypotheses: bool = False,
-    pictures: bool = False,
-    sequence: tuple[Path, ...] = (),
-    noise: float = 1.0,
-    acceleration: float = 1.0,
-    out: Pictures = None,
-    json: Json = False,
+    *, options: Annotated[ShimadaOptions | None, SPREAD] = None, json: Json = False
 ) -> None:
     """Shimada, Shirai, Kuno and Miura: joint angles and lengths of a synthetic hand, one camera.
 
@@ -221,109 +239,72 @@ def shimada(
         drake-pose reproduce shimada --runs 20 --out results/shimada
         drake-pose reproduce shimada --pictures --out results/figure_17
         drake-pose reproduce shimada --pictures --sequence SCENE --out results/figure_17_hand
-
-    Args:
-        runs: Number of sequences for each of r_13 = 35 and 40. Default: 50; with --pictures 10.
-        truncation: sequential is the paper's, default with --hypotheses; else joint; or all.
-        observed: What is measured. lines: axes of segments, fingertips and the palm's outline, as
-            in the paper; lines_wrist: the wrist's place, too; full: all points. Default: lines.
-        iterations: Linearisations of an update at most; the paper's filter has 1. Default: 20;
-            with --hypotheses 1.
-        hypotheses: Another experiment, figure 9: fingers bend through the image plane; which
-            hypotheses are made, and what rejects the wrong ones.
-        pictures: Silhouettes by Drake's renderer instead of numbers with noise.
-        sequence: With --pictures: recorded silhouettes of a right hand, cut off at the wrist, in
-            one view of unknown scale, instead (a scene with sequence: true); repeat for several.
-        noise: So many times the noise of the numbers, which the filter is told.
-        acceleration: So many times the accelerations that the filter expects.
     """
-    if truncation == "all" and (hypotheses or out is not None):
+    one = options or ShimadaOptions()
+    is_all = one.truncation == "all"
+    if is_all and (one.hypotheses or one.out is not None):
         raise UsageError("--truncation all goes without --hypotheses and --out")
-    if pictures and (hypotheses or observed or noise != 1.0):
+    if one.pictures and (one.hypotheses or one.observed or one.noise != 1.0):
         raise UsageError("--pictures goes without --hypotheses, --observed and --noise")
-    if hypotheses and (noise, acceleration) != (1.0, 1.0):
+    if one.hypotheses and (one.noise, one.acceleration) != (1.0, 1.0):
         raise UsageError("--hypotheses goes without --noise and --acceleration")
-    if sequence and (not pictures or runs or truncation == "all"):
+    if one.sequence and (not one.pictures or one.runs or is_all):
         raise UsageError("--sequence goes with --pictures, without --runs or truncation all")
-    if sequence:
-        _shimada_sequences(sequence, truncation or "joint", iterations, acceleration, out, json)
-        return
-    runs, seen = runs or (10 if pictures else 50), observed or "lines"
-    if hypotheses:
-        _shimada_hypotheses(runs, seed, truncation or "sequential", seen, iterations, out, json)
-        return
-    names = (truncation or "joint",) if truncation != "all" else ()
-    _shimada_moving(names, runs, seed, seen, pictures, (iterations, noise, acceleration), out, json)
+    run = _shimada_hypotheses if one.hypotheses else _shimada_moving
+    with _experiment(one.out) as count:
+        figures, table, warnings = (_shimada_sequences if one.sequence else run)(one, count)
+    for text in warnings:
+        warn(text)
+    _show(figures, [table], json)
 
 
-def _shimada_moving(
-    truncations: tuple[str, ...],
-    runs: int,
-    seed: int,
-    seen: str,
-    pictures: bool,
-    filtered: tuple[int | None, float, float],
-    out: Path | None,
-    json: bool,
-) -> None:
-    """The paper's moving hands, once for each truncation; none named: for all."""
-    with _experiment(out) as count:
-        from drake_pose.filtering.truncated_filter import TRUNCATIONS
-        from drake_pose.papers.shimada import PICTURES, result_table, run_experiment
-        from drake_pose.papers.shimada_pictures import save_pictures
-
-        names, measured = truncations or TRUNCATIONS, PICTURES if pictures else seen
-        results = [run_experiment(runs, seed, one, measured, count, *filtered) for one in names]
-        every = [one.as_json() for one in results]
-        if out is not None:
-            save_pictures(results[0], out)
-    by_name: dict[str, Any] = dict(zip(names, every, strict=True))
-    _show(every[0] if truncations else by_name, [result_table(*results)], json)
+_Shown = tuple[Mapping[str, Any], "RenderableType", Sequence[str]]
+"""Figures, their table, and warnings."""
 
 
-def _shimada_sequences(
-    folders: Sequence[Path],
-    truncation: str,
-    iterations: int | None,
-    acceleration: float,
-    out: Path | None,
-    json: bool,
-) -> None:
+def _shimada_moving(one: ShimadaOptions, count: Count) -> _Shown:
+    """The paper's moving hands, once for each truncation."""
+    from drake_pose.filtering.kalman.truncated_filter import TRUNCATIONS
+    from drake_pose.papers.shimada import PICTURES, result_table, run_experiment
+    from drake_pose.papers.shimada_pictures import save_pictures
+
+    names = TRUNCATIONS if one.truncation == "all" else (one.truncation or "joint",)
+    runs, seen = one.runs or (10 if one.pictures else 50), one.observed or "lines"
+    filtered = (count, one.iterations, one.noise, one.acceleration)
+    measured = PICTURES if one.pictures else seen
+    results = [run_experiment(runs, one.seed, name, measured, *filtered) for name in names]
+    if one.out is not None:
+        save_pictures(results[0], one.out)
+    figures = {name: result.as_json() for name, result in zip(names, results, strict=True)}
+    is_all = one.truncation == "all"
+    return figures if is_all else figures[names[0]], result_table(*results), ()
+
+
+def _shimada_sequences(one: ShimadaOptions, count: Count) -> _Shown:
     """Figures 17 and 18 of recorded hands."""
-    with _experiment(out) as count:
-        from drake_pose.papers.shimada import experiment_settings
-        from drake_pose.papers.shimada_pictures import save_sequence
-        from drake_pose.papers.shimada_sequences import run_sequence, sequence_table
+    from drake_pose.papers.shimada import experiment_settings
+    from drake_pose.papers.shimada_pictures import save_sequence
+    from drake_pose.papers.shimada_sequences import run_sequence, sequence_table
 
-        settings, results = experiment_settings(truncation, iterations), []
-        for folder in folders:
-            results.append(run_sequence(folder, settings, acceleration, count))
-            if out is not None:
-                save_sequence(results[-1], out)
-    for one in results:
-        warn(one.warning())
-    _show({one.name: one.as_json() for one in results}, [sequence_table(results)], json)
+    settings, results = experiment_settings(one.truncation or "joint", one.iterations), []
+    for folder in one.sequence:
+        results.append(run_sequence(folder, settings, one.acceleration, count))
+        if one.out is not None:
+            save_sequence(results[-1], one.out)
+    figures = {result.name: result.as_json() for result in results}
+    return figures, sequence_table(results), [result.warning() for result in results]
 
 
-def _shimada_hypotheses(
-    runs: int,
-    seed: int,
-    truncation: str,
-    observed: str,
-    iterations: int | None,
-    out: Path | None,
-    json: bool,
-) -> None:
+def _shimada_hypotheses(one: ShimadaOptions, count: Count) -> _Shown:
     """Figure 9."""
-    with _experiment(out) as count:
-        from drake_pose.papers.shimada_hypotheses import run_hypotheses_experiment
-        from drake_pose.papers.shimada_pictures import save_hypotheses
+    from drake_pose.papers.shimada_hypotheses import run_hypotheses_experiment
+    from drake_pose.papers.shimada_pictures import save_hypotheses
 
-        filtered = (truncation, observed, count, iterations or 1)
-        fates = run_hypotheses_experiment(runs, seed, *filtered)
-        if out is not None and not save_hypotheses(fates, out):
-            say("drake-pose: no wrong hypothesis was rejected by an inequality: nothing to draw")
-    _show(fates.as_json(), [fates.table()], json)
+    filtered = (one.truncation or "sequential", one.observed or "lines", count, one.iterations or 1)
+    fates = run_hypotheses_experiment(one.runs or 50, one.seed, *filtered)
+    if one.out is not None and not save_hypotheses(fates, one.out):
+        say("drake-pose: no wrong hypothesis was rejected by an inequality: nothing to draw")
+    return fates.as_json(), fates.table(), ()
 
 
 def date(

@@ -22,8 +22,8 @@ from drake_pose.camera.board import (
 )
 from drake_pose.camera.calibrate import Calibration, CalibrationSettings, calibrate
 from drake_pose.camera.camera_files import save_cameras
-from drake_pose.camera.rig import Lens, save_lenses
-from drake_pose.errors import CameraError, OutputError
+from drake_pose.errors import CameraError
+from drake_pose.files.folder import write_file
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,14 +161,9 @@ def undistort_pictures(
             raise CameraError(f"camera '{name}' has no lens; there are: {', '.join(lenses)}")
     written = {}
     for name, frames in pictures.items():
-        place = Path(out) / "images" / name
         for frame, path in frames.items():
             straight = lenses[name].undistort(read_board_picture(path))
-            target = place / f"{frame}.png"
-            try:
-                place.mkdir(parents=True, exist_ok=True)
-                target.write_bytes(cv2.imencode(".png", straight)[1].tobytes())
-            except OSError as error:
-                raise OutputError(f"{target}: cannot write it: {error.strerror}") from error
-            written[name, frame] = target
+            place = f"images/{name}/{frame}.png"
+            write_file(Path(out), place, cv2.imencode(".png", straight)[1].tobytes())
+            written[name, frame] = Path(out) / place
     return written

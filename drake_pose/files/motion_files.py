@@ -120,13 +120,12 @@ def centres_as_csv(frames: Sequence[str], names: Sequence[str], places: Array) -
     return csv_text([["frame", "joint", "x", "y", "z"], *cells])
 
 
-def centres_as_trc(names: Sequence[str], places: Array, rate_hz: float, name: str = TRC) -> str:
+def centres_as_trc(names: Sequence[str], places: Array, rate_hz: float) -> str:
     """A TRC file of joint centres: millimetres, y up as its readers expect (our z), 1-based frames.
 
     Args:
         places: (frames, joints, 3) in the world, z up [m]; nan is written as an empty field.
         rate_hz: frames a second.
-        name: the file's own name, which the format repeats.
     """
     count = len(places)
     head = ["DataRate", "CameraRate", "NumFrames", "NumMarkers", "Units", "OrigDataRate",
@@ -134,7 +133,7 @@ def centres_as_trc(names: Sequence[str], places: Array, rate_hz: float, name: st
     values = [f"{rate_hz:g}", f"{rate_hz:g}", count, len(names), "mm", f"{rate_hz:g}", 1, count]
     axes = [f"{axis}{k}" for k in range(1, len(names) + 1) for axis in "XYZ"]
     lines = [
-        f"PathFileType\t4\t(X/Y/Z)\t{name}",
+        f"PathFileType\t4\t(X/Y/Z)\t{TRC}",
         "\t".join(head),
         "\t".join(str(value) for value in values),
         "\t".join(["Frame#", "Time", *(cell for joint in names for cell in (joint, "", ""))]),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -110,7 +109,6 @@ def calibrate_folder(
     board: str | Path,
     out: str | Path | None = None,
     settings: CalibrationSettings | None = None,
-    on_picture: Callable[[str, str], None] | None = None,
 ) -> CalibrationReport:
     """Calibrates the cameras of a folder of pictures.
 
@@ -120,13 +118,12 @@ def calibrate_folder(
         out: the camera file to write; the lenses go beside it, `<stem>_lenses.yaml`, for
             undistort_pictures. Nothing is written where not given.
         settings: how to calibrate; the defaults where not given.
-        on_picture: called with camera and frame before each picture is searched.
 
     Raises:
         CameraError: names the file, camera or picture at fault, and what to do.
         UnknownNameError: the settings name a camera or frame that is not there.
     """
-    seen = find_boards(find_pictures(folder), load_board(board), on_picture)
+    seen = find_boards(find_pictures(folder), load_board(board))
     calibration = calibrate(seen, settings)
     if out is None:
         return CalibrationReport(calibration, seen)

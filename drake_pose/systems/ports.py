@@ -175,10 +175,10 @@ class BeliefSystem(PortedSystem, Generic[T]):
     The update is an unrestricted one, as abstract state needs.
     """
 
-    def keep_belief(self, first: T, period: float, offset: float = 0.0) -> None:
-        """Declares the belief, and when it is renewed [s]."""
+    def keep_belief(self, first: T, period: float) -> None:
+        """Declares the belief, and the time between two renewals [s]."""
         self._belief = self.DeclareAbstractState(AbstractValue.Make(first))
-        self.DeclarePeriodicUnrestrictedUpdateEvent(period, offset, self._renew)
+        self.DeclarePeriodicUnrestrictedUpdateEvent(period, 0.0, self._renew)
         self.DeclareForcedUnrestrictedUpdateEvent(self._renew)
 
     def show(self, name: str, like: Any, read: Callable[[T], Any]) -> OutputPort:

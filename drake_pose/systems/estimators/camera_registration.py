@@ -53,7 +53,7 @@ class CameraRegistration(BeliefSystem[OnlineState]):
     All that is known is state of the context; copies share it.
 
     Args:
-        period, offset: time between two updates, and of the first one [s].
+        period: time between two updates [s].
         labels: the labels that belong to the body; None: all that are not reserved.
 
     Raises:
@@ -64,7 +64,6 @@ class CameraRegistration(BeliefSystem[OnlineState]):
         self,
         registration: OnlineRegistration,
         period: float,
-        offset: float = 0.0,
         labels: Collection[int] | None = None,
     ) -> None:
         super().__init__()
@@ -74,15 +73,11 @@ class CameraRegistration(BeliefSystem[OnlineState]):
         self._labels = None if labels is None else frozenset(labels)
         self.add_input("label_image", ImageLabel16I(camera.width, camera.height))
         self.add_input("measured_positions", len(self._tree.model.position_names))
-        self.keep_belief(OnlineState(), period, offset)
+        self.keep_belief(OnlineState(), period)
         self.show("X_WC", RigidTransform(), _X_WC)
         self.show("covariance", 36, self._covariance)
         self.show("status", 1, lambda known: [float(registration.status(known))])
         self.show("registration", len(REGISTRATION), _numbers)
-
-    def online_state(self, context: Context) -> OnlineState:
-        """What is known in a context."""
-        return self.belief(context)
 
     def registered_camera(self, context: Context) -> PinholeCamera | None:
         """The camera with its pose, for searches and estimators; None unless the status is 1."""

@@ -40,6 +40,8 @@ from drake_pose.systems.estimators.mask_player import MaskPlayer
 from drake_pose.systems.estimators.truncated_ekf import STATISTICS, TruncatedEkf
 from drake_pose.systems.ports import PortedSystem, connect_same
 
+# Table 2 gives the scale of the first frame.
+_FIRST_SCALE = 1.0
 # The body is not where it was predicted if so large a share of the silhouette differs.
 _ASTRAY = 0.3
 
@@ -163,12 +165,11 @@ class HandSensor(PortedSystem):
 
     Args:
         silhouette: measures; its filter is the ``TruncatedEkf``'s.
-        scale: of the first frame, if it is known.
     """
 
-    def __init__(self, silhouette: HandSilhouette, scale: float | None = 1.0) -> None:
+    def __init__(self, silhouette: HandSilhouette) -> None:
         super().__init__()
-        self._silhouette, self._scale = silhouette, scale
+        self._silhouette = silhouette
         n = len(silhouette.belief_filter.layout)
         m = len(silhouette.belief_filter.observation.names)
         self.add_input("label_image", ImageLabel16I(silhouette.width, silhouette.height))
@@ -197,7 +198,7 @@ class HandSensor(PortedSystem):
             mask = label_image_to_mask(image)
         if begun:
             return silhouette.measure(mask, silhouette.belief_filter.predicted(belief))
-        return silhouette.measure(mask, belief, self._scale)
+        return silhouette.measure(mask, belief, _FIRST_SCALE)
 
 
 def build_hand_estimation(

@@ -35,11 +35,11 @@ class MaskPlayer(PortedSystem):
     Args:
         cameras: the cameras to play, in the order of the output ports.
         frames: the frames to play; all of the scene's where not given.
-        period: time between two frames [s]; by the scene's frame rate where not given.
         positions: (nq,) by frame, given out as ``measured_positions``; NaN in other frames.
         root_positions: (3,) by frame [m], given out as ``root_position``; NaN in other frames.
 
     Attributes:
+        period: time between two frames [s], by the scene's frame rate.
         color_cameras: the names of the cameras that have pictures (``Scene.images``) and so a port
             ``color_image_<camera>``, or ``color_image`` if there is one camera. An image of no
             pixels is given out where there is no picture.
@@ -50,7 +50,6 @@ class MaskPlayer(PortedSystem):
         scene: Scene,
         cameras: Sequence[Camera] | Mapping[str, Camera],
         frames: Sequence[str] | None = None,
-        period: float | None = None,
         positions: Mapping[str, Array] | None = None,
         root_positions: Mapping[str, Array] | None = None,
     ) -> None:
@@ -58,8 +57,7 @@ class MaskPlayer(PortedSystem):
         cameras = camera_tuple(cameras)
         self._scene = scene
         self.frames = tuple(scene.frames if frames is None else frames)
-        rate = scene.frame_rate_hz or DEFAULT_FRAME_RATE_HZ
-        self.period = 1.0 / rate if period is None else period
+        self.period = 1.0 / (scene.frame_rate_hz or DEFAULT_FRAME_RATE_HZ)
         self.color_cameras = tuple(
             camera.name
             for camera in cameras

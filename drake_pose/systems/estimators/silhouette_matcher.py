@@ -83,7 +83,7 @@ class SilhouetteMatcher(BeliefSystem[Matched]):
 
     Args:
         cameras: the calibrated cameras, in the order of the input ports, or by name.
-        period, offset: time between two matches, and of the first one [s].
+        period: time between two matches [s].
         labels: the labels that belong to the body; None: those of its model where that was made of
             a plant (``ArticulatedModel.from_plant``), else all that are not reserved. A frozenset,
             or None for all, is abstract parameter 0 of the context, where they can be varied.
@@ -102,7 +102,6 @@ class SilhouetteMatcher(BeliefSystem[Matched]):
         search: PoseSearch,
         cameras: Sequence[Camera] | Mapping[str, Camera],
         period: float,
-        offset: float = 0.0,
         labels: Collection[int] | None = None,
         family_limit: int = 4,
     ) -> None:
@@ -126,7 +125,7 @@ class SilhouetteMatcher(BeliefSystem[Matched]):
         )
         self.add_input("root_position", 3)
         q = search.tree.model.default_positions
-        self.keep_belief(Matched(q, np.eye(4), None, self._first_memory), period, offset)
+        self.keep_belief(Matched(q, np.eye(4), None, self._first_memory), period)
         self._declare_outputs(search.tree.model.plant)
 
     def _declare_outputs(self, plant: MultibodyPlant) -> None:
@@ -263,12 +262,11 @@ class SilhouetteTracker(SilhouetteMatcher):
         search: PoseSearch,
         cameras: Sequence[Camera] | Mapping[str, Camera],
         period: float,
-        offset: float = 0.0,
         labels: Collection[int] | None = None,
         tracking: TrackingSettings | None = None,
         color_cameras: Collection[str] = (),
     ) -> None:
-        super().__init__(search, cameras, period, offset, labels)
+        super().__init__(search, cameras, period, labels)
         cameras = self._cameras
         tracking = tracking or TrackingSettings()
         follower = MatchAndTrack(search, cameras, period, tracking)

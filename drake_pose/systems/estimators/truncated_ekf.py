@@ -64,7 +64,7 @@ class TruncatedEkf(BeliefSystem[_Known]):
 
     Args:
         start: the belief before the first measurement.
-        period, offset: time between two updates, one step of the prediction; of the first one [s].
+        period: time between two updates, one step of the prediction [s].
         patience: how many unlikely measurements in a row make a loss.
 
     Raises:
@@ -77,7 +77,6 @@ class TruncatedEkf(BeliefSystem[_Known]):
         belief_filter: TruncatedFilter,
         start: Belief,
         period: float,
-        offset: float = 0.0,
         patience: int = 3,
     ) -> None:
         super().__init__()
@@ -92,7 +91,7 @@ class TruncatedEkf(BeliefSystem[_Known]):
         self.add_input("measurement_covariance", self._measured**2)
         self.add_input("reset_state", n)
         self.add_input("restart", 1)
-        self.keep_belief(_Known(belief_filter.start(self._start)), period, offset)
+        self.keep_belief(_Known(belief_filter.start(self._start)), period)
         rows = belief_filter.inequalities.rows
 
         def hypotheses(known: _Known) -> tuple[Array, Array]:

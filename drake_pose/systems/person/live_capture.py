@@ -135,7 +135,6 @@ def build_live_capture(
     tracker: PersonPoseTracker,
     cameras: Mapping[str, Camera],
     sensors: LiveSensors,
-    meshcat: Meshcat | None = None,
     with_deviations: bool = False,
 ) -> Diagram:
     """Cameras' pictures, or what workers elsewhere make of them, to a person's poses.
@@ -149,7 +148,7 @@ def build_live_capture(
         builder.ExportOutput(port, f"silhouette_{name}")
     period, time = sensors.period, sensors.GetOutputPort("time")
     person = add_person_tracker(
-        builder, tracker, cameras, silhouettes, period, time, meshcat, with_deviations
+        builder, tracker, cameras, silhouettes, period, time, with_deviations=with_deviations
     )
     export_outputs(builder, person)
     return builder.Build()

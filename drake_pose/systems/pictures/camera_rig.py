@@ -28,6 +28,8 @@ from drake_pose.systems.colour_images import colour_image_to_picture
 _RENDERER = "rig_renderer"
 # What 16 bits of millimetres can hold; nothing of a room is farther away [m].
 _FARTHEST = 60.0
+# Red, green, blue of the empty picture, 0 to 1.
+_BACKGROUND = (0.55, 0.58, 0.62)
 
 _System = TypeVar("_System", bound=System)
 
@@ -68,7 +70,6 @@ def build_camera_rig(
     model: ParsedModel,
     cameras: Mapping[str, PinholeCamera],
     true_positions: Trajectory | None = None,
-    background: tuple[float, float, float] = (0.55, 0.58, 0.62),
 ) -> CameraRig:
     """Wire a body and the cameras that see it.
 
@@ -76,7 +77,6 @@ def build_camera_rig(
         cameras: any number, anywhere: from circle_of_cameras or load_cameras.
         true_positions: the body's positions (nq,) over time; where not given, the diagram has the
             input ``positions``.
-        background: red, green, blue of the empty picture, 0 to 1.
 
     Raises:
         CameraError: there is no camera, or one of parallel rays.
@@ -96,7 +96,7 @@ def build_camera_rig(
         source = builder.AddNamedSystem("true_positions", TrajectorySource(true_positions))
     add_posed_plant(builder, scene_graph, model, source.get_output_port(), "geometry_pose")
     ranges = {name: (camera.near, _FARTHEST) for name, camera in cameras.items()}
-    parameters = RenderEngineVtkParams(default_clear_color=np.array(background))
+    parameters = RenderEngineVtkParams(default_clear_color=np.array(_BACKGROUND))
     sensors = add_sensors(builder, scene_graph, cameras, ranges, parameters)
     for name, sensor in sensors.items():
         builder.ExportOutput(sensor.color_image_output_port(), f"color_image_{name}")

@@ -52,15 +52,15 @@ class TestCameraRegistration:
         mask = np.zeros((480, 640), dtype=bool)
         run.update(label_image=mask_to_label_image(mask))
         run.update(measured_positions=np.zeros(5))
-        assert system.online_state(run.context).keyframes == ()
+        assert system.belief(run.context).keyframes == ()
         mask[100:200, 100:200] = True
         run.update(1.5, label_image=mask_to_label_image(mask))
-        (kept,) = system.online_state(run.context).keyframes
+        (kept,) = system.belief(run.context).keyframes
         assert kept.name == "1.5 s"
         np.testing.assert_array_equal(kept.mask, mask)
         # What is known is state of the context.
         run.context.SetStateAndParametersFrom(system.CreateDefaultContext())
-        assert system.online_state(run.context).keyframes == ()
+        assert system.belief(run.context).keyframes == ()
 
     def test_refuses_a_period_that_is_none(self, online: OnlineRegistration) -> None:
         with pytest.raises(SettingsError, match="period"):

@@ -275,7 +275,9 @@ def _shimada_moving(one: ShimadaOptions, count: Count) -> _Shown:
     results = [run_experiment(runs, one.seed, name, measured, *filtered) for name in names]
     if one.out is not None:
         save_pictures(results[0], one.out)
-    figures = {name: result.as_json() for name, result in zip(names, results, strict=True)}
+    figures: dict[str, Any] = {
+        name: result.as_json() for name, result in zip(names, results, strict=True)
+    }
     is_all = one.truncation == "all"
     return figures if is_all else figures[names[0]], result_table(*results), ()
 

@@ -94,6 +94,7 @@ def test_a_simulated_camera_sees_the_skin(limb: ArticulatedModel) -> None:
     for name in ("true", "estimated"):
         for child in ("lower", "hand"):
             assert meshcat.HasPath(f"visualizer/{name}_skin/{child}")
+        assert meshcat.HasPath(f"visualizer/{name}")
 
 
 def test_models_without_skin_get_no_system(tmp_path: Path) -> None:

@@ -264,7 +264,7 @@ _Shown = tuple[Mapping[str, Any], "RenderableType", Sequence[str]]
 
 def _shimada_moving(one: ShimadaOptions, count: Count) -> _Shown:
     """The paper's moving hands, once for each truncation."""
-    from drake_pose.filtering.kalman.truncated_filter import TRUNCATIONS
+    from drake_pose.filtering.truncated_filter import TRUNCATIONS
     from drake_pose.papers.shimada import PICTURES, result_table, run_experiment
     from drake_pose.papers.shimada_pictures import save_pictures
 

@@ -1,19 +1,28 @@
-"""replay.html: one page that plays an estimate in a browser, with no server."""
+"""What plays an estimate: replay.html, a page that needs no server; a recording for rerun."""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from importlib import import_module
 from itertools import product
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from pydrake.geometry import Meshcat, MeshcatParams, MeshcatVisualizer, Rgba, SceneGraph
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.framework import Diagram, DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource
 
 from drake_pose.body.model import ArticulatedModel
-from drake_pose.camera.models import Camera, ParallelCamera
+from drake_pose.body.surfaces.meshes import TriangleMesh
+from drake_pose.body.tree.pose_tree import PoseTree
+from drake_pose.body.tree.tree_kinematics import TreeKinematics
+from drake_pose.camera.models import HALF_PIXEL, Camera, ParallelCamera, PinholeCamera
+from drake_pose.errors import OutputError
+from drake_pose.files.overlay import EXCESS_RGB
+from drake_pose.registration.posed_frames import SeenFrame
 from drake_pose.systems.bodies import add_meshcat_skin, add_posed_plant, body_poses
 
 _BODY_PATH, _MEASURED_PATH = "visualizer", "measured"
@@ -148,3 +157,83 @@ def _look_from(meshcat: Meshcat, camera: Camera, p_WO: np.ndarray, distance: flo
         p_OC_W = -camera.X_WC[:3, 2]
     beside = RotationMatrix.MakeZRotation(_BESIDE).multiply(p_OC_W)
     meshcat.SetCameraPose(p_WO + distance * beside / np.linalg.norm(beside), p_WO)
+
+
+Pictures = Mapping[str, Mapping[str, NDArray[np.uint8]]]
+"""Pictures (H, W, 3) by camera and frame."""
+
+
+def import_rerun() -> Any:
+    """The library rerun of the extra `rerun`; OutputError without it."""
+    try:
+        return import_module("rerun")
+    except ImportError as error:
+        raise OutputError(
+            f"recordings for rerun are written by rerun-sdk: pip install 'drake_pose[rerun]' "
+            f"({error})"
+        ) from error
+
+
+def make_recording(
+    tree: PoseTree, cameras: Iterable[Camera], frames: Sequence[SeenFrame], pictures: Pictures
+) -> bytes:
+    """The bytes of a file .rrd.
+
+    Args:
+        tree: the body, in the world or whatever the cameras' X_WC are given in.
+        cameras: pinholes are shown.
+        frames: in the order of the timeline `frame`.
+
+    Raises OutputError: rerun-sdk is not installed.
+    """
+    rr = import_rerun()
+    recording = rr.RecordingStream("drake_pose")
+    stream = recording.memory_recording()
+    recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+    for node in tree.nodes:
+        recording.log(["world", "body", node.name], _rerun_mesh(rr, node.mesh), static=True)
+    shown = [one.name for one in cameras if _log_rerun_camera(rr, recording, one)]
+    kinematics = TreeKinematics(tree)
+    for k, frame in enumerate(frames):
+        recording.set_time("frame", sequence=k)
+        recording.log("frame", rr.TextLog(frame.name))
+        values = kinematics.split(frame.values)
+        for node, X_WN, own in zip(tree.nodes, kinematics.poses(frame.values), values, strict=True):
+            recording.log(["world", "body", node.name], _rerun_pose(rr, X_WN))
+            if node.skin is not None:
+                recording.log(["world", "body", node.name], _rerun_mesh(rr, node.surface(own)))
+        for name in (one for one in shown if one in frame.masks):
+            place = ["world", name, "picture"]
+            if (picture := pictures.get(name, {}).get(frame.name)) is not None:
+                recording.log(place, rr.Image(picture).compress(jpeg_quality=90))
+            mask = frame.masks[name].astype(np.uint8)
+            recording.log([*place, "mask"], rr.SegmentationImage(mask))
+    return bytes(stream.drain_as_bytes())
+
+
+def _log_rerun_camera(rr: Any, recording: Any, camera: Camera) -> bool:
+    """Logs a pinhole's pose and lens; False: it is none."""
+    if not isinstance(camera, PinholeCamera):
+        return False
+    place = ["world", camera.name]
+    recording.log(place, _rerun_pose(rr, camera.X_WC), static=True)
+    lens = rr.Pinhole(
+        focal_length=[camera.focal_x, camera.focal_y],
+        # rerun counts from the picture's corner.
+        principal_point=[camera.center_x + HALF_PIXEL, camera.center_y + HALF_PIXEL],
+        resolution=[camera.width, camera.height],
+        camera_xyz=rr.ViewCoordinates.RDF,
+    )
+    recording.log([*place, "picture"], lens, static=True)
+    colours = rr.AnnotationContext([(1, "body", EXCESS_RGB)])
+    recording.log([*place, "picture", "mask"], colours, static=True)
+    return True
+
+
+def _rerun_mesh(rr: Any, mesh: TriangleMesh) -> Any:
+    surface = mesh.vertices, mesh.triangles
+    return rr.Mesh3D(vertex_positions=surface[0], triangle_indices=surface[1])
+
+
+def _rerun_pose(rr: Any, X_AB: NDArray[np.float64]) -> Any:
+    return rr.Transform3D(translation=X_AB[:3, 3], mat3x3=X_AB[:3, :3])

@@ -21,6 +21,7 @@ from drake_pose.camera.board import (
 )
 from drake_pose.camera.calibrate import Calibration, CalibrationSettings, calibrate
 from drake_pose.camera.camera_files import save_cameras
+from drake_pose.camera.rig import Lens, save_lenses
 from drake_pose.errors import CameraError
 from drake_pose.files.folder import write_file
 

@@ -28,8 +28,7 @@ from drake_pose.jobs.batch.batch import run_batch
 from drake_pose.jobs.batch.job import SceneJob
 from drake_pose.jobs.cluster.remote_views import ClusterSensors
 from drake_pose.jobs.cluster.scheduler import open_cluster
-from drake_pose.jobs.live.run import run_live
-from drake_pose.jobs.live.scene import LiveScene, load_live_scene
+from drake_pose.jobs.live.scene import LiveScene, load_live_scene, run_live
 from drake_pose.papers.date_capture import Studio
 from drake_pose.papers.kameda import experiment_camera
 from drake_pose.person.date.walking import make_motion

@@ -27,6 +27,7 @@ from drake_pose.fit.camera_sums import (
 )
 from drake_pose.fit.evidence import NO_EDGE, EdgePoints, pack_evidence
 from drake_pose.jobs.cluster.lines import SURFACES, Listening, serve
+from drake_pose.jobs.cluster.scheduler import host_of
 from drake_pose.jobs.live.scene import learn_backgrounds, open_sources
 from drake_pose.person.views import pack_view, see_silhouette
 from drake_pose.silhouette.areas.outline import PackedOutlines
@@ -178,11 +179,6 @@ class CameraWatch:
             view = see_silhouette(region, self._spacings[name])
             self._edges.put(number, one.time, view.edge)
             yield one.time, one.frame, pack_view(view)
-
-
-def host_of(address: str) -> str:
-    """The machine of a worker's address."""
-    return address.split("://")[-1].rsplit(":", 1)[0]
 
 
 _watches: dict[str, CameraWatch] = {}

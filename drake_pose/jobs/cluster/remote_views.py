@@ -10,6 +10,7 @@ import math
 import pickle
 import time
 import uuid
+from collections import deque
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from functools import partial
@@ -18,13 +19,18 @@ from typing import TYPE_CHECKING
 import numpy as np
 from pydrake.systems.framework import Context, DependencyTicket, DiagramBuilder, OutputPort
 
-from drake_pose.camera.frame_source import Clock, FrameSource, TimedPicture
+from drake_pose.camera.frame_source import (
+    Clock,
+    FrameSource,
+    SourceSpecification,
+    TimedPicture,
+)
 from drake_pose.camera.models import Camera
 from drake_pose.errors import ClusterError, DrakePoseError
 from drake_pose.jobs.cluster import camera_worker
-from drake_pose.jobs.cluster.camera_groups import CameraAssignment, WatchedSource, assign_cameras
-from drake_pose.jobs.cluster.camera_worker import COUNT, WatchReply, host_of
+from drake_pose.jobs.cluster.camera_worker import COUNT, WatchReply
 from drake_pose.jobs.cluster.lines import Line, Listening, RemoteKeeper, listed
+from drake_pose.jobs.cluster.scheduler import CameraAssignment, assign_cameras, host_of
 from drake_pose.jobs.cluster.worker import worker_resources
 from drake_pose.jobs.live.scene import LiveScene
 from drake_pose.person.views import KeptEdge, SilhouetteView, edge_spacing, unpack_view
@@ -173,6 +179,40 @@ class ClusterSensors(LiveSensors):
         if one is None:
             return None
         return unpack_view(one.picture.tobytes(), KeptEdge(self._keepers[name], name, one.time))
+
+
+class WatchedSource(FrameSource):
+    """A camera whose pictures stay where they are: gives packed views in their place.
+
+    Attributes:
+        queue: what came and was not read yet.
+        is_over: whether the worker has said that nothing will come any more.
+        rate: pictures a second, where known.
+    """
+
+    def __init__(self, specification: SourceSpecification, look: Callable[[], None]) -> None:
+        super().__init__(specification)
+        self.queue: deque[TimedPicture] = deque()
+        self.is_over = False
+        self.rate: float | None = None
+        self._look = look
+
+    @property
+    def ended(self) -> bool:
+        """Whether nothing will come any more."""
+        return self.is_over and not self.queue
+
+    @property
+    def rate_hz(self) -> float | None:
+        """As the source says where it is open."""
+        return self.rate
+
+    def close(self) -> None:
+        """Nothing is held open here."""
+
+    def _read(self) -> TimedPicture | None:
+        self._look()
+        return self.queue.popleft() if self.queue else None
 
 
 class WatchedGroup:

@@ -18,8 +18,7 @@ from drake_pose.errors import CameraError, OutputError, SceneError, SettingsErro
 from drake_pose.files.folder import read_summary, writes_folder
 from drake_pose.jobs.estimate.inputs import bundled_person
 from drake_pose.jobs.live.frame_results import LiveResult, LiveWriter
-from drake_pose.jobs.live.run import look_until
-from drake_pose.jobs.live.scene import LiveScene
+from drake_pose.jobs.live.scene import LiveScene, look_until
 from drake_pose.jobs.live.settings import CaptureMethod, LiveSettings
 from drake_pose.person.date.faces import learn_recorded_faces
 from drake_pose.person.date.recognition import (

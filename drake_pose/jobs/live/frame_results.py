@@ -20,8 +20,7 @@ from drake_pose.files.settings import EstimateSettings
 from drake_pose.files.summary import describe_job
 from drake_pose.files.writer import ResultWriter
 from drake_pose.jobs.estimate.person import FOLLOWED
-from drake_pose.jobs.live.run import run_live
-from drake_pose.jobs.live.scene import LiveScene
+from drake_pose.jobs.live.scene import LiveScene, run_live
 from drake_pose.jobs.live.settings import LiveSettings
 from drake_pose.person.date.skeleton import FEATURES
 from drake_pose.person.persons_in_view import keep_person

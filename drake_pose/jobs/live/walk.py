@@ -25,8 +25,7 @@ from drake_pose.files.records import PoseTable
 from drake_pose.jobs.estimate.inputs import bundled_person
 from drake_pose.jobs.live.capture import shape_of_result
 from drake_pose.jobs.live.frame_results import camera_troubles
-from drake_pose.jobs.live.run import run_live
-from drake_pose.jobs.live.scene import LiveScene
+from drake_pose.jobs.live.scene import LiveScene, run_live
 from drake_pose.jobs.live.settings import LiveSettings
 from drake_pose.person.date.skeleton import load_skeleton
 from drake_pose.person.date.walking import COMMANDS, make_motion

@@ -13,7 +13,7 @@ from drake_pose.camera.drake import dump_scenario
 from drake_pose.camera.exports import mujoco_cameras, ros_camera_info, ros_transforms
 from drake_pose.camera.models import Camera
 from drake_pose.files.folder import write_file
-from drake_pose.files.rerun_recording import Pictures, import_rerun, make_recording
+from drake_pose.files.replay import Pictures, import_rerun, make_recording
 from drake_pose.jobs.registration.inputs import Inputs
 
 _DRAKE, _MUJOCO, _RERUN = "drake.yaml", "mujoco.xml", "rerun.rrd"

@@ -16,7 +16,7 @@ from pydrake.trajectories import Trajectory
 from drake_pose.arrays import Array
 from drake_pose.body.parsed_model import ParsedModel
 from drake_pose.camera.models import Camera
-from drake_pose.filtering.measurements.hand_silhouette import HandMeasurement, HandSilhouette
+from drake_pose.filtering.hand_silhouette import HandMeasurement, HandSilhouette
 from drake_pose.filtering.state import Belief
 from drake_pose.silhouette.pictures.label_images import label_image_to_mask
 from drake_pose.silhouette.pictures.scenes import Scene

@@ -12,10 +12,9 @@ import pytest
 
 from drake_pose.camera.frame_source import SourceSpecification
 from drake_pose.errors import ClusterError, SceneError
-from drake_pose.jobs.cluster.camera_groups import assign_cameras
 from drake_pose.jobs.cluster.remote_views import ClusterSensors
-from drake_pose.jobs.live.run import run_live
-from drake_pose.jobs.live.scene import load_live_scene
+from drake_pose.jobs.cluster.scheduler import assign_cameras
+from drake_pose.jobs.live.scene import load_live_scene, run_live
 from drake_pose.person.shape import tracker_of_person
 from drake_pose.systems.person.live_capture import build_live_capture
 from tests.cli import run_command

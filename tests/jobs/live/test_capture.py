@@ -1,4 +1,3 @@
-import csv
 import json
 
 import numpy as np
@@ -13,6 +12,7 @@ from drake_pose.jobs.live.settings import LiveSettings
 from drake_pose.person.shape import KnownShape, tracker_of_person
 from tests.cli import run_command
 from tests.jobs.live_scenes import RATE_HZ, absent, standing, write_studio
+from tests.jobs.scenes import read_rows as rows_of
 
 FRAMES = 12
 GAP = range(5, 10)
@@ -28,11 +28,6 @@ def studio(tmp_path_factory, person):
         (folder / "masks" / "camera_1" / f"{k:04d}.png").unlink()
     (folder / "masks" / "camera_2" / "0004.png").write_bytes(b"\x89PNG\r\n\x1a\n broken")
     return folder
-
-
-def rows_of(path):
-    with path.open(newline="") as stream:
-        return list(csv.DictReader(stream))
 
 
 @pytest.fixture(scope="module")

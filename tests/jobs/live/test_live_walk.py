@@ -5,8 +5,7 @@ import pytest
 from pydrake.systems.framework import DiagramBuilder
 
 from drake_pose.jobs.live.local_proxy import open_page
-from drake_pose.jobs.live.run import run_live
-from drake_pose.jobs.live.scene import load_live_scene
+from drake_pose.jobs.live.scene import load_live_scene, run_live
 from drake_pose.jobs.live.walk import SETTLE, live_player, walk
 from drake_pose.person.date.walking import SPEED
 from drake_pose.systems.walk import START
@@ -75,7 +74,7 @@ def test_wrong_usage_is_refused(studio, tmp_path):
 
 def test_a_slow_computer_does_not_make_up_for_lost_time(studio, monkeypatch):
     clock = {"now": 0.0}
-    monkeypatch.setattr("drake_pose.jobs.live.run.time.monotonic", lambda: clock["now"])
+    monkeypatch.setattr("drake_pose.jobs.live.scene.time.monotonic", lambda: clock["now"])
     sensors = load_live_scene(studio).open_sensors(live=False)
     builder = DiagramBuilder()
     sensors.add(builder)

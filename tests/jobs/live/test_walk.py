@@ -13,7 +13,7 @@ from drake_pose.errors import OutputError, SettingsError
 from drake_pose.files.folder import write_summary
 from drake_pose.files.records import PoseRow, PoseTable
 from drake_pose.jobs.live.local_proxy import open_page
-from drake_pose.jobs.live.run import run_live
+from drake_pose.jobs.live.scene import run_live
 from drake_pose.jobs.live.walk import (
     REPLAY,
     Player,

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from drake_pose.filtering.measurements.hand_silhouette import HandSilhouette
+from drake_pose.filtering.hand_silhouette import HandSilhouette
 from drake_pose.filtering.state import Belief
 from drake_pose.papers.shimada import experiment_filter
 from drake_pose.papers.shimada_motion import true_states

@@ -27,6 +27,7 @@ from drake_pose.papers.kameda_pictures import (
     ratio_within,
     save_pictures,
 )
+from drake_pose.search.estimates import PoseEstimate
 from drake_pose.search.grid.inner_edges import edges_of_labels
 from drake_pose.silhouette.areas.scoring import draw_mask
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
@@ -39,12 +40,12 @@ def search():
 
 @pytest.fixture(scope="module")
 def result(search):
-    return run_experiment(search, images=8, seed=5)
+    return run_experiment(search, images=5, seed=5)
 
 
 @pytest.fixture(scope="module")
 def beam_result():
-    return run_experiment(beam_experiment_search(), images=12, seed=5)
+    return run_experiment(beam_experiment_search(), images=6, seed=5)
 
 
 def test_the_camera_is_the_papers():
@@ -92,28 +93,28 @@ def test_the_figures_are_what_drake_draws(result):
 def test_json_has_the_keys_of_the_paper_and_the_same_seed_the_same_figures(search, result):
     figures = grid_figures(result)
     assert set(PAPER) | {"median_seconds"} <= set(figures)
-    assert figures["images"] == 8
+    assert figures["images"] == 5
     E_total = [trial.result.E_total for trial in result.trials]
     assert figures["mean_e_total"] == pytest.approx(np.mean(E_total))
     assert figures["min_runs"] == min(trial.result.statistics.runs for trial in result.trials)
-    again = run_experiment(search, images=2, seed=5)
+    again = run_experiment(search, images=1, seed=5)
     for one, other in zip(result.trials, again.trials, strict=False):
         np.testing.assert_array_equal(one.result.q, other.result.q)
 
 
-def test_poses_not_found_are_counted_apart():
-    """With one candidate for each segment there is no way back: it often ends without a pose."""
-    partly = run_experiment(experiment_search(candidate_limit=1), images=8, seed=5)
-    found = [trial.result.E_total for trial in partly.trials if trial.result.found]
-    assert 0 < len(found) < 8
-    assert grid_figures(partly)["not_found"] == 8 - len(found)
-    assert grid_figures(partly)["mean_e_total"] == pytest.approx(np.mean(found))
+def test_poses_not_found_are_counted_apart(search, result):
+    nothing = PoseEstimate.nothing(search.tree, stopped_by="end")
+    lost = [replace(one, result=nothing) for one in result.trials[:2]]
+    figures = grid_figures(replace(result, trials=(*lost, *result.trials[2:])))
+    assert figures["not_found"] == 2
+    found = [trial.result.E_total for trial in result.trials[2:]]
+    assert figures["mean_e_total"] == pytest.approx(np.mean(found))
 
 
 def test_the_beam_search_matches_every_silhouette_exactly_and_names_the_truth(beam_result):
     """Without being told r, in one run over poses that the paper's search mostly misses."""
     figures = grid_figures(beam_result)
-    assert figures["exact"] == figures["proved"] == figures["truth_in_set"] == 12
+    assert figures["exact"] == figures["proved"] == figures["truth_in_set"] == 6
     assert figures["method"] == "beam"
     for trial in beam_result.trials:
         values = np.concatenate(trial.true_values)
@@ -129,7 +130,7 @@ def test_columns_stand_side_by_side(result, beam_result):
 
 
 def test_pictures_are_written(result, tmp_path):
-    few = replace(result, trials=result.trials[:2])
+    few = replace(result, trials=result.trials[:1])
     files = save_pictures(few, tmp_path)
     assert all(file.stat().st_size > 5000 for file in files)
     names = {file.name for file in files}

@@ -78,7 +78,8 @@ def test_what_means_nothing_is_refused(options, words):
 
 
 def test_the_searches_stand_beside_the_one_that_was_asked_for():
-    made = reproduce("--images", "2", "--seeds", "2", "--outside-weight", "10", "--json")
+    words = ("--images", "1", "--seeds", "2", "--renderer", "own", "--json")
+    made = reproduce(*words, "--outside-weight", "10")
     assert made.exit_code == 0, made.output
     weighted = json.loads(made.stdout)
     paper = weighted["paper_method"]

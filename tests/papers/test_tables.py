@@ -53,6 +53,9 @@ def test_counts_and_choices_are_refused_by_name():
 def test_pictures_are_written_with_their_colours(tmp_path):
     picture = np.zeros((4, 5, 3), dtype=np.uint8)
     picture[..., 0] = 200
-    path = save_picture(picture, tmp_path / "new" / "red.png")
-    np.testing.assert_array_equal(cv2.imread(str(path))[..., ::-1], picture)
-    assert save_figure(Figure(), tmp_path / "drawn" / "empty.png").stat().st_size > 100
+    # In folders that are not there, and again in those that are.
+    for _ in range(2):
+        path = save_picture(picture, tmp_path / "new" / "deeper" / "red.png")
+        np.testing.assert_array_equal(cv2.imread(str(path))[..., ::-1], picture)
+        drawn = save_figure(Figure(), tmp_path / "drawn" / "deeper" / "empty.png")
+        assert drawn.stat().st_size > 100

@@ -46,6 +46,8 @@ def path(studio):
 def test_diagram_is_the_plain_functions_in_turn(studio, cameras, backgrounds, tracker, path):
     capture = build_silhouette_capture(tracker, cameras, backgrounds, PERIOD)
     assert list(capture.stages) == ["region", "edge"]
+    # What costs time is an output only where it is asked for.
+    assert not capture.diagram.HasOutputPort("deviations")
     run = Bench(capture.diagram)
     simulator = Simulator(capture.diagram, run.context)
     own = capture.person.GetMyMutableContextFromRoot(run.context)

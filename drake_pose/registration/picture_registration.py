@@ -45,6 +45,8 @@ _SLOW = 0.6
 # edges along them are so much stronger than by chance. Right ones have .5 and more, .17 and more;
 # the best wrong ones .3 and .13, one with a free focal length .6 and .17.
 _LOOKS, _LEAST_RATIO, _LEAST_CONTOUR = 3, 0.42, 0.16
+# And it explains so much of what changes: right ones .2 and more, one that few frames bore out .09.
+_LEAST_EXPLAINED = 0.12
 # What is explained and so many times the contours together: right ones have 1.2 and more, the best
 # wrong ones .9.
 _CONTOURS, _LEAST_EVIDENCE = 4.0, 1.05
@@ -205,8 +207,12 @@ def _register(
         raise _Unexplained(camera, "no pose shows the body in two pictures")
     level, start = search.compared, near[0][0]
     pieces = level.pieces(start.X_CW)
+    # Once more, for those that are on their way to the best.
     alike = [
-        one.X_CW for one, _ in near[1:] if excess(pieces, level.pieces(one.X_CW)) <= _SIGNIFICANCE
+        again[0].X_CW
+        for one, _ in near[1:]
+        if excess(pieces, level.pieces(one.X_CW)) <= _SIGNIFICANCE
+        and (again := search.approach(one.X_CW)) is not None
     ]
     alternatives = level.distinct([start.X_CW, *alike])[1:]
     both, offset, scores = [*chosen, *moving], 0.0, np.zeros((0, 2))
@@ -415,13 +421,19 @@ def _describe(settled: _Settled, focal: bool) -> PictureRegistration:
     ratios = fit.inlier_ratios(best.found)
     ratio = float(ratios[agree].mean())
     told = _evidence(best.explained, best.contour)
-    if ratio < _LEAST_RATIO or best.contour < _LEAST_CONTOUR or told < _LEAST_EVIDENCE:
+    if (
+        best.explained < _LEAST_EXPLAINED
+        or ratio < _LEAST_RATIO
+        or best.contour < _LEAST_CONTOUR
+        or told < _LEAST_EVIDENCE
+    ):
         raise _Unexplained(
             begun.camera,
-            f"at best {max(best.explained, 0.0):.0%} of what changes is explained, {ratio:.0%} of "
-            f"the contours fit ({_LEAST_RATIO:.0%} at least), and edges along them are stronger "
-            f"than elsewhere by {best.contour:.2f} ({_LEAST_CONTOUR} at least); the first, and "
-            f"{_CONTOURS:g} times the last, are {told:.2f} together ({_LEAST_EVIDENCE} at least)",
+            f"at best {max(best.explained, 0.0):.0%} of what changes is explained "
+            f"({_LEAST_EXPLAINED:.0%} at least), {ratio:.0%} of the contours fit "
+            f"({_LEAST_RATIO:.0%} at least), and edges along them are stronger than elsewhere by "
+            f"{best.contour:.2f} ({_LEAST_CONTOUR} at least); the first, and {_CONTOURS:g} times "
+            f"the last, are {told:.2f} together ({_LEAST_EVIDENCE} at least)",
         )
     deviations = np.sqrt(np.diag(covariance))
     pose = fit.camera_covariances(best.found, covariance)[0]

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_pose.compiled import compiled
-from drake_pose.fit.kernel import add_residual, seen_from
+from drake_pose.fit.kernel import add_pull, add_pulls, count_distance, seen_from
 from drake_pose.silhouette.areas.outline import PackedOutlines
 from drake_pose.silhouette.contours.contour_points import sample_contour
 
@@ -90,7 +90,7 @@ def compare_lines(
     contour = sample_contour(packed, seen_from(camera[0], X_WN), camera[1], weights[2])
     uv, normals, lengths, nodes, p_N, clearances = contour
     noise = (weights[1] / 2.5) ** 2
-    rows, p, w = np.empty((2, 3)), np.empty(3), np.empty(12)
+    pulls = np.zeros((len(uv), 7))
     scratch, place = np.empty((3, 2 * _BLOCKS + 2)), np.empty(2)
     for i in range(len(uv)):
         node = nodes[i]
@@ -100,11 +100,12 @@ def compare_lines(
             picture, histograms[node], place, normals[i], clearances[i], step, scratch
         )
         if variance > 0.0:
-            add_residual(
-                A[node], b[node], sums[node], wide[node], X_WN[node], p_N[i], camera,
-                normals[i, 0], normals[i, 1], edge, 1.0,
-                2.0 * lengths[i] / (1.0 + variance / noise), weights, (rows, p, w),
-            )  # fmt: skip
+            length = 2.0 * lengths[i] / (1.0 + variance / noise)
+            weight, _ = count_distance(sums, node, weights, length, edge)
+            add_pull(pulls, i, normals[i, 0], normals[i, 1], edge, weight)
+            pulls[i, 5], pulls[i, 6] = weight * normals[i, 0], weight * normals[i, 1]
+            wide[node, 12] += weight * edge
+    add_pulls(A, b, wide, X_WN, camera, p_N, nodes, nodes, pulls)
 
 
 @compiled

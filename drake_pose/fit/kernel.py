@@ -29,6 +29,8 @@ REACH = 4.0
 
 # Contours correspond only where their normals point alike: at least this cosine.
 _ALIKE = 0.3
+# Points are looked for in squares: so many across the reach, or at most so many in a row.
+_SQUARES_IN_REACH, _MOST_SQUARES = 3.0, 64.0
 
 COMPARED, FITTING, CLOSE, COST, SQUARES, WEIGHT = range(6)
 """The columns of compare_contours' sums."""
@@ -42,35 +44,66 @@ def nearest_alike(
 
     Args:
         uv, normals: (n, 2) points of the body's contour.
-        edge_uv, edge_normals: (k, 2) points of the silhouette's edge, downwards (v ascends).
+        edge_uv, edge_normals: (k, 2) points of the silhouette's edge.
         reach: farther points do not correspond [pixel].
 
     Returns:
         (n,) and (k,) indices.
     """
-    n, k = len(uv), len(edge_uv)
-    of_point, of_edge = np.full(n, -1, dtype=np.int64), np.full(k, -1, dtype=np.int64)
-    nearest = np.full(k, reach * reach)
-    rows = np.ascontiguousarray(edge_uv[:, 1])
-    for i in range(n):
-        best = reach * reach
-        x, y, n0, n1 = uv[i, 0], uv[i, 1], normals[i, 0], normals[i, 1]
-        for j in range(np.searchsorted(rows, y - reach), k):
-            dv = rows[j] - y
-            if dv > reach:
+    return (
+        _nearest_of(uv, normals, edge_uv, edge_normals, reach),
+        _nearest_of(edge_uv, edge_normals, uv, normals, reach),
+    )
+
+
+@compiled
+def _nearest_of(uv: Array, normals: Array, other_uv: Array, others: Array, reach: float) -> Indices:
+    """(n,) for each point the nearest of the others (k, 2) within reach that faces alike, or -1.
+
+    The others are put into squares, and squares are looked at from each point outwards.
+    """
+    found = np.full(len(uv), -1, dtype=np.int64)
+    if len(other_uv) == 0:
+        return found
+    left = right = other_uv[0, 0]
+    top = bottom = other_uv[0, 1]
+    for j in range(len(other_uv)):
+        left, right = min(left, other_uv[j, 0]), max(right, other_uv[j, 0])
+        top, bottom = min(top, other_uv[j, 1]), max(bottom, other_uv[j, 1])
+    side = max(reach / _SQUARES_IN_REACH, max(right - left, bottom - top) / _MOST_SQUARES)
+    columns, rows = int((right - left) / side) + 1, int((bottom - top) / side) + 1
+    squares = np.empty(len(other_uv), dtype=np.int64)
+    starts = np.zeros(rows * columns + 2, dtype=np.int64)
+    for j in range(len(other_uv)):
+        row, column = int((other_uv[j, 1] - top) / side), int((other_uv[j, 0] - left) / side)
+        squares[j] = row * columns + column
+        starts[squares[j] + 1] += 1
+    for square in range(rows * columns + 1):
+        starts[square + 1] += starts[square]
+    order, sorted_others = np.empty(len(other_uv), dtype=np.int64), np.empty((len(other_uv), 4))
+    for j in range(len(other_uv) - 1, -1, -1):
+        # Where a square ends is counted down to where it begins.
+        starts[squares[j] + 1] -= 1
+        k = starts[squares[j] + 1]
+        order[k], sorted_others[k, 0], sorted_others[k, 1] = j, other_uv[j, 0], other_uv[j, 1]
+        sorted_others[k, 2], sorted_others[k, 3] = others[j, 0], others[j, 1]
+    for i in range(len(uv)):
+        best, x, y = reach * reach, uv[i, 0], uv[i, 1]
+        row, column = math.floor((y - top) / side), math.floor((x - left) / side)
+        for ring in (1, math.ceil(reach / side)):
+            first, end = max(column - ring, 0), min(column + ring + 1, columns)
+            for v in range(max(row - ring, 0), min(row + ring + 1, rows) if first < end else 0):
+                for k in range(starts[v * columns + first + 1], starts[v * columns + end + 1]):
+                    du, dv = sorted_others[k, 0] - x, sorted_others[k, 1] - y
+                    square = du * du + dv * dv
+                    if square < best:
+                        alike = normals[i, 0] * sorted_others[k, 2]
+                        if alike + normals[i, 1] * sorted_others[k, 3] >= _ALIKE:
+                            best, found[i] = square, order[k]
+            # All that is nearer than a square is wide was looked at.
+            if best <= side * side:
                 break
-            du = edge_uv[j, 0] - x
-            square = du * du + dv * dv
-            if square < best or square < nearest[j]:
-                if n0 * edge_normals[j, 0] + n1 * edge_normals[j, 1] < _ALIKE:
-                    continue
-                if square < best:
-                    best = square
-                    of_point[i] = j
-                if square < nearest[j]:
-                    nearest[j] = square
-                    of_edge[j] = i
-    return of_point, of_edge
+    return found
 
 
 @compiled
@@ -113,42 +146,44 @@ def compare_contours(
     A, b = np.zeros((count, nodes, 12, 12)), np.zeros((count, nodes, 12))
     sums, pieces = np.zeros((count, nodes + 1, 6)), np.zeros((count, squares, squares))
     wide = np.zeros((count, nodes, 13))
-    rows, p, w = np.empty((2, 3)), np.empty(3), np.empty(12)
     for c in range(count):
         begin, end = edges.starts[c], edges.starts[c + 1]
         if begin == end:
             continue
-        camera = (cameras[0][c], cameras[1][c])
-        own_A, own_b, own_sums = A[c], b[c], sums[c]
+        camera, own_sums, own_weights = (cameras[0][c], cameras[1][c]), sums[c], weights[c]
         unit, scale, spacing, worth = weights[c, 0], weights[c, 1], weights[c, 2], weights[c, 3]
         contour = sample_contour(packed, seen_from(camera[0], X_WN), camera[1], spacing)
         uv, normals = contour.uv, contour.normals
         edge_uv, edge_normals = edges.uv[begin:end], edges.normals[begin:end]
         of_point, of_edge = nearest_alike(uv, normals, edge_uv, edge_normals, REACH * scale)
         n = len(uv)
+        pulls = np.zeros((n, 7))
         for pair in range(n + len(edge_uv)):
             i = pair if pair < n else of_edge[pair - n]
             j = of_point[pair] if pair < n else pair - n
             length = contour.lengths[i] if pair < n else edges.lengths[begin + j]
-            counted = own_sums[contour.nodes[i] if pair < n else nodes]
+            counted = contour.nodes[i] if pair < n else nodes
             cost = worth * length * scale * scale
             if i < 0 or j < 0:
-                counted[COMPARED] += length * unit
-                counted[COST] += cost
+                own_sums[counted, COMPARED] += length * unit
+                own_sums[counted, COST] += cost
             else:
                 n0, n1 = normals[i, 0] + edge_normals[j, 0], normals[i, 1] + edge_normals[j, 1]
                 size = math.sqrt(n0 * n0 + n1 * n1)
                 n0, n1 = n0 / size, n1 / size
                 r = (edge_uv[j, 0] - uv[i, 0]) * n0 + (edge_uv[j, 1] - uv[i, 1]) * n1
-                grows = edge_normals[j, 0] * n0 + edge_normals[j, 1] * n1 if widths else 0.0
-                node = contour.nodes[i]
-                cost = add_residual(
-                    own_A[node], own_b[node], counted, wide[c, node], X_WN[node], contour.p_N[i],
-                    camera, n0, n1, r, grows, length, weights[c], (rows, p, w),
-                )  # fmt: skip
+                weight, cost = count_distance(own_sums, counted, own_weights, length, r)
+                add_pull(pulls, i, n0, n1, r, weight)
+                if widths:
+                    grows = weight * (edge_normals[j, 0] * n0 + edge_normals[j, 1] * n1)
+                    pulls[i, 5] += grows * n0
+                    pulls[i, 6] += grows * n1
+                    wide[c, contour.nodes[i], 12] += grows * r
             if squares > 0:
                 u, v = (uv[i, 0], uv[i, 1]) if pair < n else (edge_uv[j, 0], edge_uv[j, 1])
                 pieces[c, math.floor(v / side) % squares, math.floor(u / side) % squares] += cost
+        owners = contour.nodes
+        add_pulls(A[c], b[c], wide[c], X_WN, camera, contour.p_N, owners, owners, pulls)
     return A, b, sums, pieces, wide
 
 
@@ -163,104 +198,109 @@ def seen_from(X_CW: Array, X_WN: Array) -> Array:
 
 
 @compiled
-def _picture_rows(p_W: Array, X_CW: Array, camera: Array, rows: Array) -> None:
-    """Writes du/dp_W and dv/dp_W (2, 3) of a point."""
-    x, y, z = X_CW[0, 3], X_CW[1, 3], X_CW[2, 3]
-    for k in range(3):
-        x += X_CW[0, k] * p_W[k]
-        y += X_CW[1, k] * p_W[k]
-        z += X_CW[2, k] * p_W[k]
-    for k in range(3):
-        if camera[0] == 1.0:
-            rows[0, k] = camera[1] * X_CW[0, k]
-            rows[1, k] = camera[2] * X_CW[1, k]
-        else:
-            rows[0, k] = camera[1] * (X_CW[0, k] - X_CW[2, k] * x / z) / z
-            rows[1, k] = camera[2] * (X_CW[1, k] - X_CW[2, k] * y / z) / z
-
-
-@compiled
-def add_residual(
-    A: Array,
-    b: Array,
-    sums: Array,
-    wide: Array,
-    X_WN: Array,
-    p_N: Array,
-    camera: tuple[Array, Array],
-    n0: float,
-    n1: float,
-    r: float,
-    grows: float,
-    length: float,
-    weights: Array,
-    scratch: tuple[Array, Array, Array],
-) -> float:
-    """Adds one distance in a picture to a node's A (12, 12), lower triangle, and b (12,).
+def count_distance(
+    sums: Array, row: int, weights: Array, length: float, r: float
+) -> tuple[float, float]:
+    """Counts a distance in a row of the sums of `compare_contours`.
 
     Args:
-        A, b, sums, wide: added to, as of `compare_contours`.
-        X_WN: (4, 4) of the node.
-        p_N: (3,) its point.
-        camera: X_CW (4, 4) and kernel parameters (8,).
-        n0, n1: the direction along which the point is to move.
-        r: by how much [pixel].
-        grows: by how much more as the silhouette grows by a pixel on all sides; 0: not told.
-        length: of the contour that the point stands for [pixel].
+        sums: (rows, 6) added to.
+        row: the node's.
         weights: (4,) as of `compare_contours`.
-        scratch: (2, 3), (3,) and (12,).
+        length: of the contour that the point stands for [pixel].
+        r: the distance [pixel].
 
     Returns:
-        The cost.
+        What its square weighs, and the cost.
     """
     unit, scale, worth = weights[0], weights[1], weights[3]
     t = (r / scale) ** 2
     cost = worth * length * r * r / (1.0 + t)
     weight = worth * length / (1.0 + t) ** 2
-    sums[COMPARED] += length * unit
+    sums[row, COMPARED] += length * unit
     if t < 1.0:
-        sums[FITTING] += length * unit
-    sums[CLOSE] += length * unit / (1.0 + t)
-    sums[COST] += cost
-    sums[SQUARES] += weight * r * r
-    sums[WEIGHT] += weight
-    add_row(A, b, X_WN, p_N, camera, n0, n1, r, weight, scratch)
-    if grows != 0.0:
-        for k in range(12):
-            wide[k] += weight * grows * scratch[2][k]
-        wide[12] += weight * grows * r
-    return cost
+        sums[row, FITTING] += length * unit
+    sums[row, CLOSE] += length * unit / (1.0 + t)
+    sums[row, COST] += cost
+    sums[row, SQUARES] += weight * r * r
+    sums[row, WEIGHT] += weight
+    return weight, cost
 
 
 @compiled
-def add_row(
-    A: Array,
-    b: Array,
-    X_WN: Array,
-    p_N: Array,
-    camera: tuple[Array, Array],
-    n0: float,
-    n1: float,
-    r: float,
-    weight: float,
-    scratch: tuple[Array, Array, Array],
-) -> None:
-    """As add_residual, of a distance that has its weight."""
-    rows, p, w = scratch
-    for k in range(3):
-        p[k] = X_WN[k, 3]
-        for c in range(3):
-            p[k] += X_WN[k, c] * p_N[c]
-    _picture_rows(p, camera[0], camera[1], rows)
-    for k in range(3):
-        along = n0 * rows[0, k] + n1 * rows[1, k]
-        w[4 * k], w[4 * k + 1] = along * p[0], along * p[1]
-        w[4 * k + 2], w[4 * k + 3] = along * p[2], along
-    for k in range(12):
-        share = weight * w[k]
-        b[k] += share * r
-        for c in range(k + 1):
-            A[k, c] += share * w[c]
+def add_pull(pulls: Array, i: int, n0: float, n1: float, r: float, weight: float) -> None:
+    """Adds a weighted distance r [pixel] along (n0, n1) to a row of the pulls of `add_pulls`."""
+    pulls[i, 0] += weight * n0 * n0
+    pulls[i, 1] += weight * n0 * n1
+    pulls[i, 2] += weight * n1 * n1
+    pulls[i, 3] += weight * n0 * r
+    pulls[i, 4] += weight * n1 * r
+
+
+@compiled
+def add_pulls(
+    A: Array, b: Array, wide: Array, X_WN: Array, camera: tuple[Array, Array], p_N: Array,
+    nodes: Indices, owners: Indices, pulls: Array,
+) -> None:  # fmt: skip
+    """Adds what pulls at points in a picture to the nodes' A, lower triangles, and b.
+
+    All that pulls at one point of a contour is added up in the picture first.
+
+    Args:
+        A, b, wide: (nodes, 12, 12), (nodes, 12) and (nodes, 13) added to, as of
+            `compare_contours`.
+        X_WN: (nodes, 4, 4).
+        camera: X_CW (4, 4) and kernel parameters (8,).
+        p_N: (n, 3) the points.
+        nodes, owners: (n,) the nodes in which they are given, and with which they are moved.
+        pulls: (n, 7) sums over what pulls at each, weighted: of n n^T (00, 01, 11), of n r and of
+            n times by how much r grows as the silhouette grows by a pixel.
+    """
+    X_CW, lens = camera
+    p, rows, H = np.ones(4), np.zeros((2, 3)), np.zeros((3, 3))
+    for i in range(len(pulls)):
+        if pulls[i, 0] + pulls[i, 2] == 0.0:
+            continue
+        node, owner = nodes[i], owners[i]
+        for k in range(3):
+            p[k] = X_WN[node, k, 3]
+            for c in range(3):
+                p[k] += X_WN[node, k, c] * p_N[i, c]
+        # du/dp_W and dv/dp_W.
+        u = v = 0.0
+        share = 1.0
+        if lens[0] != 1.0:
+            for k in range(4):
+                u, v = u + X_CW[0, k] * p[k], v + X_CW[1, k] * p[k]
+            z = X_CW[2, 0] * p[0] + X_CW[2, 1] * p[1] + X_CW[2, 2] * p[2] + X_CW[2, 3]
+            share = 1.0 / z
+            u, v = u * share, v * share
+        for k in range(3):
+            rows[0, k] = lens[1] * share * (X_CW[0, k] - X_CW[2, k] * u)
+            rows[1, k] = lens[2] * share * (X_CW[1, k] - X_CW[2, k] * v)
+        for k in range(3):
+            across = pulls[i, 0] * rows[0, k] + pulls[i, 1] * rows[1, k]
+            along = pulls[i, 1] * rows[0, k] + pulls[i, 2] * rows[1, k]
+            for c in range(k + 1):
+                H[k, c] = across * rows[0, c] + along * rows[1, c]
+        for k in range(3):
+            pull = pulls[i, 3] * rows[0, k] + pulls[i, 4] * rows[1, k]
+            for c in range(4):
+                b[owner, 4 * k + c] += pull * p[c]
+            for m in range(k + 1):
+                for j in range(4):
+                    slope = H[k, m] * p[j]
+                    for c in range(4):
+                        A[owner, 4 * k + j, 4 * m + c] += slope * p[c]
+        if pulls[i, 5] != 0.0 or pulls[i, 6] != 0.0:
+            for k in range(3):
+                grows = pulls[i, 5] * rows[0, k] + pulls[i, 6] * rows[1, k]
+                for c in range(4):
+                    wide[owner, 4 * k + c] += grows * p[c]
+    for node in range(len(A)):
+        for k in range(11):
+            for c in range(k + 1, 12):
+                A[node, k, c] = 0.0
 
 
 @compiled

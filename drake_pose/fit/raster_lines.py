@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_pose.compiled import compiled
-from drake_pose.fit.kernel import add_row, seen_from
+from drake_pose.fit.kernel import add_pull, add_pulls, seen_from
 from drake_pose.silhouette.areas.outline import PackedOutlines
 from drake_pose.silhouette.contours.contour_points import (
     find_crossings,
@@ -136,7 +136,7 @@ def compare_raster(
     chosen = np.empty(most, dtype=np.int64)
     places, slopes = np.empty(most), np.empty(most)
     weights, residuals = np.empty(most), np.empty(most)
-    p_N, scratch = np.empty(3), (np.empty((2, 3)), np.empty(3), np.empty(12))
+    wide = np.zeros((len(X_WN), 13))
     for across in range(2):
         border_starts = border.row_starts if across == 0 else border.column_starts
         border_places = border.row_places if across == 0 else border.column_places
@@ -145,6 +145,10 @@ def compare_raster(
         extent = camera[1][6 + across] - 0.5
         count = (int(camera[1][7 - across]) - 1 - offset) // stride + 1
         crossings = find_crossings(segments, across, float(offset), float(stride), count)
+        # Of each crossing, and once more where skin follows another node, too.
+        p_N, pulls = np.empty((2 * len(crossings[1]), 3)), np.zeros((2 * len(crossings[1]), 7))
+        labels = np.empty((2, len(pulls)), dtype=np.int64)
+        pulling = 0
         for line in range(count):
             at = offset + line * stride
             first, end = border_starts[at], border_starts[at + 1]
@@ -180,10 +184,6 @@ def compare_raster(
                 near, far = segments.depths[s, 0], segments.depths[s, 1]
                 share = share * near / (share * near + (1.0 - share) * far)
                 i, j = segments.vertices[s, 0], segments.vertices[s, 1]
-                for axis in range(3):
-                    begin, after = packed.points[axis, i], packed.points[axis, j]
-                    p_N[axis] = (1.0 - share) * begin + share * after
-                own = (1.0 - share) * skin.shares[i] + share * skin.shares[j]
                 # The normal that points on along the line, as the residuals do.
                 du, dv = ends[s, 2] - ends[s, 0], ends[s, 3] - ends[s, 1]
                 size = math.sqrt(du * du + dv * dv)
@@ -193,16 +193,18 @@ def compare_raster(
                 squares += weight * residual * residual
                 # A share of a weight for each node that the point follows: the slope is exact, and
                 # the curvature no less than it is.
-                add_row(
-                    A[node], b[node], X_WN[node], p_N, camera, dv / size, -du / size, -residual,
-                    own * weight, scratch,
-                )  # fmt: skip
-                if own < 1.0:
-                    parent = skin.parents[node]
-                    add_row(
-                        A[parent], b[parent], X_WN[node], p_N, camera, dv / size, -du / size,
-                        -residual, (1.0 - own) * weight, scratch,
-                    )  # fmt: skip
+                own = (1.0 - share) * skin.shares[i] + share * skin.shares[j]
+                for part in range(2 if own < 1.0 else 1):
+                    labels[0, pulling] = node
+                    labels[1, pulling] = node if part == 0 else skin.parents[node]
+                    for axis in range(3):
+                        begin, after = packed.points[axis, i], packed.points[axis, j]
+                        p_N[pulling, axis] = (1.0 - share) * begin + share * after
+                    share_of_it = own if part == 0 else 1.0 - own
+                    add_pull(pulls, pulling, dv / size, -du / size, -residual, share_of_it * weight)
+                    pulling += 1
+        nodes, owners = labels
+        add_pulls(A, b, wide, X_WN, camera, p_N, nodes[:pulling], owners[:pulling], pulls[:pulling])
     return stride * apart, total, squares
 
 

@@ -59,7 +59,8 @@ def find_segments(
     capacity, count = 1024, 0
     ends, depths = np.empty((capacity, 4)), np.empty((capacity, 2))
     labels = np.empty((capacity, 4), dtype=np.int64)
-    u, v, facings, edges, points = rows.u, rows.v, rows.facings, packed.edges, packed.points
+    u, v, facings, points = rows.u, rows.v, rows.facings, packed.points
+    chosen = np.empty(packed.edges.shape[1], dtype=np.uint32)
     for node in range(X_CN.shape[0]):
         if not wanted[node]:
             continue
@@ -76,17 +77,23 @@ def find_segments(
                     depth = X[2, 0] * points[0, i] + X[2, 1] * points[1, i]
                     if not depth + X[2, 2] * points[2, i] + X[2, 3] >= camera[5]:
                         facings[t] = 0
-        for e in range(packed.starts[node, 2], packed.starts[node + 1, 2]):
-            weight = int(facings[edges[2, e]]) + int(packed.sides[e]) * int(facings[edges[3, e]])
-            if weight == 0:
-                continue
-            if count == capacity:
-                capacity *= 2
-                ends, depths = with_room(ends, count, capacity), with_room(depths, count, capacity)
-                labels = with_room(labels, count, capacity)
+        begin, end = packed.starts[node, 2], packed.starts[node + 1, 2]
+        sides = packed.sides[begin:end]
+        before, behind = packed.edges[2, begin:end], packed.edges[3, begin:end]
+        found = 0
+        for e in range(len(sides)):
+            # No branch, which the processor would guess wrong.
+            chosen[found] = e
+            found += facings[before[e]] + sides[e] * facings[behind[e]] != 0
+        if count + found > capacity:
+            capacity = 2 * (count + found)
+            ends, depths = with_room(ends, count, capacity), with_room(depths, count, capacity)
+            labels = with_room(labels, count, capacity)
+        for e in chosen[:found]:
+            weight = int(facings[before[e]]) + int(sides[e]) * int(facings[behind[e]])
             labels[count, 0], labels[count, 1] = weight, node
             for k in range(2):
-                i = np.int64(edges[k, e])
+                i = np.int64(packed.edges[k, begin + e])
                 ends[count, 2 * k], ends[count, 2 * k + 1] = u[i], v[i]
                 i += first
                 labels[count, 2 + k], depths[count, k] = i, 1.0
@@ -133,9 +140,9 @@ def find_crossings(
     used = starts[:-1].copy()
     for s in range(ends.shape[0]):
         a, b = ends[s, 1 - across], ends[s, 3 - across]
+        slope = (ends[s, 2 + across] - ends[s, across]) / (b - a)
         for line in range(begin[s], after[s]):
-            share = (first + line * spacing - a) / (b - a)
-            place = ends[s, across] + share * (ends[s, 2 + across] - ends[s, across])
+            place = ends[s, across] + (first + line * spacing - a) * slope
             k = used[line]
             used[line] += 1
             while k > starts[line] and places[k - 1] > place:

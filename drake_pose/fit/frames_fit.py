@@ -19,6 +19,7 @@ from drake_pose.fit.contour_fit import (
     Comparison,
     ContourFit,
     Noise,
+    compare_views,
     pixels_per_metre,
     symmetric,
 )
@@ -32,7 +33,12 @@ from drake_pose.fit.levenberg_marquardt import (
     StepSettings,
     minimise,
 )
-from drake_pose.fit.parameters import CAMERA_NAMES, BodyParameters, CameraParameters
+from drake_pose.fit.parameters import (
+    CAMERA_NAMES,
+    BodyParameters,
+    CameraParameters,
+    Placement,
+)
 from drake_pose.fit.unknowns import Unknowns
 
 Array = NDArray[np.float64]
@@ -153,6 +159,13 @@ class FramesFit:
         self._values = len(kinematics.names)
         places = (unknowns.entries >= self._values) & (unknowns.entries < len(body.names))
         self._stays = not places.any()
+        # A body of which nothing is unknown stands still, and all its nodes move with the camera.
+        self._stands = not np.any(unknowns.entries <= len(body.names))
+        self._placed: dict[bytes, Placement] = {}
+        self._last_look: tuple[bytes, tuple[Array, Array, Array]] = (
+            b"",
+            self._cameras.place(np.zeros(len(self._cameras.names))),
+        )
 
     def fit(
         self,
@@ -277,6 +290,8 @@ class FramesFit:
         u = len(self.unknowns.entries)
         H, g = np.zeros((u, u)), np.zeros(u)
         for moves, A, b in told:
+            if self._stands:
+                moves, A, b = moves[:1], A.sum(axis=0)[None], b.sum(axis=0)[None]
             rows, pulled = (
                 np.swapaxes(one, 0, 1).reshape(u, -1) for one in (moves, moves @ symmetric(A))
             )
@@ -302,18 +317,17 @@ class FramesFit:
         """
         places, seen = self.places(theta), _whole(evidence)
         views = self._views(seen.edges, theta, places)
-        compared = self._contours.compare(
-            views, self._of_body(theta, seen.rates), step, len(self._widths) > 0
-        )
-        placed = compared.placement
+        placed = self._placement(self._of_body(theta, seen.rates))
+        weights = self._contours.weights(views.cameras, placed, step)
+        compared = compare_views(views, placed, weights, len(self._widths) > 0)
         for c, picture in enumerate(seen.odds):
             if picture is not None:
-                weights = self._contours.weights(places[:2], placed, step)[c]
-                weights[2] = max(weights[2], _LINE_SPACING)
-                offset, width = max(1, round(weights[1] * _OFFSET)), theta[self._first_width + c]
+                own = weights[c].copy()
+                own[2] = max(own[2], _LINE_SPACING)
+                offset, width = max(1, round(own[1] * _OFFSET)), theta[self._first_width + c]
                 compare_lines(
                     placed.packed, placed.X_WN, (places[0][c], places[1][c]), picture,
-                    self._of_odds, weights, offset, compared.A[c], compared.b[c],
+                    self._of_odds, own, offset, compared.A[c], compared.b[c],
                     compared.sums[c], compared.wide[c], width,
                 )  # fmt: skip
         return compared, places
@@ -325,6 +339,15 @@ class FramesFit:
         seen = _whole(evidence)
         views = self._views(seen.edges, theta, self.places(theta))
         return self._contours.piece_costs(views, self._of_body(theta, seen.rates), step, side)
+
+    def _placement(self, own: Array) -> Placement:
+        """The body at its parameters; where it stands still in each frame, found once."""
+        if not self._stands:
+            return self.body.place(own)
+        key = own.tobytes()
+        if key not in self._placed:
+            self._placed[key] = self.body.place(own)
+        return self._placed[key]
 
     def _of_body(self, theta: Array, rates: Array | None) -> Array:
         """The body's parameters, the tree's values alone where all others are 0."""
@@ -341,7 +364,11 @@ class FramesFit:
 
     def places(self, theta: Array) -> tuple[Array, Array, Array]:
         """The cameras at all parameters (n,), as of ``CameraParameters.place``."""
-        return self._cameras.place(theta[self._first_look : self._first_width])
+        look = theta[self._first_look : self._first_width]
+        # One frame after another mostly asks for the same.
+        if look.tobytes() != self._last_look[0]:
+            self._last_look = look.tobytes(), self._cameras.place(look)
+        return self._last_look[1]
 
     def pictures(
         self, frames: Sequence[Evidence | FrameEvidence], parameters: Array, step: AnnealingStage

@@ -38,29 +38,19 @@ COMPARED, FITTING, CLOSE, COST, SQUARES, WEIGHT = range(6)
 
 @compiled
 def nearest_alike(
-    uv: Array, normals: Array, edge_uv: Array, edge_normals: Array, reach: float
-) -> tuple[Indices, Indices]:
-    """The nearest edge point of each contour point, and the other way round; -1 where none is.
+    uv: Array, normals: Array, other_uv: Array, others: Array, reach: float
+) -> Indices:
+    """The nearest point that faces alike; -1 where none is.
+
+    The others are put into squares, and squares are looked at from each point outwards.
 
     Args:
-        uv, normals: (n, 2) points of the body's contour.
-        edge_uv, edge_normals: (k, 2) points of the silhouette's edge.
+        uv, normals: (n, 2) points of a contour or an edge.
+        other_uv, others: (k, 2) points of the other one, and their normals.
         reach: farther points do not correspond [pixel].
 
     Returns:
-        (n,) and (k,) indices.
-    """
-    return (
-        _nearest_of(uv, normals, edge_uv, edge_normals, reach),
-        _nearest_of(edge_uv, edge_normals, uv, normals, reach),
-    )
-
-
-@compiled
-def _nearest_of(uv: Array, normals: Array, other_uv: Array, others: Array, reach: float) -> Indices:
-    """(n,) for each point the nearest of the others (k, 2) within reach that faces alike, or -1.
-
-    The others are put into squares, and squares are looked at from each point outwards.
+        (n,) indices.
     """
     found = np.full(len(uv), -1, dtype=np.int64)
     if len(other_uv) == 0:
@@ -155,7 +145,8 @@ def compare_contours(
         contour = sample_contour(packed, seen_from(camera[0], X_WN), camera[1], spacing)
         uv, normals = contour.uv, contour.normals
         edge_uv, edge_normals = edges.uv[begin:end], edges.normals[begin:end]
-        of_point, of_edge = nearest_alike(uv, normals, edge_uv, edge_normals, REACH * scale)
+        of_point = nearest_alike(uv, normals, edge_uv, edge_normals, REACH * scale)
+        of_edge = nearest_alike(edge_uv, edge_normals, uv, normals, REACH * scale)
         n = len(uv)
         pulls = np.zeros((n, 7))
         for pair in range(n + len(edge_uv)):

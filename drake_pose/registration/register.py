@@ -62,8 +62,8 @@ _ROUGH = (2000, 15)
 FIRST_SIDE, SECOND_SIDE = 40.0, 100.0
 # Poses that show the bodies nearer to each other than this are one [root of the area].
 _APART = 0.03
-# So many poses are fitted finely.
-_KEPT = 6
+# After so many parts of the coarse fit so many poses go on, and so many are fitted finely.
+_FIRST_LOOK, _HOPEFUL, _KEPT = 3, 12, 6
 # So often frames that agree are fitted again.
 _AGAIN = 2
 # What is missing or too much is about as large [root of the area].
@@ -246,9 +246,12 @@ class CameraSearch:
         starts[:, :3, :3] = self._R_CW
         starts[:, :3, 3] = place_by_bounds(posed, self._R_CW)
         order = np.argsort(mean_misfit(posed, starts, FIRST_SIDE), kind="stable")
-        found = [fit_pose(posed, starts[k], COARSE) for k in order[: self._fitted_count]]
-        off = mean_misfit(posed, np.array(found), SECOND_SIDE)
-        return distinct(posed, [found[k] for k in np.argsort(off, kind="stable")])[:kept]
+        looks = [starts[k] for k in order[: self._fitted_count]]
+        for part, count in ((COARSE[:_FIRST_LOOK], _HOPEFUL), (COARSE[_FIRST_LOOK:], kept)):
+            found = [fit_pose(posed, X_CW, part) for X_CW in looks]
+            off = mean_misfit(posed, np.array(found), SECOND_SIDE)
+            looks = distinct(posed, [found[k] for k in np.argsort(off, kind="stable")])[:count]
+        return looks
 
 
 def describe_fitted(

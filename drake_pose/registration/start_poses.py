@@ -18,7 +18,7 @@ T = TypeVar("T")
 # Alexa's constants: psi is the positive root of x^4 = x + 4.
 _PHI, _PSI = np.sqrt(2.0), 1.533751168755204288118041
 # The bounds are met in so many steps of Gauss and Newton's method, the last ones robust ones.
-_PLACING_STEPS, _ROBUST_FROM = 8, 2
+_PLACING_STEPS, _ROBUST_FROM = 5, 2
 # A side that is off by so much of the silhouettes' size says a quarter of what it would.
 _ROBUST_SCALE = 0.5
 # Points are no nearer to the camera than this share of the bodies' extent.

@@ -81,7 +81,8 @@ def test_nearest_points_against_brute_force():
         return uv[np.argsort(uv[:, 1])], np.column_stack([np.cos(angle), np.sin(angle)])
 
     (uv, normals), (edge_uv, edge_normals) = cloud(70), cloud(90)
-    of_point, of_edge = nearest_alike(uv, normals, edge_uv, edge_normals, 9.0)
+    of_point = nearest_alike(uv, normals, edge_uv, edge_normals, 9.0)
+    of_edge = nearest_alike(edge_uv, edge_normals, uv, normals, 9.0)
     distance = np.linalg.norm(uv[:, None] - edge_uv[None], axis=2)
     distance[(normals @ edge_normals.T < 0.3) | (distance >= 9.0)] = np.inf
     for found, expected in ((of_point, distance), (of_edge, distance.T)):

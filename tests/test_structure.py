@@ -34,7 +34,10 @@ VALUE_TYPES = {
 }
 
 # Beside the rooms, for all of them.
-FOR_ALL = {"arrays", "compiled", "csv_files", "errors", "regular_files", "version", "yaml_files"}
+FOR_ALL = {
+    *("arrays", "compiled", "csv_files", "errors", "regular_files", "version", "workers"),
+    "yaml_files",
+}
 
 MOST_FILES = 20
 MOST_LINES = 60

@@ -126,6 +126,8 @@ class EstimateSettings(CaptureSettings, EpisodeSettings):
     """beam: beam search and continuous fit; paper: Kameda, Minoh and Ikeda's search as published;
     person: one person, fitted to all cameras' silhouettes at once; auto: person if model, cameras
     and options allow it, else beam."""
+    workers: Annotated[int | None, Parameter(metavar="N")] = None
+    """Work with so many threads; the result is the same. Default: one for each core."""
     angles: Literal["continuous", "grid"] = "continuous"
     """continuous: poses are refined between coarse samples; grid: multiples of the sampling
     interval only, and the search ends where the silhouettes are matched exactly. Method beam only.
@@ -133,8 +135,8 @@ class EstimateSettings(CaptureSettings, EpisodeSettings):
 
     def __post_init__(self) -> None:
         require_choices(self)
-        for name in ("candidates", "run_limit"):
-            if getattr(self, name) < 1:
+        for name in ("candidates", "run_limit", "workers"):
+            if getattr(self, name) is not None and getattr(self, name) < 1:
                 raise SettingsError(f"{name} must be 1 or more, not {getattr(self, name)}")
         if self.time_limit is not None and not self.time_limit >= 0.0:
             raise SettingsError(f"time_limit must be 0 or more, not {self.time_limit}")
@@ -151,16 +153,16 @@ class EstimateSettings(CaptureSettings, EpisodeSettings):
     @property
     def search_settings(self) -> tuple[str, ...]:
         """The names of those that only a search heeds and that are not at their defaults."""
-        own = set(EstimateSettings.__annotations__) - {"method"}
+        own = set(EstimateSettings.__annotations__) - {"method", "workers"}
         return tuple(name for name in changed(self) if name in own)
 
     def as_json(self) -> dict[str, Any]:
-        """Returns the settings as plain JSON values."""
-        turns = self.root_rotation
+        """Returns the settings that make the result as plain JSON values."""
+        values, turns = super().as_json(), self.root_rotation
+        del values["workers"]
         if isinstance(turns, Mapping):
-            listed = [[axis, *limits] for axis, limits in turns.items()]
-            return super().as_json() | {"root_rotation": listed}
-        return super().as_json()
+            values["root_rotation"] = [[axis, *limits] for axis, limits in turns.items()]
+        return values
 
 
 def changed(settings: Any) -> tuple[str, ...]:

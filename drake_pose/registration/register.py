@@ -11,6 +11,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from itertools import combinations
 
 import numpy as np
@@ -42,6 +43,7 @@ from drake_pose.registration.start_poses import (
 from drake_pose.silhouette.areas.bending import TreeSurfaces
 from drake_pose.silhouette.areas.outline import outline_from_mesh
 from drake_pose.silhouette.areas.scoring import draw_mask
+from drake_pose.workers import map_ordered
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -230,10 +232,10 @@ class CameraSearch:
         kinematics = self._body.kinematics
         fine = PosedFrames(kinematics, self._body.few, camera, frames, FINE_SPACING)
         last = PosedFrames(kinematics, self._body.all, camera, frames, LAST_SPACING)
-        likely = _likely(fine, [fit_pose(fine, X_CW, FINE) for X_CW in looks])
-        fitted = [fit_pose(last, X_CW, LAST) for X_CW in likely]
+        likely = _likely(fine, map_ordered(partial(_fit_from, fine, FINE), looks))
+        fitted = map_ordered(partial(_fit_from, last, LAST), likely)
         fits = [SharedFit([last], [X_CW]) for X_CW in distinct(last, fitted)]
-        return describe_fitted([(fit, with_widths(fit)) for fit in fits])[0]
+        return describe_fitted([*zip(fits, map_ordered(with_widths, fits), strict=True)])[0]
 
     def search(
         self, camera: PinholeCamera, frames: Sequence[PosedFrame], kept: int = _KEPT
@@ -248,10 +250,15 @@ class CameraSearch:
         order = np.argsort(mean_misfit(posed, starts, FIRST_SIDE), kind="stable")
         looks = [starts[k] for k in order[: self._fitted_count]]
         for part, count in ((COARSE[:_FIRST_LOOK], _HOPEFUL), (COARSE[_FIRST_LOOK:], kept)):
-            found = [fit_pose(posed, X_CW, part) for X_CW in looks]
+            found = map_ordered(partial(_fit_from, posed, part), looks)
             off = mean_misfit(posed, np.array(found), SECOND_SIDE)
             looks = distinct(posed, [found[k] for k in np.argsort(off, kind="stable")])[:count]
         return looks
+
+
+def _fit_from(frames: PosedFrames, rounds: Sequence[AnnealingStage], X_CW: Array) -> Array:
+    """As ``fit_pose``, of one pose after another."""
+    return fit_pose(frames, X_CW, rounds)
 
 
 def describe_fitted(

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from drake_pose.registration.posed_frames import PosedFrames
 from drake_pose.silhouette.areas.scoring import score_bodies
+from drake_pose.workers import map_ordered
 
 Array = NDArray[np.float64]
 T = TypeVar("T")
@@ -138,10 +139,13 @@ def areas(frames: PosedFrames, X_CW: Array, side: float) -> Array:
     """
     camera, sums = frames.smaller(side)
     found = np.empty((len(X_CW), len(frames.frames), 3))
-    for k, X_WN in enumerate(frames.X_WN):
-        scored = score_bodies(frames.outlines, X_CW[:, None] @ X_WN[None], camera, sums[[k]])
-        found[:, k, [0, 2]] = scored
+
+    def score(k: int) -> None:
+        X_CN = X_CW[:, None] @ frames.X_WN[k][None]
+        found[:, k, [0, 2]] = score_bodies(frames.outlines, X_CN, camera, sums[[k]])
         found[:, k, 1] = sums[k, :, -1].sum()
+
+    map_ordered(score, range(len(frames.frames)))
     return found
 
 

@@ -14,6 +14,7 @@ from drake_pose.jobs.estimate.body_fit import fit_body
 from drake_pose.jobs.estimate.inputs import read_inputs
 from drake_pose.jobs.estimate.matching import compare_cameras, match_frames
 from drake_pose.jobs.estimate.person import follow_person
+from drake_pose.workers import working
 
 
 @writes_folder
@@ -36,11 +37,10 @@ def estimate_scene(
     Args:
         scene: cameras.yaml and masks/<camera>/<frame>.png; or masks/<frame>.png alone, of a camera
             nobody calibrated; or an episode (``open_episode``), followed from where its log begins.
-        out: folder for the result; None writes nothing.
+        out, resume: folder for the result, None writes nothing; to go on with an interrupted one.
         settings: which cameras and frames, the root, the sampling.
         truth: measured joint positions to compare with; None: joint_angles.csv, the episode's log.
         cameras: a camera file in place of the scene's own.
-        resume: go on with an interrupted result in ``out``.
         replay, overlay: whether replay.html is made, and overlays are written.
         on_frame, on_stage: called after each frame; with what is done before the first one.
 
@@ -70,9 +70,10 @@ def estimate_scene(
         else:
             missing = [frame for frame in inputs.frames if frame not in result.rows]
             frames = match_frames(inputs, search, overlay, missing)
-        result.add_all(frames, inputs.frames, on_frame)
-        if search is not None:
-            result.warnings += compare_cameras(inputs, search, result.records, on_stage)
+        with working(settings.workers):
+            result.add_all(frames, inputs.frames, on_frame)
+            if search is not None:
+                result.warnings += compare_cameras(inputs, search, result.records, on_stage)
         result.finish(replay)
     finally:
         result.write_summary()

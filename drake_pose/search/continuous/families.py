@@ -8,6 +8,7 @@ badly (``RobustFamilies``).
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -30,6 +31,7 @@ from drake_pose.search.estimates import (
 )
 from drake_pose.search.refinement import FINE_PASSES, RefinementProblem
 from drake_pose.search.starts.self_motions import Flip, flips
+from drake_pose.workers import map_ordered
 
 # A value is free whose interval is wider than this on either side, angle [rad] and length [m].
 _WIDEST = math.radians(10.0), 0.02
@@ -302,12 +304,15 @@ class RobustFamilies:
         widths = stdtrit(freedom, _ONE_SIDED) * np.sqrt(np.diag(covariance))
         low[free], high[free] = values[free] - widths, values[free] + widths
         wide = widths > np.where(kinematics.is_angle[free], *_MOVED)
-        found = [values]
-        for column in np.flatnonzero(wide) if moves else ():
+
+        def move(way: tuple[int, float]) -> list[np.ndarray]:
+            column, sign = way
             along = np.zeros(len(values))
-            along[free] = covariance[:, column] / covariance[column, column]
-            for way in (-along, along):
-                found += self._move(values, int(free[column]), way, float(widths[column]))
+            along[free] = sign * covariance[:, column] / covariance[column, column]
+            return self._move(values, int(free[column]), along, float(widths[column]))
+
+        ways = itertools.product(np.flatnonzero(wide).tolist() if moves else (), (-1.0, 1.0))
+        found = [values, *itertools.chain.from_iterable(map_ordered(move, ways))]
         # Poses found while one value was moved show what others may be, too.
         moved = free[wide]
         low[moved] = np.minimum(low[moved], np.min(found, axis=0)[moved])

@@ -43,6 +43,7 @@ from drake_pose.search.starts.coarse_search import (
 )
 from drake_pose.search.starts.self_motions import counter_turns, flips
 from drake_pose.silhouette.areas.scoring import draw_mask
+from drake_pose.workers import map_ordered
 
 # Connected pixels, or holes, no larger than this are specks [pixel].
 _SPECK = 6
@@ -263,7 +264,8 @@ class _Run:
         look = AnnealingStage(MEDIUM[0].scale, COARSE[0].spacing)
         best_looks = []
         for group, count in ((flipped, _FLIPPED), (tried, _TRIED)):
-            looks = [FittedPose(one, self._fit.cost(one, look)) for one in group]
+            costs = map_ordered(lambda one: self._fit.cost(one, look), group)
+            looks = [FittedPose(*pair) for pair in zip(group, costs, strict=True)]
             best_looks += distinct(looks, count, kinematics.turns_around, 0.5 * INTERVAL)
         return [self._fit.refine(look.values, MEDIUM) for look in best_looks if self._proceed()]
 

@@ -9,6 +9,8 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
+from threading import Lock
 
 import numpy as np
 
@@ -26,6 +28,7 @@ from drake_pose.fit.kernel import COST
 from drake_pose.fit.levenberg_marquardt import AnnealingStage, StepSettings
 from drake_pose.search.estimates import View
 from drake_pose.silhouette.areas.outline import Outline
+from drake_pose.workers import map_ordered
 
 _STEPS = StepSettings(longest=0.3, damping=1e-2, even_damping=1e-3)
 # From one point of a silhouette's edge to the next, as a share of its size.
@@ -69,24 +72,24 @@ class ViewsFit:
         )
         self.edge_length = max(1.0, float(self._views.evidence.lengths.sum()))
         self.camera_count = len(views)
-        self.evaluations = 0
+        self.evaluations, self._counting = 0, Lock()
 
     def cost(self, values: np.ndarray, step: AnnealingStage) -> float:
         """What does not fit at values (m,) [pixel]."""
-        self.evaluations += 1
+        self._count(1)
         sums = self._fit.compare(self._views, values, step).sums
         return float(sums[..., COST].sum()) / self._scale(step) ** 2
 
     def distances(self, values: np.ndarray, step: AnnealingStage) -> Distances:
         """What is left of the contours' distances at values (m,)."""
-        self.evaluations += 1
+        self._count(1)
         compared = self._fit.compare(self._views, values, step)
         moves, unit = compared.placement.dense(len(values)), error_unit(self.size)
         return distances(self._fit.outlines, self._views.cameras, compared, moves, unit)
 
     def piece_costs(self, values: np.ndarray, step: AnnealingStage) -> np.ndarray:
         """What does not fit at values (m,), by pieces of the pictures that err on their own."""
-        self.evaluations += 1
+        self._count(1)
         side = max(1.0, _PIECE * self.size)
         return self._fit.piece_costs(self._views, values, step, side) / self._scale(step) ** 2
 
@@ -97,8 +100,12 @@ class ViewsFit:
         fixed = self.kinematics.upper <= self.kinematics.lower
         fixed[list(held)] = True
         found = self._fit.fit(self._views, values, rounds, None, fixed)
-        self.evaluations += found.evaluations
+        self._count(found.evaluations)
         return FittedPose(found.values, found.cost / self._scale(rounds[-1]) ** 2)
+
+    def _count(self, evaluations: int) -> None:
+        with self._counting:  # Threads fit side by side.
+            self.evaluations += evaluations
 
     def _scale(self, step: AnnealingStage) -> float:
         return max(FINEST_SCALE, step.scale * self.size)
@@ -122,14 +129,21 @@ def refine_best(
     values = list(starts)
     kept: list[FittedPose] = []
     for rounds, count in parts:
-        refined: list[FittedPose] = []
-        for start in values:
-            if refined and not proceed():
-                break
-            refined.append(fit.refine(start, rounds))
+        found = map_ordered(partial(_refined, fit, rounds, proceed), enumerate(values))
+        refined = [one for one in found if one is not None]
         kept = distinct(refined, count, fit.kinematics.turns_around)
         values = [pose.values for pose in kept]
     return kept
+
+
+def _refined(
+    fit: ViewsFit,
+    rounds: Sequence[AnnealingStage],
+    proceed: Callable[[], bool],
+    start: tuple[int, np.ndarray],
+) -> FittedPose | None:
+    """The how manieth start (m,) refined; the first in any case, others while there is time."""
+    return fit.refine(start[1], rounds) if start[0] == 0 or proceed() else None
 
 
 def distinct(

@@ -1,0 +1,28 @@
+import threading
+
+import pytest
+
+from drake_pose.workers import map_ordered, working
+
+
+@pytest.mark.parametrize("workers", [1, 2, 5])
+def test_results_are_in_the_items_order(workers: int) -> None:
+    assert map_ordered(lambda k: k * k, range(20), workers) == [k * k for k in range(20)]
+
+
+def test_so_many_threads_work_and_each_maps_alone() -> None:
+    together = threading.Barrier(3, timeout=10.0)
+
+    def names(_: int) -> set[str]:
+        together.wait()
+        return set(map_ordered(lambda _: threading.current_thread().name, range(4)))
+
+    with working(3):
+        found = map_ordered(names, range(3))
+    assert [len(one) for one in found] == [1, 1, 1]
+    assert len(set.union(*found)) == 3
+
+
+def test_an_error_comes_out() -> None:
+    with pytest.raises(ZeroDivisionError):
+        map_ordered(lambda k: 1 // k, range(3), 2)

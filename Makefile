@@ -42,6 +42,7 @@ docs: $(VENV)/ready-docs
 DATA ?= $(wildcard ../shared/data)
 bench: $(VENV)/ready-cluster
 	$(PYTHON) -m tests.benchmarks.speed
+	$(PYTHON) -m tests.benchmarks.growth
 	$(PYTHON) -m tests.benchmarks.silhouette_camera
 	$(PYTHON) -m tests.benchmarks.estimates $(DATA)
 	$(PYTHON) -m tests.benchmarks.registration $(DATA) --cases 1

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import platform
+import time
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, version
@@ -33,7 +34,19 @@ _SUSPICIOUS = 0.15
 # Of a mask's digest this many digits are kept.
 _DIGITS = 16
 _LIMITS = {"run_limit": "run limit", "time_limit": "time limit"}
+# Summaries are written so often [s]. Of much it takes a while: this many times as long is spent on
+# the work itself.
+_SUMMARY_PERIOD, _SUMMARY_SHARE = 2.0, 20.0
 _PACKAGES = ("drake", "numpy", "numba", "opencv-python-headless")
+
+
+def next_summary(begin: float) -> float:
+    """When a summary is due again, by time.monotonic(), that now is written and was begun then [s].
+
+    Whatever ends a job writes its summary; this is for a job that is killed.
+    """
+    now = time.monotonic()
+    return now + max(_SUMMARY_PERIOD, _SUMMARY_SHARE * (now - begin))
 
 
 def describe_job(

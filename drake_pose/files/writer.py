@@ -41,16 +41,12 @@ from drake_pose.files.summary import (
     camera_warnings,
     frame_warnings,
     mask_digests,
+    next_summary,
     poor_fit_warnings,
     summarize,
 )
 from drake_pose.silhouette.pictures.scene_checks import frame_ranges
 from drake_pose.silhouette.pictures.scenes import USUAL_RATE_HZ, Scene
-
-# Whatever ends the job writes the summary; this is for a job that is killed [s]. It takes a while
-# where the recording is long: this many times as long is spent on frames.
-_SUMMARY_PERIOD = 2.0
-_SUMMARY_SHARE = 20.0
 
 # What a method says of a whole recording, in summary.json.
 _OF_THE_METHOD = ("lengths_m", "girths", "unseen", "proportions", "body_fit_seconds")
@@ -257,5 +253,4 @@ class ResultWriter:
             write_file(self.folder, JOINTS, joint_table(done.records))
         if any(record.family_count is not None for record in done.records.values()):
             write_file(self.folder, FAMILIES, family_table(done.records))
-        now = time.monotonic()
-        self._next_summary = now + max(_SUMMARY_PERIOD, _SUMMARY_SHARE * (now - begin))
+        self._next_summary = next_summary(begin)

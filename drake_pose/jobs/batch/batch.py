@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 from drake_pose.csv_files import csv_text
 from drake_pose.errors import ClusterError, DrakePoseError, OutputError
 from drake_pose.files.folder import without_nan, write_file, writes_folder
+from drake_pose.files.summary import next_summary
 from drake_pose.jobs.batch.episodes_table import episodes_table
 from drake_pose.jobs.batch.job import SceneJob
 from drake_pose.jobs.batch.tasks import (
@@ -44,8 +45,6 @@ WAITING, FINISHED, FAILED = "waiting", "finished", "failed"
 
 # A scene of which this many chunks have failed is given up.
 _HOPELESS = 3
-# Whatever ends the batch writes its summary; this is for one that is killed [s].
-_SUMMARY_PERIOD = 2.0
 
 OnProgress = Callable[[int, int, str], None]
 """Called with the number of frames done, that of all frames, and what went wrong just now or ""."""
@@ -157,6 +156,7 @@ class Batch:
         self.out, self._on_progress = out, on_progress
         self.scenes = {job.name: SceneState(job, job.describe()) for job in jobs}
         self.seconds, self._begin = 0.0, time.monotonic()
+        self._next_summary = next_summary(self._begin)
         self._waiting: deque[Task] = deque()
 
     @property
@@ -269,8 +269,9 @@ class Batch:
                     "now; remove that folder to have it estimated again",
                 )
         self._report()
-        if time.monotonic() - self._begin - self.seconds > _SUMMARY_PERIOD:
+        if (begin := time.monotonic()) > self._next_summary:
             self.write()
+            self._next_summary = next_summary(begin)
 
     def _fail(self, state: SceneState, extent: str, error: str) -> None:
         """Notes what went wrong; the scene's other chunks go on, unless it seems hopeless."""

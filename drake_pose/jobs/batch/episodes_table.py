@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -41,19 +41,21 @@ def episodes_table(episodes: Mapping[str, Mapping[str, Any]]) -> EpisodesTable |
     before have together. A new camera file begins with each episode in which one has.
     """
     rows = list[list[Any]]()
-    files: list[dict[str, list[Found]]] = [{}]
+    files: list[dict[str, _Standing]] = [{}]
     for scene, totals in episodes.items():
         named = totals.get("contradictions", ())
         joints = " ".join(one["name"] for one in named if one["what"] == "joint")
         stand, moves = files[-1], dict[str, tuple[Any, ...]]()
         for name, one in totals.get("cameras", {}).items():
-            moves[name] = _moved(stand[name], one) if name in stand else (None,) * 3
+            moves[name] = stand[name].moved(one) if name in stand else (None,) * 3
         if any(moved == "yes" for *_, moved in moves.values()):
             # Who stands still has one pose in all files.
             files.append({k: v for k, v in stand.items() if moves.get(k, "-")[-1] != "yes"})
         for name, move in moves.items():
             one = totals["cameras"][name]
-            files[-1].setdefault(name, []).append(one)
+            if name not in files[-1]:
+                files[-1][name] = _Standing(one)
+            files[-1][name].add(one)
             place = [row[3] for row in one["X_WC"][:3]]
             rows.append(
                 [scene, name, totals["frame_count"], totals["agreeing_count"], *place,
@@ -63,7 +65,7 @@ def episodes_table(episodes: Mapping[str, Mapping[str, Any]]) -> EpisodesTable |
     if not rows:
         return None
     texts = {
-        _file(k): yaml.safe_dump({name: _together(ones) for name, ones in file.items()})
+        _file(k): yaml.safe_dump({name: one.entry() for name, one in file.items()})
         for k, file in enumerate(files, 1)
     }
     return EpisodesTable(csv_text([COLUMNS, *rows]), texts)
@@ -73,40 +75,49 @@ def _file(number: int) -> str:
     return f"cameras_{number}.yaml"
 
 
-def _moved(before: Sequence[Found], one: Found) -> tuple[float, float, str]:
-    """How far a camera's pose is from that of others [mm, degrees], and whether it has moved."""
-    X_WC, covariance = _fused(before)
-    off = pose_difference(np.array(one["X_WC"]), X_WC)
-    distance = squared_distance(off, covariance + np.array(one["covariance"]))
-    shift, turn = 1e3 * np.linalg.norm(off[3:]), np.degrees(np.linalg.norm(off[:3]))
-    is_moved = float(chi2.sf(distance, len(off))) < SIGNIFICANCE
-    return float(shift), float(turn), "yes" if is_moved else "no"
-
-
-def _together(ones: Sequence[Found]) -> dict[str, Any]:
-    """A camera's entry in a file, as all episodes have it that saw it in one place.
-
-    Where its focal length was found, with which its distance goes, as the surest of them has it.
-    """
-    surest = min(ones, key=lambda one: float(one["translation_sd_mm"]))
-    own: dict[str, Any] = surest["camera"]
-    is_focal = any(one["focal_sd_px"] for one in ones)
-    return own if is_focal else own | {"X_WC": _fused(ones)[0].tolist()}
-
-
-def _fused(ones: Sequence[Found]) -> tuple[Array, Array]:
-    """X_WC (4, 4) and its covariance (6, 6), of what several episodes say, by their information.
+class _Standing:
+    """Where a camera stands that several episodes saw in one place, put together by information.
 
     What errs in one, as a joint's zero does, errs in the others, nobody knows how much alike: by
     covariance intersection (Julier and Uhlmann, 1997, equal weights) the covariance holds all the
-    same, and is that of one episode where all are as sure.
+    same, and is that of one episode where all are as sure. Sums are kept: a batch has thousands.
     """
-    first = np.array(ones[0]["X_WC"])
-    informations = [np.linalg.inv(np.array(one["covariance"])) for one in ones]
-    offs = [pose_difference(np.array(one["X_WC"]), first) for one in ones]
-    covariance = np.linalg.inv(np.mean(informations, axis=0))
-    weighted = [A @ off for A, off in zip(informations, offs, strict=True)]
-    mean, X_WC = covariance @ np.mean(weighted, axis=0), first.copy()
-    X_WC[:3, :3] = Rotation.from_rotvec(mean[:3]).as_matrix() @ first[:3, :3]
-    X_WC[:3, 3] += mean[3:]
-    return X_WC, covariance
+
+    def __init__(self, one: Found) -> None:
+        self._first, self._surest = np.array(one["X_WC"]), one
+        self._count, self._is_focal = 0, False
+        self._information, self._weighted = np.zeros((6, 6)), np.zeros(6)
+
+    def add(self, one: Found) -> None:
+        """Counts what another episode says."""
+        information = np.linalg.inv(np.array(one["covariance"]))
+        self._information += information
+        self._weighted += information @ pose_difference(np.array(one["X_WC"]), self._first)
+        self._count += 1
+        self._is_focal = self._is_focal or bool(one["focal_sd_px"])
+        self._surest = min(self._surest, one, key=lambda k: float(k["translation_sd_mm"]))
+
+    def pose(self) -> tuple[Array, Array]:
+        """X_WC (4, 4) and its covariance (6, 6)."""
+        inverse, X_WC = np.linalg.inv(self._information), self._first.copy()
+        mean = inverse @ self._weighted
+        X_WC[:3, :3] = Rotation.from_rotvec(mean[:3]).as_matrix() @ X_WC[:3, :3]
+        X_WC[:3, 3] += mean[3:]
+        return X_WC, np.asarray(self._count * inverse)
+
+    def moved(self, one: Found) -> tuple[float, float, str]:
+        """How far a pose is from here [mm, degrees], and whether the camera has moved."""
+        X_WC, covariance = self.pose()
+        off = pose_difference(np.array(one["X_WC"]), X_WC)
+        distance = squared_distance(off, covariance + np.array(one["covariance"]))
+        shift, turn = 1e3 * np.linalg.norm(off[3:]), np.degrees(np.linalg.norm(off[:3]))
+        is_moved = float(chi2.sf(distance, len(off))) < SIGNIFICANCE
+        return float(shift), float(turn), "yes" if is_moved else "no"
+
+    def entry(self) -> dict[str, Any]:
+        """The camera in a file; where its focal length was found, as the surest episode has it.
+
+        For its distance goes with that.
+        """
+        own: dict[str, Any] = self._surest["camera"]
+        return own if self._is_focal else own | {"X_WC": self.pose()[0].tolist()}

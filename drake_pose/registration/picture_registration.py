@@ -254,13 +254,15 @@ class _Settled(NamedTuple):
 
     recording: its joints' clock drifts no more; begun: with the camera and the clock that were
     found, but for the offset's deviation; zeros: (m,) that were added to the frames' values;
-    agree: (frames,) those that do; covariance: (u, u) of all that they share.
+    ratios: (frames,) of the contours, what fits; agree: those that do; covariance: (u, u) of all
+    that they share.
     """
 
     best: PictureFit
     recording: Recording
     begun: _Begun
     zeros: Array
+    ratios: Array
     agree: NDArray[np.bool_]
     covariance: Array
 
@@ -314,9 +316,10 @@ def _settle(
         offset, turned = offset + by, turned + turn
         if not left or (abs(by) < _AGAIN and np.abs(turn).max() < _TURNED):
             done = begun._replace(camera=camera, clock=replace(begun.clock, value=offset))
-            agree = best.fit.agreeing(best.fit.inlier_ratios(best.found))
+            ratios = best.fit.inlier_ratios(best.found)
+            agree = best.fit.agreeing(ratios)
             covariance = np.sum(best.fit.covariances(best.found, agree), axis=0)
-            return _Settled(best, as_now, done, assumed, agree, covariance)
+            return _Settled(best, as_now, done, assumed, ratios, agree, covariance)
 
 
 def _drift(settled: _Settled, since: float) -> tuple[float, float]:
@@ -416,9 +419,8 @@ def _constant(fitted: PictureFit, name: str) -> float:
 
 def _describe(settled: _Settled, focal: bool) -> PictureRegistration:
     """What was found; RegistrationError: it does not explain the pictures."""
-    best, recording, begun, zeros, agree, covariance = settled
+    best, recording, begun, zeros, ratios, agree, covariance = settled
     fit, (seen,) = best.fit, best.fit.seen
-    ratios = fit.inlier_ratios(best.found)
     ratio = float(ratios[agree].mean())
     told = _evidence(best.explained, best.contour)
     if (

@@ -27,10 +27,10 @@ from drake_pose.files.records import FrameRecord
 from drake_pose.files.settings import EstimateSettings
 from drake_pose.files.summary import describe_job, mask_digests, summarize
 from drake_pose.jobs.batch.job import SceneJob
-from drake_pose.jobs.estimate.episode import is_episode
 from drake_pose.jobs.estimate.inputs import follows_person
 from drake_pose.jobs.estimate.scene import estimate_scene
 from drake_pose.jobs.registration.audit import audit_scene
+from drake_pose.jobs.registration.episodes import looks_at_pictures
 from drake_pose.jobs.registration.settings import AuditSettings
 from drake_pose.silhouette.pictures.scene_checks import frame_ranges
 from drake_pose.silhouette.pictures.scenes import Scene, load_scene
@@ -193,9 +193,7 @@ def _load(job: SceneJob) -> Scene:
 def _of_episode(job: SceneJob) -> AuditSettings | None:
     """The settings of a job that audits an episode; None: it is of a scene of masks."""
     settings = job.settings
-    if isinstance(settings, AuditSettings) and (
-        settings.pictures or is_episode(job.scene, settings)
-    ):
+    if isinstance(settings, AuditSettings) and looks_at_pictures(job.scene, settings):
         return settings
     return None
 

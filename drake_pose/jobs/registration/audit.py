@@ -22,10 +22,9 @@ from drake_pose.files.options import percent
 from drake_pose.files.records import user_units
 from drake_pose.files.settings import EstimateSettings
 from drake_pose.files.summary import mask_digests
-from drake_pose.jobs.estimate.episode import is_episode
 from drake_pose.jobs.estimate.searches import make_tree
 from drake_pose.jobs.registration.episode_audit import EpisodeLook, look_at_episode
-from drake_pose.jobs.registration.episodes import EpisodeInputs, read_episode
+from drake_pose.jobs.registration.episodes import EpisodeInputs, looks_at_pictures, read_episode
 from drake_pose.jobs.registration.inputs import Inputs
 from drake_pose.jobs.registration.positions import read_known_positions
 from drake_pose.jobs.registration.report import say_reading
@@ -113,7 +112,7 @@ def audit_scene(
         "joints": None if joints is None else Path(joints),
     }
     begin = time.perf_counter()
-    if settings.pictures or is_episode(Path(scene), settings):
+    if looks_at_pictures(Path(scene), settings):
         own = None if cameras is None else Path(cameras)
         episode = read_episode(Path(scene), Path(model), files["joints"], own, settings)
         look = _look(episode, on_frame)

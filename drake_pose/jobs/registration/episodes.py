@@ -22,6 +22,7 @@ from drake_pose.jobs.estimate.episode import (
     MappedJoints,
     cameras_of,
     frames_of,
+    is_episode,
     is_timed,
     kept_pictures,
     map_log,
@@ -60,6 +61,11 @@ class EpisodeInputs:
     recordings: Mapping[str, Recording]
     warnings: tuple[str, ...]
     placed: frozenset[str]
+
+
+def looks_at_pictures(path: Path, settings: AuditSettings) -> bool:
+    """Whether a scene is looked at as an episode: it is one, or is said to be."""
+    return settings.pictures or is_episode(path, settings)
 
 
 def read_episode(

@@ -22,9 +22,8 @@ from drake_pose.files.folder import writes_folder
 from drake_pose.files.options import percent
 from drake_pose.files.summary import BADLY_EXPLAINED
 from drake_pose.fit.lengthened_body import lengthened_joints
-from drake_pose.jobs.estimate.episode import is_episode
 from drake_pose.jobs.estimate.inputs import missing_for_person
-from drake_pose.jobs.registration.episodes import EpisodeInputs, read_episode
+from drake_pose.jobs.registration.episodes import EpisodeInputs, looks_at_pictures, read_episode
 from drake_pose.jobs.registration.exports import check_exports
 from drake_pose.jobs.registration.inputs import (
     Inputs,
@@ -166,7 +165,7 @@ def _begun(
     on_camera: OnCamera | None,
 ) -> _Registration:
     """A registration that has found each camera by itself."""
-    if settings.pictures or is_episode(scene, settings):
+    if looks_at_pictures(scene, settings):
         episode = read_episode(scene, model, joints, cameras, settings)
         work = _Registration(inputs_of_episode(episode, settings), settings)
         check_exports(settings.exports, episode.cameras.values())

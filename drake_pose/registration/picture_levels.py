@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -16,9 +17,13 @@ from drake_pose.fit.background_kernel import CONTOUR, GAIN, OUTLINE, explain
 from drake_pose.registration.posed_frames import placed_points
 from drake_pose.registration.start_poses import spread_rotations
 from drake_pose.silhouette.areas.outline import Outline, pack
+from drake_pose.workers import map_ordered
 
 Array = NDArray[np.float64]
 Picture = NDArray[np.uint8]
+
+CONTOURS = 4.0
+"""What contours' edges count beside the share that is explained."""
 
 # Rotations that are tried: over all, and near upright. The body is tried so many times as far away
 # as it would be if it changed all that does, and aside by about so many times the size of that.
@@ -35,21 +40,31 @@ _STEPS = np.array([1.0, 1.0, 1.0, 0.4, 0.4, 0.6])
 _APART = 0.08
 # What a pose explains is told apart by so many squares of the picture's longer side.
 _SQUARES = 16
+# By how much of the picture's width a frame's outline counts as longer in a search.
+_SHORT = 0.3
+# So many poses are scored by a worker at once.
+_AT_ONCE = 200
 
 
 @dataclass(frozen=True)
 class SearchRound:
     """So many poses are improved in pictures of a width [pixel] by so many evaluations.
 
-    step: of the first simplex, of a turn [rad]; the other steps follow. contour: the weight of the
-    outlines' edges beside the gain.
+    step: of the first simplex, of a turn [rad]; the other steps follow.
     """
 
     width: int
     kept: int
     evaluations: int
     step: float
-    contour: float
+
+
+def evidence(explained: float, contour: float) -> float:
+    """How much speaks for a pose, of the share that it explains and its contours' edges.
+
+    Sums over contours are misled: a wrong pose that shows more of the body has longer ones.
+    """
+    return explained + CONTOURS * contour
 
 
 class PictureLevel:
@@ -110,13 +125,26 @@ class PictureLevel:
         share = float(told[GAIN]) / max(self.backgrounds.possible, 1e-9)
         return share, float(told[CONTOUR]) / max(float(told[OUTLINE]), 1.0)
 
-    def score(self, X_CW: Array, contour: float, frames: int | None = None) -> float:
-        """What is to be as large as it can be; contour: the weight of the outline's edges.
+    def score(self, X_CW: Array, frames: int | None = None) -> float:
+        """How much speaks for a pose; short outlines, which say little by chance, count as longer.
 
         frames: so many count, the first ones; None: all.
         """
-        told = self.told(X_CW, self._X_WN[:frames])
-        return float(told[GAIN] + contour * told[CONTOUR])
+        X_WN = self._X_WN[:frames]
+        told = self.told(X_CW, X_WN)
+        outline = told[OUTLINE] + _SHORT * len(X_WN) * self.camera.width
+        possible = self.backgrounds.possible * len(X_WN) / len(self._X_WN)
+        return evidence(float(told[GAIN]) / max(possible, 1e-9), float(told[CONTOUR] / outline))
+
+    def best(self, X_CW: Sequence[Array], frames: int, share: float) -> list[Array]:
+        """A share of some poses (4, 4): those with the best scores, best first."""
+
+        def scores(some: Sequence[Array]) -> list[float]:
+            return [self.score(X, frames) for X in some]
+
+        some = [X_CW[k : k + _AT_ONCE] for k in range(0, len(X_CW), _AT_ONCE)]
+        order = np.argsort(-np.concatenate(map_ordered(scores, some)), kind="stable")
+        return [X_CW[k] for k in order[: math.ceil(share * len(order))]]
 
     def pieces(self, X_CW: Array) -> Array:
         """(k, k) what a pose (4, 4) explains, by squares of the picture."""
@@ -152,8 +180,12 @@ class PictureLevel:
                 found += list(X)
         return found
 
-    def improve(self, X_CW: Array, step: SearchRound, key: int) -> tuple[float, Array]:
-        """The best score near a pose (4, 4), and that pose (Nelder and Mead's simplex)."""
+    def improve(self, numbered: tuple[int, Array], step: SearchRound) -> tuple[float, Array]:
+        """The best score near a pose (4, 4), and that pose (Nelder and Mead's simplex).
+
+        numbered: the pose, and a number that says which way the simplex begins.
+        """
+        key, X_CW = numbered
         signs = np.random.default_rng(key).choice([-1.0, 1.0], 6)
         simplex = np.vstack([np.zeros(6), np.diag(step.step * signs * _STEPS)])
         options = {
@@ -161,7 +193,7 @@ class PictureLevel:
         }  # fmt: skip
 
         def cost(x: Array) -> float:
-            return -self.score(self._moved(X_CW, x), step.contour)
+            return -self.score(self._moved(X_CW, x))
 
         found = minimize(cost, np.zeros(6), method="Nelder-Mead", options=options)
         return -float(found.fun), self._moved(X_CW, found.x)

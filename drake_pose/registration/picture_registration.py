@@ -19,6 +19,7 @@ from drake_pose.errors import RegistrationError
 from drake_pose.fit.background_kernel import GAIN
 from drake_pose.fit.covariance import excess
 from drake_pose.fit.frames_fit import TIME_OFFSET
+from drake_pose.registration.picture_levels import CONTOURS, evidence
 from drake_pose.registration.picture_search import (
     SEARCHED,
     PictureFit,
@@ -47,9 +48,8 @@ _SLOW = 0.6
 _LOOKS, _LEAST_RATIO, _LEAST_CONTOUR = 3, 0.42, 0.16
 # And it explains so much of what changes: right ones .2 and more, one that few frames bore out .09.
 _LEAST_EXPLAINED = 0.12
-# What is explained and so many times the contours together: right ones have 1.2 and more, the best
-# wrong ones .9.
-_CONTOURS, _LEAST_EVIDENCE = 4.0, 1.05
+# The evidence for right ones is 1.2 and more, for the best wrong ones .9.
+_LEAST_EVIDENCE = 1.05
 # No pose is one of which less is known [of its distance from the body; rad]. Right ones are known
 # to a hundredth; mirrored pictures are explained about as well from behind, known to a twentieth.
 _MOST_SD = 0.04
@@ -202,7 +202,7 @@ def _register(
     begin = posed_pictures(recording, chosen, 0.0)
     search = PictureSearch(body, camera, begin)
     looks = [search.approach(X_CW) for X_CW in search.search()[:_LOOKS]]
-    near = sorted((one for one in looks if one is not None), key=lambda one: -_evidence(*one[1]))
+    near = sorted((one for one in looks if one is not None), key=lambda one: -evidence(*one[1]))
     if not near:
         raise _Unexplained(camera, "no pose shows the body in two pictures")
     level, start = search.compared, near[0][0]
@@ -336,11 +336,6 @@ def _mean_time(recording: Recording, rows: Sequence[int]) -> float:
     return 0.0 if recording.times is None else float(recording.times[list(rows)].mean())
 
 
-def _evidence(explained: float, contour: float) -> float:
-    """How much speaks for a pose, of the share that it explains and its contours' edges."""
-    return explained + _CONTOURS * contour
-
-
 def _choose(
     body: RegistrationBody, camera: PinholeCamera, recording: Recording
 ) -> tuple[list[int], list[int]]:
@@ -422,7 +417,7 @@ def _describe(settled: _Settled, focal: bool) -> PictureRegistration:
     best, recording, begun, zeros, ratios, agree, covariance = settled
     fit, (seen,) = best.fit, best.fit.seen
     ratio = float(ratios[agree].mean())
-    told = _evidence(best.explained, best.contour)
+    told = evidence(best.explained, best.contour)
     if (
         best.explained < _LEAST_EXPLAINED
         or ratio < _LEAST_RATIO
@@ -434,7 +429,7 @@ def _describe(settled: _Settled, focal: bool) -> PictureRegistration:
             f"at best {max(best.explained, 0.0):.0%} of what changes is explained "
             f"({_LEAST_EXPLAINED:.0%} at least), {ratio:.0%} of the contours fit "
             f"({_LEAST_RATIO:.0%} at least), and edges along them are stronger than elsewhere by "
-            f"{best.contour:.2f} ({_LEAST_CONTOUR} at least); the first, and {_CONTOURS:g} times "
+            f"{best.contour:.2f} ({_LEAST_CONTOUR} at least); the first, and {CONTOURS:g} times "
             f"the last, are {told:.2f} together ({_LEAST_EVIDENCE} at least)",
         )
     deviations = np.sqrt(np.diag(covariance))

@@ -9,10 +9,9 @@ in the end by the one fit, on lines across the contour in the odds of pixels to 
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import cv2
 import numpy as np
@@ -29,6 +28,7 @@ from drake_pose.registration.register import RegistrationBody
 from drake_pose.registration.shared_fit import Shared, SharedFit
 from drake_pose.silhouette.areas.outline import Outline
 from drake_pose.silhouette.areas.scoring import draw_mask
+from drake_pose.workers import map_ordered
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -38,11 +38,10 @@ SEARCHED = 12
 """So many pictures carry a search."""
 
 _ROUNDS = (
-    SearchRound(48, 350, 24, 0.25, 8.0),
-    SearchRound(48, 120, 30, 0.15, 8.0),
-    SearchRound(80, 40, 50, 0.1, 10.0),
-    SearchRound(80, 15, 80, 0.06, 10.0),
-    SearchRound(160, 5, 100, 0.04, 20.0),
+    SearchRound(64, 250, 24, 0.25),
+    SearchRound(64, 80, 30, 0.15),
+    SearchRound(80, 30, 50, 0.1),
+    SearchRound(160, 10, 80, 0.06),
 )
 # So many frames, those that differ most, say which share of the starts is looked at in all.
 _FIRST, _GOOD = 4, 0.25
@@ -50,7 +49,7 @@ ABOUT = 100
 """Triangles of a node where a body is about."""
 
 # Triangles of a node, up to which width of pictures [pixel].
-_TRIANGLES, _WIDTHS = (12, 40, ABOUT), (60, 120)
+_TRIANGLES, _WIDTHS = (12, 40, ABOUT), (64, 120)
 # Poses are compared in pictures so wide, and backgrounds learned in these.
 _COMPARED, _LEARNED = 160, 320
 # Fits on lines: scales of steps [pixel of a picture _SCALED wide], and from line to line [scale];
@@ -154,13 +153,12 @@ class PictureSearch:
         level = self._level(_ROUNDS[0].width)
         found = level.starts()
         for frames, share in ((_FIRST, _GOOD), (len(self.frames), 1.0)):
-            scores = np.array([level.score(X, _ROUNDS[0].contour, frames) for X in found])
-            order = np.argsort(-scores, kind="stable")
-            found = [found[k] for k in order[: math.ceil(share * len(order))]]
+            found = level.best(found, frames, share)
         after = (*(one.kept for one in _ROUNDS[1:]), _ROUNDS[-1].kept)
         for step, most in zip(_ROUNDS, after, strict=True):
             level = self._level(step.width)
-            improved = [level.improve(X, step, key) for key, X in enumerate(found[: step.kept])]
+            improve = partial(level.improve, step=step)
+            improved = map_ordered(improve, enumerate(found[: step.kept]))
             improved.sort(key=lambda one: -one[0])
             found = level.distinct([X for _, X in improved], most)
         return found

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.camera.models import Camera
+from drake_pose.compiled import compiled
 from drake_pose.silhouette.areas.bending import PackedSurfaces, TreeSurfaces
 from drake_pose.silhouette.areas.outline import Outline, PackedOutlines, pack
 
@@ -193,15 +194,17 @@ class CameraParameters:
         return X_CW, kernel, motions
 
 
+@compiled
 def affine_motions(twists: Array) -> Array:
     """Twists (m, 7) as affine motions (m, 12)."""
-    affine = np.zeros((len(twists), 3, 4))
-    affine[:, 2, 1], affine[:, 0, 2], affine[:, 1, 0] = twists[:, :3].T
-    affine[:, 1, 2], affine[:, 2, 0], affine[:, 0, 1] = -twists[:, :3].T
-    affine[:, :, 3] = twists[:, 3:6]
-    for k in range(3):
-        affine[:, k, k] = twists[:, 6]
-    return affine.reshape(-1, 12)
+    affine = np.zeros((len(twists), 12))
+    for k in range(len(twists)):
+        own, twist = affine[k], twists[k]
+        own[9], own[2], own[4] = twist[0], twist[1], twist[2]
+        own[6], own[8], own[1] = -twist[0], -twist[1], -twist[2]
+        own[3], own[7], own[11] = twist[3], twist[4], twist[5]
+        own[0] = own[5] = own[10] = twist[6]
+    return affine
 
 
 def affine_of(M: Array, v: Array) -> Array:

@@ -82,8 +82,9 @@ def estimate_frames(
                 raise SettingsError(f"frame '{frame}': the matcher got no picture")
             was_tracked = matching.was_tracked(context)
             if pose.found and pose.pose_set is None and isinstance(search, MultiStartSearch):
-                own = matching.with_intervals(context) if was_tracked else pose
-                pose = _with_intervals(inputs, search, frame, own, begun if was_tracked else None)
+                if was_tracked and not inputs.scene.cameras_of(frame):
+                    pose = matching.with_intervals(context)
+                pose = _with_intervals(inputs, search, frame, pose, begun if was_tracked else None)
             begun = begun if was_tracked else pose
             yield frame, pose
 

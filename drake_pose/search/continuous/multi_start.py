@@ -32,6 +32,7 @@ from drake_pose.search.continuous.views_fit import (
 )
 from drake_pose.search.estimates import PoseEstimate, SearchStatistics, View
 from drake_pose.search.grid.beam_search import BeamSearch
+from drake_pose.search.grid.node_poses import coarsen
 from drake_pose.search.grid.sampled_body import SampledBody
 from drake_pose.search.settings import TOLERANT_STAGES, BeamSearchSettings
 from drake_pose.search.starts.coarse_search import (
@@ -62,12 +63,14 @@ _APART = 0.13
 # About how many of the best poses others are sought; of each so many are fitted, and so many more
 # that are made by flips of its joints.
 _SOUGHT_ABOUT, _TRIED, _FLIPPED = 3, 6, 3
-# How often other explanations are sought about the best poses.
-_ROUNDS = 2
+# How often other explanations are sought about the best poses; of several views from the second
+# time on about no more of them where one leads to nothing that costs less by this factor.
+_ROUNDS, _BETTER = 2, 0.98
 # A disc of this radius, as a share of the root of the silhouettes' mean area, is as thick as a
-# limb: where one fits into what is wrong, so many starts of the beam search below are fitted, too,
-# by the masks of so many views at most. One of its orders of nodes finds what the other misses.
-_LIMB, _BEAM_STARTS, _BEAM_VIEWS = 0.03, 10, 2
+# limb that one view shows in part, or one of several in full: where one fits into what is wrong, so
+# many starts of the beam search below are fitted, too, by the masks of so many views at most, each
+# looked at with about so many pixels. One of its orders of nodes finds what the other misses.
+_LIMBS, _BEAM_STARTS, _BEAM_VIEWS, _BEAM_PIXELS = (0.03, 0.04), 10, 2, 3000
 _BEAM = BeamSearchSettings(
     interval=math.radians(20.0),
     length_interval=LENGTH_INTERVAL,
@@ -142,6 +145,7 @@ class MultiStartSearch:
     ) -> list[np.ndarray]:
         """Values (m,) of other starts, by areas."""
         limit = max(0.0, deadline - time.perf_counter())
+        views = [coarsen(view, _BEAM_PIXELS) for view in views]
         found = self._beam.best_poses(views, root_position, _BEAM_STARTS, time_limit=limit)
         return [self._kinematics.flatten(values) for values in found]
 
@@ -218,7 +222,12 @@ class _Run:
                 if any(pose.values is values for values in self._done) or not self._proceed():
                     continue
                 self._done.append(pose.values)
-                found += self._others(pose.values)
+                others = self._others(pose.values)
+                found += others
+                least = min((one.cost for one in others), default=math.inf)
+                told = len(self._clean) > 1 and len(self._done) > _SOUGHT_ABOUT
+                if told and least > _BETTER * pool[0].cost:
+                    break
             pool = distinct([*pool, *found], _SURVIVORS, self._kinematics.turns_around)
         return pool
 
@@ -234,7 +243,8 @@ class _Run:
         not; in a single one other parts may hide either. What masks lack, or have besides, is not
         mended by another start: then there is none.
         """
-        radius, thick, wrongs = max(1.0, _LIMB * self._fit.size), np.zeros(2, dtype=bool), []
+        share = _LIMBS[len(self._clean) > 1]
+        radius, thick, wrongs = max(1.0, share * self._fit.size), np.zeros(2, dtype=bool), []
         for mask, view in self._drawn(values, self._clean):
             for side, wrong in enumerate((mask & ~view.mask, view.mask & ~mask)):
                 distances = cv2.distanceTransform(wrong.astype(np.uint8), cv2.DIST_L2, 5)

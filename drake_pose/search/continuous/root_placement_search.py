@@ -57,7 +57,7 @@ _STARTS, _FINALISTS, _AGAIN = 24, 3, 4
 # The silhouettes are looked at with about this many pixels.
 _PIXELS = 1500
 # How many times the width are kept of the root alone.
-_ROOT_FACTOR = 4
+_ROOT_FACTOR = 2
 # How many times a position's quota of the root's rotations are grown at it.
 _ROOT_SPARE = 2
 # How many times the width are grown, before the quota.

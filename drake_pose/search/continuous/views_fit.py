@@ -16,6 +16,7 @@ import numpy as np
 
 from drake_pose.body.parsed_model import nearest_turn
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
+from drake_pose.fit.camera_sums import Views
 from drake_pose.fit.contour_fit import (
     FINEST_SCALE,
     ContourFit,
@@ -31,8 +32,9 @@ from drake_pose.silhouette.areas.outline import Outline
 from drake_pose.workers import map_ordered
 
 _STEPS = StepSettings(longest=0.3, damping=1e-2, even_damping=1e-3)
-# From one point of a silhouette's edge to the next, as a share of its size.
-_EDGE_SPACING = 1.0 / 80.0
+# From one point of a silhouette's edge to the next, as a share of its size: of rounds that sample
+# the body's contour so far apart or more, and of finer ones.
+_EDGE_SPACINGS = (0.026, 1.0 / 50.0), (0.0, 1.0 / 80.0)
 # What is missing or too much is about as large, as a share of the silhouettes' size.
 _PIECE = 0.2
 
@@ -65,33 +67,36 @@ class ViewsFit:
         # A pixel of contour counts one, whatever its noise: the cost is in pixels.
         even = Noise(deviation=1.0, correlation=0.5 / self.size**3)
         self._fit = ContourFit(kinematics, outlines, even, _STEPS, pixels=self.size)
-        spacing = max(1.0, round(_EDGE_SPACING * self.size))
-        self._views = pack_views(
-            [view.camera for view in views],
-            [find_edge_points(view.mask, spacing) for view in views],
-        )
-        self.edge_length = max(1.0, float(self._views.evidence.lengths.sum()))
+        cameras = [view.camera for view in views]
+        self._levels = []
+        for least, share in _EDGE_SPACINGS:
+            spacing = max(1.0, share * self.size // 1.0)
+            edges = [find_edge_points(view.mask, spacing) for view in views]
+            self._levels.append((least, pack_views(cameras, edges)))
+        self.edge_length = max(1.0, float(self._levels[-1][1].evidence.lengths.sum()))
         self.camera_count = len(views)
         self.evaluations, self._counting = 0, Lock()
 
     def cost(self, values: np.ndarray, step: AnnealingStage) -> float:
         """What does not fit at values (m,) [pixel]."""
         self._count(1)
-        sums = self._fit.compare(self._views, values, step).sums
+        sums = self._fit.compare(self._views(step), values, step).sums
         return float(sums[..., COST].sum()) / self._scale(step) ** 2
 
     def distances(self, values: np.ndarray, step: AnnealingStage) -> Distances:
         """What is left of the contours' distances at values (m,)."""
         self._count(1)
-        compared = self._fit.compare(self._views, values, step)
+        views = self._views(step)
+        compared = self._fit.compare(views, values, step)
         moves, unit = compared.placement.dense(len(values)), error_unit(self.size)
-        return distances(self._fit.outlines, self._views.cameras, compared, moves, unit)
+        return distances(self._fit.outlines, views.cameras, compared, moves, unit)
 
     def piece_costs(self, values: np.ndarray, step: AnnealingStage) -> np.ndarray:
         """What does not fit at values (m,), by pieces of the pictures that err on their own."""
         self._count(1)
         side = max(1.0, _PIECE * self.size)
-        return self._fit.piece_costs(self._views, values, step, side) / self._scale(step) ** 2
+        costs = self._fit.piece_costs(self._views(step), values, step, side)
+        return costs / self._scale(step) ** 2
 
     def refine(
         self, values: np.ndarray, rounds: Sequence[AnnealingStage], held: Sequence[int] = ()
@@ -99,9 +104,13 @@ class ViewsFit:
         """Refine values (m,), but for some that are held, by indices."""
         fixed = self.kinematics.upper <= self.kinematics.lower
         fixed[list(held)] = True
-        found = self._fit.fit(self._views, values, rounds, None, fixed)
+        found = self._fit.fit(self._views(rounds[-1]), values, rounds, None, fixed)
         self._count(found.evaluations)
         return FittedPose(found.values, found.cost / self._scale(rounds[-1]) ** 2)
+
+    def _views(self, step: AnnealingStage) -> Views:
+        """The views as finely as a step looks at them."""
+        return next(views for least, views in self._levels if step.spacing >= least)
 
     def _count(self, evaluations: int) -> None:
         with self._counting:  # Threads fit side by side.

@@ -21,6 +21,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_solve
+from threadpoolctl import ThreadpoolController
 
 from drake_pose.fit.contour_fit import (
     Comparison,
@@ -30,6 +31,9 @@ from drake_pose.fit.contour_fit import (
 from drake_pose.silhouette.areas.outline import Outline
 
 Array = NDArray[np.float64]
+
+# Of some hundred rows BLAS's threads wait for each other: it is ten times as slow with two.
+_on_one_thread = ThreadpoolController().wrap(limits=1, user_api="blas")
 
 # A camera's picture is off by no less [of the unit].
 _LEAST_CAMERA = 1.0
@@ -267,6 +271,7 @@ def _camera_motions(outlines: Sequence[Outline], X_CW: Array, X_WN: Array, size:
     return motions * size
 
 
+@_on_one_thread
 def estimate_sizes(
     seen: Distances,
     is_angle: NDArray[np.bool_],
@@ -328,6 +333,7 @@ def estimate_sizes(
     return ErrorSizes(noise, repeated, surface, mask, max(camera, least_camera), doubts)
 
 
+@_on_one_thread
 def values_covariance(
     seen: Distances, sizes: ErrorSizes, free: NDArray[np.intp], is_angle: NDArray[np.bool_]
 ) -> Array:
@@ -353,6 +359,7 @@ def distances_covariance(seen: Distances, sizes: ErrorSizes) -> Array:
     return sum((size**2 * W for size, W in parts), np.zeros((len(seen.y), len(seen.y))))
 
 
+@_on_one_thread
 def doubted_covariance(
     seen: Distances, sizes: ErrorSizes, is_angle: NDArray[np.bool_]
 ) -> tuple[Array, Distances]:

@@ -3,7 +3,7 @@
 Nothing is known of the object. Of lightness and of colours there are thresholds at many levels;
 what is connected above or below one is a region, as in a tree of components (MSER, Matas et al.
 2002), its holes filled. Of regions that are about the same the one is kept along whose outline the
-picture changes most.
+channel changes most.
 """
 
 from __future__ import annotations
@@ -36,41 +36,49 @@ _WEAKEST = 0.25
 
 
 def find_regions(picture: Picture, most: int) -> list[Mask]:
-    """Regions (H, W) of a picture (H, W, 3), those with the strongest outlines first."""
+    """Regions (H, W) of a picture (H, W, 3): of each channel so many with the strongest outlines.
+
+    The channels are lightness and two of colour; regions of two of them may be about the same.
+    """
     height, width = picture.shape[:2]
     share = min(1.0, _WIDTH / width)
     size = max(1, round(share * width)), max(1, round(share * height))
-    whole = _channels(picture)
-    small = [np.asarray(cv2.resize(one, size, interpolation=cv2.INTER_AREA)) for one in whole]
-    slopes = [cv2.Sobel(one, cv2.CV_32F, *by) for one in small for by in ((1, 0), (0, 1))]
-    change = np.sqrt(np.sum(np.square(slopes), axis=0))
-    found = list[_Region]()
-    for k, channel in enumerate(small):
-        low, high = np.quantile(channel, (0.01, 0.99)).tolist()
-        for level in np.linspace(low, high, _LEVELS + 2)[1:-1].tolist():
-            for sign in (1.0, -1.0):
-                parts = _components(sign * channel > sign * level)
-                found += [_Region(one, _strength(one, change), k, sign, level) for one in parts]
-    found.sort(key=lambda one: -one.strength)
+    lab = cv2.cvtColor(picture, cv2.COLOR_RGB2LAB).astype(np.float32)
+    found = list[Mask]()
+    for whole in np.moveaxis(cv2.GaussianBlur(lab, (0, 0), 1.0), -1, 0):
+        small = np.asarray(cv2.resize(whole, size, interpolation=cv2.INTER_AREA), np.float32)
+        for one in _strongest(small, most):
+            found.append(_enlarged(one.mask, one.sign * whole > one.sign * one.level))
+    return found
+
+
+class _Region(NamedTuple):
+    """A mask (h, w) in a smaller picture, how strong its outline is, and the threshold."""
+
+    mask: Mask
+    strength: float
+    sign: float
+    level: float
+
+
+def _strongest(channel: Floats, most: int) -> list[_Region]:
+    """So many regions of a channel (h, w) with the strongest outlines, no two of them alike."""
+    slopes = (cv2.Sobel(channel, cv2.CV_32F, *by) for by in ((1, 0), (0, 1)))
+    change = np.hypot(*slopes)
+    low, high = np.quantile(channel, (0.01, 0.99)).tolist()
+    found = [
+        _Region(mask, _strength(mask, change), sign, level)
+        for level in np.linspace(low, high, _LEVELS + 2)[1:-1].tolist()
+        for sign in (1.0, -1.0)
+        for mask in _components(sign * channel > sign * level)
+    ]
     kept = list[_Region]()
-    for one in found:
+    for one in sorted(found, key=lambda one: -one.strength):
         if all(intersection_over_union(one.mask, other.mask) < _SAME for other in kept):
             kept.append(one)
         if len(kept) == most:
             break
-    return [
-        _enlarged(one.mask, one.sign * whole[one.channel] > one.sign * one.level) for one in kept
-    ]
-
-
-class _Region(NamedTuple):
-    """A mask (h, w) in the smaller picture, how strong its outline is, and the threshold."""
-
-    mask: Mask
-    strength: float
-    channel: int
-    sign: float
-    level: float
+    return kept
 
 
 def _strength(mask: Mask, change: Floats) -> float:
@@ -80,12 +88,6 @@ def _strength(mask: Mask, change: Floats) -> float:
     if not len(edge):
         return 0.0
     return float(np.quantile(edge, _WEAKEST)) * math.sqrt(np.count_nonzero(mask))
-
-
-def _channels(picture: Picture) -> list[Floats]:
-    """Lightness and colours (H, W) of a picture, smoothed a little."""
-    lab = cv2.cvtColor(picture, cv2.COLOR_RGB2LAB).astype(np.float32)
-    return list(np.moveaxis(cv2.GaussianBlur(lab, (0, 0), 1.0), -1, 0))
 
 
 def _components(above: Mask) -> Iterator[Mask]:

@@ -27,8 +27,8 @@ from drake_pose.silhouette.segmentation.regions import find_regions
 
 Mask = NDArray[np.bool_]
 
-# So many regions of each of a picture's three channels are looked at.
-_REGIONS = 4
+# So many regions of a picture are looked at.
+_REGIONS = 15
 # The object is a region in so many pictures at least, and in this share of them.
 _LEAST, _SHARE = 4, 0.5
 # Colours show it where their mask and the object overlap (IoU) by so much.

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from itertools import zip_longest
 from typing import NamedTuple
 
 import cv2
@@ -36,7 +37,7 @@ _WEAKEST = 0.25
 
 
 def find_regions(picture: Picture, most: int) -> list[Mask]:
-    """Regions (H, W) of a picture (H, W, 3): of each channel so many with the strongest outlines.
+    """So many regions (H, W) of a picture (H, W, 3), of each channel those with strong outlines.
 
     The channels are lightness and two of colour; regions of two of them may be about the same.
     """
@@ -44,12 +45,14 @@ def find_regions(picture: Picture, most: int) -> list[Mask]:
     share = min(1.0, _WIDTH / width)
     size = max(1, round(share * width)), max(1, round(share * height))
     lab = cv2.cvtColor(picture, cv2.COLOR_RGB2LAB).astype(np.float32)
-    found = list[Mask]()
-    for whole in np.moveaxis(cv2.GaussianBlur(lab, (0, 0), 1.0), -1, 0):
-        small = np.asarray(cv2.resize(whole, size, interpolation=cv2.INTER_AREA), np.float32)
-        for one in _strongest(small, most):
-            found.append(_enlarged(one.mask, one.sign * whole > one.sign * one.level))
-    return found
+    whole = np.moveaxis(cv2.GaussianBlur(lab, (0, 0), 1.0), -1, 0)
+    small = [np.asarray(cv2.resize(one, size, interpolation=cv2.INTER_AREA)) for one in whole]
+    # A grey picture has all of them of its lightness.
+    rows = zip_longest(*(_strongest(one, most) for one in small))
+    found = [(k, one) for row in rows for k, one in enumerate(row) if one is not None]
+    return [
+        _enlarged(one.mask, one.sign * whole[k] > one.sign * one.level) for k, one in found[:most]
+    ]
 
 
 class _Region(NamedTuple):

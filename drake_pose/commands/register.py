@@ -46,9 +46,9 @@ def register(
     --joints may also be the poses.csv of an estimate, in which the base may move.
 
     An episode needs no masks: pictures or videos beside joint positions by time or frame, a LeRobot
-    data set, a folder of DROID, a ROS bag. The camera must stand still, and the robot move in view
-    of it. By how much pictures and joints are out of step is found, too, and focal lengths that
-    nobody knows.
+    data set, a folder of DROID, a ROS bag. The robot must move in view of a camera that stands
+    still, or that rides on it (--on) and sees a --target. Of one that stands still is found, too,
+    by how much pictures and joints are out of step, and a focal length that nobody knows.
 
     Files in DIR: cameras.yaml, which estimate reads; report.html, which shows all of it;
     registration.yaml (6 x 6 covariance, other poses); summary.json; overlay/, overlay_as_given/; of
@@ -166,7 +166,7 @@ def _print_registration(result: SceneRegistration) -> None:
     console.print(frames)
     console.print(table)
     for name, one in result.summary["cameras"].items():
-        if one["masks"] == "found":
+        if "time_offset_scores" in one:
             console.print(escape(f"camera '{name}': {_say_clock(one)}"), soft_wrap=True)
     first = next(iter(result.summary["cameras"].values()))
     for key, title, of, what in PARAMETERS:

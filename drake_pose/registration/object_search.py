@@ -46,6 +46,8 @@ Look = Array
 
 # Of each picture so many poses of the object are kept; and so many starts and looks of all.
 _OF_A_PICTURE, _STARTS, _LOOKS = 8, 12, 4
+# Of a picture's regions so many may be the object: those of less E_total than this.
+_REGIONS, _EXPLAINS = 3, 0.15
 # Looks are one whose object is seen nearer to each other than this [its radius].
 _APART = 0.15
 # A look whose mean E_total is larger by so much than so many times the best one's is none.
@@ -81,7 +83,13 @@ class ObjectSearch:
             RegistrationError: the frames that agree, or all, turn the link about one axis alone.
         """
         require_turns(camera.name, self._standing, frames)
-        looks = self._search(camera, frames)
+        looks = self._search(camera, [[one] for one in spread(frames)])
+        return self._fitted(camera, frames, looks)
+
+    def _fitted(
+        self, camera: PinholeCamera, frames: Sequence[PosedFrame], looks: list[Look]
+    ) -> RegisteredCamera:
+        """The best of some looks that are fitted."""
         for rounds, spacing, surfaces in (
             (FINE, FINE_SPACING, "few"),
             (ROUNDS_WITH_CONSTANTS, LAST_SPACING, "all"),
@@ -117,15 +125,35 @@ class ObjectSearch:
         require_turns(camera.name, self._standing, agreeing, "that agree ")
         return replace(found, seen_object=seen)
 
-    def _search(self, camera: PinholeCamera, frames: Sequence[PosedFrame]) -> list[Look]:
-        """Where the best one may be near, best first."""
-        some = spread(frames)
-        alone = [PosedFrame(one.name, np.zeros(0), one.mask) for one in some]
+    def choose(
+        self, camera: PinholeCamera, choices: Sequence[Sequence[PosedFrame]]
+    ) -> tuple[Look, list[PosedFrame]]:
+        """Where camera and object are about, and of each picture the region that this explains.
+
+        Args:
+            choices: of each picture regions any of which may be the object. Pictures of which
+                none is explained are left out.
+
+        Raises RegistrationError: in no three pictures one of them turns as the link does.
+        """
+        look = self._search(camera, choices)[0]
+        found = [self._nearest(camera, own, look) for own in choices if own]
+        return look, [one for one in found if self._misfit(camera, one, look[None])[0] < _EXPLAINS]
+
+    def _search(self, camera: PinholeCamera, choices: Sequence[Sequence[PosedFrame]]) -> list[Look]:
+        """Where the best one may be near, best first.
+
+        choices: of each picture masks, one of which may be the object's.
+        """
         turns = self._standing.symmetry.turns
-        X_CT = []
-        for one in alone:
-            found = self._alone.search(camera, [one], _OF_A_PICTURE)
-            X_CT.append(np.concatenate(self._apart([X[None] for X in found], turns)))
+        kept, X_CT = list[list[PosedFrame]](), list[Array]()
+        for own in choices:
+            likely = self._likely(camera, own)
+            if likely:
+                kept.append([one for one, _ in likely])
+                alike = [self._apart([X[None] for X in found], turns) for _, found in likely]
+                X_CT.append(np.concatenate([X for found in alike for X in found]))
+        some = [own[0] for own in kept]
         X_WL = self._standing.hand_poses(np.array([one.values for one in some]))
         starts = hand_eye_starts(X_WL, X_CT, turns)
         if not len(starts):
@@ -135,32 +163,67 @@ class ObjectSearch:
                 "the joint positions those of these frames, and is it this link that the camera "
                 "rides on? Nothing was written"
             )
-        order = np.argsort(self._misfits(camera, alone, X_WL, starts, FIRST_SIDE), kind="stable")
+        order = np.argsort(self._misfits(camera, kept, starts, FIRST_SIDE), kind="stable")
         fitted = []
         for look in self._distinct(starts[order[: 10 * _STARTS]], some)[:_STARTS]:
-            fit = self._fit(camera, some, look, COARSE_SPACING, "very_few")
+            chosen = [self._nearest(camera, own, look) for own in kept]
+            fit = self._fit(camera, chosen, look, COARSE_SPACING, "very_few")
             fitted.append(self._look(fit, fit.fit(COARSE), look))
-        off = self._misfits(camera, alone, X_WL, np.array(fitted), SECOND_SIDE)
+        off = self._misfits(camera, kept, np.array(fitted), SECOND_SIDE)
         limit = _WORSE_BY + _WORSE_TIMES * float(off.min())
         order = np.argsort(off, kind="stable")
         return self._distinct([fitted[k] for k in order if off[k] <= limit], some)[:_LOOKS]
 
+    def _likely(
+        self, camera: PinholeCamera, own: Sequence[PosedFrame]
+    ) -> list[tuple[PosedFrame, list[Array]]]:
+        """Of a picture's masks those that some pose of the object explains best, and its poses.
+
+        A single one is known to be the object's.
+        """
+        told, body = [], self._standing.alone
+        for one in own:
+            alone = [PosedFrame(one.name, np.zeros(0), one.mask)]
+            found = self._alone.search(camera, alone, _OF_A_PICTURE)
+            posed = PosedFrames(body.kinematics, body.very_few, camera, alone)
+            off = float(E_total(areas(posed, np.array(found), SECOND_SIDE)).min())
+            if len(own) == 1 or off < _EXPLAINS:
+                told.append((off, one, found))
+        told.sort(key=lambda each: each[0])
+        return [(one, found) for _, one, found in told[:_REGIONS]]
+
     def _misfits(
         self,
         camera: PinholeCamera,
-        alone: Sequence[PosedFrame],
-        X_WL: Array,
+        choices: Sequence[Sequence[PosedFrame]],
         looks: Array,
         side: float,
     ) -> Array:
-        """(n,) E_total of looks (n, 2, 4, 4) in the mean of the frames; one counts one at most."""
-        off = np.zeros(len(looks))
-        for frame, X in zip(alone, X_WL, strict=True):
-            body = self._standing.alone
-            posed = PosedFrames(body.kinematics, body.very_few, camera, [frame])
-            X_CT = inverse_transforms(X @ looks[:, 0]) @ looks[:, 1]
-            off += np.minimum(E_total(areas(posed, X_CT, side))[:, 0], 1.0) / len(alone)
-        return off
+        """(n,) E_total of looks (n, 2, 4, 4) in the mean of pictures, each by its best mask."""
+        off = [
+            np.min([self._misfit(camera, one, looks, side) for one in own], axis=0)
+            for own in choices
+        ]
+        return np.asarray(np.mean(off, axis=0))
+
+    def _nearest(self, camera: PinholeCamera, own: Sequence[PosedFrame], look: Look) -> PosedFrame:
+        """Of a picture's masks that which a look explains best."""
+        return min(own, key=lambda one: self._misfit(camera, one, look[None])[0])
+
+    def _misfit(
+        self, camera: PinholeCamera, one: PosedFrame, looks: Array, side: float = SECOND_SIDE
+    ) -> Array:
+        """(n,) E_total of looks (n, 2, 4, 4) in a frame, one at most."""
+        body = self._standing.alone
+        alone = PosedFrame(one.name, np.zeros(0), one.mask)
+        posed = PosedFrames(body.kinematics, body.very_few, camera, [alone])
+        X_CT = self.seen_from(looks, one)
+        return np.minimum(E_total(areas(posed, X_CT, side))[:, 0], 1.0)
+
+    def seen_from(self, looks: Array, frame: PosedFrame) -> Array:
+        """(n, 4, 4) the object's poses X_CT in a frame's camera, of looks (n, 2, 4, 4)."""
+        X_WL = self._standing.hand_poses(frame.values[None])[0]
+        return np.asarray(inverse_transforms(X_WL @ looks[:, 0]) @ looks[:, 1])
 
     def _fit(
         self,

@@ -198,7 +198,7 @@ def _register(
     zeros: Sequence[str],
 ) -> PictureRegistration:
     """As register_pictures, the pictures being as they are."""
-    chosen, moving = _choose(body, camera, recording)
+    chosen, moving = choose_pictures(body, camera, recording)
     begin = posed_pictures(recording, chosen, 0.0)
     search = PictureSearch(body, camera, begin)
     looks = [search.approach(X_CW) for X_CW in search.search()[:_LOOKS]]
@@ -336,10 +336,13 @@ def _mean_time(recording: Recording, rows: Sequence[int]) -> float:
     return 0.0 if recording.times is None else float(recording.times[list(rows)].mean())
 
 
-def _choose(
-    body: RegistrationBody, camera: PinholeCamera, recording: Recording
+def choose_pictures(
+    body: RegistrationBody, camera: PinholeCamera, recording: Recording, count: int = SEARCHED
 ) -> tuple[list[int], list[int]]:
-    """The frames that carry the search, and those that move most beside them."""
+    """The frames that carry a search, so many at most, and those that move most beside them.
+
+    Raises RegistrationError: too few pictures with joint positions, or a body that does not move.
+    """
     values = recording.values_at(0.0)
     known = np.flatnonzero(np.isfinite(values).all(axis=1))
     if len(known) < 3:
@@ -357,13 +360,13 @@ def _choose(
         )
     rates = recording.rates_at(0.0)
     if rates is None:
-        return known[choose_frames(places, SEARCHED)].tolist(), []
+        return known[choose_frames(places, count)].tolist(), []
     ahead = node_places(body, values[known] + _RATE_STEP * rates[known])
     speed = np.linalg.norm(ahead - places, axis=2).mean(axis=1)
     slow = np.flatnonzero(speed <= np.quantile(speed, _SLOW))
-    if len(slow) < SEARCHED:
+    if len(slow) < count:
         slow = np.arange(len(known))
-    chosen = slow[choose_frames(places[slow], SEARCHED)]
+    chosen = slow[choose_frames(places[slow], count)]
     rest = np.setdiff1d(np.argsort(-speed)[: max(_MOVING, len(known) // 4)], chosen)
     moving = rest[choose_frames(places[rest], _MOVING)] if len(rest) else rest
     return known[chosen].tolist(), known[moving].tolist()

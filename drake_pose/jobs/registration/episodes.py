@@ -10,13 +10,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_pose.body.model import ArticulatedModel, load_model
+from drake_pose.body.model import OBJECT, ArticulatedModel, load_model
 from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.camera.episodes.episode import EpisodeCamera
 from drake_pose.camera.episodes.open import open_episode
 from drake_pose.camera.models import PinholeCamera
-from drake_pose.errors import SceneError
+from drake_pose.errors import SceneError, SettingsError
 from drake_pose.files.settings import EstimateSettings
 from drake_pose.jobs.estimate.episode import (
     MappedJoints,
@@ -29,8 +29,9 @@ from drake_pose.jobs.estimate.episode import (
     rows_of,
 )
 from drake_pose.jobs.estimate.searches import make_tree
-from drake_pose.jobs.registration.settings import AuditSettings
+from drake_pose.jobs.registration.settings import AuditSettings, RegistrationSettings
 from drake_pose.registration.picture_registration import Recording
+from drake_pose.registration.standing_object import StandingObject
 
 Array = NDArray[np.float64]
 
@@ -50,6 +51,8 @@ class EpisodeInputs:
         cameras: what is known of them; those in ``assumed`` have a usual focal length.
         recordings: of the same cameras.
         placed: the names of those whose pose somebody says.
+        standing: the object that cameras on a link see, in whose tree values are; None: they see
+            the robot.
     """
 
     path: Path
@@ -61,6 +64,7 @@ class EpisodeInputs:
     recordings: Mapping[str, Recording]
     warnings: tuple[str, ...]
     placed: frozenset[str]
+    standing: StandingObject | None = None
 
 
 def looks_at_pictures(path: Path, settings: AuditSettings) -> bool:
@@ -91,9 +95,15 @@ def read_episode(
             "do not tell where a robot stands"
         )
     model = load_model(model_path, package_paths=settings.packages)
+    standing = read_target(model, settings) if isinstance(settings, RegistrationSettings) else None
     tree = make_tree(model, EstimateSettings(hold=settings.hold))
+    if standing is not None:
+        tree = standing.tree(np.eye(4))
     mapped = map_log(path, episode.joints, tree, settings)
     warnings = list(mapped.warnings)
+    seen: tuple[str, ...] | None = (OBJECT,)
+    if standing is None:
+        seen = mapped.seen if mapped.unseen else None
     if mapped.unseen:
         warnings.append(
             "parts that joints move which are not logged are not looked at: "
@@ -105,8 +115,24 @@ def read_episode(
     default = TreeKinematics(tree).flatten(tree.default_values())
     recordings = {one.name: _recording(one, mapped, default, settings) for one in chosen}
     said = (*episode.warnings, *model.warnings, *warnings)
-    seen = mapped.seen if mapped.unseen else None
-    return EpisodeInputs(path, model, tree, seen, cameras, assumed, recordings, said, placed)
+    return EpisodeInputs(
+        path, model, tree, seen, cameras, assumed, recordings, said, placed, standing
+    )
+
+
+def read_target(model: ArticulatedModel, settings: RegistrationSettings) -> StandingObject | None:
+    """The object that cameras on a link see, before the robot; None: they see the robot."""
+    if settings.target is None:
+        return None
+    if settings.on is None:
+        raise SettingsError(
+            f"{settings.target} stands still, as a camera does that rides on no link, so its masks "
+            "tell nothing of the robot's world: name the link that the camera rides on (--on LINK)"
+        )
+    other = load_model(settings.target, package_paths=settings.packages)
+    held = make_tree(model, EstimateSettings(hold=settings.hold)).held
+    named = {model.position_names[index]: value for index, value in held.items()}
+    return StandingObject(model, settings.on, named, make_tree(other, EstimateSettings()))
 
 
 def _known_cameras(

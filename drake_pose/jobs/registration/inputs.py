@@ -28,7 +28,7 @@ from drake_pose.files.settings import EstimateSettings
 from drake_pose.jobs.estimate.inputs import missing_for_person
 from drake_pose.jobs.estimate.measurements import read_true_angles
 from drake_pose.jobs.estimate.searches import make_tree
-from drake_pose.jobs.registration.episodes import EpisodeInputs
+from drake_pose.jobs.registration.episodes import EpisodeInputs, read_target
 from drake_pose.jobs.registration.positions import (
     KnownPositions,
     estimate_positions,
@@ -126,11 +126,12 @@ def inputs_of_episode(episode: EpisodeInputs, settings: RegistrationSettings) ->
         SettingsError: an option that needs masks.
         UnknownNameError: a joint or link that is not there.
     """
-    for name in ("on", "target", "suggest"):
+    for name in ("suggest",) if settings.target else ("on", "suggest"):
         if getattr(settings, name):
             raise SettingsError(
                 f"--{name} needs masks, but {episode.path} has pictures: make masks of them "
                 "(drake-pose masks), or leave it out"
+                + ("; with --target FILE pictures are enough" if name == "on" else "")
             )
     kinematics = TreeKinematics(episode.tree)
     zeros, lengths = _select_parameters(episode.model, kinematics, settings)
@@ -138,7 +139,8 @@ def inputs_of_episode(episode: EpisodeInputs, settings: RegistrationSettings) ->
     positions = KnownPositions(episode.path, kinematics, {})
     return Inputs(
         scene, episode.model, episode.tree, positions, (), episode.warnings,
-        searched=tuple(episode.cameras.values()), seen=episode.seen, zeros=zeros, lengths=lengths,
+        searched=tuple(episode.cameras.values()), seen=episode.seen, standing=episode.standing,
+        zeros=zeros, lengths=lengths,
         given=tuple(one for name, one in episode.cameras.items() if name in episode.placed),
     )  # fmt: skip
 
@@ -167,7 +169,7 @@ def read_inputs(
     scene, frames = scene.every(settings.every, settings.frames)
     searched, held = _select_cameras(scene, file, settings)
     model = load_model(model_path, package_paths=settings.packages)
-    table, standing = None, _read_target(model, settings)
+    table, standing = None, read_target(model, settings)
     if joints_path is not None and standing is None:
         table = read_true_angles(joints_path, model.position_names)
     if joints_path is None or (table is not None and table.is_estimate):
@@ -252,21 +254,6 @@ def _require_angle_of_view(camera: PinholeCamera, path: Path) -> None:
                 f"{_VIEWS[1]:g} are expected: give the focal length in pixels, of pictures of "
                 "this size"
             )
-
-
-def _read_target(model: ArticulatedModel, settings: RegistrationSettings) -> StandingObject | None:
-    """The object that cameras on a link see, before the robot; None: they see the robot."""
-    if settings.target is None:
-        return None
-    if settings.on is None:
-        raise SettingsError(
-            f"{settings.target} stands still, as a camera does that rides on no link, so its masks "
-            "tell nothing of the robot's world: name the link that the camera rides on (--on LINK)"
-        )
-    other = load_model(settings.target, package_paths=settings.packages)
-    held = make_tree(model, EstimateSettings(hold=settings.hold)).held
-    named = {model.position_names[index]: value for index, value in held.items()}
-    return StandingObject(model, settings.on, named, make_tree(other, EstimateSettings()))
 
 
 def make_registration_tree(

@@ -18,6 +18,8 @@ from drake_pose.body.model import OBJECT_POSITIONS
 from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.camera.models import Camera, PinholeCamera
+from drake_pose.camera.picture_files import Picture
+from drake_pose.errors import CameraError
 from drake_pose.files.folder import writes_folder
 from drake_pose.files.options import percent
 from drake_pose.files.summary import BADLY_EXPLAINED
@@ -55,6 +57,8 @@ from drake_pose.registration.object_search import ObjectSearch
 from drake_pose.registration.picture_frames import judge_pictures
 from drake_pose.registration.picture_registration import (
     PictureRegistration,
+    choose_pictures,
+    posed_pictures,
     register_pictures,
 )
 from drake_pose.registration.posed_frames import PosedFrames, SeenFrame
@@ -65,7 +69,9 @@ from drake_pose.registration.register import (
     RegistrationBody,
     suggest_pose,
 )
+from drake_pose.registration.standing_object import StandingObject
 from drake_pose.registration.start_poses import E_total, areas, intersection_over_union
+from drake_pose.registration.target_pictures import find_in_pictures, require_seen
 from drake_pose.silhouette.pictures.scene_checks import frame_ranges
 from drake_pose.silhouette.pictures.scenes import CAMERA_FILE
 
@@ -74,6 +80,8 @@ OnCamera = Callable[[int], None]
 
 # So many pictures are shown of those that contradict.
 _SHOWN = 20
+# So many pictures of a target are looked at.
+_OF_TARGET = 24
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,7 +159,7 @@ def register_scene(
     }
     if folder is not None:
         write_result(
-            folder, work.inputs, placed, work.registered, summary, overlay, urdf, work.pictures
+            folder, work.inputs, placed, work.registered, summary, overlay, urdf, work.shown
         )
     return SceneRegistration(placed, work.registered, summary, tuple(work.warnings), folder)
 
@@ -186,6 +194,7 @@ class _Registration:
         registered, seconds, suggestions: of the cameras that were found, by name.
         parameters: what the summary says of zeros and lengths.
         pictures: of cameras that were found in these, by name, with what was found in them.
+        seen: by camera and frame, pictures in which masks of a target were found.
     """
 
     def __init__(self, inputs: Inputs, settings: RegistrationSettings) -> None:
@@ -198,7 +207,13 @@ class _Registration:
         self.suggestions = dict[str, dict[str, Any] | None]()
         self.parameters: dict[str, Any] = {"zeros": {}, "lengths": {}}
         self.pictures = dict[str, PictureRegistration]()
+        self.seen = dict[str, dict[str, Picture]]()
         self._zeros = np.zeros(len(self.body.kinematics.names))
+
+    @property
+    def shown(self) -> dict[str, dict[str, Picture]]:
+        """Pictures by camera and frame, of cameras that were found in these."""
+        return self.seen | {name: one.pictures for name, one in self.pictures.items()}
 
     @property
     def has_constants(self) -> bool:
@@ -258,6 +273,9 @@ class _Registration:
 
         Raises RegistrationError: no pose of a camera explains its pictures.
         """
+        if episode.standing is not None:
+            self._find_target(episode, episode.standing, on_camera)
+            return
         frames: list[SeenFrame] = []
         for name, camera in episode.cameras.items():
             start, focal = time.perf_counter(), self._settings.focal or name in episode.assumed
@@ -278,6 +296,41 @@ class _Registration:
             if on_camera is not None:
                 on_camera(len(self.registered))
         self.inputs = replace(self.inputs, frames=tuple(frames))
+
+    def _find_target(
+        self, episode: EpisodeInputs, standing: StandingObject, on_camera: OnCamera | None
+    ) -> None:
+        """Finds masks of an object in pictures from a link, and each camera in these.
+
+        Raises:
+            CameraError: nobody says a camera's focal length.
+            RegistrationError: no pose explains enough of a camera's pictures.
+        """
+        frames, start = list[SeenFrame](), time.perf_counter()
+        body = standing.body(np.eye(4))
+        for name, camera in episode.cameras.items():
+            if name in episode.assumed:
+                raise CameraError(
+                    f"camera '{name}': nobody says its focal length, without which pictures of a "
+                    "target do not tell how far away it is; calibrate it (drake-pose calibrate)"
+                )
+            recording = episode.recordings[name]
+            rows, _ = choose_pictures(body, camera, recording, _OF_TARGET)
+            seen = find_in_pictures(standing, camera, posed_pictures(recording, rows, 0.0))
+            self.seen[name] = {one.name: recording.picture(one.name) for one in seen}
+            frames += [SeenFrame(one.name, one.values, {name: one.mask}) for one in seen]
+            seen.sort(key=lambda one: recording.names.index(one.name))
+            lost = [recording.names[k] for k in rows if recording.names[k] not in self.seen[name]]
+            if lost:
+                self.warnings.append(say_lost(name, lost, recording.names, "target"))
+        self.inputs, seconds = (
+            replace(self.inputs, frames=tuple(frames)),
+            time.perf_counter() - start,
+        )
+        self.find_each(on_camera)
+        for name, found in self.registered.items():
+            require_seen(name, len(found.frames) - len(found.contradictions), len(self.seen[name]))
+            self.seconds[name] += seconds / len(self.registered)
 
     def judge(self) -> None:
         """Says what a user should know of the cameras with all that was found.
@@ -337,7 +390,7 @@ class _Registration:
         return {
             name: self.parameters
             | describe_camera(one, self.seconds[name] + more, told[name], on)
-            | describe_pictures(self.pictures.get(name))
+            | describe_pictures(self.pictures.get(name), name in self.seen)
             for name, one in self.registered.items()
         }
 

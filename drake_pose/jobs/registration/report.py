@@ -98,6 +98,8 @@ def make_registration_report(folder: Path, summary: Mapping[str, Any]) -> str:
             if first[key]
         ],
         by_pictures=first["masks"] == "found",
+        # A target tells nothing of clocks.
+        clocks=first["masks"] == "found" and "time_offset_scores" in first,
         offsets={name: _plot_offset(one) for name, one in summary["cameras"].items()},
         normal=_NORMAL,
         pictures=[picture for picture in pictures if picture is not None],

@@ -10,6 +10,7 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
+from drake_pose.body.model import OBJECT_POSITIONS
 from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.camera.camera_files import dump_cameras
@@ -104,10 +105,14 @@ def _describe_object(seen: ObjectPose) -> dict[str, Any]:
     }
 
 
-def describe_pictures(one: PictureRegistration | None) -> dict[str, Any]:
-    """What summary.json says of a camera that was found in pictures; None: it was in masks."""
+def describe_pictures(one: PictureRegistration | None, found: bool = False) -> dict[str, Any]:
+    """What summary.json says of a camera that was found in pictures; None: it was in masks.
+
+    found: whether these were found in pictures.
+    """
     if one is None:
-        return {"masks": "given", "time_offset_s": None, "time_offset_sd_s": None}
+        masks = "found" if found else "given"
+        return {"masks": masks, "time_offset_s": None, "time_offset_sd_s": None}
     offset, focal = one.offset, one.found.camera.focal_x
     told = offset is not None and offset.determined
     drifts = offset is not None and bool(offset.drift)
@@ -153,10 +158,10 @@ def say_drift(camera: str, drift: float, deviation: float) -> str:
     )
 
 
-def say_lost(camera: str, lost: Sequence[str], names: Sequence[str]) -> str:
+def say_lost(camera: str, lost: Sequence[str], names: Sequence[str], what: str = "robot") -> str:
     """That pictures show nothing of a robot that they should; names: of all its pictures."""
     return (
-        f"camera '{camera}': nothing of the robot is seen where it should be in frames "
+        f"camera '{camera}': nothing of the {what} is seen where it should be in frames "
         f"{frame_ranges(lost, names)}: is something before it, or are the joint positions not "
         "those of the pictures?"
     )
@@ -213,15 +218,15 @@ def write_result(
     summary: Mapping[str, Any],
     overlay: bool,
     urdf: bytes | None = None,
-    pictures: Mapping[str, PictureRegistration] | None = None,
+    pictures: Mapping[str, Mapping[str, NDArray[np.uint8]]] | None = None,
 ) -> None:
     """Writes the result folder; the camera file comes last, when all else is there.
 
     Args:
         cameras: all that the camera file is to hold.
         urdf: the robot with the zeros and lengths that were found.
-        pictures: of cameras that were found in these, by name. The folder is then a scene of the
-            masks that follow from them, at their joint positions.
+        pictures: of cameras that were found in these, by camera and frame. The folder is then a
+            scene of the masks that follow from them, at their joint positions.
 
     Raises:
         OutputError: the folder cannot be written.
@@ -233,7 +238,7 @@ def write_result(
             f"{'agrees' if one.agrees else 'CONTRADICTS the others'}"
             for one in found.frames
         ]
-        own = pictures[name].pictures if pictures else {}
+        own = pictures[name] if pictures else {}
         titled = [
             one
             for one in zip(inputs.of(name), titles, strict=True)
@@ -253,19 +258,21 @@ def write_result(
     write_summary(path, summary)
     write_file(path, REPORT, make_registration_report(path, summary))
     links = {name: one["link"] for name, one in parts.items() if "link" in one}
-    shown = {name: one.pictures for name, one in (pictures or {}).items()}
     formats = summary["settings"]["exports"]
-    write_exports(path, formats, inputs, cameras.values(), links, shown)
+    write_exports(path, formats, inputs, cameras.values(), links, pictures or {})
     write_file(path, CAMERA_FILE, dump_cameras(cameras, links))
 
 
 def _write_frames(path: Path, inputs: Inputs, camera: str, several: bool) -> None:
     """Masks of a camera's frames, and joint positions at their moments by its own clock."""
     frames, names = inputs.of(camera), TreeKinematics(inputs.tree).names
+    names = tuple(name for name in names if name not in OBJECT_POSITIONS)
     for frame in frames:
         picture = encode_png(255 * frame.mask.astype(np.uint8))
         write_file(path, f"masks/{camera}/{frame.name}.png", picture)
-    rows = [["frame", *names], *([one.name, *map(repr, one.values.tolist())] for one in frames)]
+    # An object's come last, and are 0.
+    values = [map(repr, one.values[: len(names)].tolist()) for one in frames]
+    rows = [["frame", *names], *([one.name, *own] for one, own in zip(frames, values, strict=True))]
     file = f"joint_angles_{camera}.csv" if several else "joint_angles.csv"
     write_file(path, file, csv_text(rows))
 

@@ -36,10 +36,11 @@ class RegistrationSettings(AuditSettings):
     without X_WC."""
     on: Annotated[str | None, Parameter(metavar="LINK")] = None
     """The cameras to be found ride on this link (eye in hand): their pose X_LC in its frame is
-    found, from masks of the robot's base, which is what no joint moves, or of a --target."""
+    found, from masks of the robot's base, which is what no joint moves, or from masks or pictures
+    of a --target."""
     target: Path | None = None
-    """With --on: the masks show another, rigid object (URDF, SDFormat, MJCF), which stands anywhere
-    in the world; where is found, too."""
+    """With --on: the masks, or the pictures of an episode, show another, rigid object (URDF,
+    SDFormat, MJCF), which stands anywhere in the world; where is found, too."""
     zeros: Names = ()
     """Find the zero of this joint, too, a constant that is added to its positions in all frames;
     all: of every joint; repeat for several. A URDF with the zeros is written."""

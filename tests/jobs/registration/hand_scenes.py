@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -131,3 +132,30 @@ def damage_masks(folder: Path, seed: int, wrong: str) -> None:
     for path in sorted(folder.glob("*.png")):
         mask = damaged(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) > 0, rng, (2, 6))
         write_mask(path, mask[::-1, ::-1] if path.name == wrong else mask)
+
+
+def paint_pictures(folder: Path, seed: int = 0) -> None:
+    """Pictures in place of a scene's masks, which the target fills, before clutter that changes.
+
+    The target is dull and brighter at its top left, what is behind it in stripes and boxes of
+    other colours; each picture's noise is 4 of 255.
+    """
+    rng = np.random.default_rng(seed)
+    for path in sorted((folder / "masks" / "wrist").glob("*.png")):
+        mask = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) > 0
+        height, width = mask.shape
+        grain = cv2.GaussianBlur(rng.normal(0.0, 1.0, (height, width)), (0, 0), 12.0, 3.0)
+        picture = np.array([150.0, 110.0, 70.0]) + 20.0 * (grain / grain.std())[..., None]
+        for _ in range(6):
+            corner, size = rng.uniform(0.0, [width, height]), rng.uniform(0.05, 0.4, 2) * width
+            box = cv2.boxPoints((corner.tolist(), size.tolist(), rng.uniform(0.0, 90.0)))
+            cv2.fillPoly(picture, [box.astype(np.int32)], rng.uniform(20.0, 160.0, 3).tolist())
+        light = np.linspace(1.0, 0.85, height)[:, None] * np.linspace(1.0, 0.85, width)
+        soft = cv2.GaussianBlur(mask.astype(float), (0, 0), 0.7)[..., None]
+        shown = np.array([200.0, 205.0, 215.0]) * light[..., None]
+        picture = soft * shown + (1.0 - soft) * picture + rng.normal(0.0, 4.0, picture.shape)
+        (folder / "images" / "wrist").mkdir(parents=True, exist_ok=True)
+        image = folder / "images" / "wrist" / path.name
+        cv2.imwrite(str(image), np.clip(picture[..., ::-1], 0, 255).astype(np.uint8))
+        path.unlink()
+    shutil.rmtree(folder / "masks")

@@ -12,6 +12,7 @@ import yaml
 from drake_pose.body.model import load_model
 from drake_pose.camera.camera_files import load_camera_file, load_cameras
 from drake_pose.errors import CameraError
+from drake_pose.silhouette.pictures.masks import intersection_over_union, read_mask
 from tests.cli import run_command
 from tests.jobs.estimate.test_bad_input import assert_refused
 from tests.jobs.registration.arm_scenes import ArmScene, pose_errors
@@ -23,6 +24,7 @@ from tests.jobs.registration.hand_scenes import (
     X_LC,
     TargetScene,
     damage_masks,
+    paint_pictures,
     write_hand_scene,
 )
 from tests.search.arms import LINKS
@@ -156,6 +158,44 @@ def test_a_round_target_leaves_its_own_turn_open_alone(tmp_path: Path) -> None:
     axis = np.array(target["X_WT"])[:3, 2]
     assert abs(axis @ scene.X_WT[:3, 2]) > np.cos(np.radians(0.2))
     assert any("not determined" in text for text in found["warnings"])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("looks", [BRACKET, BOX])
+def test_pictures_are_enough_of_a_target(looks: str, tmp_path: Path) -> None:
+    scene = write_hand_scene(tmp_path, looks, seed=4)
+    masks = sorted((scene.arm.folder / "masks" / "wrist").glob("*.png"))
+    drawn = {path.name: read_mask(path) for path in masks}
+    paint_pictures(scene.arm.folder)
+    found = register(of_target(scene, tmp_path / "out"))
+    require_near(found, 2.0, 0.2)
+    poses = [np.array(one["X_WT"]) for one in found["target"]["families"]]
+    assert min(pose_errors(X, scene.X_WT)[0] for X in poses) < 2.0
+    assert (found["masks"], found["contradictions"]) == ("found", [])
+    # The result is a scene of the masks, as Drake has drawn them but for the noise of the pictures.
+    for name, mask in drawn.items():
+        own = read_mask(tmp_path / "out" / "masks" / "wrist" / name)
+        assert intersection_over_union(own, mask) > 0.97
+    arm = replace(scene.arm, folder=tmp_path / "out", joints=tmp_path / "out" / "joint_angles.csv")
+    require_near(register(of_target(replace(scene, arm=arm), tmp_path / "again")), 2.0, 0.2)
+
+
+@pytest.mark.slow
+def test_pictures_that_do_not_show_the_target_are_refused(tmp_path: Path) -> None:
+    scene = write_hand_scene(tmp_path, BOX, seed=4)
+    paint_pictures(scene.arm.folder)
+    other = replace(scene, target=tmp_path / "can.urdf")
+    text = scene.target.read_text().replace(BOX, CAN)
+    other.target.write_text(text)
+    said = "no pose of the target explains its pictures"
+    assert_refused(run_command(of_target(other, tmp_path / "out")), f"camera 'wrist': {said}")
+    assert not (tmp_path / "out").exists()
+    rows = scene.arm.joints.read_text().splitlines()
+    numbers = [row.split(",", 1) for row in rows[1:]]
+    # Each frame has the joints of the one three after it.
+    moved = [f"{numbers[k][0]},{numbers[k - 3][1]}" for k in range(len(numbers))]
+    scene.arm.joints.write_text("\n".join([rows[0], *moved]))
+    assert_refused(run_command(of_target(scene, tmp_path / "out")), "camera 'wrist'")
 
 
 @pytest.mark.slow

@@ -48,7 +48,7 @@ def test_the_clock_s_offset_is_drawn_at_the_curve_s_peak(tmp_path, late):
     ]
     told = {"time_offset_s": late, "time_offset_sd_s": 0.02, "focal_sd_px": 5.0}
     page = make_registration_report(tmp_path, summary(time_offset_scores=scores.tolist(), **told))
-    assert "from pictures and a log of joint positions" in page
+    assert "from pictures and joint positions" in page
     assert (
         f"Offset {1e3 * late:.1f} ms ({1e3 * late - 39.2:.1f} to {1e3 * late + 39.2:.1f})" in page
     )

@@ -26,7 +26,7 @@ from drake_pose.registration.picture_levels import PictureLevel, SearchRound
 from drake_pose.registration.posed_frames import PosedFrame, PosedFrames
 from drake_pose.registration.register import RegistrationBody
 from drake_pose.registration.shared_fit import Shared, SharedFit
-from drake_pose.silhouette.areas.outline import Outline
+from drake_pose.silhouette.areas.outline import NOTHING, Outline
 from drake_pose.silhouette.areas.scoring import draw_mask
 from drake_pose.workers import map_ordered
 
@@ -50,6 +50,8 @@ ABOUT = 100
 
 # Triangles of a node, up to which width of pictures [pixel].
 _TRIANGLES, _WIDTHS = (12, 40, ABOUT), (64, 120)
+# Parts that are smaller than so many times the largest one do not show in the smallest pictures.
+_SMALL = 0.25
 # Poses are compared in pictures so wide, and backgrounds learned in these.
 _COMPARED, _LEARNED = 160, 320
 # Fits on lines: scales of steps [pixel of a picture _SCALED wide], and from line to line [scale];
@@ -139,7 +141,11 @@ class PictureSearch:
         self, body: RegistrationBody, camera: PinholeCamera, frames: Sequence[PosedPicture]
     ) -> None:
         self._body, self._camera, self.frames = body, camera, tuple(frames)
-        self._outlines = tuple(hull_of_few(body.very_few, count) for count in _TRIANGLES)
+        coarse = hull_of_few(body.very_few, _TRIANGLES[0])
+        least = _SMALL * max(one.ball[3] for one in coarse)
+        coarse = tuple(one if one.ball[3] >= least else NOTHING for one in coarse)
+        finer = (hull_of_few(body.very_few, count) for count in _TRIANGLES[1:])
+        self._outlines = (coarse, *finer)
         self._X_WN = np.array([body.kinematics.poses(one.values) for one in frames])
         self._levels = dict[int, PictureLevel]()
 

@@ -17,7 +17,6 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_pose.body.surfaces.meshes import TriangleMesh
 from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.camera.models import PinholeCamera
@@ -41,7 +40,7 @@ from drake_pose.registration.start_poses import (
     spread_rotations,
 )
 from drake_pose.silhouette.areas.bending import TreeSurfaces
-from drake_pose.silhouette.areas.outline import outline_from_mesh
+from drake_pose.silhouette.areas.outline import NOTHING
 from drake_pose.silhouette.areas.scoring import draw_mask
 from drake_pose.workers import map_ordered
 
@@ -107,10 +106,9 @@ class RegistrationBody:
         if girths is not None:
             surfaces = surfaces.with_rigid(with_girths(surfaces.rigid, girths))
         if seen is not None:
-            nothing = outline_from_mesh(TriangleMesh(np.zeros((0, 3)), np.zeros((0, 3), np.int64)))
             own = zip(tree.nodes, surfaces.rigid, strict=True)
             surfaces = surfaces.with_rigid(
-                [surface if node.name in seen else nothing for node, surface in own]
+                [surface if node.name in seen else NOTHING for node, surface in own]
             )
         self.very_few = few_triangles(surfaces, fewest)
         self.few = few_triangles(surfaces, FEW)

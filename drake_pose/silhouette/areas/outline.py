@@ -147,6 +147,10 @@ def _position_in_run(*keys: np.ndarray) -> np.ndarray:
     return index - np.maximum.accumulate(np.where(begins, index, 0))
 
 
+NOTHING = outline_of_triangles(np.zeros((0, 3)), np.zeros((0, 3)))
+"""The outline of a part without a surface."""
+
+
 def pack(outlines: tuple[Outline, ...]) -> PackedOutlines:
     """Returns outlines in the kernel's arrays (remembered: outlines are immutable)."""
     packed = _pack_rest(tuple(outline.rest or outline for outline in outlines))

@@ -1,26 +1,17 @@
-"""The axes of segments in a silhouette, matched to a rough pose, and as an observation of it.
+"""The axes of segments in a silhouette, matched to a rough pose.
 
 Shimada et al., (11), (12) and figure 17: no picture says which part of it shows which segment. A
 rough pose does: each point of the silhouette's edge goes to the side of a segment that is nearest.
 """
 
 import math
-from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from drake_pose.arrays import Array, Mask
-from drake_pose.body.tree.tree_kinematics import TreeKinematics
-from drake_pose.camera.models import Camera
-from drake_pose.errors import MaskError, ModelError, SettingsError
-from drake_pose.filtering.contour import ContourObservation
-from drake_pose.filtering.state import Belief
-from drake_pose.filtering.update import difference, make_evidence, update
-from drake_pose.fit.evidence import EdgePoints, find_edge_points
-
-Ends = tuple[Array, Array]
+from drake_pose.fit.evidence import EdgePoints
 
 SPACING = 2.0
 """The spacing of the silhouette's edge points that are matched [pixel]."""
@@ -42,10 +33,6 @@ _BESIDE = 2.0
 _ROUNDS = 4
 # A segment that points at the camera shows no axis [pixel].
 _SHORTEST = 5.0
-_STEP = 1e-5
-_SMALLEST_MIRROR, _MIRROR_SLOPE, _MIRROR_REACH = math.radians(8.0), 0.35, 3.0
-# A match corrects its own rough pose, which is about so far off [rad].
-_ROUGH, _ITERATIONS = math.radians(15.0), 3
 
 
 class RoughBody(NamedTuple):
@@ -210,159 +197,3 @@ def block_covariance(blocks: Array) -> Array:
     R = np.zeros((count, 2, count, 2))
     R[np.arange(count), :, np.arange(count)] = blocks
     return R.reshape(2 * count, 2 * count)
-
-
-class AxisObservation:
-    """What a camera sees of segments' axes: alpha [rad] and rho [pixel] of each.
-
-    A segment's width is that of its link's mesh, at the widest between the axis' ends.
-
-    Args:
-        body: turns a state into a pose; its tree's root stays where the tree holds it.
-        axes: start and end of each segment's axis (3,), (3,) in its link's frame, by name [m].
-        origin: (2,) where the image's origin is for rho [pixel].
-
-    Attributes:
-        names: (m) ``alpha_<link>`` and ``rho_<link>`` of each segment.
-        variances: (m,) of the noise, where a frame does not say its own.
-        wraps: (m,) true for alpha.
-
-    Raises:
-        SettingsError: no axis; or the root moves beside the plant's own positions.
-        UnknownNameError: there is no segment of such a name.
-        ModelError: a segment's link shows nothing between the ends of its axis.
-    """
-
-    def __init__(
-        self,
-        body: ContourObservation,
-        camera: Camera,
-        axes: Mapping[str, Ends],
-        origin: tuple[float, float] = (0.0, 0.0),
-    ) -> None:
-        if not axes:
-            raise SettingsError("an observation of axes needs one segment or more")
-        tree = body.tree
-        _, X_WB = tree.positions_from(tree.default_values())
-        if not np.allclose(X_WB, np.eye(4), atol=1e-9):
-            raise SettingsError(f"{tree.model.path}: the root moves beside the plant's positions")
-        self.body, self._camera, self._origin = body, camera, origin
-        self._kinematics = TreeKinematics(tree)
-        self._nodes = [tree.node_index(name) for name in axes]
-        self._ends = np.array([axes[name] for name in axes], dtype=np.float64)
-        self.links = tuple(axes)
-        meshes = tree.model.link_meshes
-        self._widths = np.array(
-            [
-                _half_width(meshes[name].vertices if name in meshes else np.zeros((0, 3)), *ends)
-                for name, ends in zip(axes, self._ends, strict=True)
-            ]
-        )
-        for name, width in zip(axes, self._widths, strict=True):
-            if width <= 0:
-                raise ModelError(
-                    f"{tree.model.path}: link '{name}' shows nothing between the ends of its axis; "
-                    "give the ends in the link's frame"
-                )
-        self.names = tuple(f"{kind}_{name}" for name in axes for kind in ("alpha", "rho"))
-        self.variances = np.tile([math.radians(2.0) ** 2, 2.0**2], len(axes))
-        self.wraps = np.tile([True, False], len(axes))
-
-    def predict(self, x: Array) -> tuple[Array, Array]:
-        """Axes (m,) at a state (n,), NaN where too short; Jacobian by central differences."""
-        h = self._axes_at(x)
-        H = np.zeros((len(h), len(x)))
-        for k, step in enumerate(_STEP * np.eye(len(x))[: len(self.body.layout.moving)]):
-            change = difference(self._axes_at(x + step), self._axes_at(x - step), self.wraps)
-            H[:, k] = change / (2 * _STEP)
-        return h, H
-
-    def mirrors(self, belief: Belief) -> list[Array]:
-        """Predictions (n,) mirrored at the image plane in the joint of one segment: (30)."""
-        x, deviations, found = belief.mean, belief.deviations(), []
-        kinematics, moving = self._kinematics, self.body.layout.moving
-        values = self.body.parameters(x)[: len(kinematics.names)]
-        for k, node in enumerate(self._nodes):
-            for value in np.flatnonzero((kinematics.value_nodes == node) & kinematics.is_angle):
-                if kinematics.names[value] not in moving:
-                    continue
-                turn = 0.5 * np.pi * np.eye(len(values))[value]
-                # About the joint's axis the segment is middle + a cos(change) + b sin(change).
-                here, quarter, half = (self._in_camera(values + i * turn, k) for i in range(3))
-                a, b = here - 0.5 * (here + half), quarter - 0.5 * (here + half)
-                moved = np.linalg.norm(b[:2]) / max(float(np.linalg.norm(a)), 1e-9)
-                change = math.remainder(2.0 * math.atan2(b[2], a[2]) + math.pi, 2.0 * math.pi)
-                index = moving.index(kinematics.names[value])
-                reach = _MIRROR_REACH * deviations[index]
-                if moved <= _MIRROR_SLOPE and _SMALLEST_MIRROR < abs(change) < reach:
-                    found.append(x.copy())
-                    found[-1][index] += change
-        return found
-
-    def measure(self, mask: Mask, x: Array) -> tuple[Array, Array]:
-        """Measure the axes in a silhouette (H, W) beside a rough state (n,).
-
-        Returns:
-            The measurement (m,), NaN where a segment is hidden, and its noise's covariance (m, m).
-
-        Raises:
-            MaskError: a mask that is not of the camera's size.
-        """
-        size = (self._camera.height, self._camera.width)
-        if mask.shape != size:
-            raise MaskError(
-                f"camera '{self._camera.name}': a mask of {mask.shape[::-1]} pixels, "
-                f"{size[::-1]} expected"
-            )
-        edge = find_edge_points(mask, SPACING)
-        around = Belief(x, np.diag(np.full(len(x), _ROUGH**2)))
-        for gate in GATES:
-            axes = match_axes(edge, self._rough(x), gate, self._origin)
-            y, R = axes.lines.ravel(), block_covariance(axes.line_covariances)
-            x = update(around, make_evidence(self, y, R), _ITERATIONS).belief.mean
-        return y, R
-
-    def _rough(self, x: Array) -> RoughBody:
-        """What is seen at a state (n,)."""
-        p_W = self._segments(self.body.node_values(x))
-        ends = self._camera.project(p_W.reshape(-1, 3))[0].reshape(-1, 2, 2)
-        # A width is seen as it is across the viewing ray.
-        middle = p_W.mean(axis=1)
-        beside = middle + self._widths[:, None] * self._camera.X_WC[:3, 0]
-        widths = self._camera.project(beside)[0] - self._camera.project(middle)[0]
-        return RoughBody(
-            ends,
-            np.linalg.norm(widths, axis=1),
-            np.ones((len(ends), 2), dtype=np.bool_),
-            np.zeros(0, dtype=np.intp),
-            self.body.draw(x, self._camera),
-        )
-
-    def _segments(self, values: Sequence[Array]) -> Array:
-        """(k, 2, 3) ends of the axes in the world."""
-        X_WN = self._kinematics.poses(self._kinematics.flatten(values))[self._nodes]
-        return np.einsum("kij,kej->kei", X_WN[:, :3, :3], self._ends) + X_WN[:, None, :3, 3]
-
-    def _in_camera(self, values: Array, k: int) -> Array:
-        """(3,) a segment from its start to its end, in the camera."""
-        start, end = self._segments(self._kinematics.split(values))[k]
-        return np.asarray(self._camera.X_CW[:3, :3] @ (end - start))
-
-    def _axes_at(self, x: Array) -> Array:
-        p_W = self._segments(self.body.node_values(x))
-        uv = self._camera.project(p_W.reshape(-1, 3))[0].reshape(-1, 2, 2) - self._origin
-        along = uv[:, 1] - uv[:, 0]
-        alpha = np.arctan2(along[:, 1], along[:, 0])
-        rho = np.cos(alpha) * uv[:, 0, 1] - np.sin(alpha) * uv[:, 0, 0]
-        h = np.column_stack([alpha, rho])
-        h[np.linalg.norm(along, axis=1) < _SHORTEST] = np.nan
-        return h.ravel()
-
-
-def _half_width(vertices: Array, start: Array, end: Array) -> float:
-    """How far the vertices (v, 3) between an axis' ends are from it at most [m]."""
-    along = (end - start) / np.linalg.norm(end - start)
-    place = (vertices - start) @ along
-    across = np.linalg.norm(vertices - start - place[:, None] * along, axis=1)
-    between = (place > -1e-9) & (place < np.linalg.norm(end - start) + 1e-9)
-    return float(across[between].max(initial=0.0))

@@ -17,9 +17,10 @@ from drake_pose.camera.episodes.episode import Episode, EpisodeCamera, JointLog
 from drake_pose.camera.episodes.folder import with_intrinsics
 from drake_pose.camera.episodes.joint_map import map_joints, read_joint_map
 from drake_pose.camera.episodes.open import open_episode
+from drake_pose.camera.picture_files import frame_key
 from drake_pose.errors import SceneError, SettingsError, UnknownNameError
 from drake_pose.files.settings import EpisodeSettings
-from drake_pose.jobs.estimate.measurements import TrueAngles, frame_key
+from drake_pose.jobs.estimate.measurements import TrueAngles
 from drake_pose.silhouette.pictures.scene_files import select_frames
 from drake_pose.silhouette.pictures.scenes import CAMERA_FILE, Scene
 

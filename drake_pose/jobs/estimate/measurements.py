@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 
 from drake_pose.body.parsed_model import ParsedModel
+from drake_pose.camera.picture_files import frame_key
 from drake_pose.csv_files import read_csv
 from drake_pose.errors import SceneError, UnknownNameError
 from drake_pose.files.records import BASE_COLUMNS, FIT_COLUMNS
-from drake_pose.silhouette.pictures.scene_files import frame_number
 
 _CENTRE_COLUMNS = ("frame", "joint", "x", "y", "z")
 
@@ -175,12 +175,6 @@ def check_units(
             )
         warnings.append(f"{text}{why}")
     return tuple(warnings)
-
-
-def frame_key(cell: str) -> int | str:
-    """A frame's number, which a table may have written as 3.0, or its name."""
-    number = frame_number(cell.removesuffix(".0"))
-    return cell if number is None else number
 
 
 def _numbers(cells: Sequence[str], path: Path, line: int) -> np.ndarray:

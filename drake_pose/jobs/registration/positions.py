@@ -16,6 +16,7 @@ from drake_pose.body.model import ArticulatedModel
 from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.camera.models import Camera
+from drake_pose.camera.picture_files import frame_key
 from drake_pose.errors import SceneError
 from drake_pose.files.records import base_pose
 from drake_pose.files.settings import EstimateSettings
@@ -23,7 +24,6 @@ from drake_pose.jobs.estimate.inputs import missing_for_person
 from drake_pose.jobs.estimate.measurements import (
     TrueAngles,
     check_units,
-    frame_key,
     read_true_angles,
 )
 from drake_pose.jobs.estimate.scene import estimate_scene

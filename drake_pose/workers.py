@@ -21,8 +21,8 @@ _CHOSEN: ContextVar[int | None] = ContextVar("workers", default=None)
 
 @contextmanager
 def working(workers: int | None) -> Iterator[None]:
-    """Has so many threads work meanwhile; None: one for each core."""
-    token = _CHOSEN.set(workers)
+    """Has so many threads work meanwhile; None: as many as before, at first one for each core."""
+    token = _CHOSEN.set(workers or _CHOSEN.get())
     try:
         yield
     finally:

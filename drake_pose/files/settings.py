@@ -75,6 +75,18 @@ class EpisodeSettings(SceneSettings):
     """Of an episode: which column of its joint log is which joint, in which unit (YAML)."""
     units: Literal["rad", "deg"] | None = None
     """The unit of angles in an episode's joint log; default: what the joints' limits say."""
+    workers: Annotated[int | None, Parameter(metavar="N")] = None
+    """Work with so many threads; the result is the same. Default: one for each core."""
+
+    def __post_init__(self) -> None:
+        if self.workers is not None and self.workers < 1:
+            raise SettingsError(f"workers must be 1 or more, not {self.workers}")
+
+    def as_json(self) -> dict[str, Any]:
+        """Returns the settings that make the result as plain JSON values."""
+        values = super().as_json()
+        del values["workers"]
+        return values
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -126,17 +138,16 @@ class EstimateSettings(CaptureSettings, EpisodeSettings):
     """beam: beam search and continuous fit; paper: Kameda, Minoh and Ikeda's search as published;
     person: one person, fitted to all cameras' silhouettes at once; auto: person if model, cameras
     and options allow it, else beam."""
-    workers: Annotated[int | None, Parameter(metavar="N")] = None
-    """Work with so many threads; the result is the same. Default: one for each core."""
     angles: Literal["continuous", "grid"] = "continuous"
     """continuous: poses are refined between coarse samples; grid: multiples of the sampling
     interval only, and the search ends where the silhouettes are matched exactly. Method beam only.
     """
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         require_choices(self)
-        for name in ("candidates", "run_limit", "workers"):
-            if getattr(self, name) is not None and getattr(self, name) < 1:
+        for name in ("candidates", "run_limit"):
+            if getattr(self, name) < 1:
                 raise SettingsError(f"{name} must be 1 or more, not {getattr(self, name)}")
         if self.time_limit is not None and not self.time_limit >= 0.0:
             raise SettingsError(f"time_limit must be 0 or more, not {self.time_limit}")
@@ -153,13 +164,12 @@ class EstimateSettings(CaptureSettings, EpisodeSettings):
     @property
     def search_settings(self) -> tuple[str, ...]:
         """The names of those that only a search heeds and that are not at their defaults."""
-        own = set(EstimateSettings.__annotations__) - {"method", "workers"}
+        own = set(EstimateSettings.__annotations__) - {"method"}
         return tuple(name for name in changed(self) if name in own)
 
     def as_json(self) -> dict[str, Any]:
         """Returns the settings that make the result as plain JSON values."""
         values, turns = super().as_json(), self.root_rotation
-        del values["workers"]
         if isinstance(turns, Mapping):
             values["root_rotation"] = [[axis, *limits] for axis, limits in turns.items()]
         return values

@@ -30,6 +30,7 @@ from drake_pose.registration.picture_search import (
 )
 from drake_pose.registration.posed_frames import PosedFrame
 from drake_pose.registration.register import RegisteredCamera, RegistrationBody, frame_misfits
+from drake_pose.workers import map_ordered
 
 Array = NDArray[np.float64]
 Picture = NDArray[np.uint8]
@@ -201,19 +202,18 @@ def _register(
     chosen, moving = choose_pictures(body, camera, recording)
     begin = posed_pictures(recording, chosen, 0.0)
     search = PictureSearch(body, camera, begin)
-    looks = [search.approach(X_CW) for X_CW in search.search()[:_LOOKS]]
+    looks = map_ordered(search.approach, search.search()[:_LOOKS])
     near = sorted((one for one in looks if one is not None), key=lambda one: -evidence(*one[1]))
     if not near:
         raise _Unexplained(camera, "no pose shows the body in two pictures")
     level, start = search.compared, near[0][0]
     pieces = level.pieces(start.X_CW)
     # Once more, for those that are on their way to the best.
-    alike = [
-        again[0].X_CW
-        for one, _ in near[1:]
-        if excess(pieces, level.pieces(one.X_CW)) <= _SIGNIFICANCE
-        and (again := search.approach(one.X_CW)) is not None
+    close = [
+        one.X_CW for one, _ in near[1:] if excess(pieces, level.pieces(one.X_CW)) <= _SIGNIFICANCE
     ]
+    again = map_ordered(search.approach, close)
+    alike = [one[0].X_CW for one in again if one is not None]
     alternatives = level.distinct([start.X_CW, *alike])[1:]
     both, offset, scores = [*chosen, *moving], 0.0, np.zeros((0, 2))
     if recording.times is not None:

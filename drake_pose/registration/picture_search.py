@@ -259,11 +259,12 @@ class PictureSearch:
             covered: (f, H, W) where the body is about; frames that do not show it tell nothing.
             outlines: the surfaces that are compared.
         """
-        posed, lights = [], self._level(_LEARNED).backgrounds.lights
-        for one, light, own in zip(frames, lights, covered, strict=True):
-            frame = see_picture(one, known, light, own)
-            if frame is not None:
-                posed.append(frame)
+        lights = self._level(_LEARNED).backgrounds.lights
+
+        def see(k: int) -> PosedFrame | None:
+            return see_picture(frames[k], known, lights[k], covered[k])
+
+        posed = [one for one in map_ordered(see, range(len(frames))) if one is not None]
         if len(posed) < 2:
             return None
         return PosedFrames(self._body.kinematics, outlines, camera, posed)

@@ -43,6 +43,7 @@ from drake_pose.registration.register import RegistrationBody
 from drake_pose.silhouette.areas.scoring import require_visible
 from drake_pose.silhouette.pictures.scene_checks import frame_ranges, read_scene
 from drake_pose.silhouette.pictures.scenes import CAMERA_FILE
+from drake_pose.workers import working
 
 OnFrame = Callable[[int], None]
 """Called with the number of frames that are done."""
@@ -105,24 +106,24 @@ def audit_scene(
         DrakePoseError: names the file, camera, frame or joint at fault.
     """
     settings, folder = settings or AuditSettings(), None if out is None else Path(out)
-    file = Path(cameras or Path(scene) / CAMERA_FILE)
     files = {
         "model": Path(model),
-        "cameras": file,
+        "cameras": (file := Path(cameras or Path(scene) / CAMERA_FILE)),
         "joints": None if joints is None else Path(joints),
     }
     begin = time.perf_counter()
-    if looks_at_pictures(Path(scene), settings):
-        own = None if cameras is None else Path(cameras)
-        episode = read_episode(Path(scene), Path(model), files["joints"], own, settings)
-        look = _look(episode, on_frame)
-    else:
-        inputs, frames = _read_inputs(Path(scene), model, joints, cameras, settings)
-        look = _Look(inputs, *_audit(inputs, frames, on_frame))
+    with working(settings.workers):
+        if looks_at_pictures(Path(scene), settings):
+            own = None if cameras is None else Path(cameras)
+            episode = read_episode(Path(scene), Path(model), files["joints"], own, settings)
+            look = _look(episode, on_frame)
+        else:
+            inputs, frames = _read_inputs(Path(scene), model, joints, cameras, settings)
+            look = _Look(inputs, *_audit(inputs, frames, on_frame))
     inputs, found = look.inputs, look.found
     seconds = time.perf_counter() - begin
-    warnings = [*inputs.warnings, *look.misplaced]
-    warnings += _doubts(inputs, found, look.unseen, file)
+    doubts = _doubts(inputs, found, look.unseen, file)
+    warnings = [*inputs.warnings, *look.misplaced, *doubts]
     summary = {
         "contradictions": _describe_contradictions(found),
         "frame_count": len(found.frames),

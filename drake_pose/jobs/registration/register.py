@@ -74,6 +74,7 @@ from drake_pose.registration.start_poses import E_total, areas, intersection_ove
 from drake_pose.registration.target_pictures import find_in_pictures, require_seen
 from drake_pose.silhouette.pictures.scene_checks import frame_ranges
 from drake_pose.silhouette.pictures.scenes import CAMERA_FILE
+from drake_pose.workers import working
 
 OnCamera = Callable[[int], None]
 """Called with the number of cameras that are done."""
@@ -136,15 +137,15 @@ def register_scene(
         "cameras": Path(cameras or Path(scene) / CAMERA_FILE),
         "joints": None if joints is None else Path(joints),
     }
-    own = None if cameras is None else Path(cameras)
-    work = _begun(Path(scene), Path(model), files["joints"], own, settings, on_camera)
-    start, urdf = time.perf_counter(), None
-    if work.inputs.positions.is_estimate:
-        work.refit_poses()
-    if work.has_constants:
-        urdf = work.find_zeros(folder)
-    work.judge()
-    described = work.describe((time.perf_counter() - start) / len(work.registered))
+    with working(settings.workers):
+        own = None if cameras is None else files["cameras"]
+        work = _begun(Path(scene), Path(model), files["joints"], own, settings, on_camera)
+        start = time.perf_counter()
+        if work.inputs.positions.is_estimate:
+            work.refit_poses()
+        urdf = work.find_zeros(folder) if work.has_constants else None
+        work.judge()
+        described = work.describe((time.perf_counter() - start) / len(work.registered))
     placed = {
         name: work.registered[name].camera if name in work.registered else camera
         for name, camera in work.inputs.scene.cameras.items()

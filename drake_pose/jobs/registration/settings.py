@@ -65,6 +65,7 @@ class RegistrationSettings(AuditSettings):
     with robot, pictures and masks."""
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         for name in self.exports:
             if name not in (known := get_args(Export)):
                 raise SettingsError(f"there is no export '{name}'; there is: {', '.join(known)}")

@@ -20,7 +20,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_solve
+from scipy.linalg.lapack import dpotri
 from threadpoolctl import ThreadpoolController
 
 from drake_pose.fit.contour_fit import (
@@ -297,7 +297,8 @@ def estimate_sizes(
     def likelihood(t: Array) -> tuple[float, Array, Array]:
         V = sum((np.exp(2.0 * a) * W for a, W in zip(t, effects, strict=True)), np.zeros((n, n)))
         L = np.linalg.cholesky(V)
-        inverse = cho_solve((L, True), np.eye(n), overwrite_b=True, check_finite=False)
+        half = np.tril(dpotri(L, lower=True)[0])
+        inverse = half + np.tril(half, -1).T
         VX = inverse @ seen.X
         H = seen.X.T @ VX + apriori
         P = inverse - VX @ np.linalg.solve(H, VX.T)
@@ -310,11 +311,11 @@ def estimate_sizes(
     for _ in range(_ITERATIONS):
         # Noise, the first, is white, and of doubts there are few.
         PW = [P, *(P @ W for W in effects[1 : len(told)]), *((P @ Z) @ Z.T for Z in seen.doubts)]
-        shares = [2.0 * np.exp(2.0 * a) * one for a, one in zip(t, PW, strict=True)]
-        pulls = 2.0 * np.exp(2.0 * t) * [Py @ W @ Py for W in effects]
-        g = 0.5 * (pulls - [np.trace(one) for one in shares]) - t / prior_deviation**2
-        turned = np.array([one.T for one in shares]).reshape(len(t), -1)
-        fisher = 0.5 * np.reshape(shares, (len(t), -1)) @ turned.T
+        scales, flat = 2.0 * np.exp(2.0 * t), np.reshape(PW, (len(t), -1))
+        pulls = [Py @ W @ Py - np.trace(one) for W, one in zip(effects, PW, strict=True)]
+        g = 0.5 * scales * pulls - t / prior_deviation**2
+        turned = np.reshape([one.T for one in PW], (len(t), -1))
+        fisher = 0.5 * np.outer(scales, scales) * (flat @ turned.T)
         step = np.linalg.solve(fisher + np.eye(len(t)) / prior_deviation**2, g)
         step /= max(1.0, np.abs(step).max())
         trial = likelihood(t + step)

@@ -103,11 +103,11 @@ def _simplified(outline: Outline, count: int) -> Outline:
 @lru_cache(maxsize=_REMEMBERED)
 def _simplify(vertices: bytes, triangles: bytes, count: int) -> Outline:
     """A surface of more triangles, by its vertices and triangles."""
-    outline = outline_from_mesh(
-        TriangleMesh(
-            np.frombuffer(vertices, np.float64).reshape(-1, 3),
-            np.frombuffer(triangles, np.int32).reshape(-1, 3),
-        )
+    # Nothing here needs the edges.
+    outline = Outline(
+        np.frombuffer(vertices, np.float64).reshape(-1, 3),
+        np.frombuffer(triangles, np.int32).reshape(-1, 3).copy(),
+        np.zeros((0, 5), np.int32),
     )
     simplified = _collapsed(outline, count, 1.0)
     too_far = _FAR / count * _size(outline)
@@ -171,7 +171,9 @@ def _squared_distances(one: Outline, other: Outline) -> Array:
     points, corners = _spread(one), other.vertices[other.triangles]
     centers = corners.mean(axis=1)
     radii = np.linalg.norm(corners - centers[:, None], axis=2).max(axis=1)
-    nearest = cKDTree(other.vertices).query(points)[0]
+    first = trimesh.triangles.closest_point(corners[cKDTree(centers).query(points)[1]], points)
+    apart = np.linalg.norm(first - points, axis=1)
+    nearest = np.fmin(cKDTree(other.vertices).query(points)[0], apart)
     pairs: list[tuple[NDArray[np.intp], NDArray[np.intp]]] = []
     # Small triangles first: a few large ones would call for all the small ones around them.
     size = float(radii.max())

@@ -14,8 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
-from scipy.stats import f as fisher
+from scipy.special import chdtrc, fdtrc, fdtri
 
 from drake_pose.fit.covariance import (
     Distances,
@@ -126,7 +125,7 @@ def half_pixel(offset: Array, covariance: Array) -> HalfPixel | None:
     """
     half = np.copysign(0.5, offset.sum())
     T = float(offset @ np.linalg.solve(covariance, offset))
-    if chi2.sf(T, 2) > SIGNIFICANCE or np.abs(offset - half).max() > _NEAR_HALF:
+    if chdtrc(2, T) > SIGNIFICANCE or np.abs(offset - half).max() > _NEAR_HALF:
         return None
     return HalfPixel(offset.tolist(), np.sqrt(np.diag(covariance)).tolist())
 
@@ -548,7 +547,7 @@ class _Auditor:
 
     def _noticed_from(self, residual: _Residual, causes: Sequence[_Cause]) -> dict[str, float]:
         """How far joints must be off to be named nearly always [rad or m]; inf: never."""
-        critical = fisher.isf(SIGNIFICANCE / max(1, len(causes)), 1, residual.info.freedom)
+        critical = fdtri(1, residual.info.freedom, 1.0 - SIGNIFICANCE / max(1, len(causes)))
         found = {}
         for cause in causes:
             along = cause.moves[:, 0]
@@ -592,7 +591,7 @@ def _residual_p_value(residual: _Residual) -> float:
 
 def _p_value(T: float, rank: int, freedom: float) -> float:
     """How often a statistic is as large by chance."""
-    return float(fisher.sf(T / rank, rank, freedom)) if rank else 1.0
+    return float(fdtrc(rank, freedom, max(T, 0.0) / rank)) if rank else 1.0
 
 
 def _explained(frames: Sequence[FrameFit]) -> Mask:

@@ -11,7 +11,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
-from functools import partial
+from functools import cached_property, partial
 from itertools import combinations
 
 import numpy as np
@@ -40,7 +40,7 @@ from drake_pose.registration.start_poses import (
     spread_rotations,
 )
 from drake_pose.silhouette.areas.bending import TreeSurfaces
-from drake_pose.silhouette.areas.outline import NOTHING
+from drake_pose.silhouette.areas.outline import NOTHING, Outline
 from drake_pose.silhouette.areas.scoring import draw_mask
 from drake_pose.workers import map_ordered
 
@@ -110,9 +110,14 @@ class RegistrationBody:
             surfaces = surfaces.with_rigid(
                 [surface if node.name in seen else NOTHING for node, surface in own]
             )
-        self.very_few = few_triangles(surfaces, fewest)
+        self._surfaces, self._fewest = surfaces, fewest
         self.few = few_triangles(surfaces, FEW)
         self.all = few_triangles(surfaces, np.iinfo(np.int64).max)
+
+    @cached_property
+    def very_few(self) -> tuple[Outline, ...]:
+        """Surfaces for searches: what only fits does without them."""
+        return few_triangles(self._surfaces, self._fewest)
 
     def with_tree(self, tree: PoseTree) -> RegistrationBody:
         """The same surfaces on another tree with the same nodes."""

@@ -26,8 +26,8 @@ from drake_pose.fit.evidence import NO_EDGE, find_edge_points
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.fit.surfaces import VERY_FEW, few_triangles
 from drake_pose.silhouette.areas.bending import TreeSurfaces
-from drake_pose.silhouette.areas.outline import Outline
-from drake_pose.silhouette.areas.scoring import draw_mask
+from drake_pose.silhouette.areas.outline import pack
+from drake_pose.silhouette.areas.scoring import draw_mask, draw_packed
 from drake_pose.silhouette.pictures.masks import intersection_over_union
 from drake_pose.silhouette.segmentation.background import cut, tell_from_background
 
@@ -56,8 +56,9 @@ _GOOD, _FAIR = 0.9, 0.8
 _SURFACE, _BAND = 0.02, 0.01
 # Surely the body, and surely not, by log-odds; and the least and most that any pixel is given.
 _SURE, _PROBABILITIES = 4.0, (0.01, 0.99)
-# GrabCut's rounds, and the side of the median filter that takes specks away [pixel].
-_CUTS, _SPECKS = 2, 5
+# GrabCut's rounds, and how large bodies are as it learns colours [root of the area, pixel]; the
+# side of the median filter that takes specks away [pixel].
+_CUTS, _CUT_SIDE, _SPECKS = 2, 70.0, 5
 # The contour fit's first and last scale, as shares of the silhouette's size.
 _WIDE, _NARROW, _SPACING = 0.25, 0.03, 0.05
 # The first rounds look at pictures in which silhouettes are so large [root of the area, pixel].
@@ -156,7 +157,7 @@ class PoseAndMask:
         self._settings = settings or PoseAndMaskSettings()
         self._rng = np.random.default_rng(seed)
         self._surfaces = TreeSurfaces(kinematics.tree)
-        self._few = few_triangles(self._surfaces, VERY_FEW)
+        self._few = pack(few_triangles(self._surfaces, VERY_FEW))
         fitted = few_triangles(self._surfaces, _TRIANGLES)
         self._fit = ContourFit(kinematics, fitted, pixels=100.0)
         ranges = kinematics.upper - kinematics.lower
@@ -242,10 +243,10 @@ class PoseAndMask:
 
     def _draw(self, values: Array, camera: Camera, few: bool = False) -> Mask:
         """The body's silhouette (H, W)."""
-        outlines: Sequence[Outline] = (
-            self._few if few else self._surfaces.at(self._kinematics.split(values))
-        )
-        return draw_mask(outlines, camera.X_CW @ self._kinematics.poses(values), camera)
+        X_CN = camera.X_CW @ self._kinematics.poses(values)
+        if few:
+            return draw_packed(self._few, X_CN, camera)
+        return draw_mask(self._surfaces.at(self._kinematics.split(values)), X_CN, camera)
 
     def _sample(self, values: Array, spread: Array, count: int) -> Array:
         """(count, m) values about some, inside the limits."""
@@ -337,7 +338,8 @@ def cut_by_odds(picture: Picture, chance: Likelihood, ratio: Likelihood) -> Mask
     labels = np.where(odds > 0.0, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
     labels[odds > _SURE] = cv2.GC_FGD
     labels[(odds < -_SURE) | (chance <= _PROBABILITIES[0])] = cv2.GC_BGD
-    found = cut(picture, labels, _CUTS)
+    every = max(1, int(math.sqrt(np.count_nonzero(odds > 0.0)) / _CUT_SIDE))
+    found = cut(picture, labels, _CUTS, every)
     return np.asarray(cv2.medianBlur(found.astype(np.uint8), _SPECKS) > 0)
 
 

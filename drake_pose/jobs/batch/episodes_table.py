@@ -9,7 +9,7 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
 from drake_pose.csv_files import csv_text
 from drake_pose.registration.contradictions import SIGNIFICANCE
@@ -111,7 +111,7 @@ class _Standing:
         off = pose_difference(np.array(one["X_WC"]), X_WC)
         distance = squared_distance(off, covariance + np.array(one["covariance"]))
         shift, turn = 1e3 * np.linalg.norm(off[3:]), np.degrees(np.linalg.norm(off[:3]))
-        is_moved = float(chi2.sf(distance, len(off))) < SIGNIFICANCE
+        is_moved = float(chdtrc(len(off), distance)) < SIGNIFICANCE
         return float(shift), float(turn), "yes" if is_moved else "no"
 
     def entry(self) -> dict[str, Any]:

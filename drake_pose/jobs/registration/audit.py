@@ -296,7 +296,7 @@ def _require_seen(body: RegistrationBody, inputs: Inputs, frames: Sequence[SeenF
         for frame in (one for one in frames if camera.name in one.masks):
             X_CN = camera.X_CW @ body.kinematics.poses(frame.values)
             try:
-                require_visible(body.very_few, X_CN, camera)
+                require_visible(body.few, X_CN, camera)
             except CameraError as error:
                 refused = refused or error
             else:

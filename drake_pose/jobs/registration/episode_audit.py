@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
 from drake_pose.camera.models import Camera, PinholeCamera
 from drake_pose.errors import SceneError
@@ -144,7 +144,7 @@ def compare_camera(
         alone: whether it is the only one, so that the base may have moved as well.
     """
     off = pose_difference(found.camera.X_WC, given.X_WC)
-    p_value = float(chi2.sf(squared_distance(off, found.covariance), len(off)))
+    p_value = float(chdtrc(len(off), squared_distance(off, found.covariance)))
     return Finding(
         "camera", given.name, float(np.linalg.norm(off[:3])), float(np.linalg.norm(off[3:])),
         found.rotation_sd, found.translation_sd,
@@ -171,7 +171,7 @@ def _clock(body: RegistrationBody, one: PictureRegistration, recording: Recordin
         ("rate", clock.drift, clock.drift_deviation, 0.0),
     ]
     several = [
-        (kind, value, sd, float(chi2.sf(value**2 / (sd**2 + least**2), 1)))
+        (kind, value, sd, float(chdtrc(1, value**2 / (sd**2 + least**2))))
         for kind, value, sd, least in told
     ]
     return [

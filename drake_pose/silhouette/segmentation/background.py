@@ -253,13 +253,26 @@ def cut_box(picture: Picture, box: Sequence[float]) -> Mask:
     return cut(picture, labels)
 
 
-def cut(picture: Picture, labels: NDArray[np.uint8], iterations: int = 6) -> Mask:
-    """The object (H, W) by the labels (H, W) of OpenCV's GrabCut, which are left as they are."""
+def cut(picture: Picture, labels: NDArray[np.uint8], iterations: int = 6, every: int = 1) -> Mask:
+    """The object (H, W) by the labels (H, W) of OpenCV's GrabCut, which are left as they are.
+
+    ``every``: colours are learnt from every so manieth row and column, and what is in doubt is cut
+    once by these; 1: all of it is cut in each of the iterations.
+    """
     found = labels.copy()
-    if np.isin(labels, (cv2.GC_PR_FGD, cv2.GC_PR_BGD)).any():
+    is_doubted = np.isin(labels, (cv2.GC_PR_FGD, cv2.GC_PR_BGD))
+    if is_doubted.any():
         cv2.setRNGSeed(_SEED)
-        colours = np.zeros((1, 65)), np.zeros((1, 65))
-        nowhere = (0, 0, 0, 0)
-        picture = np.ascontiguousarray(picture)
-        cv2.grabCut(picture, found, nowhere, *colours, iterations, cv2.GC_INIT_WITH_MASK)
+        colours, nowhere = (np.zeros((1, 65)), np.zeros((1, 65))), (0, 0, 0, 0)
+        some, own = (np.ascontiguousarray(one[::every, ::every]) for one in (picture, found))
+        cv2.grabCut(some, own, nowhere, *colours, iterations, cv2.GC_INIT_WITH_MASK)
+        if every == 1:
+            found = own
+        else:
+            x, y, w, h = cv2.boundingRect(is_doubted.astype(np.uint8))
+            box = np.s_[max(0, y - 1) : y + h + 1, max(0, x - 1) : x + w + 1]
+            own = np.ascontiguousarray(found[box])
+            some = np.ascontiguousarray(picture[box])
+            cv2.grabCut(some, own, nowhere, *colours, 1, cv2.GC_EVAL_FREEZE_MODEL)
+            found[box] = own
     return np.asarray((found == cv2.GC_FGD) | (found == cv2.GC_PR_FGD))

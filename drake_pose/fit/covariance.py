@@ -20,7 +20,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_solve
+from scipy.linalg.lapack import dpotri
 from threadpoolctl import ThreadpoolController
 
 from drake_pose.fit.contour_fit import (
@@ -292,12 +292,11 @@ def estimate_sizes(
     named = ErrorEffects._fields
     told = [k for k, name in enumerate(named) if name != "repeated" or stands_still]
     effects = [seen.effects[k] for k in told] + [Z @ Z.T for Z in seen.doubts]
-    apriori = _apriori(is_angle)
+    apriori, stacked = _apriori(is_angle), np.reshape(effects, (len(effects), -1))
 
     def likelihood(t: Array) -> tuple[float, Array, Array]:
-        V = sum((np.exp(2.0 * a) * W for a, W in zip(t, effects, strict=True)), np.zeros((n, n)))
-        L = np.linalg.cholesky(V)
-        inverse = cho_solve((L, True), np.eye(n), overwrite_b=True, check_finite=False)
+        L = np.linalg.cholesky((np.exp(2.0 * t) @ stacked).reshape(n, n))
+        inverse = symmetric(dpotri(L.T)[0].T)
         VX = inverse @ seen.X
         H = seen.X.T @ VX + apriori
         P = inverse - VX @ np.linalg.solve(H, VX.T)

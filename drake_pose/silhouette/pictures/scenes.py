@@ -74,6 +74,9 @@ class Scene:
     readers: Mapping[str, Callable[[str], np.ndarray]] = field(default_factory=dict)
     _videos: dict[Path, VideoPictures] = field(default_factory=dict, repr=False, compare=False)
     _packed: dict[Path, bytes] = field(default_factory=dict, repr=False, compare=False)
+    _latest: dict[str, tuple[str, np.ndarray]] = field(
+        default_factory=dict, repr=False, compare=False
+    )
 
     def cameras_of(self, frame: str) -> tuple[str, ...]:
         """The names of the cameras with a mask of a frame; UnknownNameError for no such frame."""
@@ -163,6 +166,8 @@ class Scene:
             SceneError: when the file is no picture of the camera's size.
         """
         file, size = self._file(self.images, camera, frame), self.cameras[camera]
+        if self._latest.get(camera, ("",))[0] == frame:
+            return self._latest[camera][1].copy()
         if camera in self.readers:
             picture = self.readers[camera](frame)
         elif file.suffix.lower() in VIDEOS:
@@ -176,7 +181,9 @@ class Scene:
                 f"{file}: is {picture.shape[1]} x {picture.shape[0]} pixels, but camera "
                 f"'{camera}' has {size.width} x {size.height}"
             )
-        return picture
+        # What is tracked in a picture is drawn over it next.
+        self._latest[camera] = frame, picture
+        return picture.copy()
 
     def _file(self, files: Mapping[tuple[str, str], Path], camera: str, frame: str) -> Path:
         if camera not in self.cameras:

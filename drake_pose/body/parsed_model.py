@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
@@ -309,7 +310,7 @@ class ParsedModel(Positions):
             make_drawable(plant, scene_graph, instances)
         return instances
 
-    @property
+    @cached_property
     def link_names(self) -> tuple[str, ...]:
         """All links, seen or not, in the order of the plant's bodies; the first is the world."""
         return link_names(self.plant)

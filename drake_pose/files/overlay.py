@@ -31,7 +31,7 @@ def paint_agreement(
     Either is alone in MISSING_RGB or EXCESS_RGB. Borders between segments (H, W) are drawn.
     """
     colours = np.array([BACKGROUND_RGB, MISSING_RGB, EXCESS_RGB, AGREEMENT_RGB], dtype=np.uint8)
-    picture = colours[np.add(mask, 2 * body, dtype=np.intp)]
+    picture = colours.take(mask + 2 * body.view(np.uint8), axis=0)
     _draw_borders(picture, body, segments)
     return picture
 
@@ -52,18 +52,22 @@ def draw_overlay(
         (h, w, 3) uint8: the surroundings, all of the picture where nothing is shown, enlarged by a
         whole number where they are small; below a silhouette is a legend.
     """
+    width = max(1, len(seen) // 500)
+    window = _surroundings(body if seen.ndim == 3 else seen | body)
+    seen, body = seen[window], body[window]
+    segments = None if segments is None else segments[window]
     if seen.ndim == 3:
         painted = seen.copy()
-        _draw_contour(painted, body, EXCESS_RGB, max(1, len(seen) // 500))
+        _draw_contour(painted, body, EXCESS_RGB, width)
         _draw_borders(painted, body, segments)
-        return _framed(_enlarged(painted[_surroundings(body)]), title)
-    window = _surroundings(seen | body)
-    picture = _enlarged(paint_agreement(seen, body, segments)[window])
-    area = max(1, int(seen.sum()))
+        return _framed(_enlarged(painted), title)
+    picture = _enlarged(paint_agreement(seen, body, segments))
+    shown, both, drawn = (int(np.count_nonzero(one)) for one in (seen, seen & body, body))
+    area = max(1, shown)
     legend = [
-        (AGREEMENT_RGB, f"agreement {100.0 * (seen & body).sum() / area:.1f} %"),
-        (MISSING_RGB, f"missing {100.0 * (seen & ~body).sum() / area:.1f} %"),
-        (EXCESS_RGB, f"excess {100.0 * (body & ~seen).sum() / area:.1f} %"),
+        (AGREEMENT_RGB, f"agreement {100.0 * both / area:.1f} %"),
+        (MISSING_RGB, f"missing {100.0 * (shown - both) / area:.1f} %"),
+        (EXCESS_RGB, f"excess {100.0 * (drawn - both) / area:.1f} %"),
     ]
     return _framed(picture, title, legend)
 
@@ -125,7 +129,8 @@ def _enlarged(picture: np.ndarray) -> np.ndarray:
     """A picture whose pixels are whole squares, so that it is not too small."""
     height, width = picture.shape[:2]
     scale = max(1, min(_LEAST_HEIGHT // height, 2 * _LEAST_WIDTH // width, 8))
-    return np.repeat(np.repeat(picture, scale, axis=0), scale, axis=1).astype(np.uint8)
+    size = width * scale, height * scale
+    return cv2.resize(picture.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
 
 
 def _framed(

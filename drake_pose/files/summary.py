@@ -7,6 +7,7 @@ import platform
 import time
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
+from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -222,6 +223,7 @@ def _joint_errors(records: Mapping[str, FrameRecord]) -> dict[str, dict[str, flo
     }
 
 
+@cache
 def versions() -> dict[str, str]:
     """The versions of drake_pose, Python and the packages that matter."""
     found = {"drake_pose": VERSION, "python": platform.python_version()}

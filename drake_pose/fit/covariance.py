@@ -292,13 +292,11 @@ def estimate_sizes(
     named = ErrorEffects._fields
     told = [k for k, name in enumerate(named) if name != "repeated" or stands_still]
     effects = [seen.effects[k] for k in told] + [Z @ Z.T for Z in seen.doubts]
-    apriori = _apriori(is_angle)
+    apriori, stacked = _apriori(is_angle), np.reshape(effects, (len(effects), -1))
 
     def likelihood(t: Array) -> tuple[float, Array, Array]:
-        V = sum((np.exp(2.0 * a) * W for a, W in zip(t, effects, strict=True)), np.zeros((n, n)))
-        L = np.linalg.cholesky(V)
-        half = np.tril(dpotri(L, lower=True)[0])
-        inverse = half + np.tril(half, -1).T
+        L = np.linalg.cholesky((np.exp(2.0 * t) @ stacked).reshape(n, n))
+        inverse = symmetric(dpotri(L.T)[0].T)
         VX = inverse @ seen.X
         H = seen.X.T @ VX + apriori
         P = inverse - VX @ np.linalg.solve(H, VX.T)

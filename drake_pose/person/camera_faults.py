@@ -105,9 +105,12 @@ class CameraJudge:
         self, fit: ContourFit, cameras: Mapping[str, Camera], held: Mask | None = None
     ) -> None:
         self._fit, self._cameras, self._held = fit, cameras, held
+        self._without: dict[tuple[FrameView, str], tuple[Array, float]] = {}
 
     def pose_without(self, frame: FrameView, left_out: str) -> tuple[Array, float]:
         """A frame's pose (m,) by all cameras but one, and what share of their contours fits."""
+        if (frame, left_out) in self._without:
+            return self._without[frame, left_out]
         names = [name for name in frame.edges if name != left_out]
         views = pack_views(
             [self._cameras[name] for name in names], [frame.edges[name] for name in names]
@@ -115,6 +118,7 @@ class CameraJudge:
         is_angle = self._fit.kinematics.is_angle
         prior = Prior(frame.values, np.where(is_angle, 1.0, 4.0) / _ANGLE_DEVIATION**2)
         found = self._fit.fit(views, frame.values, _POSE_ROUNDS, prior, self._held)
+        self._without[frame, left_out] = found.values, found.inlier_ratio
         return found.values, found.inlier_ratio
 
     def share(self, camera: Camera, edge: EdgePoints, values: Array) -> float:

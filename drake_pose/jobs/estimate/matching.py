@@ -29,7 +29,8 @@ from drake_pose.search.estimates import PoseEstimate, View
 from drake_pose.search.grid.beam_search import BeamSearch
 from drake_pose.search.scoring import PoseSearch
 from drake_pose.search.starts.root_placement import scale_camera
-from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
+from drake_pose.silhouette.areas.bending import TreeSurfaces
+from drake_pose.silhouette.areas.scoring import draw_labels
 from drake_pose.silhouette.pictures.masks import compare_masks
 from drake_pose.silhouette.pictures.scenes import USUAL_RATE_HZ, Scene
 from drake_pose.systems.estimators.diagrams import build_recorded_matching
@@ -112,19 +113,23 @@ def match_frames(
     inputs: Inputs, search: PoseSearch, overlay: bool, missing: Sequence[str]
 ) -> Iterator[FinishedFrame]:
     """The missing frames, matched or tracked, compared with their masks and drawn."""
-    scene, model, renderers = inputs.scene, inputs.model, dict[str, LabelRenderer]()
+    scene, model = inputs.scene, inputs.model
+    tree = model.pose_tree()
+    surfaces, labels = TreeSurfaces(tree), range(1, 1 + len(tree.nodes))
     for frame, pose in estimate_frames(inputs, search, missing):
         masks = {name: scene.read(name, frame) for name in scene.cameras_of(frame)}
         shown: dict[str, np.ndarray] = {**read_pictures(scene, frame), **masks} if overlay else {}
         parts, more = {}, dict[str, Any]()
+        if pose.found:
+            values = tree.values_from_positions(pose.q)
+            outlines, X_WN = surfaces.at(values), pose.X_WB @ tree.node_poses(values)
         for name in {**masks, **shown} if pose.found else ():
             camera = scene.cameras[name]
-            own = renderers.get(name) or renderers.setdefault(name, LabelRenderer(model, camera))
             if isinstance(camera, ParallelCamera):
-                own.camera = scale_camera(camera, pose.scale)
+                camera = scale_camera(camera, pose.scale)
                 if scene.scale_unknown and name in masks:
-                    more["camera_scale"] = own.camera.pixels_per_metre
-            parts[name] = own.segments(pose.q, pose.X_WB)
+                    more["camera_scale"] = camera.pixels_per_metre
+            parts[name] = draw_labels(outlines, labels, camera.X_CW @ X_WN, camera) - 1
         # A search that does not say how sure it is knows nothing of any joint.
         nothing = np.full(len(pose.q), np.nan)
         known = record_pose_set(pose.pose_set, search.tree) or {

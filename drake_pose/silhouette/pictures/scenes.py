@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import zlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -35,6 +36,9 @@ _LOOKING_BACK = np.array(
     [[0.0, 0.0, -1.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
 )
 _ANY_SCALE = 1000.0
+# The fastest of zlib's levels. Masks are kept in a kilobyte or two each, once they were read: a PNG
+# takes ten times as long to be decoded, and most masks are looked at more than once.
+_LEVEL = 1
 _UNKNOWN = "camera"
 
 
@@ -69,6 +73,10 @@ class Scene:
     warnings: tuple[str, ...] = ()
     readers: Mapping[str, Callable[[str], np.ndarray]] = field(default_factory=dict)
     _videos: dict[Path, VideoPictures] = field(default_factory=dict, repr=False, compare=False)
+    _packed: dict[Path, bytes] = field(default_factory=dict, repr=False, compare=False)
+    _latest: dict[str, tuple[str, np.ndarray]] = field(
+        default_factory=dict, repr=False, compare=False
+    )
 
     def cameras_of(self, frame: str) -> tuple[str, ...]:
         """The names of the cameras with a mask of a frame; UnknownNameError for no such frame."""
@@ -141,7 +149,14 @@ class Scene:
             MaskError: when the file is not a mask of the camera's size.
         """
         path, size = self.mask_path(camera, frame), self.cameras[camera]
-        return read_mask(path, size.width, size.height, may_be_empty=may_be_empty)
+        if (packed := self._packed.get(path)) is None:
+            mask = read_mask(path, size.width, size.height, may_be_empty=may_be_empty)
+            if mask.any():
+                self._packed[path] = zlib.compress(np.packbits(mask).tobytes(), _LEVEL)
+            return mask
+        bits = np.frombuffer(zlib.decompress(packed), np.uint8)
+        mask = np.unpackbits(bits, count=size.width * size.height).view(np.bool_)
+        return mask.reshape(size.height, size.width)
 
     def read_image(self, camera: str, frame: str) -> np.ndarray:
         """The picture (H, W, 3), red, green, blue, of a camera's frame.
@@ -151,6 +166,8 @@ class Scene:
             SceneError: when the file is no picture of the camera's size.
         """
         file, size = self._file(self.images, camera, frame), self.cameras[camera]
+        if self._latest.get(camera, ("",))[0] == frame:
+            return self._latest[camera][1].copy()
         if camera in self.readers:
             picture = self.readers[camera](frame)
         elif file.suffix.lower() in VIDEOS:
@@ -164,7 +181,9 @@ class Scene:
                 f"{file}: is {picture.shape[1]} x {picture.shape[0]} pixels, but camera "
                 f"'{camera}' has {size.width} x {size.height}"
             )
-        return picture
+        # What is tracked in a picture is drawn over it next.
+        self._latest[camera] = frame, picture
+        return picture.copy()
 
     def _file(self, files: Mapping[tuple[str, str], Path], camera: str, frame: str) -> Path:
         if camera not in self.cameras:

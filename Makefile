@@ -40,6 +40,8 @@ docs: $(VENV)/ready-docs
 
 # DATA: a folder of recorded scenes; without it only the demonstration's is estimated.
 DATA ?= $(wildcard ../shared/data)
+# As the command line has it: threads that wait for each other are not what is measured.
+bench: export OPENBLAS_NUM_THREADS = 1
 bench: $(VENV)/ready-cluster
 	$(PYTHON) -m tests.benchmarks.speed
 	$(PYTHON) -m tests.benchmarks.growth

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from functools import lru_cache
 from itertools import chain
+from threading import Lock
 
 import fast_simplification
 import numpy as np
@@ -44,6 +45,8 @@ _SIZES = 6
 _DETAILED = 4000
 # Points of a surface whose distances from another are measured.
 _POINTS = 300
+# The simplifier keeps its surface in globals, and lets other threads run: two at once mix theirs.
+_SIMPLIFIER = Lock()
 
 
 def few_rigid_triangles(surfaces: TreeSurfaces, count: int) -> TreeSurfaces:
@@ -143,9 +146,10 @@ def _collapsed(outline: Outline, count: int, unit: float) -> Outline:
     """A surface whose edges are collapsed till triangles are few, in a unit of length [m]."""
     if len(outline.triangles) <= count:
         return outline
-    points, triangles = fast_simplification.simplify(
-        outline.vertices / unit, outline.triangles, target_count=count
-    )
+    with _SIMPLIFIER:
+        points, triangles = fast_simplification.simplify(
+            outline.vertices / unit, outline.triangles, target_count=count
+        )
     return outline_from_mesh(TriangleMesh(np.asarray(points, np.float64) * unit, triangles))
 
 

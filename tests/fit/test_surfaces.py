@@ -8,9 +8,16 @@ import trimesh
 from drake_pose.body.formats.packages import bundled_model
 from drake_pose.body.model import load_model
 from drake_pose.body.surfaces.meshes import TriangleMesh
-from drake_pose.fit.surfaces import FEW, VERY_FEW, few_triangles, surface_distance
+from drake_pose.fit.surfaces import (
+    FEW,
+    VERY_FEW,
+    _simplify,
+    few_triangles,
+    surface_distance,
+)
 from drake_pose.silhouette.areas.bending import TreeSurfaces
 from drake_pose.silhouette.areas.outline import outline_from_mesh
+from drake_pose.workers import map_ordered
 
 RADIUS, TUBE, ENDS = 0.08, 0.06, (0.1, 0.3)
 
@@ -105,3 +112,18 @@ def test_a_body_loaded_again_is_not_simplified_again_but_a_changed_one_is():
     assert again is once
     np.testing.assert_allclose(np.ptp(other.vertices, axis=0), np.ptp(wider.vertices, axis=0), 0.02)
     assert len(coarser.triangles) < len(once.triangles)
+
+
+def test_threads_that_simplify_at_once_find_what_one_does():
+    balls = [
+        outline_from_mesh(TriangleMesh(ball.vertices, ball.faces))
+        for ball in (trimesh.creation.icosphere(5, radius=0.1 + 0.01 * k) for k in range(12))
+    ]
+
+    def simplified(ball):
+        return few_triangles(Rigid(ball), FEW)[0]
+
+    together = map_ordered(simplified, balls, 4)
+    _simplify.cache_clear()
+    for ball, one in zip(balls, together, strict=True):
+        np.testing.assert_array_equal(simplified(ball).vertices, one.vertices)

@@ -73,7 +73,9 @@ class Scene:
     warnings: tuple[str, ...] = ()
     readers: Mapping[str, Callable[[str], np.ndarray]] = field(default_factory=dict)
     _videos: dict[Path, VideoPictures] = field(default_factory=dict, repr=False, compare=False)
-    _packed: dict[Path, bytes] = field(default_factory=dict, repr=False, compare=False)
+    _packed: dict[tuple[Path, int, int], bytes] = field(
+        default_factory=dict, repr=False, compare=False
+    )
     _latest: dict[str, tuple[str, np.ndarray]] = field(
         default_factory=dict, repr=False, compare=False
     )
@@ -149,10 +151,11 @@ class Scene:
             MaskError: when the file is not a mask of the camera's size.
         """
         path, size = self.mask_path(camera, frame), self.cameras[camera]
-        if (packed := self._packed.get(path)) is None:
+        key = path, size.width, size.height
+        if (packed := self._packed.get(key)) is None:
             mask = read_mask(path, size.width, size.height, may_be_empty=may_be_empty)
             if mask.any():
-                self._packed[path] = zlib.compress(np.packbits(mask).tobytes(), _LEVEL)
+                self._packed[key] = zlib.compress(np.packbits(mask).tobytes(), _LEVEL)
             return mask
         bits = np.frombuffer(zlib.decompress(packed), np.uint8)
         mask = np.unpackbits(bits, count=size.width * size.height).view(np.bool_)

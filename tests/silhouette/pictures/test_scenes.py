@@ -1,3 +1,4 @@
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -142,3 +143,12 @@ def test_masks_must_fit_their_camera(tmp_path: Path) -> None:
     write_mask(tmp_path / "masks" / "left" / "0001.png", MASK.T)
     with pytest.raises(MaskError, match=r"left/0001\.png.*20 x 30"):
         load_scene(tmp_path).read("left", "0001")
+
+
+def test_a_mask_that_was_read_is_the_same_again_and_checked_again(tmp_path: Path) -> None:
+    scene = load_scene(make_scene(tmp_path))
+    for _ in range(3):
+        np.testing.assert_array_equal(scene.read("left", "0001"), MASK)
+    larger = replace(camera("left"), width=31)
+    with pytest.raises(MaskError, match=r"left/0001\.png.*30 x 20"):
+        replace(scene, cameras={**scene.cameras, "left": larger}).read("left", "0001")

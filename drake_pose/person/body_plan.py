@@ -23,8 +23,6 @@ PERSON_LANDMARKS = frozenset({*_TRUNK, *(name for limb in _LIMBS.values() for na
 """The anatomical joint centres that a model of a person has in its landmarks.yaml."""
 
 _POSES = 2048
-# A limb has no more values than these.
-_PRIMES = (2, 3, 5, 7, 11, 13, 17, 19, 23, 29, 31, 37, 41, 43, 47)
 # One in this many of them is stretched.
 _STRETCHED = 8
 # Points of a limb that are nearer to each other fill the same space [m].
@@ -98,6 +96,8 @@ class BodyPlan:
         return int(self.landmarks.nodes[self.landmarks.names.index(landmark)])
 
     def _plan(self, root: str, middle: str, end: str) -> PlannedLimb:
+        from scipy.stats import qmc  # Slow to import, and needed for persons alone.
+
         kinematics = self.kinematics
         rest = kinematics.flatten(kinematics.tree.default_values())
         moves = kinematics.motions(rest).moves
@@ -105,7 +105,7 @@ class BodyPlan:
         free = kinematics.is_angle & (kinematics.upper > kinematics.lower)
         values = np.flatnonzero(own & free)
         nodes = np.flatnonzero((moves & own).any(axis=1))
-        share = _halton(_POSES, len(values))
+        share = qmc.Halton(len(values), scramble=False).random(_POSES)
         lower, upper = (ends[values] for ends in kinematics.reach(rest))
         poses = np.clip(rest[values], lower, upper) * np.ones((_POSES, 1))
         poses[1:] = lower + share[1:] * (upper - lower)
@@ -136,17 +136,6 @@ class BodyPlan:
         lower = np.maximum(_ALONG - 1.0, 0.0)[:, None]
         steps = upper * (b - a)[:, None] + lower * (c - b)[:, None]
         return np.asarray(a[:, None] + steps)
-
-
-def _halton(count: int, size: int) -> Array:
-    """(count, size) the first points of Halton's sequence (1960): scipy.stats is slow to import."""
-    bases = np.array(_PRIMES[:size])
-    left, share, scale = np.arange(count)[:, None], np.zeros((count, size)), np.ones(size)
-    while left.any():
-        scale = scale / bases
-        share += scale * (left % bases)
-        left = left // bases
-    return share
 
 
 def crowding(samples: Array) -> Array:

@@ -26,3 +26,9 @@ def test_so_many_threads_work_and_each_maps_alone() -> None:
 def test_an_error_comes_out() -> None:
     with pytest.raises(ZeroDivisionError):
         map_ordered(lambda k: 1 // k, range(3), 2)
+
+
+def test_who_names_no_number_keeps_the_one_before() -> None:
+    with working(1), working(None):
+        names = set(map_ordered(lambda _: threading.current_thread().name, range(4)))
+    assert names == {threading.current_thread().name}

@@ -84,12 +84,6 @@ class ObjectSearch:
         """
         require_turns(camera.name, self._standing, frames)
         looks = self._search(camera, [[one] for one in spread(frames)])
-        return self._fitted(camera, frames, looks)
-
-    def _fitted(
-        self, camera: PinholeCamera, frames: Sequence[PosedFrame], looks: list[Look]
-    ) -> RegisteredCamera:
-        """The best of some looks that are fitted."""
         for rounds, spacing, surfaces in (
             (FINE, FINE_SPACING, "few"),
             (ROUNDS_WITH_CONSTANTS, LAST_SPACING, "all"),
@@ -127,18 +121,18 @@ class ObjectSearch:
 
     def choose(
         self, camera: PinholeCamera, choices: Sequence[Sequence[PosedFrame]]
-    ) -> tuple[Look, list[PosedFrame]]:
-        """Where camera and object are about, and of each picture the region that this explains.
+    ) -> tuple[Look, int]:
+        """Where camera and object are about, and of how many pictures this explains a region.
 
         Args:
-            choices: of each picture regions any of which may be the object. Pictures of which
-                none is explained are left out.
+            choices: of each picture regions any of which may be the object.
 
         Raises RegistrationError: in no three pictures one of them turns as the link does.
         """
         look = self._search(camera, choices)[0]
-        found = [self._nearest(camera, own, look) for own in choices if own]
-        return look, [one for one in found if self._misfit(camera, one, look[None])[0] < _EXPLAINS]
+        seen = [own for own in choices if own]
+        off = [self._misfits(camera, [own], look[None], SECOND_SIDE)[0] for own in seen]
+        return look, int(np.count_nonzero(np.array(off) < _EXPLAINS))
 
     def _search(self, camera: PinholeCamera, choices: Sequence[Sequence[PosedFrame]]) -> list[Look]:
         """Where the best one may be near, best first.
@@ -217,12 +211,12 @@ class ObjectSearch:
         body = self._standing.alone
         alone = PosedFrame(one.name, np.zeros(0), one.mask)
         posed = PosedFrames(body.kinematics, body.very_few, camera, [alone])
-        X_CT = self.seen_from(looks, one)
+        X_CT = self.seen_from(looks, one.values)
         return np.minimum(E_total(areas(posed, X_CT, side))[:, 0], 1.0)
 
-    def seen_from(self, looks: Array, frame: PosedFrame) -> Array:
-        """(n, 4, 4) the object's poses X_CT in a frame's camera, of looks (n, 2, 4, 4)."""
-        X_WL = self._standing.hand_poses(frame.values[None])[0]
+    def seen_from(self, looks: Array, values: Array) -> Array:
+        """(n, 4, 4) the object's poses X_CT in a camera at values (m,), of looks (n, 2, 4, 4)."""
+        X_WL = self._standing.hand_poses(values[None])[0]
         return np.asarray(inverse_transforms(X_WL @ looks[:, 0]) @ looks[:, 1])
 
     def _fit(

@@ -52,14 +52,11 @@ def find_in_pictures(
     ]
     require_turns(camera.name, standing, [own[0] for own in choices if own])
     search = ObjectSearch(standing)
-    look, found = search.choose(camera, choices)
-    require_seen(camera.name, len(found), len(choices))
+    look, count = search.choose(camera, choices)
+    require_seen(camera.name, count, len(choices))
     shown = []
     for one in pictures:
-        X_CT = search.seen_from(
-            look[None], PosedFrame(one.name, one.values, np.zeros((0, 0), bool))
-        )
-        covered = draw_mask(standing.alone.all, X_CT[0][None], camera)
+        covered = draw_mask(standing.alone.all, search.seen_from(look[None], one.values), camera)
         frame = _see(one, covered)
         if frame is not None and intersection_over_union(frame.mask, covered) > _SHOWN:
             shown.append(replace(frame, odds=None))

@@ -45,7 +45,7 @@ _UNTOLD = 0.04
 # What else may be the case is tried roughly, in so many frames.
 _ROUGH_FRAMES = 5
 # So many frames tell whether a focal length may be off.
-_HURRIED = 60
+_FOCAL_FRAMES = 60
 # Something else explains the masks better that leaves less than this share of what was left.
 _MUCH_BETTER = 0.6
 
@@ -134,7 +134,7 @@ def check_focal_length(
     counted = [frame for frame, fit in zip(frames, found.frames, strict=True) if fit.agrees]
     if len(counted) < 2:
         return found, ()
-    if abs(_focal_length_off(body, found, spread(counted, _HURRIED))) < _SURELY * _FOCAL_OFF:
+    if abs(_focal_length_off(body, found, spread(counted, _FOCAL_FRAMES))) < _SURELY * _FOCAL_OFF:
         return found, ()
     told = calibrate_joints(body, [found], [counted], (), focal=True)
     camera, deviation = told.cameras[0], float(told.focal_deviations[0])

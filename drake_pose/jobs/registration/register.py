@@ -320,14 +320,11 @@ class _Registration:
             seen = find_in_pictures(standing, camera, posed_pictures(recording, rows, 0.0))
             self.seen[name] = {one.name: recording.picture(one.name) for one in seen}
             frames += [SeenFrame(one.name, one.values, {name: one.mask}) for one in seen]
-            seen.sort(key=lambda one: recording.names.index(one.name))
             lost = [recording.names[k] for k in rows if recording.names[k] not in self.seen[name]]
             if lost:
                 self.warnings.append(say_lost(name, lost, recording.names, "target"))
-        self.inputs, seconds = (
-            replace(self.inputs, frames=tuple(frames)),
-            time.perf_counter() - start,
-        )
+        self.inputs = replace(self.inputs, frames=tuple(frames))
+        seconds = time.perf_counter() - start
         self.find_each(on_camera)
         for name, found in self.registered.items():
             require_seen(name, len(found.frames) - len(found.contradictions), len(self.seen[name]))

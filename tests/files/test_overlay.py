@@ -7,6 +7,7 @@ from drake_pose.files.overlay import (
     EXCESS_RGB,
     MISSING_RGB,
     OUTLINE_RGB,
+    PALETTE,
     draw_overlay,
     draw_shapes,
     encode_png,
@@ -56,7 +57,7 @@ DICHROMATS = {
 def test_a_large_picture_is_cut_to_the_surroundings_of_the_body() -> None:
     mask = rectangle((1900, 1100), slice(1000, 1600), slice(300, 600))
     body = rectangle((1900, 1100), slice(1000, 1600), slice(310, 610))
-    picture = draw_overlay(mask, body, None, "title")
+    picture = PALETTE[draw_overlay(mask, body, None, "title")]
     assert picture.shape[0] < 900
     assert picture.shape[1] < 900
     assert count(picture, MISSING_RGB) >= 600 * 10
@@ -91,7 +92,8 @@ def test_two_bodies_over_a_picture() -> None:
 
 def test_a_small_picture_is_enlarged_by_whole_pixels_and_nothing_lies_on_it() -> None:
     whole, none = np.ones((40, 40), dtype=bool), np.zeros((40, 40), dtype=bool)
-    shown = [count(draw_overlay(whole, body, None, "t"), MISSING_RGB) for body in (none, whole)]
+    drawn = [PALETTE[draw_overlay(whole, body, None, "t")] for body in (none, whole)]
+    shown = [count(picture, MISSING_RGB) for picture in drawn]
     scale = int(np.sqrt((shown[0] - shown[1]) / 40**2))
     assert scale > 1
     assert shown[0] - shown[1] == (40 * scale) ** 2
@@ -104,7 +106,7 @@ def test_where_nothing_is_shown_the_whole_picture_stays() -> None:
 
 def test_title_and_legend_are_written() -> None:
     mask = rectangle((500, 700), slice(100, 400), slice(100, 600))
-    picture = draw_overlay(mask, mask, None, "cam  frame 1  E_total 3.0 %")
+    picture = PALETTE[draw_overlay(mask, mask, None, "cam  frame 1  E_total 3.0 %")]
     assert (picture[:36] > 200).any()
     legend = [count(picture[-38:], c) for c in (AGREEMENT_RGB, MISSING_RGB, EXCESS_RGB)]
     assert 100 < max(legend) < 1.1 * min(legend)
@@ -115,3 +117,9 @@ def test_png_keeps_red_red() -> None:
     picture[:] = EXCESS_RGB
     decoded = cv2.imdecode(np.frombuffer(encode_png(picture), np.uint8), cv2.IMREAD_COLOR)
     assert tuple(decoded[0, 0][::-1]) == EXCESS_RGB
+
+
+def test_png_of_numbers_shows_the_palettes_colours() -> None:
+    picture = np.arange(len(PALETTE), dtype=np.uint8).reshape(4, -1)
+    decoded = cv2.imdecode(np.frombuffer(encode_png(picture), np.uint8), cv2.IMREAD_COLOR)
+    assert (decoded[..., ::-1] == PALETTE[picture]).all()

@@ -40,6 +40,7 @@ from drake_pose.registration.posed_frames import PosedFrame
 from drake_pose.registration.register import ObjectPose, RegisteredCamera
 from drake_pose.silhouette.areas.outline import outline_from_mesh
 from drake_pose.silhouette.areas.scoring import draw_labels
+from drake_pose.silhouette.pictures.masks import encode_mask
 from drake_pose.silhouette.pictures.scene_checks import frame_ranges
 from drake_pose.silhouette.pictures.scenes import CAMERA_FILE
 
@@ -268,8 +269,7 @@ def _write_frames(path: Path, inputs: Inputs, camera: str, several: bool) -> Non
     frames, names = inputs.of(camera), TreeKinematics(inputs.tree).names
     names = tuple(name for name in names if name not in OBJECT_POSITIONS)
     for frame in frames:
-        picture = encode_png(255 * frame.mask.astype(np.uint8))
-        write_file(path, f"masks/{camera}/{frame.name}.png", picture)
+        write_file(path, f"masks/{camera}/{frame.name}.png", encode_mask(frame.mask))
     # An object's come last, and are 0.
     values = [map(repr, one.values[: len(names)].tolist()) for one in frames]
     rows = [["frame", *names], *([one.name, *own] for one, own in zip(frames, values, strict=True))]

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import fcntl
 import json
+import math
 import os
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
@@ -144,14 +145,17 @@ def read_summary(path: Path) -> dict[str, Any]:
 
 def without_nan(value: Any) -> Any:
     """Returns plain JSON values: arrays become lists, numbers that are not finite become None."""
+    # Most values are numbers and texts.
+    if isinstance(value, float):
+        return float(value) if math.isfinite(value) else None
+    if isinstance(value, str | int):
+        return value
     if isinstance(value, Mapping):
         return {str(key): without_nan(entry) for key, entry in value.items()}
     if isinstance(value, np.ndarray | np.generic):
         return without_nan(value.tolist())
     if isinstance(value, list | tuple):
         return [without_nan(entry) for entry in value]
-    if isinstance(value, float):
-        return value if np.isfinite(value) else None
     return value
 
 

@@ -88,12 +88,28 @@ def find_rig_fault(
     return RigFault((), (), filled) if unfilled > _CONTRADICTING else None
 
 
-class _Seen(NamedTuple):
-    """Where a camera sees a grid's points (n,), in cells (h, w) of so many pixels; -1: nowhere."""
+class _Raster(NamedTuple):
+    """A camera's picture in cells (h, w) of so many pixels."""
 
-    cells: Integers
+    camera: Camera
     shape: tuple[int, int]
     pixels: float
+
+    @staticmethod
+    def about(camera: Camera, middle: Array) -> "_Raster":
+        """The cells that are as large as the grid about a place (3,) is fine."""
+        pixels = max(1.0, _SPACING * pixels_per_metre(camera, middle))
+        shape = int(np.ceil(camera.height / pixels)), int(np.ceil(camera.width / pixels))
+        return _Raster(camera, shape, pixels)
+
+    def cells(self, points: Array) -> Integers:
+        """In which cell (n,) each point is seen, row after row; -1: in none."""
+        uv, depth = self.camera.project(points)
+        with np.errstate(invalid="ignore"):
+            column, row = np.floor((uv.T + 0.5) / self.pixels)
+            seen = (depth > 0.0) & (column >= 0) & (column < self.shape[1])
+            seen &= (row >= 0) & (row < self.shape[0])
+        return np.where(seen, row * self.shape[1] + column, -1.0).astype(np.int64)
 
     def touched(self, mask: Mask) -> Mask:
         """Which cells (h, w) a mask (H, W) touches."""
@@ -106,11 +122,11 @@ class _Seen(NamedTuple):
 
 
 class _Hulls:
-    """Grids about the person, and what each camera sees of them."""
+    """Visual hulls of persons, on grids about them."""
 
     def __init__(self, cameras: Mapping[str, Camera]) -> None:
         self._cameras = cameras
-        self._seen: dict[tuple[str, tuple[int, ...]], _Seen] = {}
+        self._first: dict[tuple[str, tuple[int, ...]], Integers] = {}
 
     def filled(self, frames: Sequence[Mapping[str, Mask]], guess: RigFault) -> dict[str, float]:
         """What share of the silhouettes the hull can fill, by camera, if a guess is undone."""
@@ -120,42 +136,34 @@ class _Hulls:
             used = [self._cameras[name] for name in masks]
             middles = [find_figures(mask)[0].middle for mask in masks.values()]
             cell = tuple(int(k) for k in np.rint(triangulate(used, middles) / _LATTICE))
-            views = [self._look(name, cell) for name in masks]
-            touched = [one.touched(mask) for one, mask in zip(views, masks.values(), strict=True)]
-            # What touched cells and those beside them allow, and all that is not seen.
-            inside = np.logical_and.reduce(
-                [
-                    (one.cells < 0) | _grown(own).ravel()[one.cells]
-                    for one, own in zip(views, touched, strict=True)
-                ]
-            )
-            for name, one, own in zip(masks, views, touched, strict=True):
+            points = _grid(cell)
+            middle = points.mean(axis=0)
+            rasters = [_Raster.about(camera, middle) for camera in used]
+            touched = [one.touched(mask) for one, mask in zip(rasters, masks.values(), strict=True)]
+            # What touched cells and those beside them allow, and all that is not seen. Each camera
+            # looks at what the ones before it left, which soon is little.
+            cells: list[Integers] = []
+            for raster, own in zip(rasters, touched, strict=True):
+                key = raster.camera.name, cell
+                known = None if cells else self._first.get(key)
+                seen = raster.cells(points) if known is None else known
+                if not cells:
+                    self._first[key] = seen
+                inside = (seen < 0) | _grown(own).ravel()[seen]
+                points, cells = points[inside], [one[inside] for one in (*cells, seen)]
+            for name, chosen, own in zip(masks, cells, touched, strict=True):
                 hull = np.zeros(own.size, dtype=np.bool_)
-                chosen = one.cells[inside]
                 hull[chosen[chosen >= 0]] = True
                 fills = _grown(hull.reshape(own.shape)) & own
                 shares.setdefault(name, []).append(fills.sum() / own.sum() if own.any() else 1.0)
         return {name: float(np.mean(own)) for name, own in shares.items()}
 
-    def _look(self, name: str, cell: tuple[int, ...]) -> _Seen:
-        """What a camera sees of the grid about a cell of the lattice."""
-        if (name, cell) not in self._seen:
-            camera = self._cameras[name]
-            side, height = (np.arange(-end, end, _SPACING) for end in (_SIDE, _HEIGHT))
-            grid = np.stack(np.meshgrid(side, side, height, indexing="ij"), axis=-1).reshape(-1, 3)
-            points = grid + _LATTICE * np.array(cell, dtype=np.float64)
-            uv, depth = camera.project(points)
-            # A cell is as large as the grid is fine.
-            pixels = max(1.0, _SPACING * pixels_per_metre(camera, points.mean(axis=0)))
-            shape = int(np.ceil(camera.height / pixels)), int(np.ceil(camera.width / pixels))
-            with np.errstate(invalid="ignore"):
-                place = np.floor((uv + 0.5) / pixels)
-                seen = (depth > 0.0) & (place >= 0).all(axis=1)
-                seen &= (place < shape[::-1]).all(axis=1)
-            column, row = np.nan_to_num(place).T
-            cells = np.where(seen, row * shape[1] + column, -1).astype(np.int64)
-            self._seen[name, cell] = _Seen(cells, shape, pixels)
-        return self._seen[name, cell]
+
+def _grid(cell: tuple[int, ...]) -> Array:
+    """The grid's points (n, 3) about a cell of the lattice [m]."""
+    side, height = (np.arange(-end, end, _SPACING) for end in (_SIDE, _HEIGHT))
+    grid = np.stack(np.meshgrid(side, side, height, indexing="ij"), axis=-1).reshape(-1, 3)
+    return np.asarray(grid + _LATTICE * np.array(cell, dtype=np.float64))
 
 
 def _grown(cells: Mask) -> Mask:

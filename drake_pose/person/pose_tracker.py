@@ -80,17 +80,16 @@ def pose_uncertainty(
     apriori = _limits_information(fit)
     parts = _parts(fit, compared, A)
     between = _noise(A, parts.left, parts.alone)
-    likelihoods = [
-        _with_surfaces(parts, between, surface, moves, free, apriori)[0] for surface in _SURFACES
-    ]
-    surface = float(_SURFACES[int(np.argmax(likelihoods))])
+    distances = _Distances.of(parts, between, moves)
+    likeliest = int(np.argmax(distances.with_surfaces(_SURFACES, free, apriori)[0]))
+    surface = _SURFACES[likeliest : likeliest + 1]
     # The nearest points of two contours are nearer than those that belong together. So the noise
     # that counts is the larger one: of the whole body's distances, the surface's share included.
     own = (moves @ A.sum(axis=0) @ np.swapaxes(moves, 1, 2)).sum(axis=0)[np.ix_(free, free)]
     V = np.linalg.inv(own + np.diag(apriori[free]))
     Q = np.swapaxes(moves[:, free], 1, 2) @ V @ moves[:, free]
     noise = max(between, _noise(A, compared.b, Q))
-    H = _with_surfaces(parts, noise, surface, moves, free, apriori)[1]
+    H = _Distances.of(parts, noise, moves).with_surfaces(surface, free, apriori)[1][0]
     covariance = np.zeros((size, size))
     own = np.linalg.inv(H[np.ix_(free, free)] + np.diag(apriori[free]))
     covariance[np.ix_(free, free)] = own
@@ -98,7 +97,7 @@ def pose_uncertainty(
         follow = np.eye(size)[:, held]
         follow[free] = -own @ H[np.ix_(free, held)]
         covariance += follow @ held_covariance @ follow.T
-    return PoseUncertainty(covariance, H, noise, surface)
+    return PoseUncertainty(covariance, H, noise, float(surface[0]))
 
 
 def _limits_information(fit: ContourFit) -> Array:
@@ -145,31 +144,48 @@ def _parts(fit: ContourFit, compared: Comparison, A: Array) -> _Parts:
     information, turns = np.linalg.eigh(np.swapaxes(K, 1, 2) @ whole @ K)
     information, K = np.maximum(information, 0.0), K @ turns
     alone = (K / (information + _SURFACES[-1] ** -2)[:, None]) @ np.swapaxes(K, 1, 2)
-    left = compared.b - np.einsum("cnij,njk,nk->cni", A, alone, b)
+    left = compared.b - (A @ (alone @ b[..., None]))[..., 0]
     return _Parts(whole, b, K, information, alone, left)
 
 
-def _with_surfaces(
-    parts: _Parts,
-    noise: float,
-    surface: float,
-    moves: Array,
-    free: NDArray[np.intp],
-    apriori: Array,
-) -> tuple[float, Array]:
-    """The likelihood of the distances where surfaces are so far off, and the information (m, m)."""
-    information = parts.information / noise
-    pulls = np.einsum("nij,ni->nj", parts.directions, parts.b) / noise
-    share = 1.0 / (information + surface**-2)
-    across = parts.A @ parts.directions / noise
-    A = parts.A / noise - (across * share[:, None]) @ np.swapaxes(across, 1, 2)
-    b = parts.b / noise - np.einsum("nij,nj->ni", across, share * pulls)
-    H = (moves @ A @ np.swapaxes(moves, 1, 2)).sum(axis=0)
-    g = np.einsum("njk,nk->j", moves, b)[free]
-    own = H[np.ix_(free, free)] + np.diag(apriori[free])
-    explained = (share * pulls**2).sum() + g @ np.linalg.solve(own, g)
-    freedom = np.log1p(surface**2 * information).sum() + np.linalg.slogdet(own)[1]
-    return float(0.5 * (explained - freedom)), H
+class _Distances(NamedTuple):
+    """What the contours' distances of one variance say of the values where surfaces are exact.
+
+    H: (m, m) and g: (m,) the normal equations; moves: (m, k) what each value does along the parts'
+    directions, as far as it was seen; information, pulls: (k,) of the surfaces along them.
+    """
+
+    H: Array
+    g: Array
+    moves: Array
+    information: Array
+    pulls: Array
+
+    @staticmethod
+    def of(parts: _Parts, noise: float, moves: Array) -> "_Distances":
+        """What parts say where distances have this variance; moves: (nodes, m, 12)."""
+        H = (moves @ parts.A @ np.swapaxes(moves, 1, 2)).sum(axis=0) / noise
+        along = np.swapaxes(moves @ parts.A @ parts.directions, 0, 1) / noise
+        pulls = np.einsum("nij,ni->nj", parts.directions, parts.b) / noise
+        g = np.einsum("njk,nk->j", moves, parts.b) / noise
+        information = parts.information.ravel() / noise
+        return _Distances(H, g, along.reshape(len(H), -1), information, pulls.ravel())
+
+    def with_surfaces(
+        self, surfaces: Array, free: NDArray[np.intp], apriori: Array
+    ) -> tuple[Array, Array]:
+        """The likelihoods (k,) where surfaces are so far off (k,) [m], and informations (k, m, m).
+
+        All at once, as each alone is little work.
+        """
+        share = 1.0 / (self.information + surfaces[:, None] ** -2)
+        H = self.H - (self.moves * share[:, None]) @ self.moves.T
+        g = (self.g - (share * self.pulls) @ self.moves.T)[:, free]
+        own = H[:, free[:, None], free] + np.diag(apriori[free])
+        explained = (share * self.pulls**2).sum(axis=1)
+        explained += (g * np.linalg.solve(own, g[..., None])[..., 0]).sum(axis=1)
+        freedom = np.log1p(surfaces[:, None] ** 2 * self.information).sum(axis=1)
+        return 0.5 * (explained - freedom - np.linalg.slogdet(own)[1]), H
 
 
 # The share of the last frame's step that is expected again, and how far that is off [rad, m].

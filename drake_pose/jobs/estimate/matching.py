@@ -166,15 +166,14 @@ def finish_frame(
         base = base_cells(pose.X_WB) if inputs.base_moves else None
         row = PoseRow(frame, pose.q, base, pose.E_total, pose.seconds)
     more["stopped_by"] = pose.stopped_by
+    bodies = {name: own >= 0 for name, own in parts.items()}
     if row.found:
         more["joint_errors"] = inputs.joint_errors(frame, pose.q)
-        bodies = {name: own >= 0 for name, own in parts.items()}
         more["ious"] = compare_masks(masks, bodies).ious
     drawn = {}
     for name, seen in shown.items():
-        own = parts.get(name)
-        body = np.zeros(seen.shape[:2], np.bool_) if own is None else own >= 0
-        drawn[name] = Drawn(seen, body, own)
+        body = bodies[name] if name in bodies else np.zeros(seen.shape[:2], np.bool_)
+        drawn[name] = Drawn(seen, body, parts.get(name))
     return FinishedFrame(row, FrameRecord.of(row, **more), drawn)
 
 

@@ -187,14 +187,14 @@ def _finish(
         for name in scene.cameras if by_colour else {**masks, **shown}:
             camera = scene.cameras[name]
             parts[name] = draw_labels(outlines, labels, camera.X_CW @ X_WN, camera) - 1
-    bodies = {name: own >= 0 for name, own in parts.items()}
     wrong, area = np.nan, float(sum(np.count_nonzero(mask) for mask in masks.values()))
     if found and by_colour:
+        bodies = {name: own >= 0 for name, own in parts.items()}
         # Without masks, E_total is the strip between both contours over the body's area.
         area = float(sum(np.count_nonzero(body) for body in bodies.values())) or 1.0
         wrong = sum(map(edge_area, bodies.values())) * distance
     elif found and area:
-        wrong = float(sum(np.count_nonzero(mask ^ bodies[k]) for k, mask in masks.items()))
+        wrong = float(sum(np.count_nonzero(mask ^ (parts[k] >= 0)) for k, mask in masks.items()))
     pose = PoseEstimate(
         found, q, np.eye(4), (), wrong, area or 1.0, stopped_by=FOLLOWED, seconds=seconds
     )

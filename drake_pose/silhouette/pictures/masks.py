@@ -70,9 +70,10 @@ def compare_masks(
     wrong, area = 0, 0
     ious: dict[str, float] = {}
     for camera, mask in masks.items():
-        wrong += int(np.count_nonzero(mask ^ bodies[camera]))
-        area += int(np.count_nonzero(mask))
-        ious[camera] = intersection_over_union(mask, bodies[camera])
+        own, drawn, both = map(np.count_nonzero, (mask, bodies[camera], mask & bodies[camera]))
+        either = int(own + drawn - both)
+        wrong, area = wrong + int(either - both), area + int(own)
+        ious[camera] = int(both) / either if either else 1.0
     return MaskAgreement(wrong / area if area else float("nan"), ious)
 
 

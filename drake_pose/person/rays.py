@@ -104,19 +104,27 @@ def _sum_at_points(
     camera: Array, X_CW: Array, picture: NDArray[np.int8], points: Array, weights: Array
 ) -> tuple[Array, Array]:
     height, width = picture.shape
-    sums, seen, p = np.zeros(points.shape[0]), np.zeros(points.shape[0]), np.empty(3)
+    sums, seen, P = np.zeros(points.shape[0]), np.zeros(points.shape[0]), np.empty((3, 4))
+    # Row and column of a point, times its depth: lens and pose in one matrix.
+    parallel = camera[0] != 0.0
+    for c in range(4):
+        P[2, c] = X_CW[2, c] if not parallel else 1.0 * (c == 3)
+        for r in range(2):
+            P[r, c] = camera[1 + r] * X_CW[r, c] + (camera[3 + r] + 0.5) * P[2, c]
+    p00, p01, p02, p03 = P[0, 0], P[0, 1], P[0, 2], P[0, 3]
+    p10, p11, p12, p13 = P[1, 0], P[1, 1], P[1, 2], P[1, 3]
+    p20, p21, p22, p23 = P[2, 0], P[2, 1], P[2, 2], P[2, 3]
+    nearest = 0.0 if parallel else max(camera[5], 1e-300)
     for n in range(points.shape[0]):
+        total = within = 0.0
         for m in range(points.shape[1]):
-            for r in range(3):
-                p[r] = X_CW[r, 3]
-                for c in range(3):
-                    p[r] += X_CW[r, c] * points[n, m, c]
-            depth = p[2] if camera[0] == 0.0 else 1.0
-            if depth <= 0.0 or depth < camera[5]:
-                continue
-            column = int(np.floor(camera[1] * p[0] / depth + camera[3] + 0.5))
-            row = int(np.floor(camera[2] * p[1] / depth + camera[4] + 0.5))
-            if 0 <= row < height and 0 <= column < width:
-                sums[n] += weights[n, m] * picture[row, column]
-                seen[n] += weights[n, m]
+            x, y, z = points[n, m, 0], points[n, m, 1], points[n, m, 2]
+            depth = p20 * x + p21 * y + p22 * z + p23
+            share = 1.0 / depth if depth >= nearest else -1.0
+            u = (p00 * x + p01 * y + p02 * z + p03) * share
+            v = (p10 * x + p11 * y + p12 * z + p13) * share
+            if share > 0.0 and 0.0 <= u < width and 0.0 <= v < height:
+                total += weights[n, m] * picture[int(v), int(u)]
+                within += weights[n, m]
+        sums[n], seen[n] = total, within
     return sums, seen

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Literal
 
 import numpy as np
@@ -56,10 +57,12 @@ class Circle:
 
     def points(self, degrees: Array) -> Array:
         """(n, 3) the circle's points at angles (n,) [deg]."""
+        return np.asarray(self.center + self.radius * self.directions(degrees))
+
+    def directions(self, degrees: Array) -> Array:
+        """(n, 3) from the centre to the points at angles (n,) [deg], of length 1."""
         theta = np.radians(np.asarray(degrees, dtype=np.float64))[:, None]
-        return np.asarray(
-            self.center + self.radius * (np.sin(theta) * self.i + np.cos(theta) * self.j)
-        )
+        return np.asarray(np.sin(theta) * self.i + np.cos(theta) * self.j)
 
 
 def joint_circle(limb: Limb, root: Array, end: Array, outward: Array) -> Circle:
@@ -69,25 +72,32 @@ def joint_circle(limb: Limb, root: Array, end: Array, outward: Array) -> Circle:
     (3,), from neck base to shoulder or waist to hip; j = i x z for the left arm, z from shoulder to
     hand (for the right arm and for legs mirrored, to point behind the arm and in front of the leg).
     """
-    a, b = limb.lengths
     z, distance = _along(root, end)
-    # Beyond the limb's reach it is stretched out (or folded), in proportion.
-    reach = min(max(distance, abs(a - b)), a + b)
-    along = (a * a - b * b + reach * reach) / (2.0 * reach) if reach > _STRAIGHT else 0.0
-    radius = math.sqrt(max(0.0, a * a - along * along))
-    center = root + z * along * (distance / reach if reach > _STRAIGHT else 1.0)
+    along, radius = _circle_sizes(limb, distance)
     i = _unit_across(np.array([outward[0], outward[1], 0.0]), z)
     j = limb.side * np.cross(i, z)
-    return Circle(center, radius, i, -j if limb.name.endswith("leg") else j)
+    return Circle(root + along * z, float(radius), i, -j if limb.name.endswith("leg") else j)
 
 
-def _along(root: Array, end: Array) -> tuple[Array, float]:
-    """The direction (3,) from root to end, downwards where they are one, and their distance [m]."""
-    across = end - root
-    distance = float(np.linalg.norm(across))
-    if distance > _STRAIGHT:
-        return across / distance, distance
-    return np.array([0.0, 0.0, -1.0]), distance
+def _circle_sizes(limb: Limb, distances: Array) -> tuple[Array, Array]:
+    """How far from the root to the end circles' centres are, and radii, for distances of both."""
+    a, b = limb.lengths
+    # Beyond the limb's reach it is stretched out (or folded), in proportion.
+    reach = np.clip(distances, max(abs(a - b), _STRAIGHT), a + b)
+    along = (a * a - b * b + reach * reach) / (2.0 * reach)
+    return along * distances / reach, np.sqrt(np.maximum(0.0, a * a - along * along))
+
+
+def _along(root: Array, ends: Array) -> tuple[Array, Array]:
+    """Directions (..., 3) from root to ends (..., 3), downwards where they are one, and distances.
+
+    Distances (...) are in m.
+    """
+    across = ends - root
+    distances = np.sqrt((across**2).sum(axis=-1))
+    is_far = distances[..., None] > _STRAIGHT
+    ways = across / np.where(is_far, distances[..., None], 1.0)
+    return np.where(is_far, ways, [0.0, 0.0, -1.0]), distances
 
 
 def search_limb(
@@ -112,9 +122,8 @@ def search_limb(
         last: (4,) the limb's angles in the last frame [rad].
         regions: (H, W) the person in each camera's picture.
     """
-    ends = [end] if search == "rectangles" else _possible_ends(limb, root, end)
-    found = [_places(limb, R_WT, root, one, outward, last) for one in ends]
-    middles, angles = (np.concatenate(values) for values in zip(*found, strict=True))
+    ends = end[None] if search == "rectangles" else _possible_ends(limb, root, end)
+    middles, angles, ends = _places(limb, R_WT, root, ends, outward, last)
     if search == "rectangles":
         samples = rectangles(root, middles, end, limb.half_widths)
     else:
@@ -122,32 +131,40 @@ def search_limb(
     scores = correlation(samples, cameras, regions)
     best = np.flatnonzero(scores >= scores.max() - 1e-9)
     chosen = best[np.argmin(np.linalg.norm(middles[best] - near, axis=1))]
-    counts = [len(places) for places, _ in found]
-    return middles[chosen], np.repeat(ends, counts, axis=0)[chosen]
+    return middles[chosen], ends[chosen]
 
 
-def _possible_ends(limb: Limb, root: Array, end: Array) -> list[Array]:
-    """Where the end may be in truth, (3,) each: on its line from the root, and in reach."""
+def _possible_ends(limb: Limb, root: Array, end: Array) -> Array:
+    """Where the end may be in truth (k, 3): on its line from the root, and in reach."""
     direction, distance = _along(root, end)
     count = round(FEATURE_ERROR / _END_STEP)
     steps = _END_STEP * np.arange(-count, count + 1)
     distances = np.unique(np.clip(distance + steps, *_reach(limb)))
-    return [root + one * direction for one in distances]
+    return np.asarray(root + distances[:, None] * direction)
 
 
 def _places(
-    limb: Limb, R_WT: Array, root: Array, end: Array, outward: Array, last: Array
-) -> tuple[Array, Array]:
-    """Where the middle joint may be (n, 3) for an end, and the limb's angles there (n, 4)."""
+    limb: Limb, R_WT: Array, root: Array, ends: Array, outward: Array, last: Array
+) -> tuple[Array, Array, Array]:
+    """Where the middle joint may be (n, 3), the limb's angles there (n, 4), and the ends (n, 3).
+
+    ends: (k, 3) on one line from the root.
+    """
     is_leg = limb.name.endswith("leg")
     low, high = KNEE_RANGE if is_leg else ELBOW_RANGE
     degrees = np.arange(low, high + 0.5 * _STEP_DEG, _STEP_DEG)
-    middles = joint_circle(limb, root, end, outward).points(degrees)
-    angles, beyond = place_limb(limb, R_WT, root, middles, end, last)
-    if is_leg:
-        possible = beyond <= max(_HIP_TOLERANCE, float(beyond.min()))
-        middles, angles = middles[possible], angles[possible]
-    return middles, angles
+    z, distances = _along(root, ends)
+    along, radii = _circle_sizes(limb, distances)
+    directions = joint_circle(limb, root, ends[0], outward).directions(degrees)
+    centers, radii = root + along[:, None] * z, radii[:, None, None]
+    middles = (centers[:, None] + radii * directions).reshape(-1, 3)
+    each = np.repeat(ends, len(degrees), axis=0)
+    angles, beyond = place_limb(limb, R_WT, root, middles, each, last)
+    if not is_leg:
+        return middles, angles, each
+    least = beyond.reshape(len(ends), -1).min(axis=1)
+    possible = beyond <= np.repeat(np.maximum(_HIP_TOLERANCE, least), len(degrees))
+    return middles[possible], angles[possible], each[possible]
 
 
 def _points_of_segments(
@@ -207,7 +224,7 @@ def limb_angles(
 
 
 def place_limb(
-    limb: Limb, R_WT: Array, root: Array, middles: Array, end: Array, last: Array
+    limb: Limb, R_WT: Array, root: Array, middles: Array, ends: Array, last: Array
 ) -> tuple[Array, Array]:
     """The joint angles that put a limb's joints where they are, for several places of the middle.
 
@@ -215,43 +232,56 @@ def place_limb(
 
     Args:
         R_WT: (3, 3) the trunk's axes in the world.
-        root, middles, end: (3,), (n, 3), (3,) [m].
+        root, middles, ends: (3,), (n, 3), and (n, 3) or (3,) [m].
         last: (4,) angles to stay near where several sets do the same [rad].
 
     Returns:
         (n, 4) angles, and (n,) by how much the worst of its root's lies beyond its limits [rad].
     """
-    towards, distance = _along(root, end)
+    towards, distances = _along(root, np.broadcast_to(ends, middles.shape))
     frames, off_line = _triads(towards, middles - root)
     # Stretched it does not tell how it is turned about itself: as in the last frame.
-    stretched = off_line * distance < _STRETCHED * ((middles - root) ** 2).sum(axis=1)
+    stretched = off_line * distances < _STRETCHED * ((middles - root) ** 2).sum(axis=1)
     R_last = R_WT @ Rotation.from_euler(_letters(limb)[:3], last[:3]).as_matrix()
-    options = []
-    for bend in _middle_angles(limb, distance):
-        end_U = limb.middle_U + Rotation.from_euler(_letters(limb)[3], bend).apply(limb.end_L)
-        own = _triads(_along(np.zeros(3), end_U)[0], limb.middle_U[None])[0][0]
-        R_WU = frames @ own.T
-        if stretched.any():
-            as_last, _ = Rotation.align_vectors(towards, R_last @ end_U)
-            R_WU[stretched] = as_last.as_matrix() @ R_last
-        angles, beyond = _root_angles(limb, R_WT.T @ R_WU, last[:3])
-        whole = np.column_stack([angles, np.full(len(middles), bend)])
-        options.append((beyond + 1e-3 * abs(bend - last[3]), beyond, whole))
-    costs, beyonds, wholes = (np.array(values) for values in zip(*options, strict=True))
-    chosen, each = np.argmin(costs, axis=0), np.arange(len(middles))
-    return wholes[chosen, each], beyonds[chosen, each]
+    bends, is_possible = _middle_angles(limb, distances)
+    row, option = np.nonzero(is_possible)
+    bend = bends[row, option]
+    end_U = limb.middle_U + Rotation.from_euler(_letters(limb)[3], bend[:, None]).apply(limb.end_L)
+    towards_U = _along(np.zeros(3), end_U)[0]
+    own = _triads(towards_U, np.broadcast_to(limb.middle_U, end_U.shape))[0]
+    R_WU = frames[row] @ own.transpose(0, 2, 1)
+    if stretched.any():
+        still = stretched[row]
+        R_WU[still] = _least_turns(towards_U[still] @ R_last.T, towards[row[still]]) @ R_last
+    angles, beyond = _root_angles(limb, R_WT.T @ R_WU, last[:3])
+    costs, beyonds = np.full(bends.shape, np.inf), np.zeros(bends.shape)
+    roots, each = np.zeros((*bends.shape, 3)), np.arange(len(middles))
+    costs[row, option] = beyond + 1e-3 * np.abs(bend - last[3])
+    roots[row, option], beyonds[row, option] = angles, beyond
+    chosen = np.argmin(costs, axis=1)
+    return np.column_stack([roots[each, chosen], bends[each, chosen]]), beyonds[each, chosen]
 
 
-def _middle_angles(limb: Limb, distance: float) -> list[float]:
-    """The middle joint's angles [rad] for a distance of root and end: one or two inside limits."""
+def _least_turns(ones: Array, others: Array) -> Array:
+    """The least rotations (n, 3, 3) from directions (n, 3) to others (n, 3)."""
+    quaternions = np.column_stack([np.cross(ones, others), 1.0 + (ones * others).sum(axis=1)])
+    for k in np.flatnonzero(np.linalg.norm(quaternions, axis=1) < _STRAIGHT):
+        quaternions[k, :3] = _unit_across(np.zeros(3), ones[k])
+    return np.asarray(Rotation.from_quat(quaternions).as_matrix())
+
+
+def _middle_angles(limb: Limb, distances: Array) -> tuple[Array, Array]:
+    """The middle joint's angles (n, 2) [rad] for distances (n,) of root and end.
+
+    And which of them (n, 2) are inside limits, or about as near as the other one.
+    """
     base, swing, start = _bending(limb)
-    turn = math.acos(min(1.0, max(-1.0, (distance**2 - base) / swing)))
-    options = [math.remainder(start + sign * turn, 2.0 * math.pi) for sign in (-1.0, 1.0)]
-    clipped = [min(max(option, limb.lower[3]), limb.upper[3]) for option in options]
-    beyond = np.abs(np.subtract(options, clipped))
-    return [
-        c for c, off in zip(clipped, beyond, strict=True) if off <= beyond.min() + _BEND_TOLERANCE
-    ]
+    turns = np.arccos(np.clip((distances**2 - base) / swing, -1.0, 1.0))
+    options = start + np.array([-1.0, 1.0]) * turns[:, None]
+    options = np.remainder(options + math.pi, 2.0 * math.pi) - math.pi
+    clipped = np.clip(options, limb.lower[3], limb.upper[3])
+    beyond = np.abs(options - clipped)
+    return clipped, beyond <= beyond.min(axis=1, keepdims=True) + _BEND_TOLERANCE
 
 
 def _reach(limb: Limb) -> tuple[float, float]:
@@ -263,6 +293,7 @@ def _reach(limb: Limb) -> tuple[float, float]:
     return float(low), float(high)
 
 
+@lru_cache(maxsize=16)
 def _bending(limb: Limb) -> tuple[float, float, float]:
     """Base, swing [m^2], start [rad]: the squared distance is base + swing cos(bend - start)."""
     axis = np.zeros(3)
@@ -289,13 +320,13 @@ def _root_angles(limb: Limb, R_TU: Array, last: Array) -> tuple[Array, Array]:
 
 
 def _triads(x: Array, others: Array) -> tuple[Array, Array]:
-    """(n, 3, 3) axes: x of length 1, then what of the others (n, 3) is across it; how much (n,)."""
-    across = others - np.outer(others @ x, x)
-    length = np.linalg.norm(across, axis=1)
-    if (length < _STRAIGHT).any():
-        across[length < _STRAIGHT] = _unit_across(np.zeros(3), x)
-    y = across / np.linalg.norm(across, axis=1, keepdims=True)
-    return np.stack([np.broadcast_to(x, y.shape), y, y @ np.cross(x, np.eye(3))], axis=2), length
+    """(n, 3, 3) axes: x (n, 3) of length 1, then what of the others (n, 3) is across; how much."""
+    across = others - (others * x).sum(axis=1, keepdims=True) * x
+    length = np.sqrt((across**2).sum(axis=1))
+    for k in np.flatnonzero(length < _STRAIGHT):
+        across[k] = _unit_across(np.zeros(3), x[k])
+    y = across / np.sqrt((across**2).sum(axis=1, keepdims=True))
+    return np.stack([x, y, np.cross(x, y)], axis=2), length
 
 
 def _unit_across(vector: Array, axis: Array) -> Array:

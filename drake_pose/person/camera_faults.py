@@ -37,6 +37,9 @@ _LOWERED = 0.8
 _ALIKE = 1.1
 # A surface is known to 2 cm, and an edge to a pixel: what is off by more is off [m, pixel].
 _LEAST_METRES, _LEAST_PIXELS = 0.035, 2.0
+# Of a camera that has moved, so much at least shows beside the pose that it helped to find: that
+# pose goes along by 0.3 of the way with nine cameras, by half of it with four around a person.
+_SHOWN = 0.2
 # One motion explains a camera's silhouettes where they fit nearly as well as the others'.
 _EXPLAINED = 0.9
 
@@ -192,6 +195,22 @@ class CameraJudge:
             float(shares[1]),
         )
 
+    def _agree(self, names: Sequence[str], frames: Sequence[FrameView]) -> bool:
+        """Whether no camera can be at fault, by the poses of all: each without one costs as much.
+
+        What few cameras say, their pose follows.
+        """
+        if len(names) <= 3:
+            return False
+        for name in names:
+            own = [frame for frame in frames if name in frame.edges]
+            poses, shares = zip(*(self.pose_without(frame, "") for frame in own), strict=True)
+            motion = self.motion(name, [frame.edges[name] for frame in own], poses)
+            fits = motion.share_before > _EXPLAINED * float(np.mean(shares))
+            if not fits or motion.metres > _SHOWN * _LEAST_METRES:
+                return False
+        return True
+
     def find_fault(self, frames: Sequence[FrameView]) -> CameraFault | None:
         """The camera that contradicts the others most, if one does.
 
@@ -199,6 +218,8 @@ class CameraJudge:
         """
         frames = [frame for frame in frames if len(frame.edges) >= 3]
         names = [name for name in self._cameras if any(name in frame.edges for frame in frames)]
+        if self._agree(names, frames):
+            return None
         with_all = [self.pose_without(frame, "")[1] for frame in frames]
         misfits, found = {}, {}
         for name in names:

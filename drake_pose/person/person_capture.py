@@ -26,7 +26,9 @@ from drake_pose.person.views import (
     FrameViews,
     KnownColours,
     edge_spacing,
+    pack_view,
     see_silhouette,
+    unpack_view,
 )
 from drake_pose.silhouette.areas.outline import Outline
 
@@ -124,8 +126,14 @@ class _Capture:
     ) -> None:
         self._cameras, self._read, self._is_sequence = cameras, read, is_sequence
         self.tracker = PersonPoseTracker(ContourFit(tree, noise=NOISE), LENIENT, shape_values(tree))
+        # The frames that the shape is measured in are seen three times: their views by camera.
+        self._kept: dict[int, dict[str, bytes]] = {}
 
     def _see(self, frame: int) -> FrameViews:
+        if frame in self._kept:
+            kept = self._kept[frame]
+            cameras = [self._cameras[name] for name in kept]
+            return FrameViews(cameras, [unpack_view(data) for data in kept.values()])
         masks = self._read(frame)
         cameras = [self._cameras[name] for name in masks]
         pairs = zip(cameras, masks.values(), strict=True)
@@ -138,10 +146,13 @@ class _Capture:
         if not is_shape.any():
             return None, {}
         first = frames[:_SHAPE_SPAN]
+        for frame in first:
+            seen = self._see(frame)
+            self._kept[frame] = {camera.name: pack_view(view) for camera, view in seen.pairs}
         rough = self.follow_all(first, {})
         poses = {k: one.values for k in spread_over(first, _SHAPE_FRAMES) if (one := rough[k])}
-        seen = [self._see(k) for k in poses]
-        views = [(one.cameras, [view.edge for view in one.views]) for one in seen]
+        looks = [self._see(k) for k in poses]
+        views = [(one.cameras, [view.edge for view in one.views]) for one in looks]
         shape = fit_shape(fit, views, np.array(list(poses.values())))
         worn = ContourFit(fit.tree, shape.outlines, NOISE)
         self.tracker = PersonPoseTracker(worn, LENIENT, is_shape, shape.values)

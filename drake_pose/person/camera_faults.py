@@ -28,6 +28,8 @@ _POSE_ROUNDS = tuple(
 _CAMERA_ROUNDS = tuple(
     AnnealingStage(scale, 0.05) for scale in (0.4, 0.3, 0.2, 0.15, 0.1, 0.07, 0.05, 0.05)
 )
+# For a camera that is nearly where it is said to be.
+_NEAR_ROUNDS = _CAMERA_ROUNDS[4:6] + _CAMERA_ROUNDS[-1:]
 _CAMERA_STEPS = StepSettings(longest=2.0, damping=1e-6, even_damping=1e-9)
 _JUDGED = AnnealingStage(0.05, 0.05)
 _ANGLE_DEVIATION = 0.5
@@ -129,14 +131,19 @@ class CameraJudge:
         return self._fit.compare(pack_views([camera], [edge]), values, _JUDGED).inlier_ratio
 
     def motion(
-        self, name: str, edges: Sequence[EdgePoints], poses: Sequence[Array]
+        self,
+        name: str,
+        edges: Sequence[EdgePoints],
+        poses: Sequence[Array],
+        rounds: Sequence[AnnealingStage] = _CAMERA_ROUNDS,
     ) -> CameraMotion:
         """The motion of a camera that explains its edges best, by poses (m,) found without it."""
         camera, pairs = self._cameras[name], list(zip(edges, poses, strict=True))
         places = np.array([self._fit.kinematics.poses(values)[:, :3, 3] for values in poses])
         found = []
         for start in (np.zeros(3), _way_to_regions(camera, edges, places)):
-            moved = self._moved(camera, pairs, places.reshape(-1, 3).mean(axis=0), start)
+            middle = places.reshape(-1, 3).mean(axis=0)
+            moved = self._moved(camera, pairs, middle, start, rounds)
             found.append(self._describe(camera, moved, pairs, places.reshape(-1, 3)))
             # What is far off may be drawn to the wrong side of the body; else one start is enough.
             if found[0].share_after > _EXPLAINED:
@@ -149,6 +156,7 @@ class CameraJudge:
         pairs: Sequence[tuple[EdgePoints, Array]],
         middle: Array,
         start: Array,
+        rounds: Sequence[AnnealingStage],
     ) -> Camera:
         """A camera moved to fit its regions to bodies about middle (3,), first by (3,) [m]."""
         fit, reach = self._fit, float(np.linalg.norm(camera.X_WC[:3, 3] - middle))
@@ -165,7 +173,7 @@ class CameraJudge:
             np.array([values for _, values in pairs]),
             nothing,
             np.concatenate([np.zeros(3), camera.X_CW[:3, :3] @ start]),
-            _CAMERA_ROUNDS,
+            rounds,
             expected=(nothing, np.zeros(6)),
         )
         theta = np.append(found.shared, np.zeros(count - len(names)))
@@ -205,7 +213,8 @@ class CameraJudge:
         for name in names:
             own = [frame for frame in frames if name in frame.edges]
             poses, shares = zip(*(self.pose_without(frame, "") for frame in own), strict=True)
-            motion = self.motion(name, [frame.edges[name] for frame in own], poses)
+            edges = [frame.edges[name] for frame in own]
+            motion = self.motion(name, edges, poses, _NEAR_ROUNDS)
             fits = motion.share_before > _EXPLAINED * float(np.mean(shares))
             if not fits or motion.metres > _SHOWN * _LEAST_METRES:
                 return False

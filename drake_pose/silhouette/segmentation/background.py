@@ -85,12 +85,12 @@ def background_support(pictures: Sequence[Picture], background: Background) -> A
 
 
 def person_region(picture: Picture, background: Background) -> Mask:
-    """Where a picture (H, W, 3) differs from its camera's background: the person, (H, W).
+    """Where a picture (H, W, 3 or 4) differs from its camera's background: the person, (H, W).
 
     Patches much smaller than the largest are dropped as noise; the rest may be several parts, or
     nothing. Raises SettingsError for a picture of another size than the background.
     """
-    if picture.shape != background.mean.shape:
+    if picture.shape[:2] != background.mean.shape[:2]:
         raise SettingsError(
             f"the picture is {picture.shape}, but its background {background.mean.shape}"
         )
@@ -133,8 +133,9 @@ def _slices(ranges: tuple[range, range], margin: int) -> tuple[slice, slice]:
 
 
 def _off(picture: Picture, mean: Picture, tolerance: Picture) -> NDArray[Any]:
-    """(H, W) not 0 where a channel is off."""
-    off = cv2.compare(cv2.absdiff(picture, mean), tolerance, cv2.CMP_GT)
+    """(H, W) not 0 where a channel of a picture (H, W, 3 or 4) is off; a fourth says nothing."""
+    seen = cv2.cvtColor(picture, cv2.COLOR_RGBA2RGB) if picture.shape[2] == 4 else picture
+    off = cv2.compare(cv2.absdiff(seen, mean), tolerance, cv2.CMP_GT)
     return cv2.cvtColor(off, cv2.COLOR_RGB2GRAY)
 
 

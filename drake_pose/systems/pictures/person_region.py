@@ -77,15 +77,17 @@ class PersonRegion(PortedSystem):
             mask = label_image_to_mask(image)
             self._require_size(mask, "label image")
             return mask
-        picture = self.picture.Eval(context)
-        if picture is None:
+        image = self.given(context, "color_image")
+        if image is None or not image.size():
             return None
+        self._require_size(image.data, "color image")
         if self._background is None:
             raise SettingsError(
                 f"camera '{self._camera.name}': nothing tells the person from what is behind; give "
                 "a background model or connect label_image"
             )
-        return person_region(picture, self._background)
+        # Most of it is not looked at: it is copied without its fourth channel piece by piece.
+        return person_region(image.data, self._background)
 
     def _require_size(self, image: NDArray[np.generic], kind: str) -> None:
         camera = self._camera

@@ -90,7 +90,8 @@ def person_region(picture: Picture, background: Background) -> Mask:
     Patches much smaller than the largest are dropped as noise; the rest may be several parts, or
     nothing. Raises SettingsError for a picture of another size than the background.
     """
-    if picture.shape[:2] != background.mean.shape[:2]:
+    size = background.mean.shape[:2]
+    if picture.shape not in ((*size, 3), (*size, 4)):
         raise SettingsError(
             f"the picture is {picture.shape}, but its background {background.mean.shape}"
         )

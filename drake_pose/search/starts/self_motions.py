@@ -69,14 +69,14 @@ def flips(kinematics: TreeKinematics, values: np.ndarray, count: int = 16) -> li
     triples = _chained_triples(kinematics, kinematics.motions(values).moves)
     # One flip may leave the limits and the next return into them.
     for one in known:
+        if len(known) > count:
+            break
         for flip in _single_flips(kinematics, one, triples):
-            if len(known) > count:
-                break
-            gaps = [np.abs(_remainder(flip.values - other.values)).max() for other in known]
-            if min(gaps) > _DIFFERENT:
+            gaps = np.abs(_remainder(flip.values - np.array([other.values for other in known])))
+            if gaps.max(axis=1).min() > _DIFFERENT:
                 known.append(flip)
     found = []
-    for flip in known[1:]:
+    for flip in known[1 : count + 1]:
         inside = _inside(kinematics, flip.values.copy(), np.flatnonzero(flip.changed))
         if inside is not None:
             found.append(Flip(inside, flip.changed, flip.mirrored))

@@ -13,6 +13,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 
 from drake_pose.camera.models import ParallelCamera
@@ -142,12 +143,11 @@ class CoarseSearch:
         # What is behind a camera is nowhere near.
         together = np.nan_to_num(np.hstack(places), nan=1e9)
         chosen: list[int] = []
-        for i in range(len(together)):
-            gaps = np.abs(together[chosen] - together[i]).max(axis=1, initial=0.0)
-            if not chosen or gaps.min() > apart * self._size:
-                chosen.append(i)
-            if len(chosen) >= count:
-                break
+        left = np.arange(len(together))
+        while len(left) and len(chosen) < count:
+            chosen.append(left[0])
+            gaps = np.abs(together[left] - together[left[0]]).max(axis=1, initial=0.0)
+            left = left[gaps > apart * self._size]
         return poses.only(np.array(chosen, dtype=np.int64))
 
     def _parent_in(self, view: CoarseView, node: int, X_WN: np.ndarray) -> np.ndarray:
@@ -229,7 +229,13 @@ def _distances_at(
         np.clip(np.rint(first + side * (np.arange(count) + 0.5)), 0, size - 1).astype(int)
         for first, count, size in zip(origin, (rows, columns), mask.shape, strict=True)
     ]
-    return np.ascontiguousarray(signed_distances(mask)[np.ix_(*places)])
+    # What is nearest to a place lies between the places, the silhouette and what is just beside it.
+    left, top, width, height = cv2.boundingRect(mask.view(np.uint8))
+    boxes = zip(places, (top, left), (top + height, left + width), strict=True)
+    window = [(max(0, min(own[0], low - 1)), max(own[-1], high) + 1) for own, low, high in boxes]
+    distances = signed_distances(mask[tuple(slice(*ends) for ends in window)])
+    shifted = [own - first for own, (first, _) in zip(places, window, strict=True)]
+    return np.ascontiguousarray(distances[np.ix_(*shifted)])
 
 
 def _by_ball(p_PB: np.ndarray) -> np.ndarray:

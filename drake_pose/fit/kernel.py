@@ -143,8 +143,10 @@ def compare_contours(
         camera, own_sums, own_weights = (cameras[0][c], cameras[1][c]), sums[c], weights[c]
         unit, scale, spacing, worth = weights[c, 0], weights[c, 1], weights[c, 2], weights[c, 3]
         contour = sample_contour(packed, seen_from(camera[0], X_WN), camera[1], spacing)
-        uv, normals = contour.uv, contour.normals
+        # Named here, arrays are not counted as used again for each pair.
+        uv, normals, lengths, owners = contour.uv, contour.normals, contour.lengths, contour.nodes
         edge_uv, edge_normals = edges.uv[begin:end], edges.normals[begin:end]
+        edge_lengths = edges.lengths[begin:end]
         of_point = nearest_alike(uv, normals, edge_uv, edge_normals, REACH * scale)
         of_edge = nearest_alike(edge_uv, edge_normals, uv, normals, REACH * scale)
         n = len(uv)
@@ -152,16 +154,16 @@ def compare_contours(
         for pair in range(n + len(edge_uv)):
             i = pair if pair < n else of_edge[pair - n]
             j = of_point[pair] if pair < n else pair - n
-            length = contour.lengths[i] if pair < n else edges.lengths[begin + j]
-            counted = contour.nodes[i] if pair < n else nodes
+            length = lengths[i] if pair < n else edge_lengths[j]
+            counted = owners[i] if pair < n else nodes
             cost = worth * length * scale * scale
             if i < 0 or j < 0:
                 own_sums[counted, COMPARED] += length * unit
                 own_sums[counted, COST] += cost
             else:
                 n0, n1 = normals[i, 0] + edge_normals[j, 0], normals[i, 1] + edge_normals[j, 1]
-                size = math.sqrt(n0 * n0 + n1 * n1)
-                n0, n1 = n0 / size, n1 / size
+                share = 1.0 / math.sqrt(n0 * n0 + n1 * n1)
+                n0, n1 = share * n0, share * n1
                 r = (edge_uv[j, 0] - uv[i, 0]) * n0 + (edge_uv[j, 1] - uv[i, 1]) * n1
                 weight, cost = count_distance(own_sums, counted, own_weights, length, r)
                 add_pull(pulls, i, n0, n1, r, weight)
@@ -169,11 +171,10 @@ def compare_contours(
                     grows = weight * (edge_normals[j, 0] * n0 + edge_normals[j, 1] * n1)
                     pulls[i, 5] += grows * n0
                     pulls[i, 6] += grows * n1
-                    wide[c, contour.nodes[i], 12] += grows * r
+                    wide[c, owners[i], 12] += grows * r
             if squares > 0:
                 u, v = (uv[i, 0], uv[i, 1]) if pair < n else (edge_uv[j, 0], edge_uv[j, 1])
                 pieces[c, math.floor(v / side) % squares, math.floor(u / side) % squares] += cost
-        owners = contour.nodes
         add_pulls(A[c], b[c], wide[c], X_WN, camera, contour.p_N, owners, owners, pulls)
     return A, b, sums, pieces, wide
 
@@ -206,12 +207,12 @@ def count_distance(
     """
     unit, scale, worth = weights[0], weights[1], weights[3]
     t = (r / scale) ** 2
-    cost = worth * length * r * r / (1.0 + t)
-    weight = worth * length / (1.0 + t) ** 2
+    share = 1.0 / (1.0 + t)
+    cost = worth * length * r * r * share
+    weight = worth * length * share * share
     sums[row, COMPARED] += length * unit
-    if t < 1.0:
-        sums[row, FITTING] += length * unit
-    sums[row, CLOSE] += length * unit / (1.0 + t)
+    sums[row, FITTING] += length * unit * (t < 1.0)
+    sums[row, CLOSE] += length * unit * share
     sums[row, COST] += cost
     sums[row, SQUARES] += weight * r * r
     sums[row, WEIGHT] += weight

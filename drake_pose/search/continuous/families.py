@@ -228,7 +228,7 @@ class RobustFamilies:
         families: list[_Family] = []
         for values in good or [poses[0].values]:
             if not self._is_in(families, values) and self._has_room(families):
-                families.append(self._spread(values))
+                families.append(self._spread(values, moves=not self._is_broken))
                 self._add_flipped(families, families[-1])
         return self._described(families, [J(one.values) for one in families])
 
@@ -238,9 +238,13 @@ class RobustFamilies:
         return self._described([self._spread(values, moves=False)], [J])
 
     def _described(self, families: Sequence[_Family], Js: Sequence[float]) -> PoseSet:
-        broken = float(self._pieces.sum()) > _BREAKDOWN * 2.0 * self._fit.edge_length
-        tree = self._kinematics.tree
-        return _describe(self._kinematics, tree, families, Js, self._tolerance, not broken)
+        tree, is_known = self._kinematics.tree, not self._is_broken
+        return _describe(self._kinematics, tree, families, Js, self._tolerance, is_known)
+
+    @property
+    def _is_broken(self) -> bool:
+        """Whether so little fits that no value is determined, however far it could be moved."""
+        return float(self._pieces.sum()) > _BREAKDOWN * 2.0 * self._fit.edge_length
 
     def _is_as_good(self, pieces: np.ndarray) -> bool:
         """Whether costs by pieces are not significantly above the best pose's."""
@@ -311,7 +315,13 @@ class RobustFamilies:
             along[free] = sign * covariance[:, column] / covariance[column, column]
             return self._move(values, int(free[column]), along, float(widths[column]))
 
-        ways = itertools.product(np.flatnonzero(wide).tolist() if moves else (), (-1.0, 1.0))
+        # Where the covariance lets a value go to its limit it need not be moved.
+        ways = [
+            (column, sign)
+            for column in np.flatnonzero(wide & moves).tolist()
+            for sign, open_end in ((-1.0, low > lower), (1.0, high < upper))
+            if open_end[free[column]]
+        ]
         found = [values, *itertools.chain.from_iterable(map_ordered(move, ways))]
         # Poses found while one value was moved show what others may be, too.
         moved = free[wide]

@@ -239,18 +239,19 @@ class _Run:
     def _contradicting(self, values: np.ndarray) -> list[View]:
         """The views, worst first, where a disc as thick as a limb fits into what is wrong at (m,).
 
-        Of several views one at least shows where a limb is and should not be, and one where it is
+        Of several views half at least show where a limb is and should not be, and half where it is
         not; in a single one other parts may hide either. What masks lack, or have besides, is not
         mended by another start: then there is none.
         """
-        share = _LIMBS[len(self._clean) > 1]
-        radius, thick, wrongs = max(1.0, share * self._fit.size), np.zeros(2, dtype=bool), []
+        count = len(self._clean)
+        share = _LIMBS[count > 1]
+        radius, thick, wrongs = max(1.0, share * self._fit.size), np.zeros(2, dtype=np.int64), []
         for mask, view in self._drawn(values, self._clean):
             for side, wrong in enumerate((mask & ~view.mask, view.mask & ~mask)):
                 distances = cv2.distanceTransform(wrong.astype(np.uint8), cv2.DIST_L2, 5)
-                thick[side] |= distances.max() > radius
+                thick[side] += distances.max() > radius
             wrongs.append(np.count_nonzero(mask != view.mask))
-        is_wrong = thick.any() if len(self._clean) == 1 else thick.all()
+        is_wrong = thick.any() if count == 1 else (2 * thick >= count).all()
         return [self._clean[k] for k in np.argsort(wrongs)[::-1]] if is_wrong else []
 
     def _proceed(self) -> bool:

@@ -50,7 +50,7 @@ from drake_pose.search.starts.root_placement import (
 _OUTSIDE_SHARE, _OUTSIDE_WEIGHT = 0.6, 2
 # How many hypotheses are kept, shared among the scales or depths, and the share of them that may
 # have the root at one position.
-_HYPOTHESES, _QUOTA = 1000, 0.05
+_HYPOTHESES, _QUOTA = 500, 0.05
 # How many poses are refined from far; at how many of the root positions reached the poses are
 # searched again, and how many are refined to the end; and how many of each search again.
 _STARTS, _FINALISTS, _AGAIN = 24, 3, 4

@@ -228,7 +228,7 @@ class RobustFamilies:
         families: list[_Family] = []
         for values in good or [poses[0].values]:
             if not self._is_in(families, values) and self._has_room(families):
-                families.append(self._spread(values, moves=not self._is_broken))
+                families.append(self._spread(values))
                 self._add_flipped(families, families[-1])
         return self._described(families, [J(one.values) for one in families])
 
@@ -238,13 +238,9 @@ class RobustFamilies:
         return self._described([self._spread(values, moves=False)], [J])
 
     def _described(self, families: Sequence[_Family], Js: Sequence[float]) -> PoseSet:
-        tree, is_known = self._kinematics.tree, not self._is_broken
-        return _describe(self._kinematics, tree, families, Js, self._tolerance, is_known)
-
-    @property
-    def _is_broken(self) -> bool:
-        """Whether so little fits that no value is determined, however far it could be moved."""
-        return float(self._pieces.sum()) > _BREAKDOWN * 2.0 * self._fit.edge_length
+        broken = float(self._pieces.sum()) > _BREAKDOWN * 2.0 * self._fit.edge_length
+        tree = self._kinematics.tree
+        return _describe(self._kinematics, tree, families, Js, self._tolerance, not broken)
 
     def _is_as_good(self, pieces: np.ndarray) -> bool:
         """Whether costs by pieces are not significantly above the best pose's."""

@@ -167,51 +167,69 @@ def distances_in_pictures(
         pictures: each with the same values.
         most: at most so many distances are looked at, the best known ones.
     """
-    found: list[tuple[float, int, int, Array, Array, Array, float]] = []
-    mean_size = float(np.mean([picture.size for picture in pictures]))
-    for c, (A_lower, b, X_WN, X_CW, moves, size, *_) in enumerate(pictures):
-        A = symmetric(A_lower)
-        shakes = _camera_motions(outlines, X_CW, X_WN, size)
-        for n in np.flatnonzero(np.einsum("nii->n", A) > 0.0).tolist():
-            D = surface_deformations(outlines[n], X_WN[n]) * mean_size
-            share, turns = np.linalg.eigh(D.T @ A[n] @ D)
-            for known, turn in zip(share, turns.T, strict=True):
-                if known >= _LEAST_INFORMATION:
-                    along = D @ turn / np.sqrt(known)
-                    row = along @ A[n]
-                    found.append(
-                        (known, c, n, row @ moves[n].T, np.sqrt(known) * turn,
-                         row @ shakes, float(along @ b[n]))
-                    )  # fmt: skip
-    found = sorted(found, key=lambda one: -one[0])[:most]
-    of = np.array([(one[1], one[2]) for one in found], dtype=np.intp).reshape(-1, 2)
-    bends = np.array([one[4] for one in found]).reshape(-1, 12)
-    shaken = np.array([one[5] for one in found]).reshape(-1, 6)
+    of, along, bends = _known_directions(outlines, pictures, most)
+    count = pictures[0].moves.shape[1]
+    y, X, shaken = np.zeros(len(of)), np.zeros((len(of), count)), np.zeros((len(of), 6))
+    for c in np.unique(of[:, 0]).tolist():
+        at, one = np.flatnonzero(of[:, 0] == c), pictures[c]
+        parts = of[at, 1]
+        rows = np.einsum("ri,rij->rj", along[at], symmetric(one.A)[parts])
+        y[at] = np.einsum("ri,ri->r", along[at], one.b[parts])
+        X[at] = np.einsum("rj,rmj->rm", rows, one.moves[parts])
+        shaken[at] = rows @ _camera_motions(outlines, one.X_CW, one.X_WN, one.size)
     same_picture, same_part = (of[:, None, k] == of[None, :, k] for k in range(2))
     alike = bends @ bends.T * same_part
     view = _views(outlines, pictures)[of[:, 0], of[:, 1]]
     turns = bends / np.linalg.norm(bends, axis=1, keepdims=True)
     repeated = turns @ turns.T * same_part * (view[:, None] == view)
     of_part = of[:, 1, None] == np.arange(len(outlines))
-    count = pictures[0].moves.shape[1]
     information = np.zeros((count, count))
     for one in pictures:
-        told = one.moves @ symmetric(one.A) @ np.swapaxes(one.moves, 1, 2)
-        information += told.sum(axis=0)
+        # Of many values a picture tells few: of all pictures' own ones none but its own.
+        own = np.flatnonzero(one.moves.any(axis=(0, 2)))
+        moves = one.moves[:, own]
+        told = moves @ symmetric(one.A) @ np.swapaxes(moves, 1, 2)
+        information[np.ix_(own, own)] += told.sum(axis=0)
     return Distances(
-        y=np.array([one[6] for one in found]),
-        X=np.array([one[3] for one in found]).reshape(-1, count),
+        y=y,
+        X=X,
         effects=ErrorEffects(
-            np.eye(len(found)),
+            np.eye(len(of)),
             repeated,
             alike,
             alike * same_picture,
             shaken @ shaken.T * same_picture,
         ),
         information=information,
-        bends=(of_part[:, :, None] * bends[:, None]).reshape(len(found), 12 * len(outlines)),
+        bends=(of_part[:, :, None] * bends[:, None]).reshape(len(of), 12 * len(outlines)),
         pictures=of[:, 0],
     )
+
+
+def _known_directions(
+    outlines: Sequence[Outline], pictures: Sequence[Picture], most: int
+) -> tuple[NDArray[np.intp], Array, Array]:
+    """Affine motions of parts, each of a distance that a picture tells, the best known ones first.
+
+    Returns: picture and node (n, 2) of each; the motion (n, 12) by which it changes by one
+    deviation; and how it changes with deformations of the part's surface (n, 12).
+    """
+    mean_size = float(np.mean([picture.size for picture in pictures]))
+    found: list[tuple[Array, Array, NDArray[np.intp], Array, Array]] = []
+    for c, one in enumerate(pictures):
+        A = symmetric(one.A)
+        seen = np.flatnonzero(np.einsum("nii->n", A) > 0.0)
+        D = np.array([surface_deformations(outlines[n], one.X_WN[n]) for n in seen.tolist()])
+        D = mean_size * D.reshape(-1, 12, 12)
+        shares, turns = np.linalg.eigh(np.swapaxes(D, 1, 2) @ A[seen] @ D)
+        k, j = np.nonzero(shares >= _LEAST_INFORMATION)
+        known, turned = shares[k, j], turns[k, :, j]
+        root = np.sqrt(known)[:, None]
+        along = np.einsum("rij,rj->ri", D[k], turned) / root
+        found.append((known, np.full(len(k), c), seen[k], along, root * turned))
+    known, picture, part, along, bends = (np.concatenate(one) for one in zip(*found, strict=True))
+    best = np.argsort(-known, kind="stable")[:most]
+    return np.column_stack([picture, part])[best], along[best], bends[best]
 
 
 def _views(outlines: Sequence[Outline], pictures: Sequence[Picture]) -> NDArray[np.intp]:

@@ -40,6 +40,7 @@ from drake_pose.fit.parameters import (
     Placement,
 )
 from drake_pose.fit.unknowns import Unknowns
+from drake_pose.workers import map_ordered
 
 Array = NDArray[np.float64]
 
@@ -253,9 +254,13 @@ class FramesFit:
         p, u = unknowns.own_count, len(unknowns.names)
         H, g, cost = np.zeros((len(frames), u, u)), np.zeros((len(frames), u)), 0.0
         shares = []
-        for k, evidence in enumerate(frames):
+
+        def told(k: int) -> tuple[Array, Array, Array]:
             theta = unknowns.parameters(base[k], at[0][k], at[1])
-            H[k], g[k], sums = self._frame(evidence, theta, step)
+            return self._frame(frames[k], theta, step)
+
+        for k, (own_H, own_g, sums) in enumerate(map_ordered(told, range(len(frames)))):
+            H[k], g[k] = own_H, own_g
             cost += float(sums[:, :, COST].sum())
             lengths = np.maximum(sums[:, :, COMPARED].sum(axis=1), 1e-9)
             shares.append(sums[:, :, FITTING].sum(axis=1) / lengths)

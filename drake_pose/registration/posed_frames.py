@@ -100,7 +100,7 @@ class PosedFrames:
         return self._corners(self.X_WN)
 
     @cached_property
-    def _some_points(self) -> Array:
+    def some_points(self) -> Array:
         """(n, 3) the points of all frames, or of some spread over many."""
         return np.concatenate(self._corners(self.X_WN[:: max(1, len(self.X_WN) // _SOME)]))
 
@@ -115,12 +115,12 @@ class PosedFrames:
     @cached_property
     def middle(self) -> Array:
         """(3,) of the bodies' points in the world [m]."""
-        return np.asarray(self._some_points.mean(axis=0))
+        return np.asarray(self.some_points.mean(axis=0))
 
     @cached_property
     def extent(self) -> float:
         """How far the bodies' points are from their middle, root mean square [m]."""
-        off = self._some_points - self.middle
+        off = self.some_points - self.middle
         return float(np.sqrt((off**2).sum(axis=1).mean()))
 
     def evidence(self, camera: int, count: int) -> list[FrameEvidence]:
@@ -146,26 +146,20 @@ class PosedFrames:
         """What of the body may be unknown."""
         return BodyParameters(self.kinematics, self.outlines)
 
-    def smaller(self, side: float) -> tuple[PinholeCamera, Array]:
-        """The camera with smaller pictures, and the silhouettes in them.
+    def smaller(self, side: float) -> PinholeCamera:
+        """The camera with smaller pictures, in which the root of the silhouettes' area is a side.
 
-        Args:
-            side: the root of the silhouettes' area in the smaller pictures [pixel].
-
-        Returns:
-            the camera, and (frames, H, W + 1) int32 prefix sums.
+        It is as large as it was where that is smaller.
         """
-        camera = self.camera
-        width = max(8, round(camera.width * min(1.0, side / self.size)))
-        height = max(8, round(camera.height * min(1.0, side / self.size)))
-        small = camera.resized(width, height)
-        sums = []
-        for frame in self.frames:
-            shrunk = cv2.resize(
-                frame.mask.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA
-            )
-            sums.append(prefix_sums(shrunk > 0.5))
-        return small, np.array(sums)
+        camera, share = self.camera, min(1.0, side / self.size)
+        return camera.resized(
+            *(max(8, round(share * one)) for one in (camera.width, camera.height))
+        )
+
+    def sums(self, frame: int, camera: PinholeCamera) -> NDArray[np.int32]:
+        """(H, W + 1) prefix sums of a frame's silhouette in a smaller camera's picture."""
+        mask, size = self.frames[frame].mask.astype(np.float32), (camera.width, camera.height)
+        return prefix_sums(cv2.resize(mask, size, interpolation=cv2.INTER_AREA) > 0.5)
 
 
 @lru_cache(maxsize=512)

@@ -65,8 +65,8 @@ FIRST_SIDE, SECOND_SIDE = 40.0, 100.0
 _APART = 0.03
 # After so many parts of the coarse fit so many poses go on, and so many are fitted finely.
 _FIRST_LOOK, _HOPEFUL, _KEPT = 3, 12, 6
-# So often frames that agree are fitted again.
-_AGAIN = 2
+# So many of many frames tell near what poses all of them are fitted.
+_ENOUGH = 24
 # What is missing or too much is about as large [root of the area].
 _PIECE = 0.2
 # A pose is worse whose cost is larger by more standard deviations of the difference.
@@ -232,12 +232,14 @@ class CameraSearch:
         self, camera: PinholeCamera, frames: Sequence[PosedFrame], looks: Sequence[Array]
     ) -> RegisteredCamera:
         """The best of the poses that are fitted from some X_CW (4, 4), and those as good."""
-        kinematics = self._body.kinematics
-        fine = PosedFrames(kinematics, self._body.few, camera, frames, FINE_SPACING)
-        last = PosedFrames(kinematics, self._body.all, camera, frames, LAST_SPACING)
+        kinematics, some = self._body.kinematics, spread(frames, _ENOUGH)
+        fine = PosedFrames(kinematics, self._body.few, camera, some, FINE_SPACING)
+        last = PosedFrames(kinematics, self._body.all, camera, some, LAST_SPACING)
         likely = _likely(fine, map_ordered(partial(_fit_from, fine, FINE), looks))
-        fitted = map_ordered(partial(_fit_from, last, LAST), likely)
-        fits = [SharedFit([last], [X_CW]) for X_CW in distinct(last, fitted)]
+        fitted = distinct(last, map_ordered(partial(_fit_from, last, LAST), likely))
+        if len(some) < len(frames):
+            last = PosedFrames(kinematics, self._body.all, camera, frames, LAST_SPACING)
+        fits = [SharedFit([last], [X_CW]) for X_CW in fitted]
         return describe_fitted([*zip(fits, map_ordered(with_widths, fits), strict=True)])[0]
 
     def search(
@@ -318,7 +320,7 @@ def mean_misfit(frames: PosedFrames, X_CW: Array, side: float) -> Array:
 
 def distinct(frames: PosedFrames, X_CW: Sequence[Array]) -> list[Array]:
     """Those of some poses (4, 4) that show the bodies elsewhere than all before them."""
-    points = np.concatenate(frames.points)
+    points = frames.some_points
     uv = [frames.camera.with_pose(np.linalg.inv(X)).project(points)[0] for X in X_CW]
 
     def differ(i: int, j: int) -> bool:
@@ -342,10 +344,10 @@ def _likely(frames: PosedFrames, X_CW: Sequence[Array]) -> list[Array]:
 
 def with_widths(fit: SharedFit) -> Shared:
     """What was fitted to the frames that agree, the widths of their silhouettes among it."""
-    found = fit.start
-    for _ in range(_AGAIN):
-        found = fit.fit(LAST, found, fit.agreeing(fit.inlier_ratios(found)))
-    return found
+    agree = fit.agreeing(fit.inlier_ratios(fit.start))
+    found = fit.fit(LAST, fit.start, agree)
+    again = fit.agreeing(fit.inlier_ratios(found))
+    return found if np.array_equal(again, agree) else fit.fit(LAST[-1:], found, again)
 
 
 def suggest_pose(

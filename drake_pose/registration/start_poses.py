@@ -137,13 +137,13 @@ def areas(frames: PosedFrames, X_CW: Array, side: float) -> Array:
     Returns:
         (n, frames, 3) [pixel].
     """
-    camera, sums = frames.smaller(side)
+    camera = frames.smaller(side)
     found = np.empty((len(X_CW), len(frames.frames), 3))
 
     def score(k: int) -> None:
-        X_CN = X_CW[:, None] @ frames.X_WN[k][None]
-        found[:, k, [0, 2]] = score_bodies(frames.outlines, X_CN, camera, sums[[k]])
-        found[:, k, 1] = sums[k, :, -1].sum()
+        X_CN, sums = X_CW[:, None] @ frames.X_WN[k][None], frames.sums(k, camera)
+        found[:, k, [0, 2]] = score_bodies(frames.outlines, X_CN, camera, sums[None])
+        found[:, k, 1] = sums[:, -1].sum()
 
     map_ordered(score, range(len(frames.frames)))
     return found

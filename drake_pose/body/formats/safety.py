@@ -21,6 +21,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from drake_pose.body.formats.parsing import captured_warnings
 from drake_pose.body.parsed_model import ParsedModel
 from drake_pose.body.surfaces.meshes import TriangleMesh, read_meshes, workspace
+from drake_pose.body.surfaces.visual_geometry import draws_given_files
 from drake_pose.errors import DrakePoseError, ModelError
 
 TIME_LIMIT_SECONDS = 60.0
@@ -35,6 +36,7 @@ def check_in_child(
 ) -> None:
     """Read a model and prepare its drawing in a child process with a time and memory limit.
 
+    The drawing of files that were given: those that were written here Drake draws.
     Drake 1.51 can crash on a broken glTF, a texture or a file that includes itself, and a YAML
     alias bomb takes all memory. A success is remembered while the file's content stays the same.
     A process of one thread forks the child, which has then imported everything; others start one.
@@ -87,8 +89,9 @@ def why_unusable(read: Reader, path: str, packages: str, limits: str) -> str:
         model = read(Path(path), json.loads(packages), json.loads(limits))
         scene_graph = SceneGraph()
         model.add_to(MultibodyPlant(time_step=0.0), scene_graph)
-        with captured_warnings():
-            scene_graph.AddRenderer("check", MakeRenderEngineVtk(RenderEngineVtkParams()))
+        if draws_given_files(scene_graph):
+            with captured_warnings():
+                scene_graph.AddRenderer("check", MakeRenderEngineVtk(RenderEngineVtkParams()))
     except DrakePoseError as error:
         return str(error)
     except RuntimeError as error:

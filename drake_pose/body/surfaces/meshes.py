@@ -303,11 +303,21 @@ _written: dict[Path, TriangleMesh] = {}
 
 def write_obj(mesh: TriangleMesh, name: str) -> Path:
     """Write an OBJ file with normals, whose name begins with ``name``, into a temporary folder."""
-    triangles = mesh.triangles
-    digest = hashlib.sha256(mesh.vertices.tobytes() + triangles.tobytes()).hexdigest()[:16]
+    digest = hashlib.sha256(mesh.vertices.tobytes() + mesh.triangles.tobytes()).hexdigest()[:16]
     path = workspace() / f"{re.sub(r'[^A-Za-z0-9_-]', '_', name)}_{digest}.obj"
-    if path in _written:
-        return path
+    if path not in _written and not path.exists():
+        _write_with_normals(mesh, path)
+    _written[path] = mesh
+    return path
+
+
+def was_written(path: Path) -> bool:
+    """Whether write_obj wrote a file."""
+    return path in _written
+
+
+def _write_with_normals(mesh: TriangleMesh, path: Path) -> None:
+    triangles = mesh.triangles
     a, b, c = (mesh.vertices[triangles[:, corner]] for corner in range(3))
     area_normals = np.cross(b - a, c - a)
     normals = np.stack(
@@ -318,12 +328,13 @@ def write_obj(mesh: TriangleMesh, name: str) -> Path:
         axis=1,
     )
     normals = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
-    with path.open("w", encoding="ascii") as file:
+    # A process that dies of what it does next leaves a whole file or none to that which forked it.
+    unfinished = path.with_suffix(".part")
+    with unfinished.open("w", encoding="ascii") as file:
         _write_lines(file, "v %.15g %.15g %.15g\n", mesh.vertices)
         _write_lines(file, "vn %.4g %.4g %.4g\n", normals)
         _write_lines(file, "f %d//%d %d//%d %d//%d\n", np.repeat(triangles + 1, 2, axis=1))
-    _written[path] = mesh
-    return path
+    unfinished.replace(path)
 
 
 def _write_lines(file: TextIO, line: str, rows: NDArray[Any]) -> None:

@@ -36,6 +36,7 @@ from drake_pose.body.surfaces.meshes import (
     join_meshes,
     merge_duplicate_vertices,
     read_mesh_file,
+    was_written,
 )
 from drake_pose.errors import ModelError
 
@@ -141,6 +142,19 @@ def make_drawable(
                     raise ModelError(f"link '{body.name()}': {error}") from error
                 if replacement is not None:
                     scene_graph.ChangeShape(source, geometry, replacement)
+
+
+def draws_given_files(scene_graph: SceneGraph) -> bool:
+    """Whether Drake's renderer reads files that were not written here: meshes, or textures."""
+    inspector = scene_graph.model_inspector()
+    for geometry in inspector.GetAllGeometryIds(Role.kPerception):
+        shape, looks = inspector.GetShape(geometry), inspector.GetPerceptionProperties(geometry)
+        is_file = isinstance(shape, (Mesh, Convex)) and shape.source().is_path()
+        if is_file and not was_written(Path(shape.source().path())):
+            return True
+        if looks.HasProperty("phong", "diffuse_map"):
+            return True
+    return False
 
 
 def _drawable_shape(shape: Mesh | Convex) -> Mesh | Convex | None:

@@ -30,6 +30,7 @@ from drake_pose.silhouette.areas.outline import pack
 from drake_pose.silhouette.areas.scoring import draw_mask, draw_packed
 from drake_pose.silhouette.pictures.masks import intersection_over_union
 from drake_pose.silhouette.segmentation.background import cut, tell_from_background
+from drake_pose.workers import map_ordered
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -134,6 +135,7 @@ class _Frame:
 
     values: Array
     start: Array
+    rng: np.random.Generator
     share: float = 1.0
     chances: Sequence[Likelihood] = ()
     cuts: Sequence[Mask | None] = ()
@@ -155,7 +157,7 @@ class PoseAndMask:
     ) -> None:
         self._kinematics, self._cameras = kinematics, tuple(cameras)
         self._settings = settings or PoseAndMaskSettings()
-        self._rng = np.random.default_rng(seed)
+        self._seed = seed
         self._surfaces = TreeSurfaces(kinematics.tree)
         self._few = pack(few_triangles(self._surfaces, VERY_FEW))
         fitted = few_triangles(self._surfaces, _TRIANGLES)
@@ -183,7 +185,9 @@ class PoseAndMask:
         values = [np.clip(one, self._kinematics.lower, self._kinematics.upper) for one in starts]
         whole = _Level(self._cameras, pictures)
         level = self._coarse_level(whole, values)
-        frames = [_Frame(*one) for one in zip(values, starts, strict=True)]
+        # Each frame draws its own poses: frames are looked at side by side.
+        rngs = np.random.default_rng(self._seed).spawn(len(values))
+        frames = [_Frame(*one) for one in zip(values, starts, rngs, strict=True)]
         for k in range(self._settings.rounds):
             if k >= min(_COARSE_ROUNDS, self._settings.rounds - 1):
                 level = whole
@@ -216,30 +220,46 @@ class PoseAndMask:
 
     def _round(self, level: _Level, frames: Sequence[_Frame], searching: bool) -> None:
         """Betters the frames that are not settled."""
-        for one in (one for one in frames if not one.settled):
-            one.chances = self._chances(level, one)
+        moving = [k for k, one in enumerate(frames) if not one.settled]
+
+        def likely(k: int) -> None:
+            frames[k].chances = self._chances(level, frames[k])
+
+        map_ordered(likely, moving)
         ratios = self._ratios(level, [one.chances for one in frames])
-        for one, pictures, ratio in zip(frames, level.pictures, ratios, strict=True):
-            if one.settled:
-                continue
-            if searching:
-                one.values = self._search(level, one.values, one.share, ratio)
-                one.share = min(one.share, _SEARCHED_SHARE)
-                one.chances = self._chances(level, one)
-            one.cuts = [
-                None if picture is None else cut_by_odds(picture, chance, told)
-                for picture, chance, told in zip(pictures, one.chances, ratio, strict=True)
-            ]
-            before = [self._draw(one.values, camera) for camera in level.cameras]
-            one.values = self._refine(level, one)
-            one.drawn = [self._draw(one.values, camera) for camera in level.cameras]
-            pairs = zip(one.drawn, before, strict=True)
-            one.stays = all(intersection_over_union(*pair) > _SETTLED for pair in pairs)
-            one.agreements = tuple(
-                math.nan if mask is None else intersection_over_union(silhouette, mask)
-                for silhouette, mask in zip(one.drawn, one.cuts, strict=True)
-            )
-            one.share = _narrowed(one.share, one.agreements)
+
+        def better(k: int) -> None:
+            self._better(level, frames[k], level.pictures[k], ratios[k], searching)
+
+        map_ordered(better, moving)
+
+    def _better(
+        self,
+        level: _Level,
+        frame: _Frame,
+        pictures: Sequence[Picture | None],
+        ratios: Sequence[Likelihood],
+        searching: bool,
+    ) -> None:
+        """Betters a frame's pose and masks by what its pictures' background says."""
+        if searching:
+            frame.values = self._search(level, frame, ratios)
+            frame.share = min(frame.share, _SEARCHED_SHARE)
+            frame.chances = self._chances(level, frame)
+        frame.cuts = [
+            None if picture is None else cut_by_odds(picture, chance, told)
+            for picture, chance, told in zip(pictures, frame.chances, ratios, strict=True)
+        ]
+        before = [self._draw(frame.values, camera) for camera in level.cameras]
+        frame.values = self._refine(level, frame)
+        frame.drawn = [self._draw(frame.values, camera) for camera in level.cameras]
+        pairs = zip(frame.drawn, before, strict=True)
+        frame.stays = all(intersection_over_union(*pair) > _SETTLED for pair in pairs)
+        frame.agreements = tuple(
+            math.nan if mask is None else intersection_over_union(silhouette, mask)
+            for silhouette, mask in zip(frame.drawn, frame.cuts, strict=True)
+        )
+        frame.share = _narrowed(frame.share, frame.agreements)
 
     def _draw(self, values: Array, camera: Camera, few: bool = False) -> Mask:
         """The body's silhouette (H, W)."""
@@ -248,14 +268,14 @@ class PoseAndMask:
             return draw_packed(self._few, X_CN, camera)
         return draw_mask(self._surfaces.at(self._kinematics.split(values)), X_CN, camera)
 
-    def _sample(self, values: Array, spread: Array, count: int) -> Array:
+    def _sample(self, frame: _Frame, values: Array, spread: Array, count: int) -> Array:
         """(count, m) values about some, inside the limits."""
-        drawn = values + spread * self._rng.standard_normal((count, len(values)))
+        drawn = values + spread * frame.rng.standard_normal((count, len(values)))
         return np.clip(drawn, self._kinematics.lower, self._kinematics.upper)
 
     def _chances(self, level: _Level, frame: _Frame) -> list[Likelihood]:
         """How likely the body is at each pixel, of each camera."""
-        poses, found = self._sample(frame.values, frame.share * self._spread, _SAMPLES), []
+        poses, found = self._sample(frame, frame.values, frame.share * self._spread, _SAMPLES), []
         for camera in level.cameras:
             total = np.zeros((camera.height, camera.width), dtype=np.float32)
             for pose in poses:
@@ -280,17 +300,15 @@ class PoseAndMask:
                 found[f][c] = ratio
         return found
 
-    def _search(
-        self, level: _Level, values: Array, share: float, ratios: Sequence[Likelihood]
-    ) -> Array:
-        """The pose near some values that covers most of what is not background."""
+    def _search(self, level: _Level, frame: _Frame, ratios: Sequence[Likelihood]) -> Array:
+        """The pose near a frame's that covers most of what is not background."""
         told = [pair for pair in zip(level.cameras, ratios, strict=True) if pair[1].any()]
         if not told:
-            return values
-        first = share * self._spread
-        middle, spread, best, most = values, first, values, -math.inf
+            return frame.values
+        first = frame.share * self._spread
+        middle, spread, best, most = frame.values, first, frame.values, -math.inf
         for _ in range(_SEARCH_ROUNDS):
-            poses = self._sample(middle, spread, _SEARCHED)
+            poses = self._sample(frame, middle, spread, _SEARCHED)
             poses[0] = middle
             scores = np.array(
                 [

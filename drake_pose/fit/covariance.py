@@ -5,8 +5,9 @@ much of it as comes again in all pictures of a part that stands still before a c
 of a part, which all cameras see shifted, turned and stretched alike; a part's edge in one camera's
 mask, so too; and a camera, which stands or looks a little elsewhere than its calibration says. How
 large they are is estimated from what is left of the distances once the values are fitted: variance
-components by restricted maximum likelihood (Patterson and Thompson 1971) in steps of Fisher's
-scoring, each with a prior of about a pixel, for a single instant tells little of them.
+components by restricted maximum likelihood (Patterson and Thompson 1971) in steps of average
+information (Gilmour, Thompson and Cullis 1995), each with a prior of about a pixel, for a single
+instant tells little of them.
 
 A camera's error hardly shows in what is left, for the joints follow it. So a calibration is not
 trusted beyond a pixel, however well everything fits.
@@ -16,6 +17,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -45,7 +47,8 @@ _LEAST_INFORMATION = 1.0
 _MOST_DISTANCES = 400
 # A part stands still from one picture to another that moves by less [of the unit].
 _STILL = 0.5
-_ITERATIONS, _SETTLED = 20, 0.03
+# Sizes settle when a step changes their logarithms, or the log-likelihood, by no more.
+_ITERATIONS, _SETTLED, _GAIN = 20, 0.03, 0.02
 # Errors of masks and cameras are about a pixel, or this share of the silhouettes' size.
 _UNIT = 1.0 / 200.0
 # A place is known to about as much, and an angle to a full turn [m, rad].
@@ -310,29 +313,23 @@ def estimate_sizes(
     named = ErrorEffects._fields
     told = [k for k, name in enumerate(named) if name != "repeated" or stands_still]
     effects = [seen.effects[k] for k in told] + [Z @ Z.T for Z in seen.doubts]
-    apriori, stacked = _apriori(is_angle), np.reshape(effects, (len(effects), -1))
+    stacked = np.reshape(effects, (len(effects), -1))
 
-    def likelihood(t: Array) -> tuple[float, Array, Array]:
-        L = np.linalg.cholesky((np.exp(2.0 * t) @ stacked).reshape(n, n))
-        inverse = symmetric(dpotri(L.T)[0].T)
-        VX = inverse @ seen.X
-        H = seen.X.T @ VX + apriori
-        P = inverse - VX @ np.linalg.solve(H, VX.T)
-        Py = P @ seen.y
-        freedom = 2.0 * np.log(np.diag(L)).sum() + np.linalg.slogdet(H)[1]
-        return -0.5 * float(freedom + seen.y @ Py + (t @ t) / prior_deviation**2), P, Py
-
+    likelihood = partial(_likelihood, seen, stacked, _apriori(is_angle), prior_deviation)
     t = np.zeros(len(effects))
     value, P, Py = likelihood(t)
+    # All may be smaller alike by much, to which single steps would be many.
+    smaller = np.full(len(t), 0.5 * np.log(max(float(seen.y @ Py), 1e-9) / max(n, 1)))
+    scaled = likelihood(smaller)
+    if scaled[0] > value:
+        t, (value, P, Py) = smaller, scaled
     for _ in range(_ITERATIONS):
-        # Noise, the first, is white, and of doubts there are few.
-        PW = [P, *(P @ W for W in effects[1 : len(told)]), *((P @ Z) @ Z.T for Z in seen.doubts)]
-        scales, flat = 2.0 * np.exp(2.0 * t), np.reshape(PW, (len(t), -1))
-        pulls = [Py @ W @ Py - np.trace(one) for W, one in zip(effects, PW, strict=True)]
-        g = 0.5 * scales * pulls - t / prior_deviation**2
-        turned = np.reshape([one.T for one in PW], (len(t), -1))
-        fisher = 0.5 * np.outer(scales, scales) * (flat @ turned.T)
-        step = np.linalg.solve(fisher + np.eye(len(t)) / prior_deviation**2, g)
+        scales = 2.0 * np.exp(2.0 * t)
+        WPy = np.array([W @ Py for W in effects])
+        g = 0.5 * scales * (WPy @ Py - stacked @ P.ravel()) - t / prior_deviation**2
+        # Average information: no product of whole matrices, unlike Fisher's.
+        average = 0.5 * np.outer(scales, scales) * (WPy @ P @ WPy.T)
+        step = np.linalg.solve(average + np.eye(len(t)) / prior_deviation**2, g)
         step /= max(1.0, np.abs(step).max())
         trial = likelihood(t + step)
         while trial[0] < value and np.abs(step).max() > _SETTLED:
@@ -340,14 +337,30 @@ def estimate_sizes(
             trial = likelihood(t + step)
         if trial[0] < value:
             break
+        gain = trial[0] - value
         t, (value, P, Py) = t + step, trial
-        if np.abs(step).max() < _SETTLED:
+        if gain < _GAIN or np.abs(step).max() < _SETTLED:
             break
     sizes = np.zeros(len(named))
     sizes[told] = np.exp(t[: len(told)])
     noise, repeated, surface, mask, camera = sizes.tolist()
     doubts = tuple(np.exp(t[len(told) :]).tolist())
     return ErrorSizes(noise, repeated, surface, mask, max(camera, least_camera), doubts)
+
+
+def _likelihood(
+    seen: Distances, stacked: Array, apriori: Array, deviation: float, t: Array
+) -> tuple[float, Array, Array]:
+    """The restricted log-likelihood and prior of sizes' logarithms t (k,); P (n, n), and P y."""
+    n = len(seen.y)
+    L = np.linalg.cholesky((np.exp(2.0 * t) @ stacked).reshape(n, n))
+    inverse = symmetric(dpotri(L.T)[0].T)
+    VX = inverse @ seen.X
+    H = seen.X.T @ VX + apriori
+    P = inverse - VX @ np.linalg.solve(H, VX.T)
+    Py = P @ seen.y
+    freedom = 2.0 * np.log(np.diag(L)).sum() + np.linalg.slogdet(H)[1]
+    return -0.5 * float(freedom + seen.y @ Py + (t @ t) / deviation**2), P, Py
 
 
 @_on_one_thread

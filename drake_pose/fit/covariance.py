@@ -48,7 +48,9 @@ _MOST_DISTANCES = 400
 # A part stands still from one picture to another that moves by less [of the unit].
 _STILL = 0.5
 # Sizes settle when a step changes their logarithms, or the log-likelihood, by no more.
-_ITERATIONS, _SETTLED, _GAIN = 20, 0.03, 0.02
+_ITERATIONS, _SETTLED, _GAIN = 20, 0.03, 0.05
+# A step is so many times as long as the one before at most, and one at most.
+_LONGER = 1.25
 # Errors of masks and cameras are about a pixel, or this share of the silhouettes' size.
 _UNIT = 1.0 / 200.0
 # A place is known to about as much, and an angle to a full turn [m, rad].
@@ -323,6 +325,7 @@ def estimate_sizes(
     scaled = likelihood(smaller)
     if scaled[0] > value:
         t, (value, P, Py) = smaller, scaled
+    longest = 1.0
     for _ in range(_ITERATIONS):
         scales = 2.0 * np.exp(2.0 * t)
         WPy = np.array([W @ Py for W in effects])
@@ -330,14 +333,14 @@ def estimate_sizes(
         # Average information: no product of whole matrices, unlike Fisher's.
         average = 0.5 * np.outer(scales, scales) * (WPy @ P @ WPy.T)
         step = np.linalg.solve(average + np.eye(len(t)) / prior_deviation**2, g)
-        step /= max(1.0, np.abs(step).max())
+        step *= min(1.0, longest / max(np.abs(step).max(), 1e-9))
         trial = likelihood(t + step)
         while trial[0] < value and np.abs(step).max() > _SETTLED:
             step *= 0.5
             trial = likelihood(t + step)
         if trial[0] < value:
             break
-        gain = trial[0] - value
+        gain, longest = trial[0] - value, min(1.0, _LONGER * np.abs(step).max())
         t, (value, P, Py) = t + step, trial
         if gain < _GAIN or np.abs(step).max() < _SETTLED:
             break

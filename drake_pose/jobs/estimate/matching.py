@@ -83,9 +83,13 @@ def estimate_frames(
                 raise SettingsError(f"frame '{frame}': the matcher got no picture")
             was_tracked = matching.was_tracked(context)
             if pose.found and pose.pose_set is None and isinstance(search, MultiStartSearch):
-                if was_tracked and not inputs.scene.cameras_of(frame):
-                    pose = matching.with_intervals(context)
-                pose = _with_intervals(inputs, search, frame, pose, begun if was_tracked else None)
+                before = begun if was_tracked else None
+                if inputs.scene.cameras_of(frame):
+                    pose = _with_intervals(inputs, search, frame, pose, before)
+                else:
+                    # What has no mask is as sure as its contours said.
+                    own = matching.with_intervals(context) if was_tracked else pose
+                    pose = own.widened(before)
             begun = begun if was_tracked else pose
             yield frame, pose
 
@@ -97,14 +101,12 @@ def _with_intervals(
     pose: PoseEstimate,
     begun: PoseEstimate | None,
 ) -> PoseEstimate:
-    """A pose with what its masks say of each joint; where it has none, as its contours said.
+    """A pose with what its masks say of each joint.
 
     begun: what its track began with; None: it was searched.
     """
     scene, root_position = inputs.scene, (inputs.root_positions or {}).get(frame)
     masks = {name: scene.read(name, frame) for name in scene.cameras_of(frame)}
-    if not masks:
-        return pose.widened(begun)
     views = [View(scene.cameras[name], mask) for name, mask in masks.items()]
     return search.with_intervals(pose, views, root_position, begun)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,7 +13,7 @@ from drake_pose.registration.picture_registration import (
     PictureRegistration,
     posed_pictures,
 )
-from drake_pose.registration.picture_search import ABOUT, see_picture
+from drake_pose.registration.picture_search import ABOUT, PosedPicture, see_picture
 from drake_pose.registration.posed_frames import PosedFrame, PosedFrames
 from drake_pose.registration.register import (
     FrameMisfit,
@@ -23,6 +23,7 @@ from drake_pose.registration.register import (
 )
 from drake_pose.registration.shared_fit import SharedFit, agreeing_share
 from drake_pose.silhouette.areas.scoring import draw_mask
+from drake_pose.workers import map_ordered
 
 # At most so many pictures are judged, so many at once.
 _MOST, _AT_ONCE = 300, 20
@@ -85,16 +86,21 @@ def _see(
     one: PictureRegistration,
     found: RegisteredCamera,
     rows: Sequence[int],
-) -> Iterator[tuple[str, PosedFrame | None]]:
+) -> list[tuple[str, PosedFrame | None]]:
     """Pictures that should show the body, with masks; None: nothing is seen of it."""
     known, camera = one.fit.background, found.camera
     outlines = hull_of_few(body.very_few, ABOUT)
     offset = 0.0 if one.offset is None else one.offset.value
-    for posed in posed_pictures(one.recording.with_zeros(one.zeros), rows, offset):
+
+    def see(posed: PosedPicture) -> tuple[str, PosedFrame | None] | None:
         covered = draw_mask(outlines, camera.X_CW @ body.kinematics.poses(posed.values), camera)
-        if covered.mean() >= _SHOWN:
-            light = Light.between(posed.picture, known.colours)
-            yield posed.name, see_picture(posed, known, light, covered)
+        if covered.mean() < _SHOWN:
+            return None
+        light = Light.between(posed.picture, known.colours)
+        return posed.name, see_picture(posed, known, light, covered)
+
+    pictures = posed_pictures(one.recording.with_zeros(one.zeros), rows, offset)
+    return [told for told in map_ordered(see, pictures) if told is not None]
 
 
 def _misfits(

@@ -41,6 +41,7 @@ from drake_pose.fit.levenberg_marquardt import AnnealingStage, Equations, StepSe
 from drake_pose.fit.parameters import CAMERA_NAMES, POSE_NAMES
 from drake_pose.fit.unknowns import choose, join
 from drake_pose.registration.posed_frames import PosedFrames
+from drake_pose.workers import map_ordered
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -208,8 +209,12 @@ class SharedFit:
 
     def inlier_ratios(self, found: Shared) -> Array:
         """(rows,) of both contours' lengths, what fits."""
+
+        def ratio(mask: tuple[FrameEvidence, Array]) -> float:
+            return self._fit.compare(*mask, TOLD_APART)[0].inlier_ratio
+
         masks = zip(self._evidence, self._parameters(found), strict=True)
-        return np.array([self._fit.compare(*one, TOLD_APART)[0].inlier_ratio for one in masks])
+        return np.array(map_ordered(ratio, masks))
 
     def agreeing(self, ratios: Array) -> Mask:
         """(rows,) which masks fit nearly as well as the two of their camera that fit best."""
@@ -218,10 +223,12 @@ class SharedFit:
 
     def piece_costs(self, found: Shared, side: float) -> Array:
         """(rows, k, k) costs by squares of the pictures of a side [pixel]."""
-        masks = zip(self._evidence, self._parameters(found), self.rows, strict=True)
-        return np.array(
-            [self._fit.piece_costs(one, at, TOLD_APART, side)[c] for one, at, c in masks]
-        )
+
+        def costs(mask: tuple[FrameEvidence, Array, int]) -> Array:
+            return self._fit.piece_costs(*mask[:2], TOLD_APART, side)[mask[2]]
+
+        masks = zip(self._evidence, self._parameters(found), self.rows.tolist(), strict=True)
+        return np.array(map_ordered(costs, masks))
 
     def cameras(self, found: Shared) -> list[PinholeCamera]:
         """The cameras as they were found."""

@@ -21,7 +21,12 @@ from drake_pose.commands.options import (
     Resume,
     Truth,
 )
-from drake_pose.commands.terminal import FrameProgress, output_console, print_result
+from drake_pose.commands.terminal import (
+    FrameProgress,
+    output_console,
+    print_result,
+    worst_frames,
+)
 from drake_pose.errors import SceneError
 from drake_pose.files.options import percent
 from drake_pose.files.settings import EstimateSettings
@@ -114,7 +119,7 @@ def demo(
 
 
 def print_estimate(result: SceneEstimate) -> None:
-    """Prints a row a frame, the joint errors where the truth is known, and where the result is."""
+    """Prints a row a frame, of many the worst; joint errors if there is a truth; the files."""
     console = output_console()
     if result.summary["method"] == "person":
         console.print("One person was followed by all silhouettes at once (--method person).")
@@ -132,9 +137,13 @@ def print_estimate(result: SceneEstimate) -> None:
 def _frame_table(result: SceneEstimate) -> Table:
     with_truth = any(record.joint_errors for record in result.records.values())
     errors = ["mean joint error"] if with_truth else []
-    table = Table("frame", "E_total", "before", "runs", "seconds", *errors, title="Estimate")
+    records = list(result.records.items())
+    shown, which = worst_frames([record.E_total for _, record in records])
+    table = Table(
+        "frame", "E_total", "before", "runs", "seconds", *errors, title=f"Estimate{which}"
+    )
     angles = set(_angles(result))
-    for frame, record in result.records.items():
+    for frame, record in (records[k] for k in shown):
         turns = [abs(e) for name, e in record.joint_errors.items() if name in angles]
         table.add_row(
             escape(frame),

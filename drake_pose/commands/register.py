@@ -11,7 +11,13 @@ from rich.markup import escape
 from rich.table import Table
 
 from drake_pose.commands.options import SPREAD, Json, Model, Out, Overlay
-from drake_pose.commands.terminal import count_progress, output_console, print_result, say
+from drake_pose.commands.terminal import (
+    count_progress,
+    output_console,
+    print_result,
+    say,
+    worst_frames,
+)
 from drake_pose.files.options import percent
 from drake_pose.jobs.registration.settings import AuditSettings, RegistrationSettings
 
@@ -133,25 +139,25 @@ def audit(
 
 
 def _print_registration(result: SceneRegistration) -> None:
-    """A row a frame and camera, then where each camera stands and how sure that is."""
+    """A row a frame and camera, of many the worst; where cameras stand, and how sure that is."""
     from drake_pose.files.folder import REPORT
     from drake_pose.jobs.registration.report import PARAMETERS, parameter_rows
     from drake_pose.silhouette.pictures.scenes import CAMERA_FILE
 
     console = output_console()
-    frames = Table("camera", "frame", "E_total", "IoU", "", title="Masks and robot")
+    misfits = [(name, one) for name, own in result.registered.items() for one in own.frames]
+    shown, which = worst_frames([misfit.E_total for _, misfit in misfits])
+    frames = Table("camera", "frame", "E_total", "IoU", "", title=f"Masks and robot{which}")
+    for name, misfit in (misfits[k] for k in shown):
+        word = "" if misfit.agrees else "contradicts the others"
+        shares = percent(misfit.E_total), percent(misfit.iou)
+        frames.add_row(escape(name), escape(misfit.frame), *shares, word)
     table = Table(
         "camera", "place [m]", "sd [mm]", "sd [deg]", "poses", "frames", "mean IoU", "seconds",
         title="Cameras in the robot's world",
     )  # fmt: skip
     for name, found in result.registered.items():
         one = result.summary["cameras"][name]
-        for misfit in found.frames:
-            word = "" if misfit.agrees else "contradicts the others"
-            frames.add_row(
-                escape(name), escape(misfit.frame), percent(misfit.E_total),
-                percent(misfit.iou), word,
-            )  # fmt: skip
         agreeing = len(found.frames) - len(found.contradictions)
         table.add_row(
             escape(name),

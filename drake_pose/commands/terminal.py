@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
+import math
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
@@ -13,6 +14,9 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 if TYPE_CHECKING:
     from drake_pose.files.records import FrameRecord
+
+# A table shows no more frames.
+_MOST_FRAMES = 30
 
 
 class UsageError(Exception):
@@ -51,6 +55,21 @@ def output_console() -> Console:
     """Returns the console for results; a file or pipe gets lines that are not folded."""
     console = Console(highlight=False)
     return console if console.is_terminal else Console(highlight=False, width=160)
+
+
+def worst_frames(errors: Sequence[float | None]) -> tuple[list[int], str]:
+    """Which of many frames a table shows, in their order, and what its title says of that.
+
+    errors: of each; nan or None where nothing was found, which is worst.
+    """
+    order = sorted(range(len(errors)), key=lambda k: -_badness(errors[k]))
+    shown = sorted(order[:_MOST_FRAMES])
+    is_all = len(shown) == len(errors)
+    return shown, "" if is_all else f": the worst {len(shown)} of {len(errors)} frames"
+
+
+def _badness(error: float | None) -> float:
+    return math.inf if error is None or math.isnan(error) else error
 
 
 def progress_bar() -> Progress:

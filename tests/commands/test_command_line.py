@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 import drake_pose
+from drake_pose.commands.terminal import worst_frames
 from tests.cli import run_command
 from tests.jobs.scenes import TinyScene, read_rows, write_scene
 
@@ -147,3 +148,11 @@ def test_ctrl_c_keeps_finished_frames_and_the_job_can_be_resumed(tmp_path: Path)
     assert summary["complete"] is True
     assert summary["found_count"] == 60
     assert not list(out.rglob("*.part"))
+
+
+def test_tables_show_the_worst_of_many_frames() -> None:
+    few, many = [0.3, None, 0.1], [*(k / 40 for k in range(40)), float("nan")]
+    assert worst_frames(few) == ([0, 1, 2], "")
+    shown, which = worst_frames(many)
+    assert shown == list(range(11, 41))
+    assert "30 of 41" in which

@@ -1,9 +1,14 @@
-"""A small arm that stands on a plate in the world."""
+"""A small arm that stands on a plate in the world, and pictures of one that swings."""
+
+from collections.abc import Callable
+from typing import Any
 
 import pytest
 
 from drake_pose.body.model import ArticulatedModel, load_model
+from drake_pose.registration.picture_registration import Recording
 from drake_pose.registration.register import RegistrationBody
+from tests.registration.episodes import LATE, PaintedEpisode, painted_episode
 from tests.search.arms import arm_urdf
 
 
@@ -17,3 +22,24 @@ def model(tmp_path_factory: pytest.TempPathFactory) -> ArticulatedModel:
 @pytest.fixture(scope="module")
 def body(model: ArticulatedModel) -> RegistrationBody:
     return RegistrationBody(model.pose_tree())
+
+
+@pytest.fixture(scope="session")
+def episode(tmp_path_factory: pytest.TempPathFactory) -> PaintedEpisode:
+    return painted_episode(tmp_path_factory.mktemp("arm"), late=LATE)
+
+
+@pytest.fixture(scope="session")
+def recording(episode: PaintedEpisode) -> Callable[..., Recording]:
+    """That episode's, but for what is given."""
+
+    def record(**changes: Any) -> Recording:
+        given = {
+            "names": tuple(f"{k:04d}" for k in range(len(episode.times))),
+            "values_at": lambda offset: episode.values_at(episode.times + offset),
+            "read": lambda k: episode.pictures[k],
+            "times": episode.times,
+        }
+        return Recording(**(given | changes))
+
+    return record

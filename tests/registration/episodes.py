@@ -14,6 +14,9 @@ from drake_pose.registration.register import RegistrationBody
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from tests.benchmarks.registration import load_arm, write_box_arm
 
+LATE = 0.06
+"""By how much later than their times the pictures of the shared episode are [s]."""
+
 
 @dataclass(frozen=True, eq=False)
 class PaintedEpisode:

@@ -1,6 +1,7 @@
 """Laws of the parts that a registration is made of; each is a matter of milliseconds."""
 
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import replace
 from functools import cache
 from types import SimpleNamespace
@@ -14,7 +15,7 @@ from scipy.stats import t as scipy_t
 from drake_pose.body.model import ArticulatedModel, load_model
 from drake_pose.body.tree.root import RootRotation
 from drake_pose.camera.models import ParallelCamera
-from drake_pose.errors import MaskError
+from drake_pose.errors import MaskError, RegistrationError
 from drake_pose.fit.covariance import estimate_sizes
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.registration import bundle_adjustment
@@ -31,9 +32,15 @@ from drake_pose.registration.shared_fit import (
     SharedFit,
     _scatter,
 )
-from drake_pose.registration.standing_object import StandingObject, Symmetry
+from drake_pose.registration.standing_object import (
+    StandingObject,
+    Symmetry,
+    require_turns,
+    turns_between,
+)
 from drake_pose.registration.start_poses import (
     E_total,
+    _bounds,
     add_bound_equations,
     intersection_over_union,
     place_by_bounds,
@@ -156,6 +163,37 @@ def test_bounds_pull_along_the_derivative_of_how_far_they_are_off(posed: PosedFr
     np.testing.assert_allclose(g, slopes, rtol=1e-4)
     # Of four sides three unknowns follow.
     assert np.linalg.matrix_rank(H) == 3
+
+
+def test_a_border_that_a_silhouette_touches_bounds_nothing() -> None:
+    """Pixel (i, j) is the square around its middle; two rows are as near as none."""
+    for left, top, right, bottom in (
+        (5, 6, 12, 15),
+        (1, 2, 17, 17),
+        (2, 0, 19, 18),
+        (2, 2, 17, 17),
+    ):
+        mask = np.zeros((20, 20), bool)
+        mask[top : bottom + 1, left : right + 1] = True
+        bounds, seen = _bounds(mask)
+        np.testing.assert_array_equal(
+            bounds, [[left - 0.5, top - 0.5], [right + 0.5, bottom + 0.5]]
+        )
+        assert seen.tolist() == [[left > 1, top > 1], [right < 18, bottom < 18]]
+
+
+def test_a_hand_turns_about_one_axis_or_two(standing: Callable[[str], StandingObject]) -> None:
+    """Angles between turns about known axes; frames that tell too little are refused."""
+    z, x = (Rotation.from_rotvec(0.3 * axis).as_matrix() for axis in np.eye(3)[[2, 0]])
+    np.testing.assert_allclose(turns_between(np.array([np.eye(3), z])), [0.3, 0.0, 0.0], atol=1e-9)
+    assert turns_between(np.array([np.eye(3), z, x]))[1] > 0.1
+    thing = standing("box")
+    values = np.zeros((3, len(thing.body(np.eye(4)).kinematics.names)))
+    turning = values + np.random.default_rng(1).uniform(-0.8, 0.8, values.shape)
+    for some, refused in ((values, "by 0 degrees"), (turning[:2], "too few"), (turning, None)):
+        frames = [PosedFrame("", one, np.ones((2, 2), bool)) for one in some]
+        with nullcontext() if refused is None else pytest.raises(RegistrationError, match=refused):
+            require_turns("eye", thing, frames)
 
 
 def test_a_body_is_placed_where_its_bounds_are_the_silhouettes(posed: PosedFrames) -> None:
@@ -310,8 +348,8 @@ def test_an_interval_without_0_is_significant_and_a_length_s_is_that_of_its_loga
 
 def test_what_a_constant_cannot_be_told_from_is_its_gauge() -> None:
     by = 0.5 * CONSTANT_DEVIATION
-    covariance = np.diag([1.0, by**2, 1e-8])
-    covariance[0, 1] = covariance[1, 0] = 0.95 * by
+    covariance = np.diag([0.01, by**2, 1e-8])
+    covariance[0, 1] = covariance[1, 0] = 0.095 * by
     told = _constants(NAMED, shared(0, 0.1, 0.1), 20, 0.05, covariance, NAMED.names[1:])
     assert not told["elbow"].determined
     assert (told["elbow"].value, told["elbow"].gauge) == (0.0, ("pose",))

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from drake_pose.errors import RegistrationError
 from drake_pose.fit.frames_fit import TIME_OFFSET
-from drake_pose.registration.picture_registration import Recording, register_pictures
+from drake_pose.registration.picture_registration import register_pictures
 from drake_pose.registration.picture_search import (
     PictureSearch,
     PosedPicture,
@@ -16,24 +16,7 @@ from drake_pose.registration.picture_search import (
     node_places,
 )
 from tests.benchmarks.registration import pose_error
-from tests.registration.episodes import painted_episode
-
-LATE = 0.06
-
-
-@pytest.fixture(scope="module")
-def episode(tmp_path_factory):
-    return painted_episode(tmp_path_factory.mktemp("arm"), late=LATE)
-
-
-def recording(episode, **changes):
-    given = {
-        "names": tuple(f"{k:04d}" for k in range(len(episode.times))),
-        "values_at": lambda offset: episode.values_at(episode.times + offset),
-        "read": lambda k: episode.pictures[k],
-        "times": episode.times,
-    }
-    return Recording(**(given | changes))
+from tests.registration.episodes import LATE
 
 
 def near(camera, degrees=2.0):
@@ -58,8 +41,8 @@ def test_frames_differ_most_that_are_chosen(episode):
         assert nearest[chosen[k]] == nearest.max()
 
 
-def test_a_camera_and_its_clock_are_fitted_on_lines(episode):
-    rates = recording(episode).rates_at(0.0)
+def test_a_camera_and_its_clock_are_fitted_on_lines(episode, recording):
+    rates = recording().rates_at(0.0)
     values = episode.values_at(episode.times + LATE - 0.015)
     frames = [PosedPicture(f"{k}", values[k], episode.pictures[k], rates[k]) for k in range(12)]
     search = PictureSearch(episode.body, episode.camera, frames)
@@ -97,15 +80,15 @@ def test_a_camera_and_its_clock_are_fitted_on_lines(episode):
         ({"values_at": lambda offset: np.zeros((16, 5))}, "hardly moves, by 0 mm"),
     ],
 )
-def test_what_tells_nothing_is_refused_before_the_search(episode, changes, words):
+def test_what_tells_nothing_is_refused_before_the_search(episode, recording, changes, words):
     with pytest.raises(RegistrationError, match=words):
-        register_pictures(episode.body, episode.camera, recording(episode, **changes))
+        register_pictures(episode.body, episode.camera, recording(**changes))
 
 
 @pytest.mark.slow
-def test_a_camera_is_found_without_a_guess_and_as_sure_as_it_is(episode):
+def test_a_camera_is_found_without_a_guess_and_as_sure_as_it_is(episode, recording):
     nowhere = episode.camera.with_pose(np.eye(4))
-    found = register_pictures(episode.body, nowhere, recording(episode))
+    found = register_pictures(episode.body, nowhere, recording())
     error = pose_error(found.found.camera.X_WC, episode.camera.X_WC)
     deviations = np.sqrt(np.diag(found.found.covariance))
     assert (np.abs(error) < 3.0 * deviations).all()
@@ -118,10 +101,8 @@ def test_a_camera_is_found_without_a_guess_and_as_sure_as_it_is(episode):
 
 
 @pytest.mark.slow
-def test_a_clock_that_drifts_is_put_right(episode):
-    faster = recording(
-        episode, values_at=lambda offset: episode.values_at(0.97 * episode.times + offset)
-    )
+def test_a_clock_that_drifts_is_put_right(episode, recording):
+    faster = recording(values_at=lambda offset: episode.values_at(0.97 * episode.times + offset))
     found = register_pictures(episode.body, episode.camera, faster)
     # Pictures show later moments, and later ones the later they are.
     assert found.offset.drift == pytest.approx(0.03 / 0.97, abs=0.003)
@@ -130,16 +111,14 @@ def test_a_clock_that_drifts_is_put_right(episode):
 
 
 @pytest.mark.slow
-def test_mirrored_pictures_are_told(episode):
-    mirrored = recording(episode, read=lambda k: np.ascontiguousarray(episode.pictures[k][:, ::-1]))
+def test_mirrored_pictures_are_told(episode, recording):
+    mirrored = recording(read=lambda k: np.ascontiguousarray(episode.pictures[k][:, ::-1]))
     with pytest.raises(RegistrationError, match="its pictures are mirrored"):
         register_pictures(episode.body, episode.camera, mirrored)
 
 
 @pytest.mark.slow
-def test_joints_of_another_episode_are_refused(episode):
-    other = recording(
-        episode, values_at=lambda offset: -0.7 * episode.values_at(2.0 * episode.times)
-    )
+def test_joints_of_another_episode_are_refused(episode, recording):
+    other = recording(values_at=lambda offset: -0.7 * episode.values_at(2.0 * episode.times))
     with pytest.raises(RegistrationError, match="no pose explains its pictures"):
         register_pictures(episode.body, episode.camera, other)

@@ -14,7 +14,13 @@ from drake_pose.person.date.faces import (
     learn_faces,
 )
 from drake_pose.person.date.features import SkinColour, skin_blobs
-from drake_pose.person.date.recognition import measure_contour, recognise, similarity
+from drake_pose.person.date.recognition import (
+    measure_contour,
+    recognise,
+    registered_positions,
+    similarity,
+    stand_registered,
+)
 from drake_pose.systems.date.preparation import CaptureSetup
 from tests.person.studio import shared_studio
 
@@ -74,6 +80,22 @@ class TestRecognition:
             assert np.linalg.norm(found.q[:3] - q[:3]) < 0.06
             off = np.angle(np.exp(1j * (found.q[registered.heading_position] - heading)))
             assert abs(np.degrees(off)) < 5.0
+
+    def test_registered_pose_is_upright_and_symmetric_and_stands_below_what_is_seen(self, studio):
+        skeleton, cameras = studio.skeleton, list(studio.ring.values())
+        spread = [skeleton.features(registered_positions(skeleton, by)) for by in (0.0, 30.0)]
+        for head, left, right, *feet in spread:
+            np.testing.assert_allclose(left * [1, -1, 1], right, atol=1e-9)
+            np.testing.assert_allclose(np.mean(feet, axis=0)[:2], head[:2], atol=0.1)
+        hanging, raised = (one[1] for one in spread)
+        reach = np.linalg.norm(raised - hanging) / (2.0 * np.sin(np.radians(15.0)))
+        assert reach == pytest.approx(sum(skeleton.limbs["left_arm"].lengths), rel=0.15)
+        middle = np.array([0.2, -0.1, 0.8])
+        q = stand_registered(
+            skeleton, cameras, [one.project(middle[None])[0][0] for one in cameras]
+        )
+        head, _, _, *feet = skeleton.features(q)
+        np.testing.assert_allclose((head + np.mean(feet, axis=0)) / 2.0, middle, atol=1e-6)
 
     @pytest.mark.parametrize(
         "other", [{}, {"left_upper_arm_z": 80}, {"left_upper_arm_x": -90, "right_upper_arm_x": -90}]

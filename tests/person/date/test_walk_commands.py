@@ -4,14 +4,20 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from drake_pose.body.formats.packages import bundled_model
+from drake_pose.body.model import load_model
+from drake_pose.person.date.skeleton import load_skeleton
 from drake_pose.person.date.walking import (
     BODY_RADIUS,
+    COMMANDS,
     NO_COMMAND,
     NO_STEPS,
+    REGISTERED,
     SPEED,
     TURN_RATE,
     follow_command,
     follow_steps,
+    make_gestures,
     offsets_from_rest,
     recognise_command,
     stance_of,
@@ -53,6 +59,32 @@ def test_table_1():
     turn = [0, 1, 0, -1, 0, 0, 0, 0, -1, 0]
     walk = [0, 0, 0, 0, 0, 1, 0, -1, 1, 0]
     assert found == list(zip(turn, walk, strict=True))
+
+
+def test_gestures_are_those_of_their_commands():
+    """What is made by name is recognised by its commands, and who walks steps on the spot."""
+    skeleton = load_skeleton(load_model(bundled_model("person"), check=False))
+    motion = make_gestures(skeleton, 20)
+    features = np.array([skeleton.features(q) for q in motion.q])
+    stances = [
+        stance_of(skeleton.head_rotation(q)[:, 0], head, feet)
+        for q, head, feet in zip(motion.q, features[:, 0], features[:, 3:], strict=True)
+    ]
+    rest, last, told = stances[23], NO_COMMAND, {}
+    for name, one in zip(motion.names, stances, strict=True):
+        last = recognise_command(one, rest, last)
+        told.setdefault(name, []).append(last)
+    assert list(told) == [REGISTERED, *COMMANDS]
+    assert [len(own) for own in told.values()] == [24, 20, 20, 20, 20]
+    asked = [(0, 0), (1, 0), (-1, 0), (0, 1), (0, -1)]
+    assert [own[len(own) // 2] for own in told.values()] == asked
+    for name, own in told.items():
+        rows = [k for k, one in enumerate(motion.names) if one == name]
+        lifted = np.ptp(features[rows, 3:, 2], axis=0)
+        assert ((lifted > 0.1) == name.startswith("walk")).all()
+        assert own[-1] == NO_COMMAND
+    # Whoever lifts a foot stands on the other one.
+    np.testing.assert_allclose(features[:, 3:, 2].min(axis=1), features[23, 3, 2], atol=0.03)
 
 
 def spot_walk(lifts, seconds=0.1):

@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 from drake_pose.body.formats.packages import bundled_model
 from drake_pose.body.model import ArticulatedModel, load_model
 from drake_pose.camera.models import Camera, circle_of_cameras
+from drake_pose.errors import CameraError, MaskError, SettingsError
 from drake_pose.fit.contour_fit import ContourFit
 from drake_pose.fit.evidence import find_edge_points
 from drake_pose.person.camera_faults import (
@@ -18,13 +19,22 @@ from drake_pose.person.camera_faults import (
     FrameView,
     moved_since,
 )
+from drake_pose.person.checked_capture import _record
 from drake_pose.person.figures import (
+    Figure,
+    Person,
+    _is_other,
     cut_figures,
     find_figures,
     find_persons,
     find_rig_fault,
 )
-from drake_pose.person.persons_in_view import PersonRecording, keep_person, keep_views
+from drake_pose.person.persons_in_view import (
+    PersonRecording,
+    _is_strangers,
+    keep_person,
+    keep_views,
+)
 from drake_pose.person.pose_tracker import PersonPoseTracker
 from drake_pose.person.views import FrameViews, see_silhouette
 from tests.person.persons_in_view import see, stepping
@@ -249,3 +259,63 @@ class TestOthers:
         assert faults.nobody == (1, 2)
         assert (faults.blind, faults.others) == ({}, {})
         assert 1.3 < recording.height < 2.1
+
+    def test_whose_a_figure_is_that_nobody_has(self) -> None:
+        """Nearer to another, or large beside the person's own and far away."""
+        camera = circle_of_cameras(2, size=(160, 120), face_camera=False)["camera_0"]
+        me = np.array([0.0, 0.0, 1.0])
+        him, between, away = (me + by * camera.X_WC[:3, 0] for by in (0.9, 0.4, -0.8))
+        sizes = {"large": 40.0, "small": 20.0}
+
+        def is_strangers(place, area, figures, others):
+            own = (Figure(camera.project(me[None])[0][0], 100.0, np.zeros(4)),)
+            seen = Figure(camera.project(place[None])[0][0], sizes[area], np.zeros(4))
+            person = Person(me, figures, 100.0)
+            rest = [Person(one, {}, 100.0) for one in others]
+            return _is_strangers(camera, seen, person, rest, 0, own)
+
+        assert is_strangers(him, "small", {0: 0}, [him])
+        assert not is_strangers(between, "large", {0: 0}, [him])
+        assert not is_strangers(between, "large", {0: 0}, [])
+        assert is_strangers(away, "large", {0: 0}, [])
+        assert is_strangers(away, "large", {0: 0}, [him])
+        assert not is_strangers(away, "small", {0: 0}, [])
+        assert not is_strangers(away, "large", {}, [])
+
+    def test_another_stands_apart_and_is_no_part(self) -> None:
+        def person(x: float, area: float, z: float = 1.0) -> Person:
+            return Person(np.array([x, 0.0, z]), {}, area)
+
+        first = person(0.0, 100.0)
+        assert _is_other(person(2.0, 90.0), [first])
+        assert not _is_other(person(2.0, 1.0), [first])
+        assert not _is_other(person(0.1, 90.0), [first])
+        # Whatever is above one is oneself.
+        assert not _is_other(person(0.0, 90.0, 3.0), [first])
+        assert not _is_other(person(2.1, 90.0), [first, person(2.0, 100.0)])
+
+
+class TestRecord:
+    def test_masks_and_cameras_that_show_no_person_are_refused(self, four: Stage) -> None:
+        nothing = {name: np.zeros((120, 160), bool) for name in four.cameras}
+        inverted = {name: ~mask for name, mask in four.masks[0].items()}
+        small = {
+            name: camera.with_pose(
+                np.block(
+                    [
+                        [camera.X_WC[:3, :3], 0.01 * camera.X_WC[:3, 3:]],
+                        [np.zeros((1, 3)), np.ones((1, 1))],
+                    ]
+                )
+            )
+            for name, camera in four.cameras.items()
+        }
+        for cameras, masks, error, words in (
+            (four.cameras, nothing, SettingsError, "none of 1 frames two cameras see"),
+            (four.cameras, inverted, MaskError, "in 100 % of the masks"),
+            (small, four.masks[0], CameraError, "m tall by the cameras' calibration"),
+        ):
+            with pytest.raises(error, match=words):
+                _record(cameras, lambda k, masks=masks: masks, 1, True)
+        sound = _record(four.cameras, lambda k: four.masks[0], 1, True)
+        assert (sound.seen, sound.covering) == ([0], 0.0)

@@ -1,0 +1,44 @@
+"""A person of a known shape, against the model's own."""
+
+import numpy as np
+import pytest
+
+from drake_pose.body.formats.packages import bundled_model
+from drake_pose.body.model import ArticulatedModel, load_model
+from drake_pose.errors import UnknownNameError
+from drake_pose.person.shape import KnownShape, shape_parts, shape_values, tracker_of_person
+
+
+@pytest.fixture(scope="module")
+def shaped() -> ArticulatedModel:
+    return load_model(bundled_model("person").with_name("person_shape.urdf"), check=False)
+
+
+def test_a_person_of_known_lengths_and_girths(shaped: ArticulatedModel) -> None:
+    tree = shaped.pose_tree()
+    names = np.array([name for node in tree.nodes for name in node.value_names])
+    held = shape_values(tree)
+    assert held.any()
+    assert not held[: len(tree.nodes[0].value_names)].any()
+    length, (parts, groups) = str(names[held][0]), shape_parts(tree)
+    # Left and right are one part, and so is what ends it.
+    assert len(parts) < len(tree.nodes)
+    assert not any(word in part for part in parts for word in ("left_", "right_", "_end"))
+    plain = tracker_of_person(tree, None)
+    known = tracker_of_person(tree, KnownShape({length: 0.07}, {parts[2]: 1.5}))
+    rest = known.fit.kinematics.flatten(tree.default_values())
+    rest[names == length] = 0.07
+    np.testing.assert_allclose(known._search._rest, rest)
+    for group, one, other in zip(groups, plain.fit.outlines, known.fit.outlines, strict=True):
+        wide = 1.5 if group == 2 else 1.0
+        times = np.array([wide, 1.0, wide])
+        np.testing.assert_allclose(other.vertices, times * one.vertices, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("shape", "word"),
+    [(KnownShape({"nose": 0.1}, {}), "nose"), (KnownShape({}, {"tail": 2.0}), "tail")],
+)
+def test_names_that_a_model_has_not(shaped: ArticulatedModel, shape: KnownShape, word: str) -> None:
+    with pytest.raises(UnknownNameError, match=word):
+        tracker_of_person(shaped.pose_tree(), shape)

@@ -3,7 +3,7 @@ import pytest
 
 from drake_pose.errors import SettingsError, UnknownNameError
 from drake_pose.filtering.inequalities import from_bounds, stack, two_sided
-from drake_pose.filtering.state import Belief, StateLayout, make_belief
+from drake_pose.filtering.state import Belief, StateLayout, covariance_from, factor_of, make_belief
 from drake_pose.filtering.truncated_filter import FilterSettings, TruncatedFilter
 from drake_pose.filtering.truncated_normal import truncate_joint
 from drake_pose.filtering.update import make_evidence, update
@@ -205,6 +205,19 @@ def test_what_limits_say_of_a_constant_is_counted_once():
     for _ in range(30):
         shrinking = paper.update(paper.predict(shrinking), np.full(2, np.nan))
     assert shrinking.best.covariance[2, 2] < 0.5 * once.covariance[2, 2]
+
+
+@pytest.mark.parametrize("rank", [1, 3, 5])
+def test_a_product_of_factors_is_a_covariance_and_hardly_another_one(rank):
+    """Also where rounding leaves it no rank to be positive definite by."""
+    factor = np.random.default_rng(rank).normal(size=(5, rank))
+    found = covariance_from(factor)
+    np.testing.assert_array_equal(found, found.T)
+    np.testing.assert_allclose(found, factor @ factor.T, atol=1e-12)
+    assert (np.diag(np.linalg.cholesky(found)) > 0.0).all()
+    # And back: a factor of any covariance, semidefinite ones among them.
+    root = factor_of(factor @ factor.T, ())
+    np.testing.assert_allclose(root @ root.T, factor @ factor.T, atol=1e-12)
 
 
 def test_transition_and_noise():

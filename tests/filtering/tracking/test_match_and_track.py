@@ -81,6 +81,27 @@ def test_tracked_after_one_match_and_matched_again_after_a_jump(body):
     assert np.median(widths) < np.radians(35.0)
 
 
+def test_the_first_look_of_a_track_is_at_what_the_search_found(body):
+    """Nothing has moved since, whether the search or the caller says where the body is."""
+    camera = front_camera(200, shift=0.2)
+    search = paper_search(body)
+    follower = MatchAndTrack(search, [camera], PERIOD)
+    mask = LabelRenderer(body, camera).mask(np.array([0.1, 0.4, -0.4]))
+    views, tracker = [View(camera, mask)], follower.tracker
+    begun, _ = follower.next(Followed(), views)
+    told = search.search.match(views)
+    for followed, q in (
+        (begun, told.q),
+        (follower.next(Followed(), views, start=told.q + 0.02)[0], told.q + 0.02),
+    ):
+        start = tracker.start(tracker.observation.state(q))
+        expected = [tracker.follow(start, [mask], first).state.best for first in (True, False)]
+        found = followed.track.state.best
+        np.testing.assert_allclose(found.mean, expected[0].mean)
+        np.testing.assert_allclose(found.covariance, expected[0].covariance)
+        assert not np.allclose(found.covariance, expected[1].covariance)
+
+
 def test_no_pose_found_is_said_and_asked_again(body):
     camera = front_camera(200, shift=0.2)
     settings = PaperSearchSettings(interval=math.radians(20), outside_limit=0.0)
@@ -143,6 +164,12 @@ def test_lost_when_the_body_is_elsewhere(body):
     waited = tracker.follow(track, [None])
     assert not waited.lost
     assert waited.measurement is None
+    begun = tracker.follow(track, [None], first=True).state
+    np.testing.assert_array_equal(begun.best.covariance, track.state.best.covariance)
+    # Where nothing was measured contours say nothing of joints.
+    follower, pose = MatchAndTrack(paper_search(body), [camera], PERIOD), object()
+    for unmeasured in (None, waited):
+        assert follower.with_intervals(Followed(unmeasured), pose) is pose
 
 
 def test_bad_settings_and_a_bad_period_are_named(body):

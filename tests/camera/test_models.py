@@ -64,6 +64,17 @@ def test_resized_pictures_show_the_same() -> None:
     np.testing.assert_allclose((after + 0.5) * [4.0, 2.0], before + 0.5)
 
 
+def test_a_mirrored_camera_s_pictures_are_the_mirror_s() -> None:
+    """Of a scene behind a mirror in the plane x = 0 of the camera; twice mirrored is none."""
+    camera = pinhole(X_WC=np.eye(4))
+    points = np.array([[0.1, -0.2, 1.3], [-0.4, 0.3, 2.0]])
+    uv = camera.project(points)[0]
+    seen = camera.mirrored().project(points * [-1, 1, 1])[0]
+    np.testing.assert_allclose(seen, [camera.width - 1, 0] + uv * [-1, 1])
+    again = camera.mirrored().mirrored()
+    np.testing.assert_array_equal(again.kernel_parameters(), camera.kernel_parameters())
+
+
 def test_what_depth_means() -> None:
     points = np.array([[0.5, 0.5, -7.0], [0.0, 0.0, 2.0], [0.5, 0.5, 9.0]])
     uv, depth = pinhole(X_WC=np.eye(4)).project(points)

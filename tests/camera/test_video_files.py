@@ -24,6 +24,9 @@ def test_any_picture_is_read_in_any_order(tmp_path: Path, codec: str) -> None:
         np.testing.assert_array_equal(plain.read(k), video.read(k))
     with pytest.raises(SceneError, match=r"a\.mp4: has pictures 0 to 22 only"):
         video.read(23)
+    with pytest.raises(SceneError, match=r"a\.mp4: has (no picture 23|pictures 0 to 22)"):
+        plain.read(23)
+    assert (number_of(plain.read(5)), plain.rate_hz) == (5, pytest.approx(10.0, rel=0.1))
 
 
 def test_times_are_those_of_the_file_where_its_rate_varies(tmp_path: Path) -> None:

@@ -278,6 +278,16 @@ class TestPictures:
         noise = np.random.default_rng(0).integers(0, 255, (240, 320)).astype(np.uint8)
         assert CHECKERBOARD.find(noise) is None
 
+    def test_mirrored_pictures_of_markers_are_told(self, tmp_path):
+        picture, files = drawn_board(CHARUCO), {}
+        for name, shown in (("right", picture), ("mirror", picture[:, ::-1])):
+            files[name] = {"1": tmp_path / f"{name}.png"}
+            cv2.imwrite(str(files[name]["1"]), shown)
+        seen = find_boards(files, CHARUCO)
+        assert (seen.mirrored, seen.not_found) == (("mirror",), (("mirror", "1"),))
+        with pytest.raises(CameraError, match="'mirror': its pictures are mirrored"):
+            calibrate(seen)
+
     def test_pictures_of_one_camera_are_of_one_size(self, tmp_path):
         files = {frame: tmp_path / f"{frame}.png" for frame in ("1", "2")}
         for path, shape in zip(files.values(), ((20, 30), (30, 20)), strict=True):

@@ -17,7 +17,11 @@ from drake_pose.silhouette.pictures.label_images import mask_to_label_image
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from drake_pose.silhouette.pictures.masks import write_mask
 from drake_pose.silhouette.pictures.scenes import load_scene
-from drake_pose.systems.estimators.diagrams import build_recorded_matching, build_simulated_matching
+from drake_pose.systems.estimators.diagrams import (
+    _depth_range,
+    build_recorded_matching,
+    build_simulated_matching,
+)
 from drake_pose.systems.estimators.mask_player import MaskPlayer
 from drake_pose.systems.estimators.silhouette_matcher import (
     STATISTICS,
@@ -62,6 +66,24 @@ def test_simulated_camera_to_estimated_positions(chain, camera):
     errors = built.error_log.FindLog(context).data()[0]
     assert np.isinf(errors[0])
     assert (errors[1:4] < 0.02).all()
+
+
+def test_a_body_s_depths_are_those_of_its_whole_motion_and_hardly_more(tmp_path):
+    """Against every depth of what slides towards a camera and back."""
+    model = load_body(
+        tmp_path,
+        box_link("sled", 10, 10),
+        joint("slide", "prismatic", "world", "sled", (-2.0, 2.0), axis="1 0 0"),
+    )
+    camera, times = front_camera(), np.linspace(0.0, 1.0, 9)
+    way = PiecewisePolynomial.FirstOrderHold(times, 2.0 * np.sin(2.0 * np.pi * times)[None])
+    near, far = _depth_range(camera, model, way)
+    corners = model.link_meshes["sled"].vertices
+    shifts = [[way.value(t)[0, 0], 0.0, 0.0] for t in np.linspace(0.0, 1.0, 401)]
+    depths = camera.project((corners + np.array(shifts)[:, None]).reshape(-1, 3))[1]
+    assert np.ptp(depths) > 3.9
+    for out in (depths.min() - near, far - depths.max()):
+        assert 0.5 <= out < 1.0
 
 
 def test_one_camera_of_two_is_enough(chain):

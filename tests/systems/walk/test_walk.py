@@ -186,6 +186,9 @@ def test_place_lies_within_its_walls_and_the_start_is_free():
         bottom, top = spans[name]
         if name == "lawn" or name.startswith("path"):
             assert abs(top) < 0.02
+        else:
+            assert bottom > -1e-9, "it stands on the ground, not in it"
+        assert not isinstance(one.shape, Ellipsoid) or one.shape.a() == one.shape.b()
         assert bottom < 1e-9 or any(low < bottom <= high < top for low, high in carriers), name
     for k in range(sum(name.endswith("_top") for name in known)):
         left, right, top = (known[f"gate_{k}_{part}"] for part in ("left", "right", "top"))

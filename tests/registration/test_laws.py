@@ -12,7 +12,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import t as scipy_t
 
-from drake_pose.body.model import ArticulatedModel, load_model
+from drake_pose.body.model import OBJECT_POSITIONS, ArticulatedModel, load_model
 from drake_pose.body.tree.root import RootRotation
 from drake_pose.camera.models import ParallelCamera
 from drake_pose.errors import MaskError, RegistrationError
@@ -317,6 +317,55 @@ def test_poses_of_an_object_are_one_that_show_it_alike(
     poses = [one[None] for one in (X, X, near, X @ thing.symmetry.turns[2], far, little, much)]
     kept = search._apart(poses, thing.symmetry.turns)
     np.testing.assert_array_equal(kept, [X[None], far[None], much[None]])
+
+
+def test_a_camera_on_a_hand_and_what_it_sees_are_found_together(
+    standing: Callable[[str], StandingObject],
+) -> None:
+    """From near both, and told from other looks; a region that is none of it is not chosen."""
+    thing = standing("box")
+    search, rng = ObjectSearch(thing), np.random.default_rng(6)
+    camera, still = looking_at(PLACE, MIDDLE, 0.1).resized(160, 120), np.eye(4)
+    X_LC = random_poses(rng, 1)[0]
+    values = rng.uniform(-0.12, 0.12, (5, len(thing.body(still).kinematics.names)))
+    values[:, [name in OBJECT_POSITIONS for name in thing.body(still).kinematics.names]] = 0.0
+    still[:3, 3] = [0.0, 0.0, 0.9] - thing.middle
+    X_WT = thing.hand_poses(values).mean(axis=0)
+    X_WT[:3, :3] = Rotation.from_matrix(X_WT[:3, :3]).as_matrix()
+    true = np.array([X_LC, X_WT @ X_LC @ still])
+
+    def mask(X_CT: np.ndarray) -> np.ndarray:
+        return draw_mask(thing.alone.all, X_CT[None], camera)
+
+    frames = [
+        PosedFrame(f"{k}", row, mask(search.seen_from(true[None], row)[0]))
+        for k, row in enumerate(values)
+    ]
+    other = PosedFrame("0", values[0], np.roll(frames[0].mask, 30, axis=1))
+    off = true.copy()
+    off[0] = X_LC @ looking_off(0.02, [0.01, -0.01, 0.01])
+    off[1] = thing.moved(true[1], np.array([0.01, 0.01, -0.01, 0.02, 0.02, -0.02]))
+    wrong = search._misfit(camera, other, np.array([true, off]))
+    right = search._misfit(camera, frames[0], np.array([true, off]))
+    assert right[0] < 0.05 < right[1] < wrong[0]
+    assert search._nearest(camera, [other, frames[0]], true) is frames[0]
+    both = search._misfits(camera, [[other, frames[0]], [frames[1]]], true[None], 100.0)
+    assert both[0] < 0.05
+    fit = search._fit(camera, frames, off)
+    found = search._look(fit, fit.fit([STEP] * 12), off)
+    began, ended = search._misfits(camera, [[one] for one in frames], np.array([off, found]), 100.0)
+    assert ended < 0.3 * began
+    # One look after a turn that shows the object alike is the same, others are not.
+    alike = np.array([true[0], true[1] @ thing.symmetry.turns[1]])
+    far = np.array([true[0], thing.moved(true[1], np.array([0.2, 0, 0, 0, 0, 0]))])
+    np.testing.assert_array_equal(search._distinct([true, alike, far], frames), [true, far])
+
+
+def looking_off(turn: float, shift: list[float]) -> np.ndarray:
+    X = np.eye(4)
+    X[:3, :3] = Rotation.from_rotvec([turn, -turn, turn]).as_matrix()
+    X[:3, 3] = shift
+    return X
 
 
 NAMED = SimpleNamespace(

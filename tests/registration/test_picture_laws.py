@@ -10,8 +10,14 @@ from scipy.spatial.transform import Rotation
 
 from drake_pose.errors import RegistrationError
 from drake_pose.fit.background_kernel import CONTOUR, GAIN, OUTLINE
+from drake_pose.registration import picture_levels, picture_search
 from drake_pose.registration.picture_frames import judge_pictures
-from drake_pose.registration.picture_levels import PictureLevel, SearchRound, _upright_rotations
+from drake_pose.registration.picture_levels import (
+    PictureLevel,
+    SearchRound,
+    _upright_rotations,
+    evidence,
+)
 from drake_pose.registration.picture_registration import (
     PictureRegistration,
     Recording,
@@ -200,8 +206,33 @@ def test_a_clock_is_told_by_what_its_offsets_explain(episode, recording) -> None
     assert told[1][0, 0] == pytest.approx(-0.3)
 
 
-def test_rounds_look_at_fewer_poses_in_larger_pictures(episode) -> None:
-    """What each is improved in, from all starts on; smallest parts show in larger pictures only."""
+def test_a_search_ends_about_where_the_camera_is(episode, monkeypatch) -> None:
+    """With fewer starts and rounds than usual; and fitted on lines the best of it is very near."""
+    monkeypatch.setattr(picture_levels, "_ALL", 300)
+    monkeypatch.setattr(picture_levels, "_UPRIGHT", 300)
+    rounds = SearchRound(64, 40, 24, 0.25), SearchRound(64, 10, 50, 0.1)
+    monkeypatch.setattr(picture_search, "_ROUNDS", rounds)
+    shown = range(0, 16, 2)
+    frames = [PosedPicture(f"{k}", episode.values[k], episode.pictures[k]) for k in shown]
+    search = PictureSearch(episode.body, episode.camera.with_pose(np.eye(4)), frames)
+    found = search.search()
+    assert 1 < len(found) <= rounds[-1].kept
+    scores = [search._level(64).score(X) for X in found]
+    assert scores == sorted(scores, reverse=True)
+    shift, turn = errors(np.linalg.inv(found[0]), episode.camera.X_WC)
+    assert shift < 0.15
+    assert turn < np.radians(8.0)
+    camera, told = search.approach(found[0])
+    shift, turn = errors(camera.X_WC, episode.camera.X_WC)
+    assert shift < 0.01
+    assert turn < np.radians(0.5)
+    assert told == search.compared.explained(camera.X_CW)
+    assert evidence(*told) == pytest.approx(told[0] + 4.0 * told[1])
+    # A body that leaves the pictures is not fitted.
+    assert search.approach(np.diag([-1.0, 1.0, -1.0, 1.0]) @ found[0]) is None
+
+
+def test_parts_that_are_small_or_stand_still_do_not_carry_a_search(episode) -> None:
     frames = [PosedPicture(f"{k}", episode.values[k], episode.pictures[k]) for k in range(6)]
     search = PictureSearch(episode.body, episode.camera, frames)
     assert search.compared.camera.width == 160
@@ -210,6 +241,18 @@ def test_rounds_look_at_fewer_poses_in_larger_pictures(episode) -> None:
     radii = np.array([one.ball[3] for one in episode.body.very_few])
     assert shown[1] == shown[2] == (radii > 0).tolist()
     assert shown[0] == (radii >= 0.25 * radii.max()).tolist()
+    # Of frames in which the first joints stay the parts before them stay, too.
+    values = episode.values[:6].copy()
+    values[:, :2] = values[0, :2]
+    X_WN = np.array([episode.body.kinematics.poses(one) for one in values])
+    outlines = episode.body.very_few
+    level = PictureLevel(outlines, episode.camera, episode.pictures[:6], X_WN, 64)
+    moves = [
+        np.ptp([one.vertices @ X[:3, :3].T + X[:3, 3] for X in X_WN[:, k]], axis=0).max(initial=0.0)
+        for k, one in enumerate(outlines)
+    ]
+    np.testing.assert_array_equal(level._still, np.array(moves) < 1e-6)
+    assert 0 < level._still.sum() < len(outlines)
 
 
 @pytest.fixture(scope="module")

@@ -1,0 +1,102 @@
+"""What answers say of joints, widened and turned, against what values they hold."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.stats import t as student
+
+from drake_pose.body.tree.pose_tree import PoseTree
+from drake_pose.body.tree.tree_kinematics import TreeKinematics
+from drake_pose.search.continuous.families import spread
+from drake_pose.search.estimates import JointEstimate, PoseEstimate, PoseFamily, PoseSet
+from tests.search.turning import crane
+
+TURN = 2.0 * math.pi
+
+
+@pytest.fixture(scope="module")
+def tree(tmp_path_factory: pytest.TempPathFactory) -> PoseTree:
+    return crane(tmp_path_factory.mktemp("crane")).pose_tree()
+
+
+@pytest.mark.parametrize("around", [0.0, TURN, -2.0 * TURN])
+def test_a_widened_interval_holds_what_either_held(around: float) -> None:
+    """The other one moves with the value, and full turns make no difference where it turns."""
+    now = JointEstimate("a", True, 1.0, 1.4, turns_around=around != 0.0)
+    then = replace(now, low=0.4 + around, high=0.9 + around, determined=False)
+    both = now.widened(then, 0.2)
+    assert (both.low, both.high) == pytest.approx((0.6, 1.4))
+    assert not both.determined
+    assert now.widened(replace(then, determined=True), 0.2).determined
+    earlier = replace(now, low=1.0 + around, high=1.1 + around)
+    assert (now.widened(earlier, 0.5).high, now.widened(earlier, 0.5).low) == pytest.approx(
+        (1.6, 1)
+    )
+
+
+def estimate(tree: PoseTree, values: list[float], families: int) -> PoseEstimate:
+    """A pose with intervals of 0.1 about its values, one of so many families."""
+    kinematics = TreeKinematics(tree)
+    own = kinematics.split(np.array(values))
+    joints = tuple(
+        JointEstimate(name, True, value - 0.1, value + 0.1)
+        for name, value in zip(kinematics.names, values, strict=True)
+    )
+    family = PoseFamily.of_values(tree, own, 7.0, joints, 1.0)
+    known = PoseSet((family,), joints, 0.0, False, families)
+    return PoseEstimate.of_values(tree, own, 7.0, 100.0, stopped_by="end", pose_set=known)
+
+
+def test_a_track_is_as_open_as_the_families_that_it_began_with(tree: PoseTree) -> None:
+    now, begun = estimate(tree, [0.5, 0.2], 1), estimate(tree, [0.3, 0.3], 2)
+    wide = [replace(one, low=one.low - 1.0) for one in begun.pose_set.joints]
+    begun = replace(begun, pose_set=replace(begun.pose_set, joints=tuple(wide)))
+    widened = now.widened(begun).pose_set
+    assert widened.family_count == 2
+    ends = [(one.low, one.high) for one in widened.joints]
+    # By 0.2 and -0.1 both have moved since.
+    np.testing.assert_allclose(ends, [(-0.6, 0.6), (-0.9, 0.3)])
+    sure = estimate(tree, [0.3, 0.3], 1)
+    for nothing in (None, replace(begun, pose_set=None), sure):
+        assert now.widened(nothing) is now
+
+
+def test_full_turns_leave_a_pose_where_it_is(tree: PoseTree) -> None:
+    pose = estimate(tree, [0.5, 0.2], 1)
+    turns = [
+        np.array([TURN]) if k == 1 else np.zeros(len(node.value_names))
+        for k, node in enumerate(tree.nodes)
+    ]
+    by = np.concatenate(turns)
+    turned = pose.turned(tree, turns)
+    (family,) = turned.pose_set.families
+    for one in (turned, family):
+        np.testing.assert_allclose(np.concatenate(one.node_values), by + np.array([0.5, 0.2]))
+        q, X_WB = tree.positions_from(one.node_values)
+        np.testing.assert_allclose(one.q, q)
+        np.testing.assert_allclose(one.X_WB, X_WB)
+    before, after = (tree.node_poses(list(one.node_values)) for one in (pose, turned))
+    np.testing.assert_allclose(after, before, atol=1e-12)
+    for joints in (turned.pose_set.joints, family.joints):
+        np.testing.assert_allclose([one.low for one in joints], by + np.array([0.4, 0.1]))
+        np.testing.assert_allclose([one.high for one in joints], by + np.array([0.6, 0.3]))
+
+
+def test_a_covariance_is_told_as_intervals_inside_the_limits(tree: PoseTree) -> None:
+    """Student's quantile, of six motions of each camera; halved where a limit cuts."""
+    kinematics = TreeKinematics(tree)
+    pose = replace(estimate(tree, [0.5, 0.2], 1), q=np.array([7.0, 8.0]))
+    deviations = np.array([0.02, 0.05])
+    one, other = (spread(tree, pose, np.diag(deviations**2), count) for count in (1, 4))
+    for told, count in ((one, 1), (other, 4)):
+        widths = student.ppf(0.975, 6 * count) * deviations
+        ends = [(joint.low, joint.high) for joint in told.joints]
+        np.testing.assert_allclose(ends, np.array([[0.5], [0.2]]) + widths[:, None] * [-1, 1])
+        np.testing.assert_array_equal(told.families[0].q, [7.0, 8.0])
+        assert told.families[0].J == 7.0
+    wide = spread(tree, pose, 100.0 * np.eye(2), 1)
+    lower, upper = kinematics.reach(np.array([0.5, 0.2]))
+    np.testing.assert_allclose([joint.low for joint in wide.joints], lower)
+    np.testing.assert_allclose([joint.high for joint in wide.joints], upper)

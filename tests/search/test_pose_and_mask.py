@@ -1,0 +1,109 @@
+"""Poses and masks that better each other, of an arm painted over Drake's label images."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from drake_pose.search.pose_and_mask import (
+    PoseAndMask,
+    PoseAndMaskSettings,
+    _Level,
+    _narrowed,
+    cut_by_odds,
+    follow_colours,
+)
+from drake_pose.silhouette.areas.scoring import draw_mask
+from drake_pose.silhouette.pictures.masks import intersection_over_union
+from tests.registration.episodes import painted_episode
+
+
+@pytest.fixture(scope="module")
+def episode(tmp_path_factory):
+    return painted_episode(tmp_path_factory.mktemp("arm"), frames=8)
+
+
+def drawn(episode, values):
+    body = episode.body
+    return draw_mask(body.all, episode.camera.X_CW @ body.kinematics.poses(values), episode.camera)
+
+
+def test_poses_come_nearer_and_masks_are_what_is_drawn(episode):
+    """Where a camera has no picture it has no mask; what is far off is told in deviations."""
+    rng = np.random.default_rng(0)
+    deviation = np.radians(4.0)
+    starts = episode.values + rng.normal(0.0, deviation, episode.values.shape)
+    settings, told = PoseAndMaskSettings(angle=deviation, rounds=2), []
+    cameras = [episode.camera, replace(episode.camera, name="often blind")]
+    search = PoseAndMask(episode.body.kinematics, cameras, settings)
+    pictures = [[one, one if k % 4 == 0 else None] for k, one in enumerate(episode.pictures)]
+    found = search.run(pictures, list(starts), told.append)
+    assert told == [1, 2]
+    overlaps, begun = [], []
+    for one, start, true in zip(found, starts, episode.values, strict=True):
+        shown = drawn(episode, true)
+        overlaps.append(intersection_over_union(one.masks[0], shown))
+        begun.append(intersection_over_union(drawn(episode, start), shown))
+        np.testing.assert_allclose(one.deviations, (one.values - start) / deviation)
+        assert one.agreements[0] > 0.8
+    assert [one.masks[1] is None for one in found] == 2 * [False, True, True, True]
+    assert [np.isnan(one.agreements[1]) for one in found] == 2 * [False, True, True, True]
+    assert min(overlaps) > 0.9
+    assert np.median(overlaps) > np.median(begun)
+    off = np.abs([one.values - true for one, true in zip(found, episode.values, strict=True)])
+    assert np.median(off) < 0.5 * np.median(np.abs(starts - episode.values))
+
+
+def test_a_silhouette_follows_a_mask_near_its_edge_alone():
+    silhouette = np.zeros((120, 120), bool)
+    silhouette[10:110, 10:110] = True
+    mask = silhouette.copy()
+    mask[:, 108:] = False
+    mask[:, 111:] = True
+    mask[50:60, 50:60] = False
+    mask[10:110, 110] = True
+    found = follow_colours(silhouette, mask)
+    assert found[50:60, 50:60].all(), "amidst the body it does not follow"
+    # A hundredth of the size is one pixel, inwards and outwards.
+    np.testing.assert_array_equal(found[40, 105:114], [1, 1, 1, 1, 0, 1, 0, 0, 0])
+
+
+def test_a_cut_is_sure_where_odds_are_and_follows_colours_elsewhere():
+    picture = np.full((60, 80, 3), 40, np.uint8)
+    cv2.circle(picture, (40, 30), 15, (200, 180, 60), -1)
+    object_ = picture[..., 0] > 100
+    blurred = cv2.GaussianBlur(object_.astype(np.float32), (0, 0), 4.0)
+    chance = np.clip(blurred, 0.02, 0.98)
+    found = cut_by_odds(picture, chance, np.zeros_like(chance))
+    assert intersection_over_union(found, object_) > 0.97
+    ratio = np.where(np.arange(80) < 40, 9.0, -9.0) * np.ones((60, 1))
+    np.testing.assert_array_equal(
+        cut_by_odds(picture, np.full_like(chance, 0.5), ratio)[5:-5], ratio[5:-5] > 0.0
+    )
+    # What a pose rules out is nowhere.
+    assert not cut_by_odds(picture, np.full_like(chance, 0.01), ratio).any()
+
+
+@pytest.mark.parametrize(
+    ("share", "agreements", "left"),
+    [
+        (1.0, (0.95, 0.92), 0.5),
+        (0.2, (0.95,), 0.14),
+        (1.0, (0.95, 0.85), 0.7),
+        (0.5, (0.85,), 0.4),
+        (1.0, (0.7, 0.95), 1.0),
+        (1.0, (np.nan, 0.95), 0.5),
+    ],
+)
+def test_what_agrees_better_is_searched_nearer(share, agreements, left):
+    assert _narrowed(share, agreements) == pytest.approx(left)
+
+
+def test_smaller_pictures_are_those_of_smaller_cameras(episode):
+    small = _Level((episode.camera,), [[episode.pictures[0]], [None]]).smaller(0.5)
+    (camera,), ((picture,), (nothing,)) = small
+    assert picture.shape == (camera.height, camera.width, 3) == (60, 80, 3)
+    assert nothing is None
+    whole = episode.pictures[0].reshape(60, 2, 80, 2, 3).mean(axis=(1, 3))
+    assert np.abs(picture - whole).max() <= 1.0

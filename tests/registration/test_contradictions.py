@@ -3,15 +3,18 @@
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cache
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy.stats import chi2
 
 from drake_pose.body.model import ArticulatedModel
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import MaskError
 from drake_pose.jobs.registration.audit import say_off
+from drake_pose.registration import contradictions
 from drake_pose.registration.contradictions import Audit, Finding, audit_frames
 from drake_pose.registration.per_frame_fit import FrameFit, PerFrameFit
 from drake_pose.registration.posed_frames import SeenFrame
@@ -41,6 +44,37 @@ def moved(camera: PinholeCamera, by: Sequence[float]) -> PinholeCamera:
     X_WC = camera.X_WC.copy()
     X_WC[:3, 3] += by
     return camera.with_pose(X_WC)
+
+
+@pytest.mark.parametrize(
+    ("shift", "kept"), [(1.0, slice(0, 4)), (2.0, slice(4, 6)), (0.0, slice(6))]
+)
+def test_the_likeliest_set_of_frames_agrees(
+    monkeypatch: pytest.MonkeyPatch, shift: float, kept: slice
+) -> None:
+    """Four frames that are off alike outvote two that are right, unless that is hardly possible.
+
+    Frames as numbers of deviation .02; all of them together explain none of them.
+    """
+    x = np.array([shift, shift + 0.01, shift - 0.01, shift, 0.0, 0.01])
+
+    def common(chosen: np.ndarray) -> tuple[np.ndarray, float]:
+        weight = 1.0 / 0.02**2
+        # Without any frame what is given is right to within a tolerance.
+        variance = 1.0 / ((1.0 if chosen.any() else 1e4) + weight * chosen.sum())
+        return np.array([weight * x[chosen].sum() * variance]), variance
+
+    frames = SimpleNamespace(
+        _info=x,
+        _explained=np.ones(6, bool),
+        _sum=lambda chosen: chosen,
+        _common=common,
+        _residual=lambda one, mean, variance: (one - mean[0]) ** 2 / (0.02**2 + variance),
+    )
+    monkeypatch.setattr(contradictions, "_residual_p_value", lambda one: chi2.sf(one, 1))
+    expected = np.zeros(6, bool)
+    expected[kept] = True
+    np.testing.assert_array_equal(contradictions._Auditor._agreeing(frames), expected)
 
 
 Frames = Sequence[tuple[np.ndarray, np.ndarray, Sequence[PinholeCamera]]]

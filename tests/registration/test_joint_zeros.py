@@ -11,7 +11,7 @@ from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.registration.joint_zeros import calibrate_joints
 from drake_pose.registration.posed_frames import PosedFrame, PosedFrames
 from drake_pose.registration.register import CameraSearch, RegisteredCamera
-from drake_pose.registration.shared_fit import SharedFit
+from drake_pose.registration.shared_fit import CONSTANT_DEVIATION, SharedFit
 from tests.registration.arm_pictures import errors, looking_at, see
 
 MIDDLE = np.array([0.0, 0.0, 0.4])
@@ -108,6 +108,13 @@ def test_the_cost_bends_as_the_normal_equations_say(model, body, camera) -> None
     seen = PosedFrames(body.kinematics, body.all, camera, frames)
     fit = SharedFit([seen], [camera.X_CW], ["elbow_turn"])
     by = np.append(np.zeros(6), np.radians(0.1))
-    bends, said = fit.bend(fit.start, by, AnnealingStage(0.005, 0.005))
+    step = AnnealingStage(0.005, 0.005)
+    bends, said = fit.bend(fit.start, by, step)
     assert said > 0.0
     assert bends == pytest.approx(said, rel=0.5)
+    # And as its own differences say, but for what was known beforehand.
+    less, here, more = (
+        fit.equations(fit.start._replace(shared=sign * by), step).cost for sign in (-1.0, 0.0, 1.0)
+    )
+    known = (by[-1] / CONSTANT_DEVIATION) ** 2
+    assert bends == pytest.approx(0.5 * (more + less) - here - known, rel=0.2)

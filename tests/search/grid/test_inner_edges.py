@@ -1,8 +1,10 @@
 """Edges inside the silhouette: of hand-made pictures, and as a judge among poses."""
 
+import itertools
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,6 +12,7 @@ import pytest
 from drake_pose.errors import SettingsError
 from drake_pose.search.grid.inner_edges import (
     EdgeErrors,
+    _turn_subtrees,
     choose_by_edges,
     edges_of_labels,
     find_borders,
@@ -53,6 +56,44 @@ def test_half_an_edge_is_likelier_than_none() -> None:
     found = [edges.log_likelihood(one) for one in (segments, half, plain)]
     assert found == sorted(found, reverse=True)
     assert len(set(found)) == 3
+
+
+class Product:
+    """A graph of all poses of some nodes' samples."""
+
+    def __init__(self, allowed: list[np.ndarray]) -> None:
+        self._allowed = [np.flatnonzero(one) for one in allowed]
+        self.size = int(np.prod([len(one) for one in self._allowed]))
+
+    def restricted(self, allowed: list[np.ndarray | None]) -> "Product":
+        every = [np.ones(COUNT, bool) if one is None else one for one in allowed]
+        return Product([np.isin(np.arange(COUNT), own) & one for own, one in self._pairs(every)])
+
+    def _pairs(self, every: list[np.ndarray]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        return zip(self._allowed, every, strict=True)
+
+    def members(self) -> np.ndarray:
+        return np.array(list(itertools.product(*self._allowed)))
+
+
+COUNT = 5
+
+
+def test_turning_one_limb_after_the_other_ends_where_none_is_better() -> None:
+    """A sum of each node's own misfit: whose least is found node by node, by few of all poses."""
+    target, judged = np.array([3, 0, 4]), {}
+
+    def judge(samples: np.ndarray) -> float:
+        judged[tuple(samples.tolist())] = -float(np.abs(samples - target).sum())
+        return judged[tuple(samples.tolist())]
+
+    graph = Product([np.ones(COUNT, bool)] * 3)
+    tree = SimpleNamespace(subtrees=[(0,), (1,), (2,)])
+    sampled = SimpleNamespace(tree=tree, values=[np.zeros((COUNT, 1))] * 3)
+    answer = SimpleNamespace(sampled=sampled, graph=graph)
+    _turn_subtrees(answer, np.array([0, 2, 1]), judge, 100, np.random.default_rng(0))
+    assert judged[tuple(target.tolist())] == 0.0
+    assert len(judged) < 6 * COUNT
 
 
 def test_what_may_be_seen_sums_to_one() -> None:

@@ -15,6 +15,8 @@ from drake_pose.search.settings import BeamSearchSettings
 from drake_pose.search.starts.root_placement import (
     choose_root_samples,
     find_layers,
+    hub,
+    turns_freely,
     whereabouts,
 )
 from drake_pose.silhouette.areas.scoring import draw_mask
@@ -60,6 +62,34 @@ def picture(body, camera, position, angles=TRUE_ANGLES):
 
 def angle_errors(body, result):
     return [abs(result.q[body.position_index(name)] - value) for name, value in TRUE_ANGLES.items()]
+
+
+@pytest.mark.parametrize(
+    ("ranges", "free"),
+    [
+        ((2.0, 2.0, 1.0), True),
+        ((1.0, 2.0, 2.0), True),
+        ((2.0, 2.0, 0.9), False),
+        ((1.9, 2.0, 1.0), False),
+        ((2.0, 2.0), False),
+        ((2.0, 2.0, 0.0, 1.0), True),
+        ((2.0, 2.0, 1.0, 1.0), False),
+    ],
+)
+def test_three_angles_at_the_root_turn_it_in_all_ways(tmp_path, ranges, free):
+    """Ranges in half turns: all directions are two whole turns and a half one between them."""
+    names = [f"gimbal_{k}" for k in range(len(ranges) - 1)] + ["ball"]
+    parts = [f'<link name="{name}"/>' for name in names[:-1]]
+    for k, (one, share) in enumerate(zip(names, ranges, strict=True)):
+        half, axis = 0.5 * math.pi * share, ("0 0 1", "0 1 0", "1 0 0")[k % 3]
+        parent = names[k - 1] if k else "world"
+        parts.append(joint(f"turn_{k}", "revolute", parent, one, (-half, half), axis=axis))
+    arms = [box_link(f"arm_{k}", 4, 4, y=3.0) for k in range(3)]
+    arms += [joint(f"swing_{k}", "revolute", "ball", f"arm_{k}", (-1.0, 1.0)) for k in range(3)]
+    arms += [box_link("finger", 2, 2), joint("bend", "revolute", "arm_0", "finger", (0.0, 1.0))]
+    tree = load_body(tmp_path, *parts, box_link("ball", 10, 10), *arms).pose_tree()
+    assert turns_freely(tree) == free
+    assert hub(tree) == "ball"
 
 
 def test_position_and_scale_of_a_parallel_camera_are_found(body):

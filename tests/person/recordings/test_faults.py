@@ -32,8 +32,11 @@ from drake_pose.person.figures import (
 from drake_pose.person.persons_in_view import (
     PersonRecording,
     _is_strangers,
+    _tracks,
+    follow_one,
     keep_person,
     keep_views,
+    middle_of_view,
 )
 from drake_pose.person.pose_tracker import PersonPoseTracker
 from drake_pose.person.views import FrameViews, see_silhouette
@@ -281,6 +284,46 @@ class TestOthers:
         assert is_strangers(away, "large", {0: 0}, [him])
         assert not is_strangers(away, "small", {0: 0}, [])
         assert not is_strangers(away, "large", {}, [])
+
+    @pytest.mark.parametrize(("gap", "far"), [(1, 0.39), (1, 0.41), (3, 0.59), (3, 0.61)])
+    def test_who_is_hidden_may_have_gone_further_meanwhile(self, gap: int, far: float) -> None:
+        """Four tenths of a metre from frame to frame, and one more for each that is missed."""
+        first, then = (Person(np.array([x, 0.0, 1.0]), {}, 100.0) for x in (0.0, far))
+        tracks = _tracks([[], [first], *[[]] * (gap - 1), [then]])
+        same = far < 0.4 + 0.1 * (gap - 1)
+        expected = [{1: first, gap + 1: then}] if same else [{1: first}, {gap + 1: then}]
+        assert tracks == expected
+
+    def test_who_is_followed_is_seen_longest_and_comes_back(self) -> None:
+        def person(x: float, area: float = 100.0) -> Person:
+            return Person(np.array([x, 0.0, 1.0]), {0: 0}, area)
+
+        me = [person(0.0), person(0.1), person(3.0), person(3.1)]
+        him = [person(-2.0, 80.0), person(-2.1, 80.0)]
+        frames = [[me[0]], [him[0], me[1]], [], [him[1]], [me[2]], [me[3]], []]
+        found = follow_one(frames, np.zeros(3), True)
+        assert [found[k] for k in (0, 1, 4, 5, 6)] == [me[0], me[1], me[2], me[3], None]
+        # Where one is hidden one is on a straight way, without figures.
+        np.testing.assert_allclose(found[2].place, me[1].place + (me[2].place - me[1].place) / 3)
+        assert found[2].figures == {}
+        each = follow_one(frames, np.zeros(3), False)
+        assert each == [me[0], me[1], None, him[1], me[2], me[3], None]
+
+    def test_cameras_around_a_place_look_at_it(self) -> None:
+        target = (0.3, -0.2, 1.1)
+        cameras = circle_of_cameras(5, target=target, size=(161, 120), face_camera=False)
+        np.testing.assert_allclose(middle_of_view(list(cameras.values())), target, atol=1e-6)
+
+    @pytest.mark.parametrize(("side", "counts"), [(10, True), (7, False)])
+    def test_a_figure_is_no_speck_of_the_picture(self, side: int, counts: bool) -> None:
+        """Two ten-thousandths of it, or sixteen pixels: of this one 61."""
+        mask = np.zeros((239, 1285), dtype=bool)
+        mask[50 : 50 + side, 60 : 60 + side] = True
+        found = find_figures(mask)
+        assert [one.area for one in found] == [float(side**2)] * counts
+        small = np.zeros((60, 80), dtype=bool)
+        small[10:15, 10:15] = True
+        assert len(find_figures(small)) == 1
 
     def test_another_stands_apart_and_is_no_part(self) -> None:
         def person(x: float, area: float, z: float = 1.0) -> Person:

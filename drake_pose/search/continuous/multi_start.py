@@ -55,13 +55,13 @@ _WINDOW = 5
 COARSE = (AnnealingStage(0.1, 0.04, 3), AnnealingStage(0.05, 0.04, 3))
 MEDIUM = (AnnealingStage(0.05, 0.026, 4), AnnealingStage(0.025, 0.026, 4))
 FINAL = (AnnealingStage(0.0125, 0.0125, 6),)
-# How many coarse poses are fitted, how many of them go on after each coarse stage, and how many are
-# fitted to the end.
+# How many coarse poses are fitted, how many of them go on after each coarse stage in several views,
+# and how many are fitted to the end.
 _STARTS, _ROUGH, _FINALISTS = 40, (20, 12), 4
-# How many go on after each stage that follows, and how many of what is sought about a pose, in one
-# view and in several. In several what is wrong costs more from the first of these stages on; in one
-# it may be the last that tells.
-_SURVIVORS, _FOLLOWED = (12, 6), (9, 4)
+# How many go on after the stages that follow, in one view and in several; and in several how many
+# of what is sought about a pose. In these what is wrong costs more from the first stage on, in one
+# view it may be the last that tells: there none ends after a first stage.
+_SURVIVORS, _FOLLOWED = (12, 6), 4
 # Coarse poses differ where some part of the body is seen so far away, as a share of the root of the
 # silhouettes' mean area.
 _APART = 0.13
@@ -166,6 +166,10 @@ class MultiStartSearch:
         return body, ViewsFit(kinematics, self._outlines, clean), clean
 
 
+Passes = list[tuple[Sequence[AnnealingStage], int]]
+"""Rounds, and how many poses are kept after each, as ``refine_best`` takes them."""
+
+
 class _Run:
     """One match of a body, sampled roughly, with clean silhouettes, until a deadline.
 
@@ -192,8 +196,10 @@ class _Run:
     def search(self, rounds: int, as_set: bool) -> PoseEstimate:
         """Find coarse poses, refine them, seek other explanations, and refine to the end."""
         starts = self._coarse.choose_distinct(self._coarse.find(), _STARTS, _APART)
-        kept = [*_ROUGH, *[self._survivors] * len(MEDIUM)]
-        passes = _by_stages((*COARSE, *MEDIUM), kept)
+        passes: Passes = [(COARSE, self._survivors), (MEDIUM, self._survivors)]
+        if self._several:
+            kept = [*_ROUGH, *[self._survivors] * len(MEDIUM)]
+            passes = _by_stages((*COARSE, *MEDIUM), kept)
         pool = refine_best(self._fit, self._values(starts), passes, self._proceed)
         first_J = self._J(pool[0].values)
         pool = self._explore(pool, rounds)
@@ -285,7 +291,9 @@ class _Run:
             costs = map_ordered(lambda one: self._fit.cost(one, look), group)
             looks = [FittedPose(*pair) for pair in zip(group, costs, strict=True)]
             best_looks += distinct(looks, count, kinematics.turns_around, 0.5 * INTERVAL)
-        passes = _by_stages(MEDIUM, [_FOLLOWED[self._several]] * len(MEDIUM))
+        if not self._several:
+            return [self._fit.refine(look.values, MEDIUM) for look in best_looks if self._proceed()]
+        passes = _by_stages(MEDIUM, [_FOLLOWED] * len(MEDIUM))
         return refine_best(self._fit, [one.values for one in best_looks], passes, self._proceed)
 
     def _values(self, coarse: CoarsePoses, values: np.ndarray | None = None) -> list[np.ndarray]:
@@ -320,9 +328,7 @@ class _Run:
             yield draw_mask(outlines, view.camera.X_CW @ X_WN, view.camera), view
 
 
-def _by_stages(
-    stages: Sequence[AnnealingStage], kept: Sequence[int]
-) -> list[tuple[list[AnnealingStage], int]]:
+def _by_stages(stages: Sequence[AnnealingStage], kept: Sequence[int]) -> Passes:
     """Stages one after another, as ``refine_best`` takes them, and how many are kept after each."""
     return [([stage], count) for stage, count in zip(stages, kept, strict=True)]
 

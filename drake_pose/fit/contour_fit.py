@@ -289,19 +289,14 @@ def camera_weights(
 
     ``pixels``: of the unit of length, of all cameras or (c,); None: the metre's at the root.
     """
-    if pixels is None:
-        size = pixels_per_metre(cameras, placement.X_WN[0, :3, 3])
-    else:
-        size = np.broadcast_to(pixels, len(cameras[0]))
-    return np.column_stack(
-        [
-            1.0 / size,
-            np.maximum(FINEST_SCALE, step.scale * size),
-            np.maximum(FINEST_SPACING, step.spacing * size),
-            # Both contours say the same: together they count as one.
-            0.5 / (size * noise.correlation * (size * noise.deviation) ** 2),
-        ]
-    )
+    size = pixels_per_metre(cameras, placement.X_WN[0, :3, 3]) if pixels is None else pixels
+    weights = np.empty((len(cameras[0]), 4))
+    weights[:, 0] = 1.0 / size
+    weights[:, 1] = np.maximum(FINEST_SCALE, step.scale * size)
+    weights[:, 2] = np.maximum(FINEST_SPACING, step.spacing * size)
+    # Both contours say the same: together they count as one.
+    weights[:, 3] = 0.5 / (size * noise.correlation * (size * noise.deviation) ** 2)
+    return weights
 
 
 def normal_equations(total: CameraSum, placement: Placement, size: int) -> tuple[Array, Array]:

@@ -25,7 +25,7 @@ from drake_pose.files.summary import BADLY_EXPLAINED
 from drake_pose.files.writer import Drawn, FinishedFrame, OnStage
 from drake_pose.jobs.estimate.inputs import Inputs
 from drake_pose.search.continuous.multi_start import MultiStartSearch
-from drake_pose.search.estimates import PoseEstimate, View
+from drake_pose.search.estimates import TRACKED, PoseEstimate, View
 from drake_pose.search.grid.beam_search import BeamSearch
 from drake_pose.search.scoring import PoseSearch
 from drake_pose.search.starts.root_placement import scale_camera
@@ -44,6 +44,10 @@ _DOUBTFUL = 0.12
 _LEFT = 0.5
 # How many frames are compared, and how many pairs of cameras exchanged.
 _FRAMES, _PAIRS = 2, 3
+# A frame fits worse than another one that leaves so many times as much, and so much more.
+_WORSE, _MORE = 1.2, 0.01
+# Joints are elsewhere that are off by more [rad or m]; so many are named.
+_ELSEWHERE, _NAMED = 0.2, 5
 
 Match = Callable[[str, Sequence[View]], float]
 """E_total of the best pose of a frame in views."""
@@ -195,16 +199,64 @@ def compare_cameras(
     scene = inputs.scene
     if scene.images:
         return []
-    if isinstance(search, (BeamSearch, MultiStartSearch)):
-        search = search.without_alternatives()
 
     def match(frame: str, views: Sequence[View]) -> float:
         if on_stage is not None:
             on_stage("comparing the cameras", 0, None)
-        found = search.match(views, (inputs.root_positions or {}).get(frame))
+        found = _match_again(inputs, search, frame, views)
         return found.E_total if found.found else math.inf
 
     return find_contradiction(match, scene.cameras, scene.read, scene.masks, records)
+
+
+def _match_again(
+    inputs: Inputs, search: PoseSearch, frame: str, views: Sequence[View]
+) -> PoseEstimate:
+    """A frame's pose without what else looks the same."""
+    if isinstance(search, (BeamSearch, MultiStartSearch)):
+        search = search.without_alternatives()
+    return search.match(views, (inputs.root_positions or {}).get(frame))
+
+
+def check_track(
+    inputs: Inputs,
+    search: PoseSearch,
+    rows: Mapping[str, PoseRow],
+    records: Mapping[str, FrameRecord],
+) -> list[str]:
+    """A warning of a track that follows a wrong pose: its worst frame is matched by itself for it.
+
+    Nothing is matched where all frames fit nearly as well as those in which a pose was searched.
+    """
+    fits = {True: dict[str, float](), False: dict[str, float]()}
+    for frame, one in records.items():
+        if one.E_total is not None and inputs.scene.cameras_of(frame):
+            fits[one.stopped_by == TRACKED][frame] = one.E_total
+    tracked, searched = fits[True], sorted(fits[False].values())
+    worst = max(tracked, key=lambda frame: tracked[frame], default="")
+    if not searched or not _is_worse(tracked.get(worst, 0.0), searched[0]):
+        return []
+    cameras, scene = inputs.scene.cameras, inputs.scene
+    views = [View(cameras[name], scene.read(name, worst)) for name in scene.cameras_of(worst)]
+    found = _match_again(inputs, search, worst, views)
+    if not found.found or not _is_worse(tracked[worst], found.E_total):
+        return []
+    model, off = inputs.model, found.q - rows[worst].q
+    off = np.where(model.periodic, np.remainder(off + math.pi, 2.0 * math.pi) - math.pi, off)
+    joints = [model.position_names[k] for k in np.flatnonzero(np.abs(off) > _ELSEWHERE)]
+    more = f" and {len(joints) - _NAMED} more" if len(joints) > _NAMED else ""
+    where = f", with {', '.join(joints[:_NAMED])}{more} elsewhere" if joints else ""
+    return [
+        f"frame '{worst}': tracked it leaves {percent(tracked[worst])} of the silhouettes' area, "
+        f"matched by itself {percent(found.E_total)}{where}: its pose is wrong, and so may be the "
+        "others, if the track began with a wrong one; match all by themselves (--no-track) and "
+        "compare"
+    ]
+
+
+def _is_worse(error: float, other: float) -> bool:
+    """Whether a pose that leaves one E_total fits clearly worse than one that leaves another."""
+    return error > max(_WORSE * other, other + _MORE)
 
 
 def find_contradiction(

@@ -12,7 +12,7 @@ from drake_pose.files.summary import describe_job, open_job
 from drake_pose.files.writer import OnFrame, OnStage, ResultWriter
 from drake_pose.jobs.estimate.body_fit import fit_body
 from drake_pose.jobs.estimate.inputs import read_inputs
-from drake_pose.jobs.estimate.matching import compare_cameras, match_frames
+from drake_pose.jobs.estimate.matching import check_track, compare_cameras, match_frames
 from drake_pose.jobs.estimate.person import follow_person
 from drake_pose.workers import working
 
@@ -41,11 +41,10 @@ def estimate_scene(
         settings: which cameras and frames, the root, the sampling.
         truth: measured joint positions to compare with; None: joint_angles.csv, the episode's log.
         cameras: a camera file in place of the scene's own.
-        replay, overlay: whether replay.html is made, and overlays are written.
+        replay, overlay: whether replay.html and overlays are written.
         on_frame, on_stage: called after each frame; with what is done before the first one.
 
-    Returns:
-        The estimate. Interrupted (KeyboardInterrupt), the finished frames are in ``out``.
+    Returns the estimate. Interrupted (KeyboardInterrupt), the finished frames are in ``out``.
 
     Raises DrakePoseError: names the file, camera, frame, link or joint at fault.
     """
@@ -59,8 +58,8 @@ def estimate_scene(
         inputs.scene, inputs.model, job, folder, earlier=earlier, with_base=inputs.base_moves,
         frames=inputs.frames, warnings=inputs.warnings,
     )  # fmt: skip
-    search, by_search = inputs.search, "paper" if settings.method == "paper" else "beam"
-    result.more |= {"method": by_search if search is not None else "person"} | of_body
+    search, method = inputs.search, "paper" if settings.method == "paper" else "beam"
+    result.more |= {"method": method if search else "person"} | of_body
     result.begin()
     try:
         if shapes is not None:
@@ -73,6 +72,7 @@ def estimate_scene(
         with working(settings.workers):
             result.add_all(frames, inputs.frames, on_frame)
             if search is not None:
+                result.warnings += check_track(inputs, search, result.rows, result.records)
                 result.warnings += compare_cameras(inputs, search, result.records, on_stage)
         result.finish(replay)
     finally:

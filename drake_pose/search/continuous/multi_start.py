@@ -55,16 +55,21 @@ _WINDOW = 5
 COARSE = (AnnealingStage(0.1, 0.04, 3), AnnealingStage(0.05, 0.04, 3))
 MEDIUM = (AnnealingStage(0.05, 0.026, 4), AnnealingStage(0.025, 0.026, 4))
 FINAL = (AnnealingStage(0.0125, 0.0125, 6),)
-# How many coarse poses are fitted, how many go on, and how many are fitted to the end.
-_STARTS, _SURVIVORS, _FINALISTS = 40, 12, 4
+# How many coarse poses are fitted, how many of them go on after each coarse stage in several views,
+# and how many are fitted to the end.
+_STARTS, _ROUGH, _FINALISTS = 40, (20, 12), 4
+# How many go on after the stages that follow, in one view and in several; and in several how many
+# of what is sought about a pose. In these what is wrong costs more from the first stage on, in one
+# view it may be the last that tells: there none ends after a first stage.
+_SURVIVORS, _FOLLOWED = (12, 6), 4
 # Coarse poses differ where some part of the body is seen so far away, as a share of the root of the
 # silhouettes' mean area.
 _APART = 0.13
 # About how many of the best poses others are sought; of each so many are fitted, and so many more
 # that are made by flips of its joints.
 _SOUGHT_ABOUT, _TRIED, _FLIPPED = 3, 6, 3
-# How often other explanations are sought about the best poses; of several views from the second
-# time on about no more of them where one leads to nothing that costs less by this factor.
+# How often other explanations are sought about the best poses; of several views about no more of
+# them where one leads to nothing that costs less by this factor.
 _ROUNDS, _BETTER = 2, 0.98
 # A disc of this radius, as a share of the root of the silhouettes' mean area, is as thick as a
 # limb that one view shows in part, or one of several in full: where one fits into what is wrong, so
@@ -161,6 +166,10 @@ class MultiStartSearch:
         return body, ViewsFit(kinematics, self._outlines, clean), clean
 
 
+Passes = list[tuple[Sequence[AnnealingStage], int]]
+"""Rounds, and how many poses are kept after each, as ``refine_best`` takes them."""
+
+
 class _Run:
     """One match of a body, sampled roughly, with clean silhouettes, until a deadline.
 
@@ -179,13 +188,18 @@ class _Run:
         self._body, self._fit, self._kinematics = body, fit, fit.kinematics
         self._views, self._deadline, self._stopped_by = views, deadline, "end"
         self._clean, self._beam_starts = clean, beam_starts
+        self._several = len(clean) > 1
+        self._survivors = _SURVIVORS[self._several]
         self._done: list[np.ndarray] = []
         self._coarse = CoarseSearch(body, clean, HYPOTHESES if self._proceed() else 1)
 
     def search(self, rounds: int, as_set: bool) -> PoseEstimate:
         """Find coarse poses, refine them, seek other explanations, and refine to the end."""
         starts = self._coarse.choose_distinct(self._coarse.find(), _STARTS, _APART)
-        passes = [(COARSE, _SURVIVORS), (MEDIUM, _SURVIVORS)]
+        passes: Passes = [(COARSE, self._survivors), (MEDIUM, self._survivors)]
+        if self._several:
+            kept = [*_ROUGH, *[self._survivors] * len(MEDIUM)]
+            passes = _by_stages((*COARSE, *MEDIUM), kept)
         pool = refine_best(self._fit, self._values(starts), passes, self._proceed)
         first_J = self._J(pool[0].values)
         pool = self._explore(pool, rounds)
@@ -194,7 +208,7 @@ class _Run:
         if contradicting and self._proceed():
             by_areas = self._beam_starts(contradicting[:_BEAM_VIEWS])
             others = refine_best(self._fit, by_areas, passes, self._proceed)
-            pool = distinct([*pool, *others], _SURVIVORS, self._kinematics.turns_around)
+            pool = distinct([*pool, *others], self._survivors, self._kinematics.turns_around)
             refined += self._finish(self._explore(pool, min(1, rounds)))
             refined = distinct(refined, _FINALISTS, self._kinematics.turns_around)
         poses = [
@@ -225,10 +239,9 @@ class _Run:
                 others = self._others(pose.values)
                 found += others
                 least = min((one.cost for one in others), default=math.inf)
-                told = len(self._clean) > 1 and len(self._done) > _SOUGHT_ABOUT
-                if told and least > _BETTER * pool[0].cost:
+                if self._several and least > _BETTER * pool[0].cost:
                     break
-            pool = distinct([*pool, *found], _SURVIVORS, self._kinematics.turns_around)
+            pool = distinct([*pool, *found], self._survivors, self._kinematics.turns_around)
         return pool
 
     def _finish(self, pool: Sequence[FittedPose]) -> list[FittedPose]:
@@ -278,7 +291,10 @@ class _Run:
             costs = map_ordered(lambda one: self._fit.cost(one, look), group)
             looks = [FittedPose(*pair) for pair in zip(group, costs, strict=True)]
             best_looks += distinct(looks, count, kinematics.turns_around, 0.5 * INTERVAL)
-        return [self._fit.refine(look.values, MEDIUM) for look in best_looks if self._proceed()]
+        if not self._several:
+            return [self._fit.refine(look.values, MEDIUM) for look in best_looks if self._proceed()]
+        passes = _by_stages(MEDIUM, [_FOLLOWED] * len(MEDIUM))
+        return refine_best(self._fit, [one.values for one in best_looks], passes, self._proceed)
 
     def _values(self, coarse: CoarsePoses, values: np.ndarray | None = None) -> list[np.ndarray]:
         """All values (m,) of coarse poses; those of nodes not searched are taken from values."""
@@ -310,6 +326,11 @@ class _Run:
         X_WN = self._kinematics.poses(values)
         for view in views:
             yield draw_mask(outlines, view.camera.X_CW @ X_WN, view.camera), view
+
+
+def _by_stages(stages: Sequence[AnnealingStage], kept: Sequence[int]) -> Passes:
+    """Stages one after another, as ``refine_best`` takes them, and how many are kept after each."""
+    return [([stage], count) for stage, count in zip(stages, kept, strict=True)]
 
 
 def without_specks(mask: np.ndarray) -> np.ndarray:

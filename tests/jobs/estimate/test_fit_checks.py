@@ -7,10 +7,12 @@ import numpy as np
 import pytest
 import yaml
 
-from drake_pose.files.records import FrameRecord
+from drake_pose.files.records import FrameRecord, PoseRow
 from drake_pose.files.settings import EstimateSettings
-from drake_pose.jobs.estimate.matching import find_contradiction
+from drake_pose.jobs.estimate.inputs import read_inputs
+from drake_pose.jobs.estimate.matching import check_track, find_contradiction
 from drake_pose.jobs.estimate.scene import estimate_scene
+from drake_pose.search.estimates import TRACKED
 from tests.jobs.scenes import URDF, TinyScene, camera, write_scene
 
 ANGLES = ((20.0, -40.0), (-40.0, -80.0))
@@ -61,6 +63,24 @@ def test_what_keeps_the_truth_out(scene: TinyScene, tmp_path: Path) -> None:
     model.write_text(URDF.replace('lower="-1.6" upper="1.6"', 'lower="1.2" upper="1.6"'))
     *_, text = warnings_of(scene, model)
     assert "its limits (lift" in text
+
+
+@pytest.mark.parametrize(("left", "is_told"), [(0.3, True), (0.02, False)])
+def test_a_track_of_a_wrong_pose_is_told(scene: TinyScene, left: float, is_told: bool) -> None:
+    """Frame 1 is said to be tracked half a radian off, which leaves so much of its area."""
+    inputs = read_inputs(scene.folder, scene.model, EstimateSettings(interval=20.0), None)
+    wrong = np.radians(ANGLES[1]) + np.array([0.0, 0.5])
+    rows = {"0001": PoseRow("0001", wrong, None, left, 0.1)}
+    records = {
+        "0000": FrameRecord(True, 0.01, 0.1, stopped_by="end"),
+        "0001": FrameRecord(True, left, 0.1, stopped_by=TRACKED),
+    }
+    assert inputs.search is not None
+    texts = check_track(inputs, inputs.search, rows, records)
+    assert len(texts) == is_told
+    if is_told:
+        assert "frame '0001': tracked it leaves 30.00 %" in texts[0]
+        assert "with luff elsewhere" in texts[0]
 
 
 @pytest.mark.parametrize(

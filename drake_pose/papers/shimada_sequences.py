@@ -51,7 +51,7 @@ _MEMORY, _REST_TIME = 0.15, 1.0
 # Silhouettes of a rough model of somebody else differ by more than those of a hand's own.
 _WELL_MATCHED, _UNMATCHED = 0.12, 0.4
 # What was seen of the deviations; so many frames are shown.
-_INSIDE, _SHOWN = "20 to 26 %", 4
+_INSIDE, _SHOWN = "14 to 50 %", 4
 _ROWS = {
     "frames": ("frames", "{}"),
     "flexion_error_median": ("flexions of the four fingers off, median [deg]", "{:.1f}"),

@@ -291,5 +291,11 @@ def test_a_recorded_hand_is_followed_by_the_filter(shared_data):
     assert (figures["frames"], figures["lost"]) == (80, 0)
     assert figures["flexion_error_median"] < 10.0
     assert figures["silhouette_difference"] < 0.1
-    assert figures["rejected_by_an_inequality"] > 0
     assert "deviations are too small" in found.warning()
+
+
+@pytest.mark.slow
+def test_inequalities_reject_mirrored_hypotheses_of_a_recorded_hand(shared_data):
+    figures = run_sequence(shared_data / "hand_sequences" / "count").as_json()
+    assert figures["lost"] == 0
+    assert 0 < figures["rejected_by_an_inequality"] <= figures["mirrored"]

@@ -268,14 +268,15 @@ class PoseAndMask:
             return draw_packed(self._few, X_CN, camera)
         return draw_mask(self._surfaces.at(self._kinematics.split(values)), X_CN, camera)
 
-    def _sample(self, frame: _Frame, values: Array, spread: Array, count: int) -> Array:
+    def _sample(self, rng: np.random.Generator, values: Array, spread: Array, count: int) -> Array:
         """(count, m) values about some, inside the limits."""
-        drawn = values + spread * frame.rng.standard_normal((count, len(values)))
+        drawn = values + spread * rng.standard_normal((count, len(values)))
         return np.clip(drawn, self._kinematics.lower, self._kinematics.upper)
 
     def _chances(self, level: _Level, frame: _Frame) -> list[Likelihood]:
         """How likely the body is at each pixel, of each camera."""
-        poses, found = self._sample(frame, frame.values, frame.share * self._spread, _SAMPLES), []
+        spread, found = frame.share * self._spread, []
+        poses = self._sample(frame.rng, frame.values, spread, _SAMPLES)
         for camera in level.cameras:
             total = np.zeros((camera.height, camera.width), dtype=np.float32)
             for pose in poses:
@@ -308,7 +309,7 @@ class PoseAndMask:
         first = frame.share * self._spread
         middle, spread, best, most = frame.values, first, frame.values, -math.inf
         for _ in range(_SEARCH_ROUNDS):
-            poses = self._sample(frame, middle, spread, _SEARCHED)
+            poses = self._sample(frame.rng, middle, spread, _SEARCHED)
             poses[0] = middle
             scores = np.array(
                 [

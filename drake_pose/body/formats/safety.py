@@ -36,7 +36,7 @@ def check_in_child(
 ) -> None:
     """Read a model and prepare its drawing in a child process with a time and memory limit.
 
-    The drawing of files that were given: those that were written here Drake draws.
+    Drawing is prepared where it takes files that were given; those written here Drake can draw.
     Drake 1.51 can crash on a broken glTF, a texture or a file that includes itself, and a YAML
     alias bomb takes all memory. A success is remembered while the file's content stays the same.
     A process of one thread forks the child, which has then imported everything; others start one.

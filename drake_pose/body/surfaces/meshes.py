@@ -317,6 +317,7 @@ def was_written(path: Path) -> bool:
 
 
 def _write_with_normals(mesh: TriangleMesh, path: Path) -> None:
+    """Write an OBJ file whose vertices have the mean normals of the triangles about them."""
     triangles = mesh.triangles
     a, b, c = (mesh.vertices[triangles[:, corner]] for corner in range(3))
     area_normals = np.cross(b - a, c - a)

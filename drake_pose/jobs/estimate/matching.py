@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from pydrake.systems.analysis import Simulator
 
+from drake_pose.body.parsed_model import nearest_turn
 from drake_pose.camera.models import Camera, ParallelCamera
 from drake_pose.errors import SettingsError
 from drake_pose.files.options import percent
@@ -109,10 +110,13 @@ def _with_intervals(
 
     begun: what its track began with; None: it was searched.
     """
-    scene, root_position = inputs.scene, (inputs.root_positions or {}).get(frame)
-    masks = {name: scene.read(name, frame) for name in scene.cameras_of(frame)}
-    views = [View(scene.cameras[name], mask) for name, mask in masks.items()]
-    return search.with_intervals(pose, views, root_position, begun)
+    root_position = (inputs.root_positions or {}).get(frame)
+    return search.with_intervals(pose, _views(inputs.scene, frame), root_position, begun)
+
+
+def _views(scene: Scene, frame: str) -> list[View]:
+    """A frame's masks, each with its camera."""
+    return [View(scene.cameras[name], scene.read(name, frame)) for name in scene.cameras_of(frame)]
 
 
 def match_frames(
@@ -228,21 +232,24 @@ def check_track(
 
     Nothing is matched where all frames fit nearly as well as those in which a pose was searched.
     """
-    fits = {True: dict[str, float](), False: dict[str, float]()}
+    searched, tracked = list[float](), dict[str, float]()
     for frame, one in records.items():
-        if one.E_total is not None and inputs.scene.cameras_of(frame):
-            fits[one.stopped_by == TRACKED][frame] = one.E_total
-    tracked, searched = fits[True], sorted(fits[False].values())
-    worst = max(tracked, key=lambda frame: tracked[frame], default="")
-    if not searched or not _is_worse(tracked.get(worst, 0.0), searched[0]):
+        if one.E_total is None or not inputs.scene.cameras_of(frame):
+            continue
+        if one.stopped_by == TRACKED:
+            tracked[frame] = one.E_total
+        else:
+            searched.append(one.E_total)
+    if not searched or not tracked:
         return []
-    cameras, scene = inputs.scene.cameras, inputs.scene
-    views = [View(cameras[name], scene.read(name, worst)) for name in scene.cameras_of(worst)]
-    found = _match_again(inputs, search, worst, views)
+    worst = max(tracked, key=lambda frame: tracked[frame])
+    if not _is_worse(tracked[worst], min(searched)):
+        return []
+    found = _match_again(inputs, search, worst, _views(inputs.scene, worst))
     if not found.found or not _is_worse(tracked[worst], found.E_total):
         return []
-    model, off = inputs.model, found.q - rows[worst].q
-    off = np.where(model.periodic, np.remainder(off + math.pi, 2.0 * math.pi) - math.pi, off)
+    model, q = inputs.model, rows[worst].q
+    off = nearest_turn(found.q, q, model.periodic) - q
     joints = [model.position_names[k] for k in np.flatnonzero(np.abs(off) > _ELSEWHERE)]
     more = f" and {len(joints) - _NAMED} more" if len(joints) > _NAMED else ""
     where = f", with {', '.join(joints[:_NAMED])}{more} elsewhere" if joints else ""

@@ -55,13 +55,16 @@ _WINDOW = 5
 COARSE = (AnnealingStage(0.1, 0.04, 3), AnnealingStage(0.05, 0.04, 3))
 MEDIUM = (AnnealingStage(0.05, 0.026, 4), AnnealingStage(0.025, 0.026, 4))
 FINAL = (AnnealingStage(0.0125, 0.0125, 6),)
-# How many coarse poses are fitted, how many of them go on after each coarse stage in several views,
-# and how many are fitted to the end.
-_STARTS, _ROUGH, _FINALISTS = 40, (20, 12), 4
-# How many go on after the stages that follow, in one view and in several; and in several how many
-# of what is sought about a pose. In these what is wrong costs more from the first stage on, in one
-# view it may be the last that tells: there none ends after a first stage.
-_SURVIVORS, _FOLLOWED = (12, 6), 4
+# How many coarse poses are fitted, and how many are fitted to the end.
+_STARTS, _FINALISTS = 40, 4
+# How many go on after which stages, in one view and in several; and in several of what is sought
+# about a pose. In these what is wrong costs more from the first stage on, in one view it may be the
+# last that tells: there none ends after a first stage.
+_PASSES = (
+    ((COARSE, 12), (MEDIUM, 12)),
+    ((COARSE[:1], 20), (COARSE[1:], 12), (MEDIUM[:1], 6), (MEDIUM[1:], 6)),
+)
+_FOLLOWING = ((MEDIUM[:1], 4), (MEDIUM[1:], 4))
 # Coarse poses differ where some part of the body is seen so far away, as a share of the root of the
 # silhouettes' mean area.
 _APART = 0.13
@@ -166,10 +169,6 @@ class MultiStartSearch:
         return body, ViewsFit(kinematics, self._outlines, clean), clean
 
 
-Passes = list[tuple[Sequence[AnnealingStage], int]]
-"""Rounds, and how many poses are kept after each, as ``refine_best`` takes them."""
-
-
 class _Run:
     """One match of a body, sampled roughly, with clean silhouettes, until a deadline.
 
@@ -189,25 +188,22 @@ class _Run:
         self._views, self._deadline, self._stopped_by = views, deadline, "end"
         self._clean, self._beam_starts = clean, beam_starts
         self._several = len(clean) > 1
-        self._survivors = _SURVIVORS[self._several]
+        self._passes = _PASSES[self._several]
+        self._survivors = self._passes[-1][1]
         self._done: list[np.ndarray] = []
         self._coarse = CoarseSearch(body, clean, HYPOTHESES if self._proceed() else 1)
 
     def search(self, rounds: int, as_set: bool) -> PoseEstimate:
         """Find coarse poses, refine them, seek other explanations, and refine to the end."""
         starts = self._coarse.choose_distinct(self._coarse.find(), _STARTS, _APART)
-        passes: Passes = [(COARSE, self._survivors), (MEDIUM, self._survivors)]
-        if self._several:
-            kept = [*_ROUGH, *[self._survivors] * len(MEDIUM)]
-            passes = _by_stages((*COARSE, *MEDIUM), kept)
-        pool = refine_best(self._fit, self._values(starts), passes, self._proceed)
+        pool = refine_best(self._fit, self._values(starts), self._passes, self._proceed)
         first_J = self._J(pool[0].values)
         pool = self._explore(pool, rounds)
         refined = self._finish(pool)
         contradicting = self._contradicting(refined[0].values)
         if contradicting and self._proceed():
             by_areas = self._beam_starts(contradicting[:_BEAM_VIEWS])
-            others = refine_best(self._fit, by_areas, passes, self._proceed)
+            others = refine_best(self._fit, by_areas, self._passes, self._proceed)
             pool = distinct([*pool, *others], self._survivors, self._kinematics.turns_around)
             refined += self._finish(self._explore(pool, min(1, rounds)))
             refined = distinct(refined, _FINALISTS, self._kinematics.turns_around)
@@ -256,15 +252,15 @@ class _Run:
         not; in a single one other parts may hide either. What masks lack, or have besides, is not
         mended by another start: then there is none.
         """
-        count = len(self._clean)
-        share = _LIMBS[count > 1]
+        share = _LIMBS[self._several]
         radius, thick, wrongs = max(1.0, share * self._fit.size), np.zeros(2, dtype=np.int64), []
         for mask, view in self._drawn(values, self._clean):
             for side, wrong in enumerate((mask & ~view.mask, view.mask & ~mask)):
                 distances = cv2.distanceTransform(wrong.astype(np.uint8), cv2.DIST_L2, 5)
                 thick[side] += distances.max() > radius
             wrongs.append(np.count_nonzero(mask != view.mask))
-        is_wrong = thick.any() if count == 1 else (2 * thick >= count).all()
+        half = 2 * thick >= len(self._clean)
+        is_wrong = half.all() if self._several else thick.any()
         return [self._clean[k] for k in np.argsort(wrongs)[::-1]] if is_wrong else []
 
     def _proceed(self) -> bool:
@@ -293,8 +289,8 @@ class _Run:
             best_looks += distinct(looks, count, kinematics.turns_around, 0.5 * INTERVAL)
         if not self._several:
             return [self._fit.refine(look.values, MEDIUM) for look in best_looks if self._proceed()]
-        passes = _by_stages(MEDIUM, [_FOLLOWED] * len(MEDIUM))
-        return refine_best(self._fit, [one.values for one in best_looks], passes, self._proceed)
+        followed = [one.values for one in best_looks]
+        return refine_best(self._fit, followed, _FOLLOWING, self._proceed)
 
     def _values(self, coarse: CoarsePoses, values: np.ndarray | None = None) -> list[np.ndarray]:
         """All values (m,) of coarse poses; those of nodes not searched are taken from values."""
@@ -326,11 +322,6 @@ class _Run:
         X_WN = self._kinematics.poses(values)
         for view in views:
             yield draw_mask(outlines, view.camera.X_CW @ X_WN, view.camera), view
-
-
-def _by_stages(stages: Sequence[AnnealingStage], kept: Sequence[int]) -> Passes:
-    """Stages one after another, as ``refine_best`` takes them, and how many are kept after each."""
-    return [([stage], count) for stage, count in zip(stages, kept, strict=True)]
 
 
 def without_specks(mask: np.ndarray) -> np.ndarray:

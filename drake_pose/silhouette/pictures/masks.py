@@ -59,8 +59,9 @@ class MaskAgreement:
 
 def intersection_over_union(one: np.ndarray, other: np.ndarray) -> float:
     """Of two masks (H, W) bool; 1 where both are empty."""
-    either = int(np.count_nonzero(one | other))
-    return int(np.count_nonzero(one & other)) / either if either else 1.0
+    own, others, both = map(np.count_nonzero, (one, other, one & other))
+    either = int(own + others - both)
+    return int(both) / either if either else 1.0
 
 
 def compare_masks(
@@ -70,10 +71,9 @@ def compare_masks(
     wrong, area = 0, 0
     ious: dict[str, float] = {}
     for camera, mask in masks.items():
-        own, drawn, both = map(np.count_nonzero, (mask, bodies[camera], mask & bodies[camera]))
-        either = int(own + drawn - both)
-        wrong, area = wrong + int(either - both), area + int(own)
-        ious[camera] = int(both) / either if either else 1.0
+        wrong += int(np.count_nonzero(mask ^ bodies[camera]))
+        area += int(np.count_nonzero(mask))
+        ious[camera] = intersection_over_union(mask, bodies[camera])
     return MaskAgreement(wrong / area if area else float("nan"), ious)
 
 

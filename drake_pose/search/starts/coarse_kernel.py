@@ -95,9 +95,9 @@ def _make_buffers(count: int) -> ScratchBuffers:
 
 @compiled
 def _project_ball(
-    view: CoarseView, X_CP: np.ndarray, p_PB: np.ndarray, first: int, buffers: ScratchBuffers
+    view: CoarseView, X_CP: np.ndarray, p_PB: np.ndarray, buffers: ScratchBuffers
 ) -> None:
-    """Writes where a ball is seen at samples from the first on: columns, rows, scales.
+    """Writes where a ball is seen at all samples: columns, rows, scales.
 
     Single precision, and no branches: the processor does many samples at once.
     """
@@ -117,7 +117,7 @@ def _project_ball(
     x0, y0, z0 = np.float32(X_CP[0, 3]), np.float32(X_CP[1, 3]), np.float32(X_CP[2, 3])
     parallel = camera[0] != 0.0
     for k in range(buffers.rows.shape[0]):
-        p, q, r = p_PB[0, first + k], p_PB[1, first + k], p_PB[2, first + k]
+        p, q, r = p_PB[0, k], p_PB[1, k], p_PB[2, k]
         depth = one if parallel else zx * p + zy * q + zz * r + z0
         nearness = one / max(depth, least)
         column = focal_x * (xx * p + xy * q + xz * r + x0) * nearness + center_x
@@ -131,9 +131,9 @@ def _project_ball(
 
 @compiled
 def _look_at_samples(
-    view: CoarseView, X_CP: np.ndarray, balls: Balls, first: int, buffers: ScratchBuffers
+    view: CoarseView, X_CP: np.ndarray, balls: Balls, buffers: ScratchBuffers
 ) -> None:
-    """Writes what a node costs and covers at samples from the first on: costs, covered."""
+    """Writes what a node costs and covers at all samples: costs, covered."""
     zero, one, half = np.float32(0.0), np.float32(1.0), np.float32(0.5)
     tiny = np.float32(1e-9)
     slack, parts = np.float32(view.slack), np.float32(view.parts)
@@ -146,7 +146,7 @@ def _look_at_samples(
         for word in range(4):
             buffers.covered[k, word] = np.uint64(0)
     for ball in range(balls.radii.shape[0]):
-        _project_ball(view, X_CP, balls.p_PB[ball], first, buffers)
+        _project_ball(view, X_CP, balls.p_PB[ball], buffers)
         for k in range(buffers.costs.shape[0]):
             scale = buffers.scales[k]
             if scale == zero:
@@ -176,7 +176,7 @@ def score_samples(
     masks: np.ndarray,
     outside_weight: float,
     scores: np.ndarray,
-) -> None:
+) -> np.ndarray:
     """Adds what a node at all its samples would add to hypotheses in one view.
 
     Args:
@@ -184,27 +184,19 @@ def score_samples(
         masks: (B, 4) uint64 the points that the hypotheses cover.
         outside_weight: what a pixel outside counts; one newly covered counts -1.
         scores: (B, n) added to [pixel].
+
+    Returns:
+        (B, n, 4) the points that the hypotheses would cover.
     """
     count = scores.shape[1]
     buffers = _make_buffers(count)
+    united = np.empty((X_CP.shape[0], count, 4), dtype=np.uint64)
     for h in range(X_CP.shape[0]):
-        _look_at_samples(view, X_CP[h], balls, 0, buffers)
+        _look_at_samples(view, X_CP[h], balls, buffers)
         for k in range(count):
             gain = 0
             for word in range(4):
                 gain += int(count_bits(buffers.covered[k, word] & ~masks[h, word]))
+                united[h, k, word] = masks[h, word] | buffers.covered[k, word]
             scores[h, k] += outside_weight * buffers.costs[k] - gain * view.point_area
-
-
-@compiled
-def unite_pairs(
-    view: CoarseView, X_CP: np.ndarray, balls: Balls, masks: np.ndarray, pairs: np.ndarray
-) -> np.ndarray:
-    """The points (m, 4) that pairs (m, 2) of a hypothesis and a sample cover in one view."""
-    united = np.empty((pairs.shape[0], 4), dtype=np.uint64)
-    buffers = _make_buffers(1)
-    for m in range(pairs.shape[0]):
-        _look_at_samples(view, X_CP[pairs[m, 0]], balls, pairs[m, 1], buffers)
-        for word in range(4):
-            united[m, word] = masks[pairs[m, 0], word] | buffers.covered[0, word]
     return united

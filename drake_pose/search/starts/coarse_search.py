@@ -24,7 +24,6 @@ from drake_pose.search.starts.coarse_kernel import (
     CoarseView,
     fill_cover,
     score_samples,
-    unite_pairs,
 )
 from drake_pose.silhouette.pictures.masks import signed_distances
 
@@ -37,8 +36,9 @@ _MOST_CELLS = 500
 # A cell is divided into this many parts along its side, where it has as many pixels.
 _PARTS = 4
 _LEAST_HYPOTHESES = 64
-# How many times the hypotheses kept are looked at for some that do not stand alike.
-_SPARE = 8
+# How many times the hypotheses kept are looked at for some that do not stand alike: at first, and
+# where these are too few.
+_SPARES = 2, 8
 INTERVAL, LENGTH_INTERVAL = math.radians(15.0), 0.05
 """Sampling intervals of every angle [rad] and of every prismatic position [m]."""
 
@@ -159,9 +159,10 @@ class CoarseSearch:
     def _cover(self, node: int, X_WN: np.ndarray, masks: list[np.ndarray]) -> list[np.ndarray]:
         """What one hypothesis covers together with a node that has its place."""
         still = self._balls[node]._replace(p_PB=_by_ball(self._p_NB[node][None]))
-        one = np.zeros((1, 2), dtype=np.int64)
         return [
-            unite_pairs(view, np.ascontiguousarray(view.X_CW @ X_WN[node])[None], still, mask, one)
+            score_samples(view, (view.X_CW @ X_WN[node])[None], still, mask, 1.0, np.zeros((1, 1)))[
+                0
+            ]
             for view, mask in zip(self._views, masks, strict=True)
         ]
 
@@ -178,8 +179,10 @@ class CoarseSearch:
         X_PN = self.body.sampled.X_PN[node]
         X_CPs = [self._parent_in(view, node, poses.X_WN) for view in self._views]
         added = np.zeros((len(poses), len(X_PN)))
-        for view, X_CP, mask in zip(self._views, X_CPs, masks, strict=True):
+        united = [
             score_samples(view, X_CP, balls, mask, _OUTSIDE_WEIGHT, added)
+            for view, X_CP, mask in zip(self._views, X_CPs, masks, strict=True)
+        ]
         costs = (poses.costs[:, None] + added).ravel()
         parent = self._nodes[node].parent
         if self.body.sampled.tree.source(node) == parent:
@@ -188,34 +191,40 @@ class CoarseSearch:
         following = [i for i in self.body.limb_order if i not in placed]
         widest = len(self.body.sampled.X_PN[following[0]]) if following else 1
         width = min(hypotheses, max(_LEAST_HYPOTHESES, _EVALUATIONS // widest))
-        pool = min(int(np.count_nonzero(costs < np.inf)), _SPARE * width)
-        best = np.argpartition(costs, pool - 1)[:pool]
-        best = best[np.lexsort((best, costs[best]))]
-        X_WN = poses.X_WN[best // len(X_PN)]
-        X_WP = np.eye(4) if parent < 0 else X_WN[:, parent]
-        X_WN[:, node] = X_WP @ X_PN[best % len(X_PN)]
-        kept = self._unlike(X_WN, placed)[:width]
-        best = best[kept]
-        pairs = np.column_stack([best // len(X_PN), best % len(X_PN)])
-        samples = poses.samples[pairs[:, 0]]
-        samples[:, node] = pairs[:, 1]
-        united = [
-            unite_pairs(view, X_CP, balls, mask, pairs)
-            for view, X_CP, mask in zip(self._views, X_CPs, masks, strict=True)
+        possible = int(np.count_nonzero(costs < np.inf))
+        for spare in _SPARES:
+            pool = min(possible, spare * width)
+            best = np.argpartition(costs, pool - 1)[:pool]
+            best = best[np.lexsort((best, costs[best]))]
+            of, sample = best // len(X_PN), best % len(X_PN)
+            X_WP = np.eye(4) if parent < 0 else poses.X_WN[of, parent]
+            X_WN = X_WP @ X_PN[sample]
+            kept = self._unlike(poses.X_WN, of, node, X_WN, placed)[:width]
+            if pool == possible or len(kept) == width:
+                break
+        of, sample = of[kept], sample[kept]
+        samples, together = poses.samples[of], poses.X_WN[of]
+        samples[:, node], together[:, node] = sample, X_WN[kept]
+        return CoarsePoses(samples, together, costs[best[kept]]), [
+            one[of, sample] for one in united
         ]
-        return CoarsePoses(samples, X_WN[kept], costs[best]), united
 
-    def _unlike(self, X_WN: np.ndarray, placed: set[int]) -> np.ndarray:
-        """Indices of the poses whose open nodes stand unlike those of any better pose."""
+    def _unlike(
+        self, X_WN: np.ndarray, of: np.ndarray, node: int, own: np.ndarray, placed: set[int]
+    ) -> np.ndarray:
+        """Indices of the poses whose open nodes stand unlike those of any better pose.
+
+        Each is that of ``X_WN`` that ``of`` says, but for a node's own pose (n, 4, 4).
+        """
         is_open = [i for i in sorted(placed) if not placed.issuperset(self._nodes[i].children)]
         if not is_open:
-            return np.arange(len(X_WN))
-        X = X_WN[:, is_open]
-        lever = 0.15 * self._reach
-        points = [X[..., :3, 3], X[..., :3, 3] + lever * X[..., :3, 0]]
-        points.append(X[..., :3, 3] + lever * X[..., :3, 2])
-        cells = np.rint(np.concatenate(points, axis=1) / (_ALIKE * self._reach))
-        cells = cells.reshape(len(X_WN), -1).astype(np.int64)
+            return np.arange(len(of))
+        lever, points = 0.15 * self._reach, []
+        for i in is_open:
+            X = own if i == node else X_WN[of, i]
+            p = X[:, :3, 3]
+            points += [p, p + lever * X[:, :3, 0], p + lever * X[:, :3, 2]]
+        cells = np.rint(np.hstack(points) / (_ALIKE * self._reach)).astype(np.int64)
         # Any odd numbers will do; always the same, so that answers are.
         keys = np.random.default_rng(2718).integers(1, 2**62, cells.shape[1]) | 1
         return np.sort(np.unique((cells * keys).sum(axis=1), return_index=True)[1])

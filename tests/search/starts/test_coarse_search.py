@@ -10,7 +10,7 @@ from drake_pose.camera.models import ParallelCamera
 from drake_pose.search.estimates import View
 from drake_pose.search.grid.sampled_body import SampledBody
 from drake_pose.search.settings import BeamSearchSettings
-from drake_pose.search.starts.coarse_kernel import fill_cover, score_samples, unite_pairs
+from drake_pose.search.starts.coarse_kernel import fill_cover, score_samples
 from drake_pose.search.starts.coarse_search import (
     INTERVAL,
     CoarseSearch,
@@ -117,7 +117,7 @@ def test_scores_are_those_of_balls_looked_at_one_by_one(
     X_CP = np.ascontiguousarray(camera.X_CW @ X_WP)
     scores = np.zeros((n, len(p_PB)))
     masks = np.zeros((n, 4), dtype=np.uint64)
-    score_samples(view, X_CP, search._balls[node], masks, 0.8, scores)
+    united = score_samples(view, X_CP, search._balls[node], masks, 0.8, scores)
     area = body.surface_areas[node] / len(radii)
     gaps = []
     for h, sample in np.ndindex(scores.shape):
@@ -138,10 +138,8 @@ def test_scores_are_those_of_balls_looked_at_one_by_one(
     # The tables know places to a cell and distances to a quarter of one only.
     assert np.abs(gaps).max() < 0.1 * seen.mask.sum()
     assert np.abs(np.mean(gaps)) < 0.005 * seen.mask.sum()
-    pairs = np.column_stack([np.arange(n), np.full(n, 2)])
-    united = unite_pairs(view, X_CP, search._balls[node], masks, pairs)
     again = np.zeros_like(scores)
-    score_samples(view, X_CP, search._balls[node], united, 0.8, again)
+    score_samples(view, X_CP, search._balls[node], united[:, 2].copy(), 0.8, again)
     # What is covered already counts no more.
     assert (again[:, 2] >= 0.0).all()
     assert (again[:, 2] > scores[:, 2]).any()

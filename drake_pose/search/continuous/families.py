@@ -195,7 +195,7 @@ _SIGNIFICANCE, _FAMILIES = 1.96, 8
 # longest step, by what factor each step is longer, and the first one's share of what the covariance
 # allows.
 _MOVED = math.radians(3.0), 0.01
-_LONGEST_STEPS, _GROWTH, _FIRST_STEP = (0.5, 0.1), 1.6, 0.5
+_LONGEST_STEPS, _GROWTH, _FIRST_STEP = (0.5, 0.1), 1.6, 1.0
 # As often shall a value lie below the upper end of its interval, and above the lower one.
 _ONE_SIDED = 0.975
 # How large errors are is told by the motions of each camera.

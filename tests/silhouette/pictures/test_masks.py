@@ -56,7 +56,7 @@ def test_masks_are_what_opencv_and_pillow_decode(tmp_path: Path, width: int) -> 
         few = np.where(mask, 7, 0) + (np.arange(width) % 3)
         path = save(tmp_path, few.astype(np.uint8), "few.png")
         if len(np.unique(few)) > 2:
-            with pytest.raises(MaskError, match="values|full"):
+            with pytest.raises(MaskError, match=r"values|full"):
                 read_mask(path)
 
 

@@ -129,7 +129,7 @@ def find_crossings(
         after = np.int64(np.ceil(min(max(max(a, b), 0.0), float(lines))))
         # No branch, which the processor would guess wrong.
         crossing[count, 0], crossing[count, 1], crossing[count, 2] = s, begin, after
-        count += begin < after
+        count += int(begin < after)
         for line in range(begin, after):
             counts[line + 1] += 1
     for line in range(lines):

@@ -19,7 +19,7 @@ from drake_pose.fit.colours import OwnColours
 from drake_pose.fit.contour_fit import ContourFit
 from drake_pose.person.persons_in_view import ReadFrame
 from drake_pose.person.pose_tracker import PersonPoseTracker, TrackState
-from drake_pose.person.search import LENIENT, SURE
+from drake_pose.person.search import LENIENT
 from drake_pose.person.shape import NOISE, PersonShape, fit_shape, shape_values
 from drake_pose.person.views import (
     ColourViews,
@@ -32,8 +32,9 @@ from drake_pose.person.views import (
 )
 from drake_pose.silhouette.areas.outline import Outline
 
-# In how many of the frames a sequence is begun, for the best to be taken.
-_STARTS = 4
+# In how many of the frames a sequence is begun, for the best to be taken, and of what more fits
+# needs no other to be compared with.
+_STARTS, _SURE = 4, 0.97
 # The shape is fitted to some frames among this many first ones.
 _SHAPE_SPAN, _SHAPE_FRAMES = 40, 10
 
@@ -198,7 +199,7 @@ class _Capture:
             state = self.tracker.follow(None, self._see(frame))
             if state is not None and (best is None or state.share > best[1].share):
                 best = frame, state
-                if state.share > SURE:
+                if state.share > _SURE:
                     break
         if best is None:
             raise SettingsError(

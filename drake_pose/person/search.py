@@ -20,8 +20,6 @@ from drake_pose.person.rays import sum_at_points
 from drake_pose.person.views import ColourViews, FrameViews
 from drake_pose.silhouette.areas.scoring import draw_mask
 
-SURE = 0.97
-"""Of what fits to more than this share no other pose need be looked at but who looks alike."""
 HEADINGS = 12
 """Into how many directions a lost person is turned."""
 # How many of them in each frame of a sequence, and in how many frames all are tried.
@@ -162,18 +160,14 @@ class PersonSearch:
         found.sort(key=lambda one: -one.closeness)
         if len(headings) < HEADINGS:
             return self.mended(found[0], frame, enough, limbs=LIMBS_A_FRAME)
-        best = self.mended(found[0], frame, SURE)
-        for one in found[1:_MENDED]:
-            if best.inlier_ratio < SURE:
-                best = _better(best, self.mended(one, frame, SURE))
+        mended = [self.mended(one, frame) for one in found[:_MENDED]]
+        best = max(mended, key=lambda one: one.closeness)
         while True:
             others = [self._refine(values, frame) for values in self._exchanged(best.values)]
             other = max(others, key=lambda one: one.closeness)
             if other.closeness <= best.closeness:
-                if best.inlier_ratio >= SURE:
-                    return self.mended(best, frame, limbs=1)
                 return self._searched(best, self._plan.limbs.values(), frame, math.inf)
-            best = self.mended(other, frame, SURE)
+            best = self.mended(other, frame)
 
     def _guess(
         self, frame: FrameViews, heading: int, middle: Array, known: Array | None

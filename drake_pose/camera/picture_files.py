@@ -2,9 +2,7 @@
 
 import io
 import re
-import struct
 import warnings
-import zlib
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -21,10 +19,6 @@ from drake_pose.regular_files import read_regular
 SUFFIXES = (".png", ".jpg", ".jpeg")
 
 _PNG = b"\x89PNG\r\n\x1a\n"
-# Of a PNG picture: width, height and bits; then colours, compression, filters and interlacing.
-_HEADER = struct.Struct(">2I5B")
-# No mask is packed into more bytes; what is may be unpacked to a thousand times as many.
-_LARGEST_MASK = 1 << 20
 _JPEG, _JPEG_END = b"\xff\xd8", b"\xff\xd9"
 _DAMAGE = (
     OSError, SyntaxError, ValueError, Image.DecompressionBombError, Image.DecompressionBombWarning
@@ -90,9 +84,7 @@ def read_two_colours(
     has more than two values.
     """
     data = read_picture_file(path, error_type, only_png=not lossy)
-    picture = None if data.startswith(_JPEG) else _decode_steps(data)
-    if picture is None:
-        picture = decode_picture(data, cv2.IMREAD_UNCHANGED, path, error_type)
+    picture = decode_picture(data, cv2.IMREAD_UNCHANGED, path, error_type)
     found = picture.shape[1], picture.shape[0]
     expected = size[0] or found[0], size[1] or found[1]
     if found != expected:
@@ -135,10 +127,6 @@ def list_pictures(folder: Path, error_type: type[DrakePoseError]) -> dict[str, P
 
 def _split_colours(picture: NDArray[np.integer]) -> tuple[Mask, bool]:
     """Where a picture (H, W) or (H, W, channels) is not black, and if that is all of one colour."""
-    if picture.ndim == 2 or picture.shape[2] == 1:
-        mask = picture.reshape(picture.shape[:2]) != 0
-        lightest = np.count_nonzero(picture == picture.max())
-        return mask, not mask.any() or lightest == np.count_nonzero(mask)
     mask = cv2.inRange(picture, (0, 0, 0, 0), (0, 0, 0, 0)) == 0
     first = np.atleast_1d(picture[np.unravel_index(mask.argmax(), mask.shape)])
     colour = tuple(float(value) for value in first)
@@ -196,41 +184,6 @@ def _check_content(
         raise error_type(
             f"{path}: {width} x {height} pixels are too many: at most {LARGEST_SIDE} a side"
         )
-
-
-def _decode_steps(data: bytes) -> Picture | None:
-    """A grey PNG picture (H, W) of one bit or eight, its rows stored as they are or as steps.
-
-    So masks are written, but OpenCV adds up the steps of all pixels one by one; a mask's are 0 but
-    around the object. None: another picture.
-    """
-    width, height, bits, *kind = _HEADER.unpack_from(data, 16)
-    parts, place = [], len(_PNG)
-    while place < len(data):
-        name, size = data[place + 4 : place + 8], int.from_bytes(data[place : place + 4], "big")
-        parts += [data[place + 8 : place + 8 + size]] if name == b"IDAT" else []
-        kind += [-1] if name == b"tRNS" else []
-        place += 12 + size
-    content = b"".join(parts)
-    if bits not in (1, 8) or any(kind) or len(content) > _LARGEST_MASK:
-        return None
-    stride = 1 + (bits * width + 7) // 8
-    try:
-        packed = zlib.decompress(content, bufsize=height * stride)
-    except zlib.error:
-        return None
-    if len(packed) != height * stride:
-        return None
-    rows = np.frombuffer(packed, np.uint8).reshape(height, stride)
-    filters, steps = rows[:, 0], np.array(rows[:, 1:])
-    if filters.min() < filters.max() or filters[0] > 1:
-        return None
-    left, top, wide, high = cv2.boundingRect(steps)
-    if filters[0] and wide:
-        right, own = left + wide, slice(top, top + high)
-        steps[own, left:right] = np.cumsum(steps[own, left:right], axis=1, dtype=np.uint8)
-        steps[own, right:] = steps[own, right - 1 : right]
-    return steps if bits == 8 else np.unpackbits(steps, axis=1, count=width)
 
 
 def decode_picture(data: bytes, how: int, path: Path, error_type: type[DrakePoseError]) -> Picture:

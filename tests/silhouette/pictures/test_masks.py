@@ -5,7 +5,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from PIL import Image
 
 from drake_pose.camera.picture_files import read_picture
 from drake_pose.errors import MaskError
@@ -34,30 +33,6 @@ def test_round_trip(tmp_path: Path) -> None:
 def test_grey_masks(tmp_path: Path, value: int) -> None:
     path = save(tmp_path, MASK.astype(np.uint8) * np.uint8(value))
     np.testing.assert_array_equal(read_mask(path), MASK)
-
-
-@pytest.mark.parametrize("width", [1, 5, 8, 61])
-def test_masks_are_what_opencv_and_pillow_decode(tmp_path: Path, width: int) -> None:
-    generator = np.random.default_rng(width)
-    for shape in range(6):
-        mask = np.zeros((24, width), dtype=bool)
-        # Some touch the borders; one is of single pixels.
-        top, left = generator.integers(24), generator.integers(width)
-        mask[top : top + 9, left : left + 1 + 9 * shape] = True
-        mask = generator.random(mask.shape) < 0.3 if shape == 5 else mask
-        grey = np.where(mask, 255, 0).astype(np.uint8)
-        for kind in (cv2.IMWRITE_PNG_FILTER_NONE, cv2.IMWRITE_PNG_FILTER_SUB,
-                     cv2.IMWRITE_PNG_FILTER_PAETH, cv2.IMWRITE_PNG_ALL_FILTERS):  # fmt: skip
-            path = tmp_path / "m.png"
-            cv2.imwrite(str(path), grey, [cv2.IMWRITE_PNG_FILTER, kind])
-            np.testing.assert_array_equal(read_mask(path, may_be_empty=True), mask)
-        Image.fromarray(mask).save(tmp_path / "m.png")
-        np.testing.assert_array_equal(read_mask(tmp_path / "m.png", may_be_empty=True), mask)
-        few = np.where(mask, 7, 0) + (np.arange(width) % 3)
-        path = save(tmp_path, few.astype(np.uint8), "few.png")
-        if len(np.unique(few)) > 2:
-            with pytest.raises(MaskError, match=r"values|full"):
-                read_mask(path)
 
 
 def test_deep_colour_and_transparent_masks(tmp_path: Path) -> None:

@@ -6,6 +6,7 @@ import dataclasses
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -133,7 +134,7 @@ class _PosedCamera:
                 value = check_number(value, field.name, where, positive=positive)
             object.__setattr__(self, field.name, value)
 
-    @property
+    @cached_property
     def X_CW(self) -> np.ndarray:
         """(4, 4) the world's pose in the camera."""
         return inverse_pose(self.X_WC)

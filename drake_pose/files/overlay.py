@@ -139,10 +139,10 @@ def _draw_borders(
     """Draws pixels of the body whose right or lower neighbour is another segment of the body."""
     if segments is None:
         return
-    right = body[:, :-1] & body[:, 1:] & (segments[:, :-1] != segments[:, 1:])
-    lower = body[:-1] & body[1:] & (segments[:-1] != segments[1:])
-    picture[:, :-1][right] = colour
-    picture[:-1][lower] = colour
+    borders = np.zeros(body.shape, dtype=np.bool_)
+    borders[:, :-1] = body[:, 1:] & (segments[:, :-1] != segments[:, 1:])
+    borders[:-1] |= body[1:] & (segments[:-1] != segments[1:])
+    picture[borders & body] = colour
 
 
 def _surroundings(shown: np.ndarray) -> tuple[slice, slice]:

@@ -21,6 +21,9 @@ from drake_pose.fit.colours import Histograms
 
 # A frame's pose that changes by less is settled [rad, m].
 _STANDSTILL = 1e-3
+# In the first two frames by masks no rate is known, and the pose may be far off: it is given so
+# many times as many rounds to settle.
+_FIRST_ROUNDS = 4
 # Standard deviations at the start: angles [rad], the root's position and other lengths [m], and the
 # logarithm of an unknown scale.
 _START_ANGLE, _START_LENGTH, _START_GROWTH = 0.2, 0.03, 0.1
@@ -42,7 +45,8 @@ class TrackingSettings:
         length_acceleration: of the root's, and of joints that slide [m/s^2].
         growth_acceleration: of the logarithm of a scale that is unknown [1/s^2].
         memory: time in which a rate that is not seen fades [s]: a hidden limb comes to rest.
-        rounds: how often the contour is compared anew in each frame.
+        rounds: how often the contour is compared anew in each frame; in the first two by masks up
+            to four times as often, as long as the pose changes.
         root_moves: whether the root may be elsewhere than where the tree holds it.
         scale_unknown: whether the scale of the one parallel camera is unknown, and may drift.
         rest_time: in about this time joints that are not seen come to the middle of their limits
@@ -199,7 +203,10 @@ class ContourTracker:
         """A frame's state, and the measurement there; None: the frame says nothing."""
         moving, state = len(observation.layout.moving), prediction
         measurement = observation.measure(seen, state.best.mean)
-        for k in range(self.settings.rounds):
+        rounds = self.settings.rounds
+        if prediction.step <= 1 and not seen.has_pictures:
+            rounds *= _FIRST_ROUNDS
+        for k in range(rounds):
             if measurement is None:
                 break
             before = state.best.mean
@@ -208,7 +215,7 @@ class ContourTracker:
             # The contour is compared where the state is, or as good as that: lines in pictures are
             # compared no more often than there are rounds.
             if seen.has_pictures:
-                still = k + 1 == self.settings.rounds or (still and observation.is_finest(k))
+                still = k + 1 == rounds or (still and observation.is_finest(k))
             if still:
                 break
             measurement = observation.measure(seen, state.best.mean, measurement.distance, k + 1)

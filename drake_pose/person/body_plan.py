@@ -116,7 +116,7 @@ class BodyPlan:
         joints = np.array([self.landmarks.names.index(name) for name in (root, middle, end)])
         posed = np.tile(rest, (_POSES, 1))
         posed[:, values] = poses
-        X_WN = np.array([kinematics.poses(one) for one in posed])
+        X_WN = kinematics.tree.node_poses_batch([own.T for own in kinematics.split(posed.T)])
         samples_W = self._samples(joints, X_WN)
         R_WT, p_WT = X_WN[:, self.trunk, :3, :3], X_WN[:, self.trunk, :3, 3]
         samples_T = np.einsum("nji,nmj->nmi", R_WT, samples_W - p_WT[:, None])

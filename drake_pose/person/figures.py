@@ -261,7 +261,7 @@ def find_persons(
         seers = [k for k, own in enumerate(figures) if own]
         if len(seers) < 2:
             return ()
-        place = triangulate([cameras[k] for k in seers], [figures[k][0].middle for k in seers])
+        place = _place(cameras, figures, dict.fromkeys(seers, 0))
         offs = [metres_off(cameras[k], figures[k][0].middle, place[None])[0] for k in seers]
         if max(offs) < _WITHIN:
             return (_person(place, dict.fromkeys(seers, 0), figures),)
@@ -274,6 +274,14 @@ def find_persons(
         persons.append(best)
         for camera, index in best.figures.items():
             free[camera].discard(index)
+
+
+def _place(
+    cameras: Sequence[Camera], figures: Sequence[Sequence[Figure]], taken: Mapping[int, int]
+) -> Array:
+    """(3,) where the figures that are taken, by the camera's index, have their middle [m]."""
+    middles = [figures[k][i].middle for k, i in taken.items()]
+    return triangulate([cameras[k] for k in taken], middles)
 
 
 def _person(place: Array, taken: dict[int, int], figures: Sequence[Sequence[Figure]]) -> Person:
@@ -292,19 +300,20 @@ def _best_person(
     places = meeting_points(cameras, middles, 2.0 * _WITHIN, is_free)
     if not len(places):
         return None
-    scores, _ = _support(cameras, figures, free, places)
+    scores, nearest = _support(cameras, figures, free, places)
     best: tuple[float, float, Person] | None = None
-    for place in places[np.argsort(-scores)[:_LOOKED_AT]]:
-        for _ in range(2):
-            score, nearest = _support(cameras, figures, free, place[None])
-            taken = {k: int(i) for k, i in enumerate(nearest[0]) if i >= 0}
-            if len(taken) < 2:
-                break
-            used = [figures[k][i].middle for k, i in taken.items()]
-            place = triangulate([cameras[k] for k in taken], used)
+    # Places of the same figures are one person's.
+    looked_at = np.argsort(-scores)[:_LOOKED_AT]
+    for own in dict.fromkeys(map(tuple, nearest[looked_at].tolist())):
+        taken = {k: i for k, i in enumerate(own) if i >= 0}
         if len(taken) < 2:
             continue
-        person = _person(place, taken, figures)
+        place = _place(cameras, figures, taken)
+        score, again = _support(cameras, figures, free, place[None])
+        taken = {k: i for k, i in enumerate(again[0].tolist()) if i >= 0}
+        if len(taken) < 2:
+            continue
+        person = _person(_place(cameras, figures, taken), taken, figures)
         if best is None or (float(score[0]), person.area) > best[:2]:
             best = float(score[0]), person.area, person
     return None if best is None else best[2]

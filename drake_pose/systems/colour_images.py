@@ -69,6 +69,9 @@ class ColourPorts:
         )
 
     def pictures(self, context: Context) -> dict[str, Picture]:
-        """The pictures (H, W, 4) that are there, by camera."""
+        """The pictures (H, W, 4) that are there, by camera: valid until the context changes.
+
+        They are the images' own, as kernels take them, which are for arrays that can be written.
+        """
         images = self._given(context).items()
-        return {name: np.array(image.data) for name, image in images if image.size()}
+        return {name: image.mutable_data for name, image in images if image.size()}

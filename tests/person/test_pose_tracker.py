@@ -168,3 +168,22 @@ class TestPlan:
         hand = load_model(bundled_model("two_finger_hand"), check=False)
         with pytest.raises(ModelError, match="landmarks"):
             PersonPoseTracker(ContourFit(hand.pose_tree()))
+
+
+@pytest.mark.slow
+def test_no_still_is_taken_for_another_pose_that_looks_alike():
+    """To end the search where 97 % of the contours fit took one of thirty for another pose."""
+    person = load_model(bundled_model("person"), check=False)
+    cameras = list(circle_of_cameras(3, size=(640, 480)).values())
+    renderers = [LabelRenderer(person, camera) for camera in cameras]
+    fit = ContourFit(person.pose_tree(), noise=NOISE)
+    tracker = PersonPoseTracker(fit, LENIENT)
+    for q in make_motion(load_skeleton(person), 240, 0).q[::8]:
+        views = [see_silhouette(renderer.mask(q), 4.0) for renderer in renderers]
+        found = tracker.follow(None, FrameViews(cameras, views))
+        assert found is not None
+        places = [
+            tracker.plan.landmarks.positions(fit.kinematics.poses(values))
+            for values in (found.values, tracker.values(q))
+        ]
+        assert np.linalg.norm(places[0] - places[1], axis=1).max() < 0.06

@@ -138,7 +138,19 @@ class TreeKinematics:
 
     def poses(self, values: np.ndarray) -> np.ndarray:
         """X_WN (nodes, 4, 4) at values (m,)."""
-        return self.motions(values).X_WN
+        return self._found(values)[0]
+
+    def _found(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """X_WN (nodes, 4, 4) and the twists (e, 6) of all values, those that follow behind."""
+        values = np.ascontiguousarray(values, dtype=np.float64)
+        if values.shape != (len(self.names),):
+            raise SettingsError(f"{len(self.names)} values expected, got shape {values.shape}")
+        if len(self.parameters) == len(values):
+            return find_motions(self.packed, values)
+        led = self._scale * values[self.parameters[len(values) :]] + self._offset
+        X_WN, turns = find_motions(self.packed, np.append(values, led))
+        turns[len(values) :] *= self._scale[:, None]
+        return X_WN, turns
 
     def motions(
         self, values: np.ndarray, *, translation: bool = False, scale: bool = False
@@ -149,16 +161,8 @@ class TreeKinematics:
             translation: add a shift of the first root and all behind it along the world's x, y, z.
             scale: add a uniform growth of these about the first root's origin (per unit).
         """
-        values = np.ascontiguousarray(values, dtype=np.float64)
-        if values.shape != (len(self.names),):
-            raise SettingsError(f"{len(self.names)} values expected, got shape {values.shape}")
+        X_WN, turns = self._found(values)
         count = len(self.parameters)
-        if count > len(values):
-            led = self._scale * values[self.parameters[len(values) :]] + self._offset
-            X_WN, turns = find_motions(self.packed, np.append(values, led))
-            turns[len(values) :] *= self._scale[:, None]
-        else:
-            X_WN, turns = find_motions(self.packed, values)
         added = 3 * translation + scale
         twists = np.zeros((count + added, 7))
         twists[:count, :6] = turns

@@ -160,6 +160,7 @@ def finish_frame(
     masks: Mapping[str, np.ndarray],
     parts: Mapping[str, np.ndarray],
     shown: Mapping[str, np.ndarray],
+    ious: Mapping[str, float] | None = None,
     **more: Any,
 ) -> FinishedFrame:
     """A frame as written, its masks compared with the body.
@@ -169,6 +170,7 @@ def finish_frame(
         parts: by camera (H, W), which part of the body is seen, -1 where none is; none where no
             pose was found.
         shown: the masks and pictures over which the body is drawn.
+        ious: how its masks and the body overlap; None: not compared yet.
         more: fields of FrameRecord.
     """
     row = PoseRow(frame, np.full(len(pose.q), np.nan), None, math.nan, pose.seconds)
@@ -179,7 +181,7 @@ def finish_frame(
     bodies = {name: own >= 0 for name, own in parts.items()}
     if row.found:
         more["joint_errors"] = inputs.joint_errors(frame, pose.q)
-        more["ious"] = compare_masks(masks, bodies).ious
+        more["ious"] = compare_masks(masks, bodies).ious if ious is None else ious
     drawn = {}
     for name, seen in shown.items():
         body = bodies[name] if name in bodies else np.zeros(seen.shape[:2], np.bool_)

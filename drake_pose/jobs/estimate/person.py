@@ -21,7 +21,7 @@ from drake_pose.person.person_capture import PersonCapture, capture_by_colour
 from drake_pose.person.persons_in_view import ReadFrame, ViewFaults
 from drake_pose.search.estimates import PoseEstimate
 from drake_pose.silhouette.areas.scoring import draw_labels
-from drake_pose.silhouette.pictures.masks import edge_area
+from drake_pose.silhouette.pictures.masks import compare_masks, edge_area
 from drake_pose.silhouette.pictures.scene_checks import (
     describe_unreadable,
     frame_ranges,
@@ -77,8 +77,10 @@ def follow_person(
         result.more |= {"lengths_m": known.lengths, "girths": known.girths}
 
     def finished() -> Iterator[FinishedFrame]:
-        for index in range(len(inputs.frames)):
-            own = read(index), reader, float(distances[index])
+        values = [captured.tree.values_from_positions(q) for q in captured.q]
+        nodes = [np.array(own) for own in zip(*values, strict=True)]
+        for index, X_WN in enumerate(captured.tree.node_poses_batch(nodes)):
+            own = X_WN, read(index), reader, float(distances[index])
             yield _finish(inputs, captured, index, *own, seconds, overlay)
         unread = describe_unreadable(reader.refused, inputs.scene.frames)
         result.warnings += (*unread, *faults)
@@ -165,13 +167,19 @@ def _finish(
     inputs: Inputs,
     captured: PersonCapture,
     index: int,
+    X_WN: NDArray[np.float64],
     masks: Mapping[str, Mask],
     reader: ReadFrame,
     distance: float,
     seconds: float,
     overlay: bool,
 ) -> FinishedFrame:
-    """A frame with the captured person, of the girth that was found; distance: see above."""
+    """A frame with the captured person, of the girth that was found, the nodes at X_WN.
+
+    Args:
+        X_WN: (nodes, 4, 4).
+        distance: see above.
+    """
     scene, frame, q = inputs.scene, inputs.frames[index], captured.q[index]
     shown: dict[str, NDArray[np.generic]] = read_pictures(scene, frame) if overlay else {}
     # A camera that was left out is shown, too, so that one sees why.
@@ -182,25 +190,26 @@ def _finish(
     found, by_colour = bool(np.isfinite(q).all()), not masks and np.isfinite(distance)
     parts = {}
     if found:
-        X_WN = captured.tree.node_poses(captured.tree.values_from_positions(q))
         labels, outlines = range(1, 1 + len(captured.outlines)), captured.outlines
         for name in scene.cameras if by_colour else {**masks, **shown}:
             camera = scene.cameras[name]
             parts[name] = draw_labels(outlines, labels, camera.X_CW @ X_WN, camera) - 1
-    wrong, area = np.nan, float(sum(np.count_nonzero(mask) for mask in masks.values()))
+    bodies = {name: own >= 0 for name, own in parts.items()}
+    agreement = compare_masks(masks, bodies) if found else None
+    wrong, area = np.nan, 0.0
     if found and by_colour:
-        bodies = {name: own >= 0 for name, own in parts.items()}
         # Without masks, E_total is the strip between both contours over the body's area.
         area = float(sum(np.count_nonzero(body) for body in bodies.values())) or 1.0
         wrong = sum(map(edge_area, bodies.values())) * distance
-    elif found and area:
-        wrong = float(sum(np.count_nonzero(mask ^ (parts[k] >= 0)) for k, mask in masks.items()))
+    elif agreement is not None and agreement.area:
+        wrong, area = float(agreement.wrong), float(agreement.area)
     pose = PoseEstimate(
         found, q, np.eye(4), (), wrong, area or 1.0, stopped_by=FOLLOWED, seconds=seconds
     )
     return finish_frame(
         inputs, frame, pose, masks, parts, shown, share=float(captured.shares[index]),
         joints=record_deviations(inputs.model, q, captured.deviations[index]),
+        ious=None if agreement is None else agreement.ious,
     )  # fmt: skip
 
 

@@ -265,8 +265,8 @@ def place_limb(
 def _least_turns(ones: Array, others: Array) -> Array:
     """The least rotations (n, 3, 3) from directions (n, 3) to others (n, 3)."""
     quaternions = np.column_stack([np.cross(ones, others), 1.0 + (ones * others).sum(axis=1)])
-    for k in np.flatnonzero(np.linalg.norm(quaternions, axis=1) < _STRAIGHT):
-        quaternions[k, :3] = _unit_across(np.zeros(3), ones[k])
+    turned_about = np.sqrt((quaternions**2).sum(axis=1)) < _STRAIGHT
+    quaternions[turned_about, :3] = _any_across(ones[turned_about])
     return np.asarray(Rotation.from_quat(quaternions).as_matrix())
 
 
@@ -323,8 +323,8 @@ def _triads(x: Array, others: Array) -> tuple[Array, Array]:
     """(n, 3, 3) axes: x (n, 3) of length 1, then what of the others (n, 3) is across; how much."""
     across = others - (others * x).sum(axis=1, keepdims=True) * x
     length = np.sqrt((across**2).sum(axis=1))
-    for k in np.flatnonzero(length < _STRAIGHT):
-        across[k] = _unit_across(np.zeros(3), x[k])
+    straight = length < _STRAIGHT
+    across[straight] = _any_across(x[straight])
     y = across / np.sqrt((across**2).sum(axis=1, keepdims=True))
     return np.stack([x, y, np.cross(x, y)], axis=2), length
 
@@ -333,5 +333,10 @@ def _unit_across(vector: Array, axis: Array) -> Array:
     """The direction of a vector (3,) across an axis of length 1; any where there is none."""
     across = vector - (vector @ axis) * axis
     if np.linalg.norm(across) < _STRAIGHT:
-        across = np.cross(axis, np.eye(3)[int(np.argmin(np.abs(axis)))])
+        across = _any_across(axis[None])[0]
     return np.asarray(across / np.linalg.norm(across))
+
+
+def _any_across(axes: Array) -> Array:
+    """Any vectors (n, 3) across axes (n, 3), not 0."""
+    return np.cross(axes, np.eye(3)[np.argmin(np.abs(axes), axis=1)])

@@ -121,16 +121,16 @@ def find_crossings(
     """
     ends = segments.ends
     counts = np.zeros(lines + 1, dtype=np.int64)
-    begin = np.empty(ends.shape[0], dtype=np.int64)
-    after = np.empty(ends.shape[0], dtype=np.int64)
+    # (n, 3) those that cross a line, which most are too short for, and from where to where.
+    crossing, count, share = np.empty((ends.shape[0] + 1, 3), dtype=np.int64), 0, 1.0 / spacing
     for s in range(ends.shape[0]):
-        a, b = ends[s, 1 - across], ends[s, 3 - across]
-        low, high = (min(a, b) - first) / spacing, (max(a, b) - first) / spacing
-        begin[s] = after[s] = 0
-        if high > 0.0 and low <= lines - 1:
-            begin[s] = np.int64(np.ceil(max(low, 0.0)))
-            after[s] = np.int64(np.ceil(min(high, float(lines))))
-        for line in range(begin[s], after[s]):
+        a, b = (ends[s, 1 - across] - first) * share, (ends[s, 3 - across] - first) * share
+        begin = np.int64(np.ceil(min(max(min(a, b), 0.0), float(lines))))
+        after = np.int64(np.ceil(min(max(max(a, b), 0.0), float(lines))))
+        # No branch, which the processor would guess wrong.
+        crossing[count, 0], crossing[count, 1], crossing[count, 2] = s, begin, after
+        count += int(begin < after)
+        for line in range(begin, after):
             counts[line + 1] += 1
     for line in range(lines):
         counts[line + 1] += counts[line]
@@ -138,17 +138,18 @@ def find_crossings(
     places = np.empty(starts[lines])
     owners = np.empty(starts[lines], dtype=np.int64)
     used = starts[:-1].copy()
-    for s in range(ends.shape[0]):
+    for k in range(count):
+        s = crossing[k, 0]
         a, b = ends[s, 1 - across], ends[s, 3 - across]
         slope = (ends[s, 2 + across] - ends[s, across]) / (b - a)
-        for line in range(begin[s], after[s]):
+        for line in range(crossing[k, 1], crossing[k, 2]):
             place = ends[s, across] + (first + line * spacing - a) * slope
-            k = used[line]
+            i = used[line]
             used[line] += 1
-            while k > starts[line] and places[k - 1] > place:
-                places[k], owners[k] = places[k - 1], owners[k - 1]
-                k -= 1
-            places[k], owners[k] = place, s
+            while i > starts[line] and places[i - 1] > place:
+                places[i], owners[i] = places[i - 1], owners[i - 1]
+                i -= 1
+            places[i], owners[i] = place, s
     return starts, places, owners
 
 

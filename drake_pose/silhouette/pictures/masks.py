@@ -48,33 +48,46 @@ _CROSS = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
 
 @dataclass(frozen=True)
 class MaskAgreement:
-    """How a frame's silhouettes and body agree: intersection over union by camera, and E_total.
+    """How a frame's silhouettes and body agree.
 
-    E_total: the area where they differ over the silhouettes' area; NaN without a silhouette.
+    Args:
+        wrong: the area where they differ [pixel].
+        area: the silhouettes' [pixel].
+        ious: intersection over union by camera.
     """
 
-    E_total: float
+    wrong: int
+    area: int
     ious: Mapping[str, float]
+
+    @property
+    def E_total(self) -> float:
+        """The area where they differ over the silhouettes' area; NaN without a silhouette."""
+        return self.wrong / self.area if self.area else float("nan")
 
 
 def intersection_over_union(one: np.ndarray, other: np.ndarray) -> float:
     """Of two masks (H, W) bool; 1 where both are empty."""
-    own, others, both = map(np.count_nonzero, (one, other, one & other))
-    either = int(own + others - both)
-    return int(both) / either if either else 1.0
+    return _overlap(one, other)[2]
+
+
+def _overlap(one: np.ndarray, other: np.ndarray) -> tuple[int, int, float]:
+    """The area where two masks differ, that of the first [pixel], and intersection over union."""
+    own, others, both = (int(np.count_nonzero(area)) for area in (one, other, one & other))
+    either = own + others - both
+    return either - both, own, both / either if either else 1.0
 
 
 def compare_masks(
     masks: Mapping[str, np.ndarray], bodies: Mapping[str, np.ndarray]
 ) -> MaskAgreement:
     """Compares masks (H, W) bool with the body's, both by camera."""
-    wrong, area = 0, 0
-    ious: dict[str, float] = {}
-    for camera, mask in masks.items():
-        wrong += int(np.count_nonzero(mask ^ bodies[camera]))
-        area += int(np.count_nonzero(mask))
-        ious[camera] = intersection_over_union(mask, bodies[camera])
-    return MaskAgreement(wrong / area if area else float("nan"), ious)
+    found = {camera: _overlap(mask, bodies[camera]) for camera, mask in masks.items()}
+    return MaskAgreement(
+        sum(wrong for wrong, _, _ in found.values()),
+        sum(area for _, area, _ in found.values()),
+        {camera: iou for camera, (_, _, iou) in found.items()},
+    )
 
 
 def edge_area(mask: np.ndarray) -> int:

@@ -5,14 +5,18 @@ import math
 import numpy as np
 import pytest
 
+from drake_pose.body.formats.packages import bundled_model
+from drake_pose.body.model import load_model
+from drake_pose.camera.models import circle_of_cameras
 from drake_pose.filtering.contour import ContourObservation
 from drake_pose.filtering.contour_tracker import ContourTracker, TrackingSettings
-from drake_pose.filtering.match_and_track import Followed, MatchAndTrack
+from drake_pose.filtering.match_and_track import Followed, MatchAndTrack, make_tracker
 from drake_pose.filtering.state import Belief
 from drake_pose.search.estimates import View
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from tests.filtering.tracking.test_match_and_track import PERIOD
 from tests.filtering.tracking.test_unknown_scale import KnownPoses
+from tests.jobs.live_scenes import standing
 from tests.search.bodies import forked_body, front_camera
 
 CAMERA = front_camera(200, shift=0.2)
@@ -71,6 +75,26 @@ def test_a_search_is_asked_where_much_of_the_silhouette_is_not_explained(body, s
     assert not (mask[150:] | mask[:, :60].any()).any()
     follower.next(followed, [View(CAMERA, with_other)])
     assert search.calls == asked
+
+
+@pytest.mark.parametrize(("shift", "angle"), [(0.15, 0.3), (0.2, 0.2)])
+def test_a_track_is_not_late_in_its_second_frame(shift, angle):
+    """Nothing tells how fast a body is that was seen once; from then on it moves as it did."""
+    person = load_model(bundled_model("person"), check=False)
+    cameras = list(circle_of_cameras(3, size=(320, 240), face_camera=False).values())
+    tracker = make_tracker(person.pose_tree(), cameras, 1.0 / 30.0, TrackingSettings())
+    observation, renderers = tracker.observation, [LabelRenderer(person, one) for one in cameras]
+    q = standing(person, ahead=-0.3)
+    track = tracker.start(observation.state(q))
+    for k in range(3):
+        masks = [renderer.mask(q) for renderer in renderers]
+        track = tracker.follow(track, masks, first=k == 0)
+        seen = list(zip(cameras, masks, strict=True))
+        J, area = observation.difference(track.state.best.mean, seen)
+        assert J / area < 0.04, k
+        q[person.position_index("position_x")] += shift
+        for name in ("left_upper_arm_z", "right_forearm_x", "left_thigh_x", "right_thigh_x"):
+            q[person.position_index(name)] -= angle
 
 
 def test_colours_alone_are_followed_from_where_the_body_is_said_to_be(body):

@@ -19,8 +19,9 @@ from drake_pose.silhouette.areas.outline import Outline, outline_from_mesh
 
 Array = NDArray[np.float64]
 
-MANY, FEW, VERY_FEW = 2500, 400, 80
-"""Triangles a node: where a pixel counts, for a still, and for a person in real time."""
+MANY, FEW, ROUGH, VERY_FEW = 2500, 400, 160, 80
+"""Triangles a node: where a pixel counts, for a still, for its first rounds, and for a person in
+real time."""
 
 # A surface is simplified another way where it is farther from the original than its size times this
 # over the triangles wanted, as the distance of a smooth surface falls with them: 0.4 to 1.4 on all
@@ -61,6 +62,11 @@ def few_triangles(surfaces: TreeSurfaces, count: int = FEW) -> tuple[Outline, ..
         bending = surfaces.bending[node]
         outlines.append(_simplified(rigid if bending is None else bending.rest, count))
     return tuple(outlines)
+
+
+def rough_outlines(outlines: Sequence[Outline], count: int = ROUGH) -> tuple[Outline, ...]:
+    """Surfaces of few triangles with fewer still, which takes a fraction of what the first took."""
+    return tuple(_simplified(outline, count) for outline in outlines)
 
 
 def hull_of_few(outlines: Sequence[Outline], count: int) -> tuple[Outline, ...]:

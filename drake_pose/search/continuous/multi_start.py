@@ -22,7 +22,7 @@ from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.errors import SettingsError
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
-from drake_pose.fit.surfaces import few_triangles
+from drake_pose.fit.surfaces import few_triangles, rough_outlines
 from drake_pose.search.continuous.families import RobustFamilies
 from drake_pose.search.continuous.views_fit import (
     FittedPose,
@@ -96,6 +96,7 @@ class MultiStartSearch:
         self._body = SampledBody(tree, coarse)
         self.sampled = self._body.sampled
         self._outlines = few_triangles(self.sampled.surfaces)
+        self._rough = rough_outlines(self._outlines)
         self._kinematics = TreeKinematics(tree)
 
     @cached_property
@@ -166,7 +167,7 @@ class MultiStartSearch:
         if root_position is not None:
             body = body.with_root_position(root_position)
             kinematics = TreeKinematics(body.sampled.tree)
-        return body, ViewsFit(kinematics, self._outlines, clean), clean
+        return body, ViewsFit(kinematics, self._outlines, clean, self._rough), clean
 
 
 class _Run:

@@ -32,9 +32,9 @@ from drake_pose.silhouette.areas.outline import Outline
 from drake_pose.workers import map_ordered
 
 _STEPS = StepSettings(longest=0.3, damping=1e-2, even_damping=1e-3)
-# From one point of a silhouette's edge to the next, as a share of its size: of rounds that sample
-# the body's contour so far apart or more, and of finer ones.
-_EDGE_SPACINGS = (0.026, 1.0 / 50.0), (0.0, 1.0 / 80.0)
+# Rounds that sample the body's contour so far apart or more are rough. From one point of a
+# silhouette's edge to the next, as a share of its size, in rough rounds and in others.
+_ROUGH, _EDGE_SPACINGS = 0.026, (1.0 / 50.0, 1.0 / 80.0)
 # What is missing or too much is about as large, as a share of the silhouettes' size.
 _PIECE = 0.2
 
@@ -57,22 +57,27 @@ class ViewsFit:
 
     Args:
         outlines: a surface for each node; few triangles will do, see ``few_triangles``.
+        rough: those of rough rounds, of fewer triangles; None: the same.
     """
 
     def __init__(
-        self, kinematics: TreeKinematics, outlines: tuple[Outline, ...], views: Sequence[View]
+        self,
+        kinematics: TreeKinematics,
+        outlines: tuple[Outline, ...],
+        views: Sequence[View],
+        rough: tuple[Outline, ...] | None = None,
     ) -> None:
         self.kinematics = kinematics
         self.size = math.sqrt(float(np.mean([np.count_nonzero(view.mask) for view in views])))
         # A pixel of contour counts one, whatever its noise: the cost is in pixels.
         even = Noise(deviation=1.0, correlation=0.5 / self.size**3)
-        self._fit = ContourFit(kinematics, outlines, even, _STEPS, pixels=self.size)
         cameras = [view.camera for view in views]
         self._levels = []
-        for least, share in _EDGE_SPACINGS:
+        for surfaces, share in zip((rough or outlines, outlines), _EDGE_SPACINGS, strict=True):
             spacing = max(1.0, share * self.size // 1.0)
             edges = [find_edge_points(view.mask, spacing) for view in views]
-            self._levels.append((least, pack_views(cameras, edges)))
+            fit = ContourFit(kinematics, surfaces, even, _STEPS, pixels=self.size)
+            self._levels.append((fit, pack_views(cameras, edges)))
         self.edge_length = max(1.0, float(self._levels[-1][1].evidence.lengths.sum()))
         self.camera_count = len(views)
         self.evaluations, self._counting = 0, Lock()
@@ -80,22 +85,24 @@ class ViewsFit:
     def cost(self, values: np.ndarray, step: AnnealingStage) -> float:
         """What does not fit at values (m,) [pixel]."""
         self._count(1)
-        sums = self._fit.compare(self._views(step), values, step).sums
+        fit, views = self._level(step)
+        sums = fit.compare(views, values, step).sums
         return float(sums[..., COST].sum()) / self._scale(step) ** 2
 
     def distances(self, values: np.ndarray, step: AnnealingStage) -> Distances:
         """What is left of the contours' distances at values (m,)."""
         self._count(1)
-        views = self._views(step)
-        compared = self._fit.compare(views, values, step)
+        fit, views = self._level(step)
+        compared = fit.compare(views, values, step)
         moves, unit = compared.placement.dense(len(values)), error_unit(self.size)
-        return distances(self._fit.outlines, views.cameras, compared, moves, unit)
+        return distances(fit.outlines, views.cameras, compared, moves, unit)
 
     def piece_costs(self, values: np.ndarray, step: AnnealingStage) -> np.ndarray:
         """What does not fit at values (m,), by pieces of the pictures that err on their own."""
         self._count(1)
         side = max(1.0, _PIECE * self.size)
-        costs = self._fit.piece_costs(self._views(step), values, step, side)
+        fit, views = self._level(step)
+        costs = fit.piece_costs(views, values, step, side)
         return costs / self._scale(step) ** 2
 
     def refine(
@@ -104,13 +111,14 @@ class ViewsFit:
         """Refine values (m,), but for some that are held, by indices."""
         fixed = self.kinematics.upper <= self.kinematics.lower
         fixed[list(held)] = True
-        found = self._fit.fit(self._views(rounds[-1]), values, rounds, None, fixed)
+        fit, views = self._level(rounds[-1])
+        found = fit.fit(views, values, rounds, None, fixed)
         self._count(found.evaluations)
         return FittedPose(found.values, found.cost / self._scale(rounds[-1]) ** 2)
 
-    def _views(self, step: AnnealingStage) -> Views:
-        """The views as finely as a step looks at them."""
-        return next(views for least, views in self._levels if step.spacing >= least)
+    def _level(self, step: AnnealingStage) -> tuple[ContourFit, Views]:
+        """The fit and the views as finely as a step looks at them."""
+        return self._levels[step.spacing < _ROUGH]
 
     def _count(self, evaluations: int) -> None:
         with self._counting:  # Threads fit side by side.

@@ -258,7 +258,7 @@ class KnownBackground:
 
 
 def odds_picture(odds: Floats) -> Picture:
-    """A picture (H, W, 3) whose colours stand for odds (H, W), see ``odds_of_colours``."""
+    """A picture (H, W, 3) whose colours stand for log odds (H, W), see ``odds_of_colours``."""
     share = (np.clip(odds, -_MOST_ODDS, _MOST_ODDS) + _MOST_ODDS) / (2.0 * _MOST_ODDS)
     number = np.rint(share * (COLOURS - 1)).astype(np.uint16)
     channels = (number >> 8, (number >> 4) & 15, number & 15)
@@ -268,7 +268,7 @@ def odds_picture(odds: Floats) -> Picture:
 def odds_of_colours(nodes: int) -> Floats:
     """(nodes, 3, COLOURS) what the colours of an ``odds_picture`` say, as of `compare_lines`."""
     known = np.zeros((nodes, 3, COLOURS), np.float32)
-    known[:, ODDS] = np.linspace(-_MOST_ODDS, _MOST_ODDS, COLOURS)
+    known[:, ODDS] = np.exp(np.linspace(-_MOST_ODDS, _MOST_ODDS, COLOURS))
     return known
 
 

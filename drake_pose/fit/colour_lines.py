@@ -35,7 +35,7 @@ COLOURS = 4096
 """Colours that are told apart: 16 steps of red, green and blue."""
 
 ON, BESIDE, ODDS = range(3)
-"""What is known of a node's colours: their shares on it and beside it, and the log of the odds."""
+"""What is known of a node's colours: their shares on it and beside it, and one over the other."""
 
 OFFSETS = 12
 """Of the edge along a line."""
@@ -135,13 +135,13 @@ def _find_edge(
     # Of a thin part coarse blocks would see little, and too much of what is beyond.
     step = max(1, min(step, int(clearance[0] / _BLOCKS_ACROSS)))
     for k in range(-_BLOCKS, _BLOCKS + 1):
-        odds = 0.0
+        odds = 1.0
         for pixel in range(step):
             r = k * step + pixel - 0.5 * (step - 1)
             colour = _colour(picture, uv[0] + r * normal[0], uv[1] + r * normal[1])
             if colour >= 0:
-                odds += histograms[ODDS, colour]
-        share = 1.0 / (1.0 + math.exp(-min(max(odds, -30.0), 30.0)))
+                odds *= histograms[ODDS, colour]
+        share = odds / (1.0 + odds)
         # How much more likely than not the block is on the body; 0: its colours do not say.
         blocks[k + _BLOCKS] = 4.0 * _TRUST * (share - 0.5)
     inner, outer = clearance[0] / step, clearance[1] / step
@@ -241,7 +241,4 @@ def learn_colours(
                     shares[colour] += share * (counts[node, side, colour] / total - shares[colour])
         for colour in range(COLOURS):
             on_it, beside_it = histograms[node, ON, colour], histograms[node, BESIDE, colour]
-            # Most colours are never seen: a logarithm takes longer than all else here.
-            even = on_it == beside_it
-            odds = 0.0 if even else math.log((on_it + _RARE) / (beside_it + _RARE))
-            histograms[node, ODDS, colour] = odds
+            histograms[node, ODDS, colour] = (on_it + _RARE) / (beside_it + _RARE)

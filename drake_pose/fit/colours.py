@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from drake_pose.camera.models import Camera
 from drake_pose.errors import SettingsError
-from drake_pose.fit.colour_lines import COLOURS, ON, compare_lines, learn_colours
+from drake_pose.fit.colour_lines import COLOURS, ODDS, ON, compare_lines, learn_colours
 from drake_pose.fit.contour_fit import Comparison, Noise, camera_weights, pack_cameras
 from drake_pose.fit.kernel import COMPARED, SQUARES, WEIGHT
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
@@ -110,7 +110,9 @@ def step_of_lines(number: int) -> int:
 
 def no_colours(cameras: int, nodes: int) -> Histograms:
     """What is known of a body that was never seen: nothing."""
-    return np.zeros((cameras, nodes, 3, COLOURS), dtype=np.float32)
+    known = np.zeros((cameras, nodes, 3, COLOURS), dtype=np.float32)
+    known[:, :, ODDS] = 1.0
+    return known
 
 
 def check_picture(camera: Camera, picture: Picture) -> Picture:

@@ -29,8 +29,8 @@ from drake_pose.fit.camera_sums import (
     add_sums,
     compare_placed,
 )
-from drake_pose.fit.colour_lines import COLOURS, compare_lines, learn_colours
-from drake_pose.fit.colours import NO_REGION, check_picture
+from drake_pose.fit.colour_lines import compare_lines, learn_colours
+from drake_pose.fit.colours import NO_REGION, check_picture, no_colours
 from drake_pose.fit.contour_fit import (
     Comparison,
     ContourFit,
@@ -122,11 +122,8 @@ class ColourViews:
             known = learned.get(camera.name)
             size = float(scales[c])
             surely = known is None or region is not None
-            histograms = (
-                np.zeros((len(placement.X_WN), 3, COLOURS), dtype=np.float32)
-                if known is None
-                else known.copy()
-            )
+            nodes = len(placement.X_WN)
+            histograms = no_colours(1, nodes)[0] if known is None else known.copy()
             learn_colours(
                 placement.packed, placement.X_WN, self._camera(c), self.pictures[c], histograms,
                 max(2.0, _SPACING * size),

@@ -123,5 +123,5 @@ def test_odds_pictures_are_read_as_they_were_written():
     red, green, blue = np.moveaxis(picture.astype(np.intp) >> 4, -1, 0)
     table = odds_of_colours(2)
     assert table.shape == (2, 3, COLOURS)
-    read = table[1, ODDS][(red * 16 + green) * 16 + blue]
+    read = np.log(table[1, ODDS][(red * 16 + green) * 16 + blue])
     np.testing.assert_allclose(read, np.clip(odds, -8.0, 8.0), atol=0.01)

@@ -4,7 +4,7 @@ Every message names the file, link, joint, camera or frame at fault, says what w
 what to do about it.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 
 class DrakePoseError(Exception):
@@ -59,3 +59,9 @@ class UnknownNameError(DrakePoseError):
         self.known = tuple(known)
         listing = ", ".join(self.known) if self.known else "(none)"
         super().__init__(f"{where} has no {kind} '{name}'; it has: {listing}")
+
+
+def listed(names: Sequence[str], most: int = 5) -> str:
+    """Names as a message has them: of many the first, and how many more there are."""
+    more = f" and {len(names) - most} more" if len(names) > most else ""
+    return ", ".join(names[:most]) + more

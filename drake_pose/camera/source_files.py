@@ -28,7 +28,7 @@ from drake_pose.camera.picture_files import (
     read_two_colours,
 )
 from drake_pose.csv_files import read_csv
-from drake_pose.errors import CameraError, SceneError, SettingsError
+from drake_pose.errors import CameraError, SceneError, SettingsError, listed
 from drake_pose.yaml_files import read_yaml
 
 TIME_STAMPS = "timestamps.csv"
@@ -103,7 +103,7 @@ class RecordedSource(FrameSource):
             ("time", stamped, [frame for frame in files if frame not in times]),
         ):
             if frames:
-                self.drop(f"{where}: has no {what} of {_listed(frames)}", len(frames))
+                self.drop(f"{where}: has no {what} of {_frames_listed(frames)}", len(frames))
         timed = [frame for frame in times if frame in files]
         if not timed:
             raise SceneError(f"{stamped}: has no time of any picture in {folder}")
@@ -212,10 +212,9 @@ def _by_number(name: str) -> tuple[str, int]:
     return (name[: number.start()], int(number[1])) if number else (name, -1)
 
 
-def _listed(frames: list[str]) -> str:
+def _frames_listed(frames: list[str]) -> str:
     """A few frames' names."""
-    more = f" and {len(frames) - 5} more" if len(frames) > 5 else ""
-    return f"frame{'s' if len(frames) > 1 else ''} {', '.join(frames[:5])}{more}"
+    return f"frame{'s' if len(frames) > 1 else ''} {listed(frames)}"
 
 
 SOURCES = "sources.yaml"

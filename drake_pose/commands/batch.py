@@ -12,7 +12,7 @@ from rich.table import Table
 
 from drake_pose.commands.options import Json, Out, Resume, Scheduler, within, workers_of
 from drake_pose.commands.terminal import output_console, print_json, progress_bar, say, warn
-from drake_pose.errors import SceneError
+from drake_pose.errors import SceneError, listed
 from drake_pose.files.options import percent
 
 if TYPE_CHECKING:
@@ -114,8 +114,7 @@ def _audits_table(audits: Mapping[str, SceneState]) -> Table:
     table = Table("scene", "state", "agree", "contradicts the rest", "seconds", title="Audits")
     for name, state in audits.items():
         named = [f"{one['what']} {one['name']}" for one in state.totals.get("contradictions", ())]
-        more = [f"and {len(named) - _NAMED} more"] if len(named) > _NAMED else []
-        totals, text = state.totals, escape(", ".join([*named[:_NAMED], *more]))
+        totals, text = state.totals, escape(listed(named, _NAMED))
         agree = f"{totals['agreeing_count']} of {state.frame_count}" if totals else ""
         table.add_row(escape(name), state.state, agree, text, f"{state.seconds:.1f}")
     return table

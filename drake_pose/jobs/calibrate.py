@@ -22,7 +22,7 @@ from drake_pose.camera.board import (
 from drake_pose.camera.calibrate import Calibration, CalibrationSettings, calibrate
 from drake_pose.camera.camera_files import save_cameras
 from drake_pose.camera.rig import Lens, save_lenses
-from drake_pose.errors import CameraError
+from drake_pose.errors import CameraError, listed
 from drake_pose.files.folder import write_file
 
 
@@ -41,8 +41,7 @@ class CalibrationReport:
         for camera in self.seen.detections:
             blank = [f"'{frame}'" for name, frame in self.seen.not_found if name == camera]
             if blank:
-                more = f" and {len(blank) - 5} more" if len(blank) > 5 else ""
-                lines.append(f"camera '{camera}': no board found in {', '.join(blank[:5])}{more}")
+                lines.append(f"camera '{camera}': no board found in {listed(blank)}")
         for (camera, frame), reason in self.calibration.left_out.items():
             lines.append(f"camera '{camera}', picture '{frame}' left out: {reason}")
         return lines

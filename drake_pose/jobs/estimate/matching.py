@@ -13,7 +13,7 @@ from pydrake.systems.analysis import Simulator
 
 from drake_pose.body.parsed_model import nearest_turn
 from drake_pose.camera.models import Camera, ParallelCamera
-from drake_pose.errors import SettingsError
+from drake_pose.errors import SettingsError, listed
 from drake_pose.files.options import percent
 from drake_pose.files.records import (
     FrameRecord,
@@ -47,8 +47,8 @@ _LEFT = 0.5
 _FRAMES, _PAIRS = 2, 3
 # A frame fits worse than another one that leaves so many times as much, and so much more.
 _WORSE, _MORE = 1.2, 0.01
-# Joints are elsewhere that are off by more [rad or m]; so many are named.
-_ELSEWHERE, _NAMED = 0.2, 5
+# Joints are elsewhere that are off by more [rad or m].
+_ELSEWHERE = 0.2
 
 Match = Callable[[str, Sequence[View]], float]
 """E_total of the best pose of a frame in views."""
@@ -253,8 +253,7 @@ def check_track(
     model, q = inputs.model, rows[worst].q
     off = nearest_turn(found.q, q, model.periodic) - q
     joints = [model.position_names[k] for k in np.flatnonzero(np.abs(off) > _ELSEWHERE)]
-    more = f" and {len(joints) - _NAMED} more" if len(joints) > _NAMED else ""
-    where = f", with {', '.join(joints[:_NAMED])}{more} elsewhere" if joints else ""
+    where = f", with {listed(joints)} elsewhere" if joints else ""
     return [
         f"frame '{worst}': tracked it leaves {percent(tracked[worst])} of the silhouettes' area, "
         f"matched by itself {percent(found.E_total)}{where}: its pose is wrong, and so may be the "

@@ -24,7 +24,7 @@ from drake_pose.camera.models import Camera, PinholeCamera
 from drake_pose.fit.contour_fit import ContourFit, Prior, pack_views
 from drake_pose.fit.evidence import NO_EDGE, find_edge_points
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
-from drake_pose.fit.surfaces import FEW, VERY_FEW, few_triangles
+from drake_pose.fit.surfaces import VERY_FEW, few_triangles
 from drake_pose.silhouette.areas.bending import TreeSurfaces
 from drake_pose.silhouette.areas.outline import pack
 from drake_pose.silhouette.areas.scoring import (
@@ -42,6 +42,8 @@ Mask = NDArray[np.bool_]
 Picture = NDArray[np.uint8]
 Likelihood = NDArray[np.float32]
 
+# Triangles of a part that the contour fit sees.
+_TRIANGLES = 600
 # Poses that are drawn to tell how likely the body is at each pixel.
 _SAMPLES = 32
 # The cross-entropy search: rounds, poses in each, and how many of them shape the next.
@@ -164,8 +166,9 @@ class PoseAndMask:
         self._settings = settings or PoseAndMaskSettings()
         self._seed = seed
         self._surfaces = TreeSurfaces(kinematics.tree)
+        fitted = few_triangles(self._surfaces, _TRIANGLES)
         self._few = few_triangles(self._surfaces, VERY_FEW)
-        self._fit = ContourFit(kinematics, few_triangles(self._surfaces, FEW), pixels=100.0)
+        self._fit = ContourFit(kinematics, fitted, pixels=100.0)
         ranges = kinematics.upper - kinematics.lower
         lengths = np.where(
             np.isfinite(ranges), self._settings.length_share * ranges, self._settings.length

@@ -133,12 +133,7 @@ class Backgrounds:
     @cached_property
     def sums(self) -> PixelSums:
         """What a pose explains is summed from."""
-        frames, height, width = self.pictures.shape[:3]
-        total = np.zeros((height, width, _BACKGROUNDS), np.float32)
-        more = np.empty((height, width, frames, _BACKGROUNDS), np.float32)
-        for f, picture in enumerate(self.pictures):
-            shown, more[:, :, f] = self._told(picture)
-            total += shown
+        total, more = self._told
         return PixelSums(total, more, _largest(total), self._edges())
 
     @cached_property
@@ -162,21 +157,31 @@ class Backgrounds:
 
         covered: (f, H, W) where the body is known to be, about.
         """
-        told = np.zeros((*covered.shape[1:], _BACKGROUNDS), np.float32)
-        for picture, own in zip(self.pictures, covered, strict=True):
-            shown, more = self._told(picture)
-            told += shown + np.where(own[..., None], more, 0.0)
+        total, more = self._told
+        told = total.copy()
+        for f, own in enumerate(covered):
+            np.add(told, more[:, :, f], out=told, where=own[..., None])
         best = told.argmax(axis=-1)[None, ..., None]
         colours = np.take_along_axis(self.colours, best, axis=0)[0]
         off = _largest(np.abs(self.pictures - colours)) / self.deviations
         return np.asarray((off < _SAME) & ~_grown(covered, _NEAR))
 
-    def _told(self, picture: Floats) -> tuple[Floats, Floats]:
-        """(H, W, 3) log-likelihoods where each background shows, and what the body adds."""
-        likeness = [_likeness(picture, one, self.deviations) for one in self.colours]
-        stacked = np.stack(likeness, axis=-1)
-        shown = np.log(_SHOWN * stacked + (1.0 - _SHOWN))
-        return shown, np.log(_LIKE_BODY * stacked + (1.0 - _LIKE_BODY)) - shown
+    @cached_property
+    def _told(self) -> tuple[Floats, Floats]:
+        """Log-likelihoods where each background shows in all frames (H, W, 3), as in ``PixelSums``.
+
+        And what the body adds in each (H, W, f, 3).
+        """
+        frames, height, width = self.pictures.shape[:3]
+        total = np.zeros((height, width, _BACKGROUNDS), np.float32)
+        more = np.empty((height, width, frames, _BACKGROUNDS), np.float32)
+        for f, picture in enumerate(self.pictures):
+            likeness = [_likeness(picture, one, self.deviations) for one in self.colours]
+            stacked = np.stack(likeness, axis=-1)
+            shown = np.log(_SHOWN * stacked + (1.0 - _SHOWN))
+            more[:, :, f] = np.log(_LIKE_BODY * stacked + (1.0 - _LIKE_BODY)) - shown
+            total += shown
+        return total, more
 
     def _edges(self) -> Floats:
         """(2, f, H, W) how strong edges across u and v are in each frame, beyond chance."""
@@ -233,7 +238,7 @@ class KnownBackground:
                 ).astype(np.bool_)
                 & ~near[f]
             )
-            total += np.where(shows[..., None], even, 0.0)
+            cv2.accumulate(even, total, mask=shows.view(np.uint8))
             count += shows
             numbers = _numbers(even)
             on += np.bincount(numbers[inside[f]], minlength=COLOURS)

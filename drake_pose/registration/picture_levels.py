@@ -115,7 +115,7 @@ class PictureLevel:
 
         X_WN: (f, nodes, 4, 4) where the body is, if it is elsewhere than it was said to be.
         """
-        X_CN = np.ascontiguousarray((X_CW @ (self._X_WN if X_WN is None else X_WN))[:, :, :3])
+        X_CN = X_CW[:3] @ (self._X_WN if X_WN is None else X_WN)
         sums = self.backgrounds.sums
         return explain(self._packed, X_CN, self._still, self._parameters, sums, 1.0, 0)[0]
 
@@ -148,7 +148,7 @@ class PictureLevel:
 
     def pieces(self, X_CW: Array) -> Array:
         """(k, k) what a pose (4, 4) explains, by squares of the picture."""
-        X_CN = np.ascontiguousarray((X_CW @ self._X_WN)[:, :, :3])
+        X_CN = X_CW[:3] @ self._X_WN
         side = max(self.camera.width, self.camera.height) / _SQUARES
         sums = self.backgrounds.sums
         return explain(self._packed, X_CN, self._still, self._parameters, sums, side, _SQUARES)[1]

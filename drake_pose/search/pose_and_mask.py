@@ -27,7 +27,12 @@ from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.fit.surfaces import VERY_FEW, few_triangles
 from drake_pose.silhouette.areas.bending import TreeSurfaces
 from drake_pose.silhouette.areas.outline import pack
-from drake_pose.silhouette.areas.scoring import draw_mask, draw_packed
+from drake_pose.silhouette.areas.scoring import (
+    draw_mask,
+    draw_packed,
+    prefix_sums,
+    score_bodies,
+)
 from drake_pose.silhouette.pictures.masks import intersection_over_union
 from drake_pose.silhouette.segmentation.background import cut, tell_from_background
 from drake_pose.workers import map_ordered
@@ -43,6 +48,8 @@ _TRIANGLES = 600
 _SAMPLES = 32
 # The cross-entropy search: rounds, poses in each, and how many of them shape the next.
 _SEARCH_ROUNDS, _SEARCHED, _KEPT = 5, 60, 8
+# Log-odds are summed in so many parts of one.
+_PARTS = 64.0
 # The spread of these is widened a little, and stays above a share of the first one.
 _WIDENED, _LEAST_SPREAD = 1.1, 0.15
 # The first rounds search; later ones fit alone.
@@ -59,7 +66,7 @@ _SURFACE, _BAND = 0.02, 0.01
 _SURE, _PROBABILITIES = 4.0, (0.01, 0.99)
 # GrabCut's rounds, and how large bodies are as it learns colours [root of the area, pixel]; the
 # side of the median filter that takes specks away [pixel].
-_CUTS, _CUT_SIDE, _SPECKS = 2, 70.0, 5
+_CUTS, _CUT_SIDE, _SPECKS = 2, 30.0, 5
 # The contour fit's first and last scale, as shares of the silhouette's size.
 _WIDE, _NARROW, _SPACING = 0.25, 0.03, 0.05
 # The first rounds look at pictures in which silhouettes are so large [root of the area, pixel].
@@ -159,8 +166,8 @@ class PoseAndMask:
         self._settings = settings or PoseAndMaskSettings()
         self._seed = seed
         self._surfaces = TreeSurfaces(kinematics.tree)
-        self._few = pack(few_triangles(self._surfaces, VERY_FEW))
         fitted = few_triangles(self._surfaces, _TRIANGLES)
+        self._few = few_triangles(self._surfaces, VERY_FEW)
         self._fit = ContourFit(kinematics, fitted, pixels=100.0)
         ranges = kinematics.upper - kinematics.lower
         lengths = np.where(
@@ -189,8 +196,10 @@ class PoseAndMask:
         rngs = np.random.default_rng(self._seed).spawn(len(values))
         frames = [_Frame(*one) for one in zip(values, starts, rngs, strict=True)]
         for k in range(self._settings.rounds):
-            if k >= min(_COARSE_ROUNDS, self._settings.rounds - 1):
+            if k == min(_COARSE_ROUNDS, self._settings.rounds - 1):
                 level = whole
+                for one in frames:
+                    one.drawn = [self._draw(one.values, camera) for camera in self._cameras]
             self._round(level, frames, searching=k < _SEARCHING)
             on_round(k + 1)
             for one in frames:
@@ -226,7 +235,7 @@ class PoseAndMask:
             frames[k].chances = self._chances(level, frames[k])
 
         map_ordered(likely, moving)
-        ratios = self._ratios(level, [one.chances for one in frames])
+        ratios = self._ratios(level, frames)
 
         def better(k: int) -> None:
             self._better(level, frames[k], level.pictures[k], ratios[k], searching)
@@ -250,11 +259,12 @@ class PoseAndMask:
             None if picture is None else cut_by_odds(picture, chance, told)
             for picture, chance, told in zip(pictures, frame.chances, ratios, strict=True)
         ]
-        before = [self._draw(frame.values, camera) for camera in level.cameras]
-        frame.values = self._refine(level, frame)
+        before, frame.values = frame.drawn, self._refine(level, frame)
         frame.drawn = [self._draw(frame.values, camera) for camera in level.cameras]
-        pairs = zip(frame.drawn, before, strict=True)
-        frame.stays = all(intersection_over_union(*pair) > _SETTLED for pair in pairs)
+        frame.stays = bool(before) and all(
+            intersection_over_union(*pair) > _SETTLED
+            for pair in zip(frame.drawn, before, strict=True)
+        )
         frame.agreements = tuple(
             math.nan if mask is None else intersection_over_union(silhouette, mask)
             for silhouette, mask in zip(frame.drawn, frame.cuts, strict=True)
@@ -265,7 +275,7 @@ class PoseAndMask:
         """The body's silhouette (H, W)."""
         X_CN = camera.X_CW @ self._kinematics.poses(values)
         if few:
-            return draw_packed(self._few, X_CN, camera)
+            return draw_packed(pack(self._few), X_CN, camera)
         return draw_mask(self._surfaces.at(self._kinematics.split(values)), X_CN, camera)
 
     def _sample(self, rng: np.random.Generator, values: Array, spread: Array, count: int) -> Array:
@@ -286,24 +296,33 @@ class PoseAndMask:
             found.append(np.clip(chance, *_PROBABILITIES).astype(np.float32))
         return found
 
-    def _ratios(
-        self, level: _Level, chances: Sequence[Sequence[Likelihood]]
-    ) -> list[list[Likelihood]]:
-        """What the background says, of each frame and camera; nothing where there is no picture."""
-        found = [[np.zeros_like(one) for one in own] for own in chances]
+    def _ratios(self, level: _Level, frames: Sequence[_Frame]) -> list[list[Likelihood]]:
+        """What the background says, of each frame and camera.
+
+        Nothing where there is no picture, or of settled frames.
+        """
+        found = [[np.zeros_like(chance) for chance in one.chances] for one in frames]
         for c in range(len(level.cameras)):
             seen = [(f, own[c]) for f, own in enumerate(level.pictures)]
             there = [(f, picture) for f, picture in seen if picture is not None]
-            told = tell_from_background(
-                [picture for _, picture in there], [chances[f][c] for f, _ in there]
-            )
-            for (f, _), ratio in zip(there, told, strict=True):
-                found[f][c] = ratio
+            moving = [k for k, (f, _) in enumerate(there) if not frames[f].settled]
+            if moving:
+                told = tell_from_background(
+                    [picture for _, picture in there],
+                    [frames[f].chances[c] for f, _ in there],
+                    moving,
+                )
+                for k, ratio in zip(moving, told, strict=True):
+                    found[there[k][0]][c] = ratio
         return found
 
     def _search(self, level: _Level, frame: _Frame, ratios: Sequence[Likelihood]) -> Array:
         """The pose near a frame's that covers most of what is not background."""
-        told = [pair for pair in zip(level.cameras, ratios, strict=True) if pair[1].any()]
+        told = [
+            (camera, prefix_sums(np.rint(_PARTS * one).astype(np.int32))[None])
+            for camera, one in zip(level.cameras, ratios, strict=True)
+            if one.any()
+        ]
         if not told:
             return frame.values
         first = frame.share * self._spread
@@ -311,12 +330,10 @@ class PoseAndMask:
         for _ in range(_SEARCH_ROUNDS):
             poses = self._sample(frame.rng, middle, spread, _SEARCHED)
             poses[0] = middle
-            scores = np.array(
-                [
-                    sum(float(ratio[self._draw(pose, c, few=True)].sum()) for c, ratio in told)
-                    for pose in poses
-                ]
-            )
+            X_WN = np.array([self._kinematics.poses(pose) for pose in poses])
+            scores = np.zeros(len(poses))
+            for camera, sums in told:
+                scores += score_bodies(self._few, camera.X_CW @ X_WN, camera, sums)[:, 1]
             order = np.argsort(-scores, kind="stable")[:_KEPT]
             if scores[order[0]] > most:
                 best, most = poses[order[0]], scores[order[0]]

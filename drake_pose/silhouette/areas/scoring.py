@@ -18,10 +18,10 @@ from drake_pose.silhouette.areas.outline import Outline, PackedOutlines, own_cop
 from drake_pose.silhouette.areas.span_kernel import paint, score
 
 
-def prefix_sums(mask: np.ndarray) -> np.ndarray:
-    """Returns (H, W + 1) int32: how many pixels of a mask (H, W) lie left of each pixel."""
-    prefix = np.zeros((mask.shape[0], mask.shape[1] + 1), dtype=np.int32)
-    np.cumsum(mask != 0, axis=1, out=prefix[:, 1:])
+def prefix_sums(weights: np.ndarray) -> np.ndarray:
+    """Returns (H, W + 1) int32: the sum of a mask or whole numbers (H, W) left of each pixel."""
+    prefix = np.zeros((weights.shape[0], weights.shape[1] + 1), dtype=np.int32)
+    np.cumsum(weights, axis=1, dtype=np.int32, out=prefix[:, 1:])
     return prefix
 
 

@@ -167,8 +167,10 @@ def _largest_patches(patches: NDArray[Any]) -> Mask:
 _BESIDE = 0.1
 # So many pictures must show a pixel's background.
 _LEAST = 2
-# At most so many pictures make a median.
-_MOST = 40
+# Where the body is less likely than this in all that are wanted, nothing is looked at.
+_NOWHERE = 0.011
+# At most so many pictures make a median, and so many pixels tell the exposure.
+_MOST, _EXPOSED = 40, 20_000
 # The least standard deviation of a colour [grey levels]; where hardly a picture tells it, more.
 _DEVIATION, _UNSURE_DEVIATION = 4.0, 9.0
 # At this many standard deviations the colour is as likely another's as the background's.
@@ -178,7 +180,7 @@ _LOWEST, _HIGHEST = -3.0, 6.0
 
 
 def tell_from_background(
-    pictures: Sequence[Picture], probabilities: Sequence[Array]
+    pictures: Sequence[Picture], probabilities: Sequence[Array], wanted: Sequence[int]
 ) -> list[Array]:
     """How much more likely each pixel's colour is the body's than the background's.
 
@@ -186,48 +188,48 @@ def tell_from_background(
     light; ``probabilities`` (H, W) say how likely the body is at each pixel.
 
     Returns:
-        The log likelihood ratio (H, W) of each picture; 0 where no other shows the background.
+        The log likelihood ratio (H, W) of each picture that is wanted; 0 where no other shows the
+        background, and the lowest where the body is likely in none of them.
     """
-    even = _match_exposure(pictures, probabilities)
+    near = np.max([probabilities[k] for k in wanted], axis=0) >= _NOWHERE
+    gains = _exposures(pictures, np.max(probabilities, axis=0) < 0.5 * _BESIDE)
+    even = [
+        np.minimum(picture[near] / gain, 255.0, dtype=np.float32)
+        for picture, gain in zip(pictures, gains, strict=True)
+    ]
     step = -(-len(even) // _MOST)
-    stack = np.stack(even[::step])
-    hidden = np.stack(probabilities[::step]) >= _BESIDE
+    hidden = np.stack([one[near] for one in probabilities[::step]]) >= _BESIDE
     count = np.count_nonzero(~hidden, axis=0)
+    stack = np.stack(even[::step])
     middle = _masked_median(stack, hidden, count)
     spread = _masked_median(np.abs(stack - middle), hidden, count).mean(axis=-1) * _TO_DEVIATION
     deviation = np.where(count > _LEAST, np.maximum(spread, _DEVIATION), _UNSURE_DEVIATION)
     found = []
-    for picture in even:
-        off = np.sqrt(np.mean((picture - middle) ** 2, axis=-1)) / deviation
-        ratio = np.clip(0.5 * (off**2 - _EVEN**2), _LOWEST, _HIGHEST)
-        found.append(np.where(count >= _LEAST, ratio, 0.0).astype(np.float32))
+    for k in wanted:
+        squares = np.mean((even[k] - middle) ** 2, axis=-1) / deviation**2
+        ratio = np.full(near.shape, _LOWEST if len(pictures) >= _LEAST else 0.0, np.float32)
+        told = np.clip(0.5 * (squares - _EVEN**2), _LOWEST, _HIGHEST)
+        ratio[near] = np.where(count >= _LEAST, told, 0.0)
+        found.append(ratio)
     return found
 
 
-def _match_exposure(pictures: Sequence[Picture], probabilities: Sequence[Array]) -> list[Array]:
-    """Pictures of one exposure: each channel is scaled by what surely is background in all."""
-    sure = np.max(probabilities, axis=0) < 0.5 * _BESIDE
-    if not sure.any():
-        return [picture.astype(np.float32) for picture in pictures]
-    seen = np.stack([picture[sure] for picture in pictures]).astype(np.float32) + 1.0
-    reference = np.median(seen, axis=0)
-    gains = np.median(seen / reference, axis=1)
-    return [
-        np.clip(picture / gain, 0.0, 255.0).astype(np.float32)
-        for picture, gain in zip(pictures, gains, strict=True)
-    ]
+def _exposures(pictures: Sequence[Picture], sure: NDArray[np.bool_]) -> Array:
+    """(n, 3) the channels' exposures, by what surely is background (H, W) in all pictures."""
+    where = np.flatnonzero(sure)
+    if not len(where):
+        return np.ones((len(pictures), 3), np.float32)
+    where = where[:: -(-len(where) // _EXPOSED)]
+    seen = np.stack([picture.reshape(-1, 3)[where] for picture in pictures]).astype(np.float32)
+    return np.asarray(np.median((seen + 1.0) / (np.median(seen, axis=0) + 1.0), axis=1))
 
 
 def _masked_median(stack: Array, hidden: NDArray[np.bool_], count: NDArray[np.intp]) -> Array:
-    """The median (H, W, 3) of a stack (n, H, W, 3) without what is hidden (n, H, W)."""
-    result = np.zeros(stack.shape[1:], dtype=np.float32)
-    last = np.maximum(count - 1, 0)
-    for row in range(stack.shape[1]):
-        values = np.sort(np.where(hidden[:, row, :, None], np.inf, stack[:, row]), axis=0)
-        across = np.arange(values.shape[1])
-        middle = values[last[row] // 2, across] + values[(last[row] + 1) // 2, across]
-        result[row] = np.where(count[row][:, None] > 0, 0.5 * middle, 0.0)
-    return result
+    """The median (p, 3) of a stack (n, p, 3) without what is hidden (n, p); 0 of nothing."""
+    values = np.sort(np.where(hidden[:, :, None], np.float32(np.inf), stack), axis=0)
+    last, across = np.maximum(count - 1, 0), np.arange(len(count))
+    middle = 0.5 * (values[last // 2, across] + values[(last + 1) // 2, across])
+    return np.where(count[:, None] > 0, middle, np.float32(0.0))
 
 
 # GrabCut draws its first clusters at random.

@@ -113,10 +113,16 @@ def test_background_is_told_from_pictures_of_another_exposure():
         masks.append(mask)
         probabilities.append(probability)
     differs = np.abs(255.0 - 2.0 * room).max(axis=2) > 60.0
-    for ratio, mask in zip(tell_from_background(pictures, probabilities), masks, strict=True):
+    every = tell_from_background(pictures, probabilities, range(8))
+    for ratio, mask in zip(every, masks, strict=True):
         assert (ratio[~mask] < 0.0).mean() > 0.97
         assert (ratio[mask & differs] > 0.0).mean() > 0.97
-    alone = tell_from_background(pictures[:1], probabilities[:1])
+    # Of fewer that are wanted the same is told wherever their body is likely.
+    some = tell_from_background(pictures, probabilities, [5, 2])
+    for ratio, k in zip(some, (5, 2), strict=True):
+        near = probabilities[k] > 0.02
+        np.testing.assert_array_equal(ratio[near], every[k][near])
+    alone = tell_from_background(pictures[:1], probabilities[:1], [0])
     assert not alone[0].any()
 
 

@@ -254,7 +254,7 @@ class BodyState:
     def draw(self, x: Array, camera: Camera) -> Mask:
         """(H, W) what a camera would see of the body at a state (n,)."""
         X_WN = self._body.place(self.parameters(x)).X_WN
-        return draw_packed(self._whole.at(self.node_values(x)), camera.X_CW @ X_WN, camera)
+        return draw_packed(self._whole.at(self._split(x)[0]), camera.X_CW @ X_WN, camera)
 
     def parameters(self, x: Array) -> Array:
         """The tree's values, the root's shift and the logarithm of growth (m + 4,) of a state."""

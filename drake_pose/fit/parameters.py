@@ -57,7 +57,11 @@ class Placement(NamedTuple):
         """(nodes, size, 12) the affine motions that all parameters give to each node."""
         motions = np.zeros((len(self.X_WN), size, 12))
         nodes = np.repeat(np.arange(len(self.X_WN)), np.diff(self.starts))
-        np.add.at(motions, (nodes, self.parameters), self.motions[self.owners])
+        # Adding in place is slow, and only what is led by another parameter's joint needs it.
+        led = self.owners != self.parameters
+        own = nodes[~led], self.parameters[~led]
+        motions[own] = self.motions[self.owners[~led]]
+        np.add.at(motions, (nodes[led], self.parameters[led]), self.motions[self.owners[led]])
         return motions
 
 
@@ -140,7 +144,7 @@ class BodyParameters:
         """The surfaces at the tree's values (m,)."""
         if self._bending is None:
             return self._packed
-        return self._bending.at(self.kinematics.split(values))
+        return self._bending.at(values)
 
 
 class CameraParameters:

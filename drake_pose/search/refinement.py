@@ -116,7 +116,7 @@ class RefinementBody:
         """
         rooted = rooted or bool(parameters[-_EXTRA:].any())
         values = parameters if rooted else parameters[:-_EXTRA]
-        packed = self._packed.bend_to(self.node_values(parameters) if bent else None)
+        packed = self._packed.bend_to(parameters[:-_EXTRA] if bent else None)
         return self._parameters.place(values)._replace(packed=packed)
 
     def poses(self, parameters: np.ndarray) -> np.ndarray:

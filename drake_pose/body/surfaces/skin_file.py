@@ -18,6 +18,8 @@ from drake_pose.yaml_files import read_yaml
 
 _FIELDS = ("parent", "child", "mesh", "axis", "begin", "end", "colour")
 _COLOUR = (0.8, 0.8, 0.8)
+# Weights that differ less do so by the rounding of the vertices alone.
+_DIGITS = 6
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,8 +39,8 @@ class SkinBand:
     colour: tuple[float, float, float] = _COLOUR
 
     def __post_init__(self) -> None:
-        """Make a private read-only copy of the weights."""
-        weights = np.array(self.weights, dtype=np.float64)
+        """Make a private read-only copy of the weights, as many different ones as differ."""
+        weights = np.asarray(self.weights, dtype=np.float64).round(_DIGITS)
         weights.setflags(write=False)
         object.__setattr__(self, "weights", weights)
 

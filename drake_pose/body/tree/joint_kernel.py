@@ -22,19 +22,43 @@ class PackedSteps(NamedTuple):
     coefficients: np.ndarray
 
 
-class PackedBand(NamedTuple):
-    """A band of skin in the arrays that the kernel walks.
+class PackedBands(NamedTuple):
+    """Bands of skin in the arrays that the kernels walk, one band after another.
 
-    steps: the joints from the node's parent to the node; levels: (l,) the different weights; which:
-    (v,) int64 the level of each vertex; points: (v, 3) the band at rest, in the node's frame or,
-    where turned over, in the parent's; turned: (1,) bool.
+    starts: (b + 1, 3) int64 the first step, level and vertex of each; steps: the joints from the
+    node's parent to the node; levels: (l,) the different weights; which: (v,) int64 the level of
+    each vertex, counted in its band; points: (v, 3) the band at rest, in the node's frame or, where
+    turned over, in the parent's; turned: (b,) bool.
     """
 
+    starts: np.ndarray
     steps: PackedSteps
     levels: np.ndarray
     which: np.ndarray
     points: np.ndarray
     turned: np.ndarray
+
+
+def join_bands(bands: Sequence[PackedBands]) -> PackedBands:
+    """All bands together."""
+    steps = [band.steps for band in bands]
+    rows = np.cumsum([0, *(len(one.coefficients) for one in steps)])
+    counts = [np.diff(band.starts, axis=0) for band in bands]
+    return PackedBands(
+        starts=np.cumsum(np.vstack([np.zeros((1, 3), dtype=np.int64), *counts]), axis=0),
+        steps=PackedSteps(
+            sizes=np.concatenate([one.sizes for one in steps]),
+            inverted=np.concatenate([one.inverted for one in steps]),
+            starts=np.concatenate(
+                [one.starts + row for one, row in zip(steps, rows, strict=False)]
+            ),
+            coefficients=np.vstack([one.coefficients for one in steps]),
+        ),
+        levels=np.concatenate([band.levels for band in bands]),
+        which=np.concatenate([band.which for band in bands]),
+        points=np.vstack([band.points for band in bands]),
+        turned=np.concatenate([band.turned for band in bands]),
+    )
 
 
 def pack_steps(steps: Sequence[ChainStep]) -> PackedSteps:
@@ -100,40 +124,61 @@ def find_joint(
 
 
 @compiled
-def place_band(band: PackedBand, values: np.ndarray, placed: np.ndarray) -> None:
-    """Writes the vertices (n, v, 3) in the node's frame at values (n, k)."""
-    levels, steps = band.levels, band.steps
+def place_bands(
+    bands: PackedBands, ranges: np.ndarray, values: np.ndarray, bent: np.ndarray, placed: np.ndarray
+) -> np.ndarray:
+    """Places bands, each in its node's frame, but those whose values are as before.
+
+    Args:
+        ranges: (b, 2) of all values the first of each band's node, and the one after its last.
+        values: (n, m) [rad or m].
+        bent: (n, m) the values before, or NaN; they are written.
+        placed: (n, v, 3) all bands' vertices, written.
+
+    Returns:
+        (n, b) bool which bands' values have changed.
+    """
     basis, joint, product = np.empty((3, 4)), np.empty((3, 4)), np.empty((3, 4))
+    most, x = 0, np.empty(3)
+    for band in range(ranges.shape[0]):
+        most = max(most, bands.starts[band + 1, 1] - bands.starts[band, 1])
     # The last one is that of the whole way.
-    X_PN = np.zeros((levels.shape[0] + 1, 3, 4))
-    for level in range(levels.shape[0] + 1):
-        X_PN[level, 0, 0] = X_PN[level, 1, 1] = X_PN[level, 2, 2] = 1.0
-    x = np.empty(3)
+    X_PN = np.zeros((most + 1, 3, 4))
+    changed, steps = np.zeros((values.shape[0], ranges.shape[0]), dtype=np.bool_), bands.steps
     for n in range(values.shape[0]):
-        for level in range(levels.shape[0] + 1):
-            share = levels[level] if level < levels.shape[0] else 1.0
-            first = 0
-            for step in range(steps.sizes.shape[0]):
-                if step == 0:
-                    find_joint(steps, step, values[n], share, -1, basis, X_PN[level])
-                else:
+        for band in range(ranges.shape[0]):
+            begin, end = bands.starts[band], bands.starts[band + 1]
+            for k in range(ranges[band, 0], ranges[band, 1]):
+                changed[n, band] |= values[n, k] != bent[n, k]
+                bent[n, k] = values[n, k]
+            if not changed[n, band]:
+                continue
+            count = end[1] - begin[1]
+            for level in range(count + 1):
+                share = bands.levels[begin[1] + level] if level < count else 1.0
+                first = ranges[band, 0]
+                for i in range(3):
+                    for j in range(4):
+                        X_PN[level, i, j] = 1.0 if i == j else 0.0
+                for step in range(begin[0], end[0]):
                     find_joint(steps, step, values[n, first:], share, -1, basis, joint)
                     multiply(X_PN[level], joint, product)
                     for i in range(3):
                         for j in range(4):
                             X_PN[level, i, j] = product[i, j]
-                first += steps.sizes[step]
-        whole = X_PN[levels.shape[0]]
-        for vertex in range(band.points.shape[0]):
-            p, X = band.points[vertex], X_PN[band.which[vertex]]
-            if band.turned[0]:
+                    first += steps.sizes[step]
+            whole = X_PN[count]
+            for vertex in range(begin[2], end[2]):
+                p, X = bands.points[vertex], X_PN[bands.which[vertex]]
+                if bands.turned[band]:
+                    for i in range(3):
+                        x[i] = p[i] - X[i, 3]
+                    for i in range(3):
+                        placed[n, vertex, i] = X[0, i] * x[0] + X[1, i] * x[1] + X[2, i] * x[2]
+                    continue
                 for i in range(3):
-                    x[i] = p[i] - X[i, 3]
+                    x[i] = X[i, 0] * p[0] + X[i, 1] * p[1] + X[i, 2] * p[2] + X[i, 3] - whole[i, 3]
                 for i in range(3):
-                    placed[n, vertex, i] = X[0, i] * x[0] + X[1, i] * x[1] + X[2, i] * x[2]
-                continue
-            for i in range(3):
-                x[i] = X[i, 0] * p[0] + X[i, 1] * p[1] + X[i, 2] * p[2] + X[i, 3] - whole[i, 3]
-            for i in range(3):
-                total = whole[0, i] * x[0] + whole[1, i] * x[1] + whole[2, i] * x[2]
-                placed[n, vertex, i] = total
+                    total = whole[0, i] * x[0] + whole[1, i] * x[1] + whole[2, i] * x[2]
+                    placed[n, vertex, i] = total
+    return changed

@@ -29,7 +29,7 @@ from drake_pose.body.tree.link_graph import (
 from drake_pose.errors import ModelError, SettingsError
 
 if TYPE_CHECKING:
-    from drake_pose.body.tree.joint_kernel import PackedBand
+    from drake_pose.body.tree.joint_kernel import PackedBands
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,27 +58,30 @@ class NodeSkin:
 
     def vertices(self, values: Array) -> Array:
         """The vertices (n, v, 3) [m] in the node's frame at its values (n, k) [rad or m]."""
-        from drake_pose.body.tree.joint_kernel import place_band  # Slow to import: it needs numba.
+        from drake_pose.body.tree.joint_kernel import place_bands  # Slow to import: it needs numba.
 
         count = sum(step.joint_map.position_count for step in self.steps)
         values = np.ascontiguousarray(values, dtype=np.float64)
         if values.ndim != 2 or values.shape[1] != count:
             raise SettingsError(f"values of shape (n, {count}) expected, got {values.shape}")
         placed = np.empty((len(values), len(self.weights), 3))
-        place_band(self.packed, values, placed)
+        place_bands(
+            self.packed, np.array([[0, count]]), values, np.full(values.shape, np.nan), placed
+        )
         return placed
 
     @cached_property
-    def packed(self) -> "PackedBand":
+    def packed(self) -> "PackedBands":
         """The band in the kernel's arrays."""
-        from drake_pose.body.tree.joint_kernel import PackedBand, pack_steps
+        from drake_pose.body.tree.joint_kernel import PackedBands, pack_steps
 
         points = self.mesh.vertices
         if self.turned:
             X_PN = _pose_at_rest(self.steps)
             points = points @ X_PN[:3, :3].T + X_PN[:3, 3]
         levels, which = np.unique(self.weights, return_inverse=True)
-        return PackedBand(
+        return PackedBands(
+            starts=np.array([[0, 0, 0], [len(self.steps), len(levels), len(points)]]),
             steps=pack_steps(self.steps),
             levels=levels,
             which=which.reshape(-1).astype(np.int64),

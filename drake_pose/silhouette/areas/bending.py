@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from drake_pose.body.tree.joint_kernel import place_band
+from drake_pose.body.tree.joint_kernel import join_bands, place_bands
 from drake_pose.silhouette.areas.outline import (
     Outline,
     PackedOutlines,
@@ -68,11 +68,13 @@ class BendingOutline:
 class TreeSurfaces:
     """The surfaces of a pose tree's nodes at any values, each in its node's frame.
 
-    ``bending`` and ``skins``: rigid part and band, and the band's motion; None without a band.
+    ``bending`` and ``skins``: rigid part and band, and the band's motion; None without a band;
+    ``value_counts``: how many values each node has.
     """
 
     def __init__(self, tree: PoseTree) -> None:
         self._nodes = tree.nodes
+        self.value_counts = [len(node.value_names) for node in tree.nodes]
         self.skins = [node.skin for node in tree.nodes]
         self.rigid = [outline_from_mesh(node.mesh) for node in tree.nodes]
         self.bending = [
@@ -99,6 +101,11 @@ class TreeSurfaces:
         """A node's surface: bending where the node has a band."""
         return self.bending[node] or self.rigid[node]
 
+    def at_rest(self, node: int) -> Outline:
+        """A node's surface with its skin at rest."""
+        bending = self.bending[node]
+        return self.rigid[node] if bending is None else bending.rest
+
     def node_at(self, node: int, values: np.ndarray) -> Outline:
         """A node's whole surface in its frame at its values (k,) [rad or m]."""
         bending, skin = self.bending[node], self._nodes[node].skin
@@ -115,33 +122,33 @@ class PackedSurfaces:
     """A tree's surfaces as kernels take them; rigid parts may have fewer triangles than its own."""
 
     def __init__(self, surfaces: TreeSurfaces) -> None:
-        outlines = [surfaces.whole(node) for node in range(len(surfaces.rigid))]
-        self._rest = pack(tuple(o.rest if isinstance(o, BendingOutline) else o for o in outlines))
+        self._rest = pack(tuple(surfaces.at_rest(node) for node in range(len(surfaces.rigid))))
         self._own = own_copy(self._rest)
-        self._bands = []
+        # Of each node's band its place, as in ``bend``, and which of all values are the node's.
+        ends = np.cumsum([0, *surfaces.value_counts])
+        skins, parts, ranges, vertices = [], [], [], 0
         for node, bending in enumerate(surfaces.bending):
-            skin = surfaces.skins[node]
+            skin, rigid = surfaces.skins[node], surfaces.rigid[node]
             if bending is not None and skin is not None:
-                rigid = bending.rigid
-                part = np.array([node, len(rigid.vertices), len(rigid.triangles), 0], np.int64)
-                placed = np.empty((1, len(skin.weights), 3))
-                self._bands.append((node, part, skin.packed, placed))
-        self._bent = [b""] * len(outlines)
+                skins.append(skin.packed)
+                parts.append((node, len(rigid.vertices), len(rigid.triangles), vertices))
+                ranges.append(ends[node : node + 2])
+                vertices += len(skin.weights)
+        self._bands = join_bands(skins) if skins else None
+        self._parts, self._ranges = np.array(parts), np.array(ranges)
+        self._bent, self._placed = np.full((1, ends[-1]), np.nan), np.empty((1, vertices, 3))
 
-    def at(self, values: Sequence[np.ndarray]) -> PackedOutlines:
-        """All nodes' surfaces at each node's values (k_i,) [rad or m]."""
-        return own_copy(self.bend_to(values)) if self._bands else self._rest
+    def at(self, values: np.ndarray) -> PackedOutlines:
+        """All nodes' surfaces at all values (m,) [rad or m]."""
+        return self._rest if self._bands is None else own_copy(self.bend_to(values))
 
-    def bend_to(self, values: Sequence[np.ndarray] | None) -> PackedOutlines:
+    def bend_to(self, values: np.ndarray | None) -> PackedOutlines:
         """As at, in arrays that the next call changes; None: as they are."""
-        if values is None:
-            return self._own
-        for node, part, band, placed in self._bands:
-            own = np.ascontiguousarray(values[node], dtype=np.float64)
-            # Bands whose values are as before stay.
-            if self._bent[node] != own.tobytes():
-                self._bent[node] = own.tobytes()
-                self._own.balls[node] = self._rest.balls[node]
-                place_band(band, own[None], placed)
-                bend(self._own, part, placed[0])
+        if values is not None and self._bands is not None:
+            values = np.ascontiguousarray(values, dtype=np.float64)[None]
+            changed = place_bands(self._bands, self._ranges, values, self._bent, self._placed)[0]
+            if changed.any():
+                parts = self._parts[changed]
+                self._own.balls[parts[:, 0]] = self._rest.balls[parts[:, 0]]
+                bend(self._own, parts, self._placed[0])
         return self._own

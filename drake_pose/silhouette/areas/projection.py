@@ -115,32 +115,33 @@ def clip_triangle(
 
 
 @compiled
-def bend(own: PackedOutlines, part: np.ndarray, band: np.ndarray) -> None:
-    """Puts the vertices of one surface's band at other places; the surface's ball only grows.
+def bend(own: PackedOutlines, parts: np.ndarray, band: np.ndarray) -> None:
+    """Puts the vertices of surfaces' bands at other places; the surfaces' balls only grow.
 
     Args:
-        part: (4,) int64 the surface, its first vertex of the band and its first triangle of the
+        parts: (k, 4) int64 each surface, its first vertex of the band and its first triangle of the
             band, both counted from the surface's own first; the band's first row in ``band``.
         band: (v, 3) places of the vertices of all bands [m].
     """
-    node, row = part[0], part[3]
-    begin, first = own.starts[node, 0], own.starts[node, 1]
-    points, planes, ball = own.points, own.planes, own.balls[node]
-    farthest = 0.0
-    for i in range(begin + part[1], own.starts[node + 1, 0]):
-        x, y, z = band[row, 0], band[row, 1], band[row, 2]
-        row += 1
-        points[0, i], points[1, i], points[2, i] = x, y, z
-        away = (x - ball[0]) ** 2 + (y - ball[1]) ** 2 + (z - ball[2]) ** 2
-        farthest = max(farthest, away)
-    ball[3] = max(ball[3], math.sqrt(farthest))
-    for t in range(first + part[2], own.starts[node + 1, 1]):
-        a = begin + own.triangles[t, 0]
-        b = begin + own.triangles[t, 1]
-        c = begin + own.triangles[t, 2]
-        x, y, z = points[0, a], points[1, a], points[2, a]
-        bx, by, bz = points[0, b] - x, points[1, b] - y, points[2, b] - z
-        cx, cy, cz = points[0, c] - x, points[1, c] - y, points[2, c] - z
-        nx, ny, nz = by * cz - bz * cy, bz * cx - bx * cz, bx * cy - by * cx
-        planes[0, t], planes[1, t], planes[2, t] = nx, ny, nz
-        planes[3, t] = nx * x + ny * y + nz * z
+    for part in parts:
+        node, row = part[0], part[3]
+        begin, first = own.starts[node, 0], own.starts[node, 1]
+        points, planes, ball = own.points, own.planes, own.balls[node]
+        farthest = 0.0
+        for i in range(begin + part[1], own.starts[node + 1, 0]):
+            x, y, z = band[row, 0], band[row, 1], band[row, 2]
+            row += 1
+            points[0, i], points[1, i], points[2, i] = x, y, z
+            away = (x - ball[0]) ** 2 + (y - ball[1]) ** 2 + (z - ball[2]) ** 2
+            farthest = max(farthest, away)
+        ball[3] = max(ball[3], math.sqrt(farthest))
+        for t in range(first + part[2], own.starts[node + 1, 1]):
+            a = begin + own.triangles[t, 0]
+            b = begin + own.triangles[t, 1]
+            c = begin + own.triangles[t, 2]
+            x, y, z = points[0, a], points[1, a], points[2, a]
+            bx, by, bz = points[0, b] - x, points[1, b] - y, points[2, b] - z
+            cx, cy, cz = points[0, c] - x, points[1, c] - y, points[2, c] - z
+            nx, ny, nz = by * cz - bz * cy, bz * cx - bx * cz, bx * cy - by * cx
+            planes[0, t], planes[1, t], planes[2, t] = nx, ny, nz
+            planes[3, t] = nx * x + ny * y + nz * z

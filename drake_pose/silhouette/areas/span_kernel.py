@@ -291,8 +291,8 @@ def score(
     areas = np.zeros((X_CN.shape[0], 1 + prefixes.shape[0]), dtype=np.int64)
     spans = rows.spans
     for n in range(X_CN.shape[0]):
-        for k in range(parts.shape[0]):
-            bend(packed, parts[k], bands[n])
+        if parts.shape[0] > 0:
+            bend(packed, parts, bands[n])
         crossings = fill_rows(packed, 0, X_CN.shape[1], X_CN[n], camera, crossings, rows)
         for row in range(rows.reach[0], rows.reach[1]):
             for k in range(find_spans(row, crossings, rows.counts, rows.changes, spans)):

@@ -130,7 +130,7 @@ def draw_bits(
     # Of contour edges their number, weight, first row crossed and the row after the last, and of
     # those that cross a row the upper and the lower end.
     scratch = (np.empty((4, e), dtype=np.int32), np.empty((e, 4)))
-    bends, part = celled.bands.shape[0] > 0, np.array([1, 0, 0, 0])
+    bends, part = celled.bands.shape[0] > 0, np.array([[1, 0, 0, 0]])
     X_WN, X_CN = np.zeros((4, 4)), np.empty((2, 3, 4))
     X_WN[3, 3] = 1.0
     kept = np.zeros(pairs.shape[0], dtype=np.bool_)

@@ -167,7 +167,9 @@ class MultiStartSearch:
         if root_position is not None:
             body = body.with_root_position(root_position)
             kinematics = TreeKinematics(body.sampled.tree)
-        return body, ViewsFit(kinematics, self._outlines, clean, self._rough), clean
+        # In one view women and men are fitted worse with them.
+        rough = self._rough if len(clean) > 1 else None
+        return body, ViewsFit(kinematics, self._outlines, clean, rough), clean
 
 
 class _Run:

@@ -254,7 +254,9 @@ class BodyState:
     def draw(self, x: Array, camera: Camera) -> Mask:
         """(H, W) what a camera would see of the body at a state (n,)."""
         X_WN = self._body.place(self.parameters(x)).X_WN
-        return draw_packed(self._whole.at(self._split(x)[0]), camera.X_CW @ X_WN, camera)
+        # A band of skin bends by a share of an angle: full turns beyond its limits would show.
+        values = self._kinematics.within_limits(self._split(x)[0])
+        return draw_packed(self._whole.at(values), camera.X_CW @ X_WN, camera)
 
     def parameters(self, x: Array) -> Array:
         """The tree's values, the root's shift and the logarithm of growth (m + 4,) of a state."""

@@ -64,9 +64,9 @@ def few_triangles(surfaces: TreeSurfaces, count: int = FEW) -> tuple[Outline, ..
     return tuple(outlines)
 
 
-def rough_outlines(outlines: Sequence[Outline], count: int = ROUGH) -> tuple[Outline, ...]:
+def rough_outlines(outlines: Sequence[Outline]) -> tuple[Outline, ...]:
     """Surfaces of few triangles with fewer still, which takes a fraction of what the first took."""
-    return tuple(_simplified(outline, count) for outline in outlines)
+    return tuple(_simplified(outline, ROUGH) for outline in outlines)
 
 
 def hull_of_few(outlines: Sequence[Outline], count: int) -> tuple[Outline, ...]:

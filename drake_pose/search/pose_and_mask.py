@@ -26,10 +26,8 @@ from drake_pose.fit.evidence import NO_EDGE, find_edge_points
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.fit.surfaces import VERY_FEW, few_triangles
 from drake_pose.silhouette.areas.bending import TreeSurfaces
-from drake_pose.silhouette.areas.outline import pack
 from drake_pose.silhouette.areas.scoring import (
     draw_mask,
-    draw_packed,
     prefix_sums,
     score_bodies,
 )
@@ -275,7 +273,7 @@ class PoseAndMask:
         """The body's silhouette (H, W)."""
         X_CN = camera.X_CW @ self._kinematics.poses(values)
         if few:
-            return draw_packed(pack(self._few), X_CN, camera)
+            return draw_mask(self._few, X_CN, camera)
         return draw_mask(self._surfaces.at(self._kinematics.split(values)), X_CN, camera)
 
     def _sample(self, rng: np.random.Generator, values: Array, spread: Array, count: int) -> Array:

@@ -39,7 +39,7 @@ class SkinBand:
     colour: tuple[float, float, float] = _COLOUR
 
     def __post_init__(self) -> None:
-        """Make a private read-only copy of the weights, as many different ones as differ."""
+        """Make a private read-only copy of the weights, rounded."""
         weights = np.asarray(self.weights, dtype=np.float64).round(_DIGITS)
         weights.setflags(write=False)
         object.__setattr__(self, "weights", weights)

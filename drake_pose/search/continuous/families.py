@@ -191,11 +191,10 @@ _FINE = AnnealingStage(0.025, 0.0125)
 # Poses are as good as the best whose cost is larger by no more than so many standard deviations of
 # the difference; and at most so many families are told apart.
 _SIGNIFICANCE, _FAMILIES = 1.96, 8
-# A value that the covariance lets go so far is moved step by step, angle [rad] and length [m]; its
-# longest step, by what factor each step is longer, and the first one's share of what the covariance
-# allows.
+# A value that the covariance lets go so far is moved step by step, angle [rad] and length [m]:
+# first as far as that; its longest step, and by what factor each step is longer.
 _MOVED = math.radians(3.0), 0.01
-_LONGEST_STEPS, _GROWTH, _FIRST_STEP = (0.5, 0.1), 1.6, 1.0
+_LONGEST_STEPS, _GROWTH = (0.5, 0.1), 1.6
 # As often shall a value lie below the upper end of its interval, and above the lower one.
 _ONE_SIDED = 0.975
 # How large errors are is told by the motions of each camera.
@@ -336,7 +335,7 @@ class RobustFamilies:
         lower, upper = self._kinematics.lower.copy(), self._kinematics.upper.copy()
         # Beyond half a turn the values come back from the other side.
         lower[index], upper[index] = (ends[index] for ends in self._kinematics.reach(values))
-        step, found, worse = _FIRST_STEP * width, [values], 0.0
+        step, found, worse = width, [values], 0.0
         while lower[index] < found[-1][index] < upper[index] and self._proceed():
             trial = np.clip(found[-1] + min(step, longest) * along, lower, upper)
             looked = self._fit.refine(trial, _FOLLOW, held=(index,)).values

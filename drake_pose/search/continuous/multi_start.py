@@ -43,6 +43,7 @@ from drake_pose.search.starts.coarse_search import (
     CoarseSearch,
 )
 from drake_pose.search.starts.self_motions import counter_turns, flips
+from drake_pose.silhouette.areas.outline import Outline
 from drake_pose.silhouette.areas.scoring import draw_mask
 from drake_pose.workers import map_ordered
 
@@ -96,8 +97,11 @@ class MultiStartSearch:
         self._body = SampledBody(tree, coarse)
         self.sampled = self._body.sampled
         self._outlines = few_triangles(self.sampled.surfaces)
-        self._rough = rough_outlines(self._outlines)
         self._kinematics = TreeKinematics(tree)
+
+    @cached_property
+    def _rough(self) -> tuple[Outline, ...]:
+        return rough_outlines(self._outlines)
 
     @cached_property
     def _beam(self) -> BeamSearch:

@@ -159,12 +159,12 @@ class CoarseSearch:
     def _cover(self, node: int, X_WN: np.ndarray, masks: list[np.ndarray]) -> list[np.ndarray]:
         """What one hypothesis covers together with a node that has its place."""
         still = self._balls[node]._replace(p_PB=_by_ball(self._p_NB[node][None]))
-        return [
-            score_samples(view, (view.X_CW @ X_WN[node])[None], still, mask, 1.0, np.zeros((1, 1)))[
-                0
-            ]
-            for view, mask in zip(self._views, masks, strict=True)
-        ]
+        covered = []
+        for view, mask in zip(self._views, masks, strict=True):
+            X_CN = (view.X_CW @ X_WN[node])[None]
+            united = score_samples(view, X_CN, still, mask, _OUTSIDE_WEIGHT, np.zeros((1, 1)))
+            covered.append(united[:, 0])
+        return covered
 
     def _grow(
         self,

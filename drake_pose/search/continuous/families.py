@@ -219,7 +219,7 @@ class RobustFamilies:
 
     def find(self, poses: Sequence[FittedPose], J: Callable[[np.ndarray], float]) -> PoseSet:
         """The poses that fit as well as the best of some, the answer first; J (1) of values."""
-        pieces = [self._fit.piece_costs(pose.values, _LOOK) for pose in poses]
+        pieces = map_ordered(lambda pose: self._fit.piece_costs(pose.values, _LOOK), poses)
         self._pieces = min(pieces, key=lambda one: float(one.sum()))
         good = [
             pose.values for pose, one in zip(poses, pieces, strict=True) if self._is_as_good(one)
@@ -267,14 +267,17 @@ class RobustFamilies:
 
     def _add_flipped(self, families: list[_Family], family: _Family) -> None:
         """Add what flips make of a family, as far as it fits."""
-        for flip in flips(self._kinematics, family.values):
+
+        def look(flip: Flip) -> tuple[np.ndarray, np.ndarray]:
+            seen = self._fit.refine(flip.values, (_LOOK,)).values
+            return seen, self._fit.piece_costs(seen, _LOOK)
+
+        others = flips(self._kinematics, family.values) if self._has_room(families) else []
+        for flip, (seen, pieces) in zip(others, map_ordered(look, others), strict=True):
             if not self._has_room(families):
                 return
-            look = self._fit.refine(flip.values, (_LOOK,))
-            if self._is_as_good(self._fit.piece_costs(look.values, _LOOK)) and not self._is_in(
-                families, look.values
-            ):
-                values = self._kinematics.nearest_turns(look.values)
+            if self._is_as_good(pieces) and not self._is_in(families, seen):
+                values = self._kinematics.nearest_turns(seen)
                 families.append(self._flipped(family, flip, values))
 
     def _flipped(self, family: _Family, flip: Flip, values: np.ndarray) -> _Family:

@@ -9,6 +9,7 @@ as a limb is left unexplained, a beam search by areas gives other starts.
 from __future__ import annotations
 
 import copy
+import itertools
 import math
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -285,9 +286,13 @@ class _Run:
         # The subtrees of no more than half of the nodes, which follow no node before them.
         tree = kinematics.tree
         below = [one for one in tree.subtrees if tree.source(one[0]) == one[0]]
-        for nodes in (one for one in below if 2 * len(one) <= len(X_WN)):
+
+        def search_again(nodes: tuple[int, ...]) -> list[np.ndarray]:
             again = self._coarse.find_again(X_WN, nodes)
-            tried += self._values(self._coarse.choose_distinct(again, _TRIED, _APART), values)
+            return self._values(self._coarse.choose_distinct(again, _TRIED, _APART), values)
+
+        limbs = [one for one in below if 2 * len(one) <= len(X_WN)]
+        tried += itertools.chain.from_iterable(map_ordered(search_again, limbs))
         look = AnnealingStage(MEDIUM[0].scale, COARSE[0].spacing)
         best_looks = []
         for group, count in ((flipped, _FLIPPED), (tried, _TRIED)):
@@ -295,9 +300,13 @@ class _Run:
             looks = [FittedPose(*pair) for pair in zip(group, costs, strict=True)]
             best_looks += distinct(looks, count, kinematics.turns_around, 0.5 * INTERVAL)
         if not self._several:
-            return [self._fit.refine(look.values, MEDIUM) for look in best_looks if self._proceed()]
+            refined = map_ordered(self._follow, best_looks)
+            return [one for one in refined if one is not None]
         followed = [one.values for one in best_looks]
         return refine_best(self._fit, followed, _FOLLOWING, self._proceed)
+
+    def _follow(self, look: FittedPose) -> FittedPose | None:
+        return self._fit.refine(look.values, MEDIUM) if self._proceed() else None
 
     def _values(self, coarse: CoarsePoses, values: np.ndarray | None = None) -> list[np.ndarray]:
         """All values (m,) of coarse poses; those of nodes not searched are taken from values."""

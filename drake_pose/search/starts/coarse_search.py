@@ -26,6 +26,7 @@ from drake_pose.search.starts.coarse_kernel import (
     score_samples,
 )
 from drake_pose.silhouette.pictures.masks import signed_distances
+from drake_pose.workers import map_ordered
 
 _WORDS = 4
 _LEVELS = 10
@@ -45,6 +46,8 @@ INTERVAL, LENGTH_INTERVAL = math.radians(15.0), 0.05
 HYPOTHESES, _AGAIN = 2500, 300
 """At most this many are kept after each node; fewer where a limb of a pose is searched again."""
 
+# So many are scored by a worker at once.
+_AT_ONCE = 5000
 # Fewer are kept where a node's samples times the hypotheses exceed this.
 _EVALUATIONS = 150_000
 # Distances that do not count, as a share of the root of the silhouette's area.
@@ -179,10 +182,16 @@ class CoarseSearch:
         X_PN = self.body.sampled.X_PN[node]
         X_CPs = [self._parent_in(view, node, poses.X_WN) for view in self._views]
         added = np.zeros((len(poses), len(X_PN)))
-        united = [
-            score_samples(view, X_CP, balls, mask, _OUTSIDE_WEIGHT, added)
-            for view, X_CP, mask in zip(self._views, X_CPs, masks, strict=True)
-        ]
+
+        def score(part: slice) -> list[np.ndarray]:
+            return [
+                score_samples(view, X_CP[part], balls, mask[part], _OUTSIDE_WEIGHT, added[part])
+                for view, X_CP, mask in zip(self._views, X_CPs, masks, strict=True)
+            ]
+
+        step = max(1, _AT_ONCE // len(X_PN))
+        parts = [slice(k, k + step) for k in range(0, len(poses), step)]
+        united = [np.concatenate(one) for one in zip(*map_ordered(score, parts), strict=True)]
         costs = (poses.costs[:, None] + added).ravel()
         parent = self._nodes[node].parent
         if self.body.sampled.tree.source(node) == parent:
@@ -262,8 +271,8 @@ def _prepare_views(body: SampledBody, views: Sequence[View]) -> list[CoarseView]
     size = _mean_size(views)
     slack, least_cell = _SLACK * size, max(1.0, size / _CELLS)
     largest = max(max((float(r.max(initial=0.0)) for r in body.ball_radii), default=0.0), 1e-6)
-    seen = []
-    for view in views:
+
+    def prepare(view: View) -> CoarseView:
         points = _spread_points(view.mask)
         # No ball counts whose middle is outside the picture, and one as large as it covers all.
         scale = float(view.camera.kernel_parameters()[1])
@@ -279,23 +288,21 @@ def _prepare_views(body: SampledBody, views: Sequence[View]) -> list[CoarseView]
         parts = max(1, min(_PARTS, round(cell)))
         cover = np.zeros((_LEVELS, rows, columns, _WORDS), dtype=np.uint64)
         fill_cover(cover, points, origin, cell, radii)
-        seen.append(
-            CoarseView(
-                camera=view.camera.kernel_parameters(),
-                X_CW=np.ascontiguousarray(view.camera.X_CW),
-                origin=origin,
-                cell=cell,
-                radii=radii,
-                cover=cover,
-                parts=parts,
-                distances=_distances_at(
-                    view.mask, origin, cell / parts, parts * rows, parts * columns
-                ),
-                point_area=np.count_nonzero(view.mask) / len(points),
-                slack=slack,
-            )
+        side = cell / parts
+        return CoarseView(
+            camera=view.camera.kernel_parameters(),
+            X_CW=np.ascontiguousarray(view.camera.X_CW),
+            origin=origin,
+            cell=cell,
+            radii=radii,
+            cover=cover,
+            parts=parts,
+            distances=_distances_at(view.mask, origin, side, parts * rows, parts * columns),
+            point_area=np.count_nonzero(view.mask) / len(points),
+            slack=slack,
         )
-    return seen
+
+    return map_ordered(prepare, views)
 
 
 def _spread_points(mask: np.ndarray) -> np.ndarray:

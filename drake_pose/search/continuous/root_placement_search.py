@@ -10,10 +10,13 @@ anew.
 
 from __future__ import annotations
 
+import itertools
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
+from typing import TypeVar
 
 import numpy as np
 
@@ -45,6 +48,7 @@ from drake_pose.search.starts.root_placement import (
     slide_root,
     whereabouts,
 )
+from drake_pose.workers import map_ordered
 
 # What may lie outside, as in the beam search's tolerant stages; the root is off by half a step.
 _OUTSIDE_SHARE, _OUTSIDE_WEIGHT = 0.6, 2
@@ -68,6 +72,8 @@ _STAGES, _ALIKE = (Stage(60, 1.0, 2),), 0.5
 _ENOUGH = 0.004
 # Parameters of the refinement after the tree's values.
 _TRANSLATION, _GROWTH = (0, 1, 2), (3,)
+
+_Result = TypeVar("_Result")
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,11 +143,20 @@ class RootPlacementSearch:
         layers = find_layers(self.body, views, self.scale_unknown, root_position)
         placed: list[_Placed] = []
         width, runs = math.ceil(_HYPOTHESES / len(layers)), 0
+        begun: list[_Placed] = []
+
+        def search(outside_share: float, layer: Layer) -> list[_Placed]:
+            if begun and time.perf_counter() >= deadline:
+                return []
+            found = self._search_layer(layer, width, outside_share)
+            begun.extend(found[:1])
+            return found
+
         for outside_share in (_OUTSIDE_SHARE, math.inf):
-            for layer in layers if not placed else ():
-                if not placed or time.perf_counter() < deadline:
-                    placed += self._search_layer(layer, width, outside_share)
-                    runs += len(self.tree.nodes)
+            if not placed:
+                searched = map_ordered(partial(search, outside_share), layers)
+                placed += itertools.chain.from_iterable(searched)
+                runs += len(self.tree.nodes) * len(layers)
         if not placed:
             found = PoseEstimate.nothing(
                 self.tree, stopped_by="end", statistics=SearchStatistics(runs)
@@ -205,19 +220,30 @@ class RootPlacementSearch:
 
     def _improve(self, starts: Sequence[_Placed], moves: bool, deadline: float) -> _Placed:
         """The best pose reached from some; the root moves, too, if its position is unknown."""
-        pool: list[_Placed] = []
-        for start in starts:
-            if time.perf_counter() < deadline:
-                pool.append(self._settle(start, COARSE_PASSES, moves))
+
+        def before(step: Callable[[_Placed], _Result], one: _Placed) -> _Result | None:
+            return step(one) if time.perf_counter() < deadline else None
+
+        settle = partial(before, lambda one: self._settle(one, COARSE_PASSES, moves))
+        pool = [one for one in map_ordered(settle, starts) if one is not None]
         pool.sort(key=_by_J)
-        for one in self._elsewhere(pool)[:_FINALISTS]:
-            if time.perf_counter() < deadline:
-                pool += self._search_again(one, moves)
+        again = partial(before, lambda one: self._search_again(one, moves))
+        for found in map_ordered(again, self._elsewhere(pool)[:_FINALISTS]):
+            pool += found or []
         pool.sort(key=_by_J)
         best = min([*pool, *starts], key=_by_J)
-        for one in pool[:_FINALISTS]:
-            if time.perf_counter() < deadline and best.J > _ENOUGH * _area(best.views):
-                best = min(best, self._finish(one, moves, deadline), key=_by_J)
+        enough, ends = _ENOUGH * _area(best.views), [best]
+
+        def finish(one: _Placed) -> _Placed | None:
+            # One that fits well enough ends it; what is finished beside that one is left out below.
+            if min(end.J for end in ends) <= enough:
+                return None
+            ends.append(self._finish(one, moves, deadline))
+            return ends[-1]
+
+        for end in map_ordered(partial(before, finish), pool[:_FINALISTS]):
+            if end is not None and best.J > enough:
+                best = min(best, end, key=_by_J)
         return best
 
     def _elsewhere(self, pool: Sequence[_Placed]) -> list[_Placed]:

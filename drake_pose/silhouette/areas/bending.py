@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import threading
 from collections.abc import Sequence
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -123,7 +124,6 @@ class PackedSurfaces:
 
     def __init__(self, surfaces: TreeSurfaces) -> None:
         self._rest = pack(tuple(surfaces.at_rest(node) for node in range(len(surfaces.rigid))))
-        self._own = own_copy(self._rest)
         # Of each node's band its place, as in ``bend``, and which of all values are the node's.
         ends = np.cumsum([0, *surfaces.value_counts])
         skins, parts, ranges, vertices = [], [], [], 0
@@ -136,19 +136,27 @@ class PackedSurfaces:
                 vertices += len(skin.weights)
         self._bands = join_bands(skins) if skins else None
         self._parts, self._ranges = np.array(parts), np.array(ranges)
-        self._bent, self._placed = np.full((1, ends[-1]), np.nan), np.empty((1, vertices, 3))
+        self._shapes = (1, ends[-1]), (1, vertices, 3)
+        # Threads bend side by side.
+        self._threads = threading.local()
 
     def at(self, values: np.ndarray) -> PackedOutlines:
         """All nodes' surfaces at all values (m,) [rad or m]."""
         return self._rest if self._bands is None else own_copy(self.bend_to(values))
 
     def bend_to(self, values: np.ndarray | None) -> PackedOutlines:
-        """As at, in arrays that the next call changes; None: as they are."""
-        if values is not None and self._bands is not None:
+        """As at, in arrays that the thread's next call changes; None: as they are."""
+        if self._bands is None:
+            return self._rest
+        if not hasattr(self._threads, "bent"):
+            bent, placed = (np.full(shape, np.nan) for shape in self._shapes)
+            self._threads.bent = own_copy(self._rest), bent, placed
+        own, bent, placed = self._threads.bent
+        if values is not None:
             values = np.ascontiguousarray(values, dtype=np.float64)[None]
-            changed = place_bands(self._bands, self._ranges, values, self._bent, self._placed)[0]
+            changed = place_bands(self._bands, self._ranges, values, bent, placed)[0]
             if changed.any():
                 parts = self._parts[changed]
-                self._own.balls[parts[:, 0]] = self._rest.balls[parts[:, 0]]
-                bend(self._own, parts, self._placed[0])
-        return self._own
+                own.balls[parts[:, 0]] = self._rest.balls[parts[:, 0]]
+                bend(own, parts, placed[0])
+        return own

@@ -161,14 +161,16 @@ class VisualHull:
         """Returns the radii (n,) [m] of the largest balls around points (n, 3) in the hull."""
         if not self._views:
             return np.zeros(len(p_N))
-        smallest = np.full(len(p_N), np.inf)
+        smallest, left = np.full(len(p_N), np.inf), np.arange(len(p_N))
         for rows, distances in self._views:
-            uv = (p_N - self._center) @ rows.T + 0.5 * (_SIDE - 1)
+            uv = (p_N[left] - self._center) @ rows.T + 0.5 * (_SIDE - 1)
             # Which side of a pixel's edge a point falls is not left to the last digit.
             uv = np.rint(np.round(uv, 6)).astype(int)
             inside = np.all((uv >= 0) & (uv < _SIDE), axis=1)
             u, v = np.clip(uv, 0, _SIDE - 1).T
-            smallest = np.minimum(smallest, np.where(inside, distances[v, u], 0.0))
+            seen = np.where(inside, distances[v, u], 0.0)
+            smallest[left] = np.minimum(smallest[left], seen)
+            left = left[seen > 0.0]
         return np.maximum(0.0, _SHRINK * (smallest - _ROUNDING) / self._scale)
 
     def spread_balls(self, count: int) -> np.ndarray:

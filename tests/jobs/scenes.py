@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import yaml
 
 from drake_pose.body.model import load_model
 from drake_pose.camera.camera_files import save_cameras
@@ -93,6 +94,16 @@ def write_truth(scene: TinyScene, path: Path | None = None) -> Path:
         writer.writerow(["frame", *NAMES])
         writer.writerows([int(frame), *q] for frame, q in scene.truth.items())
     return path
+
+
+def edit_camera(path: Path, name: str, to: Path | None = None, **fields: object) -> Path:
+    """Changes fields of a camera in its file, or in a copy; those that are None are taken out."""
+    content = yaml.safe_load(path.read_text())
+    changed = {**content[name], **fields}
+    content[name] = {key: value for key, value in changed.items() if value is not None}
+    to = to or path
+    to.write_text(yaml.safe_dump(content, sort_keys=False))
+    return to
 
 
 def read_rows(path: Path) -> list[dict[str, str]]:

@@ -9,13 +9,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import yaml
 
 from drake_pose.body.model import load_model
 from drake_pose.camera.camera_files import load_cameras, save_cameras
 from drake_pose.camera.models import Camera
+from drake_pose.jobs.registration.episodes import GivenFiles
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from drake_pose.silhouette.pictures.masks import write_mask
+from tests.jobs.scenes import edit_camera
 from tests.registration.arm_pictures import errors
 from tests.search.arms import LINKS, arm_cameras, arm_urdf
 
@@ -30,6 +31,11 @@ class ArmScene:
     model: Path
     joints: Path
     cameras: dict[str, Camera]
+
+    @property
+    def files(self) -> GivenFiles:
+        """As a registration and an audit take them."""
+        return GivenFiles(self.folder, self.model, self.joints)
 
     def copy(self, place: Path) -> ArmScene:
         """The same elsewhere, to be spoilt."""
@@ -48,12 +54,8 @@ class ArmScene:
             csv.writer(file).writerows(rows)
 
     def edit_cameras(self, name: str, **fields: object) -> None:
-        """Changes fields of a camera in the camera file; those that are None are taken out."""
-        path = self.folder / "cameras.yaml"
-        content = yaml.safe_load(path.read_text())
-        content[name] |= fields
-        content[name] = {key: value for key, value in content[name].items() if value is not None}
-        path.write_text(yaml.safe_dump(content, sort_keys=False))
+        """As edit_camera, in the scene's camera file."""
+        edit_camera(self.folder / "cameras.yaml", name, **fields)
 
 
 def write_arm_scene(folder: Path, count: int = 5, seed: int = 4) -> ArmScene:

@@ -43,6 +43,20 @@ class ArmScene:
         joints = shutil.copy(self.joints, place / "joints.csv")
         return ArmScene(place / "scene", self.model, Path(joints), self.cameras)
 
+    def register(self, out: Path) -> list[str]:
+        """The words of a registration."""
+        given = [self.folder, "--model", self.model, "--joints", self.joints, "--out", out]
+        return ["register", *map(str, given)]
+
+    def add_to(self, name: str, value: float) -> list[list[str]]:
+        """Adds a value to a joint's readings in all frames; the table."""
+        header, *rows = self.rows()
+        column = header.index(name)
+        for row in rows:
+            row[column] = str(float(row[column]) + value)
+        self.write_rows([header, *rows])
+        return [header, *rows]
+
     def rows(self) -> list[list[str]]:
         """The table, its first line among them."""
         with self.joints.open(newline="") as file:

@@ -73,3 +73,31 @@ def test_what_pictures_do_not_tell(tmp_path):
     page = make_registration_report(tmp_path, summary(masks="given"))
     assert "from masks and joint positions" in page
     assert "Clocks" not in page
+
+
+def test_zeros_and_lengths_are_shown_with_what_to_make_of_them(tmp_path):
+    low = {"value_deg": 3.0, "sd_deg": 0.1, "low_deg": 2.8, "high_deg": 3.2}
+    small = {"value_mm": 0.1, "sd_mm": 0.2, "low_mm": -0.3, "high_mm": 0.5}
+    long = {"value_percent": 2.9, "sd_percent": 0.5, "low_percent": 1.9, "high_percent": 3.9}
+    told = {"determined": True, "significant": True, "gauge": []}
+    page = make_registration_report(
+        tmp_path,
+        summary(
+            zeros={
+                "elbow": told | low,
+                "rail": told | small | {"significant": False},
+                "wrist": told | small | {"significant": False, "low_mm": 0.05},
+                "base": told | {"determined": False, "gauge": ["target_x"]},
+            },
+            lengths={"shoulder": told | long},
+        ),
+    )
+    for row in (
+        "elbow</td><td>3.000 deg</td><td>2.800 to 3.200</td><td>significant: reads 3.00 +- 0.10 "
+        "degrees too low",
+        "rail</td><td>0.100 mm</td><td>-0.300 to 0.500</td><td>as good as 0: held at 0",
+        "wrist</td><td>0.100 mm</td><td>0.050 to 0.500</td><td>doubtful: held at 0",
+        "base</td><td></td><td></td><td>not determined, goes with target_x",
+        "shoulder</td><td>2.900 %</td><td>1.900 to 3.900</td><td>significant<",
+    ):
+        assert f"<td>{row}" in page

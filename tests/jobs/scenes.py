@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import yaml
 
-from drake_pose.body.model import load_model
+from drake_pose.body.model import ArticulatedModel, load_model
 from drake_pose.camera.camera_files import save_cameras
-from drake_pose.camera.models import PinholeCamera
+from drake_pose.camera.models import Camera, PinholeCamera
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from drake_pose.silhouette.pictures.masks import write_mask
 
@@ -52,6 +52,11 @@ class TinyScene:
     model: Path
     truth: dict[str, np.ndarray]
 
+    def estimate(self, out: Path) -> list[str]:
+        """The words of an estimate; the grid's angles are the scenes' own."""
+        given = [self.folder, "--model", self.model, "--out", out, "--interval", 20]
+        return ["estimate", *map(str, given)]
+
 
 def camera(name: str, turn_deg: float = 0.0) -> PinholeCamera:
     """A camera 3 m before the body, turned about the vertical."""
@@ -74,16 +79,22 @@ def write_scene(
     turns = {"front": 0.0, "side": 50.0}
     rig = [camera(name, turns[name]) for name in cameras]
     save_cameras(folder / "cameras.yaml", rig)
-    renderers = [LabelRenderer(model, view) for view in rig]
-    truth = {}
-    for index, row in enumerate(angles):
-        frame = f"{index:04d}"
-        truth[frame] = np.radians(row)
-        for view, renderer in zip(rig, renderers, strict=True):
-            path = folder / "masks" / view.name / f"{frame}.png"
-            path.parent.mkdir(parents=True, exist_ok=True)
-            write_mask(path, renderer.mask(truth[frame]))
-    return TinyScene(folder, model_path, truth)
+    write_masks(folder, model, rig, np.radians(angles))
+    return TinyScene(
+        folder, model_path, {f"{k:04d}": np.radians(row) for k, row in enumerate(angles)}
+    )
+
+
+def write_masks(
+    folder: Path, model: ArticulatedModel, cameras: Iterable[Camera], poses: Iterable[np.ndarray]
+) -> None:
+    """Writes what cameras see of a model in each of some poses (nq,), as Drake draws it."""
+    poses = list(poses)
+    for camera in cameras:
+        renderer, masks = LabelRenderer(model, camera), folder / "masks" / camera.name
+        masks.mkdir(parents=True)
+        for k, q in enumerate(poses):
+            write_mask(masks / f"{k:04d}.png", renderer.mask(q))
 
 
 def write_truth(scene: TinyScene, path: Path | None = None) -> Path:

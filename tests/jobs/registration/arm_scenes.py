@@ -14,9 +14,7 @@ from drake_pose.body.model import load_model
 from drake_pose.camera.camera_files import load_cameras, save_cameras
 from drake_pose.camera.models import Camera
 from drake_pose.jobs.registration.episodes import GivenFiles
-from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
-from drake_pose.silhouette.pictures.masks import write_mask
-from tests.jobs.scenes import edit_camera
+from tests.jobs.scenes import edit_camera, write_masks
 from tests.registration.arm_pictures import errors
 from tests.search.arms import LINKS, arm_cameras, arm_urdf
 
@@ -43,9 +41,10 @@ class ArmScene:
         joints = shutil.copy(self.joints, place / "joints.csv")
         return ArmScene(place / "scene", self.model, Path(joints), self.cameras)
 
-    def register(self, out: Path) -> list[str]:
+    def register(self, out: Path, with_joints: bool = True) -> list[str]:
         """The words of a registration."""
-        given = [self.folder, "--model", self.model, "--joints", self.joints, "--out", out]
+        joints = ["--joints", self.joints] if with_joints else []
+        given = [self.folder, "--model", self.model, "--out", out, *joints]
         return ["register", *map(str, given)]
 
     def add_to(self, name: str, value: float) -> list[list[str]]:
@@ -86,12 +85,7 @@ def write_arm_scene(folder: Path, count: int = 5, seed: int = 4) -> ArmScene:
     limits = np.radians([limit for _, _, _, limit, _, _ in LINKS])
     poses = rng.uniform(limits[:, 0], limits[:, 1], size=(count, len(limits)))
     save_cameras(scene.folder / "cameras.yaml", scene.cameras)
-    for camera in load_cameras(scene.folder / "cameras.yaml").values():
-        renderer = LabelRenderer(model, camera)
-        masks = scene.folder / "masks" / camera.name
-        masks.mkdir(parents=True)
-        for k, q in enumerate(poses):
-            write_mask(masks / f"{k:04d}.png", renderer.mask(q))
+    write_masks(scene.folder, model, load_cameras(scene.folder / "cameras.yaml").values(), poses)
     scene.write_rows([["frame", *JOINTS], *([k, *q] for k, q in enumerate(poses))])
     scene.edit_cameras("left", X_WC=None)
     return scene

@@ -8,9 +8,13 @@ import cv2
 import numpy as np
 import pytest
 
-from tests.jobs.estimate.test_bad_input import assert_refused
+from tests.cli import Result, assert_refused, run_command
 from tests.jobs.registration.arm_scenes import ArmScene
-from tests.jobs.registration.test_register import run
+
+
+def run(scene: ArmScene, out: Path, *more: str) -> Result:
+    return run_command([*scene.register(out), *more])
+
 
 Spoil = Callable[[ArmScene], None]
 

@@ -22,6 +22,11 @@ class PersonScene:
     person: ArticulatedModel
     truth: np.ndarray
 
+    def estimate(self, out: Path, command: str = "estimate") -> list[str]:
+        """The words of an estimate, or a capture."""
+        model = str(self.person.path)
+        return [command, str(self.folder), "--model", model, "--out", str(out), "--no-replay"]
+
 
 def record_person(
     folder: Path,

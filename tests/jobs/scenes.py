@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import csv
+import json
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, Protocol
 
 import numpy as np
 import yaml
@@ -15,6 +17,7 @@ from drake_pose.camera.camera_files import save_cameras
 from drake_pose.camera.models import Camera, PinholeCamera
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from drake_pose.silhouette.pictures.masks import write_mask
+from tests.cli import Result, run_to_end
 
 LINK = """
   <link name="{name}">
@@ -105,6 +108,21 @@ def write_truth(scene: TinyScene, path: Path | None = None) -> Path:
         writer.writerow(["frame", *NAMES])
         writer.writerows([int(frame), *q] for frame, q in scene.truth.items())
     return path
+
+
+class Estimated(Protocol):
+    """A scene that says how it is estimated."""
+
+    def estimate(self, out: Path) -> list[str]:
+        """The words of an estimate."""
+
+
+def run_estimate(
+    scene: Estimated, out: Path, *more: object, status: int = 0
+) -> tuple[Result, dict[str, Any]]:
+    """What the command said, and the summary that it wrote."""
+    result = run_to_end(*scene.estimate(out), *more, status=status)
+    return result, json.loads((out / "summary.json").read_text())
 
 
 def edit_camera(path: Path, name: str, to: Path | None = None, **fields: object) -> Path:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -103,10 +103,15 @@ def write_masks(
 def write_truth(scene: TinyScene, path: Path | None = None) -> Path:
     """Write the truth as a joint_angles.csv; frames are plain numbers there."""
     path = path or scene.folder / "joint_angles.csv"
+    return write_joints(path, NAMES, {str(int(frame)): q for frame, q in scene.truth.items()})
+
+
+def write_joints(path: Path, names: Sequence[str], values: Mapping[str, Iterable[object]]) -> Path:
+    """Writes a table of joint positions by frame."""
     with path.open("w", newline="") as file:
         writer = csv.writer(file)
-        writer.writerow(["frame", *NAMES])
-        writer.writerows([int(frame), *q] for frame, q in scene.truth.items())
+        writer.writerow(["frame", *names])
+        writer.writerows([frame, *q] for frame, q in values.items())
     return path
 
 

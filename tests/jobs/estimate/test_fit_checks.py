@@ -5,7 +5,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import yaml
 
 from drake_pose.files.records import FrameRecord, PoseRow
 from drake_pose.files.settings import EstimateSettings
@@ -13,7 +12,7 @@ from drake_pose.jobs.estimate.inputs import read_inputs
 from drake_pose.jobs.estimate.matching import check_track, find_contradiction
 from drake_pose.jobs.estimate.scene import estimate_scene
 from drake_pose.search.estimates import TRACKED
-from tests.jobs.scenes import URDF, TinyScene, camera, write_scene
+from tests.jobs.scenes import URDF, TinyScene, camera, edit_camera, write_scene
 
 ANGLES = ((20.0, -40.0), (-40.0, -80.0))
 
@@ -30,10 +29,8 @@ def warnings_of(scene: TinyScene, model: Path | None = None, **more: object) -> 
 
 def turn_camera(scene: TinyScene, name: str, degrees: float) -> None:
     """Turn a calibrated camera about the world's vertical, as if it had been moved about it."""
-    path = scene.folder / "cameras.yaml"
-    cameras = yaml.safe_load(path.read_text())
-    cameras[name]["X_WC"] = camera(name, degrees).X_WC.tolist()
-    path.write_text(yaml.safe_dump(cameras))
+    X_WC = camera(name, degrees).X_WC.tolist()
+    edit_camera(scene.folder / "cameras.yaml", name, X_WC=X_WC)
 
 
 def test_a_sound_scene_has_no_warning(scene: TinyScene) -> None:

@@ -1,4 +1,3 @@
-import csv
 import html
 import json
 from dataclasses import replace
@@ -23,6 +22,7 @@ from tests.jobs.scenes import (
     TinyScene,
     read_rows,
     run_estimate,
+    write_joints,
     write_scene,
     write_truth,
 )
@@ -161,12 +161,8 @@ def jib_positions(scene: TinyScene) -> dict[str, np.ndarray]:
 
 
 def test_another_root_with_a_position_for_each_frame(own_scene: TinyScene) -> None:
-    centres = own_scene.folder / "centres.csv"
-    with centres.open("w", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow(["frame", "joint", "x", "y", "z"])
-        for frame, p_WJ in jib_positions(own_scene).items():
-            writer.writerow([int(frame), "hook", *p_WJ])
+    rows = {frame: ["hook", *p_WJ] for frame, p_WJ in jib_positions(own_scene).items()}
+    centres = write_joints(own_scene.folder / "centres.csv", ["joint", "x", "y", "z"], rows)
     out = own_scene.folder.parent / "out"
     root = ["--root", "jib", "--root-position", f"{centres}:hook", "--root-rotation", "x=-180:180"]
     run_estimate(own_scene, out, "--method", "paper", *root)

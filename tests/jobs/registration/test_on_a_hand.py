@@ -134,9 +134,8 @@ def test_a_round_target_leaves_its_own_turn_open_alone(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("looks", [BRACKET, BOX])
-def test_pictures_are_enough_of_a_target(looks: str, tmp_path: Path) -> None:
-    scene, out = write_hand_scene(tmp_path, looks, seed=4), tmp_path / "out"
+def test_pictures_are_enough_of_a_target(tmp_path: Path) -> None:
+    scene, out = write_hand_scene(tmp_path, BRACKET, seed=4), tmp_path / "out"
     masks = sorted((scene.arm.folder / "masks" / "wrist").glob("*.png"))
     drawn = {path.name: read_mask(path) for path in masks}
     paint_pictures(scene.arm.folder)
@@ -160,11 +159,6 @@ def test_pictures_that_do_not_show_the_target_are_refused(tmp_path: Path) -> Non
     said = "camera 'wrist': no pose of the target explains its pictures"
     assert_refused(run_command(other.register(out)), said)
     assert not out.exists()
-    header, *rows = scene.arm.rows()
-    # Each frame has the joints of the one three after it.
-    moved = [[row[0], *rows[k - 3][1:]] for k, row in enumerate(rows)]
-    scene.arm.write_rows([header, *moved])
-    assert_refused(run_command(scene.register(out)), "camera 'wrist'")
 
 
 @pytest.mark.slow

@@ -99,29 +99,14 @@ def test_undistorted_pictures_fit_the_written_cameras(taken, report, tmp_path):
     assert checked >= 4
 
 
-@pytest.mark.parametrize(
-    ("pictures", "message"),
-    [
-        ({}, "holds no picture"),
-        ({"c0/1.png": (20, 30)}, "found in 0 pictures"),
-        ({"c0/1.png": (20, 30), "c0/2.png": (30, 20)}, r"2\.png: 20 x 30 pixels"),
-        ({"c0/1.png": (20, 30), "c0/1.jpg": (20, 30)}, "twice"),
-    ],
-)
-def test_folders_that_cannot_be_used(tmp_path, pictures, message):
-    (tmp_path / "images" / "c0").mkdir(parents=True)
-    (tmp_path / "board.yaml").write_text(BOARD_YAML)
-    for name, shape in pictures.items():
-        cv2.imwrite(str(tmp_path / "images" / name), np.zeros(shape, np.uint8))
-    with pytest.raises(CameraError, match=message):
-        calibrate_folder(tmp_path, tmp_path / "board.yaml")
-
-
-def test_missing_folder_and_unknown_camera(taken, tmp_path):
+def test_folders_that_cannot_be_used(taken, tmp_path):
     folder, _, _ = taken
+    (tmp_path / "images" / "c0").mkdir(parents=True)
+    cv2.imwrite(str(tmp_path / "images" / "c0" / "1.png"), np.zeros((20, 30), np.uint8))
+    with pytest.raises(CameraError, match="found in 0 pictures"):
+        calibrate_folder(tmp_path, folder / "board.yaml")
     with pytest.raises(CameraError, match="no such folder"):
         calibrate_folder(tmp_path / "nowhere", folder / "board.yaml")
+    settings = CalibrationSettings(leave_out=["c7"])
     with pytest.raises(UnknownNameError, match="c7"):
-        calibrate_folder(
-            folder, folder / "board.yaml", settings=CalibrationSettings(leave_out=["c7"])
-        )
+        calibrate_folder(folder, folder / "board.yaml", settings=settings)

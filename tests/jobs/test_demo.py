@@ -9,14 +9,13 @@ from drake_pose.body.model import load_model
 from drake_pose.jobs.demo import demo_scene, demo_settings
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from drake_pose.silhouette.pictures.scenes import load_scene
-from tests.cli import run_command
+from tests.cli import run_to_end
 from tests.jobs.scenes import read_rows
 
 
 def test_demo(tmp_path: Path) -> None:
     out = tmp_path / "demo"
-    result = run_command(["demo", "--out", str(out)])
-    assert result.exit_code == 0, result.output
+    result = run_to_end("demo", "--out", out)
     scene = load_scene(demo_scene())
     (camera,) = scene.cameras.values()
     (frame,) = scene.frames
@@ -43,9 +42,7 @@ def test_demo(tmp_path: Path) -> None:
     other.mkdir()
     (other / "summary.json").write_text(json.dumps({"scene": "elsewhere"}))
     for folder, kept in ((out, {"mine.txt", "poses.csv"}), (other, {"summary.json"})):
-        refused = run_command(["demo", "--out", str(folder)])
-        assert refused.exit_code == 1
-        assert "not empty" in refused.stderr
+        assert "not empty" in run_to_end("demo", "--out", folder, status=1).stderr
         assert kept <= {path.name for path in folder.iterdir()}
 
 

@@ -9,9 +9,8 @@ import pytest
 from pycocotools import mask as coco
 
 from drake_pose import MaskSettings, load_scene, make_masks
-from drake_pose.commands.main import app
 from drake_pose.errors import CameraError, DrakePoseError, MaskError, OutputError, SceneError
-from tests.cli import CliRunner
+from tests.cli import run_json, run_to_end
 from tests.jobs.scenes import write_scene
 
 POLYGON = [60.0, 40.0, 120.0, 40.0, 120.0, 100.0, 60.0, 100.0]
@@ -51,13 +50,6 @@ def write_coco(path, scene, annotate, paths="{camera}/{frame}.jpg"):
     return path
 
 
-def assert_same_masks(made, scene):
-    found = load_scene(made)
-    assert set(found.masks) == set(scene.masks)
-    for camera, frame in scene.masks:
-        assert (found.read(camera, frame) == scene.read(camera, frame)).all(), (camera, frame)
-
-
 @pytest.mark.parametrize("packed", [True, False])
 def test_coco_run_lengths_become_the_same_masks(tmp_path, two_views, packed):
     scene = load_scene(two_views.folder)
@@ -69,9 +61,10 @@ def test_coco_run_lengths_become_the_same_masks(tmp_path, two_views, packed):
     file = write_coco(tmp_path / "a.json", scene, halves)
     cameras = two_views.folder / "cameras.yaml"
     result = make_masks(file, tmp_path / "out", MaskSettings(classes=("arm", "4"), cameras=cameras))
-    assert result.count == 6
-    assert result.warnings == ()
-    assert_same_masks(tmp_path / "out", scene)
+    assert (result.count, result.warnings) == (6, ())
+    found = load_scene(tmp_path / "out")
+    assert set(found.masks) == set(scene.masks)
+    assert all((found.read(*key) == scene.read(*key)).all() for key in scene.masks)
     with pytest.raises(MaskError, match=r"classes arm, tool.*--class 'arm'"):
         make_masks(file, tmp_path / "none", MaskSettings(cameras=cameras))
     with pytest.raises(DrakePoseError, match=r"no class 'robot'; it has: arm, tool"):
@@ -164,18 +157,13 @@ def test_sources_in_doubt_are_refused(tmp_path, two_views):
         make_masks(masks / "side", out)
 
 
-def test_command_says_what_was_made(tmp_path, two_views, runner: CliRunner):
+def test_command_says_what_was_made(tmp_path, two_views):
     source = two_views.folder / "masks" / "side"
-    done = runner.invoke(app, ["masks", str(source), "--out", str(tmp_path / "a"), "--json"])
-    assert done.exit_code == 0, done.output
-    assert json.loads(done.stdout)["mask_count"] == 3
-    done = runner.invoke(app, ["masks", str(source), "--out", str(tmp_path / "b")])
-    assert "3 masks of 3 pictures" in done.stdout
-    wrong = ["masks", str(source), "--out", str(tmp_path / "c"), "--pixels", "soft"]
-    assert runner.invoke(app, wrong).exit_code == 2
+    assert run_json("masks", source, "--out", tmp_path / "a")["mask_count"] == 3
+    assert "3 masks of 3 pictures" in run_to_end("masks", source, "--out", tmp_path / "b").stdout
+    run_to_end("masks", source, "--out", tmp_path / "c", "--pixels", "soft", status=2)
     photograph = tmp_path / "photograph.png"
     noise = np.random.default_rng(0).integers(0, 255, (9, 9, 3), dtype=np.uint8)
     cv2.imwrite(str(photograph), noise)
-    done = runner.invoke(app, ["masks", str(photograph), "--out", str(tmp_path / "c")])
-    assert done.exit_code == 1
+    done = run_to_end("masks", photograph, "--out", tmp_path / "c", status=1)
     assert "photograph.png: is a colour picture" in done.stderr

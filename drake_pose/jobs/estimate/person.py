@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from drake_pose.arrays import Array, Mask
 from drake_pose.errors import MaskError, SceneError
 from drake_pose.files.records import record_deviations
 from drake_pose.files.writer import FinishedFrame, OnStage, ResultWriter
@@ -26,8 +27,6 @@ from drake_pose.silhouette.pictures.scene_checks import (
     frame_ranges,
     require_readable,
 )
-
-Mask = NDArray[np.bool_]
 
 FOLLOWED = "followed"
 """FrameRecord.stopped_by of a frame in which a person was followed."""
@@ -89,7 +88,7 @@ def follow_person(
 
 def _follow_colours(
     inputs: Inputs, reader: _Reader
-) -> tuple[PersonCapture, ReadFrame, tuple[str, ...], NDArray[np.float64]]:
+) -> tuple[PersonCapture, ReadFrame, tuple[str, ...], Array]:
     """A sequence of pictures of which few have masks: distances (frames,) of contours [pixel]."""
     scene, frames = inputs.scene, inputs.frames
     masked = [k for k, frame in enumerate(frames) if len(scene.cameras_of(frame)) > 1]
@@ -166,7 +165,7 @@ def _finish(
     inputs: Inputs,
     captured: PersonCapture,
     index: int,
-    X_WN: NDArray[np.float64],
+    X_WN: Array,
     masks: Mapping[str, Mask],
     reader: ReadFrame,
     distance: float,

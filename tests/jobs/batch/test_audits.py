@@ -14,7 +14,9 @@ from tests.jobs.scenes import read_rows
 
 
 @pytest.mark.slow
-def test_what_contradicts_is_named_by_scene_and_the_rest_is_resumed(tmp_path: Path) -> None:
+def test_what_contradicts_is_named_by_scene_and_the_rest_is_resumed(
+    tmp_path: Path, out: Path
+) -> None:
     """A scene that is right, one with a frame whose elbow reads otherwise, one without joints."""
     for name in ("first", "second"):
         (tmp_path / name).mkdir()
@@ -29,7 +31,7 @@ def test_what_contradicts_is_named_by_scene_and_the_rest_is_resumed(tmp_path: Pa
         "wrong": {"scene": "second/scene", "audit": "second/joints.csv"},
         "lost": {"scene": "second/scene", "audit": "nowhere.csv"},
     }
-    path, out = tmp_path / "jobs.yaml", tmp_path / "out"
+    path = tmp_path / "jobs.yaml"
     path.write_text(yaml.safe_dump({"defaults": given, "scenes": scenes}, sort_keys=False))
     # The scene that failed did not stop the others.
     audited = run_to_end("batch", path, "--out", out, status=1)

@@ -108,12 +108,12 @@ def test_results_depend_neither_on_who_works_nor_on_who_is_killed(
 
 @pytest.mark.slow
 def test_failing_scene_is_named_and_resume_computes_only_what_is_missing(
-    scenes, jobs, alone, tmp_path
+    scenes, jobs, alone, tmp_path, out
 ):
     shutil.copytree(scenes, tmp_path / "own")
     both = {"stills": {"scene": "stills"}, "motion": {"scene": "motion", "model": "broken.urdf"}}
     (tmp_path / "own" / "broken.urdf").write_text("<robot")
-    path, out = write_job(tmp_path / "own", both), tmp_path / "out"
+    path = write_job(tmp_path / "own", both)
     words = ["batch", path, "--out", out, "--workers", 0]
     failed = run_to_end(*words, status=1)
     assert "scene 'motion'" in failed.stderr
@@ -143,11 +143,8 @@ def die_on_second_chunk(task: Task) -> Outcome:
 
 
 @pytest.mark.slow
-def test_poisoned_chunk_is_given_up_and_the_rest_is_kept(
-    jobs, alone, cluster, tmp_path, monkeypatch
-):
+def test_poisoned_chunk_is_given_up_and_the_rest_is_kept(jobs, alone, cluster, out, monkeypatch):
     monkeypatch.setattr("drake_pose.jobs.batch.batch.TRIES", 2)
-    out = tmp_path / "out"
     heard = []
     result = run_batch(
         jobs, out, cluster, work=die_on_second_chunk,
@@ -228,12 +225,11 @@ def test_what_is_no_address_of_a_scheduler_is_named(address):
 
 @pytest.mark.parametrize("missing", ["distributed", "zmq"])
 def test_without_the_extra_this_process_works_and_workers_are_refused(
-    missing, tmp_path, monkeypatch
+    missing, tmp_path, out, monkeypatch
 ):
     monkeypatch.setitem(sys.modules, missing, None)
     path = tmp_path / "jobs.yaml"
     path.write_text("scenes: {gone: {scene: gone}}")
-    out = tmp_path / "out"
     words = ["batch", path, "--out", out]
     refused = run_to_end(*words, "--workers", "2", status=1)
     assert 'pip install "drake_pose[cluster]"' in refused.stderr

@@ -80,7 +80,7 @@ def test_a_camera_of_many_episodes_is_where_they_say_by_how_sure_they_are():
     assert [file["right"]["X_WC"][0][3] for file in files] == pytest.approx([weighted] * 2)
 
 
-def test_an_episode_of_a_job_has_the_settings_of_audits(tmp_path):
+def test_an_episode_of_a_job_has_the_settings_of_audits(tmp_path, out):
     painted = painted_episode(tmp_path, frames=6)
     write_episode(tmp_path / "scene", painted)
     entry = {"scene": "scene", "model": "boxes.urdf", "audit": True, "every": 2, "units": "rad"}
@@ -92,7 +92,7 @@ def test_an_episode_of_a_job_has_the_settings_of_audits(tmp_path):
     (job,) = read({"one": entry})
     assert isinstance(job.settings, AuditSettings)
     assert (job.settings.every, job.settings.units, job.audit) == (2, "rad", True)
-    (task,) = plan_scene(job, tmp_path / "out")
+    (task,) = plan_scene(job, out)
     assert len(task.frames) == 3
     jobs = read({"data": entry | {"episodes": "8:10"}})
     assert [job.name for job in jobs] == ["data_000008", "data_000009", "data_000010"]
@@ -105,12 +105,11 @@ def test_an_episode_of_a_job_has_the_settings_of_audits(tmp_path):
 
 
 @pytest.mark.slow
-def test_episodes_are_audited_in_a_batch(tmp_path):
+def test_episodes_are_audited_in_a_batch(tmp_path, out):
     painted = painted_episode(tmp_path, late=0.04)
     write_episode(tmp_path / "scene", painted)
     entry = {"scene": "scene", "model": "boxes.urdf", "audit": True, "overlay": False}
     (tmp_path / "jobs.yaml").write_text(yaml.safe_dump({"scenes": {"one": entry}}))
-    out = tmp_path / "out"
     words = ["batch", tmp_path / "jobs.yaml", "--out", out]
     for more in ([], ["--resume"]):
         run_to_end(*words, *more)

@@ -76,7 +76,9 @@ def walk() -> Walk:
     return Walk(person, cameras, see(person, cameras, truth), truth)
 
 
-def test_each_fault_of_the_files_is_named_and_costs_only_itself(walk: Walk, tmp_path: Path) -> None:
+def test_each_fault_of_the_files_is_named_and_costs_only_itself(
+    walk: Walk, tmp_path: Path, out: Path
+) -> None:
     scene = walk.write(tmp_path / "scene")
     masks = scene / "masks"
     shutil.copytree(masks / "camera_0", masks / "camera_7")
@@ -84,7 +86,7 @@ def test_each_fault_of_the_files_is_named_and_costs_only_itself(walk: Walk, tmp_
     write_mask(masks / "camera_2" / "0006.png", np.zeros((120, 160), bool))
     (masks / "camera_3" / "0002.png").unlink()
     (masks / "camera_3" / "Thumbs.db").write_bytes(b"what Windows leaves")
-    warnings, found = walk.capture(scene, tmp_path / "out")
+    warnings, found = walk.capture(scene, out)
     expected = [
         ("camera_7", "no camera", "8 masks"),
         ("0001", "camera_1", "not a PNG"),
@@ -95,12 +97,12 @@ def test_each_fault_of_the_files_is_named_and_costs_only_itself(walk: Walk, tmp_
     for parts in expected:
         assert [text for text in warnings if all(part in text for part in parts)], parts
     assert len(warnings) == len(expected), warnings
-    frames = json.loads((tmp_path / "out" / "summary.json").read_text())["frames"]
+    frames = json.loads((out / "summary.json").read_text())["frames"]
     assert "camera_1" not in frames["0001"]["ious"]
     assert np.abs(found - walk.places()).max() < 0.03
 
 
-def test_nobody_in_view_and_back_elsewhere(walk: Walk, tmp_path: Path) -> None:
+def test_nobody_in_view_and_back_elsewhere(walk: Walk, tmp_path: Path, out: Path) -> None:
     """First nobody, then the person, whom one camera alone sees for a while; then elsewhere."""
     truth = walk.truth.copy()
     truth[6:] = [stepping(walk.person, 2.0 + 0.1 * k, 0.4, -0.4) for k in range(FRAMES - 6)]
@@ -110,7 +112,7 @@ def test_nobody_in_view_and_back_elsewhere(walk: Walk, tmp_path: Path) -> None:
             if k != 4 or name != "camera_1":
                 masks[k][name] = np.zeros_like(masks[k][name])
     scene = replace(walk, masks=masks).write(tmp_path / "scene")
-    warnings, found = walk.capture(scene, tmp_path / "out")
+    warnings, found = walk.capture(scene, out)
     assert "frame 0000, 0004-0005: fewer than two cameras see the person" in warnings[0]
     off = np.abs(found - replace(walk, truth=truth).places()).max(axis=1)
     np.testing.assert_array_equal(np.isnan(off), [k in (0, 4, 5) for k in range(FRAMES)])
@@ -161,7 +163,7 @@ COLOURS = np.dstack([np.tile(np.arange(160, dtype=np.uint8), (120, 1)), *np.zero
     ],
 )
 def test_recordings_that_cannot_be_right_are_refused(
-    spoiled, parts, walk: Walk, tmp_path: Path
+    spoiled, parts, walk: Walk, tmp_path: Path, out: Path
 ) -> None:
     scene = replace(walk, masks=walk.masks[:2]).write(tmp_path / "scene")
     if spoiled.__name__ != "<lambda>":
@@ -171,7 +173,6 @@ def test_recordings_that_cannot_be_right_are_refused(
     else:
         for file in scene.glob("masks/*/*.png"):
             cv2.imwrite(str(file), spoiled(cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)))
-    out = tmp_path / "out"
     result = run_to_end("capture", scene, "--model", walk.person.path, "--out", out, status=1)
     for part in parts:
         assert part in result.stderr

@@ -73,9 +73,8 @@ def test_what_is_done_is_told(recording: PersonScene, known: list[int]) -> None:
 
 
 def test_estimate_follows_a_person_and_says_so(
-    recording: PersonScene, known: list[int], tmp_path: Path
+    recording: PersonScene, known: list[int], out: Path
 ) -> None:
-    out = tmp_path / "out"
     result, summary = run_estimate(recording, out)
     assert "followed by all silhouettes" in result.stdout
     assert known == [FRAMES]
@@ -97,10 +96,9 @@ def test_estimate_follows_a_person_and_says_so(
 
 
 def test_stills_cameras_and_frames_are_chosen_like_an_estimates(
-    known: list[int], tmp_path: Path
+    known: list[int], tmp_path: Path, out: Path
 ) -> None:
     scene = record_person(tmp_path / "scene", FRAMES, sequence=False)
-    out = tmp_path / "out"
     some = ("--frame", "0:1", "--camera", "camera_0", "--camera", "camera_2", "--no-overlay")
     _, summary = run_estimate(scene, out, *some)
     assert list(summary["frames"]) == ["0000", "0001"]
@@ -121,7 +119,7 @@ def test_a_capture_is_of_a_sequence_unless_the_scene_says_otherwise(
 
 
 def test_the_command_capture_takes_the_bundled_person(
-    recording: PersonScene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    recording: PersonScene, out: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked = {}
 
@@ -129,7 +127,7 @@ def test_the_command_capture_takes_the_bundled_person(
         asked.update(options, model=model, settings=settings)
 
     monkeypatch.setattr("drake_pose.commands.capture.estimate", note)
-    options = ["--out", tmp_path / "out", "--no-overlay", "--frame", "1"]
+    options = ["--out", out, "--no-overlay", "--frame", "1"]
     run_to_end("capture", recording.folder, *options)
     assert asked["model"].name == "person_shape.urdf"
     assert asked["settings"] == EstimateSettings(method="person", frames=("1",))
@@ -141,9 +139,8 @@ def interrupt(*_: object) -> None:
 
 
 def test_an_interrupted_recording_does_not_look_whole_and_loses_no_frames(
-    recording: PersonScene, known: list[int], tmp_path: Path
+    recording: PersonScene, known: list[int], out: Path
 ) -> None:
-    out = tmp_path / "out"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("drake_pose.jobs.estimate.person.capture_checked", interrupt)
         result, summary = run_estimate(recording, out, "--frame", "0", status=1)
@@ -187,15 +184,13 @@ def test_options_of_the_search_lead_to_the_search(
         estimate_scene(recording.folder, recording.person.path, None, settings)
 
 
-def test_what_the_method_person_cannot_do_is_refused(
-    recording: PersonScene, tmp_path: Path
-) -> None:
+def test_what_the_method_person_cannot_do_is_refused(recording: PersonScene, out: Path) -> None:
     with pytest.raises(SettingsError, match="leave hold out"):
         EstimateSettings(method="person", hold={"head_y": 1.0})
     hand = bundled_model("hand")
     with pytest.raises(ModelError, match=r"left_ankle.*landmarks\.yaml"):
-        estimate_scene(recording.folder, hand, tmp_path / "out", EstimateSettings(method="person"))
+        estimate_scene(recording.folder, hand, out, EstimateSettings(method="person"))
     alone = EstimateSettings(method="person", cameras=("camera_0",))
     with pytest.raises(SceneError, match="two calibrated cameras"):
-        estimate_scene(recording.folder, recording.person.path, tmp_path / "out", alone)
-    assert not (tmp_path / "out").exists()
+        estimate_scene(recording.folder, recording.person.path, out, alone)
+    assert not out.exists()

@@ -122,19 +122,19 @@ def test_what_does_not_say_where_the_body_is_is_refused(recording, with_start, m
         estimate_scene(scene, model, settings=settings)
 
 
-def test_a_bad_picture_is_met_before_the_work_begins(recording, tmp_path):
+def test_a_bad_picture_is_met_before_the_work_begins(recording, tmp_path, out):
     scene, model, _, start = recording
     copy = shutil.copytree(scene, tmp_path / "scene")
     cv2.imwrite(str(copy / "images" / "front" / "0005.png"), np.zeros((10, 20, 3), np.uint8))
     with pytest.raises(SceneError, match=r"0005\.png.*20 x 10"):
-        estimate_scene(copy, model, tmp_path / "out", EstimateSettings(start=start))
+        estimate_scene(copy, model, out, EstimateSettings(start=start))
     (copy / "images" / "front" / "0005.png").write_bytes(b"no picture")
     with pytest.raises(SceneError, match=r"0005\.png"):
-        estimate_scene(copy, model, tmp_path / "out", EstimateSettings(start=start))
-    assert not (tmp_path / "out" / "poses.csv").exists()
+        estimate_scene(copy, model, out, EstimateSettings(start=start))
+    assert not (out / "poses.csv").exists()
 
 
-def test_an_interrupted_sequence_of_pictures_goes_on_as_if_it_had_not_been(recording, tmp_path):
+def test_an_interrupted_sequence_of_pictures_goes_on_as_if_it_had_not_been(recording, out):
     scene, model, _, start = recording
     settings, heard = EstimateSettings(start=start), []
 
@@ -144,10 +144,8 @@ def test_an_interrupted_sequence_of_pictures_goes_on_as_if_it_had_not_been(recor
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        estimate_scene(scene, model, tmp_path / "out", settings, on_frame=stop)
-    resumed = estimate_scene(
-        scene, model, tmp_path / "out", settings, resume=True, on_frame=stop, replay=False
-    )
+        estimate_scene(scene, model, out, settings, on_frame=stop)
+    resumed = estimate_scene(scene, model, out, settings, resume=True, on_frame=stop, replay=False)
     assert heard[4:] == [(3, ""), *((k + 1, f"{k:04d}") for k in range(3, FRAMES))]
     whole = estimate_scene(scene, model, settings=settings)
     for one, other in zip(resumed.rows, whole.rows, strict=True):
@@ -155,14 +153,14 @@ def test_an_interrupted_sequence_of_pictures_goes_on_as_if_it_had_not_been(recor
     assert whole.found_count == FRAMES
     assert np.median(errors(whole, recording[2])) < 1.5
     # Overlays show an orange contour over the pictures.
-    shown = cv2.imread(str(tmp_path / "out" / "overlay" / "front" / "0001.png"))
+    shown = cv2.imread(str(out / "overlay" / "front" / "0001.png"))
     line = np.all(shown == (0, 94, 213), axis=-1)
     assert 100 < line.sum() < 0.1 * line.size
 
 
-def test_where_the_body_is_lost_no_pose_is_written(recording, tmp_path):
+def test_where_the_body_is_lost_no_pose_is_written(recording, tmp_path, out):
     scene, model, _, start = recording
-    copy, out = shutil.copytree(scene, tmp_path / "scene"), tmp_path / "out"
+    copy = shutil.copytree(scene, tmp_path / "scene")
     picture = cv2.imread(str(copy / "images" / "front" / "0003.png"))
     for k, grey in ((3, 128), (4, None)):
         # Without any colours, and with those of a room that the body has left.

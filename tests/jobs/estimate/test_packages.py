@@ -31,10 +31,10 @@ def far(tmp_path: Path, tiny_scene: TinyScene) -> tuple[Path, Path]:
 
 
 def test_a_package_is_named_where_it_is_missing_and_may_not_move(
-    tmp_path: Path, tiny_scene: TinyScene, far: tuple[Path, Path]
+    out: Path, tiny_scene: TinyScene, far: tuple[Path, Path]
 ) -> None:
     model, folder = far
-    scene, out = replace(tiny_scene, model=model), tmp_path / "out"
+    scene = replace(tiny_scene, model=model)
     words = [*scene.estimate(out), "--no-replay", "--no-overlay"]
     package = ["--package", f"parts={folder}"]
     for command in (words, ["check", str(model)]):

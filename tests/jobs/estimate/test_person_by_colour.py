@@ -47,7 +47,7 @@ def moved(estimate, truth):
     return np.abs(np.degrees([row.q[k] for row in estimate.rows] - truth[:, k]))
 
 
-def test_a_person_is_followed_from_a_start(recording, tmp_path):
+def test_a_person_is_followed_from_a_start(recording, out):
     scene, _, truth, start = recording
     settings = EstimateSettings(start=start, method="person")
     model = bundled_model("person")
@@ -57,18 +57,18 @@ def test_a_person_is_followed_from_a_start(recording, tmp_path):
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        estimate_scene(scene, model, tmp_path / "out", settings, on_frame=stop)
-    words = ["capture", scene, "--out", tmp_path / "out", "--start", start, "--model", model]
+        estimate_scene(scene, model, out, settings, on_frame=stop)
+    words = ["capture", scene, "--out", out, "--start", start, "--model", model]
     run_to_end(*words, "--resume", "--no-replay")
     # Nothing is left to be done.
-    found = estimate_scene(scene, model, tmp_path / "out", settings, resume=True, replay=False)
+    found = estimate_scene(scene, model, out, settings, resume=True, replay=False)
     assert found.summary["method"] == "person"
     assert found.found_count == FRAMES
     assert not any("lost" in text for text in found.warnings)
     # The arm is raised by 40 degrees; a pixel is 1.6 cm.
     assert moved(found, truth).max() < 3.0
     assert all(0.0 < row.error < 0.6 for row in found.rows)
-    overlays = list((tmp_path / "out" / "overlay").glob("*/*.png"))
+    overlays = list((out / "overlay").glob("*/*.png"))
     assert len(overlays) == 4 * FRAMES
 
 

@@ -31,7 +31,7 @@ def start(scene: TinyScene, out: Path, settings: dict[str, str]) -> subprocess.P
 
 
 def test_the_answer_does_not_depend_on_what_the_machine_is_set_to(
-    tiny_scene: TinyScene, tmp_path: Path
+    tiny_scene: TinyScene, tmp_path: Path, out: Path
 ) -> None:
     far = tmp_path / "Größe 模型 mit Leerzeichen"
     shutil.copytree(tiny_scene.folder, far / "scene")
@@ -43,7 +43,7 @@ def test_the_answer_does_not_depend_on_what_the_machine_is_set_to(
     # A locale that writes 0,5, where there is one.
     other = {"PYTHONHASHSEED": "77", "LC_ALL": "de_DE.UTF-8", "TZ": "Asia/Kolkata"}
     other |= {"HOME": str(nowhere / "of" / "nobody"), **dict.fromkeys(threads, "2")}
-    outs = tmp_path / "out", far / "out ä"
+    outs = out, far / "out ä"
     children = [
         start(tiny_scene, outs[0], plain),
         start(replace(tiny_scene, folder=far / "scene", model=model), outs[1], other),

@@ -34,8 +34,7 @@ def positions(out: Path) -> dict[str, np.ndarray]:
     return {row["frame"]: np.array([float(row[name]) for name in NAMES]) for row in rows}
 
 
-def test_result_folder(tiny_scene: TinyScene, tmp_path: Path) -> None:
-    out = tmp_path / "out"
+def test_result_folder(tiny_scene: TinyScene, out: Path) -> None:
     run_estimate(tiny_scene, out, "--angles", "grid")
     assert sorted(path.name for path in out.iterdir()) == [
         "families.csv", "joints.csv", "overlay", "poses.csv", "replay.html", "report.html",
@@ -54,8 +53,7 @@ def test_result_folder(tiny_scene: TinyScene, tmp_path: Path) -> None:
     assert 'src="http' not in page
 
 
-def test_summary(tiny_scene: TinyScene, tmp_path: Path) -> None:
-    out = tmp_path / "out"
+def test_summary(tiny_scene: TinyScene, out: Path) -> None:
     options = ["--json", "--no-replay", "--hold", "lift=20", "--joint-interval", "luff=40"]
     result, summary = run_estimate(tiny_scene, out, "--method", "paper", "--frame", "0:1", *options)
     assert summary == json.loads(result.stdout)
@@ -76,20 +74,16 @@ def test_summary(tiny_scene: TinyScene, tmp_path: Path) -> None:
     np.testing.assert_allclose(steps, np.round(steps), atol=1e-7)
 
 
-def test_error_and_overlay_are_what_drakes_renderer_sees(
-    tiny_scene: TinyScene, tmp_path: Path
-) -> None:
+def test_error_and_overlay_are_what_drakes_renderer_sees(tiny_scene: TinyScene, out: Path) -> None:
     settings = EstimateSettings(interval=13.0, method="paper", hold={"luff": -90.0})
-    result = estimate_scene(
-        tiny_scene.folder, tiny_scene.model, tmp_path / "out", settings, replay=False
-    )
+    result = estimate_scene(tiny_scene.folder, tiny_scene.model, out, settings, replay=False)
     scene = load_scene(tiny_scene.folder)
     renderer = LabelRenderer(load_model(tiny_scene.model), scene.cameras["front"])
     for row in result.rows:
         mask, body = scene.read("front", row.frame), renderer.mask(row.q)
         shares = [(mask & body).sum(), (mask & ~body).sum(), (body & ~mask).sum()]
         assert row.error == pytest.approx(sum(shares[1:]) / mask.sum(), abs=0.003)
-        picture = cv2.imread(str(tmp_path / "out" / "overlay" / "front" / f"{row.frame}.png"))
+        picture = cv2.imread(str(out / "overlay" / "front" / f"{row.frame}.png"))
         counts = [
             int((picture[36:-38, :, ::-1] == np.array(colour, np.uint8)).all(axis=2).sum())
             for colour in (AGREEMENT_RGB, MISSING_RGB, EXCESS_RGB)
@@ -218,11 +212,13 @@ def test_what_is_known_of_each_joint_and_of_frames_before(own_scene: TinyScene) 
         assert answer == pytest.approx(value, abs=1e-3)
 
 
-def test_what_the_model_does_not_enforce_is_told(tiny_scene: TinyScene, tmp_path: Path) -> None:
+def test_what_the_model_does_not_enforce_is_told(
+    tiny_scene: TinyScene, tmp_path: Path, out: Path
+) -> None:
     text = URDF.replace('<joint name="bolt" type="fixed">', '<joint name="bolt" type="prismatic">')
     joint = text.index('<joint name="luff"')
     end = text.index("</joint>", joint)
-    model, out = tmp_path / "loose.urdf", tmp_path / "out"
+    model = tmp_path / "loose.urdf"
     model.write_text(f'{text[:end]}<mimic joint="gone"/>{text[end:]}')
     scene, options = replace(tiny_scene, model=model), ("--frame", "0", "--no-replay")
     result, summary = run_estimate(scene, out, "--method", "paper", *options)

@@ -31,16 +31,16 @@ def run(scene: TinyScene, out: Path, *more: str) -> tuple[np.ndarray, dict]:
     return np.array([float(row[name]) for name in NAMES]), summary["frames"]["0000"]
 
 
-def test_masks_alone(bare_scene: TinyScene, tmp_path: Path) -> None:
+def test_masks_alone(bare_scene: TinyScene, out: Path) -> None:
     """Pose and scale are found, as far as a parallel camera can stand for the pinhole."""
-    q, record = run(bare_scene, tmp_path / "out")
+    q, record = run(bare_scene, out)
     np.testing.assert_allclose(q, bare_scene.truth["0000"], atol=np.radians(6.0))
     assert record["E_total"] < 0.08
     true_camera = camera("front")
     # The crane stands in the world's origin.
     depth = np.linalg.norm(true_camera.X_WC[:2, 3])
     assert record["camera_scale"] == pytest.approx(true_camera.focal_x / depth, rel=0.06)
-    assert (tmp_path / "out" / "overlay" / "camera" / "0000.png").is_file()
+    assert (out / "overlay" / "camera" / "0000.png").is_file()
     # Nothing says how sure it is: each joint may be anywhere inside its limits.
     limits = load_model(bare_scene.model, check=False)
     for k, joint in enumerate(record["joints"].values()):
@@ -49,8 +49,8 @@ def test_masks_alone(bare_scene: TinyScene, tmp_path: Path) -> None:
         assert [joint["low"], joint["high"]] == pytest.approx(ends)
 
 
-def test_a_root_position_that_is_not_known(tiny_scene: TinyScene, tmp_path: Path) -> None:
-    q, record = run(tiny_scene, tmp_path / "out", "--root-position", "unknown")
+def test_a_root_position_that_is_not_known(tiny_scene: TinyScene, out: Path) -> None:
+    q, record = run(tiny_scene, out, "--root-position", "unknown")
     np.testing.assert_allclose(q, tiny_scene.truth["0000"], atol=np.radians(6.0))
     assert record["E_total"] < 0.03
     assert record["camera_scale"] is None

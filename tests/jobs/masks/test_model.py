@@ -36,38 +36,38 @@ def filmed(tmp_path):
 
 
 @pytest.mark.slow
-def test_single_still_is_cut_in_the_band_of_its_rough_pose(tmp_path):
+def test_single_still_is_cut_in_the_band_of_its_rough_pose(tmp_path, out):
     scene = write_pictures(tmp_path / "scene", [(20.0, -60.0)], seed=4)
     start = write_start(tmp_path / "start.csv", NAMES, scene.truth, off=2.0)
     settings = MaskSettings(model=scene.model, start=start, start_error=2.0)
-    make_masks(scene.folder, tmp_path / "out", settings)
-    assert agreements(tmp_path / "out", scene).min() > 0.9
+    make_masks(scene.folder, out, settings)
+    assert agreements(out, scene).min() > 0.9
 
 
 @pytest.mark.slow
-def test_masks_are_found_from_poses_five_degrees_off_and_empty_rooms_named(filmed, tmp_path):
+def test_masks_are_found_from_poses_five_degrees_off_and_empty_rooms_named(filmed, tmp_path, out):
     start = write_start(tmp_path / "start.csv", NAMES, filmed.truth)
     for camera in ("front", "side"):
         room = cv2.imread(str(filmed.folder / "background" / f"{camera}.png"))
         cv2.imwrite(str(filmed.folder / "images" / camera / "0004.png"), room)
     settings = MaskSettings(model=filmed.model, start=start)
-    result = make_masks(filmed.folder, tmp_path / "out", settings)
-    made = load_scene(tmp_path / "out")
+    result = make_masks(filmed.folder, out, settings)
+    made = load_scene(out)
     assert result.count == 14
     assert not any(frame == "0004" for _, frame in made.masks)
     assert sum("0004.png: " in text and "not" in text for text in result.warnings) == 2
-    values = agreements(tmp_path / "out", filmed)
+    values = agreements(out, filmed)
     assert values.min() > 0.9
     assert np.median(values) > 0.95
 
 
 @pytest.mark.slow
-def test_starts_far_off_are_refused_or_named(filmed, tmp_path):
+def test_starts_far_off_are_refused_or_named(filmed, tmp_path, out):
     """Whatever is written without a word is right."""
     start = write_start(tmp_path / "start.csv", NAMES, filmed.truth, off=35.0)
     settings = MaskSettings(model=filmed.model, start=start)
-    result = make_masks(filmed.folder, tmp_path / "out", settings)
-    true, made = load_scene(filmed.folder), load_scene(tmp_path / "out")
+    result = make_masks(filmed.folder, out, settings)
+    true, made = load_scene(filmed.folder), load_scene(out)
     for camera, frame in made.masks:
         named = any(f"{camera}/{frame}.png" in text for text in result.warnings)
         assert named or iou(true.read(camera, frame), made.read(camera, frame)) > 0.9
@@ -90,7 +90,7 @@ def test_what_is_missing_is_named(filmed, tmp_path):
 
 
 @pytest.mark.slow
-def test_real_arm_from_five_degrees_off(shared_data, tmp_path):
+def test_real_arm_from_five_degrees_off(shared_data, tmp_path, out):
     """Of the ten masks that are given two have a part of the table, others lack the fingers."""
     scene = shared_data / "franka_one_view"
     with (scene / "joint_angles_fitted.csv").open() as file:
@@ -101,8 +101,8 @@ def test_real_arm_from_five_degrees_off(shared_data, tmp_path):
     settings = MaskSettings(
         model=scene / "panda" / "panda.urdf", start=start, cameras=scene / "cameras_reference.yaml"
     )
-    make_masks(scene / "images", tmp_path / "out", settings)
-    made = load_scene(tmp_path / "out")
+    make_masks(scene / "images", out, settings)
+    made = load_scene(out)
     true = load_scene(scene, load_cameras(scene / "cameras_reference.yaml"))
     values = [iou(made.read(*key), true.read(*key)) for key in made.masks]
     assert np.median(values) > 0.93

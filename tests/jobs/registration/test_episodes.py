@@ -163,9 +163,8 @@ def require_overlay_as_given(picture: np.ndarray) -> None:
 
 
 @pytest.mark.slow
-def test_an_episode_becomes_a_calibrated_scene(episode, tmp_path):
+def test_an_episode_becomes_a_calibrated_scene(episode, out):
     _, painted = episode
-    out = tmp_path / "out"
     summary = run("register", episode, out)
     assert summary["masks"] == "found"
     deviation = summary["time_offset_sd_s"]

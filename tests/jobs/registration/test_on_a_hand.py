@@ -46,8 +46,7 @@ def bracket(tmp_path_factory: pytest.TempPathFactory) -> TargetScene:
     return write_hand_scene(tmp_path_factory.mktemp("bracket"), seed=1)
 
 
-def test_the_camera_is_found_on_its_link(own_base: ArmScene, tmp_path: Path) -> None:
-    out = tmp_path / "out"
+def test_the_camera_is_found_on_its_link(own_base: ArmScene, out: Path) -> None:
     found = run_json(*own_base.register(out), "--on", "flange")
     assert found["warnings"] == []
     assert found["link"] == "flange"
@@ -66,11 +65,13 @@ def test_the_camera_is_found_on_its_link(own_base: ArmScene, tmp_path: Path) -> 
 
 
 @pytest.mark.slow
-def test_lengths_between_the_base_and_the_camera(own_base: ArmScene, tmp_path: Path) -> None:
+def test_lengths_between_the_base_and_the_camera(
+    own_base: ArmScene, tmp_path: Path, out: Path
+) -> None:
     right, short = own_base.model.read_text(), tmp_path / "short.urdf"
     assert right.count('"0 0 0.35"') == 1
     short.write_text(right.replace('"0 0 0.35"', '"0 0 0.34"'))
-    words = replace(own_base, model=short).register(tmp_path / "out")
+    words = replace(own_base, model=short).register(out)
     found = run_json(*words, "--on", "flange", "--lengths", "shoulder", "--lengths", "elbow")
     off, one = 100.0 * (0.35 / 0.34 - 1.0), found["lengths"]["shoulder"]
     assert one["low_percent"] < off < one["high_percent"]
@@ -80,7 +81,7 @@ def test_lengths_between_the_base_and_the_camera(own_base: ArmScene, tmp_path: P
     require_near(found, 3.0, 0.3)
     # Drake has the joint that the link carries where the right arm has it, but for what is left.
     places = []
-    for path in (own_base.model, tmp_path / "out" / "short_calibrated.urdf"):
+    for path in (own_base.model, out / "short_calibrated.urdf"):
         joint = load_model(path, check=False).plant.GetJointByName("roll_turn")
         places.append(joint.frame_on_parent().GetFixedPoseInBodyFrame().translation()[2])
     assert places[1] - places[0] == pytest.approx(0.34e-2 * (one["value_percent"] - off), abs=1e-9)
@@ -90,9 +91,11 @@ def test_lengths_between_the_base_and_the_camera(own_base: ArmScene, tmp_path: P
 @pytest.mark.parametrize(
     ("looks", "links", "alike"), [(BRACKET, LINKS, 1), (BRACKET, SIX, 1), (BOX, LINKS, 4)]
 )
-def test_camera_and_target_are_found(looks: str, links: tuple, alike: int, tmp_path: Path) -> None:
+def test_camera_and_target_are_found(
+    looks: str, links: tuple, alike: int, tmp_path: Path, out: Path
+) -> None:
     """A box looks alike turned by half a turn about each of its axes."""
-    scene, out = write_hand_scene(tmp_path, looks, links, seed=2), tmp_path / "out"
+    scene = write_hand_scene(tmp_path, looks, links, seed=2)
     found = run_json(*scene.register(out))
     require_near(found, 1.0, 0.1)
     target = found["target"]
@@ -108,19 +111,19 @@ def test_camera_and_target_are_found(looks: str, links: tuple, alike: int, tmp_p
 
 
 @pytest.mark.slow
-def test_damaged_masks_and_a_wrong_one(tmp_path: Path) -> None:
+def test_damaged_masks_and_a_wrong_one(tmp_path: Path, out: Path) -> None:
     scene = write_hand_scene(tmp_path, BRACKET, SIX, seed=3, width=640)
     damage_masks(scene.arm.folder / "masks" / "wrist", 3, "0005.png")
-    found = run_json(*scene.register(tmp_path / "out"), "--no-overlay")
+    found = run_json(*scene.register(out), "--no-overlay")
     assert found["contradictions"] == ["0005"]
     assert any("contradict the others" in text for text in found["warnings"])
     require_near(found, 5.0, 0.5)
 
 
 @pytest.mark.slow
-def test_a_round_target_leaves_its_own_turn_open_alone(tmp_path: Path) -> None:
+def test_a_round_target_leaves_its_own_turn_open_alone(tmp_path: Path, out: Path) -> None:
     scene = write_hand_scene(tmp_path, CAN, SIX, seed=1)
-    found = run_json(*scene.register(tmp_path / "out"), "--no-overlay")
+    found = run_json(*scene.register(out), "--no-overlay")
     require_near(found, 1.0, 0.1)
     target = found["target"]
     assert not target["determined"]
@@ -134,8 +137,8 @@ def test_a_round_target_leaves_its_own_turn_open_alone(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_pictures_are_enough_of_a_target(tmp_path: Path) -> None:
-    scene, out = write_hand_scene(tmp_path, BRACKET, seed=4), tmp_path / "out"
+def test_pictures_are_enough_of_a_target(tmp_path: Path, out: Path) -> None:
+    scene = write_hand_scene(tmp_path, BRACKET, seed=4)
     masks = sorted((scene.arm.folder / "masks" / "wrist").glob("*.png"))
     drawn = {path.name: read_mask(path) for path in masks}
     paint_pictures(scene.arm.folder)
@@ -152,8 +155,8 @@ def test_pictures_are_enough_of_a_target(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_pictures_that_do_not_show_the_target_are_refused(tmp_path: Path) -> None:
-    scene, out = write_hand_scene(tmp_path, BOX, seed=4), tmp_path / "out"
+def test_pictures_that_do_not_show_the_target_are_refused(tmp_path: Path, out: Path) -> None:
+    scene = write_hand_scene(tmp_path, BOX, seed=4)
     paint_pictures(scene.arm.folder)
     other = scene.with_looks(BOX, CAN, tmp_path / "can.urdf")
     said = "camera 'wrist': no pose of the target explains its pictures"
@@ -162,11 +165,11 @@ def test_pictures_that_do_not_show_the_target_are_refused(tmp_path: Path) -> Non
 
 
 @pytest.mark.slow
-def test_zeros_beside_camera_and_target(bracket: TargetScene, tmp_path: Path) -> None:
+def test_zeros_beside_camera_and_target(bracket: TargetScene, tmp_path: Path, out: Path) -> None:
     scene = replace(bracket, arm=bracket.arm.copy(tmp_path))
     scene.arm.add_to("elbow_turn", -np.radians(2.0))
     given = ["--zeros", "elbow_turn", "--zeros", "turret_turn"]
-    found = run_json(*scene.register(tmp_path / "out"), *given)
+    found = run_json(*scene.register(out), *given)
     assert found["zeros"]["elbow_turn"]["value_deg"] == pytest.approx(2.0, abs=0.3)
     assert found["zeros"]["elbow_turn"]["significant"]
     # The first joint's zero turns with the target, which stands anywhere.
@@ -183,12 +186,10 @@ def test_zeros_beside_camera_and_target(bracket: TargetScene, tmp_path: Path) ->
         ("--on hand --lengths paw", "no link with a length 'paw'"),
     ],
 )
-def test_what_is_refused_before_work(
-    more: str, said: str, own_base: ArmScene, tmp_path: Path
-) -> None:
-    words = own_base.register(tmp_path / "out")
+def test_what_is_refused_before_work(more: str, said: str, own_base: ArmScene, out: Path) -> None:
+    words = own_base.register(out)
     assert_refused(run_command([*words, *more.split()]), said)
-    assert not (tmp_path / "out").exists()
+    assert not out.exists()
 
 
 @pytest.mark.parametrize(
@@ -201,18 +202,15 @@ def test_what_is_refused_before_work(
         ("--zeros target_turn_x", "no joint 'target_turn_x'"),
     ],
 )
-def test_what_is_refused_of_a_target(
-    more: str, said: str, bracket: TargetScene, tmp_path: Path
-) -> None:
-    words = bracket.register(tmp_path / "out")
+def test_what_is_refused_of_a_target(more: str, said: str, bracket: TargetScene, out: Path) -> None:
+    words = bracket.register(out)
     assert_refused(run_command([*words, *more.split()]), said)
-    assert not (tmp_path / "out").exists()
+    assert not out.exists()
 
 
 def test_other_bases_hands_and_targets_are_refused(
-    bracket: TargetScene, arm_scene: ArmScene, tmp_path: Path
+    bracket: TargetScene, arm_scene: ArmScene, tmp_path: Path, out: Path
 ) -> None:
-    out = tmp_path / "out"
     stiff = write_hand_scene(tmp_path, links=SIX, seed=5, count=5, moving=5)
     jointed = replace(bracket, target=bracket.arm.model)
     for words, parts in (
@@ -226,11 +224,13 @@ def test_other_bases_hands_and_targets_are_refused(
 
 
 @pytest.mark.slow
-def test_masks_of_another_target_are_refused(bracket: TargetScene, tmp_path: Path) -> None:
+def test_masks_of_another_target_are_refused(
+    bracket: TargetScene, tmp_path: Path, out: Path
+) -> None:
     other = bracket.with_looks("0.05 0.08 0.12", "0.15 0.02 0.3", tmp_path / "other.urdf")
-    words = [*other.register(tmp_path / "out"), "--frame", "0000:0003"]
+    words = [*other.register(out), "--frame", "0000:0003"]
     assert_refused(run_command(words), "Nothing was written")
-    assert not (tmp_path / "out").exists()
+    assert not out.exists()
 
 
 @pytest.mark.parametrize(

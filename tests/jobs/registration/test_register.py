@@ -88,11 +88,10 @@ class TestRegister:
 
 
 @pytest.mark.slow
-def test_a_camera_that_has_a_pose_is_found_anew(own_arm: ArmScene, tmp_path: Path) -> None:
+def test_a_camera_that_has_a_pose_is_found_anew(own_arm: ArmScene, out: Path) -> None:
     wrong = np.eye(4)
     wrong[:3, 3] = [1.0, 0.3, -0.4]
     own_arm.edit_cameras("right", X_WC=wrong.tolist())
-    out = tmp_path / "out"
     result = run_to_end(*own_arm.register(out), "--camera", "right", "--no-overlay")
     # Nobody knows where the other one stands, and nobody asked.
     assert "camera 'left' has no X_WC" in result.stderr
@@ -106,12 +105,12 @@ def test_a_camera_that_has_a_pose_is_found_anew(own_arm: ArmScene, tmp_path: Pat
 
 @pytest.mark.slow
 def test_one_pose_and_a_held_camera_that_looks_elsewhere_are_warned_of(
-    own_arm: ArmScene, tmp_path: Path
+    own_arm: ArmScene, out: Path
 ) -> None:
     elsewhere = np.array(own_arm.cameras["right"].X_WC)
     elsewhere[:3, 3] += [0.0, 0.8, 0.0]
     own_arm.edit_cameras("right", X_WC=elsewhere.tolist())
-    result = run_to_end(*own_arm.register(tmp_path / "out"), "--frame", "2", "--json")
+    result = run_to_end(*own_arm.register(out), "--frame", "2", "--json")
     assert "camera 'right' is held at its X_WC, but the robot is not seen" in result.stderr
     assert "--camera right" in result.stderr
     assert "camera 'left': there is one frame, '0002'" in result.stderr
@@ -141,11 +140,11 @@ class TestRecordedArms:
         ious = [frame.iou for frame in one.frames]
         np.testing.assert_allclose(ious, (0.87, 0.94, 0.92, 0.95, 0.93), atol=0.01)
 
-    def test_frames_that_contradict_their_angles(self, shared_data: Path, tmp_path: Path) -> None:
+    def test_frames_that_contradict_their_angles(self, shared_data: Path, out: Path) -> None:
         folder = shared_data / "franka_one_view"
         panda = folder / "panda" / "panda.urdf"
         scene = ArmScene(folder, panda, folder / "joint_angles.csv", {})
-        result = run_to_end(*scene.register(tmp_path / "out"), "--json")
+        result = run_to_end(*scene.register(out), "--json")
         found = json.loads(result.stdout)
         assert found["contradictions"] == [f"{k:04d}" for k in range(2, 10)]
         assert "8 of 10 frames contradict the others and did not count: 0002-0009" in result.stderr
@@ -182,11 +181,11 @@ def body_poses(path: Path, q: np.ndarray, names: tuple[str, ...]) -> dict[str, n
 
 @pytest.mark.slow
 def test_zeros_and_lengths_are_found_and_written_to_a_urdf(
-    own_arm: ArmScene, tmp_path: Path
+    own_arm: ArmScene, tmp_path: Path, out: Path
 ) -> None:
     """Drake poses the corrected robot at the encoders' readings as the right one at the truth."""
     rows = own_arm.add_to("elbow_turn", -np.radians(3.0))
-    short, out = tmp_path / "short.urdf", tmp_path / "out"
+    short = tmp_path / "short.urdf"
     short.write_text(own_arm.model.read_text().replace('"0 0 0.35"', '"0 0 0.34"'))
     given = ["--zeros", "shoulder_turn", "--zeros", "elbow_turn"]
     given += ["--lengths", "shoulder", "--lengths", "turret"]
@@ -218,20 +217,22 @@ def test_zeros_and_lengths_are_found_and_written_to_a_urdf(
 
 
 def test_too_few_frames_for_all_zeros(
-    own_arm: ArmScene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    own_arm: ArmScene, out: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """And nothing is searched for first."""
     monkeypatch.setattr(CameraSearch, "register", None)
-    words = own_arm.register(tmp_path / "out")
+    words = own_arm.register(out)
     assert_refused(run_command([*words, "--zeros", "all", "--frame", "0000"]), "more frames")
-    assert not (tmp_path / "out").exists()
+    assert not out.exists()
 
 
-def test_that_no_picture_can_be_suggested_is_said(tiny_scene: TinyScene, tmp_path: Path) -> None:
+def test_that_no_picture_can_be_suggested_is_said(
+    tiny_scene: TinyScene, tmp_path: Path, out: Path
+) -> None:
     """An arm in a plane looks the same from two places, and is nowhere outside the box."""
     joints = write_truth(tiny_scene, tmp_path / "joints.csv")
     arm = ArmScene(tiny_scene.folder, tiny_scene.model, joints, {})
-    words = [*arm.register(tmp_path / "out"), "--no-overlay", "--camera", "front"]
+    words = [*arm.register(out), "--no-overlay", "--camera", "front"]
     words += ["--keep-out", "-9,-9,-9:9,9,9"]
     assert_refused(run_command(words), "--keep-out is for --suggest", status=2)
     found = run_to_end(*words, "--suggest", "--json")

@@ -60,29 +60,29 @@ def write_free_arm(scene: ArmScene, seed: int = 7) -> None:
 
 @pytest.mark.slow
 class TestFound:
-    def test_positions_are_estimated_by_the_other_camera(self, arm_scene, tmp_path) -> None:
-        out, true = tmp_path / "out", arm_scene.cameras["left"].X_WC
+    def test_positions_are_estimated_by_the_other_camera(self, arm_scene, out) -> None:
+        true = arm_scene.cameras["left"].X_WC
         words = arm_scene.register(out, with_joints=False)
         assert register_near(words, out, "left", true, 25.0, 0.8, 4.0)["joints"] is None
 
-    def test_the_base_moves_and_the_table_is_an_estimate_s(self, own_arm, tmp_path) -> None:
+    def test_the_base_moves_and_the_table_is_an_estimate_s(self, own_arm, out) -> None:
         write_free_arm(own_arm)
-        out, true = tmp_path / "out", own_arm.cameras["left"].X_WC
+        true = own_arm.cameras["left"].X_WC
         # Held at the table, which is off by a degree and 5 mm, it is 10 mm and more.
         found = register_near(own_arm.register(out), out, "left", true, 15.0, 0.5, 4.0)
         assert "0006" not in found["frames"]
 
-    def test_a_recorded_person(self, shared_data: Path, tmp_path: Path) -> None:
-        source, out = shared_data / "human_four_views", tmp_path / "out"
+    def test_a_recorded_person(self, shared_data: Path, out: Path) -> None:
+        source = shared_data / "human_four_views"
         words = ArmScene(source, PERSON, out, {}).register(out, with_joints=False)
         true = load_cameras(source / "cameras.yaml")["cam03"].X_WC
         words += ["--camera", "cam03", "--frame", "0:19"]
         # Four metres away, the person's surface known to a centimetre or two.
         register_near(words, out, "cam03", true, 100.0, 2.5, 5.0)
 
-    def test_a_body_that_stands_still_is_warned_of(self, own_arm, tmp_path: Path) -> None:
+    def test_a_body_that_stands_still_is_warned_of(self, own_arm, out: Path) -> None:
         as_estimated(own_arm, slice(1))
-        result = run_to_end(*own_arm.register(tmp_path / "out"))
+        result = run_to_end(*own_arm.register(out))
         assert "camera 'left': there is one frame, '0000'" in " ".join(result.stderr.split())
 
 
@@ -94,28 +94,28 @@ def as_estimated(arm: ArmScene, frames: slice = slice(None)) -> None:
 
 
 class TestRefused:
-    def test_nothing_is_known(self, own_arm: ArmScene, tmp_path: Path) -> None:
+    def test_nothing_is_known(self, own_arm: ArmScene, out: Path) -> None:
         own_arm.edit_cameras("right", X_WC=None)
-        result = run_command(own_arm.register(tmp_path / "out", with_joints=False))
+        result = run_command(own_arm.register(out, with_joints=False))
         assert_refused(result, "neither a camera's place nor", "X_WC of one camera", "--joints")
-        assert not (tmp_path / "out").exists()
+        assert not out.exists()
 
-    def test_a_person_before_one_known_camera(self, arm_scene: ArmScene, tmp_path: Path) -> None:
-        words = replace(arm_scene, model=PERSON).register(tmp_path / "out", with_joints=False)
+    def test_a_person_before_one_known_camera(self, arm_scene: ArmScene, out: Path) -> None:
+        words = replace(arm_scene, model=PERSON).register(out, with_joints=False)
         assert_refused(run_command(words), "right is the only camera", "two cameras or more")
 
     @pytest.mark.parametrize("more", [["--zeros", "all"], ["--focal"], ["--on", "hand"]])
-    def test_what_needs_measured_positions(self, more, arm_scene, tmp_path: Path) -> None:
-        words = arm_scene.register(tmp_path / "out", with_joints=False)
+    def test_what_needs_measured_positions(self, more, arm_scene, out: Path) -> None:
+        words = arm_scene.register(out, with_joints=False)
         assert_refused(run_command([*words, *more]), f"{more[0]} needs measured joint positions")
 
-    def test_no_moment_in_common(self, own_arm: ArmScene, tmp_path: Path) -> None:
+    def test_no_moment_in_common(self, own_arm: ArmScene, out: Path) -> None:
         own_arm.write_rows([["frame", *JOINTS, "error", "seconds"], [7, *([0.1] * 5), 0.1, 1.0]])
-        result = run_command(own_arm.register(tmp_path / "out"))
+        result = run_command(own_arm.register(out))
         assert_refused(result, "camera 'left' has no mask of a frame in which")
 
-    def test_an_estimate_without_its_cameras(self, own_arm: ArmScene, tmp_path: Path) -> None:
+    def test_an_estimate_without_its_cameras(self, own_arm: ArmScene, out: Path) -> None:
         as_estimated(own_arm)
         shutil.rmtree(own_arm.folder / "masks" / "right")
-        result = run_command(own_arm.register(tmp_path / "out"))
+        result = run_command(own_arm.register(out))
         assert_refused(result, "no camera with an X_WC has a mask of those frames")

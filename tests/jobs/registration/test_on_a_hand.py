@@ -231,18 +231,3 @@ def test_masks_of_another_target_are_refused(
     words = [*other.register(out), "--frame", "0000:0003"]
     assert_refused(run_command(words), "Nothing was written")
     assert not out.exists()
-
-
-@pytest.mark.parametrize(
-    ("fields", "said"),
-    [
-        ({"link": "hand"}, "link's name"),
-        ({"X_LC": np.eye(4).tolist()}, "link's name"),
-        ({"link": "hand", "X_LC": np.eye(4).tolist(), "X_WC": np.eye(4).tolist()}, "no X_WC"),
-    ],
-)
-def test_half_a_link_is_refused(fields: dict[str, object], said: str, tmp_path: Path) -> None:
-    sides = dict(width=8, height=6, focal_x=9, focal_y=9, center_x=3.5, center_y=2.5)
-    (tmp_path / "cameras.yaml").write_text(yaml.safe_dump({"wrist": sides | fields}))
-    with pytest.raises(CameraError, match=said):
-        load_camera_file(tmp_path / "cameras.yaml")

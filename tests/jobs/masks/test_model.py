@@ -1,6 +1,7 @@
 """Pose and mask in turn: an arm before textured rooms, begun from poses that are off."""
 
 import csv
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -10,7 +11,7 @@ from drake_pose import MaskSettings, load_scene, make_masks
 from drake_pose.camera.camera_files import load_cameras
 from drake_pose.errors import CameraError, SceneError, SettingsError
 from tests.jobs.masks.rooms import iou, moving, write_pictures
-from tests.jobs.scenes import NAMES, write_joints
+from tests.jobs.scenes import NAMES, edit_camera, write_joints
 
 OFF = 5.0
 
@@ -80,6 +81,13 @@ def test_what_is_missing_is_named(filmed, tmp_path):
     settings = MaskSettings(model=filmed.model, start=start)
     with pytest.raises(CameraError, match="needs to know the cameras"):
         make_masks(filmed.folder / "images", tmp_path / "a", settings)
+    riding = {"X_WC": None, "link": "boom", "X_LC": np.eye(4).tolist()}
+    for fields, said in ((riding, "rides on a link"), ({"X_WC": None}, "needs X_WC")):
+        other = edit_camera(
+            filmed.folder / "cameras.yaml", "side", tmp_path / "cameras.yaml", **fields
+        )
+        with pytest.raises(CameraError, match=f"'side' {said}"):
+            make_masks(filmed.folder, tmp_path / "a", replace(settings, cameras=other))
     lines = start.read_text().splitlines()
     start.write_text("\n".join(lines[:-1]))
     with pytest.raises(SceneError, match="no row of frame '0007'"):

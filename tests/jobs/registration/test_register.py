@@ -64,9 +64,10 @@ class TestRegister:
         covariance = np.array(one["covariance"])
         assert one["errors"] == ["turn_x", "turn_y", "turn_z", "x", "y", "z"]
         assert (np.linalg.eigvalsh(covariance) > 0.0).all()
-        turn = np.degrees(np.sqrt(np.trace(covariance[:3, :3]) / 3.0))
-        assert found["rotation_sd_deg"] == pytest.approx(turn)
-        assert 0.0 < turn < 1.5
+        turn, shift = np.sqrt(np.diag(covariance).reshape(2, 3).mean(axis=1))
+        assert found["rotation_sd_deg"] == pytest.approx(np.degrees(turn))
+        assert found["translation_sd_mm"] == pytest.approx(1e3 * shift)
+        assert 0.0 < np.degrees(turn) < 1.5
         assert one["X_WC"] == found["X_WC"]
 
     def test_overlays_and_report(self, registered) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
@@ -36,14 +36,6 @@ class PlacedCameras(NamedTuple):
 
     cameras: list[EpisodeCamera]
     placed: frozenset[str]
-
-    def say_left_out(self) -> list[str]:
-        """That cameras are not used whose pose nobody says."""
-        return [
-            f"camera '{one.name}' has no X_WC: it is left out"
-            for one in self.cameras
-            if one.name not in self.placed
-        ]
 
 
 class MappedJoints(NamedTuple):
@@ -95,6 +87,11 @@ def cameras_of(
     given = load_camera_file(file, distorted=True)
     chosen = [with_intrinsics(one, given, file) for one in chosen]
     return PlacedCameras(chosen, frozenset(given.cameras) - {*given.unplaced, *given.links})
+
+
+def say_left_out(names: Iterable[str], placed: Collection[str]) -> list[str]:
+    """That cameras are not used whose pose nobody says."""
+    return [f"camera '{name}' has no X_WC: it is left out" for name in names if name not in placed]
 
 
 def map_log(
@@ -202,8 +199,7 @@ def read_episode_scene(
     Raises DrakePoseError: names the file, camera or frame at fault; nobody says where a camera is.
     """
     episode = open_episode(path, joints=joints, episode=settings.episode)
-    looked_at = cameras_of(episode, cameras, settings)
-    chosen, placed = looked_at
+    chosen, placed = cameras_of(episode, cameras, settings)
     if not placed.intersection(one.name for one in chosen):
         raise SceneError(
             f"{path}: nobody says where a camera stands; find out (drake-pose register), and give "
@@ -223,7 +219,7 @@ def read_episode_scene(
     scene = Scene(
         path, {name: one.camera for name, one in known.items() if one.camera is not None}, frames,
         {}, True, rate, images=images, readers=readers,
-        warnings=(*episode.warnings, *looked_at.say_left_out()),
+        warnings=(*episode.warnings, *say_left_out([one.name for one in chosen], placed)),
     )  # fmt: skip
     return EpisodeScene(scene, episode, first, kept)
 

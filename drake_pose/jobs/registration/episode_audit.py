@@ -16,6 +16,7 @@ from scipy.special import chdtrc
 from drake_pose.arrays import Array, Picture
 from drake_pose.camera.models import Camera, PinholeCamera
 from drake_pose.errors import SceneError
+from drake_pose.jobs.estimate.episode import say_left_out
 from drake_pose.jobs.registration.episodes import EpisodeInputs
 from drake_pose.jobs.registration.inputs import Inputs
 from drake_pose.jobs.registration.positions import KnownPositions
@@ -85,11 +86,7 @@ def look_at_episode(
             f"{episode.path}: no camera has an X_WC that could be audited; give a camera file "
             "(--cameras FILE), or find out where they stand: drake-pose register"
         )
-    warnings = [
-        f"camera '{name}' has no X_WC: it is left out"
-        for name in episode.cameras
-        if name not in placed
-    ]
+    warnings = say_left_out(episode.cameras, episode.placed)
     body = RegistrationBody(episode.tree, episode.seen)
     held, findings, pictures = list[Camera](), list[Finding](), dict[str, PictureRegistration]()
     names, frames = dict[str, tuple[str, str]](), list[SeenFrame]()

@@ -179,31 +179,20 @@ def test_zeros_beside_camera_and_target(bracket: TargetScene, tmp_path: Path, ou
 
 
 @pytest.mark.parametrize(
-    ("more", "said"),
+    ("seen", "more", "said"),
     [
-        ("--on paw", "no link 'paw'"),
-        ("--on base", "no joint moves link 'base'"),
-        ("--on hand --lengths paw", "no link with a length 'paw'"),
+        ("base", "--on paw", "no link 'paw'"),
+        ("base", "--on base", "no joint moves link 'base'"),
+        ("base", "--on hand --lengths paw", "no link with a length 'paw'"),
+        ("target", "--frame 0000 --frame 0001", "are too few"),
+        ("target", "--on turret", "about one axis"),
+        ("target", "--on paw", "no link 'paw'"),
+        ("target", "--on world", "no joint moves link 'world'"),
+        ("target", "--zeros target_turn_x", "no joint 'target_turn_x'"),
     ],
 )
-def test_what_is_refused_before_work(more: str, said: str, own_base: ArmScene, out: Path) -> None:
-    words = own_base.register(out)
-    assert_refused(run_command([*words, *more.split()]), said)
-    assert not out.exists()
-
-
-@pytest.mark.parametrize(
-    ("more", "said"),
-    [
-        ("--frame 0000 --frame 0001", "are too few"),
-        ("--on turret", "about one axis"),
-        ("--on paw", "no link 'paw'"),
-        ("--on world", "no joint moves link 'world'"),
-        ("--zeros target_turn_x", "no joint 'target_turn_x'"),
-    ],
-)
-def test_what_is_refused_of_a_target(more: str, said: str, bracket: TargetScene, out: Path) -> None:
-    words = bracket.register(out)
+def test_what_is_refused(seen, more, said, own_base: ArmScene, bracket: TargetScene, out: Path):
+    words = own_base.register(out) if seen == "base" else bracket.register(out)
     assert_refused(run_command([*words, *more.split()]), said)
     assert not out.exists()
 

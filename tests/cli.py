@@ -2,9 +2,11 @@
 
 import contextlib
 import io
+import json
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 from unittest import mock
 
 from drake_pose.commands.main import main
@@ -44,6 +46,29 @@ def run_command(words: Sequence[str], env: Mapping[str, str] | None = None) -> R
         except SystemExit as end:
             status = end.code if isinstance(end.code, int) else int(end.code is not None)
     return Result(status, out.getvalue(), err.getvalue(), both.getvalue())
+
+
+def run_to_end(*words: object, status: int = 0) -> Result:
+    """Runs `drake-pose` with these words, which ends with this status."""
+    result = run_command([str(word) for word in words])
+    assert result.exit_code == status, result.output
+    return result
+
+
+def run_json(*words: object) -> dict[str, Any]:
+    """What a command says as JSON."""
+    told: dict[str, Any] = json.loads(run_to_end(*words, "--json").stdout)
+    return told
+
+
+def assert_refused(result: Result, *parts: str, status: int = 1) -> None:
+    """A message of one line that has these parts, and nothing else."""
+    assert result.exit_code == status, result.output
+    message = " ".join(result.stderr.split())
+    for part in ("drake-pose: error: ", *parts):
+        assert part in message
+    assert "Traceback" not in result.output
+    assert result.stdout == ""
 
 
 class CliRunner:

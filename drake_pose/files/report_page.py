@@ -82,7 +82,7 @@ def make_report(
     folder: Path, model: ArticulatedModel, scene: Scene, estimate: SceneEstimate
 ) -> str:
     """The page of an estimate; files and overlays that lie in its folder are linked."""
-    template = page_template("drake_pose.files", "report_template.html.j2")
+    template = page_template("drake_pose.files")
     frames = [row.frame for row in estimate.rows]
     records, joined = list(estimate.records.values()), scene.sequence
     found = ["found" if record.found else "not-found" for record in records]
@@ -126,8 +126,8 @@ def _describe_method(scene: Scene, estimate: SceneEstimate) -> str:
     return f"{how}, {others} {_METHODS[method]}" if others else how
 
 
-def page_template(package: str, name: str) -> Template:
-    """A page's template, a file of a package, which may use the style and macros of all pages."""
+def page_template(package: str) -> Template:
+    """The template of a package's page, which may use the style and macros of all pages."""
     environment = Environment(
         autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True,
         loader=PackageLoader("drake_pose.files", ""),
@@ -136,7 +136,7 @@ def page_template(package: str, name: str) -> Template:
     style = files("drake_pose.files").joinpath("report_style.css")
     environment.globals["box"] = BOX
     environment.globals["style"] = Markup(style.read_text(encoding="utf-8").rstrip())
-    source = files(package).joinpath(name)
+    source = files(package).joinpath("report_template.html.j2")
     return environment.from_string(source.read_text(encoding="utf-8"))
 
 

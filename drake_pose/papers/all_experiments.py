@@ -356,7 +356,7 @@ def _page(out: Path, short: bool) -> str:
             beside = json.loads((folder / BESIDE).read_text())
             tables = (folder / TABLES).read_text()
             finished.append({**one._asdict(), **beside, "tables": tables, "pictures": pictures})
-    return page_template("drake_pose.papers", "report_template.html.j2").render(
+    return page_template("drake_pose.papers").render(
         short=short,
         missing=[one.name for one in EXPERIMENTS if not (out / one.name).is_dir()],
         minutes=sum(one["cpu_seconds"] for one in finished) / 60,

@@ -10,12 +10,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import reduce
+from itertools import compress
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import chdtrc, fdtrc, fdtri
 
+from drake_pose.arrays import Array, Integers, Mask
 from drake_pose.fit.covariance import (
     Distances,
     ErrorSizes,
@@ -28,9 +30,6 @@ from drake_pose.fit.covariance import (
 from drake_pose.fit.parameters import POSE_NAMES
 from drake_pose.registration.per_frame_fit import FrameFit, PerFrameFit
 from drake_pose.registration.shared_fit import KNOWN_BEFOREHAND
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 BASE = "base"
 
@@ -117,7 +116,7 @@ class HalfPixel(NamedTuple):
     sd: list[float]
 
 
-def half_pixel(offset: Array, covariance: Array) -> HalfPixel | None:
+def _half_pixel(offset: Array, covariance: Array) -> HalfPixel | None:
     """What is off by half a pixel along both axes, and not by chance; None: nothing is.
 
     Args:
@@ -166,6 +165,25 @@ class _Information(NamedTuple):
     lengths: Array
     scale: float
     freedom: float
+
+    @classmethod
+    def none(cls, count: int, nodes: int) -> _Information:
+        """That of no frame; so many values were free."""
+        squares, surfaces = np.zeros((count, count)), np.zeros((count, 12 * nodes))
+        outlines = np.zeros((nodes, count, count))
+        return cls(squares, np.zeros(count), surfaces, outlines, np.zeros(nodes), 1.0, 0.0)
+
+    def plus(self, info: _Information, sign: float = 1.0) -> _Information:
+        """With another frame, by the scale of its errors; or without one of these: sign -1."""
+        weight = sign / info.scale
+        return self._replace(
+            N=self.N + weight * info.N,
+            h=self.h + weight * info.h,
+            of_surface=self.of_surface + weight * info.of_surface,
+            outlines=self.outlines + sign * info.outlines,
+            lengths=self.lengths + sign * info.lengths,
+            freedom=self.freedom + sign * info.freedom,
+        )
 
     def pixels(self, x: Array) -> float:
         """How far x moves the outlines of the parts that it moves, root mean square [pixel]."""
@@ -217,6 +235,16 @@ class _Residual(NamedTuple):
         """(p,) x of another r, zero where there is no information."""
         return np.asarray(np.linalg.solve(self.N + np.eye(len(r)), r))
 
+    def pixels(self, without: Array | None = None) -> float:
+        """How far outlines are off [pixel]; without x (p,)."""
+        left = self.r if without is None else self.r - self.N @ without
+        return self.info.pixels(self.solved(left))
+
+    @property
+    def p_value(self) -> float:
+        """How often a residual is as large by chance."""
+        return _p_value(*_statistic(self.r, self.Q, self.N), self.info.freedom)
+
     def test(self, cause: _Cause) -> _CauseTest:
         """Whether a cause is off."""
         M = cause.moves
@@ -229,10 +257,8 @@ class _Residual(NamedTuple):
 
     def sufficient(self, tests: Sequence[_CauseTest], least: float) -> list[_CauseTest]:
         """Causes that leave little of what is off, likelier ones first; less than least [pixel]."""
-        most = max(least, _SUFFICIENT_SHARE * self.info.pixels(self.solved(self.r)))
-        enough = [
-            one for one in tests if self.info.pixels(self.solved(self.r - self.N @ one.x)) < most
-        ]
+        most = max(least, _SUFFICIENT_SHARE * self.pixels())
+        enough = [one for one in tests if self.pixels(one.x) < most]
         return sorted(enough, key=lambda one: (one.cause.rank, -one.gain))
 
     def without(self, cause: _Cause) -> _Residual:
@@ -256,6 +282,7 @@ class _Auditor:
         self._tolerance = np.diag((tolerance / fit.deviations) ** 2)
         self._explained = _explained(frames)
         self._seen = dict[str, Distances]()
+        self._nothing = _Information.none(len(fit.names), len(fit.outlines))
 
     def audit(self) -> Audit:
         """Does it."""
@@ -269,13 +296,14 @@ class _Auditor:
             agreeing, together = self._agreeing(), _FRAMES_PER_GROUP
         total = self._sum(agreeing)
         frames = tuple(
-            self._audit_frame(k, _add(total, info, -1.0) if agreeing[k] else total)
+            self._audit_frame(k, total.plus(info, -1.0) if agreeing[k] else total)
             for k, info in enumerate(self._info)
         )
         kept = np.array([one.finding is None for one in frames])
-        return Audit(frames, *self._common_findings(kept, sizes))
+        common, center, noticed_from = self._common_findings(kept) if kept.any() else ((), None, {})
+        return Audit(frames, common, sizes, center, noticed_from)
 
-    def _pooled_sizes(self, which: NDArray[np.intp], together: int) -> ErrorSizes:
+    def _pooled_sizes(self, which: Integers, together: int) -> ErrorSizes:
         """How large errors are, by groups of some frames, spread over all of them."""
         if not len(which):
             return _UNKNOWN_SIZES
@@ -296,14 +324,11 @@ class _Auditor:
         return distances_in_pictures(outlines, with_widths(outlines, pictures))
 
     def _info_of(self, fitted: FrameFit, sizes: ErrorSizes) -> _Information:
-        if fitted.pictures and fitted.name not in self._seen:
-            self._seen[fitted.name] = self._distances(fitted.pictures)
         if not fitted.pictures:
-            p, nodes = len(self._fit.names), len(self._fit.outlines)
-            return _Information(
-                np.zeros((p, p)), np.zeros(p), np.zeros((p, 12 * nodes)),
-                np.zeros((nodes, p, p)), fitted.weights, 1.0, float(KNOWN_BEFOREHAND),
-            )  # fmt: skip
+            known = float(KNOWN_BEFOREHAND)
+            return self._nothing._replace(lengths=fitted.weights, freedom=known)
+        if fitted.name not in self._seen:
+            self._seen[fitted.name] = self._distances(fitted.pictures)
         seen = self._seen[fitted.name]
         own, widths = np.split(seen.X, [len(self._fit.names)], axis=1)
         X = own * self._fit.deviations
@@ -314,7 +339,7 @@ class _Auditor:
         residual = max(float(seen.y @ Py[:, 0]) - T, 0.0)
         freedom = float(KNOWN_BEFOREHAND + len(seen.y) - rank)
         scale = max((KNOWN_BEFOREHAND + residual) / freedom, 1.0)
-        outlines = np.zeros((len(self._fit.outlines), *N.shape))
+        outlines = self._nothing.outlines.copy()
         for one in fitted.pictures:
             moves = one.moves * self._fit.deviations[:, None]
             outlines += moves @ one.A @ np.swapaxes(moves, 1, 2)
@@ -332,7 +357,7 @@ class _Auditor:
             for _ in range(_MAX_ITERATIONS):
                 common = self._common(self._sum(kept))
                 residuals = [self._residual(info, *common) for info in self._info]
-                likely = [_residual_p_value(one) > SIGNIFICANCE for one in residuals]
+                likely = [one.p_value > SIGNIFICANCE for one in residuals]
                 now = self._explained & likely
                 if (now == kept).all():
                     break
@@ -345,11 +370,7 @@ class _Auditor:
 
     def _sum(self, kept: Mask) -> _Information:
         """The information of some frames, each by the scale of its errors."""
-        first = self._info[0]
-        total = _add(first._replace(scale=1.0), first._replace(scale=1.0), -1.0)
-        for k in np.flatnonzero(kept):
-            total = _add(total, self._info[k], 1.0)
-        return total
+        return reduce(_Information.plus, compress(self._info, kept), self._nothing)
 
     def _covariance(self, total: _Information) -> Array:
         """(p, p) of a sum's h, the surfaces' errors included."""
@@ -372,28 +393,20 @@ class _Auditor:
         """A frame beside the others."""
         fitted = self._frames[k]
         residual = self._residual(self._info[k], *self._common(others))
-        pixels = residual.info.pixels(residual.solved(residual.r))
-        finding = self._frame_finding(
-            residual, self._causes(fitted), pixels, bool(self._explained[k])
-        )
-        return FrameAudit(fitted.name, *fitted.inlier_ratios, pixels, finding)
-
-    def _frame_finding(
-        self, residual: _Residual, causes: Sequence[_Cause], pixels: float, explained: bool
-    ) -> Finding | None:
-        """What contradicts the other frames in one of them."""
-        p_value = _residual_p_value(residual)
-        if not explained:
-            return self._joints_finding("unexplained", residual, p_value, pixels)
-        tests = [residual.test(cause) for cause in causes]
+        tests = [residual.test(cause) for cause in self._causes(fitted)]
         # Each of the tests may find something by chance.
-        least = min(p_value, *(one.p_value for one in tests)) * (1 + len(tests))
-        if least > SIGNIFICANCE or pixels < _LEAST_PIXELS:
-            return None
-        sufficient = residual.sufficient(tests, _LEAST_PIXELS)
-        if not sufficient:
-            return self._joints_finding("joints", residual, p_value, pixels)
-        return self._finding(sufficient, residual.info.pixels(sufficient[0].x))
+        least = min(residual.p_value, *(one.p_value for one in tests)) * (1 + len(tests))
+        finding, pixels = None, residual.pixels()
+        if not self._explained[k]:
+            finding = self._joints_finding("unexplained", residual)
+        elif least <= SIGNIFICANCE and pixels >= _LEAST_PIXELS:
+            sufficient = residual.sufficient(tests, _LEAST_PIXELS)
+            finding = (
+                self._finding(sufficient, residual.info.pixels(sufficient[0].x))
+                if sufficient
+                else self._joints_finding("joints", residual)
+            )
+        return FrameAudit(fitted.name, *fitted.inlier_ratios, pixels, finding)
 
     def _causes(self, fitted: FrameFit | None) -> list[_Cause]:
         """All that may be off by itself; of the cameras those that see a frame."""
@@ -439,22 +452,16 @@ class _Auditor:
             rivals.append(BASE)
         kind, name, _, units, _ = best.cause
         x, sd = best.amount * units, np.sqrt(np.diag(best.covariance)) * units
-        if kind == "focal":
-            turn, shift, turn_sd, shift_sd = 0.0, float(x[0]), 0.0, float(sd[0])
-        elif kind != "joint":
-            # Principal points have no turn.
-            parts = (x[:-3], x[-3:], sd[:-3], sd[-3:])
-            turn, shift, turn_sd, shift_sd = (float(np.linalg.norm(one)) for one in parts)
-        elif self._fit.is_angle[self._fit.joints.index(name)]:
-            turn, shift, turn_sd, shift_sd = float(x[0]), 0.0, float(sd[0]), 0.0
-        else:
-            turn, shift, turn_sd, shift_sd = 0.0, float(x[0]), 0.0, float(sd[0])
-        off = (turn, shift, turn_sd, shift_sd)
-        return Finding(kind, name, *off, pixels, best.p_value, tuple(rivals))
+        # Poses turn and shift; a joint does one of them; the rest is shifts.
+        turns = len(x) // 2 if kind in ("camera", BASE) else 0
+        if kind == "joint":
+            turns = int(self._fit.is_angle[self._fit.joints.index(name)])
+        return Finding(
+            kind, name, _size(x[:turns]), _size(x[turns:]), _size(sd[:turns]), _size(sd[turns:]),
+            pixels, best.p_value, tuple(rivals),
+        )  # fmt: skip
 
-    def _joints_finding(
-        self, kind: str, residual: _Residual, p_value: float, pixels: float
-    ) -> Finding:
+    def _joints_finding(self, kind: str, residual: _Residual) -> Finding:
         """What is off in a frame where no cause by itself explains it."""
         x, names = residual.solved(residual.r), self._fit.joints
         sd = np.sqrt(residual.info.scale * np.diag(np.linalg.inv(residual.N + np.eye(len(x)))))
@@ -464,21 +471,20 @@ class _Auditor:
         shift = float(np.abs(joints[~turns]).max(initial=0.0))
         sure = np.flatnonzero((np.abs(x) > _NAMED_DEVIATIONS * sd)[: len(names)])
         named = {names[k]: float(joints[k]) for k in sure}
-        return Finding(kind, "", angle, shift, 0.0, 0.0, pixels, p_value, (), named)
+        off = (angle, shift, 0.0, 0.0)
+        return Finding(kind, "", *off, residual.pixels(), residual.p_value, (), named)
 
     def _common_findings(
-        self, kept: Mask, sizes: ErrorSizes
-    ) -> tuple[tuple[Finding, ...], ErrorSizes, HalfPixel | None, dict[str, float]]:
+        self, kept: Mask
+    ) -> tuple[tuple[Finding, ...], HalfPixel | None, dict[str, float]]:
         """What is off in all frames that agree, and what would be seen, as Audit has it."""
-        if not kept.any():
-            return (), sizes, None, {}
         info, count = self._sum(kept), np.count_nonzero(kept)
         Q = self._covariance(info) + info.N @ self._tolerance @ info.N / count
         residual = _Residual(info, info.N, info.h, Q)
         causes = self._causes(None)
         every = range(len(self._fit.camera_names))
         shifted = residual.test(_Cause("center", "", self._fit.center_moves(every), np.ones(2), 2))
-        center = half_pixel(shifted.amount, shifted.covariance)
+        center = _half_pixel(shifted.amount, shifted.covariance)
         others = [residual.test(one).gain for one in causes if one.kind != "center"]
         if center and shifted.gain > max(others):
             residual = residual.without(shifted.cause)
@@ -497,7 +503,7 @@ class _Auditor:
         named = [one[0].cause.name for one in zeros]
         joints = [one for one in joints if one.name not in named]
         findings = self._together(whole, [*found, *zeros], freed if zeros else [])
-        return findings, sizes, center, self._noticed_from(residual, joints)
+        return findings, center, self._noticed_from(residual, joints)
 
     def _name(
         self, residual: _Residual, causes: Sequence[_Cause], least: float
@@ -528,21 +534,19 @@ class _Auditor:
         self, residual: _Residual, named: Sequence[list[_CauseTest]], freed: Sequence[_Cause]
     ) -> tuple[Finding, ...]:
         """Findings of causes, by how much they are off together; others that are free beside."""
-        own = [one[0].cause for one in named]
-        names = {(one.kind, one.name) for one in own}
-        others = [one for one in freed if (one.kind, one.name) not in names]
-        moves = [one.moves for one in (*own, *others)]
         if not named:
             return ()
-        found = residual.test(_Cause("", "", np.hstack(moves), np.ones(0), 0))
+        own = [best.cause for best, *_ in named]
+        names = {(one.kind, one.name) for one in own}
+        others = [one for one in freed if (one.kind, one.name) not in names]
+        moves = np.hstack([one.moves for one in (*own, *others)])
+        found = residual.test(_Cause("", "", moves, np.ones(0), 0))
         findings, first = [], 0
-        for sufficient in named:
-            best = sufficient[0]
+        for best, *rivals in named:
             k = slice(first, first + len(best.amount))
             first = k.stop
             better = best._replace(amount=found.amount[k], covariance=found.covariance[k, k])
-            pixels = residual.info.pixels(better.x)
-            findings.append(self._finding([better, *sufficient[1:]], pixels))
+            findings.append(self._finding([better, *rivals], residual.info.pixels(better.x)))
         return tuple(findings)
 
     def _noticed_from(self, residual: _Residual, causes: Sequence[_Cause]) -> dict[str, float]:
@@ -561,17 +565,9 @@ class _Auditor:
         return found
 
 
-def _add(total: _Information, info: _Information, sign: float) -> _Information:
-    """A sum with another frame, or without one of them: sign -1."""
-    weight = sign / info.scale
-    return total._replace(
-        N=total.N + weight * info.N,
-        h=total.h + weight * info.h,
-        of_surface=total.of_surface + weight * info.of_surface,
-        outlines=total.outlines + sign * info.outlines,
-        lengths=total.lengths + sign * info.lengths,
-        freedom=total.freedom + sign * info.freedom,
-    )
+def _size(part: Array) -> float:
+    """A single number with its sign, or the norm of several."""
+    return float(part[0]) if len(part) == 1 else float(np.linalg.norm(part))
 
 
 def _statistic(r: Array, Q: Array, N: Array | None = None) -> tuple[float, int]:
@@ -582,11 +578,6 @@ def _statistic(r: Array, Q: Array, N: Array | None = None) -> tuple[float, int]:
         return 0.0, 0
     along = turn.T @ r
     return float(along @ np.linalg.solve(turn.T @ Q @ turn, along)), turn.shape[1]
-
-
-def _residual_p_value(residual: _Residual) -> float:
-    """How often a residual is as large by chance."""
-    return _p_value(*_statistic(residual.r, residual.Q, residual.N), residual.info.freedom)
 
 
 def _p_value(T: float, rank: int, freedom: float) -> float:

@@ -226,10 +226,9 @@ def refit_pictures(
     body: RegistrationBody,
     one: PictureRegistration,
     recording: Recording,
-    focal: bool = False,
     zeros: Sequence[str] = (),
 ) -> PictureRegistration:
-    """As register_pictures, of a camera that was found already.
+    """As register_pictures, of a camera that was found already, its focal length held.
 
     recording: as it is, whose joints' clock may drift.
     """
@@ -237,7 +236,7 @@ def refit_pictures(
     told = one.offset or TimeOffset(0.0, np.inf, np.zeros((0, 2)))
     others = [np.linalg.inv(X) for X in one.found.alternatives]
     begun = _Begun(one.found.camera, both, told, others)
-    return _fit(body, begun, recording, focal, zeros)
+    return _fit(body, begun, recording, False, zeros)
 
 
 class _Begun(NamedTuple):

@@ -9,7 +9,8 @@ from drake_pose.errors import CameraError
 
 EYE = "[[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]"
 SIDES = "width: 64, height: 48, center_x: 31.5, center_y: 23.5"
-GOOD = f"{{{SIDES}, focal_x: 60, focal_y: 61, X_WC: {EYE}}}"
+LENS = f"{SIDES}, focal_x: 60, focal_y: 61"
+GOOD = f"{{{LENS}, X_WC: {EYE}}}"
 
 
 def write(folder: Path, text: str) -> Path:
@@ -73,6 +74,9 @@ def test_principal_points_may_be_counted_as_drake_does(tmp_path: Path) -> None:
         (f"cam: {GOOD}".replace("focal_y: 61", "focal_y: [61]"), "'cam'.*focal_y"),
         (f"cam: {GOOD}".replace("[0, 1, 0, 0]", "[0, -1, 0, 0]"), "'cam'.*X_WC.*reflection"),
         (f"cam: {GOOD}".replace("[0, 0, 0, 1]", "[0, 0, 1]"), "'cam'.*X_WC.*4 x 4"),
+        (f"cam: {{{LENS}, link: hand}}", "'cam'.*link's name"),
+        (f"cam: {{{LENS}, X_LC: {EYE}}}", "'cam'.*link's name"),
+        (f"cam: {{{LENS}, link: hand, X_LC: {EYE}, X_WC: {EYE}}}", "'cam'.*no X_WC"),
         ("[" * 5000, "YAML|deeply"),
     ],
 )

@@ -20,7 +20,7 @@ from drake_pose.files.motion_files import (
 )
 from drake_pose.files.records import BASE_COLUMNS, PoseRow
 from drake_pose.silhouette.pictures.scenes import load_scene
-from tests.jobs.bvh_reader import read_bvh
+from tests.files.bvh_reader import read_bvh
 from tests.jobs.scenes import write_scene
 
 

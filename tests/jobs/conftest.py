@@ -1,5 +1,7 @@
 """Fixtures of what several jobs are tested with."""
 
+from pathlib import Path
+
 import pytest
 
 from drake_pose.jobs.cluster.scheduler import open_cluster
@@ -13,3 +15,9 @@ def cluster():
     """
     with open_cluster(2) as client:
         yield client
+
+
+@pytest.fixture
+def out(tmp_path: Path) -> Path:
+    """Where a job writes its result."""
+    return tmp_path / "out"

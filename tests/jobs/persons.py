@@ -11,8 +11,7 @@ from drake_pose.body.formats.packages import bundled_model
 from drake_pose.body.model import ArticulatedModel, load_model
 from drake_pose.camera.camera_files import save_cameras
 from drake_pose.camera.models import circle_of_cameras
-from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
-from drake_pose.silhouette.pictures.masks import write_mask
+from tests.jobs.scenes import write_masks
 
 
 @dataclass(frozen=True)
@@ -23,15 +22,19 @@ class PersonScene:
     person: ArticulatedModel
     truth: np.ndarray
 
+    def estimate(self, out: Path, command: str = "estimate") -> list[str]:
+        """The words of an estimate, or a capture."""
+        model = str(self.person.path)
+        return [command, str(self.folder), "--model", model, "--out", str(out), "--no-replay"]
+
 
 def record_person(
     folder: Path,
     frames: int = 3,
-    moved: str | None = None,
     sequence: bool = True,
     size: tuple[int, int] = (160, 120),
 ) -> PersonScene:
-    """Records a person who raises an arm; one camera may have moved after its calibration."""
+    """Records a person who raises an arm."""
     folder.mkdir(parents=True, exist_ok=True)
     person = load_model(bundled_model("person"), check=False)
     cameras = circle_of_cameras(4, size=size, face_camera=False)
@@ -44,15 +47,5 @@ def record_person(
         30.0 + 10.0 * np.arange(frames)
     )
     truth[:, person.position_index("right_upper_arm_z")] = np.radians(-30.0)
-    for name, camera in cameras.items():
-        seen = camera
-        if name == moved:
-            X_WC = camera.X_WC.copy()
-            X_WC[2, 3] += 0.35
-            seen = camera.with_pose(X_WC)
-        renderer = LabelRenderer(person, seen)
-        for k, q in enumerate(truth):
-            path = folder / "masks" / name / f"{k:04d}.png"
-            path.parent.mkdir(parents=True, exist_ok=True)
-            write_mask(path, renderer.mask(q))
+    write_masks(folder, person, cameras.values(), truth)
     return PersonScene(folder, person, truth)

@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Sequence
+import json
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, Protocol
 
 import numpy as np
+import yaml
 
-from drake_pose.body.model import load_model
+from drake_pose.body.model import ArticulatedModel, load_model
 from drake_pose.camera.camera_files import save_cameras
-from drake_pose.camera.models import PinholeCamera
+from drake_pose.camera.models import Camera, PinholeCamera
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from drake_pose.silhouette.pictures.masks import write_mask
+from tests.cli import Result, run_to_end
 
 LINK = """
   <link name="{name}">
@@ -51,6 +55,11 @@ class TinyScene:
     model: Path
     truth: dict[str, np.ndarray]
 
+    def estimate(self, out: Path) -> list[str]:
+        """The words of an estimate; the grid's angles are the scenes' own."""
+        given = [self.folder, "--model", self.model, "--out", out, "--interval", 20]
+        return ["estimate", *map(str, given)]
+
 
 def camera(name: str, turn_deg: float = 0.0) -> PinholeCamera:
     """A camera 3 m before the body, turned about the vertical."""
@@ -73,26 +82,62 @@ def write_scene(
     turns = {"front": 0.0, "side": 50.0}
     rig = [camera(name, turns[name]) for name in cameras]
     save_cameras(folder / "cameras.yaml", rig)
-    renderers = [LabelRenderer(model, view) for view in rig]
-    truth = {}
-    for index, row in enumerate(angles):
-        frame = f"{index:04d}"
-        truth[frame] = np.radians(row)
-        for view, renderer in zip(rig, renderers, strict=True):
-            path = folder / "masks" / view.name / f"{frame}.png"
-            path.parent.mkdir(parents=True, exist_ok=True)
-            write_mask(path, renderer.mask(truth[frame]))
-    return TinyScene(folder, model_path, truth)
+    write_masks(folder, model, rig, np.radians(angles))
+    return TinyScene(
+        folder, model_path, {f"{k:04d}": np.radians(row) for k, row in enumerate(angles)}
+    )
+
+
+def write_masks(
+    folder: Path, model: ArticulatedModel, cameras: Iterable[Camera], poses: Iterable[np.ndarray]
+) -> None:
+    """Writes what cameras see of a model in each of some poses (nq,), as Drake draws it."""
+    poses = list(poses)
+    for camera in cameras:
+        renderer, masks = LabelRenderer(model, camera), folder / "masks" / camera.name
+        masks.mkdir(parents=True)
+        for k, q in enumerate(poses):
+            write_mask(masks / f"{k:04d}.png", renderer.mask(q))
 
 
 def write_truth(scene: TinyScene, path: Path | None = None) -> Path:
     """Write the truth as a joint_angles.csv; frames are plain numbers there."""
     path = path or scene.folder / "joint_angles.csv"
+    return write_joints(path, NAMES, {str(int(frame)): q for frame, q in scene.truth.items()})
+
+
+def write_joints(path: Path, names: Sequence[str], values: Mapping[str, Iterable[object]]) -> Path:
+    """Writes a table of joint positions by frame."""
     with path.open("w", newline="") as file:
         writer = csv.writer(file)
-        writer.writerow(["frame", *NAMES])
-        writer.writerows([int(frame), *q] for frame, q in scene.truth.items())
+        writer.writerow(["frame", *names])
+        writer.writerows([frame, *q] for frame, q in values.items())
     return path
+
+
+class Estimated(Protocol):
+    """A scene that says how it is estimated."""
+
+    def estimate(self, out: Path) -> list[str]:
+        """The words of an estimate."""
+
+
+def run_estimate(
+    scene: Estimated, out: Path, *more: object, status: int = 0
+) -> tuple[Result, dict[str, Any]]:
+    """What the command said, and the summary that it wrote."""
+    result = run_to_end(*scene.estimate(out), *more, status=status)
+    return result, json.loads((out / "summary.json").read_text())
+
+
+def edit_camera(path: Path, name: str, to: Path | None = None, **fields: object) -> Path:
+    """Changes fields of a camera in its file, or in a copy; those that are None are taken out."""
+    content = yaml.safe_load(path.read_text())
+    changed = {**content[name], **fields}
+    content[name] = {key: value for key, value in changed.items() if value is not None}
+    to = to or path
+    to.write_text(yaml.safe_dump(content, sort_keys=False))
+    return to
 
 
 def read_rows(path: Path) -> list[dict[str, str]]:

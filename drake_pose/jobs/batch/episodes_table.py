@@ -7,15 +7,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import yaml
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.special import chdtrc
 
+from drake_pose.arrays import Array
 from drake_pose.csv_files import csv_text
 from drake_pose.registration.contradictions import SIGNIFICANCE
 from drake_pose.registration.online_registration import pose_difference, squared_distance
 
-Array = NDArray[np.float64]
 Found = Mapping[str, Any]
 
 COLUMNS = (

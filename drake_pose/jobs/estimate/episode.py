@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from drake_pose.arrays import Array, Integers, Picture
 from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.camera.camera_files import load_camera_file
@@ -23,9 +23,6 @@ from drake_pose.files.settings import EpisodeSettings
 from drake_pose.jobs.estimate.measurements import TrueAngles
 from drake_pose.silhouette.pictures.scene_files import select_frames
 from drake_pose.silhouette.pictures.scenes import CAMERA_FILE, Scene
-
-Array = NDArray[np.float64]
-Picture = NDArray[np.uint8]
 
 # What tells an episode from a scene of masks.
 _OF_EPISODES = ("videos", "images", "meta/info.json", "trajectory.h5", "metadata.yaml")
@@ -49,7 +46,7 @@ class MappedJoints(NamedTuple):
     """
 
     log: JointLog
-    asked: NDArray[np.intp]
+    asked: Integers
     names: tuple[str, ...]
     seen: tuple[str, ...]
     unseen: tuple[str, ...]
@@ -90,6 +87,11 @@ def cameras_of(
     given = load_camera_file(file, distorted=True)
     chosen = [with_intrinsics(one, given, file) for one in chosen]
     return PlacedCameras(chosen, frozenset(given.cameras) - {*given.unplaced, *given.links})
+
+
+def say_left_out(names: Iterable[str], placed: Collection[str]) -> list[str]:
+    """That cameras are not used whose pose nobody says."""
+    return [f"camera '{name}' has no X_WC: it is left out" for name in names if name not in placed]
 
 
 def map_log(
@@ -141,11 +143,8 @@ def _told_nodes(
         above = node.parent < 0 or told[node.parent]
         own = tree.nodes[tree.source(k)].value_names
         told.append(above and set(own).isdisjoint(not_logged))
-    names = [node.name for node in tree.nodes]
-    return (
-        tuple(name for name, yes in zip(names, told, strict=True) if yes),
-        tuple(name for name, yes in zip(names, told, strict=True) if not yes),
-    )
+    names = [(node.name, yes) for node, yes in zip(tree.nodes, told, strict=True)]
+    return tuple(name for name, yes in names if yes), tuple(name for name, yes in names if not yes)
 
 
 def frames_of(camera: EpisodeCamera) -> tuple[str, ...]:
@@ -153,7 +152,7 @@ def frames_of(camera: EpisodeCamera) -> tuple[str, ...]:
     return camera.frames or tuple(f"{k:06d}" for k in range(len(camera.times)))
 
 
-def rows_of(log: JointLog, camera: EpisodeCamera, kept: NDArray[np.intp], later: Array) -> Array:
+def rows_of(log: JointLog, camera: EpisodeCamera, kept: Integers, later: Array) -> Array:
     """(k, m) a log's positions so much later [s] than some of a camera's pictures, by time or name.
 
     Args:
@@ -170,7 +169,7 @@ def is_timed(log: JointLog, camera: EpisodeCamera) -> bool:
     return log.times is not None and bool(np.isfinite(camera.times).any())
 
 
-def kept_pictures(camera: EpisodeCamera, settings: EpisodeSettings) -> NDArray[np.intp]:
+def kept_pictures(camera: EpisodeCamera, settings: EpisodeSettings) -> Integers:
     """Which of a camera's pictures are asked for; UnknownNameError: there is no such."""
     if settings.every < 1:
         raise SettingsError(f"every must be 1 or more, not {settings.every}")
@@ -180,11 +179,12 @@ def kept_pictures(camera: EpisodeCamera, settings: EpisodeSettings) -> NDArray[n
 
 
 class EpisodeScene(NamedTuple):
-    """An episode's pictures as a sequence without masks, its frames those of the first camera."""
+    """An episode's pictures as a sequence without masks, its frames some of the first camera's."""
 
     scene: Scene
     episode: Episode
     first: EpisodeCamera
+    kept: Integers
 
 
 def read_episode_scene(
@@ -205,11 +205,6 @@ def read_episode_scene(
             f"{path}: nobody says where a camera stands; find out (drake-pose register), and give "
             "the cameras.yaml that it writes (--cameras FILE)"
         )
-    warnings = [
-        f"camera '{one.name}' has no X_WC: it is left out"
-        for one in chosen
-        if one.name not in placed
-    ]
     known = {one.name: one for one in chosen if one.name in placed and one.camera is not None}
     first = next(iter(known.values()))
     kept, names = kept_pictures(first, settings), frames_of(first)
@@ -223,9 +218,10 @@ def read_episode_scene(
         readers[name] = _reader(camera, {frames[k]: number for k, number in numbers.items()})
     scene = Scene(
         path, {name: one.camera for name, one in known.items() if one.camera is not None}, frames,
-        {}, True, rate, images=images, warnings=(*episode.warnings, *warnings), readers=readers,
+        {}, True, rate, images=images, readers=readers,
+        warnings=(*episode.warnings, *say_left_out([one.name for one in chosen], placed)),
     )  # fmt: skip
-    return EpisodeScene(scene, episode, first)
+    return EpisodeScene(scene, episode, first, kept)
 
 
 def _reader(camera: EpisodeCamera, numbers: Mapping[str, int]) -> Callable[[str], Picture]:
@@ -233,9 +229,7 @@ def _reader(camera: EpisodeCamera, numbers: Mapping[str, int]) -> Callable[[str]
     return lambda frame: camera.read(numbers[frame])
 
 
-def _same_moments(
-    first: EpisodeCamera, kept: NDArray[np.intp], other: EpisodeCamera
-) -> dict[int, int]:
+def _same_moments(first: EpisodeCamera, kept: Integers, other: EpisodeCamera) -> dict[int, int]:
     """By how manieth of a camera's pictures another's of the same moment, where it has one."""
     if np.isnan(first.times).any() or np.isnan(other.times).any():
         own = {frame_key(name): k for k, name in enumerate(frames_of(other))}
@@ -256,13 +250,11 @@ def logged_positions(
 
     Raises DrakePoseError: names columns, joints or units at fault.
     """
-    scene, episode, first = read
+    scene, episode, first, kept = read
     if episode.joints is None:
         return None, {}, ()
     mapped = map_log(episode.path, episode.joints, tree, settings)
     kinematics = TreeKinematics(tree)
-    every = frames_of(first)
-    kept = np.array([every.index(frame) for frame in scene.frames], np.intp)
     values = np.tile(kinematics.flatten(tree.default_values()), (len(kept), 1))
     values[:, mapped.asked] = rows_of(mapped.log, first, kept, np.zeros(()))
     starts = {

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import combinations
 from typing import Any
@@ -31,6 +31,7 @@ from drake_pose.search.grid.beam_search import BeamSearch
 from drake_pose.search.scoring import PoseSearch
 from drake_pose.search.starts.root_placement import scale_camera
 from drake_pose.silhouette.areas.bending import TreeSurfaces
+from drake_pose.silhouette.areas.outline import Outline
 from drake_pose.silhouette.areas.scoring import draw_labels
 from drake_pose.silhouette.pictures.masks import compare_masks
 from drake_pose.silhouette.pictures.scenes import USUAL_RATE_HZ, Scene
@@ -49,9 +50,6 @@ _FRAMES, _PAIRS = 2, 3
 _WORSE, _MORE = 1.2, 0.01
 # Joints are elsewhere that are off by more [rad or m].
 _ELSEWHERE = 0.2
-
-Match = Callable[[str, Sequence[View]], float]
-"""E_total of the best pose of a frame in views."""
 
 
 def estimate_frames(
@@ -89,29 +87,15 @@ def estimate_frames(
             was_tracked = matching.was_tracked(context)
             if pose.found and pose.pose_set is None and isinstance(search, MultiStartSearch):
                 before = begun if was_tracked else None
-                if inputs.scene.cameras_of(frame):
-                    pose = _with_intervals(inputs, search, frame, pose, before)
+                if views := _views(inputs.scene, frame):
+                    place = (inputs.root_positions or {}).get(frame)
+                    pose = search.with_intervals(pose, views, place, before)
                 else:
                     # What has no mask is as sure as its contours said.
                     own = matching.with_intervals(context) if was_tracked else pose
                     pose = own.widened(before)
             begun = begun if was_tracked else pose
             yield frame, pose
-
-
-def _with_intervals(
-    inputs: Inputs,
-    search: MultiStartSearch,
-    frame: str,
-    pose: PoseEstimate,
-    begun: PoseEstimate | None,
-) -> PoseEstimate:
-    """A pose with what its masks say of each joint.
-
-    begun: what its track began with; None: it was searched.
-    """
-    root_position = (inputs.root_positions or {}).get(frame)
-    return search.with_intervals(pose, _views(inputs.scene, frame), root_position, begun)
 
 
 def _views(scene: Scene, frame: str) -> list[View]:
@@ -125,21 +109,20 @@ def match_frames(
     """The missing frames, matched or tracked, compared with their masks and drawn."""
     scene, model = inputs.scene, inputs.model
     tree = model.pose_tree()
-    surfaces, labels = TreeSurfaces(tree), range(1, 1 + len(tree.nodes))
+    surfaces = TreeSurfaces(tree)
     for frame, pose in estimate_frames(inputs, search, missing):
         masks = {name: scene.read(name, frame) for name in scene.cameras_of(frame)}
         shown: dict[str, np.ndarray] = {**read_pictures(scene, frame), **masks} if overlay else {}
-        parts, more = {}, dict[str, Any]()
+        parts, more = dict[str, np.ndarray](), dict[str, Any]()
         if pose.found:
+            cameras = [scene.cameras[name] for name in {**masks, **shown}]
+            for k, camera in enumerate(cameras):
+                if isinstance(camera, ParallelCamera):
+                    cameras[k] = scaled = scale_camera(camera, pose.scale)
+                    if scene.scale_unknown and camera.name in masks:
+                        more["camera_scale"] = scaled.pixels_per_metre
             values = tree.values_from_positions(pose.q)
-            outlines, X_WN = surfaces.at(values), pose.X_WB @ tree.node_poses(values)
-        for name in {**masks, **shown} if pose.found else ():
-            camera = scene.cameras[name]
-            if isinstance(camera, ParallelCamera):
-                camera = scale_camera(camera, pose.scale)
-                if scene.scale_unknown and name in masks:
-                    more["camera_scale"] = camera.pixels_per_metre
-            parts[name] = draw_labels(outlines, labels, camera.X_CW @ X_WN, camera) - 1
+            parts = draw_parts(surfaces.at(values), pose.X_WB @ tree.node_poses(values), cameras)
         # A search that does not say how sure it is knows nothing of any joint.
         nothing = np.full(len(pose.q), np.nan)
         known = record_pose_set(pose.pose_set, search.tree) or {
@@ -151,6 +134,14 @@ def match_frames(
             runs=pose.statistics.runs, outside_limit=pose.statistics.outside_limit,
             explained=pose.explained,
         )  # fmt: skip
+
+
+def draw_parts(
+    outlines: Sequence[Outline], X_WN: np.ndarray, cameras: Iterable[Camera]
+) -> dict[str, np.ndarray]:
+    """By camera (H, W), which of a body's parts at X_WN (parts, 4, 4) is seen, -1 where none is."""
+    labels = range(1, 1 + len(outlines))
+    return {one.name: draw_labels(outlines, labels, one.X_CW @ X_WN, one) - 1 for one in cameras}
 
 
 def finish_frame(
@@ -201,18 +192,73 @@ def compare_cameras(
     records: Mapping[str, FrameRecord],
     on_stage: OnStage | None,
 ) -> list[str]:
-    """A warning of cameras that contradict each other; few frames are matched again for it."""
-    scene = inputs.scene
-    if scene.images:
+    """A warning of cameras that contradict each other; few frames are matched again for it.
+
+    Nothing is matched where the poses fit.
+    """
+    scene, cameras = inputs.scene, inputs.scene.cameras
+    known = {f: one.E_total for f, one in records.items() if one.E_total is not None}
+    usual = float(np.median(list(known.values()))) if known else 0.0
+    doubtful = _DOUBTFUL if len(cameras) == 2 else BADLY_EXPLAINED
+    if scene.images or len(cameras) < 2 or usual < doubtful:
         return []
+    whole = [f for f in known if all((name, f) in scene.masks for name in cameras)]
+    # The usual ones: in the worst, there may be more that is wrong.
+    chosen = sorted(whole, key=lambda frame: abs(known[frame] - usual))[:_FRAMES]
+    if not chosen:
+        return []
+    if on_stage is not None:
+        on_stage("comparing the cameras", 0, None)
+    masks = {frame: {name: scene.read(name, frame) for name in cameras} for frame in chosen}
 
-    def match(frame: str, views: Sequence[View]) -> float:
-        if on_stage is not None:
-            on_stage("comparing the cameras", 0, None)
-        found = _match_again(inputs, search, frame, views)
-        return found.E_total if found.found else math.inf
+    def error(owners: Mapping[str, str]) -> float:
+        """E_total, mean over the frames, each camera given the mask of another (or its own)."""
+        errors = []
+        for frame, own in masks.items():
+            views = [View(cameras[name], own[other]) for name, other in owners.items()]
+            found = _match_again(inputs, search, frame, views)
+            errors.append(found.E_total if found.found else math.inf)
+        return float(np.mean(errors))
 
-    return find_contradiction(match, scene.cameras, scene.read, scene.masks, records)
+    together = float(np.mean([known[frame] for frame in chosen]))
+    ious = {n: np.mean([records[f].ious.get(n, 0.0) for f in chosen]) for n in cameras}
+    worst = sorted(cameras, key=lambda name: ious[name])
+    sizes = {name: (camera.width, camera.height) for name, camera in cameras.items()}
+    alike = [pair for pair in combinations(worst, 2) if sizes[pair[0]] == sizes[pair[1]]]
+    for one, other in alike[:_PAIRS]:
+        after = error({n: {one: other, other: one}.get(n, n) for n in cameras})
+        if after < _LEFT * together:
+            return [
+                f"cameras '{one}' and '{other}' are exchanged, it seems: E_total is "
+                f"{percent(together)} together, but {percent(after)} with each other's pictures; "
+                "exchange their folders of masks, or their names in cameras.yaml"
+            ]
+    alone = {name: error({name: name}) for name in cameras}
+    areas = [sum(float(own[name].sum()) for own in masks.values()) for name in cameras]
+    bad: Sequence[str] = [name for name in cameras if alone[name] >= BADLY_EXPLAINED]
+    good = [alone[name] for name in cameras if name not in bad]
+    if np.average(list(alone.values()), weights=areas) < _LEFT * together:
+        left = {n: error({m: m for m in worst if m != n}) for n in worst[:_PAIRS] if len(worst) > 2}
+        first = min(left, key=lambda name: left[name], default="")
+        bad = [first] if first and left[first] < _LEFT * together else list(cameras)
+    # A camera whose place the model's own contradicts is not explained even alone.
+    elif not (bad and good and max(good) < _LEFT * min(alone[name] for name in bad)):
+        return []
+    return [_say_contradiction(bad, together, alone)]
+
+
+def _say_contradiction(cameras: Sequence[str], together: float, alone: Mapping[str, float]) -> str:
+    names = " and ".join(f"'{name}'" for name in cameras)
+    each = ", ".join(f"'{name}' {percent(error)}" for name, error in alone.items())
+    what = f"cameras {names} contradict each other"
+    if len(cameras) < len(alone):
+        others = "the others" if len(alone) > 2 else "the other one"
+        what = f"camera {names} contradicts {others}"
+    return (
+        f"{what}: E_total is {percent(together)} together, alone {each}; has one moved since it "
+        "was calibrated, are masks of another camera or instant, is X_WC the camera's pose in the "
+        "world, in metres?"
+    )
 
 
 def _match_again(
@@ -265,73 +311,3 @@ def check_track(
 def _is_worse(error: float, other: float) -> bool:
     """Whether a pose that leaves one E_total fits clearly worse than one that leaves another."""
     return error > max(_WORSE * other, other + _MORE)
-
-
-def find_contradiction(
-    match: Match,
-    cameras: Mapping[str, Camera],
-    read: Callable[[str, str], np.ndarray],
-    seen: Iterable[tuple[str, str]],
-    records: Mapping[str, FrameRecord],
-) -> list[str]:
-    """A warning of cameras that contradict each other; nothing is matched where the poses fit.
-
-    `read` gives the mask (H, W) of a camera's frame, `seen` is (camera, frame) of those there are.
-    """
-    known = {f: one.E_total for f, one in records.items() if one.E_total is not None}
-    usual = float(np.median(list(known.values()))) if known else 0.0
-    if len(cameras) < 2 or usual < (_DOUBTFUL if len(cameras) == 2 else BADLY_EXPLAINED):
-        return []
-    present = set(seen)
-    whole = [f for f in known if all((name, f) in present for name in cameras)]
-    # The usual ones: in the worst, there may be more that is wrong.
-    chosen = sorted(whole, key=lambda frame: abs(known[frame] - usual))[:_FRAMES]
-    if not chosen:
-        return []
-    masks = {frame: {name: read(name, frame) for name in cameras} for frame in chosen}
-
-    def error(owners: Mapping[str, str]) -> float:
-        """E_total, mean over the frames, each camera given the mask of another (or its own)."""
-        pairs = owners.items()
-        views = {f: [View(cameras[k], own[o]) for k, o in pairs] for f, own in masks.items()}
-        return float(np.mean([match(frame, views[frame]) for frame in chosen]))
-
-    together = float(np.mean([known[frame] for frame in chosen]))
-    ious = {n: np.mean([records[f].ious.get(n, 0.0) for f in chosen]) for n in cameras}
-    worst = sorted(cameras, key=lambda name: ious[name])
-    sizes = {name: (camera.width, camera.height) for name, camera in cameras.items()}
-    alike = [pair for pair in combinations(worst, 2) if sizes[pair[0]] == sizes[pair[1]]]
-    for one, other in alike[:_PAIRS]:
-        after = error({n: {one: other, other: one}.get(n, n) for n in cameras})
-        if after < _LEFT * together:
-            return [
-                f"cameras '{one}' and '{other}' are exchanged, it seems: E_total is "
-                f"{percent(together)} together, but {percent(after)} with each other's pictures; "
-                "exchange their folders of masks, or their names in cameras.yaml"
-            ]
-    alone = {name: error({name: name}) for name in cameras}
-    areas = [sum(float(own[name].sum()) for own in masks.values()) for name in cameras]
-    bad: Sequence[str] = [name for name in cameras if alone[name] >= BADLY_EXPLAINED]
-    good = [alone[name] for name in cameras if name not in bad]
-    if np.average(list(alone.values()), weights=areas) < _LEFT * together:
-        left = {n: error({m: m for m in worst if m != n}) for n in worst[:_PAIRS] if len(worst) > 2}
-        first = min(left, key=lambda name: left[name], default="")
-        bad = [first] if first and left[first] < _LEFT * together else list(cameras)
-    # A camera whose place the model's own contradicts is not explained even alone.
-    elif not (bad and good and max(good) < _LEFT * min(alone[name] for name in bad)):
-        return []
-    return [_say_contradiction(bad, together, alone)]
-
-
-def _say_contradiction(cameras: Sequence[str], together: float, alone: Mapping[str, float]) -> str:
-    names = " and ".join(f"'{name}'" for name in cameras)
-    each = ", ".join(f"'{name}' {percent(error)}" for name, error in alone.items())
-    what = f"cameras {names} contradict each other"
-    if len(cameras) < len(alone):
-        others = "the others" if len(alone) > 2 else "the other one"
-        what = f"camera {names} contradicts {others}"
-    return (
-        f"{what}: E_total is {percent(together)} together, alone {each}; has one moved since it "
-        "was calibrated, are masks of another camera or instant, is X_WC the camera's pose in the "
-        "world, in metres?"
-    )

@@ -9,26 +9,24 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from drake_pose.arrays import Array, Mask
 from drake_pose.errors import MaskError, SceneError
 from drake_pose.files.records import record_deviations
 from drake_pose.files.writer import FinishedFrame, OnStage, ResultWriter
 from drake_pose.jobs.estimate.inputs import Inputs
-from drake_pose.jobs.estimate.matching import finish_frame, read_pictures
+from drake_pose.jobs.estimate.matching import draw_parts, finish_frame, read_pictures
 from drake_pose.person.camera_faults import CameraFault
 from drake_pose.person.checked_capture import CheckedCapture, capture_checked
 from drake_pose.person.figures import RigFault
 from drake_pose.person.person_capture import PersonCapture, capture_by_colour
 from drake_pose.person.persons_in_view import ReadFrame, ViewFaults
 from drake_pose.search.estimates import PoseEstimate
-from drake_pose.silhouette.areas.scoring import draw_labels
 from drake_pose.silhouette.pictures.masks import compare_masks, edge_area
 from drake_pose.silhouette.pictures.scene_checks import (
     describe_unreadable,
     frame_ranges,
     require_readable,
 )
-
-Mask = NDArray[np.bool_]
 
 FOLLOWED = "followed"
 """FrameRecord.stopped_by of a frame in which a person was followed."""
@@ -90,7 +88,7 @@ def follow_person(
 
 def _follow_colours(
     inputs: Inputs, reader: _Reader
-) -> tuple[PersonCapture, ReadFrame, tuple[str, ...], NDArray[np.float64]]:
+) -> tuple[PersonCapture, ReadFrame, tuple[str, ...], Array]:
     """A sequence of pictures of which few have masks: distances (frames,) of contours [pixel]."""
     scene, frames = inputs.scene, inputs.frames
     masked = [k for k, frame in enumerate(frames) if len(scene.cameras_of(frame)) > 1]
@@ -167,7 +165,7 @@ def _finish(
     inputs: Inputs,
     captured: PersonCapture,
     index: int,
-    X_WN: NDArray[np.float64],
+    X_WN: Array,
     masks: Mapping[str, Mask],
     reader: ReadFrame,
     distance: float,
@@ -188,12 +186,8 @@ def _finish(
     if overlay:
         shown |= masks
     found, by_colour = bool(np.isfinite(q).all()), not masks and np.isfinite(distance)
-    parts = {}
-    if found:
-        labels, outlines = range(1, 1 + len(captured.outlines)), captured.outlines
-        for name in scene.cameras if by_colour else {**masks, **shown}:
-            camera = scene.cameras[name]
-            parts[name] = draw_labels(outlines, labels, camera.X_CW @ X_WN, camera) - 1
+    names = {} if not found else scene.cameras if by_colour else {**masks, **shown}
+    parts = draw_parts(captured.outlines, X_WN, [scene.cameras[name] for name in names])
     bodies = {name: own >= 0 for name, own in parts.items()}
     agreement = compare_masks(masks, bodies) if found else None
     wrong, area = np.nan, 0.0

@@ -24,12 +24,18 @@ from drake_pose.files.settings import EstimateSettings
 from drake_pose.files.summary import mask_digests
 from drake_pose.jobs.estimate.searches import make_tree
 from drake_pose.jobs.registration.episode_audit import EpisodeLook, look_at_episode
-from drake_pose.jobs.registration.episodes import EpisodeInputs, looks_at_pictures, read_episode
+from drake_pose.jobs.registration.episodes import (
+    EpisodeInputs,
+    GivenFiles,
+    looks_at_pictures,
+    read_episode,
+)
 from drake_pose.jobs.registration.inputs import Inputs
 from drake_pose.jobs.registration.positions import read_known_positions
 from drake_pose.jobs.registration.report import say_reading
 from drake_pose.jobs.registration.result import (
     describe_pictures,
+    describe_pose,
     describe_run,
     say_drift,
     write_comparisons,
@@ -42,7 +48,6 @@ from drake_pose.registration.posed_frames import PosedFrame, SeenFrame
 from drake_pose.registration.register import RegistrationBody
 from drake_pose.silhouette.areas.scoring import require_visible
 from drake_pose.silhouette.pictures.scene_checks import frame_ranges, read_scene
-from drake_pose.silhouette.pictures.scenes import CAMERA_FILE
 from drake_pose.workers import working
 
 OnFrame = Callable[[int], None]
@@ -105,25 +110,17 @@ def audit_scene(
     Raises:
         DrakePoseError: names the file, camera, frame or joint at fault.
     """
-    settings, folder = settings or AuditSettings(), None if out is None else Path(out)
-    files = {
-        "model": Path(model),
-        "cameras": (file := Path(cameras or Path(scene) / CAMERA_FILE)),
-        "joints": None if joints is None else Path(joints),
-    }
-    begin = time.perf_counter()
+    settings, begin = settings or AuditSettings(), time.perf_counter()
+    table, own, folder = (None if one is None else Path(one) for one in (joints, cameras, out))
+    files = GivenFiles(Path(scene), Path(model), table, own)
     with working(settings.workers):
-        if looks_at_pictures(Path(scene), settings):
-            own = None if cameras is None else Path(cameras)
-            episode = read_episode(Path(scene), Path(model), files["joints"], own, settings)
-            look = _look(episode, on_frame)
+        if looks_at_pictures(files.scene, settings):
+            look = _look(read_episode(files, settings), on_frame)
         else:
-            inputs, frames = _read_inputs(Path(scene), model, joints, cameras, settings)
-            look = _Look(inputs, *_audit(inputs, frames, on_frame))
+            look = _audit(*_read_inputs(files, settings), on_frame)
     inputs, found = look.inputs, look.found
     seconds = time.perf_counter() - begin
-    doubts = _doubts(inputs, found, look.unseen, file)
-    warnings = [*inputs.warnings, *look.misplaced, *doubts]
+    warnings = [*inputs.warnings, *look.misplaced, *_doubts(look, files.camera_file)]
     summary = {
         "contradictions": _describe_contradictions(found),
         "frame_count": len(found.frames),
@@ -133,7 +130,7 @@ def audit_scene(
         "noticed_from": _noticed_from(found, inputs.model),
         "principal_point_px": found.center and found.center._asdict(),
         "error_sizes_px": {name: float(getattr(found.sizes, name)) for name in _SIZES},
-        **describe_run(Path(scene), files, settings, warnings, seconds),
+        **describe_run(files, settings, warnings, seconds),
         "unseen": look.unseen,
     }
     if folder is not None:
@@ -157,16 +154,14 @@ class _Look(NamedTuple):
 def _look(episode: EpisodeInputs, on_frame: OnFrame | None) -> _Look:
     """An audit of an episode."""
     seen = look_at_episode(episode)
-    inputs, frames = seen.inputs, tuple(seen.names)
-    found, unseen, misplaced = _audit(inputs, frames, on_frame)
-    zeros = [one.name for one in found.common if one.kind == "joint"]
+    look = _audit(seen.inputs, tuple(seen.names), on_frame)
+    zeros = [one.name for one in look.found.common if one.kind == "joint"]
     if zeros:
         # Masks were found with these as they are, and lean on them.
         seen = look_at_episode(episode, seen, zeros)
-        inputs, frames = seen.inputs, tuple(seen.names)
-        found, unseen, misplaced = _audit(inputs, frames, None)
-    found = replace(found, common=(*seen.findings, *found.common))
-    return _Look(inputs, found, unseen, misplaced, seen)
+        look = _audit(seen.inputs, tuple(seen.names), None)
+    found = replace(look.found, common=(*seen.findings, *look.found.common))
+    return look._replace(found=found, episode=seen)
 
 
 def _describe_frames(inputs: Inputs, found: Audit) -> dict[str, Any]:
@@ -188,11 +183,9 @@ def _describe_cameras(look: EpisodeLook) -> dict[str, Any]:
     """Where cameras were found in pictures, how sure that is, and their clocks."""
     return {
         name: describe_pictures(one)
+        | describe_pose("X_WC", one.found.camera.X_WC, one.found)
         | {
             "camera": describe_camera(one.found.camera),
-            "X_WC": one.found.camera.X_WC.tolist(),
-            "translation_sd_mm": 1e3 * one.found.translation_sd,
-            "rotation_sd_deg": float(np.degrees(one.found.rotation_sd)),
             "covariance": one.found.covariance.tolist(),
         }
         for name, one in look.pictures.items()
@@ -209,26 +202,22 @@ def _noticed_from(found: Audit, model: ArticulatedModel) -> dict[str, float | No
     }
 
 
-def _read_inputs(
-    scene_path: Path, model_path: Path | str, joints: Path | str | None,
-    cameras: Path | str | None, settings: AuditSettings,
-) -> tuple[Inputs, tuple[str, ...]]:  # fmt: skip
-    """What is audited, and its frames, checked; arguments as of audit_scene."""
-    if joints is None:
-        raise SettingsError(f"{scene_path}: an audit of masks needs joint positions: --joints FILE")
-    given = None if cameras is None else load_cameras(cameras)
-    scene, frames = read_scene(
-        scene_path, settings.cameras, settings.frames, given, every=settings.every
-    )
+def _read_inputs(files: GivenFiles, settings: AuditSettings) -> tuple[Inputs, tuple[str, ...]]:
+    """What is audited, and its frames, checked."""
+    path = files.scene
+    if files.joints is None:
+        raise SettingsError(f"{path}: an audit of masks needs joint positions: --joints FILE")
+    given = None if files.cameras is None else load_cameras(files.cameras)
+    scene, frames = read_scene(path, settings.cameras, settings.frames, given, every=settings.every)
     if scene.scale_unknown:
         raise SceneError(
-            f"{scene_path}: has no cameras.yaml; an audit needs to know where the cameras are: "
+            f"{path}: has no cameras.yaml; an audit needs to know where the cameras are: "
             "drake-pose register finds that"
         )
     chosen = tuple(scene.cameras.values())
-    model = load_model(model_path, package_paths=settings.packages)
+    model = load_model(files.model, package_paths=settings.packages)
     tree = make_tree(model, EstimateSettings(hold=settings.hold))
-    positions = read_known_positions(Path(joints), TreeKinematics(tree))
+    positions = read_known_positions(files.joints, TreeKinematics(tree))
     warnings = [*scene.warnings, *model.warnings, *positions.warnings]
     if positions.are_one_pose(positions.of(frame, chosen[0].name) for frame in frames):
         warnings.append(
@@ -238,10 +227,8 @@ def _read_inputs(
     return Inputs(scene, model, tree, positions, chosen, tuple(warnings)), frames
 
 
-def _audit(
-    inputs: Inputs, frames: Sequence[str], on_frame: OnFrame | None
-) -> tuple[Audit, list[str], list[str]]:
-    """What was found, the frames of which no mask shows anything, and what is wrong of cameras."""
+def _audit(inputs: Inputs, frames: Sequence[str], on_frame: OnFrame | None) -> _Look:
+    """What contradicts the rest in some frames."""
     body = RegistrationBody(inputs.tree, inputs.seen)
     picks = np.linspace(0, len(frames) - 1, min(len(frames), _SAMPLE)).round()
     sample = [inputs.read(frames[int(k)]) for k in picks]
@@ -262,7 +249,7 @@ def _audit(
     if 2 * len(found.contradicting) > len(found.frames):
         shown = [inputs.read(one) for one in found.contradicting[:_LOOKED_AT]]
         misplaced = _misplaced(body, inputs, shown)
-    return found, unseen, misplaced
+    return _Look(inputs, found, unseen, misplaced)
 
 
 def _misplaced(body: RegistrationBody, inputs: Inputs, frames: Sequence[SeenFrame]) -> list[str]:
@@ -292,23 +279,19 @@ def _require_seen(body: RegistrationBody, inputs: Inputs, frames: Sequence[SeenF
     Raises CameraError: as an estimate does.
     """
     for camera in inputs.held:
-        refused: CameraError | None = None
-        for frame in (one for one in frames if camera.name in one.masks):
-            X_CN = camera.X_CW @ body.kinematics.poses(frame.values)
+        own, refused = [one for one in frames if camera.name in one.masks], list[CameraError]()
+        for frame in own:
             try:
-                require_visible(body.few, X_CN, camera)
+                require_visible(body.few, camera.X_CW @ body.kinematics.poses(frame.values), camera)
             except CameraError as error:
-                refused = refused or error
-            else:
-                break
-        else:
-            if refused is not None:
-                raise refused
+                refused.append(error)
+        if own and len(refused) == len(own):
+            raise refused[0]
 
 
-def _doubts(inputs: Inputs, found: Audit, unseen: Sequence[str], cameras: Path) -> list[str]:
+def _doubts(look: _Look, cameras: Path) -> list[str]:
     """What a user should know of the frames, and of the file of cameras."""
-    warnings = []
+    warnings, found = list[str](), look.found
     if found.center is not None:
         (x, y), (x_sd, y_sd) = found.center
         advice = (
@@ -320,8 +303,8 @@ def _doubts(inputs: Inputs, found: Audit, unseen: Sequence[str], cameras: Path) 
             f"{cameras}: the principal points are off by ({x:.2f}, {y:.2f}) +- ({x_sd:.2f}, "
             f"{y_sd:.2f}) pixels, half a pixel: {advice}"
         )
-    if unseen:
-        named = frame_ranges(unseen, inputs.scene.frames)
+    if look.unseen:
+        named = frame_ranges(look.unseen, look.inputs.scene.frames)
         warnings.append(f"frame {named}: the masks show nothing: there is nothing to compare")
     count, agreeing = len(found.frames), len(found.frames) - len(found.contradicting)
     if 2 * agreeing < count:
@@ -425,9 +408,8 @@ def say_off(one: Finding, verb: str) -> str:
     unit, factor = _UNITS.get(one.kind, _LENGTH)
     shift, shift_sd = factor * one.shift, factor * one.shift_sd
     if one.kind == "joint":
-        turns = one.angle_sd > 0.0
-        off = say_reading(angle, angle_sd, "deg") if turns else say_reading(shift, shift_sd, unit)
-        return f"{name} {off}"
+        reading = (angle, angle_sd, "deg") if one.angle_sd > 0.0 else (shift, shift_sd, unit)
+        return f"{name} {say_reading(*reading)}"
     if one.kind == "focal":
         # As for readings, the shift is what must be added.
         word, many = "short" if shift > 0.0 else "long", one.name.startswith("focal lengths")

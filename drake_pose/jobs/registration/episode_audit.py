@@ -11,21 +11,17 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import chdtrc
 
+from drake_pose.arrays import Array, Picture
 from drake_pose.camera.models import Camera, PinholeCamera
 from drake_pose.errors import SceneError
+from drake_pose.jobs.estimate.episode import say_left_out
 from drake_pose.jobs.registration.episodes import EpisodeInputs
 from drake_pose.jobs.registration.inputs import Inputs
 from drake_pose.jobs.registration.positions import KnownPositions
 from drake_pose.jobs.registration.result import say_lost
-from drake_pose.registration.contradictions import (
-    BASE,
-    LEAST_OF_JOINTS,
-    SIGNIFICANCE,
-    Finding,
-)
+from drake_pose.registration.contradictions import BASE, LEAST_OF_JOINTS, SIGNIFICANCE, Finding
 from drake_pose.registration.online_registration import pose_difference, squared_distance
 from drake_pose.registration.picture_frames import judge_pictures
 from drake_pose.registration.picture_registration import (
@@ -37,9 +33,6 @@ from drake_pose.registration.picture_registration import (
 from drake_pose.registration.posed_frames import SeenFrame, placed_points
 from drake_pose.registration.register import RegisteredCamera, RegistrationBody
 from drake_pose.silhouette.pictures.scenes import Scene
-
-Array = NDArray[np.float64]
-Picture = NDArray[np.uint8]
 
 # A camera is compared as it is given that shows the body nearer than this to where it is seen [root
 # of the silhouettes' area].
@@ -93,11 +86,7 @@ def look_at_episode(
             f"{episode.path}: no camera has an X_WC that could be audited; give a camera file "
             "(--cameras FILE), or find out where they stand: drake-pose register"
         )
-    warnings = [
-        f"camera '{name}' has no X_WC: it is left out"
-        for name in episode.cameras
-        if name not in placed
-    ]
+    warnings = say_left_out(episode.cameras, episode.placed)
     body = RegistrationBody(episode.tree, episode.seen)
     held, findings, pictures = list[Camera](), list[Finding](), dict[str, PictureRegistration]()
     names, frames = dict[str, tuple[str, str]](), list[SeenFrame]()

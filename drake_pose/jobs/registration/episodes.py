@@ -6,10 +6,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from drake_pose.arrays import Array, Picture
 from drake_pose.body.model import OBJECT, ArticulatedModel, load_model
 from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
@@ -32,13 +33,30 @@ from drake_pose.jobs.estimate.searches import make_tree
 from drake_pose.jobs.registration.settings import AuditSettings, RegistrationSettings
 from drake_pose.registration.picture_registration import Recording
 from drake_pose.registration.standing_object import StandingObject
-
-Array = NDArray[np.float64]
+from drake_pose.silhouette.pictures.scenes import CAMERA_FILE
 
 # A camera of which nobody knows a focal length is taken to have this one [picture widths].
 _USUAL_FOCAL = 0.95
 # Some dozens of pictures are looked at, again and again.
 _REMEMBERED = 64
+
+
+class GivenFiles(NamedTuple):
+    """The files of a registration or an audit.
+
+    joints: a table of joint positions; None: an episode's own, or they are estimated. cameras: a
+    camera file in place of the scene's or episode's own; None: that.
+    """
+
+    scene: Path
+    model: Path
+    joints: Path | None = None
+    cameras: Path | None = None
+
+    @property
+    def camera_file(self) -> Path:
+        """What says what is known of the cameras."""
+        return self.cameras or self.scene / CAMERA_FILE
 
 
 @dataclass(frozen=True)
@@ -72,51 +90,38 @@ def looks_at_pictures(path: Path, settings: AuditSettings) -> bool:
     return settings.pictures or is_episode(path, settings)
 
 
-def read_episode(
-    path: Path,
-    model_path: Path,
-    joints_path: Path | None,
-    camera_path: Path | None,
-    settings: AuditSettings,
-) -> EpisodeInputs:
+def read_episode(files: GivenFiles, settings: AuditSettings) -> EpisodeInputs:
     """Reads and checks what an episode holds; pictures are read when they are asked for.
 
-    Args:
-        joints_path: a table of joint positions, in place of the episode's own.
-        camera_path: a camera file, in place of the episode's own.
-
-    Raises:
-        DrakePoseError: names the file, camera, column or joint at fault.
+    Raises DrakePoseError: names the file, camera, column or joint at fault.
     """
-    episode = open_episode(path, joints=joints_path, episode=settings.episode)
+    path = files.scene
+    episode = open_episode(path, joints=files.joints, episode=settings.episode)
     if episode.joints is None:
         raise SceneError(
             f"{path}: holds no joint positions, and none are given (--joints FILE): pictures alone "
             "do not tell where a robot stands"
         )
-    model = load_model(model_path, package_paths=settings.packages)
+    model = load_model(files.model, package_paths=settings.packages)
     standing = read_target(model, settings) if isinstance(settings, RegistrationSettings) else None
     tree = make_tree(model, EstimateSettings(hold=settings.hold))
     if standing is not None:
         tree = standing.tree(np.eye(4))
     mapped = map_log(path, episode.joints, tree, settings)
-    warnings = list(mapped.warnings)
-    seen: tuple[str, ...] | None = (OBJECT,)
-    if standing is None:
-        seen = mapped.seen if mapped.unseen else None
+    warnings = [*episode.warnings, *model.warnings, *mapped.warnings]
+    seen = (OBJECT,) if standing else mapped.seen if mapped.unseen else None
     if mapped.unseen:
         warnings.append(
             "parts that joints move which are not logged are not looked at: "
             f"{', '.join(mapped.unseen)}; where these joints stand still say so: --hold NAME=VALUE "
             "[deg or m]"
         )
-    chosen, placed = cameras_of(episode, camera_path, settings)
+    chosen, placed = cameras_of(episode, files.cameras, settings)
     cameras, assumed = _known_cameras(chosen)
     default = TreeKinematics(tree).flatten(tree.default_values())
     recordings = {one.name: _recording(one, mapped, default, settings) for one in chosen}
-    said = (*episode.warnings, *model.warnings, *warnings)
     return EpisodeInputs(
-        path, model, tree, seen, cameras, assumed, recordings, said, placed, standing
+        path, model, tree, seen, cameras, assumed, recordings, tuple(warnings), placed, standing
     )
 
 
@@ -165,7 +170,7 @@ def _recording(
         return values
 
     @lru_cache(_REMEMBERED)
-    def read(k: int) -> NDArray[np.uint8]:
+    def read(k: int) -> Picture:
         return camera.read(int(kept[k]))
 
     names = tuple(frames_of(camera)[k] for k in kept)

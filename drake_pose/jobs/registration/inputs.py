@@ -9,26 +9,20 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from drake_pose.arrays import Array
 from drake_pose.body.model import OBJECT, ArticulatedModel, load_model
 from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.body.tree.root import RootRotation
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.camera.camera_files import CameraFile, load_camera_file
 from drake_pose.camera.models import Camera, PinholeCamera
-from drake_pose.errors import (
-    CameraError,
-    MaskError,
-    SceneError,
-    SettingsError,
-    UnknownNameError,
-)
+from drake_pose.errors import CameraError, MaskError, SceneError, SettingsError, UnknownNameError
 from drake_pose.files.settings import EstimateSettings
 from drake_pose.jobs.estimate.inputs import missing_for_person
 from drake_pose.jobs.estimate.measurements import read_true_angles
 from drake_pose.jobs.estimate.searches import make_tree
-from drake_pose.jobs.registration.episodes import EpisodeInputs, read_target
+from drake_pose.jobs.registration.episodes import EpisodeInputs, GivenFiles, read_target
 from drake_pose.jobs.registration.positions import (
     KnownPositions,
     estimate_positions,
@@ -36,18 +30,12 @@ from drake_pose.jobs.registration.positions import (
     read_known_positions,
 )
 from drake_pose.jobs.registration.settings import ALL, RegistrationSettings
-from drake_pose.registration.joint_zeros import (
-    links_with_length,
-    require_enough,
-    require_known,
-)
+from drake_pose.registration.joint_zeros import links_with_length, require_enough, require_known
 from drake_pose.registration.posed_frames import PosedFrame, SeenFrame
 from drake_pose.registration.standing_object import StandingObject, require_turns, stands_still
 from drake_pose.silhouette.pictures.scene_checks import check_scene
 from drake_pose.silhouette.pictures.scene_files import select_frames
 from drake_pose.silhouette.pictures.scenes import CAMERA_FILE, Scene, load_scene
-
-Array = NDArray[np.float64]
 
 # With positions that were estimated cameras are found from so many frames: what the model lacks is
 # the same in all of them, so more tell little.
@@ -145,34 +133,23 @@ def inputs_of_episode(episode: EpisodeInputs, settings: RegistrationSettings) ->
     )  # fmt: skip
 
 
-def read_inputs(
-    scene_path: Path,
-    model_path: Path,
-    joints_path: Path | None,
-    settings: RegistrationSettings,
-    camera_path: Path | None = None,
-) -> Inputs:
-    """Reads and checks everything.
+def read_inputs(files: GivenFiles, settings: RegistrationSettings) -> Inputs:
+    """Reads and checks everything; joints that no table tells are estimated from known cameras.
 
-    Args:
-        joints_path: the table of joint positions; None: they are estimated from the cameras
-            whose place is known.
-        camera_path: a camera file in place of the scene's own.
-
-    Raises:
-        DrakePoseError: names the file, camera, frame or joint at fault.
+    Raises DrakePoseError: names the file, camera, frame or joint at fault.
     """
-    if not scene_path.is_dir():
-        raise SceneError(f"{scene_path}: no such folder; a scene has {CAMERA_FILE} and masks")
-    file = load_camera_file(camera_path or scene_path / CAMERA_FILE)
-    scene = check_scene(load_scene(scene_path, file.cameras))
+    path = files.scene
+    if not path.is_dir():
+        raise SceneError(f"{path}: no such folder; a scene has {CAMERA_FILE} and masks")
+    file = load_camera_file(files.camera_file)
+    scene = check_scene(load_scene(path, file.cameras))
     scene, frames = scene.every(settings.every, settings.frames)
     searched, held = _select_cameras(scene, file, settings)
-    model = load_model(model_path, package_paths=settings.packages)
+    model = load_model(files.model, package_paths=settings.packages)
     table, standing = None, read_target(model, settings)
-    if joints_path is not None and standing is None:
-        table = read_true_angles(joints_path, model.position_names)
-    if joints_path is None or (table is not None and table.is_estimate):
+    if files.joints is not None and standing is None:
+        table = read_true_angles(files.joints, model.position_names)
+    if files.joints is None or (table is not None and table.is_estimate):
         # Only measured joint positions tell these.
         for name in ("zeros", "lengths", "focal", "on", "suggest"):
             if getattr(settings, name):
@@ -185,14 +162,14 @@ def read_inputs(
     tree, seen = make_registration_tree(model, settings, standing)
     kinematics = TreeKinematics(tree)
     zeros, lengths = _select_parameters(model, kinematics, settings)
-    if joints_path is None:
+    if files.joints is None:
         asked = EstimateSettings(
             frames=frames, every=settings.every, hold=settings.hold, packages=settings.packages
         )
-        positions = estimate_positions(scene_path, model, kinematics, held, asked)
+        positions = estimate_positions(path, model, kinematics, held, asked)
     else:
         on_link = settings.on is not None
-        positions = read_known_positions(joints_path, kinematics, on_link, table)
+        positions = read_known_positions(files.joints, kinematics, on_link, table)
     found, unknown = [camera.name for camera in searched], {*file.unplaced, *file.links}
     inputs = Inputs(
         scene, model, tree, positions, held,
@@ -210,35 +187,36 @@ def _select_cameras(
     scene: Scene, file: CameraFile, settings: RegistrationSettings
 ) -> tuple[tuple[PinholeCamera, ...], tuple[PinholeCamera, ...]]:
     """The cameras that are to be found, and the others whose place is known."""
-    path, wanted, unplaced = scene.path, settings.cameras, {*file.unplaced, *file.links}
+    path, wanted = scene.path / CAMERA_FILE, settings.cameras
+    unplaced = {*file.unplaced, *file.links}
     for name, link in file.links.items():
         if link != settings.on:
             raise SceneError(
-                f"{path / CAMERA_FILE}: camera '{name}' rides on link '{link}': find it with "
-                f"--on {link}, or take it out of the file"
+                f"{path}: camera '{name}' rides on link '{link}': find it with --on {link}, or "
+                "take it out of the file"
             )
     for name in wanted:
         if name not in file.cameras:
-            raise UnknownNameError("camera", name, file.cameras, str(path))
+            raise UnknownNameError("camera", name, file.cameras, str(scene.path))
     if not wanted and not unplaced:
         raise SceneError(
-            f"{path / CAMERA_FILE}: every camera has an X_WC; name those that are to be found "
-            f"anew: --camera {next(iter(file.cameras))}"
+            f"{path}: every camera has an X_WC; name those that are to be found anew: --camera "
+            f"{next(iter(file.cameras))}"
         )
     with_masks = {name for name, _ in scene.masks}
     searched, held = [], []
     for name, camera in file.cameras.items():
         is_wanted = name in wanted if wanted else name in unplaced and name in with_masks
-        if is_wanted and not isinstance(camera, PinholeCamera):
-            raise CameraError(
-                f"{path / CAMERA_FILE}: camera '{name}' is a parallel camera, whose distance no "
-                "picture tells; a camera that is to be found needs a focal length (projection: "
-                "pinhole)"
-            )
-        if isinstance(camera, PinholeCamera) and is_wanted:
-            _require_angle_of_view(camera, path / CAMERA_FILE)
+        if not isinstance(camera, PinholeCamera):
+            if is_wanted:
+                raise CameraError(
+                    f"{path}: camera '{name}' is a parallel camera, whose distance no picture "
+                    "tells; a camera that is to be found needs a focal length (projection: pinhole)"
+                )
+        elif is_wanted:
+            _require_angle_of_view(camera, path)
             searched.append(camera)
-        elif isinstance(camera, PinholeCamera) and name not in unplaced and settings.on is None:
+        elif name not in unplaced and settings.on is None:
             held.append(camera)
     return tuple(searched), tuple(held)
 

@@ -9,6 +9,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from drake_pose.arrays import Array
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import RegistrationError
 from drake_pose.files.options import percent
@@ -121,26 +122,25 @@ def require_determined(found: RegisteredCamera) -> None:
 
 def check_focal_length(
     body: RegistrationBody, found: RegisteredCamera, frames: Sequence[PosedFrame]
-) -> tuple[RegisteredCamera, tuple[str, ...]]:
+) -> tuple[Array, list[str]]:
     """Compares a camera's focal length with that which the masks themselves tell.
 
     Returns:
-        The camera, and a warning where it may be a little off: then it may as well stand where it
-        would with the other one, and its covariance says so.
+        The camera's covariance, and a warning where it may be a little off: then it may as well
+        stand where it would with the other one, and its covariance says so.
 
     Raises:
         RegistrationError: it is wrong, and with it the camera's distance.
     """
     counted = [frame for frame, fit in zip(frames, found.frames, strict=True) if fit.agrees]
-    if len(counted) < 2:
-        return found, ()
-    if abs(_focal_length_off(body, found, spread(counted, _FOCAL_FRAMES))) < _SURELY * _FOCAL_OFF:
-        return found, ()
+    few = spread(counted, _FOCAL_FRAMES)
+    if len(few) < 2 or abs(_focal_length_off(body, found, few)) < _SURELY * _FOCAL_OFF:
+        return found.covariance, []
     told = calibrate_joints(body, [found], [counted], (), focal=True)
     camera, deviation = told.cameras[0], float(told.focal_deviations[0])
     off = math.log(camera.focal_x / found.camera.focal_x)
     if abs(off) < max(_FOCAL_OFF, _FOCAL_DEVIATIONS * deviation):
-        return found, ()
+        return found.covariance, []
     text = (
         f"camera '{found.camera.name}': its pictures tell a focal length of {camera.focal_x:.0f} "
         f"pixels (standard deviation {deviation * camera.focal_x:.0f}), but it is given as "
@@ -150,7 +150,7 @@ def check_focal_length(
     if abs(off) > _FOCAL_WRONG:
         raise RegistrationError(f"{text}. Nothing was written")
     by = pose_difference(camera.X_WC, found.camera.X_WC)
-    return replace(found, covariance=told.covariances[0] + np.outer(by, by)), (text,)
+    return told.covariances[0] + np.outer(by, by), [text]
 
 
 def _focal_length_off(

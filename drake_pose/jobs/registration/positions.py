@@ -8,9 +8,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from drake_pose.arrays import Array
 from drake_pose.body.formats.urdf_shape import BASE_JOINTS
 from drake_pose.body.model import ArticulatedModel
 from drake_pose.body.tree.pose_tree import PoseTree
@@ -21,15 +21,9 @@ from drake_pose.errors import SceneError
 from drake_pose.files.records import base_pose
 from drake_pose.files.settings import EstimateSettings
 from drake_pose.jobs.estimate.inputs import missing_for_person
-from drake_pose.jobs.estimate.measurements import (
-    TrueAngles,
-    check_units,
-    read_true_angles,
-)
+from drake_pose.jobs.estimate.measurements import TrueAngles, check_units, read_true_angles
 from drake_pose.jobs.estimate.scene import estimate_scene
 from drake_pose.person.shape import shape_parts
-
-Array = NDArray[np.float64]
 
 # Poses are one whose joints differ by less [rad or m].
 _SAME_ANGLE, _SAME_LENGTH = math.radians(1.0), 0.005

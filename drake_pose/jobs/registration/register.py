@@ -11,21 +11,25 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from drake_pose.arrays import Array, Picture
 from drake_pose.body.formats.urdf_shape import reshaped
-from drake_pose.body.model import OBJECT_POSITIONS
+from drake_pose.body.model import OBJECT_POSITIONS, ArticulatedModel
 from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.camera.models import Camera, PinholeCamera
-from drake_pose.camera.picture_files import Picture
 from drake_pose.errors import CameraError
 from drake_pose.files.folder import writes_folder
 from drake_pose.files.options import percent
 from drake_pose.files.summary import BADLY_EXPLAINED
 from drake_pose.fit.lengthened_body import lengthened_joints
 from drake_pose.jobs.estimate.inputs import missing_for_person
-from drake_pose.jobs.registration.episodes import EpisodeInputs, looks_at_pictures, read_episode
+from drake_pose.jobs.registration.episodes import (
+    EpisodeInputs,
+    GivenFiles,
+    looks_at_pictures,
+    read_episode,
+)
 from drake_pose.jobs.registration.exports import check_exports
 from drake_pose.jobs.registration.inputs import (
     Inputs,
@@ -73,7 +77,6 @@ from drake_pose.registration.standing_object import StandingObject
 from drake_pose.registration.start_poses import E_total, areas, intersection_over_union
 from drake_pose.registration.target_pictures import find_in_pictures, require_seen
 from drake_pose.silhouette.pictures.scene_checks import frame_ranges
-from drake_pose.silhouette.pictures.scenes import CAMERA_FILE
 from drake_pose.workers import working
 
 OnCamera = Callable[[int], None]
@@ -131,15 +134,11 @@ def register_scene(
         RegistrationError: no pose of a camera explains its masks. Nothing is written then.
         DrakePoseError: names the file, camera, frame or joint at fault.
     """
-    settings, folder = settings or RegistrationSettings(), None if out is None else Path(out)
-    files = {
-        "model": Path(model),
-        "cameras": Path(cameras or Path(scene) / CAMERA_FILE),
-        "joints": None if joints is None else Path(joints),
-    }
+    settings = settings or RegistrationSettings()
+    table, own, folder = (None if one is None else Path(one) for one in (joints, cameras, out))
+    files = GivenFiles(Path(scene), Path(model), table, own)
     with working(settings.workers):
-        own = None if cameras is None else files["cameras"]
-        work = _begun(Path(scene), Path(model), files["joints"], own, settings, on_camera)
+        work = _begun(files, settings, on_camera)
         start = time.perf_counter()
         if work.inputs.positions.is_estimate:
             work.refit_poses()
@@ -155,7 +154,7 @@ def register_scene(
     summary = {
         # A single camera's part stands at the top as well.
         **(next(iter(described.values())) if len(described) == 1 else {}),
-        **describe_run(Path(scene), files, settings, work.warnings, seconds),
+        **describe_run(files, settings, work.warnings, seconds),
         "cameras": described,
     }
     if folder is not None:
@@ -166,24 +165,19 @@ def register_scene(
 
 
 def _begun(
-    scene: Path,
-    model: Path,
-    joints: Path | None,
-    cameras: Path | None,
-    settings: RegistrationSettings,
-    on_camera: OnCamera | None,
+    files: GivenFiles, settings: RegistrationSettings, on_camera: OnCamera | None
 ) -> _Registration:
     """A registration that has found each camera by itself."""
-    if looks_at_pictures(scene, settings):
-        episode = read_episode(scene, model, joints, cameras, settings)
-        work = _Registration(inputs_of_episode(episode, settings), settings)
+    if looks_at_pictures(files.scene, settings):
+        episode = read_episode(files, settings)
+        work = _Registration(inputs_of_episode(episode, settings), settings, on_camera)
         check_exports(settings.exports, episode.cameras.values())
-        work.find_in_pictures(episode, on_camera)
+        work.find_in_pictures(episode)
     else:
-        work = _Registration(read_inputs(scene, model, joints, settings, cameras), settings)
+        work = _Registration(read_inputs(files, settings), settings, on_camera)
         check_exports(settings.exports, [*work.inputs.held, *work.inputs.searched])
         work.check_held()
-        work.find_each(on_camera)
+        work.find_each()
     return work
 
 
@@ -198,8 +192,10 @@ class _Registration:
         seen: by camera and frame, pictures in which masks of a target were found.
     """
 
-    def __init__(self, inputs: Inputs, settings: RegistrationSettings) -> None:
-        self.inputs, self._settings = inputs, settings
+    def __init__(
+        self, inputs: Inputs, settings: RegistrationSettings, on_camera: OnCamera | None
+    ) -> None:
+        self.inputs, self._settings, self._on_camera = inputs, settings, on_camera
         self.body = RegistrationBody(inputs.tree, inputs.seen, girths=inputs.positions.girths)
         self._held = [one for one in inputs.held if isinstance(one, PinholeCamera)]
         self.warnings = list(inputs.warnings)
@@ -241,7 +237,7 @@ class _Registration:
                     f"--camera {camera.name}"
                 )
 
-    def find_each(self, on_camera: OnCamera | None) -> None:
+    def find_each(self) -> None:
         """Finds each camera by itself.
 
         An object whose place is not known is found with the first camera, and then stands there.
@@ -262,20 +258,25 @@ class _Registration:
                     search = CameraSearch(self.body)
                     self.warnings += _say_object(seen)
                 found = replace(found, seen_object=seen)
-            self.registered[camera.name] = found
-            self.suggestions[camera.name] = self._suggestion(found)
-            self.seconds[camera.name] = time.perf_counter() - start
-            if on_camera is not None:
-                on_camera(len(self.registered))
+            self._note(found, start)
         self.inputs = replace(inputs, tree=self.body.tree)
 
-    def find_in_pictures(self, episode: EpisodeInputs, on_camera: OnCamera | None) -> None:
+    def _note(self, found: RegisteredCamera, start: float) -> None:
+        """Keeps a camera that was found, since a moment by time.perf_counter()."""
+        name = found.camera.name
+        self.registered[name] = found
+        self.suggestions[name] = self._suggestion(found)
+        self.seconds[name] = time.perf_counter() - start
+        if self._on_camera is not None:
+            self._on_camera(len(self.registered))
+
+    def find_in_pictures(self, episode: EpisodeInputs) -> None:
         """Finds each camera of an episode in its pictures.
 
         Raises RegistrationError: no pose of a camera explains its pictures.
         """
         if episode.standing is not None:
-            self._find_target(episode, episode.standing, on_camera)
+            self._find_target(episode, episode.standing)
             return
         frames: list[SeenFrame] = []
         for name, camera in episode.cameras.items():
@@ -290,17 +291,12 @@ class _Registration:
                 )
                 for frame in one.frames
             ]  # fmt: skip
-            self.registered[name], self.pictures[name] = one.found, one
-            self.suggestions[name] = None
-            self.seconds[name] = time.perf_counter() - start
+            self.pictures[name] = one
             self.warnings += say_pictures(one, name in episode.assumed)
-            if on_camera is not None:
-                on_camera(len(self.registered))
+            self._note(one.found, start)
         self.inputs = replace(self.inputs, frames=tuple(frames))
 
-    def _find_target(
-        self, episode: EpisodeInputs, standing: StandingObject, on_camera: OnCamera | None
-    ) -> None:
+    def _find_target(self, episode: EpisodeInputs, standing: StandingObject) -> None:
         """Finds masks of an object in pictures from a link, and each camera in these.
 
         Raises:
@@ -325,7 +321,7 @@ class _Registration:
                 self.warnings.append(say_lost(name, lost, recording.names, "target"))
         self.inputs = replace(self.inputs, frames=tuple(frames))
         seconds = time.perf_counter() - start
-        self.find_each(on_camera)
+        self.find_each()
         for name, found in self.registered.items():
             require_seen(name, len(found.frames) - len(found.contradictions), len(self.seen[name]))
             self.seconds[name] += seconds / len(self.registered)
@@ -341,26 +337,26 @@ class _Registration:
         for name, found in self.registered.items():
             if self.inputs.standing is not None:
                 require_determined(found)
-            texts: tuple[str, ...] = ()
             if not (self.inputs.positions.is_estimate or self._settings.focal):
-                found, texts = self._check_focal_length(body, found)
+                found = self._check_focal_length(body, found)
             self.registered[name] = found
-            self.warnings += [*texts, *_warnings_of(found)]
+            self.warnings += _warnings_of(found)
         self.warnings += say_common(self.registered.values(), of_pictures=bool(self.pictures))
 
     def _check_focal_length(
         self, body: RegistrationBody, found: RegisteredCamera
-    ) -> tuple[RegisteredCamera, tuple[str, ...]]:
+    ) -> RegisteredCamera:
         """As check_focal_length, of a camera's masks or of the pictures that it was fitted to."""
-        name, one = found.camera.name, self.pictures.get(found.camera.name)
-        if one is None:
-            return check_focal_length(body, found, self.inputs.of(name))
-        if one.focal_deviation:
-            return found, ()
-        fitted = replace(found, frames=one.found.frames)
-        frames = [replace(frame, values=frame.values + self._zeros) for frame in one.frames]
-        told, texts = check_focal_length(body, fitted, frames)
-        return replace(told, frames=found.frames), texts
+        one = self.pictures.get(found.camera.name)
+        if one is not None and one.focal_deviation:
+            return found
+        fitted, frames = found, self.inputs.of(found.camera.name)
+        if one is not None:
+            fitted = replace(found, frames=one.found.frames)
+            frames = [replace(frame, values=frame.values + self._zeros) for frame in one.frames]
+        covariance, texts = check_focal_length(body, fitted, frames)
+        self.warnings += texts
+        return replace(found, covariance=covariance)
 
     def _judge_pictures(self, body: RegistrationBody) -> None:
         """Looks at all pictures of cameras that were found in some of them."""
@@ -453,10 +449,8 @@ class _Registration:
         )  # fmt: skip
         self.parameters = describe_parameters(found, self.body.kinematics)
         self.warnings += _say_zeros(found)
-        offsets = np.zeros(len(names))
-        for zero in (one for one in found.zeros if one.significant):
-            offsets[names.index(zero.name)] = zero.value
-        self._zeros = offsets
+        zeros = {one.name: one.value for one in found.zeros if one.significant}
+        self._zeros = np.array([zeros.get(name, 0.0) for name in names])
         model, tree, standing = inputs.model, inputs.tree, inputs.standing
         seen = next(iter(cameras.values())).seen_object
         shifts = _joint_shifts(tree, found)
@@ -468,7 +462,7 @@ class _Registration:
             tree = standing.tree(seen.X_WT)
         elif shifts:
             tree, _ = make_registration_tree(model, self._settings)
-        values = [one.values + offsets for one in inputs.frames]
+        values = [one.values + self._zeros for one in inputs.frames]
         self.inputs = replace(inputs, model=model, tree=tree, frames=inputs.moved(values))
         kinematics = TreeKinematics(tree)
         judged = zip(found.inlier_ratios, found.agrees, strict=True)
@@ -479,13 +473,13 @@ class _Registration:
             again = [replace(one, inlier_ratio=ratio, agrees=own) for one, ratio, own in rows]
             self.registered[camera.name] = replace(before, frames=tuple(again))
             self._found_again(kinematics, camera, covariance, seen)
-        return None if folder is None else _corrected_urdf(inputs, found, shifts, folder)
+        return None if folder is None else _corrected_urdf(inputs.model, zeros, shifts, folder)
 
     def _found_again(
         self,
         kinematics: TreeKinematics,
         camera: PinholeCamera,
-        covariance: NDArray[np.float64],
+        covariance: Array,
         seen: ObjectPose | None = None,
     ) -> None:
         """A camera where it was found now, with its frames' misfits; which agree is known."""
@@ -507,22 +501,23 @@ def _joint_shifts(tree: PoseTree, found: JointCalibration) -> dict[str, list[flo
 
 
 def _corrected_urdf(
-    inputs: Inputs, found: JointCalibration, shifts: Mapping[str, list[float]], folder: Path
+    model: ArticulatedModel,
+    zeros: Mapping[str, float],
+    shifts: Mapping[str, list[float]],
+    folder: Path,
 ) -> bytes | None:
     """The URDF with zeros and lengths in its joints' origins; its meshes as seen from a folder.
 
     None where nothing is significant, or the model is no URDF.
     """
-    model = inputs.model.path
-    zeros = {zero.name: zero.value for zero in found.zeros if zero.significant}
-    if not inputs.model.changes_shape or not (zeros or shifts):
+    if not model.changes_shape or not (zeros or shifts):
         return None
-    text = model.read_text(encoding="utf-8")
+    text = model.path.read_text(encoding="utf-8")
     root = ElementTree.fromstring(reshaped(text, zeros=zeros, shifts=shifts))
     for mesh in root.iter("mesh"):
         name = mesh.get("filename", "")
         if "://" not in name:
-            mesh.set("filename", os.path.relpath(model.parent / name, folder))
+            mesh.set("filename", os.path.relpath(model.path.parent / name, folder))
     return ElementTree.tostring(root, encoding="utf-8", xml_declaration=True)
 
 

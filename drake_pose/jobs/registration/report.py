@@ -87,7 +87,7 @@ def make_registration_report(folder: Path, summary: Mapping[str, Any]) -> str:
             pictures.append(overlay_picture(folder, camera, frame, errors[frame]))
         for frame in compared_frames(errors):
             pairs.append(overlay_picture(folder, camera, frame, errors[frame], AS_GIVEN))
-    return page_template("drake_pose.jobs.registration", "report_template.html.j2").render(
+    return page_template("drake_pose.jobs.registration").render(
         summary=summary,
         title=Path(str(summary["scene"])).name or str(summary["scene"]),
         model=Path(str(summary["model"])).name,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -10,31 +11,23 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
+from drake_pose.arrays import Array, Picture
 from drake_pose.body.model import OBJECT_POSITIONS
 from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.camera.camera_files import dump_cameras
 from drake_pose.camera.models import Camera
 from drake_pose.csv_files import csv_text
-from drake_pose.files.folder import (
-    OVERLAY,
-    REPORT,
-    without_nan,
-    write_file,
-    write_summary,
-)
+from drake_pose.files.folder import OVERLAY, REPORT, without_nan, write_file, write_summary
 from drake_pose.files.options import percent
 from drake_pose.files.overlay import draw_overlay, draw_shapes, encode_png
-from drake_pose.files.summary import file_digest, versions
+from drake_pose.files.summary import describe_job, file_digest, versions
+from drake_pose.jobs.registration.episodes import GivenFiles
 from drake_pose.jobs.registration.exports import write_exports
 from drake_pose.jobs.registration.inputs import Inputs
-from drake_pose.jobs.registration.report import (
-    AS_GIVEN,
-    compared_frames,
-    make_registration_report,
-)
+from drake_pose.jobs.registration.report import AS_GIVEN, compared_frames, make_registration_report
 from drake_pose.jobs.registration.settings import AuditSettings
-from drake_pose.registration.joint_zeros import JointCalibration
+from drake_pose.registration.joint_zeros import JointCalibration, KinematicParameter
 from drake_pose.registration.picture_registration import PictureRegistration
 from drake_pose.registration.posed_frames import PosedFrame
 from drake_pose.registration.register import ObjectPose, RegisteredCamera
@@ -43,8 +36,6 @@ from drake_pose.silhouette.areas.scoring import draw_labels
 from drake_pose.silhouette.pictures.masks import encode_mask
 from drake_pose.silhouette.pictures.scene_checks import frame_ranges
 from drake_pose.silhouette.pictures.scenes import CAMERA_FILE
-
-Array = NDArray[np.float64]
 
 REGISTRATION = "registration.yaml"
 
@@ -63,12 +54,11 @@ def describe_camera(
         suggestion: a pose of the robot that would tell poses apart.
         link: on which the camera rides, in whose frame its pose is then.
     """
-    pose, on, seen = "X_WC", dict[str, Any](), found.seen_object
-    if link is not None:
-        pose, on = "X_LC", {"link": link}
+    pose, seen, X = "X_WC" if link is None else "X_LC", found.seen_object, found.camera.X_WC
     return {
-        **on,
-        **_describe_pose(pose, found.camera.X_WC, found),
+        **({} if link is None else {"link": link}),
+        **describe_pose(pose, X, found),
+        "families": _describe_families(pose, X, found),
         "mean_iou": float(np.mean([frame.iou for frame in found.frames])),
         "suggestion": suggestion,
         **({} if seen is None else {"target": _describe_object(seen)}),
@@ -86,20 +76,27 @@ def describe_camera(
     }
 
 
-def _describe_pose(name: str, X: Array, found: RegisteredCamera | ObjectPose) -> dict[str, Any]:
-    """A pose (4, 4), how sure it is, and those that look alike."""
+def describe_pose(name: str, X: Array, found: RegisteredCamera | ObjectPose) -> dict[str, Any]:
+    """A pose (4, 4), and how sure it is."""
     return {
         name: X.tolist(),
         "translation_sd_mm": 1e3 * found.translation_sd,
         "rotation_sd_deg": float(np.degrees(found.rotation_sd)),
-        "families": [{name: np.asarray(one).tolist()} for one in (X, *found.alternatives)],
     }
+
+
+def _describe_families(
+    name: str, X: Array, found: RegisteredCamera | ObjectPose
+) -> list[dict[str, Any]]:
+    """A pose (4, 4), and those that look alike."""
+    return [{name: np.asarray(one).tolist()} for one in (X, *found.alternatives)]
 
 
 def _describe_object(seen: ObjectPose) -> dict[str, Any]:
     """Where an object stands that a camera on a link has seen."""
     return {
-        **_describe_pose("X_WT", seen.X_WT, seen),
+        **describe_pose("X_WT", seen.X_WT, seen),
+        "families": _describe_families("X_WT", seen.X_WT, seen),
         "determined": not len(seen.round_about),
         "covariance": seen.covariance.tolist(),
         "round_about": seen.round_about.tolist(),
@@ -115,14 +112,14 @@ def describe_pictures(one: PictureRegistration | None, found: bool = False) -> d
         masks = "found" if found else "given"
         return {"masks": masks, "time_offset_s": None, "time_offset_sd_s": None}
     offset, focal = one.offset, one.found.camera.focal_x
-    told = offset is not None and offset.determined
-    drifts = offset is not None and bool(offset.drift)
+    told = offset if offset is not None and offset.determined else None
+    drifting = offset if offset is not None and offset.drift else None
     return {
         "masks": "found",
-        "time_offset_s": offset.value if offset is not None and told else None,
-        "time_offset_sd_s": offset.deviation if offset is not None and told else None,
-        "time_drift": offset.drift if offset is not None and drifts else None,
-        "time_drift_sd": offset.drift_deviation if offset is not None and drifts else None,
+        "time_offset_s": told and told.value,
+        "time_offset_sd_s": told and told.deviation,
+        "time_drift": drifting and drifting.drift,
+        "time_drift_sd": drifting and drifting.drift_deviation,
         "time_offset_scores": [] if offset is None else offset.scores.round(4).tolist(),
         "focal_px": focal,
         "focal_sd_px": one.focal_deviation * focal if one.focal_deviation else None,
@@ -172,41 +169,36 @@ def describe_parameters(
     found: JointCalibration, kinematics: TreeKinematics
 ) -> dict[str, dict[str, Any]]:
     """Zeros in degrees or mm, lengths in percent, by name; None where it is not determined."""
-    described: dict[str, dict[str, Any]] = {"zeros": {}, "lengths": {}}
-    for kind, one in (
-        *(("zeros", zero) for zero in found.zeros),
-        *(("lengths", length) for length in found.lengths),
-    ):
-        unit, factor = "percent", 1e2
-        if kind == "zeros":
-            turns = kinematics.is_angle[kinematics.names.index(one.name)]
-            unit, factor = ("deg", float(np.degrees(1.0))) if turns else ("mm", 1e3)
+
+    def describe(one: KinematicParameter, unit: str, factor: float) -> dict[str, Any]:
         numbers = {"value": one.value, "sd": one.deviation, "low": one.low, "high": one.high}
-        told = {k: factor * value if one.determined else None for k, value in numbers.items()}
-        described[kind][one.name] = {
+        return {
             "determined": one.determined,
             "significant": one.significant,
-            **{f"{key}_{unit}": value for key, value in told.items()},
+            **{f"{k}_{unit}": factor * x if one.determined else None for k, x in numbers.items()},
             "gauge": list(one.gauge),
         }
-    return described
+
+    turns = dict(zip(kinematics.names, kinematics.is_angle, strict=True))
+    units = {True: ("deg", math.degrees(1.0)), False: ("mm", 1e3)}
+    return {
+        "zeros": {one.name: describe(one, *units[bool(turns[one.name])]) for one in found.zeros},
+        "lengths": {one.name: describe(one, "percent", 1e2) for one in found.lengths},
+    }
 
 
 def describe_run(
-    scene: Path,
-    files: Mapping[str, Path | None],
-    settings: AuditSettings,
-    warnings: Sequence[str],
-    seconds: float,
+    files: GivenFiles, settings: AuditSettings, warnings: Sequence[str], seconds: float
 ) -> dict[str, Any]:
-    """What summary.json says of every run: its files by what they are, and how it was made."""
+    """What summary.json says of every run: its files, and how it was made."""
+    job, joints = describe_job(files.scene, files.model, settings, files.cameras), files.joints
+    job["sha256"]["joints"] = joints and file_digest(joints)
     return {
         "seconds": seconds,
         "warnings": list(warnings),
-        "scene": str(scene),
-        **{name: None if file is None else str(file) for name, file in files.items()},
-        "settings": settings.as_json(),
-        "sha256": {k: None if file is None else file_digest(file) for k, file in files.items()},
+        "cameras": str(files.camera_file),
+        "joints": joints and str(joints),
+        **job,
         "versions": versions(),
     }
 
@@ -219,7 +211,7 @@ def write_result(
     summary: Mapping[str, Any],
     overlay: bool,
     urdf: bytes | None = None,
-    pictures: Mapping[str, Mapping[str, NDArray[np.uint8]]] | None = None,
+    pictures: Mapping[str, Mapping[str, Picture]] | None = None,
 ) -> None:
     """Writes the result folder; the camera file comes last, when all else is there.
 
@@ -295,7 +287,7 @@ def write_overlays(
     camera: Camera,
     titled: Iterable[tuple[PosedFrame, str]],
     seen: Collection[str] | None = None,
-    pictures: Mapping[str, NDArray[np.uint8]] | None = None,
+    pictures: Mapping[str, Picture] | None = None,
 ) -> None:
     """Draws the robot over each mask of a camera, or its picture, below a title.
 
@@ -315,7 +307,7 @@ def write_comparisons(
     frames: Sequence[PosedFrame],
     given: Camera,
     found: RegisteredCamera,
-    pictures: Mapping[str, NDArray[np.uint8]],
+    pictures: Mapping[str, Picture],
 ) -> None:
     """Draws the robot as a camera that was given would see it, and as the one that was found."""
     draw = _drawer(inputs.tree, inputs.seen)

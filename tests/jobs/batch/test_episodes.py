@@ -16,7 +16,8 @@ from drake_pose.jobs.batch.episodes_table import COLUMNS, episodes_table
 from drake_pose.jobs.batch.job import read_job
 from drake_pose.jobs.batch.tasks import plan_scene
 from drake_pose.jobs.registration.settings import AuditSettings
-from tests.cli import run_command
+from tests.cli import run_to_end
+from tests.jobs.scenes import read_rows
 from tests.registration.episodes import painted_episode
 from tests.registration.recordings import write_episode
 
@@ -79,47 +80,42 @@ def test_a_camera_of_many_episodes_is_where_they_say_by_how_sure_they_are():
     assert [file["right"]["X_WC"][0][3] for file in files] == pytest.approx([weighted] * 2)
 
 
-def test_an_episode_of_a_job_has_the_settings_of_audits(tmp_path):
+def test_an_episode_of_a_job_has_the_settings_of_audits(tmp_path, out):
     painted = painted_episode(tmp_path, frames=6)
     write_episode(tmp_path / "scene", painted)
     entry = {"scene": "scene", "model": "boxes.urdf", "audit": True, "every": 2, "units": "rad"}
-    (tmp_path / "jobs.yaml").write_text(yaml.safe_dump({"scenes": {"one": entry}}))
-    (job,) = read_job(tmp_path / "jobs.yaml")
+
+    def read(scenes):
+        (tmp_path / "jobs.yaml").write_text(yaml.safe_dump({"scenes": scenes}))
+        return read_job(tmp_path / "jobs.yaml")
+
+    (job,) = read({"one": entry})
     assert isinstance(job.settings, AuditSettings)
     assert (job.settings.every, job.settings.units, job.audit) == (2, "rad", True)
-    (task,) = plan_scene(job, tmp_path / "out")
+    (task,) = plan_scene(job, out)
     assert len(task.frames) == 3
-    many = {"data": entry | {"episodes": "8:10"}}
-    (tmp_path / "jobs.yaml").write_text(yaml.safe_dump({"scenes": many}))
-    jobs = read_job(tmp_path / "jobs.yaml")
+    jobs = read({"data": entry | {"episodes": "8:10"}})
     assert [job.name for job in jobs] == ["data_000008", "data_000009", "data_000010"]
     assert [job.settings.episode for job in jobs] == [8, 9, 10]
     for wrong in ("8", "9:8", 3):
-        many["data"]["episodes"] = wrong
-        (tmp_path / "jobs.yaml").write_text(yaml.safe_dump({"scenes": many}))
         with pytest.raises(SettingsError, match="scene 'data': episodes"):
-            read_job(tmp_path / "jobs.yaml")
-    del entry["audit"]
-    (tmp_path / "jobs.yaml").write_text(yaml.safe_dump({"scenes": {"one": entry}}))
+            read({"data": entry | {"episodes": wrong}})
     with pytest.raises(SettingsError, match="units: for audits"):
-        read_job(tmp_path / "jobs.yaml")
+        read({"one": entry | {"audit": None}})
 
 
 @pytest.mark.slow
-def test_episodes_are_audited_in_a_batch(tmp_path):
+def test_episodes_are_audited_in_a_batch(tmp_path, out):
     painted = painted_episode(tmp_path, late=0.04)
     write_episode(tmp_path / "scene", painted)
     entry = {"scene": "scene", "model": "boxes.urdf", "audit": True, "overlay": False}
     (tmp_path / "jobs.yaml").write_text(yaml.safe_dump({"scenes": {"one": entry}}))
-    out = tmp_path / "out"
-    arguments = ["batch", str(tmp_path / "jobs.yaml"), "--out", str(out)]
-    for _ in range(2):
-        result = run_command(arguments)
-        assert result.exit_code == 0, result.output
-        (row,) = csv.DictReader((out / "episodes.csv").open(newline=""))
+    words = ["batch", tmp_path / "jobs.yaml", "--out", out]
+    for more in ([], ["--resume"]):
+        run_to_end(*words, *more)
+        (row,) = read_rows(out / "episodes.csv")
         assert float(row["time_offset_s"]) == pytest.approx(0.04, abs=0.005)
         assert row["off_mm"] == ""
         place = [float(row[name]) for name in "xyz"]
         np.testing.assert_allclose(place, painted.camera.X_WC[:3, 3], atol=0.01)
-        arguments += ["--resume"] if len(arguments) == 4 else []
     assert json.loads((out / "batch.json").read_text())["scenes"]["one"]["state"] == "finished"

@@ -1,4 +1,3 @@
-import json
 import shutil
 from pathlib import Path
 
@@ -6,7 +5,6 @@ import numpy as np
 import pytest
 
 from drake_pose.body.formats.packages import bundled_model
-from drake_pose.commands.main import app
 from drake_pose.errors import ModelError, SceneError, SettingsError
 from drake_pose.files.settings import EstimateSettings
 from drake_pose.fit.contour_fit import ContourFit
@@ -14,9 +12,9 @@ from drake_pose.jobs.estimate.scene import estimate_scene
 from drake_pose.person.checked_capture import CheckedCapture
 from drake_pose.person.person_capture import PersonCapture
 from drake_pose.person.persons_in_view import ViewFaults
-from tests.cli import CliRunner, Result
+from tests.cli import run_to_end
 from tests.jobs.persons import PersonScene, record_person
-from tests.jobs.scenes import read_rows
+from tests.jobs.scenes import read_rows, run_estimate
 
 FRAMES = 3
 FILES = {
@@ -64,16 +62,6 @@ def known(recording: PersonScene, monkeypatch: pytest.MonkeyPatch) -> list[int]:
     return counts
 
 
-def estimate(
-    runner: CliRunner, scene: PersonScene, out: Path, *more: str, status: int = 0
-) -> tuple[Result, dict]:
-    """What the command said, and the summary that it wrote."""
-    given = [str(scene.folder), "--model", str(scene.person.path), "--out", str(out)]
-    result = runner.invoke(app, ["estimate", *given, "--no-replay", *more])
-    assert result.exit_code == status, result.output
-    return result, json.loads((out / "summary.json").read_text())
-
-
 def test_what_is_done_is_told(recording: PersonScene, known: list[int]) -> None:
     stages: list[tuple[str, int]] = []
     estimate_scene(
@@ -85,10 +73,9 @@ def test_what_is_done_is_told(recording: PersonScene, known: list[int]) -> None:
 
 
 def test_estimate_follows_a_person_and_says_so(
-    recording: PersonScene, known: list[int], runner: CliRunner, tmp_path: Path
+    recording: PersonScene, known: list[int], out: Path
 ) -> None:
-    out = tmp_path / "out"
-    result, summary = estimate(runner, recording, out)
+    result, summary = run_estimate(recording, out)
     assert "followed by all silhouettes" in result.stdout
     assert known == [FRAMES]
     assert {path.name for path in out.iterdir()} == FILES | {"overlay"}
@@ -109,12 +96,11 @@ def test_estimate_follows_a_person_and_says_so(
 
 
 def test_stills_cameras_and_frames_are_chosen_like_an_estimates(
-    known: list[int], runner: CliRunner, tmp_path: Path
+    known: list[int], tmp_path: Path, out: Path
 ) -> None:
     scene = record_person(tmp_path / "scene", FRAMES, sequence=False)
-    out = tmp_path / "out"
     some = ("--frame", "0:1", "--camera", "camera_0", "--camera", "camera_2", "--no-overlay")
-    _, summary = estimate(runner, scene, out, *some)
+    _, summary = run_estimate(scene, out, *some)
     assert list(summary["frames"]) == ["0000", "0001"]
     assert set(summary["cameras"]) == {"camera_0", "camera_2"}
     assert not (out / "motion.bvh").exists()
@@ -122,23 +108,18 @@ def test_stills_cameras_and_frames_are_chosen_like_an_estimates(
 
 
 def test_a_capture_is_of_a_sequence_unless_the_scene_says_otherwise(
-    own_recording: PersonScene, known: list[int], runner: CliRunner, tmp_path: Path
+    own_recording: PersonScene, known: list[int], tmp_path: Path
 ) -> None:
-    given = ["capture", str(own_recording.folder), "--model", str(own_recording.person.path)]
     own_recording.folder.joinpath("scene.yaml").unlink()
     for said in ("motion", "stills"):
         out = tmp_path / said
-        done = runner.invoke(app, [*given, "--out", str(out), "--no-replay", "--no-overlay"])
-        assert done.exit_code == 0, done.output
+        run_to_end(*own_recording.estimate(out, "capture"), "--no-overlay")
         assert (out / "motion.bvh").exists() == (said == "motion")
         own_recording.folder.joinpath("scene.yaml").write_text("sequence: false\n")
 
 
 def test_the_command_capture_takes_the_bundled_person(
-    recording: PersonScene,
-    runner: CliRunner,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
+    recording: PersonScene, out: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked = {}
 
@@ -146,9 +127,8 @@ def test_the_command_capture_takes_the_bundled_person(
         asked.update(options, model=model, settings=settings)
 
     monkeypatch.setattr("drake_pose.commands.capture.estimate", note)
-    out = tmp_path / "out"
-    options = ["--out", str(out), "--no-overlay", "--frame", "1"]
-    assert runner.invoke(app, ["capture", str(recording.folder), *options]).exit_code == 0
+    options = ["--out", out, "--no-overlay", "--frame", "1"]
+    run_to_end("capture", recording.folder, *options)
     assert asked["model"].name == "person_shape.urdf"
     assert asked["settings"] == EstimateSettings(method="person", frames=("1",))
     assert asked["overlay"] is False
@@ -159,12 +139,11 @@ def interrupt(*_: object) -> None:
 
 
 def test_an_interrupted_recording_does_not_look_whole_and_loses_no_frames(
-    recording: PersonScene, known: list[int], runner: CliRunner, tmp_path: Path
+    recording: PersonScene, known: list[int], out: Path
 ) -> None:
-    out = tmp_path / "out"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("drake_pose.jobs.estimate.person.capture_checked", interrupt)
-        result, summary = estimate(runner, recording, out, "--frame", "0", status=1)
+        result, summary = run_estimate(recording, out, "--frame", "0", status=1)
         assert "--resume" in result.stderr
         assert summary["complete"] is False
         assert read_rows(out / "poses.csv") == []
@@ -175,7 +154,7 @@ def test_an_interrupted_recording_does_not_look_whole_and_loses_no_frames(
         # Nothing is left to be done.
         ("0:2", ["0000", "0001", "0002"], [1, FRAMES]),
     ):
-        _, summary = estimate(runner, recording, out, "--resume", "--frame", frames)
+        _, summary = run_estimate(recording, out, "--resume", "--frame", frames)
         assert summary["complete"] is True
         assert [row["frame"] for row in read_rows(out / "poses.csv")] == finished
         assert known == asked
@@ -205,15 +184,13 @@ def test_options_of_the_search_lead_to_the_search(
         estimate_scene(recording.folder, recording.person.path, None, settings)
 
 
-def test_what_the_method_person_cannot_do_is_refused(
-    recording: PersonScene, tmp_path: Path
-) -> None:
+def test_what_the_method_person_cannot_do_is_refused(recording: PersonScene, out: Path) -> None:
     with pytest.raises(SettingsError, match="leave hold out"):
         EstimateSettings(method="person", hold={"head_y": 1.0})
     hand = bundled_model("hand")
     with pytest.raises(ModelError, match=r"left_ankle.*landmarks\.yaml"):
-        estimate_scene(recording.folder, hand, tmp_path / "out", EstimateSettings(method="person"))
+        estimate_scene(recording.folder, hand, out, EstimateSettings(method="person"))
     alone = EstimateSettings(method="person", cameras=("camera_0",))
     with pytest.raises(SceneError, match="two calibrated cameras"):
-        estimate_scene(recording.folder, recording.person.path, tmp_path / "out", alone)
-    assert not (tmp_path / "out").exists()
+        estimate_scene(recording.folder, recording.person.path, out, alone)
+    assert not out.exists()

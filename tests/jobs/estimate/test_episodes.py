@@ -2,12 +2,12 @@
 
 import numpy as np
 import pytest
-import yaml
 
 from drake_pose.camera.camera_files import save_cameras
 from drake_pose.errors import CameraError, SceneError, UnknownNameError
 from drake_pose.files.settings import EstimateSettings
 from drake_pose.jobs.estimate.scene import estimate_scene
+from tests.jobs.scenes import edit_camera
 from tests.registration.episodes import painted_episode
 from tests.registration.recordings import write_episode
 
@@ -42,11 +42,9 @@ def test_frames_are_chosen_and_truth_is_of_the_same_moments(episode):
 
 def test_cameras_of_another_file_are_taken(episode, tmp_path):
     scene, painted = episode
-    content = yaml.safe_load((scene / "cameras.yaml").read_text())
-    del content["camera"]["X_WC"]
-    (tmp_path / "nowhere.yaml").write_text(yaml.safe_dump(content))
+    nowhere = edit_camera(scene / "cameras.yaml", "camera", tmp_path / "nowhere.yaml", X_WC=None)
     with pytest.raises(SceneError, match="nobody says where a camera stands; find out"):
-        estimate_scene(scene, painted.path, cameras=tmp_path / "nowhere.yaml")
+        estimate_scene(scene, painted.path, cameras=nowhere)
     save_cameras(tmp_path / "small.yaml", [painted.camera.resized(160, 120)])
     with pytest.raises(CameraError, match="has 160 x 120 pixels"):
         estimate_scene(scene, painted.path, cameras=tmp_path / "small.yaml")

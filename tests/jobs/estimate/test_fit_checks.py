@@ -2,18 +2,18 @@
 
 import re
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import yaml
 
 from drake_pose.files.records import FrameRecord, PoseRow
 from drake_pose.files.settings import EstimateSettings
 from drake_pose.jobs.estimate.inputs import read_inputs
-from drake_pose.jobs.estimate.matching import check_track, find_contradiction
+from drake_pose.jobs.estimate.matching import check_track, compare_cameras
 from drake_pose.jobs.estimate.scene import estimate_scene
 from drake_pose.search.estimates import TRACKED
-from tests.jobs.scenes import URDF, TinyScene, camera, write_scene
+from tests.jobs.scenes import URDF, TinyScene, camera, edit_camera, write_scene
 
 ANGLES = ((20.0, -40.0), (-40.0, -80.0))
 
@@ -30,10 +30,8 @@ def warnings_of(scene: TinyScene, model: Path | None = None, **more: object) -> 
 
 def turn_camera(scene: TinyScene, name: str, degrees: float) -> None:
     """Turn a calibrated camera about the world's vertical, as if it had been moved about it."""
-    path = scene.folder / "cameras.yaml"
-    cameras = yaml.safe_load(path.read_text())
-    cameras[name]["X_WC"] = camera(name, degrees).X_WC.tolist()
-    path.write_text(yaml.safe_dump(cameras))
+    X_WC = camera(name, degrees).X_WC.tolist()
+    edit_camera(scene.folder / "cameras.yaml", name, X_WC=X_WC)
 
 
 def test_a_sound_scene_has_no_warning(scene: TinyScene) -> None:
@@ -96,23 +94,21 @@ def test_a_track_of_a_wrong_pose_is_told(scene: TinyScene, left: float, is_told:
 def test_who_contradicts_whom(errors, cameras, exchanged):
     """E_total is .4 but for the given cameras; (b, a): those with each other's masks."""
     rig = {name: camera(name) for name in "abc"}
-    masks = {name: np.full((4, 4), 1 + k) for k, name in enumerate("cba")}
+    masks = {name: np.full((160, 200), 1 + k) for k, name in enumerate("cba")}
 
-    def match(frame, views):
-        assert frame == "0"
+    def match(views, root_position):
         names = "".join(view.camera.name for view in views)
         swapped = tuple("cba"[int(view.mask[0, 0]) - 1] for view in views)[:2] == ("b", "a")
-        return errors.get(("b", "a") if swapped else names, 0.4)
+        error = errors.get(("b", "a") if swapped else names, 0.4)
+        return SimpleNamespace(found=True, E_total=error)
 
-    class See:
-        def __init__(self, camera, mask):
-            self.camera, self.mask = camera, mask
-
+    scene = SimpleNamespace(
+        cameras=rig, images={}, masks=[(name, "0") for name in rig],
+        read=lambda name, frame: masks[name],
+    )  # fmt: skip
+    inputs = SimpleNamespace(scene=scene, root_positions=None)
     record = FrameRecord(True, 0.4, 1.0, ious={"a": 0.1, "b": 0.2, "c": 0.9})
-    seen = [(name, "0") for name in rig]
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("drake_pose.jobs.estimate.matching.View", See)
-        found = find_contradiction(match, rig, lambda name, _: masks[name], seen, {"0": record})
+    found = compare_cameras(inputs, SimpleNamespace(match=match), {"0": record}, None)
     assert len(found) == (cameras is not None)
     if cameras is not None:
         named = " and ".join(f"'{name}'" for name in cameras)

@@ -2,15 +2,15 @@
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import trimesh
 
-from drake_pose.commands.main import app
 from drake_pose.errors import SettingsError
 from drake_pose.files.options import parse_packages
-from tests.cli import CliRunner, Result
+from tests.cli import assert_refused, run_command, run_to_end
 from tests.jobs.scenes import LINK, TinyScene
 
 BOOM = LINK.format(name="boom", z=0.25, size="0.1 0.12 0.5")
@@ -30,47 +30,27 @@ def far(tmp_path: Path, tiny_scene: TinyScene) -> tuple[Path, Path]:
     return model, folder
 
 
-def run(*arguments: object) -> Result:
-    return CliRunner().invoke(app, [str(one) for one in arguments])
-
-
-def assert_names_option(result: Result) -> None:
-    assert result.exit_code == 1, result.output
-    message = " ".join(result.stderr.split())
-    assert "link 'boom': mesh 'package://parts/boom.stl'" in message
-    assert "--package parts=FOLDER" in message
-
-
-def test_another_form_is_wrong_usage(far: tuple[Path, Path]) -> None:
-    for text in ("parts", "=x", "parts=", "parts=/no/such/folder"):
-        result = run("check", far[0], "--package", text)
-        assert result.exit_code == 2
-        assert "--package" in result.stderr
-    with pytest.raises(SettingsError, match="given twice"):
-        parse_packages([f"a={far[1]}", f"a={far[1]}"])
-
-
-def test_estimate_and_its_resumption(
-    tmp_path: Path, tiny_scene: TinyScene, far: tuple[Path, Path]
+def test_a_package_is_named_where_it_is_missing_and_may_not_move(
+    out: Path, tiny_scene: TinyScene, far: tuple[Path, Path]
 ) -> None:
     model, folder = far
-    out = tmp_path / "out"
-    arguments = ("estimate", tiny_scene.folder, "--model", model, "--out", out, "--interval", 20)
-    arguments = (*arguments, "--no-replay", "--no-overlay")
-    assert_names_option(run(*arguments))
-    assert_names_option(run("check", model))
-    package = ("--package", f"parts={folder}")
-    assert run("check", model, *package).exit_code == 0
-    result = run(*arguments, *package, "--frame", "0")
-    assert result.exit_code == 0, result.output
+    scene = replace(tiny_scene, model=model)
+    words = [*scene.estimate(out), "--no-replay", "--no-overlay"]
+    package = ["--package", f"parts={folder}"]
+    for command in (words, ["check", str(model)]):
+        missing = ("link 'boom': mesh 'package://parts/boom.stl'", "--package parts=FOLDER")
+        assert_refused(run_command(command), *missing)
+        for text in ("parts", "=x", "parts=", "parts=/no/such/folder"):
+            assert_refused(run_command([*command, "--package", text]), "--package", status=2)
+    run_to_end("check", model, *package)
+    run_to_end(*words, *package, "--frame", "0")
     summary = json.loads((out / "summary.json").read_text())
     assert summary["settings"]["packages"] == {"parts": str(folder)}
     assert summary["found_count"] == 1
-    moved = folder.with_name("moved")
-    shutil.copytree(folder, moved)
-    refused = run(*arguments, "--resume", "--package", f"parts={moved}")
-    assert refused.exit_code == 1
-    assert "packages" in refused.stderr
-    resumed = run(*arguments, *package, "--frame", "0:1", "--resume")
-    assert resumed.exit_code == 0, resumed.output
+    moved = shutil.copytree(folder, folder.with_name("moved"))
+    again = [*words, "--resume", "--package"]
+    assert_refused(run_command([*again, f"parts={moved}"]), "packages")
+    run_to_end(*again, f"parts={folder}", "--frame", "0:1")
     assert json.loads((out / "summary.json").read_text())["found_count"] == 2
+    with pytest.raises(SettingsError, match="given twice"):
+        parse_packages([f"a={folder}", f"a={folder}"])

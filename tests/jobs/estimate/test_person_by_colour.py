@@ -1,6 +1,5 @@
 """A person in a sequence of pictures without masks, painted over Drake's label images."""
 
-import csv
 import shutil
 
 import cv2
@@ -9,13 +8,13 @@ import pytest
 
 from drake_pose.body.formats.packages import bundled_model
 from drake_pose.camera.camera_files import load_cameras
-from drake_pose.commands.main import app
 from drake_pose.errors import SceneError
 from drake_pose.files.settings import EstimateSettings
 from drake_pose.jobs.estimate.scene import estimate_scene
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
-from tests.cli import CliRunner
+from tests.cli import run_to_end
 from tests.jobs.persons import record_person
+from tests.jobs.scenes import write_joints
 
 FRAMES = 5
 
@@ -37,11 +36,9 @@ def recording(tmp_path_factory):
             picture = picture + generator.normal(0.0, 4.0, picture.shape)
             file = folder / "scene" / "images" / name / f"{k:04d}.png"
             cv2.imwrite(str(file), np.clip(picture, 0, 255).astype(np.uint8))
-    with (folder / "start.csv").open("w", newline="") as stream:
-        writer = csv.writer(stream)
-        writer.writerow(["frame", *scene.person.position_names])
-        writer.writerow(["0000", *scene.truth[0]])
-    return folder / "scene", folder / "masks", scene.truth, folder / "start.csv"
+    start = folder / "start.csv"
+    write_joints(start, scene.person.position_names, {"0000": scene.truth[0]})
+    return folder / "scene", folder / "masks", scene.truth, start
 
 
 def moved(estimate, truth):
@@ -50,7 +47,7 @@ def moved(estimate, truth):
     return np.abs(np.degrees([row.q[k] for row in estimate.rows] - truth[:, k]))
 
 
-def test_a_person_is_followed_from_a_start(recording, tmp_path):
+def test_a_person_is_followed_from_a_start(recording, out):
     scene, _, truth, start = recording
     settings = EstimateSettings(start=start, method="person")
     model = bundled_model("person")
@@ -60,19 +57,18 @@ def test_a_person_is_followed_from_a_start(recording, tmp_path):
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        estimate_scene(scene, model, tmp_path / "out", settings, on_frame=stop)
-    words = ["capture", str(scene), "--out", str(tmp_path / "out"), "--start", str(start)]
-    done = CliRunner().invoke(app, [*words, "--model", str(model), "--resume", "--no-replay"])
-    assert done.exit_code == 0, done.output
+        estimate_scene(scene, model, out, settings, on_frame=stop)
+    words = ["capture", scene, "--out", out, "--start", start, "--model", model]
+    run_to_end(*words, "--resume", "--no-replay")
     # Nothing is left to be done.
-    found = estimate_scene(scene, model, tmp_path / "out", settings, resume=True, replay=False)
+    found = estimate_scene(scene, model, out, settings, resume=True, replay=False)
     assert found.summary["method"] == "person"
     assert found.found_count == FRAMES
     assert not any("lost" in text for text in found.warnings)
     # The arm is raised by 40 degrees; a pixel is 1.6 cm.
     assert moved(found, truth).max() < 3.0
     assert all(0.0 < row.error < 0.6 for row in found.rows)
-    overlays = list((tmp_path / "out" / "overlay").glob("*/*.png"))
+    overlays = list((out / "overlay").glob("*/*.png"))
     assert len(overlays) == 4 * FRAMES
 
 

@@ -1,4 +1,3 @@
-import csv
 import html
 import json
 from dataclasses import replace
@@ -11,24 +10,22 @@ from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
 
 from drake_pose.body.model import load_model
-from drake_pose.commands.main import app
 from drake_pose.files.overlay import AGREEMENT_RGB, EXCESS_RGB, MISSING_RGB
 from drake_pose.files.settings import EstimateSettings
 from drake_pose.jobs.estimate.scene import estimate_scene
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from drake_pose.silhouette.pictures.scenes import load_scene
-from tests.cli import CliRunner, Result
-from tests.jobs.scenes import NAMES, URDF, TinyScene, read_rows, write_scene, write_truth
-
-
-def estimate(
-    runner: CliRunner, scene: TinyScene, out: Path, *more: str, status: int = 0
-) -> tuple[Result, dict]:
-    """What the command said, and the summary that it wrote."""
-    given = [str(scene.folder), "--model", str(scene.model), "--out", str(out), "--interval", "20"]
-    result = runner.invoke(app, ["estimate", *given, *more])
-    assert result.exit_code == status, result.output
-    return result, json.loads((out / "summary.json").read_text())
+from tests.cli import run_json
+from tests.jobs.scenes import (
+    NAMES,
+    URDF,
+    TinyScene,
+    read_rows,
+    run_estimate,
+    write_joints,
+    write_scene,
+    write_truth,
+)
 
 
 def positions(out: Path) -> dict[str, np.ndarray]:
@@ -37,9 +34,8 @@ def positions(out: Path) -> dict[str, np.ndarray]:
     return {row["frame"]: np.array([float(row[name]) for name in NAMES]) for row in rows}
 
 
-def test_result_folder(tiny_scene: TinyScene, runner: CliRunner, tmp_path: Path) -> None:
-    out = tmp_path / "out"
-    estimate(runner, tiny_scene, out, "--angles", "grid")
+def test_result_folder(tiny_scene: TinyScene, out: Path) -> None:
+    run_estimate(tiny_scene, out, "--angles", "grid")
     assert sorted(path.name for path in out.iterdir()) == [
         "families.csv", "joints.csv", "overlay", "poses.csv", "replay.html", "report.html",
         "summary.json",
@@ -57,12 +53,9 @@ def test_result_folder(tiny_scene: TinyScene, runner: CliRunner, tmp_path: Path)
     assert 'src="http' not in page
 
 
-def test_summary(tiny_scene: TinyScene, runner: CliRunner, tmp_path: Path) -> None:
-    out = tmp_path / "out"
+def test_summary(tiny_scene: TinyScene, out: Path) -> None:
     options = ["--json", "--no-replay", "--hold", "lift=20", "--joint-interval", "luff=40"]
-    result, summary = estimate(
-        runner, tiny_scene, out, "--method", "paper", "--frame", "0:1", *options
-    )
+    result, summary = run_estimate(tiny_scene, out, "--method", "paper", "--frame", "0:1", *options)
     assert summary == json.loads(result.stdout)
     assert not (out / "replay.html").exists()
     assert summary["complete"] is True
@@ -81,20 +74,16 @@ def test_summary(tiny_scene: TinyScene, runner: CliRunner, tmp_path: Path) -> No
     np.testing.assert_allclose(steps, np.round(steps), atol=1e-7)
 
 
-def test_error_and_overlay_are_what_drakes_renderer_sees(
-    tiny_scene: TinyScene, tmp_path: Path
-) -> None:
+def test_error_and_overlay_are_what_drakes_renderer_sees(tiny_scene: TinyScene, out: Path) -> None:
     settings = EstimateSettings(interval=13.0, method="paper", hold={"luff": -90.0})
-    result = estimate_scene(
-        tiny_scene.folder, tiny_scene.model, tmp_path / "out", settings, replay=False
-    )
+    result = estimate_scene(tiny_scene.folder, tiny_scene.model, out, settings, replay=False)
     scene = load_scene(tiny_scene.folder)
     renderer = LabelRenderer(load_model(tiny_scene.model), scene.cameras["front"])
     for row in result.rows:
         mask, body = scene.read("front", row.frame), renderer.mask(row.q)
         shares = [(mask & body).sum(), (mask & ~body).sum(), (body & ~mask).sum()]
         assert row.error == pytest.approx(sum(shares[1:]) / mask.sum(), abs=0.003)
-        picture = cv2.imread(str(tmp_path / "out" / "overlay" / "front" / f"{row.frame}.png"))
+        picture = cv2.imread(str(out / "overlay" / "front" / f"{row.frame}.png"))
         counts = [
             int((picture[36:-38, :, ::-1] == np.array(colour, np.uint8)).all(axis=2).sum())
             for colour in (AGREEMENT_RGB, MISSING_RGB, EXCESS_RGB)
@@ -120,33 +109,33 @@ def test_nothing_is_written_without_a_folder(tiny_scene: TinyScene) -> None:
     assert heard == [(0, 1, ""), (1, 1, "0001")]
 
 
-def test_several_cameras_are_matched_together(runner: CliRunner, tmp_path: Path) -> None:
+def test_several_cameras_are_matched_together(tmp_path: Path) -> None:
     scene = write_scene(tmp_path / "scene", [(20.0, -40.0)], ["front", "side"])
     for options, names in (
         (("--method", "paper"), ["front", "side"]),
         (("--method", "paper", "--camera", "side"), ["side"]),
     ):
         out = tmp_path / str(len(names))
-        _, summary = estimate(runner, scene, out, *options, "--no-replay")
+        _, summary = run_estimate(scene, out, *options, "--no-replay")
         assert len(summary["frames"]["0000"]["outside_limit"]) == len(names)
         assert sorted(path.name for path in (out / "overlay").iterdir()) == names
 
 
-def test_truth_in_the_scene_is_compared_with(own_scene: TinyScene, runner: CliRunner) -> None:
+def test_truth_in_the_scene_is_compared_with(own_scene: TinyScene) -> None:
     write_truth(own_scene)
     folder = own_scene.folder.parent
     held = ["--hold", "lift=27", "--frame", "0", "--no-replay"]
-    result, summary = estimate(runner, own_scene, folder / "out", *held)
+    result, summary = run_estimate(own_scene, folder / "out", *held)
     assert "Joint errors" in result.stdout
     assert summary["frames"]["0000"]["joint_errors"]["lift"] == pytest.approx(7.0)
     assert summary["joint_errors"]["lift"]["greatest"] == pytest.approx(7.0)
     # That of another model is left alone.
     (own_scene.folder / "joint_angles.csv").write_text("frame,A1\n0,0.5\n")
-    _, summary = estimate(runner, own_scene, folder / "other", *held)
+    _, summary = run_estimate(own_scene, folder / "other", *held)
     assert summary["joint_errors"] == {}
     assert summary["warnings"] == []
     (own_scene.folder / "joint_angles.csv").write_text("frame,lift\n1,0.5\n")
-    _, summary = estimate(runner, own_scene, folder / "another", *held)
+    _, summary = run_estimate(own_scene, folder / "another", *held)
     assert summary["joint_errors"] == {}
     assert "has no row of any frame that is estimated" in summary["warnings"][0]
 
@@ -165,18 +154,12 @@ def jib_positions(scene: TinyScene) -> dict[str, np.ndarray]:
     return positions
 
 
-def test_another_root_with_a_position_for_each_frame(
-    own_scene: TinyScene, runner: CliRunner
-) -> None:
-    centres = own_scene.folder / "centres.csv"
-    with centres.open("w", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow(["frame", "joint", "x", "y", "z"])
-        for frame, p_WJ in jib_positions(own_scene).items():
-            writer.writerow([int(frame), "hook", *p_WJ])
+def test_another_root_with_a_position_for_each_frame(own_scene: TinyScene) -> None:
+    rows = {frame: ["hook", *p_WJ] for frame, p_WJ in jib_positions(own_scene).items()}
+    centres = write_joints(own_scene.folder / "centres.csv", ["joint", "x", "y", "z"], rows)
     out = own_scene.folder.parent / "out"
     root = ["--root", "jib", "--root-position", f"{centres}:hook", "--root-rotation", "x=-180:180"]
-    estimate(runner, own_scene, out, "--method", "paper", *root)
+    run_estimate(own_scene, out, "--method", "paper", *root)
     for frame, q in positions(out).items():
         np.testing.assert_allclose(q, own_scene.truth[frame], atol=1e-8)
     for row in read_rows(out / "poses.csv"):
@@ -184,10 +167,10 @@ def test_another_root_with_a_position_for_each_frame(
         assert abs(float(row["base_qw"])) == pytest.approx(1.0)
 
 
-def test_a_frame_without_a_pose(own_scene: TinyScene, runner: CliRunner) -> None:
+def test_a_frame_without_a_pose(own_scene: TinyScene) -> None:
     out = own_scene.folder.parent / "out"
     options = ["--method", "paper", "--no-replay", "--outside-limit", "0", "--hold", "lift=-90"]
-    lost, summary = estimate(runner, own_scene, out, *options, status=1)
+    lost, summary = run_estimate(own_scene, out, *options, status=1)
     assert lost.stderr.count("no pose was found\n") == 1
     assert "frame 0000-0002 (3 of 3): no pose was found" in lost.stderr
     assert summary["warnings"] == ["frame 0000-0002 (3 of 3): no pose was found"]
@@ -200,15 +183,13 @@ def test_a_frame_without_a_pose(own_scene: TinyScene, runner: CliRunner) -> None
     assert (out / "overlay" / "front" / "0000.png").is_file()
 
 
-def test_what_is_known_of_each_joint_and_of_frames_before(
-    own_scene: TinyScene, runner: CliRunner
-) -> None:
+def test_what_is_known_of_each_joint_and_of_frames_before(own_scene: TinyScene) -> None:
     """One camera, angles between the samples: the truth lies in the intervals of some family."""
     scene = write_scene(own_scene.folder.parent / "between", [(13.0, -47.0), (-31.0, -22.0)])
     out = own_scene.folder.parent / "out"
-    estimate(runner, scene, out, "--frame", "1", "--no-replay")
+    run_estimate(scene, out, "--frame", "1", "--no-replay")
     before = (out / "poses.csv").read_text().splitlines()[1]
-    _, summary = estimate(runner, scene, out, "--resume", "--no-replay")
+    _, summary = run_estimate(scene, out, "--resume", "--no-replay")
     assert list(summary["frames"]) == ["0000", "0001"]
     assert all(frame["runs"] for frame in summary["frames"].values())
     assert (out / "poses.csv").read_text().splitlines()[2] == before
@@ -232,17 +213,16 @@ def test_what_is_known_of_each_joint_and_of_frames_before(
 
 
 def test_what_the_model_does_not_enforce_is_told(
-    tiny_scene: TinyScene, tmp_path: Path, runner: CliRunner
+    tiny_scene: TinyScene, tmp_path: Path, out: Path
 ) -> None:
     text = URDF.replace('<joint name="bolt" type="fixed">', '<joint name="bolt" type="prismatic">')
     joint = text.index('<joint name="luff"')
     end = text.index("</joint>", joint)
-    model, out = tmp_path / "loose.urdf", tmp_path / "out"
+    model = tmp_path / "loose.urdf"
     model.write_text(f'{text[:end]}<mimic joint="gone"/>{text[end:]}')
     scene, options = replace(tiny_scene, model=model), ("--frame", "0", "--no-replay")
-    result, summary = estimate(runner, scene, out, "--method", "paper", *options)
-    checked = runner.invoke(app, ["check", str(model), "--json"])
-    warnings = json.loads(checked.stdout)["warnings"]
+    result, summary = run_estimate(scene, out, "--method", "paper", *options)
+    warnings = run_json("check", model)["warnings"]
     assert len(warnings) == 2
     assert summary["warnings"] == warnings
     page = html.unescape((out / "report.html").read_text())

@@ -10,7 +10,7 @@ from drake_pose.jobs.estimate.inputs import Inputs
 from drake_pose.jobs.estimate.measurements import TrueAngles
 from drake_pose.jobs.estimate.scene import estimate_scene
 from drake_pose.search.continuous.root_placement_search import RootPlacementSearch
-from drake_pose.search.estimates import TRACKED, JointEstimate
+from drake_pose.search.estimates import TRACKED
 from drake_pose.silhouette.pictures.scenes import load_scene
 from tests.jobs.scenes import TinyScene, write_scene
 from tests.search.turning import crane
@@ -53,19 +53,6 @@ def test_every_frame_of_a_sequence_has_intervals_that_hold_the_truth(tmp_path: P
         assert all(joint.high - joint.low <= 20.0 for joint, _ in known)
     assert len(inside) >= 0.8 * len(names) * len(scene.truth)
     assert np.mean(inside) >= 0.95
-
-
-def test_what_a_search_left_open_moves_along_with_a_track() -> None:
-    """A value that has moved by half a turn, and more: ends move along, by whole turns at most."""
-    now = JointEstimate("a", True, 3.0, 3.2, turns_around=True)
-    then = JointEstimate("a", False, -0.3, 0.9, turns_around=True)
-    for turns in (-1, 0, 2):
-        both = now.widened(then, 3.1 - 0.1 + 2.0 * np.pi * turns)
-        assert not both.determined
-        np.testing.assert_allclose((both.low, both.high), (2.7, 3.9))
-    held = now.widened(JointEstimate("a", True, 0.0, 0.1, turns_around=True), 3.05)
-    assert held.determined
-    assert (held.low, held.high) == (3.0, 3.2)
 
 
 def test_a_sequence_need_not_be_tracked(tmp_path: Path) -> None:

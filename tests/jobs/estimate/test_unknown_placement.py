@@ -1,6 +1,5 @@
 """Scenes without cameras.yaml, and roots whose position is not known."""
 
-import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -9,14 +8,10 @@ import numpy as np
 import pytest
 
 from drake_pose.body.model import load_model
-from drake_pose.commands.main import app
 from drake_pose.errors import SettingsError
 from drake_pose.files.settings import EstimateSettings
 from drake_pose.jobs.estimate.scene import estimate_scene
-from tests.cli import CliRunner
-from tests.jobs.scenes import NAMES, TinyScene, camera, read_rows
-
-BEAM = ("--method", "beam", "--interval", "20", "--frame", "0", "--no-replay")
+from tests.jobs.scenes import NAMES, TinyScene, camera, read_rows, run_estimate
 
 
 @pytest.fixture
@@ -29,26 +24,23 @@ def bare_scene(own_scene: TinyScene) -> TinyScene:
     return own_scene
 
 
-def run(runner: CliRunner, scene: TinyScene, out: Path, *more: str) -> tuple[np.ndarray, dict]:
+def run(scene: TinyScene, out: Path, *more: str) -> tuple[np.ndarray, dict]:
     """The positions and the record of the first frame."""
-    given = [str(scene.folder), "--model", str(scene.model), "--out", str(out), *BEAM, *more]
-    result = runner.invoke(app, ["estimate", *given])
-    assert result.exit_code == 0, result.output
+    _, summary = run_estimate(scene, out, "--method", "beam", "--frame", "0", "--no-replay", *more)
     (row,) = read_rows(out / "poses.csv")
-    summary = json.loads((out / "summary.json").read_text())
     return np.array([float(row[name]) for name in NAMES]), summary["frames"]["0000"]
 
 
-def test_masks_alone(bare_scene: TinyScene, runner: CliRunner, tmp_path: Path) -> None:
+def test_masks_alone(bare_scene: TinyScene, out: Path) -> None:
     """Pose and scale are found, as far as a parallel camera can stand for the pinhole."""
-    q, record = run(runner, bare_scene, tmp_path / "out")
+    q, record = run(bare_scene, out)
     np.testing.assert_allclose(q, bare_scene.truth["0000"], atol=np.radians(6.0))
     assert record["E_total"] < 0.08
     true_camera = camera("front")
     # The crane stands in the world's origin.
     depth = np.linalg.norm(true_camera.X_WC[:2, 3])
     assert record["camera_scale"] == pytest.approx(true_camera.focal_x / depth, rel=0.06)
-    assert (tmp_path / "out" / "overlay" / "camera" / "0000.png").is_file()
+    assert (out / "overlay" / "camera" / "0000.png").is_file()
     # Nothing says how sure it is: each joint may be anywhere inside its limits.
     limits = load_model(bare_scene.model, check=False)
     for k, joint in enumerate(record["joints"].values()):
@@ -57,10 +49,8 @@ def test_masks_alone(bare_scene: TinyScene, runner: CliRunner, tmp_path: Path) -
         assert [joint["low"], joint["high"]] == pytest.approx(ends)
 
 
-def test_a_root_position_that_is_not_known(
-    tiny_scene: TinyScene, runner: CliRunner, tmp_path: Path
-) -> None:
-    q, record = run(runner, tiny_scene, tmp_path / "out", "--root-position", "unknown")
+def test_a_root_position_that_is_not_known(tiny_scene: TinyScene, out: Path) -> None:
+    q, record = run(tiny_scene, out, "--root-position", "unknown")
     np.testing.assert_allclose(q, tiny_scene.truth["0000"], atol=np.radians(6.0))
     assert record["E_total"] < 0.03
     assert record["camera_scale"] is None

@@ -1,5 +1,6 @@
 """Masks found in pictures: by the empty room, by a box, by a network."""
 
+import filecmp
 import shutil
 
 import cv2
@@ -7,10 +8,9 @@ import numpy as np
 import pytest
 
 from drake_pose import MaskSettings, load_scene, make_masks
-from drake_pose.commands.main import app
 from drake_pose.errors import MaskError, SceneError, SettingsError
 from drake_pose.jobs.masks.masks import doubt_mask, largest_patch, refuse_mask
-from tests.cli import CliRunner
+from tests.cli import run_to_end
 from tests.jobs.masks.rooms import iou, moving, write_pictures
 from tests.silhouette.segmentation.test_network import network
 
@@ -46,23 +46,21 @@ def agreement(made, filmed, moves=False):
     return np.array(values)
 
 
-def test_empty_room_beside_the_pictures_is_used(filmed, pictures, tmp_path):
-    result = make_masks(pictures, tmp_path / "out")
+def test_empty_room_beside_the_pictures_is_used(filmed, pictures, out):
+    result = make_masks(pictures, out)
     assert result.count == 80
-    assert agreement(tmp_path / "out", filmed).mean() > 0.88
-    assert (tmp_path / "out" / "cameras.yaml").read_bytes() == (
-        filmed / "cameras.yaml"
-    ).read_bytes()
-    overlay = cv2.imread(str(tmp_path / "out" / "overlay" / "side" / "0003.jpg"))
+    assert agreement(out, filmed).mean() > 0.88
+    assert filecmp.cmp(out / "cameras.yaml", filmed / "cameras.yaml", shallow=False)
+    overlay = cv2.imread(str(out / "overlay" / "side" / "0003.jpg"))
     assert overlay.shape == (160, 200, 3)
 
 
-def test_median_of_a_recording_finds_what_moves_alone(filmed, pictures, tmp_path):
+def test_median_of_a_recording_finds_what_moves_alone(filmed, pictures, tmp_path, out):
     shutil.rmtree(pictures / "background")
     settings = MaskSettings(background="median")
-    result = make_masks(pictures, tmp_path / "out", settings)
+    result = make_masks(pictures, out, settings)
     assert not any("no good background" in text for text in result.warnings)
-    assert agreement(tmp_path / "out", filmed, moves=True).mean() > 0.8
+    assert agreement(out, filmed, moves=True).mean() > 0.8
     angles = [(20.0 + 6.0 * k, -40.0 - 5.0 * k) for k in range(10)]
     still = write_pictures(tmp_path / "scene", angles)
     result = make_masks(still.folder / "images", tmp_path / "still", settings)
@@ -70,19 +68,19 @@ def test_median_of_a_recording_finds_what_moves_alone(filmed, pictures, tmp_path
     assert sum("hardly agree" in text for text in result.warnings) == 1
 
 
-def test_pictures_of_two_sizes_are_refused(pictures, tmp_path):
+def test_pictures_of_two_sizes_are_refused(pictures, out):
     (pictures / "cameras.yaml").unlink()
     shutil.rmtree(pictures / "background")
     file = sorted((pictures / "images" / "front").iterdir())[4]
     cv2.imwrite(str(file), cv2.imread(str(file))[:-10])
     with pytest.raises(SceneError, match=r"200 x 150.*'front' had before 200 x 160"):
-        make_masks(pictures, tmp_path / "out", MaskSettings(background="median"))
+        make_masks(pictures, out, MaskSettings(background="median"))
 
 
-def test_light_that_changed_and_pictures_of_another_size_are_named(pictures, tmp_path):
+def test_light_that_changed_and_pictures_of_another_size_are_named(pictures, tmp_path, out):
     files = sorted((pictures / "images" / "front").iterdir())
     cv2.imwrite(str(files[3]), 255 - cv2.imread(str(files[3])) // 2)
-    result = make_masks(pictures, tmp_path / "out")
+    result = make_masks(pictures, out)
     assert any("0003.png" in text and "light change" in text for text in result.warnings)
     cv2.imwrite(str(pictures / "background" / "side.png"), np.zeros((10, 10, 3), np.uint8))
     with pytest.raises(SceneError, match=r"side\.png.*10 x 10.*200 x 160"):
@@ -126,20 +124,15 @@ def still(tmp_path):
     return path, true
 
 
-def test_box_cuts_a_still_out(still, tmp_path, runner: CliRunner):
+def test_box_cuts_a_still_out(still, tmp_path, out):
     path, true = still
 
-    def run(box):
-        shutil.rmtree(tmp_path / "out", ignore_errors=True)
-        return runner.invoke(app, ["masks", str(path), "-o", str(tmp_path / "out"), "--box", box])
-
-    done = run("30,20,95,85")
-    assert done.exit_code == 0, done.output
-    assert iou(load_scene(tmp_path / "out").read("camera", "still"), true) > 0.97
-    done = run("300,20,95,85")
-    assert done.exit_code == 1
-    assert "still.png: the box" in done.stderr
-    assert run("1,2,3").exit_code == 2
+    words = ["masks", path, "-o", out, "--box"]
+    run_to_end(*words, "30,20,95,85")
+    assert iou(load_scene(out).read("camera", "still"), true) > 0.97
+    words[3] = tmp_path / "none"
+    assert "still.png: the box" in run_to_end(*words, "300,20,95,85", status=1).stderr
+    run_to_end(*words, "1,2,3", status=2)
 
 
 def test_network_takes_the_colours_that_are_said(still, tmp_path):

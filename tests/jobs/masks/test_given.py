@@ -9,9 +9,8 @@ import pytest
 from pycocotools import mask as coco
 
 from drake_pose import MaskSettings, load_scene, make_masks
-from drake_pose.commands.main import app
 from drake_pose.errors import CameraError, DrakePoseError, MaskError, OutputError, SceneError
-from tests.cli import CliRunner
+from tests.cli import run_json, run_to_end
 from tests.jobs.scenes import write_scene
 
 POLYGON = [60.0, 40.0, 120.0, 40.0, 120.0, 100.0, 60.0, 100.0]
@@ -51,15 +50,8 @@ def write_coco(path, scene, annotate, paths="{camera}/{frame}.jpg"):
     return path
 
 
-def assert_same_masks(made, scene):
-    found = load_scene(made)
-    assert set(found.masks) == set(scene.masks)
-    for camera, frame in scene.masks:
-        assert (found.read(camera, frame) == scene.read(camera, frame)).all(), (camera, frame)
-
-
 @pytest.mark.parametrize("packed", [True, False])
-def test_coco_run_lengths_become_the_same_masks(tmp_path, two_views, packed):
+def test_coco_run_lengths_become_the_same_masks(tmp_path, out, two_views, packed):
     scene = load_scene(two_views.folder)
 
     def halves(mask):
@@ -68,10 +60,11 @@ def test_coco_run_lengths_become_the_same_masks(tmp_path, two_views, packed):
 
     file = write_coco(tmp_path / "a.json", scene, halves)
     cameras = two_views.folder / "cameras.yaml"
-    result = make_masks(file, tmp_path / "out", MaskSettings(classes=("arm", "4"), cameras=cameras))
-    assert result.count == 6
-    assert result.warnings == ()
-    assert_same_masks(tmp_path / "out", scene)
+    result = make_masks(file, out, MaskSettings(classes=("arm", "4"), cameras=cameras))
+    assert (result.count, result.warnings) == (6, ())
+    found = load_scene(out)
+    assert set(found.masks) == set(scene.masks)
+    assert all((found.read(*key) == scene.read(*key)).all() for key in scene.masks)
     with pytest.raises(MaskError, match=r"classes arm, tool.*--class 'arm'"):
         make_masks(file, tmp_path / "none", MaskSettings(cameras=cameras))
     with pytest.raises(DrakePoseError, match=r"no class 'robot'; it has: arm, tool"):
@@ -79,22 +72,22 @@ def test_coco_run_lengths_become_the_same_masks(tmp_path, two_views, packed):
     assert not (tmp_path / "none").exists() or not any((tmp_path / "none").iterdir())
 
 
-def test_coco_polygons_without_cameras(tmp_path, two_views):
+def test_coco_polygons_without_cameras(tmp_path, out, two_views):
     scene = load_scene(two_views.folder)
     file = write_coco(tmp_path / "a.json", scene, lambda _: [(3, [POLYGON])])
-    result = make_masks(file, tmp_path / "out")
+    result = make_masks(file, out)
     assert "have no cameras.yaml" in result.warnings[0]
-    mask = cv2.imread(str(tmp_path / "out" / "masks" / "side" / "0001.png"), cv2.IMREAD_GRAYSCALE)
+    mask = cv2.imread(str(out / "masks" / "side" / "0001.png"), cv2.IMREAD_GRAYSCALE)
     expected = np.zeros((160, 200))
     expected[40:100, 60:120] = 255
     assert (mask == expected).all()
 
 
-def test_pictures_of_an_object_that_is_not_there_are_named(tmp_path, two_views):
+def test_pictures_of_an_object_that_is_not_there_are_named(tmp_path, out, two_views):
     scene = load_scene(two_views.folder)
     count = iter(range(6))
     file = write_coco(tmp_path / "a.json", scene, lambda _: [(3, [POLYGON])] if next(count) else [])
-    result = make_masks(file, tmp_path / "out", MaskSettings(cameras=scene.path / "cameras.yaml"))
+    result = make_masks(file, out, MaskSettings(cameras=scene.path / "cameras.yaml"))
     assert result.count == 5
     assert "front/0000.jpg': the object is not found" in result.warnings[0]
     assert "0000" not in [path.stem for path in (tmp_path / "out/masks/front").iterdir()]
@@ -104,26 +97,26 @@ def test_pictures_of_an_object_that_is_not_there_are_named(tmp_path, two_views):
     assert not (tmp_path / "none" / "masks").exists()
 
 
-def test_annotations_of_another_size_or_camera_are_refused(tmp_path, two_views):
+def test_annotations_of_another_size_or_camera_are_refused(tmp_path, out, two_views):
     scene = load_scene(two_views.folder)
     cameras = scene.path / "cameras.yaml"
     file = write_coco(tmp_path / "a.json", scene, lambda _: [(3, [POLYGON])], "x/{frame}.jpg")
     with pytest.raises(SceneError, match=r"no folder of its path is a camera.*front, side"):
-        make_masks(file, tmp_path / "out", MaskSettings(cameras=cameras))
+        make_masks(file, out, MaskSettings(cameras=cameras))
     with pytest.raises(SceneError, match="has frame 0000 twice"):
-        make_masks(file, tmp_path / "out")
+        make_masks(file, out)
     content = json.loads(file.read_text())
     content["images"] = [
         {**one, "width": 100, "file_name": "side/3.png"} for one in content["images"]
     ]
     file.write_text(json.dumps(content))
     with pytest.raises(SceneError, match=r"100 x 160 pixels.*camera 'side'.*200 x 160"):
-        make_masks(file, tmp_path / "out", MaskSettings(cameras=cameras))
+        make_masks(file, out, MaskSettings(cameras=cameras))
     with pytest.raises(CameraError):
-        make_masks(file, tmp_path / "out", MaskSettings(cameras=tmp_path / "none.yaml"))
+        make_masks(file, out, MaskSettings(cameras=tmp_path / "none.yaml"))
 
 
-def test_masks_in_a_video_become_a_sequence(tmp_path, two_views):
+def test_masks_in_a_video_become_a_sequence(tmp_path, out, two_views):
     scene = load_scene(two_views.folder)
     source = tmp_path / "source"
     (source / "videos").mkdir(parents=True)
@@ -136,16 +129,15 @@ def test_masks_in_a_video_become_a_sequence(tmp_path, two_views):
                 np.dstack([np.where(scene.read(camera, frame), 255, 0).astype(np.uint8)] * 3)
             )
         video.release()
-    make_masks(source, tmp_path / "out")
-    made = load_scene(tmp_path / "out")
+    make_masks(source, out)
+    made = load_scene(out)
     assert made.sequence
     assert made.frame_rate_hz == 25.0
     for (camera, frame), mask in zip(made.masks, scene.masks, strict=True):
         assert (made.read(camera, frame) == scene.read(*mask)).mean() > 0.999
 
 
-def test_sources_in_doubt_are_refused(tmp_path, two_views):
-    out = tmp_path / "out"
+def test_sources_in_doubt_are_refused(tmp_path, out, two_views):
     masks = two_views.folder / "masks"
     with pytest.raises(SceneError, match="no such folder or file"):
         make_masks(tmp_path / "none", out)
@@ -164,18 +156,13 @@ def test_sources_in_doubt_are_refused(tmp_path, two_views):
         make_masks(masks / "side", out)
 
 
-def test_command_says_what_was_made(tmp_path, two_views, runner: CliRunner):
+def test_command_says_what_was_made(tmp_path, two_views):
     source = two_views.folder / "masks" / "side"
-    done = runner.invoke(app, ["masks", str(source), "--out", str(tmp_path / "a"), "--json"])
-    assert done.exit_code == 0, done.output
-    assert json.loads(done.stdout)["mask_count"] == 3
-    done = runner.invoke(app, ["masks", str(source), "--out", str(tmp_path / "b")])
-    assert "3 masks of 3 pictures" in done.stdout
-    wrong = ["masks", str(source), "--out", str(tmp_path / "c"), "--pixels", "soft"]
-    assert runner.invoke(app, wrong).exit_code == 2
+    assert run_json("masks", source, "--out", tmp_path / "a")["mask_count"] == 3
+    assert "3 masks of 3 pictures" in run_to_end("masks", source, "--out", tmp_path / "b").stdout
+    run_to_end("masks", source, "--out", tmp_path / "c", "--pixels", "soft", status=2)
     photograph = tmp_path / "photograph.png"
     noise = np.random.default_rng(0).integers(0, 255, (9, 9, 3), dtype=np.uint8)
     cv2.imwrite(str(photograph), noise)
-    done = runner.invoke(app, ["masks", str(photograph), "--out", str(tmp_path / "c")])
-    assert done.exit_code == 1
+    done = run_to_end("masks", photograph, "--out", tmp_path / "c", status=1)
     assert "photograph.png: is a colour picture" in done.stderr

@@ -9,13 +9,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import yaml
 
 from drake_pose.body.model import load_model
 from drake_pose.camera.camera_files import load_cameras, save_cameras
 from drake_pose.camera.models import Camera
-from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
-from drake_pose.silhouette.pictures.masks import write_mask
+from drake_pose.jobs.registration.episodes import GivenFiles
+from tests.jobs.scenes import edit_camera, write_masks
 from tests.registration.arm_pictures import errors
 from tests.search.arms import LINKS, arm_cameras, arm_urdf
 
@@ -31,11 +30,31 @@ class ArmScene:
     joints: Path
     cameras: dict[str, Camera]
 
+    @property
+    def files(self) -> GivenFiles:
+        """As a registration and an audit take them."""
+        return GivenFiles(self.folder, self.model, self.joints)
+
     def copy(self, place: Path) -> ArmScene:
         """The same elsewhere, to be spoilt."""
         shutil.copytree(self.folder, place / "scene")
         joints = shutil.copy(self.joints, place / "joints.csv")
         return ArmScene(place / "scene", self.model, Path(joints), self.cameras)
+
+    def register(self, out: Path, with_joints: bool = True) -> list[str]:
+        """The words of a registration."""
+        joints = ["--joints", self.joints] if with_joints else []
+        given = [self.folder, "--model", self.model, "--out", out, *joints]
+        return ["register", *map(str, given)]
+
+    def add_to(self, name: str, value: float) -> list[list[str]]:
+        """Adds a value to a joint's readings in all frames; the table."""
+        header, *rows = self.rows()
+        column = header.index(name)
+        for row in rows:
+            row[column] = str(float(row[column]) + value)
+        self.write_rows([header, *rows])
+        return [header, *rows]
 
     def rows(self) -> list[list[str]]:
         """The table, its first line among them."""
@@ -48,12 +67,8 @@ class ArmScene:
             csv.writer(file).writerows(rows)
 
     def edit_cameras(self, name: str, **fields: object) -> None:
-        """Changes fields of a camera in the camera file; those that are None are taken out."""
-        path = self.folder / "cameras.yaml"
-        content = yaml.safe_load(path.read_text())
-        content[name] |= fields
-        content[name] = {key: value for key, value in content[name].items() if value is not None}
-        path.write_text(yaml.safe_dump(content, sort_keys=False))
+        """As edit_camera, in the scene's camera file."""
+        edit_camera(self.folder / "cameras.yaml", name, **fields)
 
 
 def write_arm_scene(folder: Path, count: int = 5, seed: int = 4) -> ArmScene:
@@ -70,12 +85,7 @@ def write_arm_scene(folder: Path, count: int = 5, seed: int = 4) -> ArmScene:
     limits = np.radians([limit for _, _, _, limit, _, _ in LINKS])
     poses = rng.uniform(limits[:, 0], limits[:, 1], size=(count, len(limits)))
     save_cameras(scene.folder / "cameras.yaml", scene.cameras)
-    for camera in load_cameras(scene.folder / "cameras.yaml").values():
-        renderer = LabelRenderer(model, camera)
-        masks = scene.folder / "masks" / camera.name
-        masks.mkdir(parents=True)
-        for k, q in enumerate(poses):
-            write_mask(masks / f"{k:04d}.png", renderer.mask(q))
+    write_masks(scene.folder, model, load_cameras(scene.folder / "cameras.yaml").values(), poses)
     scene.write_rows([["frame", *JOINTS], *([k, *q] for k, q in enumerate(poses))])
     scene.edit_cameras("left", X_WC=None)
     return scene

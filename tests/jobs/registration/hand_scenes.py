@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -60,6 +60,17 @@ class TargetScene:
     arm: ArmScene
     target: Path
     X_WT: np.ndarray
+
+    def register(self, out: Path) -> list[str]:
+        """The words of a registration of the camera on the flange."""
+        return [*self.arm.register(out), "--on", "flange", "--target", str(self.target)]
+
+    def with_looks(self, before: str, after: str, path: Path) -> TargetScene:
+        """The same with another target, of which a text was replaced."""
+        text = self.target.read_text()
+        assert before in text
+        path.write_text(text.replace(before, after))
+        return replace(self, target=path)
 
 
 def write_hand_scene(

@@ -8,9 +8,13 @@ import cv2
 import numpy as np
 import pytest
 
-from tests.jobs.estimate.test_bad_input import assert_refused
+from tests.cli import Result, assert_refused, run_command
 from tests.jobs.registration.arm_scenes import ArmScene
-from tests.jobs.registration.test_register import run
+
+
+def run(scene: ArmScene, out: Path, *more: str) -> Result:
+    return run_command([*scene.register(out), *more])
+
 
 Spoil = Callable[[ArmScene], None]
 
@@ -93,15 +97,14 @@ BEFORE_WORK: dict[str, tuple[Spoil, list[str]]] = {
 
 
 @pytest.mark.parametrize("case", BEFORE_WORK)
-def test_bad_input_is_refused_before_work(case: str, own_arm: ArmScene, tmp_path: Path) -> None:
+def test_bad_input_is_refused_before_work(case: str, own_arm: ArmScene, out: Path) -> None:
     spoil, parts = BEFORE_WORK[case]
     spoil(own_arm)
-    assert_refused(run(own_arm, tmp_path / "out"), *parts)
-    assert not (tmp_path / "out").exists()
+    assert_refused(run(own_arm, out), *parts)
+    assert not out.exists()
 
 
-def test_unknown_names_are_refused(arm_scene: ArmScene, tmp_path: Path) -> None:
-    out = tmp_path / "out"
+def test_unknown_names_are_refused(arm_scene: ArmScene, tmp_path: Path, out: Path) -> None:
     assert_refused(run(arm_scene, out, "--camera", "top"), "'top'", "left, right")
     assert_refused(run(arm_scene, out, "--frame", "9"), "'9'", "0004")
     assert_refused(run(arm_scene, out, "--hold", "nose=3"), "'nose'")
@@ -113,15 +116,15 @@ def test_unknown_names_are_refused(arm_scene: ArmScene, tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("factor", [0.9, 1.15])
 def test_a_focal_length_that_is_not_the_camera_s(
-    factor: float, own_arm: ArmScene, tmp_path: Path
+    factor: float, own_arm: ArmScene, out: Path
 ) -> None:
     true = own_arm.cameras["left"].focal_x
     own_arm.edit_cameras("left", focal_x=factor * true, focal_y=factor * true)
-    result = run(own_arm, tmp_path / "out")
+    result = run(own_arm, out)
     assert_refused(result, "camera 'left': its pictures tell a focal length", "Nothing was written")
     told = float(re.search(r"a focal length of (\d+) pixels", result.stderr)[1])
     assert told == pytest.approx(true, rel=0.03)
-    assert not (tmp_path / "out").exists()
+    assert not out.exists()
 
 
 @pytest.mark.slow
@@ -137,9 +140,9 @@ class TestNoPoseExplains:
         ids=["mirrored", "focal length", "one row off", "something else"],
     )
     def test_nothing_is_written(
-        self, spoil: Spoil, part: str, own_arm: ArmScene, tmp_path: Path
+        self, spoil: Spoil, part: str, own_arm: ArmScene, out: Path
     ) -> None:
         spoil(own_arm)
-        result = run(own_arm, tmp_path / "out")
+        result = run(own_arm, out)
         assert_refused(result, "camera 'left': no pose explains its masks", part)
-        assert not (tmp_path / "out").exists()
+        assert not out.exists()

@@ -2,24 +2,25 @@
 
 import csv
 import json
+from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
-import yaml
 
 from drake_pose.camera.camera_files import load_cameras, save_cameras
-from drake_pose.commands.main import app
 from drake_pose.errors import DrakePoseError
 from drake_pose.files.overlay import EXCESS_RGB, MISSING_RGB
 from drake_pose.jobs.estimate.episode import is_episode
 from drake_pose.jobs.registration.audit import audit_scene
-from drake_pose.jobs.registration.episodes import read_episode
+from drake_pose.jobs.registration.episodes import EpisodeInputs, GivenFiles, read_episode
 from drake_pose.jobs.registration.register import register_scene
 from drake_pose.jobs.registration.settings import RegistrationSettings
 from drake_pose.silhouette.pictures.scenes import load_scene
 from tests.benchmarks.registration import pose_error
-from tests.cli import CliRunner
+from tests.cli import run_command
+from tests.jobs.scenes import edit_camera
 from tests.registration.episodes import painted_episode
 from tests.registration.recordings import NAMES, write_episode, write_log
 
@@ -31,15 +32,33 @@ def episode(tmp_path_factory):
     """A folder of pictures with a joint log at another rate, and what is in it."""
     folder = tmp_path_factory.mktemp("episode")
     painted = painted_episode(folder, late=LATE)
-    scene = folder / "scene"
-    write_episode(scene, painted)
-    return scene, painted
+    write_episode(folder / "scene", painted)
+    return folder / "scene", painted
+
+
+def read(
+    scene: Path,
+    painted: Any,
+    joints: Path | None = None,
+    cameras: Path | None = None,
+    **settings: Any,
+) -> EpisodeInputs:
+    files = GivenFiles(scene, painted.path, joints, cameras)
+    return read_episode(files, RegistrationSettings(**settings))
+
+
+def run(command: str, episode, out: Path, *more: object) -> dict[str, Any]:
+    """The summary of a command's result."""
+    scene, painted = episode
+    words = [command, scene, "--model", painted.path, "--out", out, "--json", *more]
+    result = run_command([str(word) for word in words])
+    assert result.exit_code == 0, result.output
+    return json.loads((out / "summary.json").read_text())
 
 
 def test_what_is_an_episode(episode, tmp_path):
-    scene, _ = episode
     settings = RegistrationSettings()
-    assert is_episode(scene, settings)
+    assert is_episode(episode[0], settings)
     (tmp_path / "images").mkdir()
     assert is_episode(tmp_path, settings)
     (tmp_path / "masks").mkdir()
@@ -47,11 +66,11 @@ def test_what_is_an_episode(episode, tmp_path):
 
 
 def test_joints_are_where_their_log_says_at_the_pictures_times(episode):
-    scene, painted = episode
-    read = read_episode(scene, painted.path, None, None, RegistrationSettings())
-    assert read.seen is None
-    assert not read.assumed
-    (recording,) = read.recordings.values()
+    _, painted = episode
+    found = read(*episode)
+    assert found.seen is None
+    assert not found.assumed
+    (recording,) = found.recordings.values()
     for offset in (0.0, 0.07):
         # Between rows of the log a swing is straight.
         np.testing.assert_allclose(
@@ -60,46 +79,38 @@ def test_joints_are_where_their_log_says_at_the_pictures_times(episode):
     ahead, behind = (painted.values_at(painted.times + by) for by in (0.02, -0.02))
     np.testing.assert_allclose(recording.rates_at(0.0), (ahead - behind) / 0.04, atol=0.05)
     np.testing.assert_array_equal(recording.read(3), painted.pictures[3])
-    some = RegistrationSettings(every=4, frames=("0004:0015",))
-    (few,) = read_episode(scene, painted.path, None, None, some).recordings.values()
+    (few,) = read(*episode, every=4, frames=("0004:0015",)).recordings.values()
     assert few.names == ("0004", "0008", "0012")
     np.testing.assert_array_equal(few.read(1), painted.pictures[8])
 
 
 def test_parts_that_unlogged_joints_move_are_not_looked_at(episode, tmp_path):
-    scene, painted = episode
-    times = np.arange(0.0, 6.0, 0.1)
-    write_log(tmp_path / "some.csv", times, painted.values_at(times)[:, :3], NAMES[:3])
-    read = read_episode(scene, painted.path, tmp_path / "some.csv", None, RegistrationSettings())
-    assert read.seen == ("box0", "box1", "box2")
-    assert any("box3, box4" in text for text in read.warnings)
-    held = RegistrationSettings(hold={"joint3": 0.0, "joint4": 10.0})
-    read = read_episode(scene, painted.path, tmp_path / "some.csv", None, held)
-    assert read.seen is None
+    _, painted = episode
+    times, table = np.arange(0.0, 6.0, 0.1), tmp_path / "some.csv"
+    write_log(table, times, painted.values_at(times)[:, :3], NAMES[:3])
+    found = read(*episode, table)
+    assert found.seen == ("box0", "box1", "box2")
+    assert any("box3, box4" in text for text in found.warnings)
+    assert read(*episode, table, hold={"joint3": 0.0, "joint4": 10.0}).seen is None
 
 
 def test_a_focal_length_that_nobody_knows_is_a_usual_one(episode, tmp_path):
     scene, painted = episode
-    (tmp_path / "images").symlink_to(scene / "images")
-    (tmp_path / "joint_angles.csv").symlink_to(scene / "joint_angles.csv")
-    read = read_episode(tmp_path, painted.path, None, None, RegistrationSettings())
-    assert read.assumed == {"camera"}
-    given = read_episode(
-        tmp_path, painted.path, None, scene / "cameras.yaml", RegistrationSettings()
-    )
+    for name in ("images", "joint_angles.csv"):
+        (tmp_path / name).symlink_to(scene / name)
+    assert read(tmp_path, painted).assumed == {"camera"}
+    given = read(tmp_path, painted, None, scene / "cameras.yaml")
     assert given.cameras["camera"].focal_x == painted.camera.focal_x
     assert not given.assumed
 
 
 def test_whether_a_camera_s_place_is_given(episode, tmp_path):
     scene, painted = episode
-    content = yaml.safe_load((scene / "cameras.yaml").read_text())
-    del content["camera"]["X_WC"]
-    file = tmp_path / "cameras.yaml"
-    file.write_text(yaml.safe_dump(content))
+    file = edit_camera(scene / "cameras.yaml", "camera", tmp_path / "cameras.yaml", X_WC=None)
     for own, expected in ((None, {"camera"}), (scene / "cameras.yaml", {"camera"}), (file, set())):
-        read = read_episode(scene, painted.path, None, own, RegistrationSettings())
-        assert read.placed == expected
+        assert read(*episode, None, own).placed == expected
+    with pytest.raises(DrakePoseError, match="no camera has an X_WC that could be audited"):
+        audit_scene(scene, painted.path, cameras=file)
 
 
 @pytest.mark.parametrize(
@@ -128,30 +139,38 @@ def test_what_cannot_be_used_is_named(episode, tmp_path, spoil, words):
     (tmp_path / "images").symlink_to(scene / "images")
     spoil(tmp_path)
     with pytest.raises(DrakePoseError, match=words):
-        read_episode(tmp_path, painted.path, None, None, RegistrationSettings())
+        read(tmp_path, painted)
 
 
-@pytest.mark.parametrize("name", ["on", "suggest"])
-def test_options_that_need_masks_are_refused(episode, name):
+def test_what_needs_masks_or_pictures_is_refused(episode, tmp_path):
     scene, painted = episode
-    value = {"on": "box4", "suggest": True}[name]
-    with pytest.raises(DrakePoseError, match=f"--{name} needs masks"):
-        register_scene(scene, painted.path, settings=RegistrationSettings(**{name: value}))
+    for name, value, advice in (("on", "box4", "; with --target FILE"), ("suggest", True, "$")):
+        settings = RegistrationSettings(**{name: value})
+        with pytest.raises(DrakePoseError, match=f"--{name} needs masks.*leave it out{advice}"):
+            register_scene(scene, painted.path, settings=settings)
+    with pytest.raises(DrakePoseError, match=r"cameras\.yaml"):
+        register_scene(tmp_path, painted.path, tmp_path / "joints.csv")
+    with pytest.raises(DrakePoseError, match="needs joint positions"):
+        audit_scene(tmp_path, painted.path)
+
+
+def require_overlay_as_given(picture: np.ndarray) -> None:
+    """The contour of the camera as given lies on that of the one that was found."""
+    found, given = ((picture == rgb[::-1]).all(axis=2) for rgb in (EXCESS_RGB, MISSING_RGB))
+    legend = slice(-38, None)
+    assert found[legend].any()
+    near = cv2.dilate(found[:-38].astype(np.uint8), np.ones((25, 25)))
+    assert near[given[:-38]].mean() > 0.95
 
 
 @pytest.mark.slow
-def test_an_episode_becomes_a_calibrated_scene(episode, tmp_path):
-    scene, painted = episode
-    out = tmp_path / "out"
-    arguments = ["register", str(scene), "--model", str(painted.path), "--out", str(out), "--json"]
-    result = CliRunner().invoke(app, arguments)
-    assert result.exit_code == 0, result.output
-    summary = json.loads((out / "summary.json").read_text())
+def test_an_episode_becomes_a_calibrated_scene(episode, out):
+    _, painted = episode
+    summary = run("register", episode, out)
     assert summary["masks"] == "found"
     deviation = summary["time_offset_sd_s"]
     assert summary["time_offset_s"] == pytest.approx(LATE, abs=3.0 * deviation + 2e-3)
-    found = load_cameras(out / "cameras.yaml")["camera"]
-    error = pose_error(found.X_WC, painted.camera.X_WC)
+    error = pose_error(load_cameras(out / "cameras.yaml")["camera"].X_WC, painted.camera.X_WC)
     assert np.linalg.norm(error[3:]) < 0.012
     assert np.degrees(np.linalg.norm(error[:3])) < 0.4
     # The result is a scene of masks, that other commands read.
@@ -159,81 +178,41 @@ def test_an_episode_becomes_a_calibrated_scene(episode, tmp_path):
     with (out / "joint_angles.csv").open(newline="") as file:
         rows = {row["frame"]: row for row in csv.DictReader(file)}
     assert set(rows) == set(masks.frames)
-    for frame in masks.frames:
-        k = int(frame)
-        told = [float(rows[frame][name]) for name in NAMES]
-        np.testing.assert_allclose(told, painted.values[k], atol=0.02)
+    told = [[float(rows[frame][name]) for name in NAMES] for frame in masks.frames]
+    np.testing.assert_allclose(told, painted.values[list(map(int, masks.frames))], atol=0.02)
     assert (out / "overlay" / "camera" / f"{masks.frames[0]}.png").is_file()
     # The camera file had the true place: as it was given the robot is seen where it was found.
     errors = {frame: one["E_total"] for frame, one in summary["frames"].items()}
     in_order = sorted(errors, key=lambda frame: -errors[frame])
     given = sorted((out / "overlay_as_given" / "camera").glob("*.png"))
     assert [one.stem for one in given] == sorted({in_order[0], in_order[len(in_order) // 2]})
-    picture = cv2.imread(str(given[0]))
-    legend = picture[-38:]
-    found, shown = (
-        cv2.dilate((part == EXCESS_RGB[::-1]).all(axis=2).astype(np.uint8), np.ones((25, 25)))
-        for part in (picture[:-38], legend)
-    )
-    blue = (picture[:-38] == MISSING_RGB[::-1]).all(axis=2)
-    assert shown.any()
-    assert found[blue].mean() > 0.95
+    require_overlay_as_given(cv2.imread(str(given[0])))
     page = (out / "report.html").read_text()
     assert "from pictures and joint positions" in page
     assert f"Offset {1e3 * summary['time_offset_s']:.1f} ms" in page
     assert "pixels, as given" in page
-    again = register_scene(
-        out,
-        painted.path,
-        out / "joint_angles.csv",
-        settings=RegistrationSettings(cameras=("camera",)),
-    )
+    anew = RegistrationSettings(cameras=("camera",))
+    again = register_scene(out, painted.path, out / "joint_angles.csv", settings=anew)
     error = pose_error(again.registered["camera"].camera.X_WC, painted.camera.X_WC)
     assert np.linalg.norm(error[3:]) < 0.02
-
-
-def test_a_folder_of_neither_masks_nor_pictures_is_refused(tmp_path, episode):
-    with pytest.raises(DrakePoseError, match=r"cameras\.yaml"):
-        register_scene(tmp_path, episode[1].path, tmp_path / "joints.csv")
-
-
-def audited(episode, tmp_path, *arguments):
-    scene, painted = episode
-    out = tmp_path / "audit"
-    command = ["audit", str(scene), "--model", str(painted.path), "--out", str(out), "--json"]
-    result = CliRunner().invoke(app, [*command, *map(str, arguments)])
-    assert result.exit_code == 0, result.output
-    return json.loads((out / "summary.json").read_text()), out
 
 
 @pytest.mark.slow
 def test_an_audit_of_an_episode_names_its_clock_and_a_camera_that_stands_elsewhere(
     episode, tmp_path
 ):
-    _scene, painted = episode
-    summary, out = audited(episode, tmp_path)
-    clock = next(one for one in summary["contradictions"] if one["cause"] == "clock")
+    _, painted = episode
+    summary = run("audit", episode, tmp_path / "audit")
+    (clock,) = summary["contradictions"]
+    assert clock["cause"] == "clock"
     assert clock["shift_ms"] == pytest.approx(1e3 * LATE, abs=5.0)
     assert f"{1e3 * LATE:.0f}"[0] in clock["text"]
-    assert {one["cause"] for one in summary["contradictions"]} == {"clock"}
     assert summary["agreeing_count"] == summary["frame_count"] == len(painted.times)
     moved = painted.camera.X_WC.copy()
     moved[:3, 3] += [0.15, -0.1, 0.05]
     save_cameras(tmp_path / "moved.yaml", [painted.camera.with_pose(moved)])
-    (tmp_path / "again").mkdir()
-    summary, out = audited(episode, tmp_path / "again", "--cameras", tmp_path / "moved.yaml")
+    summary = run("audit", episode, tmp_path / "again", "--cameras", tmp_path / "moved.yaml")
     camera = next(one for one in summary["contradictions"] if one["cause"] == "camera")
     assert camera["shift_mm"] == pytest.approx(1e3 * np.linalg.norm([0.15, 0.1, 0.05]), abs=15.0)
     assert camera["rivals"] == ["base"]
-    assert any((out / "overlay_as_given" / "camera").glob("*.png"))
-
-
-def test_an_episode_whose_camera_nobody_places_cannot_be_audited(episode, tmp_path):
-    scene, painted = episode
-    text = yaml.safe_load((scene / "cameras.yaml").read_text())
-    del text["camera"]["X_WC"]
-    (tmp_path / "cameras.yaml").write_text(yaml.safe_dump(text))
-    with pytest.raises(DrakePoseError, match="no camera has an X_WC that could be audited"):
-        audit_scene(scene, painted.path, cameras=tmp_path / "cameras.yaml")
-    with pytest.raises(DrakePoseError, match="needs joint positions"):
-        audit_scene(tmp_path, painted.path)
+    assert any((tmp_path / "again" / "overlay_as_given" / "camera").glob("*.png"))

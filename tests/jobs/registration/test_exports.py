@@ -1,6 +1,7 @@
 """What `register --export` writes, read by the programs that it is for."""
 
 import xml.etree.ElementTree as ElementTree
+from dataclasses import replace
 
 import cv2
 import mujoco
@@ -28,9 +29,7 @@ TEXTS = ("ros", "mujoco", "drake")
 def written(arm_scene, tmp_path_factory):
     """The folder of the arm's two cameras, where they truly are."""
     folder = tmp_path_factory.mktemp("exports")
-    inputs = read_inputs(
-        arm_scene.folder, arm_scene.model, arm_scene.joints, RegistrationSettings()
-    )
+    inputs = read_inputs(arm_scene.files, RegistrationSettings())
     write_exports(folder, TEXTS, inputs, arm_scene.cameras.values(), {}, {})
     return folder
 
@@ -82,8 +81,7 @@ def test_transforms_start_at_the_link_that_stands_in_the_origin(tmp_path, arm_sc
     )
     text = arm_scene.model.read_text().replace('<parent link="world"/>', '<parent link="base"/>')
     path.write_text(text.replace('<link name="world"/>', f'<link name="world"/>{base}'))
-    given = arm_scene.folder, path, arm_scene.joints
-    inputs = read_inputs(*given, RegistrationSettings())
+    inputs = read_inputs(replace(arm_scene, model=path).files, RegistrationSettings())
     cameras = arm_scene.cameras
     write_exports(tmp_path / "here", ["ros", "drake"], inputs, cameras.values(), {}, {})
     launch = (tmp_path / "here" / "ros" / "static_transforms.launch.xml").read_text()

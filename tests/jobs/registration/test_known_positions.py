@@ -123,3 +123,6 @@ def test_one_pose(tmp_path: Path) -> None:
     assert found.are_one_pose(rows)
     assert not found.are_one_pose([*rows, [0.0, 0.0], [0.0, 0.1]])
     assert not found.are_one_pose([*rows, [0.0, 0.0], [0.01, 0.0]])
+    apart = [[0.1, 0.5], [0.108, 0.52]]
+    assert not found.are_one_pose(apart)
+    assert found.are_one_pose(apart, 5.0)

@@ -2,11 +2,15 @@
 
 import re
 from html.parser import HTMLParser
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from drake_pose.jobs.registration.report import make_registration_report
+from drake_pose.jobs.registration.result import describe_pictures
+from drake_pose.registration.picture_registration import TimeOffset
+from tests.search.arms import arm_cameras
 
 
 class Paths(HTMLParser):
@@ -73,3 +77,49 @@ def test_what_pictures_do_not_tell(tmp_path):
     page = make_registration_report(tmp_path, summary(masks="given"))
     assert "from masks and joint positions" in page
     assert "Clocks" not in page
+
+
+def test_zeros_and_lengths_are_shown_with_what_to_make_of_them(tmp_path):
+    low = {"value_deg": 3.0, "sd_deg": 0.1, "low_deg": 2.8, "high_deg": 3.2}
+    small = {"value_mm": 0.1, "sd_mm": 0.2, "low_mm": -0.3, "high_mm": 0.5}
+    long = {"value_percent": 2.9, "sd_percent": 0.5, "low_percent": 1.9, "high_percent": 3.9}
+    told = {"determined": True, "significant": True, "gauge": []}
+    page = make_registration_report(
+        tmp_path,
+        summary(
+            zeros={
+                "elbow": told | low,
+                "rail": told | small | {"significant": False},
+                "wrist": told | small | {"significant": False, "low_mm": 0.05},
+                "base": told | {"determined": False, "gauge": ["target_x"]},
+            },
+            lengths={"shoulder": told | long},
+        ),
+    )
+    for row in (
+        "elbow</td><td>3.000 deg</td><td>2.800 to 3.200</td><td>significant: reads 3.00 +- 0.10 "
+        "degrees too low",
+        "rail</td><td>0.100 mm</td><td>-0.300 to 0.500</td><td>as good as 0: held at 0",
+        "wrist</td><td>0.100 mm</td><td>0.050 to 0.500</td><td>doubtful: held at 0",
+        "base</td><td></td><td></td><td>not determined, goes with target_x",
+        "shoulder</td><td>2.900 %</td><td>1.900 to 3.900</td><td>significant<",
+    ):
+        assert f"<td>{row}" in page
+
+
+def test_what_is_written_of_clocks_and_focal_lengths():
+    camera, scores = arm_cameras()[0], np.array([[0.0, 0.5], [0.1, 1.0]])
+    clock = TimeOffset(0.1, 0.02, scores, drift=1e-3, drift_deviation=1e-4)
+    one = SimpleNamespace(
+        found=SimpleNamespace(camera=camera), offset=clock, focal_deviation=0.01,
+        fit=SimpleNamespace(explained=0.3, contour=0.2),
+    )  # fmt: skip
+    told = describe_pictures(one)
+    assert (told["time_offset_s"], told["time_offset_sd_s"]) == (0.1, 0.02)
+    assert (told["time_drift"], told["time_drift_sd"]) == (1e-3, 1e-4)
+    assert told["focal_sd_px"] == pytest.approx(0.01 * camera.focal_x)
+    assert told["time_offset_scores"] == scores.tolist()
+    untold = SimpleNamespace(**{**vars(one), "focal_deviation": 0.0, "offset": None})
+    told = describe_pictures(untold)
+    for name in ("time_offset_s", "time_offset_sd_s", "time_drift", "time_drift_sd", "focal_sd_px"):
+        assert told[name] is None

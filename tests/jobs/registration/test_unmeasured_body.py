@@ -1,7 +1,8 @@
 """`drake-pose register` of a body whose joint positions nobody measured."""
 
-import json
 import shutil
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,24 +16,18 @@ from drake_pose.body.model import load_model
 from drake_pose.camera.camera_files import load_cameras
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from drake_pose.silhouette.pictures.masks import write_mask
-from tests.cli import Result, run_command
-from tests.jobs.estimate.test_bad_input import assert_refused
+from tests.cli import assert_refused, run_command, run_json, run_to_end
 from tests.jobs.registration.arm_scenes import JOINTS, ArmScene, pose_errors
 
 BASE = ("base_x", "base_y", "base_z", "base_qw", "base_qx", "base_qy", "base_qz")
-
-
-def run(scene: Path, model: Path, out: Path, *more: str) -> Result:
-    given = ["--model", str(model), "--out", str(out)]
-    return run_command(["register", str(scene), *given, *more])
+PERSON = bundled_model("person").with_name("person_shape.urdf")
 
 
 def register_near(
-    words: tuple[Any, ...], name: str, true: np.ndarray, *limits: float
+    words: Sequence[str], out: Path, name: str, true: np.ndarray, *limits: float
 ) -> dict[str, Any]:
     """Runs register; a camera is off by less than limits: mm, degrees and standard deviations."""
-    out, result = words[2], run(*words, "--json")
-    assert result.exit_code == 0, result.output
+    told = run_json(*words)
     found = yaml.safe_load((out / "registration.yaml").read_text())[name]
     X_WC = load_cameras(out / "cameras.yaml")[name].X_WC
     np.testing.assert_allclose(X_WC, found["X_WC"], atol=1e-9)
@@ -40,7 +35,7 @@ def register_near(
     off = np.concatenate([turn, X_WC[:3, 3] - true[:3, 3]])
     deviations = np.abs(off / np.sqrt(np.diag(found["covariance"]))).max()
     assert np.all(np.array([*pose_errors(X_WC, true), deviations]) < limits)
-    return json.loads(result.stdout)
+    return told
 
 
 def write_free_arm(scene: ArmScene, seed: int = 7) -> None:
@@ -65,69 +60,62 @@ def write_free_arm(scene: ArmScene, seed: int = 7) -> None:
 
 @pytest.mark.slow
 class TestFound:
-    def test_positions_are_estimated_by_the_other_camera(self, arm_scene, tmp_path) -> None:
-        words = (arm_scene.folder, arm_scene.model, tmp_path / "out")
-        found = register_near(words, "left", arm_scene.cameras["left"].X_WC, 25.0, 0.8, 4.0)
-        assert found["joints"] is None
+    def test_positions_are_estimated_by_the_other_camera(self, arm_scene, out) -> None:
+        true = arm_scene.cameras["left"].X_WC
+        words = arm_scene.register(out, with_joints=False)
+        assert register_near(words, out, "left", true, 25.0, 0.8, 4.0)["joints"] is None
 
-    def test_the_base_moves_and_the_table_is_an_estimate_s(self, own_arm, tmp_path) -> None:
+    def test_the_base_moves_and_the_table_is_an_estimate_s(self, own_arm, out) -> None:
         write_free_arm(own_arm)
-        words = (own_arm.folder, own_arm.model, tmp_path / "out", "--joints", str(own_arm.joints))
+        true = own_arm.cameras["left"].X_WC
         # Held at the table, which is off by a degree and 5 mm, it is 10 mm and more.
-        found = register_near(words, "left", own_arm.cameras["left"].X_WC, 15.0, 0.5, 4.0)
+        found = register_near(own_arm.register(out), out, "left", true, 15.0, 0.5, 4.0)
         assert "0006" not in found["frames"]
 
-    def test_a_recorded_person(self, shared_data: Path, tmp_path: Path) -> None:
+    def test_a_recorded_person(self, shared_data: Path, out: Path) -> None:
         source = shared_data / "human_four_views"
-        model = bundled_model("person").with_name("person_shape.urdf")
-        words = (source, model, tmp_path / "out", "--camera", "cam03", "--frame", "0:19")
+        words = ArmScene(source, PERSON, out, {}).register(out, with_joints=False)
         true = load_cameras(source / "cameras.yaml")["cam03"].X_WC
+        words += ["--camera", "cam03", "--frame", "0:19"]
         # Four metres away, the person's surface known to a centimetre or two.
-        register_near(words, "cam03", true, 100.0, 2.5, 5.0)
+        register_near(words, out, "cam03", true, 100.0, 2.5, 5.0)
 
-    def test_a_body_that_stands_still_is_warned_of(self, own_arm, tmp_path: Path) -> None:
-        header, row, *_ = own_arm.rows()
-        own_arm.write_rows([[*header, "error", "seconds"], [*row, 0.1, 1.0]])
-        given = ["--joints", str(own_arm.joints)]
-        result = run(own_arm.folder, own_arm.model, tmp_path / "out", *given)
-        assert result.exit_code == 0, result.output
+    def test_a_body_that_stands_still_is_warned_of(self, own_arm, out: Path) -> None:
+        as_estimated(own_arm, slice(1))
+        result = run_to_end(*own_arm.register(out))
         assert "camera 'left': there is one frame, '0000'" in " ".join(result.stderr.split())
 
 
-class TestRefused:
-    def test_nothing_is_known(self, own_arm: ArmScene, tmp_path: Path) -> None:
-        own_arm.edit_cameras("right", X_WC=None)
-        result = run(own_arm.folder, own_arm.model, tmp_path / "out")
-        assert_refused(result, "neither a camera's place nor", "X_WC of one camera", "--joints")
-        assert not (tmp_path / "out").exists()
+def as_estimated(arm: ArmScene, frames: slice = slice(None)) -> None:
+    """Some rows as an estimate has written them."""
+    header, *rows = arm.rows()
+    rows = [[*row, "0.1", "1.0"] for row in rows[frames]]
+    arm.write_rows([[*header, "error", "seconds"], *rows])
 
-    def test_a_person_before_one_known_camera(self, arm_scene: ArmScene, tmp_path: Path) -> None:
-        person = bundled_model("person").with_name("person_shape.urdf")
-        result = run(arm_scene.folder, person, tmp_path / "out")
-        assert_refused(result, "right is the only camera", "two cameras or more")
+
+class TestRefused:
+    def test_nothing_is_known(self, own_arm: ArmScene, out: Path) -> None:
+        own_arm.edit_cameras("right", X_WC=None)
+        result = run_command(own_arm.register(out, with_joints=False))
+        assert_refused(result, "neither a camera's place nor", "X_WC of one camera", "--joints")
+        assert not out.exists()
+
+    def test_a_person_before_one_known_camera(self, arm_scene: ArmScene, out: Path) -> None:
+        words = replace(arm_scene, model=PERSON).register(out, with_joints=False)
+        assert_refused(run_command(words), "right is the only camera", "two cameras or more")
 
     @pytest.mark.parametrize("more", [["--zeros", "all"], ["--focal"], ["--on", "hand"]])
-    def test_what_needs_measured_positions(
-        self, more: list[str], arm_scene: ArmScene, tmp_path: Path
-    ) -> None:
-        result = run(arm_scene.folder, arm_scene.model, tmp_path / "out", *more)
-        assert_refused(result, f"{more[0]} needs measured joint positions")
+    def test_what_needs_measured_positions(self, more, arm_scene, out: Path) -> None:
+        words = arm_scene.register(out, with_joints=False)
+        assert_refused(run_command([*words, *more]), f"{more[0]} needs measured joint positions")
 
-    def test_no_moment_in_common(self, own_arm: ArmScene, tmp_path: Path) -> None:
+    def test_no_moment_in_common(self, own_arm: ArmScene, out: Path) -> None:
         own_arm.write_rows([["frame", *JOINTS, "error", "seconds"], [7, *([0.1] * 5), 0.1, 1.0]])
-        given = ["--joints", str(own_arm.joints)]
-        result = run(own_arm.folder, own_arm.model, tmp_path / "out", *given)
+        result = run_command(own_arm.register(out))
         assert_refused(result, "camera 'left' has no mask of a frame in which")
 
-    def test_an_estimate_without_its_cameras(self, own_arm: ArmScene, tmp_path: Path) -> None:
-        rows = own_arm.rows()
-        own_arm.write_rows(
-            [
-                [*row, *(("error", "seconds") if k == 0 else (0.1, 1.0))]
-                for k, row in enumerate(rows)
-            ]
-        )
+    def test_an_estimate_without_its_cameras(self, own_arm: ArmScene, out: Path) -> None:
+        as_estimated(own_arm)
         shutil.rmtree(own_arm.folder / "masks" / "right")
-        given = ["--joints", str(own_arm.joints)]
-        result = run(own_arm.folder, own_arm.model, tmp_path / "out", *given)
+        result = run_command(own_arm.register(out))
         assert_refused(result, "no camera with an X_WC has a mask of those frames")

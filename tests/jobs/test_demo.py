@@ -1,15 +1,22 @@
 import json
 from pathlib import Path
 
+import numpy as np
+import pytest
+
+from drake_pose.body.formats.packages import bundled_model
+from drake_pose.body.model import load_model
 from drake_pose.jobs.demo import demo_scene, demo_settings
+from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from drake_pose.silhouette.pictures.scenes import load_scene
-from tests.cli import run_to_end
+from tests.cli import run_command
 from tests.jobs.scenes import read_rows
 
 
 def test_demo(tmp_path: Path) -> None:
     out = tmp_path / "demo"
-    result = run_to_end("demo", "--out", out)
+    result = run_command(["demo", "--out", str(out)])
+    assert result.exit_code == 0, result.output
     scene = load_scene(demo_scene())
     (camera,) = scene.cameras.values()
     (frame,) = scene.frames
@@ -18,15 +25,27 @@ def test_demo(tmp_path: Path) -> None:
         assert part in result.stdout
     assert overlay.is_file()
     (row,) = read_rows(out / "poses.csv")
+    model = load_model(bundled_model("man"))
+    q = np.array([float(row[name]) for name in model.position_names])
+    mask = scene.read(camera.name, frame)
+    difference = (LabelRenderer(model, camera).mask(q) ^ mask).sum() / mask.sum()
+    assert float(row["error"]) == pytest.approx(difference, abs=0.003)
     # The paper reports 22.3 % in the mean, with a model of the person herself.
-    assert float(row["error"]) < 0.2
+    assert difference < 0.2
+    ankle = np.array([float(read_rows(scene.path / "root_position.csv")[0][a]) for a in "xyz"])
+    context = model.plant.CreateDefaultContext()
+    model.plant.SetPositions(context, q)
+    foot = model.plant.EvalBodyPoseInWorld(context, model.plant.GetBodyByName("right_foot"))
+    np.testing.assert_allclose(foot.translation(), ankle, atol=1e-6)
 
     (out / "mine.txt").write_text("mine")
     other = tmp_path / "other"
     other.mkdir()
     (other / "summary.json").write_text(json.dumps({"scene": "elsewhere"}))
     for folder, kept in ((out, {"mine.txt", "poses.csv"}), (other, {"summary.json"})):
-        assert "not empty" in run_to_end("demo", "--out", folder, status=1).stderr
+        refused = run_command(["demo", "--out", str(folder)])
+        assert refused.exit_code == 1
+        assert "not empty" in refused.stderr
         assert kept <= {path.name for path in folder.iterdir()}
 
 

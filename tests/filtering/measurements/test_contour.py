@@ -9,7 +9,8 @@ from drake_pose.filtering.body_state import ROOT_SHIFT
 from drake_pose.filtering.contour import ContourObservation
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from tests.body.models import joint, link, urdf, write
-from tests.search.bodies import forked_body, front_camera
+from tests.body.skins import LIMB_URDF, write_limb
+from tests.search.bodies import forked_body, front_camera, near_camera
 
 
 def pinhole(name, turn_deg, side=260, focal=330.0, distance=2.9, height=0.9):
@@ -122,3 +123,17 @@ def test_limits_are_rows_but_of_angles_that_take_every_direction(tmp_path):
             assert not told
         else:
             assert sorted(told.values()) == pytest.approx(sorted([upper, -lower]))
+
+
+def test_skin_is_drawn_as_it_bends_inside_the_limits(tmp_path):
+    """A full turn more is the same pose; a band that bent by a share of it would not be."""
+    model = load_model(write_limb(tmp_path, text=LIMB_URDF.replace("2.5", "3.2")), check=False)
+    camera = near_camera()
+    observation = ContourObservation(model.pose_tree(), [camera])
+    inside = observation.state(np.array([0.2, 1.1, 0.4, 0.3, -0.5]))
+    for name in ("elbow", "wrist_x"):
+        beyond = inside.copy()
+        beyond[observation.layout.index(name)] += 2.0 * np.pi
+        np.testing.assert_array_equal(
+            observation.draw(beyond, camera), observation.draw(inside, camera)
+        )

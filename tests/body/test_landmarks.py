@@ -1,7 +1,5 @@
 """Landmarks: the bundled models' against Drake, in pose trees, and files that are wrong."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -40,7 +38,7 @@ LENGTHS = {
 
 
 @pytest.mark.parametrize("path", BODIES, ids=lambda path: path.stem)
-def test_bundled_landmarks_are_where_drake_puts_them(path: Path) -> None:
+def test_bundled_landmarks_are_where_drake_puts_them(path):
     model = load_model(path, check=False)
     landmarks, plant = load_landmarks(path), model.plant
     assert set(landmarks) == JOINT_CENTRES
@@ -59,7 +57,7 @@ def test_bundled_landmarks_are_where_drake_puts_them(path: Path) -> None:
 
 
 @pytest.mark.parametrize("path", BODIES, ids=lambda path: path.stem)
-def test_bundled_landmarks_span_the_measured_lengths(path: Path) -> None:
+def test_bundled_landmarks_span_the_measured_lengths(path):
     model = load_model(path, check=False)
     landmarks = load_landmarks(path)
     zero = np.zeros(len(model.position_names))
@@ -75,7 +73,7 @@ def test_bundled_landmarks_span_the_measured_lengths(path: Path) -> None:
 
 
 @pytest.mark.parametrize("root", [None, "left_shin"])
-def test_a_tree_carries_them_like_the_plant(root: str | None) -> None:
+def test_a_tree_carries_them_like_the_plant(root):
     path = BODIES[2]
     model = load_model(path, check=False)
     landmarks = load_landmarks(path)
@@ -94,7 +92,7 @@ def test_a_tree_carries_them_like_the_plant(root: str | None) -> None:
     np.testing.assert_allclose(batch, [expected, expected], atol=1e-9)
 
 
-def test_welded_links_and_a_moved_world(tmp_path: Path) -> None:
+def test_welded_links_and_a_moved_world(tmp_path):
     model = load_model(write(tmp_path, FLOATING_URDF), check=False)
     landmarks = {"tip": Landmark("welded", np.array([0.1, 0.0, 0.2]))}
     tree = model.pose_tree()
@@ -109,13 +107,13 @@ def test_welded_links_and_a_moved_world(tmp_path: Path) -> None:
     assert landmarks_of_nodes(tree, {}).positions(tree.node_poses(tree.default_values())).size == 0
 
 
-def test_what_moves_with_nothing_seen_is_refused(tmp_path: Path) -> None:
+def test_what_moves_with_nothing_seen_is_refused(tmp_path):
     model = load_model(write(tmp_path, FLOATING_URDF), check=False)
     with pytest.raises(ModelError, match="'end' is on link 'toe', which moves with no part"):
         landmarks_of_nodes(model.pose_tree(), {"end": Landmark("toe", np.zeros(3))})
 
 
-def test_unknown_links_and_bad_positions_are_named(tmp_path: Path) -> None:
+def test_unknown_links_and_bad_positions_are_named(tmp_path):
     model = load_model(write(tmp_path, FLOATING_URDF), check=False)
     wrong = {"elbow": Landmark("elbow_link", np.zeros(3))}
     q = np.array(model.default_positions)
@@ -148,7 +146,7 @@ def test_unknown_links_and_bad_positions_are_named(tmp_path: Path) -> None:
         ("landmarks: [", "not a YAML file"),
     ],
 )
-def test_bad_files_are_named(text: str, complaint: str, tmp_path: Path) -> None:
+def test_bad_files_are_named(text, complaint, tmp_path):
     file = tmp_path / "landmarks.yaml"
     file.write_text(text, encoding="utf-8")
     with pytest.raises(ModelError, match=complaint) as caught:

@@ -17,7 +17,7 @@ from .models import FLOATING_URDF, WELDED_URDF, cube_obj, joint, link, urdf, wri
 CUBE_GLTF_ROTATION = [0.0, 0.0, np.sin(np.pi / 8.0), np.cos(np.pi / 8.0)]
 
 
-def mesh_urdf(*files: str, scale: str = "1 1 1") -> str:
+def mesh_urdf(*files, scale="1 1 1"):
     visuals = "".join(
         f'<visual><geometry><mesh filename="{file}" scale="{scale}"/></geometry></visual>'
         for file in files
@@ -106,7 +106,7 @@ def test_bundled_models_are_found_through_drakes_package_map():
         package_map({"mine": "/nowhere"})
 
 
-def elbow(limits: str) -> str:
+def elbow(limits):
     return urdf(link("a"), link("b"), joint("elbow", "revolute", "a", "b", limits=limits))
 
 
@@ -166,7 +166,7 @@ def test_missing_and_foreign_files(tmp_path):
             load_model(tmp_path / name, check=False)
 
 
-def alias_bomb() -> str:
+def alias_bomb():
     lines = ["a0: &a0 [x, x, x, x, x, x, x, x, x, x]"]
     for level in range(1, 10):
         lines.append(f"a{level}: &a{level} [{', '.join([f'*a{level - 1}'] * 10)}]")

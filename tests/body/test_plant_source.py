@@ -39,13 +39,13 @@ JOINTS = {
 }
 
 
-def new_plant() -> tuple[MultibodyPlant, SceneGraph]:
+def new_plant():
     plant, scene_graph = MultibodyPlant(0.0), SceneGraph()
     plant.RegisterAsSourceForSceneGraph(scene_graph)
     return plant, scene_graph
 
 
-def body_poses(plant: MultibodyPlant, q: np.ndarray) -> np.ndarray:
+def body_poses(plant, q):
     context = plant.CreateDefaultContext()
     plant.SetPositions(context, q)
     poses = plant.get_body_poses_output_port().Eval(context)

@@ -1,5 +1,3 @@
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -12,13 +10,13 @@ SIDES = "width: 64, height: 48, center_x: 31.5, center_y: 23.5"
 GOOD = f"{{{SIDES}, focal_x: 60, focal_y: 61, X_WC: {EYE}}}"
 
 
-def write(folder: Path, text: str) -> Path:
+def write(folder, text):
     path = folder / "cameras.yaml"
     path.write_text(text)
     return path
 
 
-def test_round_trip_is_exact(tmp_path: Path) -> None:
+def test_round_trip_is_exact(tmp_path):
     rng = np.random.default_rng(0)
     X_WC = np.eye(4)
     X_WC[:3, :3] = np.linalg.qr(rng.normal(size=(3, 3)))[0]
@@ -37,14 +35,14 @@ def test_round_trip_is_exact(tmp_path: Path) -> None:
         np.testing.assert_array_equal(camera.X_WC, written[name].X_WC)
 
 
-def test_projection_may_be_spelled_out(tmp_path: Path) -> None:
+def test_projection_may_be_spelled_out(tmp_path):
     text = f"7: {{projection: parallel, {SIDES}, pixels_per_metre: 1e2, X_WC: {EYE}}}"
     camera = load_cameras(write(tmp_path, text))["7"]
     assert isinstance(camera, ParallelCamera)
     assert camera.pixels_per_metre == 100.0
 
 
-def test_principal_points_may_be_counted_as_drake_does(tmp_path: Path) -> None:
+def test_principal_points_may_be_counted_as_drake_does(tmp_path):
     for kind in ("focal_x: 60, focal_y: 61", "projection: parallel, pixels_per_metre: 9"):
         text = f"{{{kind}, pixel_centers: drake, {SIDES}, X_WC: {EYE}}}"
         camera = load_cameras(write(tmp_path, f"cam: {text}"))["cam"]
@@ -76,7 +74,7 @@ def test_principal_points_may_be_counted_as_drake_does(tmp_path: Path) -> None:
         ("[" * 5000, "YAML|deeply"),
     ],
 )
-def test_bad_files_are_refused(tmp_path: Path, text: str, message: str) -> None:
+def test_bad_files_are_refused(tmp_path, text, message):
     path = write(tmp_path, text)
     with pytest.raises(CameraError, match=message) as caught:
         load_cameras(path)
@@ -84,7 +82,7 @@ def test_bad_files_are_refused(tmp_path: Path, text: str, message: str) -> None:
     assert len(str(caught.value)) < 1000
 
 
-def test_files_that_cannot_be_read_or_written(tmp_path: Path) -> None:
+def test_files_that_cannot_be_read_or_written(tmp_path):
     (tmp_path / "binary.yaml").write_bytes(b"\xff\xfe\x00\x80")
     (tmp_path / "large.yaml").write_text("# " + "x" * (1 << 21))
     files = {
@@ -102,7 +100,7 @@ def test_files_that_cannot_be_read_or_written(tmp_path: Path) -> None:
         save_cameras(tmp_path / "nowhere" / "c.yaml", [camera])
 
 
-def test_alias_bombs_are_refused_quickly(tmp_path: Path) -> None:
+def test_alias_bombs_are_refused_quickly(tmp_path):
     lines = ["a0: &a0 [[1]]"]
     lines += [f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]" for i in range(1, 40)]
     with pytest.raises(CameraError, match="a0"):

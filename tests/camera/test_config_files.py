@@ -1,7 +1,5 @@
 """Cameras in Drake's own YAML, against Drake's own cameras of the same files."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from pydrake.common.yaml import yaml_load_typed
@@ -34,7 +32,7 @@ label: true
 """
 
 
-def indented(text: str, by: int) -> str:
+def indented(text, by):
     return "".join(f"{' ' * by}{line}\n" for line in text.strip().splitlines())
 
 
@@ -50,13 +48,13 @@ cameras:
 """
 
 
-def write(folder: Path, text: str) -> Path:
+def write(folder, text):
     path = folder / "cameras.yaml"
     path.write_text(text)
     return path
 
 
-def require_same(camera: PinholeCamera, config: CameraConfig) -> None:
+def require_same(camera, config):
     """A camera is what Drake itself makes of a CameraConfig."""
     color, _ = config.MakeCameras()
     X_PB = config.X_PB.GetDeterministicValue()
@@ -70,14 +68,14 @@ def require_same(camera: PinholeCamera, config: CameraConfig) -> None:
     [FRONT, f"any:\n{indented(FRONT, 2)}", f"cameras:\n  any:\n{indented(FRONT, 4)}",
      f"Demo:\n  cameras:\n    any:\n{indented(FRONT, 6)}"],
 )  # fmt: skip
-def test_a_config_is_known_wherever_it_stands(text: str, tmp_path: Path) -> None:
+def test_a_config_is_known_wherever_it_stands(text, tmp_path):
     cameras = load_cameras(write(tmp_path, text))
     assert list(cameras) == ["front"]
     assert isinstance(cameras["front"], PinholeCamera)
     require_same(cameras["front"], yaml_load_typed(schema=CameraConfig, data=FRONT))
 
 
-def test_a_scenario(tmp_path: Path) -> None:
+def test_a_scenario(tmp_path):
     cameras = load_cameras(write(tmp_path, SCENARIO))
     assert list(cameras) == ["front", "side", "plain"]
     side, plain = cameras["side"], cameras["plain"]
@@ -87,7 +85,7 @@ def test_a_scenario(tmp_path: Path) -> None:
     require_same(plain, CameraConfig())
 
 
-def test_round_trip(tmp_path: Path) -> None:
+def test_round_trip(tmp_path):
     written = circle_of_cameras(5, size=(320, 240))
     rng = np.random.default_rng(0)
     R = np.linalg.qr(rng.normal(size=(3, 3)))[0]
@@ -124,7 +122,7 @@ def test_round_trip(tmp_path: Path) -> None:
         ("label: true", "label: true\nX_WC: 3", "needs center_x"),
     ],
 )
-def test_what_a_camera_cannot_be(old: str, new: str, message: str, tmp_path: Path) -> None:
+def test_what_a_camera_cannot_be(old, new, message, tmp_path):
     with pytest.raises(CameraError, match=message) as raised:
         load_cameras(write(tmp_path, f"front:\n{indented(FRONT.replace(old, new), 2)}"))
     assert "cameras.yaml" in str(raised.value)
@@ -140,12 +138,12 @@ def test_what_a_camera_cannot_be(old: str, new: str, message: str, tmp_path: Pat
         ("One: {cameras: {a: {}}}\nTwo: {cameras: {a: {}}}", "several scenarios .One, Two."),
     ],
 )
-def test_scenarios_that_cannot_be_read(text: str, message: str, tmp_path: Path) -> None:
+def test_scenarios_that_cannot_be_read(text, message, tmp_path):
     with pytest.raises(CameraError, match=message):
         load_cameras(write(tmp_path, text))
 
 
-def test_cameras_that_drake_does_not_know() -> None:
+def test_cameras_that_drake_does_not_know():
     parallel = ParallelCamera("above", 10, 10, 5.0, 5.0, 5.0, np.eye(4))
     with pytest.raises(CameraError, match=r"'above'.*parallel"):
         dump_scenario([parallel])

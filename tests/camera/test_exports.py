@@ -21,7 +21,7 @@ CAMERA = PinholeCamera("head left", 64, 48, 60.0, 70.0, 25.3, 30.1, PLACE.GetAsM
 PARALLEL = ParallelCamera("flat", 64, 48, 50.0, 31.5, 23.5, np.eye(4))
 
 
-def seen_points() -> np.ndarray:
+def seen_points():
     """(n, 3) points of the world that the camera sees."""
     p_C = np.array([[0.0, 0.0, 1.0], [0.1, 0.2, 2.0], [-0.3, 0.1, 1.5], [0.2, -0.4, 3.0]])
     return p_C @ CAMERA.X_WC[:3, :3].T + CAMERA.X_WC[:3, 3]

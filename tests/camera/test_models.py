@@ -9,7 +9,6 @@ from pydrake.systems.sensors import CameraInfo
 from drake_pose.camera.drake import camera_from_drake, camera_to_drake
 from drake_pose.camera.models import (
     FACE_CAMERA,
-    Camera,
     ParallelCamera,
     PinholeCamera,
     circle_of_cameras,
@@ -17,14 +16,14 @@ from drake_pose.camera.models import (
 from drake_pose.errors import CameraError
 
 
-def pose(rpy: tuple[float, float, float], p: tuple[float, float, float]) -> np.ndarray:
+def pose(rpy, p):
     return RigidTransform(RollPitchYaw(*rpy), np.array(p)).GetAsMatrix4()
 
 
 X_WC = pose((0.3, -0.8, 1.1), (0.5, -2.0, 1.5))
 
 
-def pinhole(**changes: object) -> PinholeCamera:
+def pinhole(**changes):
     fields: dict[str, Any] = dict(
         name="cam", width=640, height=480, focal_x=600.0, focal_y=610.0, center_x=300.0,
         center_y=250.0, X_WC=X_WC,
@@ -32,7 +31,7 @@ def pinhole(**changes: object) -> PinholeCamera:
     return PinholeCamera(**(fields | changes))
 
 
-def parallel(**changes: object) -> ParallelCamera:
+def parallel(**changes):
     fields: dict[str, Any] = dict(
         name="flat", width=700, height=500, pixels_per_metre=226.0, center_x=350.0,
         center_y=200.0, X_WC=X_WC,
@@ -40,7 +39,7 @@ def parallel(**changes: object) -> ParallelCamera:
     return ParallelCamera(**(fields | changes))
 
 
-def test_pinhole_projects_as_opencv_does() -> None:
+def test_pinhole_projects_as_opencv_does():
     import cv2
 
     camera = pinhole()
@@ -55,7 +54,7 @@ def test_pinhole_projects_as_opencv_does() -> None:
     np.testing.assert_allclose(depth, p_C[:, 2], atol=1e-12)
 
 
-def test_resized_pictures_show_the_same() -> None:
+def test_resized_pictures_show_the_same():
     """Corners of the picture, half a pixel outside of the outermost centres, stay corners."""
     camera = PinholeCamera("a", 640, 480, 600.0, 590.0, 310.0, 250.0, np.eye(4))
     small = camera.resized(160, 240)
@@ -64,7 +63,7 @@ def test_resized_pictures_show_the_same() -> None:
     np.testing.assert_allclose((after + 0.5) * [4.0, 2.0], before + 0.5)
 
 
-def test_a_mirrored_camera_s_pictures_are_the_mirror_s() -> None:
+def test_a_mirrored_camera_s_pictures_are_the_mirror_s():
     """Of a scene behind a mirror in the plane x = 0 of the camera; twice mirrored is none."""
     camera = pinhole(X_WC=np.eye(4))
     points = np.array([[0.1, -0.2, 1.3], [-0.4, 0.3, 2.0]])
@@ -75,7 +74,7 @@ def test_a_mirrored_camera_s_pictures_are_the_mirror_s() -> None:
     np.testing.assert_array_equal(again.kernel_parameters(), camera.kernel_parameters())
 
 
-def test_what_depth_means() -> None:
+def test_what_depth_means():
     points = np.array([[0.5, 0.5, -7.0], [0.0, 0.0, 2.0], [0.5, 0.5, 9.0]])
     uv, depth = pinhole(X_WC=np.eye(4)).project(points)
     assert np.isnan(uv[0]).all(), "behind the camera there is no pixel"
@@ -87,7 +86,7 @@ def test_what_depth_means() -> None:
 
 
 @pytest.mark.parametrize("camera", [pinhole(), parallel()])
-def test_poses(camera: Camera) -> None:
+def test_poses(camera):
     np.testing.assert_allclose(camera.X_CW @ camera.X_WC, np.eye(4), atol=1e-14)
     assert not camera.X_WC.flags.writeable
     moved = camera.with_pose(np.eye(4))
@@ -95,7 +94,7 @@ def test_poses(camera: Camera) -> None:
     np.testing.assert_array_equal(moved.kernel_parameters(), camera.kernel_parameters())
 
 
-def test_kernel_parameters() -> None:
+def test_kernel_parameters():
     np.testing.assert_array_equal(
         pinhole(near=0.2).kernel_parameters(), [0, 600, 610, 300, 250, 0.2, 640, 480]
     )
@@ -118,7 +117,7 @@ def test_kernel_parameters() -> None:
         ("X_WC", [np.diag([1.0, 1.0, *two]) for two in [(2.0, 1.0), (-1.0, 1.0), (1.0, 2.0)]]),
     ],
 )
-def test_bad_parameters_are_named(field: str, values: list[object]) -> None:
+def test_bad_parameters_are_named(field, values):
     for value in values:
         with pytest.raises(CameraError, match=f"'cam'.*{field}"):
             pinhole(**{field: value})
@@ -126,14 +125,14 @@ def test_bad_parameters_are_named(field: str, values: list[object]) -> None:
         parallel(pixels_per_metre=-1.0)
 
 
-def test_rounded_rotation_becomes_exact() -> None:
+def test_rounded_rotation_becomes_exact():
     camera = pinhole(X_WC=np.round(X_WC, 6))
     R = camera.X_WC[:3, :3]
     np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-14)
     np.testing.assert_allclose(R, X_WC[:3, :3], atol=2e-6)
 
 
-def test_drake_and_back() -> None:
+def test_drake_and_back():
     camera = pinhole(near=0.05)
     color, depth, X_WS = camera_to_drake(camera, renderer_name="vtk")
     info = color.core().intrinsics()
@@ -147,7 +146,7 @@ def test_drake_and_back() -> None:
     assert (plain.center_x, plain.center_y) == (49.0, 39.0)
 
 
-def test_sensor_offset_of_a_drake_core_is_kept() -> None:
+def test_sensor_offset_of_a_drake_core_is_kept():
     X_BS = RigidTransform(RollPitchYaw(0.1, 0.2, 0.3), np.array([0.1, 0.0, -0.2]))
     core = RenderCameraCore("vtk", CameraInfo(100, 80, 1.0), ClippingRange(0.3, 9.0), X_BS)
     X_WB = RigidTransform(X_WC)
@@ -156,7 +155,7 @@ def test_sensor_offset_of_a_drake_core_is_kept() -> None:
     assert camera.near == 0.3
 
 
-def test_tele_camera_projects_as_the_parallel_one() -> None:
+def test_tele_camera_projects_as_the_parallel_one():
     for camera in (parallel(), parallel(center_x=-40.0, center_y=900.0)):
         color, _, X_WS = camera_to_drake(camera, renderer_name="vtk", depth_range=(-1.0, 3.0))
         tele = camera_from_drake("tele", color.core(), X_WS)
@@ -173,14 +172,14 @@ def test_tele_camera_projects_as_the_parallel_one() -> None:
     assert clipping.near() > 0.8 * clipping.far(), "far enough away for deep scenes, too"
 
 
-def test_drake_needs_the_principal_point_inside() -> None:
+def test_drake_needs_the_principal_point_inside():
     with pytest.raises(CameraError, match=r"'cam'.*principal point"):
         camera_to_drake(pinhole(center_x=-3.0), renderer_name="vtk")
     with pytest.raises(CameraError, match=r"'cam'.*depth range"):
         camera_to_drake(pinhole(), renderer_name="vtk", depth_range=(2.0, 1.0))
 
 
-def test_a_circle_of_cameras_looks_at_its_middle_and_one_at_the_face() -> None:
+def test_a_circle_of_cameras_looks_at_its_middle_and_one_at_the_face():
     cameras = circle_of_cameras(8, radius=2.5, height=1.1, target=(0.1, 0.2, 0.9), size=(64, 48))
     *circle, face = cameras.values()
     assert face.name == FACE_CAMERA

@@ -1,13 +1,12 @@
 import csv
 import io
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from drake_pose.body.formats.packages import bundled_model
 from drake_pose.body.landmarks import load_landmarks
-from drake_pose.body.model import ArticulatedModel, load_model
+from drake_pose.body.model import load_model
 from drake_pose.errors import SettingsError
 from drake_pose.files.motion_files import (
     centres_as_csv,
@@ -117,12 +116,12 @@ FRAMES = 6
 RATE_HZ = 50.0
 
 
-def open_model(name: str) -> ArticulatedModel:
+def open_model(name):
     folder, file = name.split("/")
     return load_model(bundled_model(folder).with_name(file), check=False)
 
 
-def random_positions(model: ArticulatedModel, rng: np.random.Generator) -> np.ndarray:
+def random_positions(model, rng):
     """Anywhere within the limits; lengths but the root's are the same in every frame."""
     lower = np.clip(model.lower, -3.0, 3.0)
     upper = np.clip(model.upper, -3.0, 3.0)
@@ -133,7 +132,7 @@ def random_positions(model: ArticulatedModel, rng: np.random.Generator) -> np.nd
     return q
 
 
-def link_places(model: ArticulatedModel, link: str, q: np.ndarray) -> np.ndarray:
+def link_places(model, link, q):
     """(frames, 3) where the plant has a link's origin, in the file's axes [cm]."""
     context = model.plant.CreateDefaultContext()
     found = []
@@ -148,7 +147,7 @@ def link_places(model: ArticulatedModel, link: str, q: np.ndarray) -> np.ndarray
 @pytest.mark.parametrize(
     "name", ["person/person.urdf", "person/person_shape.urdf", "hand/hand.urdf"]
 )
-def test_the_file_has_every_link_where_the_plant_has_it(name: str) -> None:
+def test_the_file_has_every_link_where_the_plant_has_it(name):
     model = open_model(name)
     q = random_positions(model, np.random.default_rng(5))
     text, filled = motion_as_bvh(model, q, None, RATE_HZ)
@@ -169,7 +168,7 @@ def test_the_file_has_every_link_where_the_plant_has_it(name: str) -> None:
     assert all(joint.channels == ["Zrotation", "Xrotation", "Yrotation"] for joint in others)
 
 
-def test_the_skeleton_at_rest_stands_as_the_model_does_with_the_captured_lengths() -> None:
+def test_the_skeleton_at_rest_stands_as_the_model_does_with_the_captured_lengths():
     model = open_model("person/person_shape.urdf")
     q = np.tile(model.default_positions, (2, 1))
     q[:, model.position_index("left_thigh_stretch")] = 0.05
@@ -186,7 +185,7 @@ def test_the_skeleton_at_rest_stands_as_the_model_does_with_the_captured_lengths
     assert places["left_foot_end"][0, 0] - places["left_foot"][0, 0] > 5.0
 
 
-def test_a_part_that_slides_in_time_has_position_channels_and_no_offset(tmp_path: Path) -> None:
+def test_a_part_that_slides_in_time_has_position_channels_and_no_offset(tmp_path):
     path = tmp_path / "lift.urdf"
     path.write_text(LIFT)
     model = load_model(path, check=False)
@@ -201,7 +200,7 @@ def test_a_part_that_slides_in_time_has_position_channels_and_no_offset(tmp_path
         np.testing.assert_allclose(places[link], link_places(model, link, q), atol=0.01)
 
 
-def test_several_parts_in_the_world_hang_on_it(tmp_path: Path) -> None:
+def test_several_parts_in_the_world_hang_on_it(tmp_path):
     path = tmp_path / "two.urdf"
     parts = "".join(TWO.format(name=name, x=x) for name, x in (("a", 0.0), ("b", 1.0)))
     path.write_text(f'<robot name="two"><link name="world"/>{parts}</robot>')
@@ -212,7 +211,7 @@ def test_several_parts_in_the_world_hang_on_it(tmp_path: Path) -> None:
     np.testing.assert_allclose(motion.places()["b"], [[100.0, 100.0, 0.0]] * 2, atol=0.01)
 
 
-def test_the_base_pose_moves_the_file() -> None:
+def test_the_base_pose_moves_the_file():
     model = open_model("hand/hand.urdf")
     q = np.tile(model.default_positions, (2, 1))
     X_WB = np.tile(np.eye(4), (2, 1, 1))
@@ -224,7 +223,7 @@ def test_the_base_pose_moves_the_file() -> None:
     np.testing.assert_allclose(places["palm"][1], [z + 10.0, y + 30.0, -x - 20.0], atol=0.01)
 
 
-def test_frames_without_a_pose_are_filled_by_the_last_known_one() -> None:
+def test_frames_without_a_pose_are_filled_by_the_last_known_one():
     model = open_model("person/person.urdf")
     q = random_positions(model, np.random.default_rng(6))
     whole = read_bvh(motion_as_bvh(model, q, None, RATE_HZ)[0])
@@ -239,7 +238,7 @@ def test_frames_without_a_pose_are_filled_by_the_last_known_one() -> None:
         motion_as_bvh(model, np.full_like(q, np.nan), None, RATE_HZ)
 
 
-def test_a_turn_past_half_a_circle_does_not_jump() -> None:
+def test_a_turn_past_half_a_circle_does_not_jump():
     model = open_model("person/person.urdf")
     q = np.tile(model.default_positions, (40, 1))
     q[:, model.position_index("head_y")] = np.linspace(2.0, 4.5, 40)

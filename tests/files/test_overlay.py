@@ -15,17 +15,17 @@ from drake_pose.files.overlay import (
 )
 
 
-def rectangle(shape: tuple[int, int], rows: slice, columns: slice) -> np.ndarray:
+def rectangle(shape, rows, columns):
     mask = np.zeros(shape, dtype=bool)
     mask[rows, columns] = True
     return mask
 
 
-def count(picture: np.ndarray, colour: tuple[int, int, int]) -> int:
+def count(picture, colour):
     return int((picture == np.array(colour, dtype=np.uint8)).all(axis=2).sum())
 
 
-def test_each_kind_of_pixel_has_its_colour() -> None:
+def test_each_kind_of_pixel_has_its_colour():
     mask = rectangle((6, 8), slice(1, 5), slice(1, 5))
     body = rectangle((6, 8), slice(1, 5), slice(3, 7))
     picture = paint_agreement(mask, body)
@@ -36,7 +36,7 @@ def test_each_kind_of_pixel_has_its_colour() -> None:
     assert [count(picture, c) for c in (MISSING_RGB, AGREEMENT_RGB, EXCESS_RGB)] == [8, 8, 8]
 
 
-def test_borders_between_segments_are_drawn_and_no_others() -> None:
+def test_borders_between_segments_are_drawn_and_no_others():
     mask = rectangle((6, 8), slice(1, 5), slice(1, 7))
     segments = np.where(mask, 1, -1)
     assert count(paint_agreement(mask, mask, segments), OUTLINE_RGB) == 0
@@ -54,7 +54,7 @@ DICHROMATS = {
 }
 
 
-def test_a_large_picture_is_cut_to_the_surroundings_of_the_body() -> None:
+def test_a_large_picture_is_cut_to_the_surroundings_of_the_body():
     mask = rectangle((1900, 1100), slice(1000, 1600), slice(300, 600))
     body = rectangle((1900, 1100), slice(1000, 1600), slice(310, 610))
     picture = PALETTE[draw_overlay(mask, body, None, "title")]
@@ -65,7 +65,7 @@ def test_a_large_picture_is_cut_to_the_surroundings_of_the_body() -> None:
     assert count(picture, AGREEMENT_RGB) >= 600 * 290
 
 
-def test_shapes_are_drawn_as_contours_over_the_silhouette() -> None:
+def test_shapes_are_drawn_as_contours_over_the_silhouette():
     mask = rectangle((600, 600), slice(100, 500), slice(100, 500))
     first = rectangle((600, 600), slice(100, 500), slice(150, 450))
     corrected = rectangle((600, 600), slice(100, 500), slice(200, 400))
@@ -79,7 +79,7 @@ def test_shapes_are_drawn_as_contours_over_the_silhouette() -> None:
     assert count(picture, AGREEMENT_RGB) > 0.95 * 400 * 400
 
 
-def test_two_bodies_over_a_picture() -> None:
+def test_two_bodies_over_a_picture():
     photo = np.full((500, 600, 3), 91, np.uint8)
     given = rectangle((500, 600), slice(100, 200), slice(150, 300))
     picture = draw_shapes(photo, [given, np.zeros_like(given)], ("as given", "as found"), "title")
@@ -90,7 +90,7 @@ def test_two_bodies_over_a_picture() -> None:
     assert count(picture, AGREEMENT_RGB) < 50
 
 
-def test_a_small_picture_is_enlarged_by_whole_pixels_and_nothing_lies_on_it() -> None:
+def test_a_small_picture_is_enlarged_by_whole_pixels_and_nothing_lies_on_it():
     whole, none = np.ones((40, 40), dtype=bool), np.zeros((40, 40), dtype=bool)
     drawn = [PALETTE[draw_overlay(whole, body, None, "t")] for body in (none, whole)]
     shown = [count(picture, MISSING_RGB) for picture in drawn]
@@ -99,12 +99,12 @@ def test_a_small_picture_is_enlarged_by_whole_pixels_and_nothing_lies_on_it() ->
     assert shown[0] - shown[1] == (40 * scale) ** 2
 
 
-def test_where_nothing_is_shown_the_whole_picture_stays() -> None:
+def test_where_nothing_is_shown_the_whole_picture_stays():
     nothing = np.zeros((500, 700), dtype=bool)
     assert draw_overlay(nothing, nothing, None, "title").shape[1] == 700
 
 
-def test_title_and_legend_are_written() -> None:
+def test_title_and_legend_are_written():
     mask = rectangle((500, 700), slice(100, 400), slice(100, 600))
     picture = PALETTE[draw_overlay(mask, mask, None, "cam  frame 1  E_total 3.0 %")]
     assert (picture[:36] > 200).any()
@@ -112,14 +112,14 @@ def test_title_and_legend_are_written() -> None:
     assert 100 < max(legend) < 1.1 * min(legend)
 
 
-def test_png_keeps_red_red() -> None:
+def test_png_keeps_red_red():
     picture = np.zeros((4, 5, 3), dtype=np.uint8)
     picture[:] = EXCESS_RGB
     decoded = cv2.imdecode(np.frombuffer(encode_png(picture), np.uint8), cv2.IMREAD_COLOR)
     assert tuple(decoded[0, 0][::-1]) == EXCESS_RGB
 
 
-def test_png_of_numbers_shows_the_palettes_colours() -> None:
+def test_png_of_numbers_shows_the_palettes_colours():
     picture = np.arange(len(PALETTE), dtype=np.uint8).reshape(4, -1)
     decoded = cv2.imdecode(np.frombuffer(encode_png(picture), np.uint8), cv2.IMREAD_COLOR)
     assert (decoded[..., ::-1] == PALETTE[picture]).all()

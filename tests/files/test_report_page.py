@@ -5,7 +5,6 @@ from contextlib import suppress
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
-from typing import Any
 
 import cv2
 import msgpack
@@ -13,7 +12,7 @@ import numpy as np
 import pytest
 
 from drake_pose.body.formats.packages import bundled_model
-from drake_pose.body.model import ArticulatedModel, load_model
+from drake_pose.body.model import load_model
 from drake_pose.camera.models import ParallelCamera, PinholeCamera, look_at
 from drake_pose.files.records import FrameRecord, JointRecord, PoseRow, SceneEstimate
 from drake_pose.files.replay import make_replay
@@ -29,7 +28,7 @@ from drake_pose.files.settings import EstimateSettings
 from drake_pose.files.summary import summarize
 from drake_pose.jobs.estimate.scene import estimate_scene
 from drake_pose.silhouette.pictures.scenes import Scene
-from tests.jobs.scenes import NAMES, TinyScene, camera, read_rows
+from tests.jobs.scenes import NAMES, camera, read_rows
 
 VOID = {"meta", "img", "br", "link", "hr"}
 
@@ -37,7 +36,7 @@ VOID = {"meta", "img", "br", "link", "hr"}
 class Page(HTMLParser):
     """Reads a page back: its tables by id or order, texts by id, links, and what it draws."""
 
-    def __init__(self, text: str) -> None:
+    def __init__(self, text):
         super().__init__()
         self.tables: list[list[list[str]]] = []
         self.by_id: dict[str, str] = {}
@@ -55,7 +54,7 @@ class Page(HTMLParser):
         self.feed(text)
         assert not self._open, "a tag is not closed"
 
-    def handle_starttag(self, tag: str, attributes: list[tuple[str, str | None]]) -> None:
+    def handle_starttag(self, tag, attributes):
         values = dict(attributes)
         self.tags.append(tag)
         if tag not in VOID:
@@ -84,15 +83,15 @@ class Page(HTMLParser):
             self.labels.append(str(values["aria-label"]))
         self.classes += (values.get("class") or "").split()
 
-    def handle_startendtag(self, tag: str, attributes: list[tuple[str, str | None]]) -> None:
+    def handle_startendtag(self, tag, attributes):
         self.handle_starttag(tag, attributes)
         self.handle_endtag(tag)
 
-    def handle_endtag(self, tag: str) -> None:
+    def handle_endtag(self, tag):
         if tag not in VOID:
             assert self._open.pop()[0] == tag
 
-    def handle_data(self, data: str) -> None:
+    def handle_data(self, data):
         for _, name in self._open:
             if name:
                 self.by_id[name] = self.by_id.get(name, "") + data
@@ -106,7 +105,7 @@ class Page(HTMLParser):
             self.joints[self._joint] = data.strip()
             self._joint = None
 
-    def curve(self, joint: str, kind: str) -> np.ndarray:
+    def curve(self, joint, kind):
         """(n, 2) points of a curve: place [pixel], and value as the axis' ticks say."""
         path = next(str(own["d"]) for name, own in self.plots[joint] if kind in name.split())
         points, (height, value) = coordinates(path), np.array(self.ticks[joint]).T
@@ -115,19 +114,19 @@ class Page(HTMLParser):
 
 
 @pytest.fixture(scope="module")
-def result(tiny_scene: TinyScene, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def result(tiny_scene, tmp_path_factory):
     out = tmp_path_factory.mktemp("report") / "out"
     settings = EstimateSettings(interval=20.0)
     estimate_scene(tiny_scene.folder, tiny_scene.model, out, settings, replay=False)
     return out
 
 
-def list_ious(result: Path) -> list[float]:
+def list_ious(result):
     frames = json.loads((result / "summary.json").read_text())["frames"].values()
     return [frame["ious"]["front"] for frame in frames]
 
 
-def test_page_says_what_the_tables_say(result: Path) -> None:
+def test_page_says_what_the_tables_say(result):
     page = Page((result / "report.html").read_text())
     poses = read_rows(result / "poses.csv")
     frames = next(table for table in page.tables if table[0][:2] == ["frame", "pose"])
@@ -151,7 +150,7 @@ def test_page_says_what_the_tables_say(result: Path) -> None:
     assert "None." in page.by_id["warnings"]
 
 
-def test_page_needs_nothing_but_itself_and_its_links_lead_somewhere(result: Path) -> None:
+def test_page_needs_nothing_but_itself_and_its_links_lead_somewhere(result):
     text = (result / "report.html").read_text()
     page = Page(text)
     assert "http" not in re.sub(r"data:image/jpeg;base64,[\w+/=]*", "", text)
@@ -166,7 +165,7 @@ def test_page_needs_nothing_but_itself_and_its_links_lead_somewhere(result: Path
         assert link.removeprefix("#") in page.by_id or (result / link).is_file(), link
 
 
-def long_report(frames: int) -> tuple[ArticulatedModel, Scene, SceneEstimate]:
+def long_report(frames):
     """A person in many frames: two cameras, gaps, frames not found, names that are no HTML."""
     model = load_model(bundled_model("person").with_name("person_shape.urdf"), check=False)
     rng = np.random.default_rng(2)
@@ -204,11 +203,11 @@ def long_report(frames: int) -> tuple[ArticulatedModel, Scene, SceneEstimate]:
 
 
 @pytest.fixture(scope="module")
-def report() -> tuple[ArticulatedModel, Scene, SceneEstimate]:
+def report():
     return long_report(1000)
 
 
-def test_a_thousand_frames_stay_small_and_names_are_shown_as_they_are(report) -> None:
+def test_a_thousand_frames_stay_small_and_names_are_shown_as_they_are(report):
     text = make_report(Path("nowhere"), *report)
     assert len(text) < 2_500_000
     page = Page(text)
@@ -223,7 +222,7 @@ def test_a_thousand_frames_stay_small_and_names_are_shown_as_they_are(report) ->
     assert "camera '<b>left</b>' agrees badly" in page.by_id["warnings"]
 
 
-def test_measured_positions_are_drawn_where_they_were(report) -> None:
+def test_measured_positions_are_drawn_where_they_were(report):
     model, scene, whole = report
     name, k = "left_forearm_x", model.position_index("left_forearm_x")
     rows, frames = whole.rows[:20], [f"{k:04d}" for k in range(20)]
@@ -248,7 +247,7 @@ def test_measured_positions_are_drawn_where_they_were(report) -> None:
     assert "green: measured" not in make_report(Path("nowhere"), model, scene, some)
 
 
-def test_bands_are_explained_where_there_are_some(report) -> None:
+def test_bands_are_explained_where_there_are_some(report):
     model, scene, whole = report
     whole = replace(whole, rows=whole.rows[:9], records=dict(list(whole.records.items())[:9]))
     assert "Blue band" in make_report(Path("nowhere"), model, scene, whole)
@@ -259,7 +258,7 @@ def test_bands_are_explained_where_there_are_some(report) -> None:
 
 
 @pytest.mark.parametrize("k", [0, 100])
-def test_a_frame_is_a_table_without_plots(report, k: int) -> None:
+def test_a_frame_is_a_table_without_plots(report, k):
     model, scene, whole = report
     name = "left_forearm_x"
     record = replace(whole.records[f"{k:04d}"], joint_errors={name: -4.0} if k == 0 else {})
@@ -280,13 +279,13 @@ def test_a_frame_is_a_table_without_plots(report, k: int) -> None:
         assert "not determined" in row[3]
 
 
-def coordinates(path: str) -> np.ndarray:
+def coordinates(path):
     return np.array(
         [[float(n) for n in pair] for pair in re.findall(r"[ML]([\d.-]+) ([\d.-]+)", path)]
     )
 
 
-def test_curves_break_at_gaps_and_keep_their_peaks() -> None:
+def test_curves_break_at_gaps_and_keep_their_peaks():
     values = np.sin(np.linspace(0.0, 20.0, 5000))
     values[2500], values[1000:1100] = 3.0, np.nan
     plot = plot_curves(
@@ -305,7 +304,7 @@ def test_curves_break_at_gaps_and_keep_their_peaks() -> None:
     assert plot.limits[1] < peak[1] < plot.limits[0]
 
 
-def test_limits_that_are_far_do_not_flatten_the_curve() -> None:
+def test_limits_that_are_far_do_not_flatten_the_curve():
     values = np.linspace(0.0, 1.0, 50)
     plot = plot_curves(
         [str(k) for k in range(50)], [("one", values)], joined=True, limits=(-90, 90)
@@ -315,7 +314,7 @@ def test_limits_that_are_far_do_not_flatten_the_curve() -> None:
     assert plot.limits == ()
 
 
-def test_stills_are_dots() -> None:
+def test_stills_are_dots():
     plot = plot_curves(["a", "b"], [("one", np.array([1.0, np.nan]))], joined=False)
     assert plot.curves[0][1].count("h0") == 1
     assert plot.dots
@@ -326,7 +325,7 @@ def test_stills_are_dots() -> None:
         assert coordinates(plot.curves[0][1])[0, 0] == pytest.approx(left + 0.5 * width, abs=0.1)
 
 
-def test_grid_joins_neighbours_of_one_state() -> None:
+def test_grid_joins_neighbours_of_one_state():
     states = ["used", "used", "no-picture", "used"]
     grid = draw_grid(["0", "1", "2", "3"], [("left", states)])
     runs = grid.rows[0][2]
@@ -334,7 +333,7 @@ def test_grid_joins_neighbours_of_one_state() -> None:
     assert runs[0][1] == pytest.approx(2 * runs[1][1], abs=0.02)
 
 
-def played(page: str) -> dict[tuple[str, str | None], dict[str, Any]]:
+def played(page):
     """What a replay tells Meshcat, by what is told and of which path."""
     told = {}
     for text in re.findall(r"base64,([\w+/=]+)", page):
@@ -345,9 +344,7 @@ def played(page: str) -> dict[tuple[str, str | None], dict[str, Any]]:
     return told
 
 
-def test_a_replay_shows_all_of_the_body_the_cameras_and_what_was_measured(
-    tiny_scene: TinyScene,
-) -> None:
+def test_a_replay_shows_all_of_the_body_the_cameras_and_what_was_measured(tiny_scene):
     model = load_model(tiny_scene.model, check=False)
     q, off = np.array([*tiny_scene.truth.values()]), np.array([0.3, -0.1])
     X_WB = np.repeat(np.eye(4)[None], len(q), axis=0)

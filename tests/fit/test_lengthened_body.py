@@ -1,7 +1,5 @@
 """Links that are longer: nodes stand where Drake has them, and move as finite differences say."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -48,7 +46,7 @@ LONGER = {
 VALUES = {"turn": 0.4, "pitch": -0.7, "yaw": 0.9, "slide": 0.05, "wave": 0.6}
 
 
-def kinematics_of(path: Path, text: str, root: str) -> TreeKinematics:
+def kinematics_of(path, text, root):
     path.write_text(text)
     fixed, place = RootRotation.fixed(np.eye(3)), np.array([0.1, -0.2, 0.3])
     model = load_model(path, check=False)
@@ -56,24 +54,24 @@ def kinematics_of(path: Path, text: str, root: str) -> TreeKinematics:
 
 
 @pytest.fixture(params=["base", "finger", "flag"])
-def body(tmp_path: Path, request: pytest.FixtureRequest) -> LengthenedBody:
+def body(tmp_path, request):
     """The tree walks joints outwards from the base, inwards from the finger, and both ways."""
     kinematics = kinematics_of(tmp_path / "odd.urdf", URDF, request.param)
     outlines = [outline_from_mesh(node.mesh) for node in kinematics.tree.nodes]
     return LengthenedBody(kinematics, outlines, joint_offsets(kinematics.tree))
 
 
-def parameters(body: LengthenedBody, logs: dict[str, float]) -> np.ndarray:
+def parameters(body, logs):
     values = [VALUES[name] for name in body.kinematics.names]
     return np.array([*values, *(logs.get(link, 0.0) for link in body.links)])
 
 
-def test_links_with_a_length(body: LengthenedBody) -> None:
+def test_links_with_a_length(body):
     assert set(body.links) == {"base", "upper", "gimbal", "mount"}
 
 
 @pytest.mark.parametrize("link", LONGER)
-def test_nodes_stand_where_drake_has_them(link: str, body: LengthenedBody, tmp_path: Path) -> None:
+def test_nodes_stand_where_drake_has_them(link, body, tmp_path):
     text = URDF
     for origin, longer in LONGER[link].items():
         assert text.count(f'"{origin}"') == 1
@@ -86,14 +84,14 @@ def test_nodes_stand_where_drake_has_them(link: str, body: LengthenedBody, tmp_p
     np.testing.assert_allclose(body.place(theta).X_WN, expected, atol=1e-12)
 
 
-def test_a_joint_behind_a_weld_is_moved_from_the_link_s_own_joint(body: LengthenedBody) -> None:
+def test_a_joint_behind_a_weld_is_moved_from_the_link_s_own_joint(body):
     offset = next(one for one in joint_offsets(body.kinematics.tree) if one.link == "mount")
     # The slide stands 0.1 up the wrist and 0.05 along the y axis of what is turned there by 1 rad.
     assert np.linalg.norm(offset.p_L) == pytest.approx(np.hypot(0.1, 0.05))
     np.testing.assert_allclose(offset.p_L, [0.0, 0.05, 0.1], atol=1e-12)
 
 
-def test_derivatives(body: LengthenedBody) -> None:
+def test_derivatives(body):
     theta = parameters(body, {"base": 0.1, "upper": -0.2, "gimbal": 0.3, "mount": -0.1})
     placement = body.place(theta)
     motions = placement.dense(len(theta)).reshape(len(placement.X_WN), len(theta), 3, 4)

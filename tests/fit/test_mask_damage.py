@@ -9,7 +9,7 @@ from tests.search.mask_damage import MaskDamage, damage_views, nudge_camera
 NOTHING = MaskDamage(missing=0, occluder=0, shadow=0, holes=0, raggedness=0, shift=0)
 
 
-def discs() -> tuple[list[View], np.ndarray]:
+def discs():
     """Two views of a flat cloud of points about the middle of both pictures."""
     views = []
     for camera in arm_cameras():
@@ -18,7 +18,7 @@ def discs() -> tuple[list[View], np.ndarray]:
     return views, np.random.default_rng(1).normal([0.0, 0.0, 0.45], 0.1, (50, 3))
 
 
-def test_nothing_is_done_where_nothing_is_asked_for() -> None:
+def test_nothing_is_done_where_nothing_is_asked_for():
     views, points = discs()
     for before, after in zip(
         views, damage_views(views, points, NOTHING, np.random.default_rng(2)), strict=True
@@ -26,7 +26,7 @@ def test_nothing_is_done_where_nothing_is_asked_for() -> None:
         np.testing.assert_array_equal(before.mask, after.mask)
 
 
-def test_each_kind_of_damage() -> None:
+def test_each_kind_of_damage():
     views, points = discs()
     area = views[0].mask.sum()
     kinds = {"missing": -1, "occluder": -1, "shadow": 1, "holes": -1}
@@ -42,7 +42,7 @@ def test_each_kind_of_damage() -> None:
         assert 0 < np.mean(changes) < 0.3 * area
 
 
-def test_ragged_edges_wander_by_so_many_pixels() -> None:
+def test_ragged_edges_wander_by_so_many_pixels():
     views, points = discs()
     damage = MaskDamage(**{**vars(NOTHING), "raggedness": 1.5})
     (after, _) = damage_views(views, points, damage, np.random.default_rng(3))
@@ -51,7 +51,7 @@ def test_ragged_edges_wander_by_so_many_pixels() -> None:
     assert 0.6 < changed / (0.8 * 1.5) < 1.4
 
 
-def test_a_nudged_camera_moves_its_picture_by_so_many_pixels() -> None:
+def test_a_nudged_camera_moves_its_picture_by_so_many_pixels():
     (camera, _) = arm_cameras()
     point = np.array([[0.1, -0.2, 0.4]])
     generator = np.random.default_rng(4)

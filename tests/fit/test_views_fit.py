@@ -8,7 +8,6 @@ from drake_pose.errors import SettingsError
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.fit.surfaces import few_triangles
 from drake_pose.search.continuous.views_fit import FittedPose, ViewsFit, distinct
-from drake_pose.search.estimates import View
 from drake_pose.silhouette.areas.bending import TreeSurfaces
 from tests.search.arms import arm_cameras, arm_tree, draw_pose, draw_view
 
@@ -16,19 +15,19 @@ FINE = tuple(AnnealingStage(scale, 0.0125, 8) for scale in (0.05, 0.025, 0.0125)
 
 
 @pytest.fixture(scope="module")
-def kinematics(tmp_path_factory: pytest.TempPathFactory) -> TreeKinematics:
+def kinematics(tmp_path_factory):
     return TreeKinematics(arm_tree(tmp_path_factory.mktemp("arm")))
 
 
-def make_fit(kinematics: TreeKinematics, views: list[View]) -> ViewsFit:
+def make_fit(kinematics, views):
     return ViewsFit(kinematics, few_triangles(TreeSurfaces(kinematics.tree)), views)
 
 
-def views_at(kinematics: TreeKinematics, values: np.ndarray) -> list[View]:
+def views_at(kinematics, values):
     return [draw_view(kinematics.tree, values, camera) for camera in arm_cameras()]
 
 
-def test_refinement_finds_the_pose_nearby(kinematics: TreeKinematics) -> None:
+def test_refinement_finds_the_pose_nearby(kinematics):
     generator = np.random.default_rng(3)
     errors = []
     for _ in range(5):
@@ -43,7 +42,7 @@ def test_refinement_finds_the_pose_nearby(kinematics: TreeKinematics) -> None:
     assert np.median(errors) < np.radians(1.5)
 
 
-def test_an_occluder_does_not_drag_the_pose(kinematics: TreeKinematics) -> None:
+def test_an_occluder_does_not_drag_the_pose(kinematics):
     truth = np.array([0.3, 0.5, 0.2, 0.8, -0.4])
     views = views_at(kinematics, truth)
     for view in views:
@@ -55,7 +54,7 @@ def test_an_occluder_does_not_drag_the_pose(kinematics: TreeKinematics) -> None:
     assert np.abs(found.values - truth).max() < np.radians(3.0)
 
 
-def test_limits_and_held_values(kinematics: TreeKinematics) -> None:
+def test_limits_and_held_values(kinematics):
     truth = np.array([0.3, 0.5, 0.2, 0.8, -0.4])
     fit = make_fit(kinematics, views_at(kinematics, truth))
     outside = kinematics.upper + 0.5
@@ -66,13 +65,13 @@ def test_limits_and_held_values(kinematics: TreeKinematics) -> None:
     assert (found.values[free] >= kinematics.lower[free]).all()
 
 
-def test_distinct_keeps_the_best_of_those_alike() -> None:
+def test_distinct_keeps_the_best_of_those_alike():
     poses = [FittedPose(np.array([x, 0.0]), cost) for x, cost in ((0, 3), (0.01, 1), (1, 2))]
     assert [pose.cost for pose in distinct(poses, 5)] == [1, 2]
     assert [pose.cost for pose in distinct(poses, 1)] == [1]
 
 
 @pytest.mark.parametrize(("name", "value"), [("scale", 0.0), ("iterations", 0), ("spacing", 0.0)])
-def test_settings_out_of_range(name: str, value: float) -> None:
+def test_settings_out_of_range(name, value):
     with pytest.raises(SettingsError, match=name):
         AnnealingStage(**{"scale": 1.0, "iterations": 1, "spacing": 1.0, name: value})

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from scipy.stats import t as student
 
-from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.search.continuous.families import spread
 from drake_pose.search.estimates import JointEstimate, PoseEstimate, PoseFamily, PoseSet
@@ -17,12 +16,12 @@ TURN = 2.0 * math.pi
 
 
 @pytest.fixture(scope="module")
-def tree(tmp_path_factory: pytest.TempPathFactory) -> PoseTree:
+def tree(tmp_path_factory):
     return crane(tmp_path_factory.mktemp("crane")).pose_tree()
 
 
 @pytest.mark.parametrize("around", [0.0, TURN, -2.0 * TURN])
-def test_a_widened_interval_holds_what_either_held(around: float) -> None:
+def test_a_widened_interval_holds_what_either_held(around):
     """The other one moves with the value, and full turns make no difference where it turns."""
     now = JointEstimate("a", True, 1.0, 1.4, turns_around=around != 0.0)
     then = replace(now, low=0.4 + around, high=0.9 + around, determined=False)
@@ -36,7 +35,7 @@ def test_a_widened_interval_holds_what_either_held(around: float) -> None:
     )
 
 
-def estimate(tree: PoseTree, values: list[float], families: int) -> PoseEstimate:
+def estimate(tree, values, families):
     """A pose with intervals of 0.1 about its values, one of so many families."""
     kinematics = TreeKinematics(tree)
     own = kinematics.split(np.array(values))
@@ -49,7 +48,7 @@ def estimate(tree: PoseTree, values: list[float], families: int) -> PoseEstimate
     return PoseEstimate.of_values(tree, own, 7.0, 100.0, stopped_by="end", pose_set=known)
 
 
-def test_a_track_is_as_open_as_the_families_that_it_began_with(tree: PoseTree) -> None:
+def test_a_track_is_as_open_as_the_families_that_it_began_with(tree):
     now, begun = estimate(tree, [0.5, 0.2], 1), estimate(tree, [0.3, 0.3], 2)
     wide = [replace(one, low=one.low - 1.0) for one in begun.pose_set.joints]
     begun = replace(begun, pose_set=replace(begun.pose_set, joints=tuple(wide)))
@@ -63,7 +62,7 @@ def test_a_track_is_as_open_as_the_families_that_it_began_with(tree: PoseTree) -
         assert now.widened(nothing) is now
 
 
-def test_full_turns_leave_a_pose_where_it_is(tree: PoseTree) -> None:
+def test_full_turns_leave_a_pose_where_it_is(tree):
     pose = estimate(tree, [0.5, 0.2], 1)
     turns = [
         np.array([TURN]) if k == 1 else np.zeros(len(node.value_names))
@@ -84,7 +83,7 @@ def test_full_turns_leave_a_pose_where_it_is(tree: PoseTree) -> None:
         np.testing.assert_allclose([one.high for one in joints], by + np.array([0.6, 0.3]))
 
 
-def test_a_covariance_is_told_as_intervals_inside_the_limits(tree: PoseTree) -> None:
+def test_a_covariance_is_told_as_intervals_inside_the_limits(tree):
     """Student's quantile, of six motions of each camera; halved where a limit cuts."""
     kinematics = TreeKinematics(tree)
     pose = replace(estimate(tree, [0.5, 0.2], 1), q=np.array([7.0, 8.0]))

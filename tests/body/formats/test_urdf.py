@@ -1,13 +1,12 @@
 """URDF files as they are found: what is read rightly, what is named, what is refused."""
 
 import os
-from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
 
-from drake_pose.body.model import ArticulatedModel, load_model
+from drake_pose.body.model import load_model
 from drake_pose.body.report import describe_model
 from drake_pose.errors import ModelError
 from tests.body.models import BOX, WELDED_URDF, joint, link, urdf, write
@@ -15,11 +14,11 @@ from tests.body.models import BOX, WELDED_URDF, joint, link, urdf, write
 STL = '<collision><geometry><mesh filename="{}"/></geometry></collision>'
 
 
-def read(folder: Path, text: str, name: str = "thing.urdf", **options) -> ArticulatedModel:
+def read(folder, text, name="thing.urdf", **options):
     return load_model(write(folder, text, name), check=False, **options)
 
 
-def refusal(folder: Path, text: str, name: str = "thing.urdf") -> str:
+def refusal(folder, text, name="thing.urdf"):
     with pytest.raises(ModelError) as caught:
         read(folder, text, name)
     message = str(caught.value)
@@ -29,12 +28,12 @@ def refusal(folder: Path, text: str, name: str = "thing.urdf") -> str:
     return message
 
 
-def arm(more_of_joint: str = "", more: str = "", a: str = BOX, **options) -> str:
+def arm(more_of_joint="", more="", a=BOX, **options):
     elbow = joint("elbow", options.pop("kind", "revolute"), "a", "b", more=more_of_joint, **options)
     return urdf(link("a", a), link("b"), elbow, more)
 
 
-def visual(shape: str, material: str = "") -> str:
+def visual(shape, material=""):
     return f"<visual><geometry>{shape}</geometry>{material}</visual>"
 
 
@@ -50,7 +49,7 @@ def test_collision_is_never_drawn_nor_read(tmp_path, extension):
 
 
 def test_materials_of_the_same_name_keep_their_own_colours(tmp_path):
-    def material(rgba: str) -> str:
+    def material(rgba):
         return f'<material name="m"><color rgba="{rgba}"/></material>'
 
     ball = '<sphere radius="0.1"/>'
@@ -238,11 +237,11 @@ def test_paths_with_spaces_letters_links_and_read_only_folders(tmp_path):
         folder.chmod(0o755)
 
 
-def package_urdf(name: str = "package://my_arm/meshes/a.stl") -> str:
+def package_urdf(name="package://my_arm/meshes/a.stl"):
     return arm(a=visual(f'<mesh filename="{name}"/>'))
 
 
-def make_package(folder: Path) -> Path:
+def make_package(folder):
     (folder / "meshes").mkdir(parents=True)
     trimesh.creation.box().export(folder / "meshes" / "a.stl")
     return folder

@@ -151,7 +151,7 @@ def test_limits_are_shared_and_what_is_held_holds_the_others(tmp_path):
     assert "'again' is written to follow joint 'again' (<mimic>): not enforced" in told
 
 
-def sdf_text() -> str:
+def sdf_text():
     links = "".join(
         f'<link name="{name}"><visual name="v"><geometry><box><size>.1 .1 .1</size></box>'
         "</geometry></visual></link>" for name in "abc"

@@ -1,8 +1,7 @@
 import numpy as np
 import pytest
 
-from drake_pose.body.model import ArticulatedModel, load_model
-from drake_pose.body.tree.pose_tree import PoseTree
+from drake_pose.body.model import load_model
 from drake_pose.body.tree.root import RootRotation
 from drake_pose.errors import ModelError, SettingsError, UnknownNameError
 from tests.body.models import (
@@ -18,9 +17,7 @@ from tests.body.models import (
 )
 
 
-def largest_difference_from_drake(
-    model: ArticulatedModel, tree: PoseTree, *, samples: int = 20
-) -> float:
+def largest_difference_from_drake(model, tree, *, samples=20):
     """Compare node_poses, positions_from and values_from_positions with the plant."""
     random = np.random.default_rng(1)
     context = model.plant.CreateDefaultContext()
@@ -138,7 +135,7 @@ def test_limits_that_drake_does_not_read_are_kept(models):
     np.testing.assert_allclose(all_joints.lower[index], [-1, -1, -np.pi, -3, -1, -np.pi])
 
 
-def planar_robot(more: str = "") -> str:
+def planar_robot(more=""):
     """A body that slides and turns in a plane, and an arm."""
     return urdf(
         *(link(name, "") for name in ("bx", "bz")),

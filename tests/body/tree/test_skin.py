@@ -1,7 +1,5 @@
 """Bands of skin: where they are, how they move, with which tree, and what is refused."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from pydrake.multibody.tree import BodyIndex
@@ -28,7 +26,7 @@ def in_frame(X, points):
     return points @ X[:3, :3].T + X[:3, 3]
 
 
-def test_at_rest_the_band_is_as_drawn(tmp_path: Path) -> None:
+def test_at_rest_the_band_is_as_drawn(tmp_path):
     model = load_limb(tmp_path)
     assert [(band.parent, band.child) for band in model.skin] == [
         ("upper", "lower"),
@@ -47,7 +45,7 @@ def test_at_rest_the_band_is_as_drawn(tmp_path: Path) -> None:
     assert tree.nodes[0].skin is None
 
 
-def test_one_joint_turns_a_vertex_by_its_share(tmp_path: Path) -> None:
+def test_one_joint_turns_a_vertex_by_its_share(tmp_path):
     model = load_limb(tmp_path)
     tree = model.pose_tree()
     node = tree.nodes[1]
@@ -63,7 +61,7 @@ def test_one_joint_turns_a_vertex_by_its_share(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_the_ends_go_with_their_links(tmp_path: Path, seed: int) -> None:
+def test_the_ends_go_with_their_links(tmp_path, seed):
     """Drake's own poses of the two links carry the band's ends; nothing else moves it."""
     model = load_limb(tmp_path)
     skin = ModelSkin(model)
@@ -89,7 +87,7 @@ def test_the_ends_go_with_their_links(tmp_path: Path, seed: int) -> None:
 
 
 @pytest.mark.parametrize("root", ["lower", "hand"])
-def test_a_turned_over_tree_has_the_same_band(tmp_path: Path, root: str) -> None:
+def test_a_turned_over_tree_has_the_same_band(tmp_path, root):
     model = load_limb(tmp_path)
     skin = ModelSkin(model)
     q = np.random.default_rng(2).uniform(model.lower, model.upper)
@@ -109,7 +107,7 @@ def test_a_turned_over_tree_has_the_same_band(tmp_path: Path, root: str) -> None
     assert any(turned)
 
 
-def test_links_welded_to_each_other_share_a_band(tmp_path: Path) -> None:
+def test_links_welded_to_each_other_share_a_band(tmp_path):
     """The band is given in the frame of a link that is welded to the one that names the node."""
     extra = (
         '<link name="cuff"/><joint name="fix" type="fixed"><parent link="lower"/>'
@@ -150,7 +148,7 @@ def test_links_welded_to_each_other_share_a_band(tmp_path: Path) -> None:
         ({"mesh": "open.obj"}, "not closed"),
     ],
 )
-def test_a_wrong_band_is_refused(tmp_path: Path, changes: dict[str, object], message: str) -> None:
+def test_a_wrong_band_is_refused(tmp_path, changes, message):
     text = tube_obj()
     (tmp_path / "open.obj").write_text(text[: text.rindex("f ")])
     with pytest.raises(ModelError, match=message) as caught:
@@ -164,12 +162,12 @@ def test_a_wrong_band_is_refused(tmp_path: Path, changes: dict[str, object], mes
     "text",
     ["- 1", "3", "bands: 3", "bands: [1", "bands: []", "bands: {a: 1}", "other: 1", "\0", "bands:"],
 )
-def test_a_broken_file_is_refused(tmp_path: Path, text: str) -> None:
+def test_a_broken_file_is_refused(tmp_path, text):
     with pytest.raises(ModelError, match=r"limb\.skin\.yaml"):
         load_limb(tmp_path, text)
 
 
-def test_names_are_checked(tmp_path: Path) -> None:
+def test_names_are_checked(tmp_path):
     path = write_limb(tmp_path, "bands:\n" + band_entry("upper", "paw"))
     for check in (False, True):
         with pytest.raises((UnknownNameError, ModelError), match=r"skin\.yaml has no link 'paw'"):
@@ -180,13 +178,13 @@ def test_names_are_checked(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("parent", "child"), [("upper", "hand"), ("world", "lower")])
-def test_a_band_joins_neighbours(tmp_path: Path, parent: str, child: str) -> None:
+def test_a_band_joins_neighbours(tmp_path, parent, child):
     model = load_limb(tmp_path, "bands:\n" + band_entry(parent, child))
     with pytest.raises(ModelError, match="not neighbours"):
         model.pose_tree()
 
 
-def test_exchanged_links_are_refused_where_drake_draws(tmp_path: Path) -> None:
+def test_exchanged_links_are_refused_where_drake_draws(tmp_path):
     model = load_limb(tmp_path, "bands:\n" + band_entry("lower", "upper"))
     with pytest.raises(DrakePoseError, match="exchanged"):
         ModelSkin(model)

@@ -1,7 +1,5 @@
 """The answer as a set where bodies fit badly: intervals, free joints, flips."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -11,7 +9,6 @@ from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.fit.surfaces import few_triangles
 from drake_pose.search.continuous.families import RobustFamilies
 from drake_pose.search.continuous.views_fit import ViewsFit
-from drake_pose.search.estimates import PoseSet, View
 from drake_pose.search.starts.self_motions import flips
 from drake_pose.silhouette.areas.bending import TreeSurfaces
 from tests.search.arms import arm_cameras, arm_tree, damaged_views, draw_view, is_held
@@ -20,18 +17,18 @@ TRUTH = np.array([0.6, 0.7, -0.7, 0.9, 0.3])
 FINE = tuple(AnnealingStage(scale, 0.0125, 8) for scale in (0.025, 0.0125))
 
 
-def find(kinematics: TreeKinematics, views: list[View], values: np.ndarray) -> PoseSet:
+def find(kinematics, views, values):
     fit = ViewsFit(kinematics, few_triangles(TreeSurfaces(kinematics.tree)), views)
     families = RobustFamilies(fit, lambda: True)
     return families.find([fit.refine(values, FINE)], lambda values: float(values[0]))
 
 
 @pytest.fixture(scope="module")
-def kinematics(tmp_path_factory: pytest.TempPathFactory) -> TreeKinematics:
+def kinematics(tmp_path_factory):
     return TreeKinematics(arm_tree(tmp_path_factory.mktemp("arm")))
 
 
-def test_intervals_hold_the_truth_and_widen_with_the_damage(kinematics: TreeKinematics) -> None:
+def test_intervals_hold_the_truth_and_widen_with_the_damage(kinematics):
     tree = kinematics.tree
     clean = [draw_view(tree, TRUTH, camera) for camera in arm_cameras(640, 480)]
     widths = []
@@ -48,9 +45,7 @@ def test_intervals_hold_the_truth_and_widen_with_the_damage(kinematics: TreeKine
     assert np.median(np.array(widths[1]) / widths[0]) > 1.03
 
 
-def test_flips_are_families_of_their_own(
-    kinematics: TreeKinematics, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_flips_are_families_of_their_own(kinematics, monkeypatch):
     """Where nothing is significant, all that flips make is as good; nothing is determined."""
     tree = kinematics.tree
     views = [draw_view(tree, TRUTH, camera) for camera in arm_cameras()]
@@ -65,7 +60,7 @@ def test_flips_are_families_of_their_own(
         assert min(gaps) < np.radians(15.0)
 
 
-def test_a_round_hand_may_turn_as_it_likes(tmp_path: Path) -> None:
+def test_a_round_hand_may_turn_as_it_likes(tmp_path):
     """A cylinder's turn about its axis does not show: free, and over the whole range."""
     path = tmp_path / "mast.urdf"
     path.write_text(
@@ -91,7 +86,7 @@ def test_a_round_hand_may_turn_as_it_likes(tmp_path: Path) -> None:
     assert (spin.low, spin.high) == (-2.0, 2.5)
 
 
-def test_time_that_is_up_leaves_the_intervals_of_the_curvature(kinematics: TreeKinematics) -> None:
+def test_time_that_is_up_leaves_the_intervals_of_the_curvature(kinematics):
     views = damaged_views(kinematics.tree, TRUTH, 1)
     fit = ViewsFit(kinematics, few_triangles(TreeSurfaces(kinematics.tree)), views)
     pose = fit.refine(TRUTH, FINE)

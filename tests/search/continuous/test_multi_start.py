@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 
-from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.search.continuous.multi_start import MultiStartSearch
-from drake_pose.search.estimates import PoseEstimate, View
+from drake_pose.search.estimates import View
 from drake_pose.workers import working
 from tests.search.arms import (
     arm_cameras,
@@ -19,49 +18,47 @@ from tests.search.arms import (
 
 
 @pytest.fixture(scope="module")
-def tree(tmp_path_factory: pytest.TempPathFactory) -> PoseTree:
+def tree(tmp_path_factory):
     return arm_tree(tmp_path_factory.mktemp("arm"))
 
 
 @pytest.fixture(scope="module")
-def search(tree: PoseTree) -> MultiStartSearch:
+def search(tree):
     return MultiStartSearch(tree)
 
 
 @pytest.fixture(scope="module")
-def pose(tree: PoseTree) -> np.ndarray:
+def pose(tree):
     return draw_pose(tree, np.random.default_rng(20))
 
 
-def clean_views(tree: PoseTree, values: np.ndarray) -> list[View]:
+def clean_views(tree, values):
     return [draw_view(tree, values, camera) for camera in arm_cameras()]
 
 
-def all_values(result: PoseEstimate) -> np.ndarray:
+def all_values(result):
     return np.concatenate(result.node_values)
 
 
-def joint_ends(tree: PoseTree, values: np.ndarray) -> np.ndarray:
+def joint_ends(tree, values):
     """Where every link begins, and the hand ends [m]."""
     X_WN = tree.node_poses(split(tree, values))
     return np.vstack([X_WN[:, :3, 3], X_WN[-1, :3, 3] + 0.15 * X_WN[-1, :3, 2]])
 
 
-def worst_place(tree: PoseTree, result: PoseEstimate, values: np.ndarray) -> float:
+def worst_place(tree, result, values):
     """How far any of these is from where it should be [m]."""
     gaps = joint_ends(tree, all_values(result)) - joint_ends(tree, values)
     return float(np.linalg.norm(gaps, axis=1).max())
 
 
-def recount(tree: PoseTree, result: PoseEstimate, views: list[View]) -> int:
+def recount(tree, result, views):
     """J by its definition (1): pixels that differ."""
     drawn = [draw_view(tree, all_values(result), view.camera) for view in views]
     return sum(int((one.mask ^ view.mask).sum()) for one, view in zip(drawn, views, strict=True))
 
 
-def test_continuous_pose_is_found_and_said_to_be_known(
-    tree: PoseTree, search: MultiStartSearch, pose: np.ndarray
-) -> None:
+def test_continuous_pose_is_found_and_said_to_be_known(tree, search, pose):
     views = clean_views(tree, pose)
     result = search.match(views)
     assert result.found
@@ -79,7 +76,7 @@ def test_continuous_pose_is_found_and_said_to_be_known(
 
 
 @pytest.mark.slow
-def test_damaged_and_ill_fitting_arms(tree: PoseTree, search: MultiStartSearch) -> None:
+def test_damaged_and_ill_fitting_arms(tree, search):
     places, held = [], []
     for seed in range(8):
         values = draw_pose(tree, np.random.default_rng(100 + seed))
@@ -97,7 +94,7 @@ def test_damaged_and_ill_fitting_arms(tree: PoseTree, search: MultiStartSearch) 
     assert np.mean(held) >= 0.85
 
 
-def test_the_same_every_time(tree: PoseTree, search: MultiStartSearch, pose: np.ndarray) -> None:
+def test_the_same_every_time(tree, search, pose):
     views = damaged_views(tree, pose, 3)
     with working(1):
         first = search.match(views)
@@ -111,7 +108,7 @@ def test_the_same_every_time(tree: PoseTree, search: MultiStartSearch, pose: np.
         assert (one.low, one.high) == (other.low, other.high)
 
 
-def test_no_time_at_all(tree: PoseTree, pose: np.ndarray) -> None:
+def test_no_time_at_all(tree, pose):
     views = clean_views(tree, pose)
     result = MultiStartSearch(tree, time_limit=0.0).match(views)
     assert result.found
@@ -120,7 +117,7 @@ def test_no_time_at_all(tree: PoseTree, pose: np.ndarray) -> None:
     assert result.seconds < 2.0
 
 
-def test_a_mask_that_no_pose_explains(search: MultiStartSearch) -> None:
+def test_a_mask_that_no_pose_explains(search):
     views = []
     for camera in arm_cameras():
         mask = np.zeros((camera.height, camera.width), dtype=bool)
@@ -133,7 +130,7 @@ def test_a_mask_that_no_pose_explains(search: MultiStartSearch) -> None:
 
 
 @pytest.mark.parametrize("which", ["all", "one pixel"])
-def test_masks_without_a_shape(search: MultiStartSearch, which: str) -> None:
+def test_masks_without_a_shape(search, which):
     (camera, _) = arm_cameras()
     mask = np.full((camera.height, camera.width), which == "all")
     mask[100, 150] = True
@@ -143,9 +140,7 @@ def test_masks_without_a_shape(search: MultiStartSearch, which: str) -> None:
     assert not result.explained
 
 
-def test_body_cut_off_by_the_pictures_edge(
-    tree: PoseTree, search: MultiStartSearch, pose: np.ndarray
-) -> None:
+def test_body_cut_off_by_the_pictures_edge(tree, search, pose):
     """What would lie outside the picture does not count against a pose."""
     views = []
     for camera, columns in zip(arm_cameras(320, 240), (slice(0, 250), slice(60, 320)), strict=True):
@@ -163,7 +158,7 @@ def test_body_cut_off_by_the_pictures_edge(
     assert worst_place(tree, result, pose) < 0.02
 
 
-def test_salt_noise(tree: PoseTree, search: MultiStartSearch, pose: np.ndarray) -> None:
+def test_salt_noise(tree, search, pose):
     generator = np.random.default_rng(8)
     views = clean_views(tree, pose)
     for view in views:

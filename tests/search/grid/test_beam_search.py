@@ -1,11 +1,8 @@
 """The beam search against brute force over whole grids, and what it promises of its answers."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
-from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.body.tree.root import RootRotation
 from drake_pose.camera.models import ParallelCamera, PinholeCamera
 from drake_pose.errors import SettingsError
@@ -22,17 +19,17 @@ from tests.search.bodies import (
     load_body,
     swinging_chain,
 )
-from tests.search.grid_problems import ProblemMaker, show_pose
+from tests.search.grid_problems import show_pose
 
 INTERVAL = 0.4
 
 
-def search(tree: PoseTree, **settings: object) -> BeamSearch:
+def search(tree, **settings):
     return BeamSearch(tree, BeamSearchSettings(interval=INTERVAL, **settings))
 
 
 @pytest.mark.parametrize("count", [1, 2])
-def test_finds_the_minimum_that_brute_force_finds(maker: ProblemMaker, count: int) -> None:
+def test_finds_the_minimum_that_brute_force_finds(maker, count):
     matcher = search(maker.tree)
     generator = np.random.default_rng(3)
     for _ in range(2):
@@ -44,7 +41,7 @@ def test_finds_the_minimum_that_brute_force_finds(maker: ProblemMaker, count: in
         assert (exact.stopped_by, exact.J, exact.E_total) == ("exact", 0.0, 0.0)
 
 
-def test_finds_the_minimum_for_a_mask_that_no_pose_explains(maker: ProblemMaker) -> None:
+def test_finds_the_minimum_for_a_mask_that_no_pose_explains(maker):
     problem = maker.make(np.random.default_rng(4), views=1, noise=0.1, on_grid=False)
     problem.views[0].mask[40:50, 5:15] = True
     result = search(maker.tree).match(problem.views)
@@ -52,7 +49,7 @@ def test_finds_the_minimum_for_a_mask_that_no_pose_explains(maker: ProblemMaker)
     assert result.J == maker.problem(problem.views).best[1]
 
 
-def test_a_sliding_joint_and_a_fixed_one(tmp_path: Path) -> None:
+def test_a_sliding_joint_and_a_fixed_one(tmp_path):
     model = load_body(
         tmp_path,
         box_link("rail", 30, 4),
@@ -69,7 +66,7 @@ def test_a_sliding_joint_and_a_fixed_one(tmp_path: Path) -> None:
     np.testing.assert_allclose(result.q, [0.15, -0.5], atol=1e-9)
 
 
-def test_what_lies_outside_the_picture_costs_nothing(tmp_path: Path) -> None:
+def test_what_lies_outside_the_picture_costs_nothing(tmp_path):
     tree = swinging_chain(tmp_path, 3).pose_tree()
     matcher = search(tree)
     camera = ParallelCamera("cut", 40, 25, 100.0, 19.637, 19.637, front_camera().X_WC)
@@ -80,7 +77,7 @@ def test_what_lies_outside_the_picture_costs_nothing(tmp_path: Path) -> None:
     assert matcher.match([view]).stopped_by == "exact"
 
 
-def test_a_root_at_another_position(tmp_path: Path) -> None:
+def test_a_root_at_another_position(tmp_path):
     model = swinging_chain(tmp_path, 3)
     still = model.pose_tree()
     values = [np.array([INTERVAL])] * 3
@@ -92,7 +89,7 @@ def test_a_root_at_another_position(tmp_path: Path) -> None:
     assert result.J <= 2.0
 
 
-def test_a_limit_still_answers_and_says_so(maker: ProblemMaker) -> None:
+def test_a_limit_still_answers_and_says_so(maker):
     problem = maker.make(np.random.default_rng(9), views=1, noise=0.0, on_grid=False)
     result = search(maker.tree, time_limit=0.0).match(problem.views)
     assert result.found
@@ -115,15 +112,13 @@ def test_a_limit_still_answers_and_says_so(maker: ProblemMaker) -> None:
         (Stage, {"hypotheses": 1, "outside_weight": 0}),
     ],
 )
-def test_settings_out_of_range_are_refused(kind: type, values: dict[str, object]) -> None:
+def test_settings_out_of_range_are_refused(kind, values):
     with pytest.raises(SettingsError):
         kind(**values)
 
 
 @pytest.mark.parametrize("side", [60, 240, 480])
-def test_what_drake_draws_is_matched_within_what_renderers_differ_by(
-    tmp_path: Path, side: int
-) -> None:
+def test_what_drake_draws_is_matched_within_what_renderers_differ_by(tmp_path, side):
     """Label images of Drake's VTK renderer; the areas that are scored are drawn otherwise."""
     model = swinging_chain(tmp_path, 4)
     matcher = BeamSearch(
@@ -151,7 +146,7 @@ def test_what_drake_draws_is_matched_within_what_renderers_differ_by(
     assert differ or side < 480
 
 
-def test_without_a_tolerance_only_equal_pixels_are_exact(tmp_path: Path) -> None:
+def test_without_a_tolerance_only_equal_pixels_are_exact(tmp_path):
     matcher = search(swinging_chain(tmp_path, 3).pose_tree(), tolerance=0.0)
     camera = front_camera(100, shift=0.137)
     view = show_pose(matcher.sampled, [grid[1] for grid in matcher.sampled.values], camera)

@@ -11,16 +11,15 @@ from drake_pose.search.grid.beam_search import BeamSearch
 from drake_pose.search.grid.examination import ExaminationSettings, examine
 from drake_pose.search.grid.pose_families import samples_at
 from drake_pose.search.settings import BeamSearchSettings
-from tests.search.grid_problems import ProblemMaker
 
 INTERVAL = 0.4
 
 
-def search_of(maker: ProblemMaker, examination: ExaminationSettings | None) -> BeamSearch:
+def search_of(maker, examination):
     return BeamSearch(maker.tree, BeamSearchSettings(interval=INTERVAL), examination)
 
 
-def test_what_is_proved_is_the_best_of_the_grid(maker: ProblemMaker) -> None:
+def test_what_is_proved_is_the_best_of_the_grid(maker):
     examined = search_of(maker, ExaminationSettings(proof_poses=10**6, family_poses=10**6))
     generator = np.random.default_rng(5)
     for noise, views in itertools.product((0.0, 0.003, 0.01, 0.03), (1, 2)):
@@ -44,7 +43,7 @@ def test_what_is_proved_is_the_best_of_the_grid(maker: ProblemMaker) -> None:
         assert answer.size == len(problem.within(best + answer.tolerance))
 
 
-def test_a_worse_pose_is_replaced(maker: ProblemMaker) -> None:
+def test_a_worse_pose_is_replaced(maker):
     search = search_of(maker, None)
     generator = np.random.default_rng(8)
     for noise in (0.0, 0.01) * 3:
@@ -63,7 +62,7 @@ def test_a_worse_pose_is_replaced(maker: ProblemMaker) -> None:
         assert tuple(samples.tolist()) in problem.within(mended.J)
 
 
-def test_a_pose_between_the_samples_is_refused(maker: ProblemMaker) -> None:
+def test_a_pose_between_the_samples_is_refused(maker):
     search = search_of(maker, None)
     problem = maker.make(np.random.default_rng(7), views=1, noise=0.0, on_grid=True)
     result = search.match(problem.views)
@@ -76,9 +75,7 @@ def test_a_pose_between_the_samples_is_refused(maker: ProblemMaker) -> None:
 @pytest.mark.parametrize(
     "limit", [{"proof_poses": 1}, {"memory": 8_000}, {"proof_time_limit": 0.0}]
 )
-def test_a_limit_leaves_a_true_bound_and_no_false_proof(
-    maker: ProblemMaker, limit: dict[str, int]
-) -> None:
+def test_a_limit_leaves_a_true_bound_and_no_false_proof(maker, limit):
     search = search_of(maker, None)
     generator = np.random.default_rng(12)
     proved = []
@@ -109,6 +106,6 @@ def test_a_limit_leaves_a_true_bound_and_no_false_proof(
         {"proof_time_limit": float("inf")},
     ],
 )
-def test_settings_out_of_range_are_refused(settings: dict[str, float]) -> None:
+def test_settings_out_of_range_are_refused(settings):
     with pytest.raises(SettingsError, match=r"time_limit|positive|or more"):
         ExaminationSettings(**settings)

@@ -3,7 +3,6 @@
 import itertools
 from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -17,7 +16,7 @@ from drake_pose.search.grid.inner_edges import (
     edges_of_labels,
     find_borders,
 )
-from drake_pose.search.grid.pose_families import GridPoseSet, find_families, samples_at
+from drake_pose.search.grid.pose_families import find_families, samples_at
 from drake_pose.search.grid.sampled_body import SampledBody
 from drake_pose.search.settings import BeamSearchSettings
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
@@ -25,14 +24,14 @@ from tests.search.bodies import box_link, front_camera, joint, load_body
 from tests.search.grid_problems import show_pose
 
 
-def two_halves(column: int) -> np.ndarray:
+def two_halves(column):
     segments = np.full((40, 60), -1)
     segments[5:35, 10:50] = 0
     segments[5:35, column:50] = 1
     return segments
 
 
-def test_borders_lie_between_segments_and_not_at_the_silhouette() -> None:
+def test_borders_lie_between_segments_and_not_at_the_silhouette():
     borders = find_borders(two_halves(30))
     expected = np.zeros((40, 60), dtype=np.bool_)
     expected[5:35, 29] = True
@@ -40,7 +39,7 @@ def test_borders_lie_between_segments_and_not_at_the_silhouette() -> None:
 
 
 @pytest.mark.parametrize(("shift", "at_least", "below"), [(0, -1, 1), (1, -150, -1), (3, -999, 0)])
-def test_edges_are_likely_where_they_are_expected(shift: int, at_least: int, below: int) -> None:
+def test_edges_are_likely_where_they_are_expected(shift, at_least, below):
     segments = two_halves(30)
     edges = edges_of_labels(segments, segments >= 0)
     found = [edges.log_likelihood(two_halves(30 + far)) for far in (shift, shift + 2)]
@@ -48,7 +47,7 @@ def test_edges_are_likely_where_they_are_expected(shift: int, at_least: int, bel
     assert found[0] > found[1] or shift == 3
 
 
-def test_half_an_edge_is_likelier_than_none() -> None:
+def test_half_an_edge_is_likelier_than_none():
     segments = two_halves(30)
     edges = edges_of_labels(segments, segments >= 0)
     half = np.where(np.arange(40)[:, None] < 20, segments, np.where(segments >= 0, 0, -1))
@@ -61,29 +60,29 @@ def test_half_an_edge_is_likelier_than_none() -> None:
 class Product:
     """A graph of all poses of some nodes' samples."""
 
-    def __init__(self, allowed: list[np.ndarray]) -> None:
+    def __init__(self, allowed):
         self._allowed = [np.flatnonzero(one) for one in allowed]
         self.size = int(np.prod([len(one) for one in self._allowed]))
 
-    def restricted(self, allowed: list[np.ndarray | None]) -> "Product":
+    def restricted(self, allowed):
         every = [np.ones(COUNT, bool) if one is None else one for one in allowed]
         return Product([np.isin(np.arange(COUNT), own) & one for own, one in self._pairs(every)])
 
-    def _pairs(self, every: list[np.ndarray]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    def _pairs(self, every):
         return zip(self._allowed, every, strict=True)
 
-    def members(self) -> np.ndarray:
+    def members(self):
         return np.array(list(itertools.product(*self._allowed)))
 
 
 COUNT = 5
 
 
-def test_turning_one_limb_after_the_other_ends_where_none_is_better() -> None:
+def test_turning_one_limb_after_the_other_ends_where_none_is_better():
     """A sum of each node's own misfit: whose least is found node by node, by few of all poses."""
     target, judged = np.array([3, 0, 4]), {}
 
-    def judge(samples: np.ndarray) -> float:
+    def judge(samples):
         judged[tuple(samples.tolist())] = -float(np.abs(samples - target).sum())
         return judged[tuple(samples.tolist())]
 
@@ -96,19 +95,19 @@ def test_turning_one_limb_after_the_other_ends_where_none_is_better() -> None:
     assert len(judged) < 6 * COUNT
 
 
-def test_what_may_be_seen_sums_to_one() -> None:
+def test_what_may_be_seen_sums_to_one():
     errors = EdgeErrors(missing=0.3, wrong=0.1, patch=3)
     assert np.allclose(np.exp(errors.log_pixel).sum(axis=1), 1.0)
     assert np.exp(errors.log_patch(50, 100.0)).sum() == pytest.approx(1.0)
 
 
 @pytest.mark.parametrize("values", [{"missing": 0.0}, {"wrong": -1.0}, {"patch": 0}])
-def test_errors_out_of_range_are_refused(values: dict[str, float]) -> None:
+def test_errors_out_of_range_are_refused(values):
     with pytest.raises(SettingsError, match=next(iter(values))):
         EdgeErrors(**values)
 
 
-def test_pictures_that_do_not_fit_are_refused() -> None:
+def test_pictures_that_do_not_fit_are_refused():
     segments = two_halves(30)
     with pytest.raises(SettingsError, match="same camera"):
         edges_of_labels(segments, np.ones((30, 60), dtype=np.bool_))
@@ -117,7 +116,7 @@ def test_pictures_that_do_not_fit_are_refused() -> None:
 
 
 @pytest.fixture
-def arm_before_trunk(tmp_path: Path) -> tuple[GridPoseSet, np.ndarray, LabelRenderer]:
+def arm_before_trunk(tmp_path):
     """Fifteen poses with one silhouette, the samples of one of them, and what draws them."""
     model = load_body(
         tmp_path,
@@ -139,15 +138,13 @@ def arm_before_trunk(tmp_path: Path) -> tuple[GridPoseSet, np.ndarray, LabelRend
     return answer, samples, LabelRenderer(model, camera)
 
 
-def show_segments(answer: GridPoseSet, samples: np.ndarray, renderer: LabelRenderer) -> np.ndarray:
+def show_segments(answer, samples, renderer):
     values = [grid[t] for grid, t in zip(answer.sampled.values, samples, strict=True)]
     return renderer.segments(*answer.sampled.tree.positions_from(values))
 
 
 @pytest.mark.parametrize("most", [300, 12])
-def test_a_hand_before_the_trunk_is_found_by_its_edges(
-    arm_before_trunk: tuple[GridPoseSet, np.ndarray, LabelRenderer], most: int
-) -> None:
+def test_a_hand_before_the_trunk_is_found_by_its_edges(arm_before_trunk, most):
     """The silhouette shows nothing of it, its edges everything."""
     answer, samples, renderer = arm_before_trunk
     seen = show_segments(answer, samples, renderer)
@@ -169,9 +166,7 @@ def test_a_hand_before_the_trunk_is_found_by_its_edges(
     assert choice.joints[-1].determined == choice.exhaustive
 
 
-def test_noise_on_the_edges_leaves_the_true_pose(
-    arm_before_trunk: tuple[GridPoseSet, np.ndarray, LabelRenderer],
-) -> None:
+def test_noise_on_the_edges_leaves_the_true_pose(arm_before_trunk):
     """Edges damaged at the rates that are stated, in squares that lie anywhere: 100 draws."""
     answer, samples, renderer = arm_before_trunk
     seen = show_segments(answer, samples, renderer)
@@ -183,7 +178,7 @@ def test_noise_on_the_edges_leaves_the_true_pose(
     }
     pictures: Iterator[np.ndarray] = iter(())
 
-    def render(q: np.ndarray, X_WB: np.ndarray) -> np.ndarray:
+    def render(q, X_WB):
         return next(pictures)
 
     left = []

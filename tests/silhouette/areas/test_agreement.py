@@ -1,14 +1,13 @@
 """The kernel against Drake's own renderer."""
 
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from drake_pose.body.model import ArticulatedModel, load_model
-from drake_pose.camera.models import Camera, ParallelCamera, PinholeCamera
+from drake_pose.body.model import load_model
+from drake_pose.camera.models import ParallelCamera, PinholeCamera
 from drake_pose.silhouette.areas.outline import outline_from_mesh
 from drake_pose.silhouette.areas.scoring import draw_mask
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
@@ -57,7 +56,7 @@ LINK = """
 """
 
 
-def model_of(folder: Path, shapes: list[str]) -> ArticulatedModel:
+def model_of(folder, shapes):
     """A chain with one link for each shape, on the world."""
     (folder / "open.obj").write_text(OPEN_MESH)
     text, parent = '<link name="base"/>', "base"
@@ -72,7 +71,7 @@ def model_of(folder: Path, shapes: list[str]) -> ArticulatedModel:
     return load_model(path, check=False)
 
 
-def looking_at_origin(rng: np.random.Generator, distance: float) -> np.ndarray:
+def looking_at_origin(rng, distance):
     """A pose X_WC from which the origin is seen near the picture's middle."""
     X_WC = np.eye(4)
     X_WC[:3, :3] = Rotation.random(random_state=rng).as_matrix()
@@ -80,7 +79,7 @@ def looking_at_origin(rng: np.random.Generator, distance: float) -> np.ndarray:
     return X_WC
 
 
-def cameras(rng: np.random.Generator) -> list[Camera]:
+def cameras(rng):
     """One parallel camera, one pinhole, and one so near that parts are behind the near plane."""
     return [
         ParallelCamera("parallel", 500, 400, 180.0, 230.3, 210.7, looking_at_origin(rng, 3.0)),
@@ -92,7 +91,7 @@ def cameras(rng: np.random.Generator) -> list[Camera]:
 
 
 @pytest.mark.parametrize("shape", list(SHAPES))
-def test_every_shape_looks_as_drake_draws_it(tmp_path: Path, shape: str) -> None:
+def test_every_shape_looks_as_drake_draws_it(tmp_path, shape):
     model = model_of(tmp_path, [shape, shape])
     for seed in range(2):
         for camera in cameras(np.random.default_rng(seed)):
@@ -102,7 +101,7 @@ def test_every_shape_looks_as_drake_draws_it(tmp_path: Path, shape: str) -> None
             assert shape == "open mesh" or whole <= 3e-4, (shape, camera.name, whole)
 
 
-def test_labels_are_links(tmp_path: Path) -> None:
+def test_labels_are_links(tmp_path):
     model = model_of(tmp_path, ["box", "sphere"])
     camera = cameras(np.random.default_rng(2))[0]
     renderer = LabelRenderer(model, camera)
@@ -120,7 +119,7 @@ def test_labels_are_links(tmp_path: Path) -> None:
             assert outside <= max(2, 0.002 * alone.sum())
 
 
-def test_wrong_use_of_a_renderer_is_refused(tmp_path: Path) -> None:
+def test_wrong_use_of_a_renderer_is_refused(tmp_path):
     renderer = LabelRenderer(
         model_of(tmp_path, ["box"]), ParallelCamera("c", 40, 30, 9.0, 20.0, 15.0, np.eye(4))
     )

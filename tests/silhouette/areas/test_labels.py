@@ -1,13 +1,10 @@
 """Label images by the span kernel, against rays cast at every triangle."""
 
-from collections.abc import Sequence
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from drake_pose.body.surfaces.meshes import TriangleMesh
-from drake_pose.camera.models import Camera
 from drake_pose.silhouette.areas.outline import outline_from_mesh
 from drake_pose.silhouette.areas.scoring import draw_labels, draw_mask
 from tests.silhouette.areas.test_span_kernel import CAMERAS, name_of
@@ -16,9 +13,7 @@ from tests.silhouette.shapes import box, brute_force_depth, random_pose, soup
 EMPTY = 32766
 
 
-def require_nearest(
-    meshes: Sequence[TriangleMesh], X_CN: np.ndarray, camera: Camera
-) -> tuple[np.ndarray, int]:
+def require_nearest(meshes, X_CN, camera):
     """Compares labels 1, 2, ... with cast rays; returns them, and how many pixels two share."""
     labels = range(1, 1 + len(meshes))
     outlines = [outline_from_mesh(mesh) for mesh in meshes]
@@ -33,7 +28,7 @@ def require_nearest(
 
 
 @pytest.mark.parametrize("camera", CAMERAS, ids=name_of)
-def test_the_nearest_of_any_triangles_is_seen(camera: Camera) -> None:
+def test_the_nearest_of_any_triangles_is_seen(camera):
     rng = np.random.default_rng(4)
     shared = 0
     for _ in range(15):
@@ -45,7 +40,7 @@ def test_the_nearest_of_any_triangles_is_seen(camera: Camera) -> None:
 
 @pytest.mark.parametrize("camera", CAMERAS, ids=name_of)
 @pytest.mark.parametrize("inside_out", [False, True])
-def test_the_nearest_of_closed_bodies_is_seen(camera: Camera, inside_out: bool) -> None:
+def test_the_nearest_of_closed_bodies_is_seen(camera, inside_out):
     # They run into each other, and a part is cut by the near plane.
     rng = np.random.default_rng(5)
     shared = 0
@@ -62,7 +57,7 @@ def test_the_nearest_of_closed_bodies_is_seen(camera: Camera, inside_out: bool) 
     assert shared > 1000
 
 
-def test_surfaces_that_are_not_closed_hide_nothing_behind_them() -> None:
+def test_surfaces_that_are_not_closed_hide_nothing_behind_them():
     cube = box(1.0)
     assert outline_from_mesh(cube).is_closed
     assert not outline_from_mesh(TriangleMesh(cube.vertices, cube.triangles[1:])).is_closed
@@ -71,7 +66,7 @@ def test_surfaces_that_are_not_closed_hide_nothing_behind_them() -> None:
     assert not outline_from_mesh(TriangleMesh(cube.vertices, turned)).is_closed
 
 
-def test_parts_of_one_label_are_one() -> None:
+def test_parts_of_one_label_are_one():
     camera = CAMERAS[1]
     X_CN = np.tile(np.eye(4), (3, 1, 1))
     X_CN[:, :3, :3] = Rotation.random(3, random_state=6).as_matrix()
@@ -82,5 +77,5 @@ def test_parts_of_one_label_are_one() -> None:
     assert set(np.unique(labels)) == {0, 5}
 
 
-def test_nothing_to_draw() -> None:
+def test_nothing_to_draw():
     assert (draw_labels([], [], np.empty((0, 4, 4)), CAMERAS[0], EMPTY) == EMPTY).all()

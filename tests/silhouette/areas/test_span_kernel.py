@@ -14,16 +14,16 @@ CAMERAS: list[Camera] = [
 ]
 
 
-def name_of(camera: Camera) -> str:
+def name_of(camera):
     return camera.name
 
 
-def draw(mesh: TriangleMesh, X_CN: np.ndarray, camera: Camera) -> np.ndarray:
+def draw(mesh, X_CN, camera):
     return draw_mask([outline_from_mesh(mesh)], X_CN[None], camera)
 
 
 @pytest.mark.parametrize("camera", CAMERAS, ids=name_of)
-def test_any_triangle_soup_is_drawn_exactly(camera: Camera) -> None:
+def test_any_triangle_soup_is_drawn_exactly(camera):
     rng = np.random.default_rng(1)
     covered = 0
     for _ in range(40):
@@ -35,7 +35,7 @@ def test_any_triangle_soup_is_drawn_exactly(camera: Camera) -> None:
     assert covered > 1000
 
 
-def test_triangles_through_the_near_plane_are_cut_exactly() -> None:
+def test_triangles_through_the_near_plane_are_cut_exactly():
     rng = np.random.default_rng(2)
     covered = 0
     for camera in CAMERAS[1:]:
@@ -49,7 +49,7 @@ def test_triangles_through_the_near_plane_are_cut_exactly() -> None:
 
 
 @pytest.mark.parametrize("camera", CAMERAS, ids=name_of)
-def test_scores_are_sums_over_masks(camera: Camera) -> None:
+def test_scores_are_sums_over_masks(camera):
     rng = np.random.default_rng(4)
     size = (camera.height, camera.width)
     sets = rng.random((3, *size)) < np.array([0.1, 0.5, 0.9])[:, None, None]
@@ -72,7 +72,7 @@ def test_scores_are_sums_over_masks(camera: Camera) -> None:
         ]
 
 
-def test_rows_with_very_many_crossings() -> None:
+def test_rows_with_very_many_crossings():
     rng = np.random.default_rng(5)
     for camera in CAMERAS[:2]:
         for triangles in (60, 400):
@@ -90,7 +90,7 @@ def test_rows_with_very_many_crossings() -> None:
 
 
 @pytest.mark.parametrize("far", [1e3, 1e9, 1e300])
-def test_far_outside_the_picture(far: float) -> None:
+def test_far_outside_the_picture(far):
     camera = CAMERAS[0]
     outline = outline_from_mesh(box(1.0))
     X_CN = np.tile(np.eye(4), (5, 1, 1))
@@ -101,14 +101,14 @@ def test_far_outside_the_picture(far: float) -> None:
     assert areas[4, 0] == areas[4, 1] > 3000
 
 
-def test_a_surface_much_greater_than_the_picture() -> None:
+def test_a_surface_much_greater_than_the_picture():
     for camera in CAMERAS:
         X_CN = np.eye(4)
         X_CN[2, 3] = 600.0
         assert draw(box(1000.0), X_CN, camera).all()
 
 
-def test_empty_surfaces() -> None:
+def test_empty_surfaces():
     empty = outline_from_mesh(TriangleMesh(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int32)))
     cube = outline_from_mesh(box(0.5))
     camera = CAMERAS[0]
@@ -121,7 +121,7 @@ def test_empty_surfaces() -> None:
 
 
 @pytest.mark.parametrize("camera", CAMERAS, ids=name_of)
-def test_subtracting_a_body_keeps_the_prefix_sums(camera: Camera) -> None:
+def test_subtracting_a_body_keeps_the_prefix_sums(camera):
     rng = np.random.default_rng(7)
     mask = rng.random((camera.height, camera.width)) < 0.7
     prefix = prefix_sums(mask)
@@ -136,7 +136,7 @@ def test_subtracting_a_body_keeps_the_prefix_sums(camera: Camera) -> None:
         assert not prefix[:, 0].any()
 
 
-def test_wrong_shapes_are_refused() -> None:
+def test_wrong_shapes_are_refused():
     camera = CAMERAS[0]
     outline = outline_from_mesh(box(1.0))
     none = np.zeros((0, camera.height, camera.width + 1), dtype=np.int32)

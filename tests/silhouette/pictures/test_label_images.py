@@ -10,7 +10,7 @@ from drake_pose.silhouette.pictures.label_images import label_image_to_mask, mas
 MASK = np.random.default_rng(0).random((20, 30)) < 0.3
 
 
-def test_round_trip() -> None:
+def test_round_trip():
     image = mask_to_label_image(MASK)
     assert isinstance(image, ImageLabel16I)
     assert (image.width(), image.height()) == (30, 20)
@@ -18,14 +18,14 @@ def test_round_trip() -> None:
     np.testing.assert_array_equal(label_image_to_mask(image.data), MASK)
 
 
-def test_labels_can_be_chosen() -> None:
+def test_labels_can_be_chosen():
     labels = np.full((4, 5), int(RenderLabel.kEmpty), dtype=np.int16)
     labels[1, 2], labels[3, 3] = 7, 9
     assert np.argwhere(label_image_to_mask(labels)).tolist() == [[1, 2], [3, 3]]
     assert np.argwhere(label_image_to_mask(labels, [9])).tolist() == [[3, 3]]
 
 
-def test_importing_the_room_loads_neither_numba_nor_drake() -> None:
+def test_importing_the_room_loads_neither_numba_nor_drake():
     code = (
         "import sys, drake_pose.silhouette, drake_pose.camera;"
         "print([m for m in ('numba', 'pydrake', 'cv2') if m in sys.modules])"

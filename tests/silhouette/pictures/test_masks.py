@@ -1,6 +1,5 @@
 import struct
 import zlib
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -15,13 +14,13 @@ MASK = np.zeros((20, 30), dtype=bool)
 MASK[4:9, 3:20] = True
 
 
-def save(folder: Path, picture: np.ndarray, name: str = "0007.png") -> Path:
+def save(folder, picture, name="0007.png"):
     path = folder / name
     cv2.imwrite(str(path), picture)
     return path
 
 
-def test_round_trip(tmp_path: Path) -> None:
+def test_round_trip(tmp_path):
     write_mask(tmp_path / "m.png", MASK)
     assert cv2.imread(str(tmp_path / "m.png"), cv2.IMREAD_UNCHANGED).max() == 255
     mask = read_mask(tmp_path / "m.png", 30, 20)
@@ -30,12 +29,12 @@ def test_round_trip(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("value", [1, 128, 255])
-def test_grey_masks(tmp_path: Path, value: int) -> None:
+def test_grey_masks(tmp_path, value):
     path = save(tmp_path, MASK.astype(np.uint8) * np.uint8(value))
     np.testing.assert_array_equal(read_mask(path), MASK)
 
 
-def test_deep_colour_and_transparent_masks(tmp_path: Path) -> None:
+def test_deep_colour_and_transparent_masks(tmp_path):
     grey = MASK.astype(np.uint16) * np.uint16(65535)
     np.testing.assert_array_equal(read_mask(save(tmp_path, grey)), MASK)
     colour = np.where(MASK[..., None], np.array([0, 200, 17]), 0).astype(np.uint8)
@@ -47,7 +46,7 @@ def test_deep_colour_and_transparent_masks(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read_mask(save(tmp_path, white)), MASK)
 
 
-def bad_pictures() -> dict[str, tuple[np.ndarray, str]]:
+def bad_pictures():
     grey = MASK.astype(np.uint8) * 255
     soft = cv2.GaussianBlur(grey, (5, 5), 0)
     two_colours = np.dstack([grey, grey, np.roll(grey, 3, axis=1)])
@@ -62,14 +61,14 @@ def bad_pictures() -> dict[str, tuple[np.ndarray, str]]:
 
 
 @pytest.mark.parametrize("case", list(bad_pictures()))
-def test_bad_masks_are_refused(tmp_path: Path, case: str) -> None:
+def test_bad_masks_are_refused(tmp_path, case):
     picture, message = bad_pictures()[case]
     path = save(tmp_path, picture)
     with pytest.raises(MaskError, match=rf"0007\.png.*{message}"):
         read_mask(path, 30, 20)
 
 
-def test_damaged_files_are_refused(tmp_path: Path) -> None:
+def test_damaged_files_are_refused(tmp_path):
     path = save(tmp_path, MASK.astype(np.uint8) * 255)
     data = path.read_bytes()
     for end in (0, 5, 8, 20, 40, len(data) - 13, len(data) - 8):
@@ -83,7 +82,7 @@ def test_damaged_files_are_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("side", [10_000, 60_000])
-def test_pictures_that_would_fill_the_memory_are_refused(tmp_path: Path, side: int) -> None:
+def test_pictures_that_would_fill_the_memory_are_refused(tmp_path, side):
     header = struct.pack(">IIBBBBB", side, side, 8, 0, 0, 0, 0)
     data = b"\x89PNG\r\n\x1a\n"
     for kind, content in ((b"IHDR", header), (b"IEND", b"")):
@@ -105,7 +104,7 @@ def test_pictures_that_would_fill_the_memory_are_refused(tmp_path: Path, side: i
         read_mask(tmp_path / "sparse.png")
 
 
-def test_unreadable_files_are_refused(tmp_path: Path) -> None:
+def test_unreadable_files_are_refused(tmp_path):
     for path in (tmp_path / "missing.png", tmp_path):
         with pytest.raises(MaskError, match=str(path)):
             read_mask(path)
@@ -118,7 +117,7 @@ def test_unreadable_files_are_refused(tmp_path: Path) -> None:
         read_mask(picture)
 
 
-def test_signed_distances_are_those_to_the_nearest_pixel_of_the_other_kind() -> None:
+def test_signed_distances_are_those_to_the_nearest_pixel_of_the_other_kind():
     mask = np.random.default_rng(4).random((14, 17)) < 0.6
     found = signed_distances(mask)
     inside, outside = np.argwhere(mask), np.argwhere(~mask)

@@ -3,14 +3,13 @@
 import struct
 import time
 from dataclasses import replace
-from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
 from drake_pose.camera.camera_files import save_cameras
-from drake_pose.camera.models import Camera, ParallelCamera, circle_of_cameras
+from drake_pose.camera.models import ParallelCamera, circle_of_cameras
 from drake_pose.errors import MaskError, SceneError
 from drake_pose.silhouette.pictures.masks import write_mask
 from drake_pose.silhouette.pictures.scene_checks import (
@@ -19,12 +18,12 @@ from drake_pose.silhouette.pictures.scene_checks import (
     frame_ranges,
     leave_out_unreadable,
 )
-from drake_pose.silhouette.pictures.scenes import Scene, load_scene
+from drake_pose.silhouette.pictures.scenes import load_scene
 
 NAMES = ("left", "middle", "right")
 
 
-def record(folder: Path, frames: list[str], still: tuple[str, ...] = ()) -> Scene:
+def record(folder, frames, still=()):
     """A square that moves to the right; from the third frame on it stands still in some cameras."""
     cameras = [ParallelCamera(n, 60, 40, 10.0, 30.0, 20.0, np.eye(4)) for n in NAMES]
     save_cameras(folder / "cameras.yaml", cameras)
@@ -39,7 +38,7 @@ def record(folder: Path, frames: list[str], still: tuple[str, ...] = ()) -> Scen
     return load_scene(folder)
 
 
-def film(folder: Path, rates: dict[str, float], counts: dict[str, int]) -> None:
+def film(folder, rates, counts):
     """Videos of grey pictures beside cameras.yaml."""
     (folder / "scene.yaml").write_text("sequence: true\n")
     (folder / "videos").mkdir(exist_ok=True)
@@ -52,7 +51,7 @@ def film(folder: Path, rates: dict[str, float], counts: dict[str, int]) -> None:
         writer.release()
 
 
-def test_videos_that_do_not_fit_together_are_named(tmp_path: Path) -> None:
+def test_videos_that_do_not_fit_together_are_named(tmp_path):
     record(tmp_path, ["000000"])
     film(tmp_path, dict.fromkeys(NAMES, 30.0), {})
     assert check_scene(load_scene(tmp_path)).warnings == ()
@@ -77,7 +76,7 @@ def test_videos_that_do_not_fit_together_are_named(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("count", [0, 10**9])
-def test_a_video_that_lies_about_its_length_is_refused(tmp_path: Path, count: int) -> None:
+def test_a_video_that_lies_about_its_length_is_refused(tmp_path, count):
     record(tmp_path, ["000000"])
     film(tmp_path, {NAMES[0]: 30.0}, {})
     video = tmp_path / "videos" / f"{NAMES[0]}.avi"
@@ -95,14 +94,14 @@ def test_a_video_that_lies_about_its_length_is_refused(tmp_path: Path, count: in
     assert time.process_time() - begin < 1.0
 
 
-def test_sound_scene_has_no_fault(tmp_path: Path) -> None:
+def test_sound_scene_has_no_fault(tmp_path):
     scene = record(tmp_path, [str(k) for k in range(8, 13)])
     # 9 precedes 10.
     assert scene.frames == ("8", "9", "10", "11", "12")
     assert check_scene(scene).warnings == ()
 
 
-def test_frozen_camera_is_left_out(tmp_path: Path) -> None:
+def test_frozen_camera_is_left_out(tmp_path):
     scene = record(tmp_path, ["1", "2", "3", "4", "5"], still=("middle",))
     (warning,) = check_scene(scene).warnings
     assert "camera 'middle' shows its last picture again in frame 4-5" in warning
@@ -110,14 +109,14 @@ def test_frozen_camera_is_left_out(tmp_path: Path) -> None:
     assert ("middle", "3") in check_scene(scene).masks
 
 
-def test_frames_recorded_twice_are_kept(tmp_path: Path) -> None:
+def test_frames_recorded_twice_are_kept(tmp_path):
     scene = record(tmp_path, ["1", "2", "3", "4"], still=NAMES)
     (warning,) = check_scene(scene).warnings
     assert warning.startswith("frame 4: all cameras show the frame before again")
     assert check_scene(scene).masks == scene.masks
 
 
-def test_dropped_frames(tmp_path: Path) -> None:
+def test_dropped_frames(tmp_path):
     scene = record(tmp_path, ["f_0002", "f_0004", "f_0006", "f_0012", "f_0014"])
     (warning,) = check_scene(scene).warnings
     assert "2 frames dropped by all cameras between f_0006 and f_0012" in warning
@@ -125,7 +124,7 @@ def test_dropped_frames(tmp_path: Path) -> None:
     assert check_scene(stills).warnings == ()
 
 
-def test_frames_that_a_camera_lacks(tmp_path: Path) -> None:
+def test_frames_that_a_camera_lacks(tmp_path):
     scene = record(tmp_path, [f"{k:02d}" for k in range(8)])
     for frame in ("02", "03", "05"):
         (tmp_path / "masks" / "right" / f"{frame}.png").unlink()
@@ -134,7 +133,7 @@ def test_frames_that_a_camera_lacks(tmp_path: Path) -> None:
     assert "camera 'right' has 5 of 8 frames; it lacks 02-03, 05" in warning
 
 
-def test_numbers_with_and_without_zeros_are_the_same_frames(tmp_path: Path) -> None:
+def test_numbers_with_and_without_zeros_are_the_same_frames(tmp_path):
     record(tmp_path, ["0001", "0002"])
     for frame in ("0001", "0002"):
         path = tmp_path / "masks" / "left" / f"{frame}.png"
@@ -145,7 +144,7 @@ def test_numbers_with_and_without_zeros_are_the_same_frames(tmp_path: Path) -> N
     assert scene.mask_path("left", "0002").name == "2.png"
 
 
-def test_misspelt_camera(tmp_path: Path) -> None:
+def test_misspelt_camera(tmp_path):
     record(tmp_path, ["1", "2"])
     (tmp_path / "masks" / "middle").rename(tmp_path / "masks" / "Midle")
     first, second = check_scene(load_scene(tmp_path)).warnings
@@ -154,7 +153,7 @@ def test_misspelt_camera(tmp_path: Path) -> None:
     assert "camera 'middle' of cameras.yaml has no masks" in second
 
 
-def test_unreadable_masks_are_left_out_where_others_have_the_frame(tmp_path: Path) -> None:
+def test_unreadable_masks_are_left_out_where_others_have_the_frame(tmp_path):
     record(tmp_path, ["1", "2", "3"])
     for frame in ("2", "3"):
         (tmp_path / "masks" / "left" / f"{frame}.png").write_bytes(b"")
@@ -171,7 +170,7 @@ def test_unreadable_masks_are_left_out_where_others_have_the_frame(tmp_path: Pat
 
 
 @pytest.mark.parametrize(("axis", "name"), [((1.0, 0.0, 0.0), "-z"), ((0.0, 1.0, 0.0), "x")])
-def test_world_that_does_not_stand(axis: tuple[float, float, float], name: str) -> None:
+def test_world_that_does_not_stand(axis, name):
     cameras = list(circle_of_cameras(4, size=(160, 120), face_camera=False).values())
     assert check_upright(cameras) == ()
     half = np.pi if name == "-z" else np.pi / 2.0
@@ -180,7 +179,7 @@ def test_world_that_does_not_stand(axis: tuple[float, float, float], name: str) 
     assert f"is the world's {'+' if name == 'x' else ''}{name}," in warning
 
 
-def turn(camera: Camera, axis: np.ndarray, angle: float) -> Camera:
+def turn(camera, axis, angle):
     x, y, z = axis
     K = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     X = np.eye(4)
@@ -188,7 +187,7 @@ def turn(camera: Camera, axis: np.ndarray, angle: float) -> Camera:
     return camera.with_pose(X @ camera.X_WC)
 
 
-def test_ranges() -> None:
+def test_ranges():
     known = [f"{k:02d}" for k in range(40)]
     assert frame_ranges(["03", "02", "07", "04"], known) == "02-04, 07"
     assert frame_ranges(known[::3], known) == "00, 03, 06, 09, 12, 15 and 8 more"

@@ -8,7 +8,7 @@ from drake_pose.silhouette.pictures.masks import intersection_over_union
 from drake_pose.silhouette.segmentation.regions import find_regions
 
 
-def drawn(cut: bool, width: int) -> tuple[np.ndarray, np.ndarray]:
+def drawn(cut, width):
     """A picture of a ring's half, a square with a pattern and clutter, and the square's mask."""
     rng, height = np.random.default_rng(0), 3 * width // 4
     picture = np.full((height, width, 3), (120, 90, 60), np.uint8)

@@ -75,25 +75,6 @@ def test_continuous_pose_is_found_and_said_to_be_known(tree, search, pose):
     assert sum(answer.determined) >= 4
 
 
-@pytest.mark.slow
-def test_damaged_and_ill_fitting_arms(tree, search):
-    places, held = [], []
-    for seed in range(8):
-        values = draw_pose(tree, np.random.default_rng(100 + seed))
-        result = search.match(damaged_views(tree, values, seed))
-        places.append(worst_place(tree, result, values))
-        assert result.pose_set is not None
-        held.append(
-            max(
-                np.mean([one.holds(v) for one, v in zip(family.joints, values, strict=True)])
-                for family in result.pose_set.families
-            )
-        )
-    # Flips leave the hand where it is, but not what is between.
-    assert np.median(places) < 0.02
-    assert np.mean(held) >= 0.85
-
-
 def test_the_same_every_time(tree, search, pose):
     views = damaged_views(tree, pose, 3)
     with working(1):
@@ -117,27 +98,19 @@ def test_no_time_at_all(tree, pose):
     assert result.seconds < 2.0
 
 
-def test_a_mask_that_no_pose_explains(search):
-    views = []
-    for camera in arm_cameras():
-        mask = np.zeros((camera.height, camera.width), dtype=bool)
-        mask[:12, :] = True
-        views.append(View(camera, mask))
-    result = search.match(views)
+@pytest.mark.parametrize(
+    "where",
+    [np.s_[:, :], np.s_[100:101, 150:151], np.s_[:12, :]],
+    ids=["all", "one pixel", "strip"],
+)
+def test_a_mask_that_no_pose_explains(search, where):
+    (camera, _) = arm_cameras()
+    mask = np.zeros((camera.height, camera.width), dtype=bool)
+    mask[where] = True
+    result = search.match([View(camera, mask)])
     assert result.found
     assert not result.explained
     assert result.E_total > 0.5
-
-
-@pytest.mark.parametrize("which", ["all", "one pixel"])
-def test_masks_without_a_shape(search, which):
-    (camera, _) = arm_cameras()
-    mask = np.full((camera.height, camera.width), which == "all")
-    mask[100, 150] = True
-    result = search.match([View(camera, mask)])
-    assert result.found
-    assert np.isfinite(result.J)
-    assert not result.explained
 
 
 def test_body_cut_off_by_the_pictures_edge(tree, search, pose):

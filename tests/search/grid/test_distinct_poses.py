@@ -37,29 +37,30 @@ def objectives(problem, poses):
     return np.array([problem.Js[(problem.choices == one).all(axis=1)][0] for one in found])
 
 
-def look_alike(tree, views, one, other):
-    """The definition, from masks of single nodes."""
+def node_masks(tree, views, values):
+    """(views, nodes, H, W) masks of single nodes."""
     outlines = [outline_from_mesh(node.mesh) for node in tree.nodes]
-    first, second = (
-        np.array(
+    X_WN = tree.node_poses(values)[:, None]
+    return np.array(
+        [
             [
-                [
-                    draw_mask([outline], X_CN[None], view.camera)
-                    for outline, X_CN in zip(outlines, view.camera.X_CW @ X_WN, strict=True)
-                ]
-                for view in views
+                draw_mask([o], v.camera.X_CW @ X, v.camera)
+                for o, X in zip(outlines, X_WN, strict=True)
             ]
-        )
-        for X_WN in (tree.node_poses(one), tree.node_poses(other))
+            for v in views
+        ]
     )
-    for node in range(len(tree.nodes)):
-        rest = [np.delete(pose, node, axis=1).any(axis=1) for pose in (first, second)]
-        hidden = not any(
-            (pose[:, node] & ~others).any()
-            for pose, others in zip((first, second), rest, strict=True)
-        )
-        common = (first[:, node] & second[:, node]).sum()
-        if not hidden and common < ALIKE * (first[:, node] | second[:, node]).sum():
+
+
+def look_alike(first, second):
+    """The definition, from masks of two poses' single nodes."""
+    for node in range(first.shape[1]):
+        is_seen = [
+            (pose[:, node] & ~np.delete(pose, node, axis=1).any(axis=1)).any()
+            for pose in (first, second)
+        ]
+        one, other = first[:, node], second[:, node]
+        if any(is_seen) and (one & other).sum() < ALIKE * (one | other).sum():
             return False
     return True
 
@@ -73,8 +74,9 @@ def test_the_list_begins_with_the_best_and_no_two_look_alike(maker, count):
     assert len(poses) == 8
     assert Js[0] == search.match(problem.views).J
     assert (np.diff(Js) >= 0).all()
-    for one, other in itertools.combinations(poses, 2):
-        assert not look_alike(maker.tree, problem.views, one, other)
+    masks = [node_masks(maker.tree, problem.views, pose) for pose in poses]
+    for one, other in itertools.combinations(masks, 2):
+        assert not look_alike(one, other)
 
 
 def test_all_poses_of_the_grid_differ_if_that_is_wanted(maker, problem):

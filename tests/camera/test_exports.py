@@ -11,7 +11,6 @@ import yaml
 from pydrake.common.eigen_geometry import Quaternion
 from pydrake.math import RigidTransform
 
-from drake_pose.camera.drake import dump_scenario
 from drake_pose.camera.exports import mujoco_cameras, ros_camera_info, ros_transforms
 from drake_pose.camera.models import ParallelCamera, PinholeCamera
 from drake_pose.errors import CameraError
@@ -86,9 +85,7 @@ def test_mujoco_sees_points_at_the_same_pixels(tmp_path):
     np.testing.assert_allclose(np.column_stack([u, v]) - 0.5, expected, atol=1e-3)
 
 
-@pytest.mark.parametrize(
-    "export", [ros_camera_info, lambda one: mujoco_cameras([one]), lambda one: dump_scenario([one])]
-)
+@pytest.mark.parametrize("export", [ros_camera_info, lambda one: mujoco_cameras([one])])
 def test_parallel_cameras_are_refused(export):
     with pytest.raises(CameraError, match=r"'flat'.*parallel"):
         export(PARALLEL)

@@ -130,25 +130,12 @@ def test_continuous_joints_have_no_limits_whatever_the_file_says(tmp_path):
     assert (model.lower[-1], model.upper[-1]) == (-np.pi, np.pi)
 
 
-def test_a_loop_of_links_is_opened_with_a_word(tmp_path):
-    text = urdf(
-        *(link(name) for name in "abcd"),
-        joint("one", "revolute", "a", "b"),
-        joint("two", "revolute", "b", "c"),
-        joint("three", "revolute", "a", "d"),
-        joint("shut", "revolute", "d", "c"),
-    )
-    model = read(tmp_path, text)
-    assert model.position_names[-3:] == ("one", "two", "three")
-    assert model.warnings == (
-        "joint 'shut' closes a loop of links at 'c': not enforced, it is left out",
-    )
-
-
 @pytest.mark.parametrize(
     ("text", "named"),
     [
         (arm(limits='lower="1" upper="-1"'), "joint 'elbow': lower limit 1"),
+        (arm(limits='lower="nan" upper="1"'), "joint 'elbow': a limit is NaN"),
+        (arm(limits='lower="low" upper="1"'), "joint 'elbow': limits 'low', '1' are not numbers"),
         (arm().replace('velocity="1"', 'velocity="-1"'), "joint 'elbow': velocity"),
         (arm(a=visual('<sphere radius="-1"/>')), "link 'a': radius of its sphere is '-1'"),
         (arm(a=visual('<box size="0 0 0"/>')), "link 'a': size of its box is '0 0 0'"),
@@ -173,6 +160,8 @@ def test_a_loop_of_links_is_opened_with_a_word(tmp_path):
         (arm(more=joint("elbow", "fixed", "b", "world")), "joint 'elbow' is defined 2 times"),
         (arm().replace(' name="elbow"', ""), "1 <joint> without a name"),
         (arm(more="<link/>"), "1 <link> without a name"),
+        ("<robot name='r'/>", "no visual geometry"),
+        ("", "not well-formed XML"),
         ("<sdf/>", "its outermost element is <sdf>"),
         ("<robot><link></robot>", "not well-formed XML: mismatched tag: line 1"),
     ],

@@ -1,7 +1,6 @@
 """Which column is which joint, in which unit: never assumed without a word."""
 
 import math
-from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -13,7 +12,6 @@ from drake_pose.camera.episodes.joint_map import (
     match_names,
     read_joint_map,
 )
-from drake_pose.camera.episodes.open import open_episode
 from drake_pose.errors import SceneError, SettingsError, UnknownNameError
 
 LOW = np.array([-2.9, -1.8, -2.9, -3.1, -2.9, -0.1, -2.9])
@@ -166,31 +164,3 @@ def test_tables_of_joints(tmp_path):
     ):
         with pytest.raises(UnknownNameError, match=message):
             mapped(ARM["names"], POSES, ARM, table=table)
-
-
-def joints_of(urdf):
-    """The moving joints of a URDF that no other joint moves, and their limits."""
-    moving = [one for one in ElementTree.parse(urdf).iter("joint") if one.get("type") != "fixed"]
-    moving = [one for one in moving if one.find("mimic") is None]
-    sides = {
-        side: [float(one.find("limit").get(side)) for one in moving] for side in ("lower", "upper")
-    }
-    arrays = {side: np.array(values) for side, values in sides.items()}
-    return {"names": tuple(one.get("name") for one in moving), **arrays}
-
-
-def test_recorded_logs(shared_data):
-    """A humanoid's fourteen arm joints are in its URDF's order, as its README says."""
-    folder = shared_data / "humanoid_head_camera"
-    log = open_episode(folder, episode=10).joints
-    model = joints_of(folder / "robot" / "g1_upper_body_from_torso.urdf")
-    found = mapped(log.names, log.positions, model)
-    arms = [k for k, name in enumerate(model["names"]) if name not in found.not_logged]
-    np.testing.assert_array_equal(found.log.positions[:, arms], log.positions[:, :14])
-    assert found.unused == log.names[14:]
-    robot = joints_of(shared_data / "droid_episodes" / "robot" / "panda_robotiq.urdf")
-    log = open_episode(shared_data / "droid_episodes" / "cloth").joints
-    table = {"finger_joint": Column("gripper_position", 0.8)}
-    found = mapped(log.names, log.positions, robot, table=table)
-    assert found.not_logged == ()
-    np.testing.assert_allclose(found.log.positions[:, -1], 0.8 * log.positions[:, -1])

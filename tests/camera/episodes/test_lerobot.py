@@ -118,16 +118,3 @@ def test_a_part_of_a_data_set_and_what_is_wrong_in_it(tmp_path):
     info.write_text(info.read_text().replace("v2.1", "v1.6"))
     with pytest.raises(SceneError, match=r"version v1\.6, but 2\.0, 2\.1 and 3\.0 are read"):
         open_episode(tmp_path)
-
-
-def test_a_recorded_data_set(shared_data):
-    folder = shared_data / "humanoid_head_camera"
-    for n, count in ((10, 290), (20, 297)):
-        episode = open_episode(folder, episode=n)
-        one, joints = episode.camera("cam_high"), episode.joints
-        assert (one.width, one.height, len(one.times), episode.warnings) == (640, 480, count, ())
-        assert (len(joints.names), joints.names[3]) == (26, "kLeftElbow")
-        assert np.abs(joints.times - one.times).max() < 1e-5
-        np.testing.assert_array_equal(one.read(200), [one.read(k) for k in (199, 200)][1])
-    with pytest.raises(SceneError, match="of 100 these are here: 10, 20"):
-        open_episode(folder)

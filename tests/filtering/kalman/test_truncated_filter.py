@@ -8,6 +8,8 @@ from drake_pose.filtering.truncated_filter import FilterSettings, TruncatedFilte
 from drake_pose.filtering.truncated_normal import truncate_joint
 from drake_pose.filtering.update import make_evidence, update
 
+ONE_TURN = from_bounds(["angle"], [0], [1])
+BEYOND_IT = two_sided(["angle"], "stop", [1.0], 2.0, np.inf)
 LAYOUT = StateLayout(("angle",), ("length",))
 NAMES = LAYOUT.names  # angle, rate_angle, length
 
@@ -138,9 +140,9 @@ def test_covariances_stay_positive_definite_when_measurements_are_nearly_exact()
         assert (belief.deviations() > 0).all()
 
 
-def make_filter(model=None, rows=None, **settings):
+def make_filter(model=None, rows=None, noise=None, **settings):
     rows = rows or from_bounds(["angle", "length"], [0.0, 0.5], [1.5, 1.5])
-    noise = LAYOUT.process_noise({"angle": 0.02})
+    noise = LAYOUT.process_noise({"angle": 0.02}) if noise is None else noise
     return TruncatedFilter(LAYOUT, model or Segment(), rows, noise, FilterSettings(**settings))
 
 
@@ -243,7 +245,7 @@ def test_transition_and_noise():
         (lambda: make_belief([0, 0], np.eye(3)), "fit"),
         (lambda: make_belief([0, 0], [[1, 2], [2, 1]]), "indefinite"),
         (
-            lambda: make_filter().start(Belief(np.zeros(3), np.full((3, 3), np.nan))),
+            lambda: make_filter().start(Belief(np.zeros(3), 0 * np.eye(3) * np.nan)),
             "'angle' is NaN",
         ),
         (lambda: make_filter().start(Belief(np.zeros(2), np.eye(2))), "3"),
@@ -256,23 +258,8 @@ def test_transition_and_noise():
         (lambda: LAYOUT.process_noise({}), "'angle'"),
         (lambda: LAYOUT.process_noise({"length": 1.0}), "length"),
         (lambda: StateLayout(("a", "a"), ()), "'a'"),
-        (
-            lambda: TruncatedFilter(
-                LAYOUT, Segment(), from_bounds(["angle"], [0], [1]), -np.eye(3)
-            ),
-            "process noise: the covariance is indefinite",
-        ),
-        (
-            lambda: make_filter(
-                rows=stack(
-                    [
-                        from_bounds(["angle"], [0], [1]),
-                        two_sided(["angle"], "stop", [1.0], 2.0, np.inf),
-                    ]
-                )
-            ),
-            "stop",
-        ),
+        (lambda: make_filter(noise=-np.eye(3)), "process noise: the covariance is indefinite"),
+        (lambda: make_filter(rows=stack([ONE_TURN, BEYOND_IT])), "stop"),
         (lambda: make_filter(rows=from_bounds(["elbow"], [0], [1])), "elbow"),
     ],
 )

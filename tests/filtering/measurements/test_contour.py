@@ -2,7 +2,6 @@ import numpy as np
 import pytest
 
 from drake_pose.body.model import load_model
-from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import SettingsError
 from drake_pose.filtering import contour
 from drake_pose.filtering.body_state import ROOT_SHIFT
@@ -11,16 +10,6 @@ from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from tests.body.models import joint, link, urdf, write
 from tests.body.skins import LIMB_URDF, write_limb
 from tests.search.bodies import forked_body, front_camera, near_camera
-
-
-def pinhole(name, turn_deg, side=260, focal=330.0, distance=2.9, height=0.9):
-    """A camera that looks at the world's axis from all around."""
-    c, s = np.cos(np.radians(turn_deg)), np.sin(np.radians(turn_deg))
-    X_WC = np.eye(4)
-    X_WC[:3, :3] = np.column_stack([[-s, c, 0.0], [0.0, 0.0, -1.0], [-c, -s, 0.0]])
-    X_WC[:3, 3] = [distance * c, distance * s, height]
-    middle = 0.5 * (side - 1)
-    return PinholeCamera(name, side, side, focal, focal, middle, middle, X_WC)
 
 
 def descend(observation, seen, x, steps=5):

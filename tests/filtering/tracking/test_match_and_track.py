@@ -3,8 +3,6 @@ import math
 import numpy as np
 import pytest
 
-from drake_pose.body.formats.packages import bundled_model
-from drake_pose.body.model import load_model
 from drake_pose.errors import SettingsError
 from drake_pose.filtering.contour import ContourObservation
 from drake_pose.filtering.contour_tracker import ContourTracker, TrackingSettings
@@ -13,7 +11,6 @@ from drake_pose.search.estimates import TRACKED, View
 from drake_pose.search.kameda import PaperSearch
 from drake_pose.search.settings import PaperSearchSettings
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
-from tests.filtering.measurements.test_contour import pinhole
 from tests.search.bodies import forked_body, front_camera
 
 PERIOD = 1 / 30
@@ -114,42 +111,6 @@ def test_no_pose_found_is_said_and_asked_again(body):
     assert followed.track is None
     followed, _ = follower.next(followed, [View(camera, speck)])
     assert followed.matches == search.calls == 2
-
-
-@pytest.mark.slow
-def test_the_man_is_followed_through_two_cameras():
-    """A body with skin: errors against the truth, and honest deviations."""
-    model = load_model(bundled_model("man"), check=False)
-    cameras = [pinhole("a", 15.0, height=-0.6), pinhole("b", 105.0, height=-0.6)]
-    observation = ContourObservation(model.pose_tree(), cameras)
-    tracker = ContourTracker(observation, PERIOD)
-    generator = np.random.default_rng(1)
-    layout = observation.layout
-    moving = len(layout.moving)
-    names = model.position_names
-    inside = 0.1 * (model.upper - model.lower)
-    centre = np.clip(model.default_positions, model.lower + inside, model.upper - inside)
-    amplitude = np.where(
-        [kind == "angle" for kind in model.position_kinds], np.minimum(inside, 0.25), 0.0
-    )
-    truth = swings(12, centre, amplitude, generator)
-    renderers = [LabelRenderer(model, camera) for camera in cameras]
-    index = [names.index(name) for name in layout.moving]
-    angles = np.array([observation.is_angle(name) for name in layout.moving])
-    start = observation.state(truth[0])
-    start[:moving] += np.where(angles, 0.08, 0.01) * generator.normal(size=moving)
-    track = tracker.start(start)
-    errors, scaled = [], []
-    for k, q in enumerate(truth):
-        masks = [renderer.mask(q) for renderer in renderers]
-        # A camera is late once.
-        track = tracker.follow(track, [None if k == 5 else masks[0], masks[1]], first=k == 0)
-        assert not track.lost
-        error = track.state.best.mean[:moving] - q[index]
-        errors.append(np.degrees(np.abs(error[angles])))
-        scaled.append(np.abs(error) / track.state.best.deviations()[:moving])
-    assert np.median(errors[4:]) < 2.5
-    assert np.mean(np.array(scaled[4:]) < 2) > 0.85
 
 
 def test_lost_when_the_body_is_elsewhere(body):

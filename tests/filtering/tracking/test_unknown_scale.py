@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
+from drake_pose.camera.models import circle_of_cameras
 from drake_pose.errors import SettingsError
 from drake_pose.filtering.contour import ContourObservation
 from drake_pose.filtering.contour_tracker import ContourTracker, TrackingSettings
 from drake_pose.filtering.match_and_track import Followed, MatchAndTrack
 from drake_pose.search.estimates import TRACKED, PoseEstimate, View
-from tests.filtering.measurements.test_contour import pinhole
 from tests.filtering.tracking.test_match_and_track import PERIOD, swings
 from tests.search.bodies import forked_body, front_camera
 
@@ -114,7 +114,7 @@ def test_joints_that_are_not_seen_come_to_rest_in_the_middle_of_their_limits(tre
 
 
 def test_a_scale_needs_one_parallel_camera(tree):
-    with pytest.raises(SettingsError, match="parallel"):
-        ContourObservation(tree, [pinhole("a", 15.0)], True, True)
-    with pytest.raises(SettingsError, match="parallel"):
-        ContourObservation(tree, [front_camera(), front_camera(name="other")], True, True)
+    (pinhole,) = circle_of_cameras(1, face_camera=False).values()
+    for cameras in ([pinhole], [front_camera(), front_camera(name="other")]):
+        with pytest.raises(SettingsError, match="parallel"):
+            ContourObservation(tree, cameras, True, True)

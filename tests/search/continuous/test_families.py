@@ -8,7 +8,7 @@ from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.fit.surfaces import few_triangles
 from drake_pose.search.continuous.families import RobustFamilies
-from drake_pose.search.continuous.views_fit import ViewsFit
+from drake_pose.search.continuous.views_fit import FittedPose, ViewsFit, distinct
 from drake_pose.search.starts.self_motions import flips
 from drake_pose.silhouette.areas.bending import TreeSurfaces
 from tests.search.arms import arm_cameras, arm_tree, damaged_views, draw_view, is_held
@@ -95,3 +95,24 @@ def test_time_that_is_up_leaves_the_intervals_of_the_curvature(kinematics):
     assert answer.family_count == 1
     assert fit.evaluations - before < 5
     assert all(joint.low < joint.high for joint in answer.joints)
+
+
+def test_refinement_keeps_limits_and_what_is_held(kinematics):
+    views = [draw_view(kinematics.tree, TRUTH, camera) for camera in arm_cameras()]
+    fit = ViewsFit(kinematics, few_triangles(TreeSurfaces(kinematics.tree)), views)
+    outside = kinematics.upper + 0.5
+    found = fit.refine(outside, FINE, held=(1,))
+    assert found.values[1] == outside[1]
+    free = [0, 2, 3, 4]
+    assert (found.values[free] <= kinematics.upper[free]).all()
+    assert (found.values[free] >= kinematics.lower[free]).all()
+    start = TRUTH + np.array([0.05, -0.05, 0.04, 0.05, -0.05])
+    near = fit.refine(start, FINE)
+    assert near.cost < 0.2 * fit.cost(start, FINE[-1])
+    assert np.abs(near.values - TRUTH).max() < np.radians(1.5)
+
+
+def test_distinct_keeps_the_best_of_those_alike():
+    poses = [FittedPose(np.array([x, 0.0]), cost) for x, cost in ((0, 3), (0.01, 1), (1, 2))]
+    assert [pose.cost for pose in distinct(poses, 5)] == [1, 2]
+    assert [pose.cost for pose in distinct(poses, 1)] == [1]

@@ -28,44 +28,40 @@ def test_round_trip(tmp_path):
     np.testing.assert_array_equal(mask, MASK)
 
 
-@pytest.mark.parametrize("value", [1, 128, 255])
-def test_grey_masks(tmp_path, value):
-    path = save(tmp_path, MASK.astype(np.uint8) * np.uint8(value))
-    np.testing.assert_array_equal(read_mask(path), MASK)
+GREY = MASK.astype(np.uint8) * 255
+COLOUR = np.where(MASK[..., None], np.array([0, 200, 17]), 0).astype(np.uint8)
 
 
-def test_deep_colour_and_transparent_masks(tmp_path):
-    grey = MASK.astype(np.uint16) * np.uint16(65535)
-    np.testing.assert_array_equal(read_mask(save(tmp_path, grey)), MASK)
-    colour = np.where(MASK[..., None], np.array([0, 200, 17]), 0).astype(np.uint8)
-    np.testing.assert_array_equal(read_mask(save(tmp_path, colour)), MASK)
-    opaque = np.dstack([colour, np.full(MASK.shape, 255, dtype=np.uint8)])
-    np.testing.assert_array_equal(read_mask(save(tmp_path, opaque)), MASK)
-    white = np.full((*MASK.shape, 4), 255, dtype=np.uint8)
-    white[:, :, 3] *= MASK
-    np.testing.assert_array_equal(read_mask(save(tmp_path, white)), MASK)
+@pytest.mark.parametrize(
+    "picture",
+    [
+        *(MASK.astype(np.uint8) * np.uint8(value) for value in (1, 128, 255)),
+        MASK.astype(np.uint16) * np.uint16(65535),
+        COLOUR,
+        np.dstack([COLOUR, np.full_like(GREY, 255)]),
+        np.dstack([np.full((*MASK.shape, 3), 255, np.uint8), GREY]),
+    ],
+    ids=["1", "128", "255", "deep", "colour", "opaque", "transparent"],
+)
+def test_masks_of_every_kind_are_read(tmp_path, picture):
+    np.testing.assert_array_equal(read_mask(save(tmp_path, picture)), MASK)
 
 
-def bad_pictures():
-    grey = MASK.astype(np.uint8) * 255
-    soft = cv2.GaussianBlur(grey, (5, 5), 0)
-    two_colours = np.dstack([grey, grey, np.roll(grey, 3, axis=1)])
-    return {
-        "empty": (np.zeros_like(grey), "empty"),
-        "full": (np.full_like(grey, 255), "full"),
-        "soft": (soft, "values"),
-        "two colours": (two_colours, "values"),
-        "no black": (np.where(MASK, 255, 3).astype(np.uint8), "full"),
-        "wrong size": (grey.T.copy(), r"20 x 30 pixels.*30 x 20"),
-    }
-
-
-@pytest.mark.parametrize("case", list(bad_pictures()))
-def test_bad_masks_are_refused(tmp_path, case):
-    picture, message = bad_pictures()[case]
-    path = save(tmp_path, picture)
+@pytest.mark.parametrize(
+    ("picture", "message"),
+    [
+        (np.zeros_like(GREY), "empty"),
+        (np.full_like(GREY, 255), "full"),
+        (cv2.GaussianBlur(GREY, (5, 5), 0), "values"),
+        (np.dstack([GREY, GREY, np.roll(GREY, 3, axis=1)]), "values"),
+        (np.where(MASK, 255, 3).astype(np.uint8), "full"),
+        (GREY.T.copy(), r"20 x 30 pixels.*30 x 20"),
+    ],
+    ids=["empty", "full", "soft", "two colours", "no black", "wrong size"],
+)
+def test_bad_masks_are_refused(tmp_path, picture, message):
     with pytest.raises(MaskError, match=rf"0007\.png.*{message}"):
-        read_mask(path, 30, 20)
+        read_mask(save(tmp_path, picture), 30, 20)
 
 
 def test_damaged_files_are_refused(tmp_path):

@@ -8,6 +8,7 @@ from drake_pose.body.tree.root import RootRotation
 from drake_pose.body.tree.tree_kinematics import TreeKinematics, joint_offsets
 from drake_pose.fit.lengthened_body import LengthenedBody
 from drake_pose.silhouette.areas.outline import outline_from_mesh
+from tests.fit.motions import assert_motions_are_derivatives
 
 # A wrist of two joints, no link that is seen between them; a mount that is welded on before the
 # last joint; and a second joint on a link.
@@ -93,11 +94,4 @@ def test_a_joint_behind_a_weld_is_moved_from_the_link_s_own_joint(body):
 
 def test_derivatives(body):
     theta = parameters(body, {"base": 0.1, "upper": -0.2, "gimbal": 0.3, "mount": -0.1})
-    placement = body.place(theta)
-    motions = placement.dense(len(theta)).reshape(len(placement.X_WN), len(theta), 3, 4)
-    point, step = np.array([0.03, -0.02, 0.05, 1.0]), 1e-6
-    for k in range(len(theta)):
-        ends = [body.place(theta + off * np.eye(len(theta))[k]).X_WN for off in (-step, step)]
-        differences = ((ends[1] - ends[0]) @ point)[:, :3] / (2.0 * step)
-        told = np.einsum("nij,nj->ni", motions[:, k], placement.X_WN @ point)
-        np.testing.assert_allclose(told, differences, atol=1e-8)
+    assert_motions_are_derivatives(body, theta)

@@ -10,8 +10,8 @@ from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.fit.proportions import ProportionedBody
 from drake_pose.silhouette.areas.bending import TreeSurfaces
 from drake_pose.silhouette.areas.outline import Outline, outline_from_mesh
+from tests.fit.motions import assert_motions_are_derivatives
 
-STEP = 1e-6
 HELD = {"wrist_flexion": 0.0, "wrist_deviation": 0.0}
 
 
@@ -33,28 +33,9 @@ def body(model):
     return ProportionedBody(TreeKinematics(tree), TreeSurfaces(tree))
 
 
-def rigid_points(body, theta, counts):
-    """Points of each node's rigid part in the world."""
-    placement = body.place(theta)
-    starts = placement.packed.starts[:, 0]
-    return [
-        (X[:3, :3] @ placement.packed.points[:, begin : begin + count] + X[:3, 3:]).T
-        for X, begin, count in zip(placement.X_WN, starts, counts, strict=False)
-    ]
-
-
-def test_every_motion_agrees_with_finite_differences(model, body):
+def test_every_motion_agrees_with_finite_differences(body):
     theta = np.random.default_rng(0).normal(0.0, 0.2, len(body.names))
-    counts = [len(outline.vertices) for outline in TreeSurfaces(palm_tree(model)).rigid]
-    points = rigid_points(body, theta, counts)
-    motions = body.place(theta).dense(len(body.names)).reshape(len(counts), -1, 3, 4)
-    for k in range(len(theta)):
-        step = STEP * np.eye(len(theta))[k]
-        ahead, behind = (rigid_points(body, theta + s, counts) for s in (step, -step))
-        for node, p_W in enumerate(points):
-            slope = (ahead[node] - behind[node]) / (2 * STEP)
-            M = motions[node, k]
-            np.testing.assert_allclose(p_W @ M[:, :3].T + M[:, 3], slope, atol=1e-8)
+    assert_motions_are_derivatives(body, theta)
 
 
 def test_planes_are_those_of_the_stretched_surfaces(body):

@@ -19,6 +19,7 @@ from drake_pose.errors import ModelError, SettingsError
 from drake_pose.fit.lengthened_body import LengthenedBody
 from drake_pose.fit.surfaces import VERY_FEW, few_triangles
 from drake_pose.silhouette.areas.bending import TreeSurfaces
+from tests.fit.motions import assert_motions_are_derivatives
 
 from ..formats import test_sdf as sdf
 from ..models import joint, link, urdf, write
@@ -101,21 +102,13 @@ def test_beside_tendons_nothing_is_enforced_and_that_is_told(tmp_path):
     assert told.startswith("4 constraints between joints or links are written in the file")
 
 
-def test_motions_against_finite_differences(tmp_path):
+@pytest.mark.parametrize("lengths", [False, True])
+def test_motions_against_finite_differences(tmp_path, lengths):
     kinematics, values = drawn(tree_of(tmp_path), np.random.default_rng(1))
     surfaces = few_triangles(TreeSurfaces(kinematics.tree), VERY_FEW)
     body = LengthenedBody(kinematics, surfaces, joint_offsets(kinematics.tree))
-    theta = np.append(values, np.linspace(0.1, 0.2, len(body.links)))
-    p_N, step = np.array([0.1, 0.2, 0.3, 1.0]), 1e-6
-    for lengthened in (False, True):
-        at = theta if lengthened else values
-        placed = body.place(at)
-        dense = placed.dense(len(at)).reshape(len(placed.X_WN), len(at), 3, 4)
-        for k in range(len(at)):
-            ends = [at + sign * step * np.eye(len(at))[k] for sign in (1.0, -1.0)]
-            above, below = (body.place(end).X_WN @ p_N for end in ends)
-            found = np.einsum("nij,nj->ni", dense[:, k], placed.X_WN @ p_N)
-            np.testing.assert_allclose(found, (above - below)[:, :3] / (2 * step), atol=1e-7)
+    logs = np.linspace(0.1, 0.2, len(body.links)) if lengths else []
+    assert_motions_are_derivatives(body, np.append(values, logs))
 
 
 def test_limits_are_shared_and_what_is_held_holds_the_others(tmp_path):

@@ -1,12 +1,17 @@
 import struct
+import subprocess
+import sys
 import zlib
 
 import cv2
 import numpy as np
 import pytest
+from pydrake.geometry import RenderLabel
+from pydrake.systems.sensors import ImageLabel16I
 
 from drake_pose.camera.picture_files import read_picture
 from drake_pose.errors import MaskError
+from drake_pose.silhouette.pictures.label_images import label_image_to_mask, mask_to_label_image
 from drake_pose.silhouette.pictures.masks import read_mask, signed_distances, write_mask
 from drake_pose.silhouette.segmentation.mask_pictures import read_mask_picture
 
@@ -122,3 +127,29 @@ def test_signed_distances_are_those_to_the_nearest_pixel_of_the_other_kind():
         nearest = np.linalg.norm(others - [row, column], axis=1).min() - 0.5
         expected = -nearest if mask[row, column] else nearest
         assert found[row, column] == pytest.approx(expected, abs=1e-4)
+
+
+def test_label_images_are_masks():
+    image = mask_to_label_image(MASK)
+    assert isinstance(image, ImageLabel16I)
+    assert (image.width(), image.height()) == (30, 20)
+    np.testing.assert_array_equal(label_image_to_mask(image), MASK)
+    np.testing.assert_array_equal(label_image_to_mask(image.data), MASK)
+
+
+def test_labels_can_be_chosen():
+    labels = np.full((4, 5), int(RenderLabel.kEmpty), dtype=np.int16)
+    labels[1, 2], labels[3, 3] = 7, 9
+    assert np.argwhere(label_image_to_mask(labels)).tolist() == [[1, 2], [3, 3]]
+    assert np.argwhere(label_image_to_mask(labels, [9])).tolist() == [[3, 3]]
+
+
+def test_importing_the_room_loads_neither_numba_nor_drake():
+    code = (
+        "import sys, drake_pose.silhouette, drake_pose.camera;"
+        "print([m for m in ('numba', 'pydrake', 'cv2') if m in sys.modules])"
+    )
+    result = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    )
+    assert result.stdout.strip() == "[]"

@@ -115,6 +115,7 @@ def test_only_the_bodies_that_are_asked_for_are_the_model(tmp_path):
     assert searched
     assert all(name.startswith("b_") for name in searched)
     assert len(ArticulatedModel.from_plant(plant, scene_graph).link_meshes) == 2 * len(made.labels)
+    assert not made.changes_shape
     with pytest.raises(ModelError, match="only the shape of a URDF"):
         made.without(["b_::thing::leg"])
 

@@ -8,6 +8,8 @@ from drake_pose.fit.covariance import (
     Distances,
     ErrorEffects,
     ErrorSizes,
+    _apriori,
+    distances_covariance,
     doubted_covariance,
     estimate_sizes,
     values_covariance,
@@ -137,3 +139,14 @@ def test_costs_by_pieces_add_up(kinematics):
     # Only where a silhouette or the body has an edge.
     assert 5 < np.count_nonzero(pieces[0]) < 80
     assert (pieces >= 0.0).all()
+
+
+def test_what_is_doubted_is_taken_out_as_likely_as_one_normal_distribution_says():
+    sizes = ErrorSizes(1.0, 0.5, 0.2, 0.1, 0.3, (2.0,))
+    seen, _ = drawn_distances(np.random.default_rng(5), sizes, 40)
+    _, without = doubted_covariance(seen, sizes, ANGLES)
+    (A,) = seen.doubts
+    values = seen.X @ np.linalg.inv(_apriori(ANGLES)) @ seen.X.T
+    whole = distances_covariance(seen, sizes) + 4.0 * A @ A.T + values
+    likeliest = 4.0 * A.T @ np.linalg.solve(whole, seen.y)
+    np.testing.assert_allclose(without.y, seen.y - A @ likeliest, atol=1e-6)

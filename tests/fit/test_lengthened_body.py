@@ -8,36 +8,37 @@ from drake_pose.body.tree.root import RootRotation
 from drake_pose.body.tree.tree_kinematics import TreeKinematics, joint_offsets
 from drake_pose.fit.lengthened_body import LengthenedBody
 from drake_pose.silhouette.areas.outline import outline_from_mesh
+from tests.body.models import joint, link, urdf
 from tests.fit.motions import assert_motions_are_derivatives
+
 
 # A wrist of two joints, no link that is seen between them; a mount that is welded on before the
 # last joint; and a second joint on a link.
-URDF = """<robot name="odd">
-  <link name="base"><visual><geometry><box size="0.2 0.3 0.1"/></geometry></visual></link>
-  <link name="upper"><visual><geometry><box size="0.1 0.1 0.4"/></geometry></visual></link>
-  <link name="gimbal"/>
-  <link name="wrist"><visual><geometry><box size="0.05 0.1 0.2"/></geometry></visual></link>
-  <link name="mount"/>
-  <link name="finger"><visual><geometry><box size="0.02 0.02 0.1"/></geometry></visual></link>
-  <link name="flag"><visual><geometry><box size="0.02 0.2 0.1"/></geometry></visual></link>
-  <joint name="turn" type="revolute"><parent link="base"/><child link="upper"/>
-    <origin xyz="0.1 0 0" rpy="0.1 0.2 0.3"/><axis xyz="0 0 1"/>
-    <limit lower="-2" upper="2" effort="1" velocity="1"/></joint>
-  <joint name="pitch" type="revolute"><parent link="upper"/><child link="gimbal"/>
-    <origin xyz="0.02 0.1 0.3" rpy="0 0.4 0"/><axis xyz="0 1 0"/>
-    <limit lower="-2" upper="2" effort="1" velocity="1"/></joint>
-  <joint name="yaw" type="revolute"><parent link="gimbal"/><child link="wrist"/>
-    <origin xyz="0.12 0 0"/><axis xyz="1 0 1"/>
-    <limit lower="-2" upper="2" effort="1" velocity="1"/></joint>
-  <joint name="weld" type="fixed"><parent link="wrist"/><child link="mount"/>
-    <origin xyz="0 0 0.1" rpy="0 0 1"/></joint>
-  <joint name="slide" type="prismatic"><parent link="mount"/><child link="finger"/>
-    <origin xyz="0 0.05 0"/><axis xyz="0 1 1"/>
-    <limit lower="-0.1" upper="0.1" effort="1" velocity="1"/></joint>
-  <joint name="wave" type="revolute"><parent link="upper"/><child link="flag"/>
-    <origin xyz="0.2 0 0.1"/><axis xyz="1 0 0"/>
-    <limit lower="-2" upper="2" effort="1" velocity="1"/></joint>
-</robot>"""
+def box(*size):
+    return f'<visual><geometry><box size="{" ".join(map(str, size))}"/></geometry></visual>'
+
+
+LIMITS = 'lower="-2" upper="2"'
+URDF = urdf(
+    link("base", box(0.2, 0.3, 0.1)),
+    link("upper", box(0.1, 0.1, 0.4)),
+    link("gimbal", ""),
+    link("wrist", box(0.05, 0.1, 0.2)),
+    link("mount", ""),
+    link("finger", box(0.02, 0.02, 0.1)),
+    link("flag", box(0.02, 0.2, 0.1)),
+    joint("turn", "revolute", "base", "upper", limits=LIMITS,
+          origin='xyz="0.1 0 0" rpy="0.1 0.2 0.3"'),
+    joint("pitch", "revolute", "upper", "gimbal", limits=LIMITS, axis="0 1 0",
+          origin='xyz="0.02 0.1 0.3" rpy="0 0.4 0"'),
+    joint("yaw", "revolute", "gimbal", "wrist", limits=LIMITS, axis="1 0 1",
+          origin='xyz="0.12 0 0"'),
+    joint("weld", "fixed", "wrist", "mount", limits=None, origin='xyz="0 0 0.1" rpy="0 0 1"'),
+    joint("slide", "prismatic", "mount", "finger", limits='lower="-0.1" upper="0.1"',
+          axis="0 1 1", origin='xyz="0 0.05 0"'),
+    joint("wave", "revolute", "upper", "flag", limits=LIMITS, axis="1 0 0",
+          origin='xyz="0.2 0 0.1"'),
+)  # fmt: skip
 # For each link with a length: its joints' origins, and the same 1.25 times as far.
 LONGER = {
     "base": {"0.1 0 0": "0.125 0 0"},

@@ -17,6 +17,7 @@ from drake_pose.camera.models import Camera, PinholeCamera
 from drake_pose.search.estimates import PoseSet, View
 from drake_pose.silhouette.areas.outline import Outline, outline_from_mesh
 from drake_pose.silhouette.areas.scoring import draw_mask
+from tests.body.models import joint, link
 
 # Each: name, parent's length, the joint's axis, its limits [deg], the box's sides and length [m].
 LINKS = (
@@ -30,19 +31,17 @@ LINKS = (
 
 def arm_urdf(links: Sequence[tuple] = LINKS) -> str:
     """The arm on a plate in the world."""
-    parts = ['<robot name="arm"><link name="world"/>']
-    parent = "world"
+    parts, parent = [], "world"
     for name, z, axis, (low, high), (width, depth), length in links:
-        parts.append(
-            f'<link name="{name}"><visual><origin xyz="0.01 0 {length / 2}"/><geometry>'
-            f'<box size="{width} {depth} {length}"/></geometry></visual></link>'
-            f'<joint name="{name}_turn" type="revolute"><parent link="{parent}"/>'
-            f'<child link="{name}"/><origin xyz="0 0 {z}"/><axis xyz="{axis}"/>'
-            f'<limit lower="{np.radians(low)}" upper="{np.radians(high)}" effort="1" '
-            'velocity="1"/></joint>'
+        visual = (
+            f'<visual><origin xyz="0.01 0 {length / 2}"/><geometry>'
+            f'<box size="{width} {depth} {length}"/></geometry></visual>'
         )
+        limits = f'lower="{np.radians(low)}" upper="{np.radians(high)}"'
+        at = {"origin": f'xyz="0 0 {z}"', "axis": axis, "limits": limits}
+        parts += [link(name, visual), joint(f"{name}_turn", "revolute", parent, name, **at)]
         parent = name
-    return "".join(parts) + "</robot>"
+    return f'<robot name="arm"><link name="world"/>{"".join(parts)}</robot>'
 
 
 def arm_tree(folder: Path) -> PoseTree:

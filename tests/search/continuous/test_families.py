@@ -11,6 +11,7 @@ from drake_pose.search.continuous.families import RobustFamilies
 from drake_pose.search.continuous.views_fit import FittedPose, ViewsFit, distinct
 from drake_pose.search.starts.self_motions import flips
 from drake_pose.silhouette.areas.bending import TreeSurfaces
+from tests.body.models import joint, link, urdf, write
 from tests.search.arms import arm_cameras, arm_tree, damaged_views, draw_view, is_held
 
 TRUTH = np.array([0.6, 0.7, -0.7, 0.9, 0.3])
@@ -37,9 +38,9 @@ def test_intervals_hold_the_truth_and_widen_with_the_damage(kinematics):
         assert is_held(answer, TRUTH)
         family = answer.families[0]
         assert family.J == family.q[0]
-        widths.append([joint.high - joint.low for joint in family.joints])
-        for joint, value in zip(family.joints, family.q, strict=True):
-            assert joint.holds(value)
+        widths.append([one.high - one.low for one in family.joints])
+        for one, value in zip(family.joints, family.q, strict=True):
+            assert one.holds(value)
     assert np.all(np.array(widths[0]) < np.radians(10.0))
     # A pixel of error in every camera is assumed where nothing is damaged, too.
     assert np.median(np.array(widths[1]) / widths[0]) > 1.03
@@ -62,24 +63,19 @@ def test_flips_are_families_of_their_own(kinematics, monkeypatch):
 
 def test_a_round_hand_may_turn_as_it_likes(tmp_path):
     """A cylinder's turn about its axis does not show: free, and over the whole range."""
-    path = tmp_path / "mast.urdf"
-    path.write_text(
-        '<robot name="mast"><link name="world"/>'
-        '<link name="boom"><visual><origin xyz="0 0 0.3"/><geometry><box size="0.1 0.2 0.6"/>'
-        "</geometry></visual></link>"
-        '<link name="knob"><visual><origin xyz="0 0 0.15"/><geometry>'
-        '<cylinder radius="0.05" length="0.3"/></geometry></visual></link>'
-        '<joint name="tilt" type="revolute"><parent link="world"/><child link="boom"/>'
-        '<axis xyz="1 0 0"/><limit lower="-1.5" upper="1.5" effort="1" velocity="1"/></joint>'
-        '<joint name="spin" type="revolute"><parent link="boom"/><child link="knob"/>'
-        '<origin xyz="0 0 0.6"/><axis xyz="0 0 1"/>'
-        '<limit lower="-2" upper="2.5" effort="1" velocity="1"/></joint></robot>'
+    box, cylinder = '<box size="0.1 0.2 0.6"/>', '<cylinder radius="0.05" length="0.3"/>'
+    shape = '<visual><origin xyz="0 0 {}"/><geometry>{}</geometry></visual>'
+    tilts, spins = 'lower="-1.5" upper="1.5"', 'lower="-2" upper="2.5"'
+    text = urdf(
+        link("boom", shape.format(0.3, box)),
+        link("knob", shape.format(0.15, cylinder)),
+        joint("tilt", "revolute", "world", "boom", origin="", axis="1 0 0", limits=tilts),
+        joint("spin", "revolute", "boom", "knob", origin='xyz="0 0 0.6"', limits=spins),
     )
-    tree = load_model(path).pose_tree()
+    tree = load_model(write(tmp_path, text)).pose_tree()
     values = np.array([0.4, 0.2])
     views = [draw_view(tree, values, camera) for camera in arm_cameras()]
-    answer = find(TreeKinematics(tree), views, values)
-    tilt, spin = answer.joints
+    tilt, spin = find(TreeKinematics(tree), views, values).joints
     assert tilt.determined
     assert tilt.holds(0.4)
     assert not spin.determined
@@ -94,7 +90,7 @@ def test_time_that_is_up_leaves_the_intervals_of_the_curvature(kinematics):
     answer = RobustFamilies(fit, lambda: False).find([pose], lambda _: 0.0)
     assert answer.family_count == 1
     assert fit.evaluations - before < 5
-    assert all(joint.low < joint.high for joint in answer.joints)
+    assert all(one.low < one.high for one in answer.joints)
 
 
 def test_refinement_keeps_limits_and_what_is_held(kinematics):

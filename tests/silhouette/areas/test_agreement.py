@@ -4,6 +4,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
+import trimesh
 from scipy.spatial.transform import Rotation
 
 from drake_pose.body.model import load_model
@@ -11,6 +12,7 @@ from drake_pose.camera.models import ParallelCamera, PinholeCamera
 from drake_pose.silhouette.areas.outline import outline_from_mesh
 from drake_pose.silhouette.areas.scoring import draw_mask
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
+from tests.body.models import joint, link, urdf, write
 from tests.silhouette.agreement import LARGEST_SHARE, measure_agreement
 
 SHAPES = {
@@ -22,53 +24,33 @@ SHAPES = {
     "open mesh": '<mesh filename="open.obj" scale="0.2 0.25 0.3"/>',
 }
 
-# A cube without its top, one more wall inside it, and a fin: neither closed nor a manifold.
-OPEN_MESH = """
-v -1 -1 -1
-v 1 -1 -1
-v 1 1 -1
-v -1 1 -1
-v -1 -1 1
-v 1 -1 1
-v 1 1 1
-v -1 1 1
-v 0 0 2
-vn 0 0 1
-f 1//1 3//1 2//1
-f 1//1 4//1 3//1
-f 1//1 2//1 6//1
-f 1//1 6//1 5//1
-f 2//1 3//1 7//1
-f 2//1 7//1 6//1
-f 3//1 4//1 8//1
-f 3//1 8//1 7//1
-f 1//1 3//1 7//1
-f 5//1 6//1 9//1
-"""
 
-LINK = """
-<link name="{name}"><inertial><mass value="1"/>
-  <inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial>
-  <visual><origin xyz="0 0 0.25" rpy="0.3 0 0.2"/><geometry>{shape}</geometry></visual></link>
-<joint name="{name}_joint" type="revolute"><parent link="{parent}"/><child link="{name}"/>
-  <origin xyz="0 0 0.4"/><axis xyz="{axis}"/>
-  <limit lower="-2" upper="2" effort="1" velocity="1"/></joint>
-"""
+# A cube without its top, one more wall inside it, and a fin: neither closed nor a manifold.
+def write_open_mesh(path):
+    """A cube without its top, one more wall inside it, and a fin: neither closed nor a manifold."""
+    z, y, x = np.indices((2, 2, 2)).reshape(3, 8) * 2 - 1
+    points = np.vstack([np.column_stack([x, y, z]), [0, 0, 2]])
+    quads = [(0, 1, 3, 2), (0, 4, 5, 1), (1, 5, 7, 3), (3, 7, 6, 2)]
+    faces = [[q[0], q[k], q[k + 1]] for q in quads for k in (1, 2)] + [[0, 3, 7], [4, 5, 8]]
+    trimesh.Trimesh(points, faces, process=False).export(path, include_normals=True)
 
 
 def model_of(folder, shapes):
     """A chain with one link for each shape, on the world."""
-    (folder / "open.obj").write_text(OPEN_MESH)
-    text, parent = '<link name="base"/>', "base"
-    text += '<joint name="weld" type="fixed"><parent link="world"/><child link="base"/></joint>'
+    write_open_mesh(folder / "open.obj")
+    parts, parent = [], "world"
     for i, shape in enumerate(shapes):
         name, axis = f"link_{i}", ("1 0 0", "0 1 0", "0 0.6 0.8")[i % 3]
-        text += LINK.format(name=name, parent=parent, shape=SHAPES[shape], axis=axis)
+        visual = (
+            '<visual><origin xyz="0 0 0.25" rpy="0.3 0 0.2"/>'
+            f"<geometry>{SHAPES[shape]}</geometry></visual>"
+        )
+        parts.append(link(name, visual))
+        at = {"origin": 'xyz="0 0 0.4"', "limits": 'lower="-2" upper="2"'}
+        parts.append(joint(f"{name}_joint", "revolute", parent, name, axis=axis, **at))
         parent = name
-    path = folder / "chain.urdf"
-    drake = "http://drake.mit.edu"
-    path.write_text(f'<robot name="chain" xmlns:drake="{drake}"><link name="world"/>{text}</robot>')
-    return load_model(path, check=False)
+    text = urdf(*parts).replace("<robot", '<robot xmlns:drake="http://drake.mit.edu"')
+    return load_model(write(folder, text), check=False)
 
 
 def looking_at_origin(rng, distance):

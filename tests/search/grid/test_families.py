@@ -95,18 +95,14 @@ def test_the_set_is_that_of_the_definition(tmp_path):
 def test_families_are_the_connected_groups_of_clusters(flipping_body):
     problem = flipping_body.make(np.random.default_rng(22), views=1, noise=0.01, on_grid=False)
     answer = found_families(problem, 120.0)
-    J = problem.best[1] + 120.0
-    gap = 0.4 * 1.01
-    groups = set()
-    for row in problem.within(J):
-        group = []
-        for node, t in enumerate(row):
-            seen = seen_values(problem, J, node)
-            breaks = seen[1:][np.diff(seen) > gap]
-            value = flipping_body.body.sampled.values[node][t, 0]
-            group.append(int((value >= breaks - 1e-9).sum()))
-        groups.add(tuple(group))
-    assert answer.family_count == len(groups)
+    J, groups = problem.best[1] + 120.0, []
+    rows = np.array([*problem.within(J)])
+    for node, grid in enumerate(flipping_body.body.sampled.values):
+        seen = seen_values(problem, J, node)
+        # A gap is more than a step of the grid.
+        breaks = seen[1:][np.diff(seen) > 0.4 * 1.01]
+        groups.append((grid[rows[:, node]] >= breaks - 1e-9).sum(axis=1))
+    assert answer.family_count == len(np.unique(groups, axis=1).T)
     assert [f.J for f in answer.families] == sorted(f.J for f in answer.families)
 
 

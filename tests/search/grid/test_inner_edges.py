@@ -1,7 +1,6 @@
 """Edges inside the silhouette: of hand-made pictures, and as a judge among poses."""
 
 import itertools
-from collections.abc import Iterator
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -61,18 +60,15 @@ class Product:
     """A graph of all poses of some nodes' samples."""
 
     def __init__(self, allowed):
-        self._allowed = [np.flatnonzero(one) for one in allowed]
-        self.size = int(np.prod([len(one) for one in self._allowed]))
+        self.allowed = allowed
+        self.size = int(np.prod([one.sum() for one in allowed]))
 
     def restricted(self, allowed):
-        every = [np.ones(COUNT, bool) if one is None else one for one in allowed]
-        return Product([np.isin(np.arange(COUNT), own) & one for own, one in self._pairs(every)])
-
-    def _pairs(self, every):
-        return zip(self._allowed, every, strict=True)
+        both = zip(self.allowed, allowed, strict=True)
+        return Product([own if one is None else own & one for own, one in both])
 
     def members(self):
-        return np.array(list(itertools.product(*self._allowed)))
+        return np.array([*itertools.product(*map(np.flatnonzero, self.allowed))])
 
 
 COUNT = 5
@@ -170,17 +166,8 @@ def test_noise_on_the_edges_leaves_the_true_pose(arm_before_trunk):
     """Edges damaged at the rates that are stated, in squares that lie anywhere: 100 draws."""
     answer, samples, renderer = arm_before_trunk
     seen = show_segments(answer, samples, renderer)
-    exact = edges_of_labels(seen, seen >= 0)
-    generator = np.random.default_rng(5)
-    drawn = {
-        tuple(member.tolist()): show_segments(answer, member, renderer)
-        for member in answer.graph.members()
-    }
-    pictures: Iterator[np.ndarray] = iter(())
-
-    def render(q, X_WB):
-        return next(pictures)
-
+    exact, generator = edges_of_labels(seen, seen >= 0), np.random.default_rng(5)
+    drawn = [show_segments(answer, member, renderer) for member in answer.graph.members()]
     left = []
     for _ in range(100):
         lost = np.kron(generator.random((17, 17)) < 0.2, np.ones((5, 5), dtype=np.bool_))
@@ -191,8 +178,8 @@ def test_noise_on_the_edges_leaves_the_true_pose(arm_before_trunk):
         damaged[tuple(places.T)] = True
         row, column = generator.choice(np.argwhere(exact.mask))
         damaged[row, column : column + 5] = True
-        pictures = iter(drawn.values())
-        choice = choose_by_edges(answer, [replace(exact, edges=damaged & exact.mask)], [render])
+        edges, pictures = replace(exact, edges=damaged & exact.mask), iter(drawn)
+        choice = choose_by_edges(answer, [edges], [lambda *_, them=pictures: next(them)])
         assert not choice.rules_out(samples)
         left.append(choice.left)
     assert np.median(left) <= 5

@@ -131,8 +131,6 @@ def test_skin_is_drawn_as_it_bends_inside_the_limits(tmp_path):
         )
 
 
-
-
 @pytest.fixture
 def model(tmp_path):
     return crane(tmp_path)

@@ -164,8 +164,11 @@ def test_what_an_explanation_says_of_a_frame_is_its_pose_and_its_intervals(fitte
         assert family.J == 7.0
         values = np.concatenate(tree.values_from_positions(q, X_WB))
         np.testing.assert_allclose(np.concatenate(family.node_values), values, atol=1e-9)
-        for joint, value in zip(told.joints, values, strict=True):
+        kinematics = explanations[0].body.kinematics
+        ranges = np.minimum(kinematics.upper - kinematics.lower, 2.0 * np.pi)
+        for joint, value, whole in zip(told.joints, values, ranges, strict=True):
             assert joint.low <= value <= joint.high
+            assert joint.determined == (joint.high - joint.low < 0.5 * whole)
 
 
 @pytest.fixture

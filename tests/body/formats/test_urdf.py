@@ -52,25 +52,24 @@ def test_materials_of_the_same_name_keep_their_own_colours(tmp_path):
     def material(rgba):
         return f'<material name="m"><color rgba="{rgba}"/></material>'
 
-    ball = '<sphere radius="0.1"/>'
+    looks = {
+        "a": material("0 1 0 1"),
+        "b": '<material name="m"/>',
+        "c": '<material name="nowhere"/>',
+        "d": material("255 0 0 1"),
+        "e": '<material name="t"><texture filename="gone.png"/></material>',
+    }
     text = urdf(
-        material("1 0 0 1"),
-        material("1 0 0 1"),
-        link("a", visual(ball, material("0 1 0 1"))),
-        link("b", visual(ball, '<material name="m"/>')),
-        link("c", visual(ball, '<material name="nowhere"/>')),
-        link("d", visual(ball, material("255 0 0 1"))),
-        link("e", visual(ball, '<material name="t"><texture filename="gone.png"/></material>')),
+        *[material("1 0 0 1")] * 2,
+        *(link(name, visual('<sphere radius="0.1"/>', one)) for name, one in looks.items()),
         *(joint(f"to_{one}", "fixed", "a", one, limits=None) for one in "bcde"),
     )
     model = read(tmp_path, text)
     inspector = model.scene_graph.model_inspector()
-    colours = {}
-    for name in "abd":
+    for name, expected in {"a": (0, 1, 0, 1), "b": (1, 0, 0, 1), "d": (1, 0, 0, 1)}.items():
         geometry = model.plant.GetVisualGeometriesForBody(model.plant.GetBodyByName(name))[0]
         rgba = inspector.GetPerceptionProperties(geometry).GetProperty("phong", "diffuse")
-        colours[name] = (rgba.r(), rgba.g(), rgba.b(), rgba.a())
-    assert colours == {"a": (0, 1, 0, 1), "b": (1, 0, 0, 1), "d": (1, 0, 0, 1)}
+        assert (rgba.r(), rgba.g(), rgba.b(), rgba.a()) == expected
 
 
 @pytest.mark.parametrize(
@@ -230,25 +229,29 @@ def package_urdf(name="package://my_arm/meshes/a.stl"):
     return arm(a=visual(f'<mesh filename="{name}"/>'))
 
 
-def make_package(folder):
+def make_package(folder, name=None):
+    """A folder with a mesh; a name of its own is written in its package.xml."""
     (folder / "meshes").mkdir(parents=True)
     trimesh.creation.box().export(folder / "meshes" / "a.stl")
+    if name:
+        (folder / "package.xml").write_text(f"<package><name> {name} </name></package>")
     return folder
 
 
-def test_packages_are_found_on_the_way_up(tmp_path):
-    root = make_package(tmp_path / "one" / "my_arm")
-    (root / "urdf").mkdir()
-    assert read(root / "urdf", package_urdf()).link_meshes["a"]
-    named = make_package(tmp_path / "two" / "other_folder")
-    (named / "package.xml").write_text("<package><name> my_arm </name></package>")
-    (named / "urdf").mkdir()
-    assert read(named / "urdf", package_urdf()).link_meshes["a"]
-    make_package(tmp_path / "three" / "my_arm")
-    (tmp_path / "three" / "my_robot" / "urdf").mkdir(parents=True)
-    beside = tmp_path / "three" / "my_robot" / "urdf"
-    for name in ("package://my_arm/meshes/a.stl", "package:///my_arm/meshes/a.stl"):
-        assert read(beside, package_urdf(name)).link_meshes["a"]
+@pytest.mark.parametrize(
+    ("package", "name", "model", "slashes"),
+    [
+        ("my_arm", None, "my_arm/urdf", "//"),
+        ("other_folder", "my_arm", "other_folder/urdf", "//"),
+        ("my_arm", None, "my_robot/urdf", "//"),
+        ("my_arm", None, "my_robot/urdf", "///"),
+    ],
+)
+def test_packages_are_found_on_the_way_up(tmp_path, package, name, model, slashes):
+    make_package(tmp_path / package, name)
+    (tmp_path / model).mkdir(parents=True)
+    text = package_urdf(f"package:{slashes}my_arm/meshes/a.stl")
+    assert read(tmp_path / model, text).link_meshes["a"]
 
 
 @pytest.mark.parametrize("variable", ["ROS_PACKAGE_PATH", "AMENT_PREFIX_PATH", "SDF_PATH"])
@@ -264,9 +267,8 @@ def test_packages_are_found_in_search_paths(tmp_path, monkeypatch, variable):
     if variable == "ROS_PACKAGE_PATH":
         monkeypatch.setenv(variable, str(place.parents[1]))
         assert read(tmp_path / "models", package_urdf("model://my_arm/meshes/a.stl"))
-        place.rename(place.with_name("renamed"))
-        (place.with_name("renamed") / "package.xml").write_text("<p><name>my_arm</name></p>")
-        monkeypatch.setenv(variable, str(place.with_name("renamed")))
+        named = make_package(tmp_path / "renamed", "my_arm")
+        monkeypatch.setenv(variable, str(named))
         assert read(tmp_path / "models", package_urdf()).link_meshes["a"]
 
 

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import trimesh
 from scipy.ndimage import distance_transform_edt
 from scipy.spatial.transform import Rotation
 
@@ -102,15 +103,8 @@ def test_poses_with_too_much_outside_are_left_out():
 
 def thick_surface():
     """An ellipsoid."""
-    u, v = np.meshgrid(np.linspace(0, np.pi, 13), np.linspace(0, 2 * np.pi, 21)[:-1])
-    ball = np.stack([np.sin(u) * np.cos(v), np.sin(u) * np.sin(v), np.cos(u)], axis=-1)
-    index = np.arange(u.size).reshape(u.shape)
-    a, b = index[:, :-1], index[:, 1:]
-    c, d = np.roll(a, -1, axis=0), np.roll(b, -1, axis=0)
-    triangles = np.concatenate(
-        [np.stack([a, b, c], -1).reshape(-1, 3), np.stack([c, b, d], -1).reshape(-1, 3)]
-    )
-    return outline_from_mesh(TriangleMesh(ball.reshape(-1, 3) * [0.05, 0.08, 0.2], triangles))
+    ball = trimesh.creation.icosphere(3)
+    return outline_from_mesh(TriangleMesh(ball.vertices * [0.05, 0.08, 0.2], ball.faces))
 
 
 def test_balls_lie_inside_and_reach_to_the_ends():

@@ -1,5 +1,6 @@
 import csv
 import io
+import re
 
 import numpy as np
 import pytest
@@ -161,6 +162,8 @@ def test_the_file_has_every_link_where_the_plant_has_it(name):
     for part in links:
         error = places[part] - link_places(model, part, q)
         assert np.linalg.norm(error, axis=1).max() < 0.01, part
+    levels = [len(tabs) for tabs in re.findall(r"^(\t*)(?:ROOT|JOINT) ", text, re.MULTILINE)]
+    assert levels[0] == 0 < min(levels[1:])
     root, *others = [one for one in motion.joints if one.channels]
     assert root.channels == [
         "Xposition", "Yposition", "Zposition", "Zrotation", "Xrotation", "Yrotation"

@@ -6,7 +6,6 @@ import math
 import numpy as np
 import pytest
 
-from drake_pose.body.model import load_model
 from drake_pose.search.continuous.multi_start import MultiStartSearch
 from drake_pose.search.continuous.search import ContinuousSearch
 from drake_pose.search.estimates import View
@@ -18,34 +17,12 @@ from drake_pose.search.kameda import PaperSearch
 from drake_pose.search.scoring import Scoring
 from drake_pose.search.settings import BeamSearchSettings, PaperSearchSettings
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
-from tests.body.models import joint, link, urdf, write
 
 from .arms import arm_cameras
+from .gripper import gripper
 
 GRID = {"interval": math.radians(15.0), "length_interval": 0.02}
 ON_GRID = np.array([math.radians(15.0), math.radians(-30.0), 0.04, 0.04])
-
-
-def box(middle, size):
-    return f'<visual><origin xyz="{middle}"/><geometry><box size="{size}"/></geometry></visual>'
-
-
-def gripper(folder, follows):
-    """A gripper on an arm; its right finger follows the left one by a <mimic>, or both are free."""
-    mast, hand = ({"axis": "1 0 0", "limits": f'lower="-{r}" upper="{r}"'} for r in (1.2, 1.5))
-    finger = {"limits": 'lower="0" upper="0.08"', "origin": 'xyz="0 0 .06"'}
-    mimic = '<mimic joint="left_joint"/>' if follows else ""
-    text = urdf(
-        link("mast", box("0 0 .15", ".05 .05 .3")),
-        link("hand", box("0 0 .03", ".06 .24 .06")),
-        link("left", box("0 .01 .05", ".03 .02 .1")),
-        link("right", box("0 -.01 .05", ".03 .02 .1")),
-        joint("mast_joint", "revolute", "world", "mast", origin="", **mast),
-        joint("hand_joint", "revolute", "mast", "hand", origin='xyz="0 0 .3"', **hand),
-        joint("left_joint", "prismatic", "hand", "left", axis="0 1 0", **finger),
-        joint("right_joint", "prismatic", "hand", "right", axis="0 -1 0", more=mimic, **finger),
-    )
-    return load_model(write(folder, text, f"gripper_{follows}.urdf"), check=False)
 
 
 def gripper_views(model, q):
@@ -56,7 +33,7 @@ def gripper_views(model, q):
 @pytest.fixture(scope="module")
 def models(tmp_path_factory):
     folder = tmp_path_factory.mktemp("gripper")
-    return {follows: gripper(folder, follows) for follows in (True, False)}
+    return {follows: gripper(folder, follows=follows) for follows in (True, False)}
 
 
 @pytest.mark.parametrize("search", [MultiStartSearch, ContinuousSearch])

@@ -50,18 +50,21 @@ def room(generator):
     return patches.repeat(20, axis=0).repeat(20, axis=1)
 
 
+def painted(mask, background, generator):
+    """An orange body before a background, with noise."""
+    noise = generator.normal(0.0, 6.0, (*mask.shape, 3))
+    return np.clip(np.where(mask[..., None], ORANGE, background) + noise, 0, 255).astype(np.uint8)
+
+
 class Painter:
-    """Paints masks before a room, with noise."""
+    """Paints masks before a room of its own."""
 
     def __init__(self, seed):
         self.generator = np.random.default_rng(seed)
         self.room = room(self.generator)
 
     def __call__(self, mask):
-        noise = self.generator.normal(0.0, 6.0, (*mask.shape, 3))
-        return np.clip(np.where(mask[..., None], ORANGE, self.room) + noise, 0, 255).astype(
-            np.uint8
-        )
+        return painted(mask, self.room, self.generator)
 
 
 def numbered(colour):

@@ -1,0 +1,28 @@
+"""A gripper on an arm, whose fingers follow each other or are free."""
+
+from pathlib import Path
+
+from drake_pose.body.model import ArticulatedModel, load_model
+from tests.body.models import joint, link, urdf, write
+
+
+def _box(middle: str, size: str) -> str:
+    return f'<visual><origin xyz="{middle}"/><geometry><box size="{size}"/></geometry></visual>'
+
+
+def gripper(folder: Path, *, follows: bool) -> ArticulatedModel:
+    """A gripper on an arm; its right finger follows the left one by a <mimic>, or both are free."""
+    mast, hand = ({"axis": "1 0 0", "limits": f'lower="-{r}" upper="{r}"'} for r in (1.2, 1.5))
+    finger = {"limits": 'lower="0" upper="0.08"', "origin": 'xyz="0 0 .06"'}
+    mimic = '<mimic joint="left_joint"/>' if follows else ""
+    text = urdf(
+        link("mast", _box("0 0 .15", ".05 .05 .3")),
+        link("hand", _box("0 0 .03", ".06 .24 .06")),
+        link("left", _box("0 .01 .05", ".03 .02 .1")),
+        link("right", _box("0 -.01 .05", ".03 .02 .1")),
+        joint("mast_joint", "revolute", "world", "mast", origin="", **mast),
+        joint("hand_joint", "revolute", "mast", "hand", origin='xyz="0 0 .3"', **hand),
+        joint("left_joint", "prismatic", "hand", "left", axis="0 1 0", **finger),
+        joint("right_joint", "prismatic", "hand", "right", axis="0 -1 0", more=mimic, **finger),
+    )
+    return load_model(write(folder, text, f"gripper_{follows}.urdf"), check=False)

@@ -39,8 +39,8 @@ class Page:
         text = re.sub(r"<(meta|img|br|link|hr)\b([^>]*?)/?>", r"<\1\2/>", text)
         self.root = ElementTree.fromstring(text.replace("&middot;", "."))
         every = [*self.root.iter()]
-        self.tags = {one.tag for one in every}
-        self.classes = {name for one in every for name in one.get("class", "").split()}
+        self.tags = [one.tag for one in every]
+        self.classes = [name for one in every for name in one.get("class", "").split()]
         self.by_id = {one.get("id"): "".join(one.itertext()) for one in every if one.get("id")}
         self.tables = [
             [["".join(cell.itertext()) for cell in row] for row in table.iter("tr")]
@@ -107,7 +107,7 @@ def test_page_needs_nothing_but_itself_and_its_links_lead_somewhere(result):
     text = (result / "report.html").read_text()
     page = Page(text)
     assert "http" not in re.sub(r"data:image/jpeg;base64,[\w+/=]*", "", text)
-    assert not {"script", "link", "iframe"} & page.tags
+    assert not {"script", "link", "iframe"} & {*page.tags}
     drawn = cv2.imread(str(next(result.glob("overlay/front/*.png"))))
     assert "img" in page.tags
     for image in page.root.iter("img"):
@@ -166,7 +166,7 @@ def test_a_thousand_frames_stay_small_and_names_are_shown_as_they_are(report):
     page = Page(text)
     assert page.by_id["found"] == "980 of 1000"
     assert page.table("joint")[1][:2] == ["left_thigh_stretch", "0.0200"]
-    assert not {"b", "script"} & page.tags
+    assert not {"b", "script"} & {*page.tags}
     _, left, right = page.table("camera")
     assert [left[0], right[0]] == ["<b>left</b>", "right & low"]
     assert left[6] == "see the warnings"
@@ -206,7 +206,7 @@ def test_bands_are_explained_where_there_are_some(report):
     bare = {frame: replace(one, joints={}) for frame, one in whole.records.items()}
     page = make_report(Path("nowhere"), model, scene, replace(whole, records=bare))
     assert " band" not in page
-    assert not {"known", "open"} & Page(page).classes
+    assert not {"known", "open"} & {*Page(page).classes}
 
 
 def test_a_frame_is_a_table_without_plots(report):

@@ -1,12 +1,13 @@
 """Models whose parts are left out or longer than in their file."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from drake_pose.body.formats.urdf_shape import reshaped
 from drake_pose.body.model import load_model
-from drake_pose.camera.models import ParallelCamera
-from drake_pose.errors import ModelError, UnknownNameError
+from drake_pose.errors import UnknownNameError
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from tests.body.models import JOINTED_BASE_URDF, write
 from tests.search.bodies import forked_body, front_camera
@@ -14,11 +15,8 @@ from tests.search.bodies import forked_body, front_camera
 
 def area(model, q, scale=1.0):
     """How much Drake draws of it [pixel]."""
-    camera = front_camera(300, shift=0.2)
-    wide = ParallelCamera(
-        "wide", 300, 300, scale * 100.0, camera.center_x, camera.center_y, camera.X_WC
-    )
-    return int(np.count_nonzero(LabelRenderer(model, wide).mask(q)))
+    camera = replace(front_camera(300, shift=0.2), pixels_per_metre=scale * 100.0)
+    return int(np.count_nonzero(LabelRenderer(model, camera).mask(q)))
 
 
 def test_a_link_without_looks_is_drawn_by_nobody(tmp_path):
@@ -81,15 +79,3 @@ def test_joints_and_looks_lie_elsewhere_on_their_links(tmp_path):
         np.testing.assert_allclose(after.vertices, before.vertices + by, atol=1e-12)
     with pytest.raises(UnknownNameError, match="tail"):
         model.reshaped(moves={"tail": move})
-
-
-def test_only_urdf_models_change_their_shape(tmp_path):
-    path = tmp_path / "ball.sdf"
-    path.write_text(
-        '<sdf version="1.9"><model name="m"><link name="a"><visual name="v"><geometry><sphere>'
-        "<radius>0.1</radius></sphere></geometry></visual></link></model></sdf>"
-    )
-    model = load_model(path)
-    assert not model.changes_shape
-    with pytest.raises(ModelError, match="URDF"):
-        model.without(["a"])

@@ -1,7 +1,5 @@
 """Landmarks: the bundled models' against Drake, in pose trees, and files that are wrong."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -40,26 +38,33 @@ LENGTHS = {
 
 
 @pytest.mark.parametrize("path", BODIES, ids=lambda path: path.stem)
-def test_bundled_landmarks_are_where_drake_puts_them(path: Path) -> None:
+@pytest.mark.parametrize("root", [None, "left_shin"])
+def test_bundled_landmarks_are_where_drake_puts_them(path, root):
+    """By the model's positions, and by a pose tree that may be turned over."""
     model = load_model(path, check=False)
     landmarks, plant = load_landmarks(path), model.plant
     assert set(landmarks) == JOINT_CENTRES
-    context = plant.CreateDefaultContext()
-    rng = np.random.default_rng(1)
+    context, rng = plant.CreateDefaultContext(), np.random.default_rng(1)
+    tree = model.pose_tree(root, root_position=None if root is None else [0.3, -0.2, 0.5])
+    placed = landmarks_of_nodes(tree, landmarks)
+    assert placed.names == tuple(landmarks)
     for _ in range(3):
-        q = rng.uniform(model.lower, model.upper)
+        values = tree.values_from_positions(rng.uniform(model.lower, model.upper))
+        (q, X_WB), X_WN = tree.positions_from(values), tree.node_poses(values)
         plant.SetPositions(context, q)
-        expected = [
-            plant.CalcPointsPositions(
-                context, plant.GetBodyByName(link).body_frame(), point, plant.world_frame()
-            ).ravel()
+        p_B = [
+            plant.GetBodyByName(link).EvalPoseInWorld(context).multiply(point)
             for link, point in landmarks.values()
         ]
-        np.testing.assert_allclose(landmark_positions(model, landmarks, q), expected, atol=1e-12)
+        expected = p_B @ X_WB[:3, :3].T + X_WB[:3, 3]
+        np.testing.assert_allclose(landmark_positions(model, landmarks, q, X_WB), expected)
+        batch = placed.positions(np.stack([X_WN, X_WN]))
+        np.testing.assert_allclose(batch, [expected, expected], atol=1e-9)
+        np.testing.assert_array_equal(placed.positions(X_WN), batch[0])
 
 
 @pytest.mark.parametrize("path", BODIES, ids=lambda path: path.stem)
-def test_bundled_landmarks_span_the_measured_lengths(path: Path) -> None:
+def test_bundled_landmarks_span_the_measured_lengths(path):
     model = load_model(path, check=False)
     landmarks = load_landmarks(path)
     zero = np.zeros(len(model.position_names))
@@ -74,27 +79,7 @@ def test_bundled_landmarks_span_the_measured_lengths(path: Path) -> None:
     assert at["left_wrist"][1] > 100 > -100 > at["right_wrist"][1]
 
 
-@pytest.mark.parametrize("root", [None, "left_shin"])
-def test_a_tree_carries_them_like_the_plant(root: str | None) -> None:
-    path = BODIES[2]
-    model = load_model(path, check=False)
-    landmarks = load_landmarks(path)
-    tree = model.pose_tree(root, root_position=None if root is None else [0.3, -0.2, 0.5])
-    placed = landmarks_of_nodes(tree, landmarks)
-    assert placed.names == tuple(landmarks)
-    rng = np.random.default_rng(2)
-    values = tree.default_values()
-    if root is None:
-        values = tree.values_from_positions(rng.uniform(model.lower, model.upper))
-    X_WN = tree.node_poses(values)
-    q, X_WB = tree.positions_from(values)
-    expected = landmark_positions(model, landmarks, q, X_WB)
-    np.testing.assert_allclose(placed.positions(X_WN), expected, atol=1e-9)
-    batch = placed.positions(np.stack([X_WN, X_WN]))
-    np.testing.assert_allclose(batch, [expected, expected], atol=1e-9)
-
-
-def test_welded_links_and_a_moved_world(tmp_path: Path) -> None:
+def test_welded_links_and_a_moved_world(tmp_path):
     model = load_model(write(tmp_path, FLOATING_URDF), check=False)
     landmarks = {"tip": Landmark("welded", np.array([0.1, 0.0, 0.2]))}
     tree = model.pose_tree()
@@ -109,13 +94,7 @@ def test_welded_links_and_a_moved_world(tmp_path: Path) -> None:
     assert landmarks_of_nodes(tree, {}).positions(tree.node_poses(tree.default_values())).size == 0
 
 
-def test_what_moves_with_nothing_seen_is_refused(tmp_path: Path) -> None:
-    model = load_model(write(tmp_path, FLOATING_URDF), check=False)
-    with pytest.raises(ModelError, match="'end' is on link 'toe', which moves with no part"):
-        landmarks_of_nodes(model.pose_tree(), {"end": Landmark("toe", np.zeros(3))})
-
-
-def test_unknown_links_and_bad_positions_are_named(tmp_path: Path) -> None:
+def test_links_unknown_or_unseen_and_bad_positions_are_named(tmp_path):
     model = load_model(write(tmp_path, FLOATING_URDF), check=False)
     wrong = {"elbow": Landmark("elbow_link", np.zeros(3))}
     q = np.array(model.default_positions)
@@ -123,6 +102,8 @@ def test_unknown_links_and_bad_positions_are_named(tmp_path: Path) -> None:
         landmark_positions(model, wrong, q)
     with pytest.raises(UnknownNameError, match=r"'elbow'.*no link 'elbow_link'"):
         landmarks_of_nodes(model.pose_tree(), wrong)
+    with pytest.raises(ModelError, match="'end' is on link 'toe', which moves with no part"):
+        landmarks_of_nodes(model.pose_tree(), {"end": Landmark("toe", np.zeros(3))})
     for bad in (q[:-1], np.full_like(q, np.nan)):
         with pytest.raises(SettingsError, match="finite numbers"):
             landmark_positions(model, {}, bad)
@@ -148,7 +129,7 @@ def test_unknown_links_and_bad_positions_are_named(tmp_path: Path) -> None:
         ("landmarks: [", "not a YAML file"),
     ],
 )
-def test_bad_files_are_named(text: str, complaint: str, tmp_path: Path) -> None:
+def test_bad_files_are_named(text, complaint, tmp_path):
     file = tmp_path / "landmarks.yaml"
     file.write_text(text, encoding="utf-8")
     with pytest.raises(ModelError, match=complaint) as caught:

@@ -39,13 +39,13 @@ JOINTS = {
 }
 
 
-def new_plant() -> tuple[MultibodyPlant, SceneGraph]:
+def new_plant():
     plant, scene_graph = MultibodyPlant(0.0), SceneGraph()
     plant.RegisterAsSourceForSceneGraph(scene_graph)
     return plant, scene_graph
 
 
-def body_poses(plant: MultibodyPlant, q: np.ndarray) -> np.ndarray:
+def body_poses(plant, q):
     context = plant.CreateDefaultContext()
     plant.SetPositions(context, q)
     poses = plant.get_body_poses_output_port().Eval(context)
@@ -115,6 +115,7 @@ def test_only_the_bodies_that_are_asked_for_are_the_model(tmp_path):
     assert searched
     assert all(name.startswith("b_") for name in searched)
     assert len(ArticulatedModel.from_plant(plant, scene_graph).link_meshes) == 2 * len(made.labels)
+    assert not made.changes_shape
     with pytest.raises(ModelError, match="only the shape of a URDF"):
         made.without(["b_::thing::leg"])
 

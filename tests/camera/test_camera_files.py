@@ -1,10 +1,25 @@
-from pathlib import Path
+import shlex
+import xml.etree.ElementTree as ElementTree
 
+import cv2
+import mujoco
 import numpy as np
 import pytest
+import yaml
+from pydrake.common.eigen_geometry import Quaternion
+from pydrake.common.yaml import yaml_load_typed
+from pydrake.math import RigidTransform
+from pydrake.systems.sensors import CameraConfig
 
 from drake_pose.camera.camera_files import load_cameras, save_cameras
-from drake_pose.camera.models import ParallelCamera, PinholeCamera
+from drake_pose.camera.drake import (
+    camera_from_drake,
+    camera_to_config,
+    dump_scenario,
+    save_scenario,
+)
+from drake_pose.camera.exports import mujoco_cameras, ros_camera_info, ros_transforms
+from drake_pose.camera.models import ParallelCamera, PinholeCamera, circle_of_cameras
 from drake_pose.errors import CameraError
 
 EYE = "[[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]"
@@ -13,13 +28,13 @@ LENS = f"{SIDES}, focal_x: 60, focal_y: 61"
 GOOD = f"{{{LENS}, X_WC: {EYE}}}"
 
 
-def write(folder: Path, text: str) -> Path:
+def write(folder, text):
     path = folder / "cameras.yaml"
     path.write_text(text)
     return path
 
 
-def test_round_trip_is_exact(tmp_path: Path) -> None:
+def test_round_trip_is_exact(tmp_path):
     rng = np.random.default_rng(0)
     X_WC = np.eye(4)
     X_WC[:3, :3] = np.linalg.qr(rng.normal(size=(3, 3)))[0]
@@ -38,14 +53,14 @@ def test_round_trip_is_exact(tmp_path: Path) -> None:
         np.testing.assert_array_equal(camera.X_WC, written[name].X_WC)
 
 
-def test_projection_may_be_spelled_out(tmp_path: Path) -> None:
+def test_projection_may_be_spelled_out(tmp_path):
     text = f"7: {{projection: parallel, {SIDES}, pixels_per_metre: 1e2, X_WC: {EYE}}}"
     camera = load_cameras(write(tmp_path, text))["7"]
     assert isinstance(camera, ParallelCamera)
     assert camera.pixels_per_metre == 100.0
 
 
-def test_principal_points_may_be_counted_as_drake_does(tmp_path: Path) -> None:
+def test_principal_points_may_be_counted_as_drake_does(tmp_path):
     for kind in ("focal_x: 60, focal_y: 61", "projection: parallel, pixels_per_metre: 9"):
         text = f"{{{kind}, pixel_centers: drake, {SIDES}, X_WC: {EYE}}}"
         camera = load_cameras(write(tmp_path, f"cam: {text}"))["cam"]
@@ -80,7 +95,7 @@ def test_principal_points_may_be_counted_as_drake_does(tmp_path: Path) -> None:
         ("[" * 5000, "YAML|deeply"),
     ],
 )
-def test_bad_files_are_refused(tmp_path: Path, text: str, message: str) -> None:
+def test_bad_files_are_refused(tmp_path, text, message):
     path = write(tmp_path, text)
     with pytest.raises(CameraError, match=message) as caught:
         load_cameras(path)
@@ -88,7 +103,7 @@ def test_bad_files_are_refused(tmp_path: Path, text: str, message: str) -> None:
     assert len(str(caught.value)) < 1000
 
 
-def test_files_that_cannot_be_read_or_written(tmp_path: Path) -> None:
+def test_files_that_cannot_be_read_or_written(tmp_path):
     (tmp_path / "binary.yaml").write_bytes(b"\xff\xfe\x00\x80")
     (tmp_path / "large.yaml").write_text("# " + "x" * (1 << 21))
     files = {
@@ -106,7 +121,7 @@ def test_files_that_cannot_be_read_or_written(tmp_path: Path) -> None:
         save_cameras(tmp_path / "nowhere" / "c.yaml", [camera])
 
 
-def test_alias_bombs_are_refused_quickly(tmp_path: Path) -> None:
+def test_alias_bombs_are_refused_quickly(tmp_path):
     lines = ["a0: &a0 [[1]]"]
     lines += [f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]" for i in range(1, 40)]
     with pytest.raises(CameraError, match="a0"):
@@ -114,3 +129,210 @@ def test_alias_bombs_are_refused_quickly(tmp_path: Path) -> None:
     lines = [f"cam: {{{SIDES}, focal_x: 1, focal_y: 1, X_WC: *a39}}", *lines]
     with pytest.raises(CameraError):
         load_cameras(write(tmp_path, "\n".join([*lines[1:], lines[0]])))
+
+
+FRONT = """
+name: front
+width: 320
+height: 200
+focal: !FovDegrees {y: 40}
+clipping_near: 0.2
+z_near: 0.3
+X_PB:
+  base_frame: world
+  translation: [1, 2, 3]
+  rotation: !Rpy {deg: [-100, 10, 30]}
+X_BC: {translation: [0.01, 0, 0]}
+renderer_class: !RenderEngineVtkParams {}
+label: true
+"""
+
+
+def indented(text, by):
+    return "".join(f"{' ' * by}{line}\n" for line in text.strip().splitlines())
+
+
+SCENARIO = f"""
+directives:
+- add_model: {{name: arm, file: package://drake_models/arm.urdf}}
+model_drivers: {{arm: !IiwaDriver {{hand_model_name: wsg}}}}
+cameras:
+  first:
+{indented(FRONT, 4)}
+  side: {{focal: !FocalLength {{x: 500}}, center_x: 300.5}}
+  plain:
+"""
+
+
+def require_same(camera, config):
+    """A camera is what Drake itself makes of a CameraConfig."""
+    color, _ = config.MakeCameras()
+    X_PB = config.X_PB.GetDeterministicValue()
+    expected = camera_from_drake(camera.name, color.core(), X_PB)
+    np.testing.assert_allclose(camera.kernel_parameters(), expected.kernel_parameters())
+    np.testing.assert_allclose(camera.X_WC, expected.X_WC, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [FRONT, f"any:\n{indented(FRONT, 2)}", f"cameras:\n  any:\n{indented(FRONT, 4)}",
+     f"Demo:\n  cameras:\n    any:\n{indented(FRONT, 6)}"],
+)  # fmt: skip
+def test_a_config_is_known_wherever_it_stands(text, tmp_path):
+    cameras = load_cameras(write(tmp_path, text))
+    assert list(cameras) == ["front"]
+    assert isinstance(cameras["front"], PinholeCamera)
+    require_same(cameras["front"], yaml_load_typed(schema=CameraConfig, data=FRONT))
+
+
+def test_a_scenario(tmp_path):
+    cameras = load_cameras(write(tmp_path, SCENARIO))
+    assert list(cameras) == ["front", "side", "plain"]
+    side, plain = cameras["side"], cameras["plain"]
+    assert isinstance(side, PinholeCamera)
+    assert isinstance(plain, PinholeCamera)
+    assert (side.focal_x, side.focal_y, side.center_x) == (500.0, 500.0, 300.0)
+    require_same(plain, CameraConfig())
+
+
+def test_scenarios_that_are_written_are_read_and_known_to_drake(tmp_path):
+    written = circle_of_cameras(5, size=(320, 240))
+    rng = np.random.default_rng(0)
+    R = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    X_WC = np.eye(4)
+    X_WC[:3, :3], X_WC[:3, 3] = R * np.linalg.det(R), rng.normal(size=3)
+    written["odd"] = PinholeCamera("odd", 64, 48, 60.0, 1.5, 1 / 3, 23.5, X_WC, near=300.0)
+    save_scenario(tmp_path / "scenario.yaml", written)
+    read = load_cameras(tmp_path / "scenario.yaml")
+    assert list(read) == list(written)
+    for name, camera in read.items():
+        expected = written[name].kernel_parameters()
+        np.testing.assert_allclose(camera.kernel_parameters(), expected, rtol=1e-14)
+        np.testing.assert_allclose(camera.X_WC, written[name].X_WC, atol=1e-14)
+        # Drake makes cameras of what was written.
+        require_same(written[name], camera_to_config(written[name]))
+    assert "label: true" in dump_scenario(written)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("base_frame: world", "base_frame: 'iiwa::link7'", "'front'.*'iiwa::link7'.*in the world"),
+        ("!Rpy {deg: [-100, 10, 30]}", "!Uniform {}", "'front': X_PB is drawn by lot"),
+        ("[1, 2, 3]", "!UniformVector {min: [0, 0, 0], max: [1, 1, 1]}", "drawn by lot"),
+        ("width: 320", "width: -3", "width must be"),
+        ("width: 320", "widht: 320", "no CameraConfig.*widht"),
+        ("{y: 40}", "{y: 0}", "focal"),
+        ("!FovDegrees {y: 40}", "{}", "'front': no CameraConfig.*FocalLength"),
+        ("!FovDegrees {y: 40}", "[500]", r"'front': no CameraConfig: .*fields, not \[500\]"),
+        ("[1, 2, 3]", "[1, 2]", "no CameraConfig"),
+        ("[1, 2, 3]", "[1, .nan, 3]", "not finite"),
+        ("clipping_near: 0.2", "clipping_near: 0", "near"),
+        ("name: front", "name: ../up", "camera's name"),
+        ("label: true", "label: true\nX_WC: 3", "needs center_x"),
+    ],
+)
+def test_what_a_camera_cannot_be(old, new, message, tmp_path):
+    with pytest.raises(CameraError, match=message) as raised:
+        load_cameras(write(tmp_path, f"front:\n{indented(FRONT.replace(old, new), 2)}"))
+    assert "cameras.yaml" in str(raised.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("cameras: [1]", "mapping from names"),
+        ("cameras: {}", "mapping from names"),
+        ("cameras: {a: 3}", "'a'.*fields of a CameraConfig"),
+        ("cameras: {a: {name: c}, b: {name: c}}", "'c' is given twice"),
+        ("One: {cameras: {a: {}}}\nTwo: {cameras: {a: {}}}", "several scenarios .One, Two."),
+    ],
+)
+def test_scenarios_that_cannot_be_read(text, message, tmp_path):
+    with pytest.raises(CameraError, match=message):
+        load_cameras(write(tmp_path, text))
+
+
+def test_cameras_that_drake_does_not_know():
+    parallel = ParallelCamera("above", 10, 10, 5.0, 5.0, 5.0, np.eye(4))
+    with pytest.raises(CameraError, match=r"'above'.*parallel"):
+        dump_scenario([parallel])
+    outside = PinholeCamera("off", 10, 10, 5.0, 5.0, -3.0, 5.0, np.eye(4))
+    with pytest.raises(CameraError, match=r"'off'.*principal point"):
+        dump_scenario([outside])
+
+
+PLACE = RigidTransform(Quaternion(np.array([0.5, -0.7, 0.4, 0.3]) / np.sqrt(0.99)), [0.3, -0.2, 1])
+CAMERA = PinholeCamera("head left", 64, 48, 60.0, 70.0, 25.3, 30.1, PLACE.GetAsMatrix4())
+PARALLEL = ParallelCamera("flat", 64, 48, 50.0, 31.5, 23.5, np.eye(4))
+
+
+def seen_points():
+    """(n, 3) points of the world that the camera sees."""
+    p_C = np.array([[0.0, 0.0, 1.0], [0.1, 0.2, 2.0], [-0.3, 0.1, 1.5], [0.2, -0.4, 3.0]])
+    return p_C @ CAMERA.X_WC[:3, :3].T + CAMERA.X_WC[:3, 3]
+
+
+def test_a_camera_info_projects_as_the_camera():
+    info = yaml.safe_load(ros_camera_info(CAMERA))
+    K, D, R, P = (
+        np.array(info[key]["data"]).reshape(info[key]["rows"], info[key]["cols"])
+        for key in (
+            "camera_matrix", "distortion_coefficients", "rectification_matrix", "projection_matrix",
+        )
+    )  # fmt: skip
+    assert info["distortion_model"] == "plumb_bob"
+    assert (info["image_width"], info["image_height"]) == (64, 48)
+    assert (K.size, R.size, P.size) == (9, 9, 12)
+    np.testing.assert_array_equal(D, np.zeros((1, 5)))
+    np.testing.assert_array_equal(R, np.eye(3))
+    np.testing.assert_array_equal(P[:, :3], K)
+    X_CW = np.linalg.inv(CAMERA.X_WC)
+    turn, shift = cv2.Rodrigues(X_CW[:3, :3])[0], X_CW[:3, 3]
+    for used in (K, P[:, :3]):
+        uv, _ = cv2.projectPoints(seen_points(), turn, shift, used, D)
+        np.testing.assert_allclose(uv[:, 0], CAMERA.project(seen_points())[0], atol=1e-9)
+
+
+def test_a_launch_file_publishes_the_optical_frame():
+    launch = ElementTree.fromstring(ros_transforms([CAMERA], {"head left": "panda_link0"}))
+    (node,) = launch
+    assert (node.get("pkg"), node.get("exec")) == ("tf2_ros", "static_transform_publisher")
+    words = shlex.split(node.get("args", ""))
+    given = dict(zip(words[::2], words[1::2], strict=True))
+    assert given["--frame-id"] == "panda_link0"
+    assert given["--child-frame-id"] == "head_left_optical_frame"
+    q = Quaternion(*(float(given[f"--q{axis}"]) for axis in "wxyz"))
+    pose = RigidTransform(q, [float(given[f"--{axis}"]) for axis in "xyz"])
+    np.testing.assert_allclose(pose.GetAsMatrix4(), CAMERA.X_WC, atol=1e-12)
+
+
+def test_mujoco_sees_points_at_the_same_pixels(tmp_path):
+    (tmp_path / "cameras.xml").write_text(mujoco_cameras([CAMERA]))
+    text = '<mujoco><worldbody><include file="cameras.xml"/></worldbody></mujoco>'
+    (tmp_path / "scene.xml").write_text(text)
+    model = mujoco.MjModel.from_xml_path(str(tmp_path / "scene.xml"))
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    assert model.camera("head left").id == 0
+    assert model.cam_resolution[0].tolist() == [64, 48]
+    scene, camera = mujoco.MjvScene(model, 10), mujoco.MjvCamera()
+    camera.type, camera.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, 0
+    everything = mujoco.mjtCatBit.mjCAT_ALL
+    mujoco.mjv_updateScene(model, data, mujoco.MjvOption(), None, camera, everything, scene)
+    # What its renderer hands to glFrustum, and the pose that it looks from.
+    view = scene.camera[0]
+    x, y, z = ((seen_points() - data.cam_xpos[0]) @ data.cam_xmat[0].reshape(3, 3)).T
+    left = view.frustum_center - view.frustum_width
+    u = 64 * (view.frustum_near * x / -z - left) / (2.0 * view.frustum_width)
+    height = view.frustum_top - view.frustum_bottom
+    v = 48 * (view.frustum_top - view.frustum_near * y / -z) / height
+    # It counts from the picture's corner, half a pixel before the first centre.
+    expected = CAMERA.project(seen_points())[0]
+    np.testing.assert_allclose(np.column_stack([u, v]) - 0.5, expected, atol=1e-3)
+
+
+@pytest.mark.parametrize("export", [ros_camera_info, lambda one: mujoco_cameras([one])])
+def test_parallel_cameras_are_refused(export):
+    with pytest.raises(CameraError, match=r"'flat'.*parallel"):
+        export(PARALLEL)

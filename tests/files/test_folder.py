@@ -24,19 +24,18 @@ from drake_pose.files.writer import ResultWriter
 from drake_pose.jobs.batch.batch import run_batch
 from drake_pose.jobs.live.capture import capture_live
 from drake_pose.silhouette.pictures.scenes import load_scene
-from tests.jobs.scenes import TinyScene
 
 NAMES = ("a", "b")
 
 
-def row(frame: str, *q: float, base: np.ndarray | None = None, error: float = 0.25) -> PoseRow:
+def row(frame, *q, base=None, error=0.25):
     return PoseRow(frame, np.array(q), base, error, 1.5)
 
 
 LOST = row("0002", np.nan, np.nan, error=np.nan)
 
 
-def test_rows_are_on_the_disk_when_append_returns_and_read_back(tmp_path: Path) -> None:
+def test_rows_are_on_the_disk_when_append_returns_and_read_back(tmp_path):
     base = np.array([1.0, 2.0, 3.0, 1.0, 0.0, 0.0, 0.0])
     for with_base, cells in ((False, ""), (True, ",1,2,3,1,0,0,0")):
         table = PoseTable(tmp_path, NAMES, with_base)
@@ -55,7 +54,7 @@ def test_rows_are_on_the_disk_when_append_returns_and_read_back(tmp_path: Path) 
         assert (first.found, second.found) == (True, False)
 
 
-def test_reading_drops_a_row_that_was_cut_off(tmp_path: Path) -> None:
+def test_reading_drops_a_row_that_was_cut_off(tmp_path):
     table = PoseTable(tmp_path, NAMES, False)
     assert table.read() == []
     table.write([row("0001", 0.5, -1.25)])
@@ -72,13 +71,13 @@ def test_reading_drops_a_row_that_was_cut_off(tmp_path: Path) -> None:
         ("frame,a,b,error,seconds\n1,x,2,3,4\n", "line 2 is damaged"),
     ],
 )
-def test_what_cannot_be_resumed_is_refused(tmp_path: Path, text: str, message: str) -> None:
+def test_what_cannot_be_resumed_is_refused(tmp_path, text, message):
     (tmp_path / "poses.csv").write_text(text)
     with pytest.raises(OutputError, match=message):
         PoseTable(tmp_path, NAMES, False).read()
 
 
-def test_a_folder_that_holds_something_or_cannot_be_is_refused(tmp_path: Path) -> None:
+def test_a_folder_that_holds_something_or_cannot_be_is_refused(tmp_path):
     (tmp_path / "out").write_text("mine")
     (tmp_path / "link").symlink_to("nowhere")
     for place, message in (
@@ -93,7 +92,7 @@ def test_a_folder_that_holds_something_or_cannot_be_is_refused(tmp_path: Path) -
     assert {path.name for path in tmp_path.iterdir()} == {"link", "out"}
 
     @writes_folder
-    def job(out: Path) -> None:
+    def job(out):
         """Cannot be resumed."""
 
     with pytest.raises(OutputError, match="not empty"):
@@ -110,7 +109,7 @@ with claimed(Path(sys.argv[1])):
 """
 
 
-def test_a_folder_belongs_to_one_run_until_that_ends_however_it_ends(tmp_path: Path) -> None:
+def test_a_folder_belongs_to_one_run_until_that_ends_however_it_ends(tmp_path):
     place = tmp_path / "new" / "out"
     jobs = (estimate_scene, register_scene, audit_scene, make_masks, run_batch, capture_live)
     command = [sys.executable, "-c", HOLD, str(place)]
@@ -135,10 +134,10 @@ def test_a_folder_belongs_to_one_run_until_that_ends_however_it_ends(tmp_path: P
     assert not list(tmp_path.iterdir())
 
 
-def test_files_appear_whole_or_not_at_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_files_appear_whole_or_not_at_all(tmp_path, monkeypatch):
     write_file(tmp_path / "out", "overlay/cam/1.png", b"first")
 
-    def full_disk(path: Path, data: bytes) -> None:
+    def full_disk(path, data):
         path.touch()
         raise OSError(28, "No space left on device")
 
@@ -149,14 +148,14 @@ def test_files_appear_whole_or_not_at_all(tmp_path: Path, monkeypatch: pytest.Mo
     assert [path.name for path in (tmp_path / "out" / "overlay" / "cam").iterdir()] == ["1.png"]
 
 
-def test_summary_has_no_nan(tmp_path: Path) -> None:
+def test_summary_has_no_nan(tmp_path):
     write_summary(tmp_path, {"a": float("nan"), "b": [np.float64(1.5), np.inf], "c": np.arange(2)})
     text = (tmp_path / "summary.json").read_text()
     assert json.loads(text) == {"a": None, "b": [1.5, None], "c": [0, 1]}
     assert read_summary(tmp_path) == json.loads(text)
 
 
-def test_the_same_job_is_resumed_and_no_other(tmp_path: Path) -> None:
+def test_the_same_job_is_resumed_and_no_other(tmp_path):
     settings = {"interval": 20.0, "frames": ["0000"]}
     job = {"sha256": {"model": "m", "cameras": "c"}, "settings": settings}
     assert open_job(tmp_path, job, resume=False) is None
@@ -173,12 +172,10 @@ def test_the_same_job_is_resumed_and_no_other(tmp_path: Path) -> None:
             open_job(tmp_path, job | other, resume=True)
 
 
-def test_finished_frames_whose_masks_were_replaced_are_forgotten(
-    own_scene: TinyScene, tmp_path: Path
-) -> None:
+def test_finished_frames_whose_masks_were_replaced_are_forgotten(own_scene, tmp_path):
     scene, model, out = load_scene(own_scene.folder), load_model(own_scene.model), tmp_path / "out"
 
-    def writer(**more: object) -> ResultWriter:
+    def writer(**more):
         made = ResultWriter(scene, model, {"scene": "s", "settings": {}}, out, **more)
         made.begin()
         return made
@@ -201,7 +198,7 @@ def test_finished_frames_whose_masks_were_replaced_are_forgotten(
 
 
 @pytest.mark.parametrize("text", [None, "{", "[]"])
-def test_a_damaged_summary_is_named(tmp_path: Path, text: str | None) -> None:
+def test_a_damaged_summary_is_named(tmp_path, text):
     if text is not None:
         (tmp_path / "summary.json").write_text(text)
     with pytest.raises(OutputError, match=r"summary\.json"):

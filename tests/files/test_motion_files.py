@@ -1,13 +1,13 @@
 import csv
 import io
-from pathlib import Path
+import re
 
 import numpy as np
 import pytest
 
 from drake_pose.body.formats.packages import bundled_model
 from drake_pose.body.landmarks import load_landmarks
-from drake_pose.body.model import ArticulatedModel, load_model
+from drake_pose.body.model import load_model
 from drake_pose.errors import SettingsError
 from drake_pose.files.motion_files import (
     centres_as_csv,
@@ -19,9 +19,9 @@ from drake_pose.files.motion_files import (
     write_motion,
 )
 from drake_pose.files.records import BASE_COLUMNS, PoseRow
-from drake_pose.silhouette.pictures.scenes import load_scene
+from tests.body.models import joint, link, urdf, write
 from tests.files.bvh_reader import read_bvh
-from tests.jobs.scenes import write_scene
+from tests.jobs.scenes import URDF
 
 
 @pytest.fixture(scope="module")
@@ -33,50 +33,52 @@ def q(person):
     return rows
 
 
-def test_csv_has_the_joint_centres_of_frames_with_a_pose(person, q):
+@pytest.fixture(scope="module")
+def centres(person, q):
+    """Names and places of the person's joint centres."""
     landmarks = load_landmarks(person.path)
-    places = joint_centres(person, landmarks, q)
-    text = centres_as_csv(["0", "1", "2"], list(landmarks), places)
-    rows = list(csv.DictReader(io.StringIO(text)))
-    assert len(rows) == 2 * len(landmarks)
-    wrists = {row["frame"]: row for row in rows if row["joint"] == "left_wrist"}
-    elbow = next(row for row in rows if row["frame"] == "1" and row["joint"] == "left_elbow")
+    return list(landmarks), joint_centres(person, landmarks, q)
+
+
+def test_csv_has_the_joint_centres_of_frames_with_a_pose(centres):
+    names, places = centres
+    rows = list(csv.DictReader(io.StringIO(centres_as_csv(["0", "1", "2"], names, places))))
+    assert len(rows) == 2 * len(names)
+    at = {(row["frame"], row["joint"]): [float(row[axis]) for axis in "xyz"] for row in rows}
+    hanging, raised = (
+        np.subtract(at[frame, "left_wrist"], at[frame, "left_elbow"]) for frame in ("0", "1")
+    )
     # The forearm points forward, along the world's x.
-    assert float(wrists["1"]["z"]) == pytest.approx(float(elbow["z"]), abs=0.03)
-    assert float(wrists["1"]["x"]) - float(elbow["x"]) > 0.2
-    assert float(wrists["0"]["z"]) < float(elbow["z"]) - 0.2
+    assert raised[2] == pytest.approx(0.0, abs=0.03)
+    assert raised[0] > 0.2
+    assert hanging[2] < -0.2
 
 
-def test_trc_is_in_millimetres_with_y_up(person, q):
-    landmarks = load_landmarks(person.path)
-    places = joint_centres(person, landmarks, q)
-    lines = centres_as_trc(list(landmarks), places, 60.0).splitlines()
-    assert lines[0].startswith("PathFileType\t4\t(X/Y/Z)")
-    header = dict(zip(lines[1].split("\t"), lines[2].split("\t"), strict=True))
-    assert header["NumFrames"] == "3"
-    assert header["NumMarkers"] == str(len(landmarks))
+def test_trc_is_in_millimetres_with_y_up(centres):
+    names, places = centres
+    cells = [line.split("\t") for line in centres_as_trc(names, places, 60.0).splitlines()]
+    assert cells[0][:3] == ["PathFileType", "4", "(X/Y/Z)"]
+    header = dict(zip(cells[1], cells[2], strict=True))
+    assert (header["NumFrames"], header["NumMarkers"]) == ("3", str(len(names)))
     assert header["Units"] == "mm"
-    first = lines[6].split("\t")
-    k = list(landmarks).index("left_hip")
-    x, y, z = (float(cell) for cell in first[2 + 3 * k : 5 + 3 * k])
-    np.testing.assert_allclose([x, -z, y], 1e3 * places[0, k], atol=1e-3)
-    assert float(lines[7].split("\t")[1]) == pytest.approx(1 / 60.0, abs=1e-6)
-    assert all(cell == "" for cell in lines[8].split("\t")[2:])
-    assert {len(line.split("\t")) for line in lines[6:9]} == {2 + 3 * len(landmarks)}
+    x, y, z = np.array(cells[6][2:], dtype=float).reshape(-1, 3).T
+    np.testing.assert_allclose(np.column_stack([x, -z, y]), 1e3 * places[0], atol=1e-3)
+    assert float(cells[7][1]) == pytest.approx(1 / 60.0, abs=1e-6)
+    assert cells[8][2:] == [""] * (3 * len(names))
 
 
 def test_a_results_files_honour_the_base_and_leave_out_what_is_not_known(tmp_path):
-    scene = write_scene(tmp_path / "scene", [(20, -40)] * 4)
-    (scene.folder / "scene.yaml").write_text("sequence: true\nframe_rate_hz: 25\n")
-    (scene.model.parent / "landmarks.yaml").write_text(
-        "landmarks:\n  hook: {link: jib, point: [0, 0, 0.4]}\n"
-    )
-    model = load_model(scene.model, check=False)
+    (tmp_path / "crane.urdf").write_text(URDF)
+    marks = tmp_path / "landmarks.yaml"
+    marks.write_text("landmarks:\n  hook: {link: jib, point: [0, 0, 0.4]}\n")
+    model = load_model(tmp_path / "crane.urdf", check=False)
     base = np.array([1.0, 2.0, 3.0, np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)])  # 90 degrees about z.
-    q = np.array([0.5, -1.0])
-    lost = PoseRow("0002", np.full(2, np.nan), None, np.nan, 0.1)
-    rows = [PoseRow("0001", q, base, 0.1, 0.1), lost, PoseRow("0003", q, base, 0.1, 0.1)]
-    warnings = write_motion(tmp_path / "out", model, load_scene(scene.folder).frames, rows, 25.0)
+    q, frames = np.array([0.5, -1.0]), ("0001", "0002", "0003")
+    poses = [q, np.full(2, np.nan), q]
+    bases = [base, None, base]
+    rows = [PoseRow(*one, 0.1, 0.1) for one in zip(frames, poses, bases, strict=True)]
+    (warning,) = write_motion(tmp_path / "out", model, frames, rows, 25.0)
+    assert "1 of 3 frames" in warning
     context = model.plant.CreateDefaultContext()
     model.plant.SetPositions(context, q)
     jib = model.plant.GetBodyByName("jib").EvalPoseInWorld(context)
@@ -87,17 +89,15 @@ def test_a_results_files_honour_the_base_and_leave_out_what_is_not_known(tmp_pat
     np.testing.assert_allclose(found, [1.0 - y, 2.0 + x, 3.0 + z], atol=1e-4)
     motion = read_bvh((tmp_path / "out" / "motion.bvh").read_text())
     assert motion.frame_time == pytest.approx(0.04)
-    p_WJ = jib.translation()
-    place = [100 * (1.0 - p_WJ[1]), 100 * (3.0 + p_WJ[2]), -100 * (2.0 + p_WJ[0])]
+    x, y, z = jib.translation()
+    place = [100 * (1.0 - y), 100 * (3.0 + z), -100 * (2.0 + x)]
     np.testing.assert_allclose(motion.places()["jib"], [place] * 3, atol=0.01)
-    assert "1 of 3 frames" in warnings[0]
     mot = (tmp_path / "out" / "positions.mot").read_text().splitlines()
-    header = mot[mot.index("endheader") + 1].split("\t")
-    assert header[-7:] == list(BASE_COLUMNS)
+    assert mot[mot.index("endheader") + 1].split("\t")[-7:] == list(BASE_COLUMNS)
     assert [float(cell) for cell in mot[-1].split("\t")[-7:]] == pytest.approx(base, abs=1e-5)
     # A robot is no character: without landmarks or a skin there is no skeleton to animate.
-    (scene.model.parent / "landmarks.yaml").unlink()
-    assert not write_motion(tmp_path / "robot", model, ("0001", "0002", "0003"), rows, 25.0)
+    marks.unlink()
+    assert not write_motion(tmp_path / "robot", model, frames, rows, 25.0)
     assert {file.name for file in (tmp_path / "robot").iterdir()} == {"positions.mot"}
 
 
@@ -117,12 +117,12 @@ FRAMES = 6
 RATE_HZ = 50.0
 
 
-def open_model(name: str) -> ArticulatedModel:
+def open_model(name):
     folder, file = name.split("/")
     return load_model(bundled_model(folder).with_name(file), check=False)
 
 
-def random_positions(model: ArticulatedModel, rng: np.random.Generator) -> np.ndarray:
+def random_positions(model, rng):
     """Anywhere within the limits; lengths but the root's are the same in every frame."""
     lower = np.clip(model.lower, -3.0, 3.0)
     upper = np.clip(model.upper, -3.0, 3.0)
@@ -133,7 +133,7 @@ def random_positions(model: ArticulatedModel, rng: np.random.Generator) -> np.nd
     return q
 
 
-def link_places(model: ArticulatedModel, link: str, q: np.ndarray) -> np.ndarray:
+def link_places(model, link, q):
     """(frames, 3) where the plant has a link's origin, in the file's axes [cm]."""
     context = model.plant.CreateDefaultContext()
     found = []
@@ -148,7 +148,7 @@ def link_places(model: ArticulatedModel, link: str, q: np.ndarray) -> np.ndarray
 @pytest.mark.parametrize(
     "name", ["person/person.urdf", "person/person_shape.urdf", "hand/hand.urdf"]
 )
-def test_the_file_has_every_link_where_the_plant_has_it(name: str) -> None:
+def test_the_file_has_every_link_where_the_plant_has_it(name):
     model = open_model(name)
     q = random_positions(model, np.random.default_rng(5))
     text, filled = motion_as_bvh(model, q, None, RATE_HZ)
@@ -156,63 +156,73 @@ def test_the_file_has_every_link_where_the_plant_has_it(name: str) -> None:
     places = motion.places()
     assert filled == 0
     assert motion.frame_time == pytest.approx(1.0 / RATE_HZ)
-    links = [joint.link for joint in skeleton_of(model, q)]
+    links = [one.link for one in skeleton_of(model, q)]
     # Every part that is seen, but for the lower half of a limb, whose place is the upper half's.
     assert set(links) == {link for link in model.link_meshes if not link.endswith("_end")}
-    for link in links:
-        error = places[link] - link_places(model, link, q)
-        assert np.linalg.norm(error, axis=1).max() < 0.01, link
-    root, *others = [joint for joint in motion.joints if joint.channels]
+    for part in links:
+        error = places[part] - link_places(model, part, q)
+        assert np.linalg.norm(error, axis=1).max() < 0.01, part
+    levels = [len(tabs) for tabs in re.findall(r"^(\t*)(?:ROOT|JOINT) ", text, re.MULTILINE)]
+    assert levels[0] == 0 < min(levels[1:])
+    root, *others = [one for one in motion.joints if one.channels]
     assert root.channels == [
         "Xposition", "Yposition", "Zposition", "Zrotation", "Xrotation", "Yrotation"
     ]  # fmt: skip
-    assert all(joint.channels == ["Zrotation", "Xrotation", "Yrotation"] for joint in others)
+    assert all(one.channels == ["Zrotation", "Xrotation", "Yrotation"] for one in others)
 
 
-def test_the_skeleton_at_rest_stands_as_the_model_does_with_the_captured_lengths() -> None:
+def test_the_skeleton_at_rest_stands_as_the_model_does_with_the_captured_lengths():
     model = open_model("person/person_shape.urdf")
     q = np.tile(model.default_positions, (2, 1))
     q[:, model.position_index("left_thigh_stretch")] = 0.05
     q[1, model.position_index("left_shin_x")] = 1.0
     motion = read_bvh(motion_as_bvh(model, q, None, RATE_HZ)[0])
-    for joint in motion.joints:
-        if joint.name in model.link_names and joint.parent >= 0:
-            parent = motion.joints[joint.parent].name
-            rest = link_places(model, joint.name, q[:1]) - link_places(model, parent, q[:1])
-            np.testing.assert_allclose(joint.offset, rest[0], atol=1e-3)
+    for one in motion.joints:
+        if one.name in model.link_names and one.parent >= 0:
+            parent = motion.joints[one.parent].name
+            rest = link_places(model, one.name, q[:1]) - link_places(model, parent, q[:1])
+            np.testing.assert_allclose(one.offset, rest[0], atol=1e-3)
     # Up is y: the head above the feet, the toes before the heels.
     places = motion.places()
     assert places["head"][0, 1] - places["left_foot"][0, 1] > 100.0
     assert places["left_foot_end"][0, 0] - places["left_foot"][0, 0] > 5.0
 
 
-def test_a_part_that_slides_in_time_has_position_channels_and_no_offset(tmp_path: Path) -> None:
-    path = tmp_path / "lift.urdf"
-    path.write_text(LIFT)
-    model = load_model(path, check=False)
+def test_a_part_that_slides_in_time_has_position_channels_and_no_offset(tmp_path):
+    parts = map(link, ("mast", "carriage", "arm", "left_finger"))
+    text = urdf(
+        *parts,
+        joint("bolt", "fixed", "world", "mast", limits=None),
+        joint("height", "prismatic", "mast", "carriage", limits='lower="0" upper="0.5"'),
+        joint("swing", "revolute", "carriage", "arm"),
+        joint("grip", "prismatic", "arm", "left_finger", axis="0 1 0"),
+    )
+    model = load_model(write(tmp_path, text), check=False)
     q = np.array([[0.1, 0.5, 0.02], [0.3, -0.4, 0.02], [0.2, 0.1, 0.07]])
     motion = read_bvh(motion_as_bvh(model, q, None, RATE_HZ)[0])
     places = motion.places()
-    by_name = {joint.name: joint for joint in motion.joints}
-    assert len(by_name["carriage"].channels) == 6
+    by_name = {one.name: one for one in motion.joints}
+    assert len(by_name["carriage"].channels) == len(by_name["left_finger"].channels) == 6
     assert not by_name["carriage"].offset.any()
-    assert len(by_name["left_finger"].channels) == 6
-    for link in ("mast", "carriage", "arm", "left_finger"):
-        np.testing.assert_allclose(places[link], link_places(model, link, q), atol=0.01)
+    for name in ("mast", "carriage", "arm", "left_finger"):
+        np.testing.assert_allclose(places[name], link_places(model, name, q), atol=0.01)
 
 
-def test_several_parts_in_the_world_hang_on_it(tmp_path: Path) -> None:
-    path = tmp_path / "two.urdf"
-    parts = "".join(TWO.format(name=name, x=x) for name, x in (("a", 0.0), ("b", 1.0)))
-    path.write_text(f'<robot name="two"><link name="world"/>{parts}</robot>')
-    model = load_model(path, check=False)
+def test_several_parts_in_the_world_hang_on_it(tmp_path):
+    turn = {"axis": "0 1 0", "kind": "revolute", "parent": "world"}
+    text = urdf(
+        *map(link, "ab"),
+        joint("turn_a", child="a", origin='xyz="0 0 1"', **turn),
+        joint("turn_b", child="b", origin='xyz="1 0 1"', **turn),
+    )
+    model = load_model(write(tmp_path, text), check=False)
     q = np.array([[0.2, -0.3], [0.4, 0.1]])
     motion = read_bvh(motion_as_bvh(model, q, None, RATE_HZ)[0])
-    assert [joint.name for joint in motion.joints if joint.channels] == ["world", "a", "b"]
+    assert [one.name for one in motion.joints if one.channels] == ["world", "a", "b"]
     np.testing.assert_allclose(motion.places()["b"], [[100.0, 100.0, 0.0]] * 2, atol=0.01)
 
 
-def test_the_base_pose_moves_the_file() -> None:
+def test_the_base_pose_moves_the_file():
     model = open_model("hand/hand.urdf")
     q = np.tile(model.default_positions, (2, 1))
     X_WB = np.tile(np.eye(4), (2, 1, 1))
@@ -224,7 +234,7 @@ def test_the_base_pose_moves_the_file() -> None:
     np.testing.assert_allclose(places["palm"][1], [z + 10.0, y + 30.0, -x - 20.0], atol=0.01)
 
 
-def test_frames_without_a_pose_are_filled_by_the_last_known_one() -> None:
+def test_frames_without_a_pose_are_filled_by_the_last_known_one():
     model = open_model("person/person.urdf")
     q = random_positions(model, np.random.default_rng(6))
     whole = read_bvh(motion_as_bvh(model, q, None, RATE_HZ)[0])
@@ -239,31 +249,10 @@ def test_frames_without_a_pose_are_filled_by_the_last_known_one() -> None:
         motion_as_bvh(model, np.full_like(q, np.nan), None, RATE_HZ)
 
 
-def test_a_turn_past_half_a_circle_does_not_jump() -> None:
+def test_a_turn_past_half_a_circle_does_not_jump():
     model = open_model("person/person.urdf")
     q = np.tile(model.default_positions, (40, 1))
     q[:, model.position_index("head_y")] = np.linspace(2.0, 4.5, 40)
     q[:, model.position_index("head_x")] = np.linspace(-0.9, 0.9, 40)
     motion = read_bvh(motion_as_bvh(model, q, None, RATE_HZ)[0])
     assert np.abs(np.diff(motion.rows[:, 3:], axis=0)).max() < 15.0
-
-
-LIFT = """<robot name="lift">
-  <link name="mast"><visual><geometry><box size="0.1 0.1 1"/></geometry></visual></link>
-  <link name="carriage"><visual><geometry><box size="0.2 0.2 0.1"/></geometry></visual></link>
-  <link name="arm"><visual><geometry><box size="0.5 0.1 0.1"/></geometry></visual></link>
-  <link name="left_finger"><visual><geometry><box size="0.1 0.02 0.02"/></geometry></visual></link>
-  <link name="world"/>
-  <joint name="bolt" type="fixed"><parent link="world"/><child link="mast"/>
-    <origin xyz="1 0 0.5" rpy="0 0 0.3"/></joint>
-  <joint name="height" type="prismatic"><parent link="mast"/><child link="carriage"/>
-    <origin xyz="0.1 0 0"/><axis xyz="0 0 1"/><limit lower="0" upper="0.5"/></joint>
-  <joint name="swing" type="revolute"><parent link="carriage"/><child link="arm"/>
-    <origin xyz="0.2 0 0"/><axis xyz="0 0 1"/><limit lower="-1" upper="1"/></joint>
-  <joint name="grip" type="prismatic"><parent link="arm"/><child link="left_finger"/>
-    <origin xyz="0.3 0 0"/><axis xyz="0 1 0"/><limit lower="0" upper="0.1"/></joint>
-</robot>"""
-
-TWO = """<link name="{name}"><visual><geometry><box size="1 1 1"/></geometry></visual></link>
-  <joint name="turn_{name}" type="revolute"><parent link="world"/><child link="{name}"/>
-    <origin xyz="{x} 0 1"/><axis xyz="0 1 0"/><limit lower="-1" upper="1"/></joint>"""

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from drake_pose.body.model import ArticulatedModel, load_model
+from drake_pose.body.model import load_model
 from drake_pose.files import overlay
 from drake_pose.files.records import (
     FrameRecord,
@@ -25,7 +25,7 @@ from tests.body.models import joint, link, urdf, write
 
 
 @pytest.fixture(scope="module")
-def model(tmp_path_factory: pytest.TempPathFactory) -> ArticulatedModel:
+def model(tmp_path_factory):
     """Angles from 1 to 2 and all around, and a length from 3 to 3.4."""
     parts = [link(name) for name in ("base", "arm", "slide", "wheel")]
     parts += [
@@ -38,13 +38,11 @@ def model(tmp_path_factory: pytest.TempPathFactory) -> ArticulatedModel:
     return load_model(path, check=False)
 
 
-def record(E_total: float | None = 0.1, **more: object) -> FrameRecord:
+def record(E_total=0.1, **more):
     return FrameRecord(E_total is not None, E_total, 2.0, **more)  # type: ignore[arg-type]
 
 
-def test_an_interval_ends_at_the_limits_and_determines_below_half_the_range(
-    model: ArticulatedModel,
-) -> None:
+def test_an_interval_ends_at_the_limits_and_determines_below_half_the_range(model):
     q = np.array([1.9, 3.2, 3.0])
     told = record_deviations(model, q, np.array([0.1, 0.06, 0.5]))
     assert told["bend"].determined
@@ -63,9 +61,7 @@ def test_an_interval_ends_at_the_limits_and_determines_below_half_the_range(
     assert record_deviations(model, np.full(3, np.nan), np.zeros(3)) == {}
 
 
-def test_what_was_measured_is_the_pose_less_its_error_inside_the_limits(
-    model: ArticulatedModel,
-) -> None:
+def test_what_was_measured_is_the_pose_less_its_error_inside_the_limits(model):
     q = np.array([[1.9, 3.2, 3.0]])
     errors = {"bend": math.degrees(0.2), "reach": -0.1}
     measured = measured_positions(model, q, [record(joint_errors=errors)])
@@ -76,7 +72,7 @@ def test_what_was_measured_is_the_pose_less_its_error_inside_the_limits(
     assert again[0, 0] == pytest.approx(1.7)
 
 
-def test_a_base_is_told_in_seven_numbers_and_back() -> None:
+def test_a_base_is_told_in_seven_numbers_and_back():
     X_WB = np.eye(4)
     X_WB[:3, :3] = [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
     X_WB[:3, 3] = [0.1, -0.2, 0.3]
@@ -84,7 +80,7 @@ def test_a_base_is_told_in_seven_numbers_and_back() -> None:
     np.testing.assert_array_equal(base_pose(None), np.eye(4))
 
 
-def test_a_summary_counts_and_averages_what_was_found() -> None:
+def test_a_summary_counts_and_averages_what_was_found():
     records = {
         "a": record(0.1, ious={"left": 0.9, "right": 0.7}, joint_errors={"bend": -3.0}),
         "b": record(0.3, ious={"left": 0.5}, joint_errors={"bend": 1.0}),
@@ -101,7 +97,7 @@ def test_a_summary_counts_and_averages_what_was_found() -> None:
     assert FrameRecord.from_json(told["frames"]["a"]) == records["a"]
 
 
-def test_a_camera_that_agrees_less_than_the_others_is_named_once() -> None:
+def test_a_camera_that_agrees_less_than_the_others_is_named_once():
     records = {"a": record(ious={"left": 0.9, "right": 0.6, "top": 0.92, "back": 0.8})}
     (text,) = camera_warnings(records)
     assert "'right'" in text
@@ -110,7 +106,7 @@ def test_a_camera_that_agrees_less_than_the_others_is_named_once() -> None:
     assert not camera_warnings({"a": record(ious={"left": 0.9, "right": 0.1})})
 
 
-def test_frames_without_a_pose_share_a_line() -> None:
+def test_frames_without_a_pose_share_a_line():
     records = {name: record() for name in ("0", "1", "2", "3", "4")}
     records |= {"1": record(None), "2": record(None), "4": record(stopped_by="time_limit")}
     # Of a person that is followed it is said elsewhere.
@@ -121,8 +117,8 @@ def test_frames_without_a_pose_share_a_line() -> None:
     assert "time limit" in stopped
 
 
-def test_a_bad_fit_says_what_stands_at_a_limit_and_what_was_held(model: ArticulatedModel) -> None:
-    def told(bend: float, error: float) -> tuple[str, ...]:
+def test_a_bad_fit_says_what_stands_at_a_limit_and_what_was_held(model):
+    def told(bend, error):
         row = PoseRow("a", np.array([bend, 3.2, -np.pi]), None, error, 1.0)
         return poor_fit_warnings([row], {"a": record(error)}, model, ["reach"])
 
@@ -133,12 +129,12 @@ def test_a_bad_fit_says_what_stands_at_a_limit_and_what_was_held(model: Articula
     assert "what is held (reach)" in told(1.5, 0.4)[0]
 
 
-def test_an_overlay_gives_shares_of_the_silhouette(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_overlay_gives_shares_of_the_silhouette(monkeypatch):
     seen, body = np.zeros((20, 20), dtype=bool), np.zeros((20, 20), dtype=bool)
     seen[2:12, 2:12], body[4:14, 2:12] = True, True
     legends = []
 
-    def framed(picture: np.ndarray, title: str, legend: object = ()) -> np.ndarray:
+    def framed(picture, title, legend=()):
         legends.append(legend)
         return picture
 

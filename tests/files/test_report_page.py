@@ -3,9 +3,8 @@ import json
 import re
 from contextlib import suppress
 from dataclasses import replace
-from html.parser import HTMLParser
 from pathlib import Path
-from typing import Any
+from xml.etree import ElementTree
 
 import cv2
 import msgpack
@@ -13,7 +12,7 @@ import numpy as np
 import pytest
 
 from drake_pose.body.formats.packages import bundled_model
-from drake_pose.body.model import ArticulatedModel, load_model
+from drake_pose.body.model import load_model
 from drake_pose.camera.models import ParallelCamera, PinholeCamera, look_at
 from drake_pose.files.records import FrameRecord, JointRecord, PoseRow, SceneEstimate
 from drake_pose.files.replay import make_replay
@@ -29,144 +28,97 @@ from drake_pose.files.settings import EstimateSettings
 from drake_pose.files.summary import summarize
 from drake_pose.jobs.estimate.scene import estimate_scene
 from drake_pose.silhouette.pictures.scenes import Scene
-from tests.jobs.scenes import NAMES, TinyScene, camera, read_rows
-
-VOID = {"meta", "img", "br", "link", "hr"}
+from tests.jobs.scenes import NAMES, camera, read_rows
 
 
-class Page(HTMLParser):
-    """Reads a page back: its tables by id or order, texts by id, links, and what it draws."""
+class Page:
+    """A page read back: its tables, texts by id, and figures; every tag must be closed."""
 
-    def __init__(self, text: str) -> None:
-        super().__init__()
-        self.tables: list[list[list[str]]] = []
-        self.by_id: dict[str, str] = {}
-        self.links: list[str] = []
-        self.sources: list[str] = []
-        self.joints: dict[str, str] = {}
-        self.classes: list[str] = []
-        self.tags: list[str] = []
-        self.labels: list[str] = []
-        self.plots: dict[str, list[tuple[str, dict[str, str | None]]]] = {}
-        self.ticks: dict[str, list[tuple[float, float]]] = {}
-        self._plot = ""
-        self._open: list[tuple[str, str | None]] = []
-        self._joint: str | None = None
-        self.feed(text)
-        assert not self._open, "a tag is not closed"
+    def __init__(self, text):
+        text = re.sub(r"<!doctype[^>]*>", "", text, flags=re.IGNORECASE)
+        text = re.sub(r"<(meta|img|br|link|hr)\b([^>]*?)/?>", r"<\1\2/>", text)
+        self.root = ElementTree.fromstring(text.replace("&middot;", "."))
+        every = [*self.root.iter()]
+        self.tags = [one.tag for one in every]
+        self.classes = [name for one in every for name in one.get("class", "").split()]
+        self.by_id = {one.get("id"): "".join(one.itertext()) for one in every if one.get("id")}
+        self.tables = [
+            [["".join(cell.itertext()) for cell in row] for row in table.iter("tr")]
+            for table in self.root.iter("table")
+        ]
+        self.plots = {}
+        for figure in self.root.iter("figure"):
+            if (drawn := figure.find(".//svg")) is not None:
+                label = drawn.get("aria-label", "").split(" by frame")[0]
+                self.plots[figure.get("data-joint") or label] = figure
+        assert all(one.get("aria-hidden") or one.get("aria-label") for one in self.root.iter("svg"))
+        assert all(one.get("alt") for one in self.root.iter("img"))
 
-    def handle_starttag(self, tag: str, attributes: list[tuple[str, str | None]]) -> None:
-        values = dict(attributes)
-        self.tags.append(tag)
-        if tag not in VOID:
-            self._open.append((tag, values.get("id")))
-        if tag == "table":
-            self.tables.append([])
-        elif tag == "tr":
-            self.tables[-1].append([])
-        elif tag in ("td", "th"):
-            self.tables[-1][-1].append("")
-        elif tag == "a":
-            self.links.append(str(values["href"]))
-        elif tag == "img":
-            self.sources.append(str(values["src"]))
-            assert values["alt"]
-        elif tag == "svg":
-            assert values.get("aria-hidden") or values.get("aria-label")
-            if not self._plot:
-                self._plot = str(values.get("aria-label", "")).split(" by frame")[0]
-        if tag == "figure":
-            self._joint = values.get("data-joint")
-            self._plot = self._joint or ""
-        if tag in ("path", "text"):
-            self.plots.setdefault(self._plot, []).append((str(values.get("class")), values))
-        if values.get("aria-label"):
-            self.labels.append(str(values["aria-label"]))
-        self.classes += (values.get("class") or "").split()
+    def table(self, *head):
+        """The table that begins with these cells."""
+        return next(table for table in self.tables if table[0][: len(head)] == [*head])
 
-    def handle_startendtag(self, tag: str, attributes: list[tuple[str, str | None]]) -> None:
-        self.handle_starttag(tag, attributes)
-        self.handle_endtag(tag)
-
-    def handle_endtag(self, tag: str) -> None:
-        if tag not in VOID:
-            assert self._open.pop()[0] == tag
-
-    def handle_data(self, data: str) -> None:
-        for _, name in self._open:
-            if name:
-                self.by_id[name] = self.by_id.get(name, "") + data
-        tags = [tag for tag, _ in self._open]
-        if {"td", "th"} & set(tags):
-            self.tables[-1][-1][-1] += data
-        if tags[-1:] == ["text"] and self.plots[self._plot][-1][0] == "y":
-            height = float(str(self.plots[self._plot][-1][1]["y"])) - 4.0
-            self.ticks.setdefault(self._plot, []).append((height, float(data)))
-        if "figcaption" in tags and self._joint:
-            self.joints[self._joint] = data.strip()
-            self._joint = None
-
-    def curve(self, joint: str, kind: str) -> np.ndarray:
+    def curve(self, joint, kind):
         """(n, 2) points of a curve: place [pixel], and value as the axis' ticks say."""
-        path = next(str(own["d"]) for name, own in self.plots[joint] if kind in name.split())
-        points, (height, value) = coordinates(path), np.array(self.ticks[joint]).T
+        drawn = [*self.plots[joint].iter()]
+        path = next(one.get("d") for one in drawn if kind in one.get("class", "").split())
+        ticks = [one for one in drawn if (one.tag, one.get("class")) == ("text", "y")]
+        height, value = np.array([(float(one.get("y")) - 4.0, float(one.text)) for one in ticks]).T
+        points = coordinates(path)
         points[:, 1] = np.polynomial.Polynomial.fit(height, value, 1)(points[:, 1])
         return points
 
 
 @pytest.fixture(scope="module")
-def result(tiny_scene: TinyScene, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def result(tiny_scene, tmp_path_factory):
     out = tmp_path_factory.mktemp("report") / "out"
     settings = EstimateSettings(interval=20.0)
     estimate_scene(tiny_scene.folder, tiny_scene.model, out, settings, replay=False)
     return out
 
 
-def list_ious(result: Path) -> list[float]:
-    frames = json.loads((result / "summary.json").read_text())["frames"].values()
-    return [frame["ious"]["front"] for frame in frames]
-
-
-def test_page_says_what_the_tables_say(result: Path) -> None:
+def test_page_says_what_the_tables_say(result):
     page = Page((result / "report.html").read_text())
     poses = read_rows(result / "poses.csv")
-    frames = next(table for table in page.tables if table[0][:2] == ["frame", "pose"])
-    assert [row[0] for row in frames[1:]] == [row["frame"] for row in poses]
-    for row, pose in zip(frames[1:], poses, strict=True):
-        assert row[1] == "found"
-        assert float(row[2].rstrip(" %")) == pytest.approx(100.0 * float(pose["error"]), abs=0.051)
-    assert set(page.joints) == set(NAMES)
-    for name, text in page.joints.items():
+    records = json.loads((result / "summary.json").read_text())["frames"].values()
+    errors = [100.0 * float(pose["error"]) for pose in poses]
+    for row, pose, error in zip(page.table("frame", "pose")[1:], poses, errors, strict=True):
+        assert row[:2] == [pose["frame"], "found"]
+        assert float(row[2].rstrip(" %")) == pytest.approx(error, abs=0.051)
+    for name in NAMES:
+        text = "".join(page.plots[name].find("figcaption").itertext())
         values = np.degrees([float(pose[name]) for pose in poses])
         numbers = [float(number) for number in re.findall(r"-?\d+\.?\d*(?:e-?\d+)?", text)]
         np.testing.assert_allclose(numbers[:2], [values.min(), values.max()], rtol=1e-3)
     for curve, told in (
-        ("E_total", [float(pose["error"]) for pose in poses]),
-        ("Intersection over union of each camera", list_ious(result)),
+        ("E_total", errors),
+        (
+            "Intersection over union of each camera",
+            [100.0 * one["ious"]["front"] for one in records],
+        ),
     ):
-        np.testing.assert_allclose(page.curve(curve, "c0")[:, 1], 100.0 * np.array(told), atol=0.01)
+        np.testing.assert_allclose(page.curve(curve, "c0")[:, 1], told, atol=0.01)
     assert page.by_id["found"] == "3 of 3"
-    cameras = next(table for table in page.tables if table[0][0] == "camera")
-    assert cameras[1][:3] == ["front", "3", "3"]
+    assert page.table("camera")[1][:3] == ["front", "3", "3"]
     assert "None." in page.by_id["warnings"]
 
 
-def test_page_needs_nothing_but_itself_and_its_links_lead_somewhere(result: Path) -> None:
+def test_page_needs_nothing_but_itself_and_its_links_lead_somewhere(result):
     text = (result / "report.html").read_text()
     page = Page(text)
     assert "http" not in re.sub(r"data:image/jpeg;base64,[\w+/=]*", "", text)
-    assert not {"script", "link", "iframe"} & set(page.tags)
-    assert page.sources
-    for source in page.sources:
-        data = base64.b64decode(source.removeprefix("data:image/jpeg;base64,"))
+    assert not {"script", "link", "iframe"} & {*page.tags}
+    drawn = cv2.imread(str(next(result.glob("overlay/front/*.png"))))
+    assert "img" in page.tags
+    for image in page.root.iter("img"):
+        data = base64.b64decode(image.get("src").removeprefix("data:image/jpeg;base64,"))
         small = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
-        drawn = cv2.imread(str(next(result.glob("overlay/front/*.png"))))
         assert small.shape[0] <= min(drawn.shape[0], 400)
-    for link in page.links:
+    for link in (one.get("href") for one in page.root.iter("a")):
         assert link.removeprefix("#") in page.by_id or (result / link).is_file(), link
 
 
-def long_report(frames: int) -> tuple[ArticulatedModel, Scene, SceneEstimate]:
+def long_report(frames):
     """A person in many frames: two cameras, gaps, frames not found, names that are no HTML."""
     model = load_model(bundled_model("person").with_name("person_shape.urdf"), check=False)
     rng = np.random.default_rng(2)
@@ -204,26 +156,25 @@ def long_report(frames: int) -> tuple[ArticulatedModel, Scene, SceneEstimate]:
 
 
 @pytest.fixture(scope="module")
-def report() -> tuple[ArticulatedModel, Scene, SceneEstimate]:
+def report():
     return long_report(1000)
 
 
-def test_a_thousand_frames_stay_small_and_names_are_shown_as_they_are(report) -> None:
+def test_a_thousand_frames_stay_small_and_names_are_shown_as_they_are(report):
     text = make_report(Path("nowhere"), *report)
     assert len(text) < 2_500_000
     page = Page(text)
     assert page.by_id["found"] == "980 of 1000"
-    still = next(table for table in page.tables if table[0][0] == "joint")
-    assert still[1][:2] == ["left_thigh_stretch", "0.0200"]
-    assert not {"b", "script"} & set(page.tags)
-    cameras = next(table for table in page.tables if table[0][0] == "camera")
-    assert [row[0] for row in cameras[1:]] == ["<b>left</b>", "right & low"]
-    assert cameras[1][6] == "see the warnings"
-    assert cameras[2][1:3] == ["987", "955"]
+    assert page.table("joint")[1][:2] == ["left_thigh_stretch", "0.0200"]
+    assert not {"b", "script"} & {*page.tags}
+    _, left, right = page.table("camera")
+    assert [left[0], right[0]] == ["<b>left</b>", "right & low"]
+    assert left[6] == "see the warnings"
+    assert right[1:3] == ["987", "955"]
     assert "camera '<b>left</b>' agrees badly" in page.by_id["warnings"]
 
 
-def test_measured_positions_are_drawn_where_they_were(report) -> None:
+def test_measured_positions_are_drawn_where_they_were(report):
     model, scene, whole = report
     name, k = "left_forearm_x", model.position_index("left_forearm_x")
     rows, frames = whole.rows[:20], [f"{k:04d}" for k in range(20)]
@@ -248,45 +199,45 @@ def test_measured_positions_are_drawn_where_they_were(report) -> None:
     assert "green: measured" not in make_report(Path("nowhere"), model, scene, some)
 
 
-def test_bands_are_explained_where_there_are_some(report) -> None:
+def test_bands_are_explained_where_there_are_some(report):
     model, scene, whole = report
-    whole = replace(whole, rows=whole.rows[:9], records=dict(list(whole.records.items())[:9]))
+    whole = replace(whole, rows=whole.rows[:9], records=dict([*whole.records.items()][:9]))
     assert "Blue band" in make_report(Path("nowhere"), model, scene, whole)
     bare = {frame: replace(one, joints={}) for frame, one in whole.records.items()}
     page = make_report(Path("nowhere"), model, scene, replace(whole, records=bare))
     assert " band" not in page
-    assert not {"known", "open"} & set(Page(page).classes)
+    assert not {"known", "open"} & {*Page(page).classes}
 
 
-@pytest.mark.parametrize("k", [0, 100])
-def test_a_frame_is_a_table_without_plots(report, k: int) -> None:
+def test_a_frame_is_a_table_without_plots(report):
+    """Of the estimate, its interval, and what was measured; of one without a pose there is none."""
     model, scene, whole = report
     name = "left_forearm_x"
-    record = replace(whole.records[f"{k:04d}"], joint_errors={name: -4.0} if k == 0 else {})
-    summary = whole.summary | {"joint_errors": {name: {}} if k == 0 else {}}
-    one = replace(whole, rows=whole.rows[k : k + 1], records={f"{k:04d}": record}, summary=summary)
-    page = Page(make_report(Path("nowhere"), model, scene, one))
-    assert not page.ticks
-    tables = [table for table in page.tables if table[0][0] == "joint"]
-    assert bool(tables) is (k == 0)
-    if tables:
-        value = np.degrees(whole.rows[0].q[model.position_index(name)])
-        row = next(row for row in tables[0] if row[0] == name)
-        numbers = [float(number) for number in re.findall(r"-?\d+\.\d+", " ".join(row[1:5]))]
-        # The estimate, its interval, and what was measured.
-        unit = np.degrees(0.02)
-        expected = [value, value - unit, value + unit, value + 4.0]
-        np.testing.assert_allclose(numbers, expected, atol=0.006)
-        assert "not determined" in row[3]
+    for k, off in ((0, {name: -4.0}), (100, {})):
+        record = replace(whole.records[f"{k:04d}"], joint_errors=off)
+        summary = whole.summary | {"joint_errors": {key: {} for key in off}}
+        rows, records = whole.rows[k : k + 1], {f"{k:04d}": record}
+        one = replace(whole, rows=rows, records=records, summary=summary)
+        page = Page(make_report(Path("nowhere"), model, scene, one))
+        assert "y" not in page.classes
+        tables = [table for table in page.tables if table[0][0] == "joint"]
+        assert len(tables) == len(off)
+        for row in (row for table in tables for row in table if row[0] == name):
+            value = np.degrees(rows[0].q[model.position_index(name)])
+            numbers = [float(number) for number in re.findall(r"-?\d+\.\d+", " ".join(row[1:5]))]
+            unit = np.degrees(0.02)
+            expected = [value, value - unit, value + unit, value + 4.0]
+            np.testing.assert_allclose(numbers, expected, atol=0.006)
+            assert "not determined" in row[3]
 
 
-def coordinates(path: str) -> np.ndarray:
+def coordinates(path):
     return np.array(
         [[float(n) for n in pair] for pair in re.findall(r"[ML]([\d.-]+) ([\d.-]+)", path)]
     )
 
 
-def test_curves_break_at_gaps_and_keep_their_peaks() -> None:
+def test_curves_break_at_gaps_and_keep_their_peaks():
     values = np.sin(np.linspace(0.0, 20.0, 5000))
     values[2500], values[1000:1100] = 3.0, np.nan
     plot = plot_curves(
@@ -305,7 +256,7 @@ def test_curves_break_at_gaps_and_keep_their_peaks() -> None:
     assert plot.limits[1] < peak[1] < plot.limits[0]
 
 
-def test_limits_that_are_far_do_not_flatten_the_curve() -> None:
+def test_limits_that_are_far_do_not_flatten_the_curve():
     values = np.linspace(0.0, 1.0, 50)
     plot = plot_curves(
         [str(k) for k in range(50)], [("one", values)], joined=True, limits=(-90, 90)
@@ -315,7 +266,7 @@ def test_limits_that_are_far_do_not_flatten_the_curve() -> None:
     assert plot.limits == ()
 
 
-def test_stills_are_dots() -> None:
+def test_stills_are_dots():
     plot = plot_curves(["a", "b"], [("one", np.array([1.0, np.nan]))], joined=False)
     assert plot.curves[0][1].count("h0") == 1
     assert plot.dots
@@ -326,7 +277,7 @@ def test_stills_are_dots() -> None:
         assert coordinates(plot.curves[0][1])[0, 0] == pytest.approx(left + 0.5 * width, abs=0.1)
 
 
-def test_grid_joins_neighbours_of_one_state() -> None:
+def test_grid_joins_neighbours_of_one_state():
     states = ["used", "used", "no-picture", "used"]
     grid = draw_grid(["0", "1", "2", "3"], [("left", states)])
     runs = grid.rows[0][2]
@@ -334,7 +285,7 @@ def test_grid_joins_neighbours_of_one_state() -> None:
     assert runs[0][1] == pytest.approx(2 * runs[1][1], abs=0.02)
 
 
-def played(page: str) -> dict[tuple[str, str | None], dict[str, Any]]:
+def played(page):
     """What a replay tells Meshcat, by what is told and of which path."""
     told = {}
     for text in re.findall(r"base64,([\w+/=]+)", page):
@@ -345,9 +296,7 @@ def played(page: str) -> dict[tuple[str, str | None], dict[str, Any]]:
     return told
 
 
-def test_a_replay_shows_all_of_the_body_the_cameras_and_what_was_measured(
-    tiny_scene: TinyScene,
-) -> None:
+def test_a_replay_shows_all_of_the_body_the_cameras_and_what_was_measured(tiny_scene):
     model = load_model(tiny_scene.model, check=False)
     q, off = np.array([*tiny_scene.truth.values()]), np.array([0.3, -0.1])
     X_WB = np.repeat(np.eye(4)[None], len(q), axis=0)

@@ -62,7 +62,7 @@ class TestEdges:
         assert np.isnan(edge.middle).all()
 
     @pytest.mark.parametrize("degrees", [0.0, 10.0, 26.0, 45.0, 63.0, 80.0])
-    def test_points_are_on_the_edge_in_the_mean(self, degrees: float) -> None:
+    def test_points_are_on_the_edge_in_the_mean(self, degrees):
         # Half a plane, of which a pixel belongs to it whose centre does; many offsets of its edge.
         n = np.array([np.cos(np.radians(degrees)), np.sin(np.radians(degrees))])
         v, u = np.mgrid[:200, :200]

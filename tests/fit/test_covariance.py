@@ -8,6 +8,8 @@ from drake_pose.fit.covariance import (
     Distances,
     ErrorEffects,
     ErrorSizes,
+    _apriori,
+    distances_covariance,
     doubted_covariance,
     estimate_sizes,
     values_covariance,
@@ -15,7 +17,6 @@ from drake_pose.fit.covariance import (
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.fit.surfaces import few_triangles
 from drake_pose.search.continuous.views_fit import ViewsFit
-from drake_pose.search.estimates import View
 from drake_pose.silhouette.areas.bending import TreeSurfaces
 from tests.search.arms import arm_tree, damaged_views, draw_pose
 
@@ -25,9 +26,7 @@ ANGLES = np.ones(3, dtype=bool)
 ALL = np.arange(3)
 
 
-def drawn_distances(
-    generator: np.random.Generator, sizes: ErrorSizes, count: int = 150
-) -> tuple[Distances, np.ndarray]:
+def drawn_distances(generator, sizes, count=150):
     """Distances that follow three values and five kinds of errors; and the values' errors."""
     X = generator.normal(0.0, 20.0, (count, 3))
     kinds = [generator.normal(0.0, 1.5, (count, k)) for k in (40, 60, 12)]
@@ -44,19 +43,19 @@ def drawn_distances(
     return seen, np.linalg.solve(X.T @ X, X.T @ y)
 
 
-def test_sizes_are_those_that_were_drawn() -> None:
+def test_sizes_are_those_that_were_drawn():
     generator = np.random.default_rng(1)
     sizes = ErrorSizes(1.5, 1.2, 0.4, 1.0, 2.0)
     found = [estimate_sizes(drawn_distances(generator, sizes)[0], ANGLES) for _ in range(4)]
     np.testing.assert_allclose(np.median([one[:5] for one in found], axis=0), sizes[:5], rtol=0.4)
 
 
-def test_a_calibration_is_not_trusted_beyond_a_pixel() -> None:
+def test_a_calibration_is_not_trusted_beyond_a_pixel():
     seen, _ = drawn_distances(np.random.default_rng(2), ErrorSizes(1.0, 0.5, 0.1, 0.1, 0.01))
     assert estimate_sizes(seen, ANGLES).camera == 1.0
 
 
-def test_covariance_is_that_of_many_fits() -> None:
+def test_covariance_is_that_of_many_fits():
     generator = np.random.default_rng(3)
     sizes = ErrorSizes(1.0, 1.0, 0.5, 0.5, 2.0)
     ratios = []
@@ -69,7 +68,7 @@ def test_covariance_is_that_of_many_fits() -> None:
 
 
 @pytest.mark.parametrize("size", [0.0, 1.0, 5.0])
-def test_what_is_doubted_widens_what_leans_on_it(size: float) -> None:
+def test_what_is_doubted_widens_what_leans_on_it(size):
     """Of values whose fit knew nothing of it, as many are inside as is claimed, however large."""
     generator, inside, widths = np.random.default_rng(4), [], []
     for _ in range(12):
@@ -86,7 +85,7 @@ def test_what_is_doubted_widens_what_leans_on_it(size: float) -> None:
     assert np.median(widths) < 4.0
 
 
-def test_values_that_do_not_show_are_as_unsure_as_a_full_turn() -> None:
+def test_values_that_do_not_show_are_as_unsure_as_a_full_turn():
     nothing = Distances(
         np.zeros(0),
         np.zeros((0, 3)),
@@ -102,13 +101,11 @@ def test_values_that_do_not_show_are_as_unsure_as_a_full_turn() -> None:
 
 
 @pytest.fixture(scope="module")
-def kinematics(tmp_path_factory: pytest.TempPathFactory) -> TreeKinematics:
+def kinematics(tmp_path_factory):
     return TreeKinematics(arm_tree(tmp_path_factory.mktemp("arm")))
 
 
-def fitted(
-    kinematics: TreeKinematics, views: list[View], truth: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, ErrorSizes]:
+def fitted(kinematics, views, truth):
     """How far a pose fitted from the truth is from it, its standard deviations, and the sizes."""
     fit = ViewsFit(kinematics, few_triangles(TreeSurfaces(kinematics.tree)), views)
     values = fit.refine(truth, FINE).values
@@ -119,9 +116,7 @@ def fitted(
     return values - truth, np.sqrt(np.diag(covariance)), sizes
 
 
-def test_truths_lie_in_their_intervals_where_cameras_masks_and_links_are_off(
-    kinematics: TreeKinematics,
-) -> None:
+def test_truths_lie_in_their_intervals_where_cameras_masks_and_links_are_off(kinematics):
     """And points that erred each by itself would claim far more."""
     errors, deviations = [], []
     generator = np.random.default_rng(7)
@@ -135,7 +130,7 @@ def test_truths_lie_in_their_intervals_where_cameras_masks_and_links_are_off(
     assert np.median(ratios) > 0.2
 
 
-def test_costs_by_pieces_add_up(kinematics: TreeKinematics) -> None:
+def test_costs_by_pieces_add_up(kinematics):
     truth = np.array([0.6, 0.7, -0.7, 0.9, 0.3])
     views = damaged_views(kinematics.tree, truth, 2)
     fit = ViewsFit(kinematics, few_triangles(TreeSurfaces(kinematics.tree)), views)
@@ -144,3 +139,14 @@ def test_costs_by_pieces_add_up(kinematics: TreeKinematics) -> None:
     # Only where a silhouette or the body has an edge.
     assert 5 < np.count_nonzero(pieces[0]) < 80
     assert (pieces >= 0.0).all()
+
+
+def test_what_is_doubted_is_taken_out_as_likely_as_one_normal_distribution_says():
+    sizes = ErrorSizes(1.0, 0.5, 0.2, 0.1, 0.3, (2.0,))
+    seen, _ = drawn_distances(np.random.default_rng(5), sizes, 40)
+    _, without = doubted_covariance(seen, sizes, ANGLES)
+    (A,) = seen.doubts
+    values = seen.X @ np.linalg.inv(_apriori(ANGLES)) @ seen.X.T
+    whole = distances_covariance(seen, sizes) + 4.0 * A @ A.T + values
+    likeliest = 4.0 * A.T @ np.linalg.solve(whole, seen.y)
+    np.testing.assert_allclose(without.y, seen.y - A @ likeliest, atol=1e-6)

@@ -1,5 +1,7 @@
 """Unknowns of every kind found again in drawn silhouettes, and their equations."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.sparse import csr_array
@@ -66,35 +68,22 @@ def poses(body, count, seed):
 def draw(body, cameras, theta, camera_theta=None):
     """The edges that cameras see of a body; drawn by the span kernel, not by the fit's."""
     placement = body.place(theta)
-    parameters = np.zeros(9 * len(cameras)) if camera_theta is None else camera_theta
-    X_CW, kernel, _ = CameraParameters(cameras, root_of(body)).place(parameters)
-    edges = []
-    for c, camera in enumerate(cameras):
-        focal = float(kernel[c, 1])
-        moved = (
-            PinholeCamera(
-                camera.name, camera.width, camera.height, focal, float(kernel[c, 2]),
-                camera.center_x, camera.center_y, np.linalg.inv(X_CW[c]),
-            )
-            if isinstance(camera, PinholeCamera)
-            else ParallelCamera(
-                camera.name, camera.width, camera.height, focal,
-                camera.center_x, camera.center_y, np.linalg.inv(X_CW[c]),
-            )
-        )  # fmt: skip
-        outlines = _outlines(body, placement)
-        edges.append(find_edge_points(draw_mask(outlines, X_CW[c] @ placement.X_WN, moved), 2.0))
-    return pack_evidence(edges)
-
-
-def _outlines(body, placement):
     starts = placement.packed.starts[:, 0]
-    return [
+    outlines = [
         outline_from_mesh(
             TriangleMesh(placement.packed.points[:, starts[k] : starts[k + 1]].T, one.triangles)
         )
         for k, one in enumerate(body.outlines)
     ]
+    parameters = np.zeros(9 * len(cameras)) if camera_theta is None else camera_theta
+    X_CW, kernel, _ = CameraParameters(cameras, root_of(body)).place(parameters)
+    edges = []
+    for camera, X, (_, fx, fy, *_) in zip(cameras, X_CW, kernel.tolist(), strict=True):
+        is_pinhole = isinstance(camera, PinholeCamera)
+        lens = {"focal_x": fx, "focal_y": fy} if is_pinhole else {"pixels_per_metre": fx}
+        moved = replace(camera, X_WC=np.linalg.inv(X), **lens)
+        edges.append(find_edge_points(draw_mask(outlines, X @ placement.X_WN, moved), 2.0))
+    return pack_evidence(edges)
 
 
 def root_of(body):
@@ -102,61 +91,49 @@ def root_of(body):
     return kinematics.poses(kinematics.flatten(kinematics.tree.default_values()))[0, :3, 3]
 
 
-def names_of(camera, count=9):
-    return [f"{camera.name}.{name}" for name in CAMERA_NAMES[:count]]
+def test_a_focal_length_and_a_scale_of_all_frames_are_found(body, rig):
+    truth = poses(body, 3, 3)
+    for camera in (rig[0], parallel(rig[0])):
+        moved = np.array([0.0] * 6 + [0.08, 0.0, 0.0])
+        names = parameter_names(body, [camera])
+        unknowns = choose(names, [f"{camera.name}.{CAMERA_NAMES[6]}"], shared=True)
+        frames = [draw(body, [camera], theta, moved) for theta in truth]
+        found = FramesFit(body, [camera], unknowns).fit(
+            frames, truth, np.zeros((3, 0)), np.zeros(1), ROUNDS
+        )
+        np.testing.assert_allclose(found.shared, 0.08, atol=0.004)
 
 
-class TestKnownAnswers:
-    def test_focal_length_and_scale(self, body, rig):
-        truth = poses(body, 3, 3)
-        for camera in (rig[0], parallel(rig[0])):
-            moved = np.array([0.0] * 6 + [0.08, 0.0, 0.0])
-            all_names = parameter_names(body, [camera])
-            unknowns = choose(all_names, names_of(camera)[6:7], shared=True)
-            frames = [draw(body, [camera], theta, moved) for theta in truth]
-            found = FramesFit(body, [camera], unknowns).fit(
-                frames, truth, np.zeros((3, 0)), np.zeros(1), ROUNDS
-            )
-            np.testing.assert_allclose(found.shared, 0.08, atol=0.004)
-
-    def test_joint_zeros_of_all_frames(self, body, rig):
-        truth = poses(body, 4, 4)
-        zeros = np.array([0.08, -0.1, 0.07, 0.05])
-        index = [list(body.names).index(name) for name in BENT]
-        readings = truth.copy()
-        readings[:, index] -= zeros
-        fit = FramesFit(body, rig, choose(body.names, BENT, shared=True))
-        frames = [draw(body, rig, theta) for theta in truth]
-        found = fit.fit(frames, readings, np.zeros((4, 0)), np.zeros(4), ROUNDS)
-        np.testing.assert_allclose(found.shared, zeros, atol=0.012)
+def test_joint_zeros_of_all_frames_are_found(body, rig):
+    truth = poses(body, 4, 4)
+    zeros = np.array([0.08, -0.1, 0.07, 0.05])
+    readings = truth.copy()
+    readings[:, [list(body.names).index(name) for name in BENT]] -= zeros
+    fit = FramesFit(body, rig, choose(body.names, BENT, shared=True))
+    frames = [draw(body, rig, theta) for theta in truth]
+    found = fit.fit(frames, readings, np.zeros((4, 0)), np.zeros(4), ROUNDS)
+    np.testing.assert_allclose(found.shared, zeros, atol=0.012)
 
 
 def test_equations_are_the_slope_of_the_cost(body, rig):
     """Of every parameter at once, where all points have their counterparts."""
-    camera = parallel(rig[0])
-    cameras = [rig[1], camera]
+    cameras = [rig[1], parallel(rig[0])]
     truth = poses(body, 1, 7)
     every = parameter_names(body, cameras)
-    all_names = every[: -len(cameras)]
-    fit = FramesFit(body, cameras, choose(every, all_names))
-    generator = np.random.default_rng(0)
+    names = every[: -len(cameras)]
+    fit = FramesFit(body, cameras, choose(every, names))
+    generator, none = np.random.default_rng(0), np.zeros(0)
     rates = generator.uniform(-1.0, 1.0, len(body.kinematics.names))
     evidence = [FrameEvidence(draw(body, cameras, truth[0]), rates=rates)]
-    base = np.pad(truth, ((0, 0), (0, len(all_names) - truth.shape[1])))
-    step = AnnealingStage(0.1, 0.002)
+    base = np.pad(truth, ((0, 0), (0, len(names) - truth.shape[1])))
     base += 0.015 * generator.uniform(-1, 1, base.shape)
-    none = np.zeros(0)
-    at = fit.equations(evidence, base, np.zeros((1, len(all_names))), none, step)
-    slopes, expected = [], []
-    for k in range(len(all_names)):
-        ends = []
-        for sign in (-1.0, 1.0):
-            own = np.zeros((1, len(all_names)))
-            own[0, k] = sign * 2e-3
-            ends.append(fit.equations(evidence, base, own, none, step).cost)
-        slopes.append((ends[1] - ends[0]) / (2 * 2e-3))
-        expected.append(2.0 * at.g[0, k])
-    slopes, expected = np.array(slopes), np.array(expected)
+
+    def equations(own):
+        return fit.equations(evidence, base, own[None], none, AnnealingStage(0.1, 0.002))
+
+    steps = 2e-3 * np.eye(len(names))
+    slopes = np.array([equations(d).cost - equations(-d).cost for d in steps]) / (2 * 2e-3)
+    expected = 2.0 * equations(np.zeros(len(names))).g[0, : len(names)]
     # Counterparts change on the way: the slopes agree on the whole.
     cosine = slopes @ expected / np.linalg.norm(slopes) / np.linalg.norm(expected)
     assert cosine > 0.93

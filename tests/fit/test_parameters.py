@@ -3,24 +3,20 @@
 import numpy as np
 import pytest
 
-from drake_pose.body.formats.packages import bundled_model
-from drake_pose.body.model import load_model
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
-from drake_pose.camera.models import ParallelCamera, PinholeCamera, circle_of_cameras
+from drake_pose.camera.models import ParallelCamera, circle_of_cameras
 from drake_pose.fit.parameters import CAMERA_NAMES, BodyParameters, CameraParameters
 from drake_pose.fit.surfaces import VERY_FEW, few_triangles
 from drake_pose.silhouette.areas.bending import TreeSurfaces
-
-STEP = 1e-6
+from tests.fit.motions import STEP, assert_motions_are_derivatives
 
 
 @pytest.fixture(scope="module")
-def body():
-    tree = load_model(bundled_model("person"), check=False).pose_tree()
-    kinematics = TreeKinematics(tree)
+def body(person):
+    tree = person.pose_tree()
     outlines = few_triangles(TreeSurfaces(tree), VERY_FEW)
     groups = np.arange(len(tree.nodes)) % 3 - 1
-    return BodyParameters(kinematics, outlines, groups, ("one", "two"))
+    return BodyParameters(TreeKinematics(tree), outlines, groups, ("one", "two"))
 
 
 @pytest.fixture(scope="module")
@@ -33,35 +29,8 @@ def theta(body):
     return np.concatenate([values, [0.2, -0.1, 0.15, 0.1], [0.2, -0.15]])
 
 
-def world_points(placement):
-    """One point of each node's surface, wherever the parameters have brought it."""
-    starts = placement.packed.starts[:-1, 0]
-    p_N = placement.packed.points[:, starts].T
-    return np.einsum("nij,nj->ni", placement.X_WN[:, :3, :3], p_N) + placement.X_WN[:, :3, 3]
-
-
-def motion_of(placement, node, parameter):
-    """The affine motion (3, 4) that a parameter gives to a node."""
-    affine = np.zeros((3, 4))
-    for k in range(placement.starts[node], placement.starts[node + 1]):
-        if placement.parameters[k] == parameter:
-            affine += placement.motions[placement.owners[k]].reshape(3, 4)
-    return affine
-
-
 def test_body_parameters_against_finite_differences(body, theta):
-    placement = body.place(theta)
-    p_W = world_points(placement)
-    for parameter, name in enumerate(body.names):
-        ends = [theta.copy(), theta.copy()]
-        ends[0][parameter] -= STEP
-        ends[1][parameter] += STEP
-        below, above = (world_points(body.place(end)) for end in ends)
-        for node in range(len(p_W)):
-            affine = motion_of(placement, node, parameter)
-            speed = (above[node] - below[node]) / (2 * STEP)
-            found = affine @ [*p_W[node], 1.0]
-            np.testing.assert_allclose(found, speed, atol=1e-7, err_msg=f"{name}, node {node}")
+    assert_motions_are_derivatives(body, theta)
 
 
 def test_values_alone_are_all_parameters_at_rest(body, theta):
@@ -80,26 +49,20 @@ def picture(X_CW, kernel, p_W):
 
 
 def test_camera_parameters_against_finite_differences():
-    pinhole = next(iter(circle_of_cameras(1).values()))
+    (pinhole,) = circle_of_cameras(1, face_camera=False).values()
     parallel = ParallelCamera("parallel", 640, 480, 250.0, 320.0, 240.0, pinhole.X_WC)
-    assert isinstance(pinhole, PinholeCamera)
     cameras = CameraParameters([pinhole, parallel], np.array([0.1, -0.2, 1.0]))
     theta = np.random.default_rng(2).uniform(-0.3, 0.3, len(cameras.names))
     X_CW, kernel, motions = cameras.place(theta)
-    points = np.array([[0.3, 0.1, 1.2], [-0.4, 0.2, 0.6]])
-    for index, name in enumerate(cameras.names):
+    for index, step in enumerate(STEP * np.eye(len(theta))):
         c, k = divmod(index, len(CAMERA_NAMES))
-        ends = [theta.copy(), theta.copy()]
-        ends[0][index] -= STEP
-        ends[1][index] += STEP
-        moved = [cameras.place(end) for end in ends]
-        for p_W in points:
-            low, high = (picture(one[0][c], one[1][c], p_W) for one in moved)
-            shifted = p_W + STEP * motions[c, k].reshape(3, 4) @ [*p_W, 1.0]
-            back = p_W - STEP * motions[c, k].reshape(3, 4) @ [*p_W, 1.0]
-            expected = picture(X_CW[c], kernel[c], shifted) - picture(X_CW[c], kernel[c], back)
+        above, below = (cameras.place(theta + by) for by in (step, -step))
+        for p_W in np.array([[0.3, 0.1, 1.2], [-0.4, 0.2, 0.6]]):
+            seen = picture(above[0][c], above[1][c], p_W) - picture(below[0][c], below[1][c], p_W)
+            by = STEP * motions[c, k].reshape(3, 4) @ [*p_W, 1.0]
+            told = picture(X_CW[c], kernel[c], p_W + by) - picture(X_CW[c], kernel[c], p_W - by)
             np.testing.assert_allclose(
-                expected / (2 * STEP), (high - low) / (2 * STEP), rtol=1e-5, atol=1e-3, err_msg=name
+                told / STEP, seen / STEP, rtol=1e-5, atol=2e-3, err_msg=cameras.names[index]
             )
 
 

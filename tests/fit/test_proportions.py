@@ -7,11 +7,11 @@ from drake_pose.body.formats.packages import bundled_model
 from drake_pose.body.model import load_model
 from drake_pose.body.tree.root import RootRotation
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
-from drake_pose.fit.proportions import ProportionedBody
+from drake_pose.fit.proportions import ProportionedBody, SequencePrior
 from drake_pose.silhouette.areas.bending import TreeSurfaces
 from drake_pose.silhouette.areas.outline import Outline, outline_from_mesh
+from tests.fit.motions import assert_motions_are_derivatives
 
-STEP = 1e-6
 HELD = {"wrist_flexion": 0.0, "wrist_deviation": 0.0}
 
 
@@ -33,28 +33,9 @@ def body(model):
     return ProportionedBody(TreeKinematics(tree), TreeSurfaces(tree))
 
 
-def rigid_points(body, theta, counts):
-    """Points of each node's rigid part in the world."""
-    placement = body.place(theta)
-    starts = placement.packed.starts[:, 0]
-    return [
-        (X[:3, :3] @ placement.packed.points[:, begin : begin + count] + X[:3, 3:]).T
-        for X, begin, count in zip(placement.X_WN, starts, counts, strict=False)
-    ]
-
-
-def test_every_motion_agrees_with_finite_differences(model, body):
+def test_every_motion_agrees_with_finite_differences(body):
     theta = np.random.default_rng(0).normal(0.0, 0.2, len(body.names))
-    counts = [len(outline.vertices) for outline in TreeSurfaces(palm_tree(model)).rigid]
-    points = rigid_points(body, theta, counts)
-    motions = body.place(theta).dense(len(body.names)).reshape(len(counts), -1, 3, 4)
-    for k in range(len(theta)):
-        step = STEP * np.eye(len(theta))[k]
-        ahead, behind = (rigid_points(body, theta + s, counts) for s in (step, -step))
-        for node, p_W in enumerate(points):
-            slope = (ahead[node] - behind[node]) / (2 * STEP)
-            M = motions[node, k]
-            np.testing.assert_allclose(p_W @ M[:, :3].T + M[:, 3], slope, atol=1e-8)
+    assert_motions_are_derivatives(body, theta)
 
 
 def test_planes_are_those_of_the_stretched_surfaces(body):
@@ -80,3 +61,19 @@ def test_a_stretched_model_stands_where_the_stretched_body_does(model, body):
         own = packed.points[:, packed.starts[node, 0] :][:, : len(vertices)].T
         order, own_order = np.lexsort(vertices.round(9).T), np.lexsort(own.round(9).T)
         np.testing.assert_allclose(vertices[order], own[own_order], atol=1e-8)
+
+
+def test_a_sequence_is_as_usual_and_moves_on_as_it_did():
+    prior = SequencePrior(
+        np.array([[1.0, 2.0]]),
+        np.array([0.5]),
+        np.array([4.0]),
+        np.array([0.1, 0.2]),
+        *np.zeros((2, 2)),
+    )
+    coupling = prior.coupling(5)
+    x = np.random.default_rng(1).normal(size=(5, 2))
+    told = ((coupling.rows @ x.ravel() - coupling.mean) ** 2 * coupling.information).sum()
+    usual = 4.0 * ((x @ [1.0, 2.0] - 0.5) ** 2).sum()
+    faster = (np.diff(x, 2, axis=0) / [0.1, 0.2]) ** 2
+    assert told == pytest.approx(usual + faster.sum())

@@ -49,16 +49,17 @@ def beam_result():
 
 
 def test_the_camera_is_the_papers():
-    camera = experiment_camera()
+    camera, side = experiment_camera(), experiment_camera(0.5 * np.pi)
     assert (camera.width, camera.height, camera.pixels_per_metre) == (700, 700, 226.0)
-    # The world's y is the picture's right, z its up, x comes towards the camera.
-    pixels, _ = camera.project(np.array([[0.0, 0, 0], [0, 1, 0], [0, 0, 1]]))
-    np.testing.assert_allclose(pixels[1:] - pixels[0], [[226, 0], [0, -226]], atol=1e-9)
-    # From the side, what comes towards the front goes left.
-    side = experiment_camera(0.5 * np.pi)
-    pixels, depths = side.project(np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]))
-    expected = [[-226, 0], [0, 0], [0, -226]]
-    np.testing.assert_allclose(pixels[1:] - pixels[0], expected, atol=1e-9)
+    # The world's y is the picture's right, z its up, x comes towards the camera; from the side,
+    # what comes towards the front goes left.
+    axes = np.vstack([np.zeros(3), np.eye(3)])
+    for one, expected in (
+        (camera, [[0, 0], [226, 0], [0, -226]]),
+        (side, [[-226, 0], [0, 0], [0, -226]]),
+    ):
+        pixels, depths = one.project(axes)
+        np.testing.assert_allclose(pixels[1:] - pixels[0], expected, atol=1e-9)
     assert depths[2] < depths[0]
 
 
@@ -129,19 +130,16 @@ def test_columns_stand_side_by_side(result, beam_result):
     assert table.row_count > grid_table([[result]]).row_count >= len(PAPER)
 
 
-def test_pictures_are_written(result, tmp_path):
-    few = replace(result, trials=result.trials[:1])
-    files = save_pictures(few, tmp_path)
+def test_pictures_are_written(result, beam_result, tmp_path):
+    """Of the paper's search and of ours."""
+    files = save_pictures(replace(result, trials=result.trials[:1]), tmp_path / "paper")
     assert all(file.stat().st_size > 5000 for file in files)
     names = {file.name for file in files}
     assert {"figure_11_runs_of_step_3.png", "figure_12_chest_candidates.png"} < names
-    assert ("figure_12_not_matched.png" in names) == any(not one.exact for one in few.trials)
-
-
-def test_the_beam_search_has_its_own_pictures(beam_result, tmp_path):
+    assert ("figure_12_not_matched.png" in names) == (not result.trials[0].exact)
     several = [one for one in beam_result.trials if one.result.pose_set.family_count > 1][:1]
-    few = (*beam_result.trials[:1], *several)
-    names = {file.name for file in save_pictures(replace(beam_result, trials=few), tmp_path)}
+    few = replace(beam_result, trials=(*beam_result.trials[:1], *several))
+    names = {file.name for file in save_pictures(few, tmp_path / "beam")}
     assert "figure_11_milliseconds.png" in names
     assert ("families_1.png" in names) == bool(several)
 
@@ -202,19 +200,15 @@ def test_edges_settle_what_the_silhouette_leaves_open():
     few = [one for one in result.trials if 1 < one.result.pose_set.size < 100]
     alone = [one for one in result.trials if one.result.pose_set.size == 1]
     counts = settle_by_edges(replace(result, trials=(*few, *alone[:1])))
-    assert counts["ambiguous"] == len(few) > 1
-    assert 0 < counts["edges_narrow"] <= counts["ambiguous"]
-    assert counts["edges_settle"] <= counts["edges_narrow"]
-    assert counts["edges_settle_rightly"] == counts["edges_settle"]
-    assert counts["edges_keep_truth"] == counts["ambiguous"]
+    noisy = settle_by_edges(replace(result, trials=tuple(few)), noise=0.2)
+    for one in (counts, noisy):
+        assert one["ambiguous"] == one["edges_keep_truth"] == len(few) > 1
+        assert one["edges_settle_rightly"] == one["edges_settle"]
+    assert 0 < noisy["edges_settle"] <= counts["edges_settle"] <= counts["edges_narrow"]
     # With edges to the pixel nothing that can be settled is left open.
     assert counts["edges_settle"] + counts["edges_undecidable"] == counts["ambiguous"]
-    assert str(counts["edges_keep_truth"]) in edge_lines(counts)
-    noisy = settle_by_edges(replace(result, trials=tuple(few)), noise=0.2)
-    assert noisy["edges_keep_truth"] == noisy["ambiguous"] == len(few)
-    assert 0 < noisy["edges_settle"] <= counts["edges_settle"]
-    assert noisy["edges_settle_rightly"] == noisy["edges_settle"]
     assert noisy["edges_undecidable"] == counts["edges_undecidable"]
+    assert str(counts["edges_keep_truth"]) in edge_lines(counts)
 
 
 def test_noise_loses_moves_and_adds_edges():

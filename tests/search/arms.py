@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 
+import cv2
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from drake_pose.body.model import load_model
 from drake_pose.body.surfaces.meshes import TriangleMesh
@@ -14,7 +17,7 @@ from drake_pose.camera.models import Camera, PinholeCamera
 from drake_pose.search.estimates import PoseSet, View
 from drake_pose.silhouette.areas.outline import Outline, outline_from_mesh
 from drake_pose.silhouette.areas.scoring import draw_mask
-from tests.search.mask_damage import MaskDamage, damage_views, nudge_camera
+from tests.body.models import joint, link
 
 # Each: name, parent's length, the joint's axis, its limits [deg], the box's sides and length [m].
 LINKS = (
@@ -28,19 +31,17 @@ LINKS = (
 
 def arm_urdf(links: Sequence[tuple] = LINKS) -> str:
     """The arm on a plate in the world."""
-    parts = ['<robot name="arm"><link name="world"/>']
-    parent = "world"
+    parts, parent = [], "world"
     for name, z, axis, (low, high), (width, depth), length in links:
-        parts.append(
-            f'<link name="{name}"><visual><origin xyz="0.01 0 {length / 2}"/><geometry>'
-            f'<box size="{width} {depth} {length}"/></geometry></visual></link>'
-            f'<joint name="{name}_turn" type="revolute"><parent link="{parent}"/>'
-            f'<child link="{name}"/><origin xyz="0 0 {z}"/><axis xyz="{axis}"/>'
-            f'<limit lower="{np.radians(low)}" upper="{np.radians(high)}" effort="1" '
-            'velocity="1"/></joint>'
+        visual = (
+            f'<visual><origin xyz="0.01 0 {length / 2}"/><geometry>'
+            f'<box size="{width} {depth} {length}"/></geometry></visual>'
         )
+        limits = f'lower="{np.radians(low)}" upper="{np.radians(high)}"'
+        at = {"origin": f'xyz="0 0 {z}"', "axis": axis, "limits": limits}
+        parts += [link(name, visual), joint(f"{name}_turn", "revolute", parent, name, **at)]
         parent = name
-    return "".join(parts) + "</robot>"
+    return f'<robot name="arm"><link name="world"/>{"".join(parts)}</robot>'
 
 
 def arm_tree(folder: Path) -> PoseTree:
@@ -103,7 +104,10 @@ def draw_pose(tree: PoseTree, generator: np.random.Generator) -> np.ndarray:
 def damaged_views(
     tree: PoseTree, values: np.ndarray, seed: int, width: int = 640, height: int = 480
 ) -> list[View]:
-    """What the cameras see of an arm whose links are a little too thick or thin, damaged."""
+    """What cameras that stand a little elsewhere see of an arm too thick or too thin, damaged.
+
+    One part of it is missing in all views; in each a blob is attached, and edges are ragged.
+    """
     generator = np.random.default_rng(seed)
     outlines = []
     for node in tree.nodes:
@@ -111,14 +115,28 @@ def damaged_views(
         scale = np.exp(generator.normal(0.0, 0.015))
         vertices = middle + scale * (node.mesh.vertices - middle)
         outlines.append(outline_from_mesh(TriangleMesh(vertices, node.mesh.triangles)))
-    damage = MaskDamage()
-    clean = [
-        draw_view(tree, values, camera, outlines, nudge_camera(camera, damage.shift, generator))
-        for camera in arm_cameras(width, height)
-    ]
-    X_WN = tree.node_poses(split(tree, values))
-    points = [
-        node.mesh.vertices @ X[:3, :3].T + X[:3, 3]
-        for node, X in zip(tree.nodes, X_WN, strict=True)
-    ]
-    return damage_views(clean, np.vstack(points), damage, generator)
+    joints = tree.node_poses(split(tree, values))[:, :3, 3]
+    lost, views = joints[[generator.integers(len(joints))]], []
+    for camera in arm_cameras(width, height):
+        turn = generator.normal(0.0, 1.0, 3) / camera.focal_x
+        X_CC = np.eye(4)
+        X_CC[:3, :3] = Rotation.from_rotvec(turn * [1.0, 1.0, 3.0]).as_matrix()
+        moved = camera.with_pose(camera.X_WC @ X_CC)
+        mask = draw_view(tree, values, camera, outlines, moved).mask.astype(np.uint8)
+        size = math.sqrt(mask.sum())
+        _draw_disc(mask, camera.project(lost)[0][0], 0.12 * size, 0)
+        edge = np.argwhere(mask > cv2.erode(mask, np.ones((3, 3), np.uint8)))
+        _draw_disc(mask, edge[generator.integers(len(edge)), ::-1], 0.06 * size, 1)
+        views.append(View(camera, _ragged(mask, generator)))
+    return views
+
+
+def _draw_disc(mask: np.ndarray, uv: np.ndarray, radius: float, value: int) -> None:
+    cv2.circle(mask, (round(uv[0]), round(uv[1])), round(radius), value, -1)
+
+
+def _ragged(mask: np.ndarray, generator: np.random.Generator) -> np.ndarray:
+    """The mask with its edge moved by a smooth random field of 0.7 pixels."""
+    inside, outside = (cv2.distanceTransform(m, cv2.DIST_L2, 5) for m in (mask, 1 - mask))
+    field = cv2.GaussianBlur(generator.standard_normal(mask.shape), (0, 0), 3.0)
+    return np.asarray(inside - outside + 0.7 / field.std() * field > 0.0)

@@ -8,6 +8,7 @@ import pytest
 
 from drake_pose.search.continuous.multi_start import MultiStartSearch
 from drake_pose.search.continuous.search import ContinuousSearch
+from drake_pose.search.estimates import View
 from drake_pose.search.grid.beam_search import BeamSearch
 from drake_pose.search.grid.branch_and_bound import branch_and_bound
 from drake_pose.search.grid.examination import ExaminationSettings
@@ -15,11 +16,18 @@ from drake_pose.search.grid.sampled_body import SampledBody
 from drake_pose.search.kameda import PaperSearch
 from drake_pose.search.scoring import Scoring
 from drake_pose.search.settings import BeamSearchSettings, PaperSearchSettings
+from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 
-from .gripper import gripper, gripper_views
+from .arms import arm_cameras
+from .gripper import gripper
 
 GRID = {"interval": math.radians(15.0), "length_interval": 0.02}
 ON_GRID = np.array([math.radians(15.0), math.radians(-30.0), 0.04, 0.04])
+
+
+def gripper_views(model, q):
+    """What two cameras see of it, drawn by Drake."""
+    return [View(camera, LabelRenderer(model, camera).mask(q)) for camera in arm_cameras()]
 
 
 @pytest.fixture(scope="module")

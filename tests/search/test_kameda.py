@@ -34,46 +34,17 @@ def random_silhouette(search, camera, generator):
 @pytest.fixture
 def sliders(tmp_path):
     """A 20 x 10 box that slides right, and on it a 6 x 8 box that slides up: areas by hand."""
-    model = load_body(
+    return load_body(
         tmp_path,
         box_link("wide", 20, 10),
         joint("right", "prismatic", "world", "wide", (-0.1, 0.1), axis="0 1 0"),
         box_link("small", 6, 8),
         joint("up", "prismatic", "wide", "small", (0.0, 0.08), axis="0 0 1"),
-    )
-    return model.pose_tree()
+    ).pose_tree()
 
 
-def slider_search(tree, r=0.0, K=5):
-    settings = PaperSearchSettings(
-        intervals={"right": 0.05, "up": 0.04}, outside_limit=r, candidate_limit=K
-    )
-    return PaperSearch(tree, settings)
-
-
-def test_step_3_keeps_what_stays_inside_and_step_4_scores_it(sliders):
-    """The silhouette is the wide box 5 pixels to the right with the small one 8 pixels up.
-
-    Outside area of the wide box at -10, -5, 0, 5, 10: 15, 10, 5, 0, 5 columns of 10 pixels.
-    """
-    camera = front_camera()
-    search = slider_search(sliders, r=60.0)
-    mask = silhouette(search, camera, [np.array([0.05]), np.array([0.08])])
-    # 20 x 10, and of the small box (rows 4 to 12 above the middle) all but one row.
-    assert mask.sum() == 200 + 6 * 7
-    scoring = Scoring(search.sampled, [View(camera, mask)])
-    slides = search.sampled.values[0][:, 0]
-    nothing_covered = scoring.uncovered([], np.empty(0, dtype=int), np.empty((0, 4, 4)))
-    poses = scoring.candidate_poses(0, np.eye(4))
-    outside, covered = scoring.candidate_areas(0, np.arange(len(poses)), poses, nothing_covered)
-    np.testing.assert_array_equal(outside[0] + covered, 200)
-    # To the right of the middle of the picture the small box hides no column of the wide one.
-    expected = {-0.10: 150, -0.05: 100, 0.0: 50, 0.05: 0, 0.10: 50}
-    assert {round(s, 2): area for s, area in zip(slides, outside[0], strict=True)} == expected
-    result = search.match([View(camera, mask)])
-    assert result.J == 0
-    np.testing.assert_allclose(result.q, [0.05, 0.08])
-    assert result.statistics.runs == 2
+def slider_search(tree, **settings):
+    return PaperSearch(tree, PaperSearchSettings(intervals={"right": 0.05, "up": 0.04}, **settings))
 
 
 def test_step_6_goes_back_to_the_nearest_ancestor_with_an_untried_candidate(tmp_path):
@@ -104,22 +75,17 @@ def test_step_6_goes_back_to_the_nearest_ancestor_with_an_untried_candidate(tmp_
 
 
 def test_no_pose_is_an_answer(sliders):
-    camera = front_camera()
     mask = np.zeros((100, 100), dtype=bool)
     mask[2:4, 2:4] = True
-    result = slider_search(sliders, r=0.0).match([View(camera, mask)])
-    assert not result.found
+    result = slider_search(sliders, outside_limit=0.0).match([View(front_camera(), mask)])
+    assert (result.found, result.statistics.runs, result.stopped_by) == (False, 1, "end")
     assert np.isnan(result.q).all()
-    assert result.statistics.runs == 1
-    assert result.stopped_by == "end"
 
 
 def test_automatic_threshold_doubles_until_a_pose_is_found(sliders):
-    camera = front_camera()
     mask = np.zeros((100, 100), dtype=bool)
     mask[46:54, 41:59] = True
-    settings = PaperSearchSettings(intervals={"right": 0.05, "up": 0.04})
-    result = PaperSearch(sliders, settings).match([View(camera, mask)])
+    result = slider_search(sliders).match([View(front_camera(), mask)])
     # 12.6 % of the mean of 200 and 48 pixels is 15.6; the wide box leaves the mask by 56.
     assert result.found
     assert result.statistics.outside_limit[0] == pytest.approx(0.126 * 124 * 4)

@@ -1,6 +1,7 @@
 """Small surfaces and an independent, slow way to draw them."""
 
 import numpy as np
+import trimesh
 from scipy.spatial.transform import Rotation
 
 from drake_pose.body.surfaces.meshes import TriangleMesh
@@ -23,10 +24,8 @@ def soup(rng: np.random.Generator, vertices: int, triangles: int, size: float) -
 
 def box(size: float) -> TriangleMesh:
     """A closed cube about the origin, triangles counter-clockwise seen from outside."""
-    corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)]) - 0.5
-    quads = [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]
-    triangles = [[q[0], q[k], q[k + 1]] for q in quads for k in (1, 2)]
-    return TriangleMesh(corners * size, np.array(triangles, dtype=np.int32))
+    cube = trimesh.creation.box((size, size, size))
+    return TriangleMesh(np.array(cube.vertices), np.array(cube.faces, dtype=np.int32))
 
 
 def brute_force_mask(mesh: TriangleMesh, X_CN: np.ndarray, camera: Camera) -> np.ndarray:

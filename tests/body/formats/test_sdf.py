@@ -18,23 +18,23 @@ SHAPE = "<box><size>0.1 0.2 0.3</size></box>"
 LIMITS = "<limit><lower>-1</lower><upper>1</upper></limit>"
 
 
-def link(name: str, shape: str = SHAPE, more: str = "") -> str:
+def link(name, shape=SHAPE, more=""):
     visual = f'<visual name="v"><geometry>{shape}</geometry></visual>' if shape else ""
     return f'<link name="{name}">{visual}{more}</link>'
 
 
-def joint(name: str, parent: str, child: str, more: str = LIMITS, kind: str = "revolute") -> str:
+def joint(name, parent, child, more=LIMITS, kind="revolute"):
     return (
         f'<joint name="{name}" type="{kind}"><parent>{parent}</parent><child>{child}</child>'
         f"<axis><xyz>0 0 1</xyz>{more}</axis></joint>"
     )
 
 
-def sdf(*parts: str, name: str = "m") -> str:
+def sdf(*parts, name="m"):
     return f'<sdf version="1.9"><model name="{name}">{"".join(parts)}</model></sdf>'
 
 
-def collision(mesh: str) -> str:
+def collision(mesh):
     shape = f"<geometry><mesh><uri>{mesh}</uri></mesh></geometry>"
     return f'<collision name="c">{shape}</collision>'
 
@@ -134,7 +134,7 @@ def test_included_models_are_read_in_the_same_way(tmp_path):
     np.testing.assert_allclose(X_WB.translation(), [1.0, 0.0, 0.0], atol=1e-12)
 
 
-def directives(*lines: str) -> str:
+def directives(*lines):
     return "directives:\n" + "\n".join(lines) + "\n"
 
 

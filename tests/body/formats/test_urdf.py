@@ -1,13 +1,12 @@
 """URDF files as they are found: what is read rightly, what is named, what is refused."""
 
 import os
-from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
 
-from drake_pose.body.model import ArticulatedModel, load_model
+from drake_pose.body.model import load_model
 from drake_pose.body.report import describe_model
 from drake_pose.errors import ModelError
 from tests.body.models import BOX, WELDED_URDF, joint, link, urdf, write
@@ -15,11 +14,11 @@ from tests.body.models import BOX, WELDED_URDF, joint, link, urdf, write
 STL = '<collision><geometry><mesh filename="{}"/></geometry></collision>'
 
 
-def read(folder: Path, text: str, name: str = "thing.urdf", **options) -> ArticulatedModel:
+def read(folder, text, name="thing.urdf", **options):
     return load_model(write(folder, text, name), check=False, **options)
 
 
-def refusal(folder: Path, text: str, name: str = "thing.urdf") -> str:
+def refusal(folder, text, name="thing.urdf"):
     with pytest.raises(ModelError) as caught:
         read(folder, text, name)
     message = str(caught.value)
@@ -29,12 +28,12 @@ def refusal(folder: Path, text: str, name: str = "thing.urdf") -> str:
     return message
 
 
-def arm(more_of_joint: str = "", more: str = "", a: str = BOX, **options) -> str:
+def arm(more_of_joint="", more="", a=BOX, **options):
     elbow = joint("elbow", options.pop("kind", "revolute"), "a", "b", more=more_of_joint, **options)
     return urdf(link("a", a), link("b"), elbow, more)
 
 
-def visual(shape: str, material: str = "") -> str:
+def visual(shape, material=""):
     return f"<visual><geometry>{shape}</geometry>{material}</visual>"
 
 
@@ -50,28 +49,27 @@ def test_collision_is_never_drawn_nor_read(tmp_path, extension):
 
 
 def test_materials_of_the_same_name_keep_their_own_colours(tmp_path):
-    def material(rgba: str) -> str:
+    def material(rgba):
         return f'<material name="m"><color rgba="{rgba}"/></material>'
 
-    ball = '<sphere radius="0.1"/>'
+    looks = {
+        "a": material("0 1 0 1"),
+        "b": '<material name="m"/>',
+        "c": '<material name="nowhere"/>',
+        "d": material("255 0 0 1"),
+        "e": '<material name="t"><texture filename="gone.png"/></material>',
+    }
     text = urdf(
-        material("1 0 0 1"),
-        material("1 0 0 1"),
-        link("a", visual(ball, material("0 1 0 1"))),
-        link("b", visual(ball, '<material name="m"/>')),
-        link("c", visual(ball, '<material name="nowhere"/>')),
-        link("d", visual(ball, material("255 0 0 1"))),
-        link("e", visual(ball, '<material name="t"><texture filename="gone.png"/></material>')),
+        *[material("1 0 0 1")] * 2,
+        *(link(name, visual('<sphere radius="0.1"/>', one)) for name, one in looks.items()),
         *(joint(f"to_{one}", "fixed", "a", one, limits=None) for one in "bcde"),
     )
     model = read(tmp_path, text)
     inspector = model.scene_graph.model_inspector()
-    colours = {}
-    for name in "abd":
+    for name, expected in {"a": (0, 1, 0, 1), "b": (1, 0, 0, 1), "d": (1, 0, 0, 1)}.items():
         geometry = model.plant.GetVisualGeometriesForBody(model.plant.GetBodyByName(name))[0]
         rgba = inspector.GetPerceptionProperties(geometry).GetProperty("phong", "diffuse")
-        colours[name] = (rgba.r(), rgba.g(), rgba.b(), rgba.a())
-    assert colours == {"a": (0, 1, 0, 1), "b": (1, 0, 0, 1), "d": (1, 0, 0, 1)}
+        assert (rgba.r(), rgba.g(), rgba.b(), rgba.a()) == expected
 
 
 @pytest.mark.parametrize(
@@ -131,25 +129,12 @@ def test_continuous_joints_have_no_limits_whatever_the_file_says(tmp_path):
     assert (model.lower[-1], model.upper[-1]) == (-np.pi, np.pi)
 
 
-def test_a_loop_of_links_is_opened_with_a_word(tmp_path):
-    text = urdf(
-        *(link(name) for name in "abcd"),
-        joint("one", "revolute", "a", "b"),
-        joint("two", "revolute", "b", "c"),
-        joint("three", "revolute", "a", "d"),
-        joint("shut", "revolute", "d", "c"),
-    )
-    model = read(tmp_path, text)
-    assert model.position_names[-3:] == ("one", "two", "three")
-    assert model.warnings == (
-        "joint 'shut' closes a loop of links at 'c': not enforced, it is left out",
-    )
-
-
 @pytest.mark.parametrize(
     ("text", "named"),
     [
         (arm(limits='lower="1" upper="-1"'), "joint 'elbow': lower limit 1"),
+        (arm(limits='lower="nan" upper="1"'), "joint 'elbow': a limit is NaN"),
+        (arm(limits='lower="low" upper="1"'), "joint 'elbow': limits 'low', '1' are not numbers"),
         (arm().replace('velocity="1"', 'velocity="-1"'), "joint 'elbow': velocity"),
         (arm(a=visual('<sphere radius="-1"/>')), "link 'a': radius of its sphere is '-1'"),
         (arm(a=visual('<box size="0 0 0"/>')), "link 'a': size of its box is '0 0 0'"),
@@ -174,6 +159,8 @@ def test_a_loop_of_links_is_opened_with_a_word(tmp_path):
         (arm(more=joint("elbow", "fixed", "b", "world")), "joint 'elbow' is defined 2 times"),
         (arm().replace(' name="elbow"', ""), "1 <joint> without a name"),
         (arm(more="<link/>"), "1 <link> without a name"),
+        ("<robot name='r'/>", "no visual geometry"),
+        ("", "not well-formed XML"),
         ("<sdf/>", "its outermost element is <sdf>"),
         ("<robot><link></robot>", "not well-formed XML: mismatched tag: line 1"),
     ],
@@ -238,29 +225,33 @@ def test_paths_with_spaces_letters_links_and_read_only_folders(tmp_path):
         folder.chmod(0o755)
 
 
-def package_urdf(name: str = "package://my_arm/meshes/a.stl") -> str:
+def package_urdf(name="package://my_arm/meshes/a.stl"):
     return arm(a=visual(f'<mesh filename="{name}"/>'))
 
 
-def make_package(folder: Path) -> Path:
+def make_package(folder, name=None):
+    """A folder with a mesh; a name of its own is written in its package.xml."""
     (folder / "meshes").mkdir(parents=True)
     trimesh.creation.box().export(folder / "meshes" / "a.stl")
+    if name:
+        (folder / "package.xml").write_text(f"<package><name> {name} </name></package>")
     return folder
 
 
-def test_packages_are_found_on_the_way_up(tmp_path):
-    root = make_package(tmp_path / "one" / "my_arm")
-    (root / "urdf").mkdir()
-    assert read(root / "urdf", package_urdf()).link_meshes["a"]
-    named = make_package(tmp_path / "two" / "other_folder")
-    (named / "package.xml").write_text("<package><name> my_arm </name></package>")
-    (named / "urdf").mkdir()
-    assert read(named / "urdf", package_urdf()).link_meshes["a"]
-    make_package(tmp_path / "three" / "my_arm")
-    (tmp_path / "three" / "my_robot" / "urdf").mkdir(parents=True)
-    beside = tmp_path / "three" / "my_robot" / "urdf"
-    for name in ("package://my_arm/meshes/a.stl", "package:///my_arm/meshes/a.stl"):
-        assert read(beside, package_urdf(name)).link_meshes["a"]
+@pytest.mark.parametrize(
+    ("package", "name", "model", "slashes"),
+    [
+        ("my_arm", None, "my_arm/urdf", "//"),
+        ("other_folder", "my_arm", "other_folder/urdf", "//"),
+        ("my_arm", None, "my_robot/urdf", "//"),
+        ("my_arm", None, "my_robot/urdf", "///"),
+    ],
+)
+def test_packages_are_found_on_the_way_up(tmp_path, package, name, model, slashes):
+    make_package(tmp_path / package, name)
+    (tmp_path / model).mkdir(parents=True)
+    text = package_urdf(f"package:{slashes}my_arm/meshes/a.stl")
+    assert read(tmp_path / model, text).link_meshes["a"]
 
 
 @pytest.mark.parametrize("variable", ["ROS_PACKAGE_PATH", "AMENT_PREFIX_PATH", "SDF_PATH"])
@@ -276,9 +267,8 @@ def test_packages_are_found_in_search_paths(tmp_path, monkeypatch, variable):
     if variable == "ROS_PACKAGE_PATH":
         monkeypatch.setenv(variable, str(place.parents[1]))
         assert read(tmp_path / "models", package_urdf("model://my_arm/meshes/a.stl"))
-        place.rename(place.with_name("renamed"))
-        (place.with_name("renamed") / "package.xml").write_text("<p><name>my_arm</name></p>")
-        monkeypatch.setenv(variable, str(place.with_name("renamed")))
+        named = make_package(tmp_path / "renamed", "my_arm")
+        monkeypatch.setenv(variable, str(named))
         assert read(tmp_path / "models", package_urdf()).link_meshes["a"]
 
 

@@ -15,11 +15,11 @@ CORNERS = np.array([[0, 0, 0], [1, 0, 0], [0, 2, 0], [0, 0, 3]], dtype=float)
 FACES = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])
 
 
-def tetrahedron() -> trimesh.Trimesh:
+def tetrahedron():
     return trimesh.Trimesh(CORNERS, FACES, process=False)
 
 
-def assert_tetrahedron(mesh: TriangleMesh, scale: float = 1.0) -> None:
+def assert_tetrahedron(mesh, scale=1.0):
     assert len(mesh.vertices) == 4
     places = {tuple(np.round(corner, 6)) for corner in mesh.vertices[mesh.triangles].reshape(-1, 3)}
     assert places == {tuple(corner) for corner in np.round(CORNERS * scale, 6)}
@@ -28,11 +28,11 @@ def assert_tetrahedron(mesh: TriangleMesh, scale: float = 1.0) -> None:
     assert np.einsum("ij,ij->", a, np.cross(b, c)) / 6.0 == pytest.approx(scale**3)
 
 
-def binary_stl() -> bytes:
+def binary_stl():
     return tetrahedron().export(file_type="stl")
 
 
-def text_stl() -> str:
+def text_stl():
     return tetrahedron().export(file_type="stl_ascii")
 
 

@@ -19,7 +19,9 @@ from drake_pose.errors import ModelError, SettingsError
 from drake_pose.fit.lengthened_body import LengthenedBody
 from drake_pose.fit.surfaces import VERY_FEW, few_triangles
 from drake_pose.silhouette.areas.bending import TreeSurfaces
+from tests.fit.motions import assert_motions_are_derivatives
 
+from ..formats import test_sdf as sdf
 from ..models import joint, link, urdf, write
 
 LIMITS = 'lower="0" upper="0.8"'
@@ -87,16 +89,8 @@ def test_what_is_not_enforced_is_told_and_what_is_stands_in_the_report(tmp_path)
 
 
 def test_beside_tendons_nothing_is_enforced_and_that_is_told(tmp_path):
-    ends = "".join(
-        f'<drake:tendon_constraint_{name} value="{value}"/>'
-        for name, value in (
-            ("offset", 0),
-            ("stiffness", 1),
-            ("damping", 0),
-            ("lower_limit", -1),
-            ("upper_limit", 1),
-        )
-    )
+    values = {"offset": 0, "stiffness": 1, "damping": 0, "lower_limit": -1, "upper_limit": 1}
+    ends = "".join(f'<drake:tendon_constraint_{n} value="{v}"/>' for n, v in values.items())
     tendon = (
         '<drake:tendon_constraint><drake:tendon_constraint_joint name="wrist" a="1"/>'
         f"{ends}</drake:tendon_constraint></robot>"
@@ -108,21 +102,13 @@ def test_beside_tendons_nothing_is_enforced_and_that_is_told(tmp_path):
     assert told.startswith("4 constraints between joints or links are written in the file")
 
 
-def test_motions_against_finite_differences(tmp_path):
+@pytest.mark.parametrize("lengths", [False, True])
+def test_motions_against_finite_differences(tmp_path, lengths):
     kinematics, values = drawn(tree_of(tmp_path), np.random.default_rng(1))
     surfaces = few_triangles(TreeSurfaces(kinematics.tree), VERY_FEW)
     body = LengthenedBody(kinematics, surfaces, joint_offsets(kinematics.tree))
-    theta = np.append(values, np.linspace(0.1, 0.2, len(body.links)))
-    p_N, step = np.array([0.1, 0.2, 0.3, 1.0]), 1e-6
-    for lengthened in (False, True):
-        at = theta if lengthened else values
-        placed = body.place(at)
-        dense = placed.dense(len(at)).reshape(len(placed.X_WN), len(at), 3, 4)
-        for k in range(len(at)):
-            ends = [at + sign * step * np.eye(len(at))[k] for sign in (1.0, -1.0)]
-            above, below = (body.place(end).X_WN @ p_N for end in ends)
-            found = np.einsum("nij,nj->ni", dense[:, k], placed.X_WN @ p_N)
-            np.testing.assert_allclose(found, (above - below)[:, :3] / (2 * step), atol=1e-7)
+    logs = np.linspace(0.1, 0.2, len(body.links)) if lengths else []
+    assert_motions_are_derivatives(body, np.append(values, logs))
 
 
 def test_limits_are_shared_and_what_is_held_holds_the_others(tmp_path):
@@ -151,23 +137,15 @@ def test_limits_are_shared_and_what_is_held_holds_the_others(tmp_path):
     assert "'again' is written to follow joint 'again' (<mimic>): not enforced" in told
 
 
-def sdf_text() -> str:
-    links = "".join(
-        f'<link name="{name}"><visual name="v"><geometry><box><size>.1 .1 .1</size></box>'
-        "</geometry></visual></link>" for name in "abc"
-    )  # fmt: skip
-    joints = "".join(
-        f'<joint name="{name}" type="prismatic"><parent>a</parent><child>{child}</child><axis>'
-        f"<xyz>0 1 0</xyz><limit><lower>-1</lower><upper>1</upper></limit>{mimic}</axis></joint>"
-        for name, child, mimic in (
-            ("lead", "b", ""),
-            ("follow", "c", '<mimic joint="lead"><multiplier>-2</multiplier><offset>.1</offset>'
-             "<reference>.2</reference></mimic>"),
-        )
-    )  # fmt: skip
-    return f'<sdf version="1.11"><model name="m">{links}{joints}</model></sdf>'
-
-
+MIMIC = (
+    '<mimic joint="lead"><multiplier>-2</multiplier><offset>.1</offset><reference>.2</reference>'
+    "</mimic>"
+)
+SDF = sdf.sdf(
+    *map(sdf.link, "abc"),
+    sdf.joint("lead", "a", "b", kind="prismatic"),
+    sdf.joint("follow", "a", "c", sdf.LIMITS + MIMIC, kind="prismatic"),
+)
 MJCF = """<mujoco model="m"><worldbody><body name="a"><geom type="box" size=".1 .1 .1"/>
 <body name="b"><joint name="lead" type="slide" axis="0 1 0" ref=".05"/>
 <geom type="box" size=".1 .1 .1"/></body>
@@ -176,9 +154,7 @@ MJCF = """<mujoco model="m"><worldbody><body name="a"><geom type="box" size=".1 
 <equality><joint joint1="follow" joint2="lead" polycoef=".4 -2 0 0 0"/></equality></mujoco>"""
 
 
-@pytest.mark.parametrize(
-    ("text", "name"), [(sdf_text(), "m.sdf"), (MJCF, "m.xml")], ids=["sdf", "mjcf"]
-)
+@pytest.mark.parametrize(("text", "name"), [(SDF, "m.sdf"), (MJCF, "m.xml")], ids=["sdf", "mjcf"])
 def test_every_format_couples_alike(tmp_path, text, name):
     model = load_model(write(tmp_path, text, name), check=False)
     (one,) = model.couplings

@@ -1,8 +1,7 @@
 import numpy as np
 import pytest
 
-from drake_pose.body.model import ArticulatedModel, load_model
-from drake_pose.body.tree.pose_tree import PoseTree
+from drake_pose.body.model import load_model
 from drake_pose.body.tree.root import RootRotation
 from drake_pose.errors import ModelError, SettingsError, UnknownNameError
 from tests.body.models import (
@@ -18,9 +17,7 @@ from tests.body.models import (
 )
 
 
-def largest_difference_from_drake(
-    model: ArticulatedModel, tree: PoseTree, *, samples: int = 20
-) -> float:
+def largest_difference_from_drake(model, tree, *, samples=20):
     """Compare node_poses, positions_from and values_from_positions with the plant."""
     random = np.random.default_rng(1)
     context = model.plant.CreateDefaultContext()
@@ -41,21 +38,12 @@ def largest_difference_from_drake(
     return worst
 
 
-TEXTS = {
-    "floating": FLOATING_URDF,
-    "jointed": JOINTED_BASE_URDF,
-    "welded": WELDED_URDF,
-    "all_joints": JOINTS_SDF,
-}
-
-
 @pytest.fixture(scope="module")
 def models(tmp_path_factory):
+    texts = {"floating": FLOATING_URDF, "jointed": JOINTED_BASE_URDF, "welded": WELDED_URDF}
     folder = tmp_path_factory.mktemp("models")
-    files = {
-        name: write(folder, text, f"{name}.{'sdf' if text.startswith('<sdf') else 'urdf'}")
-        for name, text in TEXTS.items()
-    }
+    files = {name: write(folder, text, f"{name}.urdf") for name, text in texts.items()}
+    files["all_joints"] = write(folder, JOINTS_SDF, "all_joints.sdf")
     return {name: load_model(file, check=False) for name, file in files.items()}
 
 
@@ -128,6 +116,10 @@ def test_own_root_keeps_its_joints_and_is_held_at_root_position(models):
     assert len(grid) == 5**3
     origins = tree.relative_transforms(0, grid)[:, :3, 3]
     np.testing.assert_allclose(origins, np.tile([0.3, 0.2, 0.1], (len(grid), 1)), atol=1e-12)
+    # A joint that is held has one sample.
+    tree = models["floating"].pose_tree(held={"shoulder_y": 0.4})
+    grid = tree.grid(tree.node_index("arm"), np.radians(20.0))
+    assert (len(grid), set(grid[:, 1])) == (5, {0.4})
 
 
 def test_limits_that_drake_does_not_read_are_kept(models):
@@ -138,33 +130,31 @@ def test_limits_that_drake_does_not_read_are_kept(models):
     np.testing.assert_allclose(all_joints.lower[index], [-1, -1, -np.pi, -3, -1, -np.pi])
 
 
-def planar_robot(more: str = "") -> str:
+def planar_robot(*more):
     """A body that slides and turns in a plane, and an arm."""
+    free = {"limits": None, "origin": ""}
     return urdf(
         *(link(name, "") for name in ("bx", "bz")),
-        link("body"),
-        link("arm"),
+        *map(link, ("body", "arm")),
         joint("x", "prismatic", "world", "bx", axis="1 0 0", limits=None),
-        joint("z", "prismatic", "bx", "bz", axis="0 0 1", limits=None, origin=""),
-        joint("turn", "continuous", "bz", "body", axis="0 1 0", limits=None, origin=""),
+        joint("z", "prismatic", "bx", "bz", axis="0 0 1", **free),
+        joint("turn", "continuous", "bz", "body", axis="0 1 0", **free),
         joint("shoulder", "revolute", "body", "arm"),
-        more,
+        *more,
     )
 
 
 def test_slides_without_limits_say_where_the_only_object_stands(tmp_path):
     model = load_model(write(tmp_path, planar_robot()), check=False)
-    tree = model.pose_tree()
     slides = [model.position_index("x"), model.position_index("z")]
-    assert dict(tree.held) == dict.fromkeys(slides, 0.0)
-    assert largest_difference_from_drake(model, tree) < 1e-9
     moved = model.pose_tree(root_position=(1.0, -2.0, 3.0))
-    assert largest_difference_from_drake(model, moved) < 1e-9
+    turned = model.pose_tree("arm", root_position=(0.0, 0.0, 0.0))
+    for tree in (model.pose_tree(), moved, turned):
+        assert largest_difference_from_drake(model, tree) < 1e-9
+    for tree in (model.pose_tree(), moved):
+        assert dict(tree.held) == dict.fromkeys(slides, 0.0)
     X_WN = moved.node_poses(moved.default_values())
     np.testing.assert_allclose(X_WN[0, :3, 3], (1.0, -2.0, 3.0), atol=1e-12)
-    assert dict(moved.held) == dict(tree.held)
-    turned = model.pose_tree("arm", root_position=(0.0, 0.0, 0.0))
-    assert largest_difference_from_drake(model, turned) < 1e-9
 
 
 def test_slides_without_limits_are_refused_where_they_must_be_searched(tmp_path):
@@ -200,39 +190,38 @@ def test_planar_joint_agrees_with_drake_and_needs_limits(tmp_path):
         load_model(path, limits={"nose": (0.0, 1.0)}, check=False)
 
 
+HAND = [
+    *(link("palm", ""), link("thumb"), link("finger")),
+    joint("wrist", "revolute", "world", "palm"),
+    joint("t", "revolute", "palm", "thumb"),
+    joint("f", "revolute", "palm", "finger"),
+]
+BESIDE = [
+    *(link("table"), link("cup"), link("handle")),
+    joint("t", "fixed", "world", "table", limits=None),
+    joint("h", "revolute", "cup", "handle"),
+]
+HANGING = [
+    *(link("ball", SPHERE), link("upper"), link("lower")),
+    joint("a1", "revolute", "world", "upper"),
+    joint("a2", "revolute", "upper", "lower"),
+]
+
+
 @pytest.mark.parametrize(
     ("parts", "root", "nodes"),
     [
-        (  # Links on a link that is not seen make a node with an empty mesh ...
-            [link("palm", ""), link("thumb"), link("finger"),
-             joint("wrist", "revolute", "world", "palm"),
-             joint("t", "revolute", "palm", "thumb"), joint("f", "revolute", "palm", "finger")],
-            None,
-            [("palm", -1), ("thumb", 0), ("finger", 0)],
-        ),
-        (  # ... that merely continues a chain where the tree starts at one of them.
-            [link("palm", ""), link("thumb"), link("finger"),
-             joint("wrist", "revolute", "world", "palm"),
-             joint("t", "revolute", "palm", "thumb"), joint("f", "revolute", "palm", "finger")],
-            "finger",
-            [("finger", -1), ("thumb", 0)],
-        ),
-        (  # What is seen in the world stands beside a floating body.
-            [link("table"), link("cup"), link("handle"),
-             joint("t", "fixed", "world", "table", limits=None),
-             joint("h", "revolute", "cup", "handle")],
-            "handle",
-            [("handle", -1), ("cup", 0), ("table", -1)],
-        ),
-        (  # What hangs on a world that is not seen, too.
-            [link("ball", SPHERE), link("upper"), link("lower"),
-             joint("a1", "revolute", "world", "upper"), joint("a2", "revolute", "upper", "lower")],
-            None,
-            [("ball", -1), ("upper", -1), ("lower", 1)],
-        ),
+        # Links on a link that is not seen make a node with an empty mesh ...
+        (HAND, None, [("palm", -1), ("thumb", 0), ("finger", 0)]),
+        # ... that merely continues a chain where the tree starts at one of them.
+        (HAND, "finger", [("finger", -1), ("thumb", 0)]),
+        # What is seen in the world stands beside a floating body.
+        (BESIDE, "handle", [("handle", -1), ("cup", 0), ("table", -1)]),
+        # What hangs on a world that is not seen, too.
+        (HANGING, None, [("ball", -1), ("upper", -1), ("lower", 1)]),
     ],
     ids=["unseen", "unseen inside", "seen world", "unseen world"],
-)  # fmt: skip
+)
 def test_what_is_not_seen_and_what_stands_in_the_world(tmp_path, parts, root, nodes):
     model = loaded(tmp_path, *parts)
     tree = model.pose_tree(root, root_position=None if root is None else [0, 0, 1])
@@ -251,33 +240,27 @@ def test_moving_the_root_equals_building_the_tree_there(models):
         np.testing.assert_allclose(moved.node_poses(values), built.node_poses(values), atol=1e-12)
 
 
-def test_held_joint_has_one_sample(models):
-    tree = models["floating"].pose_tree(held={"shoulder_y": 0.4})
-    arm = tree.node_index("arm")
-    grid = tree.grid(arm, np.radians(20.0))
-    assert set(grid[:, 1]) == {0.4}
-    assert len(grid) == 5
+@pytest.mark.parametrize(
+    ("root", "arguments", "error", "words"),
+    [
+        ("nose", {}, UnknownNameError, "link 'nose'.*trunk"),
+        ("between", {}, ModelError, "'between' has no visual geometry"),
+        (None, {"held": {"nose": 1.0}}, UnknownNameError, "joint 'nose'"),
+        ("leg", {}, SettingsError, "root_position"),
+        (None, {"root_position": [0, 0, np.nan]}, SettingsError, "three finite"),
+        (None, {"held": {"slide": np.inf}}, SettingsError, "finite number"),
+        (None, {"held": {"slide": 0.4}}, SettingsError, r"'slide' .* 0\.4, outside its limits, -0"),
+    ],
+)
+def test_bad_arguments_name_what_exists(models, root, arguments, error, words):
+    with pytest.raises(error, match=words):
+        models["floating"].pose_tree(root, **arguments)
 
 
-def test_bad_arguments_name_what_exists(models):
-    floating, jointed = models["floating"], models["jointed"]
-    with pytest.raises(UnknownNameError, match=r"link 'nose'.*trunk"):
-        floating.pose_tree("nose")
-    with pytest.raises(ModelError, match="'between' has no visual geometry"):
-        floating.pose_tree("between")
-    with pytest.raises(UnknownNameError, match="joint 'nose'"):
-        floating.pose_tree(held={"nose": 1.0})
-    with pytest.raises(SettingsError, match="root_position"):
-        floating.pose_tree("leg")
-    with pytest.raises(SettingsError, match="three finite"):
-        floating.pose_tree(root_position=[0, 0, np.nan])
-    with pytest.raises(SettingsError, match="finite number"):
-        floating.pose_tree(held={"slide": np.inf})
-    with pytest.raises(SettingsError, match=r"'slide' is held at 0\.4, outside its limits, -0\.2"):
-        floating.pose_tree(held={"slide": 0.4})
+def test_bad_grids_and_values_are_refused(models):
     with pytest.raises(SettingsError, match="cannot be held"):
-        jointed.pose_tree("arm", root_position=[0, 0, 0], held={"head_y": 0.0})
-    tree = floating.pose_tree()
+        models["jointed"].pose_tree("arm", root_position=[0, 0, 0], held={"head_y": 0.0})
+    tree = models["floating"].pose_tree()
     with pytest.raises(UnknownNameError, match="joint 'nose'"):
         tree.grid(0, 0.3, {"nose": 0.1})
     with pytest.raises(SettingsError, match="positive"):

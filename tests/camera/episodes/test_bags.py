@@ -1,6 +1,5 @@
 """Bags that the writers of rosbags wrote, of ROS 1 and of both kinds of ROS 2."""
 
-from pathlib import Path
 from typing import Any
 
 import cv2
@@ -29,7 +28,7 @@ NONE = np.zeros(0)
 class Bag:
     """Writes messages of sensors into a bag; times are in [s] after START."""
 
-    def __init__(self, folder: Path, kind: str) -> None:
+    def __init__(self, folder, kind):
         from rosbags import rosbag1, rosbag2, typesys
 
         self.is1, stores = kind == "ros1", typesys.Stores
@@ -44,43 +43,41 @@ class Bag:
             plugin = rosbag2.StoragePlugin[kind.upper()]
             self.writer = rosbag2.Writer(self.path, version=9, storage_plugin=plugin)
 
-    def new(self, kind: str, /, **fields: Any) -> Any:
+    def new(self, kind, /, **fields):
         return self.store.types[kind](**fields)
 
-    def header(self, time: float, frame: str = "") -> Any:
+    def header(self, time, frame=""):
         stamp = START + round(1e9 * time) if np.isfinite(time) else 0
         parts = {"sec": stamp // 10**9, "nanosec": stamp % 10**9}
         own = {"seq": 0} if self.is1 else {}
         stamped = self.new("builtin_interfaces/msg/Time", **parts)
         return self.new("std_msgs/msg/Header", stamp=stamped, frame_id=frame, **own)
 
-    def write(self, topic: str, kind: str, logged: float, **fields: Any) -> None:
+    def write(self, topic, kind, logged, **fields):
         if topic not in self.topics:
             self.topics[topic] = self.writer.add_connection(topic, kind, typestore=self.store)
         pack = self.store.serialize_ros1 if self.is1 else self.store.serialize_cdr
         data = pack(self.new(kind, **fields), kind)
         self.writer.write(self.topics[topic], START + round(1e9 * logged), data)
 
-    def image(
-        self, topic: str, time: float, picture: np.ndarray, coding: str, logged: float = 0.0
-    ) -> None:
+    def image(self, topic, time, picture, coding, logged=0.0):
         height, width = picture.shape[:2]
         padded = np.pad(picture.reshape(height, -1), ((0, 0), (0, 5)))
         fields = {"height": height, "width": width, "encoding": coding, "is_bigendian": 0}
         fields |= {"header": self.header(time, "lens"), "step": padded.shape[1]}
         self.write(topic, "sensor_msgs/msg/Image", logged, data=padded.ravel(), **fields)
 
-    def compressed(self, topic: str, time: float, number: int, kind: str = "jpeg") -> None:
+    def compressed(self, topic, time, number, kind="jpeg"):
         data = cv2.imencode(".jpg", numbered(number)[:, :, ::-1])[1].ravel()
         fields = {"header": self.header(time, "lens"), "format": kind, "data": data}
         self.write(topic, "sensor_msgs/msg/CompressedImage", time, **fields)
 
-    def joints(self, topic: str, time: float, **positions: float) -> None:
+    def joints(self, topic, time, **positions):
         fields = {"header": self.header(time), "name": [*positions], "velocity": NONE}
         fields |= {"position": np.array([*positions.values()], dtype=float), "effort": NONE}
         self.write(topic, "sensor_msgs/msg/JointState", time, **fields)
 
-    def info(self, topic: str, model: str, D: tuple[float, ...], P: Any = (0.0,) * 12) -> None:
+    def info(self, topic, model, D, P=(0.0,) * 12):
         sides = dict.fromkeys(("x_offset", "y_offset", "height", "width"), 0)
         region = self.new("sensor_msgs/msg/RegionOfInterest", do_rectify=False, **sides)
         fields = {"header": self.header(0.0), "height": SIDE, "width": SIDE, "roi": region}
@@ -89,7 +86,7 @@ class Bag:
             fields[name.upper() if self.is1 else name] = np.array(one, dtype=float)
         self.write(topic, "sensor_msgs/msg/CameraInfo", 0.0, **fields)
 
-    def mount(self, parent: str, child: str, X: np.ndarray) -> None:
+    def mount(self, parent, child, X):
         q = Rotation.from_matrix(X[:3, :3]).as_quat()
         named = dict(zip("xyz", X[:3, 3], strict=True)), dict(zip("xyzw", q, strict=True))
         p = self.new("geometry_msgs/msg/Vector3", **named[0])
@@ -100,7 +97,7 @@ class Bag:
         self.write("/tf_static", "tf2_msgs/msg/TFMessage", 0.0, transforms=[one])
 
 
-def pose(seed: int) -> np.ndarray:
+def pose(seed):
     X = np.eye(4)
     X[:3, :3] = Rotation.random(random_state=seed).as_matrix()
     X[:3, 3] = np.random.default_rng(seed).normal(size=3)
@@ -108,7 +105,7 @@ def pose(seed: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_camera_on_a_hand_and_two_publishers_of_joints(tmp_path: Path, kind: str) -> None:
+def test_a_camera_on_a_hand_and_two_publishers_of_joints(tmp_path, kind):
     bag = Bag(tmp_path, kind)
     with bag.writer:
         bag.info("/hand/camera_info", "plumb_bob", PLUMB)
@@ -148,7 +145,7 @@ def test_a_camera_on_a_hand_and_two_publishers_of_joints(tmp_path: Path, kind: s
     assert "depth" not in said
 
 
-def test_encodings(tmp_path: Path) -> None:
+def test_encodings(tmp_path):
     bag, red, grey = Bag(tmp_path, "sqlite3"), numbered(0), np.full((SIDE, SIDE), 140, np.uint8)
     with bag.writer:
         bag.joints("/joint_states", 0.0, x=0.0)
@@ -173,7 +170,7 @@ def test_encodings(tmp_path: Path) -> None:
     assert "/strange is left out: bayer_rggb16 is not one of rgb8, bgr8" in episode.warnings[0]
 
 
-def test_lenses_are_undone_as_their_formulas_say(tmp_path: Path) -> None:
+def test_lenses_are_undone_as_their_formulas_say(tmp_path):
     bag, P = Bag(tmp_path, "mcap"), [50, 0, 30, 0, 0, 51, 29, 0, 0, 0, 1, 0]
     rational = (-0.3, 0.1, 1e-3, -2e-3, 0.01, 0.05, 0.02, 0.003)
     fisheye = (0.1, -0.02, 0.003, -0.001)
@@ -200,7 +197,7 @@ def test_lenses_are_undone_as_their_formulas_say(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_bags_that_are_odd_or_cut_short(tmp_path: Path, kind: str) -> None:
+def test_bags_that_are_odd_or_cut_short(tmp_path, kind):
     bag, years = Bag(tmp_path, kind), 3e8 if kind == "mcap" else 0.0
     with bag.writer:
         for k in range(COUNT):
@@ -222,7 +219,7 @@ def test_bags_that_are_odd_or_cut_short(tmp_path: Path, kind: str) -> None:
         open_episode(bag.path)
 
 
-def test_a_bag_without_pictures_says_what_it_has(tmp_path: Path) -> None:
+def test_a_bag_without_pictures_says_what_it_has(tmp_path):
     bag = Bag(tmp_path, "mcap")
     with bag.writer:
         bag.image("/depth", 0.0, np.zeros((4, 4, 2), np.uint8), "16UC1")

@@ -1,7 +1,6 @@
 """DROID's folders, written by h5py and PyAV as its recorder writes them."""
 
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,7 +15,7 @@ ANGLES = np.arange(7) + 0.01 * EACH[:, None]
 STATE, STAMPS = "observation/robot_state", "observation/timestamp"
 
 
-def write_episode(folder: Path, **changed: np.ndarray | None) -> Path:
+def write_episode(folder, **changed):
     """`111` is the hand's camera, and `222` a stereo one; datasets may be changed or left out."""
     import h5py
 
@@ -41,7 +40,7 @@ def write_episode(folder: Path, **changed: np.ndarray | None) -> Path:
     return write_video(folder / "recordings" / "MP4" / "111.mp4", range(COUNT))
 
 
-def test_cameras_and_joints_are_on_the_recorders_clock(tmp_path: Path) -> None:
+def test_cameras_and_joints_are_on_the_recorders_clock(tmp_path):
     write_episode(tmp_path)
     episode = open_episode(tmp_path)
     # 256 x 64 pixels are two pictures side by side.
@@ -62,7 +61,7 @@ def test_cameras_and_joints_are_on_the_recorders_clock(tmp_path: Path) -> None:
     assert "camera '111' is the hand's" in "\n".join(episode.warnings)
 
 
-def test_videos_that_are_longer_than_their_time_stamps(tmp_path: Path) -> None:
+def test_videos_that_are_longer_than_their_time_stamps(tmp_path):
     video = write_video(write_episode(tmp_path), range(COUNT + 2))
     episode = open_episode(tmp_path)
     assert len(episode.camera("111").times) == COUNT
@@ -75,7 +74,7 @@ def test_videos_that_are_longer_than_their_time_stamps(tmp_path: Path) -> None:
     np.testing.assert_allclose(timed.camera("111").times, 1e-3 * (received - 41), rtol=0, atol=1e-6)
 
 
-def test_what_is_missing_or_damaged_is_named(tmp_path: Path) -> None:
+def test_what_is_missing_or_damaged_is_named(tmp_path):
     file, none = tmp_path / "trajectory.h5", {"111_estimated_capture": None}
     for changed, message in (
         (none | {"111_frame_received": None}, r"111\.mp4: has no .*cameras/111_est.* has: 222_est"),

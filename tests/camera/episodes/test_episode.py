@@ -11,19 +11,19 @@ from drake_pose.errors import SceneError, UnknownNameError
 TIMES = 0.1 * np.arange(20)
 
 
-def camera(times: np.ndarray) -> EpisodeCamera:
+def camera(times):
     return EpisodeCamera("a", 4, 3, times, None, None, lambda k: np.zeros((3, 4 + k, 3), np.uint8))
 
 
-def log(times: np.ndarray) -> JointLog:
+def log(times):
     return JointLog(("x", "y"), times, np.column_stack([2.0 * times, np.sin(times)]))
 
 
-def episode(times: np.ndarray, joints: JointLog | None) -> Episode:
+def episode(times, joints):
     return Episode.checked(Path("here"), [camera(times)], joints)
 
 
-def test_positions_between_rows_and_none_beyond_them() -> None:
+def test_positions_between_rows_and_none_beyond_them():
     wanted = np.array([-0.06, -0.04, 0.0, 0.05, 1.84, 1.9, 1.94, 1.96, np.nan])
     found = log(TIMES).at(wanted)
     expected = [np.nan, 0.0, 0.0, 0.1, 3.68, 3.8, 3.8, np.nan, np.nan]
@@ -37,7 +37,7 @@ def test_positions_between_rows_and_none_beyond_them() -> None:
     np.testing.assert_array_equal(one.at(np.array([1.99, 2.0]))[:, 0], [np.nan, 7.0])
 
 
-def test_rows_of_frames_are_found_by_name_or_number() -> None:
+def test_rows_of_frames_are_found_by_name_or_number():
     rows = JointLog(("x",), None, np.array([[1.0], [2.0], [3.0]]), ("7", "last", "12.0"))
     found = rows.of_frames(["0012", "007", "last", "8"])
     np.testing.assert_array_equal(found[:, 0], [3.0, 1.0, 2.0, np.nan])
@@ -47,7 +47,7 @@ def test_rows_of_frames_are_found_by_name_or_number() -> None:
         log(TIMES).of_frames(["7"])
 
 
-def test_clocks_that_run_backwards() -> None:
+def test_clocks_that_run_backwards():
     times = TIMES.copy()
     times[5], times[7] = times[4], 0.05
     kept, said = ascending(times, "the log")
@@ -61,7 +61,7 @@ def test_clocks_that_run_backwards() -> None:
         ascending(np.zeros(0), "the log")
 
 
-def test_what_is_odd_is_named() -> None:
+def test_what_is_odd_is_named():
     broken = log(TIMES)
     broken.positions[[3, 9], 1] = np.nan, np.inf
     for times, joints, expected in (
@@ -79,7 +79,7 @@ def test_what_is_odd_is_named() -> None:
         assert expected in said[0] if expected else said == ()
 
 
-def test_what_cannot_be_used_is_refused() -> None:
+def test_what_cannot_be_used_is_refused():
     with pytest.raises(SceneError, match="here: holds no camera's pictures because"):
         Episode.checked(Path("here"), [], log(TIMES), ["because"])
     with pytest.raises(SceneError, match="holds no row"):

@@ -1,7 +1,5 @@
 """Episodes in folders, whose videos PyAV encodes and whose pictures OpenCV writes."""
 
-from pathlib import Path
-
 import cv2
 import numpy as np
 import pytest
@@ -20,20 +18,20 @@ from tests.camera.episodes.recordings import (
 )
 
 
-def write_table(path: Path, kind: str, stamps: list[object]) -> Path:
+def write_table(path, kind, stamps):
     rows = [f"{stamp},{0.01 * k},{k}" for k, stamp in enumerate(stamps)]
     path.write_text("\n".join([f"{kind},joint1,grip", *rows]) + "\n")
     return path
 
 
-def write_images(folder: Path, numbers: list[int]) -> Path:
+def write_images(folder, numbers):
     (folder / "images" / "a").mkdir(parents=True)
     for k in numbers:
         cv2.imwrite(str(folder / "images" / "a" / f"{k}.png"), numbered(k)[:, :, ::-1])
     return folder / "images" / "a"
 
 
-def test_videos_beside_a_faster_log(tmp_path: Path) -> None:
+def test_videos_beside_a_faster_log(tmp_path):
     write_video(tmp_path / "videos" / "left.mp4", range(12))
     write_video(tmp_path / "videos" / "right.avi", range(7), codec="mpeg4")
     write_table(tmp_path / "joint_angles.csv", "time", [round(0.02 * k, 3) for k in range(60)])
@@ -52,7 +50,7 @@ def test_videos_beside_a_faster_log(tmp_path: Path) -> None:
         open_episode(tmp_path / "joint_angles.csv")
 
 
-def test_stills_by_frame_and_pictures_by_time(tmp_path: Path) -> None:
+def test_stills_by_frame_and_pictures_by_time(tmp_path):
     stamps, table = write_images(tmp_path, [2, 9, 10]) / "timestamps.csv", tmp_path / "other.csv"
     write_table(tmp_path / "joint_angles.csv", "frame", ["010", "2", "9"])
     episode = open_episode(tmp_path)
@@ -79,7 +77,7 @@ def test_stills_by_frame_and_pictures_by_time(tmp_path: Path) -> None:
     assert any("2 frames have no picture, or no time" in text for text in timed.warnings)
 
 
-def test_distortion_is_taken_out_as_the_formula_says(tmp_path: Path) -> None:
+def test_distortion_is_taken_out_as_the_formula_says(tmp_path):
     D = (-0.3, 0.1, 2e-3, -1e-3, 0.02)
     file = tmp_path / "cameras.yaml"
     seen = np.repeat(distorted(D)[:, :, None], 3, axis=2)
@@ -115,14 +113,14 @@ def test_distortion_is_taken_out_as_the_formula_says(tmp_path: Path) -> None:
         ("frame,q\n5,1\n", "camera 'a': 1 of 1 pictures have no row .* called alike in both"),
     ],
 )
-def test_tables_that_cannot_be_used(tmp_path: Path, table: str, message: str) -> None:
+def test_tables_that_cannot_be_used(tmp_path, table, message):
     write_images(tmp_path, [1])
     (tmp_path / "joint_angles.csv").write_text(table)
     with pytest.raises(SceneError, match=message):
         open_episode(tmp_path)
 
 
-def test_what_is_no_episode(tmp_path: Path) -> None:
+def test_what_is_no_episode(tmp_path):
     (tmp_path / "nothing").mkdir()
     (tmp_path / "notes.txt").touch()
     for name, message in ((".", "notes.txt, nothing"), ("nothing", "empty"), ("gone", "no such")):
@@ -130,7 +128,7 @@ def test_what_is_no_episode(tmp_path: Path) -> None:
             open_episode(tmp_path / name)
 
 
-def test_recorded_episodes(shared_data: Path) -> None:
+def test_recorded_episodes(shared_data):
     for name, count, rows in (("short", 62, 184), ("cloth", 124, 370)):
         episode = open_episode(shared_data / "droid_episodes" / name)
         assert (episode.warnings, episode.joints.positions.shape) == ((), (rows, 8))

@@ -1,8 +1,6 @@
 """Which column is which joint, in which unit: never assumed without a word."""
 
 import math
-from pathlib import Path
-from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
@@ -11,7 +9,6 @@ import pytest
 from drake_pose.camera.episodes.episode import JointLog
 from drake_pose.camera.episodes.joint_map import (
     Column,
-    MappedJoints,
     map_joints,
     match_names,
     read_joint_map,
@@ -25,9 +22,7 @@ ARM = {"names": tuple(f"panda_joint{k}" for k in range(1, 8)), "lower": LOW, "up
 POSES = np.array([[0.1, -0.5, 0.3, -2.4, 0.2, 2.0, 0.7], [0.2, -0.4, 0.1, -2.0, 0.1, 1.5, 0.9]])
 
 
-def mapped(
-    logged: tuple[str, ...], readings: Any, model: dict[str, Any], **more: Any
-) -> MappedJoints:
+def mapped(logged, readings, model, **more):
     readings = np.array(readings, dtype=float)
     log = JointLog(logged, 0.1 * np.arange(len(readings)), readings)
     is_angle = [not name.startswith("slide") for name in model["names"]]
@@ -53,7 +48,7 @@ def mapped(
         ("m0 m1 finger", "a1 a2 finger", [0, 1, 2]),
     ],
 )
-def test_names(logged: str, wanted: str, found: list[int | None]) -> None:
+def test_names(logged, wanted, found):
     names, joints = logged.split(), wanted.split()
     expected = {a: joints[k] for a, k in zip(names, found, strict=True) if k is not None}
     matched, said = match_names(names, joints)
@@ -62,7 +57,7 @@ def test_names(logged: str, wanted: str, found: list[int | None]) -> None:
         assert all(f"{a} for {b}" in said[0] for a, b in expected.items() if a != b)
 
 
-def test_positions_are_in_the_models_order_and_what_is_missing_is_named() -> None:
+def test_positions_are_in_the_models_order_and_what_is_missing_is_named():
     order = [6, 5, 3, 2, 1, 0]
     names = ("gripper", *(f"joint{k + 1}" for k in order))
     found = mapped(names, np.column_stack([[0.5, 0.6], POSES[:, order]]), ARM)
@@ -78,7 +73,7 @@ def test_positions_are_in_the_models_order_and_what_is_missing_is_named() -> Non
         mapped(("x", "y"), np.zeros((2, 2)), ARM)
 
 
-def test_units_are_told_or_follow_from_the_limits() -> None:
+def test_units_are_told_or_follow_from_the_limits():
     names, degrees = ARM["names"], np.rad2deg(POSES)
     wide = ARM | {"lower": np.full(7, -3.0), "upper": np.full(7, 3.0)}
     holes = np.where(np.eye(2, 7, dtype=bool), np.nan, POSES)
@@ -104,7 +99,7 @@ def test_units_are_told_or_follow_from_the_limits() -> None:
         mapped(names, POSES, ARM, units="turns")
 
 
-def test_normalised_readings_ask_for_their_ranges() -> None:
+def test_normalised_readings_ask_for_their_ranges():
     limits = {"lower": np.full(2, -1.92), "upper": np.full(2, 1.92)}
     model, names = {"names": ("pan", "lift"), **limits}, ("main_pan", "main_lift", "claw")
     # As degrees they would all be within 110.
@@ -127,7 +122,7 @@ def test_normalised_readings_ask_for_their_ranges() -> None:
     assert "joint 'pan': column 'main_pan' has 1 of 1 readings beyond -100 ... 100" in said
 
 
-def test_a_joint_without_limits_counts_on_over_a_turn() -> None:
+def test_a_joint_without_limits_counts_on_over_a_turn():
     turning = np.linspace(0.0, 9.0, 30)
     read = np.arctan2(np.sin(turning), np.cos(turning))[:, None]
     read[7] = turning[7] = np.nan
@@ -136,7 +131,7 @@ def test_a_joint_without_limits_counts_on_over_a_turn() -> None:
     np.testing.assert_allclose(found, turning, atol=1e-12)
 
 
-def test_tables_of_joints(tmp_path: Path) -> None:
+def test_tables_of_joints(tmp_path):
     path = tmp_path / "joint_map.yaml"
     path.write_text(
         "shoulder_pan: {column: main_shoulder_pan, from: [100, -100], to: [-1.92, 1.92]}\n"
@@ -173,7 +168,7 @@ def test_tables_of_joints(tmp_path: Path) -> None:
             mapped(ARM["names"], POSES, ARM, table=table)
 
 
-def joints_of(urdf: Path) -> dict[str, Any]:
+def joints_of(urdf):
     """The moving joints of a URDF that no other joint moves, and their limits."""
     moving = [one for one in ElementTree.parse(urdf).iter("joint") if one.get("type") != "fixed"]
     moving = [one for one in moving if one.find("mimic") is None]
@@ -184,7 +179,7 @@ def joints_of(urdf: Path) -> dict[str, Any]:
     return {"names": tuple(one.get("name") for one in moving), **arrays}
 
 
-def test_recorded_logs(shared_data: Path) -> None:
+def test_recorded_logs(shared_data):
     """A humanoid's fourteen arm joints are in its URDF's order, as its README says."""
     folder = shared_data / "humanoid_head_camera"
     log = open_episode(folder, episode=10).joints

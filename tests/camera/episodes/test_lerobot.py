@@ -1,8 +1,6 @@
 """LeRobot data sets, written by pyarrow and PyAV as LeRobot 2.1 and 3.0 lay them out."""
 
 import json
-from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -18,7 +16,7 @@ V2 = "chunk-{episode_chunk:03d}/{video_key}/episode_{episode_index:06d}"
 V3 = "{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}"
 
 
-def write_info(folder: Path, version: str, template: str, names: Any) -> None:
+def write_info(folder, version, template, names):
     features = {
         "observation.state": {"dtype": "float32", "shape": [3], "names": names},
         TOP: {"dtype": "video", "info": {"video.is_depth_map": False}},
@@ -33,7 +31,7 @@ def write_info(folder: Path, version: str, template: str, names: Any) -> None:
     (folder / "meta" / "info.json").write_text(json.dumps(content))
 
 
-def write_rows(path: Path, episodes: list[int]) -> None:
+def write_rows(path, episodes):
     import pyarrow.parquet
 
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -48,7 +46,7 @@ def write_rows(path: Path, episodes: list[int]) -> None:
     pyarrow.parquet.write_table(pyarrow.table(columns), path)
 
 
-def write_v21(folder: Path, names: Any = (["pan", "lift", "grip"],)) -> None:
+def write_v21(folder, names=(["pan", "lift", "grip"],)):
     write_info(folder, "v2.1", V2, names)
     for n, count in LENGTHS.items():
         where = V2.format(episode_chunk=n // 2, video_key=TOP, episode_index=n)
@@ -58,7 +56,7 @@ def write_v21(folder: Path, names: Any = (["pan", "lift", "grip"],)) -> None:
         write_rows(folder / "data" / f"{where}.parquet", [n])
 
 
-def write_v30(folder: Path) -> None:
+def write_v30(folder):
     import pyarrow.parquet
 
     write_info(folder, "v3.0", V3, {"motors": ["pan", "lift", "grip"]})
@@ -81,7 +79,7 @@ def write_v30(folder: Path) -> None:
 
 
 @pytest.mark.parametrize("write", [write_v21, write_v30])
-def test_each_episode_has_its_own_pictures_and_rows(tmp_path: Path, write: Any) -> None:
+def test_each_episode_has_its_own_pictures_and_rows(tmp_path, write):
     write(tmp_path)
     for n, count in LENGTHS.items():
         episode = open_episode(tmp_path, episode=n)
@@ -99,7 +97,7 @@ def test_each_episode_has_its_own_pictures_and_rows(tmp_path: Path, write: Any) 
         open_episode(tmp_path)
 
 
-def test_a_part_of_a_data_set_and_what_is_wrong_in_it(tmp_path: Path) -> None:
+def test_a_part_of_a_data_set_and_what_is_wrong_in_it(tmp_path):
     write_v21(tmp_path, names=None)
     for n in (0, 1):
         (tmp_path / f"data/chunk-000//episode_{n:06d}.parquet").unlink()
@@ -122,7 +120,7 @@ def test_a_part_of_a_data_set_and_what_is_wrong_in_it(tmp_path: Path) -> None:
         open_episode(tmp_path)
 
 
-def test_a_recorded_data_set(shared_data: Path) -> None:
+def test_a_recorded_data_set(shared_data):
     folder = shared_data / "humanoid_head_camera"
     for n, count in ((10, 290), (20, 297)):
         episode = open_episode(folder, episode=n)

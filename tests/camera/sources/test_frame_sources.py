@@ -92,17 +92,16 @@ class TestFolder:
     def test_masks(self, tmp_path):
         mask = np.zeros((HEIGHT, WIDTH), np.uint8)
         mask[4:9, 3:6] = 200
-        cv2.imwrite(str(tmp_path / "0.png"), mask)
-        cv2.imwrite(str(tmp_path / "1.jpg"), mask)
-        cv2.imwrite(str(tmp_path / "2.png"), 0 * mask)
-        cv2.imwrite(str(tmp_path / "3.png"), np.arange(WIDTH * HEIGHT).reshape(HEIGHT, WIDTH) % 256)
-        cv2.imwrite(str(tmp_path / "4.png"), np.full_like(mask, 255))
+        many = np.arange(WIDTH * HEIGHT).reshape(HEIGHT, WIDTH) % 256
+        written = {"0.png": mask, "1.jpg": mask, "2.png": 0 * mask, "3.png": many}
+        for name, one in (written | {"4.png": np.full_like(mask, 255)}).items():
+            cv2.imwrite(str(tmp_path / name), one)
         source = open_source(specify(tmp_path, background=None))
-        found = read_all(source)
-        assert [one.picture.dtype for one in found] == [bool, bool, bool]
-        np.testing.assert_array_equal(found[0].picture, mask > 0)
-        np.testing.assert_array_equal(found[1].picture, mask > 0)
-        assert not found[2].picture.any(), "nobody is there: no fault"
+        found = [one.picture for one in read_all(source)]
+        assert [one.dtype for one in found] == [bool, bool, bool]
+        # Nobody in the last one is no fault.
+        for one, expected in zip(found, (mask > 0, mask > 0, np.zeros_like(mask)), strict=True):
+            np.testing.assert_array_equal(one, expected)
         assert "must have two" in source.problems[0]
         assert "full" in source.problems[1]
 
@@ -207,36 +206,50 @@ def wait_for(what, patience=10.0):
 
 
 class TestDevice:
-    def test_newest_picture_is_kept_and_the_camera_opened_again(self, monkeypatch):
-        FakeCamera.opened = 0
+    @pytest.fixture
+    def device(self, monkeypatch):
+        """Opens it after so many tries."""
         monkeypatch.setattr(cv2, "VideoCapture", FakeCamera)
         monkeypatch.setattr("drake_pose.camera.frame_source.FIRST_PAUSE", 0.02)
-        source = open_source(specify("7", "device"))
-        try:
-            # It cannot be opened at first, then gives three pictures at a time, and fails again.
-            wait_for(lambda: FakeCamera.opened >= 4)
-            one = source.read()
-            assert int(one.frame) >= 5, "older ones are gone"
-            assert abs(one.time - time.monotonic()) < 5.0
-            assert not source.ended
-            assert "cannot be opened" in source.problems[0]
-            assert "answers again" in source.problems[1]
-            assert "stopped" in source.problems[2]
-        finally:
-            source.close()
-        assert source.ended
+        opened = []
 
-    def test_wrong_size_ends_it(self, monkeypatch):
-        FakeCamera.opened = 1
-        monkeypatch.setattr(cv2, "VideoCapture", FakeCamera)
-        source = open_source(specify("7", "device", width=640, height=480))
+        def open_after(tries, **more):
+            FakeCamera.opened = tries
+            opened.append(open_source(specify("7", "device", **more)))
+            return opened[0]
+
+        yield open_after
+        opened[0].close()
+        assert opened[0].ended
+
+    def test_newest_picture_is_kept_and_the_camera_opened_again(self, device):
+        source = device(0)
+        # It cannot be opened at first, then gives three pictures at a time, and fails again.
+        wait_for(lambda: FakeCamera.opened >= 4)
+        one = source.read()
+        assert int(one.frame) >= 5, "older ones are gone"
+        assert abs(one.time - time.monotonic()) < 5.0
+        assert not source.ended
+        for k, expected in enumerate(("cannot be opened", "answers again", "stopped")):
+            assert expected in source.problems[k]
+
+    def test_wrong_size_ends_it(self, device):
+        source = device(1, width=640, height=480)
         wait_for(lambda: source.ended)
         assert source.read() is None
         assert "32 x 24" in source.problems[0]
-        source.close()
 
 
 VIDEO = {"kind": "video", "location": "a"}
+ENTRIES = {
+    name: {
+        "kind": "folder",
+        "rate_hz": 10,
+        "location": f"images/{name}",
+        "background": f"empty/{name}",
+    }
+    for name in ("camera_1", "camera_0")
+}
 
 
 class TestSourcesFile:
@@ -250,19 +263,12 @@ class TestSourcesFile:
         return tmp_path
 
     @staticmethod
-    def entries():
-        common = {"kind": "folder", "rate_hz": 10}
-        return {
-            name: common | {"location": f"images/{name}", "background": f"empty/{name}"}
-            for name in ("camera_1", "camera_0")
-        }
-
-    def save(self, studio, entries):
+    def load(studio, entries):
         (studio / "sources.yaml").write_text(yaml.safe_dump(entries, sort_keys=False))
+        return load_sources(studio)
 
     def test_file_is_read_in_the_order_of_the_cameras(self, studio):
-        self.save(studio, self.entries())
-        found = load_sources(studio)
+        found = self.load(studio, ENTRIES)
         assert list(found) == ["camera_0", "camera_1"]
         one = found["camera_0"]
         assert (one.width, one.height, one.rate_hz) == (WIDTH, HEIGHT, 10.0)
@@ -274,8 +280,8 @@ class TestSourcesFile:
 
     def test_device_may_have_a_number_or_an_address(self, studio):
         devices = [{"kind": "device", "location": place, "masks": True} for place in (0, "rtsp://")]
-        self.save(studio, dict(zip(("camera_0", "camera_1"), devices, strict=True)))
-        found = load_sources(studio / "sources.yaml")
+        found = self.load(studio, dict(zip(("camera_0", "camera_1"), devices, strict=True)))
+        assert load_sources(studio / "sources.yaml") == found
         assert [one.location for one in found.values()] == ["0", "rtsp://"]
         assert all(one.live and one.gives_masks for one in found.values())
 
@@ -293,25 +299,21 @@ class TestSourcesFile:
         ],
     )
     def test_wrong_entries_are_named(self, studio, change, why):
-        self.save(studio, {**self.entries(), **change})
         with pytest.raises(SceneError, match=why) as error:
-            load_sources(studio)
+            self.load(studio, ENTRIES | change)
         assert "sources.yaml" in str(error.value)
 
     def test_calibrated_camera_without_source_is_named(self, studio):
-        self.save(studio, {"camera_0": self.entries()["camera_0"]})
         with pytest.raises(SceneError, match=r"'camera_1' of .* has no source"):
-            load_sources(studio)
+            self.load(studio, {"camera_0": ENTRIES["camera_0"]})
 
     def test_background_that_is_missing_or_of_another_size_is_named(self, studio):
-        entries = self.entries()
-        entries["camera_0"]["background"] = "nothing"
-        self.save(studio, entries)
-        with pytest.raises(SceneError, match="empty-room"):
-            load_background_pictures(load_sources(studio)["camera_0"])
+        missing = {"camera_0": ENTRIES["camera_0"] | {"background": "nothing"}}
         cv2.imwrite(str(studio / "empty/camera_1/0.png"), np.zeros((5, 7, 3), np.uint8))
-        with pytest.raises(SceneError, match="7 x 5"):
-            load_background_pictures(load_sources(studio)["camera_1"])
+        found = self.load(studio, ENTRIES | missing)
+        for name, why in (("camera_0", "empty-room"), ("camera_1", "7 x 5")):
+            with pytest.raises(SceneError, match=why):
+                load_background_pictures(found[name])
 
 
 @pytest.mark.parametrize(

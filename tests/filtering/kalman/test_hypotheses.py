@@ -1,10 +1,121 @@
-"""Weights of explanations: conserved, whatever is merged or given up."""
-
 import numpy as np
 import pytest
 
-from drake_pose.filtering.hypotheses import Hypothesis, merge_twins, normalise, prune
+from drake_pose.filtering.hand import HAND_STATE
+from drake_pose.filtering.hypotheses import (
+    Hypothesis,
+    RepeatedView,
+    anchored,
+    begin_repeated_view,
+    measure_curvature,
+    merge_twins,
+    next_view,
+    normalise,
+    prune,
+)
 from drake_pose.filtering.state import Belief
+from drake_pose.filtering.update import make_evidence, update
+from drake_pose.papers.shimada import experiment_filter
+from drake_pose.papers.shimada_motion import make_sequence
+
+CHANCE = 1e-9
+
+
+@pytest.fixture(scope="module")
+def hand():
+    f, observation = experiment_filter()
+    sequence = make_sequence(35.0, "full", observation, np.random.default_rng(0))
+    return f, observation, sequence
+
+
+def test_a_view_lasts_while_only_noise_changes(hand):
+    _, observation, sequence = hand
+    y = sequence.measurements[3]
+    noise = np.sqrt(observation.variances)
+    generator = np.random.default_rng(1)
+    view = next_view(None, make_evidence(observation, y), CHANCE)
+    assert view.count == 1
+    for count in range(2, 500):
+        again = y + noise * generator.normal(size=len(y))
+        view = next_view(view, make_evidence(observation, again), CHANCE)
+        assert view.count == count
+    assert next_view(view, make_evidence(observation, y + 4 * noise), CHANCE).count == 1
+    assert next_view(view, make_evidence(observation, y), 0.0).count == 1
+    # The threshold is a probability, whatever is hidden; what was hidden makes a new view.
+    few = np.where(np.arange(len(y)) < 4, y, np.nan)
+    first = next_view(None, make_evidence(observation, few), CHANCE)
+    for other, is_new in ((few + 3.5 * noise, False), (few + 9 * noise, True), (y, True)):
+        found = next_view(first, make_evidence(observation, other), CHANCE)
+        assert found.count == (1 if is_new else 2)
+    # An angle that jumps by a full turn has not changed.
+    turned = y + 2 * np.pi * observation.wraps
+    assert next_view(view, make_evidence(observation, turned), CHANCE).count == view.count + 1
+
+
+class Parabola:
+    """h = x^2 / 2 + x: its tangent at 0 leaves out x^2 / 2."""
+
+    names = ("h",)
+    variances = np.array([1e-4])
+    wraps = np.zeros(1, dtype=bool)
+
+    def predict(self, x):
+        return np.array([0.5 * x[0] ** 2 + x[0]]), np.array([[x[0] + 1.0]])
+
+    def mirrors(self, belief):
+        return []
+
+
+def test_the_curvature_is_the_mean_square_of_what_the_tangent_leaves_out():
+    deviation = 0.3
+    belief = Belief(np.zeros(1), np.array([[deviation**2]]))
+    draws = np.random.default_rng(0).normal(size=200000) * deviation
+    expected = np.mean((0.5 * draws**2) ** 2)
+    assert measure_curvature(Parabola(), belief) == pytest.approx([expected], rel=0.03)
+
+
+def test_a_thousand_frames_tell_the_sum_of_state_and_offset_and_no_more():
+    """Against the closed form: prior, offset and mean noise as one normal distribution."""
+    prior = Belief(np.zeros(1), np.array([[0.09]]))
+    repeated = begin_repeated_view(Parabola(), prior, prior, np.zeros(1))
+    tangent = anchored(Parabola(), repeated.tangent)
+    C = measure_curvature(Parabola(), prior)[0]
+    frames, y = 1000, 0.4
+    for _ in range(frames):
+        repeated = RepeatedView(
+            repeated.tangent, update(repeated.belief, make_evidence(tangent, np.array([y]))).belief
+        )
+    noise = Parabola.variances[0] / frames + C
+    assert repeated.state().covariance[0, 0] == pytest.approx(1 / (1 / 0.09 + 1 / noise), rel=1e-6)
+    assert repeated.state().mean[0] == pytest.approx(y * 0.09 / (0.09 + noise), rel=1e-6)
+    total = np.ones(2) @ repeated.belief.covariance @ np.ones(2)
+    assert total == pytest.approx(Parabola.variances[0] / frames, rel=1e-2)
+
+
+def test_the_anchored_jacobian_against_differences(hand):
+    _, observation, sequence = hand
+    x = sequence.states[5]
+    tangent = anchored(observation, x)
+    n, m = len(x), len(observation.names)
+    z = np.r_[sequence.states[6], np.random.default_rng(0).normal(size=m)]
+    h, H = tangent.predict(z)
+    step = np.random.default_rng(1).normal(size=n + m) * 1e-3
+    np.testing.assert_allclose(tangent.predict(z + step)[0] - h, H @ step, atol=1e-9)
+    h0, _ = observation.predict(x)
+    np.testing.assert_allclose(tangent.predict(np.r_[x, np.zeros(m)])[0], h0)
+
+
+def test_offsets_stay_while_the_state_moves(hand):
+    f, observation, sequence = hand
+    guess = f.start(sequence.guess).best
+    repeated = begin_repeated_view(observation, guess, guess, guess.mean)
+    A, U = HAND_STATE.transition(), f.predict(f.start(sequence.guess)).hypotheses[0].free.covariance
+    moved = repeated.moved(A, U)
+    n = len(HAND_STATE)
+    np.testing.assert_allclose(moved.state().mean, A @ guess.mean)
+    np.testing.assert_allclose(moved.state().covariance, A @ guess.covariance @ A.T + U)
+    np.testing.assert_allclose(moved.belief.mean[n:], repeated.belief.mean[n:])
+    np.testing.assert_array_equal(moved.belief.covariance, moved.belief.covariance.T)
 
 
 def at(place, log_weight, deviation=1.0):

@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+from scipy.stats import multivariate_normal
 
 from drake_pose.errors import SettingsError, UnknownNameError
 from drake_pose.filtering.inequalities import from_bounds, stack, two_sided
@@ -8,6 +9,8 @@ from drake_pose.filtering.truncated_filter import FilterSettings, TruncatedFilte
 from drake_pose.filtering.truncated_normal import truncate_joint
 from drake_pose.filtering.update import make_evidence, update
 
+ONE_TURN = from_bounds(["angle"], [0], [1])
+BEYOND_IT = two_sided(["angle"], "stop", [1.0], 2.0, np.inf)
 LAYOUT = StateLayout(("angle",), ("length",))
 NAMES = LAYOUT.names  # angle, rate_angle, length
 
@@ -62,37 +65,27 @@ def random_belief(seed):
     return make_belief(generator.normal(size=3), A @ A.T + 0.1 * np.eye(3))
 
 
+TOGETHER = np.array([[0.3, 0.25], [0.25, 0.3]])
+
+
+@pytest.mark.parametrize("R", [None, TOGETHER], ids=["each by itself", "together"])
 @pytest.mark.parametrize("iterations", [1, 10])
-def test_a_linear_measurement_gives_bayes_rule_in_information_form(iterations):
+def test_a_linear_measurement_gives_bayes_rule_in_information_form(iterations, R):
+    """With noise that errs in each part by itself, or together."""
+    noise = np.diag(Linear.variances) if R is None else R
+    H, y = Linear.H, np.array([1.0, -2.0])
     for seed in range(5):
-        prior, y = random_belief(seed), np.array([1.0, -2.0])
-        model = Linear()
-        result = update(prior, make_evidence(model, y), iterations)
+        prior, model = random_belief(seed), Linear()
+        result = update(prior, make_evidence(model, y, R), iterations)
         # Where the tangent is the same everywhere, the second one settles it.
-        assert model.calls <= 2
-        information = (
-            np.linalg.inv(prior.covariance) + Linear.H.T @ np.diag(1 / Linear.variances) @ Linear.H
-        )
-        covariance = np.linalg.inv(information)
-        mean = covariance @ (
-            np.linalg.solve(prior.covariance, prior.mean) + Linear.H.T @ (y / Linear.variances)
-        )
+        assert R is not None or model.calls <= 2
+        information = np.linalg.inv(prior.covariance) + H.T @ np.linalg.inv(noise) @ H
+        told = np.linalg.solve(prior.covariance, prior.mean) + H.T @ np.linalg.solve(noise, y)
+        mean, covariance = np.linalg.solve(information, told), np.linalg.inv(information)
         np.testing.assert_allclose(result.belief.mean, mean, atol=1e-9)
         np.testing.assert_allclose(result.belief.covariance, covariance, atol=1e-9)
-        S = Linear.H @ prior.covariance @ Linear.H.T + np.diag(Linear.variances)
-        r = y - Linear.H @ prior.mean
-        expected = -0.5 * (r @ np.linalg.solve(S, r) + np.linalg.slogdet(2 * np.pi * S)[1])
+        expected = multivariate_normal.logpdf(y, H @ prior.mean, H @ prior.covariance @ H.T + noise)
         assert result.log_likelihood == pytest.approx(expected)
-
-
-def test_noise_that_errs_together_is_weighed_as_its_covariance_says():
-    prior = Belief(np.array([0.3, -0.2, 0.1]), np.diag([0.5, 0.1, 0.4]) + 0.05)
-    y, R = np.array([1.0, 0.4]), np.array([[0.3, 0.25], [0.25, 0.3]])
-    result = update(prior, make_evidence(Linear(), y, R)).belief
-    information = np.linalg.inv(prior.covariance) + Linear.H.T @ np.linalg.inv(R) @ Linear.H
-    np.testing.assert_allclose(result.covariance, np.linalg.inv(information))
-    weighed = np.linalg.solve(prior.covariance, prior.mean) + Linear.H.T @ np.linalg.solve(R, y)
-    np.testing.assert_allclose(result.mean, np.linalg.solve(information, weighed))
 
 
 def test_what_is_occluded_is_left_out():
@@ -138,9 +131,9 @@ def test_covariances_stay_positive_definite_when_measurements_are_nearly_exact()
         assert (belief.deviations() > 0).all()
 
 
-def make_filter(model=None, rows=None, **settings):
+def make_filter(model=None, rows=None, noise=None, **settings):
     rows = rows or from_bounds(["angle", "length"], [0.0, 0.5], [1.5, 1.5])
-    noise = LAYOUT.process_noise({"angle": 0.02})
+    noise = LAYOUT.process_noise({"angle": 0.02}) if noise is None else noise
     return TruncatedFilter(LAYOUT, model or Segment(), rows, noise, FilterSettings(**settings))
 
 
@@ -243,7 +236,7 @@ def test_transition_and_noise():
         (lambda: make_belief([0, 0], np.eye(3)), "fit"),
         (lambda: make_belief([0, 0], [[1, 2], [2, 1]]), "indefinite"),
         (
-            lambda: make_filter().start(Belief(np.zeros(3), np.full((3, 3), np.nan))),
+            lambda: make_filter().start(Belief(np.zeros(3), 0 * np.eye(3) * np.nan)),
             "'angle' is NaN",
         ),
         (lambda: make_filter().start(Belief(np.zeros(2), np.eye(2))), "3"),
@@ -256,23 +249,8 @@ def test_transition_and_noise():
         (lambda: LAYOUT.process_noise({}), "'angle'"),
         (lambda: LAYOUT.process_noise({"length": 1.0}), "length"),
         (lambda: StateLayout(("a", "a"), ()), "'a'"),
-        (
-            lambda: TruncatedFilter(
-                LAYOUT, Segment(), from_bounds(["angle"], [0], [1]), -np.eye(3)
-            ),
-            "process noise: the covariance is indefinite",
-        ),
-        (
-            lambda: make_filter(
-                rows=stack(
-                    [
-                        from_bounds(["angle"], [0], [1]),
-                        two_sided(["angle"], "stop", [1.0], 2.0, np.inf),
-                    ]
-                )
-            ),
-            "stop",
-        ),
+        (lambda: make_filter(noise=-np.eye(3)), "process noise: the covariance is indefinite"),
+        (lambda: make_filter(rows=stack([ONE_TURN, BEYOND_IT])), "stop"),
         (lambda: make_filter(rows=from_bounds(["elbow"], [0], [1])), "elbow"),
     ],
 )

@@ -2,24 +2,17 @@ import numpy as np
 import pytest
 
 from drake_pose.body.model import load_model
-from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import SettingsError
 from drake_pose.filtering import contour
 from drake_pose.filtering.body_state import ROOT_SHIFT
 from drake_pose.filtering.contour import ContourObservation
+from drake_pose.filtering.inequalities import from_model
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from tests.body.models import joint, link, urdf, write
-from tests.search.bodies import forked_body, front_camera
-
-
-def pinhole(name, turn_deg, side=260, focal=330.0, distance=2.9, height=0.9):
-    """A camera that looks at the world's axis from all around."""
-    c, s = np.cos(np.radians(turn_deg)), np.sin(np.radians(turn_deg))
-    X_WC = np.eye(4)
-    X_WC[:3, :3] = np.column_stack([[-s, c, 0.0], [0.0, 0.0, -1.0], [-c, -s, 0.0]])
-    X_WC[:3, 3] = [distance * c, distance * s, height]
-    middle = 0.5 * (side - 1)
-    return PinholeCamera(name, side, side, focal, focal, middle, middle, X_WC)
+from tests.body.skins import LIMB_URDF, write_limb
+from tests.jobs.scenes import camera
+from tests.search.bodies import forked_body, front_camera, near_camera
+from tests.search.turning import crane
 
 
 def descend(observation, seen, x, steps=5):
@@ -122,3 +115,50 @@ def test_limits_are_rows_but_of_angles_that_take_every_direction(tmp_path):
             assert not told
         else:
             assert sorted(told.values()) == pytest.approx(sorted([upper, -lower]))
+
+
+def test_skin_is_drawn_as_it_bends_inside_the_limits(tmp_path):
+    """A full turn more is the same pose; a band that bent by a share of it would not be."""
+    model = load_model(write_limb(tmp_path, text=LIMB_URDF.replace("2.5", "3.2")), check=False)
+    camera = near_camera()
+    observation = ContourObservation(model.pose_tree(), [camera])
+    inside = observation.state(np.array([0.2, 1.1, 0.4, 0.3, -0.5]))
+    for name in ("elbow", "wrist_x"):
+        beyond = inside.copy()
+        beyond[observation.layout.index(name)] += 2.0 * np.pi
+        np.testing.assert_array_equal(
+            observation.draw(beyond, camera), observation.draw(inside, camera)
+        )
+
+
+@pytest.fixture
+def model(tmp_path):
+    return crane(tmp_path)
+
+
+def test_a_pose_goes_on_in_the_turn_of_the_track(model):
+    """As a search finds it, within half a turn; as a track has counted it, two turns on."""
+    observation = ContourObservation(model.pose_tree(), [camera("front")])
+    names = observation.layout.names
+    swing, luff = names.index("swing"), names.index("luff")
+    last = observation.state(np.array([13.0, 3.0]))
+    found = observation.continued(observation.state(np.array([0.4, -2.0])), last)
+    assert found[swing] == pytest.approx(0.4 + 4.0 * np.pi)
+    # Its limits are those of two turns.
+    assert found[luff] == pytest.approx(-2.0 + 2.0 * np.pi)
+    assert np.all(found[len(observation.layout.moving) :] == 0.0)
+    near = observation.continued(observation.state(np.array([13.1, 3.1])), last)
+    np.testing.assert_allclose(near[[swing, luff]], [13.1, 3.1])
+
+
+def test_what_turns_round_is_not_truncated(model, tmp_path):
+    """The filter of states keeps a joint's own limits, but for those that are none."""
+    assert from_model(model).rows == ("luff >= -6.28319", "luff <= 6.28319")
+    observation = ContourObservation(model.pose_tree(), [camera("front")])
+    with pytest.warns(UserWarning, match="no joint has a limit"):
+        assert not len(observation.inequalities())
+    wide = crane(tmp_path, 'lower="-1e16" upper="1e16"')
+    assert not len(from_model(wide))
+    narrow = crane(tmp_path, 'lower="-1" upper="2"')
+    observation = ContourObservation(narrow.pose_tree(), [camera("front")])
+    assert observation.inequalities().rows == ("luff >= -1", "luff <= 2")

@@ -40,6 +40,9 @@ def observation(body, camera):
     return ContourObservation(body.pose_tree(), [camera])
 
 
+TRUTH = np.array([0.2, 0.9, -0.6])
+
+
 def room(generator):
     """(SIDE, SIDE, 3) patches of all colours but orange."""
     patches = generator.integers(0, 256, (24, 24, 3))
@@ -47,73 +50,83 @@ def room(generator):
     return patches.repeat(20, axis=0).repeat(20, axis=1)
 
 
-def painted(mask, background, generator, noise=6.0, colour=ORANGE):
-    picture = np.where(mask[..., None], colour, background) + generator.normal(
-        0.0, noise, (*mask.shape, 3)
-    )
-    return np.clip(picture, 0, 255).astype(np.uint8)
+def painted(mask, background, generator):
+    """An orange body before a background, with noise."""
+    noise = generator.normal(0.0, 6.0, (*mask.shape, 3))
+    return np.clip(np.where(mask[..., None], ORANGE, background) + noise, 0, 255).astype(np.uint8)
+
+
+class Painter:
+    """Paints masks before a room of its own."""
+
+    def __init__(self, seed):
+        self.generator = np.random.default_rng(seed)
+        self.room = room(self.generator)
+
+    def __call__(self, mask):
+        return painted(mask, self.room, self.generator)
+
+
+def numbered(colour):
+    """The number of a colour's bin."""
+    return int(np.dot(colour >> 4, [256, 16, 1]))
+
+
+def followed(observation, pictures):
+    """A tracker, and its track of the body at TRUTH after so many pictures."""
+    tracker = ContourTracker(observation, PERIOD)
+    track = tracker.start(observation.state(TRUTH))
+    for k, picture in enumerate(pictures):
+        track = tracker.follow(track, [None], k == 0, pictures=[picture])
+    return tracker, track
 
 
 def test_colours_lead_back_to_the_truth(observation, renderer):
-    generator = np.random.default_rng(3)
-    background, truth = room(generator), np.array([0.2, 0.9, -0.6])
-    picture = painted(renderer.mask(truth), background, generator)
-    x = observation.state(truth)
+    picture = Painter(3)(renderer.mask(TRUTH))
+    x = observation.state(TRUTH)
     colours = observation.learn([picture], x, observation.no_colours(), True)
     seen = observation.look([None], [picture], colours)
     found, measured = descend(observation, seen, x + np.r_[0.12, -0.15, 0.1, 0, 0, 0], steps=6)
     # Segments of 12 to 24 pixels: a quarter of a pixel is a degree.
-    np.testing.assert_allclose(observation.positions(found)[0], truth, atol=np.radians(2.5))
+    np.testing.assert_allclose(observation.positions(found)[0], TRUTH, atol=np.radians(2.5))
     assert measured.distance < 0.8
     assert measured.share > 0.9
 
 
 def test_learned_colours_are_those_on_both_sides(observation, renderer):
-    truth = np.array([0.1, 1.2, -1.0])
-    picture = np.where(renderer.mask(truth)[..., None], ORANGE, GREEN).astype(np.uint8)
-    known = observation.learn([picture], observation.state(truth), observation.no_colours())
+    picture = np.where(renderer.mask(TRUTH)[..., None], ORANGE, GREEN).astype(np.uint8)
+    known = observation.learn([picture], observation.state(TRUTH), observation.no_colours())
     seen = known[0, known[0, :, ON].sum(axis=-1) > 0]
     assert len(seen) == 3
     for side, colour in ((ON, ORANGE), (BESIDE, GREEN)):
-        number = int(np.dot(colour >> 4, [256, 16, 1]))
-        assert number < COLOURS
+        assert numbered(colour) < COLOURS
         # Where the contour bends, strips reach over it to the other side.
-        assert np.all(seen[:, side, number] > 0.8)
+        assert np.all(seen[:, side, numbered(colour)] > 0.8)
         np.testing.assert_allclose(seen[:, side].sum(axis=-1), 1.0, rtol=1e-4)
 
 
 def test_old_colours_fade_at_the_rate(observation, renderer, monkeypatch):
     monkeypatch.setattr(colours, "_RATE", 0.25)
     monkeypatch.setattr(colours, "_AGREEING", 100.0)
-    truth = np.array([0.1, 1.2, -1.0])
-    mask, x = renderer.mask(truth), observation.state(truth)
-    known = observation.no_colours()
+    mask, known = renderer.mask(TRUTH), observation.no_colours()
     for colour in (ORANGE, np.array([20, 20, 200])):
         picture = np.where(mask[..., None], colour, GREEN).astype(np.uint8)
-        known = observation.learn([picture], x, known)
-    old = int(np.dot(ORANGE >> 4, [256, 16, 1]))
-    shares = known[0, :, ON, old]
+        known = observation.learn([picture], observation.state(TRUTH), known)
+    shares = known[0, :, ON, numbered(ORANGE)]
     np.testing.assert_allclose(shares[shares > 0], 0.75, atol=0.06)
 
 
-def test_a_body_like_its_background_says_nothing(observation, renderer):
-    truth = np.array([0.2, 0.9, -0.6])
+def test_a_body_like_its_background_says_nothing(observation):
     plain = np.full((SIDE, SIDE, 4), 120, dtype=np.uint8)
-    x = observation.state(truth)
+    x = observation.state(TRUTH)
     colours = observation.learn([plain], x, observation.no_colours(), True)
     assert observation.measure(observation.look([None], [plain], colours), x) is None
-    tracker = ContourTracker(observation, PERIOD)
-    assert tracker.follow(tracker.start(x), [None], pictures=[plain]).lost
+    tracker, track = followed(observation, [])
+    assert tracker.follow(track, [None], pictures=[plain]).lost
 
 
 def test_a_covered_lens_is_a_loss_that_teaches_nothing(observation, renderer):
-    generator = np.random.default_rng(6)
-    truth = np.array([0.2, 0.9, -0.6])
-    picture = painted(renderer.mask(truth), room(generator), generator)
-    tracker = ContourTracker(observation, PERIOD)
-    track = tracker.follow(
-        tracker.start(observation.state(truth)), [None], True, pictures=[picture]
-    )
+    tracker, track = followed(observation, [Painter(6)(renderer.mask(TRUTH))])
     dark = tracker.follow(track, [None], pictures=[np.zeros((SIDE, SIDE, 3), dtype=np.uint8)])
     assert dark.lost
     np.testing.assert_array_equal(dark.colours, track.colours)
@@ -121,15 +134,10 @@ def test_a_covered_lens_is_a_loss_that_teaches_nothing(observation, renderer):
 
 def test_a_lost_track_is_no_surer_than_its_motion_allows(observation, renderer):
     """All lines may be those of something else: they tell nothing of where the body is."""
-    generator = np.random.default_rng(7)
-    background, truth = room(generator), np.array([0.2, 0.9, -0.6])
-    picture = painted(renderer.mask(truth), background, generator)
-    tracker = ContourTracker(observation, PERIOD)
-    track = tracker.start(observation.state(truth))
-    for k in range(3):
-        track = tracker.follow(track, [None], k == 0, pictures=[picture])
+    paint, mask = Painter(7), renderer.mask(TRUTH)
+    tracker, track = followed(observation, [paint(mask)] * 3)
     assert not track.lost
-    aside = painted(np.roll(renderer.mask(truth), 9, axis=1), background, generator)
+    aside = paint(np.roll(mask, 9, axis=1))
     expected = tracker.filter.predict(track.state).best
     lost = tracker.follow(track, [None], pictures=[aside])
     assert lost.lost
@@ -144,24 +152,16 @@ def test_a_lost_track_is_no_surer_than_its_motion_allows(observation, renderer):
 
 def test_a_part_that_is_astray_makes_its_own_joints_unsure(observation, renderer):
     """The outermost arm jumps; the others stay and are learned from."""
-    generator = np.random.default_rng(8)
-    background, truth = room(generator), np.array([0.2, 0.9, -0.6])
-    tracker = ContourTracker(observation, PERIOD)
-    track = tracker.start(observation.state(truth))
-    for k in range(4):
-        picture = painted(renderer.mask(truth), background, generator)
-        track = tracker.follow(track, [None], k == 0, pictures=[picture])
-    jumped = truth + np.array([0.0, 0.0, 1.2])
-    picture = painted(renderer.mask(jumped), background, generator)
-    after = tracker.follow(track, [None], pictures=[picture])
+    paint = Painter(8)
+    tracker, track = followed(observation, [paint(renderer.mask(TRUTH)) for _ in range(4)])
+    jumped = TRUTH + np.array([0.0, 0.0, 1.2])
+    after = tracker.follow(track, [None], pictures=[paint(renderer.mask(jumped))])
     assert after.lost
     parts = after.measurement.part_distances
     astray = parts > LOST_COLOUR_DISTANCE
     assert 0 < np.count_nonzero(astray) < len(parts)
-    before, now = (
-        tracker.filter.predict(track.state).best.deviations(),
-        after.state.best.deviations(),
-    )
+    before = tracker.filter.predict(track.state).best.deviations()
+    now = after.state.best.deviations()
     error = np.abs(observation.positions(after.state.best.mean)[0] - jumped)
     assert np.all(now[:2] < 0.9 * before[:2])
     assert now[2] >= 0.99 * before[2]

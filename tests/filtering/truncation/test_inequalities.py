@@ -20,16 +20,10 @@ from drake_pose.filtering.inequalities import (
     stack,
     two_sided,
 )
+from tests.body.models import joint, link, urdf, write
 from tests.written_files import assert_same_files
 
 HAND = bundled_model("two_finger_hand")
-FREE_AND_LIMITED = """<robot name="r">
-<link name="base"><visual><geometry><box size="1 1 1"/></geometry></visual></link>
-<link name="free"/><link name="limited"/>
-<joint name="turns" type="continuous"><parent link="base"/><child link="free"/>
-<axis xyz="0 0 1"/></joint>
-<joint name="bends" type="revolute"><parent link="base"/><child link="limited"/>
-<axis xyz="0 0 1"/><limit lower="-1" upper="2" effort="1" velocity="1"/></joint></robot>"""
 
 
 @pytest.fixture(scope="module")
@@ -54,51 +48,40 @@ def test_every_limit_of_the_hand_is_a_pair_of_rows_named_after_its_joint(hand):
 
 
 def test_table_1(hand):
-    """Every row of table 1, by poses and lengths just inside and just outside of it."""
+    """Both bounds of every difference that table 1 couples, and no others."""
     rows = model_inequalities(hand)
     # 10 couplings: 2 flexion pairs and one across, 2 + 2 + 3 of lengths; each two-sided.
     assert len(rows) == 2 * (len(hand.position_names) - 7) + 20
-    inside = np.r_[np.zeros(7), 0.5 * (hand.lower[7:] + hand.upper[7:])]
-    middle = dict(zip(rows.columns, inside, strict=True))
-    # Lengths in the middle of the set, not of each interval.
-    middle.update(
-        {f"length_{i}{j}": [0.062, 0.040, 0.037][j - 1] for i in (1, 2) for j in (1, 2, 3)}
-    )
+    bounds = {}
+    for phi, b in zip(rows.phi, rows.b, strict=True):
+        first, *second = np.flatnonzero(phi)
+        if second:
+            assert phi[second] == [-phi[first]]
+            pair = rows.columns[first], rows.columns[second[0]]
+            bounds.setdefault(pair, {})["lower" if phi[first] < 0.0 else "upper"] = b / phi[first]
+    assert len(bounds) == 10
     degree = np.pi / 180
-    cases = [
+    for first, second, lower, upper in (
         ("flexion_12", "flexion_13", -10 * degree, 10 * degree),
         ("flexion_22", "flexion_23", -10 * degree, 10 * degree),
         ("flexion_11", "flexion_21", -35 * degree, 35 * degree),
         ("length_21", "length_22", 0.0, 0.030),
         ("length_12", "length_13", -0.010, 0.010),
         ("length_13", "length_23", -0.005, 0.005),
-    ]
-
-    def satisfied(changes):
-        x = np.array([{**middle, **changes}[name] for name in rows.columns])
-        names = set(changes)
-        chosen = [k for k, row in enumerate(rows.phi) if np.count_nonzero(row) == 2]
-        used = [{rows.columns[i] for i in np.flatnonzero(rows.phi[k])} for k in chosen]
-        mine = [k for k, columns in zip(chosen, used, strict=True) if columns == names]
-        assert len(mine) == 2
-        return bool((rows.margins(x)[mine] >= 0).all())
-
-    for first, second, lower, upper in cases:
-        for bound, outward in ((lower, -1), (upper, 1)):
-            base = middle[second]
-            assert satisfied({first: base + bound - outward * 1e-6, second: base})
-            assert not satisfied({first: base + bound + outward * 1e-6, second: base})
+    ):
+        assert bounds[first, second] == pytest.approx({"lower": lower, "upper": upper})
 
 
 def test_a_joint_that_turns_freely_has_no_row_and_a_model_without_any_is_told_of(tmp_path):
-    file = tmp_path / "r.urdf"
-    file.write_text(FREE_AND_LIMITED)
+    parts = [link(name) for name in ("base", "free", "limited")]
+    turns = joint("turns", "continuous", "base", "free", limits=None)
+    bends = joint("bends", "revolute", "base", "limited", limits='lower="-1" upper="2"')
+    file = write(tmp_path, urdf(*parts, turns, bends))
     assert from_model(load_model(file)).rows == ("bends >= -1", "bends <= 2")
-    limit = '<limit lower="-1" upper="2" effort="1" velocity="1"/>'
-    file.write_text(FREE_AND_LIMITED.replace("revolute", "continuous").replace(limit, ""))
+    bends = joint("bends", "continuous", "base", "limited", limits=None)
+    file = write(tmp_path, urdf(*parts, turns, bends))
     with pytest.warns(UserWarning, match="no joint has a limit"):
-        rows = model_inequalities(load_model(file))
-    assert len(rows) == 0
+        assert len(model_inequalities(load_model(file))) == 0
 
 
 def test_the_rows_that_clash_are_named_and_no_others():

@@ -1,7 +1,5 @@
 """The answer as a set where bodies fit badly: intervals, free joints, flips."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -10,28 +8,28 @@ from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.fit.surfaces import few_triangles
 from drake_pose.search.continuous.families import RobustFamilies
-from drake_pose.search.continuous.views_fit import ViewsFit
-from drake_pose.search.estimates import PoseSet, View
+from drake_pose.search.continuous.views_fit import FittedPose, ViewsFit, distinct
 from drake_pose.search.starts.self_motions import flips
 from drake_pose.silhouette.areas.bending import TreeSurfaces
+from tests.body.models import joint, link, urdf, write
 from tests.search.arms import arm_cameras, arm_tree, damaged_views, draw_view, is_held
 
 TRUTH = np.array([0.6, 0.7, -0.7, 0.9, 0.3])
 FINE = tuple(AnnealingStage(scale, 0.0125, 8) for scale in (0.025, 0.0125))
 
 
-def find(kinematics: TreeKinematics, views: list[View], values: np.ndarray) -> PoseSet:
+def find(kinematics, views, values):
     fit = ViewsFit(kinematics, few_triangles(TreeSurfaces(kinematics.tree)), views)
     families = RobustFamilies(fit, lambda: True)
     return families.find([fit.refine(values, FINE)], lambda values: float(values[0]))
 
 
 @pytest.fixture(scope="module")
-def kinematics(tmp_path_factory: pytest.TempPathFactory) -> TreeKinematics:
+def kinematics(tmp_path_factory):
     return TreeKinematics(arm_tree(tmp_path_factory.mktemp("arm")))
 
 
-def test_intervals_hold_the_truth_and_widen_with_the_damage(kinematics: TreeKinematics) -> None:
+def test_intervals_hold_the_truth_and_widen_with_the_damage(kinematics):
     tree = kinematics.tree
     clean = [draw_view(tree, TRUTH, camera) for camera in arm_cameras(640, 480)]
     widths = []
@@ -40,17 +38,15 @@ def test_intervals_hold_the_truth_and_widen_with_the_damage(kinematics: TreeKine
         assert is_held(answer, TRUTH)
         family = answer.families[0]
         assert family.J == family.q[0]
-        widths.append([joint.high - joint.low for joint in family.joints])
-        for joint, value in zip(family.joints, family.q, strict=True):
-            assert joint.holds(value)
+        widths.append([one.high - one.low for one in family.joints])
+        for one, value in zip(family.joints, family.q, strict=True):
+            assert one.holds(value)
     assert np.all(np.array(widths[0]) < np.radians(10.0))
     # A pixel of error in every camera is assumed where nothing is damaged, too.
     assert np.median(np.array(widths[1]) / widths[0]) > 1.03
 
 
-def test_flips_are_families_of_their_own(
-    kinematics: TreeKinematics, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_flips_are_families_of_their_own(kinematics, monkeypatch):
     """Where nothing is significant, all that flips make is as good; nothing is determined."""
     tree = kinematics.tree
     views = [draw_view(tree, TRUTH, camera) for camera in arm_cameras()]
@@ -65,33 +61,28 @@ def test_flips_are_families_of_their_own(
         assert min(gaps) < np.radians(15.0)
 
 
-def test_a_round_hand_may_turn_as_it_likes(tmp_path: Path) -> None:
+def test_a_round_hand_may_turn_as_it_likes(tmp_path):
     """A cylinder's turn about its axis does not show: free, and over the whole range."""
-    path = tmp_path / "mast.urdf"
-    path.write_text(
-        '<robot name="mast"><link name="world"/>'
-        '<link name="boom"><visual><origin xyz="0 0 0.3"/><geometry><box size="0.1 0.2 0.6"/>'
-        "</geometry></visual></link>"
-        '<link name="knob"><visual><origin xyz="0 0 0.15"/><geometry>'
-        '<cylinder radius="0.05" length="0.3"/></geometry></visual></link>'
-        '<joint name="tilt" type="revolute"><parent link="world"/><child link="boom"/>'
-        '<axis xyz="1 0 0"/><limit lower="-1.5" upper="1.5" effort="1" velocity="1"/></joint>'
-        '<joint name="spin" type="revolute"><parent link="boom"/><child link="knob"/>'
-        '<origin xyz="0 0 0.6"/><axis xyz="0 0 1"/>'
-        '<limit lower="-2" upper="2.5" effort="1" velocity="1"/></joint></robot>'
+    box, cylinder = '<box size="0.1 0.2 0.6"/>', '<cylinder radius="0.05" length="0.3"/>'
+    shape = '<visual><origin xyz="0 0 {}"/><geometry>{}</geometry></visual>'
+    tilts, spins = 'lower="-1.5" upper="1.5"', 'lower="-2" upper="2.5"'
+    text = urdf(
+        link("boom", shape.format(0.3, box)),
+        link("knob", shape.format(0.15, cylinder)),
+        joint("tilt", "revolute", "world", "boom", origin="", axis="1 0 0", limits=tilts),
+        joint("spin", "revolute", "boom", "knob", origin='xyz="0 0 0.6"', limits=spins),
     )
-    tree = load_model(path).pose_tree()
+    tree = load_model(write(tmp_path, text)).pose_tree()
     values = np.array([0.4, 0.2])
     views = [draw_view(tree, values, camera) for camera in arm_cameras()]
-    answer = find(TreeKinematics(tree), views, values)
-    tilt, spin = answer.joints
+    tilt, spin = find(TreeKinematics(tree), views, values).joints
     assert tilt.determined
     assert tilt.holds(0.4)
     assert not spin.determined
     assert (spin.low, spin.high) == (-2.0, 2.5)
 
 
-def test_time_that_is_up_leaves_the_intervals_of_the_curvature(kinematics: TreeKinematics) -> None:
+def test_time_that_is_up_leaves_the_intervals_of_the_curvature(kinematics):
     views = damaged_views(kinematics.tree, TRUTH, 1)
     fit = ViewsFit(kinematics, few_triangles(TreeSurfaces(kinematics.tree)), views)
     pose = fit.refine(TRUTH, FINE)
@@ -99,4 +90,25 @@ def test_time_that_is_up_leaves_the_intervals_of_the_curvature(kinematics: TreeK
     answer = RobustFamilies(fit, lambda: False).find([pose], lambda _: 0.0)
     assert answer.family_count == 1
     assert fit.evaluations - before < 5
-    assert all(joint.low < joint.high for joint in answer.joints)
+    assert all(one.low < one.high for one in answer.joints)
+
+
+def test_refinement_keeps_limits_and_what_is_held(kinematics):
+    views = [draw_view(kinematics.tree, TRUTH, camera) for camera in arm_cameras()]
+    fit = ViewsFit(kinematics, few_triangles(TreeSurfaces(kinematics.tree)), views)
+    outside = kinematics.upper + 0.5
+    found = fit.refine(outside, FINE, held=(1,))
+    assert found.values[1] == outside[1]
+    free = [0, 2, 3, 4]
+    assert (found.values[free] <= kinematics.upper[free]).all()
+    assert (found.values[free] >= kinematics.lower[free]).all()
+    start = TRUTH + np.array([0.05, -0.05, 0.04, 0.05, -0.05])
+    near = fit.refine(start, FINE)
+    assert near.cost < 0.2 * fit.cost(start, FINE[-1])
+    assert np.abs(near.values - TRUTH).max() < np.radians(1.5)
+
+
+def test_distinct_keeps_the_best_of_those_alike():
+    poses = [FittedPose(np.array([x, 0.0]), cost) for x, cost in ((0, 3), (0.01, 1), (1, 2))]
+    assert [pose.cost for pose in distinct(poses, 5)] == [1, 2]
+    assert [pose.cost for pose in distinct(poses, 1)] == [1]

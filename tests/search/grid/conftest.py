@@ -7,7 +7,7 @@ from tests.search.grid_problems import ProblemMaker
 
 
 @pytest.fixture(scope="session", params=["chain", "fork"])
-def maker(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> ProblemMaker:
+def maker(request, tmp_path_factory):
     folder = tmp_path_factory.mktemp("body")
     model = swinging_chain(folder, 3) if request.param == "chain" else forked_body(folder)
     return ProblemMaker(model.pose_tree(), 0.4)

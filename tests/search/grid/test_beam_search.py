@@ -1,17 +1,17 @@
 """The beam search against brute force over whole grids, and what it promises of its answers."""
 
-from pathlib import Path
+import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.body.tree.root import RootRotation
 from drake_pose.camera.models import ParallelCamera, PinholeCamera
 from drake_pose.errors import SettingsError
 from drake_pose.search.estimates import View
 from drake_pose.search.grid.beam_search import BeamSearch
-from drake_pose.search.grid.examination import ExaminationSettings
+from drake_pose.search.grid.examination import ExaminationSettings, examine
 from drake_pose.search.grid.pose_families import renderer_tolerance, samples_at
 from drake_pose.search.settings import BeamSearchSettings, Stage
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
@@ -22,17 +22,17 @@ from tests.search.bodies import (
     load_body,
     swinging_chain,
 )
-from tests.search.grid_problems import ProblemMaker, show_pose
+from tests.search.grid_problems import show_pose
 
 INTERVAL = 0.4
 
 
-def search(tree: PoseTree, **settings: object) -> BeamSearch:
+def search(tree, **settings):
     return BeamSearch(tree, BeamSearchSettings(interval=INTERVAL, **settings))
 
 
 @pytest.mark.parametrize("count", [1, 2])
-def test_finds_the_minimum_that_brute_force_finds(maker: ProblemMaker, count: int) -> None:
+def test_finds_the_minimum_that_brute_force_finds(maker, count):
     matcher = search(maker.tree)
     generator = np.random.default_rng(3)
     for _ in range(2):
@@ -44,7 +44,7 @@ def test_finds_the_minimum_that_brute_force_finds(maker: ProblemMaker, count: in
         assert (exact.stopped_by, exact.J, exact.E_total) == ("exact", 0.0, 0.0)
 
 
-def test_finds_the_minimum_for_a_mask_that_no_pose_explains(maker: ProblemMaker) -> None:
+def test_finds_the_minimum_for_a_mask_that_no_pose_explains(maker):
     problem = maker.make(np.random.default_rng(4), views=1, noise=0.1, on_grid=False)
     problem.views[0].mask[40:50, 5:15] = True
     result = search(maker.tree).match(problem.views)
@@ -52,7 +52,7 @@ def test_finds_the_minimum_for_a_mask_that_no_pose_explains(maker: ProblemMaker)
     assert result.J == maker.problem(problem.views).best[1]
 
 
-def test_a_sliding_joint_and_a_fixed_one(tmp_path: Path) -> None:
+def test_a_sliding_joint_and_a_fixed_one(tmp_path):
     model = load_body(
         tmp_path,
         box_link("rail", 30, 4),
@@ -69,7 +69,7 @@ def test_a_sliding_joint_and_a_fixed_one(tmp_path: Path) -> None:
     np.testing.assert_allclose(result.q, [0.15, -0.5], atol=1e-9)
 
 
-def test_what_lies_outside_the_picture_costs_nothing(tmp_path: Path) -> None:
+def test_what_lies_outside_the_picture_costs_nothing(tmp_path):
     tree = swinging_chain(tmp_path, 3).pose_tree()
     matcher = search(tree)
     camera = ParallelCamera("cut", 40, 25, 100.0, 19.637, 19.637, front_camera().X_WC)
@@ -80,7 +80,7 @@ def test_what_lies_outside_the_picture_costs_nothing(tmp_path: Path) -> None:
     assert matcher.match([view]).stopped_by == "exact"
 
 
-def test_a_root_at_another_position(tmp_path: Path) -> None:
+def test_a_root_at_another_position(tmp_path):
     model = swinging_chain(tmp_path, 3)
     still = model.pose_tree()
     values = [np.array([INTERVAL])] * 3
@@ -92,7 +92,7 @@ def test_a_root_at_another_position(tmp_path: Path) -> None:
     assert result.J <= 2.0
 
 
-def test_a_limit_still_answers_and_says_so(maker: ProblemMaker) -> None:
+def test_a_limit_still_answers_and_says_so(maker):
     problem = maker.make(np.random.default_rng(9), views=1, noise=0.0, on_grid=False)
     result = search(maker.tree, time_limit=0.0).match(problem.views)
     assert result.found
@@ -115,15 +115,13 @@ def test_a_limit_still_answers_and_says_so(maker: ProblemMaker) -> None:
         (Stage, {"hypotheses": 1, "outside_weight": 0}),
     ],
 )
-def test_settings_out_of_range_are_refused(kind: type, values: dict[str, object]) -> None:
+def test_settings_out_of_range_are_refused(kind, values):
     with pytest.raises(SettingsError):
         kind(**values)
 
 
 @pytest.mark.parametrize("side", [60, 240, 480])
-def test_what_drake_draws_is_matched_within_what_renderers_differ_by(
-    tmp_path: Path, side: int
-) -> None:
+def test_what_drake_draws_is_matched_within_what_renderers_differ_by(tmp_path, side):
     """Label images of Drake's VTK renderer; the areas that are scored are drawn otherwise."""
     model = swinging_chain(tmp_path, 4)
     matcher = BeamSearch(
@@ -151,7 +149,7 @@ def test_what_drake_draws_is_matched_within_what_renderers_differ_by(
     assert differ or side < 480
 
 
-def test_without_a_tolerance_only_equal_pixels_are_exact(tmp_path: Path) -> None:
+def test_without_a_tolerance_only_equal_pixels_are_exact(tmp_path):
     matcher = search(swinging_chain(tmp_path, 3).pose_tree(), tolerance=0.0)
     camera = front_camera(100, shift=0.137)
     view = show_pose(matcher.sampled, [grid[1] for grid in matcher.sampled.values], camera)
@@ -161,3 +159,99 @@ def test_without_a_tolerance_only_equal_pixels_are_exact(tmp_path: Path) -> None
     assert result.stopped_by == "end"
     assert result.J == 1.0
     assert search(matcher.tree, tolerance=1.0).match([view]).stopped_by == "exact"
+
+
+def search_of(maker, examination):
+    return BeamSearch(maker.tree, BeamSearchSettings(interval=INTERVAL), examination)
+
+
+def test_what_is_proved_is_the_best_of_the_grid(maker):
+    examined = search_of(maker, ExaminationSettings(proof_poses=10**6, family_poses=10**6))
+    generator = np.random.default_rng(5)
+    for noise, views in itertools.product((0.0, 0.003, 0.01, 0.03), (1, 2)):
+        problem = maker.make(generator, views=views, noise=noise, on_grid=noise == 0.0)
+        result = examined.match(problem.views)
+        best = problem.best[1]
+        assert result.proved_optimal
+        assert result.J == result.lower_bound == best
+        assert not result.budget_spent
+        samples = samples_at(maker.body.sampled, result.node_values)
+        assert samples is not None
+        assert tuple(samples.tolist()) in problem.within(best)
+        area = sum(int(view.mask.sum()) for view in problem.views)
+        assert result.E_total == pytest.approx(best / area)
+        q, X_WB = maker.tree.positions_from(result.node_values)
+        np.testing.assert_array_equal(result.q, q)
+        np.testing.assert_array_equal(result.X_WB, X_WB)
+        answer = result.pose_set
+        assert answer is not None
+        assert answer.complete
+        assert answer.size == len(problem.within(best + answer.tolerance))
+
+
+def test_a_worse_pose_is_replaced(maker):
+    search = search_of(maker, None)
+    generator = np.random.default_rng(8)
+    for noise in (0.0, 0.01) * 3:
+        problem = maker.make(generator, views=1, noise=noise, on_grid=noise == 0.0)
+        found = search.match(problem.views)
+        assert found.pose_set is None
+        assert found.proved_optimal == (found.J == 0)
+        wrong = int(generator.integers(len(problem.Js)))
+        values = tuple(maker.body.sampled.values_at(problem.choices[wrong]))
+        bad = replace(found, node_values=values, J=float(problem.Js[wrong]))
+        mended = examine(search.body, problem.views, bad, ExaminationSettings())
+        assert mended.proved_optimal
+        assert mended.J == problem.best[1] < bad.J
+        samples = samples_at(maker.body.sampled, mended.node_values)
+        assert samples is not None
+        assert tuple(samples.tolist()) in problem.within(mended.J)
+
+
+def test_a_pose_between_the_samples_is_refused(maker):
+    search = search_of(maker, None)
+    problem = maker.make(np.random.default_rng(7), views=1, noise=0.0, on_grid=True)
+    result = search.match(problem.views)
+    values = tuple(value + 0.1 for value in result.node_values)
+    moved = replace(result, node_values=values)
+    with pytest.raises(SettingsError, match="not on the body's sampling grid"):
+        examine(search.body, problem.views, moved, ExaminationSettings())
+
+
+@pytest.mark.parametrize(
+    "limit", [{"proof_poses": 1}, {"memory": 8_000}, {"proof_time_limit": 0.0}]
+)
+def test_a_limit_leaves_a_true_bound_and_no_false_proof(maker, limit):
+    search = search_of(maker, None)
+    generator = np.random.default_rng(12)
+    proved = []
+    for number in range(12):
+        problem = maker.make(generator, views=1, noise=0.01, on_grid=False)
+        start = int(np.argsort(problem.Js)[number])
+        values = search.sampled.values_at(problem.choices[start])
+        found = replace(search.match(problem.views), node_values=values, J=float(problem.Js[start]))
+        settings = ExaminationSettings(family_poses=1, **limit)
+        proof = examine(search.body, problem.views, found, settings)
+        assert proof.lower_bound <= problem.best[1] <= proof.J <= found.J
+        assert proof.J in problem.Js
+        assert proof.budget_spent or proof.proved_optimal
+        assert proof.pose_set.complete or not any(proof.pose_set.determined)
+        proved.append(proof.proved_optimal)
+    assert not all(proved)
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"tolerance": -1.0},
+        {"families": 0},
+        {"proof_poses": 0},
+        {"memory": 0},
+        {"proof_time_limit": -1.0},
+        {"family_time_limit": float("nan")},
+        {"proof_time_limit": float("inf")},
+    ],
+)
+def test_limits_out_of_range_are_refused(settings):
+    with pytest.raises(SettingsError, match=r"time_limit|positive|or more"):
+        ExaminationSettings(**settings)

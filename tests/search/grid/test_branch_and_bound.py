@@ -1,27 +1,23 @@
 """The branch and bound against the definition over whole grids."""
 
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from drake_pose.search.grid.branch_and_bound import branch_and_bound
-from drake_pose.search.grid.pose_graph import PartialPoseGraph
 from drake_pose.search.settings import BoundLimits
 from tests.search.bodies import box_link, joint, load_body
-from tests.search.grid_problems import GridProblem, ProblemMaker
+from tests.search.grid_problems import ProblemMaker
 
 
-def members(graph: PartialPoseGraph, problem: GridProblem) -> set[tuple[int, ...]]:
+def members(graph, problem):
     return {tuple(row) for row in problem.choices.tolist() if graph.contains(np.array(row))}
 
 
 @pytest.mark.parametrize("views", [1, 2])
 @pytest.mark.parametrize("extra", [0.0, 3.0, 40.0, 400.0])
-def test_finds_exactly_the_poses_within_the_limit(
-    maker: ProblemMaker, views: int, extra: float
-) -> None:
+def test_finds_exactly_the_poses_within_the_limit(maker, views, extra):
     generator = np.random.default_rng(1)
     for noise, on_grid in [(0.0, True), (0.0, False), (0.01, True)]:
         problem = maker.make(generator, views=views, noise=noise, on_grid=on_grid)
@@ -38,7 +34,7 @@ def test_finds_exactly_the_poses_within_the_limit(
                 assert found.lower_bound <= J
 
 
-def test_a_limit_that_no_pose_reaches_leaves_nothing(maker: ProblemMaker) -> None:
+def test_a_limit_that_no_pose_reaches_leaves_nothing(maker):
     problem = maker.make(np.random.default_rng(2), views=1, noise=0.02, on_grid=False)
     found = branch_and_bound(maker.body, problem.views, problem.best[1] - 1.0)
     assert found.complete
@@ -46,7 +42,7 @@ def test_a_limit_that_no_pose_reaches_leaves_nothing(maker: ProblemMaker) -> Non
     assert found.lower_bound == problem.best[1]
 
 
-def test_what_was_left_out_is_no_better_than_the_bound(maker: ProblemMaker) -> None:
+def test_what_was_left_out_is_no_better_than_the_bound(maker):
     generator = np.random.default_rng(3)
     for limits in (BoundLimits(states=3), BoundLimits(pairs=5), BoundLimits(time_limit=0.0)):
         problem = maker.make(generator, views=1, noise=0.02, on_grid=False)
@@ -62,7 +58,7 @@ def test_what_was_left_out_is_no_better_than_the_bound(maker: ProblemMaker) -> N
             assert found.graph.contains(samples)
 
 
-def test_hidden_limbs_multiply_and_are_counted(tmp_path: Path) -> None:
+def test_hidden_limbs_multiply_and_are_counted(tmp_path):
     """Two short arms of two links each that a broad trunk hides at every angle."""
     parts = [
         box_link("trunk", 40, 40),
@@ -86,7 +82,7 @@ def test_hidden_limbs_multiply_and_are_counted(tmp_path: Path) -> None:
     assert sum(len(layer.samples) for layer in found.graph.layers) < 2 * (7 + 7**2) + 2
 
 
-def test_random_members_are_spread_evenly(maker: ProblemMaker) -> None:
+def test_random_members_are_spread_evenly(maker):
     generator = np.random.default_rng(6)
     problem = maker.make(generator, views=1, noise=0.0, on_grid=True)
     limit = float(np.sort(problem.Js)[7])
@@ -98,7 +94,7 @@ def test_random_members_are_spread_evenly(maker: ProblemMaker) -> None:
     assert counts.max() < 270
 
 
-def test_a_narrower_limit_and_fewer_samples_leave_fewer_poses(maker: ProblemMaker) -> None:
+def test_a_narrower_limit_and_fewer_samples_leave_fewer_poses(maker):
     problem = maker.make(np.random.default_rng(7), views=1, noise=0.0, on_grid=False)
     best = problem.best[1]
     graph = branch_and_bound(maker.body, problem.views, best + 100.0).graph

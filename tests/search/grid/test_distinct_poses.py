@@ -5,73 +5,68 @@ import itertools
 import numpy as np
 import pytest
 
-from drake_pose.body.tree.pose_tree import PoseTree
-from drake_pose.search.estimates import View
 from drake_pose.search.grid.beam_search import BeamSearch
 from drake_pose.search.grid.pose_families import samples_at
 from drake_pose.search.settings import BeamSearchSettings
 from drake_pose.silhouette.areas.outline import outline_from_mesh
 from drake_pose.silhouette.areas.scoring import draw_mask
 from tests.search.bodies import forked_body
-from tests.search.grid_problems import GridProblem, ProblemMaker
+from tests.search.grid_problems import ProblemMaker
 
 INTERVAL = 0.2
 ALIKE = 0.7
 
 
 @pytest.fixture(scope="module")
-def maker(tmp_path_factory: pytest.TempPathFactory) -> ProblemMaker:
+def maker(tmp_path_factory):
     return ProblemMaker(forked_body(tmp_path_factory.mktemp("fork")).pose_tree(), INTERVAL)
 
 
 @pytest.fixture
-def problem(maker: ProblemMaker) -> GridProblem:
+def problem(maker):
     return maker.make(np.random.default_rng(2), views=1, noise=0.0, on_grid=False)
 
 
-def settings(**more: object) -> BeamSearchSettings:
+def settings(**more):
     return BeamSearchSettings(interval=INTERVAL, **more)
 
 
-def objectives(problem: GridProblem, poses: list[list[np.ndarray]]) -> np.ndarray:
+def objectives(problem, poses):
     """J of poses of the grid, by the definition."""
     found = [samples_at(problem.body.sampled, values) for values in poses]
     return np.array([problem.Js[(problem.choices == one).all(axis=1)][0] for one in found])
 
 
-def look_alike(
-    tree: PoseTree, views: list[View], one: list[np.ndarray], other: list[np.ndarray]
-) -> bool:
-    """The definition, from masks of single nodes."""
+def node_masks(tree, views, values):
+    """(views, nodes, H, W) masks of single nodes."""
     outlines = [outline_from_mesh(node.mesh) for node in tree.nodes]
-    first, second = (
-        np.array(
+    X_WN = tree.node_poses(values)[:, None]
+    return np.array(
+        [
             [
-                [
-                    draw_mask([outline], X_CN[None], view.camera)
-                    for outline, X_CN in zip(outlines, view.camera.X_CW @ X_WN, strict=True)
-                ]
-                for view in views
+                draw_mask([o], v.camera.X_CW @ X, v.camera)
+                for o, X in zip(outlines, X_WN, strict=True)
             ]
-        )
-        for X_WN in (tree.node_poses(one), tree.node_poses(other))
+            for v in views
+        ]
     )
-    for node in range(len(tree.nodes)):
-        rest = [np.delete(pose, node, axis=1).any(axis=1) for pose in (first, second)]
-        hidden = not any(
-            (pose[:, node] & ~others).any()
-            for pose, others in zip((first, second), rest, strict=True)
-        )
-        common = (first[:, node] & second[:, node]).sum()
-        if not hidden and common < ALIKE * (first[:, node] | second[:, node]).sum():
+
+
+def look_alike(first, second):
+    """The definition, from masks of two poses' single nodes."""
+    for node in range(first.shape[1]):
+        is_seen = [
+            (pose[:, node] & ~np.delete(pose, node, axis=1).any(axis=1)).any()
+            for pose in (first, second)
+        ]
+        one, other = first[:, node], second[:, node]
+        if any(is_seen) and (one & other).sum() < ALIKE * (one | other).sum():
             return False
     return True
 
 
 @pytest.mark.parametrize("count", [1, 2])
-def test_the_list_begins_with_the_best_and_no_two_look_alike(
-    maker: ProblemMaker, count: int
-) -> None:
+def test_the_list_begins_with_the_best_and_no_two_look_alike(maker, count):
     problem = maker.make(np.random.default_rng(1), views=count, noise=0.0, on_grid=False)
     search = BeamSearch(maker.tree, settings())
     poses = search.best_poses(problem.views, count=8, alike=ALIKE)
@@ -79,19 +74,18 @@ def test_the_list_begins_with_the_best_and_no_two_look_alike(
     assert len(poses) == 8
     assert Js[0] == search.match(problem.views).J
     assert (np.diff(Js) >= 0).all()
-    for one, other in itertools.combinations(poses, 2):
-        assert not look_alike(maker.tree, problem.views, one, other)
+    masks = [node_masks(maker.tree, problem.views, pose) for pose in poses]
+    for one, other in itertools.combinations(masks, 2):
+        assert not look_alike(one, other)
 
 
-def test_all_poses_of_the_grid_differ_if_that_is_wanted(
-    maker: ProblemMaker, problem: GridProblem
-) -> None:
+def test_all_poses_of_the_grid_differ_if_that_is_wanted(maker, problem):
     poses = BeamSearch(maker.tree, settings()).best_poses(problem.views, count=10, alike=2.0)
     np.testing.assert_array_equal(objectives(problem, poses), np.sort(problem.Js)[:10])
     assert len({tuple(np.concatenate(values)) for values in poses}) == 10
 
 
-def test_alternatives_to_an_exact_pose_are_listed_too(maker: ProblemMaker) -> None:
+def test_alternatives_to_an_exact_pose_are_listed_too(maker):
     search = BeamSearch(maker.tree, settings())
     problem = maker.show([grid[1] for grid in search.sampled.values])
     poses = search.best_poses(problem.views, count=6)

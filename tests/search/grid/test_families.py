@@ -1,14 +1,12 @@
 """The set of poses as good as the best: against the definition, and on experiment A."""
 
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from drake_pose.search.estimates import View
 from drake_pose.search.grid.pose_families import (
-    GridPoseSet,
     cluster_samples,
     contour_length,
     estimate_joints,
@@ -20,11 +18,11 @@ from drake_pose.search.grid.pose_families import (
 from drake_pose.search.settings import BoundLimits
 from tests.search.arms import is_held
 from tests.search.bodies import box_link, forked_body, joint, load_body, swinging_chain
-from tests.search.grid_problems import GridProblem, ProblemMaker
+from tests.search.grid_problems import ProblemMaker
 
 
 @pytest.fixture(scope="module")
-def flipping_body(tmp_path_factory: pytest.TempPathFactory) -> ProblemMaker:
+def flipping_body(tmp_path_factory):
     """A trunk, an arm whose turn towards the camera looks like one away from it, a hidden hand."""
     model = load_body(
         tmp_path_factory.mktemp("flipping"),
@@ -38,17 +36,17 @@ def flipping_body(tmp_path_factory: pytest.TempPathFactory) -> ProblemMaker:
     return ProblemMaker(model.pose_tree(), 0.4)
 
 
-def found_families(problem: GridProblem, tolerance: float | None = None) -> GridPoseSet:
+def found_families(problem, tolerance=None):
     samples, J = problem.best
     return find_families(problem.body, problem.views, samples, J, tolerance)
 
 
-def seen_values(problem: GridProblem, J: float, node: int) -> np.ndarray:
+def seen_values(problem, J, node):
     rows = np.array(sorted(problem.within(J)))
     return np.unique(problem.body.sampled.values[node][rows[:, node], 0])
 
 
-def test_towards_and_away_from_the_camera_are_two_families(flipping_body: ProblemMaker) -> None:
+def test_towards_and_away_from_the_camera_are_two_families(flipping_body):
     values = [np.array([0.4]), np.array([0.8]), np.array([-1.2])]
     problem = flipping_body.show(values)
     answer = found_families(problem)
@@ -72,7 +70,7 @@ def test_towards_and_away_from_the_camera_are_two_families(flipping_body: Proble
     assert not is_held(answer, np.array([0.4, 0.0, 0.0]))
 
 
-def test_the_set_is_that_of_the_definition(tmp_path: Path) -> None:
+def test_the_set_is_that_of_the_definition(tmp_path):
     generator = np.random.default_rng(21)
     for model in (swinging_chain(tmp_path, 3), forked_body(tmp_path)):
         maker = ProblemMaker(model.pose_tree(), 0.4)
@@ -94,27 +92,21 @@ def test_the_set_is_that_of_the_definition(tmp_path: Path) -> None:
                 assert report.determined or ends == pytest.approx((seen[0], seen[-1]))
 
 
-def test_families_are_the_connected_groups_of_clusters(flipping_body: ProblemMaker) -> None:
+def test_families_are_the_connected_groups_of_clusters(flipping_body):
     problem = flipping_body.make(np.random.default_rng(22), views=1, noise=0.01, on_grid=False)
     answer = found_families(problem, 120.0)
-    J = problem.best[1] + 120.0
-    gap = 0.4 * 1.01
-    groups = set()
-    for row in problem.within(J):
-        group = []
-        for node, t in enumerate(row):
-            seen = seen_values(problem, J, node)
-            breaks = seen[1:][np.diff(seen) > gap]
-            value = flipping_body.body.sampled.values[node][t, 0]
-            group.append(int((value >= breaks - 1e-9).sum()))
-        groups.add(tuple(group))
-    assert answer.family_count == len(groups)
+    J, groups = problem.best[1] + 120.0, []
+    rows = np.array([*problem.within(J)])
+    for node, grid in enumerate(flipping_body.body.sampled.values):
+        seen = seen_values(problem, J, node)
+        # A gap is more than a step of the grid.
+        breaks = seen[1:][np.diff(seen) > 0.4 * 1.01]
+        groups.append((grid[rows[:, node]] >= breaks - 1e-9).sum(axis=1))
+    assert answer.family_count == len(np.unique(groups, axis=1).T)
     assert [f.J for f in answer.families] == sorted(f.J for f in answer.families)
 
 
-def test_a_better_pose_that_turns_up_takes_the_place_of_the_known_one(
-    flipping_body: ProblemMaker,
-) -> None:
+def test_a_better_pose_that_turns_up_takes_the_place_of_the_known_one(flipping_body):
     problem = flipping_body.make(np.random.default_rng(23), views=1, noise=0.0, on_grid=True)
     worse = int(np.argsort(problem.Js)[40])
     J = float(problem.Js[worse])
@@ -125,9 +117,7 @@ def test_a_better_pose_that_turns_up_takes_the_place_of_the_known_one(
 
 
 @pytest.mark.parametrize("limits", [{"time_limit": 0.0}, {"states": 1}, {"pairs": 1}])
-def test_a_limit_still_leaves_the_best_pose_and_is_reported(
-    flipping_body: ProblemMaker, limits: dict[str, float]
-) -> None:
+def test_a_limit_still_leaves_the_best_pose_and_is_reported(flipping_body, limits):
     problem = flipping_body.make(np.random.default_rng(24), views=1, noise=0.0, on_grid=False)
     samples, J = problem.best
     answer = find_families(
@@ -138,7 +128,7 @@ def test_a_limit_still_leaves_the_best_pose_and_is_reported(
     assert answer.families[0].J == J
 
 
-def test_by_default_the_noise_is_a_share_of_the_contour(flipping_body: ProblemMaker) -> None:
+def test_by_default_the_noise_is_a_share_of_the_contour(flipping_body):
     problem = flipping_body.make(np.random.default_rng(25), views=1, noise=0.01, on_grid=True)
     assert found_families(problem).tolerance == pytest.approx(0.05 * contour_length(problem.views))
     mask = np.zeros((70, 70), dtype=np.bool_)
@@ -149,7 +139,7 @@ def test_by_default_the_noise_is_a_share_of_the_contour(flipping_body: ProblemMa
     assert contour_length([View(problem.views[0].camera, mask)]) == expected
 
 
-def test_samples_that_turn_a_node_alike_are_one_cluster(tmp_path: Path) -> None:
+def test_samples_that_turn_a_node_alike_are_one_cluster(tmp_path):
     model = load_body(
         tmp_path,
         box_link("wheel", 10, 4),
@@ -163,14 +153,14 @@ def test_samples_that_turn_a_node_alike_are_one_cluster(tmp_path: Path) -> None:
     assert set(labels.tolist()) == {-1, 0}
 
 
-def test_steps_of_grids() -> None:
+def test_steps_of_grids():
     product = np.array([[0.0, 1.0, 5.0], [0.0, 3.0, 5.0], [0.5, 1.0, 5.0], [0.5, 3.0, 5.0]])
     np.testing.assert_allclose(grid_steps(product), [0.5, 2.0, np.inf])
     circle = np.array([[math.cos(a), math.sin(a)] for a in np.arange(6) * math.pi / 3])
     np.testing.assert_allclose(grid_steps(circle), [1.0, 1.0])
 
 
-def test_two_neighbouring_values_are_still_determined(tmp_path: Path) -> None:
+def test_two_neighbouring_values_are_still_determined(tmp_path):
     sampled = ProblemMaker(swinging_chain(tmp_path, 2).pose_tree(), 0.5).body.sampled
     grid = sampled.values[0][:, 0]
     pair, three = [np.flatnonzero((grid > -0.1) & (grid < limit)) for limit in (0.6, 1.1)]
@@ -182,7 +172,7 @@ def test_two_neighbouring_values_are_still_determined(tmp_path: Path) -> None:
     assert not one.holds(0.76)
 
 
-def test_a_pose_off_the_grid_has_no_samples(tmp_path: Path) -> None:
+def test_a_pose_off_the_grid_has_no_samples(tmp_path):
     sampled = ProblemMaker(swinging_chain(tmp_path, 2).pose_tree(), 0.5).body.sampled
     assert samples_at(sampled, [np.array([0.5]), np.array([-1.0])]) is not None
     assert samples_at(sampled, [np.array([0.5]), np.array([-0.9])]) is None

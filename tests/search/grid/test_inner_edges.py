@@ -1,9 +1,7 @@
 """Edges inside the silhouette: of hand-made pictures, and as a judge among poses."""
 
 import itertools
-from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -17,7 +15,7 @@ from drake_pose.search.grid.inner_edges import (
     edges_of_labels,
     find_borders,
 )
-from drake_pose.search.grid.pose_families import GridPoseSet, find_families, samples_at
+from drake_pose.search.grid.pose_families import find_families, samples_at
 from drake_pose.search.grid.sampled_body import SampledBody
 from drake_pose.search.settings import BeamSearchSettings
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
@@ -25,14 +23,14 @@ from tests.search.bodies import box_link, front_camera, joint, load_body
 from tests.search.grid_problems import show_pose
 
 
-def two_halves(column: int) -> np.ndarray:
+def two_halves(column):
     segments = np.full((40, 60), -1)
     segments[5:35, 10:50] = 0
     segments[5:35, column:50] = 1
     return segments
 
 
-def test_borders_lie_between_segments_and_not_at_the_silhouette() -> None:
+def test_borders_lie_between_segments_and_not_at_the_silhouette():
     borders = find_borders(two_halves(30))
     expected = np.zeros((40, 60), dtype=np.bool_)
     expected[5:35, 29] = True
@@ -40,7 +38,7 @@ def test_borders_lie_between_segments_and_not_at_the_silhouette() -> None:
 
 
 @pytest.mark.parametrize(("shift", "at_least", "below"), [(0, -1, 1), (1, -150, -1), (3, -999, 0)])
-def test_edges_are_likely_where_they_are_expected(shift: int, at_least: int, below: int) -> None:
+def test_edges_are_likely_where_they_are_expected(shift, at_least, below):
     segments = two_halves(30)
     edges = edges_of_labels(segments, segments >= 0)
     found = [edges.log_likelihood(two_halves(30 + far)) for far in (shift, shift + 2)]
@@ -48,7 +46,7 @@ def test_edges_are_likely_where_they_are_expected(shift: int, at_least: int, bel
     assert found[0] > found[1] or shift == 3
 
 
-def test_half_an_edge_is_likelier_than_none() -> None:
+def test_half_an_edge_is_likelier_than_none():
     segments = two_halves(30)
     edges = edges_of_labels(segments, segments >= 0)
     half = np.where(np.arange(40)[:, None] < 20, segments, np.where(segments >= 0, 0, -1))
@@ -61,29 +59,26 @@ def test_half_an_edge_is_likelier_than_none() -> None:
 class Product:
     """A graph of all poses of some nodes' samples."""
 
-    def __init__(self, allowed: list[np.ndarray]) -> None:
-        self._allowed = [np.flatnonzero(one) for one in allowed]
-        self.size = int(np.prod([len(one) for one in self._allowed]))
+    def __init__(self, allowed):
+        self.allowed = allowed
+        self.size = int(np.prod([one.sum() for one in allowed]))
 
-    def restricted(self, allowed: list[np.ndarray | None]) -> "Product":
-        every = [np.ones(COUNT, bool) if one is None else one for one in allowed]
-        return Product([np.isin(np.arange(COUNT), own) & one for own, one in self._pairs(every)])
+    def restricted(self, allowed):
+        both = zip(self.allowed, allowed, strict=True)
+        return Product([own if one is None else own & one for own, one in both])
 
-    def _pairs(self, every: list[np.ndarray]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        return zip(self._allowed, every, strict=True)
-
-    def members(self) -> np.ndarray:
-        return np.array(list(itertools.product(*self._allowed)))
+    def members(self):
+        return np.array([*itertools.product(*map(np.flatnonzero, self.allowed))])
 
 
 COUNT = 5
 
 
-def test_turning_one_limb_after_the_other_ends_where_none_is_better() -> None:
+def test_turning_one_limb_after_the_other_ends_where_none_is_better():
     """A sum of each node's own misfit: whose least is found node by node, by few of all poses."""
     target, judged = np.array([3, 0, 4]), {}
 
-    def judge(samples: np.ndarray) -> float:
+    def judge(samples):
         judged[tuple(samples.tolist())] = -float(np.abs(samples - target).sum())
         return judged[tuple(samples.tolist())]
 
@@ -96,19 +91,19 @@ def test_turning_one_limb_after_the_other_ends_where_none_is_better() -> None:
     assert len(judged) < 6 * COUNT
 
 
-def test_what_may_be_seen_sums_to_one() -> None:
+def test_what_may_be_seen_sums_to_one():
     errors = EdgeErrors(missing=0.3, wrong=0.1, patch=3)
     assert np.allclose(np.exp(errors.log_pixel).sum(axis=1), 1.0)
     assert np.exp(errors.log_patch(50, 100.0)).sum() == pytest.approx(1.0)
 
 
 @pytest.mark.parametrize("values", [{"missing": 0.0}, {"wrong": -1.0}, {"patch": 0}])
-def test_errors_out_of_range_are_refused(values: dict[str, float]) -> None:
+def test_errors_out_of_range_are_refused(values):
     with pytest.raises(SettingsError, match=next(iter(values))):
         EdgeErrors(**values)
 
 
-def test_pictures_that_do_not_fit_are_refused() -> None:
+def test_pictures_that_do_not_fit_are_refused():
     segments = two_halves(30)
     with pytest.raises(SettingsError, match="same camera"):
         edges_of_labels(segments, np.ones((30, 60), dtype=np.bool_))
@@ -117,7 +112,7 @@ def test_pictures_that_do_not_fit_are_refused() -> None:
 
 
 @pytest.fixture
-def arm_before_trunk(tmp_path: Path) -> tuple[GridPoseSet, np.ndarray, LabelRenderer]:
+def arm_before_trunk(tmp_path):
     """Fifteen poses with one silhouette, the samples of one of them, and what draws them."""
     model = load_body(
         tmp_path,
@@ -139,15 +134,13 @@ def arm_before_trunk(tmp_path: Path) -> tuple[GridPoseSet, np.ndarray, LabelRend
     return answer, samples, LabelRenderer(model, camera)
 
 
-def show_segments(answer: GridPoseSet, samples: np.ndarray, renderer: LabelRenderer) -> np.ndarray:
+def show_segments(answer, samples, renderer):
     values = [grid[t] for grid, t in zip(answer.sampled.values, samples, strict=True)]
     return renderer.segments(*answer.sampled.tree.positions_from(values))
 
 
 @pytest.mark.parametrize("most", [300, 12])
-def test_a_hand_before_the_trunk_is_found_by_its_edges(
-    arm_before_trunk: tuple[GridPoseSet, np.ndarray, LabelRenderer], most: int
-) -> None:
+def test_a_hand_before_the_trunk_is_found_by_its_edges(arm_before_trunk, most):
     """The silhouette shows nothing of it, its edges everything."""
     answer, samples, renderer = arm_before_trunk
     seen = show_segments(answer, samples, renderer)
@@ -169,23 +162,12 @@ def test_a_hand_before_the_trunk_is_found_by_its_edges(
     assert choice.joints[-1].determined == choice.exhaustive
 
 
-def test_noise_on_the_edges_leaves_the_true_pose(
-    arm_before_trunk: tuple[GridPoseSet, np.ndarray, LabelRenderer],
-) -> None:
+def test_noise_on_the_edges_leaves_the_true_pose(arm_before_trunk):
     """Edges damaged at the rates that are stated, in squares that lie anywhere: 100 draws."""
     answer, samples, renderer = arm_before_trunk
     seen = show_segments(answer, samples, renderer)
-    exact = edges_of_labels(seen, seen >= 0)
-    generator = np.random.default_rng(5)
-    drawn = {
-        tuple(member.tolist()): show_segments(answer, member, renderer)
-        for member in answer.graph.members()
-    }
-    pictures: Iterator[np.ndarray] = iter(())
-
-    def render(q: np.ndarray, X_WB: np.ndarray) -> np.ndarray:
-        return next(pictures)
-
+    exact, generator = edges_of_labels(seen, seen >= 0), np.random.default_rng(5)
+    drawn = [show_segments(answer, member, renderer) for member in answer.graph.members()]
     left = []
     for _ in range(100):
         lost = np.kron(generator.random((17, 17)) < 0.2, np.ones((5, 5), dtype=np.bool_))
@@ -196,8 +178,8 @@ def test_noise_on_the_edges_leaves_the_true_pose(
         damaged[tuple(places.T)] = True
         row, column = generator.choice(np.argwhere(exact.mask))
         damaged[row, column : column + 5] = True
-        pictures = iter(drawn.values())
-        choice = choose_by_edges(answer, [replace(exact, edges=damaged & exact.mask)], [render])
+        edges, pictures = replace(exact, edges=damaged & exact.mask), iter(drawn)
+        choice = choose_by_edges(answer, [edges], [lambda *_, them=pictures: next(them)])
         assert not choice.rules_out(samples)
         left.append(choice.left)
     assert np.median(left) <= 5

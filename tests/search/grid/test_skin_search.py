@@ -5,7 +5,6 @@ import itertools
 import numpy as np
 import pytest
 
-from drake_pose.body.model import ArticulatedModel
 from drake_pose.camera.models import ParallelCamera
 from drake_pose.search.estimates import View
 from drake_pose.search.grid.beam_search import BeamSearch
@@ -21,11 +20,11 @@ INTERVAL = 0.8
 
 
 @pytest.fixture(scope="module")
-def limb(tmp_path_factory: pytest.TempPathFactory) -> ArticulatedModel:
+def limb(tmp_path_factory):
     return load_limb(tmp_path_factory.mktemp("limb"))
 
 
-def side_camera() -> ParallelCamera:
+def side_camera():
     """Looks along -x from an odd angle; the shoulder is at the middle of the picture."""
     turn = 0.3
     c, s = np.cos(turn), np.sin(turn)
@@ -33,17 +32,17 @@ def side_camera() -> ParallelCamera:
     return ParallelCamera("side", 120, 120, 90.0, 60.2, 60.1, X_WC)
 
 
-def view_of(tree, values) -> View:
+def view_of(tree, values):
     camera = side_camera()
     surfaces = TreeSurfaces(tree).at(values)
     return View(camera, draw_mask(surfaces, camera.X_CW @ tree.node_poses(values), camera))
 
 
-def random_samples(sampled: SampledTree, rng: np.random.Generator) -> np.ndarray:
+def random_samples(sampled, rng):
     return np.array([rng.integers(len(values)) for values in sampled.values])
 
 
-def test_the_objective_counts_the_skin(limb: ArticulatedModel) -> None:
+def test_the_objective_counts_the_skin(limb):
     tree = limb.pose_tree()
     sampled = SampledTree(tree, PaperSearchSettings(interval=INTERVAL))
     rng = np.random.default_rng(0)
@@ -59,7 +58,7 @@ def test_the_objective_counts_the_skin(limb: ArticulatedModel) -> None:
 
 
 @pytest.mark.parametrize("seed", range(2))
-def test_the_papers_search_is_that_of_plain_pictures(limb: ArticulatedModel, seed: int) -> None:
+def test_the_papers_search_is_that_of_plain_pictures(limb, seed):
     tree = limb.pose_tree()
     settings = PaperSearchSettings(interval=INTERVAL, outside_limit=8.0, candidate_limit=3)
     search = PaperSearch(tree, settings)
@@ -74,7 +73,7 @@ def test_the_papers_search_is_that_of_plain_pictures(limb: ArticulatedModel, see
         assert result.J == naive.best[0]
 
 
-def test_the_beam_search_finds_the_minimum(limb: ArticulatedModel) -> None:
+def test_the_beam_search_finds_the_minimum(limb):
     tree = limb.pose_tree()
     search = BeamSearch(tree, BeamSearchSettings(interval=INTERVAL))
     sampled = search.sampled

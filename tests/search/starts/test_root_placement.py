@@ -1,4 +1,5 @@
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -28,16 +29,17 @@ SETTINGS = BeamSearchSettings(interval=math.radians(30.0))
 @pytest.fixture(scope="module")
 def body(tmp_path_factory):
     """A trunk with two unequal arms, which turns in the picture and slides anywhere."""
+    slides, parent = [], "world"
+    for name, axis in (("x", "1 0 0"), ("y", "0 1 0"), ("z", "0 0 1")):
+        carriage = f"carriage_{name}"
+        slides.append(f'<link name="{carriage}"/>')
+        slides.append(joint(f"slide_{name}", "prismatic", parent, carriage, (-9.0, 9.0), axis=axis))
+        parent = carriage
     return load_body(
         tmp_path_factory.mktemp("body"),
-        box_link("carriage_y", 0.001, 0.001).replace("visual", "collision"),
-        joint("slide_x", "prismatic", "world", "carriage_x", (-9.0, 9.0), axis="1 0 0"),
-        box_link("carriage_x", 0.001, 0.001).replace("visual", "collision"),
-        joint("slide_y", "prismatic", "carriage_x", "carriage_y", (-9.0, 9.0), axis="0 1 0"),
-        box_link("carriage_z", 0.001, 0.001).replace("visual", "collision"),
-        joint("slide_z", "prismatic", "carriage_y", "carriage_z", (-9.0, 9.0), axis="0 0 1"),
+        *slides,
         box_link("trunk", 10, 24, z=-12.0),
-        joint("trunk_turn", "revolute", "carriage_z", "trunk", (-1.2, 1.2)),
+        joint("trunk_turn", "revolute", parent, "trunk", (-1.2, 1.2)),
         box_link("left", 4, 15, y=1.0, z=-7.0),
         joint("left_turn", "revolute", "trunk", "left", (-0.2, 2.2), y=4.0, z=-2.0),
         box_link("right", 5, 12, y=-1.0, z=-5.0),
@@ -46,6 +48,8 @@ def body(tmp_path_factory):
 
 
 TRUE_ANGLES = {"trunk_turn": 0.4, "left_turn": 1.3, "right_turn": -0.9}
+PLACE = np.array([0.0, 0.13, 0.31])
+EYE = PinholeCamera("eye", 200, 200, 300.0, 300.0, 99.5, 99.5, front_camera().X_WC)
 
 
 def picture(body, camera, position, angles=TRUE_ANGLES):
@@ -92,24 +96,30 @@ def test_three_angles_at_the_root_turn_it_in_all_ways(tmp_path, ranges, free):
     assert hub(tree) == "ball"
 
 
-def test_position_and_scale_of_a_parallel_camera_are_found(body):
+@pytest.fixture(scope="module")
+def seen(body):
+    """The body before a parallel camera of 100 pixels a metre, its trunk at PLACE."""
     camera = front_camera(160)
-    mask = picture(body, camera, (0.0, 0.13, 0.31))
-    told = ParallelCamera("front", 160, 160, 7.0, 79.5, 79.5, camera.X_WC)
-    search = RootPlacementSearch(body.pose_tree(), SETTINGS, scale_unknown=True)
-    result = search.match([View(told, mask)])
+    return View(camera, picture(body, camera, PLACE))
+
+
+def placed(tree, views, *position, **settings):
+    return RootPlacementSearch(tree, SETTINGS, **settings).match(views, *position)
+
+
+def test_position_and_scale_of_a_parallel_camera_are_found(body, seen):
+    told = replace(seen.camera, pixels_per_metre=7.0)
+    result = placed(body.pose_tree(), [View(told, seen.mask)], scale_unknown=True)
     assert result.E_total < 0.04
     assert result.scale * 7.0 == pytest.approx(100.0, rel=0.04)
-    assert result.root_position[1:] == pytest.approx([0.13, 0.31], abs=0.02)
+    assert result.root_position[1:] == pytest.approx(PLACE[1:], abs=0.02)
     assert max(angle_errors(body, result)) < 0.1
     q_position = [result.q[body.position_index(f"slide_{axis}")] for axis in "yz"]
     assert q_position == pytest.approx(result.root_position[1:])
 
 
 def test_depth_of_a_pinhole_is_found(body):
-    camera = PinholeCamera("eye", 200, 200, 300.0, 300.0, 99.5, 99.5, front_camera().X_WC)
-    mask = picture(body, camera, (3.8, 0.05, 0.1))
-    result = RootPlacementSearch(body.pose_tree(), SETTINGS).match([View(camera, mask)])
+    result = placed(body.pose_tree(), [View(EYE, picture(body, EYE, (3.8, 0.05, 0.1)))])
     assert result.E_total < 0.05
     # The camera stands at x = 5.
     assert 5.0 - result.root_position[0] == pytest.approx(1.2, rel=0.06)
@@ -118,20 +128,17 @@ def test_depth_of_a_pinhole_is_found(body):
 
 def test_two_cameras_find_the_position_in_space(body):
     front = front_camera(160)
-    R_turn = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-    X_WC = np.eye(4)
-    X_WC[:3, :3] = R_turn @ front.X_WC[:3, :3]
-    side = ParallelCamera("side", 160, 160, 100.0, 79.5, 79.5, X_WC)
+    turn = np.array(
+        [[0.0, -1.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0, 0, 0, 1]]
+    )
+    side = replace(front, name="side", X_WC=turn @ front.X_WC)
     position = (0.21, -0.12, 0.18)
     views = [View(camera, picture(body, camera, position)) for camera in (front, side)]
-    search = RootPlacementSearch(body.pose_tree(), SETTINGS)
-    result = search.match(views)
-    assert result.E_total < 0.06
-    assert result.root_position == pytest.approx(position, abs=0.03)
     # A camera may be missing; what the other one cannot see stays arbitrary.
-    alone = search.match(views[:1])
-    assert alone.E_total < 0.06
-    assert alone.root_position[1:] == pytest.approx(position[1:], abs=0.03)
+    for count, known in ((2, slice(0, 3)), (1, slice(1, 3))):
+        result = placed(body.pose_tree(), views[:count])
+        assert result.E_total < 0.06
+        assert result.root_position[known] == pytest.approx(position[known], abs=0.03)
 
 
 def test_what_touches_the_pictures_edge_may_reach_beyond_it(body):
@@ -143,14 +150,12 @@ def test_what_touches_the_pictures_edge_may_reach_beyond_it(body):
     assert np.linalg.norm(layer.positions[:, 1:] - [0.1, 0.8], axis=1).min() < 0.04
 
 
-def test_a_turned_over_tree_finds_as_good_a_pose(body):
+def test_a_turned_over_tree_finds_as_good_a_pose(body, seen):
     """The same silhouette, searched from the trunk and from the end of an arm."""
-    camera = front_camera(160)
-    mask = picture(body, camera, (0.0, 0.13, 0.31))
-    own = RootPlacementSearch(body.pose_tree(), SETTINGS).match([View(camera, mask)])
+    own = placed(body.pose_tree(), [seen])
     rotation = RootRotation.limited([("x", -180.0, 180.0)])
     tree = body.pose_tree("left", root_position=np.zeros(3), root_rotation=rotation)
-    turned = RootPlacementSearch(tree, SETTINGS).match([View(camera, mask)])
+    turned = placed(tree, [seen])
     assert abs(own.E_total - turned.E_total) < 0.03
     # The plant's own joints cannot turn the body about the arm: its world is turned instead.
     assert max(angle_errors(body, own)) < 0.1
@@ -158,29 +163,22 @@ def test_a_turned_over_tree_finds_as_good_a_pose(body):
     assert math.atan2(*turned.X_WB[[2, 1], 1]) == pytest.approx(TRUE_ANGLES["trunk_turn"], abs=0.1)
 
 
-def test_a_known_position_is_kept(body):
-    camera = front_camera(160)
-    position = np.array([0.0, 0.13, 0.31])
-    mask = picture(body, camera, position)
-    result = RootPlacementSearch(body.pose_tree(), SETTINGS).match([View(camera, mask)], position)
-    assert result.root_position == pytest.approx(position)
+def test_a_known_position_is_kept(body, seen):
+    result = placed(body.pose_tree(), [seen], PLACE)
+    assert result.root_position == pytest.approx(PLACE)
     assert result.E_total < 0.04
 
 
-def test_no_time_gives_an_answer_all_the_same(body):
-    camera = front_camera(160)
-    mask = picture(body, camera, (0.0, 0.13, 0.31))
-    settings = BeamSearchSettings(interval=SETTINGS.interval, time_limit=0.0)
-    result = RootPlacementSearch(body.pose_tree(), settings).match([View(camera, mask)])
-    assert result.found
-    assert result.stopped_by == "time_limit"
+def test_no_time_gives_an_answer_all_the_same(body, seen):
+    settings = replace(SETTINGS, time_limit=0.0)
+    result = RootPlacementSearch(body.pose_tree(), settings).match([seen])
+    assert (result.found, result.stopped_by) == (True, "time_limit")
 
 
 def test_scale_needs_one_parallel_camera(body):
-    camera = PinholeCamera("eye", 200, 200, 300.0, 300.0, 99.5, 99.5, front_camera().X_WC)
     search = RootPlacementSearch(body.pose_tree(), SETTINGS, scale_unknown=True)
     with pytest.raises(SettingsError, match="eye"):
-        search.match([View(camera, np.ones((200, 200), dtype=np.bool_))])
+        search.match([View(EYE, np.ones((200, 200), dtype=np.bool_))])
     with pytest.raises(SettingsError, match="at least one view"):
         search.match([])
 
@@ -188,13 +186,11 @@ def test_scale_needs_one_parallel_camera(body):
 def test_whereabouts_count_the_steps_that_are_tried():
     mask = np.zeros((200, 200), dtype=np.bool_)
     mask[50:170, 50:170] = True
-    camera = PinholeCamera("eye", 200, 200, 300.0, 300.0, 99.5, 99.5, front_camera().X_WC)
-    near = whereabouts([View(camera, mask)], np.array([5.0 - 1.12, 0.0, 0.0]))
-    far = whereabouts([View(camera, mask)], np.array([5.0 - 1.12**2, 0.0, 0.0]))
-    aside = whereabouts(
-        [View(camera, mask)], np.array([5.0 - 1.12, 2.0 * 10.0 / 300.0 * 1.12, 0.0])
-    )
     # The camera stands at x = 5; a twelfth of the silhouette's extent is 10 pixels.
+    near, far, aside = (
+        whereabouts([View(EYE, mask)], np.array([5.0 - depth, y, 0.0]))
+        for depth, y in ((1.12, 0.0), (1.12**2, 0.0), (1.12, 2.0 * 10.0 / 300.0 * 1.12))
+    )
     assert near - far == pytest.approx([0.0, 0.0, 1.0])
     assert np.abs(aside - near) == pytest.approx([2.0, 0.0, 0.0])
 

@@ -12,16 +12,16 @@ VALUES = np.array([0.6, 0.7, -0.7, 0.9, 0.3])
 
 
 @pytest.fixture(scope="module")
-def kinematics(tmp_path_factory: pytest.TempPathFactory) -> TreeKinematics:
+def kinematics(tmp_path_factory):
     return TreeKinematics(arm_tree(tmp_path_factory.mktemp("arm")))
 
 
-def poses(kinematics: TreeKinematics, values: np.ndarray) -> np.ndarray:
+def poses(kinematics, values):
     """By the plant, not by the compiled kinematics."""
     return kinematics.tree.node_poses(split(kinematics.tree, values))
 
 
-def test_flips_leave_the_end_where_it_is(kinematics: TreeKinematics) -> None:
+def test_flips_leave_the_end_where_it_is(kinematics):
     found = flips(kinematics, VALUES)
     before = poses(kinematics, VALUES)
     assert found
@@ -40,19 +40,19 @@ def test_flips_leave_the_end_where_it_is(kinematics: TreeKinematics) -> None:
     assert best.changed.tolist() == [True, True, True, False, False]
 
 
-def test_flipping_twice_returns(kinematics: TreeKinematics) -> None:
+def test_flipping_twice_returns(kinematics):
     for flip in flips(kinematics, VALUES):
         back = [again.values for again in flips(kinematics, flip.values)]
         assert min(np.abs(values - VALUES).max() for values in back) < 1e-9
 
 
-def test_flips_outside_the_limits_are_left_out(kinematics: TreeKinematics) -> None:
+def test_flips_outside_the_limits_are_left_out(kinematics):
     # The turret reaches 150 degrees to either side, so that 10 cannot become 190.
     values = np.radians([10.0, 40.0, -30.0, 50.0, 20.0])
     assert flips(kinematics, values) == []
 
 
-def test_counter_turns_keep_the_direction_of_what_follows(kinematics: TreeKinematics) -> None:
+def test_counter_turns_keep_the_direction_of_what_follows(kinematics):
     # With the shoulder upright, turret and roll have one axis.
     values = np.array([0.6, 0.0, -0.5, 0.9, 0.3])
     found = counter_turns(kinematics, values, np.radians(30.0))
@@ -64,7 +64,7 @@ def test_counter_turns_keep_the_direction_of_what_follows(kinematics: TreeKinema
     assert all(((one >= kinematics.lower) & (one <= kinematics.upper)).all() for one in found)
 
 
-def test_a_chain_in_a_plane_has_counter_turns_but_no_flips(tmp_path) -> None:
+def test_a_chain_in_a_plane_has_counter_turns_but_no_flips(tmp_path):
     kinematics = TreeKinematics(swinging_chain(tmp_path, 3).pose_tree())
     values = np.array([0.3, -0.4, 0.5])
     assert flips(kinematics, values) == []

@@ -1,17 +1,18 @@
 """The kernel against Drake's own renderer."""
 
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 from scipy.spatial.transform import Rotation
 
-from drake_pose.body.model import ArticulatedModel, load_model
-from drake_pose.camera.models import Camera, ParallelCamera, PinholeCamera
+from drake_pose.body.model import load_model
+from drake_pose.camera.models import ParallelCamera, PinholeCamera
 from drake_pose.silhouette.areas.outline import outline_from_mesh
 from drake_pose.silhouette.areas.scoring import draw_mask
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
+from tests.body.models import joint, link, urdf, write
 from tests.silhouette.agreement import LARGEST_SHARE, measure_agreement
 
 SHAPES = {
@@ -23,56 +24,36 @@ SHAPES = {
     "open mesh": '<mesh filename="open.obj" scale="0.2 0.25 0.3"/>',
 }
 
+
 # A cube without its top, one more wall inside it, and a fin: neither closed nor a manifold.
-OPEN_MESH = """
-v -1 -1 -1
-v 1 -1 -1
-v 1 1 -1
-v -1 1 -1
-v -1 -1 1
-v 1 -1 1
-v 1 1 1
-v -1 1 1
-v 0 0 2
-vn 0 0 1
-f 1//1 3//1 2//1
-f 1//1 4//1 3//1
-f 1//1 2//1 6//1
-f 1//1 6//1 5//1
-f 2//1 3//1 7//1
-f 2//1 7//1 6//1
-f 3//1 4//1 8//1
-f 3//1 8//1 7//1
-f 1//1 3//1 7//1
-f 5//1 6//1 9//1
-"""
-
-LINK = """
-<link name="{name}"><inertial><mass value="1"/>
-  <inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial>
-  <visual><origin xyz="0 0 0.25" rpy="0.3 0 0.2"/><geometry>{shape}</geometry></visual></link>
-<joint name="{name}_joint" type="revolute"><parent link="{parent}"/><child link="{name}"/>
-  <origin xyz="0 0 0.4"/><axis xyz="{axis}"/>
-  <limit lower="-2" upper="2" effort="1" velocity="1"/></joint>
-"""
+def write_open_mesh(path):
+    """A cube without its top, one more wall inside it, and a fin: neither closed nor a manifold."""
+    z, y, x = np.indices((2, 2, 2)).reshape(3, 8) * 2 - 1
+    points = np.vstack([np.column_stack([x, y, z]), [0, 0, 2]])
+    quads = [(0, 1, 3, 2), (0, 4, 5, 1), (1, 5, 7, 3), (3, 7, 6, 2)]
+    faces = [[q[0], q[k], q[k + 1]] for q in quads for k in (1, 2)] + [[0, 3, 7], [4, 5, 8]]
+    trimesh.Trimesh(points, faces, process=False).export(path, include_normals=True)
 
 
-def model_of(folder: Path, shapes: list[str]) -> ArticulatedModel:
+def model_of(folder, shapes):
     """A chain with one link for each shape, on the world."""
-    (folder / "open.obj").write_text(OPEN_MESH)
-    text, parent = '<link name="base"/>', "base"
-    text += '<joint name="weld" type="fixed"><parent link="world"/><child link="base"/></joint>'
+    write_open_mesh(folder / "open.obj")
+    parts, parent = [], "world"
     for i, shape in enumerate(shapes):
         name, axis = f"link_{i}", ("1 0 0", "0 1 0", "0 0.6 0.8")[i % 3]
-        text += LINK.format(name=name, parent=parent, shape=SHAPES[shape], axis=axis)
+        visual = (
+            '<visual><origin xyz="0 0 0.25" rpy="0.3 0 0.2"/>'
+            f"<geometry>{SHAPES[shape]}</geometry></visual>"
+        )
+        parts.append(link(name, visual))
+        at = {"origin": 'xyz="0 0 0.4"', "limits": 'lower="-2" upper="2"'}
+        parts.append(joint(f"{name}_joint", "revolute", parent, name, axis=axis, **at))
         parent = name
-    path = folder / "chain.urdf"
-    drake = "http://drake.mit.edu"
-    path.write_text(f'<robot name="chain" xmlns:drake="{drake}"><link name="world"/>{text}</robot>')
-    return load_model(path, check=False)
+    text = urdf(*parts).replace("<robot", '<robot xmlns:drake="http://drake.mit.edu"')
+    return load_model(write(folder, text), check=False)
 
 
-def looking_at_origin(rng: np.random.Generator, distance: float) -> np.ndarray:
+def looking_at_origin(rng, distance):
     """A pose X_WC from which the origin is seen near the picture's middle."""
     X_WC = np.eye(4)
     X_WC[:3, :3] = Rotation.random(random_state=rng).as_matrix()
@@ -80,7 +61,7 @@ def looking_at_origin(rng: np.random.Generator, distance: float) -> np.ndarray:
     return X_WC
 
 
-def cameras(rng: np.random.Generator) -> list[Camera]:
+def cameras(rng):
     """One parallel camera, one pinhole, and one so near that parts are behind the near plane."""
     return [
         ParallelCamera("parallel", 500, 400, 180.0, 230.3, 210.7, looking_at_origin(rng, 3.0)),
@@ -92,7 +73,7 @@ def cameras(rng: np.random.Generator) -> list[Camera]:
 
 
 @pytest.mark.parametrize("shape", list(SHAPES))
-def test_every_shape_looks_as_drake_draws_it(tmp_path: Path, shape: str) -> None:
+def test_every_shape_looks_as_drake_draws_it(tmp_path, shape):
     model = model_of(tmp_path, [shape, shape])
     for seed in range(2):
         for camera in cameras(np.random.default_rng(seed)):
@@ -102,7 +83,7 @@ def test_every_shape_looks_as_drake_draws_it(tmp_path: Path, shape: str) -> None
             assert shape == "open mesh" or whole <= 3e-4, (shape, camera.name, whole)
 
 
-def test_labels_are_links(tmp_path: Path) -> None:
+def test_labels_are_links(tmp_path):
     model = model_of(tmp_path, ["box", "sphere"])
     camera = cameras(np.random.default_rng(2))[0]
     renderer = LabelRenderer(model, camera)
@@ -120,7 +101,7 @@ def test_labels_are_links(tmp_path: Path) -> None:
             assert outside <= max(2, 0.002 * alone.sum())
 
 
-def test_wrong_use_of_a_renderer_is_refused(tmp_path: Path) -> None:
+def test_wrong_use_of_a_renderer_is_refused(tmp_path):
     renderer = LabelRenderer(
         model_of(tmp_path, ["box"]), ParallelCamera("c", 40, 30, 9.0, 20.0, 15.0, np.eye(4))
     )

@@ -1,14 +1,11 @@
 """Surfaces with bands of skin: kernel, brute force and Drake's renderer agree; gaps are closed."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from drake_pose.body.model import ArticulatedModel
 from drake_pose.body.surfaces.meshes import TriangleMesh
-from drake_pose.camera.models import Camera, ParallelCamera, PinholeCamera, look_at
+from drake_pose.camera.models import ParallelCamera, PinholeCamera, look_at
 from drake_pose.silhouette.areas.bending import BendingOutline, TreeSurfaces
 from drake_pose.silhouette.areas.outline import outline_from_mesh
 from drake_pose.silhouette.areas.scoring import draw_mask, prefix_sums, score_bodies, subtract_body
@@ -22,14 +19,14 @@ from tests.silhouette.shapes import brute_force_mask
 SIDE = 160
 
 
-def looking_along(direction: np.ndarray, distance: float) -> np.ndarray:
+def looking_along(direction, distance):
     """A camera's pose (4, 4) in the limb's world, its middle in view."""
     z = np.asarray(direction, dtype=float) / np.linalg.norm(direction)
     middle, up = np.array([0.0, 0.0, 0.1]), (0, 0, 1) if abs(z[2]) < 0.9 else (0, 1, 0)
     return look_at(middle - distance * z, middle, up)
 
 
-def cameras(rng: np.random.Generator) -> list[Camera]:
+def cameras(rng):
     X_WC = [looking_along(rng.normal(size=3), 1.2) for _ in range(2)]
     middle = SIDE / 2 + 0.137
     return [
@@ -38,15 +35,13 @@ def cameras(rng: np.random.Generator) -> list[Camera]:
     ]
 
 
-def pose(
-    model: ArticulatedModel, q: np.ndarray, camera: Camera
-) -> tuple[list[np.ndarray], np.ndarray]:
+def pose(model, q, camera):
     tree = model.pose_tree()
     values = tree.values_from_positions(q)
     return values, camera.X_CW @ tree.node_poses(values)
 
 
-def test_kernel_and_brute_force_agree(tmp_path: Path) -> None:
+def test_kernel_and_brute_force_agree(tmp_path):
     model = load_limb(tmp_path)
     tree = model.pose_tree()
     surfaces = TreeSurfaces(tree)
@@ -67,7 +62,7 @@ def test_kernel_and_brute_force_agree(tmp_path: Path) -> None:
     assert gained > 100
 
 
-def test_many_poses_at_once_are_scored_as_one_by_one(tmp_path: Path) -> None:
+def test_many_poses_at_once_are_scored_as_one_by_one(tmp_path):
     model = load_limb(tmp_path)
     surfaces = TreeSurfaces(model.pose_tree())
     rng = np.random.default_rng(1)
@@ -95,7 +90,7 @@ def test_many_poses_at_once_are_scored_as_one_by_one(tmp_path: Path) -> None:
             np.testing.assert_array_equal(left, sets[0] & ~mask)
 
 
-def test_bits_have_the_band_of_their_sample(tmp_path: Path) -> None:
+def test_bits_have_the_band_of_their_sample(tmp_path):
     """The beam search's pictures are the kernel's, for each of many samples of a node."""
     model = load_limb(tmp_path)
     tree = model.pose_tree()
@@ -123,7 +118,7 @@ def test_bits_have_the_band_of_their_sample(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("seed", range(2))
-def test_drake_draws_the_same(tmp_path: Path, seed: int) -> None:
+def test_drake_draws_the_same(tmp_path, seed):
     model = load_limb(tmp_path)
     rng = np.random.default_rng(10 + seed)
     for camera in cameras(rng):
@@ -142,7 +137,7 @@ def test_drake_draws_the_same(tmp_path: Path, seed: int) -> None:
     assert names <= {"upper", "lower", "hand"}
 
 
-def test_wrong_bands_are_refused() -> None:
+def test_wrong_bands_are_refused():
     tetrahedron = TriangleMesh(
         np.vstack([np.zeros(3), np.eye(3)]), np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
     )

@@ -1,11 +1,20 @@
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from drake_pose.body.surfaces.meshes import TriangleMesh
 from drake_pose.camera.models import Camera, ParallelCamera, PinholeCamera
+from drake_pose.errors import CameraError
 from drake_pose.silhouette.areas.outline import outline_from_mesh
-from drake_pose.silhouette.areas.scoring import draw_mask, prefix_sums, score_bodies, subtract_body
-from tests.silhouette.shapes import box, brute_force_mask, random_pose, soup
+from drake_pose.silhouette.areas.scoring import (
+    draw_labels,
+    draw_mask,
+    prefix_sums,
+    require_visible,
+    score_bodies,
+    subtract_body,
+)
+from tests.silhouette.shapes import box, brute_force_depth, brute_force_mask, random_pose, soup
 
 CAMERAS: list[Camera] = [
     ParallelCamera("parallel", 90, 70, 60.0, 44.3, 33.1, np.eye(4)),
@@ -14,42 +23,52 @@ CAMERAS: list[Camera] = [
 ]
 
 
-def name_of(camera: Camera) -> str:
+def name_of(camera):
     return camera.name
 
 
-def draw(mesh: TriangleMesh, X_CN: np.ndarray, camera: Camera) -> np.ndarray:
-    return draw_mask([outline_from_mesh(mesh)], X_CN[None], camera)
+def require_exact(mesh, X_CN, camera):
+    """Compares a mesh's mask with cast rays; returns it."""
+    mask = draw_mask([outline_from_mesh(mesh)], X_CN[None], camera)
+    np.testing.assert_array_equal(mask, brute_force_mask(mesh, X_CN, camera))
+    return mask
 
 
 @pytest.mark.parametrize("camera", CAMERAS, ids=name_of)
-def test_any_triangle_soup_is_drawn_exactly(camera: Camera) -> None:
+def test_any_triangle_soup_is_drawn_exactly(camera):
     rng = np.random.default_rng(1)
     covered = 0
     for _ in range(40):
         mesh = soup(rng, 12, int(rng.integers(1, 30)), 0.4)
-        X_CN = random_pose(rng, (0.1, -0.1, 3.0))
-        mask = brute_force_mask(mesh, X_CN, camera)
-        np.testing.assert_array_equal(draw(mesh, X_CN, camera), mask)
-        covered += mask.sum()
+        covered += require_exact(mesh, random_pose(rng, (0.1, -0.1, 3.0)), camera).sum()
     assert covered > 1000
 
 
-def test_triangles_through_the_near_plane_are_cut_exactly() -> None:
+@pytest.mark.parametrize("count", [60, 400])
+def test_rows_with_very_many_crossings(count):
+    rng = np.random.default_rng(5)
+    corners = 0.03 * rng.normal(size=(count, 3, 3)) + 0.4 * rng.normal(size=(count, 1, 3))
+    small = TriangleMesh(
+        corners.reshape(-1, 3), np.arange(3 * count, dtype=np.int32).reshape(-1, 3)
+    )
+    for camera in CAMERAS[:2]:
+        require_exact(small, random_pose(rng, (0.0, 0.0, 3.0)), camera)
+
+
+def test_triangles_through_the_near_plane_are_cut_exactly():
     rng = np.random.default_rng(2)
     covered = 0
     for camera in CAMERAS[1:]:
         for _ in range(60):
             mesh = soup(rng, 12, int(rng.integers(1, 20)), 0.4)
             X_CN = random_pose(rng, (0.0, 0.0, rng.uniform(-0.6, 0.8)))
-            mask = brute_force_mask(mesh, X_CN, camera)
-            np.testing.assert_array_equal(draw(mesh, X_CN, camera), mask)
+            mask = require_exact(mesh, X_CN, camera)
             covered += 0 < mask.sum() < mask.size
     assert covered > 30
 
 
 @pytest.mark.parametrize("camera", CAMERAS, ids=name_of)
-def test_scores_are_sums_over_masks(camera: Camera) -> None:
+def test_scores_are_sums_over_masks(camera):
     rng = np.random.default_rng(4)
     size = (camera.height, camera.width)
     sets = rng.random((3, *size)) < np.array([0.1, 0.5, 0.9])[:, None, None]
@@ -72,25 +91,8 @@ def test_scores_are_sums_over_masks(camera: Camera) -> None:
         ]
 
 
-def test_rows_with_very_many_crossings() -> None:
-    rng = np.random.default_rng(5)
-    for camera in CAMERAS[:2]:
-        for triangles in (60, 400):
-            mesh = soup(rng, 300, triangles, 0.3)
-            small = TriangleMesh(
-                (
-                    mesh.vertices[mesh.triangles] * 0.1 + rng.normal(size=(triangles, 1, 3)) * 0.4
-                ).reshape(-1, 3),
-                np.arange(3 * triangles, dtype=np.int32).reshape(-1, 3),
-            )
-            X_CN = random_pose(rng, (0.0, 0.0, 3.0))
-            np.testing.assert_array_equal(
-                draw(small, X_CN, camera), brute_force_mask(small, X_CN, camera)
-            )
-
-
 @pytest.mark.parametrize("far", [1e3, 1e9, 1e300])
-def test_far_outside_the_picture(far: float) -> None:
+def test_far_outside_the_picture(far):
     camera = CAMERAS[0]
     outline = outline_from_mesh(box(1.0))
     X_CN = np.tile(np.eye(4), (5, 1, 1))
@@ -101,14 +103,14 @@ def test_far_outside_the_picture(far: float) -> None:
     assert areas[4, 0] == areas[4, 1] > 3000
 
 
-def test_a_surface_much_greater_than_the_picture() -> None:
+def test_a_surface_much_greater_than_the_picture():
+    X_CN = np.eye(4)
+    X_CN[2, 3] = 600.0
     for camera in CAMERAS:
-        X_CN = np.eye(4)
-        X_CN[2, 3] = 600.0
-        assert draw(box(1000.0), X_CN, camera).all()
+        assert draw_mask([outline_from_mesh(box(1000.0))], X_CN[None], camera).all()
 
 
-def test_empty_surfaces() -> None:
+def test_empty_surfaces():
     empty = outline_from_mesh(TriangleMesh(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int32)))
     cube = outline_from_mesh(box(0.5))
     camera = CAMERAS[0]
@@ -121,7 +123,7 @@ def test_empty_surfaces() -> None:
 
 
 @pytest.mark.parametrize("camera", CAMERAS, ids=name_of)
-def test_subtracting_a_body_keeps_the_prefix_sums(camera: Camera) -> None:
+def test_subtracting_a_body_keeps_the_prefix_sums(camera):
     rng = np.random.default_rng(7)
     mask = rng.random((camera.height, camera.width)) < 0.7
     prefix = prefix_sums(mask)
@@ -136,7 +138,7 @@ def test_subtracting_a_body_keeps_the_prefix_sums(camera: Camera) -> None:
         assert not prefix[:, 0].any()
 
 
-def test_wrong_shapes_are_refused() -> None:
+def test_wrong_shapes_are_refused():
     camera = CAMERAS[0]
     outline = outline_from_mesh(box(1.0))
     none = np.zeros((0, camera.height, camera.width + 1), dtype=np.int32)
@@ -148,3 +150,153 @@ def test_wrong_shapes_are_refused() -> None:
         draw_mask([outline], np.tile(np.eye(4), (2, 1, 1)), camera)
     with pytest.raises(ValueError, match="finite"):
         draw_mask([outline], np.full((1, 4, 4), np.nan), camera)
+
+
+PINHOLE = PinholeCamera("eye", 64, 48, 60.0, 60.0, 31.5, 23.5, np.eye(4))
+PARALLEL = ParallelCamera("flat", 64, 48, 20.0, 31.5, 23.5, np.eye(4))
+CUBE = outline_from_mesh(box(1.0))
+
+
+def at(x, y, z):
+    X_CN = np.eye(4)
+    X_CN[:3, 3] = (x, y, z)
+    return X_CN
+
+
+def test_a_body_in_view_is_accepted():
+    require_visible([CUBE], at(0, 0, 3)[None], PINHOLE)
+    require_visible([CUBE], at(0, 0, -3)[None], PARALLEL)
+    require_visible([CUBE, CUBE], np.array([at(0, 0, 3), at(0, 0, -3)]), PINHOLE)
+    require_visible([CUBE], at(0.6, 0, 0)[None], PINHOLE)  # beside the camera, in part before it
+
+
+def test_a_body_out_of_sight_is_refused():
+    with pytest.raises(CameraError, match=r"'eye'.*behind"):
+        require_visible([CUBE, CUBE], np.array([at(0, 0, -3), at(1, 0, -2)]), PINHOLE)
+    with pytest.raises(CameraError, match=r"'eye' is inside"):
+        require_visible([CUBE, CUBE], np.array([at(0, 0, 3), at(0.1, 0.2, 0.3)]), PINHOLE)
+    with pytest.raises(CameraError, match=r"'eye'.*outside the picture"):
+        require_visible([CUBE], at(50, 0, 3)[None], PINHOLE)
+    with pytest.raises(CameraError, match=r"'flat'.*outside the picture"):
+        require_visible([CUBE], at(0, 50, 3)[None], PARALLEL)
+
+
+EMPTY = 32766
+
+
+def require_nearest(meshes, X_CN, camera):
+    """Compares labels 1, 2, ... with cast rays; returns them, and how many pixels two share."""
+    labels = range(1, 1 + len(meshes))
+    outlines = [outline_from_mesh(mesh) for mesh in meshes]
+    image = draw_labels(outlines, labels, X_CN, camera, EMPTY)
+    depths = np.array([brute_force_depth(m, X, camera) for m, X in zip(meshes, X_CN, strict=True)])
+    seen = np.isfinite(depths).any(axis=0)
+    np.testing.assert_array_equal(image != EMPTY, seen)
+    own = np.take_along_axis(depths, np.where(seen, image - 1, 0)[None], axis=0)[0]
+    # The kernel's depths are 32 bit floats: where two are as near, either may be seen.
+    assert (own[seen] <= depths.min(axis=0)[seen] * (1.0 + 1e-5)).all()
+    return image, int((np.isfinite(depths).sum(axis=0) > 1).sum())
+
+
+@pytest.mark.parametrize("camera", CAMERAS, ids=name_of)
+def test_the_nearest_of_any_triangles_is_seen(camera):
+    rng = np.random.default_rng(4)
+    shared = 0
+    for _ in range(15):
+        meshes = [soup(rng, 12, int(rng.integers(1, 20)), 0.4) for _ in range(3)]
+        X_CN = np.array([random_pose(rng, (0.1, -0.1, rng.uniform(2.5, 3.5))) for _ in meshes])
+        shared += require_nearest(meshes, X_CN, camera)[1]
+    assert shared > 1000
+
+
+@pytest.mark.parametrize("camera", CAMERAS, ids=name_of)
+@pytest.mark.parametrize("inside_out", [False, True])
+def test_the_nearest_of_closed_bodies_is_seen(camera, inside_out):
+    # They run into each other, and a part is cut by the near plane.
+    rng = np.random.default_rng(5)
+    shared = 0
+    for trial in range(10):
+        middle = 2.0 if trial % 2 else 0.4
+        meshes = [box(float(rng.uniform(0.3, 0.9))) for _ in range(4)]
+        if inside_out:
+            meshes[0] = TriangleMesh(meshes[0].vertices, meshes[0].triangles[:, ::-1])
+        assert [outline_from_mesh(m).is_closed for m in meshes] == [not inside_out, *3 * [True]]
+        places = rng.uniform(-0.4, 0.4, (4, 3))
+        places[:, 2] += middle
+        X_CN = np.array([random_pose(rng, (x, y, z)) for x, y, z in places])
+        shared += require_nearest(meshes, X_CN, camera)[1]
+    assert shared > 1000
+
+
+def test_surfaces_that_are_not_closed_hide_nothing_behind_them():
+    cube = box(1.0)
+    assert outline_from_mesh(cube).is_closed
+    assert not outline_from_mesh(TriangleMesh(cube.vertices, cube.triangles[1:])).is_closed
+    turned = cube.triangles.copy()
+    turned[0] = turned[0, ::-1]
+    assert not outline_from_mesh(TriangleMesh(cube.vertices, turned)).is_closed
+
+
+def test_parts_of_one_label_are_one():
+    camera = CAMERAS[1]
+    X_CN = np.tile(np.eye(4), (3, 1, 1))
+    X_CN[:, :3, :3] = Rotation.random(3, random_state=6).as_matrix()
+    X_CN[:, 2, 3] = 2.0, 2.1, 2.2
+    outlines = [outline_from_mesh(box(0.6))] * 3
+    labels = draw_labels(outlines, [5, 5, 5], X_CN, camera)
+    np.testing.assert_array_equal(labels == 5, draw_mask(outlines, X_CN, camera))
+    assert set(np.unique(labels)) == {0, 5}
+
+
+def test_nothing_to_draw():
+    assert (draw_labels([], [], np.empty((0, 4, 4)), CAMERAS[0], EMPTY) == EMPTY).all()
+
+
+def directed_edges(triangles):
+    """Every use of an edge: from, to, triangle."""
+    return sorted(
+        (int(t[k]), int(t[(k + 1) % 3]), i) for i, t in enumerate(triangles) for k in range(3)
+    )
+
+
+def uses_of_records(edges):
+    uses = []
+    for v0, v1, t0, t1, s1 in edges.tolist():
+        uses.append((v0, v1, t0))
+        if s1 != 0:
+            uses.append((v0, v1, t1) if s1 > 0 else (v1, v0, t1))
+        else:
+            assert t1 == -1
+    return sorted(uses)
+
+
+def test_records_hold_every_use_of_an_edge_once():
+    rng = np.random.default_rng(0)
+    for _ in range(30):
+        # Few vertices, many triangles: edges of many triangles, and triangles given twice.
+        outline = outline_from_mesh(soup(rng, 7, 40, 1.0))
+        assert uses_of_records(outline.edges) == directed_edges(outline.triangles)
+
+
+def test_records_are_as_few_as_can_be():
+    # Three triangles on one edge, two of them running the same way.
+    triangles = np.array([[0, 1, 2], [0, 1, 3], [1, 0, 4]], dtype=np.int32)
+    points = np.random.default_rng(1).normal(size=(5, 3))
+    outline = outline_from_mesh(TriangleMesh(points, triangles))
+    assert len(outline.edges) == 2 + 6
+
+
+def test_vertices_at_one_place_are_merged():
+    mesh = box(1.0)
+    split = TriangleMesh(
+        np.vstack([mesh.vertices[mesh.triangles].reshape(-1, 3), [[9.0, 9.0, 9.0]]]),
+        np.arange(36, dtype=np.int32).reshape(-1, 3),
+    )
+    outline = outline_from_mesh(split)
+    assert len(outline.vertices) == 8
+    assert len(outline.edges) == 18
+
+
+def test_null_triangles_are_left_out():
+    mesh = TriangleMesh(np.eye(3), np.array([[0, 1, 2], [0, 0, 1], [2, 2, 2]], dtype=np.int32))
+    assert len(outline_from_mesh(mesh).triangles) == 1

@@ -2,21 +2,22 @@
 
 import numpy as np
 import pytest
+import trimesh
 from scipy.ndimage import distance_transform_edt
 from scipy.spatial.transform import Rotation
 
 from drake_pose.body.surfaces.meshes import TriangleMesh
-from drake_pose.camera.models import Camera, ParallelCamera, PinholeCamera
-from drake_pose.silhouette.areas.outline import Outline, outline_from_mesh
+from drake_pose.camera.models import ParallelCamera, PinholeCamera
+from drake_pose.silhouette.areas.outline import outline_from_mesh
 from drake_pose.silhouette.areas.scoring import VisualHull, draw_mask
-from drake_pose.silhouette.bits.bit_kernel import NEAREST_STRIDE, BitView, draw_bits, make_bit_view
+from drake_pose.silhouette.bits.bit_kernel import NEAREST_STRIDE, draw_bits, make_bit_view
 from drake_pose.silhouette.bits.bounding_balls import draw_discs, prune_by_balls
 from drake_pose.silhouette.contours.contour_points import divide_outline
 
 _POSES = 120
 
 
-def crooked_surface(seed: int, triangles: int = 60) -> Outline:
+def crooked_surface(seed, triangles=60):
     """Random triangles in a ball: open, crossing, with edges of one and of several triangles."""
     generator = np.random.default_rng(seed)
     vertices = generator.uniform(-0.12, 0.12, (triangles // 2, 3))
@@ -25,14 +26,14 @@ def crooked_surface(seed: int, triangles: int = 60) -> Outline:
     )
 
 
-def picture_cameras() -> list[Camera]:
+def picture_cameras():
     return [
         ParallelCamera("parallel", 90, 70, 180.0, 40.3, 33.7, np.eye(4)),
         PinholeCamera("pinhole", 90, 70, 150.0, 170.0, 40.3, 33.7, np.eye(4)),
     ]
 
 
-def random_poses(seed: int, depth: float = 1.0) -> np.ndarray:
+def random_poses(seed, depth=1.0):
     X = np.tile(np.eye(4), (_POSES, 1, 1))
     generator = np.random.default_rng(seed)
     X[:, :3, :3] = Rotation.random(_POSES, random_state=generator).as_matrix()
@@ -40,13 +41,13 @@ def random_poses(seed: int, depth: float = 1.0) -> np.ndarray:
     return X
 
 
-def random_mask(seed: int) -> np.ndarray:
+def random_mask(seed):
     mask = np.zeros((70, 90), dtype=bool)
     mask[12:55, 20:71] = np.random.default_rng(seed).random((43, 51)) < 0.8
     return mask
 
 
-def read_bits(view: BitView, numbers: np.ndarray, run: np.ndarray, words: np.ndarray) -> np.ndarray:
+def read_bits(view, numbers, run, words):
     """The mask (H, W) that a run of words stands for."""
     first, count, place = run
     row = np.zeros(int(numbers[-1, -1]) // 64 + 1, dtype=np.uint64)
@@ -61,13 +62,13 @@ def read_bits(view: BitView, numbers: np.ndarray, run: np.ndarray, words: np.nda
     return mask
 
 
-def pairs() -> np.ndarray:
+def pairs():
     return np.column_stack([np.zeros(_POSES), np.arange(_POSES)]).astype(np.int32)
 
 
 @pytest.mark.parametrize("camera", picture_cameras(), ids=lambda camera: camera.name)
 @pytest.mark.parametrize("spread", [0.0, 0.25])
-def test_bits_are_the_pixels_of_the_span_kernel(camera: Camera, spread: float) -> None:
+def test_bits_are_the_pixels_of_the_span_kernel(camera, spread):
     outline, mask = crooked_surface(1), random_mask(2)
     view = make_bit_view(mask, camera.kernel_parameters(), camera.X_CW, 5)
     # Some poses come so near that no table suits, and some are cut by the near plane.
@@ -89,7 +90,7 @@ def test_bits_are_the_pixels_of_the_span_kernel(camera: Camera, spread: float) -
     assert distance[band].max() <= 5 * np.sqrt(2.0)
 
 
-def test_poses_with_too_much_outside_are_left_out() -> None:
+def test_poses_with_too_much_outside_are_left_out():
     camera, outline, mask = picture_cameras()[0], crooked_surface(5), random_mask(6)
     view = make_bit_view(mask, camera.kernel_parameters(), camera.X_CW, 0)
     X_WN = random_poses(7)
@@ -100,20 +101,13 @@ def test_poses_with_too_much_outside_are_left_out() -> None:
     assert np.array_equal(kept, outside <= limit)
 
 
-def thick_surface() -> Outline:
+def thick_surface():
     """An ellipsoid."""
-    u, v = np.meshgrid(np.linspace(0, np.pi, 13), np.linspace(0, 2 * np.pi, 21)[:-1])
-    ball = np.stack([np.sin(u) * np.cos(v), np.sin(u) * np.sin(v), np.cos(u)], axis=-1)
-    index = np.arange(u.size).reshape(u.shape)
-    a, b = index[:, :-1], index[:, 1:]
-    c, d = np.roll(a, -1, axis=0), np.roll(b, -1, axis=0)
-    triangles = np.concatenate(
-        [np.stack([a, b, c], -1).reshape(-1, 3), np.stack([c, b, d], -1).reshape(-1, 3)]
-    )
-    return outline_from_mesh(TriangleMesh(ball.reshape(-1, 3) * [0.05, 0.08, 0.2], triangles))
+    ball = trimesh.creation.icosphere(3)
+    return outline_from_mesh(TriangleMesh(ball.vertices * [0.05, 0.08, 0.2], ball.faces))
 
 
-def test_balls_lie_inside_and_reach_to_the_ends() -> None:
+def test_balls_lie_inside_and_reach_to_the_ends():
     balls = VisualHull(thick_surface()).spread_balls(8)
     # A ball inside an ellipsoid: its points in all directions are inside.
     directions = Rotation.random(300, random_state=1).as_matrix()[:, 0]
@@ -123,7 +117,7 @@ def test_balls_lie_inside_and_reach_to_the_ends() -> None:
     assert np.ptp(balls[:, 2]) > 0.2
 
 
-def test_nothing_has_no_balls() -> None:
+def test_nothing_has_no_balls():
     empty = outline_from_mesh(TriangleMesh(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int32)))
     assert VisualHull(empty).spread_balls(5).shape == (0, 4)
     assert VisualHull(empty).radii(np.zeros((2, 3))).tolist() == [0.0, 0.0]
@@ -131,7 +125,7 @@ def test_nothing_has_no_balls() -> None:
 
 @pytest.mark.parametrize("camera", picture_cameras(), ids=lambda camera: camera.name)
 @pytest.mark.parametrize("limit", [0.0, 40.0])
-def test_pruning_loses_no_pose_inside_the_limit(camera: Camera, limit: float) -> None:
+def test_pruning_loses_no_pose_inside_the_limit(camera, limit):
     outline = thick_surface()
     mask = np.zeros((70, 90), dtype=bool)
     mask[10:60, 15:80] = True
@@ -148,7 +142,7 @@ def test_pruning_loses_no_pose_inside_the_limit(camera: Camera, limit: float) ->
 
 
 @pytest.mark.parametrize("camera", picture_cameras(), ids=lambda camera: camera.name)
-def test_discs_hold_all_that_can_be_reached(camera: Camera) -> None:
+def test_discs_hold_all_that_can_be_reached(camera):
     outline, mask = thick_surface(), random_mask(9)
     view = make_bit_view(mask, camera.kernel_parameters(), camera.X_CW, 0)
     X_WN = random_poses(10)
@@ -159,7 +153,7 @@ def test_discs_hold_all_that_can_be_reached(camera: Camera) -> None:
         assert not (drawn & mask & ~disc).any()
 
 
-def test_the_pixel_outside_is_nearly_the_nearest() -> None:
+def test_the_pixel_outside_is_nearly_the_nearest():
     mask = np.zeros((70, 90), dtype=bool)
     mask[:50, 20:71] = True
     mask[20:23, 30:35] = False

@@ -4,7 +4,7 @@ import pytest
 from drake_pose.body.surfaces.meshes import TriangleMesh
 from drake_pose.camera.models import ParallelCamera, PinholeCamera
 from drake_pose.silhouette.areas.outline import outline_from_mesh, pack
-from drake_pose.silhouette.contours.contour_points import ContourPoints, sample_contour
+from drake_pose.silhouette.contours.contour_points import sample_contour
 from tests.silhouette.shapes import box, random_pose, soup
 
 CAMERAS = [
@@ -13,7 +13,7 @@ CAMERAS = [
 ]
 
 
-def find_contour_points(outlines, X_CN, camera, spacing=1.0) -> ContourPoints:
+def find_contour_points(outlines, X_CN, camera, spacing=1.0):
     parameters = camera.kernel_parameters()
     return sample_contour(pack(tuple(outlines)), np.ascontiguousarray(X_CN), parameters, spacing)
 

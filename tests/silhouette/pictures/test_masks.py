@@ -1,13 +1,17 @@
 import struct
+import subprocess
+import sys
 import zlib
-from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from pydrake.geometry import RenderLabel
+from pydrake.systems.sensors import ImageLabel16I
 
 from drake_pose.camera.picture_files import read_picture
 from drake_pose.errors import MaskError
+from drake_pose.silhouette.pictures.label_images import label_image_to_mask, mask_to_label_image
 from drake_pose.silhouette.pictures.masks import read_mask, signed_distances, write_mask
 from drake_pose.silhouette.segmentation.mask_pictures import read_mask_picture
 
@@ -15,13 +19,13 @@ MASK = np.zeros((20, 30), dtype=bool)
 MASK[4:9, 3:20] = True
 
 
-def save(folder: Path, picture: np.ndarray, name: str = "0007.png") -> Path:
+def save(folder, picture, name="0007.png"):
     path = folder / name
     cv2.imwrite(str(path), picture)
     return path
 
 
-def test_round_trip(tmp_path: Path) -> None:
+def test_round_trip(tmp_path):
     write_mask(tmp_path / "m.png", MASK)
     assert cv2.imread(str(tmp_path / "m.png"), cv2.IMREAD_UNCHANGED).max() == 255
     mask = read_mask(tmp_path / "m.png", 30, 20)
@@ -29,47 +33,43 @@ def test_round_trip(tmp_path: Path) -> None:
     np.testing.assert_array_equal(mask, MASK)
 
 
-@pytest.mark.parametrize("value", [1, 128, 255])
-def test_grey_masks(tmp_path: Path, value: int) -> None:
-    path = save(tmp_path, MASK.astype(np.uint8) * np.uint8(value))
-    np.testing.assert_array_equal(read_mask(path), MASK)
+GREY = MASK.astype(np.uint8) * 255
+COLOUR = np.where(MASK[..., None], np.array([0, 200, 17]), 0).astype(np.uint8)
 
 
-def test_deep_colour_and_transparent_masks(tmp_path: Path) -> None:
-    grey = MASK.astype(np.uint16) * np.uint16(65535)
-    np.testing.assert_array_equal(read_mask(save(tmp_path, grey)), MASK)
-    colour = np.where(MASK[..., None], np.array([0, 200, 17]), 0).astype(np.uint8)
-    np.testing.assert_array_equal(read_mask(save(tmp_path, colour)), MASK)
-    opaque = np.dstack([colour, np.full(MASK.shape, 255, dtype=np.uint8)])
-    np.testing.assert_array_equal(read_mask(save(tmp_path, opaque)), MASK)
-    white = np.full((*MASK.shape, 4), 255, dtype=np.uint8)
-    white[:, :, 3] *= MASK
-    np.testing.assert_array_equal(read_mask(save(tmp_path, white)), MASK)
+@pytest.mark.parametrize(
+    "picture",
+    [
+        *(MASK.astype(np.uint8) * np.uint8(value) for value in (1, 128, 255)),
+        MASK.astype(np.uint16) * np.uint16(65535),
+        COLOUR,
+        np.dstack([COLOUR, np.full_like(GREY, 255)]),
+        np.dstack([np.full((*MASK.shape, 3), 255, np.uint8), GREY]),
+    ],
+    ids=["1", "128", "255", "deep", "colour", "opaque", "transparent"],
+)
+def test_masks_of_every_kind_are_read(tmp_path, picture):
+    np.testing.assert_array_equal(read_mask(save(tmp_path, picture)), MASK)
 
 
-def bad_pictures() -> dict[str, tuple[np.ndarray, str]]:
-    grey = MASK.astype(np.uint8) * 255
-    soft = cv2.GaussianBlur(grey, (5, 5), 0)
-    two_colours = np.dstack([grey, grey, np.roll(grey, 3, axis=1)])
-    return {
-        "empty": (np.zeros_like(grey), "empty"),
-        "full": (np.full_like(grey, 255), "full"),
-        "soft": (soft, "values"),
-        "two colours": (two_colours, "values"),
-        "no black": (np.where(MASK, 255, 3).astype(np.uint8), "full"),
-        "wrong size": (grey.T.copy(), r"20 x 30 pixels.*30 x 20"),
-    }
-
-
-@pytest.mark.parametrize("case", list(bad_pictures()))
-def test_bad_masks_are_refused(tmp_path: Path, case: str) -> None:
-    picture, message = bad_pictures()[case]
-    path = save(tmp_path, picture)
+@pytest.mark.parametrize(
+    ("picture", "message"),
+    [
+        (np.zeros_like(GREY), "empty"),
+        (np.full_like(GREY, 255), "full"),
+        (cv2.GaussianBlur(GREY, (5, 5), 0), "values"),
+        (np.dstack([GREY, GREY, np.roll(GREY, 3, axis=1)]), "values"),
+        (np.where(MASK, 255, 3).astype(np.uint8), "full"),
+        (GREY.T.copy(), r"20 x 30 pixels.*30 x 20"),
+    ],
+    ids=["empty", "full", "soft", "two colours", "no black", "wrong size"],
+)
+def test_bad_masks_are_refused(tmp_path, picture, message):
     with pytest.raises(MaskError, match=rf"0007\.png.*{message}"):
-        read_mask(path, 30, 20)
+        read_mask(save(tmp_path, picture), 30, 20)
 
 
-def test_damaged_files_are_refused(tmp_path: Path) -> None:
+def test_damaged_files_are_refused(tmp_path):
     path = save(tmp_path, MASK.astype(np.uint8) * 255)
     data = path.read_bytes()
     for end in (0, 5, 8, 20, 40, len(data) - 13, len(data) - 8):
@@ -83,7 +83,7 @@ def test_damaged_files_are_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("side", [10_000, 60_000])
-def test_pictures_that_would_fill_the_memory_are_refused(tmp_path: Path, side: int) -> None:
+def test_pictures_that_would_fill_the_memory_are_refused(tmp_path, side):
     header = struct.pack(">IIBBBBB", side, side, 8, 0, 0, 0, 0)
     data = b"\x89PNG\r\n\x1a\n"
     for kind, content in ((b"IHDR", header), (b"IEND", b"")):
@@ -105,7 +105,7 @@ def test_pictures_that_would_fill_the_memory_are_refused(tmp_path: Path, side: i
         read_mask(tmp_path / "sparse.png")
 
 
-def test_unreadable_files_are_refused(tmp_path: Path) -> None:
+def test_unreadable_files_are_refused(tmp_path):
     for path in (tmp_path / "missing.png", tmp_path):
         with pytest.raises(MaskError, match=str(path)):
             read_mask(path)
@@ -118,7 +118,7 @@ def test_unreadable_files_are_refused(tmp_path: Path) -> None:
         read_mask(picture)
 
 
-def test_signed_distances_are_those_to_the_nearest_pixel_of_the_other_kind() -> None:
+def test_signed_distances_are_those_to_the_nearest_pixel_of_the_other_kind():
     mask = np.random.default_rng(4).random((14, 17)) < 0.6
     found = signed_distances(mask)
     inside, outside = np.argwhere(mask), np.argwhere(~mask)
@@ -127,3 +127,29 @@ def test_signed_distances_are_those_to_the_nearest_pixel_of_the_other_kind() -> 
         nearest = np.linalg.norm(others - [row, column], axis=1).min() - 0.5
         expected = -nearest if mask[row, column] else nearest
         assert found[row, column] == pytest.approx(expected, abs=1e-4)
+
+
+def test_label_images_are_masks():
+    image = mask_to_label_image(MASK)
+    assert isinstance(image, ImageLabel16I)
+    assert (image.width(), image.height()) == (30, 20)
+    np.testing.assert_array_equal(label_image_to_mask(image), MASK)
+    np.testing.assert_array_equal(label_image_to_mask(image.data), MASK)
+
+
+def test_labels_can_be_chosen():
+    labels = np.full((4, 5), int(RenderLabel.kEmpty), dtype=np.int16)
+    labels[1, 2], labels[3, 3] = 7, 9
+    assert np.argwhere(label_image_to_mask(labels)).tolist() == [[1, 2], [3, 3]]
+    assert np.argwhere(label_image_to_mask(labels, [9])).tolist() == [[3, 3]]
+
+
+def test_importing_the_room_loads_neither_numba_nor_drake():
+    code = (
+        "import sys, drake_pose.silhouette, drake_pose.camera;"
+        "print([m for m in ('numba', 'pydrake', 'cv2') if m in sys.modules])"
+    )
+    result = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    )
+    assert result.stdout.strip() == "[]"

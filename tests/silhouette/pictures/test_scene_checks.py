@@ -3,14 +3,14 @@
 import struct
 import time
 from dataclasses import replace
-from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from drake_pose.camera.camera_files import save_cameras
-from drake_pose.camera.models import Camera, ParallelCamera, circle_of_cameras
+from drake_pose.camera.models import ParallelCamera, circle_of_cameras
 from drake_pose.errors import MaskError, SceneError
 from drake_pose.silhouette.pictures.masks import write_mask
 from drake_pose.silhouette.pictures.scene_checks import (
@@ -19,12 +19,12 @@ from drake_pose.silhouette.pictures.scene_checks import (
     frame_ranges,
     leave_out_unreadable,
 )
-from drake_pose.silhouette.pictures.scenes import Scene, load_scene
+from drake_pose.silhouette.pictures.scenes import load_scene
 
 NAMES = ("left", "middle", "right")
 
 
-def record(folder: Path, frames: list[str], still: tuple[str, ...] = ()) -> Scene:
+def record(folder, frames, still=()):
     """A square that moves to the right; from the third frame on it stands still in some cameras."""
     cameras = [ParallelCamera(n, 60, 40, 10.0, 30.0, 20.0, np.eye(4)) for n in NAMES]
     save_cameras(folder / "cameras.yaml", cameras)
@@ -39,47 +39,45 @@ def record(folder: Path, frames: list[str], still: tuple[str, ...] = ()) -> Scen
     return load_scene(folder)
 
 
-def film(folder: Path, rates: dict[str, float], counts: dict[str, int]) -> None:
-    """Videos of grey pictures beside cameras.yaml."""
+def film(folder, rate, count=60, **changed):
+    """Videos of grey pictures beside cameras.yaml; changed: a camera's rate and count."""
     (folder / "scene.yaml").write_text("sequence: true\n")
     (folder / "videos").mkdir(exist_ok=True)
     kind = cv2.VideoWriter.fourcc(*"MJPG")
-    for name, rate in rates.items():
+    for name in NAMES:
+        own_rate, own_count = changed.get(name, (rate, count))
         path = str(folder / "videos" / f"{name}.avi")
-        writer = cv2.VideoWriter(path, kind, rate, (60, 40))
-        for k in range(counts.get(name, 60)):
+        writer = cv2.VideoWriter(path, kind, own_rate, (60, 40))
+        for k in range(own_count):
             writer.write(np.full((40, 60, 3), k, np.uint8))
         writer.release()
 
 
-def test_videos_that_do_not_fit_together_are_named(tmp_path: Path) -> None:
+def test_videos_that_do_not_fit_together_are_named(tmp_path):
     record(tmp_path, ["000000"])
-    film(tmp_path, dict.fromkeys(NAMES, 30.0), {})
+    film(tmp_path, 30.0)
     assert check_scene(load_scene(tmp_path)).warnings == ()
-    film(
-        tmp_path, {name: 29.8 + 0.2 * (name == "left") for name in NAMES}, dict.fromkeys(NAMES, 200)
-    )
+    film(tmp_path, 29.8, 200, left=(30.0, 200))
     (drift,) = check_scene(load_scene(tmp_path)).warnings
     assert "has 29.8 pictures a second" in drift
     assert "they are 1 pictures apart" in drift
-    film(tmp_path, dict.fromkeys(NAMES, 30.0), {})
-    film(tmp_path, {NAMES[1]: 25.0}, {})
-    words = rf"{NAMES[1]}\.avi has 25 pictures a second, .* 30: .*12 pictures apart.*-r RATE"
+    film(tmp_path, 30.0, middle=(25.0, 60))
+    words = r"middle\.avi has 25 pictures a second, .* 30: .*12 pictures apart.*-r RATE"
     with pytest.raises(SceneError, match=words):
         load_scene(tmp_path)
-    film(tmp_path, dict.fromkeys(NAMES, 30.0), {NAMES[1]: 45})
+    film(tmp_path, 30.0, middle=(30.0, 45))
     (text,) = check_scene(load_scene(tmp_path)).warnings
-    assert f"'{NAMES[1]}' has 45 of 60 frames; it lacks 000045-000059" in text
-    video = tmp_path / "videos" / f"{NAMES[0]}.avi"
+    assert "'middle' has 45 of 60 frames; it lacks 000045-000059" in text
+    video = tmp_path / "videos" / "left.avi"
     video.write_bytes(video.read_bytes()[: video.stat().st_size // 2])
     with pytest.raises(SceneError, match=r"cut short: it ends after \d+ .* says 60; .*--frame"):
-        load_scene(tmp_path).read_image(NAMES[0], "000059")
+        load_scene(tmp_path).read_image("left", "000059")
 
 
 @pytest.mark.parametrize("count", [0, 10**9])
-def test_a_video_that_lies_about_its_length_is_refused(tmp_path: Path, count: int) -> None:
+def test_a_video_that_lies_about_its_length_is_refused(tmp_path, count):
     record(tmp_path, ["000000"])
-    film(tmp_path, {NAMES[0]: 30.0}, {})
+    film(tmp_path, 30.0)
     video = tmp_path / "videos" / f"{NAMES[0]}.avi"
     data = bytearray(video.read_bytes())
     # The number of pictures in AVI's headers of the file and of its stream.
@@ -95,46 +93,45 @@ def test_a_video_that_lies_about_its_length_is_refused(tmp_path: Path, count: in
     assert time.process_time() - begin < 1.0
 
 
-def test_sound_scene_has_no_fault(tmp_path: Path) -> None:
-    scene = record(tmp_path, [str(k) for k in range(8, 13)])
-    # 9 precedes 10.
-    assert scene.frames == ("8", "9", "10", "11", "12")
-    assert check_scene(scene).warnings == ()
+@pytest.mark.parametrize(
+    ("frames", "still", "left_out", "words"),
+    [
+        # 9 precedes 10.
+        ("8 9 10 11 12", (), [], None),
+        (
+            "1 2 3 4 5",
+            ("middle",),
+            ["4", "5"],
+            "'middle' shows its last picture again in frame 4-5",
+        ),
+        ("1 2 3 4", NAMES, [], "frame 4: all cameras show the frame before again"),
+        (
+            "f_02 f_04 f_06 f_12 f_14",
+            (),
+            [],
+            "2 frames dropped by all cameras between f_06 and f_12",
+        ),
+    ],
+)
+def test_faults_of_a_sequence_are_named(tmp_path, frames, still, left_out, words):
+    scene = record(tmp_path, frames.split(), still)
+    assert " ".join(scene.frames) == frames
+    checked = check_scene(scene)
+    assert len(checked.warnings) == (words is not None)
+    assert words is None or words in checked.warnings[0]
+    assert scene.masks.keys() - checked.masks.keys() == {("middle", frame) for frame in left_out}
+    assert "dropped" not in "".join(check_scene(replace(scene, sequence=False)).warnings)
 
 
-def test_frozen_camera_is_left_out(tmp_path: Path) -> None:
-    scene = record(tmp_path, ["1", "2", "3", "4", "5"], still=("middle",))
-    (warning,) = check_scene(scene).warnings
-    assert "camera 'middle' shows its last picture again in frame 4-5" in warning
-    assert ("middle", "4") not in check_scene(scene).masks
-    assert ("middle", "3") in check_scene(scene).masks
-
-
-def test_frames_recorded_twice_are_kept(tmp_path: Path) -> None:
-    scene = record(tmp_path, ["1", "2", "3", "4"], still=NAMES)
-    (warning,) = check_scene(scene).warnings
-    assert warning.startswith("frame 4: all cameras show the frame before again")
-    assert check_scene(scene).masks == scene.masks
-
-
-def test_dropped_frames(tmp_path: Path) -> None:
-    scene = record(tmp_path, ["f_0002", "f_0004", "f_0006", "f_0012", "f_0014"])
-    (warning,) = check_scene(scene).warnings
-    assert "2 frames dropped by all cameras between f_0006 and f_0012" in warning
-    stills = replace(scene, sequence=False)
-    assert check_scene(stills).warnings == ()
-
-
-def test_frames_that_a_camera_lacks(tmp_path: Path) -> None:
-    scene = record(tmp_path, [f"{k:02d}" for k in range(8)])
+def test_frames_that_a_camera_lacks(tmp_path):
+    record(tmp_path, [f"{k:02d}" for k in range(8)])
     for frame in ("02", "03", "05"):
         (tmp_path / "masks" / "right" / f"{frame}.png").unlink()
-    scene = load_scene(tmp_path)
-    (warning,) = check_scene(scene).warnings
+    (warning,) = check_scene(load_scene(tmp_path)).warnings
     assert "camera 'right' has 5 of 8 frames; it lacks 02-03, 05" in warning
 
 
-def test_numbers_with_and_without_zeros_are_the_same_frames(tmp_path: Path) -> None:
+def test_numbers_with_and_without_zeros_are_the_same_frames(tmp_path):
     record(tmp_path, ["0001", "0002"])
     for frame in ("0001", "0002"):
         path = tmp_path / "masks" / "left" / f"{frame}.png"
@@ -145,7 +142,7 @@ def test_numbers_with_and_without_zeros_are_the_same_frames(tmp_path: Path) -> N
     assert scene.mask_path("left", "0002").name == "2.png"
 
 
-def test_misspelt_camera(tmp_path: Path) -> None:
+def test_misspelt_camera(tmp_path):
     record(tmp_path, ["1", "2"])
     (tmp_path / "masks" / "middle").rename(tmp_path / "masks" / "Midle")
     first, second = check_scene(load_scene(tmp_path)).warnings
@@ -154,7 +151,7 @@ def test_misspelt_camera(tmp_path: Path) -> None:
     assert "camera 'middle' of cameras.yaml has no masks" in second
 
 
-def test_unreadable_masks_are_left_out_where_others_have_the_frame(tmp_path: Path) -> None:
+def test_unreadable_masks_are_left_out_where_others_have_the_frame(tmp_path):
     record(tmp_path, ["1", "2", "3"])
     for frame in ("2", "3"):
         (tmp_path / "masks" / "left" / f"{frame}.png").write_bytes(b"")
@@ -170,25 +167,17 @@ def test_unreadable_masks_are_left_out_where_others_have_the_frame(tmp_path: Pat
         leave_out_unreadable(scene.of_cameras(("left", "right")), scene.frames)
 
 
-@pytest.mark.parametrize(("axis", "name"), [((1.0, 0.0, 0.0), "-z"), ((0.0, 1.0, 0.0), "x")])
-def test_world_that_does_not_stand(axis: tuple[float, float, float], name: str) -> None:
+@pytest.mark.parametrize(("turn", "name"), [([180.0, 0.0, 0.0], "-z"), ([0.0, 90.0, 0.0], "+x")])
+def test_world_that_does_not_stand(turn, name):
     cameras = list(circle_of_cameras(4, size=(160, 120), face_camera=False).values())
     assert check_upright(cameras) == ()
-    half = np.pi if name == "-z" else np.pi / 2.0
-    turned = [turn(camera, np.array(axis), half) for camera in cameras]
-    (warning,) = check_upright(turned)
-    assert f"is the world's {'+' if name == 'x' else ''}{name}," in warning
-
-
-def turn(camera: Camera, axis: np.ndarray, angle: float) -> Camera:
-    x, y, z = axis
-    K = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     X = np.eye(4)
-    X[:3, :3] += np.sin(angle) * K + (1.0 - np.cos(angle)) * K @ K
-    return camera.with_pose(X @ camera.X_WC)
+    X[:3, :3] = Rotation.from_rotvec(turn, degrees=True).as_matrix()
+    (warning,) = check_upright([camera.with_pose(X @ camera.X_WC) for camera in cameras])
+    assert f"is the world's {name}," in warning
 
 
-def test_ranges() -> None:
+def test_ranges():
     known = [f"{k:02d}" for k in range(40)]
     assert frame_ranges(["03", "02", "07", "04"], known) == "02-04, 07"
     assert frame_ranges(known[::3], known) == "00, 03, 06, 09, 12, 15 and 8 more"

@@ -15,23 +15,18 @@ from drake_pose.silhouette.segmentation.background import (
     person_region,
     tell_from_background,
 )
+from drake_pose.silhouette.segmentation.regions import find_regions
 from tests.jobs.masks.rooms import texture
 
 
-def test_person_before_a_noisy_wall():
-    generator = np.random.default_rng(0)
-    wall = generator.integers(60, 200, (120, 160, 3)).astype(float)
-    wall = cv2.GaussianBlur(wall, (0, 0), 8)
-
-    def taken(picture):
-        return np.clip(picture + generator.normal(0, 3, picture.shape), 0, 255).astype(np.uint8)
-
-    row, column = np.indices((120, 160))
-    person = (column - 80) ** 2 + (row - 60) ** 2 <= 30**2
-    empty = [taken(wall) for _ in range(8)]
-    wall[person] = (240, 20, 30)
-    region = person_region(taken(wall), learn_background(empty))
-    assert (region & person).sum() / (region | person).sum() > 0.97
+def test_a_background_is_the_mean_and_deviation_of_pictures():
+    pictures = np.random.default_rng(0).integers(0, 256, (8, 9, 12, 3)).astype(np.uint8)
+    found = learn_background([*pictures[:7], pictures[7]])
+    np.testing.assert_array_equal(found.mean, np.rint(pictures.mean(axis=0)))
+    deviation = np.sqrt(pictures.astype(float).var(axis=0).mean(axis=-1))
+    np.testing.assert_allclose(found.deviation, deviation, rtol=1e-5)
+    still = learn_background([pictures[0]] * 2)
+    np.testing.assert_array_equal(still.deviation, 3.0)
 
 
 @pytest.mark.parametrize("seed", range(40))
@@ -69,13 +64,13 @@ def test_sizes_must_agree():
         person_region(np.zeros((5, 4, 3), np.uint8), background)
 
 
-def passing(room):
-    """Pictures (9) of a room in which a white square passes, and where it is."""
+def passing(room, shown=255.0, count=9):
+    """Pictures of a room in which a square passes, and where it is."""
     rng, pictures, masks = np.random.default_rng(2), [], []
-    for k in range(9):
+    for k in range(count):
         mask = np.zeros(room.shape[:2], bool)
         mask[40:100, 15 * k : 15 * k + 40] = True
-        picture = np.where(mask[:, :, None], 255.0, room) + 2.0 * rng.standard_normal(room.shape)
+        picture = np.where(mask[:, :, None], shown, room) + 2.0 * rng.standard_normal(room.shape)
         pictures.append(picture.clip(0, 255).astype(np.uint8))
         masks.append(mask)
     return pictures, np.array(masks)
@@ -98,20 +93,13 @@ def test_what_passes_is_not_in_the_median_and_hides_what_it_covers():
 
 def test_background_is_told_from_pictures_of_another_exposure():
     """A square that moves before a room, half the pictures redder and darker."""
-    rng = np.random.default_rng(2)
-    room = texture(rng)
-    pictures, masks, probabilities = [], [], []
-    for k in range(8):
-        mask = np.zeros(room.shape[:2], bool)
-        mask[40:100, 15 * k : 15 * k + 40] = True
-        probability = cv2.GaussianBlur(mask.astype(np.float32), (0, 0), 5.0).clip(0.01, 0.99)
-        picture = np.where(mask[:, :, None], 255.0 - room, room)
-        picture = picture * ((0.9, 0.7, 0.6) if k % 2 else (1.0, 1.0, 1.0))
-        pictures.append(
-            (picture + 2.0 * rng.standard_normal(room.shape)).clip(0, 255).astype(np.uint8)
-        )
-        masks.append(mask)
-        probabilities.append(probability)
+    room = texture(np.random.default_rng(2))
+    pictures, masks = passing(room, 255.0 - room, 8)
+    for k in (1, 3, 5, 7):
+        pictures[k] = (pictures[k] * np.array([0.9, 0.7, 0.6])).astype(np.uint8)
+    probabilities = [
+        cv2.GaussianBlur(mask.astype(np.float32), (0, 0), 5.0).clip(0.01, 0.99) for mask in masks
+    ]
     differs = np.abs(255.0 - 2.0 * room).max(axis=2) > 60.0
     every = tell_from_background(pictures, probabilities, range(8))
     for ratio, mask in zip(every, masks, strict=True):
@@ -138,3 +126,32 @@ def test_a_box_around_an_object_cuts_it_out():
             cut_box(picture, box)
     with pytest.raises(SettingsError, match="whole picture"):
         cut_box(picture, (0, 0, 160, 120))
+
+
+def drawn(cut, width):
+    """A picture of a ring's half, a square with a pattern and clutter, and the square's mask."""
+    rng, height = np.random.default_rng(0), 3 * width // 4
+    picture = np.full((height, width, 3), (120, 90, 60), np.uint8)
+    cv2.ellipse(picture, (width // 4, height // 2), (90, 60), 20.0, 0.0, 220.0, (60, 90, 160), 20)
+    turned = cv2.boxPoints(((0.7 * width, (0.05 if cut else 0.5) * height), (150.0, 110.0), 25.0))
+    mask = cv2.fillPoly(np.zeros((height, width), np.uint8), [turned.astype(np.int32)], 1) > 0
+    picture[mask] = 225
+    u, v = np.meshgrid(np.arange(width), np.arange(height))
+    inner = cv2.erode(mask.view(np.uint8), np.ones((25, 25), np.uint8), borderValue=0) > 0
+    picture[inner & ((u // 9 + v // 9) % 2 == 0)] = 20
+    noisy = picture + rng.normal(0.0, 6.0, picture.shape)
+    return np.clip(noisy, 0, 255).astype(np.uint8), mask
+
+
+@pytest.mark.parametrize(("cut", "width"), [(False, 640), (True, 640), (False, 400)])
+def test_a_patterned_object_is_one_region(cut, width):
+    picture, mask = drawn(cut, width)
+    grey = np.repeat(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)[..., None], 3, axis=2)
+    for shown in (picture, grey):
+        regions = find_regions(shown, 12)
+        assert max(intersection_over_union(one, mask) for one in regions) > 0.97
+        assert all(one.shape == mask.shape for one in regions)
+
+
+def test_there_may_be_none():
+    assert find_regions(np.full((60, 80, 3), 100, np.uint8), 12) == []

@@ -1,7 +1,7 @@
 """Masks of Pillow, OpenCV, and COCO (compared with its own library and matplotlib)."""
 
-import builtins
 import json
+import sys
 
 import cv2
 import numpy as np
@@ -91,9 +91,7 @@ def test_probabilities_from_one_half_on(tmp_path, kind, most):
 def test_masks_as_they_should_be_are_read(tmp_path, classes):
     path = tmp_path / "a.png"
     for colour in (1, 255, (0, 0, 200), (10, 10, 10)):
-        picture = np.zeros(
-            (HEIGHT, WIDTH, 3) if isinstance(colour, tuple) else classes.shape, np.uint8
-        )
+        picture = np.zeros((*classes.shape, *np.shape(colour)), np.uint8)
         picture[classes > 0] = colour
         cv2.imwrite(str(path), picture)
         assert (read_mask_picture(path) == (classes > 0)).all()
@@ -102,11 +100,8 @@ def test_masks_as_they_should_be_are_read(tmp_path, classes):
 
 
 def test_what_is_no_picture_is_refused(tmp_path):
-    for name, data in {
-        "a.png": b"\x89PNG\r\n\x1a\n",
-        "b.png": b"GIF89a",
-        "c.jpg": b"\xff\xd8\xff",
-    }.items():
+    starts = {"a.png": b"\x89PNG\r\n\x1a\n", "b.png": b"GIF89a", "c.jpg": b"\xff\xd8\xff"}
+    for name, data in starts.items():
         (tmp_path / name).write_bytes(data)
         with pytest.raises(MaskError, match=name):
             read_mask_picture(tmp_path / name)
@@ -174,14 +169,7 @@ def test_damaged_run_lengths_are_refused(counts):
 
 
 def test_run_lengths_without_the_library_say_what_to_install(monkeypatch):
-    real = builtins.__import__
-
-    def without(name, *rest, **more):
-        if name == "pycocotools":
-            raise ImportError(name)
-        return real(name, *rest, **more)
-
-    monkeypatch.setattr(builtins, "__import__", without)
+    monkeypatch.setitem(sys.modules, "pycocotools", None)
     with pytest.raises(MaskError, match=r"drake_pose\[coco\]"):
         decode_run_lengths([25], 5, 5)
 

@@ -21,6 +21,7 @@ from drake_pose.search.starts.root_placement import (
     whereabouts,
 )
 from drake_pose.silhouette.areas.scoring import draw_mask
+from drake_pose.workers import working
 from tests.search.bodies import box_link, front_camera, joint, load_body
 
 SETTINGS = BeamSearchSettings(interval=math.radians(30.0))
@@ -116,6 +117,16 @@ def test_position_and_scale_of_a_parallel_camera_are_found(body, seen):
     assert max(angle_errors(body, result)) < 0.1
     q_position = [result.q[body.position_index(f"slide_{axis}")] for axis in "yz"]
     assert q_position == pytest.approx(result.root_position[1:])
+
+
+def test_the_same_on_any_number_of_cores(body, seen):
+    views = [View(replace(seen.camera, pixels_per_metre=7.0), seen.mask)]
+    found = []
+    for workers in (1, 3):
+        with working(workers):
+            found.append(placed(body.pose_tree(), views, scale_unknown=True))
+    np.testing.assert_array_equal(found[0].q, found[1].q)
+    assert found[0].statistics == found[1].statistics
 
 
 def test_depth_of_a_pinhole_is_found(body):

@@ -1,12 +1,14 @@
 """Surfaces with bands of skin: kernel, brute force and Drake's renderer agree; gaps are closed."""
 
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from drake_pose.body.surfaces.meshes import TriangleMesh
 from drake_pose.camera.models import ParallelCamera, PinholeCamera, look_at
-from drake_pose.silhouette.areas.bending import BendingOutline, TreeSurfaces
+from drake_pose.silhouette.areas.bending import BendingOutline, PackedSurfaces, TreeSurfaces
 from drake_pose.silhouette.areas.outline import outline_from_mesh
 from drake_pose.silhouette.areas.scoring import draw_mask, prefix_sums, score_bodies, subtract_body
 from drake_pose.silhouette.bits.bit_kernel import draw_bits, make_bit_view
@@ -135,6 +137,19 @@ def test_drake_draws_the_same(tmp_path, seed):
     assert np.count_nonzero(moved != there) <= 0.004 * (there >= 0).sum()
     names = {renderer.link_names[label] for label in np.unique(there) if label >= 0}
     assert names <= {"upper", "lower", "hand"}
+
+
+def test_each_thread_bends_its_own_copy(tmp_path):
+    """The main thread's band is read after another thread has bent it otherwise."""
+    tree = load_limb(tmp_path).pose_tree()
+    surfaces, rest = PackedSurfaces(TreeSurfaces(tree)), tree.default_values()
+    ends = np.concatenate(rest), np.concatenate(rest) + 0.4
+    held = surfaces.bend_to(ends[0])
+    before = held.points.copy()
+    with ThreadPoolExecutor(1) as pool:
+        other = pool.submit(lambda: surfaces.at(ends[1]).points).result()
+    assert np.abs(other - before).max() > 1e-3
+    np.testing.assert_array_equal(held.points, before)
 
 
 def test_wrong_bands_are_refused():

@@ -120,7 +120,9 @@ def find_crossings(
         starts (lines + 1,) of the lines' crossings, their places (n,) [pixel] and segments (n,).
     """
     ends = segments.ends
-    counts = np.zeros(lines + 1, dtype=np.int64)
+    starts = np.zeros(lines + 1, dtype=np.int64)
+    # By how many more edges than the one before it a line is crossed.
+    more = np.zeros(lines + 1, dtype=np.int64)
     # (n, 3) those that cross a line, which most are too short for, and from where to where.
     crossing, count, share = np.empty((ends.shape[0] + 1, 3), dtype=np.int64), 0, 1.0 / spacing
     for s in range(ends.shape[0]):
@@ -130,11 +132,12 @@ def find_crossings(
         # No branch, which the processor would guess wrong.
         crossing[count, 0], crossing[count, 1], crossing[count, 2] = s, begin, after
         count += int(begin < after)
-        for line in range(begin, after):
-            counts[line + 1] += 1
+        more[begin] += 1
+        more[after] -= 1
+    crossed = 0
     for line in range(lines):
-        counts[line + 1] += counts[line]
-    starts = counts
+        crossed += more[line]
+        starts[line + 1] = starts[line] + crossed
     places = np.empty(starts[lines])
     owners = np.empty(starts[lines], dtype=np.int64)
     used = starts[:-1].copy()

@@ -234,6 +234,7 @@ class PersonPoseTracker:
         schedule: EXACT, or LENIENT where the model is only like the person.
         held: (m,) values that stay, such as lengths; None: none.
         rest: (m,) values of a person at rest, with the held ones; None: the tree's.
+        plan: of the same kinematics, where it is made already.
 
     Raises:
         ModelError: the model has no landmarks of trunk, arms and legs.
@@ -246,8 +247,10 @@ class PersonPoseTracker:
         schedule: AnnealingSchedule = EXACT,
         held: Mask | None = None,
         rest: Array | None = None,
+        plan: BodyPlan | None = None,
     ) -> None:
-        self.fit, self.schedule, self.plan = fit, schedule, BodyPlan(fit.kinematics)
+        self.fit, self.schedule = fit, schedule
+        self.plan = plan or BodyPlan(fit.kinematics)
         is_angle = fit.kinematics.is_angle
         self._held = np.zeros(len(is_angle), dtype=np.bool_) if held is None else held
         self._information = np.where(is_angle, _ANGLE_DEVIATION, _LENGTH_DEVIATION) ** -2.0

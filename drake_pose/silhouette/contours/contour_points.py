@@ -30,6 +30,8 @@ from drake_pose.silhouette.areas.span_kernel import make_rows
 
 # Slits and overlaps narrower than this [pixel] are rounding where surfaces touch.
 _SLIT = 1e-6
+# Crossings of lines are told apart as finely before they are put in order.
+_BUCKETS = 128
 
 
 class Segments(NamedTuple):
@@ -138,21 +140,37 @@ def find_crossings(
     for line in range(lines):
         crossed += more[line]
         starts[line + 1] = starts[line] + crossed
-    places = np.empty(starts[lines])
-    owners = np.empty(starts[lines], dtype=np.int64)
-    used = starts[:-1].copy()
+    found, at = np.empty((starts[lines], 3), dtype=np.int64), np.empty(starts[lines])
+    n, low, high = 0, np.inf, -np.inf
     for k in range(count):
         s = crossing[k, 0]
         a, b = ends[s, 1 - across], ends[s, 3 - across]
         slope = (ends[s, 2 + across] - ends[s, across]) / (b - a)
         for line in range(crossing[k, 1], crossing[k, 2]):
-            place = ends[s, across] + (first + line * spacing - a) * slope
-            i = used[line]
-            used[line] += 1
-            while i > starts[line] and places[i - 1] > place:
-                places[i], owners[i] = places[i - 1], owners[i - 1]
-                i -= 1
-            places[i], owners[i] = place, s
+            at[n] = ends[s, across] + (first + line * spacing - a) * slope
+            found[n, 0], found[n, 1] = line, s
+            low, high, n = min(low, at[n]), max(high, at[n]), n + 1
+    # About in order of their places first: then few are exchanged on the lines.
+    buckets, fine = np.zeros(_BUCKETS + 2, dtype=np.int64), _BUCKETS / max(high - low, 1e-9)
+    for k in range(n):
+        found[k, 2] = min(max(int((at[k] - low) * fine), 0), _BUCKETS)
+        buckets[found[k, 2] + 1] += 1
+    for k in range(_BUCKETS + 1):
+        buckets[k + 1] += buckets[k]
+    order = np.empty(n, dtype=np.int64)
+    for k in range(n):
+        order[buckets[found[k, 2]]] = k
+        buckets[found[k, 2]] += 1
+    places, owners = np.empty(n), np.empty(n, dtype=np.int64)
+    used = starts[:-1].copy()
+    for index in order:
+        line, s, place = found[index, 0], found[index, 1], at[index]
+        i = used[line]
+        used[line] += 1
+        while i > starts[line] and places[i - 1] > place:
+            places[i], owners[i] = places[i - 1], owners[i - 1]
+            i -= 1
+        places[i], owners[i] = place, s
     return starts, places, owners
 
 

@@ -42,6 +42,8 @@ OFFSETS = 12
 
 # Blocks of pixels on either side of the contour: beyond the last offset there are four more.
 _BLOCKS = 9
+# Of a block so many pixels are looked at: its others say the same, and each is far off in memory.
+_PIXELS = 4
 # So many blocks go across the thinnest part at least, where they are coarser than a pixel.
 _BLOCKS_ACROSS = 6.0
 # A block's colours are believed to be on the right side with this much above one half, at most.
@@ -134,10 +136,12 @@ def _find_edge(
     blocks, on, beside = scratch[0], scratch[1], scratch[2]
     # Of a thin part coarse blocks would see little, and too much of what is beyond.
     step = max(1, min(step, int(clearance[0] / _BLOCKS_ACROSS)))
+    pixels = min(step, _PIXELS)
+    apart = step / pixels
     for k in range(-_BLOCKS, _BLOCKS + 1):
         odds = 1.0
-        for pixel in range(step):
-            r = k * step + pixel - 0.5 * (step - 1)
+        for pixel in range(pixels):
+            r = k * step + apart * (pixel + 0.5) - 0.5 * step
             colour = _colour(picture, uv[0] + r * normal[0], uv[1] + r * normal[1])
             if colour >= 0:
                 odds *= histograms[ODDS, colour]

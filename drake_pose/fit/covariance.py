@@ -224,8 +224,7 @@ def _known_directions(
     for c, one in enumerate(pictures):
         A = symmetric(one.A)
         seen = np.flatnonzero(np.einsum("nii->n", A) > 0.0)
-        D = np.array([surface_deformations(outlines[n], one.X_WN[n]) for n in seen.tolist()])
-        D = mean_size * D.reshape(-1, 12, 12)
+        D = mean_size * surface_deformations([outlines[n] for n in seen.tolist()], one.X_WN[seen])
         shares, turns = np.linalg.eigh(np.swapaxes(D, 1, 2) @ A[seen] @ D)
         k, j = np.nonzero(shares >= _LEAST_INFORMATION)
         known, turned = shares[k, j], turns[k, :, j]
@@ -251,17 +250,17 @@ def _views(outlines: Sequence[Outline], pictures: Sequence[Picture]) -> NDArray[
     return found
 
 
-def surface_deformations(outline: Outline, X_WN: Array) -> Array:
-    """(12, 12) affine motions, in columns, that each move a part's surface by about one metre."""
-    R = X_WN[:3, :3]
-    middle = outline.moments[3, :3]
-    squares = np.diag(outline.moments)[:3] - middle**2
+def surface_deformations(outlines: Sequence[Outline], X_WN: Array) -> Array:
+    """(n, 12, 12) affine motions, in columns, that move each part's surface by about one metre."""
+    R, moments = X_WN[:, :3, :3], np.array([one.moments for one in outlines]).reshape(-1, 4, 4)
+    middles = moments[:, 3, :3]
+    squares = np.diagonal(moments, axis1=1, axis2=2)[:, :3] - middles**2
     sizes = np.sqrt(np.maximum(squares, 1e-6))
-    stretches = np.einsum("xi,yj->ijxy", R, R / sizes)
-    shifts = -stretches @ (X_WN[:3, 3] + R @ middle)
-    K = np.zeros((12, 12))
-    K[[3, 7, 11], :3] = R
-    K[:, 3:] = np.concatenate([stretches, shifts[..., None]], axis=3).reshape(9, 12).T
+    stretches = np.einsum("nxi,nyj->nijxy", R, R / sizes[:, None])
+    shifts = -(stretches @ (X_WN[:, :3, 3:] + R @ middles[..., None])[:, None, None])
+    K = np.zeros((len(R), 12, 12))
+    K[:, [3, 7, 11], :3] = R
+    K[:, :, 3:] = np.swapaxes(np.concatenate([stretches, shifts], axis=4).reshape(-1, 9, 12), 1, 2)
     return K
 
 
@@ -270,11 +269,9 @@ def with_widths(outlines: Sequence[Outline], pictures: Sequence[Picture]) -> lis
     found = []
     for k, one in enumerate(pictures):
         wider = np.zeros((len(outlines), len(pictures), 12))
-        for n, (outline, X_WN) in enumerate(zip(outlines, one.X_WN, strict=True)):
-            if len(outline.vertices):
-                # The part's surface is about a metre wider on all sides.
-                by = surface_deformations(outline, X_WN)[:, [3, 7, 11]].sum(axis=1)
-                wider[n, k] = by * one.size
+        # A part's surface is about a metre wider on all sides; one without any is nowhere.
+        by = surface_deformations(outlines, one.X_WN)[:, :, [3, 7, 11]].sum(axis=2)
+        wider[:, k] = by * one.size * [[len(outline.vertices) > 0] for outline in outlines]
         found.append(one._replace(moves=np.concatenate([one.moves, wider], axis=1)))
     return found
 

@@ -30,7 +30,7 @@ REACH = 4.0
 # Contours correspond only where their normals point alike: at least this cosine.
 _ALIKE = 0.3
 # Points are looked for in squares: so many across the reach, or at most so many in a row.
-_SQUARES_IN_REACH, _MOST_SQUARES = 3.0, 64.0
+_SQUARES_IN_REACH, _MOST_SQUARES = 8.0, 64.0
 
 COMPARED, FITTING, CLOSE, COST, SQUARES, WEIGHT = range(6)
 """The columns of compare_contours' sums."""
@@ -61,11 +61,12 @@ def nearest_alike(
         left, right = min(left, other_uv[j, 0]), max(right, other_uv[j, 0])
         top, bottom = min(top, other_uv[j, 1]), max(bottom, other_uv[j, 1])
     side = max(reach / _SQUARES_IN_REACH, max(right - left, bottom - top) / _MOST_SQUARES)
-    columns, rows = int((right - left) / side) + 1, int((bottom - top) / side) + 1
+    share = 1.0 / side
+    columns, rows = int((right - left) * share) + 1, int((bottom - top) * share) + 1
     squares = np.empty(len(other_uv), dtype=np.int64)
     starts = np.zeros(rows * columns + 2, dtype=np.int64)
     for j in range(len(other_uv)):
-        row, column = int((other_uv[j, 1] - top) / side), int((other_uv[j, 0] - left) / side)
+        row, column = int((other_uv[j, 1] - top) * share), int((other_uv[j, 0] - left) * share)
         squares[j] = row * columns + column
         starts[squares[j] + 1] += 1
     for square in range(rows * columns + 1):
@@ -78,21 +79,25 @@ def nearest_alike(
         order[k], sorted_others[k, 0], sorted_others[k, 1] = j, other_uv[j, 0], other_uv[j, 1]
         sorted_others[k, 2], sorted_others[k, 3] = others[j, 0], others[j, 1]
     for i in range(len(uv)):
-        best, x, y = reach * reach, uv[i, 0], uv[i, 1]
-        row, column = math.floor((y - top) / side), math.floor((x - left) / side)
-        for ring in (1, math.ceil(reach / side)):
+        best, x, y, nearest = reach * reach, uv[i, 0], uv[i, 1], -1
+        row, column = math.floor((y - top) * share), math.floor((x - left) * share)
+        for ring in (1, 2, 4, math.ceil(reach * share)):
             first, end = max(column - ring, 0), min(column + ring + 1, columns)
             for v in range(max(row - ring, 0), min(row + ring + 1, rows) if first < end else 0):
                 for k in range(starts[v * columns + first + 1], starts[v * columns + end + 1]):
                     du, dv = sorted_others[k, 0] - x, sorted_others[k, 1] - y
                     square = du * du + dv * dv
-                    if square < best:
-                        alike = normals[i, 0] * sorted_others[k, 2]
-                        if alike + normals[i, 1] * sorted_others[k, 3] >= _ALIKE:
-                            best, found[i] = square, order[k]
-            # All that is nearer than a square is wide was looked at.
-            if best <= side * side:
+                    alike = (
+                        normals[i, 0] * sorted_others[k, 2] + normals[i, 1] * sorted_others[k, 3]
+                    )
+                    # No branch, which the processor would guess wrong.
+                    is_nearer = (square < best) & (alike >= _ALIKE)
+                    best, nearest = (square, k) if is_nearer else (best, nearest)
+            # All that is nearer than so many squares are wide was looked at.
+            if best <= (ring * side) ** 2:
                 break
+        if nearest >= 0:
+            found[i] = order[nearest]
     return found
 
 

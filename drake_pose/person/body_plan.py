@@ -54,6 +54,11 @@ class PlannedLimb:
     weights: Array
     length: float
 
+    def places(self, X_WT: Array) -> Array:
+        """(n, m, 3) its points in the world [m] where the trunk is at X_WT (4, 4)."""
+        placed = self.samples_T.reshape(-1, 3) @ X_WT[:3, :3].T + X_WT[:3, 3]
+        return np.asarray(placed.reshape(self.samples_T.shape))
+
 
 class BodyPlan:
     """A person's limbs and trunk in a pose tree.
@@ -98,8 +103,8 @@ class BodyPlan:
     def _plan(self, root: str, middle: str, end: str) -> PlannedLimb:
         from scipy.stats import qmc  # Slow to import, and needed for persons alone.
 
-        kinematics = self.kinematics
-        rest = kinematics.flatten(kinematics.tree.default_values())
+        kinematics, tree = self.kinematics, self.kinematics.tree
+        rest = kinematics.flatten(tree.default_values())
         moves = kinematics.motions(rest).moves
         own = moves[self._node(end)] & ~moves[self._node("neck")]
         free = kinematics.is_angle & (kinematics.upper > kinematics.lower)
@@ -116,10 +121,14 @@ class BodyPlan:
         joints = np.array([self.landmarks.names.index(name) for name in (root, middle, end)])
         posed = np.tile(rest, (_POSES, 1))
         posed[:, values] = poses
-        X_WN = kinematics.tree.node_poses_batch([own.T for own in kinematics.split(posed.T)])
-        samples_W = self._samples(joints, X_WN)
-        R_WT, p_WT = X_WN[:, self.trunk, :3, :3], X_WN[:, self.trunk, :3, 3]
-        samples_T = np.einsum("nji,nmj->nmi", R_WT, samples_W - p_WT[:, None])
+        each = [own.T for own in kinematics.split(posed.T)]
+        X_WN = np.tile(tree.node_poses(kinematics.split(rest)), (_POSES, 1, 1, 1))
+        for node in nodes.tolist():
+            X_PN = tree.relative_transforms(node, each[tree.source(node)])
+            X_WN[:, node] = X_WN[:, tree.nodes[node].parent] @ X_PN
+        X_WT = X_WN[0, self.trunk]
+        samples_W = self._samples(joints, X_WN).reshape(-1, 3)
+        samples_T = ((samples_W - X_WT[:3, 3]) @ X_WT[:3, :3]).reshape(_POSES, -1, 3)
         a, b, c = self.landmarks.positions(X_WN[0])[joints]
         length = float(np.linalg.norm(b - a) + np.linalg.norm(c - b))
         weights = crowding(samples_T)
@@ -140,6 +149,6 @@ class BodyPlan:
 
 def crowding(samples: Array) -> Array:
     """(n, m) weights of points (n, m, 3): one over the points about each, over m."""
-    off = samples[:, :, None] - samples[:, None]
-    near = np.einsum("nabi,nabi->nab", off, off) < _APART**2
+    x, y, z = (own[:, :, None] - own[:, None] for own in np.moveaxis(samples, 2, 0))
+    near = x * x + y * y + z * z < _APART**2
     return np.asarray(1.0 / (near.sum(axis=2) * samples.shape[1]))

@@ -25,7 +25,6 @@ from drake_pose.person.camera_faults import (
 from drake_pose.person.figures import RigFault, find_rig_fault
 from drake_pose.person.person_capture import PersonCapture, capture_person, spread_over
 from drake_pose.person.persons_in_view import PersonRecording, ReadFrame, ViewFaults
-from drake_pose.person.pose_tracker import PersonPoseTracker
 from drake_pose.person.shape import NOISE, shape_values
 from drake_pose.person.views import edge_spacing
 
@@ -140,9 +139,9 @@ class _Judge(CameraJudge):
         held, noise = shape_values(tree), None if captured.shape is None else NOISE
         super().__init__(ContourFit(tree, captured.outlines, noise), cameras, held)
         self._recording = recording
-        tracker = PersonPoseTracker(self._fit, held=held)
         found = np.flatnonzero(np.isfinite(captured.q).all(axis=1)).tolist()
-        self._values = {k: tracker.values(captured.q[k]) for k in found}
+        flatten = self._fit.kinematics.flatten
+        self._values = {k: flatten(tree.values_from_positions(captured.q[k])) for k in found}
 
     def find(self) -> CameraFault | None:
         """The camera that contradicts the others in all frames or in the last, and since when."""

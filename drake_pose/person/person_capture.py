@@ -154,8 +154,8 @@ class _Capture:
         looks = [self._see(k) for k in poses]
         views = [(one.cameras, [view.edge for view in one.views]) for one in looks]
         shape = fit_shape(fit, views, np.array(list(poses.values())))
-        worn = ContourFit(fit.tree, shape.outlines, NOISE)
-        self.tracker = PersonPoseTracker(worn, LENIENT, is_shape, shape.values)
+        worn, plan = ContourFit(fit.kinematics, shape.outlines, NOISE), self.tracker.plan
+        self.tracker = PersonPoseTracker(worn, LENIENT, is_shape, shape.values, plan)
         states = zip(poses, shape.poses, strict=True)
         return shape, {k: self.tracker.start(pose) for k, pose in states}
 

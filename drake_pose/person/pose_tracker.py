@@ -18,7 +18,14 @@ from numpy.typing import NDArray
 from drake_pose.arrays import Array, Mask
 from drake_pose.fit.camera_sums import AddUp
 from drake_pose.fit.colours import OwnColours
-from drake_pose.fit.contour_fit import Comparison, ContourFit, PoseFit, Prior, pack_views
+from drake_pose.fit.contour_fit import (
+    Comparison,
+    ContourFit,
+    PoseFit,
+    Prior,
+    pack_views,
+    symmetric,
+)
 from drake_pose.fit.covariance import surface_deformations
 from drake_pose.fit.kernel import COMPARED, FITTING, SQUARES, WEIGHT
 from drake_pose.person.body_plan import BodyPlan
@@ -74,7 +81,7 @@ def pose_uncertainty(
     size = len(fit.lower)
     held = np.zeros(size, dtype=np.bool_) if held is None else held
     free = np.flatnonzero(~held)
-    A = np.tril(compared.A) + np.swapaxes(np.tril(compared.A, -1), -1, -2)
+    A = symmetric(compared.A)
     # (nodes, m, 12): what each value does to each node.
     moves = compared.placement.dense(size)
     apriori = _limits_information(fit)
@@ -134,12 +141,7 @@ class _Parts(NamedTuple):
 
 def _parts(fit: ContourFit, compared: Comparison, A: Array) -> _Parts:
     """All parts, each free to shift, turn and stretch; A: (cameras, nodes, 12, 12), symmetric."""
-    K = np.array(
-        [
-            surface_deformations(outline, X_WN)
-            for outline, X_WN in zip(fit.outlines, compared.placement.X_WN, strict=True)
-        ]
-    )
+    K = surface_deformations(fit.outlines, compared.placement.X_WN)
     whole, b = A.sum(axis=0), compared.b.sum(axis=0)
     information, turns = np.linalg.eigh(np.swapaxes(K, 1, 2) @ whole @ K)
     information, K = np.maximum(information, 0.0), K @ turns
@@ -232,6 +234,7 @@ class PersonPoseTracker:
         schedule: EXACT, or LENIENT where the model is only like the person.
         held: (m,) values that stay, such as lengths; None: none.
         rest: (m,) values of a person at rest, with the held ones; None: the tree's.
+        plan: of the same kinematics, where it is made already.
 
     Raises:
         ModelError: the model has no landmarks of trunk, arms and legs.
@@ -244,8 +247,10 @@ class PersonPoseTracker:
         schedule: AnnealingSchedule = EXACT,
         held: Mask | None = None,
         rest: Array | None = None,
+        plan: BodyPlan | None = None,
     ) -> None:
-        self.fit, self.schedule, self.plan = fit, schedule, BodyPlan(fit.kinematics)
+        self.fit, self.schedule = fit, schedule
+        self.plan = plan or BodyPlan(fit.kinematics)
         is_angle = fit.kinematics.is_angle
         self._held = np.zeros(len(is_angle), dtype=np.bool_) if held is None else held
         self._information = np.where(is_angle, _ANGLE_DEVIATION, _LENGTH_DEVIATION) ** -2.0

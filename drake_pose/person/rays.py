@@ -77,15 +77,13 @@ def meeting_points(
 
 def triangulate(cameras: Sequence[Camera], pixels: Sequence[Array]) -> Array:
     """(3,) the point nearest to the rays of one pixel (2,) in each camera [m]; nan has no say."""
-    A, b = np.zeros((3, 3)), np.zeros(3)
-    for camera, uv in zip(cameras, pixels, strict=True):
-        if np.isnan(uv).any():
-            continue
-        origin, direction = viewing_rays(camera, uv[None])
-        across = np.eye(3) - np.outer(direction[0], direction[0])
-        A += across
-        b += across @ origin[0]
-    return np.asarray(np.linalg.lstsq(A, b, rcond=None)[0])
+    seen = [k for k, uv in enumerate(pixels) if not np.isnan(uv).any()]
+    rays = [viewing_rays(cameras[k], pixels[k]) for k in seen]
+    origins, directions = np.array(rays).reshape(-1, 2, 3).transpose(1, 0, 2)
+    # Each ray tells where the point is across it.
+    across = np.eye(3) - directions[:, :, None] * directions[:, None]
+    told = (across @ origins[..., None])[..., 0]
+    return np.asarray(np.linalg.lstsq(across.sum(axis=0), told.sum(axis=0), rcond=None)[0])
 
 
 def sum_at_points(

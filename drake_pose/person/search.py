@@ -220,7 +220,7 @@ class PersonSearch:
         others[limb.nodes] = False
         outlines = [self._fit.outlines[node] for node in np.flatnonzero(others)]
         X_WT = X_WN[self._plan.trunk]
-        places = limb.samples_T @ X_WT[:3, :3].T + X_WT[:3, 3]
+        places = limb.places(X_WT)
         here = self._plan.samples(limb, X_WN)[None]
         scores, now, weights = np.zeros(len(places)), 0.0, crowding(here)
         for camera, region in zip(*frame.small, strict=True):
@@ -270,7 +270,7 @@ class PersonSearch:
     ) -> list[PoseFit]:
         """Fits whose limb was placed where its own colours (nodes, COLOURS) are seen most."""
         X_WT = self._fit.kinematics.poses(values)[self._plan.trunk]
-        places = limb.samples_T @ X_WT[:3, :3].T + X_WT[:3, 3]
+        places = limb.places(X_WT)
         half, scores = len(limb.nodes) // 2, np.zeros(len(places))
         for camera, picture in zip(views.cameras, views.pictures, strict=True):
             colours = colour_numbers(picture)

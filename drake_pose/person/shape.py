@@ -108,7 +108,7 @@ def tracker_of_person(tree: PoseTree, shape: KnownShape | None) -> PersonPoseTra
             raise UnknownNameError("part", part, parts, str(tree.model.path))
     if shape.girths:
         widths = np.array([shape.girths.get(part, 1.0) for part in parts])
-        fit = ContourFit(tree, with_girths(fit.outlines, widths[groups]), NOISE)
+        fit = ContourFit(fit.kinematics, with_girths(fit.outlines, widths[groups]), NOISE)
     return PersonPoseTracker(fit, LENIENT, held, rest)
 
 
@@ -140,7 +140,7 @@ def fit_shape(fit: ContourFit, frames: Frames, poses: Array) -> PersonShape:
         shared_information=_sides_information(names, len(parts)),
     )
     lengths, girths = found.shared[:count], np.exp(found.shared[count:])
-    worn = ContourFit(fit.tree, with_girths(fit.outlines, girths[groups]), fit.noise)
+    worn = ContourFit(fit.kinematics, with_girths(fit.outlines, girths[groups]), fit.noise)
     values = np.zeros(len(is_shape))
     values[is_shape] = poses[:, is_shape] = lengths
     poses[:, ~is_shape] = found.own

@@ -123,13 +123,14 @@ def match_frames(
                         more["camera_scale"] = scaled.pixels_per_metre
             values = tree.values_from_positions(pose.q)
             parts = draw_parts(surfaces.at(values), pose.X_WB @ tree.node_poses(values), cameras)
+        bodies = {name: own >= 0 for name, own in parts.items()}
         # A search that does not say how sure it is knows nothing of any joint.
         nothing = np.full(len(pose.q), np.nan)
         known = record_pose_set(pose.pose_set, search.tree) or {
             "joints": record_deviations(model, pose.q, nothing)
         }
         yield finish_frame(
-            inputs, frame, pose, masks, parts, shown, **more, **known,
+            inputs, frame, pose, masks, parts, bodies, shown, **more, **known,
             first_E_total=pose.first_E_total if pose.found else None,
             runs=pose.statistics.runs, outside_limit=pose.statistics.outside_limit,
             explained=pose.explained,
@@ -150,6 +151,7 @@ def finish_frame(
     pose: PoseEstimate,
     masks: Mapping[str, np.ndarray],
     parts: Mapping[str, np.ndarray],
+    bodies: Mapping[str, np.ndarray],
     shown: Mapping[str, np.ndarray],
     ious: Mapping[str, float] | None = None,
     **more: Any,
@@ -160,6 +162,7 @@ def finish_frame(
         masks: by camera, of those that the pose was found by.
         parts: by camera (H, W), which part of the body is seen, -1 where none is; none where no
             pose was found.
+        bodies: (H, W) where any is.
         shown: the masks and pictures over which the body is drawn.
         ious: how its masks and the body overlap; None: not compared yet.
         more: fields of FrameRecord.
@@ -169,7 +172,6 @@ def finish_frame(
         base = base_cells(pose.X_WB) if inputs.base_moves else None
         row = PoseRow(frame, pose.q, base, pose.E_total, pose.seconds)
     more["stopped_by"] = pose.stopped_by
-    bodies = {name: own >= 0 for name, own in parts.items()}
     if row.found:
         more["joint_errors"] = inputs.joint_errors(frame, pose.q)
         more["ious"] = compare_masks(masks, bodies).ious if ious is None else ious

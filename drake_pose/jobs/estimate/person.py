@@ -201,7 +201,7 @@ def _finish(
         found, q, np.eye(4), (), wrong, area or 1.0, stopped_by=FOLLOWED, seconds=seconds
     )
     return finish_frame(
-        inputs, frame, pose, masks, parts, shown, share=float(captured.shares[index]),
+        inputs, frame, pose, masks, parts, bodies, shown, share=float(captured.shares[index]),
         joints=record_deviations(inputs.model, q, captured.deviations[index]),
         ious=None if agreement is None else agreement.ious,
     )  # fmt: skip

@@ -30,6 +30,8 @@ from drake_pose.silhouette.areas.span_kernel import make_rows
 
 # Slits and overlaps narrower than this [pixel] are rounding where surfaces touch.
 _SLIT = 1e-6
+# Crossings of lines are told apart as finely before they are put in order.
+_BUCKETS = 128
 
 
 class Segments(NamedTuple):
@@ -120,7 +122,9 @@ def find_crossings(
         starts (lines + 1,) of the lines' crossings, their places (n,) [pixel] and segments (n,).
     """
     ends = segments.ends
-    counts = np.zeros(lines + 1, dtype=np.int64)
+    starts = np.zeros(lines + 1, dtype=np.int64)
+    # By how many more edges than the one before it a line is crossed.
+    more = np.zeros(lines + 1, dtype=np.int64)
     # (n, 3) those that cross a line, which most are too short for, and from where to where.
     crossing, count, share = np.empty((ends.shape[0] + 1, 3), dtype=np.int64), 0, 1.0 / spacing
     for s in range(ends.shape[0]):
@@ -130,26 +134,43 @@ def find_crossings(
         # No branch, which the processor would guess wrong.
         crossing[count, 0], crossing[count, 1], crossing[count, 2] = s, begin, after
         count += int(begin < after)
-        for line in range(begin, after):
-            counts[line + 1] += 1
+        more[begin] += 1
+        more[after] -= 1
+    crossed = 0
     for line in range(lines):
-        counts[line + 1] += counts[line]
-    starts = counts
-    places = np.empty(starts[lines])
-    owners = np.empty(starts[lines], dtype=np.int64)
-    used = starts[:-1].copy()
+        crossed += more[line]
+        starts[line + 1] = starts[line] + crossed
+    found, at = np.empty((starts[lines], 3), dtype=np.int64), np.empty(starts[lines])
+    n, low, high = 0, np.inf, -np.inf
     for k in range(count):
         s = crossing[k, 0]
         a, b = ends[s, 1 - across], ends[s, 3 - across]
         slope = (ends[s, 2 + across] - ends[s, across]) / (b - a)
         for line in range(crossing[k, 1], crossing[k, 2]):
-            place = ends[s, across] + (first + line * spacing - a) * slope
-            i = used[line]
-            used[line] += 1
-            while i > starts[line] and places[i - 1] > place:
-                places[i], owners[i] = places[i - 1], owners[i - 1]
-                i -= 1
-            places[i], owners[i] = place, s
+            at[n] = ends[s, across] + (first + line * spacing - a) * slope
+            found[n, 0], found[n, 1] = line, s
+            low, high, n = min(low, at[n]), max(high, at[n]), n + 1
+    # About in order of their places first: then few are exchanged on the lines.
+    buckets, fine = np.zeros(_BUCKETS + 2, dtype=np.int64), _BUCKETS / max(high - low, 1e-9)
+    for k in range(n):
+        found[k, 2] = min(max(int((at[k] - low) * fine), 0), _BUCKETS)
+        buckets[found[k, 2] + 1] += 1
+    for k in range(_BUCKETS + 1):
+        buckets[k + 1] += buckets[k]
+    order = np.empty(n, dtype=np.int64)
+    for k in range(n):
+        order[buckets[found[k, 2]]] = k
+        buckets[found[k, 2]] += 1
+    places, owners = np.empty(n), np.empty(n, dtype=np.int64)
+    used = starts[:-1].copy()
+    for index in order:
+        line, s, place = found[index, 0], found[index, 1], at[index]
+        i = used[line]
+        used[line] += 1
+        while i > starts[line] and places[i - 1] > place:
+            places[i], owners[i] = places[i - 1], owners[i - 1]
+            i -= 1
+        places[i], owners[i] = place, s
     return starts, places, owners
 
 

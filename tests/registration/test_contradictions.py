@@ -217,3 +217,11 @@ def test_masks_of_another_size_and_empty_ones_are_refused(body, poses, cameras) 
     empty = SeenFrame("0000", poses[0], {"left": ~mask})
     with pytest.raises(MaskError, match="no mask shows the body"):
         PerFrameFit(body.kinematics, surfaces, cameras[:1], [empty])
+
+
+@pytest.mark.parametrize(("shift", "word"), [(0.05, "later"), (-0.05, "earlier")])
+def test_a_clock_that_is_off_is_told_in_milliseconds(shift, word):
+    off = Finding("clock", "left", 0.0, shift, 0.0, 0.004, 1.0, 0.0)
+    assert f"camera 'left': its pictures show the joints of 50 +- 4 ms {word} by" in say_off(
+        off, "off"
+    )

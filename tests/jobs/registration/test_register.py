@@ -3,6 +3,7 @@
 import json
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -13,14 +14,14 @@ import yaml
 from drake_pose.body.model import load_model
 from drake_pose.camera.camera_files import load_cameras
 from drake_pose.files.overlay import EXCESS_RGB, MISSING_RGB
-from drake_pose.jobs.registration.register import register_scene, say_common
+from drake_pose.jobs.registration.register import _joint_shifts, register_scene, say_common
 from drake_pose.jobs.registration.settings import RegistrationSettings
 from drake_pose.registration.register import CameraSearch, FrameMisfit, RegisteredCamera
 from drake_pose.silhouette.pictures.scenes import load_scene
 from tests.cli import Result, assert_refused, run_command, run_json, run_to_end
 from tests.jobs.registration.arm_scenes import ArmScene, pose_errors
 from tests.jobs.scenes import TinyScene, write_truth
-from tests.search.arms import arm_cameras
+from tests.search.arms import arm_cameras, arm_tree
 
 
 @pytest.fixture(scope="module")
@@ -178,6 +179,16 @@ def body_poses(path: Path, q: np.ndarray, names: tuple[str, ...]) -> dict[str, n
     plant.SetPositions(context, q)
     bodies = {name: plant.GetBodyByName(name) for name in names}
     return {name: one.EvalPoseInWorld(context).GetAsMatrix4() for name, one in bodies.items()}
+
+
+def test_a_longer_link_carries_the_next_joint_farther_along_it(tmp_path: Path) -> None:
+    """A tenth more of the .35 m between two joints, by the URDF; what is not sure stays."""
+    lengths = [
+        SimpleNamespace(name=name, value=value, significant=sure)
+        for name, value, sure in (("shoulder", 0.1, True), ("elbow", 0.2, False))
+    ]
+    shifts = _joint_shifts(arm_tree(tmp_path), SimpleNamespace(lengths=lengths))
+    assert shifts == {"roll_turn": pytest.approx([0.0, 0.0, 0.035])}
 
 
 @pytest.mark.slow

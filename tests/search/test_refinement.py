@@ -23,10 +23,12 @@ from drake_pose.search.starts.neighbourhood import NeighbourhoodSearch
 from drake_pose.search.starts.part_placement import PartSearch, find_parts, find_reflections
 from drake_pose.silhouette.areas.bending import TreeSurfaces
 from drake_pose.silhouette.areas.scoring import draw_mask
+from tests.search.bodies import forked_body
 
 _X_WC = np.array(
     [[0.0, 0.0, -1.0, 5.0], [1.0, 0.0, 0.0, 0.1], [0.0, -1.0, 0.0, -0.35], [0.0, 0.0, 0.0, 1.0]]
 )
+
 _TURN = np.array([[0.0, -1.0, 0, 0], [1.0, 0.0, 0, 0], [0, 0, 1.0, 0], [0, 0, 0, 1.0]])
 
 
@@ -180,6 +182,13 @@ def test_parts_are_ends_of_limbs_and_nodes_of_the_trunk(body):
         for before, after in zip(part.nodes, part.nodes[1:], strict=False):
             assert nodes[after].parent == before
         assert part.held == tuple(nodes[part.nodes[-1]].children)
+
+
+def test_no_part_reaches_over_a_fork(tmp_path):
+    """A trunk and what is hung on it, which are as short as limbs can be."""
+    tree = forked_body(tmp_path).pose_tree()
+    for part in find_parts(tree):
+        assert all(len(tree.nodes[node].children) == 1 for node in part.nodes[:-1])
 
 
 def middles(body, parameters, part):

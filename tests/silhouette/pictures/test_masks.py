@@ -12,7 +12,12 @@ from pydrake.systems.sensors import ImageLabel16I
 from drake_pose.camera.picture_files import read_picture
 from drake_pose.errors import MaskError
 from drake_pose.silhouette.pictures.label_images import label_image_to_mask, mask_to_label_image
-from drake_pose.silhouette.pictures.masks import read_mask, signed_distances, write_mask
+from drake_pose.silhouette.pictures.masks import (
+    compare_masks,
+    read_mask,
+    signed_distances,
+    write_mask,
+)
 from drake_pose.silhouette.segmentation.mask_pictures import read_mask_picture
 
 MASK = np.zeros((20, 30), dtype=bool)
@@ -153,3 +158,13 @@ def test_importing_the_room_loads_neither_numba_nor_drake():
         [sys.executable, "-c", code], capture_output=True, text=True, check=True
     )
     assert result.stdout.strip() == "[]"
+
+
+def test_masks_agree_by_what_is_wrong_over_all_cameras_silhouettes():
+    """One is right; the other lacks 10 of its 85 pixels."""
+    body = MASK.copy()
+    body[4:9, 3:5] = False
+    found = compare_masks({"a": MASK, "b": MASK}, {"a": MASK, "b": body})
+    assert (found.wrong, found.area) == (10, 170)
+    assert found.E_total == pytest.approx(10 / 170)
+    assert found.ious == {"a": 1.0, "b": pytest.approx(75 / 85)}

@@ -1,5 +1,6 @@
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 
@@ -139,3 +140,17 @@ def test_masks_must_fit_their_camera_however_often_they_are_read(tmp_path):
     write_mask(scene.mask_path("right", "0003"), MASK.T)
     with pytest.raises(MaskError, match=r"right/0003\.png.*20 x 30"):
         scene.read("right", "0003")
+
+
+@pytest.mark.parametrize("width", [30, 31])
+def test_pictures_have_their_cameras_size(tmp_path, width):
+    save_cameras(tmp_path / "cameras.yaml", [camera("left")])
+    folder = tmp_path / "images" / "left"
+    folder.mkdir(parents=True)
+    cv2.imwrite(str(folder / "0001.png"), np.full((20, width, 3), (10, 20, 30), np.uint8))
+    scene = load_scene(tmp_path, sequence=True)
+    if width == 30:
+        np.testing.assert_array_equal(scene.read_image("left", "0001")[7, 8], [30, 20, 10])
+        return
+    with pytest.raises(SceneError, match=r"0001.png: is 31 x 20 pixels, but camera 'left' has 30"):
+        scene.read_image("left", "0001")

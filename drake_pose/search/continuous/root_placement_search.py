@@ -142,21 +142,22 @@ class RootPlacementSearch:
         deadline = math.inf if limit is None else begin + limit
         layers = find_layers(self.body, views, self.scale_unknown, root_position)
         placed: list[_Placed] = []
-        width, runs = math.ceil(_HYPOTHESES / len(layers)), 0
-        begun: list[_Placed] = []
+        width = math.ceil(_HYPOTHESES / len(layers))
+        # How many poses each search of a layer has found.
+        counts: list[int] = []
 
         def search(outside_share: float, layer: Layer) -> list[_Placed]:
-            if begun and time.perf_counter() >= deadline:
+            if any(counts) and time.perf_counter() >= deadline:
                 return []
             found = self._search_layer(layer, width, outside_share)
-            begun.extend(found[:1])
+            counts.append(len(found))
             return found
 
         for outside_share in (_OUTSIDE_SHARE, math.inf):
             if not placed:
                 searched = map_ordered(partial(search, outside_share), layers)
                 placed += itertools.chain.from_iterable(searched)
-                runs += len(self.tree.nodes) * len(layers)
+        runs = len(counts) * len(self.tree.nodes)
         if not placed:
             found = PoseEstimate.nothing(
                 self.tree, stopped_by="end", statistics=SearchStatistics(runs)
@@ -238,8 +239,10 @@ class RootPlacementSearch:
             # One that fits well enough ends it; what is finished beside that one is left out below.
             if min(end.J for end in ends) <= enough:
                 return None
-            ends.append(self._finish(one, moves, deadline))
-            return ends[-1]
+            # Not what is last in the list: another thread may have added its own.
+            end = self._finish(one, moves, deadline)
+            ends.append(end)
+            return end
 
         for end in map_ordered(partial(before, finish), pool[:_FINALISTS]):
             if end is not None and best.J > enough:

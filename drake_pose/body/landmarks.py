@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from drake_pose.arrays import Array, Integers
+from drake_pose.arrays import Array, Indices
 from drake_pose.body.parsed_model import ParsedModel
 from drake_pose.body.tree.link_graph import PlantKinematics, build_link_graph
 from drake_pose.body.tree.pose_tree import PoseTree
@@ -27,7 +27,7 @@ class NodeLandmarks:
     """Landmarks at ``points`` (n, 3) [m] in the frames of a pose tree's ``nodes`` (n,)."""
 
     names: tuple[str, ...]
-    nodes: Integers
+    nodes: Indices
     points: Array
 
     def positions(self, X_WN: Array) -> Array:

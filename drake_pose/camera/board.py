@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_pose.arrays import Array, Integers
+from drake_pose.arrays import Array, Indices
 from drake_pose.camera.models import check_number
 from drake_pose.camera.picture_files import decode_picture, list_pictures, read_picture_file
 from drake_pose.errors import CameraError
@@ -35,7 +35,7 @@ _FEWEST_CORNERS = 8
 class Detection:
     """Which corners of a board (n,), increasing, were found in a picture, and where (n, 2)."""
 
-    corners: Integers
+    corners: Indices
     uv: Array
 
 

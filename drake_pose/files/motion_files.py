@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from pydrake.multibody.tree import PrismaticJoint
 from scipy.spatial.transform import Rotation
 
+from drake_pose.arrays import Array
 from drake_pose.body.landmarks import (
     Landmark,
     landmark_positions,
@@ -32,8 +33,6 @@ from drake_pose.csv_files import csv_text
 from drake_pose.errors import SettingsError
 from drake_pose.files.folder import BVH, JOINT_CENTRES, MOT, TRC, write_file
 from drake_pose.files.records import BASE_COLUMNS, PoseRow, base_cells, base_pose, user_units
-
-Array = NDArray[np.float64]
 
 # Turns the scene's world, z up, into that of the file, y up; nothing is mirrored.
 R_YW = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])

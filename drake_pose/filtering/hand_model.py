@@ -9,16 +9,13 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.multibody.tree import Joint, RevoluteJoint
 
-from drake_pose.arrays import Array
+from drake_pose.arrays import Array, Indices
 from drake_pose.body.model import ArticulatedModel
 from drake_pose.errors import ModelError
 from drake_pose.filtering.couplings import UsualPose, couplings_file, load_usual_pose
 from drake_pose.filtering.state import StateLayout
-
-Indices = NDArray[np.intp]
 
 TURN, BASE, SEGMENT = 0, 1, 2
 """A step along a finger turns what is beyond it, leads to the finger's base, or along a segment."""

@@ -10,10 +10,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from drake_pose.arrays import Array, Mask
+from drake_pose.arrays import Array, Indices, Mask
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.filtering.contour import ContourObservation
 from drake_pose.filtering.contour_tracker import ContourTracker, Track
@@ -29,8 +28,6 @@ from drake_pose.fit.proportions import (
 from drake_pose.fit.surfaces import few_rigid_triangles
 from drake_pose.search.estimates import JointEstimate, PoseFamily, PoseSet, joint_estimates
 from drake_pose.silhouette.areas.bending import TreeSurfaces
-
-Indices = NDArray[np.intp]
 
 # Of a normal distribution, 95 % lie within this many standard deviations.
 _NORMAL_95 = 1.96

@@ -26,13 +26,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from drake_pose.arrays import Array, Floats, Mask, Picture
 from drake_pose.fit.background_kernel import PixelSums
 from drake_pose.fit.colour_lines import COLOURS, ODDS
-
-Array = NDArray[np.float64]
-Floats = NDArray[np.float32]
-Picture = NDArray[np.uint8]
-Mask = NDArray[np.bool_]
 
 _BACKGROUNDS = 3
 # Shares of what looks like its background where that shows, and where the body does.

@@ -11,12 +11,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from drake_pose.arrays import Array, Floats
 from drake_pose.compiled import compiled
 from drake_pose.silhouette.areas.outline import PackedOutlines
 from drake_pose.silhouette.areas.span_kernel import fill_rows, find_spans, make_rows
-
-Array = NDArray[np.float64]
-Floats = NDArray[np.float32]
 
 # What pixels that the body covers in all frames count: of their background nothing is known.
 _ALWAYS_COVERED = 0.3

@@ -12,15 +12,13 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from drake_pose.arrays import Array
 from drake_pose.fit.evidence import EdgePoints, Evidence, pack_evidence
 from drake_pose.fit.kernel import compare_contours
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.fit.parameters import Placement
 from drake_pose.silhouette.areas.outline import PackedOutlines
-
-Array = NDArray[np.float64]
 
 # Cameras and nodes of a request.
 _HEADER = struct.Struct("<2q")

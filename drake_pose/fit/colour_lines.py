@@ -21,15 +21,13 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from drake_pose.arrays import Array, Mask, Picture
 from drake_pose.compiled import compiled
 from drake_pose.fit.kernel import add_pull, add_pulls, count_distance, seen_from
 from drake_pose.silhouette.areas.outline import PackedOutlines
 from drake_pose.silhouette.contours.contour_points import sample_contour
 
-Array = NDArray[np.float64]
 Histograms = NDArray[np.float32]
-Picture = NDArray[np.uint8]
-Mask = NDArray[np.bool_]
 
 COLOURS = 4096
 """Colours that are told apart: 16 steps of red, green and blue."""

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from drake_pose.arrays import Array, Picture
 from drake_pose.camera.models import Camera
 from drake_pose.errors import SettingsError
 from drake_pose.fit.colour_lines import COLOURS, ODDS, ON, compare_lines, learn_colours
@@ -22,11 +23,9 @@ from drake_pose.fit.parameters import Placement
 from drake_pose.silhouette.areas.outline import Outline
 from drake_pose.silhouette.areas.scoring import draw_labels
 
-Array = NDArray[np.float64]
 Histograms = NDArray[np.float32]
 """(cameras, nodes, 3, COLOURS) what is known of a body's colours in each camera's pictures."""
 
-Picture = NDArray[np.uint8]
 
 NO_REGION = np.zeros((0, 0), dtype=np.bool_)
 """Where nobody knows where the body is seen: as `learn_colours` takes it."""

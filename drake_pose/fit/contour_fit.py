@@ -12,8 +12,8 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from drake_pose.arrays import Array, Mask
 from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.camera.models import Camera
@@ -35,9 +35,6 @@ from drake_pose.fit.parameters import BodyParameters, Placement
 from drake_pose.fit.surfaces import VERY_FEW, few_triangles
 from drake_pose.silhouette.areas.bending import TreeSurfaces
 from drake_pose.silhouette.areas.outline import Outline
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 # Finer than this [pixel] silhouettes cannot tell.
 FINEST_SCALE, FINEST_SPACING = 1.5, 1.0

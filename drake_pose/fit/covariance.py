@@ -25,14 +25,13 @@ from numpy.typing import NDArray
 from scipy.linalg.lapack import dpotri
 from threadpoolctl import ThreadpoolController
 
+from drake_pose.arrays import Array
 from drake_pose.fit.contour_fit import (
     Comparison,
     pixels_per_metre,
     symmetric,
 )
 from drake_pose.silhouette.areas.outline import Outline
-
-Array = NDArray[np.float64]
 
 # Of some hundred rows BLAS's threads wait for each other: it is ten times as slow with two.
 _on_one_thread = ThreadpoolController().wrap(limits=1, user_api="blas")

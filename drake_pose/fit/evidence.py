@@ -9,10 +9,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from drake_pose.arrays import Array, Mask
 from drake_pose.compiled import compiled
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 # A chord over so many pixels to both sides gives the edge's direction.
 _CHORD = 3

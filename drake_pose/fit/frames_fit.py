@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
+from drake_pose.arrays import Array
 from drake_pose.camera.models import Camera
 from drake_pose.errors import SettingsError
 from drake_pose.fit.background import odds_of_colours
@@ -41,9 +41,6 @@ from drake_pose.fit.parameters import (
 )
 from drake_pose.fit.unknowns import Unknowns
 from drake_pose.workers import map_ordered
-
-Array = NDArray[np.float64]
-
 
 WIDTH = "width"
 """By how much a silhouette is too wide on all sides [pixel]: a parameter of each camera."""

@@ -14,15 +14,12 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from drake_pose.arrays import Array, Indices
 from drake_pose.compiled import compiled, multiply
 from drake_pose.fit.evidence import Evidence
 from drake_pose.silhouette.areas.outline import PackedOutlines
 from drake_pose.silhouette.contours.contour_points import sample_contour
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
 
 REACH = 4.0
 """Distances beyond this many scales do not correspond."""

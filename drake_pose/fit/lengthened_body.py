@@ -9,16 +9,14 @@ from __future__ import annotations
 from collections.abc import Collection, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from drake_pose.arrays import Array
 from drake_pose.body.model import OBJECT_POSITIONS
 from drake_pose.body.tree.link_graph import chain_transforms
 from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.body.tree.tree_kinematics import JointOffset, TreeKinematics, joint_offsets
 from drake_pose.fit.parameters import BodyParameters, Placement, affine_motions, owners_of
 from drake_pose.silhouette.areas.outline import Outline
-
-Array = NDArray[np.float64]
 
 
 class LengthenedBody(BodyParameters):

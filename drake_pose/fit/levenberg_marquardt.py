@@ -18,10 +18,9 @@ from numpy.typing import NDArray
 from scipy.sparse import block_diag, csc_array, csr_array, diags_array
 from scipy.sparse.linalg import splu
 
+from drake_pose.arrays import Array
 from drake_pose.compiled import compiled
 from drake_pose.errors import SettingsError
-
-Array = NDArray[np.float64]
 
 _LEAST_DAMPING, _MOST_DAMPING = 1e-4, 1e2
 # A scale begins with no more than this.

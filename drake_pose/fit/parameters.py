@@ -13,14 +13,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from drake_pose.arrays import Array, Indices
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.camera.models import Camera
 from drake_pose.compiled import compiled
 from drake_pose.silhouette.areas.bending import PackedSurfaces, TreeSurfaces
 from drake_pose.silhouette.areas.outline import Outline, PackedOutlines, pack
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
 
 ROOT_NAMES = ("root_shift_x", "root_shift_y", "root_shift_z", "log_growth")
 """The shift of the first root along the world's axes [m], and the logarithm of the growth of it and

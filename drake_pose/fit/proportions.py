@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array, diags_array, eye_array, kron, vstack
 
+from drake_pose.arrays import Array, Indices
 from drake_pose.body.model import ArticulatedModel
 from drake_pose.body.tree.tree_kinematics import Motions, TreeKinematics, joint_offsets
 from drake_pose.camera.models import Camera
@@ -36,9 +37,6 @@ from drake_pose.fit.parameters import (
 from drake_pose.fit.unknowns import Unknowns, choose, join
 from drake_pose.silhouette.areas.bending import TreeSurfaces
 from drake_pose.silhouette.areas.outline import PackedOutlines
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
 
 LENGTH_PREFIX, WIDTH_PREFIX, PLACE_PREFIX = "log_length_", "log_width_", "joint_place_"
 """Begin the names of the logarithms of how much longer a part is, and of how much wider a part or

@@ -17,6 +17,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from drake_pose.arrays import Array, Mask
 from drake_pose.compiled import compiled
 from drake_pose.fit.kernel import add_pull, add_pulls, seen_from
 from drake_pose.silhouette.areas.outline import PackedOutlines
@@ -25,9 +26,6 @@ from drake_pose.silhouette.contours.contour_points import (
     find_line_spans,
     find_segments,
 )
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 _FAR = 1e9
 # What distances within the slack weigh: enough to choose among the poses that all bounds allow.

@@ -13,11 +13,10 @@ import trimesh
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from drake_pose.arrays import Array
 from drake_pose.body.surfaces.meshes import TriangleMesh
 from drake_pose.silhouette.areas.bending import TreeSurfaces
 from drake_pose.silhouette.areas.outline import Outline, outline_from_mesh
-
-Array = NDArray[np.float64]
 
 MANY, FEW, ROUGH, VERY_FEW = 2500, 400, 160, 80
 """Triangles a node: where a pixel counts, for a still, for its first rounds, and for a person in

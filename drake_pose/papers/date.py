@@ -7,9 +7,9 @@ from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from rich.table import Table
 
+from drake_pose.arrays import Array, Picture
 from drake_pose.body.landmarks import landmarks_of_nodes, load_landmarks
 from drake_pose.body.model import ArticulatedModel
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
@@ -25,9 +25,6 @@ from drake_pose.papers.tables import Count, figure_table, require_choice, uncoun
 from drake_pose.person.date.skeleton import LIMBS
 from drake_pose.person.date.walking import REGISTERED, UPRIGHT, Motion, make_motion
 from drake_pose.systems.colour_images import picture_to_colour_image
-
-Array = NDArray[np.float64]
-Picture = NDArray[np.uint8]
 
 METHODS = ("silhouette", "stages", "paper")
 SHOWN_CAMERA = "camera_0"

@@ -10,12 +10,12 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.common.value import AbstractValue
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context
 from pydrake.systems.sensors import ImageRgba8U
 
+from drake_pose.arrays import Array, Picture
 from drake_pose.body.formats.packages import bundled_model
 from drake_pose.body.model import ArticulatedModel, load_model
 from drake_pose.camera.models import FACE_CAMERA, Camera, PinholeCamera, circle_of_cameras
@@ -42,8 +42,6 @@ from drake_pose.systems.person.live_capture import SilhouetteCapture, build_silh
 from drake_pose.systems.pictures.camera_rig import CameraRig, build_camera_rig
 from drake_pose.systems.ports import StagedDiagram
 
-Array = NDArray[np.float64]
-Picture = NDArray[np.uint8]
 Images = Mapping[str, ImageRgba8U]
 
 # Of every pixel [grey levels].

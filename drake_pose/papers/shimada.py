@@ -10,10 +10,10 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple, cast
 
 import numpy as np
-from numpy.typing import NDArray
 from rich.table import Table
 from scipy.special import chdtri
 
+from drake_pose.arrays import Array
 from drake_pose.body.formats.packages import bundled_model
 from drake_pose.body.model import ArticulatedModel, load_model
 from drake_pose.camera.models import PinholeCamera
@@ -46,8 +46,6 @@ from drake_pose.papers.shimada_sequences import Track, follow_pictures, track_of
 from drake_pose.papers.tables import Count, figure_table, require_choice, require_counts, uncounted
 from drake_pose.systems.bodies import held_positions
 from drake_pose.systems.estimators.hand_tracking import build_hand_estimation
-
-Array = NDArray[np.float64]
 
 CASES = {"r13_35": 35.0, "r13_40": 40.0}
 """The two true lengths of finger 1's last segment [pixel at scale 1, mm]."""

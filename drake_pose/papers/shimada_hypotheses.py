@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.table import Table
 
+from drake_pose.arrays import Array
 from drake_pose.filtering.inequalities import Inequalities
 from drake_pose.filtering.truncated_filter import FilterState
 from drake_pose.papers.shimada import (
@@ -19,8 +20,6 @@ from drake_pose.papers.shimada import (
 )
 from drake_pose.papers.shimada_motion import OBSERVED, SyntheticSequence, make_sequence
 from drake_pose.papers.tables import Count, figure_table, require_choice, require_counts, uncounted
-
-Array = NDArray[np.float64]
 
 OBLIQUENESS = math.radians(60)
 """How far the fingers point out of the image plane, so that segments bend back through it."""

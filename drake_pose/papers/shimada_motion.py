@@ -4,8 +4,8 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from drake_pose.arrays import Array
 from drake_pose.filtering.hand import (
     FLEXIONS,
     HAND_STATE,
@@ -16,8 +16,6 @@ from drake_pose.filtering.hand import (
 )
 from drake_pose.filtering.hand_model import PALM, QUATERNION, WRIST
 from drake_pose.filtering.state import Belief
-
-Array = NDArray[np.float64]
 
 FRAMES = 55
 # What is hidden, by what is observed.

@@ -7,6 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from drake_pose.arrays import Array
 from drake_pose.filtering.hand import (
     FLEXIONS,
     HAND_STATE,
@@ -19,8 +20,6 @@ from drake_pose.papers.shimada_hypotheses import HypothesesResult
 from drake_pose.papers.shimada_motion import FRAMES
 from drake_pose.papers.shimada_sequences import SequenceResult, Track
 from drake_pose.papers.tables import save_figure
-
-Array = NDArray[np.float64]
 
 _OBSERVATION = HandObservation(pixels_per_metre=PIXELS_PER_METRE)
 _SHOWN_FRAMES = (1, 8, 16, 32, 40, 55)

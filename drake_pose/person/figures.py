@@ -13,7 +13,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from drake_pose.arrays import Array, Integers, Mask, Picture
+from drake_pose.arrays import Array, Indices, Mask, Picture
 from drake_pose.camera.models import Camera
 from drake_pose.fit import contour_fit
 from drake_pose.person.rays import meeting_points, triangulate, viewing_rays
@@ -102,7 +102,7 @@ class _Raster(NamedTuple):
         shape = int(np.ceil(camera.height / pixels)), int(np.ceil(camera.width / pixels))
         return _Raster(camera, shape, pixels)
 
-    def cells(self, points: Array) -> Integers:
+    def cells(self, points: Array) -> Indices:
         """In which cell (n,) each point is seen, row after row; -1: in none."""
         uv, depth = self.camera.project(points)
         with np.errstate(invalid="ignore"):
@@ -126,7 +126,7 @@ class _Hulls:
 
     def __init__(self, cameras: Mapping[str, Camera]) -> None:
         self._cameras = cameras
-        self._first: dict[tuple[str, tuple[int, ...]], Integers] = {}
+        self._first: dict[tuple[str, tuple[int, ...]], Indices] = {}
 
     def filled(self, frames: Sequence[Mapping[str, Mask]], guess: RigFault) -> dict[str, float]:
         """What share of the silhouettes the hull can fill, by camera, if a guess is undone."""
@@ -142,7 +142,7 @@ class _Hulls:
             touched = [one.touched(mask) for one, mask in zip(rasters, masks.values(), strict=True)]
             # What touched cells and those beside them allow, and all that is not seen. Each camera
             # looks at what the ones before it left, which soon is little.
-            cells: list[Integers] = []
+            cells: list[Indices] = []
             for raster, own in zip(rasters, touched, strict=True):
                 key = raster.camera.name, cell
                 known = None if cells else self._first.get(key)
@@ -324,7 +324,7 @@ def _support(
     figures: Sequence[Sequence[Figure]],
     free: Sequence[set[int]],
     places: Array,
-) -> tuple[Array, Integers]:
+) -> tuple[Array, Indices]:
     """What speaks (n,) for somebody at places (n, 3), and by camera (n, m) the figure, or -1."""
     scores = np.zeros(len(places))
     taken = np.full((len(places), len(cameras)), -1)

@@ -11,8 +11,8 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from drake_pose.arrays import Array, Mask
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.fit.contour_fit import Noise
@@ -29,9 +29,6 @@ from drake_pose.registration.shared_fit import (
     pose_covariance,
 )
 from drake_pose.silhouette.areas.outline import Outline
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 _FIRST = (AnnealingStage(0.08, 0.02), AnnealingStage(0.06, 0.02, 3))
 # Then as fine as the model is like the body: the finest at which so much of the contours fits.

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import chdtrc, fdtrc, fdtri
 
-from drake_pose.arrays import Array, Integers, Mask
+from drake_pose.arrays import Array, Indices, Mask
 from drake_pose.fit.covariance import (
     Distances,
     ErrorSizes,
@@ -303,7 +303,7 @@ class _Auditor:
         common, center, noticed_from = self._common_findings(kept) if kept.any() else ((), None, {})
         return Audit(frames, common, sizes, center, noticed_from)
 
-    def _pooled_sizes(self, which: Integers, together: int) -> ErrorSizes:
+    def _pooled_sizes(self, which: Indices, together: int) -> ErrorSizes:
         """How large errors are, by groups of some frames, spread over all of them."""
         if not len(which):
             return _UNKNOWN_SIZES

@@ -13,9 +13,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import stdtr, stdtrit
 
+from drake_pose.arrays import Array, Mask
 from drake_pose.body.model import OBJECT_POSITIONS
 from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.camera.models import PinholeCamera
@@ -30,9 +30,6 @@ from drake_pose.registration.shared_fit import (
     Shared,
     SharedFit,
 )
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 # So many standard deviations to either side it is looked whether the cost bends as it should.
 _ASIDE = 2.0

@@ -14,9 +14,9 @@ from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from drake_pose.arrays import Array
 from drake_pose.body.model import OBJECT_POSITIONS
 from drake_pose.body.tree.link_graph import inverse_transforms
 from drake_pose.camera.models import PinholeCamera
@@ -40,7 +40,6 @@ from drake_pose.registration.shared_fit import ROUNDS_WITH_CONSTANTS, Shared, Sh
 from drake_pose.registration.standing_object import StandingObject, require_turns, turns_between
 from drake_pose.registration.start_poses import E_total, apart_from_before, areas
 
-Array = NDArray[np.float64]
 Look = Array
 """(2, 4, 4): the camera's pose X_LC in the hand's frame, and the object's, X_WT."""
 

@@ -15,17 +15,15 @@ from enum import IntEnum
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.special import fdtri
 
+from drake_pose.arrays import Array
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import RegistrationError, SettingsError
 from drake_pose.registration.posed_frames import PosedFrame, PosedFrames, placed_points
 from drake_pose.registration.register import CameraSearch, RegisteredCamera, RegistrationBody
 from drake_pose.registration.start_poses import E_total, areas
-
-Array = NDArray[np.float64]
 
 # A frame contradicts of which less than this share fits of what usually fits.
 _CONTRADICTS = 0.7

@@ -10,8 +10,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from drake_pose.arrays import Array
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.camera.models import Camera
 from drake_pose.fit.contour_fit import Comparison, Noise, inlier_ratio_of
@@ -25,8 +25,6 @@ from drake_pose.fit.unknowns import choose
 from drake_pose.registration.posed_frames import SeenFrame, common_size, middle_of
 from drake_pose.registration.shared_fit import TOLD_APART
 from drake_pose.silhouette.areas.outline import Outline
-
-Array = NDArray[np.float64]
 
 _ROUNDS = tuple(
     AnnealingStage(scale, 0.02) for scale in (0.12, 0.09, 0.07, 0.05, 0.04, 0.03, 0.025)

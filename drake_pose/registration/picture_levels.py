@@ -8,9 +8,9 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import minimize
 
+from drake_pose.arrays import Array, Picture
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.fit.background import Backgrounds
 from drake_pose.fit.background_kernel import CONTOUR, GAIN, OUTLINE, explain
@@ -18,9 +18,6 @@ from drake_pose.registration.posed_frames import placed_points
 from drake_pose.registration.start_poses import spread_rotations
 from drake_pose.silhouette.areas.outline import Outline, pack
 from drake_pose.workers import map_ordered
-
-Array = NDArray[np.float64]
-Picture = NDArray[np.uint8]
 
 CONTOURS = 4.0
 """What contours' edges count beside the share that is explained."""

@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from drake_pose.arrays import Array, Picture
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import RegistrationError
 from drake_pose.fit.background_kernel import GAIN
@@ -31,9 +32,6 @@ from drake_pose.registration.picture_search import (
 from drake_pose.registration.posed_frames import PosedFrame
 from drake_pose.registration.register import RegisteredCamera, RegistrationBody, frame_misfits
 from drake_pose.workers import map_ordered
-
-Array = NDArray[np.float64]
-Picture = NDArray[np.uint8]
 
 # Rates are told by positions so much before and after [s].
 _RATE_STEP = 0.05

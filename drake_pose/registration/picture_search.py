@@ -15,8 +15,8 @@ from functools import cached_property, partial
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from drake_pose.arrays import Array, Mask, Picture
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.fit.background import KnownBackground, Light, mask_of_odds, odds_picture
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
@@ -29,10 +29,6 @@ from drake_pose.registration.shared_fit import Shared, SharedFit
 from drake_pose.silhouette.areas.outline import NOTHING, Outline
 from drake_pose.silhouette.areas.scoring import draw_mask
 from drake_pose.workers import map_ordered
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
-Picture = NDArray[np.uint8]
 
 SEARCHED = 12
 """So many pictures carry a search."""

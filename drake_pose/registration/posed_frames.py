@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 
+from drake_pose.arrays import Array, Mask
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.camera.models import Camera, PinholeCamera
 from drake_pose.errors import MaskError
@@ -26,9 +27,6 @@ from drake_pose.fit.evidence import (
 from drake_pose.fit.parameters import BodyParameters
 from drake_pose.silhouette.areas.outline import Outline
 from drake_pose.silhouette.areas.scoring import prefix_sums
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 LAST_SPACING = 1.0 / 300.0
 # Where bodies are is told from about so many frames.

@@ -17,6 +17,7 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
+from drake_pose.arrays import Array
 from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.camera.models import PinholeCamera
@@ -43,9 +44,6 @@ from drake_pose.silhouette.areas.bending import TreeSurfaces
 from drake_pose.silhouette.areas.outline import NOTHING, Outline
 from drake_pose.silhouette.areas.scoring import draw_mask
 from drake_pose.workers import map_ordered
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 COARSE = tuple(AnnealingStage(s, 0.05) for s in (0.25, 0.2, 0.15, 0.12, 0.09, 0.07, 0.05, 0.04))
 FINE = (

@@ -18,8 +18,8 @@ from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from drake_pose.arrays import Array, Mask
 from drake_pose.body.model import OBJECT_POSITIONS
 from drake_pose.body.tree.tree_kinematics import JointOffset
 from drake_pose.camera.models import PinholeCamera
@@ -42,9 +42,6 @@ from drake_pose.fit.parameters import CAMERA_NAMES, POSE_NAMES
 from drake_pose.fit.unknowns import choose, join
 from drake_pose.registration.posed_frames import PosedFrames
 from drake_pose.workers import map_ordered
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 ROUNDS_WITH_CONSTANTS = (
     *(AnnealingStage(scale, 0.02) for scale in (0.12, 0.09, 0.07, 0.05, 0.03, 0.02)),

@@ -10,9 +10,9 @@ from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from drake_pose.arrays import Array
 from drake_pose.body.model import OBJECT, OBJECT_POSITIONS, ArticulatedModel
 from drake_pose.body.surfaces.meshes import TriangleMesh, join_meshes
 from drake_pose.body.tree.link_graph import inverse_transforms
@@ -26,8 +26,6 @@ from drake_pose.registration.register import ObjectPose, RegistrationBody
 from drake_pose.registration.start_poses import apart_from_before
 from drake_pose.silhouette.areas.bending import TreeSurfaces
 from drake_pose.silhouette.areas.outline import outline_from_mesh
-
-Array = NDArray[np.float64]
 
 # A hand that turns by less about a second axis tells nothing of where along the first one it is.
 _LEAST_TURN = np.radians(4.0)

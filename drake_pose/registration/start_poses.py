@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from drake_pose.arrays import Array
 from drake_pose.registration.posed_frames import PosedFrames
 from drake_pose.silhouette.areas.scoring import score_bodies
 from drake_pose.workers import map_ordered
 
-Array = NDArray[np.float64]
 T = TypeVar("T")
 
 # Alexa's constants: psi is the positive root of x^4 = x + 4.

@@ -12,8 +12,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from drake_pose.arrays import Mask
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import RegistrationError
 from drake_pose.fit.background import KnownBackground, Light
@@ -24,8 +24,6 @@ from drake_pose.registration.standing_object import StandingObject, require_turn
 from drake_pose.silhouette.areas.scoring import draw_mask
 from drake_pose.silhouette.pictures.masks import intersection_over_union
 from drake_pose.silhouette.segmentation.regions import find_regions
-
-Mask = NDArray[np.bool_]
 
 # So many regions of a picture are looked at.
 _REGIONS = 15

@@ -19,6 +19,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from drake_pose.arrays import Array, Mask, Picture
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.camera.models import Camera, PinholeCamera
 from drake_pose.fit.contour_fit import ContourFit, Prior, pack_views
@@ -35,9 +36,6 @@ from drake_pose.silhouette.pictures.masks import intersection_over_union
 from drake_pose.silhouette.segmentation.background import cut, tell_from_background
 from drake_pose.workers import map_ordered
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
-Picture = NDArray[np.uint8]
 Likelihood = NDArray[np.float32]
 
 # Triangles of a part that the contour fit sees.

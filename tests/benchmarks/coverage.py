@@ -22,6 +22,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from drake_pose.arrays import Array, Mask
 from drake_pose.body.formats.packages import bundled_model
 from drake_pose.body.model import ArticulatedModel, load_model
 from drake_pose.camera.camera_files import save_cameras
@@ -33,8 +34,6 @@ from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from drake_pose.silhouette.pictures.masks import write_mask
 from tests.benchmarks.tables import print_table
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 Damage = Callable[[Mask, np.random.Generator], Mask]
 
 _FRAMES, _RATE_HZ, _FASTEST = 24, 30.0, 2.0

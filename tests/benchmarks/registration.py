@@ -20,9 +20,9 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from drake_pose.arrays import Array, Mask
 from drake_pose.body.model import load_model
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import RegistrationError
@@ -38,9 +38,6 @@ from drake_pose.registration.register import CameraSearch, RegistrationBody
 from drake_pose.registration.start_poses import areas
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from tests.benchmarks.tables import print_table
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 _SEED, _FRAMES = 13_000, 5
 # A camera is found that is off by less [mm, deg].

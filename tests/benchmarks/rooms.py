@@ -27,10 +27,9 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import ModelInstanceIndex, PlanarJoint, SpatialInertia
 from pydrake.systems.sensors import CameraInfo
 
+from drake_pose.arrays import Array
 from drake_pose.body.model import ArticulatedModel
 from drake_pose.camera.models import PinholeCamera
-
-Array = NDArray[np.float64]
 
 LOG_HZ = 50.0
 """Rows of a joint log a second."""

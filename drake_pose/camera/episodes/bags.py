@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from drake_pose.arrays import Array, Integers, Picture
+from drake_pose.arrays import Array, Indices, Picture
 from drake_pose.camera.episodes.episode import Episode, EpisodeCamera, JointLog, ascending
 from drake_pose.camera.picture_files import decode_colours
 from drake_pose.camera.rig import Lens
@@ -149,7 +149,7 @@ def _camera_name(topic: str) -> str:
     return "_".join(parts)
 
 
-def _seconds(rows: Sequence[_Row], what: str, warnings: list[str]) -> tuple[Array, Integers]:
+def _seconds(rows: Sequence[_Row], what: str, warnings: list[str]) -> tuple[Array, Indices]:
     """The headers' times [s], or the bag's where they have none, and which rows are in order."""
     stamps = np.array([row[:2] for row in rows])
     clock = 0 if stamps[:, 0].any() else 1
@@ -255,7 +255,7 @@ def _lens(info: Any, *, is_rectified: bool, where: str) -> Lens:
 class _TopicPictures:
     """The pictures of a topic: the next one costs nothing more, any other a look into the index."""
 
-    def __init__(self, path: Path, topic: str, log_times: Integers) -> None:
+    def __init__(self, path: Path, topic: str, log_times: Indices) -> None:
         self._path, self._topic, self._log_times = path, topic, log_times
         self._reader: Any = None
         self._messages: Iterator[Any] = iter(())

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from drake_pose.arrays import Array, Integers, Picture
+from drake_pose.arrays import Array, Indices, Picture
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.camera.picture_files import frame_key
 from drake_pose.camera.rig import Lens
@@ -159,7 +159,7 @@ class Episode:
         return self.cameras[name]
 
 
-def ascending(times: Array, what: str) -> tuple[Integers, list[str]]:
+def ascending(times: Array, what: str) -> tuple[Indices, list[str]]:
     """Which time stamps (n,) come after all before them, and a warning of the others.
 
     Raises SceneError: there is none, or too many others, so that the clock cannot be trusted.

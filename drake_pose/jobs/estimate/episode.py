@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from drake_pose.arrays import Array, Integers, Picture
+from drake_pose.arrays import Array, Indices, Picture
 from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.camera.camera_files import load_camera_file
@@ -46,7 +46,7 @@ class MappedJoints(NamedTuple):
     """
 
     log: JointLog
-    asked: Integers
+    asked: Indices
     names: tuple[str, ...]
     seen: tuple[str, ...]
     unseen: tuple[str, ...]
@@ -152,7 +152,7 @@ def frames_of(camera: EpisodeCamera) -> tuple[str, ...]:
     return camera.frames or tuple(f"{k:06d}" for k in range(len(camera.times)))
 
 
-def rows_of(log: JointLog, camera: EpisodeCamera, kept: Integers, later: Array) -> Array:
+def rows_of(log: JointLog, camera: EpisodeCamera, kept: Indices, later: Array) -> Array:
     """(k, m) a log's positions so much later [s] than some of a camera's pictures, by time or name.
 
     Args:
@@ -169,7 +169,7 @@ def is_timed(log: JointLog, camera: EpisodeCamera) -> bool:
     return log.times is not None and bool(np.isfinite(camera.times).any())
 
 
-def kept_pictures(camera: EpisodeCamera, settings: EpisodeSettings) -> Integers:
+def kept_pictures(camera: EpisodeCamera, settings: EpisodeSettings) -> Indices:
     """Which of a camera's pictures are asked for; UnknownNameError: there is no such."""
     if settings.every < 1:
         raise SettingsError(f"every must be 1 or more, not {settings.every}")
@@ -184,7 +184,7 @@ class EpisodeScene(NamedTuple):
     scene: Scene
     episode: Episode
     first: EpisodeCamera
-    kept: Integers
+    kept: Indices
 
 
 def read_episode_scene(
@@ -229,7 +229,7 @@ def _reader(camera: EpisodeCamera, numbers: Mapping[str, int]) -> Callable[[str]
     return lambda frame: camera.read(numbers[frame])
 
 
-def _same_moments(first: EpisodeCamera, kept: Integers, other: EpisodeCamera) -> dict[int, int]:
+def _same_moments(first: EpisodeCamera, kept: Indices, other: EpisodeCamera) -> dict[int, int]:
     """By how manieth of a camera's pictures another's of the same moment, where it has one."""
     if np.isnan(first.times).any() or np.isnan(other.times).any():
         own = {frame_key(name): k for k, name in enumerate(frames_of(other))}

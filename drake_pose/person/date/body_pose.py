@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from drake_pose.arrays import Array, Integers, Mask
+from drake_pose.arrays import Array, Indices, Mask
 from drake_pose.body.tree.tree_kinematics import PackedTree, find_motions
 from drake_pose.camera.models import Camera
 from drake_pose.compiled import compiled
@@ -79,7 +79,7 @@ def _unlocked(q: Array, limb: Limb) -> Array:
 def reach(
     skeleton: Skeleton,
     q: Array,
-    index: Integers,
+    index: Indices,
     part: tuple[int, Array],
     target: Array,
     steps: int = _ROUNDS * _STEPS_A_ROUND,
@@ -110,7 +110,7 @@ def reach(
 def _reach(
     packed: PackedTree,
     values: Array,
-    index: Integers,
+    index: Indices,
     point: Array,
     limits: tuple[Array, Array],
     target: Array,
@@ -255,7 +255,7 @@ def estimate_pose(
     return PaperPose(skeleton.clip(aimed), limbs, place)
 
 
-def uncross_feet(skeleton: Skeleton, last: Array, features: Array) -> Integers:
+def uncross_feet(skeleton: Skeleton, last: Array, features: Array) -> Indices:
     """The order (5,) in which features (5, 3) [m] have the feet not crossed, by the last q (nq,).
 
     Feet that pass each other are exchanged where one is taken for the other, which then lasts.

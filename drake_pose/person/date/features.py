@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from drake_pose.arrays import Array, Integers, Mask, Picture
+from drake_pose.arrays import Array, Indices, Mask, Picture
 from drake_pose.camera.models import Camera
 from drake_pose.person.date.skeleton import FEATURES
 from drake_pose.person.rays import meeting_points
@@ -43,8 +43,8 @@ class Blobs:
     """
 
     centroids: Array
-    areas: Integers
-    boxes: Integers
+    areas: Indices
+    boxes: Indices
     mask: Mask
 
 
@@ -90,9 +90,9 @@ class Features:
     """
 
     places: Array
-    support: Integers
+    support: Indices
     points: Array
-    owners: Integers
+    owners: Indices
 
 
 def inside_silhouettes(
@@ -121,7 +121,7 @@ def inside_silhouettes(
     return kept
 
 
-def expect_features(places: Array, support: Integers, last: Array, last_support: Integers) -> Array:
+def expect_features(places: Array, support: Indices, last: Array, last_support: Indices) -> Array:
     """Where FEATURES are expected in the next frame (5, 3) [m]: feet a step on, the others here.
 
     Else passing feet would be exchanged; hands that meet stop, and a step on would be exchanged.

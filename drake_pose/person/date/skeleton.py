@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from drake_pose.arrays import Array, Integers
+from drake_pose.arrays import Array, Indices
 from drake_pose.body.model import ArticulatedModel
 from drake_pose.body.parsed_model import ParsedModel
 from drake_pose.body.surfaces.meshes import TriangleMesh
@@ -51,8 +51,8 @@ class Limb:
     root_T: Array
     middle_U: Array
     end_L: Array
-    axes: Integers
-    positions: Integers
+    axes: Indices
+    positions: Indices
     lower: Array
     upper: Array
     half_widths: Array
@@ -86,11 +86,11 @@ class Skeleton:
     kinematics: TreeKinematics
     nodes: Mapping[str, int]
     face_H: Array
-    head_positions: Integers
-    head_angles: Integers
-    neck_angles: Integers
-    order: Integers
-    chains: Sequence[tuple[PackedTree, Integers]]
+    head_positions: Indices
+    head_angles: Indices
+    neck_angles: Indices
+    order: Indices
+    chains: Sequence[tuple[PackedTree, Indices]]
     limbs: Mapping[str, Limb]
     lower: Array
     upper: Array
@@ -184,7 +184,7 @@ def load_skeleton(model: ArticulatedModel) -> Skeleton:
     )
 
 
-def _chain(packed: PackedTree, node: int) -> tuple[PackedTree, Integers]:
+def _chain(packed: PackedTree, node: int) -> tuple[PackedTree, Indices]:
     """A node and those that it hangs on by themselves, and which values are theirs."""
     path: list[int] = []
     while node >= 0:
@@ -238,7 +238,7 @@ def _limb(kinematics: TreeKinematics, nodes: Mapping[str, int], name: str) -> Li
     )
 
 
-def _axes(model: ParsedModel, positions: Sequence[int], name: str) -> Integers:
+def _axes(model: ParsedModel, positions: Sequence[int], name: str) -> Indices:
     """The axes 0, 1, 2 that the positions' names end with."""
     letters = [model.position_names[i].rsplit("_", 1)[-1] for i in positions]
     if any(letter not in _AXES for letter in letters):

@@ -9,10 +9,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_pose.arrays import Mask, Picture
+from drake_pose.arrays import Floats, Mask, Picture
 from drake_pose.errors import SettingsError
-
-Array = NDArray[np.float32]
 
 _LEAST_DEVIATION = 3.0
 # How many standard deviations the colour must be off.
@@ -35,7 +33,7 @@ class Background:
     """An empty scene's mean colour (H, W, 3) and its standard deviation (H, W) [grey levels]."""
 
     mean: Picture
-    deviation: Array
+    deviation: Floats
 
 
 def learn_background(pictures: Sequence[Picture]) -> Background:
@@ -75,7 +73,7 @@ def _require_one_size(pictures: Sequence[Picture], least: int, message: str) -> 
         raise SettingsError(message)
 
 
-def background_support(pictures: Sequence[Picture], background: Background) -> Array:
+def background_support(pictures: Sequence[Picture], background: Background) -> Floats:
     """(H, W) in what fraction of pictures each pixel shows the background."""
     tolerance = _tolerance(background)
     shown = np.zeros(background.deviation.shape, dtype=np.float32)
@@ -180,8 +178,8 @@ _LOWEST, _HIGHEST = -3.0, 6.0
 
 
 def tell_from_background(
-    pictures: Sequence[Picture], probabilities: Sequence[Array], wanted: Sequence[int]
-) -> list[Array]:
+    pictures: Sequence[Picture], probabilities: Sequence[Floats], wanted: Sequence[int]
+) -> list[Floats]:
     """How much more likely each pixel's colour is the body's than the background's.
 
     Pictures (H, W, 3) of one camera that stands still are brought to each other's exposure and
@@ -214,7 +212,7 @@ def tell_from_background(
     return found
 
 
-def _exposures(pictures: Sequence[Picture], sure: NDArray[np.bool_]) -> Array:
+def _exposures(pictures: Sequence[Picture], sure: NDArray[np.bool_]) -> Floats:
     """(n, 3) the channels' exposures, by what surely is background (H, W) in all pictures."""
     where = np.flatnonzero(sure)
     if not len(where):
@@ -224,7 +222,7 @@ def _exposures(pictures: Sequence[Picture], sure: NDArray[np.bool_]) -> Array:
     return np.asarray(np.median((seen + 1.0) / (np.median(seen, axis=0) + 1.0), axis=1))
 
 
-def _masked_median(stack: Array, hidden: NDArray[np.bool_], count: NDArray[np.intp]) -> Array:
+def _masked_median(stack: Floats, hidden: NDArray[np.bool_], count: NDArray[np.intp]) -> Floats:
     """The median (p, 3) of a stack (n, p, 3) without what is hidden (n, p); 0 of nothing."""
     values = np.sort(np.where(hidden[:, :, None], np.float32(np.inf), stack), axis=0)
     last, across = np.maximum(count - 1, 0), np.arange(len(count))

@@ -7,13 +7,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_pose.arrays import Mask, Picture
+from drake_pose.arrays import Floats, Mask, Picture
 from drake_pose.camera.models import LARGEST_SIDE
 from drake_pose.errors import SettingsError
 from drake_pose.regular_files import read_regular
 from drake_pose.silhouette.segmentation.mask_pictures import ALL
-
-Array = NDArray[np.float32]
 
 # Where an ONNX file's messages hold others, by field: from its model down to what is told of data
 # in other files (onnx.proto).
@@ -104,7 +102,7 @@ class SegmentationNetwork:
         score = cv2.resize(self._score(output), (width, height), interpolation=cv2.INTER_LINEAR)
         return np.asarray(score > 0.0)
 
-    def _score(self, output: NDArray[np.generic]) -> Array:
+    def _score(self, output: NDArray[np.generic]) -> Floats:
         """(h, w) positive where the object is more likely than anything else."""
         if output.ndim not in (3, 4) or output.shape[0] != 1:
             raise SettingsError(

@@ -15,13 +15,9 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from drake_pose.arrays import Floats, Mask, Picture
 from drake_pose.silhouette.pictures.masks import intersection_over_union
-
-Floats = NDArray[np.float32]
-Picture = NDArray[np.uint8]
-Mask = NDArray[np.bool_]
 
 # Pictures are looked at so wide at most [pixel], at so many levels of each channel.
 _WIDTH, _LEVELS = 480, 16

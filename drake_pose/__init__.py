@@ -29,9 +29,7 @@ if TYPE_CHECKING:
     from drake_pose.jobs.registration.audit import SceneAudit, audit_scene
     from drake_pose.jobs.registration.register import SceneRegistration, register_scene
     from drake_pose.jobs.registration.settings import RegistrationSettings
-    from drake_pose.search.continuous.multi_start import MultiStartSearch
-    from drake_pose.search.estimates import View
-    from drake_pose.search.grid.beam_search import BeamSearch
+    from drake_pose.search import BeamSearch, MultiStartSearch, View
     from drake_pose.silhouette.pictures.scenes import Scene, load_scene
     from drake_pose.systems.estimators.camera_registration import CameraRegistration
     from drake_pose.systems.estimators.silhouette_matcher import (
@@ -47,11 +45,11 @@ __version__ = VERSION
 
 _HOMES = {
     "ArticulatedModel": "body.model",
-    "BeamSearch": "search.grid.beam_search",
+    "BeamSearch": "search",
     "CameraRegistration": "systems.estimators.camera_registration",
     "EstimateSettings": "files.settings",
     "MaskSettings": "jobs.masks.settings",
-    "MultiStartSearch": "search.continuous.multi_start",
+    "MultiStartSearch": "search",
     "ParallelCamera": "camera.models",
     "PersonTracker": "systems.person.person_tracker",
     "PinholeCamera": "camera.models",
@@ -65,7 +63,7 @@ _HOMES = {
     "SilhouetteMatcher": "systems.estimators.silhouette_matcher",
     "SilhouetteTracker": "systems.estimators.silhouette_matcher",
     "TruncatedEkf": "systems.estimators.truncated_ekf",
-    "View": "search.estimates",
+    "View": "search",
     "audit_scene": "jobs.registration.audit",
     "build_pose_tree": "body.tree.tree_builder",
     "bundled_model": "body.formats.packages",

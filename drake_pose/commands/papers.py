@@ -130,7 +130,7 @@ def _kameda_grid(images: int, options: KamedaOptions, json: bool) -> None:
             settle_by_edges,
         )
         from drake_pose.papers.kameda_pictures import save_pictures
-        from drake_pose.search.scoring import PoseSearch
+        from drake_pose.search import PoseSearch
 
         interval, first = options.interval or 20.0, options.seed or 0
         renderer, scale = options.renderer or "drake", options.body_scale or 1.0

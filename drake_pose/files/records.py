@@ -21,7 +21,7 @@ from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.csv_files import csv_text, read_csv
 from drake_pose.errors import OutputError
 from drake_pose.files.folder import POSES, cannot_write, write_file
-from drake_pose.search.estimates import JointEstimate, PoseSet, following_joints
+from drake_pose.search import JointEstimate, PoseSet, following_joints
 
 BASE_COLUMNS = ("base_x", "base_y", "base_z", "base_qw", "base_qx", "base_qy", "base_qz")
 """Columns of the plant's world in the scene's world: position [m] and unit quaternion."""

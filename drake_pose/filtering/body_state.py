@@ -28,7 +28,7 @@ from drake_pose.filtering.inequalities import (
 from drake_pose.filtering.state import StateLayout
 from drake_pose.fit.parameters import BodyParameters
 from drake_pose.fit.surfaces import MANY, few_rigid_triangles
-from drake_pose.search.starts.root_placement import slide_root
+from drake_pose.search import slide_root
 from drake_pose.silhouette.areas.bending import PackedSurfaces, TreeSurfaces
 from drake_pose.silhouette.areas.scoring import draw_packed
 

@@ -12,9 +12,14 @@ from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.camera.models import Camera
 from drake_pose.filtering.contour import ContourObservation
 from drake_pose.filtering.contour_tracker import ContourTracker, Track, TrackingSettings
-from drake_pose.search.continuous.families import spread
-from drake_pose.search.estimates import TRACKED, UNEXPLAINED, PoseEstimate, View
-from drake_pose.search.scoring import PoseSearch
+from drake_pose.search import (
+    TRACKED,
+    UNEXPLAINED,
+    PoseEstimate,
+    PoseSearch,
+    View,
+    covariance_pose_set,
+)
 from drake_pose.silhouette.pictures.masks import edge_area
 
 # A track is lost when E_total is this many times what it was after the last match, and this more.
@@ -142,7 +147,7 @@ class MatchAndTrack:
         observation = self.tracker.observation
         own = observation.covariance(track.measurement, pose.area)
         pictures = len(observation.cameras)
-        return replace(pose, pose_set=spread(self._search.tree, pose, own, pictures))
+        return replace(pose, pose_set=covariance_pose_set(self._search.tree, pose, own, pictures))
 
     def _match(
         self, last: Followed, tracked: tuple[Track, PoseEstimate] | None, frame: _Frame

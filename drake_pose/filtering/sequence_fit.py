@@ -26,7 +26,7 @@ from drake_pose.fit.proportions import (
     fit_proportions,
 )
 from drake_pose.fit.surfaces import few_rigid_triangles
-from drake_pose.search.estimates import JointEstimate, PoseFamily, PoseSet, joint_estimates
+from drake_pose.search import JointEstimate, PoseFamily, PoseSet, joint_estimates
 from drake_pose.silhouette.areas.bending import TreeSurfaces
 
 # Of a normal distribution, 95 % lie within this many standard deviations.

@@ -45,7 +45,7 @@ from drake_pose.papers.shimada_pictures import save_hypotheses
 from drake_pose.papers.shimada_pictures import save_pictures as save_shimada
 from drake_pose.papers.tables import Count, Figures
 from drake_pose.person.date.walking import COMMANDS, REGISTERED
-from drake_pose.search.scoring import PoseSearch
+from drake_pose.search import PoseSearch
 from drake_pose.version import VERSION
 
 REPORT, FIGURES, TABLES, BESIDE = "report.html", "figures.json", "tables.txt", "paper.json"

@@ -17,14 +17,20 @@ from drake_pose.body.model import load_model
 from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.camera.models import Camera, ParallelCamera
 from drake_pose.papers.tables import Count, require_counts, uncounted
-from drake_pose.search.continuous.search import ContinuousSearch
-from drake_pose.search.estimates import PoseEstimate, View
-from drake_pose.search.grid.beam_search import BeamSearch
-from drake_pose.search.grid.examination import ExaminationSettings, examine
-from drake_pose.search.grid.pose_families import renderer_tolerance
-from drake_pose.search.kameda import PaperSearch
-from drake_pose.search.scoring import PoseSearch, SampledTree
-from drake_pose.search.settings import BeamSearchSettings, PaperSearchSettings
+from drake_pose.search import (
+    BeamSearch,
+    BeamSearchSettings,
+    ContinuousSearch,
+    ExaminationSettings,
+    PaperSearch,
+    PaperSearchSettings,
+    PoseEstimate,
+    PoseSearch,
+    SampledTree,
+    View,
+    examine,
+    renderer_tolerance,
+)
 from drake_pose.silhouette.areas.outline import Outline
 from drake_pose.silhouette.areas.scoring import draw_labels, draw_mask
 from drake_pose.silhouette.pictures.label_images import label_image_to_mask

@@ -11,17 +11,14 @@ from rich.table import Table
 
 from drake_pose.papers.kameda import PAPER_IMAGES, ExperimentResult, Trial
 from drake_pose.papers.tables import Count, figure_table, spread_over_seeds, uncounted
-from drake_pose.search.continuous.families import CONFIDENCE
-from drake_pose.search.continuous.search import ContinuousSearch
-from drake_pose.search.grid.inner_edges import (
+from drake_pose.search import CONFIDENCE, ContinuousSearch, GridPoseSet, PaperSearch, samples_at
+from drake_pose.search.inner_edges import (
     EdgeErrors,
     InnerEdges,
     choose_by_edges,
     edges_of_labels,
     find_borders,
 )
-from drake_pose.search.grid.pose_families import GridPoseSet, samples_at
-from drake_pose.search.kameda import PaperSearch
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 
 PAPER = {

@@ -14,10 +14,7 @@ from drake_pose.body.parsed_model import ParsedModel
 from drake_pose.files.overlay import paint_agreement
 from drake_pose.papers.kameda import Causes, ExperimentResult, Trial, experiment_camera
 from drake_pose.papers.tables import draw_panels, save_figure
-from drake_pose.search.estimates import PoseFamily, PoseSet, View
-from drake_pose.search.grid.pose_families import samples_at
-from drake_pose.search.kameda import PaperSearch
-from drake_pose.search.scoring import Scoring
+from drake_pose.search import PaperSearch, PoseFamily, PoseSet, Scoring, View, samples_at
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 
 _EXAMPLES, _SETS, _MOST_NAMES = 4, 3, 5

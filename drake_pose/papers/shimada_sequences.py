@@ -34,7 +34,7 @@ from drake_pose.filtering.truncated_filter import (
 )
 from drake_pose.jobs.estimate.inputs import TRUTH_FILE, Inputs, read_inputs
 from drake_pose.papers.tables import Advance, Count, figure_table, uncounted
-from drake_pose.search.estimates import View
+from drake_pose.search import View
 from drake_pose.silhouette.pictures.label_images import label_image_to_mask
 from drake_pose.systems.estimators.hand_tracking import HandSensor, build_recorded_hand_estimation
 from drake_pose.systems.estimators.truncated_ekf import TruncatedEkf

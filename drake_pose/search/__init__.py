@@ -1,1 +1,68 @@
-"""Silhouettes in, poses out: Kameda's search and wider ones, no Drake framework in them."""
+"""Searches for the pose that silhouettes show: on grids of joint values, and continuous ones."""
+
+from drake_pose.search.beam_search import BeamSearch
+from drake_pose.search.continuous_search import ContinuousSearch
+from drake_pose.search.estimates import (
+    TRACKED,
+    UNEXPLAINED,
+    JointEstimate,
+    PoseEstimate,
+    PoseFamily,
+    PoseSet,
+    View,
+    following_joints,
+    joint_estimates,
+)
+from drake_pose.search.kameda import PaperSearch
+from drake_pose.search.multi_start import MEDIUM, MultiStartSearch
+from drake_pose.search.pose_and_mask import FoundPose, PoseAndMask, PoseAndMaskSettings
+from drake_pose.search.pose_families import (
+    ExaminationSettings,
+    GridPoseSet,
+    examine,
+    renderer_tolerance,
+    samples_at,
+)
+from drake_pose.search.root_placement import hub, scale_camera, slide_root, turns_freely
+from drake_pose.search.root_placement_search import RootPlacementSearch
+from drake_pose.search.sampled_body import PoseSearch, SampledTree, Scoring
+from drake_pose.search.settings import BeamSearchSettings, PaperSearchSettings
+from drake_pose.search.views_fit import CONFIDENCE, ViewsFit, covariance_pose_set
+
+__all__ = [
+    "CONFIDENCE",
+    "MEDIUM",
+    "TRACKED",
+    "UNEXPLAINED",
+    "BeamSearch",
+    "BeamSearchSettings",
+    "ContinuousSearch",
+    "ExaminationSettings",
+    "FoundPose",
+    "GridPoseSet",
+    "JointEstimate",
+    "MultiStartSearch",
+    "PaperSearch",
+    "PaperSearchSettings",
+    "PoseAndMask",
+    "PoseAndMaskSettings",
+    "PoseEstimate",
+    "PoseFamily",
+    "PoseSearch",
+    "PoseSet",
+    "RootPlacementSearch",
+    "SampledTree",
+    "Scoring",
+    "View",
+    "ViewsFit",
+    "covariance_pose_set",
+    "examine",
+    "following_joints",
+    "hub",
+    "joint_estimates",
+    "renderer_tolerance",
+    "samples_at",
+    "scale_camera",
+    "slide_root",
+    "turns_freely",
+]

@@ -12,7 +12,7 @@ import numpy as np
 from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.errors import SettingsError
 from drake_pose.search.estimates import PoseEstimate, SearchStatistics, View
-from drake_pose.search.scoring import Regions, SampledTree, Scoring
+from drake_pose.search.sampled_body import Regions, SampledTree, Scoring
 from drake_pose.search.settings import PaperSearchSettings
 
 # The paper's r = 200 pixels is 12.6 % of a node's mean projected area (section 6.1).

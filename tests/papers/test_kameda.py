@@ -27,8 +27,8 @@ from drake_pose.papers.kameda_pictures import (
     ratio_within,
     save_pictures,
 )
-from drake_pose.search.estimates import PoseEstimate
-from drake_pose.search.grid.inner_edges import edges_of_labels
+from drake_pose.search import PoseEstimate
+from drake_pose.search.inner_edges import edges_of_labels
 from drake_pose.silhouette.areas.scoring import draw_mask
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 

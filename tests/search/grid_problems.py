@@ -9,9 +9,8 @@ import numpy as np
 from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.camera.models import ParallelCamera
 from drake_pose.search.estimates import View
-from drake_pose.search.grid.pose_families import samples_at
-from drake_pose.search.grid.sampled_body import SampledBody
-from drake_pose.search.scoring import SampledTree, Scoring
+from drake_pose.search.pose_families import samples_at
+from drake_pose.search.sampled_body import SampledBody, SampledTree, Scoring
 from drake_pose.search.settings import BeamSearchSettings
 from drake_pose.silhouette.areas.outline import Outline, outline_from_mesh
 from drake_pose.silhouette.areas.scoring import draw_mask

@@ -8,13 +8,12 @@ import pytest
 from scipy.stats import t as student
 
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
-from drake_pose.search.continuous.families import spread
-from drake_pose.search.continuous.multi_start import MultiStartSearch
-from drake_pose.search.continuous.search import ContinuousSearch
+from drake_pose.search.beam_search import BeamSearch
+from drake_pose.search.continuous_search import ContinuousSearch
 from drake_pose.search.estimates import JointEstimate, PoseEstimate, PoseFamily, PoseSet
-from drake_pose.search.grid.beam_search import BeamSearch
-from drake_pose.search.grid.examination import ExaminationSettings
-from drake_pose.search.grid.pose_families import _joined
+from drake_pose.search.multi_start import MultiStartSearch
+from drake_pose.search.pose_families import ExaminationSettings, _joined
+from drake_pose.search.views_fit import spread
 from tests.search.turning import crane, views_of
 
 TURN = 2.0 * math.pi

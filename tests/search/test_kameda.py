@@ -7,7 +7,7 @@ import pytest
 from drake_pose.errors import MaskError, SettingsError
 from drake_pose.search.estimates import View
 from drake_pose.search.kameda import PaperSearch, _Run
-from drake_pose.search.scoring import Scoring
+from drake_pose.search.sampled_body import Scoring
 from drake_pose.search.settings import PaperSearchSettings
 from drake_pose.silhouette.areas.scoring import draw_mask
 from tests.search.bodies import (

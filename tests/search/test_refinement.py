@@ -8,8 +8,8 @@ import pytest
 from drake_pose.body.formats.packages import bundled_model
 from drake_pose.body.model import load_model
 from drake_pose.camera.models import ParallelCamera, PinholeCamera
-from drake_pose.search.continuous.families import find_intervals
 from drake_pose.search.estimates import View
+from drake_pose.search.parts import NeighbourhoodSearch, PartSearch, find_parts, find_reflections
 from drake_pose.search.refinement import (
     COARSE_PASSES,
     FINE_PASSES,
@@ -19,8 +19,7 @@ from drake_pose.search.refinement import (
     RefinementProblem,
     descend,
 )
-from drake_pose.search.starts.neighbourhood import NeighbourhoodSearch
-from drake_pose.search.starts.part_placement import PartSearch, find_parts, find_reflections
+from drake_pose.search.views_fit import find_intervals
 from drake_pose.silhouette.areas.bending import TreeSurfaces
 from drake_pose.silhouette.areas.scoring import draw_mask
 from tests.search.bodies import forked_body

@@ -22,7 +22,7 @@ from drake_pose.jobs.demo import stored_scene
 from drake_pose.jobs.estimate.scene import estimate_scene
 from drake_pose.papers.kameda import draw_values
 from drake_pose.papers.kameda_real_pictures import REAL_EXPERIMENTS
-from drake_pose.search.estimates import PoseEstimate, View
+from drake_pose.search import PoseEstimate, View
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 
 FOLDER = Path(__file__).parent

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drake_pose.search.grid.pose_families import renderer_tolerance
+from drake_pose.search import renderer_tolerance
 from drake_pose.silhouette.areas.bending import TreeSurfaces
 from drake_pose.silhouette.areas.scoring import draw_mask
 from tests.silhouettes.stored import (

@@ -18,9 +18,7 @@ from drake_pose.camera.drake import camera_to_drake
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.files.overlay import paint_agreement
 from drake_pose.jobs.demo import run_demo
-from drake_pose.search.estimates import View
-from drake_pose.search.kameda import PaperSearch
-from drake_pose.search.settings import PaperSearchSettings
+from drake_pose.search import PaperSearch, PaperSearchSettings, View
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 
 FOLDER = Path(__file__).resolve().parent

@@ -32,8 +32,7 @@ from drake_pose.filtering.sequence_fit import (
 )
 from drake_pose.jobs.estimate.inputs import Inputs
 from drake_pose.jobs.estimate.searches import leave_out_links, make_placement_search
-from drake_pose.search.continuous.root_placement_search import RootPlacementSearch
-from drake_pose.search.estimates import TRACKED, PoseEstimate, View
+from drake_pose.search import TRACKED, PoseEstimate, RootPlacementSearch, View
 from drake_pose.silhouette.areas.bending import TreeSurfaces
 from drake_pose.silhouette.areas.scoring import draw_mask
 from drake_pose.silhouette.pictures.scenes import USUAL_RATE_HZ

@@ -23,9 +23,7 @@ from drake_pose.fit.contour_fit import pack_views
 from drake_pose.fit.evidence import find_edge_points
 from drake_pose.fit.kernel import collect
 from drake_pose.fit.surfaces import few_triangles
-from drake_pose.search.continuous.multi_start import MEDIUM, MultiStartSearch
-from drake_pose.search.continuous.views_fit import ViewsFit
-from drake_pose.search.estimates import View
+from drake_pose.search import MEDIUM, MultiStartSearch, View, ViewsFit
 from drake_pose.silhouette.areas.bending import TreeSurfaces
 from drake_pose.silhouette.areas.outline import pack
 

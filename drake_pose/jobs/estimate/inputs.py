@@ -32,9 +32,7 @@ from drake_pose.jobs.estimate.searches import (
     make_tree,
 )
 from drake_pose.person.body_plan import PERSON_LANDMARKS
-from drake_pose.search.continuous.root_placement_search import RootPlacementSearch
-from drake_pose.search.estimates import PoseEstimate
-from drake_pose.search.scoring import PoseSearch
+from drake_pose.search import PoseEstimate, PoseSearch, RootPlacementSearch
 from drake_pose.silhouette.areas.scoring import require_visible
 from drake_pose.silhouette.pictures.scene_checks import (
     check_upright,

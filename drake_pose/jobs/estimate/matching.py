@@ -25,11 +25,15 @@ from drake_pose.files.records import (
 from drake_pose.files.summary import BADLY_EXPLAINED
 from drake_pose.files.writer import Drawn, FinishedFrame, OnStage
 from drake_pose.jobs.estimate.inputs import Inputs
-from drake_pose.search.continuous.multi_start import MultiStartSearch
-from drake_pose.search.estimates import TRACKED, PoseEstimate, View
-from drake_pose.search.grid.beam_search import BeamSearch
-from drake_pose.search.scoring import PoseSearch
-from drake_pose.search.starts.root_placement import scale_camera
+from drake_pose.search import (
+    TRACKED,
+    BeamSearch,
+    MultiStartSearch,
+    PoseEstimate,
+    PoseSearch,
+    View,
+    scale_camera,
+)
 from drake_pose.silhouette.areas.bending import TreeSurfaces
 from drake_pose.silhouette.areas.outline import Outline
 from drake_pose.silhouette.areas.scoring import draw_labels

@@ -20,7 +20,7 @@ from drake_pose.person.checked_capture import CheckedCapture, capture_checked
 from drake_pose.person.figures import RigFault
 from drake_pose.person.person_capture import PersonCapture, capture_by_colour
 from drake_pose.person.persons_in_view import ReadFrame, ViewFaults
-from drake_pose.search.estimates import PoseEstimate
+from drake_pose.search import PoseEstimate
 from drake_pose.silhouette.pictures.masks import compare_masks, edge_area
 from drake_pose.silhouette.pictures.scene_checks import (
     describe_unreadable,

@@ -15,14 +15,18 @@ from drake_pose.body.tree.root import RootRotation
 from drake_pose.errors import SettingsError
 from drake_pose.files.records import user_units
 from drake_pose.files.settings import EstimateSettings, RootTurns
-from drake_pose.search.continuous.multi_start import MultiStartSearch
-from drake_pose.search.continuous.root_placement_search import RootPlacementSearch
-from drake_pose.search.grid.beam_search import BeamSearch
-from drake_pose.search.grid.examination import ExaminationSettings
-from drake_pose.search.kameda import PaperSearch
-from drake_pose.search.scoring import PoseSearch
-from drake_pose.search.settings import BeamSearchSettings, PaperSearchSettings
-from drake_pose.search.starts.root_placement import hub, turns_freely
+from drake_pose.search import (
+    BeamSearch,
+    BeamSearchSettings,
+    ExaminationSettings,
+    MultiStartSearch,
+    PaperSearch,
+    PaperSearchSettings,
+    PoseSearch,
+    RootPlacementSearch,
+    hub,
+    turns_freely,
+)
 
 # Sampling interval of a root that can be turned in all ways, where its position is searched [deg].
 _FREE_ROOT_INTERVAL = 30.0

@@ -29,7 +29,7 @@ from drake_pose.jobs.estimate.searches import make_tree
 from drake_pose.jobs.masks.settings import MEDIAN, MaskSettings
 from drake_pose.jobs.masks.sources import FoundMask, Source
 from drake_pose.jobs.registration.positions import read_known_positions
-from drake_pose.search.pose_and_mask import (
+from drake_pose.search import (
     FoundPose,
     PoseAndMask,
     PoseAndMaskSettings,

@@ -25,8 +25,7 @@ from drake_pose.body.tree.tree_builder import build_pose_tree
 from drake_pose.camera.models import Camera, PinholeCamera
 from drake_pose.filtering.contour_tracker import TrackingSettings
 from drake_pose.registration.online_registration import OnlineRegistration
-from drake_pose.search.estimates import PoseEstimate
-from drake_pose.search.scoring import PoseSearch
+from drake_pose.search import PoseEstimate, PoseSearch
 from drake_pose.silhouette.pictures.scenes import Scene
 from drake_pose.systems.bodies import add_meshcat_skin, add_posed_plant, add_skin
 from drake_pose.systems.estimators.camera_registration import CameraRegistration

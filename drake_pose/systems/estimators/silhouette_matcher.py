@@ -17,8 +17,7 @@ from drake_pose.camera.models import Camera, camera_tuple
 from drake_pose.errors import SettingsError
 from drake_pose.filtering.contour_tracker import TrackingSettings
 from drake_pose.filtering.match_and_track import Followed, MatchAndTrack
-from drake_pose.search.estimates import TRACKED, PoseEstimate, View
-from drake_pose.search.scoring import PoseSearch
+from drake_pose.search import TRACKED, PoseEstimate, PoseSearch, View
 from drake_pose.silhouette.pictures.label_images import label_image_to_mask
 from drake_pose.systems.bodies import body_poses
 from drake_pose.systems.colour_images import ColourPorts

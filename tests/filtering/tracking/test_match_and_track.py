@@ -11,9 +11,7 @@ from drake_pose.filtering.contour import ContourObservation
 from drake_pose.filtering.contour_tracker import ContourTracker, TrackingSettings
 from drake_pose.filtering.match_and_track import Followed, MatchAndTrack, make_tracker
 from drake_pose.filtering.state import Belief
-from drake_pose.search.estimates import TRACKED, PoseEstimate, View
-from drake_pose.search.kameda import PaperSearch
-from drake_pose.search.settings import PaperSearchSettings
+from drake_pose.search import TRACKED, PaperSearch, PaperSearchSettings, PoseEstimate, View
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from tests.jobs.live_scenes import standing
 from tests.search.bodies import forked_body, front_camera

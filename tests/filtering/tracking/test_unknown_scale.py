@@ -17,7 +17,7 @@ from drake_pose.filtering.sequence_fit import (
     pose_set,
     tilted,
 )
-from drake_pose.search.estimates import TRACKED, View
+from drake_pose.search import TRACKED, View
 from tests.filtering.tracking.test_match_and_track import PERIOD, KnownPoses, swings
 from tests.search.bodies import forked_body, front_camera
 

@@ -9,7 +9,7 @@ import pytest
 
 from drake_pose.files.settings import EstimateSettings
 from drake_pose.jobs.estimate.inputs import Inputs, read_inputs
-from drake_pose.search.estimates import View
+from drake_pose.search import View
 from drake_pose.silhouette.areas.bending import TreeSurfaces
 from drake_pose.silhouette.areas.scoring import draw_mask
 

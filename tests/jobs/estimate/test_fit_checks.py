@@ -12,7 +12,7 @@ from drake_pose.files.settings import EstimateSettings
 from drake_pose.jobs.estimate.inputs import read_inputs
 from drake_pose.jobs.estimate.matching import check_track, compare_cameras
 from drake_pose.jobs.estimate.scene import estimate_scene
-from drake_pose.search.estimates import TRACKED
+from drake_pose.search import TRACKED
 from tests.jobs.scenes import URDF, TinyScene, camera, edit_camera, write_scene
 
 ANGLES = ((20.0, -40.0), (-40.0, -80.0))

@@ -9,8 +9,7 @@ from drake_pose.jobs.estimate.body_fit import _StartedSearch
 from drake_pose.jobs.estimate.inputs import Inputs
 from drake_pose.jobs.estimate.measurements import TrueAngles
 from drake_pose.jobs.estimate.scene import estimate_scene
-from drake_pose.search.continuous.root_placement_search import RootPlacementSearch
-from drake_pose.search.estimates import TRACKED
+from drake_pose.search import TRACKED, RootPlacementSearch
 from drake_pose.silhouette.pictures.scenes import load_scene
 from tests.jobs.scenes import TinyScene, write_scene
 from tests.search.turning import crane

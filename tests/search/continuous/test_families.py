@@ -7,9 +7,8 @@ from drake_pose.body.model import load_model
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.fit.surfaces import few_triangles
-from drake_pose.search.continuous.families import RobustFamilies
-from drake_pose.search.continuous.views_fit import FittedPose, ViewsFit, distinct
-from drake_pose.search.starts.self_motions import flips
+from drake_pose.search.self_motions import flips
+from drake_pose.search.views_fit import FittedPose, RobustFamilies, ViewsFit, distinct
 from drake_pose.silhouette.areas.bending import TreeSurfaces
 from tests.body.models import joint, link, urdf, write
 from tests.search.arms import arm_cameras, arm_tree, damaged_views, draw_view, is_held

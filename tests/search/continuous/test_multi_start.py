@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from drake_pose.search.continuous.multi_start import MultiStartSearch, without_specks
 from drake_pose.search.estimates import View
+from drake_pose.search.multi_start import MultiStartSearch, without_specks
 from drake_pose.workers import working
 from tests.search.arms import (
     arm_cameras,

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from drake_pose.errors import SettingsError
-from drake_pose.search.continuous.multi_start import MultiStartSearch
-from drake_pose.search.continuous.search import ContinuousSearch
+from drake_pose.search.beam_search import BeamSearch
+from drake_pose.search.continuous_search import ContinuousSearch
 from drake_pose.search.estimates import View
-from drake_pose.search.grid.beam_search import BeamSearch
 from drake_pose.search.kameda import PaperSearch
+from drake_pose.search.multi_start import MultiStartSearch
 from drake_pose.silhouette.areas.bending import TreeSurfaces
 from drake_pose.silhouette.areas.scoring import draw_mask
 from tests.search.bodies import front_camera, swinging_chain

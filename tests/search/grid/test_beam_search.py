@@ -9,10 +9,14 @@ import pytest
 from drake_pose.body.tree.root import RootRotation
 from drake_pose.camera.models import ParallelCamera, PinholeCamera
 from drake_pose.errors import SettingsError
+from drake_pose.search.beam_search import BeamSearch
 from drake_pose.search.estimates import View
-from drake_pose.search.grid.beam_search import BeamSearch
-from drake_pose.search.grid.examination import ExaminationSettings, examine
-from drake_pose.search.grid.pose_families import renderer_tolerance, samples_at
+from drake_pose.search.pose_families import (
+    ExaminationSettings,
+    examine,
+    renderer_tolerance,
+    samples_at,
+)
 from drake_pose.search.settings import BeamSearchSettings, Stage
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from tests.search.bodies import (

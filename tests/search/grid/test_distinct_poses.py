@@ -5,8 +5,8 @@ import itertools
 import numpy as np
 import pytest
 
-from drake_pose.search.grid.beam_search import BeamSearch
-from drake_pose.search.grid.pose_families import samples_at
+from drake_pose.search.beam_search import BeamSearch
+from drake_pose.search.pose_families import samples_at
 from drake_pose.search.settings import BeamSearchSettings
 from drake_pose.silhouette.areas.outline import outline_from_mesh
 from drake_pose.silhouette.areas.scoring import draw_mask

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from drake_pose.search.estimates import View
-from drake_pose.search.grid.pose_families import (
+from drake_pose.search.pose_families import (
     cluster_samples,
     contour_length,
     estimate_joints,

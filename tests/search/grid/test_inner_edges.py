@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 
 from drake_pose.errors import SettingsError
-from drake_pose.search.grid.inner_edges import (
+from drake_pose.search.inner_edges import (
     EdgeErrors,
     _turn_subtrees,
     choose_by_edges,
     edges_of_labels,
     find_borders,
 )
-from drake_pose.search.grid.pose_families import find_families, samples_at
-from drake_pose.search.grid.sampled_body import SampledBody
+from drake_pose.search.pose_families import find_families, samples_at
+from drake_pose.search.sampled_body import SampledBody
 from drake_pose.search.settings import BeamSearchSettings
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from tests.search.bodies import box_link, front_camera, joint, load_body

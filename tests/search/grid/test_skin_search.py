@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from drake_pose.camera.models import ParallelCamera
+from drake_pose.search.beam_search import BeamSearch
 from drake_pose.search.estimates import View
-from drake_pose.search.grid.beam_search import BeamSearch
 from drake_pose.search.kameda import PaperSearch
-from drake_pose.search.scoring import SampledTree, Scoring
+from drake_pose.search.sampled_body import SampledTree, Scoring
 from drake_pose.search.settings import BeamSearchSettings, PaperSearchSettings
 from drake_pose.silhouette.areas.bending import TreeSurfaces
 from drake_pose.silhouette.areas.scoring import draw_mask

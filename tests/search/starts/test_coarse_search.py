@@ -6,15 +6,16 @@ import numpy as np
 import pytest
 
 from drake_pose.camera.models import ParallelCamera
-from drake_pose.search.estimates import View
-from drake_pose.search.grid.sampled_body import SampledBody
-from drake_pose.search.settings import BeamSearchSettings
-from drake_pose.search.starts.coarse_kernel import fill_cover, score_samples
-from drake_pose.search.starts.coarse_search import (
+from drake_pose.search.coarse_search import (
     INTERVAL,
     CoarseSearch,
     _spread_points,
+    fill_cover,
+    score_samples,
 )
+from drake_pose.search.estimates import View
+from drake_pose.search.sampled_body import SampledBody
+from drake_pose.search.settings import BeamSearchSettings
 from drake_pose.silhouette.pictures.masks import signed_distances
 from tests.search.arms import arm_cameras, arm_tree, damaged_views, draw_pose, draw_view, split
 

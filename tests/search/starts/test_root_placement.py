@@ -9,17 +9,17 @@ from drake_pose.body.model import load_model
 from drake_pose.body.tree.root import RootRotation
 from drake_pose.camera.models import ParallelCamera, PinholeCamera
 from drake_pose.errors import SettingsError
-from drake_pose.search.continuous.root_placement_search import RootPlacementSearch
 from drake_pose.search.estimates import View
-from drake_pose.search.grid.sampled_body import SampledBody
-from drake_pose.search.settings import BeamSearchSettings
-from drake_pose.search.starts.root_placement import (
+from drake_pose.search.root_placement import (
     choose_root_samples,
     find_layers,
     hub,
     turns_freely,
     whereabouts,
 )
+from drake_pose.search.root_placement_search import RootPlacementSearch
+from drake_pose.search.sampled_body import SampledBody
+from drake_pose.search.settings import BeamSearchSettings
 from drake_pose.silhouette.areas.scoring import draw_mask
 from drake_pose.workers import working
 from tests.search.bodies import box_link, front_camera, joint, load_body

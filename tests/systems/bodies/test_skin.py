@@ -12,8 +12,7 @@ from pydrake.systems.primitives import ConstantVectorSource
 from drake_pose.body.model import ArticulatedModel
 from drake_pose.body.tree.node_skin import ModelSkin
 from drake_pose.camera.models import ParallelCamera
-from drake_pose.search.kameda import PaperSearch
-from drake_pose.search.settings import PaperSearchSettings
+from drake_pose.search import PaperSearch, PaperSearchSettings
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from drake_pose.systems.bodies import MeshcatSkin, add_meshcat_skin
 from drake_pose.systems.estimators.diagrams import build_simulated_matching

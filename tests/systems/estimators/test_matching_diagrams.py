@@ -9,10 +9,13 @@ from pydrake.trajectories import PiecewisePolynomial
 from drake_pose.camera.camera_files import save_cameras
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import SettingsError
-from drake_pose.search.grid.beam_search import BeamSearch
-from drake_pose.search.grid.examination import ExaminationSettings
-from drake_pose.search.kameda import PaperSearch
-from drake_pose.search.settings import BeamSearchSettings, PaperSearchSettings
+from drake_pose.search import (
+    BeamSearch,
+    BeamSearchSettings,
+    ExaminationSettings,
+    PaperSearch,
+    PaperSearchSettings,
+)
 from drake_pose.silhouette.pictures.label_images import mask_to_label_image
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from drake_pose.silhouette.pictures.masks import write_mask

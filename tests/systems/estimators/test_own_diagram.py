@@ -13,8 +13,7 @@ from pydrake.systems.sensors import CameraConfig, RgbdSensor
 
 from drake_pose.body.model import ArticulatedModel
 from drake_pose.errors import CameraError, SettingsError, UnknownNameError
-from drake_pose.search.kameda import PaperSearch
-from drake_pose.search.settings import PaperSearchSettings
+from drake_pose.search import PaperSearch, PaperSearchSettings
 from drake_pose.systems.estimators.silhouette_matcher import SilhouetteMatcher, SilhouetteTracker
 from drake_pose.systems.pictures.camera_rig import cameras_from_drake
 from tests.search.bodies import front_camera, swinging_chain

@@ -7,8 +7,7 @@ from pydrake.trajectories import PiecewisePolynomial
 
 from drake_pose.errors import SettingsError, UnknownNameError
 from drake_pose.filtering.contour_tracker import TrackingSettings
-from drake_pose.search.kameda import PaperSearch
-from drake_pose.search.settings import PaperSearchSettings
+from drake_pose.search import PaperSearch, PaperSearchSettings
 from drake_pose.silhouette.pictures.label_images import (
     EMPTY,
     label_image_to_mask,

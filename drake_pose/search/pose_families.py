@@ -1,8 +1,11 @@
-"""All poses of the grid as good as the best within the noise, in families.
+"""All poses of the grid as good as the best within the noise, in families; is the best proved?
 
 Two samples of a node are neighbours if no value differs by more than a step of the grid, or if they
 place the node alike. The samples of a node that occur fall into clusters of neighbours of
 neighbours; a family is a choice of one cluster for each node.
+
+A complete branch and bound without a find proves that J is greater than its limit everywhere: just
+below the best J known. An incomplete one gives a smaller bound.
 """
 
 import math
@@ -15,16 +18,17 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from drake_pose.search.estimates import JointEstimate, PoseFamily, PoseSet, View
-from drake_pose.search.grid.branch_and_bound import PosesWithin, branch_and_bound
-from drake_pose.search.grid.pose_graph import (
+from drake_pose.errors import SettingsError
+from drake_pose.search.branch_and_bound import (
     Layer,
     PartialPoseGraph,
+    PosesWithin,
+    branch_and_bound,
     single_pose,
-    spread,
 )
-from drake_pose.search.grid.sampled_body import SampledBody
-from drake_pose.search.scoring import SampledTree
+from drake_pose.search.estimates import JointEstimate, PoseEstimate, PoseFamily, PoseSet, View
+from drake_pose.search.partial_poses import expand_groups
+from drake_pose.search.sampled_body import SampledBody, SampledTree
 from drake_pose.search.settings import BoundLimits
 
 _ROUNDING = 1e-6
@@ -144,7 +148,7 @@ def split_into_families(graph: PartialPoseGraph, labels: list[np.ndarray]) -> li
         ends, codes, weights = _bundle(layer, found if several else np.zeros_like(found))
         origins, bundle_starts = codes
         begins = np.searchsorted(origins, states)
-        source, edge = spread(begins, np.searchsorted(origins, states, side="right"))
+        source, edge = expand_groups(begins, np.searchsorted(origins, states, side="right"))
         pairs = np.column_stack([families[source], bundle_starts[edge]])
         known, families = np.unique(pairs, axis=0, return_inverse=True)
         clusters = clusters[known[:, 0]]
@@ -311,3 +315,91 @@ def _describe_family(
     values = sampled.values_at(samples if graph.objective(samples) == family.J else graph.central())
     joints = estimate_joints(sampled, graph.samples_seen(), values, complete=complete)
     return PoseFamily.of_values(sampled.tree, values, family.J, joints, family.size)
+
+
+@dataclass(frozen=True)
+class ExaminationSettings:
+    """Parameters of an examination.
+
+    Args:
+        proof_time_limit: the proof ends after this time [s], proved or not; None: no limit, 0: it
+            is not tried. An answer with J = 0 needs none.
+        family_time_limit: the same of the search for all poses as good; it then answers with those
+            it has, and no joint is called determined.
+        proof_poses: the proof ends after so many poses of nodes are drawn: unlike a
+            limit on time, with the same result on every machine.
+        family_poses: the same of the search for all poses as good: about two seconds.
+        memory: of each of the two, for what it keeps; it ends as if its time were over [byte].
+        families: how many families are described at most.
+        tolerance: as in ``find_families`` [pixel].
+
+    Raises:
+        SettingsError: if a value is out of its range.
+    """
+
+    proof_time_limit: float | None = None
+    family_time_limit: float | None = None
+    proof_poses: int = 25_000
+    family_poses: int = 50_000
+    memory: int = BoundLimits.memory
+    families: int = 32
+    tolerance: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.tolerance is not None and not self.tolerance >= 0.0:
+            raise SettingsError(f"tolerance must be 0 pixels or more, not {self.tolerance}")
+        if self.families < 1:
+            raise SettingsError(f"families must be 1 or more, not {self.families}")
+        self.limits("family"), self.limits("proof")
+
+    def limits(self, step: str) -> BoundLimits:
+        """Those of the "proof", or of the search for all poses as good, of a "family"."""
+        poses, seconds = getattr(self, f"{step}_poses"), getattr(self, f"{step}_time_limit")
+        return BoundLimits(poses=poses, memory=self.memory, time_limit=seconds)
+
+
+def examine(
+    body: SampledBody,
+    views: Sequence[View],
+    result: PoseEstimate,
+    settings: ExaminationSettings,
+    root_position: np.ndarray | None = None,
+    within: PosesWithin | None = None,
+) -> PoseEstimate:
+    """The result, or a better pose, with ``lower_bound``, ``budget_spent`` and ``pose_set``.
+
+    ``within``: all poses within a tolerance of exactness, where the search has found them.
+
+    Raises:
+        SettingsError: if the result is not of the body's grid.
+    """
+    if not result.found:
+        return result
+    if root_position is not None:
+        body = body.with_root_position(root_position)
+    samples = samples_at(body.sampled, result.node_values)
+    if samples is None:
+        raise SettingsError("the pose to be examined is not on the body's sampling grid")
+    J, lower_bound, spent = result.J, 0.0, result.J > 0.0
+    if within is None and J > 0.0 and settings.proof_time_limit != 0.0:
+        better = branch_and_bound(body, views, J - 1.0, settings.limits("proof"))
+        if better.graph.best_J < J:
+            J, samples = better.graph.best_J, better.graph.central()
+        lower_bound, spent = J if better.complete else better.lower_bound, better.limited
+    answer = find_families(
+        body, views, samples, J, settings.tolerance, settings.families, settings.limits("family"),
+        within if settings.tolerance is None else None,
+    )  # fmt: skip
+    best = answer.families[0]
+    J = min(J, best.J)
+    if J < result.J:
+        q, X_WB, values = best.q, best.X_WB, best.node_values
+        result = replace(result, q=q, X_WB=X_WB, node_values=values, J=J)
+    # A complete set has all that is as good or better.
+    lower_bound = J if answer.complete else min(lower_bound, J)
+    return replace(
+        result,
+        lower_bound=lower_bound,
+        budget_spent=answer.budget_spent or (spent and lower_bound < J),
+        pose_set=answer,
+    )

@@ -24,26 +24,26 @@ from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.errors import SettingsError
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.fit.surfaces import few_triangles, rough_outlines
-from drake_pose.search.continuous.families import RobustFamilies
-from drake_pose.search.continuous.views_fit import (
-    FittedPose,
-    ViewsFit,
-    distinct,
-    refine_best,
-)
-from drake_pose.search.estimates import PoseEstimate, SearchStatistics, View
-from drake_pose.search.grid.beam_search import BeamSearch
-from drake_pose.search.grid.node_poses import coarsen
-from drake_pose.search.grid.sampled_body import SampledBody
-from drake_pose.search.settings import TOLERANT_STAGES, BeamSearchSettings
-from drake_pose.search.starts.coarse_search import (
+from drake_pose.search.beam_search import BeamSearch
+from drake_pose.search.coarse_search import (
     HYPOTHESES,
     INTERVAL,
     LENGTH_INTERVAL,
     CoarsePoses,
     CoarseSearch,
 )
-from drake_pose.search.starts.self_motions import counter_turns, flips
+from drake_pose.search.estimates import PoseEstimate, SearchStatistics, View
+from drake_pose.search.partial_poses import coarsen
+from drake_pose.search.sampled_body import SampledBody
+from drake_pose.search.self_motions import counter_turns, flips
+from drake_pose.search.settings import TOLERANT_STAGES, BeamSearchSettings
+from drake_pose.search.views_fit import (
+    FittedPose,
+    RobustFamilies,
+    ViewsFit,
+    distinct,
+    refine_best,
+)
 from drake_pose.silhouette.areas.outline import Outline
 from drake_pose.silhouette.areas.scoring import draw_mask
 from drake_pose.workers import map_ordered

@@ -23,11 +23,17 @@ import numpy as np
 from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.camera.models import ParallelCamera
 from drake_pose.errors import SettingsError
+from drake_pose.search.beam_search import BeamSearch, grow
 from drake_pose.search.estimates import PoseEstimate, SearchStatistics, View
-from drake_pose.search.grid.beam_search import BeamSearch
-from drake_pose.search.grid.beam_stages import grow
-from drake_pose.search.grid.node_poses import BAND, Pictures, PoseStore, coarsen
-from drake_pose.search.grid.partial_poses import Expansion, PartialPoses
+from drake_pose.search.partial_poses import (
+    BAND,
+    Expansion,
+    PartialPoses,
+    Pictures,
+    PoseStore,
+    coarsen,
+)
+from drake_pose.search.parts import NeighbourhoodSearch, PartSearch
 from drake_pose.search.refinement import (
     COARSE_PASSES,
     FINE_PASSES,
@@ -36,10 +42,7 @@ from drake_pose.search.refinement import (
     RefinementProblem,
     descend,
 )
-from drake_pose.search.settings import BeamSearchSettings, Stage
-from drake_pose.search.starts.neighbourhood import NeighbourhoodSearch
-from drake_pose.search.starts.part_placement import PartSearch
-from drake_pose.search.starts.root_placement import (
+from drake_pose.search.root_placement import (
     Layer,
     choose_root_samples,
     find_layers,
@@ -48,6 +51,7 @@ from drake_pose.search.starts.root_placement import (
     slide_root,
     whereabouts,
 )
+from drake_pose.search.settings import BeamSearchSettings, Stage
 from drake_pose.workers import map_ordered
 
 # What may lie outside, as in the beam search's tolerant stages; the root is off by half a step.

@@ -23,8 +23,8 @@ from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.camera.models import Camera, ParallelCamera
 from drake_pose.errors import SettingsError
 from drake_pose.search.estimates import View
-from drake_pose.search.grid.node_poses import Pictures
-from drake_pose.search.grid.sampled_body import SampledBody
+from drake_pose.search.partial_poses import Pictures
+from drake_pose.search.sampled_body import SampledBody
 from drake_pose.silhouette.areas.scoring import score_bodies
 
 # The picture in which random poses are measured [pixel], and how many.

@@ -10,9 +10,9 @@ from typing import NamedTuple
 import numpy as np
 
 from drake_pose.body.tree.pose_tree import PoseTree
-from drake_pose.search.continuous.families import SAME, TOLERANCE, find_intervals
+from drake_pose.search.beam_search import BeamSearch
 from drake_pose.search.estimates import PoseEstimate, SearchStatistics, View
-from drake_pose.search.grid.beam_search import BeamSearch
+from drake_pose.search.parts import NeighbourhoodSearch, PartSearch
 from drake_pose.search.refinement import (
     COARSE_PASSES,
     FINE_PASSES,
@@ -22,8 +22,7 @@ from drake_pose.search.refinement import (
     descend,
 )
 from drake_pose.search.settings import BeamSearchSettings, Stage
-from drake_pose.search.starts.neighbourhood import NeighbourhoodSearch
-from drake_pose.search.starts.part_placement import PartSearch
+from drake_pose.search.views_fit import SAME, TOLERANCE, find_intervals
 
 # The grids that begin [deg]; the next one searches only where none before has led to a good pose.
 # What one grid and order of nodes misses, another often has.

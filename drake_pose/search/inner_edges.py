@@ -14,9 +14,9 @@ import numpy as np
 from scipy.special import logsumexp
 
 from drake_pose.errors import SettingsError
+from drake_pose.search.branch_and_bound import PartialPoseGraph
 from drake_pose.search.estimates import JointEstimate
-from drake_pose.search.grid.pose_families import GridPoseSet, estimate_joints
-from drake_pose.search.grid.pose_graph import PartialPoseGraph
+from drake_pose.search.pose_families import GridPoseSet, estimate_joints
 
 RenderSegments = Callable[[np.ndarray, np.ndarray], np.ndarray]
 """Draws a pose, q (nq,) and X_WB (4, 4): (H, W) int the segment seen at each pixel, -1 for none.

@@ -13,15 +13,13 @@ from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.camera.models import Camera, ParallelCamera
 from drake_pose.errors import SettingsError
-from drake_pose.filtering.couplings import (
-    UsualPose,
-    couplings_file,
-    load_couplings,
-    load_usual_pose,
-)
 from drake_pose.filtering.inequalities import (
     Inequalities,
+    UsualPose,
+    couplings_file,
     from_bounds,
+    load_couplings,
+    load_usual_pose,
     say_if_unlimited,
     stack,
 )
@@ -41,9 +39,6 @@ GROWTH = "log_growth"
 """The logarithm of how much larger the body is seen than a parallel camera's scale says."""
 
 _ROOT = (*ROOT_SHIFT, GROWTH)
-
-# So many triangles show a rigid part beside bands of skin to a fraction of a pixel.
-_WITH_SKIN = 160
 
 
 class BodyState:
@@ -82,8 +77,9 @@ class BodyState:
         self._kinematics = TreeKinematics(tree)
         surfaces = TreeSurfaces(tree)
         self._whole = PackedSurfaces(surfaces)
-        # Few triangles are compared; what is drawn has all of them.
-        compared = few_rigid_triangles(surfaces, _WITH_SKIN if surfaces.bends else MANY)
+        # Few triangles are compared; what is drawn has all of them. Beside bands of skin 160 show
+        # a rigid part to a fraction of a pixel.
+        compared = few_rigid_triangles(surfaces, 160 if surfaces.bends else MANY)
         self._body = BodyParameters(self._kinematics, compared.rigid, surfaces=compared)
         free = self._kinematics.lower < self._kinematics.upper
         names = [n for n, is_free in zip(self._kinematics.names, free, strict=True) if is_free]

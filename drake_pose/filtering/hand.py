@@ -28,10 +28,6 @@ HAND_STATE, MEASURED = TWO_FINGERS.layout, TWO_FINGERS.measured
 """The two-finger hand's state, and what is measured of it."""
 SPREADS, FLEXIONS, LENGTHS = TWO_FINGERS.spreads, TWO_FINGERS.flexions, TWO_FINGERS.lengths
 
-# A mirrored angle closer than this is the same [rad], one further from the prediction not tried
-# [deviations]; a segment shorter than this in the image shows no axis [pixel]; the noise of the
-# scale where it is known.
-_SMALLEST_CHANGE, _MIRROR_REACH, _SHORTEST, _SCALE_DEVIATION = math.radians(8), 3.0, 5.0, 1e-3
 _QUATERNION, _ANGLES = 2, 6
 
 
@@ -45,7 +41,11 @@ class HandObservation:
         angle_deviation, distance_deviation: noise of a line's alpha [rad] and rho [pixel].
         mirror_slope: (30) holds where a joint's turn moves its segment's end by less than this
             fraction of what it would move it in the image plane.
-        rest: in so many frames, how joints are usually held is told once.
+        smallest_change: a mirrored angle that is closer is the same [rad].
+        mirror_reach: mirrored angles farther from the prediction are not tried [deviations].
+        shortest: a segment that is shorter in the picture shows no axis [pixel].
+        scale_deviation: noise of the scale where it is known.
+        rest: number of frames in which how joints are usually held counts as one measurement.
         hand: which one.
 
     Raises:
@@ -57,6 +57,10 @@ class HandObservation:
     angle_deviation: float = math.radians(1.0)
     distance_deviation: float = 1.0
     mirror_slope: float = 0.35
+    smallest_change: float = math.radians(8.0)
+    mirror_reach: float = 3.0
+    shortest: float = 5.0
+    scale_deviation: float = 1e-3
     rest: float = 30.0
     hand: HandModel = field(default=TWO_FINGERS, repr=False)
 
@@ -78,7 +82,7 @@ class HandObservation:
         deviations = np.full(len(self.names), self.point_deviation)
         deviations[lines:scale:2] = self.angle_deviation
         deviations[lines + 1 : scale : 2] = self.distance_deviation
-        deviations[scale] = _SCALE_DEVIATION
+        deviations[scale] = self.scale_deviation
         if usual is not None:
             deviations[scale + 1 :] = math.sqrt(self.rest) * usual.deviation
         return deviations**2
@@ -105,7 +109,7 @@ class HandObservation:
 
     def _project(self, x: Array) -> tuple[Array, Array, Array, Array]:
         hand = self.hand
-        return project_hand(x[hand.seen], hand.chains, self.pixels_per_metre, _SHORTEST)
+        return project_hand(x[hand.seen], hand.chains, self.pixels_per_metre, self.shortest)
 
     def mirrors(self, belief: Belief) -> list[Array]:
         """Predictions (n,) mirrored at the image plane in one joint, where (30) holds.
@@ -116,7 +120,7 @@ class HandObservation:
         hand, x, found = self.hand, belief.mean, []
         _, _, points, J = self._project(x)
         flexions = hand.layout.indices(hand.flexions)
-        reaches = _MIRROR_REACH * belief.deviations()[flexions]
+        reaches = self.mirror_reach * belief.deviations()[flexions]
         starts, ends = hand.line_ends[: len(flexions)].T
         own = np.searchsorted(hand.seen, flexions)
         a = points[ends] - points[starts]
@@ -124,7 +128,7 @@ class HandObservation:
         slopes = np.linalg.norm(b[:, :2], axis=1) / np.maximum(np.linalg.norm(b, axis=1), 1e-9)
         changes = 2.0 * np.arctan2(b[:, 2], a[:, 2]) + np.pi
         changes -= 2.0 * np.pi * np.round(changes / (2.0 * np.pi))
-        can = (slopes <= self.mirror_slope) & (np.abs(changes) > _SMALLEST_CHANGE)
+        can = (slopes <= self.mirror_slope) & (np.abs(changes) > self.smallest_change)
         for k in np.flatnonzero(can & (np.abs(changes) < reaches)):
             found.append(x.copy())
             found[-1][flexions[k]] += changes[k]

@@ -14,7 +14,7 @@ from pydrake.multibody.tree import Joint, RevoluteJoint
 from drake_pose.arrays import Array, Indices
 from drake_pose.body.model import ArticulatedModel
 from drake_pose.errors import ModelError
-from drake_pose.filtering.couplings import UsualPose, couplings_file, load_usual_pose
+from drake_pose.filtering.inequalities import UsualPose, couplings_file, load_usual_pose
 from drake_pose.filtering.state import StateLayout
 
 TURN, BASE, SEGMENT = 0, 1, 2
@@ -27,10 +27,6 @@ PALM_EDGES = ("left", "right", "top", "bottom")
 
 # The axes of a hand's palm, y along the fingers and z out of the palm, as those of the state.
 _FROM_LINK = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])
-# Where a palm's outlines are taken, over its height: at the wrist, and before the knuckles.
-_WRIST_BAND, _KNUCKLE_BAND, _KNUCKLES, _DIRECTIONS = 0.07, (0.78, 0.84), 0.85, 16
-# A finger's thickness is measured so far about a joint, and so far from its end [m].
-_ABOUT_JOINT, _FROM_END = 0.003, (0.004, 0.010)
 
 
 class Chains(NamedTuple):
@@ -284,9 +280,9 @@ def _read_finger(
         steps.append(Step(joint.name(), TURN, tuple(axis)))
         last = joint.child_body().name()
         if last in model.link_meshes:
-            radii.append(_radius(model, last, -_ABOUT_JOINT, _ABOUT_JOINT))
+            radii.append(_radius(model, last, -0.003, 0.003))
     end = model.link_meshes[last].vertices[:, 1].max()
-    radii.append(_radius(model, last, end - _FROM_END[1], end - _FROM_END[0]))
+    radii.append(_radius(model, last, end - 0.010, end - 0.004))
     steps.append(Step(f"length_{last}", SEGMENT, tuple(_FROM_LINK @ R[:, 1])))
     sizes[f"length_{last}"] = float(end - radii[-1])
     return tuple(steps), radii
@@ -313,14 +309,25 @@ def _band(model: ArticulatedModel, link: str, low: float, high: float) -> Array:
     return band
 
 
-def _palm_rings(model: ArticulatedModel, palm: str, height: float) -> Array:
-    """(2, K, 3) a palm's outlines at the wrist and before the knuckles [m]."""
+def _palm_rings(
+    model: ArticulatedModel,
+    palm: str,
+    height: float,
+    count: int = 16,
+    wrist: float = 0.07,
+    knuckles: tuple[float, float, float] = (0.78, 0.84, 0.85),
+) -> Array:
+    """(2, count, 3) a palm's outlines at the wrist and before the knuckles [m].
+
+    Taken from the palm's end to ``wrist``, and between two of ``knuckles`` to stand at the third,
+    all as fractions of its height.
+    """
     low = float(model.link_meshes[palm].vertices[:, 1].min())
-    angles = 2.0 * np.pi * np.arange(_DIRECTIONS) / _DIRECTIONS
+    angles = 2.0 * np.pi * np.arange(count) / count
     directions = np.column_stack([np.cos(angles), np.sin(angles)])
-    bands = ((low, low + _WRIST_BAND * height), [share * height for share in _KNUCKLE_BAND])
-    rings = np.zeros((2, _DIRECTIONS, 3))
-    for ring, (begin, end), x in zip(rings, bands, (low, _KNUCKLES * height), strict=True):
+    bands = ((low, low + wrist * height), [share * height for share in knuckles[:2]])
+    rings = np.zeros((2, count, 3))
+    for ring, (begin, end), x in zip(rings, bands, (low, knuckles[2] * height), strict=True):
         band = _band(model, palm, begin, end) @ _FROM_LINK.T
         ring[:] = band[np.argmax(band[:, 1:] @ directions.T, axis=0)]
         ring[:, 0] = x

@@ -1,4 +1,8 @@
-"""A hand measured in a silhouette that does not say which part of it is which."""
+"""The axes of segments in a silhouette, matched to a rough pose.
+
+Shimada et al., (11), (12) and figure 17: no picture says which part of it shows which segment. A
+rough pose does: each point of the silhouette's edge goes to the side of a segment that is nearest.
+"""
 
 import math
 from collections.abc import Sequence
@@ -11,32 +15,256 @@ from numpy.typing import NDArray
 
 from drake_pose.arrays import Array, Mask
 from drake_pose.errors import MaskError
-from drake_pose.filtering.axes import (
-    GATES,
-    SPACING,
-    RoughBody,
-    block_covariance,
-    match_axes,
-)
 from drake_pose.filtering.hand import HandObservation, scaled_rotation
 from drake_pose.filtering.hand_model import PALM, QUATERNION, WRIST, HandModel
 from drake_pose.filtering.state import Belief, factor_of
 from drake_pose.filtering.truncated_filter import TruncatedFilter
 from drake_pose.fit.evidence import EdgePoints, find_edge_points
 
-# Searches at most; a search's poses in a round, those that the next is drawn about, rounds, those
-# that are followed.
-_SEARCHES, _POSES, _ELITE, _SEARCH_ROUNDS, _FOLLOWED = 3, 120, 15, 5, 4
-# Its widest deviations: wrist [pixel], quaternion, angles [rad], lengths [m]; and how much finer
-# than the picture it draws.
-_WIDEST_WRIST, _WIDEST_TURN, _WIDEST_ANGLE, _WIDEST_LENGTH = 8.0, 0.14, math.radians(18.0), 0.012
-_ZOOM = 0.5
-# How surely a joint or a tip lies inside the silhouette, and along its edge [radii].
-_INSIDE, _ALONG = 0.5, 10.0
-# A round end, drawn as a polygon.
-_RIM = np.array([[math.cos(k * math.pi / 12), math.sin(k * math.pi / 12)] for k in range(24)])
-# Gates and the wrist's search are for fingers of this radius [pixel].
-_USUAL_RADIUS = 8.0
+
+@dataclass(frozen=True)
+class MatchingSettings:
+    """How edge points are matched to a rough pose's segments.
+
+    Args:
+        spacing: distance between two edge points [pixel].
+        gates: distance between edge points and a rough side, from match to match [pixel].
+        edge_deviation, correlation: an edge point's standard deviation, and the length of edge
+            whose errors are alike, larger since the next frame errs alike [pixel].
+        width_deviation: standard deviation of half a segment's width [pixel].
+        surest_place, surest_angle, surest_tip: least standard deviation of a line's place [pixel]
+            and direction [rad], and of a tip [pixel].
+        largest_angle_deviation, largest_tip_deviation: a line [rad] or a tip [pixel] that is less
+            sure is not measured.
+        facing, facing_tip: least cosine between a point's normal and a side's, or a tip's.
+        end: fraction of a side at each end that is not matched.
+        beside: distance outside a side at which the rough body shows nothing unless the side is
+            hidden [pixel].
+        rounds: of the robust fit.
+        shortest: a segment that is shorter in the picture shows no axis [pixel].
+    """
+
+    spacing: float = 2.0
+    gates: tuple[float, ...] = (14.0, 9.0, 6.0, 4.0)
+    edge_deviation: float = 0.35
+    correlation: float = 8.0
+    width_deviation: float = 0.4
+    surest_place: float = 0.1
+    surest_angle: float = math.radians(0.2)
+    surest_tip: float = 0.15
+    largest_angle_deviation: float = math.radians(10.0)
+    largest_tip_deviation: float = 3.0
+    facing: float = 0.85
+    facing_tip: float = 0.7
+    end: float = 0.08
+    beside: float = 2.0
+    rounds: int = 4
+    shortest: float = 5.0
+
+
+MATCHING = MatchingSettings()
+
+
+class RoughBody(NamedTuple):
+    """What a rough pose shows in one picture [pixel].
+
+    Attributes:
+        ends: (L, 2, 2) start and end of each segment's axis, or of an edge.
+        widths: (L,) half the width of a segment; 0 for an edge.
+        sides: (L, 2) whether a side may be seen: that of the normal (-y, x), and the other.
+        tips: (T,) the lines that end in a round tip of their width.
+        drawn: (H, W) the body.
+    """
+
+    ends: Array
+    widths: Array
+    sides: Mask
+    tips: NDArray[np.intp]
+    drawn: NDArray[np.uint8] | Mask
+
+
+class Axes(NamedTuple):
+    """Lines and tips, NaN where not seen.
+
+    Attributes:
+        lines: (L, 2) alpha, the angle from start to end [rad], and rho [pixel]: points (u, v) of a
+            line have rho = v cos(alpha) - u sin(alpha).
+        line_covariances: (L, 2, 2).
+        tips: (T, 2) [pixel]; tip_covariances: (T, 2, 2).
+    """
+
+    lines: Array
+    line_covariances: Array
+    tips: Array
+    tip_covariances: Array
+
+
+class _Matched(NamedTuple):
+    """Edge points by the feature they were matched to: offset = slope @ (its two unknowns)."""
+
+    feature: NDArray[np.intp]
+    side: NDArray[np.intp]
+    slope: Array
+    offset: Array
+    weight: Array
+
+
+def match_axes(
+    edge: EdgePoints, rough: RoughBody, gate: float, origin: tuple[float, float] = (0.0, 0.0)
+) -> Axes:
+    """The axes of segments that a silhouette's edge shows, both sides or one.
+
+    Args:
+        gate: how far from the rough side an edge point may be [pixel].
+        origin: where the picture's point (0, 0) of the lines and tips is [pixel].
+    """
+    count = len(rough.ends)
+    along = rough.ends[:, 1] - rough.ends[:, 0]
+    size = np.linalg.norm(along, axis=1)
+    along = along / np.maximum(size, 1e-9)[:, None]
+    normal = np.column_stack([-along[:, 1], along[:, 0]])
+    matched = _match(edge, rough, gate, along, normal, size)
+    solution, covariance, sides = _solve(matched, count + len(rough.tips), gate)
+    one_sided = (rough.widths > 0) & (sides[:count].min(axis=1) < 0.3 * sides[:count].max(axis=1))
+    shift, turn = solution[:count].T
+    C = covariance[:count]
+    C[:, 0, 0] += np.where(one_sided, MATCHING.width_deviation**2, 0.0) + MATCHING.surest_place**2
+    C[:, 1, 1] += MATCHING.surest_angle**2
+    middle = rough.ends.mean(axis=1) - origin + shift[:, None] * normal
+    alpha = np.arctan2(along[:, 1], along[:, 0]) + np.arctan(turn)
+    alpha = np.remainder(alpha + np.pi, 2 * np.pi) - np.pi
+    c, s = np.cos(alpha), np.sin(alpha)
+    lines = np.column_stack([alpha, c * middle[:, 1] - s * middle[:, 0]])
+    # rho changes with alpha by minus the distance along the axis.
+    J = np.zeros((count, 2, 2))
+    J[:, 0, 1], J[:, 1, 0], J[:, 1, 1] = 1.0, 1.0, -(c * middle[:, 0] + s * middle[:, 1])
+    lines[(C[:, 1, 1] > MATCHING.largest_angle_deviation**2) | (size < MATCHING.shortest)] = np.nan
+    tips = rough.ends[rough.tips, 1] - origin + solution[count:]
+    tip_covariances = covariance[count:] + MATCHING.surest_tip**2 * np.eye(2)
+    # The end of a segment that points at the camera may be its joint.
+    unsure = np.linalg.eigvalsh(tip_covariances)[:, 1] > MATCHING.largest_tip_deviation**2
+    tips[unsure | (size < rough.widths)[rough.tips]] = np.nan
+    return Axes(lines, J @ C @ J.transpose(0, 2, 1), tips, tip_covariances)
+
+
+def _match(
+    edge: EdgePoints, rough: RoughBody, gate: float, along: Array, normal: Array, size: Array
+) -> _Matched:
+    """Gives each edge point to the visible side or tip that is nearest, within the gate."""
+    line, side = np.nonzero(rough.sides)
+    sign, uv = 1.0 - 2.0 * side, edge.uv
+    relative = uv - rough.ends[line, :1]
+    place = np.einsum("cnk,ck->cn", relative, along[line])
+    across = np.einsum("cnk,ck->cn", relative, normal[line])
+    outside = sign[:, None] * across - rough.widths[line, None]
+    facing = sign[:, None] * (normal[line] @ edge.normals.T)
+    share = place / np.maximum(size[line], 1e-9)[:, None]
+    beside = uv + (sign[:, None] * (MATCHING.beside - outside))[..., None] * normal[line, None]
+    can = (
+        (np.abs(outside) < gate)
+        & (facing > MATCHING.facing)
+        & (np.abs(share - 0.5) < 0.5 - MATCHING.end)
+    )
+    can &= _is_empty(rough.drawn, beside)
+    ends, widths = rough.ends[rough.tips, 1], rough.widths[rough.tips]
+    radial = uv - ends[:, None]
+    distance = np.linalg.norm(radial, axis=2)
+    radial = radial / np.maximum(distance, 1e-9)[..., None]
+    beyond = distance - widths[:, None]
+    beside = ends[:, None] + (widths[:, None, None] + MATCHING.beside) * radial
+    round_tip = (np.abs(beyond) < gate) & _is_empty(rough.drawn, beside)
+    round_tip &= np.einsum("tnk,nk->tn", radial, edge.normals) > MATCHING.facing_tip
+    round_tip &= np.einsum("tnk,tk->tn", radial, along[rough.tips]) > 0.1
+    cost = np.abs(np.vstack([outside, beyond]))
+    cost[~np.vstack([can, round_tip])] = np.inf
+    nearest = np.argmin(cost, axis=0)
+    points = np.flatnonzero(np.isfinite(cost[nearest, np.arange(len(uv))]))
+    own = nearest[points]
+    is_tip = own >= len(line)
+    k, t = np.where(is_tip, 0, own), np.where(is_tip, own - len(line), 0)
+    lever = (share[k, points] - 0.5) * size[line[k]]
+    on_line = np.column_stack([np.ones(len(points)), lever])
+    slope = on_line
+    offset = sign[k] * outside[k, points]
+    feature = line[k]
+    if len(rough.tips):
+        slope = np.where(is_tip[:, None], radial[t, points], on_line)
+        offset = np.where(is_tip, beyond[t, points], offset)
+        feature = np.where(is_tip, len(rough.ends) + t, feature)
+    return _Matched(feature, side[k], slope, offset, edge.lengths[points])
+
+
+def _is_empty(drawn: NDArray[np.uint8] | Mask, uv: Array) -> Mask:
+    """Whether a picture shows nothing at points (..., 2), the nearest ones inside of it."""
+    size = (drawn.shape[1] - 1, drawn.shape[0] - 1)
+    u, v = np.moveaxis(np.clip(np.rint(uv).astype(np.intp), 0, size), -1, 0)
+    return np.asarray(drawn[v, u] == 0)
+
+
+def _solve(matched: _Matched, count: int, gate: float) -> tuple[Array, Array, Array]:
+    """Each feature's unknowns (F, 2), their covariance (F, 2, 2), weight of its sides (F, 2)."""
+    f, g, e = matched.feature, matched.slope, matched.offset
+
+    def total(values: Array) -> Array:
+        return np.asarray(np.bincount(f, values, count), dtype=np.float64)
+
+    solution = np.zeros((count, 2))
+    for k in range(MATCHING.rounds):
+        residual = e - np.einsum("nk,nk->n", g, solution[f])
+        # Geman and McClure's weight, of a scale that shrinks to a pixel.
+        w = matched.weight / (1.0 + (residual / max(2.0, gate / 3.0**k)) ** 2) ** 2
+        N = np.empty((count, 2, 2))
+        N[:, 0, 0], N[:, 1, 1] = total(w * g[:, 0] ** 2) + 1e-9, total(w * g[:, 1] ** 2) + 1e-9
+        N[:, 0, 1] = N[:, 1, 0] = total(w * g[:, 0] * g[:, 1])
+        right = np.column_stack([total(w * e * g[:, 0]), total(w * e * g[:, 1])])
+        solution[:] = np.linalg.solve(N, right[..., None])[..., 0]
+    residual = e - np.einsum("nk,nk->n", g, solution[f])
+    variance = total(w * residual**2) / np.maximum(total(w), 1e-9)
+    noise = np.maximum(variance, MATCHING.edge_deviation**2) * MATCHING.correlation
+    sides = np.column_stack([total(w * (matched.side == side)) for side in range(2)])
+    return solution, noise[:, None, None] * np.linalg.inv(N), sides
+
+
+def block_covariance(blocks: Array) -> Array:
+    """(2 k, 2 k) with the blocks (k, 2, 2) on the diagonal, else 0."""
+    count = len(blocks)
+    R = np.zeros((count, 2, count, 2))
+    R[np.arange(count), :, np.arange(count)] = blocks
+    return R.reshape(2 * count, 2 * count)
+
+
+@dataclass(frozen=True)
+class HandSearchSettings:
+    """The cross-entropy search for a hand's pose.
+
+    Args:
+        searches: at most.
+        poses, elite, rounds: poses of a round, those that the next round is drawn about, rounds.
+        followed: poses whose edges are matched.
+        wrist_deviation, turn_deviation, angle_deviation, length_deviation: largest standard
+            deviations of the first round: wrist [pixel], quaternion, angles [rad], lengths [m].
+        zoom: size of the pictures that are compared, as a multiple of the mask's.
+        inside, along: standard deviation of a hidden joint or tip across the silhouette's edge, and
+            along it [radii].
+        usual_radius: finger's radius for which gates and ``wrist_deviation`` are given [pixel].
+    """
+
+    searches: int = 3
+    poses: int = 120
+    elite: int = 15
+    rounds: int = 5
+    followed: int = 4
+    wrist_deviation: float = 8.0
+    turn_deviation: float = 0.14
+    angle_deviation: float = math.radians(18.0)
+    length_deviation: float = 0.012
+    zoom: float = 0.5
+    inside: float = 0.5
+    along: float = 10.0
+    usual_radius: float = 8.0
+
+
+SEARCH = HandSearchSettings()
 
 
 class HandMeasurement(NamedTuple):
@@ -81,9 +309,12 @@ class HandSilhouette:
         palm, points, radii = self._outline(x)
         # OpenCV takes sixteenths of pixels, and draws a quarter of a pixel more.
         palm, points = (16 * (zoom * (uv + 0.5) - 0.5) for uv in (palm, points))
-        rims = 16 * zoom * (radii - 0.25)[..., None, None] * _RIM
+        # A round end is a polygon.
+        angles = np.arange(24) * (np.pi / 12.0)
+        rim = np.column_stack([np.cos(angles), np.sin(angles)])
+        rims = 16 * zoom * (radii - 0.25)[..., None, None] * rim
         rims += points[: radii.size].reshape(*radii.shape, 1, 2)
-        rods = np.concatenate([rims[:, :-1], rims[:, 1:]], axis=2).reshape(-1, 2 * len(_RIM), 2)
+        rods = np.concatenate([rims[:, :-1], rims[:, 1:]], axis=2).reshape(-1, 2 * len(rim), 2)
         for part in (palm, *rods):
             hull = cv2.convexHull(np.round(part).astype(np.int32))
             cv2.fillConvexPoly(picture, hull, 1, shift=4)
@@ -101,15 +332,15 @@ class HandSilhouette:
             raise MaskError(
                 f"a mask of {mask.shape[::-1]} pixels, {(self.width, self.height)} expected"
             )
-        edge = find_edge_points(mask, SPACING)
+        edge = find_edge_points(mask, MATCHING.spacing)
         if not len(edge.uv):
             nothing = np.full(len(self._observation.names), np.nan)
             return HandMeasurement(nothing, np.diag(nothing), prediction.mean, 1.0)
-        found = self._follow(mask, edge, prediction, prediction.mean, GATES[2:], scale)
+        found = self._follow(mask, edge, prediction, prediction.mean, MATCHING.gates[2:], scale)
         if found.difference > self.well_matched:
-            for seed in range(_SEARCHES):
+            for seed in range(SEARCH.searches):
                 for x in self._search(mask, prediction, seed):
-                    other = self._follow(mask, edge, prediction, x, GATES, scale)
+                    other = self._follow(mask, edge, prediction, x, MATCHING.gates, scale)
                     found = min(found, other, key=lambda one: one.difference)
                 if found.difference <= self.well_matched:
                     break
@@ -141,7 +372,11 @@ class HandSilhouette:
     @property
     def _unit(self) -> float:
         """The thickness of fingers, over that which the widths of searches are made for."""
-        return float(np.mean(self._hand.radii)) * self._observation.pixels_per_metre / _USUAL_RADIUS
+        return (
+            float(np.mean(self._hand.radii))
+            * self._observation.pixels_per_metre
+            / SEARCH.usual_radius
+        )
 
     def _rough(self, x: Array) -> RoughBody:
         palm, points, radii = self._outline(x)
@@ -200,36 +435,43 @@ class HandSilhouette:
             away = (point - nearest) / max(float(np.linalg.norm(point - nearest)), 1.0)
             y[rows] = nearest - 0.5 * radius * away - self.center
             # Nothing is known of where along the edge.
-            along = _ALONG**2 * np.eye(2) + (_INSIDE**2 - _ALONG**2) * np.outer(away, away)
+            along = SEARCH.along**2 * np.eye(2) + (SEARCH.inside**2 - SEARCH.along**2) * np.outer(
+                away, away
+            )
             R[rows, rows] = radius**2 * along
 
     def _search(self, mask: Mask, prediction: Belief, seed: int) -> Array:
         """(k, n) poses around a prediction whose silhouettes are the most alike: cross-entropy."""
-        size = (round(_ZOOM * self.width), round(_ZOOM * self.height))
+        size = (round(SEARCH.zoom * self.width), round(SEARCH.zoom * self.height))
         small = cv2.resize(mask.view(np.uint8), size, interpolation=cv2.INTER_NEAREST)
         generator, mean = np.random.default_rng(seed), prediction.mean
         rows = self.belief_filter.inequalities
         seen, hand = self._hand.seen, self._hand
         turn = hand.layout.indices(QUATERNION)
         widest = np.repeat(
-            (self._unit * _WIDEST_WRIST, _WIDEST_TURN, _WIDEST_ANGLE, _WIDEST_LENGTH),
+            (
+                self._unit * SEARCH.wrist_deviation,
+                SEARCH.turn_deviation,
+                SEARCH.angle_deviation,
+                SEARCH.length_deviation,
+            ),
             (2, 4, len(hand.angles), len(hand.layout.constant)),
         )
         narrowed = np.minimum(1.0, widest / np.maximum(prediction.deviations()[seen], 1e-12))
         P = prediction.covariance[np.ix_(seen, seen)] * np.outer(narrowed, narrowed)
         spread, elite = np.sqrt(np.diag(P)), mean[None]
-        for k in range(_SEARCH_ROUNDS):
-            poses = np.tile(mean, (_POSES, 1))
-            poses[:, seen] += generator.normal(size=(_POSES, len(seen))) @ factor_of(P).T
+        for k in range(SEARCH.rounds):
+            poses = np.tile(mean, (SEARCH.poses, 1))
+            poses[:, seen] += generator.normal(size=(SEARCH.poses, len(seen))) @ factor_of(P).T
             poses[: len(elite)] = elite
             norms = np.linalg.norm(poses[:, turn], axis=1, keepdims=True)
             poses[:, turn] *= np.linalg.norm(prediction.mean[turn]) / norms
             for phi, b in zip(rows.phi, rows.b, strict=True):
                 beyond = np.maximum(poses @ phi - b, 0.0)
                 poses -= np.outer(beyond, phi / (phi @ phi))
-            wrong = [np.count_nonzero(self.draw(x, _ZOOM) != small) for x in poses]
-            elite = poses[np.argsort(wrong)[:_ELITE]]
+            wrong = [np.count_nonzero(self.draw(x, SEARCH.zoom) != small) for x in poses]
+            elite = poses[np.argsort(wrong)[: SEARCH.elite]]
             mean = elite.mean(axis=0)
             off = (elite - mean)[:, seen]
             P = off.T @ off / len(off) + np.diag((0.15 * spread) ** 2) * 0.5**k
-        return elite[:_FOLLOWED]
+        return elite[: SEARCH.followed]

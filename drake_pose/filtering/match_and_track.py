@@ -10,8 +10,12 @@ import numpy as np
 from drake_pose.arrays import Array, Mask, Picture
 from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.camera.models import Camera
-from drake_pose.filtering.contour import ContourObservation
-from drake_pose.filtering.contour_tracker import ContourTracker, Track, TrackingSettings
+from drake_pose.filtering.contour_tracker import (
+    ContourObservation,
+    ContourTracker,
+    Track,
+    TrackingSettings,
+)
 from drake_pose.search import (
     TRACKED,
     UNEXPLAINED,
@@ -21,9 +25,6 @@ from drake_pose.search import (
     covariance_pose_set,
 )
 from drake_pose.silhouette.pictures.masks import edge_area
-
-# A track is lost when E_total is this many times what it was after the last match, and this more.
-_LOST_GROWTH, _LOST_MARGIN = 1.5, 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -208,7 +209,8 @@ class MatchAndTrack:
     def _is_lost(
         self, track: Track, result: PoseEstimate, reference: float, has_masks: bool
     ) -> bool:
-        limit = _LOST_GROWTH * reference + _LOST_MARGIN
+        """Whether a track left the contour, or its E_total grew by half and .1 since its match."""
+        limit = 1.5 * reference + 0.1
         return track.lost or (has_masks and result.E_total > min(limit, UNEXPLAINED))
 
     def _difference(self, track: Track, frame: _Frame) -> tuple[float, float]:

@@ -14,8 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from drake_pose.arrays import Array, Indices, Mask
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
-from drake_pose.filtering.contour import ContourObservation
-from drake_pose.filtering.contour_tracker import ContourTracker, Track
+from drake_pose.filtering.contour_tracker import ContourObservation, ContourTracker, Track
 from drake_pose.fit.contour_fit import Noise
 from drake_pose.fit.evidence import find_edge_points
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
@@ -29,29 +28,53 @@ from drake_pose.fit.surfaces import few_rigid_triangles
 from drake_pose.search import JointEstimate, PoseFamily, PoseSet, joint_estimates
 from drake_pose.silhouette.areas.bending import TreeSurfaces
 
-# Of a normal distribution, 95 % lie within this many standard deviations.
-_NORMAL_95 = 1.96
-# Angles that differ by less in the root mean square of all frames are the same [rad].
-_SAME = 0.1
-# Triangles of each rigid part, and the distance of the silhouettes' points [pixel].
-_TRIANGLES, _SPACING = 160, 2.0
-# The parts of a fit [pixel].
-_ROUNDS = (AnnealingStage(15.0, 3.0, 6), AnnealingStage(6.0, 3.0, 8), AnnealingStage(3.0, 3.0, 20))
-# Pictures closer in time than this say the same: they are worth one together [s].
-_MEMORY = 0.15
-# How far the body's contour is from a mask's edge, where its proportions are fitted and its flesh
-# is still not that of who is seen, and how much of it errs together: that of a finger's bone [px].
-_DEVIATION, _CORRELATION = 2.0, 75.0
-START_FRAMES = 90
-"""Through so many frames starts are followed."""
-# They are tilted by so much about both axes of the picture, either way [rad], and compared with the
-# first frame so often. Tracks closer than _APART are one [rad]; given up is whose E_total in the
-# first frame is so much larger than the best one's, and who is beyond the number of the best.
-_TILT, _SETTLING, _APART, _LESS, _MOST_STARTS = 0.7, 4, 0.2, 0.03, 6
-# A joint at its limits (three deviations squared) counts as so much E_total of a start.
-_PRIOR_WEIGHT = 0.0003
-# So many starts are fitted at most, and fits whose cost is so many times the best one's given up.
-_STARTS, _WORSE = 3, 1.1
+
+@dataclass(frozen=True)
+class SequenceSettings:
+    """How a recorded sequence is fitted; chosen on ``hand_sequences``.
+
+    Args:
+        same: fits are one whose angles differ by less, root mean square over all frames [rad].
+        triangles: of each rigid part.
+        spacing: distance between two points of a silhouette's edge [pixel].
+        rounds: the parts of a fit [pixel].
+        memory: pictures closer in time say the same; together they count as one [s].
+        deviation, correlation: standard deviation of the body's contour about a mask's edge, and
+            the length of contour whose errors are alike [pixel]: flesh is not that of who is seen,
+            along a finger's bone.
+        start_frames: frames through which starts are followed.
+        tilt: starts are tilted by this about both axes of the picture, either way [rad].
+        settling: comparisons of a start with the first frame.
+        apart: starts that are closer are one [rad].
+        worse_start: starts whose E_total in the first frame exceeds the best by more are dropped.
+        followed_starts, fitted_starts: starts that are followed, and fitted, at most.
+        prior_weight: E_total that a squared deviation of a joint from its usual angle counts as.
+        worse_fit: fits whose cost is more than this multiple of the best one's are dropped.
+    """
+
+    same: float = 0.1
+    triangles: int = 160
+    spacing: float = 2.0
+    rounds: tuple[AnnealingStage, ...] = (
+        AnnealingStage(15.0, 3.0, 6),
+        AnnealingStage(6.0, 3.0, 8),
+        AnnealingStage(3.0, 3.0, 20),
+    )
+    memory: float = 0.15
+    deviation: float = 2.0
+    correlation: float = 75.0
+    start_frames: int = 90
+    tilt: float = 0.7
+    settling: int = 4
+    apart: float = 0.2
+    worse_start: float = 0.03
+    followed_starts: int = 6
+    prior_weight: float = 0.0003
+    fitted_starts: int = 3
+    worse_fit: float = 1.1
+
+
+SEQUENCE = SequenceSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +101,9 @@ class FollowedStart:
     @property
     def cost(self) -> float:
         """What tells the better of two."""
-        return float(np.mean(self.errors)) + _PRIOR_WEIGHT * float(np.mean(self.prior_distances))
+        return float(np.mean(self.errors)) + SEQUENCE.prior_weight * float(
+            np.mean(self.prior_distances)
+        )
 
 
 def tilted(observation: ContourObservation, x: Array, tilt: Sequence[float]) -> Array:
@@ -99,22 +124,25 @@ def find_start(
 ) -> list[FollowedStart]:
     """The poses to be followed in frames of all cameras' masks, best first, from a state (n,)."""
     observation = tracker.observation
-    steps = (0.0, _TILT, -_TILT)
+    steps = (0.0, SEQUENCE.tilt, -SEQUENCE.tilt)
     candidates = []
     for tilt in [(a, b) for a in steps for b in steps]:
         track = tracker.start(tilted(observation, x, tilt))
-        for _ in range(_SETTLING):
+        for _ in range(SEQUENCE.settling):
             track = tracker.follow(tracker.start(track.state.best.mean), masks[0], first=True)
         candidates.append(_judged(observation, track, masks[0]))
     candidates.sort(key=lambda one: one.cost)
     kept: list[FollowedStart] = []
     for one in candidates:
-        if one.errors[0] > candidates[0].errors[0] + _LESS or len(kept) >= _MOST_STARTS:
+        if (
+            one.errors[0] > candidates[0].errors[0] + SEQUENCE.worse_start
+            or len(kept) >= SEQUENCE.followed_starts
+        ):
             continue
         moving = len(observation.layout.moving)
-        if all(np.abs(one.x - other.x)[:moving].max() > _APART for other in kept):
+        if all(np.abs(one.x - other.x)[:moving].max() > SEQUENCE.apart for other in kept):
             kept.append(one)
-    for frame in masks[1:START_FRAMES]:
+    for frame in masks[1 : SEQUENCE.start_frames]:
         kept = [_judged(observation, tracker.follow(one.track, frame), frame, one) for one in kept]
     return sorted(kept, key=lambda one: one.cost)
 
@@ -150,7 +178,7 @@ class FittedSequence:
         kinematics = self.body.kinematics
         count, around = len(kinematics.names), kinematics.turns_around
         values = self.fitted.parameters[frame, :count]
-        half = _NORMAL_95 * self.fitted.deviations[frame, :count]
+        half = 1.96 * self.fitted.deviations[frame, :count]
         half = np.where(around, np.minimum(half, np.pi), half)
         low = np.where(around, values - half, np.maximum(values - half, kinematics.lower))
         high = np.where(around, values + half, np.minimum(values + half, kinematics.upper))
@@ -171,29 +199,32 @@ def fit_sequence(
         period: time between two frames [s].
     """
     observation = tracker.observation
-    surfaces = few_rigid_triangles(TreeSurfaces(observation.tree), _TRIANGLES)
+    surfaces = few_rigid_triangles(TreeSurfaces(observation.tree), SEQUENCE.triangles)
     body = ProportionedBody(TreeKinematics(observation.tree), surfaces)
-    edges = [find_edge_points(mask, _SPACING) for mask in masks]
-    step = max(1, min(int(_MEMORY / period + 1e-9), (len(masks) - 1) // 2))
+    edges = [find_edge_points(mask, SEQUENCE.spacing) for mask in masks]
+    step = max(1, min(int(SEQUENCE.memory / period + 1e-9), (len(masks) - 1) // 2))
     picked = np.arange(0, len(masks), step, dtype=np.intp)
     camera = observation.cameras[0]
 
     def fit(frames: Indices, begin: Array, last: bool) -> FittedProportions:
         apart = period * float(frames[1] - frames[0])
-        worth = min(1.0, apart / _MEMORY)
-        noise = Noise(_DEVIATION, _CORRELATION / worth)
-        prior, rounds = _sequence_prior(tracker, apart), _ROUNDS[-1:] if last else _ROUNDS
+        worth = min(1.0, apart / SEQUENCE.memory)
+        noise = Noise(SEQUENCE.deviation, SEQUENCE.correlation / worth)
+        prior, rounds = (
+            _sequence_prior(tracker, apart),
+            SEQUENCE.rounds[-1:] if last else SEQUENCE.rounds,
+        )
         seen = [edges[k] for k in frames.tolist()]
         return fit_proportions(body, camera, seen, begin, rounds, noise, prior)
 
     coarse = []
-    for states in starts[:_STARTS]:
+    for states in starts[: SEQUENCE.fitted_starts]:
         begin = np.array([observation.parameters(states[k]) for k in picked.tolist()])
         coarse.append(fit(picked, begin, False))
     coarse.sort(key=lambda one: one.cost)
     kept: list[FittedProportions] = []
     for one in coarse:
-        near = one.cost <= _WORSE * coarse[0].cost
+        near = one.cost <= SEQUENCE.worse_fit * coarse[0].cost
         if near and not any(_are_same(body, one, other) for other in kept):
             kept.append(one)
     if step == 1:
@@ -236,7 +267,7 @@ def _are_same(body: ProportionedBody, one: FittedProportions, other: FittedPropo
     count = len(kinematics.names)
     values, others = one.parameters[:, :count], other.parameters[:, :count]
     off = (kinematics.nearest_turns(values, others) - others)[:, kinematics.is_angle]
-    return bool(np.sqrt(np.square(off).mean(axis=0)).max(initial=0.0) < _SAME)
+    return bool(np.sqrt(np.square(off).mean(axis=0)).max(initial=0.0) < SEQUENCE.same)
 
 
 def _are_determined(kinematics: TreeKinematics, low: Array, high: Array) -> Array:

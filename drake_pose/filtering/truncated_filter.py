@@ -1,27 +1,26 @@
-"""The filter: predict, linearise at every hypothesis, update, truncate, weigh."""
+"""Several explanations of the same pictures, weighed against each other, each within a view.
 
+The same view for long teaches nothing new: what one view may tell in all, and no more. A filter
+linearised anew in every frame of a static view becomes ever surer: the flaw that Shimada et al.
+state in section 7. Here a view keeps the tangent of its first frame; what that leaves out is an
+offset of each measurement, unknown, the same in all frames of the view, of the size of the
+curvature at its first frame, estimated beside the state and forgotten when the view ends.
+"""
+
+import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from itertools import count
 from typing import Literal, get_args
 
 import numpy as np
+from scipy.special import chdtri
 
 from drake_pose.arrays import Array
 from drake_pose.errors import SettingsError
-from drake_pose.filtering.hypotheses import (
-    Hypothesis,
-    Rejection,
-    View,
-    anchored,
-    begin_repeated_view,
-    merge_twins,
-    next_view,
-    normalise,
-    prune,
-)
 from drake_pose.filtering.inequalities import Inequalities, inner_point
-from drake_pose.filtering.state import Belief, StateLayout, make_belief
+from drake_pose.filtering.state import Belief, StateLayout, factor_of, make_belief
 from drake_pose.filtering.truncated_normal import (
     Truncated,
     clip,
@@ -32,22 +31,222 @@ from drake_pose.filtering.truncated_normal import (
 )
 from drake_pose.filtering.update import (
     Evidence,
+    LinearObservation,
     ObservationModel,
     Truncate,
     Updated,
+    difference,
     make_evidence,
     update,
 )
 
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """Frames that show the same: the measurement (m,) of the first, and how many."""
+
+    reference: Array
+    count: int
+
+
+def next_view(view: View | None, seen: Evidence, significance: float) -> View:
+    """The view a measurement belongs to: the one so far, or one that begins with it.
+
+    Args:
+        significance: a view is new when noise alone would make it differ so much from the reference
+            with no more than this probability; 0: every one is new.
+    """
+    y = seen.y
+    if view is None or significance == 0 or len(view.reference) != len(y):
+        return View(y, 1)
+    change = difference(y, view.reference, seen.model.wraps)
+    both = np.isfinite(change)
+    new_rows = np.isfinite(y) & ~np.isfinite(view.reference)
+    if new_rows.any() or not both.any():
+        return View(y, 1)
+    size = float(np.sum(change[both] ** 2 / (2.0 * np.diag(seen.covariance)[both])))
+    is_new = size > _largest_change(significance, int(np.count_nonzero(both)))
+    return View(y, 1) if is_new else View(view.reference, view.count + 1)
+
+
+@lru_cache(maxsize=1024)
+def _largest_change(significance: float, count: int) -> float:
+    return float(chdtri(count, significance))
+
+
+def measure_curvature(model: ObservationModel, belief: Belief) -> Array:
+    """(m,) mean square of what the tangent at a belief's mean leaves out of a measurement.
+
+    By second differences along the columns of the covariance's root.
+    """
+    h, H = model.predict(belief.mean)
+    used = np.flatnonzero(np.abs(H).sum(axis=0) > 0)
+    root = factor_of(belief.covariance[np.ix_(used, used)])
+    total = np.zeros(len(h))
+    for column in root.T:
+        step = np.zeros_like(belief.mean)
+        step[used] = column
+        ends = [model.predict(belief.mean + sign * step)[0] for sign in (1.0, -1.0)]
+        bend = 0.5 * sum(difference(end, h, model.wraps) for end in ends)
+        # E[(b z^2)^2] = 3 b^2 for a standard normal z.
+        total += 3.0 * np.nan_to_num(bend) ** 2
+    return total
+
+
+@dataclass(frozen=True, eq=False)
+class RepeatedView:
+    """What is believed within a view: the state, and beside it the tangent's offsets.
+
+    Attributes:
+        tangent: (n,) where the view's first frame was linearised.
+        belief: over n + m numbers: the state, then what the tangent leaves out of each measurement.
+    """
+
+    tangent: Array
+    belief: Belief
+
+    def state(self) -> Belief:
+        """The belief about the state alone."""
+        n = len(self.tangent)
+        return Belief(self.belief.mean[:n].copy(), self.belief.covariance[:n, :n].copy())
+
+    def moved(self, A: Array, U: Array) -> "RepeatedView":
+        """One step at constant velocity; the offsets stay as they are."""
+        n, P = len(self.tangent), self.belief.covariance.copy()
+        mean = np.r_[A @ self.belief.mean[:n], self.belief.mean[n:]]
+        P[:n, :n] = self.state().moved(A, U).covariance
+        P[:n, n:] = A @ P[:n, n:]
+        P[n:, :n] = P[:n, n:].T
+        return RepeatedView(self.tangent, Belief(mean, P))
+
+
+def begin_repeated_view(
+    model: ObservationModel, free: Belief, seen: Belief, tangent: Array
+) -> RepeatedView:
+    """A view's second frame: nothing is known yet of the offsets but how large they may be.
+
+    Args:
+        free: the prediction of the second frame, without its limits.
+        seen: how far the state may be from the tangent, where the curvature is measured.
+        tangent: (n,) where the first frame was linearised.
+    """
+    curvature = measure_curvature(model, Belief(tangent, seen.covariance))
+    n, m = len(tangent), len(curvature)
+    P = np.zeros((n + m, n + m))
+    P[:n, :n] = free.covariance
+    P[n:, n:] = np.diag(curvature)
+    return RepeatedView(tangent, Belief(np.r_[free.mean, np.zeros(m)], P))
+
+
+def anchored(model: ObservationModel, tangent: Array) -> LinearObservation:
+    """A model held at the tangent (n,) of one state, with offsets: linear in both, (n + m,)."""
+    h, H = model.predict(tangent)
+    at, slope = np.r_[tangent, np.zeros(len(h))], np.hstack([H, np.eye(len(h))])
+    return LinearObservation(model.names, model.variances, model.wraps, at, h, slope)
+
+
+@dataclass(frozen=True, eq=False)
+class Hypothesis:
+    """One explanation.
+
+    Attributes:
+        belief: mean and covariance, inside the limits.
+        free: what is believed without the present limits; the next step is predicted from it.
+        log_weight: logarithm of its weight among all.
+        log_evidence: the same without what the present limits say of it.
+        born: the step it was made at by mirroring; 0 for the first.
+        place: which of those made at that step it is: both tell it from all others.
+        active: names of the rows that cut its belief in the last step.
+        sites: of the last truncation, where the next one begins; see ``Truncated``.
+        tangent: (n,) where the first frame of the present view was linearised.
+        repeated: what is believed within a view that lasts; None in its first frame.
+    """
+
+    belief: Belief
+    free: Belief
+    log_weight: float = 0.0
+    log_evidence: float = 0.0
+    born: int = 0
+    place: int = 0
+    active: tuple[str, ...] = ()
+    sites: Array = field(default_factory=lambda: np.zeros((0, 2)))
+    tangent: Array = field(default_factory=lambda: np.zeros(0))
+    repeated: RepeatedView | None = None
+
+    @property
+    def weight(self) -> float:
+        """Between 0 and 1."""
+        return math.exp(self.log_weight)
+
+
+@dataclass(frozen=True)
+class Rejection:
+    """A hypothesis that was given up.
+
+    Attributes:
+        hypothesis: as it was then; for a constraint its belief is that without the limits.
+        reason: "constraint", "weight", "twin" or "cap".
+        row: the violated inequality's name, for a constraint.
+        c: its c_k (24), for a constraint.
+    """
+
+    step: int
+    hypothesis: Hypothesis
+    reason: str
+    row: str = ""
+    c: float = math.nan
+
+
+def normalise(hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
+    """The same with weights that add up to 1, the heaviest first."""
+    ordered = sorted(hypotheses, key=lambda h: -h.log_weight)
+    logs = np.array([h.log_weight for h in ordered])
+    total = logs[0] + math.log(np.exp(logs - logs[0]).sum())
+    return [
+        replace(h, log_weight=h.log_weight - total, log_evidence=h.log_evidence - total)
+        for h in ordered
+    ]
+
+
+def merge_twins(
+    hypotheses: Sequence[Hypothesis], distance: float, step: int
+) -> tuple[list[Hypothesis], list[Rejection]]:
+    """Keep the heavier of any two nearer than so many deviations, with the weight of both."""
+    kept: list[Hypothesis] = []
+    rejected = []
+    for candidate in hypotheses:
+        for place, other in enumerate(kept):
+            scale = np.maximum(other.belief.deviations(), 1e-12)
+            if np.abs((candidate.belief.mean - other.belief.mean) / scale).max() < distance:
+                both = float(np.logaddexp(other.log_weight, candidate.log_weight))
+                gain = both - other.log_weight
+                kept[place] = replace(
+                    other, log_weight=both, log_evidence=other.log_evidence + gain
+                )
+                rejected.append(Rejection(step, candidate, "twin"))
+                break
+        else:
+            kept.append(candidate)
+    return kept, rejected
+
+
+def prune(
+    hypotheses: Sequence[Hypothesis], cap: int, smallest_weight: float, step: int
+) -> tuple[list[Hypothesis], list[Rejection]]:
+    """Keep at most ``cap``, and none lighter than ``smallest_weight``; always the heaviest."""
+    ordered = normalise(hypotheses)
+    kept = [h for h in ordered[1:cap] if h.weight >= smallest_weight]
+    rejected = [
+        Rejection(step, h, "weight" if h.weight < smallest_weight else "cap")
+        for place, h in enumerate(ordered)
+        if place and h not in kept
+    ]
+    return normalise([ordered[0], *kept]), rejected
+
+
 Truncation = Literal["joint", "sequential", "clip", "none"]
 Branch = tuple[Hypothesis, Updated]
 TRUNCATIONS: tuple[Truncation, ...] = get_args(Truncation)
-
-# Hypotheses closer than this in every element are one [deviations]; of the joint truncation.
-_TWIN_DISTANCE, _TOLERANCE = 0.3, 1e-3
-_ROUGH_ITERATIONS = 3
-# A hypothesis is given up that lies beyond a row by more: whose c_k (24) is below this.
-_REJECT_BELOW = -4.0
 
 
 @dataclass(frozen=True)
@@ -63,6 +262,10 @@ class FilterSettings:
         novelty: a measurement shows nothing new if noise alone would make it differ as much
             from the one that began the view with more than this probability, see ``views``. 0:
             every frame is new, as in the paper; so it is always with "sequential" and "clip".
+        twin_distance: hypotheses that are closer in every element are one [deviations].
+        tolerance: of the joint truncation [deviations].
+        rough_iterations: linearisations of hypotheses that are compared before they are kept.
+        rejected_below: a hypothesis is given up whose c_k (24) of a row is below this.
 
     Raises:
         SettingsError: a value out of its range.
@@ -73,6 +276,10 @@ class FilterSettings:
     hypothesis_cap: int = 4
     smallest_weight: float = 1e-4
     novelty: float = 1e-9
+    twin_distance: float = 0.3
+    tolerance: float = 1e-3
+    rough_iterations: int = 3
+    rejected_below: float = -4.0
 
     def __post_init__(self) -> None:
         if self.truncation not in TRUNCATIONS:
@@ -188,7 +395,7 @@ class TruncatedFilter:
             start: (n,) where to linearise first; y (m,) and variances as for ``update``.
         """
         seen = make_evidence(self.observation, y, variances)
-        few = min(self.settings.iterations, _ROUGH_ITERATIONS)
+        few = min(self.settings.iterations, self.settings.rough_iterations)
         return update(prediction, seen, few, start, False, self._limits).truncated.mean
 
     def update(
@@ -221,7 +428,7 @@ class TruncatedFilter:
             self._finish(h, done.belief, done.truncated, done.log_likelihood) for h, done in alive
         ]
         leader = max(range(len(finished)), key=lambda i: finished[i].log_weight)
-        merged, twins = merge_twins(normalise(finished), _TWIN_DISTANCE, step)
+        merged, twins = merge_twins(normalise(finished), self.settings.twin_distance, step)
         kept, pruned = prune(merged, settings.hypothesis_cap, settings.smallest_weight, step)
         best = alive[leader][1]
         return FilterState(
@@ -279,7 +486,7 @@ class TruncatedFilter:
             c = result.truncated.c
             k = int(np.argmin(c))
             worst_c.append(c[k])
-            if c[k] < _REJECT_BELOW:
+            if c[k] < self.settings.rejected_below:
                 name = self.inequalities.rows[k]
                 gone = replace(hypothesis, belief=result.belief)
                 rejected.append(Rejection(step, gone, "constraint", name, float(c[k])))
@@ -321,4 +528,4 @@ class TruncatedFilter:
             return truncate_sequential(belief, self.inequalities)
         if self.settings.truncation == "clip":
             return clip(belief, self.inequalities)
-        return truncate_joint(belief, self._rows, _TOLERANCE, sites)
+        return truncate_joint(belief, self._rows, self.settings.tolerance, sites)

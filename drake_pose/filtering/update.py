@@ -19,15 +19,29 @@ from drake_pose.filtering.truncated_normal import Truncated, unlimited
 
 Truncate = Callable[[Belief, Array], Truncated]
 
-# A first guess far off is approached with more noise than there is, cooled from step to step:
-# narrow curved valleys, such as that of a known scale, would stop a descent.
-_GOOD_FIT = 9.0
-_COOLING = 6.0
-# Steps below this many deviations end the iteration; with limits, below this many.
-_SETTLED = 0.01
-_SETTLED_WITH_LIMITS = 0.3
-# From this linearisation on the steps are halved: the tangents may point to and fro.
-_PATIENCE = 8
+
+@dataclass(frozen=True)
+class IterationSettings:
+    """How an update is iterated.
+
+    A first guess far off is approached with more noise than there is, cooled from step to step:
+    narrow curved valleys, such as that of a known scale, would stop a descent.
+
+    Args:
+        good_fit: squared residual per measurement, in variances, above which noise is added.
+        cooling: factor by which the added noise falls from step to step.
+        settled, settled_with_limits: steps below end the iteration [deviations].
+        full_steps: later steps are halved, since tangents may point to and fro.
+    """
+
+    good_fit: float = 9.0
+    cooling: float = 6.0
+    settled: float = 0.01
+    settled_with_limits: float = 0.3
+    full_steps: int = 8
+
+
+ITERATION = IterationSettings()
 
 
 class ObservationModel(Protocol):
@@ -215,13 +229,13 @@ def update(
     """
     x, temperature = prediction.mean if start is None else start, 1.0
     sites = np.zeros((0, 2)) if sites is None else sites
-    settled = _SETTLED if truncate is None else _SETTLED_WITH_LIMITS
+    settled = ITERATION.settled if truncate is None else ITERATION.settled_with_limits
     if not np.isfinite(seen.y).any():
         iterations = 1
     for made in range(iterations):
         line = _linearise(prediction, seen, x)
         if made == 0 and iterations > 1 and tempered:
-            temperature = max(1.0, line.misfit / _GOOD_FIT)
+            temperature = max(1.0, line.misfit / ITERATION.good_fit)
         belief, log_likelihood, distance = _fuse(prediction, line, temperature)
         truncated = unlimited(belief) if truncate is None else truncate(belief, sites)
         sites = truncated.sites
@@ -229,8 +243,8 @@ def update(
         size = np.abs(step / np.maximum(belief.deviations(), 1e-12)).max()
         if temperature == 1.0 and size < settled:
             break
-        x = x + (step if made < _PATIENCE else 0.5 * step)
-        temperature = max(1.0, temperature / _COOLING)
+        x = x + (step if made < ITERATION.full_steps else 0.5 * step)
+        temperature = max(1.0, temperature / ITERATION.cooling)
     return Updated(belief, truncated, log_likelihood, distance, len(line.noise))
 
 

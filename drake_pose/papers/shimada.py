@@ -18,7 +18,6 @@ from drake_pose.body.formats.packages import bundled_model
 from drake_pose.body.model import ArticulatedModel, load_model
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import SettingsError
-from drake_pose.filtering.couplings import model_inequalities
 from drake_pose.filtering.hand import (
     FLEXIONS,
     HAND_STATE,
@@ -29,6 +28,7 @@ from drake_pose.filtering.hand import (
 )
 from drake_pose.filtering.hand_model import TWO_FINGERS
 from drake_pose.filtering.hand_silhouette import HandSilhouette
+from drake_pose.filtering.inequalities import model_inequalities
 from drake_pose.filtering.truncated_filter import (
     FilterSettings,
     TruncatedFilter,

@@ -21,11 +21,10 @@ from drake_pose.camera.models import ParallelCamera
 from drake_pose.csv_files import read_csv
 from drake_pose.errors import SceneError
 from drake_pose.files.settings import EstimateSettings
-from drake_pose.filtering.couplings import model_inequalities
 from drake_pose.filtering.hand import HandObservation
 from drake_pose.filtering.hand_model import PALM, HandModel, palm_rotation, read_hand
 from drake_pose.filtering.hand_silhouette import HandSilhouette
-from drake_pose.filtering.inequalities import from_bounds, stack
+from drake_pose.filtering.inequalities import from_bounds, model_inequalities, stack
 from drake_pose.filtering.state import Belief
 from drake_pose.filtering.truncated_filter import (
     FilterSettings,

@@ -8,7 +8,7 @@ import pytest
 
 from drake_pose.body.landmarks import landmark_positions, load_landmarks
 from drake_pose.body.model import ArticulatedModel, load_model
-from drake_pose.filtering.couplings import model_inequalities
+from drake_pose.filtering.inequalities import model_inequalities
 from tests.urdf.surfaces import URDF, Silhouettes, read_obj, written_again
 
 PERSON = URDF / "person" / "person.urdf"

@@ -19,11 +19,14 @@ from drake_pose.files.overlay import draw_shapes
 from drake_pose.files.records import user_units
 from drake_pose.files.settings import EstimateSettings
 from drake_pose.files.writer import OnStage
-from drake_pose.filtering.contour import ContourObservation
-from drake_pose.filtering.contour_tracker import ContourTracker, TrackingSettings
+from drake_pose.filtering.contour_tracker import (
+    ContourObservation,
+    ContourTracker,
+    TrackingSettings,
+)
 from drake_pose.filtering.match_and_track import make_tracker
 from drake_pose.filtering.sequence_fit import (
-    START_FRAMES,
+    SEQUENCE,
     FittedSequence,
     FollowedStart,
     find_start,
@@ -105,7 +108,7 @@ class _BodyFit:
     ) -> None:
         self._inputs, self._settings, self._tracking = inputs, settings, tracking
         self._camera = next(iter(inputs.scene.cameras.values()))
-        frames = inputs.frames[:START_FRAMES]
+        frames = inputs.frames[: SEQUENCE.start_frames]
         self._masks = [inputs.scene.read(self._camera.name, frame) for frame in frames]
         self._more: dict[str, Any] = {}
         self._period = 1.0 / (inputs.scene.frame_rate_hz or USUAL_RATE_HZ)

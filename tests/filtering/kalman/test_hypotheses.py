@@ -2,7 +2,8 @@ import numpy as np
 import pytest
 
 from drake_pose.filtering.hand import HAND_STATE
-from drake_pose.filtering.hypotheses import (
+from drake_pose.filtering.state import Belief
+from drake_pose.filtering.truncated_filter import (
     Hypothesis,
     RepeatedView,
     anchored,
@@ -13,7 +14,6 @@ from drake_pose.filtering.hypotheses import (
     normalise,
     prune,
 )
-from drake_pose.filtering.state import Belief
 from drake_pose.filtering.update import make_evidence, update
 from drake_pose.papers.shimada import experiment_filter
 from drake_pose.papers.shimada_motion import make_sequence

@@ -3,9 +3,9 @@ import pytest
 
 from drake_pose.body.model import load_model
 from drake_pose.errors import SettingsError
-from drake_pose.filtering import contour
+from drake_pose.filtering import contour_tracker
 from drake_pose.filtering.body_state import ROOT_SHIFT
-from drake_pose.filtering.contour import ContourObservation
+from drake_pose.filtering.contour_tracker import ContourObservation, ContourSettings
 from drake_pose.filtering.inequalities import from_model
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from tests.body.models import joint, link, urdf, write
@@ -70,8 +70,8 @@ def test_slopes_agree_with_finite_differences_of_the_contour(tmp_path, monkeypat
     """The measured distances change with the state as H says, where nothing is robust."""
     model = forked_body(tmp_path)
     camera = front_camera(400, shift=0.2)
-    monkeypatch.setattr(contour, "SPACING", 1.0)
-    monkeypatch.setattr(contour, "DEVIATION", 30.0)
+    plain = ContourSettings(spacing=1.0, deviation=30.0)
+    monkeypatch.setattr(contour_tracker, "CONTOUR", plain)
     observation = ContourObservation(model.pose_tree(), [camera])
     truth = observation.state(np.array([0.2, 0.9, -0.6]))
     mask = observation.draw(truth, camera)

@@ -9,7 +9,6 @@ from drake_pose.body.formats.packages import bundled_model
 from drake_pose.body.model import load_model
 from drake_pose.camera.models import ParallelCamera
 from drake_pose.errors import MaskError
-from drake_pose.filtering.axes import GATES, SPACING, match_axes
 from drake_pose.filtering.hand import (
     FLEXIONS,
     HAND_STATE,
@@ -18,7 +17,7 @@ from drake_pose.filtering.hand import (
     SPREADS,
     plant_positions,
 )
-from drake_pose.filtering.hand_silhouette import HandSilhouette
+from drake_pose.filtering.hand_silhouette import MATCHING, HandSilhouette, match_axes
 from drake_pose.filtering.state import Belief
 from drake_pose.filtering.update import difference
 from drake_pose.fit.evidence import find_edge_points
@@ -80,7 +79,7 @@ def test_lines_and_tips_are_those_of_the_hand_from_table_2s_guess(render, seed):
     told = off[np.isfinite(off)]
     assert len(told) >= 15
     # What is told is what the rough pose was matched to in the end.
-    edge, gate = find_edge_points(mask, SPACING), SILHOUETTE._unit * GATES[-1]
+    edge, gate = find_edge_points(mask, MATCHING.spacing), SILHOUETTE._unit * MATCHING.gates[-1]
     lines = match_axes(edge, SILHOUETTE._rough(found.rough), gate, CENTER).lines.ravel()
     end = MEASURED.index("scale")
     measured = found.y[end - len(lines) : end]

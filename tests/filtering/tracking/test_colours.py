@@ -4,8 +4,10 @@ import numpy as np
 import pytest
 
 from drake_pose.errors import SettingsError
-from drake_pose.filtering.contour import ContourObservation
-from drake_pose.filtering.contour_tracker import LOST_COLOUR_DISTANCE, ContourTracker
+from drake_pose.filtering.contour_tracker import (
+    ContourObservation,
+    ContourTracker,
+)
 from drake_pose.fit import colours
 from drake_pose.fit.colour_lines import BESIDE, COLOURS, ON
 from drake_pose.fit.colours import part_distances, weigh_parts
@@ -158,7 +160,7 @@ def test_a_part_that_is_astray_makes_its_own_joints_unsure(observation, renderer
     after = tracker.follow(track, [None], pictures=[paint(renderer.mask(jumped))])
     assert after.lost
     parts = after.measurement.part_distances
-    astray = parts > LOST_COLOUR_DISTANCE
+    astray = parts > tracker.settings.lost_colour_distance
     assert 0 < np.count_nonzero(astray) < len(parts)
     before = tracker.filter.predict(track.state).best.deviations()
     now = after.state.best.deviations()

@@ -7,8 +7,11 @@ from drake_pose.body.formats.packages import bundled_model
 from drake_pose.body.model import load_model
 from drake_pose.camera.models import circle_of_cameras
 from drake_pose.errors import SettingsError
-from drake_pose.filtering.contour import ContourObservation
-from drake_pose.filtering.contour_tracker import ContourTracker, TrackingSettings
+from drake_pose.filtering.contour_tracker import (
+    ContourObservation,
+    ContourTracker,
+    TrackingSettings,
+)
 from drake_pose.filtering.match_and_track import Followed, MatchAndTrack, make_tracker
 from drake_pose.filtering.state import Belief
 from drake_pose.search import TRACKED, PaperSearch, PaperSearchSettings, PoseEstimate, View

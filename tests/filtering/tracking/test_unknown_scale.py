@@ -8,8 +8,11 @@ import pytest
 from drake_pose.body.tree.root import RootRotation
 from drake_pose.camera.models import circle_of_cameras
 from drake_pose.errors import SettingsError
-from drake_pose.filtering.contour import ContourObservation
-from drake_pose.filtering.contour_tracker import ContourTracker, TrackingSettings
+from drake_pose.filtering.contour_tracker import (
+    ContourObservation,
+    ContourTracker,
+    TrackingSettings,
+)
 from drake_pose.filtering.match_and_track import Followed, MatchAndTrack
 from drake_pose.filtering.sequence_fit import (
     find_start,

@@ -7,16 +7,14 @@ import pytest
 from drake_pose.body.formats.packages import bundled_model
 from drake_pose.body.model import load_model
 from drake_pose.errors import ModelError, SettingsError, UnknownNameError
-from drake_pose.filtering.couplings import (
-    load_couplings,
-    load_usual_pose,
-    model_inequalities,
-)
 from drake_pose.filtering.inequalities import (
     from_bounds,
     from_model,
     inner_point,
+    load_couplings,
+    load_usual_pose,
     make_inequalities,
+    model_inequalities,
     stack,
     two_sided,
 )

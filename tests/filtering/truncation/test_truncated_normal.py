@@ -15,11 +15,11 @@ from drake_pose.filtering.inequalities import (
 from drake_pose.filtering.state import make_belief
 from drake_pose.filtering.truncated_normal import (
     clip,
+    interval_moments,
     join_rows,
     truncate_joint,
     truncate_sequential,
 )
-from drake_pose.filtering.truncation_kernels import interval_moments
 
 METHODS = {"sequential": truncate_sequential, "joint": truncate_joint}
 

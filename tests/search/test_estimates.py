@@ -13,7 +13,7 @@ from drake_pose.search.continuous_search import ContinuousSearch
 from drake_pose.search.estimates import JointEstimate, PoseEstimate, PoseFamily, PoseSet
 from drake_pose.search.multi_start import MultiStartSearch
 from drake_pose.search.pose_families import ExaminationSettings, _joined
-from drake_pose.search.views_fit import spread
+from drake_pose.search.views_fit import covariance_pose_set
 from tests.search.turning import crane, views_of
 
 TURN = 2.0 * math.pi
@@ -92,14 +92,16 @@ def test_a_covariance_is_told_as_intervals_inside_the_limits(tree):
     kinematics = TreeKinematics(tree)
     pose = replace(estimate(tree, [0.5, 0.2], 1), q=np.array([7.0, 8.0]))
     deviations = np.array([0.02, 0.05])
-    one, other = (spread(tree, pose, np.diag(deviations**2), count) for count in (1, 4))
+    one, other = (
+        covariance_pose_set(tree, pose, np.diag(deviations**2), count) for count in (1, 4)
+    )
     for told, count in ((one, 1), (other, 4)):
         widths = student.ppf(0.975, 6 * count) * deviations
         ends = [(joint.low, joint.high) for joint in told.joints]
         np.testing.assert_allclose(ends, np.array([[0.5], [0.2]]) + widths[:, None] * [-1, 1])
         np.testing.assert_array_equal(told.families[0].q, [7.0, 8.0])
         assert told.families[0].J == 7.0
-    wide = spread(tree, pose, 100.0 * np.eye(2), 1)
+    wide = covariance_pose_set(tree, pose, 100.0 * np.eye(2), 1)
     lower, upper = kinematics.reach(np.array([0.5, 0.2]))
     np.testing.assert_allclose([joint.low for joint in wide.joints], lower)
     np.testing.assert_allclose([joint.high for joint in wide.joints], upper)

@@ -50,8 +50,8 @@ def test_flips_are_families_of_their_own(kinematics, monkeypatch):
     tree = kinematics.tree
     views = [draw_view(tree, TRUTH, camera) for camera in arm_cameras()]
     with monkeypatch.context() as patch:
-        patch.setattr("drake_pose.search.continuous.families._SIGNIFICANCE", 1e6)
-        patch.setattr("drake_pose.search.continuous.families._FAMILIES", 5)
+        patch.setattr("drake_pose.search.views_fit._SIGNIFICANCE", 1e6)
+        patch.setattr("drake_pose.search.views_fit._FAMILIES", 5)
         assert not any(find(kinematics, views, TRUTH).determined)
     answer = find(kinematics, damaged_views(tree, TRUTH, 1), TRUTH)
     flipped = [flip.values for flip in flips(kinematics, answer.families[0].q)]

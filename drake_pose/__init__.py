@@ -31,22 +31,22 @@ if TYPE_CHECKING:
     from drake_pose.jobs.registration.settings import RegistrationSettings
     from drake_pose.search import BeamSearch, MultiStartSearch, View
     from drake_pose.silhouette.pictures.scenes import Scene, load_scene
-    from drake_pose.systems.estimators.camera_registration import CameraRegistration
-    from drake_pose.systems.estimators.silhouette_matcher import (
-        SilhouetteMatcher,
-        SilhouetteTracker,
-    )
-    from drake_pose.systems.estimators.truncated_ekf import TruncatedEkf
+    from drake_pose.systems.diagrams import CameraRegistration
     from drake_pose.systems.person.person_tracker import PersonTracker
     from drake_pose.systems.pictures.camera_rig import cameras_from_drake
     from drake_pose.systems.pictures.silhouette_camera import SilhouetteCamera
+    from drake_pose.systems.silhouette_matcher import (
+        SilhouetteMatcher,
+        SilhouetteTracker,
+    )
+    from drake_pose.systems.truncated_ekf import TruncatedEkf
 
 __version__ = VERSION
 
 _HOMES = {
     "ArticulatedModel": "body.model",
     "BeamSearch": "search",
-    "CameraRegistration": "systems.estimators.camera_registration",
+    "CameraRegistration": "systems.diagrams",
     "EstimateSettings": "files.settings",
     "MaskSettings": "jobs.masks.settings",
     "MultiStartSearch": "search",
@@ -60,9 +60,9 @@ _HOMES = {
     "SceneMasks": "jobs.masks.masks",
     "SceneRegistration": "jobs.registration.register",
     "SilhouetteCamera": "systems.pictures.silhouette_camera",
-    "SilhouetteMatcher": "systems.estimators.silhouette_matcher",
-    "SilhouetteTracker": "systems.estimators.silhouette_matcher",
-    "TruncatedEkf": "systems.estimators.truncated_ekf",
+    "SilhouetteMatcher": "systems.silhouette_matcher",
+    "SilhouetteTracker": "systems.silhouette_matcher",
+    "TruncatedEkf": "systems.truncated_ekf",
     "View": "search",
     "audit_scene": "jobs.registration.audit",
     "build_pose_tree": "body.tree.tree_builder",

@@ -24,7 +24,7 @@ from drake_pose.papers.date_capture import (
 from drake_pose.papers.tables import Count, figure_table, require_choice, uncounted
 from drake_pose.person.date.skeleton import LIMBS
 from drake_pose.person.date.walking import REGISTERED, UPRIGHT, Motion, make_motion
-from drake_pose.systems.colour_images import picture_to_colour_image
+from drake_pose.systems.images import picture_to_colour_image
 
 METHODS = ("silhouette", "stages", "paper")
 SHOWN_CAMERA = "camera_0"

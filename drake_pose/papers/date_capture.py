@@ -29,7 +29,6 @@ from drake_pose.person.pose_tracker import PersonPoseTracker, TrackState
 from drake_pose.silhouette.areas.outline import outline_from_mesh
 from drake_pose.silhouette.areas.scoring import draw_labels
 from drake_pose.silhouette.segmentation.background import Background, learn_background
-from drake_pose.systems.colour_images import colour_image_to_picture
 from drake_pose.systems.date.capture import PaperCapture, build_paper_capture
 from drake_pose.systems.date.preparation import (
     CAPTURE_METHODS,
@@ -38,6 +37,7 @@ from drake_pose.systems.date.preparation import (
     prepare_paper_capture,
     see_person,
 )
+from drake_pose.systems.images import colour_image_to_picture
 from drake_pose.systems.person.live_capture import SilhouetteCapture, build_silhouette_capture
 from drake_pose.systems.pictures.camera_rig import CameraRig, build_camera_rig
 from drake_pose.systems.ports import StagedDiagram

@@ -41,7 +41,7 @@ from drake_pose.person.date.skeleton import FEATURES
 from drake_pose.person.date.walking import COMMANDS, make_gestures
 from drake_pose.person.rays import viewing_rays
 from drake_pose.systems.bodies import add_posed_plant, held_positions
-from drake_pose.systems.colour_images import colour_image_to_picture, picture_to_colour_image
+from drake_pose.systems.images import colour_image_to_picture, picture_to_colour_image
 from drake_pose.systems.pictures.camera_rig import add_sensors
 from drake_pose.systems.walk import Walker, garden_objects, view_from_behind, walker_transform
 

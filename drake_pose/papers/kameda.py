@@ -36,8 +36,8 @@ from drake_pose.silhouette.areas.scoring import draw_labels, draw_mask
 from drake_pose.silhouette.pictures.label_images import label_image_to_mask
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from drake_pose.systems.bodies import held_positions
-from drake_pose.systems.estimators.diagrams import build_simulated_matching
-from drake_pose.systems.estimators.silhouette_matcher import camera_port
+from drake_pose.systems.diagrams import build_simulated_matching
+from drake_pose.systems.ports import camera_port
 
 Renderer = Literal["drake", "own"]
 """Who draws the silhouettes: Drake's VTK renderer, or the code that scores them."""

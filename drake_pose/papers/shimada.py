@@ -45,7 +45,7 @@ from drake_pose.papers.shimada_motion import (
 from drake_pose.papers.shimada_sequences import Track, follow_pictures, track_of
 from drake_pose.papers.tables import Count, figure_table, require_choice, require_counts, uncounted
 from drake_pose.systems.bodies import held_positions
-from drake_pose.systems.estimators.hand_tracking import build_hand_estimation
+from drake_pose.systems.truncated_ekf import build_hand_estimation
 
 CASES = {"r13_35": 35.0, "r13_40": 40.0}
 """The two true lengths of finger 1's last segment [pixel at scale 1, mm]."""

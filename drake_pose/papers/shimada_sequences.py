@@ -35,8 +35,11 @@ from drake_pose.jobs.estimate.inputs import TRUTH_FILE, Inputs, read_inputs
 from drake_pose.papers.tables import Advance, Count, figure_table, uncounted
 from drake_pose.search import View
 from drake_pose.silhouette.pictures.label_images import label_image_to_mask
-from drake_pose.systems.estimators.hand_tracking import HandSensor, build_recorded_hand_estimation
-from drake_pose.systems.estimators.truncated_ekf import TruncatedEkf
+from drake_pose.systems.truncated_ekf import (
+    HandSensor,
+    TruncatedEkf,
+    build_recorded_hand_estimation,
+)
 
 # Deviations of the wrist [pixel], the quaternion and angles [rad]: of the rough pose, of its rates
 # a frame, of accelerations per frame^2 at 30 Hz; of lengths and the palm's sizes, and limits of

@@ -55,6 +55,11 @@ def require_time_forward(system: LeafSystem, context: Context, last: float) -> N
         )
 
 
+def camera_port(kind: str, camera: Camera, cameras: Sequence[Camera]) -> str:
+    """Name of the port that carries a camera's image of a kind, where there are ``cameras``."""
+    return kind if len(cameras) == 1 else f"{kind}_{camera.name}"
+
+
 def connect_same(builder: DiagramBuilder, giver: System, taker: System) -> None:
     """Connect all outputs of a system to inputs of the same names of another, where there are."""
     for index in range(giver.num_output_ports()):

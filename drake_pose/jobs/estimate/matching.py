@@ -39,7 +39,7 @@ from drake_pose.silhouette.areas.outline import Outline
 from drake_pose.silhouette.areas.scoring import draw_labels
 from drake_pose.silhouette.pictures.masks import compare_masks
 from drake_pose.silhouette.pictures.scenes import USUAL_RATE_HZ, Scene
-from drake_pose.systems.estimators.diagrams import build_recorded_matching
+from drake_pose.systems.diagrams import build_recorded_matching
 
 # From this E_total on (median of the frames), two cameras that are matched together are compared.
 # More are compared only where the pictures are explained badly: a real person in four leaves 15 to

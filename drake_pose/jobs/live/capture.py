@@ -32,7 +32,6 @@ from drake_pose.person.person_capture import capture_person
 from drake_pose.person.persons_in_view import PersonRecording
 from drake_pose.person.shape import KnownShape, shape_values, tracker_of_person
 from drake_pose.person.views import shows_somebody
-from drake_pose.systems.colour_images import colour_image_to_picture
 from drake_pose.systems.date.capture import build_paper_capture
 from drake_pose.systems.date.preparation import (
     CAPTURE_METHODS,
@@ -41,6 +40,7 @@ from drake_pose.systems.date.preparation import (
     prepare_paper_capture,
     render_registered_pose,
 )
+from drake_pose.systems.images import colour_image_to_picture
 from drake_pose.systems.person.live_capture import LiveSensors, build_live_capture
 from drake_pose.systems.ports import evaluate
 

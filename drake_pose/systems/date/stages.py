@@ -15,8 +15,8 @@ from drake_pose.person.date.features import Features, SkinColour, find_features
 from drake_pose.person.date.recognition import Recognition, RegisteredPose, recognise
 from drake_pose.person.date.skeleton import FEATURES, Skeleton
 from drake_pose.silhouette.segmentation.background import Background
-from drake_pose.systems.colour_images import colour_image_to_picture
 from drake_pose.systems.date.preparation import PersonView, see_person
+from drake_pose.systems.images import colour_image_to_picture
 from drake_pose.systems.pictures.person_region import PersonRegion
 from drake_pose.systems.ports import PortedSystem, require_different
 

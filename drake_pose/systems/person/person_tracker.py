@@ -18,7 +18,7 @@ from drake_pose.person.persons_in_view import keep_views
 from drake_pose.person.pose_tracker import PersonPoseTracker, TrackState
 from drake_pose.person.views import ColourViews, FrameViews, shows_somebody
 from drake_pose.systems.bodies import body_poses
-from drake_pose.systems.colour_images import ColourPorts
+from drake_pose.systems.images import ColourPorts
 from drake_pose.systems.ports import MemorySystem, require_different, require_period
 
 # Who was seen beside the person is looked for in this many more frames; to look takes long.

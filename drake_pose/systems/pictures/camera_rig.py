@@ -23,7 +23,7 @@ from drake_pose.camera.models import Camera, PinholeCamera
 from drake_pose.errors import CameraError, UnknownNameError
 from drake_pose.silhouette.pictures.label_images import label_image_to_mask
 from drake_pose.systems.bodies import add_posed_plant
-from drake_pose.systems.colour_images import colour_image_to_picture
+from drake_pose.systems.images import colour_image_to_picture
 
 _RENDERER = "rig_renderer"
 # What 16 bits of millimetres can hold; nothing of a room is farther away [m].

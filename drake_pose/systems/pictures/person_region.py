@@ -14,7 +14,7 @@ from drake_pose.camera.models import Camera
 from drake_pose.errors import CameraError, SettingsError
 from drake_pose.silhouette.pictures.label_images import label_image_to_mask
 from drake_pose.silhouette.segmentation.background import Background, person_region
-from drake_pose.systems.colour_images import colour_image_to_picture
+from drake_pose.systems.images import colour_image_to_picture
 from drake_pose.systems.ports import PortedSystem
 
 

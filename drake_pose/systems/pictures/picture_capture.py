@@ -25,7 +25,7 @@ from drake_pose.camera.frame_source import (
 from drake_pose.camera.models import Camera
 from drake_pose.errors import SettingsError, UnknownNameError
 from drake_pose.silhouette.pictures.label_images import fill_label_image
-from drake_pose.systems.colour_images import fill_colour_image
+from drake_pose.systems.images import fill_colour_image
 from drake_pose.systems.ports import PortedSystem, require_period
 
 USUAL_RATE_HZ = 30.0

@@ -16,9 +16,9 @@ from drake_pose.person.date.features import expect_features, find_features
 from drake_pose.person.date.recognition import recognise
 from drake_pose.person.date.skeleton import LIMBS
 from drake_pose.silhouette.segmentation.background import person_region
-from drake_pose.systems.colour_images import picture_to_colour_image
 from drake_pose.systems.date.capture import PaperPoseEstimator, build_paper_capture
 from drake_pose.systems.date.preparation import CAPTURE_METHODS, CaptureSetup, see_person
+from drake_pose.systems.images import picture_to_colour_image
 from drake_pose.systems.pictures.camera_rig import build_camera_rig
 from tests.person.studio import shared_studio
 from tests.systems.bench import Bench

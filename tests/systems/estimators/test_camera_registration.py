@@ -13,8 +13,11 @@ from drake_pose.errors import SettingsError
 from drake_pose.registration.online_registration import OnlineRegistration, pose_difference
 from drake_pose.registration.register import RegistrationBody
 from drake_pose.silhouette.pictures.label_images import mask_to_label_image
-from drake_pose.systems.estimators.camera_registration import REGISTRATION, CameraRegistration
-from drake_pose.systems.estimators.diagrams import build_simulated_registration
+from drake_pose.systems.diagrams import (
+    REGISTRATION,
+    CameraRegistration,
+    build_simulated_registration,
+)
 from tests.registration.test_register import looking_at
 from tests.search.arms import arm_urdf
 from tests.systems.bench import Bench

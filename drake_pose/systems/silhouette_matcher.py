@@ -20,10 +20,11 @@ from drake_pose.filtering.match_and_track import Followed, MatchAndTrack
 from drake_pose.search import TRACKED, PoseEstimate, PoseSearch, View
 from drake_pose.silhouette.pictures.label_images import label_image_to_mask
 from drake_pose.systems.bodies import body_poses
-from drake_pose.systems.colour_images import ColourPorts
+from drake_pose.systems.images import ColourPorts
 from drake_pose.systems.ports import (
     BeliefSystem,
     SharedValue,
+    camera_port,
     require_different,
     require_period,
     require_time_forward,
@@ -31,11 +32,6 @@ from drake_pose.systems.ports import (
 
 STATISTICS = ("found", "J", "E_total", "first_E_total", "runs", "outside_limit", "seconds")
 """What the elements of the output ``statistics`` are."""
-
-
-def camera_port(kind: str, camera: Camera, cameras: Sequence[Camera]) -> str:
-    """Name of the port that carries a camera's image of a kind, where there are ``cameras``."""
-    return kind if len(cameras) == 1 else f"{kind}_{camera.name}"
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,22 +1,43 @@
-"""The truncated filter as a Drake system: measurements in, a belief within limits out."""
+"""The truncated filter as a Drake system: measurements in, a belief within limits out.
+
+And the hand's sensor of section 6, which measures a silhouette for it.
+"""
+
+from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from pydrake.systems.framework import Context
+from pydrake.geometry import SceneGraph
+from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPort
+from pydrake.systems.sensors import ImageLabel16I
+from pydrake.trajectories import Trajectory
 from scipy.special import chdtri
 
 from drake_pose.arrays import Array
+from drake_pose.body.parsed_model import ParsedModel
+from drake_pose.camera.models import Camera
 from drake_pose.errors import SettingsError
+from drake_pose.filtering.hand_silhouette import HandMeasurement, HandSilhouette
 from drake_pose.filtering.state import Belief, make_belief
 from drake_pose.filtering.truncated_filter import FilterState, TruncatedFilter
-from drake_pose.systems.ports import BeliefSystem, SharedValue, require_period, require_time_forward
+from drake_pose.silhouette.pictures.label_images import label_image_to_mask
+from drake_pose.silhouette.pictures.scenes import Scene
+from drake_pose.systems.diagrams import add_simulated_cameras
+from drake_pose.systems.images import MaskPlayer
+from drake_pose.systems.ports import (
+    BeliefSystem,
+    PortedSystem,
+    SharedValue,
+    connect_same,
+    require_period,
+    require_time_forward,
+)
 
 STATISTICS = ("step", "hypotheses", "distance", "count", "lost")
 """What the elements of the output ``statistics`` are."""
-
-_LOSS_PROBABILITY = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,6 +87,7 @@ class TruncatedEkf(BeliefSystem[_Known]):
         start: the belief before the first measurement.
         period: time between two updates, one step of the prediction [s].
         patience: how many unlikely measurements in a row make a loss.
+        loss_probability: p-value below which a measurement is unlikely.
 
     Raises:
         SettingsError: a start that does not fit, a period or patience that is not positive; and, in
@@ -78,12 +100,14 @@ class TruncatedEkf(BeliefSystem[_Known]):
         start: Belief,
         period: float,
         patience: int = 3,
+        loss_probability: float = 1e-6,
     ) -> None:
         super().__init__()
         require_period("filter", period)
         if patience < 1:
             raise SettingsError(f"patience must be 1 or more, not {patience}")
         self.filter, self._patience = belief_filter, patience
+        self._loss_probability = loss_probability
         self._start = make_belief(start.mean, start.covariance)
         n, cap = len(belief_filter.layout), belief_filter.settings.hypothesis_cap
         self._measured = len(belief_filter.observation.names)
@@ -138,7 +162,108 @@ class TruncatedEkf(BeliefSystem[_Known]):
             noise = noise.reshape(self._measured, self._measured)
         now = self.filter.update(now, y, variances=noise)
         if now.count:
-            is_unlikely = now.distance > chdtri(now.count, _LOSS_PROBABILITY)
+            is_unlikely = now.distance > chdtri(now.count, self._loss_probability)
             unlikely = unlikely + 1 if is_unlikely else 0
         lost = unlikely >= self._patience
         return _Known(now, last.step + 1, unlikely, lost, context.get_time())
+
+
+class HandSensor(PortedSystem):
+    """Measures a hand's axes and tips in a silhouette, lengths unknown: figure 17.
+
+    .. pydrake_system::
+
+        name: HandSensor
+        input_ports: [label_image, estimated_state, covariance, statistics]
+        output_ports: [measurement, measurement_covariance, rough_state, difference]
+
+    The inputs but the image come from the ``TruncatedEkf`` that takes the first two outputs. Of the
+    label image only the silhouette is used; an image that is not connected, or blank, shows
+    nothing. ``rough_state`` (n) and ``difference`` (1) are as of ``HandMeasurement``.
+
+    Args:
+        silhouette: measures; its filter is the ``TruncatedEkf``'s.
+    """
+
+    def __init__(self, silhouette: HandSilhouette) -> None:
+        super().__init__()
+        self._silhouette = silhouette
+        n = len(silhouette.belief_filter.layout)
+        m = len(silhouette.belief_filter.observation.names)
+        self.add_input("label_image", ImageLabel16I(silhouette.width, silhouette.height))
+        self.add_input("estimated_state", n)
+        self.add_input("covariance", n * n)
+        self.add_input("statistics", len(STATISTICS))
+        measured = self.add_cache("measured", self._measure)
+
+        def show(name: str, size: int, read: Callable[[HandMeasurement], Array]) -> None:
+            self.add_output(name, size, lambda context: read(measured.Eval(context)))
+
+        show("measurement", m, lambda one: one.y)
+        show("measurement_covariance", m * m, lambda one: one.covariance.ravel())
+        show("rough_state", n, lambda one: one.rough)
+        show("difference", 1, lambda one: np.array([one.difference]))
+
+    def _measure(self, context: Context) -> HandMeasurement:
+        image, mean = self.given(context, "label_image"), self.given(context, "estimated_state")
+        covariance = self.given(context, "covariance").reshape(len(mean), len(mean))
+        begun = self.given(context, "statistics")[STATISTICS.index("step")] > 0
+        belief = Belief(mean, covariance)
+        silhouette = self._silhouette
+        if image is None:
+            mask = np.zeros((silhouette.height, silhouette.width), dtype=np.bool_)
+        else:
+            mask = label_image_to_mask(image)
+        if begun:
+            return silhouette.measure(mask, silhouette.belief_filter.predicted(belief))
+        # Table 2 gives the scale of the first frame.
+        return silhouette.measure(mask, belief, 1.0)
+
+
+def build_hand_estimation(
+    model: ParsedModel,
+    camera: Camera,
+    silhouette: HandSilhouette,
+    start: Belief,
+    true_positions: Trajectory,
+    period: float,
+) -> tuple[Diagram, TruncatedEkf, HandSensor]:
+    """Plant, Drake's renderer, ``HandSensor``, ``TruncatedEkf``: angles, lengths from pictures.
+
+    Args:
+        model: the hand that is seen, in the plant's positions over time.
+        start: the belief before the first picture.
+        period: time between two pictures [s].
+    """
+    builder = DiagramBuilder()
+    scene_graph = builder.AddNamedSystem("scene_graph", SceneGraph())
+    _, images = add_simulated_cameras(builder, scene_graph, model, [camera], true_positions)
+    return _add_hand_filter(builder, images[0], silhouette, start, period)
+
+
+def build_recorded_hand_estimation(
+    scene: Scene, silhouette: HandSilhouette, start: Belief
+) -> tuple[Diagram, TruncatedEkf, HandSensor]:
+    """The same of a scene's recorded silhouettes: ``MaskPlayer``, ``HandSensor``, ``TruncatedEkf``.
+
+    Args:
+        scene: of one camera.
+        start: the belief before the first picture.
+    """
+    builder, player = DiagramBuilder(), MaskPlayer(scene, scene.cameras)
+    builder.AddNamedSystem("mask_player", player)
+    image = player.GetOutputPort("label_image")
+    return _add_hand_filter(builder, image, silhouette, start, player.period)
+
+
+def _add_hand_filter(
+    builder: DiagramBuilder, image: OutputPort, silhouette: HandSilhouette, start: Belief,
+    period: float,
+) -> tuple[Diagram, TruncatedEkf, HandSensor]:  # fmt: skip
+    ekf = TruncatedEkf(silhouette.belief_filter, start, period)
+    builder.AddNamedSystem("truncated_ekf", ekf)
+    sensor = builder.AddNamedSystem("hand_sensor", HandSensor(silhouette))
+    builder.Connect(image, sensor.GetInputPort("label_image"))
+    connect_same(builder, sensor, ekf)
+    connect_same(builder, ekf, sensor)
+    return builder.Build(), ekf, sensor

@@ -70,7 +70,7 @@ CONTOUR = ContourSettings()
 _PLAIN = Noise(deviation=1.0, correlation=0.5)
 
 
-class Seen(NamedTuple):
+class ContourEvidence(NamedTuple):
     """What a frame shows.
 
     views: the edges of masks; pictures: of cameras without a mask, else None; colours: what is
@@ -117,7 +117,7 @@ class ContourObservation(BodyState):
         masks: Sequence[Mask | None],
         pictures: Sequence[Picture | None] | None = None,
         colours: Histograms | None = None,
-    ) -> Seen:
+    ) -> ContourEvidence:
         """What a frame shows: the points of masks' edges, found once for all its measurements.
 
         Args:
@@ -144,7 +144,7 @@ class ContourObservation(BodyState):
             compared.append(
                 None if picture is None or mask is not None else check_picture(camera, picture)
             )
-        return Seen(pack_views(self.cameras, edges), tuple(compared), colours)
+        return ContourEvidence(pack_views(self.cameras, edges), tuple(compared), colours)
 
     def is_finest(self, number: int) -> bool:
         """Whether no later measurement of a frame looks at pictures more closely than this one."""
@@ -185,7 +185,7 @@ class ContourObservation(BodyState):
 
     def measure(
         self,
-        seen: Seen,
+        seen: ContourEvidence,
         x: Array,
         distance: float | None = None,
         number: int = 0,
@@ -216,7 +216,7 @@ class ContourObservation(BodyState):
         return self._compress(x, *found, part_distances(found[0].sums[shown]))
 
     def _compare(
-        self, seen: Seen, x: Array, width: float, number: int
+        self, seen: ContourEvidence, x: Array, width: float, number: int
     ) -> tuple[Comparison, float] | None:
         """Contours compared with so wide a scale [pixel], and how far they are apart [pixel]."""
         step = AnnealingStage(width, CONTOUR.spacing)
@@ -465,7 +465,7 @@ class ContourTracker:
         return Track(state, measurement, bool(astray.any()), colours)
 
     def _fit(
-        self, observation: ContourObservation, seen: Seen, prediction: FilterState
+        self, observation: ContourObservation, seen: ContourEvidence, prediction: FilterState
     ) -> tuple[FilterState, ContourMeasurement | None]:
         """A frame's state, and the measurement there; None: the frame says nothing."""
         moving, state = len(observation.layout.moving), prediction
@@ -500,7 +500,7 @@ class ContourTracker:
     def _unsure(
         self,
         observation: ContourObservation,
-        seen: Seen,
+        seen: ContourEvidence,
         prediction: FilterState,
         state: FilterState,
         measurement: ContourMeasurement,

@@ -58,7 +58,7 @@ def make_tracker(
 
 
 @dataclass(frozen=True, eq=False)
-class _Frame:
+class _GivenFrame:
     """What is given of a frame, by camera, the root where it is now, and when it began [s]."""
 
     views: Sequence[View]
@@ -124,7 +124,7 @@ class MatchAndTrack:
             observation = observation.with_root_position(root_position)
         masks = [seen.get(name) for name in names]
         shown = [pictures.get(name) for name in names] if pictures else None
-        frame = _Frame(views, root_position, observation, masks, shown, begin)
+        frame = _GivenFrame(views, root_position, observation, masks, shown, begin)
         tracked: tuple[Track, PoseEstimate] | None = None
         if last.track is not None:
             track = self._follow(last.track, frame, False)
@@ -151,7 +151,7 @@ class MatchAndTrack:
         return replace(pose, pose_set=covariance_pose_set(self._search.tree, pose, own, pictures))
 
     def _match(
-        self, last: Followed, tracked: tuple[Track, PoseEstimate] | None, frame: _Frame
+        self, last: Followed, tracked: tuple[Track, PoseEstimate] | None, frame: _GivenFrame
     ) -> tuple[Followed, PoseEstimate]:
         """The best of what was tracked, if anything, and of what the search finds."""
         matched = self._search.match(frame.views, frame.root_position)
@@ -172,7 +172,9 @@ class MatchAndTrack:
         track, result = min(found, key=lambda pair: pair[1].E_total)
         return Followed(track, result.E_total, last.matches + 1), result
 
-    def _begin(self, start: Array, last: Followed, frame: _Frame) -> tuple[Followed, PoseEstimate]:
+    def _begin(
+        self, start: Array, last: Followed, frame: _GivenFrame
+    ) -> tuple[Followed, PoseEstimate]:
         """A track that begins where the body is known to be."""
         x = frame.observation.state(start)
         if last.track is not None:
@@ -184,7 +186,7 @@ class MatchAndTrack:
         return Followed(track, reference, last.matches), replace(result, found=found)
 
     def _go_on(
-        self, last: Followed, tracked: tuple[Track, PoseEstimate] | None, frame: _Frame
+        self, last: Followed, tracked: tuple[Track, PoseEstimate] | None, frame: _GivenFrame
     ) -> tuple[Followed, PoseEstimate]:
         """What is known where neither a track nor a mask nor a start says where the body is."""
         if tracked is None:
@@ -194,7 +196,7 @@ class MatchAndTrack:
             return last, replace(result, found=False)
         return Followed(tracked[0], last.reference, last.matches), replace(tracked[1], found=False)
 
-    def _follow(self, track: Track, frame: _Frame, first: bool) -> Track:
+    def _follow(self, track: Track, frame: _GivenFrame, first: bool) -> Track:
         """The tracker's next frame; first: it is the one that the track begins in."""
         return self.tracker.follow(track, frame.masks, first, frame.root_position, frame.pictures)
 
@@ -213,7 +215,7 @@ class MatchAndTrack:
         limit = 1.5 * reference + 0.1
         return track.lost or (has_masks and result.E_total > min(limit, UNEXPLAINED))
 
-    def _difference(self, track: Track, frame: _Frame) -> tuple[float, float]:
+    def _difference(self, track: Track, frame: _GivenFrame) -> tuple[float, float]:
         """The area where the body differs from what is seen, and the body's [pixel]."""
         observation, x = frame.observation, track.state.best.mean
         if frame.views:
@@ -227,7 +229,7 @@ class MatchAndTrack:
             J += edge_area(drawn) * track.measurement.distance
         return J, max(area, 1.0)
 
-    def _result(self, track: Track, frame: _Frame) -> PoseEstimate:
+    def _result(self, track: Track, frame: _GivenFrame) -> PoseEstimate:
         """The pose of a track, and how well it explains what is seen."""
         observation, x = frame.observation, track.state.best.mean
         q, X_WB = observation.positions(x)

@@ -30,26 +30,26 @@ from drake_pose.filtering.truncated_normal import (
     unlimited,
 )
 from drake_pose.filtering.update import (
-    Evidence,
     LinearObservation,
+    Measurement,
     ObservationModel,
     Truncate,
     Updated,
     difference,
-    make_evidence,
+    make_measurement,
     update,
 )
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class StaticView:
     """Frames that show the same: the measurement (m,) of the first, and how many."""
 
     reference: Array
     count: int
 
 
-def next_view(view: View | None, seen: Evidence, significance: float) -> View:
+def next_view(view: StaticView | None, seen: Measurement, significance: float) -> StaticView:
     """The view a measurement belongs to: the one so far, or one that begins with it.
 
     Args:
@@ -58,15 +58,15 @@ def next_view(view: View | None, seen: Evidence, significance: float) -> View:
     """
     y = seen.y
     if view is None or significance == 0 or len(view.reference) != len(y):
-        return View(y, 1)
+        return StaticView(y, 1)
     change = difference(y, view.reference, seen.model.wraps)
     both = np.isfinite(change)
     new_rows = np.isfinite(y) & ~np.isfinite(view.reference)
     if new_rows.any() or not both.any():
-        return View(y, 1)
+        return StaticView(y, 1)
     size = float(np.sum(change[both] ** 2 / (2.0 * np.diag(seen.covariance)[both])))
     is_new = size > _largest_change(significance, int(np.count_nonzero(both)))
-    return View(y, 1) if is_new else View(view.reference, view.count + 1)
+    return StaticView(y, 1) if is_new else StaticView(view.reference, view.count + 1)
 
 
 @lru_cache(maxsize=1024)
@@ -311,7 +311,7 @@ class FilterState:
     rejections: tuple[Rejection, ...] = ()
     distance: float = 0.0
     count: int = 0
-    view: View | None = None
+    view: StaticView | None = None
 
     @property
     def best(self) -> Belief:
@@ -394,7 +394,7 @@ class TruncatedFilter:
         Args:
             start: (n,) where to linearise first; y (m,) and variances as for ``update``.
         """
-        seen = make_evidence(self.observation, y, variances)
+        seen = make_measurement(self.observation, y, variances)
         few = min(self.settings.iterations, self.settings.rough_iterations)
         return update(prediction, seen, few, start, False, self._limits).truncated.mean
 
@@ -416,7 +416,7 @@ class TruncatedFilter:
             SettingsError: the measurement does not fit.
         """
         step, settings = state.step + 1, self.settings
-        seen = make_evidence(observation or self.observation, y, variances)
+        seen = make_measurement(observation or self.observation, y, variances)
         view = next_view(state.view, seen, self.novelty)
         if view.count > 1:
             branches = [self._repeat(h, seen) for h in state.hypotheses]
@@ -436,7 +436,7 @@ class TruncatedFilter:
         )
 
     def _branches(
-        self, hypothesis: Hypothesis, seen: Evidence, step: int, places: Iterator[int]
+        self, hypothesis: Hypothesis, seen: Measurement, step: int, places: Iterator[int]
     ) -> list[Branch]:
         """A hypothesis updated at its prediction, and at each mirrored one, which are counted."""
         own = replace(hypothesis, repeated=None)
@@ -460,7 +460,7 @@ class TruncatedFilter:
             for h, start in starts
         ]
 
-    def _repeat(self, hypothesis: Hypothesis, seen: Evidence) -> Branch:
+    def _repeat(self, hypothesis: Hypothesis, seen: Measurement) -> Branch:
         """A hypothesis updated by a further frame of the same view."""
         repeated = hypothesis.repeated
         if repeated is None:

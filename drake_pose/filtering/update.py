@@ -89,7 +89,7 @@ class LinearObservation:
         return []
 
 
-class Evidence(NamedTuple):
+class Measurement(NamedTuple):
     """A measurement y (m,), NaN where occluded, of a model, with its noise's covariance (m, m)."""
 
     model: ObservationModel
@@ -117,7 +117,9 @@ class Updated:
     count: int
 
 
-def make_evidence(model: ObservationModel, y: Array, variances: Array | None = None) -> Evidence:
+def make_measurement(
+    model: ObservationModel, y: Array, variances: Array | None = None
+) -> Measurement:
     """A measurement y (m,), NaN where occluded, and its noise, else the model's.
 
     Args:
@@ -144,67 +146,17 @@ def make_evidence(model: ObservationModel, y: Array, variances: Array | None = N
             )
     own = np.diag(model.variances)
     if variances is None:
-        return Evidence(model, np.asarray(y, dtype=np.float64), own)
+        return Measurement(model, np.asarray(y, dtype=np.float64), own)
     noise = variances if np.ndim(variances) == 2 else np.diag(variances)
     bad = np.flatnonzero(np.isfinite(y) & ~(np.diag(noise) > 0))
     if len(bad):
         raise SettingsError(f"the variance of measurement '{model.names[bad[0]]}' must be positive")
-    return Evidence(model, y, np.where(np.isfinite(noise), noise, own))
-
-
-class _Line(NamedTuple):
-    """A measurement made linear at x: innovation = H (x - prediction) + noise (k, k).
-
-    misfit: squared distance of what was measured from what is expected at x, over its count.
-    """
-
-    H: Array
-    noise: Array
-    innovation: Array
-    misfit: float
-
-
-def _linearise(prediction: Belief, seen: Evidence, x: Array) -> _Line:
-    h, H = seen.model.predict(x)
-    rows = np.isfinite(seen.y) & np.isfinite(h)
-    residual = difference(seen.y[rows], h[rows], seen.model.wraps[rows])
-    H, noise = H[rows], seen.covariance[np.ix_(rows, rows)]
-    misfit = float(residual @ np.linalg.solve(noise, residual)) / max(len(residual), 1)
-    return _Line(H, noise, residual + H @ (x - prediction.mean), misfit)
-
-
-def _fuse(prediction: Belief, line: _Line, temperature: float = 1.0) -> tuple[Belief, float, float]:
-    """The belief with a line whose noise has a temperature, log likelihood, squared distance.
-
-    Raises:
-        SettingsError: S is not positive definite.
-    """
-    count, P = len(line.noise), prediction.covariance
-    if not count:
-        return prediction, 0.0, 0.0
-    noise = temperature * line.noise
-    HP = line.H @ P
-    S = HP @ line.H.T + noise
-    root, failed = dpotrf(S, lower=1)
-    if failed:
-        raise SettingsError(
-            "the covariance of the innovation is not positive definite: give every measurement "
-            "a positive variance"
-        )
-    weighed = dpotrs(root, line.innovation, lower=1)[0]
-    distance = float(line.innovation @ weighed)
-    log_determinant = 2.0 * float(np.log(np.diag(root)).sum())
-    log_likelihood = -0.5 * (distance + log_determinant + count * math.log(2 * math.pi))
-    gain = dpotrs(root, HP, lower=1)[0].T
-    rest = prediction.root - gain @ (line.H @ prediction.root)
-    covariance = rest @ rest.T + gain @ noise @ gain.T
-    mean = prediction.mean + P @ (line.H.T @ weighed)
-    return Belief(mean, 0.5 * (covariance + covariance.T)), log_likelihood, distance
+    return Measurement(model, y, np.where(np.isfinite(noise), noise, own))
 
 
 def update(
     prediction: Belief,
-    seen: Evidence,
+    seen: Measurement,
     iterations: int = 1,
     start: Array | None = None,
     tempered: bool = True,
@@ -225,18 +177,43 @@ def update(
         sites: of the last truncation.
 
     Raises:
-        SettingsError: the belief has no density inside the limits.
+        SettingsError: the belief has no density inside the limits, or a variance is not positive.
     """
     x, temperature = prediction.mean if start is None else start, 1.0
     sites = np.zeros((0, 2)) if sites is None else sites
     settled = ITERATION.settled if truncate is None else ITERATION.settled_with_limits
     if not np.isfinite(seen.y).any():
         iterations = 1
+    P = prediction.covariance
     for made in range(iterations):
-        line = _linearise(prediction, seen, x)
+        # Made linear at x: innovation = H (x - prediction) + noise, over what is measured there.
+        h, H = seen.model.predict(x)
+        rows = np.isfinite(seen.y) & np.isfinite(h)
+        count = int(np.count_nonzero(rows))
+        residual = difference(seen.y[rows], h[rows], seen.model.wraps[rows])
+        H, plain = H[rows], seen.covariance[np.ix_(rows, rows)]
+        innovation = residual + H @ (x - prediction.mean)
         if made == 0 and iterations > 1 and tempered:
-            temperature = max(1.0, line.misfit / ITERATION.good_fit)
-        belief, log_likelihood, distance = _fuse(prediction, line, temperature)
+            misfit = float(residual @ np.linalg.solve(plain, residual)) / max(count, 1)
+            temperature = max(1.0, misfit / ITERATION.good_fit)
+        belief, log_likelihood, distance = prediction, 0.0, 0.0
+        if count:
+            noise, HP = temperature * plain, H @ P
+            root, failed = dpotrf(HP @ H.T + noise, lower=1)
+            if failed:
+                raise SettingsError(
+                    "the covariance of the innovation is not positive definite: give every "
+                    "measurement a positive variance"
+                )
+            weighed = dpotrs(root, innovation, lower=1)[0]
+            distance = float(innovation @ weighed)
+            log_determinant = 2.0 * float(np.log(np.diag(root)).sum())
+            log_likelihood = -0.5 * (distance + log_determinant + count * math.log(2 * math.pi))
+            gain = dpotrs(root, HP, lower=1)[0].T
+            rest = prediction.root - gain @ (H @ prediction.root)
+            covariance = rest @ rest.T + gain @ noise @ gain.T
+            mean = prediction.mean + P @ (H.T @ weighed)
+            belief = Belief(mean, 0.5 * (covariance + covariance.T))
         truncated = unlimited(belief) if truncate is None else truncate(belief, sites)
         sites = truncated.sites
         step = truncated.mean - x
@@ -245,7 +222,7 @@ def update(
             break
         x = x + (step if made < ITERATION.full_steps else 0.5 * step)
         temperature = max(1.0, temperature / ITERATION.cooling)
-    return Updated(belief, truncated, log_likelihood, distance, len(line.noise))
+    return Updated(belief, truncated, log_likelihood, distance, count)
 
 
 def difference(values: Array, expected: Array, turning: Mask) -> Array:

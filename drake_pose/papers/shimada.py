@@ -34,7 +34,7 @@ from drake_pose.filtering.truncated_filter import (
     TruncatedFilter,
     Truncation,
 )
-from drake_pose.filtering.update import make_evidence, update
+from drake_pose.filtering.update import make_measurement, update
 from drake_pose.papers.shimada_motion import (
     ACCELERATIONS,
     FRAMES,
@@ -280,7 +280,7 @@ def _bound(hand_filter: TruncatedFilter, sequence: SyntheticSequence) -> Array:
     for t, (truth, y) in enumerate(zip(sequence.states, sequence.measurements, strict=True)):
         if t:
             belief = hand_filter.predicted(belief)
-        belief = update(belief, make_evidence(hand_filter.observation, y), 1, truth).belief
+        belief = update(belief, make_measurement(hand_filter.observation, y), 1, truth).belief
     return belief.mean
 
 

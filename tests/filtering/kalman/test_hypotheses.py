@@ -14,7 +14,7 @@ from drake_pose.filtering.truncated_filter import (
     normalise,
     prune,
 )
-from drake_pose.filtering.update import make_evidence, update
+from drake_pose.filtering.update import make_measurement, update
 from drake_pose.papers.shimada import experiment_filter
 from drake_pose.papers.shimada_motion import make_sequence
 
@@ -33,23 +33,23 @@ def test_a_view_lasts_while_only_noise_changes(hand):
     y = sequence.measurements[3]
     noise = np.sqrt(observation.variances)
     generator = np.random.default_rng(1)
-    view = next_view(None, make_evidence(observation, y), CHANCE)
+    view = next_view(None, make_measurement(observation, y), CHANCE)
     assert view.count == 1
     for count in range(2, 500):
         again = y + noise * generator.normal(size=len(y))
-        view = next_view(view, make_evidence(observation, again), CHANCE)
+        view = next_view(view, make_measurement(observation, again), CHANCE)
         assert view.count == count
-    assert next_view(view, make_evidence(observation, y + 4 * noise), CHANCE).count == 1
-    assert next_view(view, make_evidence(observation, y), 0.0).count == 1
+    assert next_view(view, make_measurement(observation, y + 4 * noise), CHANCE).count == 1
+    assert next_view(view, make_measurement(observation, y), 0.0).count == 1
     # The threshold is a probability, whatever is hidden; what was hidden makes a new view.
     few = np.where(np.arange(len(y)) < 4, y, np.nan)
-    first = next_view(None, make_evidence(observation, few), CHANCE)
+    first = next_view(None, make_measurement(observation, few), CHANCE)
     for other, is_new in ((few + 3.5 * noise, False), (few + 9 * noise, True), (y, True)):
-        found = next_view(first, make_evidence(observation, other), CHANCE)
+        found = next_view(first, make_measurement(observation, other), CHANCE)
         assert found.count == (1 if is_new else 2)
     # An angle that jumps by a full turn has not changed.
     turned = y + 2 * np.pi * observation.wraps
-    assert next_view(view, make_evidence(observation, turned), CHANCE).count == view.count + 1
+    assert next_view(view, make_measurement(observation, turned), CHANCE).count == view.count + 1
 
 
 class Parabola:
@@ -83,7 +83,8 @@ def test_a_thousand_frames_tell_the_sum_of_state_and_offset_and_no_more():
     frames, y = 1000, 0.4
     for _ in range(frames):
         repeated = RepeatedView(
-            repeated.tangent, update(repeated.belief, make_evidence(tangent, np.array([y]))).belief
+            repeated.tangent,
+            update(repeated.belief, make_measurement(tangent, np.array([y]))).belief,
         )
     noise = Parabola.variances[0] / frames + C
     assert repeated.state().covariance[0, 0] == pytest.approx(1 / (1 / 0.09 + 1 / noise), rel=1e-6)

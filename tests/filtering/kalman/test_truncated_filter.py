@@ -7,7 +7,7 @@ from drake_pose.filtering.inequalities import from_bounds, stack, two_sided
 from drake_pose.filtering.state import Belief, StateLayout, covariance_from, factor_of, make_belief
 from drake_pose.filtering.truncated_filter import FilterSettings, TruncatedFilter
 from drake_pose.filtering.truncated_normal import truncate_joint
-from drake_pose.filtering.update import make_evidence, update
+from drake_pose.filtering.update import make_measurement, update
 
 ONE_TURN = from_bounds(["angle"], [0], [1])
 BEYOND_IT = two_sided(["angle"], "stop", [1.0], 2.0, np.inf)
@@ -76,7 +76,7 @@ def test_a_linear_measurement_gives_bayes_rule_in_information_form(iterations, R
     H, y = Linear.H, np.array([1.0, -2.0])
     for seed in range(5):
         prior, model = random_belief(seed), Linear()
-        result = update(prior, make_evidence(model, y, R), iterations)
+        result = update(prior, make_measurement(model, y, R), iterations)
         # Where the tangent is the same everywhere, the second one settles it.
         assert R is not None or model.calls <= 2
         information = np.linalg.inv(prior.covariance) + H.T @ np.linalg.inv(noise) @ H
@@ -90,9 +90,9 @@ def test_a_linear_measurement_gives_bayes_rule_in_information_form(iterations, R
 
 def test_what_is_occluded_is_left_out():
     prior = random_belief(1)
-    one = update(prior, make_evidence(Linear(), np.array([1.0, np.nan])))
+    one = update(prior, make_measurement(Linear(), np.array([1.0, np.nan])))
     assert one.count == 1
-    nothing = update(prior, make_evidence(Linear(), np.full(2, np.nan)))
+    nothing = update(prior, make_measurement(Linear(), np.full(2, np.nan)))
     np.testing.assert_allclose(nothing.belief.covariance, prior.covariance, atol=1e-12)
     np.testing.assert_allclose(nothing.belief.mean, prior.mean)
 
@@ -106,7 +106,7 @@ def test_iteration_finds_the_posteriors_largest_density():
         r = (y - model.predict(x)[0]) / 0.01
         return r @ r + (x - prior.mean) ** 2 @ (1 / np.diag(prior.covariance))
 
-    seen = make_evidence(model, y)
+    seen = make_measurement(model, y)
     result = update(prior, seen, iterations=20)
     best = cost(result.belief.mean)
     generator = np.random.default_rng(0)
@@ -123,7 +123,7 @@ def test_iteration_finds_the_posteriors_largest_density():
 def test_covariances_stay_positive_definite_when_measurements_are_nearly_exact():
     model = Segment(deviation=1e-9)
     belief = Belief(np.array([0.2, 0.0, 1.0]), np.diag([1e4, 1e2, 1e4]))
-    seen = make_evidence(model, np.array([np.cos(0.3), np.sin(0.3)]))
+    seen = make_measurement(model, np.array([np.cos(0.3), np.sin(0.3)]))
     for _ in range(20):
         belief = update(belief, seen, 10).belief
         np.testing.assert_array_equal(belief.covariance, belief.covariance.T)
@@ -226,10 +226,10 @@ def test_transition_and_noise():
 @pytest.mark.parametrize(
     ("make", "word"),
     [
-        (lambda: make_evidence(Linear(), np.zeros(3)), "measures 2"),
-        (lambda: make_evidence(Linear(), np.array([0, np.inf])), "'b' is infinite"),
-        (lambda: make_evidence(Linear(), np.ones(2), np.array([1, -1])), "'b' must be positive"),
-        (lambda: make_evidence(Linear(), np.ones(2), np.ones(3)), "measures 2"),
+        (lambda: make_measurement(Linear(), np.zeros(3)), "measures 2"),
+        (lambda: make_measurement(Linear(), np.array([0, np.inf])), "'b' is infinite"),
+        (lambda: make_measurement(Linear(), np.ones(2), np.array([1, -1])), "'b' must be positive"),
+        (lambda: make_measurement(Linear(), np.ones(2), np.ones(3)), "measures 2"),
         (lambda: make_belief([np.nan, 0], np.eye(2)), "'0' is NaN"),
         (lambda: make_belief([0, 0], [[1, np.inf], [np.inf, 1]]), "NaN or infinity"),
         (lambda: make_belief([0, 0], [[1, 0.5], [0, 1]]), "symmetric"),

@@ -7,17 +7,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from drake_pose.arrays import Array, Mask, Picture
+from drake_pose.arrays import Array, Floats, Mask, Picture
 from drake_pose.errors import SettingsError
 from drake_pose.filtering.body_state import GROWTH, BodyState
 from drake_pose.filtering.state import Belief
 from drake_pose.filtering.truncated_filter import FilterSettings, FilterState, TruncatedFilter
 from drake_pose.filtering.update import LinearObservation
-from drake_pose.fit.camera_sums import Views
 from drake_pose.fit.colours import (
-    COLOUR_CORRELATION,
-    COLOUR_SPACING,
-    Histograms,
+    LINES,
     add_pictures,
     check_picture,
     learned,
@@ -29,6 +26,7 @@ from drake_pose.fit.colours import (
 from drake_pose.fit.contour_fit import (
     Comparison,
     Noise,
+    Views,
     camera_weights,
     compare_views,
     normal_equations,
@@ -37,7 +35,7 @@ from drake_pose.fit.contour_fit import (
 )
 from drake_pose.fit.covariance import distances, error_unit, estimate_sizes, values_covariance
 from drake_pose.fit.evidence import NO_EDGE, find_edge_points
-from drake_pose.fit.kernel import COMPARED, FITTING, REACH, SQUARES, WEIGHT
+from drake_pose.fit.kernel import REACH, Sum
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
 
 
@@ -79,7 +77,7 @@ class ContourEvidence(NamedTuple):
 
     views: Views
     pictures: tuple[Picture | None, ...]
-    colours: Histograms | None
+    colours: Floats | None
 
     @property
     def has_pictures(self) -> bool:
@@ -116,7 +114,7 @@ class ContourObservation(BodyState):
         self,
         masks: Sequence[Mask | None],
         pictures: Sequence[Picture | None] | None = None,
-        colours: Histograms | None = None,
+        colours: Floats | None = None,
     ) -> ContourEvidence:
         """What a frame shows: the points of masks' edges, found once for all its measurements.
 
@@ -150,7 +148,7 @@ class ContourObservation(BodyState):
         """Whether no later measurement of a frame looks at pictures more closely than this one."""
         return step_of_lines(number) == step_of_lines(number + 9)
 
-    def no_colours(self) -> Histograms:
+    def no_colours(self) -> Floats:
         """What is known of a body's colours that was never seen."""
         return no_colours(len(self.cameras), len(self._body.outlines))
 
@@ -158,10 +156,10 @@ class ContourObservation(BodyState):
         self,
         pictures: Sequence[Picture | None],
         x: Array,
-        colours: Histograms,
+        colours: Floats,
         surely: bool = False,
         without: Mask | None = None,
-    ) -> Histograms:
+    ) -> Floats:
         """What is known of the body's colours after a frame.
 
         Args:
@@ -226,12 +224,12 @@ class ContourObservation(BodyState):
         if seen.colours is not None and seen.has_pictures:
             pixels = step_of_lines(number)
             # Coarse lines are so wide that they would say the same.
-            lines = AnnealingStage(width, COLOUR_SPACING * min(pixels, 2))
-            correlation = _PLAIN.correlation * COLOUR_CORRELATION / CONTOUR.correlation
+            lines = AnnealingStage(width, LINES.spacing * min(pixels, 2))
+            correlation = _PLAIN.correlation * LINES.correlation / CONTOUR.correlation
             noise = replace(_PLAIN, correlation=correlation)
             add_pictures(compared, self.cameras, seen.pictures, seen.colours, lines, noise, pixels)
             weigh_parts(compared, CONTOUR.deviation, seen.pictures)
-        squares, weight = compared.sums[:, :, [SQUARES, WEIGHT]].sum(axis=(0, 1))
+        squares, weight = compared.sums[:, :, [Sum.SQUARES, Sum.WEIGHT]].sum(axis=(0, 1))
         return None if weight <= 0.0 else (compared, math.sqrt(squares / weight))
 
     def _compress(
@@ -260,7 +258,7 @@ class ContourObservation(BodyState):
             y=-(turns.T @ slopes) / root,
             H=slope,
             at=x,
-            share=float(contour[FITTING] / max(contour[COMPARED], 1e-9)),
+            share=float(contour[Sum.FITTING] / max(contour[Sum.COMPARED], 1e-9)),
             distance=distance,
             part_distances=parts,
             compared=compared,
@@ -353,7 +351,7 @@ class Track:
     state: FilterState
     measurement: ContourMeasurement | None
     lost: bool
-    colours: Histograms | None = None
+    colours: Floats | None = None
 
 
 class ContourTracker:

@@ -1,24 +1,24 @@
 """Pictures of a camera that stands still as evidence of a body's pose, without masks.
 
-A body at known positions covers each pixel in some frames; in the others one background shows. So a
-pixel's colours over the frames say how well a set of frames fits in which the body covers it. A
-pixel may have a few backgrounds, as where something was put down. For a background and a frame,
-with s how much likelier the colour is under that background than any colour, likelihoods are
+A body at known positions covers each pixel in some frames; in the others one background shows, or
+one of a few, as where something was put down. For a background and a frame, with s the likelihood
+ratio of the colour under that background to any colour, likelihoods are
 
     background shows: .92 s + .08        body shows: .25 s + .75
 
 as backgrounds change now and then, and a body may look like what is behind it. The sum of their
-logarithms over the frames, of the best background, is what a pixel says of a set (``PixelSums``).
+logarithms over the frames, of the best background, scores a set of frames in which the body covers
+the pixel (``PixelSums``, ``explain``).
 
-Once a pose is about known, which background lies behind each pixel is, too, and so are the odds of
-each pixel of a frame to show the body: lines across the contour then say where its edge is
-(``fit.colour_lines``), as they do in pictures whose colours are known.
+Once a pose is about known, so are the background of each pixel and the odds that a pixel shows the
+body: lines across the contour then measure where its edge is (``fit.colours``).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from enum import IntEnum
 from functools import cached_property
 from typing import NamedTuple
 
@@ -27,43 +27,46 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_pose.arrays import Array, Floats, Mask, Picture
-from drake_pose.fit.background_kernel import PixelSums
-from drake_pose.fit.colour_lines import COLOURS, ODDS
+from drake_pose.compiled import compiled
+from drake_pose.fit.colours import COLOURS, Colour
+from drake_pose.silhouette.areas.outline import PackedOutlines
+from drake_pose.silhouette.areas.span_kernel import fill_rows, find_spans, make_rows
 
-_BACKGROUNDS = 3
-# Shares of what looks like its background where that shows, and where the body does.
-_SHOWN, _LIKE_BODY = 0.92, 0.25
-# The logarithm of how much likelier a background's own colour is than any colour.
-_LOG_PEAK = 4.0
-# Where one of a few backgrounds is known to be behind a pixel, its own colour is so many times
-# likelier still: what looks like it to the noise is hardly ever a body of about the same colour.
-_KNOWN_TIMES = 20.0
-# Deviations within which a colour is as good as its background's, and is counted among it.
-_EXACT, _SAME = 1.5, 3.0
-# Beside noise, a colour is off by this share of the gradient there, as cameras shake; and noise is
-# no less than this [of 255].
-_SHAKEN, _LEAST_NOISE = 0.15, 1.5
-# Edges are as strong as they count from so many deviations of noise on; they run across an axis
-# where their slope along the other one is no more than so many times that along it.
-_STRONG, _ALIGNED = 4.0, 1.7
-# Logarithms of odds beyond this are as good as this.
-_MOST_ODDS = 8.0
-# For masks odds are smoothed so far [pixel]; and a mask ends so far at most from where the body
-# should be [root of its area].
-_SMOOTH, _REACH = 0.7, 0.1
-# So near to its contour a body may be on either side [pixel].
-_NEAR = 3
-# Backgrounds are looked for in so many rows at once, which stay in the processor's cache.
-_ROWS = 8
-# Of a background's pixels every how manieth tells its noise.
-_SAMPLE = 37
-# Colours that a body or a background was not seen to have are as likely as this share of any.
-_UNSEEN_COLOUR = 0.1
-# So many times as likely as any colour is one at most.
-_MOST_FREQUENT = 60.0
-# Light is evened in so many rounds, without pixels that are off by more deviations; gains beyond
-# these are none. It is told in pictures about so wide [pixel].
-_LIGHT_ROUNDS, _LIGHT_OUTLIERS, _GAINS, _LIGHT_WIDTH = 4, 2.0, (0.5, 2.0), 160
+
+@dataclass(frozen=True)
+class BackgroundModel:
+    """How colours of a body and of what is behind it are distributed.
+
+    Args:
+        shown, like_body: the fraction of pixels that look like their background where it shows, and
+            where the body covers it.
+        log_peak: logarithm of the likelihood ratio of a background's own colour to any colour.
+        known_times: this ratio is larger by this factor where it is known which background lies
+            behind a pixel.
+        exact: colours within this many standard deviations are as likely as the background's own.
+        same: colours within this many standard deviations belong to the background.
+        shaken: standard deviation of a colour per gradient there [pixel], as cameras shake.
+        min_noise: the least standard deviation of a colour [of 255].
+        near: half the width of the strip along a contour where either side may show [pixel].
+        max_log_odds: log odds are clipped to this.
+        unseen, max_frequent: colours are at least and at most this many times as frequent as any.
+    """
+
+    shown: float = 0.92
+    like_body: float = 0.25
+    log_peak: float = 4.0
+    known_times: float = 20.0
+    exact: float = 1.5
+    same: float = 3.0
+    shaken: float = 0.15
+    min_noise: float = 1.5
+    near: int = 3
+    max_log_odds: float = 8.0
+    unseen: float = 0.1
+    max_frequent: float = 60.0
+
+
+MODEL = BackgroundModel()
 
 
 class Light(NamedTuple):
@@ -73,21 +76,24 @@ class Light(NamedTuple):
     offset: Floats
 
     @staticmethod
-    def between(picture: Picture | Floats, reference: Floats) -> Light:
-        """That of a picture (H, W, 3), without what differs otherwise."""
+    def between(picture: Picture | Floats, reference: Floats, rounds: int = 4) -> Light:
+        """That of a picture (H, W, 3): a line fitted to each channel, without outliers.
+
+        Gains are between a half and two. Pictures are sampled about 160 pixels wide.
+        """
         light = Light(np.ones(3, np.float32), np.zeros(3, np.float32))
-        step = max(1, picture.shape[1] // _LIGHT_WIDTH)
+        step = max(1, picture.shape[1] // 160)
         for channel in range(3):
             both = (one[::step, ::step, channel].ravel() for one in (picture, reference))
             x, y = (np.asarray(one, np.float32) for one in both)
             keep = np.ones(len(x), bool)
-            for _ in range(_LIGHT_ROUNDS):
+            for _ in range(rounds):
                 mean_x, mean_y = x[keep].mean(), y[keep].mean()
                 off_x = x[keep] - mean_x
                 gain = float(off_x @ (y[keep] - mean_y)) / max(float(off_x @ off_x), 1e-6)
-                gain = min(max(gain, _GAINS[0]), _GAINS[1])
+                gain = min(max(gain, 0.5), 2.0)
                 off = np.abs(gain * (x - mean_x) + mean_y - y)
-                keep = off <= _LIGHT_OUTLIERS * (1.5 * np.median(off) + 1.0)
+                keep = off <= 2.0 * (1.5 * np.median(off) + 1.0)
             light.gain[channel], light.offset[channel] = gain, mean_y - gain * mean_x
         return light
 
@@ -95,6 +101,20 @@ class Light(NamedTuple):
         """A picture (H, W, 3) in the reference's light."""
         by = np.column_stack([np.diag(self.gain), self.offset])
         return np.asarray(cv2.transform(picture.astype(np.float32), by))
+
+
+class PixelSums(NamedTuple):
+    """What pictures say of sets of frames in which a body covers a pixel.
+
+    shown: (H, W, 3) float32 log-likelihoods of three backgrounds where no frame is covered; more:
+    (H, W, f, 3) float32 what a covered frame adds; none: (H, W) float32 the best of shown; edges:
+    (2, f, H, W) float32 how strong edges across u and v are in each frame, beyond chance.
+    """
+
+    shown: Floats
+    more: Floats
+    none: Floats
+    edges: Floats
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,7 +150,17 @@ class Backgrounds:
     def sums(self) -> PixelSums:
         """What a pose explains is summed from."""
         total, more = self._told
-        return PixelSums(total, more, _largest(total), self._edges())
+        noise = float(self.deviations.min())
+        edges = np.empty((2, *self.pictures.shape[:3]), np.float32)
+        for f, picture in enumerate(self.pictures):
+            u, v = (_largest(np.abs(one)) for one in _slopes(picture))
+            # An edge is as strong as it counts from four standard deviations of the noise on. It
+            # runs across an axis where the slope along the other one is not much more.
+            strength = np.minimum(1.0, np.hypot(u, v) / (4.0 * noise))
+            for k, (across, along) in enumerate(((u, v), (v, u))):
+                own = np.where(along <= 1.7 * across, strength, 0.0)
+                edges[k, f] = cv2.dilate(own, np.ones((3, 3), np.uint8))
+        return PixelSums(total, more, _largest(total), edges - edges.mean())
 
     @cached_property
     def possible(self) -> float:
@@ -144,7 +174,7 @@ class Backgrounds:
         found = np.zeros(self.pictures.shape[1:3], np.float32)
         for picture in self.pictures:
             likeness = _likeness(picture, self.colours[0], self.deviations)
-            share = cv2.blur(1.0 - likeness / np.float32(np.exp(_LOG_PEAK)), (3, 3))
+            share = cv2.blur(1.0 - likeness / np.float32(np.exp(MODEL.log_peak)), (3, 3))
             found += np.where(share > 0.5, share, 0.0)
         return found
 
@@ -160,7 +190,7 @@ class Backgrounds:
         best = told.argmax(axis=-1)[None, ..., None]
         colours = np.take_along_axis(self.colours, best, axis=0)[0]
         off = _largest(np.abs(self.pictures - colours)) / self.deviations
-        return np.asarray((off < _SAME) & ~_grown(covered, _NEAR))
+        return np.asarray((off < MODEL.same) & ~_grown(covered, MODEL.near))
 
     @cached_property
     def _told(self) -> tuple[Floats, Floats]:
@@ -169,27 +199,15 @@ class Backgrounds:
         And what the body adds in each (H, W, f, 3).
         """
         frames, height, width = self.pictures.shape[:3]
-        total = np.zeros((height, width, _BACKGROUNDS), np.float32)
-        more = np.empty((height, width, frames, _BACKGROUNDS), np.float32)
+        total = np.zeros((height, width, len(self.colours)), np.float32)
+        more = np.empty((height, width, frames, len(self.colours)), np.float32)
         for f, picture in enumerate(self.pictures):
             likeness = [_likeness(picture, one, self.deviations) for one in self.colours]
             stacked = np.stack(likeness, axis=-1)
-            shown = np.log(_SHOWN * stacked + (1.0 - _SHOWN))
-            more[:, :, f] = np.log(_LIKE_BODY * stacked + (1.0 - _LIKE_BODY)) - shown
+            shown = np.log(MODEL.shown * stacked + (1.0 - MODEL.shown))
+            more[:, :, f] = np.log(MODEL.like_body * stacked + (1.0 - MODEL.like_body)) - shown
             total += shown
         return total, more
-
-    def _edges(self) -> Floats:
-        """(2, f, H, W) how strong edges across u and v are in each frame, beyond chance."""
-        noise = float(self.deviations.min())
-        found = np.empty((2, *self.pictures.shape[:3]), np.float32)
-        for f, picture in enumerate(self.pictures):
-            u, v = (_largest(np.abs(one)) for one in _slopes(picture))
-            strength = np.minimum(1.0, np.hypot(u, v) / (_STRONG * noise))
-            for k, (across, along) in enumerate(((u, v), (v, u))):
-                own = np.where(along <= _ALIGNED * across, strength, 0.0)
-                found[k, f] = cv2.dilate(own, np.ones((3, 3), np.uint8))
-        return found - found.mean()
 
 
 @dataclass(frozen=True, eq=False)
@@ -224,7 +242,7 @@ class KnownBackground:
         height, width = covered.shape[1:]
         total, count = np.zeros((height, width, 3), np.float32), np.zeros((height, width))
         on, beside = (np.zeros(COLOURS) for _ in range(2))
-        inside, near = ~_grown(~covered, _NEAR), _grown(covered, _NEAR)
+        inside, near = ~_grown(~covered, MODEL.near), _grown(covered, MODEL.near)
         small, means = [], []
         for f, (picture, light) in enumerate(zip(pictures, lights, strict=True)):
             even = light.evened(picture)
@@ -239,7 +257,7 @@ class KnownBackground:
             numbers = _numbers(even)
             on += np.bincount(numbers[inside[f]], minlength=COLOURS)
             beside += np.bincount(numbers[~near[f]], minlength=COLOURS)
-            rows = np.flatnonzero(shows)[::_SAMPLE]
+            rows = np.flatnonzero(shows)[::37]
             small.append((rows, even.reshape(-1, 3)[rows]))
         colours = (total / np.maximum(count, 1.0)[..., None]).astype(np.float32)
         means = [_largest(np.abs(own - colours.reshape(-1, 3)[rows])) for rows, own in small]
@@ -253,14 +271,16 @@ class KnownBackground:
         """(H, W) logarithms of the odds that each pixel of a picture shows the body."""
         even = light.evened(picture)
         numbers = _numbers(even)
-        likeness = _likeness(even, self.colours, self.deviations) * np.float32(_KNOWN_TIMES)
-        shown = np.log(_SHOWN * likeness + (1.0 - _SHOWN))
+        likeness = _likeness(even, self.colours, self.deviations) * np.float32(MODEL.known_times)
+        shown = np.log(MODEL.shown * likeness + (1.0 - MODEL.shown))
         return np.asarray(self.on[numbers] - np.where(self.unseen, self.beside[numbers], shown))
 
 
 def odds_picture(odds: Floats) -> Picture:
     """A picture (H, W, 3) whose colours stand for log odds (H, W), see ``odds_of_colours``."""
-    share = (np.clip(odds, -_MOST_ODDS, _MOST_ODDS) + _MOST_ODDS) / (2.0 * _MOST_ODDS)
+    share = (np.clip(odds, -MODEL.max_log_odds, MODEL.max_log_odds) + MODEL.max_log_odds) / (
+        2.0 * MODEL.max_log_odds
+    )
     number = np.rint(share * (COLOURS - 1)).astype(np.uint16)
     channels = (number >> 8, (number >> 4) & 15, number & 15)
     return np.stack([(one << 4).astype(np.uint8) for one in channels], axis=-1)
@@ -268,20 +288,23 @@ def odds_picture(odds: Floats) -> Picture:
 
 def odds_of_colours(nodes: int) -> Floats:
     """(nodes, 3, COLOURS) what the colours of an ``odds_picture`` say, as of `compare_lines`."""
-    known = np.zeros((nodes, 3, COLOURS), np.float32)
-    known[:, ODDS] = np.exp(np.linspace(-_MOST_ODDS, _MOST_ODDS, COLOURS))
+    known = np.zeros((nodes, len(Colour), COLOURS), np.float32)
+    known[:, Colour.ODDS] = np.exp(np.linspace(-MODEL.max_log_odds, MODEL.max_log_odds, COLOURS))
     return known
 
 
-def mask_of_odds(odds: Floats, covered: Mask) -> Mask:
+def mask_of_odds(odds: Floats, covered: Mask, smooth: float = 0.7, reach: float = 0.1) -> Mask:
     """Where odds (H, W) are for the body.
 
     Args:
-        covered: (H, W) where the body is about; the mask ends not far from there.
+        odds: (H, W) log odds.
+        covered: (H, W) where the body is about.
+        smooth: standard deviation of the Gaussian that smooths the odds [pixel].
+        reach: a mask ends within this distance of where the body is about [root of its area].
     """
-    reach = max(_NEAR, round(_REACH * float(np.sqrt(np.count_nonzero(covered)))))
-    near = _grown(covered[None], reach)[0]
-    found = ((cv2.GaussianBlur(odds, (0, 0), _SMOOTH) > 0.0) & near).astype(np.uint8)
+    limit = max(MODEL.near, round(reach * float(np.sqrt(np.count_nonzero(covered)))))
+    near = _grown(covered[None], limit)[0]
+    found = ((cv2.GaussianBlur(odds, (0, 0), smooth) > 0.0) & near).astype(np.uint8)
     found = cv2.morphologyEx(found, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
     return np.asarray(cv2.morphologyEx(found, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8)), bool)
 
@@ -301,8 +324,8 @@ def _slopes(picture: Floats) -> tuple[Floats, Floats]:
 def _deviations(picture: Floats, noise: float) -> Floats:
     """(H, W) of the colours of a background (H, W, 3)."""
     gradient = _largest(np.hypot(*_slopes(picture)))
-    white = max(_LEAST_NOISE, noise)
-    return np.sqrt(white**2 + (_SHAKEN * gradient) ** 2).astype(np.float32)
+    white = max(MODEL.min_noise, noise)
+    return np.sqrt(white**2 + (MODEL.shaken * gradient) ** 2).astype(np.float32)
 
 
 def _grown(masks: Mask, by: int) -> Mask:
@@ -314,7 +337,9 @@ def _grown(masks: Mask, by: int) -> Mask:
 def _likeness(pictures: Floats, colours: Floats, deviations: Floats) -> Floats:
     """(..., H, W) how much likelier colours (..., H, W, 3) are under a background than any."""
     off = _largest(np.abs(pictures - colours)) / deviations
-    return np.asarray(np.exp(_LOG_PEAK - 0.5 * np.maximum(off - _EXACT, 0.0) ** 2), np.float32)
+    return np.asarray(
+        np.exp(MODEL.log_peak - 0.5 * np.maximum(off - MODEL.exact, 0.0) ** 2), np.float32
+    )
 
 
 def _numbers(picture: Floats) -> NDArray[np.uint16]:
@@ -333,33 +358,132 @@ def _log_frequencies(numbers: Array) -> Floats:
         low, middle, high = (np.take(padded, range(k, k + 16), axis=axis) for k in range(3))
         counts = 0.25 * low + 0.5 * middle + 0.25 * high
     times = COLOURS * counts.ravel() / max(float(counts.sum()), 1.0)
-    return np.log(np.minimum(times, _MOST_FREQUENT) + _UNSEEN_COLOUR).astype(np.float32)
+    return np.log(np.minimum(times, MODEL.max_frequent) + MODEL.unseen).astype(np.float32)
 
 
-def _find_colours(pictures: Floats, deviations: Floats) -> Floats:
-    """(3, H, W, 3) the colours that most frames share, then those that most of the others do."""
-    rows = range(0, pictures.shape[1], _ROWS)
-    strips = [(pictures[:, k : k + _ROWS], deviations[k : k + _ROWS]) for k in rows]
-    return np.concatenate([_find_strip(*one) for one in strips], axis=1)
+def _find_colours(pictures: Floats, deviations: Floats, rows: int = 8) -> Floats:
+    """(3, H, W, 3) the colours that most frames share, then those that most of the others do.
+
+    Colours of all pairs of frames are compared, in strips of rows that stay in the cache.
+    """
+    strips = []
+    for k in range(0, pictures.shape[1], rows):
+        own, count = pictures[:, k : k + rows], len(pictures)
+        off = np.zeros((count, count, *own.shape[1:3]), np.float32)
+        for f, picture in enumerate(own):
+            off[f, f:] = _largest(np.abs(own[f:] - picture)) / deviations[k : k + rows]
+            off[f:, f] = off[f, f:]
+        close = off < MODEL.same
+        # Of equal numbers the closer ones.
+        support = np.where(close, np.float32(1.0) - np.float32(0.01) * off, np.float32(0.0))
+        left, found = np.ones(own.shape[:3], bool), list[Floats]()
+        for _ in range(3):
+            told = np.einsum("fghw,ghw->fhw", support, left.astype(np.float32))
+            best = np.where(left, told, -1.0).argmax(axis=0)
+            shared = np.take_along_axis(close, best[None, None], axis=0)[0] & left
+            number = shared.sum(axis=0)[..., None]
+            mean = (own * shared[..., None]).sum(axis=0) / np.maximum(number, 1)
+            found.append(np.where(number > 0, mean, found[0] if found else mean).astype(np.float32))
+            left &= ~shared
+        strips.append(np.array(found))
+    return np.concatenate(strips, axis=1)
 
 
-def _find_strip(pictures: Floats, deviations: Floats) -> Floats:
-    """As _find_colours, of a few rows, by how near the colours of all pairs of frames are."""
-    count = len(pictures)
-    off = np.zeros((count, count, *deviations.shape), np.float32)
-    for f, picture in enumerate(pictures):
-        off[f, f:] = _largest(np.abs(pictures[f:] - picture)) / deviations
-        off[f:, f] = off[f, f:]
-    close = off < _SAME
-    # Of equal numbers the closer ones.
-    support = np.where(close, np.float32(1.0) - np.float32(0.01) * off, np.float32(0.0))
-    left, found = np.ones(pictures.shape[:3], bool), list[Floats]()
-    for _ in range(_BACKGROUNDS):
-        told = np.einsum("fghw,ghw->fhw", support, left.astype(np.float32))
-        best = np.where(left, told, -1.0).argmax(axis=0)
-        shared = np.take_along_axis(close, best[None, None], axis=0)[0] & left
-        number = shared.sum(axis=0)[..., None]
-        mean = (pictures * shared[..., None]).sum(axis=0) / np.maximum(number, 1)
-        found.append(np.where(number > 0, mean, found[0] if found else mean).astype(np.float32))
-        left &= ~shared
-    return np.array(found)
+class Explained(IntEnum):
+    """What ``explain`` sums up.
+
+    GAIN: the log-likelihood beyond that of no body. CONTOUR: the edges' strength beyond chance
+    along the outlines. OUTLINE: their length [pixel]. AREA: the bodies' [pixel].
+    """
+
+    GAIN = 0
+    CONTOUR = 1
+    OUTLINE = 2
+    AREA = 3
+
+
+@compiled
+def explain(
+    packed: PackedOutlines,
+    X_CN: Array,
+    still: NDArray[np.bool_],
+    camera: Array,
+    sums: PixelSums,
+    side: float,
+    squares: int,
+    always_covered: float = 0.3,
+) -> tuple[Array, Array]:
+    """What a body explains that stands at X_CN (f, nodes, 3, 4) in the frames.
+
+    Args:
+        packed: the nodes' surfaces.
+        still: (nodes,) which nodes stand at one place in all frames: they are their own background,
+            so that their outline tells alone.
+        camera: (8,) kernel parameters.
+        sums: of the pictures.
+        side, squares: the gain is also told by (squares, squares) squares of a side [pixel]; 0:
+            it is not.
+        always_covered: factor of the gain of pixels that the body covers in all frames, whose
+            background is not known.
+
+    Returns:
+        (4,) sums by ``Explained``; (squares, squares) the gain in each square.
+    """
+    height, width = sums.none.shape
+    frames, one = X_CN.shape[0], np.uint64(1)
+    told, pieces = np.zeros(4), np.zeros((squares, squares))
+    words = np.zeros((height, width), dtype=np.uint64)
+    rows, crossings = make_rows(packed, camera)
+    top, bottom = height, 0
+    for f in range(frames):
+        for node in range(X_CN.shape[1]):
+            crossings = fill_rows(packed, node, node + 1, X_CN[f], camera, crossings, rows)
+            top, bottom = min(top, rows.reach[0]), max(bottom, rows.reach[1])
+            # Higher bits are those of what stands still.
+            bit = one << np.uint64(f + frames if still[node] else f)
+            for row in range(rows.reach[0], rows.reach[1]):
+                for k in range(find_spans(row, crossings, rows.counts, rows.changes, rows.spans)):
+                    for column in range(rows.spans[k, 0], rows.spans[k, 1]):
+                        words[row, column] |= bit
+    every = (one << np.uint64(frames)) - one
+    for row in range(top, bottom):
+        for column in range(width):
+            word = words[row, column]
+            if word == 0:
+                continue
+            covered = word & every
+            if covered != 0:
+                a, b, c = sums.shown[row, column]
+                left, f = covered, 0
+                while left != 0:
+                    if left & one:
+                        told[Explained.AREA] += 1.0
+                        a += sums.more[row, column, f, 0]
+                        b += sums.more[row, column, f, 1]
+                        c += sums.more[row, column, f, 2]
+                    left >>= one
+                    f += 1
+                gain = max(a, b, c) - sums.none[row, column]
+                if covered == every:
+                    gain = always_covered * max(gain, 0.0)
+                told[Explained.GAIN] += gain
+                if squares > 0:
+                    pieces[int(row / side) % squares, int(column / side) % squares] += gain
+            left_of = words[row, column - 1] if column > 0 else word
+            right_of = words[row, column + 1] if column < width - 1 else word
+            above = words[row - 1, column] if row > 0 else word
+            below = words[row + 1, column] if row < height - 1 else word
+            across_u, across_v = word & ~(left_of & right_of), word & ~(above & below)
+            left, f = across_u | across_v, 0
+            while left != 0:
+                if left & one:
+                    strength = -np.inf
+                    if across_u >> np.uint64(f) & one:
+                        strength = sums.edges[0, f % frames, row, column]
+                    if across_v >> np.uint64(f) & one:
+                        strength = max(strength, sums.edges[1, f % frames, row, column])
+                    told[Explained.CONTOUR] += strength
+                    told[Explained.OUTLINE] += 1.0
+                left >>= one
+                f += 1
+    return told, pieces

@@ -1,6 +1,19 @@
-"""Pictures as evidence of a body's pose: what is known of its colours, and how lines are looked at.
+"""Pictures as evidence of a body's pose: colours along lines across the body's contour.
 
-Nothing is kept here between frames: who follows a body keeps the histograms, and gets new ones.
+Of every part of a body it is known how frequent colours are on it and beside it. Along a line
+across the contour the pixels' colours then say where the edge lies, and how surely: the colours are
+compared with those that were to be expected if the edge lay at each of twelve offsets. The mean of
+the offsets is a residual and their variance its weight, so that lines over which body and
+background look alike count for little. What covers the body puts edges far from where neighbouring
+lines have them: the cost saturates as that of silhouettes' edges does.
+
+The idea is that of region-based trackers: Prisacariu and Reid 2012, Tjaden et al. 2018, Stoiber et
+al. 2022 (SRT3D), 2023 (M3T). Two things differ. Only the contour of the whole body is looked at,
+beyond which the background begins, and lines end where the model says that another part of the body
+or the other side of a thin one begins. And what a line says is divided by what the window of
+offsets would say by itself, so that a line that says nothing has no weight.
+
+Nothing is kept here between frames: a tracker keeps the histograms, and gets new ones.
 """
 
 from __future__ import annotations
@@ -8,48 +21,73 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from enum import IntEnum
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_pose.arrays import Array, Picture
+from drake_pose.arrays import Array, Floats, Mask, Picture
 from drake_pose.camera.models import Camera
+from drake_pose.compiled import compiled
 from drake_pose.errors import SettingsError
-from drake_pose.fit.colour_lines import COLOURS, ODDS, ON, compare_lines, learn_colours
 from drake_pose.fit.contour_fit import Comparison, Noise, camera_weights, pack_cameras
-from drake_pose.fit.kernel import COMPARED, SQUARES, WEIGHT
+from drake_pose.fit.kernel import Sum, add_pull, add_pulls, count_distance, seen_from
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.fit.parameters import Placement
-from drake_pose.silhouette.areas.outline import Outline
+from drake_pose.silhouette.areas.outline import Outline, PackedOutlines
 from drake_pose.silhouette.areas.scoring import draw_labels
+from drake_pose.silhouette.contours.contour_points import sample_contour
 
-Histograms = NDArray[np.float32]
-"""(cameras, nodes, 3, COLOURS) what is known of a body's colours in each camera's pictures."""
-
-
-NO_REGION = np.zeros((0, 0), dtype=np.bool_)
-"""Where nobody knows where the body is seen: as `learn_colours` takes it."""
-
-# Rarer colours are not a part's own [a share of all]; fewer pixels say nothing of a part.
-_RARE, _FEW = 4e-4, 100
-# A part is no closer to a contour than this [pixel], and is judged by no less of it [pixel].
-_CLOSE, _TELLING = 0.7, 20.0
-# What a part's lines say of their own noise is trusted no further than this [pixel]: of a part that
-# is far off they have to say where it is.
-_NOISIEST = 2.0
+COLOURS = 4096
+"""Number of colours that histograms tell apart: 16 steps of red, green and blue."""
 
 
-# From offset to offset of lines, in one round after the other [pixel]; the last is that of all
-# further rounds.
-_STEPS = (4, 2, 1)
-COLOUR_SPACING, COLOUR_CORRELATION = 2.0, 5.0
-"""Of lines along the contour, so many pixels where the step is one; and how much of a contour errs
-together [pixel]: its lines count as one."""
-# Colours are counted so far inside of the contour, and outside of it [pixel].
-_WIDTHS = (16.0, 30.0)
-# The share of a frame's colours in what is known after it. Lines on which the edge seems to be
-# further from the contour [pixel] teach nothing: something else is there.
-_RATE, _AGREEING = 0.1, 2.5
+class Colour(IntEnum):
+    """Rows of a node's histograms: frequencies on it and beside it, and their ratio."""
+
+    ON = 0
+    BESIDE = 1
+    ODDS = 2
+
+
+class LineSettings(NamedTuple):
+    """Lines across a contour.
+
+    Attributes:
+        offsets: number of the edge's offsets along a line.
+        blocks: number of blocks of pixels on either side of the contour: four beyond the last
+            offset.
+        pixels: number of pixels that are read of a block: its others say the same.
+        blocks_across: least number of blocks across the thinnest part, where they are coarser than
+            a pixel.
+        trust: a block is believed to be on the right side with at most this above one half.
+        speaks: a line counts if the window's variance is this factor above the edge's.
+        spacing: from line to line along the contour [pixel], where the step is one.
+        correlation: length of contour whose lines err together [pixel].
+        steps: from offset to offset, round after round [pixel]; the last is that of all further
+            rounds.
+        widths: of the strips inside and outside of the contour in which colours are counted
+            [pixel].
+        rate: weight of a frame's colours in the histograms after it.
+        agreeing: a line whose edge seems to be further from the contour [pixel] teaches nothing.
+    """
+
+    offsets: int = 12
+    blocks: int = 9
+    pixels: int = 4
+    blocks_across: float = 6.0
+    trust: float = 0.4
+    speaks: float = 1.15
+    spacing: float = 2.0
+    correlation: float = 5.0
+    steps: tuple[int, int, int] = (4, 2, 1)
+    widths: tuple[float, float] = (16.0, 30.0)
+    rate: float = 0.1
+    agreeing: float = 2.5
+
+
+LINES = LineSettings()
 
 
 def colour_numbers(pixels: Picture) -> NDArray[np.intp]:
@@ -67,18 +105,19 @@ class OwnColours:
         usual: (nodes,) the share of its pixels that had them there; nan: it was not seen.
     """
 
-    known: NDArray[np.bool_]
+    known: Mask
     usual: Array
 
     @staticmethod
     def learned(
-        histograms: Iterable[NDArray[np.float32]],
+        histograms: Iterable[Floats],
         outlines: Sequence[Outline],
         X_WN: Array,
         views: Iterable[tuple[Camera, Picture]],
     ) -> OwnColours:
         """Those of cameras' histograms, of a body of these surfaces at X_WN (nodes, 4, 4)."""
-        known = np.any([one[:, ON] > _RARE for one in histograms], axis=0)
+        # Rarer colours than this fraction of the pixels are not a part's own.
+        known = np.any([one[:, Colour.ON] > 4e-4 for one in histograms], axis=0)
         own = OwnColours(known, np.ones(len(known)))
         return OwnColours(known, own._shares(outlines, X_WN, views))
 
@@ -99,18 +138,19 @@ class OwnColours:
             parts = labels[seen] - 1
             np.add.at(counts[0], parts, self.known[parts, colour_numbers(picture[seen])])
             np.add.at(counts[1], parts, 1.0)
-        return np.where(counts[1] < _FEW, np.nan, counts[0] / np.maximum(counts[1], 1.0))
+        # Fewer than a hundred pixels say nothing of a part.
+        return np.where(counts[1] < 100, np.nan, counts[0] / np.maximum(counts[1], 1.0))
 
 
 def step_of_lines(number: int) -> int:
     """From offset to offset of lines in a round, counted from 0 [pixel]."""
-    return _STEPS[min(number, len(_STEPS) - 1)]
+    return LINES.steps[min(number, len(LINES.steps) - 1)]
 
 
-def no_colours(cameras: int, nodes: int) -> Histograms:
+def no_colours(cameras: int, nodes: int) -> Floats:
     """What is known of a body that was never seen: nothing."""
-    known = np.zeros((cameras, nodes, 3, COLOURS), dtype=np.float32)
-    known[:, :, ODDS] = 1.0
+    known = np.zeros((cameras, nodes, len(Colour), COLOURS), dtype=np.float32)
+    known[:, :, Colour.ODDS] = 1.0
     return known
 
 
@@ -138,7 +178,7 @@ def add_pictures(
     compared: Comparison,
     cameras: Sequence[Camera],
     pictures: Sequence[Picture | None],
-    histograms: Histograms,
+    histograms: Floats,
     step: AnnealingStage,
     noise: Noise,
     pixels: int,
@@ -166,7 +206,12 @@ def add_pictures(
             )  # fmt: skip
 
 
-def weigh_parts(compared: Comparison, deviation: float, pictures: Sequence[Picture | None]) -> None:
+def weigh_parts(
+    compared: Comparison,
+    deviation: float,
+    pictures: Sequence[Picture | None],
+    noisiest: float = 2.0,
+) -> None:
     """Gives parts whose lines scatter more than those of others less weight, in place.
 
     A part has few lines that err independently: its variance is taken half way, on a scale of
@@ -176,17 +221,19 @@ def weigh_parts(compared: Comparison, deviation: float, pictures: Sequence[Pictu
         compared: of all cameras.
         deviation: the least of lines [pixel].
         pictures: of each camera; None: its silhouettes are not weighed.
+        noisiest: the largest standard deviation that a part's lines are given [pixel]: lines of a
+            part that is far off must still show where it is.
     """
     shown = [c for c, picture in enumerate(pictures) if picture is not None]
-    squares, weight = (compared.sums[shown, :-1, k] for k in (SQUARES, WEIGHT))
+    squares, weight = (compared.sums[shown, :-1, k] for k in (Sum.SQUARES, Sum.WEIGHT))
     overall = max(deviation**2, float(squares.sum() / max(float(weight.sum()), 1e-12)))
-    own = np.clip(squares / np.maximum(weight, 1e-12), deviation**2, _NOISIEST**2)
+    own = np.clip(squares / np.maximum(weight, 1e-12), deviation**2, noisiest**2)
     share = np.sqrt(overall / own)
     compared.A[shown] *= share[..., None, None]
     compared.b[shown] *= share[..., None]
 
 
-def part_distances(sums: Array) -> Array:
+def part_distances(sums: Array, closest: float = 0.7, shortest: float = 20.0) -> Array:
     """(nodes,) how far each part is from the contour that colours show [pixel].
 
     What covers a part in one camera says nothing against it where another sees it: the mean over
@@ -194,21 +241,23 @@ def part_distances(sums: Array) -> Array:
 
     Args:
         sums: (cameras, nodes + 1, 6) of pictures, as of `compare_contours`.
+        closest: a part is no closer to a contour [pixel].
+        shortest: a part with less contour is not evaluated [pixel].
     """
-    squares, weight, length = (sums[:, :-1, k] for k in (SQUARES, WEIGHT, COMPARED))
-    own = np.maximum(_CLOSE**2, squares / np.maximum(weight, 1e-12))
+    squares, weight, length = (sums[:, :-1, k] for k in (Sum.SQUARES, Sum.WEIGHT, Sum.COMPARED))
+    own = np.maximum(closest**2, squares / np.maximum(weight, 1e-12))
     told = length.sum(axis=0)
     distances = np.sqrt(told / np.maximum((length / own).sum(axis=0), 1e-12))
-    return np.where(told >= _TELLING, distances, 0.0)
+    return np.where(told >= shortest, distances, 0.0)
 
 
 def learned(
     placed: Placement,
     cameras: Sequence[Camera],
     pictures: Sequence[Picture | None],
-    histograms: Histograms,
+    histograms: Floats,
     surely: bool = False,
-) -> Histograms:
+) -> Floats:
     """What is known of the colours after a frame.
 
     Args:
@@ -220,11 +269,219 @@ def learned(
     """
     known = histograms.copy()
     packed = pack_cameras(cameras)
-    rate, agreeing = (1.0, math.inf) if surely else (_RATE, _AGREEING)
+    rate, agreeing = (1.0, math.inf) if surely else (LINES.rate, LINES.agreeing)
     for c, picture in enumerate(pictures):
         if picture is not None:
             learn_colours(
                 placed.packed, placed.X_WN, (packed[0][c], packed[1][c]), picture, known[c],
-                COLOUR_SPACING, np.array(_WIDTHS), rate, agreeing, 0, NO_REGION,
+                LINES.spacing, np.array(LINES.widths), rate, agreeing, 0,
+                np.zeros((0, 0), np.bool_),
             )  # fmt: skip
     return known
+
+
+@compiled
+def compare_lines(
+    packed: PackedOutlines,
+    X_WN: Array,
+    camera: tuple[Array, Array],
+    picture: Picture,
+    histograms: Floats,
+    weights: Array,
+    step: int,
+    A: Array,
+    b: Array,
+    sums: Array,
+    wide: Array,
+    width: float = 0.0,
+) -> None:
+    """Adds what one camera's picture says of the nodes' affine motions.
+
+    Args:
+        packed: the nodes' surfaces.
+        X_WN: (nodes, 4, 4).
+        camera: X_CW (4, 4) and kernel parameters (8,).
+        picture: (H, W, 3 or 4).
+        histograms: (nodes, 3, COLOURS) what is known of the nodes' colours.
+        weights: (4,) as of `compare_contours`.
+        step: from offset to offset [pixel].
+        A, b, sums, wide: (nodes, 12, 12), (nodes, 12), (nodes + 1, 6) and (nodes, 13) added to, as
+            of `compare_contours`; lengths are of lines that say something, by how much they do.
+        width: the body looks wider than it is by so much on all sides [pixel].
+    """
+    contour = sample_contour(packed, seen_from(camera[0], X_WN), camera[1], weights[2])
+    uv, normals, lengths, nodes, p_N, clearances = contour
+    noise = (weights[1] / 2.5) ** 2
+    pulls = np.zeros((len(uv), 7))
+    scratch, place = np.empty((3, 2 * LINES.blocks + 2)), np.empty(2)
+    for i in range(len(uv)):
+        node = nodes[i]
+        for k in range(2):
+            place[k] = uv[i, k] + width * normals[i, k]
+        edge, variance = _find_edge(
+            picture, histograms[node], place, normals[i], clearances[i], step, scratch
+        )
+        if variance > 0.0:
+            length = 2.0 * lengths[i] / (1.0 + variance / noise)
+            weight, _ = count_distance(sums, node, weights, length, edge)
+            add_pull(pulls, i, normals[i, 0], normals[i, 1], edge, weight)
+            pulls[i, 5], pulls[i, 6] = weight * normals[i, 0], weight * normals[i, 1]
+            wide[node, 12] += weight * edge
+    add_pulls(A, b, wide, X_WN, camera, p_N, nodes, nodes, pulls)
+
+
+@compiled
+def _colour(picture: Picture, u: float, v: float) -> int:
+    """The colour at a place [pixel]; -1 outside of the picture."""
+    column, row = math.floor(u + 0.5), math.floor(v + 0.5)
+    if column < 0 or row < 0 or column >= picture.shape[1] or row >= picture.shape[0]:
+        return -1
+    colour = 0
+    for channel in range(3):
+        colour = 16 * colour + (int(picture[row, column, channel]) >> 4)
+    return colour
+
+
+@compiled
+def _find_edge(
+    picture: Picture,
+    histograms: Floats,
+    uv: Array,
+    normal: Array,
+    clearance: Array,
+    step: int,
+    scratch: Array,
+) -> tuple[float, float]:
+    """Where the edge lies on a line, outwards, and the variance [pixel]; -1: nothing is said."""
+    blocks, on, beside = scratch[0], scratch[1], scratch[2]
+    # The variance of an edge that lies anywhere in the window [steps^2].
+    anywhere = (LINES.offsets**2 - 1) / 12.0
+    # Of a thin part coarse blocks would see little, and too much of what is beyond.
+    step = max(1, min(step, int(clearance[0] / LINES.blocks_across)))
+    pixels = min(step, LINES.pixels)
+    apart = step / pixels
+    for k in range(-LINES.blocks, LINES.blocks + 1):
+        odds = 1.0
+        for pixel in range(pixels):
+            r = k * step + apart * (pixel + 0.5) - 0.5 * step
+            colour = _colour(picture, uv[0] + r * normal[0], uv[1] + r * normal[1])
+            if colour >= 0:
+                odds *= histograms[Colour.ODDS, colour]
+        share = odds / (1.0 + odds)
+        # How much more likely than not the block is on the body; 0: its colours do not say.
+        blocks[k + LINES.blocks] = 4.0 * LINES.trust * (share - 0.5)
+    inner, outer = clearance[0] / step, clearance[1] / step
+    # How likely the colours of all blocks before one are, on the body and beside it.
+    on[0] = beside[0] = 1.0
+    for k in range(2 * LINES.blocks + 1):
+        on[k + 1] = on[k] * (1.0 + blocks[k])
+        beside[k + 1] = beside[k] * (1.0 - blocks[k])
+    total, first, second = 0.0, 0.0, 0.0
+    for offset in range(LINES.offsets):
+        d = offset - 0.5 * (LINES.offsets - 1)
+        # The blocks at d - inner < k < d are on the body, those at d < k < d + outer beside it.
+        here = offset - LINES.offsets // 2 + 1 + LINES.blocks
+        begin = max(
+            0, min(here, math.floor(max(d - inner, -2.0 * LINES.blocks)) + 1 + LINES.blocks)
+        )
+        end = min(
+            2 * LINES.blocks + 1,
+            max(here, math.ceil(min(d + outer, 2.0 * LINES.blocks)) + LINES.blocks),
+        )
+        likelihood = on[here] / on[begin] * beside[end] / beside[here]
+        total += likelihood
+        first += likelihood * d
+        second += likelihood * d * d
+    if total < 1e-30:
+        return 0.0, -1.0
+    mean = first / total
+    # An edge between two offsets has the least variance.
+    variance = max(second / total - mean * mean, 1.0 / 12.0)
+    # The window alone would say 0 +- its own width: what the colours say is the rest.
+    information = 1.0 / variance - 1.0 / anywhere
+    if variance * LINES.speaks > anywhere:
+        return 0.0, -1.0
+    edge = min(max(mean / variance / information, -0.5 * LINES.offsets), 0.5 * LINES.offsets)
+    return edge * step, step * step / information
+
+
+@compiled
+def learn_colours(
+    packed: PackedOutlines,
+    X_WN: Array,
+    camera: tuple[Array, Array],
+    picture: Picture,
+    histograms: Floats,
+    spacing: float,
+    widths: Array,
+    rate: float,
+    agreeing: float,
+    step: int,
+    region: Mask,
+    rare: float = 1e-4,
+    fewest: float = 20.0,
+) -> None:
+    """Counts the colours on both sides of a body's contour, and forgets old ones.
+
+    Args:
+        packed, X_WN, camera, picture: as of `compare_lines`.
+        histograms: (nodes, 3, COLOURS) changed.
+        spacing: of the contour's points [pixel].
+        widths: (2,) of the strips inside and outside that are counted [pixel].
+        rate: the new colours' share; of a node of which nothing is known yet they are all.
+        agreeing: lines on which the edge seems to be further from the contour than this teach
+            nothing [pixel]; inf: all do.
+        step: from offset to offset [pixel] of lines that say where the edge is, on both sides of
+            which colours are then counted; 0: they are counted on both sides of the contour.
+        region: (H, W) where the body is known to be seen: it says what is on the body and what is
+            beside it. (0, 0): that is not known.
+        rare: added to frequencies, so that colours below it count as never seen [of all pixels].
+        fewest: fewer pixels on one side of a node's contour teach nothing.
+    """
+    X_CN = seen_from(camera[0], X_WN)
+    uv, normals, _, nodes, _, clearances = sample_contour(packed, X_CN, camera[1], spacing)
+    counts = np.zeros((len(histograms), 2, COLOURS), dtype=np.float32)
+    totals = np.zeros((len(histograms), 2))
+    scratch = np.empty((3, 2 * LINES.blocks + 2))
+    for i in range(len(uv)):
+        node, middle = nodes[i], 0.0
+        if agreeing < np.inf and not len(region):
+            edge, variance = _find_edge(
+                picture, histograms[node], uv[i], normals[i], clearances[i], max(step, 1), scratch
+            )
+            if variance > 0.0 and abs(edge) > agreeing:
+                continue
+            if variance > 0.0 and step > 0:
+                middle = edge
+        for side in range(2):
+            sign = -1.0 if side == Colour.ON else 1.0
+            pixels = int(min(widths[side], clearances[i, side] - 1.0))
+            for k in range(1, pixels):
+                r = middle + sign * k
+                u, v = uv[i, 0] + r * normals[i, 0], uv[i, 1] + r * normals[i, 1]
+                colour = _colour(picture, u, v)
+                if colour < 0:
+                    break
+                where = side
+                if len(region):
+                    where = (
+                        Colour.ON
+                        if region[math.floor(v + 0.5), math.floor(u + 0.5)]
+                        else Colour.BESIDE
+                    )
+                counts[node, where, colour] += 1.0
+                totals[node, where] += 1.0
+    for node in range(len(histograms)):
+        for side in range(2):
+            shares, total = histograms[node, side], totals[node, side]
+            if total >= fewest:
+                # Of a side of which nothing is known yet the new colours are all.
+                share = rate if shares.any() else 1.0
+                for colour in range(COLOURS):
+                    shares[colour] += share * (counts[node, side, colour] / total - shares[colour])
+        for colour in range(COLOURS):
+            on_it, beside_it = (
+                histograms[node, Colour.ON, colour],
+                histograms[node, Colour.BESIDE, colour],
+            )
+            histograms[node, Colour.ODDS, colour] = (on_it + rare) / (beside_it + rare)

@@ -7,9 +7,11 @@ C(theta) = w sum_i l_i r_i^2 / (1 + (r_i / s)^2) + (theta - m)^T P (theta - m).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import io
+import struct
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
@@ -17,29 +19,16 @@ from drake_pose.arrays import Array, Mask
 from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.camera.models import Camera
-from drake_pose.fit.camera_sums import (
-    AddUp,
-    CameraSum,
-    Views,
-    add_cameras,
-)
-from drake_pose.fit.evidence import EdgePoints, pack_evidence
-from drake_pose.fit.kernel import CLOSE, COMPARED, COST, FITTING, collect, compare_contours
-from drake_pose.fit.levenberg_marquardt import (
-    AnnealingStage,
-    Equations,
-    StepSettings,
-    minimise,
-)
+from drake_pose.fit.evidence import EdgePoints, Evidence, pack_evidence
+from drake_pose.fit.kernel import Sum, collect, compare_contours
+from drake_pose.fit.levenberg_marquardt import AnnealingStage, Equations, StepSettings, minimise
 from drake_pose.fit.parameters import BodyParameters, Placement
 from drake_pose.fit.surfaces import VERY_FEW, few_triangles
 from drake_pose.silhouette.areas.bending import TreeSurfaces
-from drake_pose.silhouette.areas.outline import Outline
+from drake_pose.silhouette.areas.outline import Outline, PackedOutlines
 
-# Finer than this [pixel] silhouettes cannot tell.
-FINEST_SCALE, FINEST_SPACING = 1.5, 1.0
-# So many squares of a picture's rows and columns are told apart.
-_SQUARES = 64
+FINEST_SCALE = 1.5
+"""Silhouettes resolve no smaller distances [pixel]."""
 
 
 @dataclass(frozen=True)
@@ -71,6 +60,58 @@ class Prior:
 
     mean: Array
     information: Array
+
+
+class Views(NamedTuple):
+    """What all cameras say of one frame, as the kernel takes it.
+
+    cameras: X_CW (c, 4, 4) and kernel parameters (c, 8); evidence: their silhouettes' edges.
+    """
+
+    cameras: tuple[Array, Array]
+    evidence: Evidence
+
+
+class CameraSum(NamedTuple):
+    """What some cameras together say of each node's affine motion x (12,): x^T A x - 2 b^T x.
+
+    A: (nodes, 12, 12), lower triangles; b: (nodes, 12); sums: (nodes + 1, 6) as of
+    `compare_contours`.
+    """
+
+    A: Array
+    b: Array
+    sums: Array
+
+
+AddUp = Callable[[Placement, AnnealingStage], CameraSum]
+"""Compares a body's contours with all cameras' edges, wherever these are, and adds up."""
+
+
+class SumRequest(NamedTuple):
+    """A body's place, to be compared with cameras' edges that are elsewhere.
+
+    names: of the cameras; times: (c,) the time stamps of their pictures [s]; cameras: X_CW
+    (c, 4, 4) and kernel parameters (c, 8); weights: (c, 4) as of `compare_contours`; packed: the
+    body's surfaces; X_WN: (nodes, 4, 4).
+    """
+
+    names: Sequence[str]
+    times: Array
+    cameras: tuple[Array, Array]
+    weights: Array
+    packed: PackedOutlines
+    X_WN: Array
+
+
+class EdgeKeeper(Protocol):
+    """Keeps the edges of some cameras' pictures, and compares contours with them elsewhere."""
+
+    def ask(self, request: SumRequest) -> bool:
+        """Begins to compare and add up; False where it cannot."""
+
+    def answer(self) -> CameraSum | None:
+        """Waits for what was asked for; None where it does not come, or the edges are gone."""
 
 
 class Comparison(NamedTuple):
@@ -122,13 +163,13 @@ class PoseFit:
     def closeness(self) -> float:
         """How well both contours fit, 0 to 1: what tells the better one of two fits."""
         total = self.sums.sum(axis=0)
-        return float(total[CLOSE] / max(total[COMPARED], 1e-9))
+        return float(total[Sum.CLOSE] / max(total[Sum.COMPARED], 1e-9))
 
 
 def inlier_ratio_of(sums: Array) -> float:
     """Of both contours' lengths, what fits, 0 to 1; sums (..., 6) of `compare_contours`."""
     total = sums.reshape(-1, sums.shape[-1]).sum(axis=0)
-    return float(total[FITTING] / max(total[COMPARED], 1e-9))
+    return float(total[Sum.FITTING] / max(total[Sum.COMPARED], 1e-9))
 
 
 def pack_views(cameras: Sequence[Camera], edges: Sequence[EdgePoints]) -> Views:
@@ -225,7 +266,7 @@ class ContourFit:
             total = add_up(placement, step)
             H, g = normal_equations(total, placement, len(theta))
             sums = total.sums
-            cost = float(sums[:, COST].sum())
+            cost = float(sums[:, Sum.COST].sum())
             if prior is not None:
                 off = theta - prior.mean
                 H, g = H + np.diag(prior.information), g + prior.information * off
@@ -254,7 +295,8 @@ class ContourFit:
         placement = self.body.place(theta)
         weights = self.weights(views.cameras, placement, step)
         placed = placement.packed, placement.X_WN
-        return np.asarray(compare_contours(*placed, *views, weights, _SQUARES, side, False)[3])
+        # Up to 64 squares of a picture's rows and columns are told apart.
+        return np.asarray(compare_contours(*placed, *views, weights, 64, side, False)[3])
 
     def weights(
         self, cameras: tuple[Array, Array], placement: Placement, step: AnnealingStage
@@ -290,7 +332,7 @@ def camera_weights(
     weights = np.empty((len(cameras[0]), 4))
     weights[:, 0] = 1.0 / size
     weights[:, 1] = np.maximum(FINEST_SCALE, step.scale * size)
-    weights[:, 2] = np.maximum(FINEST_SPACING, step.spacing * size)
+    weights[:, 2] = np.maximum(1.0, step.spacing * size)
     # Both contours say the same: together they count as one.
     weights[:, 3] = 0.5 / (size * noise.correlation * (size * noise.deviation) ** 2)
     return weights
@@ -318,3 +360,101 @@ def pixels_per_metre(cameras: tuple[Array, Array], place: Array) -> Array:
     kind, focal, near = parameters[:, 0], parameters[:, 1], parameters[:, 5]
     depth = np.maximum(X_CW[:, 2, :3] @ place + X_CW[:, 2, 3], near)
     return np.asarray(focal / np.where(kind == 0.0, depth, 1.0))
+
+
+def compare_placed(
+    packed: PackedOutlines, X_WN: Array, views: Views, weights: Array
+) -> tuple[Array, Array, Array]:
+    """A, b and sums of each camera; arguments as of `compare_contours`."""
+    A, b, sums, *_ = compare_contours(packed, X_WN, *views, weights, 0, 1.0, False)
+    return A, b, sums
+
+
+def add_cameras(A: Array, b: Array, sums: Array) -> CameraSum:
+    """The sum of what each camera says, as of `compare_placed`."""
+    return CameraSum(A.sum(axis=0), b.sum(axis=0), sums.sum(axis=0))
+
+
+def add_sums(parts: Sequence[CameraSum], nodes: int) -> CameraSum:
+    """The sum of groups of cameras; none at all say nothing."""
+    total = no_cameras(nodes)
+    for part in parts:
+        for into, one in zip(total, part, strict=True):
+            into += one
+    return total
+
+
+def no_cameras(nodes: int) -> CameraSum:
+    """What no camera says of this many nodes."""
+    return CameraSum(
+        np.zeros((nodes, 12, 12)), np.zeros((nodes, 12)), np.zeros((nodes + 1, len(Sum)))
+    )
+
+
+def pack_sum(total: CameraSum) -> bytes:
+    """Packs a sum without loss; of the symmetric matrices the lower triangles."""
+    A, b, sums = total
+    row, column = np.tril_indices(12)
+    rows = np.concatenate([A[:, row, column], b, sums[:-1]], axis=1)
+    return np.concatenate([rows.ravel(), sums[-1]]).astype("<f8").tobytes()
+
+
+def unpack_sum(data: bytes) -> CameraSum:
+    """The sum that was packed."""
+    numbers = np.frombuffer(data, "<f8")
+    rows = numbers[: -len(Sum)].reshape(-1, 78 + 12 + len(Sum))
+    A = np.zeros((len(rows), 12, 12))
+    row, column = np.tril_indices(12)
+    A[:, row, column], b, sums = np.split(rows, [78, 78 + 12], axis=1)
+    # Kernels are compiled for arrays that lie in one piece and can be written.
+    return CameraSum(A, b.copy(), np.vstack([sums, numbers[-len(Sum) :]]))
+
+
+def pack_request(request: SumRequest, numbers: Sequence[int]) -> bytes:
+    """Packs a request without the surfaces; numbers: (c,) of its cameras for who is asked."""
+    X_CW, parameters = request.cameras
+    parts = (
+        np.asarray(numbers, np.float64), request.times, X_CW, parameters, request.weights,
+        request.X_WN,
+    )  # fmt: skip
+    header = struct.pack("<2q", len(request.times), len(request.X_WN))
+    return header + np.concatenate([np.ravel(one) for one in parts]).astype("<f8").tobytes()
+
+
+def answer_request(
+    data: bytes, packed: PackedOutlines, find_edge: Callable[[int, float], EdgePoints | None]
+) -> CameraSum | None:
+    """The sum that a packed request asks for; None where edges are not there.
+
+    Args:
+        data: of pack_request.
+        packed: the body's surfaces.
+        find_edge: the edge of a camera's picture, by the camera's number and the time stamp [s].
+    """
+    count, nodes = struct.unpack_from("<2q", data)
+    sizes = np.cumsum([count, count, 16 * count, 8 * count, 4 * count])
+    numbers, times, X_CW, parameters, weights, X_WN = np.split(
+        np.frombuffer(data, "<f8", offset=struct.calcsize("<2q")).astype(np.float64), sizes
+    )
+    found = [find_edge(int(k), float(t)) for k, t in zip(numbers, times, strict=True)]
+    edges = [edge for edge in found if edge is not None]
+    if len(edges) < count:
+        return None
+    cameras = X_CW.reshape(-1, 4, 4), parameters.reshape(-1, 8)
+    views = Views(cameras, pack_evidence(edges))
+    return add_cameras(
+        *compare_placed(packed, X_WN.reshape(nodes, 4, 4), views, weights.reshape(-1, 4))
+    )
+
+
+def pack_surfaces(packed: PackedOutlines) -> bytes:
+    """Packs a body's surfaces."""
+    stream = io.BytesIO()
+    np.savez(stream, **packed._asdict())
+    return stream.getvalue()
+
+
+def unpack_surfaces(data: bytes) -> PackedOutlines:
+    """The surfaces that were packed."""
+    with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
+        return PackedOutlines(**{name: arrays[name] for name in PackedOutlines._fields})

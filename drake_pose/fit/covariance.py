@@ -17,7 +17,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -25,35 +24,12 @@ from numpy.typing import NDArray
 from scipy.linalg.lapack import dpotri
 from threadpoolctl import ThreadpoolController
 
-from drake_pose.arrays import Array
-from drake_pose.fit.contour_fit import (
-    Comparison,
-    pixels_per_metre,
-    symmetric,
-)
+from drake_pose.arrays import Array, Mask
+from drake_pose.fit.contour_fit import Comparison, pixels_per_metre, symmetric
 from drake_pose.silhouette.areas.outline import Outline
 
 # Of some hundred rows BLAS's threads wait for each other: it is ten times as slow with two.
 _on_one_thread = ThreadpoolController().wrap(limits=1, user_api="blas")
-
-# A camera's picture is off by no less [of the unit].
-_LEAST_CAMERA = 1.0
-# Standard deviation of the logarithms of sizes about the unit, of what a single instant shows.
-_PRIOR_DEVIATION = 1.0
-# A motion by a unit that is seen along less contour than this is as noise [units].
-_LEAST_INFORMATION = 1.0
-# At most so many independent distances are looked at, the best known ones.
-_MOST_DISTANCES = 400
-# A part stands still from one picture to another that moves by less [of the unit].
-_STILL = 0.5
-# Sizes settle when a step changes their logarithms, or the log-likelihood, by no more.
-_ITERATIONS, _SETTLED, _GAIN = 20, 0.03, 0.05
-# A step is so many times as long as the one before at most, and one at most.
-_LONGER = 1.25
-# Errors of masks and cameras are about a pixel, or this share of the silhouettes' size.
-_UNIT = 1.0 / 200.0
-# A place is known to about as much, and an angle to a full turn [m, rad].
-_PLACE = 10.0
 
 
 class ErrorSizes(NamedTuple):
@@ -108,7 +84,7 @@ class Distances(NamedTuple):
     doubts: tuple[Array, ...] = ()
 
 
-class Picture(NamedTuple):
+class ComparedMask(NamedTuple):
     """A body's contours compared with one silhouette.
 
     Attributes:
@@ -130,8 +106,11 @@ class Picture(NamedTuple):
 
 
 def error_unit(size: float) -> float:
-    """What errors are measured in, of silhouettes of a size, the root of their area [pixel]."""
-    return max(1.0, _UNIT * size)
+    """The unit of masks' and cameras' errors [pixel]: one, or a 200th of the silhouettes' size.
+
+    size: the root of the silhouettes' area [pixel].
+    """
+    return max(1.0, size / 200.0)
 
 
 def distances(
@@ -153,24 +132,28 @@ def distances(
     X_WN = compared.placement.X_WN
     size = unit / pixels_per_metre(cameras, X_WN[:, :3, 3].mean(axis=0))
     pictures = [
-        Picture(A, b, X_WN, X_CW, moves, float(one))
+        ComparedMask(A, b, X_WN, X_CW, moves, float(one))
         for A, b, X_CW, one in zip(compared.A, compared.b, cameras[0], size, strict=True)
     ]
-    return distances_in_pictures(outlines, pictures)
+    return distances_in_masks(outlines, pictures)
 
 
-def distances_in_pictures(
+def distances_in_masks(
     outlines: Sequence[Outline],
-    pictures: Sequence[Picture],
-    most: int = _MOST_DISTANCES,
+    pictures: Sequence[ComparedMask],
+    most: int = 400,
+    widths: bool = False,
 ) -> Distances:
-    """The distances in several pictures, each of which errs as a whole, too.
+    """The distances in several masks, each of which errs as a whole, too.
 
     Args:
         outlines: the nodes' surfaces.
-        pictures: each with the same values.
-        most: at most so many distances are looked at, the best known ones.
+        pictures: the masks, each with the same values.
+        most: number of independent distances that are used, the best known ones.
+        widths: whether each silhouette may be too wide on all sides, by a further value [unit].
     """
+    if widths:
+        pictures = _with_widths(outlines, pictures)
     of, along, bends = _known_directions(outlines, pictures, most)
     count = pictures[0].moves.shape[1]
     y, X, shaken = np.zeros(len(of)), np.zeros((len(of), count)), np.zeros((len(of), 6))
@@ -211,7 +194,7 @@ def distances_in_pictures(
 
 
 def _known_directions(
-    outlines: Sequence[Outline], pictures: Sequence[Picture], most: int
+    outlines: Sequence[Outline], pictures: Sequence[ComparedMask], most: int
 ) -> tuple[NDArray[np.intp], Array, Array]:
     """Affine motions of parts, each of a distance that a picture tells, the best known ones first.
 
@@ -225,7 +208,8 @@ def _known_directions(
         seen = np.flatnonzero(np.einsum("nii->n", A) > 0.0)
         D = mean_size * surface_deformations([outlines[n] for n in seen.tolist()], one.X_WN[seen])
         shares, turns = np.linalg.eigh(np.swapaxes(D, 1, 2) @ A[seen] @ D)
-        k, j = np.nonzero(shares >= _LEAST_INFORMATION)
+        # Motions by a unit that are seen along less contour are as noise.
+        k, j = np.nonzero(shares >= 1.0)
         known, turned = shares[k, j], turns[k, :, j]
         root = np.sqrt(known)[:, None]
         along = np.einsum("rij,rj->ri", D[k], turned) / root
@@ -235,8 +219,11 @@ def _known_directions(
     return np.column_stack([picture, part])[best], along[best], bends[best]
 
 
-def _views(outlines: Sequence[Outline], pictures: Sequence[Picture]) -> NDArray[np.intp]:
-    """(pictures, nodes) which picture was the first that showed a part where this one does."""
+def _views(outlines: Sequence[Outline], pictures: Sequence[ComparedMask]) -> NDArray[np.intp]:
+    """(pictures, nodes) which picture was the first that showed a part where this one does.
+
+    Where a part moves by less than half the unit it stands still.
+    """
     X_CN = np.array([one.X_CW @ one.X_WN for one in pictures])[:, :, :3]
     found = np.tile(np.arange(len(pictures))[:, None], len(outlines))
     for n, outline in enumerate(outlines):
@@ -244,7 +231,7 @@ def _views(outlines: Sequence[Outline], pictures: Sequence[Picture]) -> NDArray[
             continue
         for c, one in enumerate(pictures):
             by = X_CN[: c + 1, n] - X_CN[c, n]
-            still = np.einsum("kij,jl,kil->k", by, outline.moments, by) < (_STILL * one.size) ** 2
+            still = np.einsum("kij,jl,kil->k", by, outline.moments, by) < (0.5 * one.size) ** 2
             found[c, n] = found[np.flatnonzero(still)[0], n]
     return found
 
@@ -263,8 +250,10 @@ def surface_deformations(outlines: Sequence[Outline], X_WN: Array) -> Array:
     return K
 
 
-def with_widths(outlines: Sequence[Outline], pictures: Sequence[Picture]) -> list[Picture]:
-    """Pictures whose silhouettes may be too wide on all sides: a further value for each [unit]."""
+def _with_widths(
+    outlines: Sequence[Outline], pictures: Sequence[ComparedMask]
+) -> list[ComparedMask]:
+    """Masks that may be too wide on all sides: a further value for each [unit]."""
     found = []
     for k, one in enumerate(pictures):
         wider = np.zeros((len(outlines), len(pictures), 12))
@@ -293,27 +282,41 @@ def _camera_motions(outlines: Sequence[Outline], X_CW: Array, X_WN: Array, size:
 @_on_one_thread
 def estimate_sizes(
     seen: Distances,
-    is_angle: NDArray[np.bool_],
-    least_camera: float = _LEAST_CAMERA,
-    prior_deviation: float = _PRIOR_DEVIATION,
+    is_angle: Mask,
+    least_camera: float = 1.0,
+    prior_deviation: float = 1.0,
+    settled: float = 0.03,
 ) -> ErrorSizes:
-    """How large the errors are: the likeliest, given what is left and the prior.
+    """The likeliest sizes of the errors, given the residuals and the prior.
 
     Args:
         seen: the distances.
         is_angle: (m,) which values are angles.
-        least_camera: a picture errs as a whole by no less [of the unit].
-        prior_deviation: of the logarithms of sizes about the unit, before anything is seen.
+        least_camera: a camera errs by no less [of the unit].
+        prior_deviation: standard deviation of the sizes' logarithms about the unit.
+        settled: steps end where logarithms of sizes change by no more.
     """
     n = len(seen.y)
-    stands_still = np.abs(seen.effects.repeated - seen.effects.noise).max(initial=0.0) > _SETTLED
+    stands_still = np.abs(seen.effects.repeated - seen.effects.noise).max(initial=0.0) > settled
     # Of parts that move, noise is noise.
     named = ErrorEffects._fields
     told = [k for k, name in enumerate(named) if name != "repeated" or stands_still]
     effects = [seen.effects[k] for k in told] + [Z @ Z.T for Z in seen.doubts]
     stacked = np.reshape(effects, (len(effects), -1))
 
-    likelihood = partial(_likelihood, seen, stacked, _apriori(is_angle), prior_deviation)
+    apriori = _apriori(is_angle)
+
+    def likelihood(t: Array) -> tuple[float, Array, Array]:
+        """Restricted log-likelihood and prior of sizes' logarithms t (k,); P (n, n); P y (n,)."""
+        L = np.linalg.cholesky((np.exp(2.0 * t) @ stacked).reshape(n, n))
+        inverse = symmetric(dpotri(L.T)[0].T)
+        VX = inverse @ seen.X
+        H = seen.X.T @ VX + apriori
+        P = inverse - VX @ np.linalg.solve(H, VX.T)
+        Py = P @ seen.y
+        freedom = 2.0 * np.log(np.diag(L)).sum() + np.linalg.slogdet(H)[1]
+        return -0.5 * float(freedom + seen.y @ Py + (t @ t) / prior_deviation**2), P, Py
+
     t = np.zeros(len(effects))
     value, P, Py = likelihood(t)
     # All may be smaller alike by much, to which single steps would be many.
@@ -322,7 +325,7 @@ def estimate_sizes(
     if scaled[0] > value:
         t, (value, P, Py) = smaller, scaled
     longest = 1.0
-    for _ in range(_ITERATIONS):
+    for _ in range(20):
         scales = 2.0 * np.exp(2.0 * t)
         WPy = np.array([W @ Py for W in effects])
         g = 0.5 * scales * (WPy @ Py - stacked @ P.ravel()) - t / prior_deviation**2
@@ -331,14 +334,14 @@ def estimate_sizes(
         step = np.linalg.solve(average + np.eye(len(t)) / prior_deviation**2, g)
         step *= min(1.0, longest / max(np.abs(step).max(), 1e-9))
         trial = likelihood(t + step)
-        while trial[0] < value and np.abs(step).max() > _SETTLED:
+        while trial[0] < value and np.abs(step).max() > settled:
             step *= 0.5
             trial = likelihood(t + step)
         if trial[0] < value:
             break
-        gain, longest = trial[0] - value, min(1.0, _LONGER * np.abs(step).max())
+        gain, longest = trial[0] - value, min(1.0, 1.25 * np.abs(step).max())
         t, (value, P, Py) = t + step, trial
-        if gain < _GAIN or np.abs(step).max() < _SETTLED:
+        if gain < 0.05 or np.abs(step).max() < settled:
             break
     sizes = np.zeros(len(named))
     sizes[told] = np.exp(t[: len(told)])
@@ -347,24 +350,9 @@ def estimate_sizes(
     return ErrorSizes(noise, repeated, surface, mask, max(camera, least_camera), doubts)
 
 
-def _likelihood(
-    seen: Distances, stacked: Array, apriori: Array, deviation: float, t: Array
-) -> tuple[float, Array, Array]:
-    """The restricted log-likelihood and prior of sizes' logarithms t (k,); P (n, n), and P y."""
-    n = len(seen.y)
-    L = np.linalg.cholesky((np.exp(2.0 * t) @ stacked).reshape(n, n))
-    inverse = symmetric(dpotri(L.T)[0].T)
-    VX = inverse @ seen.X
-    H = seen.X.T @ VX + apriori
-    P = inverse - VX @ np.linalg.solve(H, VX.T)
-    Py = P @ seen.y
-    freedom = 2.0 * np.log(np.diag(L)).sum() + np.linalg.slogdet(H)[1]
-    return -0.5 * float(freedom + seen.y @ Py + (t @ t) / deviation**2), P, Py
-
-
 @_on_one_thread
 def values_covariance(
-    seen: Distances, sizes: ErrorSizes, free: NDArray[np.intp], is_angle: NDArray[np.bool_]
+    seen: Distances, sizes: ErrorSizes, free: NDArray[np.intp], is_angle: Mask
 ) -> Array:
     """(f, f) covariance of the free values, fitted as if each distance erred by itself.
 
@@ -390,7 +378,7 @@ def distances_covariance(seen: Distances, sizes: ErrorSizes) -> Array:
 
 @_on_one_thread
 def doubted_covariance(
-    seen: Distances, sizes: ErrorSizes, is_angle: NDArray[np.bool_]
+    seen: Distances, sizes: ErrorSizes, is_angle: Mask
 ) -> tuple[Array, Distances]:
     """What the doubts add to the covariance (m, m) of the values, and the distances without them.
 
@@ -411,9 +399,9 @@ def doubted_covariance(
     return (follow * variances) @ follow.T + np.outer(off, off), without
 
 
-def _apriori(is_angle: NDArray[np.bool_]) -> Array:
-    """(m, m) information: as much as an even distribution over its range has variance."""
-    return np.diag(12.0 / np.where(is_angle, 2.0 * np.pi, _PLACE) ** 2)
+def _apriori(is_angle: Mask) -> Array:
+    """(m, m) information of an even distribution over a full turn, or over ten metres."""
+    return np.diag(12.0 / np.where(is_angle, 2.0 * np.pi, 10.0) ** 2)
 
 
 def excess(pieces: Array, others: Array) -> float:

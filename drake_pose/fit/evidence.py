@@ -12,9 +12,6 @@ from numpy.typing import NDArray
 from drake_pose.arrays import Array, Mask
 from drake_pose.compiled import compiled
 
-# A chord over so many pixels to both sides gives the edge's direction.
-_CHORD = 3
-
 
 class EdgePoints(NamedTuple):
     """Points of a silhouette's edge in one picture, from top to bottom.
@@ -90,15 +87,16 @@ def widened(evidence: Evidence, widths: Array) -> Evidence:
     return Evidence(uv[order], evidence.normals[order], evidence.lengths[order], evidence.starts)
 
 
-def find_edge_points(region: Mask, spacing: float) -> EdgePoints:
+def find_edge_points(region: Mask, spacing: float, chord: int = 3) -> EdgePoints:
     """Points of a silhouette's edge, holes included; the picture's border is no edge.
 
     Args:
         region: (H, W) the silhouette.
         spacing: from point to point [pixel].
+        chord: the edge's direction is that of a chord over this many pixels to both sides.
     """
     contours, _ = cv2.findContours(region.view(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
-    chains = [chain.reshape(-1, 2) for chain in contours if len(chain) > 2 * _CHORD + 1]
+    chains = [chain.reshape(-1, 2) for chain in contours if len(chain) > 2 * chord + 1]
     if not chains:
         return NO_EDGE
     starts = np.cumsum([0, *(len(chain) for chain in chains)])
@@ -107,7 +105,7 @@ def find_edge_points(region: Mask, spacing: float) -> EdgePoints:
     largest = max(moments, key=lambda one: one["m00"])
     area = max(largest["m00"], 1e-9)
     uv, normals, lengths = _sample(
-        np.concatenate(chains), starts, spacing, region.shape[1], region.shape[0]
+        np.concatenate(chains), starts, spacing, region.shape[1], region.shape[0], chord
     )
     order = np.argsort(uv[:, 1])
     return EdgePoints(
@@ -120,7 +118,12 @@ def find_edge_points(region: Mask, spacing: float) -> EdgePoints:
 
 @compiled
 def _sample(
-    pixels: NDArray[np.int32], starts: NDArray[np.int64], spacing: float, width: int, height: int
+    pixels: NDArray[np.int32],
+    starts: NDArray[np.int64],
+    spacing: float,
+    width: int,
+    height: int,
+    chord: int,
 ) -> tuple[Array, Array, Array]:
     """Points, normals and lengths along closed chains of pixels (n, 2)."""
     capacity = int(2 * len(pixels) / spacing) + 2 * len(starts)
@@ -134,11 +137,11 @@ def _sample(
             x, y = pixels[begin + i]
             if x == 0 or y == 0 or x == width - 1 or y == height - 1:
                 continue
-            before = pixels[begin + (i - _CHORD) % count]
-            after = pixels[begin + (i + _CHORD) % count]
+            before = pixels[begin + (i - chord) % count]
+            after = pixels[begin + (i + chord) % count]
             du, dv = float(after[0] - before[0]), float(after[1] - before[1])
             size = np.sqrt(du * du + dv * dv)
-            if size < 0.5 * _CHORD:
+            if size < 0.5 * chord:
                 continue
             # OpenCV runs with the region to the left: outwards is to the right, y down.
             n0, n1 = -dv / size, du / size
@@ -147,6 +150,6 @@ def _sample(
             # the columns: whichever cross it.
             inside = 0.5 * max(abs(n0), abs(n1))
             uv[found, 0], uv[found, 1] = x + inside * n0, y + inside * n1
-            lengths[found] = size / (2 * _CHORD) * count / points
+            lengths[found] = size / (2 * chord) * count / points
             found += 1
     return uv[:found], normals[:found], lengths[:found]

@@ -13,19 +13,19 @@ from drake_pose.arrays import Array
 from drake_pose.camera.models import Camera
 from drake_pose.errors import SettingsError
 from drake_pose.fit.background import odds_of_colours
-from drake_pose.fit.camera_sums import Views
-from drake_pose.fit.colour_lines import compare_lines
+from drake_pose.fit.colours import compare_lines
 from drake_pose.fit.contour_fit import (
     Comparison,
     ContourFit,
     Noise,
+    Views,
     compare_views,
     pixels_per_metre,
     symmetric,
 )
-from drake_pose.fit.covariance import Picture
+from drake_pose.fit.covariance import ComparedMask
 from drake_pose.fit.evidence import Evidence, FrameEvidence, widened
-from drake_pose.fit.kernel import COMPARED, COST, FITTING, WEIGHT
+from drake_pose.fit.kernel import Sum
 from drake_pose.fit.levenberg_marquardt import (
     AnnealingStage,
     Coupling,
@@ -47,13 +47,6 @@ WIDTH = "width"
 
 TIME_OFFSET = "time_offset"
 """By how much later than their positions pictures were taken [s]: a parameter of the frame."""
-
-# Of an unknown of which nothing is told: one over the variance.
-_LEAST_INFORMATION = 1e-4
-# From offset to offset of lines across contours in odds of pixels [scale].
-_OFFSET = 0.4
-# Lines nearer to each other than this say the same [pixel].
-_LINE_SPACING = 3.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,7 +86,7 @@ class FittedFrames:
         """
         frames, p = self.own.shape
         H = self.equations.H
-        whole = block_diag(*H[:, :p, :p]) + _LEAST_INFORMATION * np.eye(frames * p)
+        whole = block_diag(*H[:, :p, :p]) + 1e-4 * np.eye(frames * p)
         if self.coupling is not None:
             whole += self.coupling.curvature().toarray()
         covariance = np.linalg.inv(whole)
@@ -258,9 +251,9 @@ class FramesFit:
 
         for k, (own_H, own_g, sums) in enumerate(map_ordered(told, range(len(frames)))):
             H[k], g[k] = own_H, own_g
-            cost += float(sums[:, :, COST].sum())
-            lengths = np.maximum(sums[:, :, COMPARED].sum(axis=1), 1e-9)
-            shares.append(sums[:, :, FITTING].sum(axis=1) / lengths)
+            cost += float(sums[:, :, Sum.COST].sum())
+            lengths = np.maximum(sums[:, :, Sum.COMPARED].sum(axis=1), 1e-9)
+            shares.append(sums[:, :, Sum.FITTING].sum(axis=1) / lengths)
             off = at[0][k] - about[0][k]
             own_information = unknowns.information[:p]
             H[k, range(p), range(p)] += own_information
@@ -306,7 +299,7 @@ class FramesFit:
             H[k] = H[:, k] = np.einsum(
                 "nux,nx->u", told[0 if self._fixed else c][0], compared.wide[c, :, :12]
             )
-            H[k, k] = compared.sums[c][:, WEIGHT].sum()
+            H[k, k] = compared.sums[c][:, Sum.WEIGHT].sum()
         return H, g, compared.sums
 
     def compare(
@@ -324,9 +317,10 @@ class FramesFit:
         compared = compare_views(views, placed, weights, len(self._widths) > 0)
         for c, picture in enumerate(seen.odds):
             if picture is not None:
+                # Lines nearer than three pixels say the same; offsets are 0.4 scales apart.
                 own = weights[c].copy()
-                own[2] = max(own[2], _LINE_SPACING)
-                offset, width = max(1, round(own[1] * _OFFSET)), theta[self._first_width + c]
+                own[2] = max(own[2], 3.0)
+                offset, width = max(1, round(own[1] * 0.4)), theta[self._first_width + c]
                 compare_lines(
                     placed.packed, placed.X_WN, (places[0][c], places[1][c]), picture,
                     self._of_odds, own, offset, compared.A[c], compared.b[c],
@@ -374,7 +368,7 @@ class FramesFit:
 
     def pictures(
         self, frames: Sequence[Evidence | FrameEvidence], parameters: Array, step: AnnealingStage
-    ) -> list[Picture]:
+    ) -> list[ComparedMask]:
         """What each silhouette says at all parameters (frames, n).
 
         Its values are the unknowns but widths: each frame's own, then the shared ones.
@@ -394,7 +388,9 @@ class FramesFit:
                 moves = np.zeros((len(X_WN), len(frames) * p + q, 12))
                 moves[:, k * p : (k + 1) * p], moves[:, len(frames) * p :] = own, shared
                 A = symmetric(compared.A[c])
-                found.append(Picture(A, compared.b[c], X_WN, X_CW[c], moves, float(sizes[c]), c))
+                found.append(
+                    ComparedMask(A, compared.b[c], X_WN, X_CW[c], moves, float(sizes[c]), c)
+                )
         return found
 
     def _moves(

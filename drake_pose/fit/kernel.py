@@ -12,6 +12,7 @@ on. So the points of a node add up to a 12 x 12 matrix, however many unknowns mo
 from __future__ import annotations
 
 import math
+from enum import IntEnum
 
 import numpy as np
 
@@ -24,19 +25,28 @@ from drake_pose.silhouette.contours.contour_points import sample_contour
 REACH = 4.0
 """Distances beyond this many scales do not correspond."""
 
-# Contours correspond only where their normals point alike: at least this cosine.
-_ALIKE = 0.3
-# Points are looked for in squares: so many across the reach, or at most so many in a row.
-_SQUARES_IN_REACH, _MOST_SQUARES = 8.0, 64.0
 
-COMPARED, FITTING, CLOSE, COST, SQUARES, WEIGHT = range(6)
-"""The columns of compare_contours' sums."""
+class Sum(IntEnum):
+    """Columns of the sums of ``compare_contours``.
+
+    COMPARED: length of contour. FITTING: length of what fits to within the scale. CLOSE: one minus
+    the cost in squares of the scale, along the contour [all in units of length]. COST, and SQUARES
+    of the distances, both weighted as in A and b. WEIGHT: the weights' sum.
+    """
+
+    COMPARED = 0
+    FITTING = 1
+    CLOSE = 2
+    COST = 3
+    SQUARES = 4
+    WEIGHT = 5
 
 
 @compiled
 def nearest_alike(
-    uv: Array, normals: Array, other_uv: Array, others: Array, reach: float
-) -> Indices:
+    uv: Array, normals: Array, other_uv: Array, others: Array, reach: float,
+    least_cosine: float = 0.3, most_squares: float = 64.0,
+) -> Indices:  # fmt: skip
     """The nearest point that faces alike; -1 where none is.
 
     The others are put into squares, and squares are looked at from each point outwards.
@@ -45,6 +55,8 @@ def nearest_alike(
         uv, normals: (n, 2) points of a contour or an edge.
         other_uv, others: (k, 2) points of the other one, and their normals.
         reach: farther points do not correspond [pixel].
+        least_cosine: of the angle between the normals of points that correspond.
+        most_squares: in a row.
 
     Returns:
         (n,) indices.
@@ -57,7 +69,7 @@ def nearest_alike(
     for j in range(len(other_uv)):
         left, right = min(left, other_uv[j, 0]), max(right, other_uv[j, 0])
         top, bottom = min(top, other_uv[j, 1]), max(bottom, other_uv[j, 1])
-    side = max(reach / _SQUARES_IN_REACH, max(right - left, bottom - top) / _MOST_SQUARES)
+    side = max(reach / 8.0, max(right - left, bottom - top) / most_squares)
     share = 1.0 / side
     columns, rows = int((right - left) * share) + 1, int((bottom - top) * share) + 1
     squares = np.empty(len(other_uv), dtype=np.int64)
@@ -88,7 +100,7 @@ def nearest_alike(
                         normals[i, 0] * sorted_others[k, 2] + normals[i, 1] * sorted_others[k, 3]
                     )
                     # No branch, which the processor would guess wrong.
-                    is_nearer = (square < best) & (alike >= _ALIKE)
+                    is_nearer = (square < best) & (alike >= least_cosine)
                     best, nearest = (square, k) if is_nearer else (best, nearest)
             # All that is nearer than so many squares are wide was looked at.
             if best <= (ring * side) ** 2:
@@ -126,11 +138,9 @@ def compare_contours(
         widths: whether it is told what follows the silhouettes' widths.
 
     Returns:
-        A (c, nodes, 12, 12), lower triangles, and b (c, nodes, 12); sums (c, nodes + 1, 6) of each
-        node's contour, and of all edges in the last row: COMPARED, the length; FITTING, how much of
-        it fits to within the scale; CLOSE, one minus the cost in squares of the scale, summed along
-        it [all in units of length]; COST, and SQUARES of the distances, both as weighted in A and
-        b; WEIGHT, of these; (c, k, k) the COST by squares of the picture; and (c, nodes, 13)
+        A (c, nodes, 12, 12), lower triangles, and b (c, nodes, 12); sums (c, nodes + 1, 6) by
+        ``Sum`` of each node's contour, and of all edges in the last row; (c, k, k) the cost by
+        squares of the picture; and (c, nodes, 13)
         by how much b grows as silhouettes grow by a pixel, then so much their cost, over two;
         0 where it is not told.
     """
@@ -160,8 +170,8 @@ def compare_contours(
             counted = owners[i] if pair < n else nodes
             cost = worth * length * scale * scale
             if i < 0 or j < 0:
-                own_sums[counted, COMPARED] += length * unit
-                own_sums[counted, COST] += cost
+                own_sums[counted, Sum.COMPARED] += length * unit
+                own_sums[counted, Sum.COST] += cost
             else:
                 n0, n1 = normals[i, 0] + edge_normals[j, 0], normals[i, 1] + edge_normals[j, 1]
                 share = 1.0 / math.sqrt(n0 * n0 + n1 * n1)
@@ -212,12 +222,12 @@ def count_distance(
     share = 1.0 / (1.0 + t)
     cost = worth * length * r * r * share
     weight = worth * length * share * share
-    sums[row, COMPARED] += length * unit
-    sums[row, FITTING] += length * unit * (t < 1.0)
-    sums[row, CLOSE] += length * unit * share
-    sums[row, COST] += cost
-    sums[row, SQUARES] += weight * r * r
-    sums[row, WEIGHT] += weight
+    sums[row, Sum.COMPARED] += length * unit
+    sums[row, Sum.FITTING] += length * unit * (t < 1.0)
+    sums[row, Sum.CLOSE] += length * unit * share
+    sums[row, Sum.COST] += cost
+    sums[row, Sum.SQUARES] += weight * r * r
+    sums[row, Sum.WEIGHT] += weight
     return weight, cost
 
 

@@ -22,12 +22,6 @@ from drake_pose.arrays import Array
 from drake_pose.compiled import compiled
 from drake_pose.errors import SettingsError
 
-_LEAST_DAMPING, _MOST_DAMPING = 1e-4, 1e2
-# A scale begins with no more than this.
-_NEXT_DAMPING = 0.1
-# Steps that gain a smaller share of the cost end a round.
-_STANDSTILL = 1e-3
-
 
 @dataclass(frozen=True)
 class AnnealingStage:
@@ -60,11 +54,18 @@ class StepSettings:
         damping: a share of the diagonal, added to it, at first.
         even_damping: a share of the mean of the diagonal, which keeps what does not show where it
             is.
+        least_damping, most_damping: limits of the damping; a step that needs more ends the round.
+        next_damping: no round begins with more damping.
+        standstill: a step that lowers the cost by a smaller share of it ends the round.
     """
 
     longest: float = 0.35
     damping: float = 1e-3
     even_damping: float = 1e-4
+    least_damping: float = 1e-4
+    most_damping: float = 1e2
+    next_damping: float = 0.1
+    standstill: float = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,14 +170,14 @@ def minimise(
             if tried.cost < cost:
                 gain = 1.0 - tried.cost / cost
                 (own, shared), equations, cost = trial, tried, tried.cost
-                damping = max(0.2 * damping, _LEAST_DAMPING)
-                if gain < _STANDSTILL:
+                damping = max(0.2 * damping, settings.least_damping)
+                if gain < settings.standstill:
                     break
             else:
                 damping *= 10.0
-                if damping > _MOST_DAMPING:
+                if damping > settings.most_damping:
                     break
-        damping = min(damping, _NEXT_DAMPING)
+        damping = min(damping, settings.next_damping)
     return Minimum(own, shared, float(cost), evaluations)
 
 

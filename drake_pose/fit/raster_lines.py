@@ -27,10 +27,6 @@ from drake_pose.silhouette.contours.contour_points import (
     find_segments,
 )
 
-_FAR = 1e9
-# What distances within the slack weigh: enough to choose among the poses that all bounds allow.
-_WITHIN = 0.03
-
 
 class Border(NamedTuple):
     """Where a silhouette's border crosses rows and columns of pixel centres.
@@ -278,7 +274,7 @@ def _pixels_apart(
     length, open_at, inside = 0.0, -0.5, False
     i, j = 0, first
     while i < count or j < end:
-        place = min(max(math.ceil(places[i]), 0), width) - 0.5 if i < count else _FAR
+        place = min(max(math.ceil(places[i]), 0), width) - 0.5 if i < count else math.inf
         if j < end and border[j] <= place:
             place = border[j]
             j += 1
@@ -319,7 +315,7 @@ def _compare_line(
     # First each crossing of the contour with the nearest of the border, then the other way round.
     for one in range(count + end - first):
         begin, after = (first + one % 2, end) if one < count else ((one - count) % 2, count)
-        nearest, best = -1, _FAR
+        nearest, best = -1, math.inf
         for other in range(begin, after, 2):
             k, m = (one, other) if one < count else (other, first + one - count)
             distance = places[k] - border[m]
@@ -335,6 +331,7 @@ def _compare_line(
                 hinge = math.copysign(beyond, best) * slopes[nearest]
                 residuals[nearest] += weight * hinge
                 weights[nearest] += weight
-            weight *= _WITHIN
+            # Enough to choose among the poses that all bounds allow.
+            weight *= 0.03
         weights[nearest] += weight
         residuals[nearest] += weight * residual

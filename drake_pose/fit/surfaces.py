@@ -18,33 +18,9 @@ from drake_pose.body.surfaces.meshes import TriangleMesh
 from drake_pose.silhouette.areas.bending import TreeSurfaces
 from drake_pose.silhouette.areas.outline import Outline, outline_from_mesh
 
-MANY, FEW, ROUGH, VERY_FEW = 2500, 400, 160, 80
-"""Triangles a node: where a pixel counts, for a still, for its first rounds, and for a person in
-real time."""
+MANY, FEW, VERY_FEW = 2500, 400, 80
+"""Triangles of a node: where a pixel counts, for a still, and for a person in real time."""
 
-# A surface is simplified another way where it is farther from the original than its size times this
-# over the triangles wanted, as the distance of a smooth surface falls with them: 0.4 to 1.4 on all
-# parts of the bundled bodies, from 80 triangles to 400.
-_FAR = 2.0
-# Or where it has so many times the triangles wanted.
-_MANY_TIMES = 3.0
-# The other surface is kept where its distance is less than so many times the first one's.
-_NEARER = 0.75
-# The other way: so many times as large as triangles are wanted the simplifier gets a surface, whose
-# errors grow no further than a few hundred units.
-_UNITS_A_TRIANGLE = 25.0
-# It goes on while there are more than this many times the triangles wanted, with vertices on a grid
-# so wide in the same units.
-_ENOUGH = 1.1
-_GRIDS = 10.0, 20.0, 40.0
-# A process that estimates or audits many scenes of a body simplifies its surfaces once.
-_REMEMBERED = 256
-# Triangles are told apart by so many sizes, each a quarter of the one before.
-_SIZES = 6
-# Of a surface of more triangles very few are made out of few ones: as near, in a sixth of the time.
-_DETAILED = 4000
-# Points of a surface whose distances from another are measured.
-_POINTS = 300
 # The simplifier keeps its surface in globals, and lets other threads run: two at once mix theirs.
 _SIMPLIFIER = Lock()
 
@@ -63,17 +39,20 @@ def few_triangles(surfaces: TreeSurfaces, count: int = FEW) -> tuple[Outline, ..
     return tuple(outlines)
 
 
-def rough_outlines(outlines: Sequence[Outline]) -> tuple[Outline, ...]:
+def rough_outlines(outlines: Sequence[Outline], count: int = 160) -> tuple[Outline, ...]:
     """Surfaces of few triangles with fewer still, which takes a fraction of what the first took."""
-    return tuple(_simplified(outline, ROUGH) for outline in outlines)
+    return tuple(_simplified(outline, count) for outline in outlines)
 
 
-def hull_of_few(outlines: Sequence[Outline], count: int) -> tuple[Outline, ...]:
-    """Surfaces with few triangles each; of one that will not simplify its convex hull."""
+def hull_of_few(outlines: Sequence[Outline], count: int, limit: float = 3.0) -> tuple[Outline, ...]:
+    """Surfaces with few triangles each.
+
+    A surface that will not simplify below `limit` times as many becomes its convex hull.
+    """
     found = []
     for outline in outlines:
         few = _simplified(outline, count)
-        if len(few.triangles) > _MANY_TIMES * count:
+        if len(few.triangles) > limit * count:
             hull = trimesh.convex.convex_hull(few.vertices)
             mesh = TriangleMesh(np.array(hull.vertices), np.array(hull.faces))
             few = _simplified(outline_from_mesh(mesh), count)
@@ -100,17 +79,21 @@ def _simplified(outline: Outline, count: int) -> Outline:
     """
     if len(outline.triangles) <= count:
         return outline
-    if count < FEW and len(outline.triangles) > _DETAILED:
+    if count < FEW and len(outline.triangles) > 4000:
+        # Very few triangles made out of few ones are as near, in a sixth of the time.
         few = _simplified(outline, FEW)
-        outline = few if len(few.triangles) <= _ENOUGH * FEW else outline
+        outline = few if len(few.triangles) <= 1.1 * FEW else outline
     vertices = np.ascontiguousarray(outline.vertices, np.float64)
     triangles = np.ascontiguousarray(outline.triangles, np.int32)
     return _simplify(vertices.tobytes(), triangles.tobytes(), count)
 
 
-@lru_cache(maxsize=_REMEMBERED)
+@lru_cache(maxsize=256)
 def _simplify(vertices: bytes, triangles: bytes, count: int) -> Outline:
-    """A surface of more triangles, by its vertices and triangles."""
+    """A surface of more triangles, by its vertices and triangles.
+
+    A process that estimates or audits many scenes of a body simplifies its surfaces once.
+    """
     # Nothing here needs the edges.
     outline = Outline(
         np.frombuffer(vertices, np.float64).reshape(-1, 3),
@@ -118,33 +101,28 @@ def _simplify(vertices: bytes, triangles: bytes, count: int) -> Outline:
         np.zeros((0, 5), np.int32),
     )
     simplified = _collapsed(outline, count, 1.0)
-    too_far = _FAR / count * _size(outline)
+    size = float(np.linalg.norm(np.ptp(outline.vertices, axis=0)))
+    # The distance of a smooth surface falls with the triangles: it is 0.4 to 1.4 times size / count
+    # on all parts of the bundled bodies, from 80 triangles to 400.
+    too_far = 2.0 / count * size
     distance = surface_distance(outline, simplified)
-    too_many = len(simplified.triangles) > _MANY_TIMES * count
+    too_many = len(simplified.triangles) > 3.0 * count
     if distance <= too_far and not too_many:
         return simplified
-    merged = _merged(outline, count)
+    # A surface with slivers: the simplifier gets it in a unit in which its largest errors, a few
+    # hundred units, are small. Vertices that are close together are merged before the next time.
+    unit = size / (25.0 * count)
+    merged = _collapsed(outline, count, unit)
+    for grid in (10.0, 20.0, 40.0):
+        if len(merged.triangles) <= 1.1 * count:
+            break
+        places = np.round(merged.vertices / (grid * unit)) * (grid * unit)
+        merged = outline_from_mesh(TriangleMesh(places, merged.triangles))
+        merged = _collapsed(merged, count, unit)
     merged_distance = surface_distance(outline, merged)
-    if merged_distance < _NEARER * distance or (too_many and merged_distance <= too_far):
+    if merged_distance < 0.75 * distance or (too_many and merged_distance <= too_far):
         return merged
     return simplified
-
-
-def _merged(outline: Outline, count: int) -> Outline:
-    """A surface simplified where it has slivers.
-
-    The simplifier gets it in a unit in which its largest errors are small, and vertices that are
-    close together are merged before the next time.
-    """
-    unit = _size(outline) / (_UNITS_A_TRIANGLE * count)
-    outline = _collapsed(outline, count, unit)
-    for grid in _GRIDS:
-        if len(outline.triangles) <= _ENOUGH * count:
-            break
-        places = np.round(outline.vertices / (grid * unit)) * (grid * unit)
-        outline = outline_from_mesh(TriangleMesh(places, outline.triangles))
-        outline = _collapsed(outline, count, unit)
-    return outline
 
 
 def _collapsed(outline: Outline, count: int, unit: float) -> Outline:
@@ -156,11 +134,6 @@ def _collapsed(outline: Outline, count: int, unit: float) -> Outline:
             outline.vertices / unit, outline.triangles, target_count=count
         )
     return outline_from_mesh(TriangleMesh(np.asarray(points, np.float64) * unit, triangles))
-
-
-def _size(outline: Outline) -> float:
-    """The diagonal of the box around a surface [m]."""
-    return float(np.linalg.norm(np.ptp(outline.vertices, axis=0)))
 
 
 def surface_distance(one: Outline, other: Outline) -> float:
@@ -185,8 +158,7 @@ def _squared_distances(one: Outline, other: Outline) -> Array:
     nearest = np.fmin(cKDTree(other.vertices).query(points)[0], apart)
     pairs: list[tuple[NDArray[np.intp], NDArray[np.intp]]] = []
     # Small triangles first: a few large ones would call for all the small ones around them.
-    size = float(radii.max())
-    sizes = size * 0.25 ** np.arange(_SIZES)
+    sizes = float(radii.max()) * 0.25 ** np.arange(6)
     for least, most in zip((*sizes[1:], -1.0), sizes, strict=True):
         own = np.flatnonzero((radii > least) & (radii <= most))
         if not len(own):
@@ -206,11 +178,11 @@ def _squared_distances(one: Outline, other: Outline) -> Array:
     return squares
 
 
-def _spread(outline: Outline) -> Array:
-    """Points (n, 3) of a surface, as many in equal areas."""
+def _spread(outline: Outline, count: int = 300) -> Array:
+    """Points (count, 3) of a surface, as many in equal areas."""
     generator = np.random.default_rng(0)
     areas = np.cumsum(np.linalg.norm(outline.planes[:, :3], axis=1))
-    where = np.searchsorted(areas, areas[-1] * (np.arange(_POINTS) + 0.5) / _POINTS)
+    where = np.searchsorted(areas, areas[-1] * (np.arange(count) + 0.5) / count)
     a, b, c = outline.vertices[outline.triangles[where]].transpose(1, 0, 2)
-    across, along = generator.uniform(size=(2, _POINTS, 1))
+    across, along = generator.uniform(size=(2, count, 1))
     return a + np.sqrt(across) * ((b - a) + along * (c - b))

@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_pose.arrays import Array, Mask
-from drake_pose.fit.camera_sums import AddUp
 from drake_pose.fit.colours import OwnColours
 from drake_pose.fit.contour_fit import (
+    AddUp,
     Comparison,
     ContourFit,
     PoseFit,
@@ -27,7 +27,7 @@ from drake_pose.fit.contour_fit import (
     symmetric,
 )
 from drake_pose.fit.covariance import surface_deformations
-from drake_pose.fit.kernel import COMPARED, FITTING, SQUARES, WEIGHT
+from drake_pose.fit.kernel import Sum
 from drake_pose.person.body_plan import BodyPlan
 from drake_pose.person.search import (
     CYCLE,
@@ -343,7 +343,7 @@ class PersonPoseTracker:
         if own is not None:
             fitted, shown = self._recoloured(fitted, colours, own)
         step = fitted.values - last.values
-        lengths, fitting = fitted.sums[:-1, [COMPARED, FITTING]].T
+        lengths, fitting = fitted.sums[:-1, [Sum.COMPARED, Sum.FITTING]].T
         worst = np.min(
             fitting / np.maximum(lengths, 1e-9), where=lengths >= _TELLING, initial=shown
         )
@@ -375,7 +375,7 @@ class PersonPoseTracker:
         """RMS distance [pixel] of the contour at values (m,) to the colours'; nan: none is seen."""
         placement = self.fit.body.place(values)
         sums = colours.compare(self.fit, placement, self.schedule.follow[-1]).sums
-        squares, weight = sums[:, :, [SQUARES, WEIGHT]].sum(axis=(0, 1))
+        squares, weight = sums[:, :, [Sum.SQUARES, Sum.WEIGHT]].sum(axis=(0, 1))
         return float(np.sqrt(squares / weight)) if weight > 0.0 else float("nan")
 
     def _restarted(self, state: TrackState, last: TrackState, frame: FrameViews) -> TrackState:

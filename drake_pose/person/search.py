@@ -13,7 +13,7 @@ from drake_pose.arrays import Array, Mask
 from drake_pose.errors import SettingsError
 from drake_pose.fit.colours import colour_numbers
 from drake_pose.fit.contour_fit import ContourFit, PoseFit, Prior
-from drake_pose.fit.kernel import COMPARED, FITTING
+from drake_pose.fit.kernel import Sum
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.person.body_plan import UPPER_SAMPLES, BodyPlan, PlannedLimb, crowding
 from drake_pose.person.rays import sum_at_points
@@ -198,7 +198,7 @@ class PersonSearch:
 
     def _doubtful(self, fitted: PoseFit, frame: FrameViews) -> list[PlannedLimb]:
         """The limbs that fit badly, hardly show, or would fill more elsewhere; always the worst."""
-        lengths, fitting = fitted.sums[:, [COMPARED, FITTING]].T
+        lengths, fitting = fitted.sums[:, [Sum.COMPARED, Sum.FITTING]].T
         shares = np.where(lengths > 0.0, fitting / np.maximum(lengths, 1e-9), 1.0)
         found = []
         for limb in self._plan.limbs.values():

@@ -19,21 +19,18 @@ from numpy.typing import NDArray
 
 from drake_pose.arrays import Array, Mask, Picture
 from drake_pose.camera.models import Camera, ParallelCamera
-from drake_pose.fit.camera_sums import (
+from drake_pose.fit.colours import check_picture, compare_lines, learn_colours, no_colours
+from drake_pose.fit.contour_fit import (
     AddUp,
     CameraSum,
+    Comparison,
+    ContourFit,
     EdgeKeeper,
     SumRequest,
     Views,
     add_cameras,
     add_sums,
     compare_placed,
-)
-from drake_pose.fit.colour_lines import compare_lines, learn_colours
-from drake_pose.fit.colours import NO_REGION, check_picture, no_colours
-from drake_pose.fit.contour_fit import (
-    Comparison,
-    ContourFit,
     pack_cameras,
     pack_views,
     pixels_per_metre,
@@ -131,7 +128,7 @@ class ColourViews:
                 1.0 if surely else _RATE,
                 math.inf if surely else max(_AGREEING * size, _LEAST_AGREEING),
                 max(1, round(_COUNTED * size)),
-                NO_REGION if region is None else np.ascontiguousarray(region),
+                np.zeros((0, 0), np.bool_) if region is None else np.ascontiguousarray(region),
             )  # fmt: skip
             learned[camera.name] = histograms
         return learned

@@ -16,7 +16,7 @@ from drake_pose.arrays import Array, Mask
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.fit.contour_fit import Noise
-from drake_pose.fit.covariance import distances_in_pictures, estimate_sizes, values_covariance
+from drake_pose.fit.covariance import distances_in_masks, estimate_sizes, values_covariance
 from drake_pose.fit.evidence import Evidence
 from drake_pose.fit.frames_fit import FramesFit, parameter_names
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
@@ -152,7 +152,7 @@ def _covariances(
     count = len(edges)
     frames = np.unique(np.linspace(0, count - 1, _TELLING_FRAMES).round().astype(int))
     pictures = fit.pictures([edges[k] for k in frames], parameters[frames], _UNCUT)
-    seen = distances_in_pictures(fit.body.outlines, pictures, _MOST_DISTANCES)
+    seen = distances_in_masks(fit.body.outlines, pictures, _MOST_DISTANCES)
     shared = [name.split(".")[-1] in CAMERA_NAMES[:3] for name in fit.unknowns.names[len(own) :]]
     is_angle = np.concatenate([np.tile(own, len(frames)), shared])
     sizes = estimate_sizes(seen, is_angle, prior_deviation=PRIOR_DEVIATION)

@@ -19,13 +19,12 @@ from scipy.special import chdtrc, fdtrc, fdtri
 
 from drake_pose.arrays import Array, Indices, Mask
 from drake_pose.fit.covariance import (
+    ComparedMask,
     Distances,
     ErrorSizes,
-    Picture,
     distances_covariance,
-    distances_in_pictures,
+    distances_in_masks,
     estimate_sizes,
-    with_widths,
 )
 from drake_pose.fit.parameters import POSE_NAMES
 from drake_pose.registration.per_frame_fit import FrameFit, PerFrameFit
@@ -318,10 +317,10 @@ class _Auditor:
             sizes.append(estimate_sizes(seen, is_angle, least_camera=0.0)[:5])
         return ErrorSizes(*np.median(np.array(sizes), axis=0).tolist())
 
-    def _distances(self, pictures: Sequence[Picture]) -> Distances:
+    def _distances(self, pictures: Sequence[ComparedMask]) -> Distances:
         """The distances in pictures; their values are what was free, then each picture's width."""
         outlines = self._fit.outlines
-        return distances_in_pictures(outlines, with_widths(outlines, pictures))
+        return distances_in_masks(outlines, pictures, widths=True)
 
     def _info_of(self, fitted: FrameFit, sizes: ErrorSizes) -> _Information:
         if not fitted.pictures:

@@ -15,10 +15,10 @@ from drake_pose.arrays import Array
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.camera.models import Camera
 from drake_pose.fit.contour_fit import Comparison, Noise, inlier_ratio_of
-from drake_pose.fit.covariance import Picture
+from drake_pose.fit.covariance import ComparedMask
 from drake_pose.fit.evidence import Evidence
 from drake_pose.fit.frames_fit import FramesFit, parameter_names
-from drake_pose.fit.kernel import COST, WEIGHT
+from drake_pose.fit.kernel import Sum
 from drake_pose.fit.levenberg_marquardt import AnnealingStage, StepSettings
 from drake_pose.fit.parameters import POSE_NAMES, BodyParameters
 from drake_pose.fit.unknowns import choose
@@ -56,7 +56,7 @@ class FrameFit:
     """
 
     name: str
-    pictures: tuple[Picture, ...]
+    pictures: tuple[ComparedMask, ...]
     inlier_ratios: tuple[Mapping[str, float], Mapping[str, float]]
     weights: Array
 
@@ -130,7 +130,7 @@ class PerFrameFit:
         held = self._with_widths(evidence, held)
         before, after = (self._all.compare(evidence, one, TOLD_APART)[0] for one in (held, theta))
         told = after
-        costs = [float(one.sums[:, :, COST].sum()) for one in (before, after)]
+        costs = [float(one.sums[:, :, Sum.COST].sum()) for one in (before, after)]
         if costs[0] <= _FITS_ALREADY * costs[1]:
             theta, told, change = held, before, given[0]
         return FrameFit(
@@ -156,7 +156,7 @@ class PerFrameFit:
             if k in inner or (np.argmin(costs, axis=0) == min(max(k, 1), len(_WIDTHS) - 2)).any():
                 found[-len(self._cameras) :] = _WIDTHS[k]
                 compared, _ = self._few.compare(evidence, found, TOLD_APART)
-                costs[k] = compared.sums[:, :, COST].sum(axis=1)
+                costs[k] = compared.sums[:, :, Sum.COST].sum(axis=1)
         best = np.clip(np.argmin(costs, axis=0), 1, len(_WIDTHS) - 2)
         low, middle, high = (np.choose(best + k, costs) for k in (-1, 0, 1))
         bend = low - 2.0 * middle + high
@@ -213,6 +213,6 @@ class PerFrameFit:
 
 def _weights(compared: Comparison) -> Array:
     """(nodes,) how much contour was compared; edges are shared out among the nodes."""
-    weights = compared.sums[:, :, WEIGHT].sum(axis=0)
+    weights = compared.sums[:, :, Sum.WEIGHT].sum(axis=0)
     own = max(float(weights[:-1].sum()), 1e-9)
     return np.asarray(weights[:-1] * weights.sum() / own)

@@ -12,8 +12,7 @@ from scipy.optimize import minimize
 
 from drake_pose.arrays import Array, Picture
 from drake_pose.camera.models import PinholeCamera
-from drake_pose.fit.background import Backgrounds
-from drake_pose.fit.background_kernel import CONTOUR, GAIN, OUTLINE, explain
+from drake_pose.fit.background import Backgrounds, Explained, explain
 from drake_pose.registration.posed_frames import placed_points
 from drake_pose.registration.start_poses import spread_rotations
 from drake_pose.silhouette.areas.outline import Outline, pack
@@ -119,8 +118,8 @@ class PictureLevel:
     def explained(self, X_CW: Array) -> tuple[float, float]:
         """Of a pose (4, 4) the share of all that could be explained, and edges beyond chance."""
         told = self.told(X_CW)
-        share = float(told[GAIN]) / max(self.backgrounds.possible, 1e-9)
-        return share, float(told[CONTOUR]) / max(float(told[OUTLINE]), 1.0)
+        share = float(told[Explained.GAIN]) / max(self.backgrounds.possible, 1e-9)
+        return share, float(told[Explained.CONTOUR]) / max(float(told[Explained.OUTLINE]), 1.0)
 
     def score(self, X_CW: Array, frames: int | None = None) -> float:
         """How much speaks for a pose; short outlines, which say little by chance, count as longer.
@@ -129,9 +128,12 @@ class PictureLevel:
         """
         X_WN = self._X_WN[:frames]
         told = self.told(X_CW, X_WN)
-        outline = told[OUTLINE] + _SHORT * len(X_WN) * self.camera.width
+        outline = told[Explained.OUTLINE] + _SHORT * len(X_WN) * self.camera.width
         possible = self.backgrounds.possible * len(X_WN) / len(self._X_WN)
-        return evidence(float(told[GAIN]) / max(possible, 1e-9), float(told[CONTOUR] / outline))
+        return evidence(
+            float(told[Explained.GAIN]) / max(possible, 1e-9),
+            float(told[Explained.CONTOUR] / outline),
+        )
 
     def best(self, X_CW: Sequence[Array], frames: int, share: float) -> list[Array]:
         """A share of some poses (4, 4): those with the best scores, best first."""

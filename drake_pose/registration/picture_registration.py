@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from drake_pose.arrays import Array, Picture
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import RegistrationError
-from drake_pose.fit.background_kernel import GAIN
+from drake_pose.fit.background import Explained
 from drake_pose.fit.covariance import excess
 from drake_pose.fit.frames_fit import TIME_OFFSET
 from drake_pose.registration.picture_levels import CONTOURS, evidence
@@ -394,7 +394,7 @@ def _scan(
         values = recording.values_at(float(offset))[rows]
         if np.isfinite(values).all():
             X_WN = np.array([body.kinematics.poses(one) for one in values])
-            scores[k] = level.told(camera.X_CW, X_WN)[GAIN]
+            scores[k] = level.told(camera.X_CW, X_WN)[Explained.GAIN]
     k = int(np.nanargmax(scores))
     offset = float(_OFFSETS[k])
     if 0 < k < len(scores) - 1 and np.isfinite(scores[k - 1 : k + 2]).all():

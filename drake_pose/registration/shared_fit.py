@@ -28,11 +28,10 @@ from drake_pose.fit.covariance import (
     Distances,
     ErrorSizes,
     distances_covariance,
-    distances_in_pictures,
+    distances_in_masks,
     doubted_covariance,
     estimate_sizes,
     values_covariance,
-    with_widths,
 )
 from drake_pose.fit.evidence import FrameEvidence
 from drake_pose.fit.frames_fit import FramesFit, parameter_names
@@ -368,7 +367,7 @@ class SharedFit:
         (evidence, *_), _, which = self._at(found, which)
         pictures = self._fit.pictures(evidence, self._parameters(found)[which], step)
         outlines = self._fit.body.outlines
-        return distances_in_pictures(outlines, with_widths(outlines, pictures))
+        return distances_in_masks(outlines, pictures, widths=True)
 
 
 def fit_pose(seen: PosedFrames, X_CW: Array, rounds: Sequence[AnnealingStage]) -> Array:

@@ -24,11 +24,11 @@ from scipy.special import ndtri, stdtrit
 from drake_pose.body.parsed_model import nearest_turn
 from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
-from drake_pose.fit.camera_sums import Views
 from drake_pose.fit.contour_fit import (
     FINEST_SCALE,
     ContourFit,
     Noise,
+    Views,
     pack_views,
 )
 from drake_pose.fit.covariance import (
@@ -41,7 +41,7 @@ from drake_pose.fit.covariance import (
     values_covariance,
 )
 from drake_pose.fit.evidence import find_edge_points
-from drake_pose.fit.kernel import COST
+from drake_pose.fit.kernel import Sum
 from drake_pose.fit.levenberg_marquardt import AnnealingStage, StepSettings
 from drake_pose.search.estimates import (
     JointEstimate,
@@ -112,7 +112,7 @@ class ViewsFit:
         self._count(1)
         fit, views = self._level(step)
         sums = fit.compare(views, values, step).sums
-        return float(sums[..., COST].sum()) / self._scale(step) ** 2
+        return float(sums[..., Sum.COST].sum()) / self._scale(step) ** 2
 
     def distances(self, values: np.ndarray, step: AnnealingStage) -> Distances:
         """What is left of the contours' distances at values (m,)."""

@@ -5,14 +5,15 @@ import pytest
 
 from drake_pose.fit.background import (
     Backgrounds,
+    Explained,
     KnownBackground,
     Light,
+    explain,
     mask_of_odds,
     odds_of_colours,
     odds_picture,
 )
-from drake_pose.fit.background_kernel import AREA, CONTOUR, GAIN, OUTLINE, explain
-from drake_pose.fit.colour_lines import COLOURS, ODDS
+from drake_pose.fit.colours import COLOURS, Colour
 from drake_pose.silhouette.areas.outline import pack
 from drake_pose.silhouette.areas.scoring import draw_mask
 from tests.registration.episodes import painted_episode
@@ -43,8 +44,8 @@ def test_what_a_pose_explains_is_a_sum_over_pixels(episode):
     always = covered.all(axis=-1)
     gain[always] = 0.3 * np.maximum(gain[always], 0.0)
     gain[~covered.any(axis=-1)] = 0.0
-    assert told[AREA] == masks.sum()
-    np.testing.assert_allclose(told[GAIN], gain.sum(), rtol=1e-4)
+    assert told[Explained.AREA] == masks.sum()
+    np.testing.assert_allclose(told[Explained.GAIN], gain.sum(), rtol=1e-4)
     by_square = np.add.reduceat(np.add.reduceat(gain, [0, 20, 40], 0), [0, 20, 40, 60], 1)
     np.testing.assert_allclose(pieces[:3], by_square, rtol=1e-3, atol=1e-2)
 
@@ -60,14 +61,14 @@ def test_outlines_are_where_neighbours_are_not_covered(episode):
         left, right = inner[:, 1:-1, :-2], inner[:, 1:-1, 2:]
         above, below = inner[:, :-2, 1:-1], inner[:, 2:, 1:-1]
         across_u, across_v = masks & ~(left & right), masks & ~(above & below)
-        assert told[OUTLINE] == (across_u | across_v).sum()
+        assert told[Explained.OUTLINE] == (across_u | across_v).sum()
         u, v = (
             np.where(a, e, -np.inf) for a, e in zip((across_u, across_v), sums.edges, strict=True)
         )
         strongest = np.maximum(u, v)[across_u | across_v]
-        np.testing.assert_allclose(told[CONTOUR], strongest.sum(), rtol=1e-4)
+        np.testing.assert_allclose(told[Explained.CONTOUR], strongest.sum(), rtol=1e-4)
         # What stands still is its own background, and explains nothing else.
-        assert (told[GAIN] == 0.0) == still
+        assert (told[Explained.GAIN] == 0.0) == still
 
 
 def test_the_true_pose_explains_most_of_those_near(episode):
@@ -77,7 +78,7 @@ def test_the_true_pose_explains_most_of_those_near(episode):
     def gain(X_CW):
         packed, X_CN = drawn(episode, X_CW)[1]
         return explain(packed, X_CN, np.zeros(X_CN.shape[1], bool), parameters, sums, 1.0, 0)[0][
-            GAIN
+            Explained.GAIN
         ]
 
     true = gain(episode.camera.X_CW)
@@ -123,5 +124,5 @@ def test_odds_pictures_are_read_as_they_were_written():
     red, green, blue = np.moveaxis(picture.astype(np.intp) >> 4, -1, 0)
     table = odds_of_colours(2)
     assert table.shape == (2, 3, COLOURS)
-    read = np.log(table[1, ODDS][(red * 16 + green) * 16 + blue])
+    read = np.log(table[1, Colour.ODDS][(red * 16 + green) * 16 + blue])
     np.testing.assert_allclose(read, np.clip(odds, -8.0, 8.0), atol=0.01)

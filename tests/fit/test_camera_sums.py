@@ -6,20 +6,22 @@ import pytest
 from drake_pose.body.formats.packages import bundled_model
 from drake_pose.body.model import load_model
 from drake_pose.camera.models import circle_of_cameras
-from drake_pose.fit.camera_sums import (
+from drake_pose.fit.contour_fit import (
+    ContourFit,
     SumRequest,
     Views,
     add_cameras,
     add_sums,
     answer_request,
     compare_placed,
+    pack_cameras,
     pack_request,
     pack_sum,
     pack_surfaces,
+    pack_views,
     unpack_sum,
     unpack_surfaces,
 )
-from drake_pose.fit.contour_fit import ContourFit, pack_cameras, pack_views
 from drake_pose.fit.evidence import NO_EDGE, find_edge_points, pack_evidence
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.silhouette.areas.scoring import draw_mask

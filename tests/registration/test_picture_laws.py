@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from drake_pose.errors import RegistrationError
-from drake_pose.fit.background_kernel import CONTOUR, GAIN, OUTLINE
+from drake_pose.fit.background import Explained
 from drake_pose.registration import picture_levels, picture_search
 from drake_pose.registration.picture_frames import judge_pictures
 from drake_pose.registration.picture_levels import (
@@ -114,14 +114,14 @@ def test_poses_that_improve_explain_more_and_the_true_one_most(
     assert 0.5 < share < 1.0
     assert contour > level.explained(aside)[1]
     told = level.told(true)
-    assert share == pytest.approx(told[GAIN] / level.backgrounds.possible)
-    assert contour == pytest.approx(told[CONTOUR] / told[OUTLINE])
+    assert share == pytest.approx(told[Explained.GAIN] / level.backgrounds.possible)
+    assert contour == pytest.approx(told[Explained.CONTOUR] / told[Explained.OUTLINE])
 
 
 def test_what_a_pose_explains_is_told_apart_by_squares(level: PictureLevel, episode) -> None:
     X_CW = episode.camera.X_CW
     pieces = level.pieces(X_CW)
-    assert pieces.sum() == pytest.approx(level.told(X_CW)[GAIN])
+    assert pieces.sum() == pytest.approx(level.told(X_CW)[Explained.GAIN])
     # 80 by 60 pixels, in squares of 5.
     assert pieces.shape == (16, 16)
     assert (pieces[12:] == 0.0).all()

@@ -18,7 +18,7 @@ import numpy as np
 from distributed import get_worker
 
 from drake_pose.camera.frame_source import SourceSpecification
-from drake_pose.fit.camera_sums import (
+from drake_pose.fit.contour_fit import (
     Views,
     answer_request,
     compare_placed,

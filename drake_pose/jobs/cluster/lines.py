@@ -14,7 +14,7 @@ from typing import NamedTuple
 import zmq
 
 from drake_pose.errors import ClusterError
-from drake_pose.fit.camera_sums import (
+from drake_pose.fit.contour_fit import (
     CameraSum,
     SumRequest,
     pack_request,

@@ -18,8 +18,7 @@ from drake_pose.body.model import load_model
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.camera.models import ParallelCamera
 from drake_pose.compiled import is_stored
-from drake_pose.fit.camera_sums import compare_placed
-from drake_pose.fit.contour_fit import pack_views
+from drake_pose.fit.contour_fit import compare_placed, pack_views
 from drake_pose.fit.evidence import find_edge_points
 from drake_pose.fit.kernel import collect
 from drake_pose.fit.surfaces import few_triangles

@@ -12,7 +12,7 @@ from pydrake.systems.framework import Context
 
 from drake_pose.arrays import Array
 from drake_pose.camera.models import Camera, camera_tuple
-from drake_pose.fit.colour_lines import COLOURS
+from drake_pose.fit.colours import COLOURS
 from drake_pose.fit.contour_fit import inlier_ratio_of
 from drake_pose.person.persons_in_view import keep_views
 from drake_pose.person.pose_tracker import PersonPoseTracker, TrackState

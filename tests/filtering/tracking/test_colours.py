@@ -9,10 +9,9 @@ from drake_pose.filtering.contour_tracker import (
     ContourTracker,
 )
 from drake_pose.fit import colours
-from drake_pose.fit.colour_lines import BESIDE, COLOURS, ON
-from drake_pose.fit.colours import part_distances, weigh_parts
+from drake_pose.fit.colours import COLOURS, LINES, Colour, part_distances, weigh_parts
 from drake_pose.fit.contour_fit import Comparison
-from drake_pose.fit.kernel import COMPARED, SQUARES, WEIGHT
+from drake_pose.fit.kernel import Sum
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from tests.filtering.measurements.test_contour import descend
 from tests.filtering.tracking.test_match_and_track import PERIOD
@@ -98,9 +97,9 @@ def test_colours_lead_back_to_the_truth(observation, renderer):
 def test_learned_colours_are_those_on_both_sides(observation, renderer):
     picture = np.where(renderer.mask(TRUTH)[..., None], ORANGE, GREEN).astype(np.uint8)
     known = observation.learn([picture], observation.state(TRUTH), observation.no_colours())
-    seen = known[0, known[0, :, ON].sum(axis=-1) > 0]
+    seen = known[0, known[0, :, Colour.ON].sum(axis=-1) > 0]
     assert len(seen) == 3
-    for side, colour in ((ON, ORANGE), (BESIDE, GREEN)):
+    for side, colour in ((Colour.ON, ORANGE), (Colour.BESIDE, GREEN)):
         assert numbered(colour) < COLOURS
         # Where the contour bends, strips reach over it to the other side.
         assert np.all(seen[:, side, numbered(colour)] > 0.8)
@@ -108,13 +107,12 @@ def test_learned_colours_are_those_on_both_sides(observation, renderer):
 
 
 def test_old_colours_fade_at_the_rate(observation, renderer, monkeypatch):
-    monkeypatch.setattr(colours, "_RATE", 0.25)
-    monkeypatch.setattr(colours, "_AGREEING", 100.0)
+    monkeypatch.setattr(colours, "LINES", LINES._replace(rate=0.25, agreeing=100.0))
     mask, known = renderer.mask(TRUTH), observation.no_colours()
     for colour in (ORANGE, np.array([20, 20, 200])):
         picture = np.where(mask[..., None], colour, GREEN).astype(np.uint8)
         known = observation.learn([picture], observation.state(TRUTH), known)
-    shares = known[0, :, ON, numbered(ORANGE)]
+    shares = known[0, :, Colour.ON, numbered(ORANGE)]
     np.testing.assert_allclose(shares[shares > 0], 0.75, atol=0.06)
 
 
@@ -174,11 +172,11 @@ def test_a_part_that_is_astray_makes_its_own_joints_unsure(observation, renderer
 
 def test_a_part_is_as_far_off_as_the_cameras_that_see_it_well_say():
     sums = np.zeros((2, 5, 6))
-    sums[..., COMPARED], sums[..., WEIGHT] = 50.0, 2.0
+    sums[..., Sum.COMPARED], sums[..., Sum.WEIGHT] = 50.0, 2.0
     for node, distances in enumerate([(1.0, 1.0), (1.0, 9.0), (3.0, 4.0), (9.0, 9.0)]):
-        sums[:, node, SQUARES] = 2.0 * np.square(distances)
+        sums[:, node, Sum.SQUARES] = 2.0 * np.square(distances)
     # Of the last part hardly anything is said.
-    sums[:, 3, COMPARED] = 5.0
+    sums[:, 3, Sum.COMPARED] = 5.0
     expected = [1.0, np.sqrt(2.0 / (1 + 1 / 81)), np.sqrt(2.0 / (1 / 9 + 1 / 16)), 0.0]
     np.testing.assert_allclose(part_distances(sums), expected)
     assert not part_distances(np.zeros((2, 5, 6))).any()
@@ -186,10 +184,10 @@ def test_a_part_is_as_far_off_as_the_cameras_that_see_it_well_say():
 
 def test_a_part_whose_lines_scatter_counts_less():
     sums = np.zeros((2, 4, 6))
-    sums[..., WEIGHT] = 1.0
+    sums[..., Sum.WEIGHT] = 1.0
     # The last row is that of masks' edges.
-    sums[0, :, SQUARES] = 0.25, 1.44, 100.0, 50.0
-    sums[1, :, SQUARES] = 50.0
+    sums[0, :, Sum.SQUARES] = 0.25, 1.44, 100.0, 50.0
+    sums[1, :, Sum.SQUARES] = 50.0
     compared = Comparison(
         np.ones((2, 3, 12, 12)), np.ones((2, 3, 12)), sums, np.zeros((2, 3, 13)), None
     )

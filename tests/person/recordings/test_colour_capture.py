@@ -7,8 +7,7 @@ import pytest
 
 from drake_pose.body.landmarks import landmark_positions, load_landmarks
 from drake_pose.camera.models import circle_of_cameras
-from drake_pose.fit.colour_lines import BESIDE, ON
-from drake_pose.fit.colours import OwnColours
+from drake_pose.fit.colours import Colour, OwnColours
 from drake_pose.fit.contour_fit import ContourFit
 from drake_pose.person.person_capture import capture_by_colour
 from drake_pose.person.pose_tracker import PersonPoseTracker
@@ -128,10 +127,10 @@ class TestLearning:
         for regions in (None, masks):
             known = views.learned(fit, tracker.values(off), regions)
             # Red is little in the room.
-            on = sum(one[:, ON].reshape(-1, 16, 256)[:, :7].sum() for one in known.values())
-            seen = sum((one[:, ON].sum(axis=1) > 0.0).sum() for one in known.values())
+            on = sum(one[:, Colour.ON].reshape(-1, 16, 256)[:, :7].sum() for one in known.values())
+            seen = sum((one[:, Colour.ON].sum(axis=1) > 0.0).sum() for one in known.values())
             wrong.append(on / seen)
-            beside = [one[:, BESIDE].sum(axis=1) for one in known.values()]
+            beside = [one[:, Colour.BESIDE].sum(axis=1) for one in known.values()]
             assert np.all(np.isclose(beside, 0.0) | np.isclose(beside, 1.0, atol=1e-3))
         assert wrong[1] < 0.5 * wrong[0]
 

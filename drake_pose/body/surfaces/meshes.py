@@ -1,6 +1,5 @@
 """Triangle meshes, from mesh files and to files that Drake's renderer draws."""
 
-import atexit
 import functools
 import hashlib
 import io
@@ -10,6 +9,7 @@ import tempfile
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Sequence
 from dataclasses import dataclass
+from multiprocessing.util import Finalize
 from operator import methodcaller
 from pathlib import Path
 from typing import Any, TextIO
@@ -281,7 +281,8 @@ def is_drawn_by_drake(path: Path) -> bool:
 def workspace() -> Path:
     """This process's temporary folder for converted files; it is removed at exit."""
     folder = tempfile.TemporaryDirectory(prefix="drake_pose_")
-    atexit.register(folder.cleanup)
+    # Not atexit: processes that multiprocessing starts end without it.
+    Finalize(None, folder.cleanup, exitpriority=0)
     return Path(folder.name)
 
 

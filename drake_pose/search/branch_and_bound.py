@@ -7,6 +7,8 @@ much of it, and the search then says so. The poses found, which may be very many
 graph of partial poses.
 """
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -15,13 +17,11 @@ import numpy as np
 from drake_pose.search.estimates import View
 from drake_pose.search.pair_kernel import NO_CHILDREN, prune_pairs, unite
 from drake_pose.search.partial_poses import (
-    Expansion,
     LimitReached,
     PartialPoses,
     Pictures,
     PoseStore,
     RowTable,
-    all_pairs,
     expand_groups,
 )
 from drake_pose.search.sampled_body import SampledBody
@@ -41,15 +41,9 @@ class Layer:
     samples: np.ndarray
     ends: np.ndarray
 
-    def chosen(self, edges: np.ndarray) -> "Layer":
+    def chosen(self, edges: np.ndarray) -> Layer:
         """Some of the edges, (m,) bool."""
         return Layer(self.node, self.origins[edges], self.samples[edges], self.ends[edges])
-
-
-def make_layer(node: int, origins: np.ndarray, samples: np.ndarray, ends: np.ndarray) -> Layer:
-    """A layer of edges in any order."""
-    order = np.lexsort((samples, origins))
-    return Layer(node, origins[order], samples[order], ends[order])
 
 
 class PartialPoseGraph:
@@ -63,7 +57,24 @@ class PartialPoseGraph:
     """
 
     def __init__(self, layers: Sequence[Layer], Js: np.ndarray) -> None:
-        self.layers, self.Js = _prune(list(layers), np.asarray(Js, dtype=np.float64))
+        # Leave out states that lead nowhere or are led to from nowhere, and number the rest anew.
+        origins = [layer.origins for layer in layers[1:]] + [np.arange(len(Js))]
+        reached = [np.array([True])]
+        for layer, following in zip(layers, origins, strict=True):
+            size = int(max(layer.ends.max(initial=0), following.max(initial=-1))) + 1
+            there = np.zeros(size, dtype=np.bool_)
+            there[layer.ends[reached[-1][layer.origins]]] = True
+            reached.append(there)
+        useful = reached[-1][: len(Js)]
+        self.Js = np.asarray(Js, dtype=np.float64)[useful]
+        self.layers: list[Layer] = []
+        for layer, there in zip(layers[::-1], reached[-2::-1], strict=True):
+            kept = layer.chosen(useful[layer.ends] & there[layer.origins])
+            ends = (np.cumsum(useful) - 1)[kept.ends]
+            useful = np.zeros(len(there), dtype=np.bool_)
+            useful[kept.origins] = True
+            places = np.cumsum(useful) - 1
+            self.layers.insert(0, Layer(kept.node, places[kept.origins], kept.samples, ends))
         counts = [int(layer.origins.max(initial=-1)) + 1 for layer in self.layers]
         self.ways: list[np.ndarray] = [np.ones(1)]
         self.rests: list[np.ndarray] = [np.ones(len(self.Js))]
@@ -73,6 +84,13 @@ class PartialPoseGraph:
         for layer, states in zip(self.layers[::-1], counts[::-1], strict=True):
             weights = self.rests[0][layer.ends]
             self.rests.insert(0, np.bincount(layer.origins, weights, minlength=states))
+
+    @classmethod
+    def of_pose(cls, samples: np.ndarray, J: float) -> PartialPoseGraph:
+        """The set of one pose, samples (nodes,), with objective J."""
+        zero = np.zeros(1, dtype=np.int64)
+        layers = [Layer(node, zero, np.array([t]), zero) for node, t in enumerate(samples)]
+        return cls(layers, np.array([J]))
 
     @property
     def size(self) -> float:
@@ -107,7 +125,7 @@ class PartialPoseGraph:
             seen[layer.node] = np.unique(layer.samples)
         return seen
 
-    def restricted(self, allowed: Sequence[np.ndarray | None]) -> "PartialPoseGraph":
+    def restricted(self, allowed: Sequence[np.ndarray | None]) -> PartialPoseGraph:
         """The poses that take allowed samples alone, (samples,) bool of each node; None: all."""
         rules = [allowed[layer.node] for layer in self.layers]
         layers = [
@@ -116,7 +134,7 @@ class PartialPoseGraph:
         ]
         return PartialPoseGraph(layers, self.Js)
 
-    def up_to(self, J: float) -> "PartialPoseGraph":
+    def up_to(self, J: float) -> PartialPoseGraph:
         """Those poses whose objective is no greater."""
         kept = self.Js <= J
         last = self.layers[-1].chosen(kept[self.layers[-1].ends])
@@ -161,46 +179,6 @@ class PartialPoseGraph:
             edge = edges[int(np.argmax(ways[layer.origins[edges]]))]
             samples[layer.node], state = layer.samples[edge], int(layer.origins[edge])
         return samples
-
-
-def _prune(layers: list[Layer], Js: np.ndarray) -> tuple[list[Layer], np.ndarray]:
-    """The layers without states that lead nowhere or are led to from nowhere, numbered anew."""
-    origins = [layer.origins for layer in layers[1:]] + [np.arange(len(Js))]
-    reached = [np.array([True])]
-    for layer, following in zip(layers, origins, strict=True):
-        size = int(max(layer.ends.max(initial=0), following.max(initial=-1))) + 1
-        there = np.zeros(size, dtype=np.bool_)
-        there[layer.ends[reached[-1][layer.origins]]] = True
-        reached.append(there)
-    useful = reached[-1][: len(Js)]
-    Js = Js[useful]
-    pruned: list[Layer] = []
-    for layer, there in zip(layers[::-1], reached[-2::-1], strict=True):
-        kept = layer.chosen(useful[layer.ends] & there[layer.origins])
-        ends = (np.cumsum(useful) - 1)[kept.ends]
-        useful = np.zeros(len(there), dtype=np.bool_)
-        useful[kept.origins] = True
-        places = np.cumsum(useful) - 1
-        pruned.insert(0, Layer(kept.node, places[kept.origins], kept.samples, ends))
-    return pruned, Js
-
-
-def single_pose(samples: np.ndarray, J: float) -> PartialPoseGraph:
-    """The set of one pose, samples (nodes,), with objective J."""
-    zero = np.zeros(1, dtype=np.int64)
-    layers = [Layer(node, zero, np.array([t]), zero) for node, t in enumerate(samples)]
-    return PartialPoseGraph(layers, np.array([J]))
-
-
-# What lies outside counts so much where partial poses must be ranked: it stays outside, while what
-# is not covered yet may be covered by a later node.
-_OUTSIDE_WEIGHT = 2
-# More pairs than these are worth a look at what later nodes can really cover; so many poses of a
-# node are tried for it at a time, and where there are more, a disc that holds all will do.
-_FEW_PAIRS, _TRIES = 300, 5000
-# Masks of more words than these get narrower bands, but none narrower than this many pixels.
-_WORDS = 2000
-_LEAST_BAND = 8
 
 
 @dataclass(frozen=True)
@@ -249,12 +227,18 @@ class _BranchAndBound:
         kept_samples: np.ndarray | None,
     ) -> None:
         self.order = body.limb_order
-        self.J_limit = J_limit
-        self.limits = limits
-        self.pictures = _make_pictures(body, views, J_limit)
+        self.J_limit, self.limits = J_limit, limits
+        # Bands so wide that nothing within the limit lies beyond, if masks get no more words than
+        # this; bands are no narrower than 8 pixels.
+        most_words, least_band = 2000, 8
+        sides = (view.mask.shape[i] for view in views for i in (0, 1))
+        band = max(1, int(min(J_limit, max(sides)))) if J_limit >= 1.0 else 0
+        self.pictures = Pictures(body, views, band, in_full=True)
+        while band > least_band and self.pictures.part_starts[-1] > most_words:
+            band //= 2
+            self.pictures = Pictures(body, views, band, in_full=True)
         self.store = PoseStore(body, self.pictures, outside_limit=J_limit, limits=limits)
-        self.expansion = Expansion(self.store)
-        self.nodes = self.expansion.nodes
+        self.nodes = self.store.tree_nodes
         self.reaches = _SubtreeReaches(self.store)
         self._layers: list[Layer] = []
         self._complete = True
@@ -266,7 +250,7 @@ class _BranchAndBound:
 
     def run(self) -> PosesWithin:
         """Place all nodes."""
-        partial = self.expansion.start()
+        partial = self.store.start()
         while len(self._layers) < len(self.nodes):
             try:
                 self.store.reserve()
@@ -303,25 +287,23 @@ class _BranchAndBound:
         if forks or len(partial) == 0:
             node = (forks or waiting)[0]
             partial = self._fit_pairs(partial, node)
-            return partial, node, self._pairs(partial, node)
-        totals = [int(np.diff(self.expansion.groups(partial, node)).sum()) for node in waiting]
+            return partial, node, self.store.pairs(partial, node)
+        totals = [int(np.diff(self.store.groups(partial, node)).sum()) for node in waiting]
         node = waiting[int(np.argmin(totals))]
         partial = self._fit_pairs(partial, node)
-        pairs = self._pairs(partial, node)
-        if min(totals) > _FEW_PAIRS:
+        pairs = self.store.pairs(partial, node)
+        # More pairs than these are worth a look at what later nodes can really cover.
+        if min(totals) > 300:
             for other in waiting:
-                if np.diff(self.expansion.groups(partial, other)).sum() <= self.limits.pairs:
+                if np.diff(self.store.groups(partial, other)).sum() <= self.limits.pairs:
                     pruned = self._pruned_pairs(partial, other, waiting)
                     if len(pruned) < len(pairs):
                         node, pairs = other, pruned
         return partial, node, pairs
 
-    def _pairs(self, partial: PartialPoses, node: int) -> np.ndarray:
-        return all_pairs(self.expansion.groups(partial, node))
-
     def _pruned_pairs(self, partial: PartialPoses, node: int, waiting: Sequence[int]) -> np.ndarray:
         """Those pairs that leave no more than what the waiting nodes can really cover."""
-        pairs = self._pairs(partial, node)
+        pairs = self.store.pairs(partial, node)
         below = self.reaches.child_rows(node, pairs[:, 1])
         others = [
             self.reaches.rows(other, self.store.parents(partial.poses, other))
@@ -339,30 +321,31 @@ class _BranchAndBound:
 
     def _place(self, partial: PartialPoses, node: int, pairs: np.ndarray) -> PartialPoses:
         """Place a node as pairs (p, 2) say, and note the edges."""
-        expansion = self.expansion
-        made = expansion.make(partial, node, pairs, expansion.score(partial, node, pairs))
-        firsts, made, numbers = expansion.choose(
+        store = self.store
+        made = store.make(partial, node, pairs, store.score(partial, node, pairs))
+        firsts, made, numbers = store.choose(
             partial, made, node, pairs, len(pairs), far_matters=True
         )
-        samples = self.store.nodes[node].samples[pairs[:, 1]].astype(np.int64)
+        samples = store.nodes[node].samples[pairs[:, 1]].astype(np.int64)
         if self._kept >= 0:
             own = np.flatnonzero(
                 (pairs[:, 0] == self._kept) & (samples == self._kept_samples[node])
             )
             self._kept = int(numbers[own[0]]) if len(own) else -1
-        room = min(self.limits.states, self.limits.memory // (4 * 8 * self.expansion.words))
+        room = min(self.limits.states, self.limits.memory // (4 * 8 * store.words))
         kept = self._keep(made, np.ones(len(made)), max(1, room))
         places = np.cumsum(kept) - 1
         edges = kept[numbers]
         origins = pairs[edges, 0].astype(np.int64)
-        self._layers.append(make_layer(node, origins, samples[edges], places[numbers[edges]]))
+        layer = Layer(node, origins, samples[edges], places[numbers[edges]])
+        self._layers.append(layer.chosen(np.lexsort((layer.samples, layer.origins))))
         if self._kept >= 0:
             self._kept = int(places[self._kept]) if kept[self._kept] else -1
-        return expansion.with_masks(partial, made.chosen(kept), node, pairs[firsts[kept]])
+        return store.with_masks(partial, made.chosen(kept), node, pairs[firsts[kept]])
 
     def _fit_pairs(self, partial: PartialPoses, node: int) -> PartialPoses:
         """Keep as many of the best as make no more pairs than allowed."""
-        counts = np.diff(self.expansion.groups(partial, node)).ravel()
+        counts = np.diff(self.store.groups(partial, node)).ravel()
         kept = self._keep(partial, counts, self.limits.pairs)
         if kept.all():
             return partial
@@ -379,7 +362,9 @@ class _BranchAndBound:
         alive = partial.bounds <= self.J_limit
         if counts[alive].sum() <= limit:
             return np.asarray(alive)
-        costs = np.where(alive, partial.costs(_OUTSIDE_WEIGHT), np.iinfo(np.int64).max)
+        # What lies outside counts twice: it stays outside, while what is not covered yet may be
+        # covered by a later node.
+        costs = np.where(alive, partial.costs(2), np.iinfo(np.int64).max)
         if self._kept >= 0:
             costs[self._kept] = np.iinfo(np.int64).min
         order = np.argsort(costs, kind="stable")
@@ -402,12 +387,32 @@ class _SubtreeReaches:
         self._used = 0
         self._rows = [RowTable(1) for _ in store.tree_nodes]
 
-    def rows(self, node: int, parents: np.ndarray) -> np.ndarray:
-        """For poses (n,) of the node's parent the rows of ``table``."""
-        missing = self._rows[node].missing(parents)
-        if len(missing):
-            self._rows[node].make(missing, self._unite(node, missing)[:, None])
-        return self._rows[node].rows[parents, 0]
+    def rows(self, node: int, parents: np.ndarray, tries: int = 5000) -> np.ndarray:
+        """For poses (n,) of the node's parent the rows of ``table``, within the store's limits.
+
+        ``tries``: where more poses of the node are to be tried, a disc that holds all will do.
+        """
+        known, store = self._rows[node], self._store
+        missing = known.missing(parents)
+        if len(missing) == 0:
+            return known.rows[parents, 0]
+        if len(missing) * len(store.body.sampled.values[node]) > tries:
+            places = store.reach_rows(node, missing)
+            groups = np.column_stack([places, places + 1])
+            runs, words, below = store.reach_runs, store.reach_words, NO_CHILDREN
+        else:
+            groups = store.pose_groups(node, missing)
+            below = self.child_rows(node, expand_groups(groups[:, 0], groups[:, 1])[1])
+            runs, words = store.nodes[node].runs, store.nodes[node].words
+        made = np.arange(self._used, self._used + len(missing))
+        self._used += len(missing)
+        if self._used > len(self.table):
+            store.reserve(8 * self._used * self.table.shape[1])
+            more = np.zeros((self._used, self.table.shape[1]), dtype=np.uint64)
+            self.table = np.concatenate([self.table, more])
+        unite(self.table, made, groups, runs, words, len(store.pictures.views), below)
+        known.make(missing, made[:, None])
+        return known.rows[parents, 0]
 
     def child_rows(self, node: int, poses: np.ndarray) -> np.ndarray:
         """(children, all poses) int64 the rows of a node's children at poses (n,) of the node."""
@@ -416,35 +421,3 @@ class _SubtreeReaches:
         for row, child in zip(rows, children, strict=True):
             row[poses] = self.rows(child, poses)
         return rows
-
-    def _unite(self, node: int, parents: np.ndarray) -> np.ndarray:
-        """New rows for poses (n,) of a node's parent, within the store's limits."""
-        store = self._store
-        if len(parents) * len(store.body.sampled.values[node]) > _TRIES:
-            places = store.reach_rows(node, parents)
-            groups = np.column_stack([places, places + 1])
-            runs, words, below = store.reach_runs, store.reach_words, NO_CHILDREN
-        else:
-            groups = store.groups(node, parents)
-            below = self.child_rows(node, expand_groups(groups[:, 0], groups[:, 1])[1])
-            runs, words = store.nodes[node].runs, store.nodes[node].words
-        rows = np.arange(self._used, self._used + len(parents))
-        self._used += len(parents)
-        if self._used > len(self.table):
-            store.reserve(8 * self._used * self.table.shape[1])
-            more = np.zeros((self._used, self.table.shape[1]), dtype=np.uint64)
-            self.table = np.concatenate([self.table, more])
-        unite(self.table, rows, groups, runs, words, len(store.pictures.views), below)
-        return rows
-
-
-def _make_pictures(body: SampledBody, views: Sequence[View], J_limit: float) -> Pictures:
-    """The silhouettes with bands so wide that nothing within the limit lies beyond, if possible."""
-    if J_limit < 1.0:
-        return Pictures(body, views, 0, in_full=True)
-    band = int(min(J_limit, max(view.mask.shape[i] for view in views for i in (0, 1))))
-    while True:
-        pictures = Pictures(body, views, max(1, band), in_full=True)
-        if band <= _LEAST_BAND or pictures.part_starts[-1] <= _WORDS:
-            return pictures
-        band //= 2

@@ -28,13 +28,6 @@ from drake_pose.search.settings import BoundLimits
 from drake_pose.silhouette.bits.bit_kernel import WORD, BitView, draw_bits, make_bit_view
 from drake_pose.silhouette.bits.bounding_balls import draw_discs, prune_by_balls
 
-BAND = 24
-"""How far around a silhouette the union of what lies outside is told from its sum [pixel]."""
-
-# How many poses of a node, and discs that hold what can be reached, are drawn before the limits are
-# looked at again.
-_TRIED_TOGETHER, _REACHES_TOGETHER = 100_000, 20_000
-
 
 class LimitReached(Exception):
     """Raised to leave a search that has no time or no room left."""
@@ -72,12 +65,13 @@ class Pictures:
         everything: (w,) uint64 all pixels of the silhouettes.
 
     Args:
-        band: the width of the band [pixel]; 0: none.
+        band: how far around a silhouette the union of what lies outside is told from its sum
+            [pixel]; 0: nowhere.
         in_full: never simplify a surface, so that areas are those of the definition.
     """
 
     def __init__(
-        self, body: SampledBody, views: Sequence[View], band: int, in_full: bool = False
+        self, body: SampledBody, views: Sequence[View], band: int = 24, in_full: bool = False
     ) -> None:
         self.body, self.views = body, tuple(views)
         self.has_bands = band > 0
@@ -88,7 +82,9 @@ class Pictures:
         ]
         pixels = [int(view.inside[-1, -1]) for view in self.bit_views]
         self.area = float(sum(pixels))
-        self.everything = np.concatenate([_ones(count) for count in pixels])
+        # In as many words as each part has.
+        ones = [np.arange((count // WORD + 1) * WORD) < count for count in pixels]
+        self.everything = np.packbits(np.concatenate(ones), bitorder="little").view(np.uint64)
         if self.has_bands:
             pixels += [int(view.band[-1, -1]) for view in self.bit_views]
         self.part_starts = np.concatenate([[0], np.cumsum([n // WORD + 1 for n in pixels])])
@@ -112,13 +108,6 @@ class Pictures:
             unite_poses(masks, np.arange(len(masks)), runs, words)
             total += areas
         return total
-
-
-def _ones(count: int) -> np.ndarray:
-    """The first ``count`` bits set, in as many words as a part of that many pixels has."""
-    bits = np.zeros((count // WORD + 1) * WORD, dtype=np.uint8)
-    bits[:count] = 1
-    return np.packbits(bits, bitorder="little").view(np.uint64)
 
 
 class RowTable:
@@ -155,192 +144,6 @@ class _Poses:
     areas: np.ndarray
     runs: np.ndarray
     words: np.ndarray
-
-
-class PoseStore:
-    """All poses of nodes with so much of their area outside at most, by parent.
-
-    Args:
-        outside_share: of a node's mean projected area.
-        outside_limit: instead of a share of it, this area [pixel].
-        limits: on what is drawn; methods raise LimitReached where one is reached. None: none.
-    """
-
-    def __init__(
-        self,
-        body: SampledBody,
-        pictures: Pictures,
-        outside_share: float = np.inf,
-        outside_limit: float | None = None,
-        limits: BoundLimits | None = None,
-    ) -> None:
-        self.body, self.pictures, self.limits = body, pictures, limits
-        self.tree_nodes = body.sampled.tree.nodes
-        self.deadline = np.inf if limits is None else limits.deadline
-        self._outside_share, self._outside_limit = outside_share, outside_limit
-        self._reserved = 0
-        parts = len(pictures.part_starts) - 1
-        self.nodes = [
-            _Poses(
-                np.empty(0, dtype=np.int32),
-                np.empty((0, 4, 4)),
-                np.empty((0, 3), dtype=np.int32),
-                np.empty((0, parts, 3), dtype=np.int64),
-                np.empty(0, dtype=np.uint64),
-            )
-            for _ in self.tree_nodes
-        ]
-        # For each node and pose of its parent: where its poses begin and end; and what it reaches.
-        self._groups = [RowTable(2) for _ in self.nodes]
-        self._reach_rows = [RowTable(1) for _ in self.nodes]
-        self.reach_runs = np.empty((0, len(pictures.views), 3), dtype=np.int64)
-        self.reach_words = np.empty(0, dtype=np.uint64)
-
-    def reserve(self, size: int = 0) -> None:
-        """Notes memory [byte]; raises LimitReached where it is too much, or the time is over."""
-        self._reserved += size
-        if self.limits is None:
-            return
-        used = self.reach_runs.nbytes + self.reach_words.nbytes + self._reserved
-        used += sum(array.nbytes for poses in self.nodes for array in vars(poses).values())
-        drawn = sum(len(poses.samples) for poses in self.nodes)
-        late = time.perf_counter() >= self.deadline
-        if late or used > self.limits.memory or drawn > self.limits.poses:
-            raise LimitReached
-
-    def _in_turn(self, missing: np.ndarray, together: int) -> Iterator[np.ndarray]:
-        """Poses (n,) of a parent, so many at a time, within the limits."""
-        for begin in range(0, len(missing), together):
-            self.reserve()
-            yield missing[begin : begin + together]
-
-    def groups(self, node: int, parents: np.ndarray) -> np.ndarray:
-        """Where the node's poses, drawn where missing, begin and end (n, 2) by parent (n,)."""
-        known = self._groups[node]
-        together = max(1, _TRIED_TOGETHER // len(self.body.sampled.X_PN[node]))
-        for missing in self._in_turn(known.missing(parents), together):
-            counts = self._draw(node, missing)
-            ends = len(self.nodes[node].samples) - counts.sum() + np.cumsum(counts)
-            known.make(missing, np.column_stack([ends - counts, ends]))
-        return known.rows[parents]
-
-    def samples(self, poses: np.ndarray) -> np.ndarray:
-        """The samples (..., nodes) that the nodes take at poses (..., nodes)."""
-        return np.stack(
-            [stored.samples[poses[..., i]] for i, stored in enumerate(self.nodes)], axis=-1
-        )
-
-    def reach_rows(self, node: int, parents: np.ndarray) -> np.ndarray:
-        """For poses (n,) of the node's parent the rows of ``reach_runs`` of what it can reach."""
-        known, views = self._reach_rows[node], self.pictures.bit_views
-        ball = self.body.reach_balls[node]
-        for missing in self._in_turn(known.missing(parents), _REACHES_TOGETHER):
-            runs = np.empty((len(missing), len(views), 3), dtype=np.int64)
-            used, pieces = len(self.reach_words), [self.reach_words]
-            X_WP = self._parent_poses(node, missing)
-            for index, view in enumerate(views):
-                view_runs, words = draw_discs(view, X_WP, ball[:3], ball[3])
-                runs[:, index] = view_runs + np.array([self.pictures.part_starts[index], 0, used])
-                used += len(words)
-                pieces.append(words)
-            known.make(missing, len(self.reach_runs) + np.arange(len(missing))[:, None])
-            self.reach_runs = np.concatenate([self.reach_runs, runs])
-            self.reach_words = np.concatenate(pieces)
-        return known.rows[parents, 0]
-
-    def parents(self, poses: np.ndarray, node: int) -> np.ndarray:
-        """The poses (B,) of a node's parent among poses (B, nodes); 0 for a root."""
-        parent = self.tree_nodes[node].parent
-        if parent < 0:
-            return np.zeros(len(poses), dtype=np.int32)
-        return np.asarray(poses[:, parent])
-
-    def reaches(self, poses: np.ndarray, node: int, pairs: np.ndarray) -> Reaches:
-        """What later nodes can reach where pairs (p, 2) of poses (B, nodes) place ``node``."""
-        waiting = self._frontier(poses, node)[1]
-        rows = np.empty((len(waiting), len(pairs)), dtype=np.int64)
-        for i, other in enumerate(waiting if len(pairs) else ()):
-            own = self.tree_nodes[other].parent == node
-            parents = pairs[:, 1] if own else self.parents(poses, other)[pairs[:, 0]]
-            rows[i] = self.reach_rows(other, parents)
-        return Reaches(self.reach_runs, self.reach_words, rows)
-
-    def open_nodes(self, poses: np.ndarray, node: int) -> np.ndarray:
-        """Nodes that have children to come, once ``node`` is placed beside poses (B, nodes)."""
-        return self._frontier(poses, node)[0]
-
-    def _frontier(self, poses: np.ndarray, node: int) -> tuple[np.ndarray, list[int]]:
-        placed = np.flatnonzero(poses[0] >= 0).tolist() if len(poses) else ()
-        return self.body.frontier(frozenset((*placed, node)))
-
-    def _parent_poses(self, node: int, parents: np.ndarray) -> np.ndarray:
-        """X_WP (n, 4, 4) of poses (n,) of the node's parent."""
-        parent = self.tree_nodes[node].parent
-        return np.eye(4)[None] if parent < 0 else self.nodes[parent].X_WN[parents]
-
-    def _draw(self, node: int, parents: np.ndarray) -> np.ndarray:
-        """Draw the node for poses of its parent; returns how many poses each adds."""
-        X_WP = self._parent_poses(node, parents)
-        X_PN = self.body.sampled.X_PN[node]
-        pairs = np.empty((len(X_WP) * len(X_PN), 2), dtype=np.int32)
-        pairs[:, 0] = np.repeat(np.arange(len(X_WP)), len(X_PN))
-        pairs[:, 1] = np.tile(np.arange(len(X_PN)), len(X_WP))
-        if self.body.sampled.tree.source(node) != node:
-            taken = self.nodes[self.tree_nodes[node].parent].samples[parents]
-            pairs = pairs[pairs[:, 1] == taken[pairs[:, 0]]]
-        views, limit = self.pictures.bit_views, self._limit(node)
-        for view in views:
-            left = prune_by_balls(
-                view, X_WP, self.body.p_PB[node], self.body.ball_radii[node], pairs, limit
-            )
-            pairs = pairs[left]
-        drawn: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
-        for index, view in enumerate(views):
-            celled = self.body.celled_outline(
-                node, self.pictures.views[index].camera, self.pictures.coarse
-            )
-            kept, areas, runs, words = draw_bits(celled, view, X_WP, X_PN, pairs, limit)
-            pairs = pairs[kept]
-            drawn = [(a[kept], r[kept], w) for a, r, w in drawn] + [(areas, runs, words)]
-        if len(views) > 1:
-            kept = sum(areas[:, 1:].sum(axis=1) for areas, _, _ in drawn) <= limit
-            pairs = pairs[kept]
-            drawn = [(a[kept], r[kept], w) for a, r, w in drawn]
-        self._append(node, X_WP, pairs, drawn)
-        return np.bincount(pairs[:, 0], minlength=len(X_WP))
-
-    def _limit(self, node: int) -> float:
-        """The area that may lie outside the silhouettes in all views together [pixel]."""
-        if self._outside_limit is not None:
-            return self._outside_limit
-        if self._outside_share in (0.0, np.inf):
-            return self._outside_share
-        areas = [self.body.mean_area(node, view.camera) for view in self.pictures.views]
-        return self._outside_share * sum(areas)
-
-    def _append(
-        self,
-        node: int,
-        X_WP: np.ndarray,
-        pairs: np.ndarray,
-        drawn: list[tuple[np.ndarray, np.ndarray, np.ndarray]],
-    ) -> None:
-        """Add drawn poses to the node's arrays."""
-        poses, starts = self.nodes[node], self.pictures.part_starts
-        runs = np.empty((len(pairs), len(starts) - 1, 3), dtype=np.int64)
-        areas = np.zeros((len(pairs), 3), dtype=np.int32)
-        used = len(poses.words)
-        for index, (view_areas, view_runs, words) in enumerate(drawn):
-            areas += view_areas
-            for kind, part in enumerate(range(index, len(starts) - 1, len(drawn))):
-                runs[:, part] = view_runs[:, kind] + np.array([starts[part], 0, used])
-            used += len(words)
-        X_WN = X_WP[pairs[:, 0]] @ self.body.sampled.X_PN[node][pairs[:, 1]]
-        poses.samples = np.concatenate([poses.samples, pairs[:, 1]])
-        poses.X_WN = np.concatenate([poses.X_WN, X_WN])
-        poses.areas = np.concatenate([poses.areas, areas])
-        poses.runs = np.concatenate([poses.runs, runs])
-        poses.words = np.concatenate([poses.words, *(words for _, _, words in drawn)])
 
 
 @dataclass(frozen=True)
@@ -387,20 +190,173 @@ class PartialPoses:
         return np.asarray(outside_weight * (self.outside + self.lost) - self.covered)
 
 
-class Expansion:
-    """Places nodes in partial poses, from poses that a store draws."""
+class PoseStore:
+    """All poses of nodes with so much of their area outside at most, and what they make together.
 
-    def __init__(self, store: PoseStore) -> None:
-        self.store = store
-        self.nodes = store.body.sampled.tree.nodes
-        self.words = int(store.pictures.part_starts[-1])
+    The one expansion of all searches: it places nodes in partial poses.
+
+    Args:
+        outside_share: of a node's mean projected area.
+        outside_limit: instead of a share of it, this area [pixel].
+        limits: on what is drawn; methods raise LimitReached where one is reached. None: none.
+    """
+
+    def __init__(
+        self,
+        body: SampledBody,
+        pictures: Pictures,
+        outside_share: float = np.inf,
+        outside_limit: float | None = None,
+        limits: BoundLimits | None = None,
+    ) -> None:
+        self.body, self.pictures, self.limits = body, pictures, limits
+        self.tree_nodes = body.sampled.tree.nodes
+        self.deadline = np.inf if limits is None else limits.deadline
+        self._outside_share, self._outside_limit = outside_share, outside_limit
+        self._reserved = 0
+        parts = len(pictures.part_starts) - 1
+        self.nodes = [
+            _Poses(
+                np.empty(0, dtype=np.int32),
+                np.empty((0, 4, 4)),
+                np.empty((0, 3), dtype=np.int32),
+                np.empty((0, parts, 3), dtype=np.int64),
+                np.empty(0, dtype=np.uint64),
+            )
+            for _ in self.tree_nodes
+        ]
+        # For each node and pose of its parent: where its poses begin and end; and what it reaches.
+        self._groups = [RowTable(2) for _ in self.nodes]
+        self._reach_rows = [RowTable(1) for _ in self.nodes]
+        self.reach_runs = np.empty((0, len(pictures.views), 3), dtype=np.int64)
+        self.reach_words = np.empty(0, dtype=np.uint64)
+        self.words = int(pictures.part_starts[-1])
         keys = random_keys(2 * self.words + len(self.nodes) + 2)
         self._mask_keys = keys[: 2 * self.words]
         self._node_keys = keys[2 * self.words : -2]
         self._far_keys = keys[-2:]
 
+    def reserve(self, size: int = 0) -> None:
+        """Notes memory [byte]; raises LimitReached where it is too much, or the time is over."""
+        self._reserved += size
+        if self.limits is None:
+            return
+        used = self.reach_runs.nbytes + self.reach_words.nbytes + self._reserved
+        used += sum(array.nbytes for poses in self.nodes for array in vars(poses).values())
+        drawn = sum(len(poses.samples) for poses in self.nodes)
+        late = time.perf_counter() >= self.deadline
+        if late or used > self.limits.memory or drawn > self.limits.poses:
+            raise LimitReached
+
+    def _in_turn(self, missing: np.ndarray, together: int) -> Iterator[np.ndarray]:
+        """Poses (n,) of a parent, so many at a time, within the limits."""
+        for begin in range(0, len(missing), together):
+            self.reserve()
+            yield missing[begin : begin + together]
+
+    def pose_groups(self, node: int, parents: np.ndarray, together: int = 100_000) -> np.ndarray:
+        """Where the node's poses, drawn where missing, begin and end (n, 2) by parent (n,).
+
+        ``together``: so many are tried before the limits are looked at again.
+        """
+        known = self._groups[node]
+        together = max(1, together // len(self.body.sampled.X_PN[node]))
+        for missing in self._in_turn(known.missing(parents), together):
+            counts = self._draw(node, missing)
+            ends = len(self.nodes[node].samples) - counts.sum() + np.cumsum(counts)
+            known.make(missing, np.column_stack([ends - counts, ends]))
+        return known.rows[parents]
+
+    def samples(self, poses: np.ndarray) -> np.ndarray:
+        """The samples (..., nodes) that the nodes take at poses (..., nodes)."""
+        return np.stack(
+            [stored.samples[poses[..., i]] for i, stored in enumerate(self.nodes)], axis=-1
+        )
+
+    def reach_rows(self, node: int, parents: np.ndarray, together: int = 20_000) -> np.ndarray:
+        """For poses (n,) of the node's parent the rows of ``reach_runs`` of what it can reach.
+
+        ``together``: so many are drawn before the limits are looked at again.
+        """
+        known, views = self._reach_rows[node], self.pictures.bit_views
+        ball = self.body.reach_balls[node]
+        for missing in self._in_turn(known.missing(parents), together):
+            runs = np.empty((len(missing), len(views), 3), dtype=np.int64)
+            used, pieces = len(self.reach_words), [self.reach_words]
+            X_WP = self._parent_poses(node, missing)
+            for index, view in enumerate(views):
+                view_runs, words = draw_discs(view, X_WP, ball[:3], ball[3])
+                runs[:, index] = view_runs + np.array([self.pictures.part_starts[index], 0, used])
+                used += len(words)
+                pieces.append(words)
+            known.make(missing, len(self.reach_runs) + np.arange(len(missing))[:, None])
+            self.reach_runs = np.concatenate([self.reach_runs, runs])
+            self.reach_words = np.concatenate(pieces)
+        return known.rows[parents, 0]
+
+    def parents(self, poses: np.ndarray, node: int) -> np.ndarray:
+        """The poses (B,) of a node's parent among poses (B, nodes); 0 for a root."""
+        parent = self.tree_nodes[node].parent
+        if parent < 0:
+            return np.zeros(len(poses), dtype=np.int32)
+        return np.asarray(poses[:, parent])
+
+    def _parent_poses(self, node: int, parents: np.ndarray) -> np.ndarray:
+        """X_WP (n, 4, 4) of poses (n,) of the node's parent."""
+        parent = self.tree_nodes[node].parent
+        return np.eye(4)[None] if parent < 0 else self.nodes[parent].X_WN[parents]
+
+    def _draw(self, node: int, parents: np.ndarray) -> np.ndarray:
+        """Draw the node for poses of its parent; returns how many poses each adds."""
+        X_WP = self._parent_poses(node, parents)
+        X_PN = self.body.sampled.X_PN[node]
+        pairs = np.empty((len(X_WP) * len(X_PN), 2), dtype=np.int32)
+        pairs[:, 0] = np.repeat(np.arange(len(X_WP)), len(X_PN))
+        pairs[:, 1] = np.tile(np.arange(len(X_PN)), len(X_WP))
+        if self.body.sampled.tree.source(node) != node:
+            taken = self.nodes[self.tree_nodes[node].parent].samples[parents]
+            pairs = pairs[pairs[:, 1] == taken[pairs[:, 0]]]
+        views = self.pictures.bit_views
+        # The area that may lie outside the silhouettes in all views together [pixel].
+        limit = self._outside_share if self._outside_limit is None else self._outside_limit
+        if self._outside_limit is None and 0.0 < limit < np.inf:
+            areas = [self.body.mean_area(node, view.camera) for view in self.pictures.views]
+            limit *= sum(areas)
+        for view in views:
+            left = prune_by_balls(
+                view, X_WP, self.body.p_PB[node], self.body.ball_radii[node], pairs, limit
+            )
+            pairs = pairs[left]
+        drawn: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
+        for index, view in enumerate(views):
+            celled = self.body.celled_outline(
+                node, self.pictures.views[index].camera, self.pictures.coarse
+            )
+            kept, view_areas, view_runs, words = draw_bits(celled, view, X_WP, X_PN, pairs, limit)
+            pairs = pairs[kept]
+            drawn = [(a[kept], r[kept], w) for a, r, w in drawn] + [(view_areas, view_runs, words)]
+        if len(views) > 1:
+            kept = sum(one[:, 1:].sum(axis=1) for one, _, _ in drawn) <= limit
+            pairs = pairs[kept]
+            drawn = [(a[kept], r[kept], w) for a, r, w in drawn]
+        poses, starts = self.nodes[node], self.pictures.part_starts
+        runs = np.empty((len(pairs), len(starts) - 1, 3), dtype=np.int64)
+        total = np.zeros((len(pairs), 3), dtype=np.int32)
+        used = len(poses.words)
+        for index, (view_areas, view_runs, words) in enumerate(drawn):
+            total += view_areas
+            for kind, part in enumerate(range(index, len(starts) - 1, len(drawn))):
+                runs[:, part] = view_runs[:, kind] + np.array([starts[part], 0, used])
+            used += len(words)
+        poses.samples = np.concatenate([poses.samples, pairs[:, 1]])
+        poses.X_WN = np.concatenate([poses.X_WN, X_WP[pairs[:, 0]] @ X_PN[pairs[:, 1]]])
+        poses.areas = np.concatenate([poses.areas, total])
+        poses.runs = np.concatenate([poses.runs, runs])
+        poses.words = np.concatenate([poses.words, *(words for _, _, words in drawn)])
+        return np.bincount(pairs[:, 0], minlength=len(X_WP))
+
     def start(self) -> PartialPoses:
-        """The one that has placed nothing."""
+        """The partial pose that has placed nothing."""
         zero = np.zeros(1, dtype=np.int64)
         return PartialPoses(
             np.zeros((1, self.words), dtype=np.uint64),
@@ -415,10 +371,10 @@ class Expansion:
         start.poses[0] = poses
         start.poses[0, list(nodes)] = -1
         for node in np.flatnonzero(start.poses[0] >= 0):
-            stored, pose = self.store.nodes[node], start.poses[0, node : node + 1]
+            stored, pose = self.nodes[node], start.poses[0, node : node + 1]
             unite_poses(start.masks, pose, stored.runs, stored.words)
             start.outside[0] += int(stored.areas[pose[0], 2])
-        silhouettes = int(self.store.pictures.part_starts[len(self.store.pictures.views)])
+        silhouettes = int(self.pictures.part_starts[len(self.pictures.views)])
         ones = np.bitwise_count(start.masks[0])
         start.covered[0] = ones[:silhouettes].sum()
         start.outside[0] += ones[silhouettes:].sum()
@@ -427,19 +383,24 @@ class Expansion:
 
     def objectives(self, whole: PartialPoses) -> np.ndarray:
         """(B,) what the objective of whole poses is, as far as the pictures show [pixel]."""
-        return np.asarray(self.store.pictures.area - whole.covered + whole.outside)
+        return np.asarray(self.pictures.area - whole.covered + whole.outside)
 
     def groups(self, partial: PartialPoses, node: int) -> np.ndarray:
         """Where the node's poses begin and end (B, 2) that each may take."""
         if len(partial) == 0:
             return np.zeros((0, 2), dtype=np.int64)
-        return self.store.groups(node, self.store.parents(partial.poses, node))
+        return self.pose_groups(node, self.parents(partial.poses, node))
+
+    def pairs(self, partial: PartialPoses, node: int) -> np.ndarray:
+        """(p, 2) int32 each partial pose with each pose that it may take."""
+        groups = self.groups(partial, node)
+        return np.column_stack(expand_groups(groups[:, 0], groups[:, 1])).astype(np.int32)
 
     def score(
         self, partial: PartialPoses, node: int, pairs: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         """Areas newly covered (p, 2) of silhouette and band [pixel], and what hashes gain (p,)."""
-        stored, views = self.store.nodes[node], len(self.store.pictures.views)
+        stored, views = self.nodes[node], len(self.pictures.views)
         return score_pairs(partial.masks, pairs, stored.runs, stored.words, views, self._mask_keys)
 
     def make(
@@ -451,7 +412,7 @@ class Expansion:
     ) -> PartialPoses:
         """What pairs (p, 2), scored, make, without their masks; ``lost`` is not known."""
         areas, added = scores
-        origins, beyond = pairs[:, 0], self.store.nodes[node].areas[pairs[:, 1], 2]
+        origins, beyond = pairs[:, 0], self.nodes[node].areas[pairs[:, 1], 2]
         poses = partial.poses[origins]
         poses[:, node] = pairs[:, 1]
         far = partial.far[origins]
@@ -489,15 +450,22 @@ class Expansion:
             Their indices; themselves, without masks; of each pair looked at the place among
                 them, or -1.
         """
-        is_open = self.store.open_nodes(made.poses, node)
+        placed = np.flatnonzero(partial.poses[0] >= 0).tolist() if len(partial) else ()
+        is_open, waiting = self.body.frontier(frozenset((*placed, node)))
         openings = made.poses[:, is_open].astype(np.uint64) @ self._node_keys[is_open]
         codes = made.hashes + openings
         if far_matters:
             codes += made.far.astype(np.uint64) @ self._far_keys
-        stored = self.store.nodes[node]
+        # What later nodes can reach.
+        rows = np.empty((len(waiting), len(pairs)), dtype=np.int64)
+        for i, other in enumerate(waiting if len(pairs) else ()):
+            own = self.tree_nodes[other].parent == node
+            parents = pairs[:, 1] if own else self.parents(partial.poses, other)[pairs[:, 0]]
+            rows[i] = self.reach_rows(other, parents)
+        stored = self.nodes[node]
         chosen, lost, places = choose_pairs(
-            partial.masks, pairs, stored.runs, stored.words, self.store.pictures.everything,
-            self.store.reaches(partial.poses, node, pairs), width, codes,
+            partial.masks, pairs, stored.runs, stored.words, self.pictures.everything,
+            Reaches(self.reach_runs, self.reach_words, rows), width, codes,
             openings if limit < np.inf else openings[:0], made.least_outside, limit,
         )  # fmt: skip
         return chosen, replace(made.chosen(chosen), lost=lost), places
@@ -506,14 +474,9 @@ class Expansion:
         self, partial: PartialPoses, made: PartialPoses, node: int, pairs: np.ndarray
     ) -> PartialPoses:
         """What pairs made, with the masks."""
-        masks, stored = partial.masks[pairs[:, 0]], self.store.nodes[node]
+        masks, stored = partial.masks[pairs[:, 0]], self.nodes[node]
         unite_poses(masks, pairs[:, 1], stored.runs, stored.words)
         return replace(made, masks=masks)
-
-
-def all_pairs(groups: np.ndarray) -> np.ndarray:
-    """(p, 2) int32 each partial pose with each pose that it may take, by groups (B, 2)."""
-    return np.column_stack(expand_groups(groups[:, 0], groups[:, 1])).astype(np.int32)
 
 
 def expand_groups(begins: np.ndarray, ends: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

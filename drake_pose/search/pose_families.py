@@ -24,7 +24,6 @@ from drake_pose.search.branch_and_bound import (
     PartialPoseGraph,
     PosesWithin,
     branch_and_bound,
-    single_pose,
 )
 from drake_pose.search.estimates import JointEstimate, PoseEstimate, PoseFamily, PoseSet, View
 from drake_pose.search.partial_poses import expand_groups
@@ -234,7 +233,7 @@ def find_families(
         graph = graph.up_to(graph.best_J + tolerance)
     complete = found.complete
     if graph.size == 0.0:
-        graph, complete = single_pose(samples, J), False
+        graph, complete = PartialPoseGraph.of_pose(samples, J), False
     described = _describe(body.sampled, graph, samples, tolerance, complete, most)
     return replace(described, budget_spent=found.limited)
 

@@ -26,8 +26,6 @@ from drake_pose.errors import SettingsError
 from drake_pose.search.beam_search import BeamSearch, grow
 from drake_pose.search.estimates import PoseEstimate, SearchStatistics, View
 from drake_pose.search.partial_poses import (
-    BAND,
-    Expansion,
     PartialPoses,
     Pictures,
     PoseStore,
@@ -184,13 +182,12 @@ class RootPlacementSearch:
         turns = _ROOT_SPARE * _ROOT_FACTOR * quota
         chosen = choose_root_samples(self.body, views, layer.positions, turns, _OUTSIDE_WEIGHT)
         body = place_body(self.body, layer.positions, chosen)
-        store = PoseStore(body, Pictures(body, views, BAND), outside_share)
-        expansion = Expansion(store)
-        last = self._grow(expansion, width, quota, chosen // len(self.sampled.X_PN[0]))
+        store = PoseStore(body, Pictures(body, views), outside_share)
+        last = self._grow(store, width, quota, chosen // len(self.sampled.X_PN[0]))
         if last is None:
             return []
         # As many pixels as in the silhouettes themselves.
-        Js = _area(layer.views) / store.pictures.area * expansion.objectives(last)
+        Js = _area(layer.views) / store.pictures.area * store.objectives(last)
         samples = store.samples(last.poses)
         order = np.argsort(Js, kind="stable")
         firsts = np.sort(np.unique(samples[order, 0], return_index=True)[1])[:_STARTS]
@@ -202,22 +199,22 @@ class RootPlacementSearch:
         return found
 
     def _grow(
-        self, expansion: Expansion, width: int, quota: int, places: np.ndarray
+        self, store: PoseStore, width: int, quota: int, places: np.ndarray
     ) -> PartialPoses | None:
         """Whole poses, no root position having more than its quota at any time.
 
         ``places``: the position of each of the root's samples.
         """
-        hypotheses: PartialPoses | None = expansion.start()
+        hypotheses: PartialPoses | None = store.start()
         factor = _ROOT_FACTOR
         for node in self.body.order:
             if hypotheses is None:
                 break
             spare = _SPARE * factor * width
-            grown, _ = grow(expansion, hypotheses, node, spare, _OUTSIDE_WEIGHT, np.inf)
+            grown, _ = grow(store, hypotheses, node, spare, _OUTSIDE_WEIGHT)
             hypotheses = None
             if grown is not None:
-                roots = expansion.store.nodes[0].samples[grown.poses[:, 0]]
+                roots = store.nodes[0].samples[grown.poses[:, 0]]
                 kept = _within_quota(places[roots], factor * quota)[: factor * width]
                 hypotheses = grown.chosen(kept)
             factor = 1

@@ -20,7 +20,6 @@ from scipy.spatial import cKDTree
 
 from drake_pose.errors import SettingsError
 from drake_pose.search.branch_and_bound import (
-    Layer,
     PartialPoseGraph,
     PosesWithin,
     branch_and_bound,
@@ -29,8 +28,6 @@ from drake_pose.search.estimates import JointEstimate, PoseEstimate, PoseFamily,
 from drake_pose.search.partial_poses import expand_groups
 from drake_pose.search.sampled_body import SampledBody, SampledTree
 from drake_pose.search.settings import BoundLimits
-
-_ROUNDING = 1e-6
 
 
 def grid_steps(grid: np.ndarray) -> np.ndarray:
@@ -73,7 +70,7 @@ def estimate_joints(
             if around[k]:
                 values = _joined(values, float(about[i][k]), float(steps[k]))
             known = complete or np.isinf(steps[k])
-            determined = bool(known and np.ptp(values) <= steps[k] * (1.0 + _ROUNDING))
+            determined = bool(known and np.ptp(values) <= steps[k] * (1.0 + 1e-6))
             margin = 0.5 * steps[k] if determined else 0.0
             low, high = float(values[0] - margin), float(values[-1] + margin)
             if not around[k]:
@@ -87,27 +84,12 @@ def _joined(values: np.ndarray, about: float, step: float) -> np.ndarray:
     full = 2.0 * np.pi
     gaps = np.diff(values, append=values[0] + full)
     widest = int(np.argmax(gaps))
-    if len(values) == 1 or gaps[widest] <= step * (1.0 + _ROUNDING):
+    if len(values) == 1 or gaps[widest] <= step * (1.0 + 1e-6):
         return values
     first = (widest + 1) % len(values)
     risen = np.concatenate([values[first:], values[:first] + full])
     turns = np.round((about - 0.5 * (risen[0] + risen[-1])) / full)
     return np.asarray(risen + full * turns)
-
-
-_NEIGHBOUR = 1.01
-_ALIKE = 1e-6
-# Beyond this many pairs of a state and a family, later nodes are not told apart any more.
-_MOST_PAIRS = 200_000
-
-
-@dataclass(frozen=True)
-class GraphFamily:
-    """A family of a graph: clusters (nodes,) int64, count of poses, smallest J [pixel]."""
-
-    clusters: np.ndarray
-    size: float
-    J: float
 
 
 def cluster_samples(sampled: SampledTree, node: int, samples: np.ndarray) -> np.ndarray:
@@ -125,10 +107,10 @@ def cluster_samples(sampled: SampledTree, node: int, samples: np.ndarray) -> np.
     turns = np.where(around, 2.0 * np.pi / steps, 0.0)
     scaled = np.where(turns > 0.0, np.mod(scaled, np.where(turns > 0.0, turns, 1.0)), scaled)
     tree = cKDTree(scaled - np.where(turns > 0.0, 0.0, scaled.min(axis=0)), boxsize=turns)
-    near = tree.query_pairs(_NEIGHBOUR, p=np.inf, output_type="ndarray")
+    near = tree.query_pairs(1.01, p=np.inf, output_type="ndarray")
     # With two axes in line, other values place the node alike.
     X_PN = sampled.X_PN[node][samples, :3].reshape(len(samples), -1)
-    alike = cKDTree(X_PN).query_pairs(_ALIKE, output_type="ndarray")
+    alike = cKDTree(X_PN).query_pairs(1e-6, output_type="ndarray")
     links = np.vstack([near, alike])
     ones = np.ones(len(links))
     graph = coo_array((ones, (links[:, 0], links[:, 1])), shape=(len(samples), len(samples)))
@@ -136,47 +118,40 @@ def cluster_samples(sampled: SampledTree, node: int, samples: np.ndarray) -> np.
     return labels
 
 
-def split_into_families(graph: PartialPoseGraph, labels: list[np.ndarray]) -> list[GraphFamily]:
-    """The families of a graph by clusters of samples, best first, of equals the larger first."""
+def split_into_families(
+    graph: PartialPoseGraph, labels: list[np.ndarray], most_pairs: int = 200_000
+) -> list[tuple[float, float, np.ndarray]]:
+    """The families of a graph by clusters of samples: J [pixel], poses, clusters (nodes,).
+
+    Best first, of equals the larger first. ``most_pairs``: beyond so many pairs of a state and a
+    family, later nodes are not told apart any more.
+    """
     states, families = np.zeros(1, dtype=np.int64), np.zeros(1, dtype=np.int64)
     sizes: np.ndarray = np.ones(1)
     clusters = np.zeros((1, len(labels)), dtype=np.int64)
     for layer in graph.layers:
         found = labels[layer.node][layer.samples]
-        several = found.max(initial=0) > 0 and len(states) < _MOST_PAIRS
-        ends, codes, weights = _bundle(layer, found if several else np.zeros_like(found))
-        origins, bundle_starts = codes
-        begins = np.searchsorted(origins, states)
-        source, edge = expand_groups(begins, np.searchsorted(origins, states, side="right"))
-        pairs = np.column_stack([families[source], bundle_starts[edge]])
+        several = found.max(initial=0) > 0 and len(states) < most_pairs
+        # Edges alike in origin, cluster and end are one.
+        keys = np.column_stack([layer.origins, found if several else 0 * found, layer.ends])
+        bundles, weights = np.unique(keys, axis=0, return_counts=True)
+        begins = np.searchsorted(bundles[:, 0], states)
+        after = np.searchsorted(bundles[:, 0], states, side="right")
+        source, edge = expand_groups(begins, after)
+        pairs = np.column_stack([families[source], bundles[edge, 1]])
         known, families = np.unique(pairs, axis=0, return_inverse=True)
         clusters = clusters[known[:, 0]]
         clusters[:, layer.node] = known[:, 1]
-        keys = np.column_stack([ends[edge], families.ravel()])
+        keys = np.column_stack([bundles[edge, 2], families.ravel()])
         merged, places = np.unique(keys, axis=0, return_inverse=True)
         sizes = np.bincount(places.ravel(), sizes[source] * weights[edge], minlength=len(merged))
         states, families = merged[:, 0], merged[:, 1]
-    found = []
+    split = []
     for family in np.unique(families):
         own = families == family
         J = float(graph.Js[states[own]].min())
-        found.append(GraphFamily(clusters[family], float(sizes[own].sum()), J))
-    return sorted(found, key=lambda family: (family.J, -family.size))
-
-
-def _bundle(
-    layer: Layer, labels: np.ndarray
-) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray], np.ndarray]:
-    """Edges alike in origin, cluster and end as one: ends, (origins, clusters), how many each."""
-    keys = np.column_stack([layer.origins, labels, layer.ends])
-    bundles, counts = np.unique(keys, axis=0, return_counts=True)
-    return bundles[:, 2], (bundles[:, 0], bundles[:, 1]), counts.astype(np.float64)
-
-
-# The share of the contours' pixels that noise may turn.
-_CONTOUR_SHARE = 0.05
-# The share of them that two renderers draw differently on average.
-_RENDERERS_DIFFER = 0.001
+        split.append((J, float(sizes[own].sum()), clusters[family]))
+    return sorted(split, key=lambda one: (one[0], -one[1]))
 
 
 @dataclass(frozen=True)
@@ -226,7 +201,7 @@ def find_families(
         tolerance = within.J_limit - J
     elif tolerance is None:
         exact = renderer_tolerance(views)
-        tolerance = exact - J if J <= exact else _CONTOUR_SHARE * contour_length(views)
+        tolerance = exact - J if J <= exact else 0.05 * contour_length(views)
     found = within or branch_and_bound(body, views, J + tolerance, limits, samples)
     graph = found.graph
     if graph.best_J < J:
@@ -234,8 +209,29 @@ def find_families(
     complete = found.complete
     if graph.size == 0.0:
         graph, complete = PartialPoseGraph.of_pose(samples, J), False
-    described = _describe(body.sampled, graph, samples, tolerance, complete, most)
-    return replace(described, budget_spent=found.limited)
+    sampled, described = body.sampled, []
+    seen = graph.samples_seen()
+    labels = [cluster_samples(sampled, node, own) for node, own in enumerate(seen)]
+    families = split_into_families(graph, labels)
+    for family_J, size, clusters in families[:most]:
+        own = graph.restricted(
+            [label == cluster for label, cluster in zip(labels, clusters, strict=True)]
+        )
+        # The pose given stands for its own family if it is a best one.
+        first = samples if own.objective(samples) == family_J else own.central()
+        values = sampled.values_at(first)
+        joints = estimate_joints(sampled, own.samples_seen(), values, complete=complete)
+        described.append(PoseFamily.of_values(sampled.tree, values, family_J, joints, size))
+    return GridPoseSet(
+        families=tuple(described),
+        joints=estimate_joints(sampled, seen, described[0].node_values, complete=complete),
+        tolerance=tolerance,
+        complete=complete,
+        family_count=len(families),
+        graph=graph,
+        sampled=sampled,
+        budget_spent=found.limited,
+    )
 
 
 def samples_at(sampled: SampledTree, node_values: Sequence[np.ndarray]) -> np.ndarray | None:
@@ -267,53 +263,8 @@ def renderer_tolerance(views: Sequence[View]) -> float:
     areas that are scored: .1 % of the contour's pixels on average for pictures of 80 to 1280
     pixels, one independently of the other. This is five standard deviations above that.
     """
-    expected = _RENDERERS_DIFFER * contour_length(views)
+    expected = 0.001 * contour_length(views)
     return math.floor(expected + 5.0 * math.sqrt(expected) + 1.0)
-
-
-def _describe(
-    sampled: SampledTree,
-    graph: PartialPoseGraph,
-    samples: np.ndarray,
-    tolerance: float,
-    complete: bool,
-    most: int,
-) -> GridPoseSet:
-    """The set that a graph holds; ``samples`` stands for its own family if it is a best one."""
-    labels = [
-        cluster_samples(sampled, node, seen) for node, seen in enumerate(graph.samples_seen())
-    ]
-    families = split_into_families(graph, labels)
-    described = []
-    for family in families[:most]:
-        own = graph.restricted(
-            [label == cluster for label, cluster in zip(labels, family.clusters, strict=True)]
-        )
-        described.append(_describe_family(sampled, own, family, samples, complete))
-    return GridPoseSet(
-        families=tuple(described),
-        joints=estimate_joints(
-            sampled, graph.samples_seen(), described[0].node_values, complete=complete
-        ),
-        tolerance=tolerance,
-        complete=complete,
-        family_count=len(families),
-        graph=graph,
-        sampled=sampled,
-        budget_spent=False,
-    )
-
-
-def _describe_family(
-    sampled: SampledTree,
-    graph: PartialPoseGraph,
-    family: GraphFamily,
-    samples: np.ndarray,
-    complete: bool,
-) -> PoseFamily:
-    values = sampled.values_at(samples if graph.objective(samples) == family.J else graph.central())
-    joints = estimate_joints(sampled, graph.samples_seen(), values, complete=complete)
-    return PoseFamily.of_values(sampled.tree, values, family.J, joints, family.size)
 
 
 @dataclass(frozen=True)

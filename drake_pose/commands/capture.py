@@ -10,17 +10,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 from drake_pose.commands.estimate import estimate, print_estimate
 from drake_pose.commands.options import (
     SPREAD,
-    CaptureWorkers,
     Json,
     Out,
     Overlay,
     Replay,
     Resume,
-    Scheduler,
     Truth,
-    live_scene,
     within,
-    workers_of,
 )
 from drake_pose.commands.terminal import (
     FrameProgress,
@@ -35,10 +31,10 @@ from drake_pose.files.settings import CaptureSettings, EstimateSettings, changed
 from drake_pose.jobs.live.settings import CaptureMethod, LiveSettings
 
 if TYPE_CHECKING:
-    from distributed import Client
     from rich.table import Table
 
     from drake_pose.jobs.live.frame_results import LiveResult
+    from drake_pose.systems.person.live_capture import LiveSensors
 
 
 def capture(
@@ -50,8 +46,6 @@ def capture(
     method: CaptureMethod = "person",
     settings: Annotated[CaptureSettings | None, SPREAD] = None,
     live: Annotated[LiveSettings | None, SPREAD] = None,
-    workers: CaptureWorkers = 0,
-    scheduler: Scheduler = None,
     truth: Truth = None,
     resume: Resume = False,
     overlay: Overlay = True,
@@ -79,8 +73,7 @@ def capture(
     of_masks = bool(truth or resume or set(changed(settings)) - {"packages"})
     # The name of SOURCES; its module would make every command's start slow.
     has_sources = (scene / "sources.yaml").is_file()
-    on_workers = bool(workers or scheduler)
-    _check(scene, method, of_masks, has_sources, live, on_workers)
+    _check(scene, method, of_masks, has_sources, live)
     if method == "person" and not has_sources:
         from drake_pose.jobs.estimate.inputs import bundled_person
 
@@ -92,8 +85,7 @@ def capture(
         )  # fmt: skip
         return
     live = replace(live, replay=replay, packages=settings.packages)
-    with workers_of(workers, scheduler) as client:
-        _print_result(_capture_live(scene, out, model, method, live, client), json)
+    _print_result(_capture_live(scene, out, model, method, live), json)
 
 
 def _check(
@@ -102,14 +94,13 @@ def _check(
     of_masks: bool,
     has_sources: bool,
     live: LiveSettings,
-    on_workers: bool,
 ) -> None:
     """Refuses options that do not go together."""
-    of_person = bool(live.shape or not live.fit_shape or on_workers)
+    of_person = bool(live.shape or not live.fit_shape)
     if method != "person" and (of_masks or of_person):
         raise UsageError(
-            "--camera, --frame, --every, --truth, --start, --no-track, --resume, --shape, "
-            "--no-fit-shape, --workers and --scheduler are for --method person"
+            "--camera, --frame, --every, --truth, --start, --no-track, --resume, --shape "
+            "and --no-fit-shape are for --method person"
         )
     if method == "person" and live.faces is not None:
         raise UsageError("--face-camera and --faces are for --method stages and paper")
@@ -118,7 +109,7 @@ def _check(
             "--camera, --frame, --every, --truth, --start, --no-track and --resume are for a "
             f"folder of masks or pictures; {scene} has a sources.yaml"
         )
-    if method == "person" and not has_sources and (on_workers or live != LiveSettings()):
+    if method == "person" and not has_sources and live != LiveSettings():
         raise UsageError(f"{scene} has no sources.yaml, which that option is for")
 
 
@@ -147,11 +138,10 @@ def _capture_live(
     model: Path | None,
     method: CaptureMethod,
     settings: LiveSettings,
-    client: Client | None,
 ) -> LiveResult:
-    """Captures as the pictures come, here or on workers, or by the paper's stages."""
+    """Captures as the pictures come, by all silhouettes at once or by the paper's stages."""
     from drake_pose.jobs.live.capture import capture_live
-    from drake_pose.jobs.live.scene import is_live_scene
+    from drake_pose.jobs.live.scene import hush_opencv, is_live_scene, load_live_scene
 
     if method != "person" and folder.is_dir() and not is_live_scene(folder):
         raise SceneError(
@@ -159,8 +149,11 @@ def _capture_live(
             "which masks do not show: name the pictures and those of the empty room there"
         )
     with FrameProgress() as progress:
-        tolerance = {"tolerance": settings.tolerance}
-        scene, sensors = live_scene(folder, client, tolerance, tolerance)
+        hush_opencv()
+        scene = load_live_scene(folder)
+
+        def sensors() -> LiveSensors:
+            return scene.open_sensors(tolerance=settings.tolerance)
 
         def show(count: int, _: bool) -> None:
             progress.show_stage("frames", count, None)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
@@ -13,13 +13,7 @@ from drake_pose.commands.terminal import UsageError, warn
 from drake_pose.files.options import within
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from distributed import Client
-
-    from drake_pose.jobs.live.scene import LiveScene
-    from drake_pose.systems.person.live_capture import LiveSensors
-
 
 SPREAD = Parameter("*")
 """The fields of a settings class are options."""
@@ -46,16 +40,6 @@ Truth = Annotated[
     ),
 ]
 Seed = Annotated[int, within(0), Parameter(help="Seed of the random numbers.")]
-CaptureWorkers = Annotated[
-    int,
-    within(0),
-    Parameter(
-        "--workers",
-        metavar="N",
-        help="Number of worker processes on this machine that process the pictures of a "
-        "sources.yaml, each those of its own cameras; 0: none, this process does it.",
-    ),
-]
 Scheduler = Annotated[
     str | None,
     Parameter(
@@ -96,23 +80,3 @@ def workers_of(
         if scheduler is not None:
             require_fit_workers(client, shared)
         yield client
-
-
-def live_scene(
-    folder: Path, client: Client | None, here: dict[str, Any], there: dict[str, Any]
-) -> tuple[LiveScene, Callable[[], LiveSensors]]:
-    """A scene of live cameras, and what opens them: in this process, or on workers."""
-    from drake_pose.jobs.live.scene import hush_opencv, load_live_scene
-
-    hush_opencv()
-    # Workers may have another working folder.
-    scene = load_live_scene(folder if client is None else folder.absolute())
-
-    def sensors() -> LiveSensors:
-        if client is None:
-            return scene.open_sensors(**here)
-        from drake_pose.jobs.cluster.remote_views import ClusterSensors
-
-        return ClusterSensors(client, scene, **there)
-
-    return scene, sensors

@@ -11,12 +11,8 @@ from cyclopts import Parameter
 from drake_pose.commands.options import (
     SPREAD,
     Browser,
-    CaptureWorkers,
     Json,
-    Scheduler,
-    live_scene,
     within,
-    workers_of,
 )
 from drake_pose.commands.terminal import UsageError, print_json, say, warn
 from drake_pose.errors import SettingsError
@@ -24,7 +20,6 @@ from drake_pose.files.settings import Packages
 from drake_pose.jobs.live.settings import LiveSettings, Seconds, Shape
 
 if TYPE_CHECKING:
-    from distributed import Client
     from pydrake.geometry import Meshcat
 
     from drake_pose.jobs.live.walk import Player
@@ -43,8 +38,6 @@ class WalkOptions:
     live: Annotated[Path | None, Parameter(metavar="FOLDER")] = None
     """Walk as the person before live cameras: folder with sources.yaml."""
     shape: Shape = None
-    workers: CaptureWorkers = 0
-    scheduler: Scheduler = None
     method: Literal["stance", "paper"] = "stance"
     """stance: standing ahead or behind walks; paper: only while walking on the spot."""
     model: Path | None = None
@@ -70,8 +63,8 @@ class WalkOptions:
         return self.method == "paper"
 
     def __post_init__(self) -> None:
-        if self.live is None and (self.workers or self.scheduler or self.shape):
-            raise SettingsError("--shape, --workers and --scheduler are for --live")
+        if self.live is None and self.shape:
+            raise SettingsError("--shape is for --live")
         if self.package and self.model is None:
             raise SettingsError("--package is for --model")
         if self.rate == 0.0:
@@ -105,26 +98,25 @@ def walk(
         raise UsageError("--rate is for a result")
     from drake_pose.jobs.live import walk as walking
 
-    with workers_of(options.workers, options.scheduler) as client:
-        if options.live is not None:
-            player = _live_player(options.live, options, client)
-        elif result is not None:
-            player = walking.recorded_player(result, options.model, options.rate, options.package)
-        else:
-            player = walking.simulated_player() if options.simulate else walking.key_player()
-        waits = player.q is not None and (options.browser if options.wait is None else options.wait)
-        page = _open_page(options, waits)
+    if options.live is not None:
+        player = _live_player(options.live, options)
+    elif result is not None:
+        player = walking.recorded_player(result, options.model, options.rate, options.package)
+    else:
+        player = walking.simulated_player() if options.simulate else walking.key_player()
+    waits = player.q is not None and (options.browser if options.wait is None else options.wait)
+    page = _open_page(options, waits)
 
-        def ask() -> bool:
-            if waits and options.seconds is None:
-                say("drake-pose: the end; space or the page's button plays it again, Ctrl-C ends")
-                return walking.wait_for_replay(page)
-            return False
+    def ask() -> bool:
+        if waits and options.seconds is None:
+            say("drake-pose: the end; space or the page's button plays it again, Ctrl-C ends")
+            return walking.wait_for_replay(page)
+        return False
 
-        walked = walking.walk(
-            player, page, options.seconds, options.speed, _say_command, ask, options.on_spot,
-            lambda text: say(f"drake-pose: {text}"),
-        )  # fmt: skip
+    walked = walking.walk(
+        player, page, options.seconds, options.speed, _say_command, ask, options.on_spot,
+        lambda text: say(f"drake-pose: {text}"),
+    )  # fmt: skip
     for text in walked.get("warnings", ()):
         warn(text)
     if json:
@@ -133,14 +125,14 @@ def walk(
         say(f"drake-pose: {walking.summary_line(walked)}")
 
 
-def _live_player(folder: Path, options: WalkOptions, client: Client | None) -> Player:
+def _live_player(folder: Path, options: WalkOptions) -> Player:
     """Walks with the cameras of a folder."""
+    from drake_pose.jobs.live.scene import hush_opencv, load_live_scene
     from drake_pose.jobs.live.walk import live_player
 
     settings = LiveSettings(shape=options.shape, packages=options.package)
-    # A recording cannot be skipped from afar as fast as its moments pass: it is waited for.
-    scene, sensors = live_scene(folder, client, {"live": True}, {})
-    return live_player(scene, options.model, settings, sensors)
+    hush_opencv()
+    return live_player(load_live_scene(folder), options.model, settings)
 
 
 def _open_page(options: WalkOptions, waits: bool = False) -> Meshcat:

@@ -10,7 +10,7 @@ import math
 import struct
 import zlib
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import cv2
@@ -25,17 +25,14 @@ from drake_pose.fit.contour_fit import (
     CameraSum,
     Comparison,
     ContourFit,
-    EdgeKeeper,
-    SumRequest,
     Views,
     add_cameras,
-    add_sums,
     compare_placed,
     pack_cameras,
     pack_views,
     pixels_per_metre,
 )
-from drake_pose.fit.evidence import EdgePoints, find_edge_points, pack_evidence
+from drake_pose.fit.evidence import EdgePoints, find_edge_points
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.fit.parameters import Placement
 from drake_pose.person.rays import triangulate
@@ -154,21 +151,11 @@ _LEVEL = 1
 
 
 @dataclass(frozen=True, eq=False)
-class KeptEdge:
-    """Who keeps a view's edge elsewhere. camera: its name; time: the picture's stamp [s]."""
-
-    keeper: EdgeKeeper
-    camera: str
-    time: float
-
-
-@dataclass(frozen=True, eq=False)
 class SilhouetteView:
-    """A camera's region (H, W), points of its edge, and who else can compare contours with it."""
+    """A camera's region (H, W) and points of its edge."""
 
     region: Mask
     edge: EdgePoints
-    kept: KeptEdge | None = None
 
     @property
     def height(self) -> int:
@@ -208,19 +195,18 @@ def pack_view(view: SilhouetteView) -> bytes:
     return header + bits + numbers.astype("<f8").tobytes()
 
 
-def unpack_view(data: bytes, kept: KeptEdge | None = None) -> SilhouetteView:
+def unpack_view(data: bytes) -> SilhouetteView:
     """The view that was packed; region and edge are unpacked when they are looked at first."""
-    return _PackedView(data, kept)
+    return _PackedView(data)
 
 
 class _PackedView(SilhouetteView):
-    """A view that is unpacked no more than it must: who adds up sums needs no pictures."""
+    """A view whose region and edge are unpacked when they are looked at first."""
 
     _data: bytes
 
-    def __init__(self, data: bytes, kept: KeptEdge | None) -> None:
+    def __init__(self, data: bytes) -> None:
         object.__setattr__(self, "_data", data)
-        object.__setattr__(self, "kept", kept)
 
     @property
     def height(self) -> int:
@@ -256,7 +242,6 @@ class FrameViews:
 
     cameras: Sequence[Camera]
     views: Sequence[SilhouetteView]
-    _packed: dict[tuple[int, ...], Views] = field(default_factory=dict, init=False, repr=False)
 
     @property
     def pairs(self) -> list[tuple[Camera, SilhouetteView]]:
@@ -275,56 +260,17 @@ class FrameViews:
 
     def add_up(self, fit: ContourFit) -> AddUp:
         """What compares a body's contours with all cameras, as `fit` weighs them, and adds up."""
-        here = tuple(k for k, view in enumerate(self.views) if view.kept is None)
 
         def total(placement: Placement, step: AnnealingStage) -> CameraSum:
-            weights = fit.weights(self._arrays, placement, step)
-            asked = [
-                (keeper, index, keeper.ask(self._request(index, placement, weights)))
-                for keeper, index in self._kept
-            ]
-            parts = [self._compared(here, placement, weights)] if here or not asked else []
-            for keeper, index, is_asked in asked:
-                answer = keeper.answer() if is_asked else None
-                parts.append(answer or self._compared(index, placement, weights))
-            return parts[0] if len(parts) == 1 else add_sums(parts, len(placement.X_WN))
+            views = self._packed
+            weights = fit.weights(views.cameras, placement, step)
+            return add_cameras(*compare_placed(placement.packed, placement.X_WN, views, weights))
 
         return total
 
     @cached_property
-    def _arrays(self) -> tuple[Array, Array]:
-        return pack_cameras(self.cameras)
-
-    @cached_property
-    def _kept(self) -> list[tuple[EdgeKeeper, tuple[int, ...]]]:
-        """Who keeps edges elsewhere, and of which cameras."""
-        found: dict[int, tuple[EdgeKeeper, list[int]]] = {}
-        for k, view in enumerate(self.views):
-            if view.kept is not None:
-                keeper = view.kept.keeper
-                found.setdefault(id(keeper), (keeper, []))[1].append(k)
-        return [(keeper, tuple(index)) for keeper, index in found.values()]
-
-    def _request(self, index: tuple[int, ...], placement: Placement, weights: Array) -> SumRequest:
-        kept = [one for k in index if (one := self.views[k].kept) is not None]
-        chosen = list(index)
-        return SumRequest(
-            [one.camera for one in kept],
-            np.array([one.time for one in kept]),
-            (self._arrays[0][chosen], self._arrays[1][chosen]),
-            weights[chosen],
-            placement.packed,
-            placement.X_WN,
-        )
-
-    def _compared(self, index: tuple[int, ...], placement: Placement, weights: Array) -> CameraSum:
-        """Some cameras compared in this process, and added up."""
-        chosen = list(index)
-        if index not in self._packed:
-            cameras = self._arrays[0][chosen], self._arrays[1][chosen]
-            self._packed[index] = Views(cameras, pack_evidence([self.views[k].edge for k in index]))
-        packed, X_WN = placement.packed, placement.X_WN
-        return add_cameras(*compare_placed(packed, X_WN, self._packed[index], weights[chosen]))
+    def _packed(self) -> Views:
+        return pack_views(self.cameras, [view.edge for view in self.views])
 
     @cached_property
     def seers(self) -> list[int]:

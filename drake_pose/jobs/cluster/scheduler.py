@@ -1,4 +1,4 @@
-"""Workers on this machine or on others, by Dask (the extra `cluster`), and who watches what."""
+"""Workers on this machine or on others, by Dask (the extra `cluster`)."""
 
 from __future__ import annotations
 
@@ -7,16 +7,13 @@ import hashlib
 import logging
 import os
 import tempfile
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-import numpy as np
-
 from drake_pose import version
-from drake_pose.camera.frame_source import SourceSpecification
 from drake_pose.errors import ClusterError
 
 if TYPE_CHECKING:
@@ -42,7 +39,7 @@ _CONFIGURATION = {
 
 def has_dask() -> bool:
     """Whether the extra ``cluster`` is installed."""
-    return all(find_spec(name) for name in ("distributed", "zmq"))
+    return find_spec("distributed") is not None
 
 
 @contextmanager
@@ -60,7 +57,7 @@ def open_cluster(workers: int | None = None, scheduler: str | None = None) -> It
     """
     if not has_dask():
         raise ClusterError(
-            'workers need Dask distributed and pyzmq: pip install "drake_pose[cluster]"; or do '
+            'workers need Dask distributed: pip install "drake_pose[cluster]"; or do '
             "without them: --workers 0"
         )
     opened = _embedded(workers) if scheduler is None else _connected(scheduler)
@@ -219,54 +216,3 @@ def require_fit_workers(client: Client, out: Path | None = None) -> None:
 def address_of(client: Client) -> str:
     """A client's scheduler, for messages."""
     return "its address" if client.scheduler is None else str(client.scheduler.address)
-
-
-def host_of(address: str) -> str:
-    """The machine of a worker's address."""
-    return address.split("://")[-1].rsplit(":", 1)[0]
-
-
-class CameraAssignment(NamedTuple):
-    """Cameras that one worker looks through. hosts: where; empty: anywhere."""
-
-    specifications: tuple[SourceSpecification, ...]
-    hosts: frozenset[str] = frozenset()
-
-    def allows(self, address: str) -> bool:
-        """Whether the worker of an address can look through them."""
-        return not self.hosts or host_of(address) in self.hosts
-
-
-def assign_cameras(
-    specifications: Sequence[SourceSpecification], workers: Mapping[str, Collection[str]]
-) -> list[CameraAssignment]:
-    """Shares cameras out among workers.
-
-    Recordings and cameras in a network can be opened anywhere. A camera that hangs on a machine is
-    looked through by the workers there: where workers run on several machines, those that were
-    started with a resource of the camera's name (``workers``: those names by address).
-
-    Raises:
-        ClusterError: there is no worker, or nobody says where a camera is.
-    """
-    if not workers:
-        raise ClusterError("there are no workers to watch cameras; start some")
-    all_hosts = sorted({host_of(address) for address in workers})
-    groups: dict[frozenset[str], list[SourceSpecification]] = {}
-    for one in specifications:
-        hosts: frozenset[str] = frozenset()
-        if len(all_hosts) > 1 and one.live and "://" not in one.location:
-            hosts = frozenset(host_of(a) for a, names in workers.items() if one.camera in names)
-            if not hosts:
-                raise ClusterError(
-                    f"camera '{one.camera}' hangs on one of {', '.join(all_hosts)}, and nobody "
-                    f'says on which: start a worker there with --resources "{one.camera}=1"'
-                )
-        groups.setdefault(hosts, []).append(one)
-    assignments = []
-    for hosts, group in groups.items():
-        count = sum(not hosts or host_of(address) in hosts for address in workers)
-        # Neighbours stay together.
-        for part in np.array_split(np.arange(len(group)), min(count, len(group))):
-            assignments.append(CameraAssignment(tuple(group[k] for k in part), hosts))
-    return assignments

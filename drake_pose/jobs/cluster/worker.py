@@ -18,23 +18,15 @@ import tempfile
 import threading
 import time
 from contextlib import suppress
-from typing import IO, TYPE_CHECKING
+from typing import IO
 
 from drake_pose.errors import ClusterError
-
-if TYPE_CHECKING:
-    from distributed import Worker
 
 # Between two looks of a child whether its parent is there [s].
 _LOOK = 0.2
 # How much of what a child said last is looked at [byte].
 _TAIL = 4096
 _local = threading.local()
-
-
-def worker_resources(dask_worker: Worker) -> tuple[str, ...]:
-    """The names of the resources that the worker that is asked was started with."""
-    return tuple(dask_worker.state.total_resources)
 
 
 def call_in_child(payload: bytes) -> bytes:

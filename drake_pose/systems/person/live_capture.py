@@ -137,7 +137,7 @@ def build_live_capture(
     sensors: LiveSensors,
     with_deviations: bool = False,
 ) -> Diagram:
-    """Cameras' pictures, or what workers elsewhere make of them, to a person's poses.
+    """Cameras' pictures to a person's poses.
 
     The diagram's outputs are those of PersonTracker, and ``silhouette_<camera>``, its inputs; the
     arguments but the sensors are those of add_person_tracker, as are the errors.

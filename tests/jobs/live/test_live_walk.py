@@ -44,28 +44,19 @@ def test_person_before_the_cameras_walks_is_lost_and_found_again(studio, person)
     assert 0.6 < found["found_share"] < 0.95
 
 
-@pytest.mark.parametrize(
-    "more", [["--seconds", "1.5"], pytest.param(["--workers", "2"], marks=pytest.mark.slow)]
-)
-def test_recordings_are_walked_as_if_live(studio, person, more):
+def test_recordings_are_walked_as_if_live(studio, person):
     words = ["walk", "--live", str(studio), "--model", str(person.path), "--no-browser", "--json"]
-    done = run_command([*words, *more])
+    done = run_command([*words, "--seconds", "1.5"])
     assert done.exit_code == 0, done.output
     found = json.loads(done.stdout)
     assert set(found["commands"]) == {"turn left", "turn right", "walk ahead", "walk behind"}
     assert "http://localhost:" in done.stderr
-    if "--seconds" in more:
-        assert 0.0 < found["seconds"] < 2.5
-        return
-    # Recordings lose nothing with workers, however busy the computer is.
-    assert found["commands"]["walk ahead"] == pytest.approx((2 * AHEAD + 2) / RATE_HZ, abs=0.4)
-    assert found["seconds"] > REST / RATE_HZ
+    assert 0.0 < found["seconds"] < 2.5
 
 
 def test_wrong_usage_is_refused(studio, tmp_path):
     live = ["--live", str(studio)]
-    both = [*live, "--workers", "2", "--scheduler", "a"]
-    for words in ([*live, "--simulate"], ["--workers", "2"], both):
+    for words in ([*live, "--simulate"], ["--shape", str(studio)]):
         assert run_command(["walk", *words, "--no-browser"]).exit_code == 2
     done = run_command(["walk", "--live", str(tmp_path), "--no-browser"])
     assert done.exit_code == 1

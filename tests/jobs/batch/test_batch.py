@@ -177,7 +177,7 @@ def test_everything_listens_on_the_loopback_address(cluster):
         if connection.status == psutil.CONN_LISTEN
     ]
     assert len(listening) >= 3
-    assert set(listening) == {"127.0.0.1"}
+    assert all(ip.startswith("127.") for ip in listening)
 
 
 def test_workers_must_be_like_this_program(cluster, tmp_path, monkeypatch):

@@ -1,8 +1,11 @@
 """README, CONTRIBUTING and the pages under tutorials: links, examples, commands, formats."""
 
+import os
 import pkgutil
 import re
 import shlex
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -66,6 +69,21 @@ def test_python_examples_run(
     printed = capsys.readouterr().out
     assert printed
     assert "nan" not in printed
+
+
+@pytest.mark.slow
+def test_a_camera_reaches_another_process_by_lcm() -> None:
+    """The two programs of a page, on a port of this test's own."""
+    camera, matcher = (
+        code.replace(":7667", f":{20000 + os.getpid() % 10000}")
+        for code in blocks(TEXTS["tutorials/cluster.md"], "py")
+    )
+    with subprocess.Popen([sys.executable, "-c", camera], cwd=ROOT) as process:
+        try:
+            found = subprocess.check_output([sys.executable, "-c", matcher], cwd=ROOT, text=True)
+        finally:
+            process.kill()
+    assert 0.0 < float(found.split()[-1]) < 0.15
 
 
 @pytest.mark.slow

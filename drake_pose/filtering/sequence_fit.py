@@ -18,12 +18,8 @@ from drake_pose.filtering.contour_tracker import ContourObservation, ContourTrac
 from drake_pose.fit.contour_fit import Noise
 from drake_pose.fit.evidence import find_edge_points
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
-from drake_pose.fit.proportions import (
-    FittedProportions,
-    ProportionedBody,
-    SequencePrior,
-    fit_proportions,
-)
+from drake_pose.fit.problem import Solution
+from drake_pose.fit.proportions import ProportionedBody, fit_proportions, sequence_prior
 from drake_pose.fit.surfaces import few_rigid_triangles
 from drake_pose.search import JointEstimate, PoseFamily, PoseSet, joint_estimates
 from drake_pose.silhouette.areas.bending import TreeSurfaces
@@ -168,17 +164,21 @@ def _judged(
 
 @dataclass(frozen=True, eq=False)
 class FittedSequence:
-    """One explanation of a sequence: its proportions, and its pose in every frame."""
+    """One explanation of a sequence: its proportions, and its pose in every frame.
+
+    deviations: (frames, k) of the tree's values and ROOT_NAMES.
+    """
 
     body: ProportionedBody
-    fitted: FittedProportions
+    fitted: Solution
+    deviations: Array
 
     def estimates(self, frame: int) -> tuple[JointEstimate, ...]:
         """What is known of each of the tree's values in a frame."""
         kinematics = self.body.kinematics
         count, around = len(kinematics.names), kinematics.turns_around
         values = self.fitted.parameters[frame, :count]
-        half = 1.96 * self.fitted.deviations[frame, :count]
+        half = 1.96 * self.deviations[frame, :count]
         half = np.where(around, np.minimum(half, np.pi), half)
         low = np.where(around, values - half, np.maximum(values - half, kinematics.lower))
         high = np.where(around, values + half, np.minimum(values + half, kinematics.upper))
@@ -206,32 +206,36 @@ def fit_sequence(
     picked = np.arange(0, len(masks), step, dtype=np.intp)
     camera = observation.cameras[0]
 
-    def fit(frames: Indices, begin: Array, last: bool) -> FittedProportions:
+    def fit(frames: Indices, begin: Array, last: bool) -> FittedSequence:
         apart = period * float(frames[1] - frames[0])
         worth = min(1.0, apart / SEQUENCE.memory)
         noise = Noise(SEQUENCE.deviation, SEQUENCE.correlation / worth)
-        prior, rounds = (
-            _sequence_prior(tracker, apart),
-            SEQUENCE.rounds[-1:] if last else SEQUENCE.rounds,
-        )
+        rounds = SEQUENCE.rounds[-1:] if last else SEQUENCE.rounds
+        usual, rest_time = observation.usual, tracker.settings.rest_time
+        information = (0.0 if rest_time is None else apart / rest_time) / usual.deviation**2
+        names = observation.layout.moving
+        accelerations = np.array([tracker.acceleration(name) for name in names]) * apart**2
+        prior = sequence_prior(len(frames), (usual.phi, usual.mean, information), accelerations)
         seen = [edges[k] for k in frames.tolist()]
-        return fit_proportions(body, camera, seen, begin, rounds, noise, prior)
+        limits = _limits(observation)
+        found = fit_proportions(body, camera, seen, begin, rounds, noise, limits, prior)
+        return FittedSequence(body, *found)
 
     coarse = []
     for states in starts[: SEQUENCE.fitted_starts]:
         begin = np.array([observation.parameters(states[k]) for k in picked.tolist()])
         coarse.append(fit(picked, begin, False))
-    coarse.sort(key=lambda one: one.cost)
-    kept: list[FittedProportions] = []
+    coarse.sort(key=lambda one: one.fitted.cost)
+    kept: list[FittedSequence] = []
     for one in coarse:
-        near = one.cost <= SEQUENCE.worse_fit * coarse[0].cost
-        if near and not any(_are_same(body, one, other) for other in kept):
+        near = one.fitted.cost <= SEQUENCE.worse_fit * coarse[0].fitted.cost
+        if near and not any(_are_same(one, other) for other in kept):
             kept.append(one)
     if step == 1:
-        return [FittedSequence(body, one) for one in kept]
+        return kept
     every = np.arange(len(masks), dtype=np.intp)
     return [
-        FittedSequence(body, fit(every, _interpolated(every, picked, one.parameters), True))
+        fit(every, _interpolated(every, picked, one.fitted.parameters[:, : len(body.names)]), True)
         for one in kept
     ]
 
@@ -261,11 +265,11 @@ def pose_set(
     return PoseSet(tuple(families), joints, 0.0, False, len(families))
 
 
-def _are_same(body: ProportionedBody, one: FittedProportions, other: FittedProportions) -> bool:
+def _are_same(one: FittedSequence, other: FittedSequence) -> bool:
     """Whether two fits are the same explanation: no value is far off in all frames together."""
-    kinematics = body.kinematics
+    kinematics = one.body.kinematics
     count = len(kinematics.names)
-    values, others = one.parameters[:, :count], other.parameters[:, :count]
+    values, others = one.fitted.parameters[:, :count], other.fitted.parameters[:, :count]
     off = (kinematics.nearest_turns(values, others) - others)[:, kinematics.is_angle]
     return bool(np.sqrt(np.square(off).mean(axis=0)).max(initial=0.0) < SEQUENCE.same)
 
@@ -276,12 +280,9 @@ def _are_determined(kinematics: TreeKinematics, low: Array, high: Array) -> Arra
     return np.asarray(high - low < 0.5 * ranges)
 
 
-def _sequence_prior(tracker: ContourTracker, period: float) -> SequencePrior:
-    """What a tracker knows of frames that are a time apart [s]."""
-    observation, rest_time = tracker.observation, tracker.settings.rest_time
-    names = list(observation.layout.moving)
-    usual, limits = observation.usual, observation.inequalities()
-    worth = 0.0 if rest_time is None else period / rest_time
+def _limits(observation: ContourObservation) -> tuple[Array, Array]:
+    """(p,) lower and upper limits of what moves."""
+    names, limits = list(observation.layout.moving), observation.inequalities()
     lower, upper = np.full(len(names), -np.inf), np.full(len(names), np.inf)
     for phi, b in zip(limits.for_columns(names).phi, limits.b, strict=True):
         if np.count_nonzero(phi) == 1:
@@ -290,15 +291,7 @@ def _sequence_prior(tracker: ContourTracker, period: float) -> SequencePrior:
                 upper[k] = min(upper[k], b / phi[k])
             else:
                 lower[k] = max(lower[k], b / phi[k])
-    accelerations = np.array([tracker.acceleration(name) for name in names])
-    return SequencePrior(
-        phi=usual.phi,
-        mean=usual.mean,
-        information=worth / usual.deviation**2,
-        acceleration=accelerations * period**2,
-        lower=lower,
-        upper=upper,
-    )
+    return lower, upper
 
 
 def _interpolated(every: Indices, picked: Indices, parameters: Array) -> Array:

@@ -246,10 +246,12 @@ class ContourFit:
             return Equations(H[np.ix_(index, index)][None], g[index][None], cost)
 
         limits = self.lower[index], self.upper[index]
-        found = minimise(evaluate, current[index][None], np.zeros(0), limits, rounds, self.steps)
+        own, _, cost, evaluations = minimise(
+            evaluate, current[index][None], np.zeros(0), limits, rounds, self.steps
+        )
         fitted = current.copy()
-        fitted[index] = found.own[0]
-        return PoseFit(fitted, sums, found.cost, found.evaluations)
+        fitted[index] = own[0]
+        return PoseFit(fitted, sums, cost, evaluations)
 
     def compare(
         self, views: Views, theta: Array, step: AnnealingStage, widths: bool = False

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_pose.arrays import Array, Mask
+from drake_pose.arrays import Array, Mask, Picture
 from drake_pose.compiled import compiled
 
 
@@ -49,18 +49,21 @@ class Evidence(NamedTuple):
     starts: NDArray[np.int64]
 
 
-class FrameEvidence(NamedTuple):
-    """All that a frame tells.
+class Observation(NamedTuple):
+    """What cameras see of a body in one frame, and what is known of its joints then.
 
     Attributes:
         edges: of its silhouettes, camera after camera.
+        values: (k,) known values of the first k parameters of a ``Problem``, such as encoders'
+            readings [rad or m]; the others are 0.
         odds: of each camera a picture (H, W, 3) whose colours are odds (``fit.background``), or
             None; empty: of none.
-        rates: (m,) how fast the pose tree's values change [rad/s or m/s]; None: nobody knows.
+        rates: (m,) velocities of the pose tree's values [rad/s or m/s]; None: not known.
     """
 
     edges: Evidence
-    odds: tuple[NDArray[np.uint8] | None, ...] = ()
+    values: Array = np.zeros(0)
+    odds: tuple[Picture | None, ...] = ()
     rates: Array | None = None
 
 

@@ -84,7 +84,7 @@ class Equations:
 
 
 @dataclass(frozen=True, eq=False)
-class Coupling:
+class LinearPrior:
     """Linear combinations of all frames' own unknowns x (frames p,), and what is known of them.
 
     Attributes:
@@ -109,23 +109,6 @@ class Coupling:
         return csc_array(self.rows.T @ diags_array(self.information) @ self.rows)
 
 
-@dataclass(frozen=True, eq=False)
-class Minimum:
-    """Where a minimisation ended.
-
-    Attributes:
-        own: (frames, p) each frame's own unknowns.
-        shared: (q,) those of all frames.
-        cost: at the last evaluation: before the last step, if that was taken untried.
-        evaluations: how often the equations were asked for.
-    """
-
-    own: Array
-    shared: Array
-    cost: float
-    evaluations: int
-
-
 def minimise(
     evaluate: Callable[[Array, Array, AnnealingStage], Equations],
     own: Array,
@@ -133,8 +116,8 @@ def minimise(
     limits: tuple[Array, Array],
     rounds: Sequence[AnnealingStage],
     settings: StepSettings | None = None,
-    coupling: Coupling | None = None,
-) -> Minimum:
+    coupling: LinearPrior | None = None,
+) -> tuple[Array, Array, float, int]:
     """The unknowns with the least cost near where they start, inside their limits.
 
     Args:
@@ -145,6 +128,10 @@ def minimise(
         rounds: one after another.
         settings: how steps are made.
         coupling: what is known of the own unknowns of several frames together.
+
+    Returns:
+        own and shared unknowns; the cost at the last evaluation, which is before the last step
+        where that was taken untried; and the number of evaluations.
     """
     settings = settings or StepSettings()
     curvature = None if coupling is None else coupling.curvature()
@@ -178,7 +165,7 @@ def minimise(
                 if damping > settings.most_damping:
                     break
         damping = min(damping, settings.next_damping)
-    return Minimum(own, shared, float(cost), evaluations)
+    return own, shared, float(cost), evaluations
 
 
 def damped_step(

@@ -7,14 +7,17 @@ other way, in its own picture alone.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from drake_pose.arrays import Array, Indices
-from drake_pose.body.tree.tree_kinematics import TreeKinematics
+from drake_pose.body.model import OBJECT_POSITIONS
+from drake_pose.body.tree.link_graph import chain_transforms
+from drake_pose.body.tree.pose_tree import PoseTree
+from drake_pose.body.tree.tree_kinematics import JointOffset, TreeKinematics, joint_offsets
 from drake_pose.camera.models import Camera
 from drake_pose.compiled import compiled
 from drake_pose.silhouette.areas.bending import PackedSurfaces, TreeSurfaces
@@ -64,12 +67,17 @@ class Placement(NamedTuple):
 
 
 class BodyParameters:
-    """A body's parameters: its tree's values, then ROOT_NAMES, then the logarithms of its girths.
+    """A body's parameters.
+
+    They are its tree's values, ROOT_NAMES, the logarithms of its girths, and the logarithms of its
+    links' scales. A scaled link carries its joints farther from its own joint, along their offsets;
+    its surface stays as it is, and all behind such a joint is shifted.
 
     Attributes:
         kinematics: the pose tree's.
         outlines: a surface for each node.
         groups: (nodes,) which girth each node has, or -1.
+        links: the links with a scale, in the order of their parameters.
         names: of the n parameters.
 
     Args:
@@ -80,6 +88,7 @@ class BodyParameters:
         girth_names: of the girths.
         surfaces: the pose tree's, where bands of skin shall bend with the values; the outlines are
             these at rest then, and there are no girths.
+        offsets: joints whose origins move as their links are scaled.
     """
 
     def __init__(
@@ -89,41 +98,90 @@ class BodyParameters:
         groups: Sequence[int] | None = None,
         girth_names: Sequence[str] = (),
         surfaces: TreeSurfaces | None = None,
+        offsets: Sequence[JointOffset] = (),
     ) -> None:
         bends = surfaces is not None and surfaces.bends
         self._bending = PackedSurfaces(surfaces) if surfaces is not None and bends else None
         self.kinematics, self.outlines = kinematics, tuple(outlines)
+        self.links = tuple(dict.fromkeys(one.link for one in offsets))
         nodes, count = len(self.outlines), len(kinematics.names) + len(ROOT_NAMES)
         made_by = kinematics.parameters
         self.groups = np.full(nodes, -1) if groups is None else np.array(groups)
         girths = tuple(f"{GIRTH_PREFIX}{name}" for name in girth_names)
-        self.names = (*kinematics.names, *ROOT_NAMES, *girths)
+        lengths = tuple(length_name(link) for link in self.links)
+        self.names = (*kinematics.names, *ROOT_NAMES, *girths, *lengths)
         self._packed = pack(self.outlines)
         values = kinematics.flatten(kinematics.tree.default_values())
         moves = kinematics.motions(values, translation=True, scale=True).moves
         self._rooted = moves[:, -1]
-        self._of_root = np.arange(len(made_by)) < np.count_nonzero(kinematics.value_nodes == 0)
         self._values_only = owners_of(moves[:, :-4], made_by)
         self._wide = np.flatnonzero(self.groups >= 0)
+        self._offsets, self._first_length = tuple(offsets), count + len(girths)
+        self._scaled = np.array([self.links.index(one.link) for one in offsets], dtype=np.intp)
+        self._find_behind()
+        # What moves the root moves the point about which the body grows.
+        of_root = np.arange(len(made_by)) < np.count_nonzero(kinematics.value_nodes == 0)
+        self._of_root = np.concatenate([of_root, self._behind[0]])
         self._all = owners_of(
-            np.hstack([moves, np.eye(nodes, dtype=np.bool_)[:, self._wide]]),
-            np.concatenate([made_by, np.arange(count - 4, count), count + self.groups[self._wide]]),
-        )
+            np.hstack(
+                [
+                    moves[:, :-4], self._behind, moves[:, -4:],
+                    np.eye(nodes, dtype=np.bool_)[:, self._wide],
+                ]
+            ),
+            np.concatenate(
+                [
+                    made_by, self._first_length + self._scaled, np.arange(count - 4, count),
+                    count + self.groups[self._wide],
+                ]
+            ),
+        )  # fmt: skip
+
+    def _find_behind(self) -> None:
+        """Which nodes are behind each joint whose origin moves, and which joints' axes move."""
+        kinematics, offsets = self.kinematics, self._offsets
+        self._behind = np.zeros((len(self.outlines), len(offsets)), dtype=np.bool_)
+        self._shifted = np.zeros((len(kinematics.parameters), len(offsets)), dtype=np.bool_)
+        if not offsets:
+            return
+        for i, node in enumerate(kinematics.tree.nodes):
+            if node.parent >= 0:
+                self._behind[i] = self._behind[node.parent]
+            self._behind[i] |= [one.node == i for one in offsets]
+        for i, placement in enumerate(kinematics.tree.placements):
+            first = kinematics.packed.value_starts[i]
+            for k, step in enumerate(placement.steps):
+                last = first + step.joint_map.position_count
+                # Walked inwards, a joint comes before its offset.
+                before = [one.node != i or one.step + one.inverted <= k for one in offsets]
+                self._shifted[first:last] = self._behind[i] & before
+                first = last
 
     def place(self, theta: Array) -> Placement:
         """The body at its tree's values (m,), or at all parameters (n,)."""
         count = len(self.kinematics.names)
         at = self.kinematics.motions(theta[:count])
-        affine = affine_motions(at.twists)
         if len(theta) == count:
+            affine = affine_motions(at.twists)
             return Placement(self._at(theta), at.X_WN, affine, *self._values_only)
-        root, growth = at.X_WN[0, :3, 3], float(np.exp(theta[count + 3]))
+        X_WN, twists = at.X_WN.copy(), at.twists
+        if self._offsets:
+            offsets = self._offsets_in_world(theta[:count], at.X_WN)
+            scale = np.exp(theta[self._first_length :])[self._scaled][:, None]
+            shifts = (scale - 1.0) * offsets
+            X_WN[:, :3, 3] += self._behind @ shifts
+            twists = twists.copy()
+            # A joint whose origin is shifted turns about another axis.
+            twists[:, 3:6] -= np.cross(twists[:, :3], self._shifted @ shifts)
+            moved = np.zeros((len(offsets), 7))
+            moved[:, 3:6] = scale * offsets
+            twists = np.vstack([twists, moved])
+        affine = affine_motions(twists)
+        root, growth = X_WN[0, :3, 3].copy(), float(np.exp(theta[count + 3]))
         moved = theta[count : count + 3] + (1.0 - growth) * root
-        X_WN = at.X_WN.copy()
+        X_WN[self._rooted, :3, 3] = moved + growth * X_WN[self._rooted, :3, 3]
         X_WN[self._rooted, :3, :3] *= growth
-        X_WN[self._rooted, :3, 3] = moved + growth * at.X_WN[self._rooted, :3, 3]
         M, v = affine.reshape(-1, 3, 4)[:, :, :3], affine.reshape(-1, 3, 4)[:, :, 3]
-        # What moves the root moves the point about which the body has grown.
         held = (1.0 - growth) * (M @ root + v) * self._of_root[:, None]
         twists = np.zeros((4, 7))
         twists[:3, 3:6] = np.eye(3)
@@ -132,17 +190,48 @@ class BodyParameters:
         packed = self._at(theta[:count])
         if len(self._wide):
             scale = np.ones((len(X_WN), 3))
-            girths = np.exp(theta[count + 4 :])[self.groups[self._wide]]
+            girths = np.exp(theta[count + 4 : self._first_length])[self.groups[self._wide]]
             scale[self._wide, 0] = scale[self._wide, 2] = girths
             packed = stretched(packed, scale)
-            motions.append(np.array([_widening(X) for X in X_WN[self._wide]]))
+            widening = np.zeros((len(self._wide), 3, 4))
+            for own, X in zip(widening, X_WN[self._wide], strict=True):
+                across = X[:3, [0, 2]]
+                own[:, :3] = across @ across.T / (across[:, 0] @ across[:, 0])
+                own[:, 3] = -own[:, :3] @ X[:3, 3]
+            motions.append(widening.reshape(-1, 12))
         return Placement(packed, X_WN, np.vstack(motions), *self._all)
 
     def _at(self, values: Array) -> PackedOutlines:
         """The surfaces at the tree's values (m,)."""
-        if self._bending is None:
-            return self._packed
-        return self._bending.at(values)
+        return self._packed if self._bending is None else self._bending.at(values)
+
+    def _offsets_in_world(self, values: Array, X_WN: Array) -> Array:
+        """(offsets, 3) at the tree's values (m,), nothing scaled."""
+        tree, split = self.kinematics.tree, self.kinematics.split(values)
+        found = np.zeros((len(self._offsets), 3))
+        for k, one in enumerate(self._offsets):
+            placement, parent = tree.placements[one.node], tree.nodes[one.node].parent
+            R_WA = placement.X_PA[:3, :3] if parent < 0 else X_WN[parent, :3, :3]
+            if one.step + one.inverted > 0:
+                steps = placement.steps[: one.step + one.inverted]
+                own = tree.step_values(one.node, split[tree.source(one.node)][None])
+                R_WA = R_WA @ chain_transforms(steps, own)[0, :3, :3]
+            found[k] = R_WA @ one.p_A
+        return found
+
+
+def length_name(link: str) -> str:
+    """The name of the logarithm of a link's scale among the parameters."""
+    return f"length of {link}"
+
+
+def lengthened_joints(tree: PoseTree, links: Collection[str] | None = None) -> list[JointOffset]:
+    """The robot's joints that links, all where None, carry at a distance from their own."""
+    return [
+        one
+        for one in joint_offsets(tree)
+        if (links is None or one.link in links) and one.joint not in OBJECT_POSITIONS
+    ]
 
 
 class CameraParameters:
@@ -223,15 +312,6 @@ def owners_of(moves: NDArray[np.bool_], parameters: Indices) -> tuple[Indices, I
     """
     owners = np.nonzero(moves)[1].astype(np.int64)
     return np.cumsum([0, *moves.sum(axis=1)]), owners, parameters[owners]
-
-
-def _widening(X_WN: Array) -> Array:
-    """The affine motion (12,) of a part that grows across its y axis, per relative growth."""
-    M = np.zeros((3, 4))
-    across = X_WN[:3, [0, 2]]
-    M[:, :3] = across @ across.T / (across[:, 0] @ across[:, 0])
-    M[:, 3] = -M[:, :3] @ X_WN[:3, 3]
-    return M.reshape(-1)
 
 
 def stretched(packed: PackedOutlines, scale: Array) -> PackedOutlines:

@@ -10,21 +10,19 @@ joints keep their meaning.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array, diags_array, eye_array, kron, vstack
 
-from drake_pose.arrays import Array, Indices
+from drake_pose.arrays import Array
 from drake_pose.body.model import ArticulatedModel
-from drake_pose.body.tree.tree_kinematics import Motions, TreeKinematics, joint_offsets
+from drake_pose.body.tree.tree_kinematics import TreeKinematics, joint_offsets
 from drake_pose.camera.models import Camera
 from drake_pose.errors import ModelError
 from drake_pose.fit.contour_fit import Noise
-from drake_pose.fit.evidence import EdgePoints, pack_evidence
-from drake_pose.fit.frames_fit import FramesFit
-from drake_pose.fit.levenberg_marquardt import AnnealingStage, Coupling
+from drake_pose.fit.evidence import EdgePoints, Observation, pack_evidence
+from drake_pose.fit.levenberg_marquardt import AnnealingStage, LinearPrior
 from drake_pose.fit.parameters import (
     ROOT_NAMES,
     BodyParameters,
@@ -34,17 +32,8 @@ from drake_pose.fit.parameters import (
     owners_of,
     stretched,
 )
-from drake_pose.fit.unknowns import Unknowns, choose, join
+from drake_pose.fit.problem import Problem, Solution, Unknowns
 from drake_pose.silhouette.areas.bending import TreeSurfaces
-from drake_pose.silhouette.areas.outline import PackedOutlines
-
-LENGTH_PREFIX, WIDTH_PREFIX, PLACE_PREFIX = "log_length_", "log_width_", "joint_place_"
-"""Begin the names of the logarithms of how much longer a part is, and of how much wider a part or
-all parts of a limb are; and of how far along a part its own joint lies, over the part's length."""
-
-# Of the logarithms of lengths and widths, as people differ, and of where a joint lies along its
-# part, over the part's length: standard deviations.
-_LENGTH_DEVIATION, _WIDTH_DEVIATION, _PLACE_DEVIATION = 0.15, 0.1, 0.15
 
 
 class ProportionedBody(BodyParameters):
@@ -82,8 +71,8 @@ class ProportionedBody(BodyParameters):
             else:
                 self.limbs[i] = len(firsts)
                 firsts.append(node.name)
-        self.length_names = tuple(f"{LENGTH_PREFIX}{node.name}" for node in nodes)
-        self.width_names = tuple(f"{WIDTH_PREFIX}{name}" for name in firsts)
+        self.length_names = tuple(f"log_length_{node.name}" for node in nodes)
+        self.width_names = tuple(f"log_width_{name}" for name in firsts)
         self._joints = {
             offset.node: offset.joint
             for offset in joint_offsets(kinematics.tree)
@@ -93,7 +82,7 @@ class ProportionedBody(BodyParameters):
             and nodes[offset.node].name in firsts
         }
         self.placed = np.array(sorted(self._joints), dtype=np.intp)
-        self.place_names = tuple(f"{PLACE_PREFIX}{nodes[i].name}" for i in self.placed)
+        self.place_names = tuple(f"joint_place_{nodes[i].name}" for i in self.placed)
         self.names = (
             *kinematics.names,
             *ROOT_NAMES,
@@ -103,27 +92,23 @@ class ProportionedBody(BodyParameters):
         )
         self.axes, self._along, self._rest = self._find_axes()
         self._parents = np.array([node.parent for node in nodes])
-        self._owners = self._find_owners()
-
-    def _find_owners(self) -> tuple[Indices, Indices, Indices]:
-        """Which nodes each motion of `place` moves, in its order, and which parameter makes it."""
-        count, nodes = len(self.kinematics.names) + len(ROOT_NAMES), len(self._parents)
-        every = np.arange(nodes)
-        values = self.kinematics.flatten(self.kinematics.tree.default_values())
-        below = np.eye(nodes, dtype=np.bool_)
+        # Which nodes each motion of `place` moves, in its order, and which parameter makes it.
+        count, every = len(kinematics.names) + len(ROOT_NAMES), np.arange(len(nodes))
+        values = kinematics.flatten(kinematics.tree.default_values())
+        below = np.eye(len(nodes), dtype=np.bool_)
         for i, parent in enumerate(self._parents):
             below[i] |= (parent >= 0) & below[parent]
         hanging = np.flatnonzero(self._parents >= 0)
-        lengths, widths = count + every, count + nodes + self.limbs
+        lengths, widths = count + every, count + len(nodes) + self.limbs
         by = self._parents[hanging]
         places = len(self.names) - len(self.placed) + np.arange(len(self.placed))
         own, hung = every[:, None] == every, below[:, hanging]
         moves = (
-            self.kinematics.motions(values).moves, np.ones((nodes, 4), np.bool_), own, own,
+            kinematics.motions(values).moves, np.ones((len(nodes), 4), np.bool_), own, own,
             hung, hung, below[:, self.placed],
         )  # fmt: skip
         made_by = np.arange(count), lengths, widths, lengths[by], widths[by], places
-        return owners_of(np.hstack(moves), np.concatenate(made_by))
+        self._owners = owners_of(np.hstack(moves), np.concatenate(made_by))
 
     def _find_axes(self) -> tuple[NDArray[np.int64], Array, Array]:
         """(nodes,) axes; (nodes, 3) [m] along them how long, and the same at rest in the parent."""
@@ -173,7 +158,7 @@ class ProportionedBody(BodyParameters):
     def joint_places(self, theta: Array) -> Array:
         """(nodes,) how far along each part its joint is moved, over the part's length."""
         shares = np.zeros(len(self.limbs))
-        shares[self.placed] = theta[len(self.names) - len(self.placed) :]
+        shares[self.placed] = theta[len(self.names) - len(self.placed) : len(self.names)]
         return shares
 
     def place(self, theta: Array) -> Placement:
@@ -197,7 +182,20 @@ class ProportionedBody(BodyParameters):
                 places[i] += shares[i] * (R[node.parent] @ self._rest[i])
         shift, growth = theta[count : count + 3], float(np.exp(theta[count + 3]))
         moved = places[0] + shift - growth * places[0]
-        M, v = self._moving(at_rest, maps, places, growth)
+        # M (k, 3, 3) and v (k, 3) that values, the root's shift and its growth make: what is moved
+        # by M p + v has not grown about the root yet, nor is it shifted.
+        nodes = kinematics.value_nodes
+        affine = affine_motions(at_rest.twists).reshape(-1, 3, 4)
+        turned = affine[:, :, :3]
+        velocity = np.einsum("kij,kj->ki", turned, at_rest.X_WN[nodes, :3, 3]) + affine[:, :, 3]
+        # The first root is what carries nothing stretched.
+        by = np.concatenate([maps, np.eye(3)[None]])[self._parents[nodes]]
+        velocity = np.einsum("kij,kj->ki", by, velocity)
+        of_values = velocity - np.einsum("kij,kj->ki", turned, places[nodes])
+        # What moves the root moves the point about which the body has grown.
+        of_values += (1.0 / growth - 1.0) * velocity * (nodes == 0)[:, None]
+        M = [turned, np.zeros((3, 3, 3)), np.eye(3)[None]]
+        v = [of_values, np.eye(3) / growth, -places[:1]]
         hanging = np.flatnonzero(self._parents >= 0)
         along = R[np.arange(len(R)), :, self.axes]
         long = along[:, :, None] * along[:, None]
@@ -216,86 +214,40 @@ class ProportionedBody(BodyParameters):
         X_WN[:, :3, :3] *= growth
         X_WN[:, :3, 3] = moved + growth * places
         packed = stretched(self._at(theta[:count]), scale)
-        self._move_flesh(packed, -self._along * shares[:, None])
-        motions = affine_of(all_M, growth * all_v - all_M @ moved)
-        return Placement(packed, X_WN, motions, *self._owners)
-
-    def _moving(
-        self, at_rest: Motions, maps: Array, places: Array, growth: float
-    ) -> tuple[list[Array], list[Array]]:
-        """M (k, 3, 3) and v (k, 3) that values, the root's shift and its growth make.
-
-        What is moved by M p + v has not grown about the root yet, nor is it shifted.
-        """
-        nodes = self.kinematics.value_nodes
-        affine = affine_motions(at_rest.twists).reshape(-1, 3, 4)
-        M = affine[:, :, :3]
-        velocity = np.einsum("kij,kj->ki", M, at_rest.X_WN[nodes, :3, 3]) + affine[:, :, 3]
-        # The first root is what carries nothing stretched.
-        by = np.concatenate([maps, np.eye(3)[None]])[self._parents[nodes]]
-        velocity = np.einsum("kij,kj->ki", by, velocity)
-        v = velocity - np.einsum("kij,kj->ki", M, places[nodes])
-        # What moves the root moves the point about which the body has grown.
-        v += (1.0 / growth - 1.0) * velocity * (nodes == 0)[:, None]
-        return [M, np.zeros((3, 3, 3)), np.eye(3)[None]], [v, np.eye(3) / growth, -places[:1]]
-
-    def _move_flesh(self, packed: PackedOutlines, moved: Array) -> None:
-        """Moves each node's rigid part in its frame by (nodes, 3) [m]; bands stay at the joints."""
+        # A node's rigid part moves with its joint's place; bands stay at the joints.
+        flesh = -self._along * shares[:, None]
         for i in self.placed.tolist():
             vertices = packed.starts[i, 0] + np.arange(len(self.outlines[i].vertices))
             triangles = packed.starts[i, 1] + np.arange(len(self.outlines[i].triangles))
-            packed.points[:, vertices] += moved[i][:, None]
-            packed.planes[3, triangles] += moved[i] @ packed.planes[:3, triangles]
-            packed.balls[i, :3] += moved[i]
-            packed.balls[i, 3] += np.linalg.norm(moved[i])
+            packed.points[:, vertices] += flesh[i][:, None]
+            packed.planes[3, triangles] += flesh[i] @ packed.planes[:3, triangles]
+            packed.balls[i, :3] += flesh[i]
+            packed.balls[i, 3] += np.linalg.norm(flesh[i])
+        motions = affine_of(all_M, growth * all_v - all_M @ moved)
+        return Placement(packed, X_WN, motions, *self._owners)
 
 
-@dataclass(frozen=True, eq=False)
-class FittedProportions:
-    """A body's proportions and its pose in the frames that they were fitted to.
-
-    Args:
-        parameters: (frames, n) all parameters.
-        deviations: (frames, k) of the tree's values and ROOT_NAMES, 0 where they were held.
-        cost: what tells the better of two fits to the same frames.
-    """
-
-    parameters: Array
-    deviations: Array
-    cost: float
-
-
-@dataclass(frozen=True, eq=False)
-class SequencePrior:
+def sequence_prior(
+    frames: int, usual: tuple[Array, Array, Array], acceleration: Array
+) -> LinearPrior:
     """What is known without pictures of p unknowns of frames that follow one another.
 
-    The unknowns are the tree's values that are free, then ROOT_NAMES.
-
     Args:
-        phi: (k, p) what is usually about mean, mean: (k,), information: (k,) one over the variance.
-        acceleration: (p,) standard deviation of what an unknown is further on than the two frames
-            before it say.
-        lower, upper: (p,) limits.
+        frames: their number, three or more.
+        usual: phi (k, p) of which phi x has the mean (k,), with the information (k,), one over the
+            variance.
+        acceleration: (p,) standard deviation of an unknown about where the two frames before it
+            lead.
     """
-
-    phi: Array
-    mean: Array
-    information: Array
-    acceleration: Array
-    lower: Array
-    upper: Array
-
-    def coupling(self, frames: int) -> Coupling:
-        """The same of so many frames' unknowns together."""
-        p = len(self.acceleration)
-        motion = diags_array([1.0, -2.0, 1.0], offsets=[0, 1, 2], shape=(frames - 2, frames))
-        rows = vstack([kron(eye_array(frames), self.phi), kron(motion, eye_array(p))])
-        still = np.tile(self.acceleration**-2.0, frames - 2)
-        return Coupling(
-            csr_array(rows),
-            np.r_[np.tile(self.mean, frames), np.zeros(len(still))],
-            np.r_[np.tile(self.information, frames), still],
-        )
+    phi, mean, information = usual
+    motion = diags_array([1.0, -2.0, 1.0], offsets=[0, 1, 2], shape=(frames - 2, frames))
+    rows = vstack([kron(eye_array(frames), phi), kron(motion, eye_array(len(acceleration)))])
+    still = np.tile(acceleration**-2.0, frames - 2)
+    return LinearPrior(
+        csr_array(rows),
+        np.r_[np.tile(mean, frames), np.zeros(len(still))],
+        np.r_[np.tile(information, frames), still],
+    )
 
 
 def fit_proportions(
@@ -305,8 +257,9 @@ def fit_proportions(
     starts: Array,
     rounds: Sequence[AnnealingStage],
     noise: Noise,
-    sequence: SequencePrior,
-) -> FittedProportions:
+    limits: tuple[Array, Array],
+    prior: LinearPrior,
+) -> tuple[Solution, Array]:
     """The proportions of a body that several frames of one camera show, its pose near in each.
 
     Args:
@@ -316,40 +269,38 @@ def fit_proportions(
         starts: (frames, k) about what the tree's values and ROOT_NAMES are; or (frames, n) all
             parameters, those of proportions as in the first frame.
         rounds: the parts of the fit [pixel].
-        noise: what a point of contour is worth [pixel].
-        sequence: what is known of the frames without pictures.
+        noise: of contours [pixel].
+        limits: lower and upper (p,) of the tree's values that are free, then of ROOT_NAMES.
+        prior: of the same unknowns of all frames.
+
+    Returns:
+        the solution, and standard deviations (frames, k) of the tree's values and ROOT_NAMES, 0
+        where they were held.
     """
-    unknowns = _unknowns(body, sequence)
-    fit = FramesFit(body, [camera], unknowns, noise=noise, pixels=1.0)
+    kinematics = body.kinematics
+    moving = np.array(kinematics.names)[kinematics.lower < kinematics.upper].tolist()
+    # Standard deviations: as people differ.
+    problem = Problem(
+        body,
+        [camera],
+        [
+            Unknowns([*moving, *ROOT_NAMES], lower=limits[0], upper=limits[1]),
+            Unknowns(body.length_names, True, deviation=0.15),
+            Unknowns(body.width_names, True, deviation=0.1),
+            Unknowns(body.place_names, True, deviation=0.15),
+        ],
+        noise=noise,
+        pixels=1.0,
+    )
     held = np.zeros((len(frames), len(body.names)))
     held[:, : starts.shape[1]] = starts
-    own, common = np.split(unknowns.entries, [unknowns.own_count])
+    own, common = np.split(problem.entries, [problem.own_count])
     first, shared = held[:, own].copy(), held[0, common].copy()
-    held[:, own] = held[:, common] = 0.0
-    found = fit.fit(
-        [pack_evidence([edge]) for edge in frames],
-        held,
-        first,
-        shared,
-        rounds,
-        expected=(first, np.zeros(len(common))),
-        coupling=sequence.coupling(len(frames)),
+    held[:, problem.entries] = 0.0
+    seen = [Observation(pack_evidence([e]), row) for e, row in zip(frames, held, strict=True)]
+    found = problem.solve(
+        seen, rounds, (first, shared), expected=(first, np.zeros(len(common))), coupling=prior
     )
-    off = np.zeros((len(frames), len(body.kinematics.names) + len(ROOT_NAMES)))
+    off = np.zeros((len(frames), len(kinematics.names) + len(ROOT_NAMES)))
     off[:, own] = found.own_deviations()
-    return FittedProportions(found.parameters[:, : len(body.names)], off, found.cost)
-
-
-def _unknowns(body: ProportionedBody, sequence: SequencePrior) -> Unknowns:
-    """The pose of each frame, then lengths, widths and places that all share."""
-    kinematics = body.kinematics
-    moving = np.array(kinematics.names)[kinematics.lower < kinematics.upper]
-    own = choose(
-        body.names, [*moving.tolist(), *ROOT_NAMES], lower=sequence.lower, upper=sequence.upper
-    )
-    shared = (
-        (body.length_names, _LENGTH_DEVIATION),
-        (body.width_names, _WIDTH_DEVIATION),
-        (body.place_names, _PLACE_DEVIATION),
-    )
-    return join(own, *(choose(body.names, names, shared=True, deviation=d) for names, d in shared))
+    return found, off

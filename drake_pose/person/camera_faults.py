@@ -12,11 +12,10 @@ import numpy as np
 from drake_pose.arrays import Array, Mask
 from drake_pose.camera.models import Camera
 from drake_pose.fit.contour_fit import ContourFit, Prior, pack_views
-from drake_pose.fit.evidence import EdgePoints, pack_evidence
-from drake_pose.fit.frames_fit import FramesFit, parameter_names
+from drake_pose.fit.evidence import EdgePoints, Observation, pack_evidence
 from drake_pose.fit.levenberg_marquardt import AnnealingStage, StepSettings
-from drake_pose.fit.parameters import CAMERA_NAMES, CameraParameters
-from drake_pose.fit.unknowns import choose
+from drake_pose.fit.parameters import POSE_NAMES
+from drake_pose.fit.problem import Problem, Unknowns
 from drake_pose.person.figures import pixels_per_metre
 from drake_pose.person.rays import viewing_rays
 
@@ -160,24 +159,22 @@ class CameraJudge:
     ) -> Camera:
         """A camera moved to fit its regions to bodies about middle (3,), first by (3,) [m]."""
         fit, reach = self._fit, float(np.linalg.norm(camera.X_WC[:3, 3] - middle))
-        every, count = parameter_names(fit.body, [camera]), len(CAMERA_NAMES)
-        names = [f"{camera.name}.{name}" for name in CAMERA_NAMES[:6]]
+        names = [f"{camera.name}.{name}" for name in POSE_NAMES]
         # What the pictures see of a turn about the camera is the person's way about it.
         deviations = np.array([_TURN] * 3 + [_SHIFT + _TURN * reach] * 3)
-        unknowns = choose(every, names, shared=True, deviation=deviations)
+        seen = [Observation(pack_evidence([edge]), values) for edge, values in pairs]
         nothing = np.zeros((len(pairs), 0))
-        found = FramesFit(
-            fit.body, [camera], unknowns, pivot=middle, noise=fit.noise, steps=_CAMERA_STEPS
-        ).fit(
-            [pack_evidence([edge]) for edge, _ in pairs],
-            np.array([values for _, values in pairs]),
-            nothing,
-            np.concatenate([np.zeros(3), camera.X_CW[:3, :3] @ start]),
+        problem = Problem(
+            fit.body, [camera], [Unknowns(names, True, deviation=deviations)], pivot=middle,
+            noise=fit.noise, steps=_CAMERA_STEPS,
+        )  # fmt: skip
+        found = problem.solve(
+            seen,
             rounds,
+            (nothing, np.concatenate([np.zeros(3), camera.X_CW[:3, :3] @ start])),
             expected=(nothing, np.zeros(6)),
         )
-        theta = np.append(found.shared, np.zeros(count - len(names)))
-        X_CW = CameraParameters([camera], middle).place(theta)[0][0]
+        X_CW = problem.places(found.parameters[0])[0][0]
         return camera.with_pose(np.linalg.inv(X_CW))
 
     def _describe(

@@ -13,12 +13,11 @@ from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.camera.models import Camera
 from drake_pose.errors import ModelError, UnknownNameError
 from drake_pose.fit.contour_fit import ContourFit, Noise, pack_views
-from drake_pose.fit.evidence import NO_EDGE, EdgePoints, pack_evidence
-from drake_pose.fit.frames_fit import FramesFit
+from drake_pose.fit.evidence import NO_EDGE, EdgePoints, Observation, pack_evidence
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.fit.parameters import GIRTH_PREFIX, BodyParameters
+from drake_pose.fit.problem import Problem, Unknowns
 from drake_pose.fit.surfaces import with_girths
-from drake_pose.fit.unknowns import Unknowns, choose, join
 from drake_pose.person.pose_tracker import PersonPoseTracker, pose_uncertainty
 from drake_pose.person.search import LENIENT
 from drake_pose.silhouette.areas.outline import Outline
@@ -125,22 +124,30 @@ def fit_shape(fit: ContourFit, frames: Frames, poses: Array) -> PersonShape:
     count = int(is_shape.sum())
     names = [name for name, wanted in zip(body.names, is_shape, strict=False) if wanted]
     cameras = {camera.name: camera for seers, _ in frames for camera in seers}
-    evidence = []
+    observations = []
     for seers, edges in frames:
         seen = {camera.name: edge for camera, edge in zip(seers, edges, strict=True)}
-        evidence.append(pack_evidence([seen.get(name, NO_EDGE) for name in cameras]))
+        packed = pack_evidence([seen.get(name, NO_EDGE) for name in cameras])
+        observations.append(Observation(packed))
     poses = np.array(poses, dtype=np.float64)
-    unknowns = _unknowns(fit, body, is_shape)
-    found = FramesFit(body, list(cameras.values()), unknowns, noise=fit.noise).fit(
-        evidence,
-        np.zeros((len(frames), 0)),
-        poses[:, ~is_shape],
-        np.zeros(count + len(parts)),
+    pose, shape = (
+        Unknowns(
+            np.array(body.names[: len(chosen)])[chosen].tolist(), shared, fit.lower[chosen],
+            fit.upper[chosen], deviation,
+        )
+        for chosen, shared, deviation in ((~is_shape, False, _POSE), (is_shape, True, _LENGTH))
+    )  # fmt: skip
+    girths = [name for name in body.names if name.startswith(GIRTH_PREFIX)]
+    girth = Unknowns(girths, True, -_WIDEST, _WIDEST, _GIRTH)
+    problem = Problem(body, list(cameras.values()), [pose, shape, girth], noise=fit.noise)
+    found = problem.solve(
+        observations,
         _ROUNDS,
+        (poses[:, ~is_shape], np.zeros(count + len(parts))),
         shared_information=_sides_information(names, len(parts)),
     )
-    lengths, girths = found.shared[:count], np.exp(found.shared[count:])
-    worn = ContourFit(fit.kinematics, with_girths(fit.outlines, girths[groups]), fit.noise)
+    lengths, widths = found.shared[:count], np.exp(found.shared[count:])
+    worn = ContourFit(fit.kinematics, with_girths(fit.outlines, widths[groups]), fit.noise)
     values = np.zeros(len(is_shape))
     values[is_shape] = poses[:, is_shape] = lengths
     poses[:, ~is_shape] = found.own
@@ -148,28 +155,9 @@ def fit_shape(fit: ContourFit, frames: Frames, poses: Array) -> PersonShape:
     covariance = np.linalg.inv(prior + _frame_information(worn, frames, poses, is_shape))
     known = KnownShape(
         dict(zip(names, lengths.tolist(), strict=True)),
-        dict(zip(parts, girths.tolist(), strict=True)),
+        dict(zip(parts, widths.tolist(), strict=True)),
     )
     return PersonShape(known, values, np.asarray(covariance), poses, worn.outlines)
-
-
-def _unknowns(fit: ContourFit, body: BodyParameters, is_shape: Mask) -> Unknowns:
-    """Each frame's pose, and the lengths and girths of all frames."""
-    names = np.array(body.names[: len(is_shape)])
-    girths = [name for name in body.names if name.startswith(GIRTH_PREFIX)]
-    pose, length = (
-        choose(
-            body.names,
-            names[chosen].tolist(),
-            shared=shared,
-            lower=fit.lower[chosen],
-            upper=fit.upper[chosen],
-            deviation=deviation,
-        )
-        for chosen, shared, deviation in ((~is_shape, False, _POSE), (is_shape, True, _LENGTH))
-    )
-    girth = choose(body.names, girths, shared=True, lower=-_WIDEST, upper=_WIDEST, deviation=_GIRTH)
-    return join(pose, length, girth)
 
 
 def _sides_information(names: Sequence[str], girths: int) -> Array:

@@ -28,7 +28,7 @@ from drake_pose.fit.covariance import (
 )
 from drake_pose.fit.parameters import POSE_NAMES
 from drake_pose.registration.per_frame_fit import FrameFit, PerFrameFit
-from drake_pose.registration.shared_fit import KNOWN_BEFOREHAND
+from drake_pose.registration.shared_fit import SHARED
 
 BASE = "base"
 
@@ -324,7 +324,7 @@ class _Auditor:
 
     def _info_of(self, fitted: FrameFit, sizes: ErrorSizes) -> _Information:
         if not fitted.pictures:
-            known = float(KNOWN_BEFOREHAND)
+            known = float(SHARED.known_beforehand)
             return self._nothing._replace(lengths=fitted.weights, freedom=known)
         if fitted.name not in self._seen:
             self._seen[fitted.name] = self._distances(fitted.pictures)
@@ -336,8 +336,8 @@ class _Auditor:
         N, h = X.T @ PX, PX.T @ seen.y
         T, rank = _statistic(h, N)
         residual = max(float(seen.y @ Py[:, 0]) - T, 0.0)
-        freedom = float(KNOWN_BEFOREHAND + len(seen.y) - rank)
-        scale = max((KNOWN_BEFOREHAND + residual) / freedom, 1.0)
+        freedom = float(SHARED.known_beforehand + len(seen.y) - rank)
+        scale = max((SHARED.known_beforehand + residual) / freedom, 1.0)
         outlines = self._nothing.outlines.copy()
         for one in fitted.pictures:
             moves = one.moves * self._fit.deviations[:, None]

@@ -20,16 +20,10 @@ from drake_pose.body.model import OBJECT_POSITIONS
 from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import RegistrationError, UnknownNameError
-from drake_pose.fit.lengthened_body import length_name, lengthened_joints
-from drake_pose.fit.parameters import POSE_NAMES
+from drake_pose.fit.parameters import POSE_NAMES, length_name, lengthened_joints
 from drake_pose.registration.posed_frames import PosedFrame, PosedFrames
 from drake_pose.registration.register import RegisteredCamera, RegistrationBody
-from drake_pose.registration.shared_fit import (
-    CONSTANT_DEVIATION,
-    ROUNDS_WITH_CONSTANTS,
-    Shared,
-    SharedFit,
-)
+from drake_pose.registration.shared_fit import SHARED, Shared, SharedFit
 
 # So many standard deviations to either side it is looked whether the cost bends as it should.
 _ASIDE = 2.0
@@ -194,9 +188,9 @@ def _fit_constants(
     Significant is at a level what is so beside the others, once all can be told.
     """
     # Constants that are off let good frames contradict, so all count at first.
-    fit, found = fit.from_found(fit.fit(ROUNDS_WITH_CONSTANTS))
+    fit, found = fit.from_found(fit.fit(SHARED.rounds_with_constants))
     which = fit.agreeing(fit.inlier_ratios(found))
-    fit, found = fit.from_found(fit.fit(ROUNDS_WITH_CONSTANTS, found, which))
+    fit, found = fit.from_found(fit.fit(SHARED.rounds_with_constants, found, which))
     freedom = max(1, _PICTURE_MOTIONS * int(np.count_nonzero(which)) - len(fit.names))
     own, shared = fit.covariances(found, which)
     covariance = own + shared
@@ -241,7 +235,7 @@ def _as_the_cost_bends(fit: SharedFit, found: Shared, which: Mask, covariance: A
     found_covariance = covariance.copy()
     for k in range(len(fit.names) - len(fit.constants), len(fit.names)):
         along = covariance[:, k] / math.sqrt(covariance[k, k])
-        bends, said = fit.bend(found, _ASIDE * along, ROUNDS_WITH_CONSTANTS[-1], which)
+        bends, said = fit.bend(found, _ASIDE * along, SHARED.rounds_with_constants[-1], which)
         share = min(1.0, max(_NO_BEND, bends / said))
         found_covariance += (1.0 / share - 1.0) * np.outer(along, along)
     return found_covariance
@@ -261,7 +255,7 @@ def _constants(
     for name in names:
         k = fit.names.index(name)
         value, deviation = float(found.shared[k]), float(deviations[k])
-        if deviation > _DETERMINED * CONSTANT_DEVIATION:
+        if deviation > _DETERMINED * SHARED.constant_deviation:
             goes = np.abs(covariance[:, k]) > _GOES_WITH * deviations * deviation
             gauge = tuple(fit.names[j] for j in np.flatnonzero(goes) if j != k)
             ends = (-math.inf, math.inf)

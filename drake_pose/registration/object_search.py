@@ -36,7 +36,7 @@ from drake_pose.registration.register import (
     spread,
     with_widths,
 )
-from drake_pose.registration.shared_fit import ROUNDS_WITH_CONSTANTS, Shared, SharedFit
+from drake_pose.registration.shared_fit import SHARED, Shared, SharedFit
 from drake_pose.registration.standing_object import StandingObject, require_turns, turns_between
 from drake_pose.registration.start_poses import E_total, apart_from_before, areas
 
@@ -85,7 +85,7 @@ class ObjectSearch:
         looks = self._search(camera, [[one] for one in spread(frames)])
         for rounds, spacing, surfaces in (
             (FINE, FINE_SPACING, "few"),
-            (ROUNDS_WITH_CONSTANTS, LAST_SPACING, "all"),
+            (SHARED.rounds_with_constants, LAST_SPACING, "all"),
         ):
             fits = [self._fit(camera, frames, look, spacing, surfaces) for look in looks]
             fitted = [

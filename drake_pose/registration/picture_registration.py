@@ -19,7 +19,7 @@ from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import RegistrationError
 from drake_pose.fit.background import Explained
 from drake_pose.fit.covariance import excess
-from drake_pose.fit.frames_fit import TIME_OFFSET
+from drake_pose.fit.problem import TIME_OFFSET
 from drake_pose.registration.picture_levels import CONTOURS, evidence
 from drake_pose.registration.picture_search import (
     SEARCHED,

@@ -20,7 +20,7 @@ from drake_pose.fit.evidence import (
     NO_EDGE,
     EdgePoints,
     Evidence,
-    FrameEvidence,
+    Observation,
     find_edge_points,
     pack_evidence,
 )
@@ -121,13 +121,13 @@ class PosedFrames:
         off = self.some_points - self.middle
         return float(np.sqrt((off**2).sum(axis=1).mean()))
 
-    def evidence(self, camera: int, count: int) -> list[FrameEvidence]:
-        """What each frame tells, where the camera is the how manieth of so many."""
+    def observations(self, camera: int, count: int) -> list[Observation]:
+        """The frames, the camera being that of an index among a number of cameras."""
         found = []
         for frame, edge in zip(self.frames, self._edges, strict=True):
             edges = pack_evidence([edge if c == camera else NO_EDGE for c in range(count)])
             odds = tuple(frame.odds if c == camera else None for c in range(count))
-            found.append(FrameEvidence(edges, odds, frame.rates))
+            found.append(Observation(edges, frame.values, odds, frame.rates))
         return found
 
     @cached_property

@@ -3,17 +3,17 @@
 A mask that is too wide on all sides makes its body seem nearer. Each mask's width is unknown, too:
 thin links and their distances from one another tell the two apart.
 
-How sure what is shared is: contours do not err point by point. There are the noise of points, the
-surface of a part in all frames alike, its edge in one mask, and each frame as a whole
-(``fit.covariance``). How large these are is told by what is left of the distances at the scale of
-the fit; frames' pulls scatter as these say, or by a factor more. What is off alike in all frames
-and is not fitted, zeros, lengths and lenses, moves what is fitted: its size is told so, too.
+Covariances: contours do not err point by point. There are the noise of points, the surface of a
+part in all frames alike, its edge in one mask, and each frame as a whole (``fit.covariance``). The
+residuals at the scale of the fit tell the sizes of these errors; frames scatter as these say, or by
+a factor more. What is off alike in all frames and is not fitted, offsets, link scales and lenses,
+moves what is fitted: its size is estimated, too.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -21,9 +21,8 @@ import numpy as np
 
 from drake_pose.arrays import Array, Mask
 from drake_pose.body.model import OBJECT_POSITIONS
-from drake_pose.body.tree.tree_kinematics import JointOffset
+from drake_pose.body.tree.tree_kinematics import JointOffset, TreeKinematics
 from drake_pose.camera.models import PinholeCamera
-from drake_pose.fit.contour_fit import Noise
 from drake_pose.fit.covariance import (
     Distances,
     ErrorSizes,
@@ -33,60 +32,72 @@ from drake_pose.fit.covariance import (
     estimate_sizes,
     values_covariance,
 )
-from drake_pose.fit.evidence import FrameEvidence
-from drake_pose.fit.frames_fit import FramesFit, parameter_names
-from drake_pose.fit.lengthened_body import LengthenedBody, length_name, lengthened_joints
+from drake_pose.fit.evidence import Observation
 from drake_pose.fit.levenberg_marquardt import AnnealingStage, Equations, StepSettings
-from drake_pose.fit.parameters import CAMERA_NAMES, POSE_NAMES
-from drake_pose.fit.unknowns import choose, join
-from drake_pose.registration.posed_frames import PosedFrames
+from drake_pose.fit.parameters import (
+    CAMERA_NAMES,
+    GIRTH_PREFIX,
+    POSE_NAMES,
+    BodyParameters,
+    length_name,
+    lengthened_joints,
+)
+from drake_pose.fit.problem import Problem, Unknowns, parameter_names
+from drake_pose.registration.posed_frames import PosedFrames, SeenFrame, common_size, middle_of
+from drake_pose.silhouette.areas.outline import Outline
 from drake_pose.workers import map_ordered
 
-ROUNDS_WITH_CONSTANTS = (
-    *(AnnealingStage(scale, 0.02) for scale in (0.12, 0.09, 0.07, 0.05, 0.03, 0.02)),
-    AnnealingStage(0.01, 0.01),
-    # Again and again, for what hardly shows, such as a zero that turns with the camera, gains so
-    # little in a step that a round ends before it is there.
-    *(AnnealingStage(0.005, 0.005, 6) for _ in range(5)),
-)
-"""Parts of a fit that has constants to find beside cameras."""
 
-TOLD_APART = AnnealingStage(0.025, 0.01)
-"""At this scale frames are told apart that agree and that contradict."""
+class SharedFitSettings(NamedTuple):
+    """Numbers of fits of cameras and of what all frames share.
 
-CONSTANT_DEVIATION, FOCAL_DEVIATION = 0.2, 0.1
-"""What is known beforehand of zeros [rad or m] and the logarithms of lengths, and of the logarithms
-of focal lengths: deviations."""
+    Args:
+        rounds_with_constants: the parts of a fit that has constants to find beside cameras. The
+            last one comes again and again: what hardly shows, such as an offset that turns with the
+            camera, gains so little in a step that a round ends before it is there.
+        told_apart: the scale at which frames that agree are told from outliers.
+        fitted: the scale at which cameras were fitted in the end.
+        steps: how steps are made.
+        constant_deviation: prior standard deviation of joint offsets [rad or m] and of the
+            logarithms of link scales.
+        focal_deviation: the same of the logarithms of focal lengths.
+        known_beforehand: the scale of frames' errors is known beforehand as well as this number of
+            distances tells it.
+        prior_deviation: standard deviation of the logarithms of errors' sizes: a factor of twenty.
+        min_inlier_ratio: a mask agrees if its inlier ratio is at least this fraction of the mean of
+            the camera's two best.
+        point_error, error_length: contours err by this along this length [pixel]: weight of
+            contours against priors of single frames.
+    """
 
-KNOWN_BEFOREHAND = 20
-"""The scale of frames' errors is known beforehand as well as so many distances tell it."""
+    rounds_with_constants: tuple[AnnealingStage, ...] = (
+        AnnealingStage(0.12, 0.02),
+        AnnealingStage(0.09, 0.02),
+        AnnealingStage(0.07, 0.02),
+        AnnealingStage(0.05, 0.02),
+        AnnealingStage(0.03, 0.02),
+        AnnealingStage(0.02, 0.02),
+        AnnealingStage(0.01, 0.01),
+        *(5 * (AnnealingStage(0.005, 0.005, 6),)),
+    )
+    told_apart: AnnealingStage = AnnealingStage(0.025, 0.01)
+    fitted: AnnealingStage = AnnealingStage(0.005, 0.005)
+    steps: StepSettings = StepSettings(longest=0.3, damping=1e-2, even_damping=1e-6)
+    constant_deviation: float = 0.2
+    focal_deviation: float = 0.1
+    known_beforehand: int = 20
+    prior_deviation: float = 3.0
+    min_inlier_ratio: float = 0.7
+    point_error: float = 4.0
+    error_length: float = 100.0
 
-STEPS = StepSettings(longest=0.3, damping=1e-2, even_damping=1e-6)
 
-# And of where an object stands, once it was found [m, rad].
-_OBJECT_DEVIATION = 1.0
-# A frame agrees whose inlier ratio is this share of that of the two that fit best.
-_AGREES = 0.7
-# Masks are wider or narrower by no more [pixel].
-_WIDEST = 6.0
-# At this scale cameras were fitted in the end.
-_FITTED = AnnealingStage(0.005, 0.005)
-# Sizes of errors are known beforehand to a factor of twenty; frames tell them.
-PRIOR_DEVIATION = 3.0
-# What a picture tells of a direction is nothing below this share of what it tells best.
-_TOLD = 1e-3
-# What may be off, and is not fitted: groups, and units [rad, m, 1, 1, share of the focal length].
-_ZEROS, _LENGTHS, _LENSES = "zeros", "lengths", "lenses"
-_ZERO, _SLID, _LENGTH, _FOCAL, _CENTER = np.radians(0.5), 0.002, 0.01, 0.01, 0.005
-# What is known of anything at least, that equations can be solved.
-_LEAST = 1e-9
-# Where parts err by so much [pixel], a calibration is no better than this [pixel].
-_PARTS_ERR, _NO_BETTER = 0.2, 1.0
+SHARED = SharedFitSettings()
 
 
 def agreeing_share(ratios: Array) -> float:
     """The least inlier ratio of a mask that agrees with the others of its camera, (n,) ratios."""
-    return float(_AGREES * np.sort(ratios)[-2:].mean())
+    return float(SHARED.min_inlier_ratio * np.sort(ratios)[-2:].mean())
 
 
 class Shared(NamedTuple):
@@ -104,6 +115,7 @@ class SharedFit:
 
     Attributes:
         seen: what each camera sees.
+        problem: all frames' unknowns.
         rows: (rows,) the how manieth camera each mask is of, one camera's after another's.
         names: of the u shared unknowns: those of each camera, then the constants.
         per_camera: so many of them each camera has.
@@ -131,30 +143,30 @@ class SharedFit:
         self._options: dict[str, Any] = {"offsets": offsets, "looks": looks, "widths": widths}
         first, body = seen[0], seen[0].body
         if offsets:
-            body = LengthenedBody(first.kinematics, first.outlines, offsets)
+            body = BodyParameters(first.kinematics, first.outlines, offsets=offsets)
         self.rows = np.repeat(np.arange(len(seen)), [len(one.frames) for one in seen])
-        self._values = np.array([frame.values for one in seen for frame in one.frames])
-        each = [one.evidence(c, len(seen)) for c, one in enumerate(seen)]
-        self._evidence = [evidence for own in each for evidence in own]
+        self._observations = [
+            frame for c, one in enumerate(seen) for frame in one.observations(c, len(seen))
+        ]
         cameras = [
             one.camera.with_pose(np.linalg.inv(X)) for one, X in zip(seen, X_CW, strict=True)
         ]
         self.per_camera = looks
         names = [f"{camera.name}.{name}" for camera in cameras for name in CAMERA_NAMES[:looks]]
         self.names = (*names, *constants)
-        deviations = {one: CONSTANT_DEVIATION for one in constants}
-        deviations |= dict.fromkeys(OBJECT_POSITIONS, _OBJECT_DEVIATION)
-        deviations |= {f"{one.name}.{CAMERA_NAMES[6]}": FOCAL_DEVIATION for one in cameras}
+        deviations = dict.fromkeys(constants, SHARED.constant_deviation)
+        # Of where an object stands, once it was found [m, rad].
+        deviations |= dict.fromkeys(OBJECT_POSITIONS, 1.0)
+        deviations |= {f"{one.name}.{CAMERA_NAMES[6]}": SHARED.focal_deviation for one in cameras}
         known = np.array([deviations.get(name, np.inf) for name in self.names])
-        every = parameter_names(body, cameras)
-        unknowns = choose(every, self.names, shared=True, deviation=known)
+        unknowns = [Unknowns(self.names, True, deviation=known)]
         if widths:
-            own = choose(every, every[-len(cameras) :], lower=-_WIDEST, upper=_WIDEST)
-            unknowns = join(own, unknowns)
-        sizes = np.array([one.size for one in seen])
-        self._fit = FramesFit(
+            # Masks are wider or narrower by at most six pixels.
+            every = parameter_names(body, cameras)
+            unknowns.append(Unknowns(every[-len(cameras) :], lower=-6.0, upper=6.0))
+        self.problem = Problem(
             body, cameras, unknowns, pivot=np.array([one.middle for one in seen]),
-            noise=Noise.of_a_pixel(sizes), steps=STEPS, pixels=sizes,
+            steps=SHARED.steps, pixels=np.array([one.size for one in seen]),
         )  # fmt: skip
 
     @property
@@ -169,8 +181,8 @@ class SharedFit:
         which: Mask | None = None,
     ) -> Shared:
         """Fits all from where it starts to those of the masks (rows,) that count."""
-        given, expected, which = self._at(start or self.start, which)
-        found = self._fit.fit(*given, rounds, expected=expected)
+        seen, at, expected, which = self._at(start or self.start, which)
+        found = self.problem.solve(seen, rounds, at, expected=expected)
         widths = np.zeros(len(self.rows))
         widths[which] = found.own.sum(axis=1)
         return Shared(found.shared, widths)
@@ -186,19 +198,19 @@ class SharedFit:
 
     def equations(self, at: Shared, step: AnnealingStage, which: Mask | None = None) -> Equations:
         """The normal equations of the masks (rows,) that count, own unknowns first."""
-        given, expected, _ = self._at(at, which)
-        return self._fit.equations(*given, step, expected)
+        seen, unknowns, expected, _ = self._at(at, which)
+        return self.problem.equations(seen, unknowns, step, expected)
 
     def bend(
         self, found: Shared, by: Array, step: AnnealingStage, which: Mask | None = None
     ) -> tuple[float, float]:
         """How much the cost bends upwards as what is shared moves by (u,), by slopes and by H."""
-        p = self._fit.unknowns.own_count
+        p = self.problem.own_count
         less, here, more = (
             self.equations(Shared(found.shared + sign * by, found.widths), step, which)
             for sign in (-1.0, 0.0, 1.0)
         )
-        known = float(self._fit.unknowns.information[p:] @ by**2)
+        known = float(self.problem.information[p:] @ by**2)
         slopes = (more.g - less.g).sum(axis=0)[p:]
         said = float(by @ here.H.sum(axis=0)[p:, p:] @ by)
         return 0.5 * float(by @ slopes) - known, said - known
@@ -206,10 +218,10 @@ class SharedFit:
     def inlier_ratios(self, found: Shared) -> Array:
         """(rows,) of both contours' lengths, what fits."""
 
-        def ratio(mask: tuple[FrameEvidence, Array]) -> float:
-            return self._fit.compare(*mask, TOLD_APART)[0].inlier_ratio
+        def ratio(mask: tuple[Observation, Array]) -> float:
+            return self.problem.compare(*mask, SHARED.told_apart)[0].inlier_ratio
 
-        masks = zip(self._evidence, self._parameters(found), strict=True)
+        masks = zip(self._observations, self._parameters(found), strict=True)
         return np.array(map_ordered(ratio, masks))
 
     def agreeing(self, ratios: Array) -> Mask:
@@ -220,15 +232,15 @@ class SharedFit:
     def piece_costs(self, found: Shared, side: float) -> Array:
         """(rows, k, k) costs by squares of the pictures of a side [pixel]."""
 
-        def costs(mask: tuple[FrameEvidence, Array, int]) -> Array:
-            return self._fit.piece_costs(*mask[:2], TOLD_APART, side)[mask[2]]
+        def costs(mask: tuple[Observation, Array, int]) -> Array:
+            return self.problem.piece_costs(*mask[:2], SHARED.told_apart, side)[mask[2]]
 
-        masks = zip(self._evidence, self._parameters(found), self.rows.tolist(), strict=True)
+        masks = zip(self._observations, self._parameters(found), self.rows.tolist(), strict=True)
         return np.array(map_ordered(costs, masks))
 
     def cameras(self, found: Shared) -> list[PinholeCamera]:
         """The cameras as they were found."""
-        X_CW, kernel, _ = self._fit.places(self._parameters(found)[0])
+        X_CW, kernel, _ = self.problem.places(self._parameters(found)[0])
         return [
             replace(one.camera, X_WC=np.linalg.inv(X), focal_x=float(k[1]), focal_y=float(k[2]))
             for one, X, k in zip(self.seen, X_CW, kernel, strict=True)
@@ -239,17 +251,26 @@ class SharedFit:
 
         Of contours that err, and what is off alike in all frames adds.
         """
-        seen = self._doubted_distances(found, _FITTED, which)
+        seen = self._doubted_distances(found, SHARED.fitted, which)
         is_angle = np.zeros(seen.X.shape[1], bool)
-        sizes = estimate_sizes(seen, is_angle, 0.0, PRIOR_DEVIATION)
+        sizes = estimate_sizes(seen, is_angle, 0.0, SHARED.prior_deviation)
         doubted, seen = doubted_covariance(seen, sizes, is_angle)
         covariance = values_covariance(seen, sizes, np.arange(len(is_angle)), is_angle)
-        covariance *= _scatter(seen, sizes, len(self.names))
-        trusted = _calibration_error(self._doubted_distances(found, TOLD_APART, which))
-        for c, camera in enumerate(self.cameras(found)):
-            unseen = _unseen_errors(self.seen[c], camera.X_CW, trusted)[: self.per_camera]
-            at = np.arange(len(unseen)) + c * len(unseen)
-            doubted[at, at] += unseen**2
+        covariance *= scatter_factor(seen, sizes, len(self.names))
+        # Wrong intrinsics err alike in all frames: the pose follows, and nothing is left of it. So
+        # where parts are seen to err, a calibration is trusted to a pixel at best. What comes again
+        # where a part stands still may be the part's surface: none of it counts as noise here.
+        seen = self._doubted_distances(found, SHARED.told_apart, which)
+        seen = seen._replace(effects=seen.effects._replace(repeated=seen.effects.noise))
+        sizes = estimate_sizes(seen, np.zeros(seen.X.shape[1], bool), 0.0, SHARED.prior_deviation)
+        pixels = min(1.0, (sizes.surface**2 + sizes.mask**2) / 0.2**2)
+        for c, (one, camera) in enumerate(zip(self.seen, self.cameras(found), strict=True)):
+            depth = float(camera.X_CW[2, :3] @ one.middle + camera.X_CW[2, 3])
+            size = pixels * depth / one.camera.focal_x
+            turn = size / one.extent
+            off = np.array([turn, turn, turn, size, size, size * depth / one.extent, turn])
+            at = np.arange(self.per_camera) + c * self.per_camera
+            doubted[at, at] += off[: self.per_camera] ** 2
         own = slice(len(self.names))
         return covariance[own, own], doubted[own, own]
 
@@ -265,16 +286,16 @@ class SharedFit:
             weights: of the masks that count.
             covariance: (u, u) of what is shared.
         """
-        p, at = self._fit.unknowns.own_count, self.names.index(name)
-        equations = self.equations(found, _FITTED, which)
+        p, at = self.problem.own_count, self.names.index(name)
+        equations = self.equations(found, SHARED.fitted, which)
         H, g = equations.H, equations.g
         more = np.einsum("f,fi->fi", weights, H[:, p + at])
         own = weights**2 * H[:, p + at, p + at]
         H = np.block([[H, more[:, :, None]], [more[:, None, :], own[:, None, None]]])
         g = np.column_stack([g, weights * g[:, p + at]])
-        gains = np.linalg.solve(H[:, :p, :p] + _LEAST * np.eye(p), H[:, :p, p:])
+        gains = np.linalg.solve(H[:, :p, :p] + 1e-9 * np.eye(p), H[:, :p, p:])
         S = (H[:, p:, p:] - np.einsum("fpi,fpj->fij", H[:, :p, p:], gains)).sum(axis=0)
-        S += _LEAST * np.eye(len(S))
+        S += 1e-9 * np.eye(len(S))
         left = (g[:, p:] - np.einsum("fpi,fp->fi", gains, g[:, :p])).sum(axis=0)
         inverse = np.linalg.inv(S)
         said = np.linalg.inv(S[:-1, :-1])[at, at]
@@ -283,61 +304,74 @@ class SharedFit:
 
     def camera_covariances(self, found: Shared, covariance: Array) -> Array:
         """(cameras, 6, 6) of the poses' errors in the world, covariance being of what is shared."""
-        X_CW, _, motions = self._fit.places(self._parameters(found)[0])
+        X_CW, _, motions = self.problem.places(self._parameters(found)[0])
         own = [slice(k, k + 6) for k in self.per_camera * np.arange(len(X_CW))]
         several = zip(X_CW, motions, own, strict=True)
         return np.array([pose_covariance(X, J[:6], covariance[k, k]) for X, J, k in several])
 
     def _at(
         self, at: Shared, which: Mask | None
-    ) -> tuple[tuple[list[FrameEvidence], Array, Array, Array], tuple[Array, Array], Mask]:
-        """Masks that count as ``FramesFit`` takes them: what is seen and held, both unknowns.
+    ) -> tuple[list[Observation], tuple[Array, Array], tuple[Array, Array], Mask]:
+        """Masks that count; their own and shared unknowns; what these are expected to be.
 
-        Then what these are expected to be, and which masks (rows,) those are.
+        Then which masks (rows,) those are.
         """
         which = np.ones(len(self.rows), bool) if which is None else which
-        own, evidence = self._own(at)[which], [self._evidence[k] for k in np.flatnonzero(which)]
-        expected = np.zeros_like(own), np.zeros(len(self.names))
-        return (evidence, self._values[which], own, at.shared), expected, which
+        own, seen = self._own(at)[which], [self._observations[k] for k in np.flatnonzero(which)]
+        return seen, (own, at.shared), (np.zeros_like(own), np.zeros(len(self.names))), which
 
     def _own(self, at: Shared) -> Array:
         """(rows, own unknowns): of each mask the width of its camera's."""
-        own = np.zeros((len(self.rows), self._fit.unknowns.own_count))
+        own = np.zeros((len(self.rows), self.problem.own_count))
         if own.size:
             own[np.arange(len(own)), self.rows] = at.widths
         return own
 
     def _parameters(self, at: Shared) -> Array:
         """(rows, n) all parameters."""
-        held = np.zeros((len(self.rows), len(self._fit.names)))
-        held[:, : self._values.shape[1]] = self._values
-        rows = zip(held, self._own(at), strict=True)
-        return np.array([self._fit.unknowns.parameters(one, own, at.shared) for one, own in rows])
+        return self.problem.parameters(self._observations, self._own(at), at.shared)
+
+    def distances(self, at: Shared, step: AnnealingStage, which: Mask | None = None) -> Distances:
+        """The distances in all masks that count; values are what is shared, then the widths."""
+        seen, _, _, which = self._at(at, which)
+        pictures = self.problem.pictures(seen, self._parameters(at)[which], step)
+        return distances_in_masks(self.problem.body.outlines, pictures, widths=True)
 
     def _doubted_distances(
         self, found: Shared, step: AnnealingStage, which: Mask | None
     ) -> Distances:
         """The distances in all masks that count; values are what is shared, then the widths.
 
-        Doubted are, where they are not among it: zeros, lengths, each and all alike, and lenses.
+        What may be off alike in all frames, and is not shared, is doubted: joints' offsets [half a
+        degree or two millimetres], link scales, each and all alike [1 %], and lenses [1 % of the
+        focal length; half a percent of it where the principal point lies].
         """
-        whole, names = self._doubting, self._doubting.names
+        whole = self._doubting
+        names, kinematics, units = whole.names, self.seen[0].kinematics, dict[str, float]()
+        groups: dict[str, list[str]] = {"offsets": [], "scales": [], "lenses": []}
+        for name, is_angle in zip(kinematics.names, kinematics.is_angle, strict=True):
+            units[name] = np.radians(0.5) if is_angle else 0.002
+            groups["offsets"] += [] if name in OBJECT_POSITIONS else [name]
+        for camera in (one.camera for one in self.seen):
+            lens = [f"{camera.name}.{name}" for name in CAMERA_NAMES[len(POSE_NAMES) :]]
+            units |= zip(lens, (0.01, *[0.005 * camera.focal_x] * 2), strict=True)
+            groups["lenses"] += lens
+        looks = [f"{one.camera.name}.{name}" for one in self.seen for name in POSE_NAMES]
+        groups["scales"] = [name for name in names if name not in units and name not in looks]
         shared = np.zeros(len(names))
         own = [names.index(name) for name in self.names]
         shared[own] = found.shared
-        seen = whole._distances(Shared(shared, found.widths), step, which)
-        units, groups = whole._doubt_units(), []
-        for kind in (_ZEROS, _LENGTHS, _LENSES):
-            doubted = [k for k, name in enumerate(names) if k not in own and units[name][0] == kind]
-            Z = seen.X[:, doubted] * [units[names[k]][1] for k in doubted]
-            # Lengths may all be off alike, too.
-            alike = kind == _LENGTHS
-            groups.append(np.column_stack([Z, Z.sum(axis=1)]) if alike else Z)
-        values = np.array([*own, *range(len(names), seen.X.shape[1])])
-        return seen._replace(
-            X=seen.X[:, values],
-            information=seen.information[np.ix_(values, values)],
-            doubts=tuple(Z for Z in groups if Z.any()),
+        distances = whole.distances(Shared(shared, found.widths), step, which)
+        doubts = []
+        for kind, members in groups.items():
+            doubted = [k for k, name in enumerate(names) if k not in own and name in members]
+            Z = distances.X[:, doubted] * [units.get(names[k], 0.01) for k in doubted]
+            doubts.append(np.column_stack([Z, Z.sum(axis=1)]) if kind == "scales" else Z)
+        values = np.array([*own, *range(len(names), distances.X.shape[1])])
+        return distances._replace(
+            X=distances.X[:, values],
+            information=distances.information[np.ix_(values, values)],
+            doubts=tuple(Z for Z in doubts if Z.any()),
         )
 
     @cached_property
@@ -351,23 +385,6 @@ class SharedFit:
         names = [*self.constants, *zeros, *(one for one in lengths if one not in self.constants)]
         options = self._options | {"offsets": offsets, "looks": len(CAMERA_NAMES)}
         return SharedFit(self.seen, self._X_CW, names, **options)
-
-    def _doubt_units(self) -> dict[str, tuple[str, float]]:
-        """Of each name the group in which it is doubted, "" where not, and by how much."""
-        kinematics, units = self.seen[0].kinematics, dict.fromkeys(self.names, (_LENGTHS, _LENGTH))
-        for name, is_angle in zip(kinematics.names, kinematics.is_angle, strict=True):
-            units[name] = "" if name in OBJECT_POSITIONS else _ZEROS, _ZERO if is_angle else _SLID
-        for camera in (one.camera for one in self.seen):
-            own = [("", 1.0)] * 6 + [(_LENSES, _FOCAL)] + [(_LENSES, _CENTER * camera.focal_x)] * 2
-            units |= zip((f"{camera.name}.{name}" for name in CAMERA_NAMES), own, strict=True)
-        return units
-
-    def _distances(self, found: Shared, step: AnnealingStage, which: Mask | None) -> Distances:
-        """The distances in all masks that count; values are what is shared, then the widths."""
-        (evidence, *_), _, which = self._at(found, which)
-        pictures = self._fit.pictures(evidence, self._parameters(found)[which], step)
-        outlines = self._fit.body.outlines
-        return distances_in_masks(outlines, pictures, widths=True)
 
 
 def fit_pose(seen: PosedFrames, X_CW: Array, rounds: Sequence[AnnealingStage]) -> Array:
@@ -392,7 +409,7 @@ def pose_covariance(X_CW: Array, motions: Array, covariance: Array) -> Array:
     return np.asarray(J @ covariance @ J.T)
 
 
-def _scatter(seen: Distances, sizes: ErrorSizes, shared: int) -> float:
+def scatter_factor(seen: Distances, sizes: ErrorSizes, shared: int) -> float:
     """By what factor frames disagree more about what they share than errors say: of variances.
 
     Each frame's distances along what it tells of the shared values, its width put right, are
@@ -405,7 +422,7 @@ def _scatter(seen: Distances, sizes: ErrorSizes, shared: int) -> float:
         X, widths = np.split(seen.X[rows], [shared], axis=1)
         X = X - widths @ np.linalg.pinv(widths) @ X
         U, told, _ = np.linalg.svd(X, full_matrices=False)
-        U = U[:, told > _TOLD * told.max()]
+        U = U[:, told > 1e-3 * told.max()]
         L = np.linalg.cholesky(U.T @ V[np.ix_(rows, rows)] @ U)
         designs.append(np.linalg.solve(L, U.T @ X))
         lefts.append(np.linalg.solve(L, U.T @ seen.y[rows]))
@@ -414,26 +431,119 @@ def _scatter(seen: Distances, sizes: ErrorSizes, shared: int) -> float:
     design, left = np.concatenate(designs), np.concatenate(lefts)
     by, _, rank, _ = np.linalg.lstsq(design, left)
     off = left - design @ by
-    scale = (KNOWN_BEFOREHAND + float(off @ off)) / (KNOWN_BEFOREHAND + len(off) - rank)
+    scale = (SHARED.known_beforehand + float(off @ off)) / (
+        SHARED.known_beforehand + len(off) - rank
+    )
     # Frames that agree by chance are no surer.
     return max(scale, 1.0)
 
 
-def _calibration_error(seen: Distances) -> float:
-    """By how much a calibration may be off that no frame contradicts [pixel].
+@dataclass(frozen=True, eq=False)
+class AdjustedBundle:
+    """What was fitted together.
 
-    Wrong intrinsics err alike in all frames: the pose follows, and nothing is left of it. So where
-    parts are seen to err, a calibration is not trusted beyond a pixel either. What comes again
-    where a part stands still may be the part's surface: none of it counts as noise here.
+    Args:
+        cameras: those that were unknown, with their poses.
+        covariances: (c, 6, 6) of these poses' errors, as of ``RegisteredCamera``.
+        values: (frames, m) the body's, lengths among them [rad or m].
+        girths: (nodes,) how many times as wide the nodes are across their y axes.
     """
-    seen = seen._replace(effects=seen.effects._replace(repeated=seen.effects.noise))
-    sizes = estimate_sizes(seen, np.zeros(seen.X.shape[1], bool), 0.0, PRIOR_DEVIATION)
-    return min(_NO_BETTER, _NO_BETTER * (sizes.surface**2 + sizes.mask**2) / _PARTS_ERR**2)
+
+    cameras: tuple[PinholeCamera, ...]
+    covariances: Array
+    values: Array
+    girths: Array
 
 
-def _unseen_errors(seen: PosedFrames, X_CW: Array, pixels: float) -> Array:
-    """(7,) by how much a camera's turn, shift and focal length are off then: deviations."""
-    depth = float(X_CW[2, :3] @ seen.middle + X_CW[2, 3])
-    size = pixels * depth / seen.camera.focal_x
-    turn = size / seen.extent
-    return np.array([turn, turn, turn, size, size, size * depth / seen.extent, turn])
+def adjust_bundle(
+    kinematics: TreeKinematics,
+    outlines: Sequence[Outline],
+    cameras: Sequence[PinholeCamera],
+    unknown: Collection[str],
+    frames: Sequence[SeenFrame],
+    is_length: Mask,
+    parts: Sequence[str] = (),
+    groups: Sequence[int] | None = None,
+    telling_frames: int = 4,
+) -> AdjustedBundle:
+    """Fits poses and cameras together, in the end as finely as the model is like the body.
+
+    Args:
+        cameras: all cameras, those that are unknown near where they stand.
+        frames: what they see, and about which values of the body.
+        is_length: (m,) which of the pose tree's values are lengths, the same in all frames.
+        parts: names of the parts that have a girth: how wide they are across their y axes.
+        groups: (nodes,) which of these each node belongs to, or -1; None: none.
+        telling_frames: number of frames from which covariances are estimated.
+
+    Raises:
+        MaskError: a mask of another size than its camera's picture, or no mask shows the body.
+    """
+    values, size = np.array([frame.values for frame in frames]), common_size(cameras, frames)
+    body = BodyParameters(kinematics, outlines, groups, parts)
+    free = (kinematics.lower < kinematics.upper) & ~is_length
+    looks = [k for k, camera in enumerate(cameras) if camera.name in unknown]
+    # Known beforehand: estimated angles [rad], places and lengths [m], logarithms of girths.
+    worth = SHARED.point_error * np.sqrt(SHARED.error_length)
+    deviations = np.where(is_length, 0.03, 0.5) / worth
+    pose, lengths = (
+        Unknowns(
+            np.array(kinematics.names)[which].tolist(), shared, kinematics.lower[which],
+            kinematics.upper[which], deviations[which],
+        )
+        for which, shared in ((free, False), (is_length, True))
+    )  # fmt: skip
+    girths = [name for name in body.names if name.startswith(GIRTH_PREFIX)]
+    poses = [f"{cameras[k].name}.{name}" for k in looks for name in POSE_NAMES]
+    unknowns = [
+        pose,
+        lengths,
+        Unknowns(girths, True, deviation=0.15 / worth),
+        Unknowns(poses, True),
+    ]
+    fit = Problem(
+        body, cameras, unknowns, pivot=middle_of(kinematics, frames), steps=SHARED.steps,
+        pixels=size,
+    )  # fmt: skip
+    held = np.where(free | is_length, 0.0, values)
+    seen = [
+        Observation(frame.edges(cameras, size / 150.0), row)
+        for frame, row in zip(frames, held, strict=True)
+    ]
+    count = len(lengths.names)
+    shared = np.zeros(len(fit.names) - fit.own_count)
+    shared[:count] = values[0, is_length]
+    start = now = values[:, free], shared
+    found, rounds = None, [AnnealingStage(0.08, 0.02), AnnealingStage(0.06, 0.02, 3)]
+    # Then as fine as the model is like the body: the finest scale at which 0.7 of contours fit.
+    for scale in (0.04, 0.03, 0.02, 0.01, 0.005):
+        rounds.append(AnnealingStage(scale, 0.015, 6))
+        tried = fit.solve(seen, rounds, now, expected=start)
+        if found and tried.inlier_ratios[tried.inlier_ratios > 0.0].mean() < 0.7:
+            break
+        found, now, rounds = tried, (tried.own, tried.shared), []
+    assert found is not None
+    # The covariance is that of some frames, and of some distances in them, several an unknown: a
+    # surface that is not the body's is so in all frames. How far it is off shows at a scale at
+    # which nothing is left out because it is off.
+    some = np.unique(np.linspace(0, len(seen) - 1, telling_frames).round().astype(int))
+    uncut = AnnealingStage(0.08, 0.015)
+    pictures = fit.pictures([seen[k] for k in some], found.parameters[some], uncut)
+    distances = distances_in_masks(body.outlines, pictures, 1000)
+    turns = [name.split(".")[-1] in CAMERA_NAMES[:3] for name in fit.names[fit.own_count :]]
+    is_angle = np.concatenate([np.tile(kinematics.is_angle[free], len(some)), turns])
+    sizes = estimate_sizes(distances, is_angle, prior_deviation=SHARED.prior_deviation)
+    whole = values_covariance(distances, sizes, np.arange(len(is_angle)), is_angle)
+    X_CW, _, motions = fit.places(found.parameters[0])
+    own = np.arange(len(whole) - len(poses), len(whole)).reshape(len(looks), 6)
+    return AdjustedBundle(
+        tuple(replace(cameras[k], X_WC=np.linalg.inv(X_CW[k])) for k in looks),
+        np.array(
+            [
+                pose_covariance(X_CW[k], motions[k, :6], whole[np.ix_(at, at)])
+                for k, at in zip(looks, own, strict=True)
+            ]
+        ),
+        found.parameters[:, : values.shape[1]],
+        np.exp(np.append(found.shared[count : count + len(parts)], 0.0)[body.groups]),
+    )

@@ -17,11 +17,10 @@ from drake_pose.body.model import load_model
 from drake_pose.body.surfaces.meshes import TriangleMesh
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.camera.models import circle_of_cameras
-from drake_pose.fit.evidence import find_edge_points, pack_evidence
-from drake_pose.fit.frames_fit import FramesFit, parameter_names
+from drake_pose.fit.evidence import Observation, find_edge_points, pack_evidence
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.fit.parameters import BodyParameters
-from drake_pose.fit.unknowns import choose
+from drake_pose.fit.problem import Problem, Unknowns
 from drake_pose.silhouette.areas.outline import outline_from_mesh
 from drake_pose.silhouette.areas.scoring import draw_mask
 from tests.benchmarks.speed import fastest, limb_mesh
@@ -65,11 +64,10 @@ def measure_step(
     X_WN = kinematics.poses(np.full(len(kinematics.names), 0.05))
     edges = [find_edge_points(draw_mask(outlines, one.X_CW @ X_WN, one), 1.0) for one in seen]
     body = BodyParameters(kinematics, outlines)
-    fit = FramesFit(body, seen, choose(parameter_names(body, seen), kinematics.names))
-    held = np.zeros((frames, len(kinematics.names)))
+    problem = Problem(body, seen, [Unknowns(kinematics.names)])
     steps = (AnnealingStage(0.01, 1e-6),)
-    several = [pack_evidence(edges)] * frames
-    return fastest(lambda: fit.fit(several, held, held, np.zeros(0), steps), 3)
+    several = [Observation(pack_evidence(edges))] * frames
+    return fastest(lambda: problem.solve(several, steps), 3)
 
 
 def growth_rows() -> Iterator[tuple[str, ...]]:

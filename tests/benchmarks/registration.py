@@ -27,7 +27,7 @@ from drake_pose.body.model import load_model
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import RegistrationError
 from drake_pose.files.settings import EstimateSettings
-from drake_pose.fit.lengthened_body import lengthened_joints
+from drake_pose.fit.parameters import lengthened_joints
 from drake_pose.jobs.estimate.searches import make_tree
 from drake_pose.jobs.registration.episodes import GivenFiles
 from drake_pose.jobs.registration.inputs import read_inputs

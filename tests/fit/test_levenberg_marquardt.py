@@ -8,8 +8,8 @@ from scipy.sparse import csr_array
 from drake_pose.errors import SettingsError
 from drake_pose.fit.levenberg_marquardt import (
     AnnealingStage,
-    Coupling,
     Equations,
+    LinearPrior,
     StepSettings,
     minimise,
 )
@@ -64,16 +64,18 @@ def test_minimum_of_a_linear_problem(frames, p, q, couples, bound):
     if couples and p:
         rows, mean = generator.normal(size=(7, frames * p)), generator.normal(size=7)
         information = generator.uniform(0.5, 20.0, 7)
-        coupling = Coupling(csr_array(rows), mean, information)
+        coupling = LinearPrior(csr_array(rows), mean, information)
         root = np.sqrt(information)
         matrix = np.vstack([matrix, np.column_stack([root[:, None] * rows, np.zeros((7, q))])])
         right = np.r_[right, root * mean]
     stages = [AnnealingStage(1.0, 1.0, 40)] * 20
-    found = found_by_steps(A, b, p, bound, stages, coupling, longest=10.0, damping=1e-4)
+    own, shared, cost, _ = found_by_steps(
+        A, b, p, bound, stages, coupling, longest=10.0, damping=1e-4
+    )
     expected = lsq_linear(matrix, right, (-bound, bound), tol=1e-14)
-    np.testing.assert_allclose(found.cost, 2.0 * expected.cost, rtol=1e-4)
+    np.testing.assert_allclose(cost, 2.0 * expected.cost, rtol=1e-4)
     if bound == np.inf:
-        np.testing.assert_allclose(np.r_[found.own.ravel(), found.shared], expected.x, atol=1e-5)
+        np.testing.assert_allclose(np.r_[own.ravel(), shared], expected.x, atol=1e-5)
     else:
         assert (np.abs(expected.x) > bound - 1e-6).any()
 
@@ -84,12 +86,12 @@ def test_step_of_all_frames_is_that_of_the_whole_system(frames, p, q):
     A, b = random_frames(np.random.default_rng(5), frames, p, q)
     share = 0.3
     stage = [AnnealingStage(1.0, 1.0)]
-    found = found_by_steps(A, b, p, np.inf, stage, longest=1e3, damping=share)
+    own, shared, *_ = found_by_steps(A, b, p, np.inf, stage, longest=1e3, damping=share)
     matrix, right = whole(A, b, p)
     H = matrix.T @ matrix
     step = np.linalg.solve(H + np.diag(share * np.diag(H) + 1e-9), matrix.T @ right)
-    np.testing.assert_allclose(found.own.reshape(-1), step[: frames * p], atol=1e-12)
-    np.testing.assert_allclose(found.shared, step[frames * p :], atol=1e-12)
+    np.testing.assert_allclose(own.reshape(-1), step[: frames * p], atol=1e-12)
+    np.testing.assert_allclose(shared, step[frames * p :], atol=1e-12)
 
 
 @pytest.mark.parametrize(("name", "value"), [("scale", 0.0), ("iterations", 0), ("spacing", 0.0)])

@@ -11,7 +11,7 @@ from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.registration.joint_zeros import calibrate_joints
 from drake_pose.registration.posed_frames import PosedFrame, PosedFrames
 from drake_pose.registration.register import CameraSearch, RegisteredCamera
-from drake_pose.registration.shared_fit import CONSTANT_DEVIATION, SharedFit
+from drake_pose.registration.shared_fit import SHARED, SharedFit
 from tests.registration.arm_pictures import errors, looking_at, see
 
 MIDDLE = np.array([0.0, 0.0, 0.4])
@@ -116,5 +116,5 @@ def test_the_cost_bends_as_the_normal_equations_say(model, body, camera) -> None
     less, here, more = (
         fit.equations(fit.start._replace(shared=sign * by), step).cost for sign in (-1.0, 0.0, 1.0)
     )
-    known = (by[-1] / CONSTANT_DEVIATION) ** 2
+    known = (by[-1] / SHARED.constant_deviation) ** 2
     assert bends == pytest.approx(0.5 * (more + less) - here - known, rel=0.2)

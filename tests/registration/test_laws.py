@@ -17,8 +17,10 @@ from drake_pose.body.tree.root import RootRotation
 from drake_pose.camera.models import ParallelCamera
 from drake_pose.errors import MaskError, RegistrationError
 from drake_pose.fit.covariance import estimate_sizes
+from drake_pose.fit.evidence import Observation
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
-from drake_pose.registration import bundle_adjustment
+from drake_pose.fit.parameters import BodyParameters
+from drake_pose.fit.problem import parameter_names
 from drake_pose.registration.joint_zeros import _as_the_cost_bends, _constants, _significant
 from drake_pose.registration.object_search import ObjectSearch, hand_eye_starts
 from drake_pose.registration.online_registration import pose_difference
@@ -26,11 +28,11 @@ from drake_pose.registration.per_frame_fit import PerFrameFit
 from drake_pose.registration.posed_frames import PosedFrame, PosedFrames, SeenFrame
 from drake_pose.registration.register import RegistrationBody
 from drake_pose.registration.shared_fit import (
-    CONSTANT_DEVIATION,
-    FOCAL_DEVIATION,
+    SHARED,
     Shared,
     SharedFit,
-    _scatter,
+    adjust_bundle,
+    scatter_factor,
 )
 from drake_pose.registration.standing_object import (
     StandingObject,
@@ -69,11 +71,10 @@ def with_zero(posed: PosedFrames) -> SharedFit:
 
 def test_what_is_known_beforehand_pulls_by_what_it_says(posed: PosedFrames) -> None:
     fit, free = with_zero(posed), with_zero(posed)
-    nothing = np.zeros_like(free._fit.unknowns.information)
-    free._fit.unknowns = replace(free._fit.unknowns, information=nothing)
+    free.problem.information = np.zeros_like(free.problem.information)
     shared = np.array([0.01, 0.0, -0.01, 0.002, 0.003, 0.0, 0.04, -0.03])
     with_prior, without = (one.equations(Shared(shared, np.zeros(2)), STEP) for one in (fit, free))
-    known = np.array([0.0] * 6 + [FOCAL_DEVIATION**-2, CONSTANT_DEVIATION**-2])
+    known = np.array([0.0] * 6 + [SHARED.focal_deviation**-2, SHARED.constant_deviation**-2])
     H, g = with_prior.H - without.H, with_prior.g - without.g
     np.testing.assert_allclose(H.sum(axis=0)[1:, 1:], np.diag(known), atol=1e-6)
     np.testing.assert_allclose(g.sum(axis=0)[1:], known * shared, atol=1e-6)
@@ -111,11 +112,11 @@ def test_a_camera_s_covariance_is_that_of_its_moves(posed: PosedFrames) -> None:
 
 def test_what_frames_share_does_not_scatter_and_what_they_do_not_does(posed: PosedFrames) -> None:
     fit = SharedFit([posed], [posed.camera.X_CW])
-    seen, rng = fit._distances(fit.start, STEP, None), np.random.default_rng(3)
+    seen, rng = fit.distances(fit.start, STEP), np.random.default_rng(3)
     sizes = estimate_sizes(seen, np.zeros(seen.X.shape[1], bool), 0.0)
 
     def scatter(y: np.ndarray) -> float:
-        return _scatter(seen._replace(y=y), sizes, 6)
+        return scatter_factor(seen._replace(y=y), sizes, 6)
 
     apart = seen.X[:, :6] @ rng.normal(0.0, 0.05, (6, 2))
     apart = np.where(seen.pictures == seen.pictures[0], *apart.T)
@@ -396,7 +397,7 @@ def test_an_interval_without_0_is_significant_and_a_length_s_is_that_of_its_loga
 
 
 def test_what_a_constant_cannot_be_told_from_is_its_gauge() -> None:
-    by = 0.5 * CONSTANT_DEVIATION
+    by = 0.5 * SHARED.constant_deviation
     covariance = np.diag([0.01, by**2, 1e-8])
     covariance[0, 1] = covariance[1, 0] = 0.095 * by
     told = _constants(NAMED, shared(0, 0.1, 0.1), 20, 0.05, covariance, NAMED.names[1:])
@@ -469,11 +470,8 @@ def test_three_pictures_tell_camera_and_object() -> None:
     assert min(np.abs(best[1] - X_WT @ turn).max() for turn in (np.eye(4), half)) < 1e-9
 
 
-def test_a_bundle_finds_poses_and_a_camera_together(
-    body: RegistrationBody, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_bundle_finds_poses_and_a_camera_together(body: RegistrationBody) -> None:
     """From positions that are off, and a camera that stands elsewhere; another one holds both."""
-    monkeypatch.setattr(bundle_adjustment, "_TELLING_FRAMES", 1)
     cameras = [replace(one, name=n) for one, n in zip(arm_cameras(), ("a", "b"), strict=True)]
     rng, kinematics, frames = np.random.default_rng(3), body.kinematics, []
     true = rng.uniform(-0.8, 0.8, (3, len(kinematics.names)))
@@ -485,7 +483,7 @@ def test_a_bundle_finds_poses_and_a_camera_together(
     X_WC[:3, 3] += [0.02, -0.02, 0.02]
     given = [cameras[0], cameras[1].with_pose(X_WC)]
     nothing = np.zeros(len(kinematics.names), bool)
-    found = bundle_adjustment.adjust_bundle(kinematics, body.few, given, ("b",), frames, nothing)
+    found = adjust_bundle(kinematics, body.few, given, ("b",), frames, nothing, telling_frames=1)
     (camera,), (covariance,) = found.cameras, found.covariances
     shift, turn = errors(camera.X_WC, cameras[1].X_WC)
     assert shift < 0.012
@@ -515,8 +513,9 @@ def per_frame(body: RegistrationBody, posed: PosedFrames) -> tuple[PerFrameFit, 
 
 
 @pytest.mark.parametrize("wider", [-2, 1, 2])
-def test_masks_are_as_much_wider_as_they_were_made(per_frame, wider: int) -> None:
+def test_masks_are_as_much_wider_as_they_were_made(per_frame, body, wider: int) -> None:
     fit, (frame, *_) = per_frame
+    posed_body = body.kinematics, body.few
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * abs(wider) + 1,) * 2)
     widths = []
     for by in (0, wider):
@@ -524,17 +523,17 @@ def test_masks_are_as_much_wider_as_they_were_made(per_frame, wider: int) -> Non
         mask = frame.masks["eye"].astype(np.uint8)
         mask = (change(mask, disc) if by else mask).astype(bool)
         made = replace(frame, masks={"eye": mask})
-        held = np.zeros(len(fit._all.names))
-        held[: len(frame.values)] = frame.values
-        edges = made.edges(fit._cameras, fit._size / 100.0)
-        widths.append(fit._with_widths(edges, held)[-2])
+        seen = Observation(made.edges(fit.cameras, fit.size / 100.0))
+        theta = np.zeros(len(parameter_names(BodyParameters(*posed_body), fit.cameras)))
+        theta[: len(frame.values)] = frame.values
+        widths.append(fit.with_widths(seen, theta)[-2])
     assert widths[1] - widths[0] == pytest.approx(wider, abs=0.35)
 
 
 def test_cameras_that_move_like_a_pixel_or_a_longer_lens_see_that(per_frame) -> None:
     """Principal points and focal lengths told as motions, against projections."""
     fit, _ = per_frame
-    for k, camera in enumerate(fit._cameras):
+    for k, camera in enumerate(fit.cameras):
         still = camera.with_pose(np.eye(4))
         z = fit._depth(k)
         p_C = np.array([[x, y, z] for x in (-0.1, 0.1) for y in (-0.1, 0.1)])

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from drake_pose.errors import RegistrationError
-from drake_pose.fit.frames_fit import TIME_OFFSET
+from drake_pose.fit.problem import TIME_OFFSET
 from drake_pose.registration.picture_registration import register_pictures
 from drake_pose.registration.picture_search import (
     PictureSearch,

@@ -22,7 +22,7 @@ from drake_pose.errors import CameraError
 from drake_pose.files.folder import writes_folder
 from drake_pose.files.options import percent
 from drake_pose.files.summary import BADLY_EXPLAINED
-from drake_pose.fit.lengthened_body import lengthened_joints
+from drake_pose.fit.parameters import lengthened_joints
 from drake_pose.jobs.estimate.inputs import missing_for_person
 from drake_pose.jobs.registration.episodes import (
     EpisodeInputs,
@@ -55,7 +55,6 @@ from drake_pose.jobs.registration.result import (
 )
 from drake_pose.jobs.registration.settings import RegistrationSettings
 from drake_pose.person.shape import shape_parts, shape_values
-from drake_pose.registration.bundle_adjustment import adjust_bundle
 from drake_pose.registration.joint_zeros import JointCalibration, calibrate_joints
 from drake_pose.registration.object_search import ObjectSearch
 from drake_pose.registration.picture_frames import judge_pictures
@@ -73,6 +72,7 @@ from drake_pose.registration.register import (
     RegistrationBody,
     suggest_pose,
 )
+from drake_pose.registration.shared_fit import adjust_bundle
 from drake_pose.registration.standing_object import StandingObject
 from drake_pose.registration.start_poses import E_total, areas, intersection_over_union
 from drake_pose.registration.target_pictures import find_in_pictures, require_seen

@@ -16,7 +16,7 @@ from drake_pose.body.model import ArticulatedModel, load_model
 from drake_pose.body.report import describe_model, model_warnings
 from drake_pose.body.tree.tree_kinematics import TreeKinematics, joint_offsets
 from drake_pose.errors import ModelError, SettingsError
-from drake_pose.fit.lengthened_body import LengthenedBody
+from drake_pose.fit.parameters import BodyParameters
 from drake_pose.fit.surfaces import VERY_FEW, few_triangles
 from drake_pose.silhouette.areas.bending import TreeSurfaces
 from tests.fit.motions import assert_motions_are_derivatives
@@ -106,8 +106,8 @@ def test_beside_tendons_nothing_is_enforced_and_that_is_told(tmp_path):
 def test_motions_against_finite_differences(tmp_path, lengths):
     kinematics, values = drawn(tree_of(tmp_path), np.random.default_rng(1))
     surfaces = few_triangles(TreeSurfaces(kinematics.tree), VERY_FEW)
-    body = LengthenedBody(kinematics, surfaces, joint_offsets(kinematics.tree))
-    logs = np.linspace(0.1, 0.2, len(body.links)) if lengths else []
+    body = BodyParameters(kinematics, surfaces, offsets=joint_offsets(kinematics.tree))
+    logs = [0.0] * 4 + np.linspace(0.1, 0.2, len(body.links)).tolist() if lengths else []
     assert_motions_are_derivatives(body, np.append(values, logs))
 
 

@@ -150,7 +150,7 @@ def test_all_poses_are_found_and_starts_that_end_alike_are_one_explanation(fitte
     off = np.degrees(np.abs(found.fitted.parameters[:, index] - states[:, :3]))
     begun = np.degrees(np.abs(np.array(starts[0])[:, :3] - states[:, :3]))
     assert np.median(off) < 0.25 * np.median(begun)
-    deviations = np.degrees(found.fitted.deviations[:, index])
+    deviations = np.degrees(found.deviations[:, index])
     assert (deviations > 0.0).all()
     assert np.mean(off < 2.0 * deviations) > 0.9
 

@@ -1,4 +1,10 @@
-"""Several frames fitted together: each one's own unknowns, and those that all frames share."""
+"""A fit of several frames: unknowns of each frame, unknowns that all frames share, observations.
+
+An unknown is added to one parameter of a frame. So a joint's position is an unknown of each frame
+that is added to the joint's value; its offset is a shared unknown that is added to the same value,
+where an encoder's readings are held; a segment's length is a shared unknown, added to a shape
+joint's value.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +17,7 @@ from scipy.linalg import block_diag
 
 from drake_pose.arrays import Array
 from drake_pose.camera.models import Camera
-from drake_pose.errors import SettingsError
+from drake_pose.errors import SettingsError, UnknownNameError
 from drake_pose.fit.background import odds_of_colours
 from drake_pose.fit.colours import compare_lines
 from drake_pose.fit.contour_fit import (
@@ -24,41 +30,53 @@ from drake_pose.fit.contour_fit import (
     symmetric,
 )
 from drake_pose.fit.covariance import ComparedMask
-from drake_pose.fit.evidence import Evidence, FrameEvidence, widened
+from drake_pose.fit.evidence import Observation, widened
 from drake_pose.fit.kernel import Sum
 from drake_pose.fit.levenberg_marquardt import (
     AnnealingStage,
-    Coupling,
     Equations,
+    LinearPrior,
     StepSettings,
     minimise,
 )
-from drake_pose.fit.parameters import (
-    CAMERA_NAMES,
-    BodyParameters,
-    CameraParameters,
-    Placement,
-)
-from drake_pose.fit.unknowns import Unknowns
+from drake_pose.fit.parameters import CAMERA_NAMES, BodyParameters, CameraParameters, Placement
 from drake_pose.workers import map_ordered
 
 WIDTH = "width"
-"""By how much a silhouette is too wide on all sides [pixel]: a parameter of each camera."""
+"""Parameter of each camera: by how much its silhouettes are too wide on all sides [pixel]."""
 
 TIME_OFFSET = "time_offset"
-"""By how much later than their positions pictures were taken [s]: a parameter of the frame."""
+"""Parameter of a frame: by how much later than its positions its pictures were taken [s]."""
 
 
 @dataclass(frozen=True, eq=False)
-class FittedFrames:
-    """What frames were fitted by.
+class Unknowns:
+    """Parameters of frames that are unknown.
+
+    Args:
+        names: of the u parameters, see ``parameter_names``.
+        shared: whether they are the same in all frames.
+        lower, upper: limits of all, or (u,) of each [rad, m, pixel or a logarithm].
+        deviation: standard deviation of all, or (u,) of each, about what is expected.
+    """
+
+    names: Sequence[str]
+    shared: bool = False
+    lower: float | Array = -np.inf
+    upper: float | Array = np.inf
+    deviation: float | Array = np.inf
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """The unknowns of a problem that fit best.
 
     Attributes:
         own: (frames, p) each frame's own unknowns.
         shared: (q,) those of all frames.
         parameters: (frames, n) all parameters of the frames.
-        cost: of all frames at the end, with what is known without pictures.
-        ending: tells the equations, and what fits, at the end; asked where that is asked for.
+        cost: of all frames, priors included.
+        ending: evaluates the normal equations and the inlier ratios at the end, when asked for.
         coupling: what was known of the frames' own unknowns together.
     """
 
@@ -67,22 +85,22 @@ class FittedFrames:
     parameters: Array
     cost: float
     ending: Callable[[], tuple[Equations, Array]]
-    coupling: Coupling | None = None
+    coupling: LinearPrior | None = None
 
     @property
     def equations(self) -> Equations:
-        """The normal equations at the end, priors included but for the coupling."""
+        """The normal equations, priors included but for the coupling."""
         return self.ending()[0]
 
     @property
     def inlier_ratios(self) -> Array:
-        """(frames, cameras) of both contours' lengths, what fits."""
+        """(frames, cameras) fraction of both contours' lengths that fits."""
         return self.ending()[1]
 
     def own_deviations(self) -> Array:
-        """(frames, p) standard deviations, with the coupling and what shared unknowns may be.
+        """(frames, p) standard deviations of own unknowns, shared ones being unknown, too.
 
-        They are 100 [of the unknown's unit] at most, where nothing tells.
+        They are 100 [of the unknown's unit] at most, where nothing is observed.
         """
         frames, p = self.own.shape
         H = self.equations.H
@@ -104,30 +122,36 @@ def parameter_names(body: BodyParameters, cameras: Sequence[Camera]) -> tuple[st
     return (*body.names, TIME_OFFSET, *looks, *widths)
 
 
-class FramesFit:
-    """Fits unknowns of several frames that the same cameras see.
+class Problem:
+    """Unknowns of frames of a body that the same cameras see.
 
     Attributes:
         body: the body.
-        names: of all parameters of a frame, parameter_names.
+        names: of the u unknowns: the p of each frame first, then the q shared ones.
+        entries: (u,) the parameter of a frame that each is added to.
+        own_count: p.
+        information: (u,) one over the variance of each, without pictures.
 
     Args:
         body: the body.
         cameras: the cameras.
         unknowns: which parameters are unknown.
-        pivot: (3,) or (cameras, 3), about which in the world cameras turn [m]; None: the root's
-            place.
-        noise: what a point of contour is worth.
+        pivot: (3,) or (cameras, 3) the point in the world about which cameras turn [m]; None: the
+            root's place.
+        noise: of contours; None: a pixel's, or ``Noise()`` where lengths are in metres.
         steps: how steps are made.
-        pixels: of the unit of length of rounds and noise, of all cameras or (cameras,); None: the
-            metre's at the root.
+        pixels: the unit of length of rounds and noise [pixel], of all cameras or (cameras,); None:
+            a metre at the root.
+
+    Raises:
+        UnknownNameError: an unknown that is no parameter.
     """
 
     def __init__(
         self,
         body: BodyParameters,
         cameras: Sequence[Camera],
-        unknowns: Unknowns,
+        unknowns: Sequence[Unknowns],
         *,
         pivot: Array | None = None,
         noise: Noise | None = None,
@@ -135,154 +159,166 @@ class FramesFit:
         pixels: float | Array | None = None,
     ) -> None:
         kinematics = body.kinematics
-        values = kinematics.flatten(kinematics.tree.default_values())
-        where = kinematics.poses(values)[0, :3, 3] if pivot is None else pivot
-        self.body, self._cameras = body, CameraParameters(cameras, where)
-        self.names = parameter_names(body, cameras)
-        self.unknowns = unknowns
+        if pivot is None:
+            values = kinematics.flatten(kinematics.tree.default_values())
+            pivot = kinematics.poses(values)[0, :3, 3]
+        if noise is None and pixels is not None:
+            noise = Noise.of_a_pixel(pixels)
+        self.body, self._cameras = body, CameraParameters(cameras, pivot)
+        every = list(parameter_names(body, cameras))
+        unknowns = sorted(unknowns, key=lambda one: one.shared)
+        self.names = tuple(name for one in unknowns for name in one.names)
+        for name in self.names:
+            if name not in every:
+                raise UnknownNameError("parameter", name, every, "the fit")
+        self.entries = np.array([every.index(name) for name in self.names], dtype=np.intp)
+        self.own_count = sum(len(one.names) for one in unknowns if not one.shared)
+        self._lower, self._upper, self.information = (
+            np.concatenate(
+                [np.broadcast_to(value, len(one.names)) for one, value in given] or [np.zeros(0)]
+            )
+            for given in (
+                [(one, one.lower) for one in unknowns],
+                [(one, one.upper) for one in unknowns],
+                [(one, 1.0 / np.square(one.deviation)) for one in unknowns],
+            )
+        )
         self._contours = ContourFit(kinematics, body.outlines, noise, steps, pixels, body)
-        self._first_look = len(body.names) + 1
-        self._first_width = len(self.names) - len(cameras)
-        self._widths = np.flatnonzero(unknowns.entries >= self._first_width)
+        self._count, self._first_look = len(every), len(body.names) + 1
+        self._first_width = len(every) - len(cameras)
+        self._widths = np.flatnonzero(self.entries >= self._first_width)
         self._of_odds = odds_of_colours(len(body.outlines))
-        self._fixed = not np.any(unknowns.entries >= self._first_look)
+        self._fixed = not np.any(self.entries >= self._first_look)
         # A body is placed faster that neither grows nor is shifted.
         self._values = len(kinematics.names)
-        places = (unknowns.entries >= self._values) & (unknowns.entries < len(body.names))
+        places = (self.entries >= self._values) & (self.entries < len(body.names))
         self._stays = not places.any()
         # A body of which nothing is unknown stands still, and all its nodes move with the camera.
-        self._stands = not np.any(unknowns.entries <= len(body.names))
+        self._stands = not np.any(self.entries <= len(body.names))
         self._placed: dict[bytes, Placement] = {}
         self._last_look: tuple[bytes, tuple[Array, Array, Array]] = (
             b"",
             self._cameras.place(np.zeros(len(self._cameras.names))),
         )
 
-    def fit(
+    def solve(
         self,
-        frames: Sequence[Evidence | FrameEvidence],
-        held: Array,
-        own: Array,
-        shared: Array,
+        observations: Sequence[Observation],
         rounds: Sequence[AnnealingStage],
+        start: tuple[Array, Array] | None = None,
         *,
         expected: tuple[Array, Array] | None = None,
         shared_information: Array | None = None,
-        coupling: Coupling | None = None,
-    ) -> FittedFrames:
-        """Fits the unknowns.
+        coupling: LinearPrior | None = None,
+    ) -> Solution:
+        """The unknowns that fit best, near where they start.
 
         Args:
-            frames: what the cameras see in each.
-            held: (frames, n) each frame's parameters where all unknowns are 0, such as an encoder's
-                readings; or with fewer columns, those of the body's first parameters.
-            own, shared: (frames, p) and (q,) where to start.
+            observations: the frames.
             rounds: the parts of the fit.
-            expected: own and shared unknowns that what is known without pictures is about; None:
-                where the fit starts.
-            shared_information: (q, q) what else is known of the shared unknowns.
+            start: (frames, p) own and (q,) shared unknowns; None: all 0.
+            expected: mean of the unknowns' prior; None: where the fit starts.
+            shared_information: (q, q) further information about the shared unknowns.
             coupling: what is known of all frames' own unknowns together.
 
         Raises:
             SettingsError: shapes that do not fit each other.
         """
-        p, q = self.unknowns.own_count, len(self.unknowns.names) - self.unknowns.own_count
-        base = np.zeros((len(frames), len(self.names)))
-        if own.shape != (len(frames), p) or shared.shape != (q,) or len(held) != len(frames):
+        frames, p, q = len(observations), self.own_count, len(self.names) - self.own_count
+        own, shared = (np.zeros((frames, p)), np.zeros(q)) if start is None else start
+        if own.shape != (frames, p) or shared.shape != (q,):
             raise SettingsError(
-                f"{len(frames)} frames with {p} own and {q} shared unknowns expected, got "
-                f"{own.shape}, {shared.shape} and {len(held)} frames that are held"
+                f"{frames} frames with {p} own and {q} shared unknowns expected, got "
+                f"{own.shape} and {shared.shape}"
             )
-        base[:, : held.shape[1]] = held
         about = (own.copy(), shared.copy()) if expected is None else expected
 
         def evaluate(own: Array, shared: Array, step: AnnealingStage) -> Equations:
-            return self._equations(frames, base, (own, shared), about, step, shared_information)[0]
+            return self._equations(observations, (own, shared), about, step, shared_information)[0]
 
-        limits = self.unknowns.lower, self.unknowns.upper
-        found = minimise(evaluate, own, shared, limits, rounds, self._contours.steps, coupling)
-        at = found.own, found.shared
-        parameters = [
-            self.unknowns.parameters(one, x, found.shared)
-            for one, x in zip(base, found.own, strict=True)
-        ]
-        return FittedFrames(
-            found.own,
-            found.shared,
-            np.array(parameters),
-            found.cost,
-            cache(lambda: self._equations(frames, base, at, about, rounds[-1], shared_information)),
+        limits = self._lower, self._upper
+        own, shared, cost = minimise(
+            evaluate, own, shared, limits, rounds, self._contours.steps, coupling
+        )[:3]
+        at, last = (own, shared), rounds[-1]
+        return Solution(
+            own,
+            shared,
+            self.parameters(observations, own, shared),
+            cost,
+            cache(lambda: self._equations(observations, at, about, last, shared_information)),
             coupling,
         )
 
     def equations(
         self,
-        frames: Sequence[Evidence | FrameEvidence],
-        held: Array,
-        own: Array,
-        shared: Array,
+        observations: Sequence[Observation],
+        at: tuple[Array, Array],
         step: AnnealingStage,
         expected: tuple[Array, Array] | None = None,
     ) -> Equations:
-        """The normal equations at some unknowns; arguments as in fit."""
-        base = np.zeros((len(frames), len(self.names)))
-        base[:, : held.shape[1]] = held
-        about = (own, shared) if expected is None else expected
-        return self._equations(frames, base, (own, shared), about, step, None)[0]
+        """The normal equations at own and shared unknowns; arguments as of ``solve``."""
+        return self._equations(observations, at, expected or at, step, None)[0]
+
+    def parameters(self, observations: Sequence[Observation], own: Array, shared: Array) -> Array:
+        """(frames, n) all parameters at own (frames, p) and shared (q,) unknowns."""
+        theta = np.zeros((len(observations), self._count))
+        for row, one in zip(theta, observations, strict=True):
+            row[: len(one.values)] = one.values
+        for entry, unknown in zip(self.entries.tolist(), (*own.T, *shared), strict=True):
+            theta[:, entry] += unknown
+        return theta
 
     def _equations(
         self,
-        frames: Sequence[Evidence | FrameEvidence],
-        base: Array,
+        observations: Sequence[Observation],
         at: tuple[Array, Array],
         about: tuple[Array, Array],
         step: AnnealingStage,
         shared_information: Array | None,
     ) -> tuple[Equations, Array]:
-        """The equations, and of both contours' lengths what fits (frames, cameras)."""
-        unknowns = self.unknowns
-        p, u = unknowns.own_count, len(unknowns.names)
-        H, g, cost = np.zeros((len(frames), u, u)), np.zeros((len(frames), u)), 0.0
-        shares = []
+        """The equations, and the inlier ratios (frames, cameras)."""
+        p, u, frames = self.own_count, len(self.names), len(observations)
+        H, g, cost = np.zeros((frames, u, u)), np.zeros((frames, u)), 0.0
+        ratios = []
+        parameters = self.parameters(observations, *at)
 
         def told(k: int) -> tuple[Array, Array, Array]:
-            theta = unknowns.parameters(base[k], at[0][k], at[1])
-            return self._frame(frames[k], theta, step)
+            return self._frame(observations[k], parameters[k], step)
 
-        for k, (own_H, own_g, sums) in enumerate(map_ordered(told, range(len(frames)))):
+        for k, (own_H, own_g, sums) in enumerate(map_ordered(told, range(frames))):
             H[k], g[k] = own_H, own_g
             cost += float(sums[:, :, Sum.COST].sum())
             lengths = np.maximum(sums[:, :, Sum.COMPARED].sum(axis=1), 1e-9)
-            shares.append(sums[:, :, Sum.FITTING].sum(axis=1) / lengths)
+            ratios.append(sums[:, :, Sum.FITTING].sum(axis=1) / lengths)
             off = at[0][k] - about[0][k]
-            own_information = unknowns.information[:p]
+            own_information = self.information[:p]
             H[k, range(p), range(p)] += own_information
             g[k, :p] += own_information * off
             cost += float(own_information @ off**2)
-        information = np.diag(unknowns.information[p:])
+        information = np.diag(self.information[p:])
         if shared_information is not None:
             information = information + shared_information
         off = at[1] - about[1]
         # The prior of what is shared counts once: with the first frame.
         H[0, p:, p:] += information
         g[0, p:] += information @ off
-        return Equations(H, g, cost + float(off @ information @ off)), np.array(shares)
+        return Equations(H, g, cost + float(off @ information @ off)), np.array(ratios)
 
     def _frame(
-        self, evidence: Evidence | FrameEvidence, theta: Array, step: AnnealingStage
+        self, seen: Observation, theta: Array, step: AnnealingStage
     ) -> tuple[Array, Array, Array]:
         """A frame's equations of the unknowns, and its sums."""
-        compared, (_, _, motions) = self.compare(evidence, theta, step)
-        rates = evidence.rates if isinstance(evidence, FrameEvidence) else None
+        compared, (_, _, motions) = self.compare(seen, theta, step)
         if self._fixed:
-            moves = self._moves(compared, motions, 0, rates)
+            moves = self._moves(compared, motions, 0, seen.rates)
             told = [(moves, compared.total.A, compared.total.b)]
         else:
             told = [
-                (self._moves(compared, motions, c, rates), A, b)
+                (self._moves(compared, motions, c, seen.rates), A, b)
                 for c, (A, b) in enumerate(zip(compared.A, compared.b, strict=True))
             ]
-        u = len(self.unknowns.entries)
+        u = len(self.entries)
         H, g = np.zeros((u, u)), np.zeros(u)
         for moves, A, b in told:
             if self._stands:
@@ -294,7 +330,7 @@ class FramesFit:
             g -= rows @ b.ravel()
         for k in self._widths:
             # Of a silhouette that is wider all distances are less.
-            c = self.unknowns.entries[k] - self._first_width
+            c = self.entries[k] - self._first_width
             g[k] = -compared.wide[c, :, 12].sum()
             H[k] = H[:, k] = np.einsum(
                 "nux,nx->u", told[0 if self._fixed else c][0], compared.wide[c, :, :12]
@@ -303,15 +339,15 @@ class FramesFit:
         return H, g, compared.sums
 
     def compare(
-        self, evidence: Evidence | FrameEvidence, theta: Array, step: AnnealingStage
+        self, seen: Observation, theta: Array, step: AnnealingStage
     ) -> tuple[Comparison, tuple[Array, Array, Array]]:
         """A frame's contours compared with its silhouettes at all parameters (n,).
 
         Returns:
             the comparison, and the cameras as of ``CameraParameters.place``.
         """
-        places, seen = self.places(theta), _whole(evidence)
-        views = self._views(seen.edges, theta, places)
+        places = self.places(theta)
+        views = self._views(seen, theta)
         placed = self._placement(self._of_body(theta, seen.rates))
         weights = self._contours.weights(views.cameras, placed, step)
         compared = compare_views(views, placed, weights, len(self._widths) > 0)
@@ -329,11 +365,10 @@ class FramesFit:
         return compared, places
 
     def piece_costs(
-        self, evidence: Evidence | FrameEvidence, theta: Array, step: AnnealingStage, side: float
+        self, seen: Observation, theta: Array, step: AnnealingStage, side: float
     ) -> Array:
         """(cameras, k, k) the costs at all parameters (n,) by squares of a side [pixel]."""
-        seen = _whole(evidence)
-        views = self._views(seen.edges, theta, self.places(theta))
+        views = self._views(seen, theta)
         return self._contours.piece_costs(views, self._of_body(theta, seen.rates), step, side)
 
     def _placement(self, own: Array) -> Placement:
@@ -353,10 +388,11 @@ class FramesFit:
             own[: self._values] += rates * theta[len(own)]
         return own[: self._values] if self._stays and not own[self._values :].any() else own
 
-    def _views(self, evidence: Evidence, theta: Array, places: tuple[Array, Array, Array]) -> Views:
+    def _views(self, seen: Observation, theta: Array) -> Views:
         """The cameras, and their silhouettes as wide as they are."""
         widths = theta[self._first_width :]
-        return Views(places[:2], widened(evidence, -widths) if widths.any() else evidence)
+        edges = widened(seen.edges, -widths) if widths.any() else seen.edges
+        return Views(self.places(theta)[:2], edges)
 
     def places(self, theta: Array) -> tuple[Array, Array, Array]:
         """The cameras at all parameters (n,), as of ``CameraParameters.place``."""
@@ -367,26 +403,25 @@ class FramesFit:
         return self._last_look[1]
 
     def pictures(
-        self, frames: Sequence[Evidence | FrameEvidence], parameters: Array, step: AnnealingStage
+        self, observations: Sequence[Observation], parameters: Array, step: AnnealingStage
     ) -> list[ComparedMask]:
         """What each silhouette says at all parameters (frames, n).
 
         Its values are the unknowns but widths: each frame's own, then the shared ones.
         """
-        chosen = self.unknowns.entries < self._first_width
-        p = int(np.count_nonzero(chosen & ~self.unknowns.shared))
-        q = int(np.count_nonzero(chosen & self.unknowns.shared))
+        chosen, frames = self.entries < self._first_width, len(observations)
+        p = int(np.count_nonzero(chosen[: self.own_count]))
+        q = int(np.count_nonzero(chosen[self.own_count :]))
         found = []
-        for k, (evidence, theta) in enumerate(zip(frames, parameters, strict=True)):
-            compared, (X_CW, kernel, motions) = self.compare(evidence, theta, step)
+        for k, (seen, theta) in enumerate(zip(observations, parameters, strict=True)):
+            compared, (X_CW, kernel, motions) = self.compare(seen, theta, step)
             X_WN = compared.placement.X_WN
             sizes = 1.0 / pixels_per_metre((X_CW, kernel), X_WN[:, :3, 3].mean(axis=0))
             for c in np.flatnonzero(compared.A.any(axis=(1, 2, 3))).tolist():
-                rates = evidence.rates if isinstance(evidence, FrameEvidence) else None
-                told = self._moves(compared, motions, c, rates)[:, chosen]
+                told = self._moves(compared, motions, c, seen.rates)[:, chosen]
                 own, shared = np.split(told, [p], axis=1)
-                moves = np.zeros((len(X_WN), len(frames) * p + q, 12))
-                moves[:, k * p : (k + 1) * p], moves[:, len(frames) * p :] = own, shared
+                moves = np.zeros((len(X_WN), frames * p + q, 12))
+                moves[:, k * p : (k + 1) * p], moves[:, frames * p :] = own, shared
                 A = symmetric(compared.A[c])
                 found.append(
                     ComparedMask(A, compared.b[c], X_WN, X_CW[c], moves, float(sizes[c]), c)
@@ -397,7 +432,7 @@ class FramesFit:
         self, compared: Comparison, motions: Array, camera: int, rates: Array | None
     ) -> Array:
         """(nodes, u, 12) how the unknowns move the nodes before a camera; widths move none."""
-        entries, placement = self.unknowns.entries, compared.placement
+        entries, placement = self.entries, compared.placement
         moves = np.zeros((len(placement.X_WN), len(entries), 12))
         own, late = entries < len(self.body.names), entries == len(self.body.names)
         if own.any() or late.any():
@@ -409,8 +444,3 @@ class FramesFit:
         turned = (look >= 0) & (look < len(CAMERA_NAMES)) & (entries < self._first_width)
         moves[:, turned] = motions[camera, look[turned]]
         return moves
-
-
-def _whole(evidence: Evidence | FrameEvidence) -> FrameEvidence:
-    """A frame's edges; of one that has no more it is not known how the body moves."""
-    return evidence if isinstance(evidence, FrameEvidence) else FrameEvidence(evidence)

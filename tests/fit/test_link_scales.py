@@ -6,7 +6,7 @@ import pytest
 from drake_pose.body.model import load_model
 from drake_pose.body.tree.root import RootRotation
 from drake_pose.body.tree.tree_kinematics import TreeKinematics, joint_offsets
-from drake_pose.fit.lengthened_body import LengthenedBody
+from drake_pose.fit.parameters import BodyParameters
 from drake_pose.silhouette.areas.outline import outline_from_mesh
 from tests.body.models import joint, link, urdf
 from tests.fit.motions import assert_motions_are_derivatives
@@ -60,12 +60,12 @@ def body(tmp_path, request):
     """The tree walks joints outwards from the base, inwards from the finger, and both ways."""
     kinematics = kinematics_of(tmp_path / "odd.urdf", URDF, request.param)
     outlines = [outline_from_mesh(node.mesh) for node in kinematics.tree.nodes]
-    return LengthenedBody(kinematics, outlines, joint_offsets(kinematics.tree))
+    return BodyParameters(kinematics, outlines, offsets=joint_offsets(kinematics.tree))
 
 
-def parameters(body, logs):
+def parameters(body, logs, placed=(0.0, 0.0, 0.0, 0.0)):
     values = [VALUES[name] for name in body.kinematics.names]
-    return np.array([*values, *(logs.get(link, 0.0) for link in body.links)])
+    return np.array([*values, *placed, *(logs.get(link, 0.0) for link in body.links)])
 
 
 def test_links_with_a_length(body):
@@ -94,5 +94,7 @@ def test_a_joint_behind_a_weld_is_moved_from_the_link_s_own_joint(body):
 
 
 def test_derivatives(body):
-    theta = parameters(body, {"base": 0.1, "upper": -0.2, "gimbal": 0.3, "mount": -0.1})
+    """Also of a body that has grown about its root and is shifted."""
+    logs = {"base": 0.1, "upper": -0.2, "gimbal": 0.3, "mount": -0.1}
+    theta = parameters(body, logs, (0.1, -0.2, 0.3, 0.15))
     assert_motions_are_derivatives(body, theta)

@@ -10,16 +10,11 @@ from drake_pose.body.surfaces.meshes import TriangleMesh
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.camera.models import ParallelCamera, PinholeCamera, circle_of_cameras
 from drake_pose.errors import SettingsError, UnknownNameError
-from drake_pose.fit.evidence import NO_EDGE, FrameEvidence, find_edge_points, pack_evidence
-from drake_pose.fit.frames_fit import FittedFrames, FramesFit, parameter_names
-from drake_pose.fit.levenberg_marquardt import AnnealingStage, Coupling, Equations
-from drake_pose.fit.parameters import (
-    CAMERA_NAMES,
-    BodyParameters,
-    CameraParameters,
-)
+from drake_pose.fit.evidence import NO_EDGE, Observation, find_edge_points, pack_evidence
+from drake_pose.fit.levenberg_marquardt import AnnealingStage, Equations, LinearPrior
+from drake_pose.fit.parameters import CAMERA_NAMES, BodyParameters, CameraParameters
+from drake_pose.fit.problem import Problem, Solution, Unknowns, parameter_names
 from drake_pose.fit.surfaces import VERY_FEW, few_triangles
-from drake_pose.fit.unknowns import choose, join
 from drake_pose.silhouette.areas.bending import TreeSurfaces
 from drake_pose.silhouette.areas.outline import outline_from_mesh
 from drake_pose.silhouette.areas.scoring import draw_mask
@@ -95,12 +90,9 @@ def test_a_focal_length_and_a_scale_of_all_frames_are_found(body, rig):
     truth = poses(body, 3, 3)
     for camera in (rig[0], parallel(rig[0])):
         moved = np.array([0.0] * 6 + [0.08, 0.0, 0.0])
-        names = parameter_names(body, [camera])
-        unknowns = choose(names, [f"{camera.name}.{CAMERA_NAMES[6]}"], shared=True)
-        frames = [draw(body, [camera], theta, moved) for theta in truth]
-        found = FramesFit(body, [camera], unknowns).fit(
-            frames, truth, np.zeros((3, 0)), np.zeros(1), ROUNDS
-        )
+        unknowns = [Unknowns([f"{camera.name}.{CAMERA_NAMES[6]}"], shared=True)]
+        seen = [Observation(draw(body, [camera], theta, moved), theta) for theta in truth]
+        found = Problem(body, [camera], unknowns).solve(seen, ROUNDS)
         np.testing.assert_allclose(found.shared, 0.08, atol=0.004)
 
 
@@ -109,27 +101,41 @@ def test_joint_zeros_of_all_frames_are_found(body, rig):
     zeros = np.array([0.08, -0.1, 0.07, 0.05])
     readings = truth.copy()
     readings[:, [list(body.names).index(name) for name in BENT]] -= zeros
-    fit = FramesFit(body, rig, choose(body.names, BENT, shared=True))
-    frames = [draw(body, rig, theta) for theta in truth]
-    found = fit.fit(frames, readings, np.zeros((4, 0)), np.zeros(4), ROUNDS)
-    np.testing.assert_allclose(found.shared, zeros, atol=0.012)
+    problem = Problem(body, rig, [Unknowns(BENT, shared=True)])
+    pairs = zip(truth, readings, strict=True)
+    seen = [Observation(draw(body, rig, theta), row) for theta, row in pairs]
+    np.testing.assert_allclose(problem.solve(seen, ROUNDS).shared, zeros, atol=0.012)
+
+
+def test_unknowns_are_added_to_what_is_known_of_a_frame(body, rig):
+    """Also where two are added to one parameter: a frame's own angle and a joint's offset."""
+    own = Unknowns(BENT[:2])
+    problem = Problem(body, rig, [Unknowns(BENT[1:3], shared=True), own])
+    assert problem.names == (*BENT[:2], *BENT[1:3])
+    values = np.random.default_rng(0).normal(size=(2, 5))
+    seen = [Observation(pack_evidence([NO_EDGE] * len(rig)), row) for row in values]
+    theta = problem.parameters(seen, np.array([[1.0, 2.0], [3.0, 4.0]]), np.array([10.0, 20.0]))
+    expected = np.zeros((2, len(parameter_names(body, rig))))
+    expected[:, :5] = values
+    at = [body.names.index(name) for name in BENT[:3]]
+    expected[:, at] += [[1.0, 12.0, 20.0], [3.0, 14.0, 20.0]]
+    np.testing.assert_allclose(theta, expected)
 
 
 def test_equations_are_the_slope_of_the_cost(body, rig):
     """Of every parameter at once, where all points have their counterparts."""
     cameras = [rig[1], parallel(rig[0])]
     truth = poses(body, 1, 7)
-    every = parameter_names(body, cameras)
-    names = every[: -len(cameras)]
-    fit = FramesFit(body, cameras, choose(every, names))
+    names = parameter_names(body, cameras)[: -len(cameras)]
+    problem = Problem(body, cameras, [Unknowns(names)])
     generator, none = np.random.default_rng(0), np.zeros(0)
     rates = generator.uniform(-1.0, 1.0, len(body.kinematics.names))
-    evidence = [FrameEvidence(draw(body, cameras, truth[0]), rates=rates)]
-    base = np.pad(truth, ((0, 0), (0, len(names) - truth.shape[1])))
+    base = np.pad(truth[0], (0, len(names) - truth.shape[1]))
     base += 0.015 * generator.uniform(-1, 1, base.shape)
+    seen = [Observation(draw(body, cameras, truth[0]), base, rates=rates)]
 
     def equations(own):
-        return fit.equations(evidence, base, own[None], none, AnnealingStage(0.1, 0.002))
+        return problem.equations(seen, (own[None], none), AnnealingStage(0.1, 0.002))
 
     steps = 2e-3 * np.eye(len(names))
     slopes = np.array([equations(d).cost - equations(-d).cost for d in steps]) / (2 * 2e-3)
@@ -143,17 +149,16 @@ def test_equations_are_the_slope_of_the_cost(body, rig):
 def test_what_is_known_without_pictures_counts_once(body, rig):
     """Of each frame's own unknowns in each, of the shared ones in all together."""
     names, girths = BENT[:2], body.names[-2:]
-    known = join(
-        choose(body.names, names, deviation=0.5),
-        choose(body.names, girths, shared=True, deviation=0.25),
+    known, free = (
+        Problem(body, rig, [Unknowns(names, deviation=a), Unknowns(girths, True, deviation=b)])
+        for a, b in ((0.5, 0.25), (np.inf, np.inf))
     )
-    told = join(choose(body.names, names), choose(body.names, girths, shared=True))
-    frames, held = [pack_evidence([NO_EDGE] * len(rig))] * 3, poses(body, 3, 8)
+    held = poses(body, 3, 8)
+    seen = [Observation(pack_evidence([NO_EDGE] * len(rig)), row) for row in held]
     own, shared = np.arange(6.0).reshape(3, 2), np.array([1.0, -2.0])
     about = np.ones((3, 2)), np.zeros(2)
     with_it, without = (
-        FramesFit(body, rig, one).equations(frames, held, own, shared, ROUNDS[0], about)
-        for one in (known, told)
+        one.equations(seen, (own, shared), ROUNDS[0], about) for one in (known, free)
     )
     off, own_information, information = own - about[0], np.full(2, 4.0), np.full(2, 16.0)
     H, g = np.zeros((3, 4, 4)), np.zeros((3, 4))
@@ -167,11 +172,10 @@ def test_what_is_known_without_pictures_counts_once(body, rig):
 
 def test_what_does_not_fit_is_refused(body, rig):
     with pytest.raises(UnknownNameError, match="no_such"):
-        choose(body.names, ["no_such"])
-    fit = FramesFit(body, rig, choose(body.names, BENT))
-    nothing = draw(body, rig, poses(body, 1, 1)[0])
+        Problem(body, rig, [Unknowns(["no_such"])])
+    seen = [Observation(draw(body, rig, poses(body, 1, 1)[0]))]
     with pytest.raises(SettingsError, match="1 frames with 4 own and 0 shared"):
-        fit.fit([nothing], np.zeros((1, 3)), np.zeros((1, 3)), np.zeros(0), ROUNDS)
+        Problem(body, rig, [Unknowns(BENT)]).solve(seen, ROUNDS, (np.zeros((1, 3)), np.zeros(0)))
 
 
 @pytest.mark.parametrize("couples", [False, True])
@@ -181,12 +185,10 @@ def test_deviations_of_frames_are_those_of_the_whole_system(couples):
     J = generator.normal(size=(frames, 9, p + q))
     H = np.einsum("fij,fik->fjk", J, J)
     rows, information = generator.normal(size=(5, frames * p)), generator.uniform(1.0, 9.0, 5)
-    coupling = Coupling(csr_array(rows), np.zeros(5), information) if couples else None
+    coupling = LinearPrior(csr_array(rows), np.zeros(5), information) if couples else None
     equations = Equations(H, np.zeros((frames, p + q)), 0.0)
     nothing = np.zeros((frames, p))
-    fitted = FittedFrames(
-        nothing, np.zeros(q), nothing, 0.0, lambda: (equations, nothing), coupling
-    )
+    fitted = Solution(nothing, np.zeros(q), nothing, 0.0, lambda: (equations, nothing), coupling)
     whole = np.zeros((frames * p + q, frames * p + q))
     for k in range(frames):
         at = np.r_[k * p : (k + 1) * p, frames * p : frames * p + q]
@@ -199,12 +201,10 @@ def test_deviations_of_frames_are_those_of_the_whole_system(couples):
 
 def test_what_nothing_tells_has_a_large_deviation():
     rows = csr_array(np.array([[1.0, -1.0]]))
-    coupling = Coupling(rows, np.zeros(1), np.array([1e6]))
+    coupling = LinearPrior(rows, np.zeros(1), np.array([1e6]))
     H = np.zeros((2, 2, 2))
     H[:, 1, 1] = 1.0
     nothing = np.zeros((2, 1))
     equations = Equations(H, np.zeros((2, 2)), 0.0)
-    fitted = FittedFrames(
-        nothing, np.zeros(1), nothing, 0.0, lambda: (equations, nothing), coupling
-    )
+    fitted = Solution(nothing, np.zeros(1), nothing, 0.0, lambda: (equations, nothing), coupling)
     assert (fitted.own_deviations() > 50.0).all()

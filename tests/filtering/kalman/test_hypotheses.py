@@ -151,6 +151,10 @@ def test_twins_are_one_with_the_weight_of_both():
     assert total(kept) == pytest.approx(1.0)
     assert kept[0].weight == pytest.approx(some[0].weight + some[1].weight)
     np.testing.assert_allclose(gains(kept), -2.0)
+    # However small a deviation is: .2 of it apart, and .4.
+    small = normalise([at(0.0, 0.0, 1e-3), at(0.2e-3, -1.0, 1e-3), at(0.4e-3, -2.0, 1e-3)])
+    kept, _ = merge_twins(small, 0.3, 7)
+    assert [one.belief.mean[0] for one in kept] == [0.0, 0.4e-3]
 
 
 def test_what_is_given_up_is_too_light_or_one_too_many():

@@ -159,6 +159,8 @@ def test_what_turns_round_is_not_truncated(model, tmp_path):
         assert not len(observation.inequalities())
     wide = crane(tmp_path, 'lower="-1e16" upper="1e16"')
     assert not len(from_model(wide))
+    full = crane(tmp_path, f'lower="{-np.pi}" upper="{np.pi}"')
+    assert not len(from_model(full))
     narrow = crane(tmp_path, 'lower="-1" upper="2"')
     observation = ContourObservation(narrow.pose_tree(), [camera("front")])
     assert observation.inequalities().rows == ("luff >= -1", "luff <= 2")

@@ -66,8 +66,7 @@ def capture(
         scene: Folder with cameras.yaml and masks, pictures or videos; or with a sources.yaml.
         model: A person with landmarks.yaml beside it. Default: the bundled one.
         method: person: by all silhouettes at once; paper: by skin seen in colour pictures, and a
-            search for elbows and knees, all as Date et al. print it; stages: the same stages with
-            a search by the limbs' surfaces, and a waist and feet that err less.
+            search for elbows and knees, all as Date et al. print it.
     """
     settings, live = settings or CaptureSettings(), live or LiveSettings()
     of_masks = bool(truth or resume or set(changed(settings)) - {"packages"})
@@ -103,7 +102,7 @@ def _check(
             "and --no-fit-shape are for --method person"
         )
     if method == "person" and live.faces is not None:
-        raise UsageError("--face-camera and --faces are for --method stages and paper")
+        raise UsageError("--face-camera and --faces are for --method paper")
     if has_sources and of_masks:
         raise UsageError(
             "--camera, --frame, --every, --truth, --start, --no-track and --resume are for a "

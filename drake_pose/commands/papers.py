@@ -314,7 +314,7 @@ def date(
     cameras: Annotated[int, within(3)] = 9,
     frames: Annotated[int, within(40)] = 240,
     seed: Seed = 0,
-    method: Literal["silhouette", "stages", "paper"] = "silhouette",
+    method: Literal["silhouette", "paper"] = "silhouette",
     renderer: Literal["drake", "own"] = "drake",
     walk: bool = False,
     out: Pictures = None,
@@ -323,9 +323,8 @@ def date(
     """Date, Yoshimatsu, Arita and Taniguchi: a moving person before many calibrated cameras.
 
     A simulated person walks, reaches, leans, crouches, turns and crosses the arms. Compared are the
-    paper's inverse kinematics alone, the paper's search for elbows and knees, both with our search,
-    waist and feet, and one fit to all silhouettes at once. Times are those of one core, without
-    rendering.
+    paper's inverse kinematics alone, the paper's search for elbows and knees, and one fit to all
+    silhouettes at once. Times are those of one core, without rendering.
 
         drake-pose reproduce date --cameras 5 --frames 120 --out results/date
 
@@ -333,21 +332,19 @@ def date(
         cameras: Number of cameras, including the one at the face; the paper has 9.
         frames: Number of frames; fewer than 120 do not show all motions.
         method: Whose figures lead. paper: the paper's, all as printed (rectangles on one circle,
-            the waist by 0.55, 0.225, 0.225, feet nearest to their last places), alone; stages: its
-            stages with points of the limbs' surfaces, the person's own waist within the legs'
-            reach, and feet a step on, beside it; silhouette: a fit to all silhouettes, too.
+            the waist by 0.55, 0.225, 0.225, feet nearest to their last places), alone; silhouette:
+            a fit to all silhouettes beside it.
         renderer: Who draws the person. drake: Drake's renderer; own: this project's, in flat
             colours (the face camera's pictures are Drake's).
         walk: Another experiment, section 6.2 and figure 8: the gestures of its table 1 walk an
-            avatar through a place. Captured by --method paper, or stages (default).
+            avatar through a place. Always captured by the paper's method.
     """
     with _experiment(out) as count:
         from drake_pose.papers.date import run_experiment
         from drake_pose.papers.date_walk import run_walk_through, save_pictures
 
         if walk:
-            stages = "paper" if method == "paper" else "stages"
-            walked = run_walk_through(cameras, seed, stages, count, renderer=renderer)
+            walked = run_walk_through(cameras, seed, count, renderer=renderer)
             if out is not None:
                 walked.save(out)
             _show(walked.figures, [walked.table()], json)

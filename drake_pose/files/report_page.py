@@ -51,7 +51,6 @@ _METHODS = {
     "person": "one person followed by all silhouettes at once",
     "person_by_colour": "one person followed by colour",
     "paper_capture": "one person followed by skin-coloured features, as published",
-    "stages_capture": "one person followed by skin-coloured features and limbs' surfaces",
 }
 _ABOUT = {
     "poses.csv": "every position of every frame [rad or m]",

@@ -184,11 +184,8 @@ def _date(short: bool, folder: Path, count: Count) -> Outcome:
     rows: list[tuple[Any, ...]] = []
     for joint in ("elbow", "knee"):
         what = f"{joint}s, upright: by inverse kinematics alone, then with the search [mm]"
-        found, own = (
-            f"{figures[f'{way}{joint}_ik_mm']:.0f} to {figures[f'{way}{joint}_mm']:.0f}"
-            for way in ("", "stages_")
-        )
-        all_at_once = f"{own}; all silhouettes {figures[f'{joint}s']['silhouette_mm']:.1f}"
+        found = f"{figures[f'{joint}_ik_mm']:.0f} to {figures[f'{joint}_mm']:.0f}"
+        all_at_once = f"{figures[f'{joint}s']['silhouette_mm']:.1f}"
         rows.append((what, "", "wrong, then right (figure 7)", found, all_at_once))
     both = ("paper", "silhouette")
     whole = [f"{result.milliseconds(way)['all']:.0f} ms, one core" for way in both]
@@ -202,21 +199,17 @@ def _date(short: bool, folder: Path, count: Count) -> Outcome:
 
 def _date_walk(short: bool, folder: Path, count: Count) -> Outcome:
     cameras, size = (4, (320, 240)) if short else (9, (640, 480))
-    walks = {name: run_walk_through(cameras, 0, name, count, size) for name in ("paper", "stages")}
-    for name, walk in walks.items():
-        walk.save(folder / name)
-    figures = {name: walk.figures for name, walk in walks.items()}
-    both, followed = list(figures.values()), "{captured_s:.1f} s ({wrongly_s:.1f} s wrongly)"
+    walk = run_walk_through(cameras, 0, count, size)
+    walk.save(folder)
+    followed = "{captured_s:.1f} s ({wrongly_s:.1f} s wrongly)"
     rows: list[tuple[Any, ...]] = []
     for name in COMMANDS:
-        true, *seen = (
-            both[0]["commands"][name]["true_s"],
-            *(one["commands"][name] for one in both),
-        )
-        rows.append((f"{name} (true: {true:.1f} s)", followed, "works (figure 8)", *seen))
+        one = walk.figures["commands"][name]
+        true = f"{name} (true: {one['true_s']:.1f} s)"
+        rows.append((true, followed, "works (figure 8)", one, _NONE))
     end = "{place_error_m:.2f} m, {heading_error_deg:.0f} degrees"
-    rows.append(("off at the walk's end", end, _NONE, *both))
-    return Outcome(figures, [walk.table() for walk in walks.values()], rows)
+    rows.append(("off at the walk's end", end, _NONE, walk.figures, _NONE))
+    return Outcome(walk.figures, [walk.table()], rows)
 
 
 EXPERIMENTS = (

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -11,57 +12,44 @@ from rich.table import Table
 
 from drake_pose.arrays import Array, Picture
 from drake_pose.body.landmarks import landmarks_of_nodes, load_landmarks
-from drake_pose.body.model import ArticulatedModel
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
-from drake_pose.papers.date_capture import (
-    PaperTrack,
-    Seen,
-    SilhouetteTrack,
-    Studio,
-    Track,
-    one_core,
-)
+from drake_pose.papers.date_capture import PaperTrack, SilhouetteTrack, Studio, one_core
 from drake_pose.papers.tables import Count, figure_table, require_choice, uncounted
+from drake_pose.person.date.features import (
+    Features,
+    PersonView,
+)
 from drake_pose.person.date.skeleton import LIMBS
 from drake_pose.person.date.walking import REGISTERED, UPRIGHT, Motion, make_motion
+from drake_pose.systems.date import (
+    PaperSettings,
+)
 from drake_pose.systems.images import picture_to_colour_image
 
-METHODS = ("silhouette", "stages", "paper")
 SHOWN_CAMERA = "camera_0"
 TITLES = {
     "ik_only": "the paper's IK alone",
     "paper": "the paper's search",
-    "stages_ik_only": "our IK alone",
-    "stages": "our search",
     "silhouette": "all silhouettes",
 }
 """What the ways of capturing are called."""
 
-# A track is right again within twice its usual error, or within this [mm].
-_RIGHT_AGAIN, _RIGHT_MM = 2.0, 25.0
 # How long a destroyed track is watched [frames].
-_WATCHED, _FEWEST_WATCHED = 30, 10
+_WATCHED = 30
 
 
 class Moment(NamedTuple):
     """The middle frame of a motion: pictures (H, W, 3), `compared` side by side with all estimates.
 
-    `faces` (130, 80, 3) are the seen face, nearest template, and the model's head, or none.
+    What the paper's stages saw: the person by camera, the features in space, and `faces`
+    (130, 80, 3), the seen face, nearest template, and the model's head, or none.
     """
 
     compared: Picture
     picture: Picture
-    seen: Seen
+    views: Mapping[str, PersonView]
+    found: Features
     faces: tuple[Picture, ...]
-
-
-class DestroyedTrack(NamedTuple):
-    """A track that lost the person during a motion. errors: mean of each frame since [mm]."""
-
-    way: str
-    motion: str
-    track: Track
-    errors: list[float]
 
 
 class DateResult:
@@ -74,25 +62,34 @@ class DateResult:
             stiff trunk is laid through them, in each frame (4,) in the order of LIMBS [mm]; nan
             where the registered pose was recognised instead.
         face_errors: angle between true and estimated direction of the head in each frame [deg].
-        destroyed: tracks on their way back, by the motion at their destruction, or REGISTERED.
+        destroyed: tracks on their way back: way of capturing, the motion at the destruction, or
+            REGISTERED, the track, and the mean error of each frame since [mm].
         moments: by motion, what pictures show.
     """
 
     def __init__(self, studio: Studio, motion: Motion, method: str, seed: int) -> None:
         self.studio, self.names = studio, motion.names
         self._motion, self._method = motion, method
-        renderer = "drake" if studio.own_drawing is None else "own"
+        renderer = "own" if studio.own_drawing else "drake"
         self._settings = {"seed": seed, "method": method, "renderer": renderer}
-        self._tracks = _tracks(studio, motion.q[0], method)
+        setup = studio.prepare(motion.q[0])
+        alone = replace(setup, settings=PaperSettings(search=False))
+        self._tracks: dict[str, PaperTrack | SilhouetteTrack] = {
+            "ik_only": PaperTrack.build(alone),
+            "paper": PaperTrack.build(setup),
+        }
+        if method == "silhouette":
+            self._tracks[method] = SilhouetteTrack.build(studio)
         self._generator = np.random.default_rng([seed, 2])
         self._destroyed_at = frames_of_destruction(motion)
-        self._joints = _JointCentres(studio.model)
+        landmarks, tree = load_landmarks(studio.model.path), studio.model.pose_tree()
+        del landmarks["head_top"]
+        self._kinematics = TreeKinematics(tree)
+        self._landmarks = landmarks_of_nodes(tree, landmarks)
         self.errors: dict[str, list[Array]] = {way: [] for way in self._tracks}
-        self.found_errors: dict[str, list[Array]] = {
-            way: [] for way, track in self._tracks.items() if isinstance(track, PaperTrack)
-        }
+        self.found_errors: dict[str, list[Array]] = {"ik_only": [], "paper": []}
         self.face_errors: list[float] = []
-        self.destroyed: list[DestroyedTrack] = []
+        self.destroyed: list[tuple[str, str, PaperTrack | SilhouetteTrack, list[float]]] = []
         self.moments: dict[str, Moment] = {}
 
     def step(self, k: int) -> None:
@@ -103,11 +100,11 @@ class DateResult:
         if k in self._destroyed_at:
             for way in dict.fromkeys((self._method, "paper")):
                 lost = self._tracks[way].destroyed(self._motion.q[k - 1], self._generator)
-                self.destroyed.append(DestroyedTrack(way, self._destroyed_at[k], lost, []))
+                self.destroyed.append((way, self._destroyed_at[k], lost, []))
         estimates = {}
         for way, track in self._tracks.items():
             estimates[way] = track.step(images)
-            self.errors[way].append(self._joints.errors(estimates[way], q))
+            self.errors[way].append(self._joint_errors(estimates[way], q))
             if isinstance(track, PaperTrack):
                 true = [studio.skeleton.limb_points(q, name)[1] for name in LIMBS]
                 off = 1e3 * np.linalg.norm(track.middle_joints() - true, axis=1)
@@ -115,17 +112,27 @@ class DateResult:
         heads = [studio.skeleton.head_rotation(one)[:, 2] for one in (estimates[self._method], q)]
         cosine = float(np.clip(heads[0] @ heads[1], -1.0, 1.0))
         self.face_errors.append(math.degrees(math.acos(cosine)))
-        for one in self.destroyed:
-            if len(one.errors) < _WATCHED:
-                one.errors.append(_mean(self._joints.errors(one.track.step(images), q)))
+        for _, _, lost, errors in self.destroyed:
+            if len(errors) < _WATCHED:
+                errors.append(_mean(self._joint_errors(lost.step(images), q)))
         if _is_middle(self._motion, k):
             paper = self._tracks["paper"]
             assert isinstance(paper, PaperTrack)
-            seen = paper.seen()
-            compared = studio.side_by_side([q, *estimates.values()], SHOWN_CAMERA)
-            head = studio.face_at(estimates["paper"]) if seen.faces else None
-            faces = () if head is None else (*seen.faces, head)
-            self.moments[self.names[k]] = Moment(compared, shots[SHOWN_CAMERA], seen, faces)
+            views, found, faces = paper.seen()
+            shown = [studio.shown_at(one, SHOWN_CAMERA) for one in (q, *estimates.values())]
+            head = studio.face_at(estimates["paper"]) if faces else None
+            self.moments[self.names[k]] = Moment(
+                np.hstack(shown), shots[SHOWN_CAMERA], views, found,
+                () if head is None else (*faces, head),
+            )  # fmt: skip
+
+    def _joint_errors(self, found: Array, q: Array) -> Array:
+        """(k,) how far the joint centres at found positions (nq,) are off those at q (nq,) [mm]."""
+        order = self.studio.skeleton.order
+        places = [
+            self._landmarks.positions(self._kinematics.poses(one[order])) for one in (found, q)
+        ]
+        return np.asarray(1e3 * np.linalg.norm(places[0] - places[1], axis=1))
 
     @property
     def motions(self) -> tuple[str, ...]:
@@ -133,18 +140,21 @@ class DateResult:
         return tuple(name for name in dict.fromkeys(self.names) if name != REGISTERED)
 
     def recoveries(self, way: str) -> dict[str, int | None]:
-        """Frames until a destroyed track was right again, by motion; None: not within _WATCHED."""
-        right = max(_RIGHT_MM, _RIGHT_AGAIN * _mean(self.errors[way]))
+        """Frames until a destroyed track was right again, by motion; None: not while watched.
+
+        It is right within twice its usual error, or 25 mm.
+        """
+        right = max(25.0, 2.0 * _mean(self.errors[way]))
         return {
-            one.motion: next((k for k, off in enumerate(one.errors, 1) if off <= right), None)
-            for one in self.destroyed
-            if one.way == way
+            motion: next((k for k, off in enumerate(errors, 1) if off <= right), None)
+            for own, motion, _, errors in self.destroyed
+            if own == way
         }
 
     @property
     def slowest_recovery(self) -> float:
         """The longest that a frame's pose took on the way back [ms]."""
-        own = [one.track for one in self.destroyed if one.way == self._method]
+        own = [track for way, _, track, _ in self.destroyed if way == self._method]
         return max((lap["pose"] for track in own for lap in track.milliseconds), default=0.0)
 
     def milliseconds(self, way: str) -> dict[str, float]:
@@ -161,6 +171,8 @@ class DateResult:
         recoveries, spent = self.recoveries(self._method), self.milliseconds(self._method)
         cameras = len(self.studio.cameras)
         anywhere = [n for motion, n in recoveries.items() if motion != REGISTERED]
+        soon = anywhere or list(recoveries.values())
+        known = [n for n in soon if n is not None]
         return {
             "joint_error_mm": _mean(own),
             "joint_error_p95_mm": float(np.percentile(own, 95)),
@@ -172,7 +184,7 @@ class DateResult:
             **self._as_found(UPRIGHT),
             "as_found": {motion: self._as_found((motion,)) for motion in self.motions},
             "face_error_deg": all_motions["face_error_deg"],
-            "frames_to_recover": _slowest(anywhere or list(recoveries.values())),
+            "frames_to_recover": max(known) if known and len(known) == len(soon) else None,
             "frames_to_recover_registered": recoveries.get(REGISTERED),
             "ms_of_slowest_recovering_frame": self.slowest_recovery,
             "ms_per_frame": spent,
@@ -188,13 +200,11 @@ class DateResult:
         """Mean errors of elbows and knees as found, with the search and without [mm]."""
         chosen = np.isin(self.names, motions)
         figures = {}
-        for way, found in self.found_errors.items():
-            errors = np.array(found)[chosen]
+        for way, ending in (("ik_only", "ik_mm"), ("paper", "mm")):
+            errors = np.array(self.found_errors[way])[chosen]
             errors = errors[np.isfinite(errors).all(axis=1)]
-            before, ending = way.removesuffix("ik_only"), "ik_mm" if "ik" in way else "mm"
             for joint, limbs in (("elbow", errors[:, :2]), ("knee", errors[:, 2:])):
-                key = f"{'stages_' if 'stages' in before else ''}{joint}_{ending}"
-                figures[key] = _mean(limbs) if len(limbs) else math.nan
+                figures[f"{joint}_{ending}"] = _mean(limbs) if len(limbs) else math.nan
         return figures
 
     def _of_motions(self, motions: Sequence[str]) -> dict[str, float]:
@@ -206,7 +216,7 @@ class DateResult:
     def _of_joints(self, ends: tuple[str, ...]) -> dict[str, float]:
         """Mean errors in all motions of the joints whose names end so, by way of capturing."""
         moving = np.isin(self.names, self.motions)
-        chosen = [i for i, name in enumerate(self._joints.names) if name.endswith(ends)]
+        chosen = [i for i, name in enumerate(self._landmarks.names) if name.endswith(ends)]
         return {
             f"{way}_mm": _mean(np.array(one)[moving][:, chosen]) for way, one in self.errors.items()
         }
@@ -217,9 +227,7 @@ class DateResult:
         found = {motion: self._as_found((motion,)) for motion in self.motions}
         headings = {f"{way}_mm": f"{TITLES[way]} [mm]" for way in self.errors}
         found_headings = {
-            f"{before}{joint}_{ending}": f"{joint}s, {whose} {how}"
-            for before, whose in (("", "the paper's"), ("stages_", "our"))
-            if f"{before}elbow_mm" in found[self.motions[0]]
+            f"{joint}_{ending}": f"{joint}s, {how}"
             for joint in ("elbow", "knee")
             for ending, how in (("ik_mm", "IK alone"), ("mm", "search"))
         }
@@ -268,8 +276,8 @@ def run_experiment(
     Args:
         cameras: how many, the face camera included.
         seed: another one draws other motions.
-        method: whose figures lead: "paper", all as it prints it, alone; "stages", its stages with
-            our search, waist and feet beside it; "silhouette", all silhouettes at once, too.
+        method: whose figures lead: "paper", all as it prints it, alone; "silhouette", all
+            silhouettes at once, beside it.
         size: width and height of the pictures [pixel].
         renderer: who draws the person, "drake", or "own", the code of the label images; the face
             camera's pictures are Drake's.
@@ -277,7 +285,7 @@ def run_experiment(
     Raises:
         SettingsError: an argument is out of its range.
     """
-    require_choice("method", method, METHODS)
+    require_choice("method", method, ("silhouette", "paper"))
     with one_core():
         studio = Studio.build(cameras, size, np.random.default_rng([seed, 1]), renderer)
         motion = make_motion(studio.skeleton, frames, seed)
@@ -287,39 +295,6 @@ def run_experiment(
             result.step(k)
             advance(k + 1)
     return result
-
-
-def _tracks(studio: Studio, q: Array, method: str) -> dict[str, Track]:
-    """The ways of capturing that are compared; q (nq,) is the registered pose."""
-    tracks: dict[str, Track] = {
-        way: PaperTrack.build(setup)
-        for way, setup in studio.prepare(q).items()
-        if method != "paper" or "stages" not in way
-    }
-    if method == "silhouette":
-        tracks[method] = SilhouetteTrack.build(studio.model, studio.cameras, studio.backgrounds)
-    return tracks
-
-
-class _JointCentres:
-    """The joint centres that are compared."""
-
-    def __init__(self, model: ArticulatedModel) -> None:
-        landmarks = load_landmarks(model.path)
-        del landmarks["head_top"]
-        tree = model.pose_tree()
-        self._kinematics = TreeKinematics(tree)
-        self._landmarks = landmarks_of_nodes(tree, landmarks)
-        self._order = np.array([model.position_index(name) for name in self._kinematics.names])
-        self.names = self._landmarks.names
-
-    def errors(self, found: Array, q: Array) -> Array:
-        """(k,) how far those at found positions (nq,) are off those at q (nq,) [mm]."""
-        places = [
-            self._landmarks.positions(self._kinematics.poses(one[self._order]))
-            for one in (found, q)
-        ]
-        return np.asarray(1e3 * np.linalg.norm(places[0] - places[1], axis=1))
 
 
 def _table_of_motions(
@@ -334,9 +309,12 @@ def _table_of_motions(
 
 
 def frames_of_destruction(motion: Motion) -> dict[int, str]:
-    """Where tracks are destroyed: amid each whole motion, and at the registered pose's return."""
+    """Where tracks are destroyed: amid each whole motion, and at the registered pose's return.
+
+    None is destroyed in the last ten frames.
+    """
     count = len(motion.names)
-    found = {k: motion.names[k] for k in range(count - _FEWEST_WATCHED) if _is_middle(motion, k)}
+    found = {k: motion.names[k] for k in range(count - 10) if _is_middle(motion, k)}
     again = 1 + max(k for k, name in enumerate(motion.names) if name != REGISTERED)
     return found if again == count else {**found, again: REGISTERED}
 
@@ -345,12 +323,6 @@ def _is_middle(motion: Motion, k: int) -> bool:
     """Whether frame k is the middle one of its motion."""
     same = [i for i, name in enumerate(motion.names) if name == motion.names[k]]
     return motion.names[k] != REGISTERED and k == same[len(same) // 2]
-
-
-def _slowest(frames: Sequence[int | None]) -> int | None:
-    """The largest; None where one is."""
-    known = [n for n in frames if n is not None]
-    return max(known) if known and len(known) == len(frames) else None
 
 
 def _mean(values: Array | Sequence[Array]) -> float:

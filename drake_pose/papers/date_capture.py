@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -18,44 +17,41 @@ from pydrake.systems.sensors import ImageRgba8U
 from drake_pose.arrays import Array, Picture
 from drake_pose.body.formats.packages import bundled_model
 from drake_pose.body.model import ArticulatedModel, load_model
-from drake_pose.camera.models import FACE_CAMERA, Camera, PinholeCamera, circle_of_cameras
+from drake_pose.camera.models import FACE_CAMERA, PinholeCamera, circle_of_cameras
 from drake_pose.errors import SettingsError
 from drake_pose.fit.contour_fit import ContourFit
 from drake_pose.papers.tables import require_choice
-from drake_pose.person.date.faces import FACE_HEIGHT, FACE_WIDTH, cut_face, face_direction
-from drake_pose.person.date.features import Features, SkinColour
+from drake_pose.person.date.features import (
+    FACE_SIZE,
+    Features,
+    PersonView,
+    SkinColour,
+    cut_face,
+    nearest_template,
+    see_person,
+)
 from drake_pose.person.date.skeleton import LIMBS, Skeleton, load_skeleton
 from drake_pose.person.pose_tracker import PersonPoseTracker, TrackState
 from drake_pose.silhouette.areas.outline import outline_from_mesh
 from drake_pose.silhouette.areas.scoring import draw_labels
 from drake_pose.silhouette.segmentation.background import Background, learn_background
-from drake_pose.systems.date.capture import PaperCapture, build_paper_capture
-from drake_pose.systems.date.preparation import (
-    CAPTURE_METHODS,
+from drake_pose.systems.date import (
     CaptureSetup,
-    PersonView,
+    PaperCapture,
+    build_paper_capture,
     prepare_paper_capture,
-    see_person,
 )
 from drake_pose.systems.images import colour_image_to_picture
 from drake_pose.systems.person.live_capture import SilhouetteCapture, build_silhouette_capture
 from drake_pose.systems.pictures.camera_rig import CameraRig, build_camera_rig
 from drake_pose.systems.ports import StagedDiagram
 
-Images = Mapping[str, ImageRgba8U]
-
-# Of every pixel [grey levels].
-_NOISE = 3.0
-_EMPTY_PICTURES = 5
-_FAR_AWAY = -9.0
-# Of the bundled person [red, green, blue].
-_SKIN, _CLOTHES = (217, 166, 135), (31, 88, 106)
-# An edge point every 8 pixels of 640 x 480 pictures.
-_EDGE_POINTS = 60.0
-_FEWEST_CAMERAS = 3
 # A power of two: the time from frame to frame is exactly the same, and so is the motion expected.
 PERIOD = 1.0 / 32.0
 """From frame to frame [s]."""
+
+
+Images = Mapping[str, ImageRgba8U]
 
 
 @contextmanager
@@ -71,16 +67,23 @@ def one_core() -> Iterator[None]:
 
 @dataclass(frozen=True, eq=False)
 class Studio:
-    """The simulated person, cameras (the face camera among them), empty room and noise."""
+    """The simulated person, cameras (the face camera among them), empty rooms and noise.
+
+    Args:
+        rooms: (H, W, 3) what each camera sees of the empty room, without noise.
+        own_drawing: whether the kernel of label images draws the person before the cameras on the
+            circle, skin and clothes of one colour each; else Drake's renderer.
+    """
 
     model: ArticulatedModel
     skeleton: Skeleton
     cameras: Mapping[str, PinholeCamera]
     rig: CameraRig
     context: Context
+    rooms: Mapping[str, Picture]
     backgrounds: Mapping[str, Background]
     generator: np.random.Generator
-    own_drawing: _OwnDrawing | None = None
+    own_drawing: bool
 
     @staticmethod
     def build(
@@ -93,103 +96,79 @@ class Studio:
         Raises SettingsError: neither of them, or too few cameras.
         """
         require_choice("renderer", renderer, ("drake", "own"))
-        if cameras < _FEWEST_CAMERAS:
-            raise SettingsError(f"cameras must be {_FEWEST_CAMERAS} or more, not {cameras}")
+        if cameras < 3:
+            raise SettingsError(f"cameras must be 3 or more, not {cameras}")
         model = load_model(bundled_model("person"), check=False)
         placed = circle_of_cameras(cameras - 1, size=size)
         rig = build_camera_rig(model, placed)
         context = rig.diagram.CreateDefaultContext()
         away = np.array(model.default_positions)
-        away[model.position_index("position_z")] = _FAR_AWAY
+        away[model.position_index("position_z")] = -9.0
         rig.set_positions(context, away)
         rooms = {name: rig.picture(context, name) for name in placed}
         backgrounds = {
-            name: learn_background([noisy(room, generator) for _ in range(_EMPTY_PICTURES)])
+            name: learn_background([noisy(room, generator) for _ in range(5)])
             for name, room in rooms.items()
         }
-        own = _OwnDrawing(model, rooms) if renderer == "own" else None
-        skeleton = load_skeleton(model)
-        return Studio(model, skeleton, placed, rig, context, backgrounds, generator, own)
+        skeleton, own = load_skeleton(model), renderer == "own"
+        return Studio(model, skeleton, placed, rig, context, rooms, backgrounds, generator, own)
 
     def pictures(self, q: Array) -> dict[str, Picture]:
         """What all cameras see of a person at q (nq,), noise included."""
         self.rig.set_positions(self.context, q)
-        return {name: noisy(self._drawn(name, q), self.generator) for name in self.cameras}
+        own = self._own_pictures(q) if self.own_drawing else {}
+        return {
+            name: noisy(
+                own[name] if name in own else self.rig.picture(self.context, name), self.generator
+            )
+            for name in self.cameras
+        }
 
-    def _drawn(self, name: str, q: Array) -> Picture:
-        """What a camera sees of the person, who is at q (nq,) in the rig, too."""
-        if self.own_drawing is None or name == FACE_CAMERA:
-            return self.rig.picture(self.context, name)
-        return self.own_drawing.picture(self.cameras[name], q)
+    def _own_pictures(self, q: Array) -> dict[str, Picture]:
+        """The person at q (nq,) before the empty rooms of the cameras on the circle."""
+        plant, meshes = self.model.plant, self.model.link_meshes
+        context = plant.CreateDefaultContext()
+        plant.SetPositions(context, q)
+        X_WL = [plant.GetBodyByName(n).EvalPoseInWorld(context).GetAsMatrix4() for n in meshes]
+        bare = np.array([name.endswith(("head", "hand", "foot")) for name in meshes])
+        # Skin and clothes of the bundled person [red, green, blue].
+        colours = np.where(bare[:, None], (217, 166, 135), (31, 88, 106)).astype(np.uint8)
+        outlines = [outline_from_mesh(mesh) for mesh in meshes.values()]
+        found = {}
+        for name, camera in self.cameras.items():
+            if name != FACE_CAMERA:
+                numbers = np.arange(1, len(X_WL) + 1)
+                labels = draw_labels(outlines, numbers, camera.X_CW @ X_WL, camera)
+                found[name], person = np.array(self.rooms[name]), labels > 0
+                found[name][person] = colours[labels[person] - 1]
+        return found
 
-    def prepare(self, q: Array) -> dict[str, CaptureSetup]:
-        """What must be known before, by way of capturing: faces, skin, and q (nq,), registered."""
-        setup = prepare_paper_capture(
-            self.model, self.cameras, FACE_CAMERA, q, self.pictures(q), self.backgrounds
+    def prepare(self, q: Array) -> CaptureSetup:
+        """What the paper's method must know before: faces, skin, and q (nq,), registered."""
+        shots = self.pictures(q)
+        return prepare_paper_capture(
+            self.model, self.cameras, FACE_CAMERA, q, shots, self.backgrounds
         )
-        paper, stages = CAPTURE_METHODS["paper"], CAPTURE_METHODS["stages"]
-        ways = {
-            "ik_only": replace(paper, search="none"), "paper": paper,
-            "stages_ik_only": replace(stages, search="none"), "stages": stages,
-        }  # fmt: skip
-        return {way: replace(setup, settings=settings) for way, settings in ways.items()}
 
-    def side_by_side(self, poses: Sequence[Array], name: str) -> Picture:
-        """The person in poses (nq,) as a camera sees it, side by side (H, n W, 3)."""
-        shown = []
-        for q in poses:
-            self.rig.set_positions(self.context, q)
-            shown.append(self.rig.picture(self.context, name))
-        return np.hstack(shown)
+    def shown_at(self, q: Array, camera: str) -> Picture:
+        """The person at q (nq,) as a camera sees it (H, W, 3), without noise."""
+        self.rig.set_positions(self.context, q)
+        return self.rig.picture(self.context, camera)
 
     def face_at(self, q: Array) -> Picture | None:
         """The face (130, 80, 3) of a person at q as the face camera sees it; None: no skin."""
-        self.rig.set_positions(self.context, q)
-        picture = self.rig.picture(self.context, FACE_CAMERA)
+        picture = self.shown_at(q, FACE_CAMERA)
         mask = self.rig.mask(self.context, FACE_CAMERA)
         return cut_face(picture, see_person(picture, mask, SkinColour()).blobs)
 
 
-class _OwnDrawing:
-    """The person as the kernel of label images draws it, skin and clothes of one colour each."""
-
-    def __init__(self, model: ArticulatedModel, rooms: Mapping[str, Picture]) -> None:
-        self._plant, self._rooms = model.plant, rooms
-        self._context = model.plant.CreateDefaultContext()
-        self._links = [model.plant.GetBodyByName(name) for name in model.link_meshes]
-        self._outlines = [outline_from_mesh(mesh) for mesh in model.link_meshes.values()]
-        bare = [name.endswith(("head", "hand", "foot")) for name in model.link_meshes]
-        self._colours = np.where(np.array(bare)[:, None], _SKIN, _CLOTHES).astype(np.uint8)
-
-    def picture(self, camera: Camera, q: Array) -> Picture:
-        """The person at q (nq,) before the empty room."""
-        self._plant.SetPositions(self._context, q)
-        X_WL = [link.EvalPoseInWorld(self._context).GetAsMatrix4() for link in self._links]
-        numbers = np.arange(1, len(X_WL) + 1)
-        labels = draw_labels(self._outlines, numbers, camera.X_CW @ X_WL, camera)
-        picture, person = np.array(self._rooms[camera.name]), labels > 0
-        picture[person] = self._colours[labels[person] - 1]
-        return picture
-
-
-def noisy(picture: Picture, generator: np.random.Generator) -> Picture:
-    """A picture with a camera's noise."""
+def noisy(picture: Picture, generator: np.random.Generator, deviation: float = 3.0) -> Picture:
+    """A picture with a camera's noise, of this standard deviation in every pixel [grey levels]."""
     # One byte a channel is enough for noise, and four times as fast as a double.
     noise = np.empty(picture.shape, dtype=np.int16)
     cv2.setRNGSeed(int(generator.integers(1 << 31)))
-    cv2.randn(noise, np.zeros(3), np.full(3, _NOISE))
+    cv2.randn(noise, np.zeros(3), np.full(3, deviation))
     return np.clip(picture + noise, 0, 255).astype(np.uint8)
-
-
-class Seen(NamedTuple):
-    """What the paper's stages saw in a frame: the person by camera, and features in space.
-
-    `faces` (130, 80, 3) are the face as cut from the picture, and the nearest template, or none.
-    """
-
-    views: Mapping[str, PersonView]
-    found: Features
-    faces: tuple[Picture, ...]
 
 
 class _StagedRun:
@@ -231,7 +210,7 @@ class _StagedRun:
 
 
 class PaperTrack(_StagedRun):
-    """The paper's way, with its limb search or without; recognised frames add no milliseconds."""
+    """The paper's way; frames in which the registered pose is recognised add no milliseconds."""
 
     def __init__(self, capture: PaperCapture) -> None:
         super().__init__(capture)
@@ -266,8 +245,11 @@ class PaperTrack(_StagedRun):
         port = self._capture.diagram.GetOutputPort("limb_points")
         return np.array(port.Eval(self.context)).reshape(len(LIMBS), 3, 3)[:, 1]
 
-    def seen(self) -> Seen:
-        """What was seen in the last frame; none of it changes what was estimated."""
+    def seen(self) -> tuple[dict[str, PersonView], Features, tuple[Picture, ...]]:
+        """What was seen in the last frame: the person by camera, features, and the face.
+
+        The face (130, 80, 3) is as cut from the picture, and its nearest template; none: not seen.
+        """
         setup, diagram, context = self._capture.estimator.setup, self._capture.diagram, self.context
         views = {
             name: diagram.GetOutputPort(f"person_view_{name}").Eval(context)
@@ -276,17 +258,18 @@ class PaperTrack(_StagedRun):
         finder = diagram.GetSubsystemByName("features")
         found = finder.GetOutputPort("found").Eval(finder.GetMyContextFromRoot(context))
         if setup.face_camera is None or setup.faces is None:
-            return Seen(views, found, ())
+            return views, found, ()
         name, templates = setup.face_camera.name, setup.faces
         picture = colour_image_to_picture(diagram.GetInputPort(f"color_image_{name}").Eval(context))
-        blobs = diagram.GetOutputPort(f"person_view_{name}").Eval(context).blobs
-        face = cut_face(picture, blobs)
-        nearest = None if face is None else face_direction(face, templates)
-        if face is None or nearest is None or nearest.outside > setup.settings.farthest_face:
-            return Seen(views, found, ())
-        flat = templates.mean + templates.coordinates[nearest.template] @ templates.basis
-        template = np.clip(flat, 0, 255).astype(np.uint8).reshape(FACE_HEIGHT, FACE_WIDTH, 3)
-        return Seen(views, found, (face, template))
+        face = cut_face(picture, diagram.GetOutputPort(f"person_view_{name}").Eval(context).blobs)
+        if face is None:
+            return views, found, ()
+        nearest, outside = nearest_template(face, templates)
+        if outside > setup.settings.farthest_face:
+            return views, found, ()
+        flat = templates.mean + templates.coordinates[nearest] @ templates.basis
+        template = np.clip(flat, 0, 255).astype(np.uint8).reshape(*FACE_SIZE[::-1], 3)
+        return views, found, (face, template)
 
     def destroyed(self, q: Array, generator: np.random.Generator) -> PaperTrack:
         """A track that is turned around, its left and right exchanged; q (nq,) is where it was."""
@@ -314,14 +297,10 @@ class SilhouetteTrack(_StagedRun):
         self._capture, self._tracker, self._shared = capture, tracker, shared
 
     @staticmethod
-    def build(
-        model: ArticulatedModel,
-        cameras: Mapping[str, Camera],
-        backgrounds: Mapping[str, Background],
-    ) -> SilhouetteTrack:
-        """A track that knows nothing yet."""
-        tracker = PersonPoseTracker(ContourFit(model.pose_tree()))
-        capture = build_silhouette_capture(tracker, cameras, backgrounds, PERIOD, _EDGE_POINTS)
+    def build(studio: Studio) -> SilhouetteTrack:
+        """A track that knows nothing yet, with an edge point every 8 of 480 rows of a picture."""
+        tracker, views = PersonPoseTracker(ContourFit(studio.model.pose_tree())), studio.cameras
+        capture = build_silhouette_capture(tracker, views, studio.backgrounds, PERIOD, 60.0)
         return SilhouetteTrack(capture, tracker)
 
     def step(self, images: Images) -> Array:
@@ -371,6 +350,3 @@ class SilhouetteTrack(_StagedRun):
     def _set_state(self, state: TrackState) -> None:
         person = self._capture.person
         person.set_person(person.GetMyMutableContextFromRoot(self.context), state)
-
-
-Track = PaperTrack | SilhouetteTrack

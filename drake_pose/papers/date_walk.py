@@ -39,7 +39,7 @@ from drake_pose.papers.tables import (
 )
 from drake_pose.person.date.skeleton import FEATURES
 from drake_pose.person.date.walking import COMMANDS, make_gestures
-from drake_pose.person.rays import viewing_rays
+from drake_pose.person.views import viewing_rays
 from drake_pose.systems.bodies import add_posed_plant, held_positions
 from drake_pose.systems.images import colour_image_to_picture, picture_to_colour_image
 from drake_pose.systems.pictures.camera_rig import add_sensors
@@ -89,20 +89,19 @@ class WalkThrough(NamedTuple):
 def run_walk_through(
     cameras: int = 9,
     seed: int = 0,
-    method: str = "paper",
     count: Count = uncounted,
     size: tuple[int, int] = (640, 480),
     renderer: str = "drake",
 ) -> WalkThrough:
-    """Captures table 1's gestures by the stages, and lets them walk on the spot through the place.
+    """Captures table 1's gestures the paper's way, and lets them walk on the spot.
 
-    Arguments are those of papers.date.run_experiment; method is "paper" or "stages".
+    Arguments are those of papers.date.run_experiment.
     """
     with one_core():
         studio = Studio.build(cameras, size, np.random.default_rng([seed, 1]), renderer)
         motion = make_gestures(studio.skeleton)
         names, model = np.array(motion.names), studio.model
-        track = PaperTrack.build(studio.prepare(motion.q[0])[method])
+        track = PaperTrack.build(studio.prepare(motion.q[0]))
         advance, q, shots = count("frames", len(names)), np.empty_like(motion.q), []
         for k, true_q in enumerate(motion.q):
             seen = studio.pictures(true_q)
@@ -125,7 +124,7 @@ def run_walk_through(
         "commands": seconds,
         "place_error_m": float(np.linalg.norm(off[:2])),
         "heading_error_deg": abs(math.degrees(math.remainder(off[2], 2.0 * math.pi))),
-        "frames": len(names), "cameras": cameras, "seed": seed, "method": method,
+        "frames": len(names), "cameras": cameras, "seed": seed, "method": "paper",
         "renderer": renderer,
     }  # fmt: skip
     middles = {name: int(np.median(np.flatnonzero(names == name))) for name in COMMANDS}
@@ -197,7 +196,7 @@ def save_pictures(result: DateResult, folder: Path) -> list[Path]:
 def _draw_skin(moment: Moment) -> Picture:
     """Figure 2: the input, with the skin that was found in it outlined and its centroids."""
     picture = np.ascontiguousarray(moment.picture)
-    blobs = moment.seen.views[SHOWN_CAMERA].blobs
+    blobs = moment.views[SHOWN_CAMERA].blobs
     outlines, _ = cv2.findContours(
         blobs.mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE
     )
@@ -209,10 +208,10 @@ def _draw_skin(moment: Moment) -> Picture:
 
 def _draw_points(result: DateResult, moment: Moment) -> Figure:
     """Figure 3: where rays of skin meet, by the feature they were given to, and the features."""
-    found = moment.seen.found
+    found = moment.found
     figure = Figure(figsize=(6.0, 6.0))
     axes = figure.add_subplot(projection="3d")
-    for name, view in moment.seen.views.items():
+    for name, view in moment.views.items():
         origins, directions = viewing_rays(result.studio.cameras[name], view.blobs.centroids)
         for origin, direction in zip(origins, directions, strict=True):
             # As far as the person: from a little before the features to a little behind them.

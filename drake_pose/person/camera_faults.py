@@ -17,7 +17,7 @@ from drake_pose.fit.levenberg_marquardt import AnnealingStage, StepSettings
 from drake_pose.fit.parameters import POSE_NAMES
 from drake_pose.fit.problem import Problem, Unknowns
 from drake_pose.person.figures import pixels_per_metre
-from drake_pose.person.rays import viewing_rays
+from drake_pose.person.views import viewing_rays
 
 # A camera that was pushed has turned and shifted by about this much [rad, m].
 _TURN, _SHIFT = 0.15, 0.3

@@ -16,7 +16,7 @@ import numpy as np
 from drake_pose.arrays import Array, Indices, Mask, Picture
 from drake_pose.camera.models import Camera
 from drake_pose.fit import contour_fit
-from drake_pose.person.rays import meeting_points, triangulate, viewing_rays
+from drake_pose.person.views import meeting_points, triangulate, viewing_rays
 
 # Silhouettes of a sound rig are filled but for this much.
 _UNFILLED = 0.01

@@ -17,8 +17,7 @@ from drake_pose.person.figures import (
     metres_off,
     pixels_per_metre,
 )
-from drake_pose.person.rays import triangulate
-from drake_pose.person.views import FrameViews, edge_spacing, see_silhouette
+from drake_pose.person.views import FrameViews, edge_spacing, see_silhouette, triangulate
 
 ReadFrame = Callable[[int], Mapping[str, Mask]]
 """Gives the masks (H, W) of a frame, counted from 0, by camera; one may be missing."""

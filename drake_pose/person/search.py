@@ -16,8 +16,7 @@ from drake_pose.fit.contour_fit import ContourFit, PoseFit, Prior
 from drake_pose.fit.kernel import Sum
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.person.body_plan import UPPER_SAMPLES, BodyPlan, PlannedLimb, crowding
-from drake_pose.person.rays import sum_at_points
-from drake_pose.person.views import ColourViews, FrameViews
+from drake_pose.person.views import ColourViews, FrameViews, sum_at_points
 from drake_pose.silhouette.areas.scoring import draw_mask
 
 HEADINGS = 12

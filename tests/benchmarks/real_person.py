@@ -17,7 +17,7 @@ import numpy as np
 from drake_pose.body.landmarks import landmark_positions, load_landmarks
 from drake_pose.body.model import load_model
 from drake_pose.papers.tables import draw_panels, save_figure
-from drake_pose.person.date.body_pose import Waist, estimate_pose, waist_of
+from drake_pose.person.date.pose import Waist, estimate_pose, waist_of
 from drake_pose.person.date.skeleton import LIMBS, load_skeleton
 from drake_pose.silhouette.pictures.scenes import load_scene
 

@@ -7,12 +7,17 @@ import numpy as np
 from drake_pose.body.formats.packages import bundled_model
 from drake_pose.body.model import load_model
 from drake_pose.camera.models import FACE_CAMERA, circle_of_cameras
-from drake_pose.person.date.faces import cut_face, learn_faces
-from drake_pose.person.date.features import SkinColour, find_features
-from drake_pose.person.date.recognition import register_pose, registered_positions
+from drake_pose.person.date.features import (
+    SkinColour,
+    cut_face,
+    find_features,
+    learn_faces,
+    register_pose,
+    registered_positions,
+)
 from drake_pose.person.date.skeleton import load_skeleton
 from drake_pose.silhouette.segmentation.background import learn_background
-from drake_pose.systems.date.preparation import see_person
+from drake_pose.systems.date import see_person
 from drake_pose.systems.pictures.camera_rig import build_camera_rig
 from tests.person.persons_in_view import posed
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from pydrake.systems.framework import Context, DiagramBuilder
 
-from drake_pose.arrays import Mask, Picture
+from drake_pose.arrays import Array, Mask, Picture
 from drake_pose.body.formats.packages import bundled_model
 from drake_pose.body.model import ArticulatedModel, load_model
 from drake_pose.body.tree.pose_tree import PoseTree
@@ -20,10 +20,9 @@ from drake_pose.jobs.estimate.inputs import bundled_person
 from drake_pose.jobs.live.frame_results import LiveResult, LiveWriter
 from drake_pose.jobs.live.scene import LiveScene, look_until
 from drake_pose.jobs.live.settings import CaptureMethod, LiveSettings
-from drake_pose.person.date.faces import learn_recorded_faces
-from drake_pose.person.date.recognition import (
-    Recognition,
+from drake_pose.person.date.features import (
     RegisteredPose,
+    learn_recorded_faces,
     recognise,
     stand_registered,
 )
@@ -32,11 +31,9 @@ from drake_pose.person.person_capture import capture_person
 from drake_pose.person.persons_in_view import PersonRecording
 from drake_pose.person.shape import KnownShape, shape_values, tracker_of_person
 from drake_pose.person.views import shows_somebody
-from drake_pose.systems.date.capture import build_paper_capture
-from drake_pose.systems.date.preparation import (
-    CAPTURE_METHODS,
-    CaptureSettings,
+from drake_pose.systems.date import (
     CaptureSetup,
+    build_paper_capture,
     prepare_paper_capture,
     render_registered_pose,
 )
@@ -71,8 +68,8 @@ def capture_live(
             more for the frames that give the person's shape, or show the registered pose.
         on_report: called at once when cameras stop and return, and with bad pictures.
         on_frame: called with each frame: how many there are, and whether a person was found.
-        method: "person" by all silhouettes at once; the others by the stages of Date et al. (skin,
-            rays, inverse kinematics, search; see find_registered_pose): see CAPTURE_METHODS.
+        method: "person" by all silhouettes at once; "paper" by the stages of Date et al. (skin,
+            rays, inverse kinematics, search; see find_registered_pose).
 
     Raises:
         SceneError, CameraError, ModelError, SettingsError, UnknownNameError: what was given cannot
@@ -84,8 +81,7 @@ def capture_live(
     model = load_model(model_path or usual, package_paths=settings.packages)
     setup = shape = None
     if method != "person":
-        how = CAPTURE_METHODS[method]
-        setup = find_registered_pose(scene, model, settings, opener, on_report, how)
+        setup = find_registered_pose(scene, model, settings, opener, on_report)
     elif settings.shape is not None:
         shape = shape_of_result(settings.shape)
     elif settings.fit_shape:
@@ -173,7 +169,6 @@ def find_registered_pose(
     settings: LiveSettings,
     open_sensors: Callable[[], LiveSensors],
     on_report: Callable[[str], None],
-    how: CaptureSettings,
 ) -> CaptureSetup:
     """What capture needs, from the pictures in which a person shows the registered pose.
 
@@ -182,7 +177,6 @@ def find_registered_pose(
         settings: no shape can be given; without a camera before the face, and templates as of
             learn_recorded_faces, its direction is found by inverse kinematics alone.
         open_sensors: opens the sensors, which are used up.
-        how: settings of the stages.
 
     Raises:
         SceneError, CameraError, ModelError, SettingsError, UnknownNameError: what was given cannot
@@ -202,11 +196,11 @@ def find_registered_pose(
             f"{path}: two cameras never saw a person whole at the same time: compare the "
             "pictures with those of the empty room"
         )
-    needed = how.recognition
-    if best.similarity < needed:
+    (q, similarity), needed = best, blank.settings.recognition
+    if similarity < needed:
         raise SettingsError(
             f"{path}: nobody showed the registered pose, upright with both arms spread: the "
-            f"likest silhouettes agree with it by {best.similarity:.2f}, {needed:.2f} are needed; "
+            f"likest silhouettes agree with it by {similarity:.2f}, {needed:.2f} are needed; "
             "show it once, give a model of the person's measures (urdf/person/make_person.py "
             "makes one), or capture by all silhouettes (--method person)"
         )
@@ -214,7 +208,7 @@ def find_registered_pose(
     for name in cameras:
         if name not in known:
             on_report(f"camera '{name}' gave no picture of the registered pose: left out")
-    return prepare_paper_capture(model, known, face, best.q, shown, scene.backgrounds, how, faces)
+    return prepare_paper_capture(model, known, face, q, shown, scene.backgrounds, faces=faces)
 
 
 def _best_moment(
@@ -222,11 +216,11 @@ def _best_moment(
     ring: Mapping[str, PinholeCamera],
     sensors: LiveSensors,
     on_report: Callable[[str], None],
-) -> tuple[Recognition | None, dict[str, Picture]]:
-    """The moment that is most like the registered pose, and its pictures."""
+) -> tuple[tuple[Array, float] | None, dict[str, Picture]]:
+    """Positions and similarity of the moment most like the registered pose; its pictures."""
     diagram = build_paper_capture(setup, sensors, sensors.period).diagram
     registered: RegisteredPose | None = None
-    best: Recognition | None = None
+    best: tuple[Array, float] | None = None
     shown: dict[str, Picture] = {}
     since = 0
 
@@ -243,17 +237,17 @@ def _best_moment(
             cameras, seen = [ring[name] for name in contours], list(contours.values())
             if len(seen) >= 2:
                 if registered is None:
-                    q = stand_registered(setup.skeleton, cameras, [one.middle for one in seen])
+                    q = stand_registered(setup.skeleton, cameras, [middle for _, middle in seen])
                     registered = render_registered_pose(setup.skeleton, q, ring)
                 found = recognise(setup.skeleton, registered, cameras, seen, threshold=0.0)
-                if found is not None and (best is None or found.similarity > best.similarity):
+                if found is not None and (best is None or found[1] > best[1]):
                     images = {
                         name: evaluate(sensors.GetOutputPort(f"color_image_{name}"), context)
                         for name in views
                     }
                     best, since = found, 0
                     shown = {k: colour_image_to_picture(one).copy() for k, one in images.items()}
-        is_sure = best is not None and best.similarity >= setup.settings.recognition
+        is_sure = best is not None and best[1] >= setup.settings.recognition
         return is_sure and since >= _MORE_MOMENTS
 
     look_until(diagram, sensors, look, on_report)

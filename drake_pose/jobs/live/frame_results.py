@@ -30,7 +30,7 @@ from drake_pose.silhouette.areas.scoring import draw_mask
 from drake_pose.silhouette.pictures.masks import compare_masks
 from drake_pose.silhouette.pictures.scene_checks import frame_ranges
 from drake_pose.silhouette.pictures.scenes import Scene
-from drake_pose.systems.date.preparation import PersonView
+from drake_pose.systems.date import PersonView
 from drake_pose.systems.person.live_capture import LiveSensors
 from drake_pose.systems.pictures.picture_capture import CameraCount
 

@@ -11,8 +11,8 @@ from cyclopts import Parameter
 from drake_pose.errors import SettingsError
 from drake_pose.files.options import within
 
-CaptureMethod = Literal["person", "stages", "paper"]
-"""By all silhouettes at once, or by one of systems.date.preparation's CAPTURE_METHODS."""
+CaptureMethod = Literal["person", "paper"]
+"""By all silhouettes at once, or by the stages of Date et al. as they print them."""
 
 Seconds = Annotated[float | None, within(0.01)]
 Shape = Annotated[
@@ -47,11 +47,11 @@ class LiveSettings:
     """Largest difference of time stamps of simultaneous pictures. Default: half the time between
     two pictures of a camera, or 0.9 of it if cameras are live."""
     face_camera: Annotated[str | None, Parameter(metavar="NAME")] = None
-    """With --method stages and paper: the camera before the face, which tells where the person
-    looks; needs --faces."""
+    """With --method paper: the camera before the face, which tells where the person looks; needs
+    --faces."""
     faces: Annotated[Path | None, Parameter(metavar="FOLDER")] = None
-    """With --method stages and paper: pictures of the person's face, and directions.csv:
-    picture,turn,nod [deg]."""
+    """With --method paper: pictures of the person's face, and directions.csv: picture,turn,nod
+    [deg]."""
     replay: Annotated[bool, _OF_PYTHON] = True
     packages: Annotated[Mapping[str, Path], _OF_PYTHON] = field(default_factory=dict)
 

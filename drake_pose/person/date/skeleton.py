@@ -5,6 +5,7 @@ Head - neck base - trunk, and two arms and legs of 3 + 1 rotations: 23 degrees o
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -12,7 +13,6 @@ import numpy as np
 
 from drake_pose.arrays import Array, Indices
 from drake_pose.body.model import ArticulatedModel
-from drake_pose.body.parsed_model import ParsedModel
 from drake_pose.body.surfaces.meshes import TriangleMesh
 from drake_pose.body.tree.joint_kernel import PackedSteps
 from drake_pose.body.tree.tree_kinematics import PackedTree, TreeKinematics
@@ -23,11 +23,6 @@ LIMBS = ("left_arm", "right_arm", "left_leg", "right_leg")
 
 FEATURES = ("head", "left_hand", "right_hand", "left_foot", "right_foot")
 """The skin-coloured parts that are measured, head and the limbs' ends, in the limbs' order."""
-
-_SEGMENTS = {"arm": ("upper_arm", "forearm", "hand"), "leg": ("thigh", "shin", "foot")}
-_FARTHEST_FEATURE = 0.05
-_POINTS_ON_SURFACE = 60
-_AXES = {"x": 0, "y": 1, "z": 2}
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +37,6 @@ class Limb:
         axes: (4,) 0, 1, 2 for x, y, z: three at the root in the order of rotation, then the middle.
         positions, lower, upper: (4,) where their angles stand in q, and their limits [rad].
         half_widths: (2,) mean distance of either segment's surface from its joints' line [m].
-        surfaces: (m, 3) points all over either segment's surface, in its frame [m].
     """
 
     name: str
@@ -56,12 +50,16 @@ class Limb:
     lower: Array
     upper: Array
     half_widths: Array
-    surfaces: tuple[Array, Array]
 
     @property
     def lengths(self) -> tuple[float, float]:
         """From root to middle joint, and from there to the end [m]."""
         return float(np.linalg.norm(self.middle_U)), float(np.linalg.norm(self.end_L))
+
+    @property
+    def is_leg(self) -> bool:
+        """Whether it is a leg."""
+        return self.name.endswith("leg")
 
     @property
     def side(self) -> float:
@@ -125,14 +123,14 @@ class Skeleton:
         """(3,) half-way between the hips, in the trunk's frame [m]."""
         return 0.5 * (self.limbs["left_leg"].root_T + self.limbs["right_leg"].root_T)
 
-    def with_features(self, q: Array, places: Array) -> Skeleton:
+    def with_features(self, q: Array, places: Array, farthest: float = 0.05) -> Skeleton:
         """The same person whose features are at places (5, 3) measured in a known pose q (nq,) [m].
 
-        Features of seen skin move by five centimetres at most; nan: not measured.
+        A feature moves by `farthest` [m] at most; nan: not measured.
         """
         off = np.nan_to_num(np.asarray(places) - self.features(q))
         length = np.linalg.norm(off, axis=1, keepdims=True)
-        off *= np.minimum(1.0, _FARTHEST_FEATURE / np.maximum(length, 1e-12))
+        off *= np.minimum(1.0, farthest / np.maximum(length, 1e-12))
         R_WN = self.poses(q)[:, :3, :3]
         limbs = {
             name: replace(limb, end_L=limb.end_L + R_WN[limb.lower_node].T @ step)
@@ -154,9 +152,12 @@ def load_skeleton(model: ArticulatedModel) -> Skeleton:
     kinematics = TreeKinematics(model.pose_tree())
     tree = kinematics.tree
     nodes = {node.name: index for index, node in enumerate(tree.nodes)}
-    parents = {"trunk": "head"}
+    parts = {"arm": ("upper_arm", "forearm", "hand"), "leg": ("thigh", "shin", "foot")}
+    segments, parents = {}, {"trunk": "head"}
     for name in LIMBS:
-        upper, lower, _ = _segments(name)
+        side, kind = name.split("_")
+        upper, lower, end = (f"{side}_{part}" for part in parts[kind])
+        segments[name] = upper, lower, end
         parents |= {upper: "trunk", lower: upper}
     for name, parent in parents.items():
         if name not in nodes or tree.nodes[tree.nodes[nodes[name]].parent].name != parent:
@@ -178,10 +179,19 @@ def load_skeleton(model: ArticulatedModel) -> Skeleton:
         neck_angles=np.array(tree.nodes[nodes["trunk"]].positions),
         order=order,
         chains=[(packed, order[values]) for packed, values in chains],
-        limbs={name: _limb(kinematics, nodes, name) for name in LIMBS},
+        limbs={name: _limb(kinematics, nodes, name, *segments[name]) for name in LIMBS},
         lower=model.lower,
         upper=model.upper,
     )
+
+
+def registered_positions(skeleton: Skeleton, spread_deg: float = 80.0) -> Array:
+    """Positions (nq,) of the paper's registered pose: upright, both arms spread by degrees."""
+    q = np.zeros(len(skeleton.lower))
+    for name in LIMBS[:2]:
+        limb = skeleton.limbs[name]
+        q[limb.positions[1]] = limb.side * math.radians(spread_deg)
+    return skeleton.clip(q)
 
 
 def _chain(packed: PackedTree, node: int) -> tuple[PackedTree, Indices]:
@@ -204,24 +214,39 @@ def _chain(packed: PackedTree, node: int) -> tuple[PackedTree, Indices]:
     ), values
 
 
-def _segments(limb: str) -> tuple[str, str, str]:
-    """The links of a limb: upper and lower segment, and end."""
-    side, kind = limb.split("_")
-    upper, lower, end = (f"{side}_{part}" for part in _SEGMENTS[kind])
-    return upper, lower, end
-
-
-def _limb(kinematics: TreeKinematics, nodes: Mapping[str, int], name: str) -> Limb:
+def _limb(
+    kinematics: TreeKinematics,
+    nodes: Mapping[str, int],
+    name: str,
+    upper: str,
+    lower: str,
+    end: str,
+) -> Limb:
+    """The limb of two segments and an end, which is fixed to the lower one or hangs on it."""
     tree = kinematics.tree
-    model, (upper, lower, end) = tree.model, _segments(name)
+    model = tree.model
     positions = [*tree.nodes[nodes[upper]].positions, *tree.nodes[nodes[lower]].positions]
     if len(positions) != 4:
         raise ModelError(f"{model.path}: '{upper}' and '{lower}' must have 3 + 1 positions")
+    if end not in model.link_meshes:
+        raise ModelError(f"{model.path}: there must be a link '{end}' with visual geometry")
+    letters = [model.position_names[i].rsplit("_", 1)[-1] for i in positions]
+    if not set(letters) <= set("xyz"):
+        raise ModelError(
+            f"{model.path}: '{upper}' must turn about joints whose names end with _x, _y or _z, "
+            f"not {', '.join(model.position_names[i] for i in positions)}"
+        )
     X_WN = kinematics.poses(np.zeros(len(kinematics.names)))
     trunk, first, second = X_WN[[nodes["trunk"], nodes[upper], nodes[lower]]]
-    middle_U, end_L = _offset(first, second), _end_middle(model, lower, end)
-    meshes = [model.link_meshes[segment] for segment in (upper, lower)]
-    widths = zip(meshes, (middle_U, end_L), strict=True)
+    context = model.plant.CreateDefaultContext()
+    model.plant.SetPositions(context, np.zeros(len(model.position_names)))
+    frame = model.plant.GetBodyByName(lower).body_frame()
+    X_LE = model.plant.GetBodyByName(end).body_frame().CalcPose(context, frame).GetAsMatrix4()
+    middle_U, end_L = _offset(first, second), _moved(X_LE, _middle(model.link_meshes[end]))
+    half_widths = []
+    for segment, along in ((upper, middle_U), (lower, end_L)):
+        across = np.cross(model.link_meshes[segment].vertices, along / np.linalg.norm(along))
+        half_widths.append(np.linalg.norm(across, axis=1).mean())
     return Limb(
         name=name,
         upper_node=nodes[upper],
@@ -229,24 +254,12 @@ def _limb(kinematics: TreeKinematics, nodes: Mapping[str, int], name: str) -> Li
         root_T=_offset(trunk, first),
         middle_U=middle_U,
         end_L=end_L,
-        axes=_axes(model, positions, upper),
+        axes=np.array(["xyz".index(letter) for letter in letters]),
         positions=np.array(positions),
         lower=model.lower[positions],
         upper=model.upper[positions],
-        half_widths=np.array([_half_width(mesh.vertices, along) for mesh, along in widths]),
-        surfaces=(_surface_points(meshes[0]), _surface_points(meshes[1])),
+        half_widths=np.array(half_widths),
     )
-
-
-def _axes(model: ParsedModel, positions: Sequence[int], name: str) -> Indices:
-    """The axes 0, 1, 2 that the positions' names end with."""
-    letters = [model.position_names[i].rsplit("_", 1)[-1] for i in positions]
-    if any(letter not in _AXES for letter in letters):
-        raise ModelError(
-            f"{model.path}: '{name}' must turn about joints whose names end with _x, _y or _z, not "
-            f"{', '.join(model.position_names[i] for i in positions)}"
-        )
-    return np.array([_AXES[letter] for letter in letters])
 
 
 def _moved(X_AB: Array, p_B: Array) -> Array:
@@ -259,37 +272,8 @@ def _offset(X_WA: Array, X_WB: Array) -> Array:
     return np.asarray(X_WA[:3, :3].T @ (X_WB[:3, 3] - X_WA[:3, 3]))
 
 
-def _end_middle(model: ParsedModel, lower: str, end: str) -> Array:
-    """(3,) the middle of a hand or foot in the frame of the segment before it."""
-    if end not in model.link_meshes:
-        raise ModelError(f"{model.path}: there must be a link '{end}' with visual geometry")
-    context = model.plant.CreateDefaultContext()
-    model.plant.SetPositions(context, np.zeros(len(model.position_names)))
-    frame = model.plant.GetBodyByName(lower).body_frame()
-    X_LE = model.plant.GetBodyByName(end).body_frame().CalcPose(context, frame)
-    return _moved(X_LE.GetAsMatrix4(), _middle(model.link_meshes[end]))
-
-
-def _half_width(vertices: Array, along: Array) -> float:
-    """Mean distance of vertices (n, 3) from the line through the origin along a vector (3,)."""
-    direction = along / np.linalg.norm(along)
-    return float(np.linalg.norm(np.cross(vertices, direction), axis=1).mean())
-
-
-def _surface_points(mesh: TriangleMesh) -> Array:
-    """(m, 3) middles of triangles, one for each of m equal parts of the surface's area."""
-    middles, area = _triangle_middles(mesh)
-    parts = (np.arange(_POINTS_ON_SURFACE) + 0.5) / _POINTS_ON_SURFACE * area.sum()
-    return middles[np.minimum(np.searchsorted(np.cumsum(area), parts), len(area) - 1)]
-
-
 def _middle(mesh: TriangleMesh) -> Array:
     """(3,) the middle of a surface, weighed by area."""
-    middles, area = _triangle_middles(mesh)
-    return np.asarray((area[:, None] * middles).sum(axis=0) / area.sum())
-
-
-def _triangle_middles(mesh: TriangleMesh) -> tuple[Array, Array]:
-    """(n, 3) middles of triangles, and what is proportional to their areas (n,)."""
     a, b, c = (mesh.vertices[mesh.triangles[:, k]] for k in range(3))
-    return (a + b + c) / 3.0, np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    middles, area = (a + b + c) / 3.0, np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    return np.asarray((area[:, None] * middles).sum(axis=0) / area.sum())

@@ -4,27 +4,40 @@ Facing right or left turns the view, standing ahead of or behind the rest place 
 """
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
 from drake_pose.arrays import Array
 from drake_pose.errors import SettingsError
-from drake_pose.person.date.recognition import registered_positions
-from drake_pose.person.date.skeleton import Skeleton
+from drake_pose.person.date.skeleton import Skeleton, registered_positions
 
-NO_COMMAND = (0, 0)
 
-TURN_RATE, SPEED, BODY_RADIUS = math.radians(40.0), 0.9, 0.3
-"""How fast the view turns [rad/s] and one walks [m/s], and how near one comes to walls [m]."""
-# A command begins at one threshold and ends at a lower one, so that noise does not toggle it: how
-# far the face is turned away from the rest direction [rad], and how far one stands from the rest
-# place [m].
-_TURN, _STEP = (math.radians(25.0), math.radians(15.0)), (0.18, 0.10)
-# How much higher than the other a lifted foot is [m]; without another step for so long nobody walks
-# on the spot any more [s].
-_LIFT, _PAUSE = 0.05, 1.0
+@dataclass(frozen=True)
+class WalkSettings:
+    """How gestures walk.
+
+    A command begins at one threshold and ends at a lower one, so that noise does not toggle it.
+
+    Args:
+        turn_rate, speed: how fast the view turns [rad/s] and one walks [m/s].
+        body_radius: how near one comes to walls [m].
+        turn: how far the face is turned away from the rest direction [rad].
+        step: how far one stands from the rest place [m].
+        lift: how much higher than the other a lifted foot is [m].
+        pause: without another step for so long nobody walks on the spot any more [s].
+    """
+
+    turn_rate: float = math.radians(40.0)
+    speed: float = 0.9
+    body_radius: float = 0.3
+    turn: tuple[float, float] = (math.radians(25.0), math.radians(15.0))
+    step: tuple[float, float] = (0.18, 0.10)
+    lift: float = 0.05
+    pause: float = 1.0
+
+
+WALK = WalkSettings()
 
 
 def stance_of(left_W: Array, head_W: Array, feet_W: Array) -> Array:
@@ -62,12 +75,9 @@ def recognise_command(stance: Array, rest: Array, last: tuple[int, int]) -> tupl
         Turning: 1 left, -1 right, 0 not; walking: 1 forward, -1 backward, 0 not.
     """
     if not np.isfinite(stance).all():
-        return NO_COMMAND
+        return 0, 0
     turned, ahead = offsets_from_rest(stance, rest)
-    return _switch(turned, last[0], *_TURN), _switch(ahead, last[1], *_STEP)
-
-
-NO_STEPS = (0.0, 0.0, 0.0)
+    return _switch(turned, last[0], *WALK.turn), _switch(ahead, last[1], *WALK.step)
 
 
 def follow_steps(lift: float, steps: Array, seconds: float) -> Array:
@@ -76,20 +86,16 @@ def follow_steps(lift: float, steps: Array, seconds: float) -> Array:
     Args:
         lift: how much higher the left foot is than the right one [m]; nan: not seen.
         steps: (3,) the foot lifted last (1 left, -1 right, 0 none), since when it was [s], and how
-            many steps, each with the other foot, were taken without a pause.
+            many steps, each with the other foot, were taken without a pause; 0 at first. Two are
+            walking on the spot.
         seconds: since the last frame.
     """
     foot, since, count = steps[0], steps[1] + seconds, steps[2]
-    if since > _PAUSE:
+    if since > WALK.pause:
         count = 0.0
-    if abs(lift) >= _LIFT and math.copysign(1.0, lift) != foot:
+    if abs(lift) >= WALK.lift and math.copysign(1.0, lift) != foot:
         return np.array([math.copysign(1.0, lift), 0.0, count + 1.0])
     return np.array([foot, since, count])
-
-
-def walks_on_spot(steps: Array) -> bool:
-    """Whether steps (3,) of follow_steps are walking on the spot: one foot, then the other."""
-    return bool(steps[2] >= 2.0)
 
 
 def follow_command(
@@ -109,16 +115,16 @@ def follow_command(
         half_size: the place is a square about the origin; half its side [m].
         obstacles: (n, 3) x, y and radius of round obstacles [m].
     """
-    turn = command[0] * TURN_RATE * seconds
+    turn = command[0] * WALK.turn_rate * seconds
     middle = pose[2] + 0.5 * turn
-    chord = command[1] * SPEED * seconds * float(np.sinc(0.5 * turn / math.pi))
+    chord = command[1] * WALK.speed * seconds * float(np.sinc(0.5 * turn / math.pi))
     place = pose[:2] + chord * np.array([math.cos(middle), math.sin(middle)])
     for x, y, radius in np.empty((0, 3)) if obstacles is None else obstacles:
         away = place - (x, y)
-        distance, allowed = float(np.linalg.norm(away)), radius + BODY_RADIUS
+        distance, allowed = float(np.linalg.norm(away)), radius + WALK.body_radius
         if 0.0 < distance < allowed:
             place = place + away * (allowed / distance - 1.0)
-    limit = half_size - BODY_RADIUS
+    limit = half_size - WALK.body_radius
     heading = math.atan2(math.sin(pose[2] + turn), math.cos(pose[2] + turn))
     return np.array([*np.clip(place, -limit, limit), heading])
 
@@ -130,8 +136,6 @@ def _switch(value: float, last: int, begin: float, end: float) -> int:
     return int(math.copysign(1, value)) if abs(value) >= begin else 0
 
 
-KeyPose = dict[str, float]
-
 MOTIONS = ("walk", "reach", "lean", "crouch", "turn", "cross")
 """The motions, in their order; before the first and after the last the registered pose is shown."""
 
@@ -141,47 +145,42 @@ UPRIGHT = ("walk", "reach", "turn", "cross")
 REGISTERED = "registered"
 FEWEST_FRAMES = 40
 
-# In fewer frames the motions would be faster than people are; so they are not all shown.
-_WHOLE = 120
-_FOOT_HEIGHT = 0.04
 
-
-def _sides(left: float = 1.0, right: float = 1.0, **degrees: float) -> KeyPose:
+def _sides(left: float = 1.0, right: float = 1.0, **degrees: float) -> dict[str, float]:
     """Angles [deg] of joints on both sides, times what is theirs."""
     sides = {"left": left, "right": right}
     return {f"{side}_{joint}": k * a for joint, a in degrees.items() for side, k in sides.items()}
 
 
-_RELAXED: KeyPose = _sides(forearm_x=-10.0) | _sides(right=-1.0, upper_arm_z=8.0)
+def _key_poses(motion: str) -> list[dict[str, float]]:
+    """Angles [deg] that differ from the relaxed pose; a motion goes from one to the next, and back.
 
-
-def _stride(side: float) -> KeyPose:
-    swung = _sides(side, -side, upper_arm_x=28.0, thigh_x=-25.0)
-    bent = {"left_shin_x": 18.0 - 12.0 * side, "right_shin_x": 18.0 + 12.0 * side}
-    return swung | bent | _sides(forearm_x=-25.0)
-
-
-# Angles [deg] that differ from the relaxed pose; a motion goes from one to the next and back.
-_KEY_POSES: Mapping[str, tuple[KeyPose, ...]] = {
-    "walk": (_stride(1.0), _stride(-1.0)),
-    "reach": (
-        {"left_upper_arm_x": -85.0, "left_forearm_x": -35.0},
-        {"left_upper_arm_x": -140.0, "right_upper_arm_z": -75.0, "right_forearm_x": -85.0},
-        _sides(right=-1.0, upper_arm_z=80.0) | {"left_forearm_x": -95.0, "left_upper_arm_y": -35.0},
-    ),
-    "lean": ({"neck_base_x": 35.0} | _sides(thigh_x=-35.0),),
-    "crouch": (
-        {"neck_base_x": 12.0}
-        | _sides(thigh_x=-75.0, shin_x=110.0)
-        | _sides(right=-1.0, thigh_z=15.0),
-    ),
-    "turn": ({"head_y": 45.0}, {"head_y": -45.0}),
-    "cross": (
-        {"left_upper_arm_x": -45.0, "left_forearm_x": -85.0}
-        | {"right_upper_arm_x": -55.0, "right_forearm_x": -75.0}
-        | _sides(right=-1.0, upper_arm_y=-45.0),
-    ),
-}
+    See MOTIONS.
+    """
+    if motion == "walk":
+        return [
+            _sides(side, -side, upper_arm_x=28.0, thigh_x=-25.0)
+            | {"left_shin_x": 18.0 - 12.0 * side, "right_shin_x": 18.0 + 12.0 * side}
+            | _sides(forearm_x=-25.0)
+            for side in (1.0, -1.0)
+        ]
+    if motion == "reach":
+        aside = {"left_forearm_x": -95.0, "left_upper_arm_y": -35.0}
+        return [
+            {"left_upper_arm_x": -85.0, "left_forearm_x": -35.0},
+            {"left_upper_arm_x": -140.0, "right_upper_arm_z": -75.0, "right_forearm_x": -85.0},
+            _sides(right=-1.0, upper_arm_z=80.0) | aside,
+        ]
+    if motion == "lean":
+        return [{"neck_base_x": 35.0} | _sides(thigh_x=-35.0)]
+    if motion == "crouch":
+        bent = _sides(thigh_x=-75.0, shin_x=110.0) | _sides(right=-1.0, thigh_z=15.0)
+        return [{"neck_base_x": 12.0} | bent]
+    if motion == "turn":
+        return [{"head_y": 45.0}, {"head_y": -45.0}]
+    left = {"left_upper_arm_x": -45.0, "left_forearm_x": -85.0}
+    right = {"right_upper_arm_x": -55.0, "right_forearm_x": -75.0}
+    return [left | right | _sides(right=-1.0, upper_arm_y=-45.0)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -205,24 +204,28 @@ def make_motion(skeleton: Skeleton, frames: int, seed: int) -> Motion:
     generator = np.random.default_rng(seed)
     registered = registered_positions(skeleton)
     relaxed = _positions(skeleton, {}, 1.0)
-    whole = max(frames, _WHOLE)
+    # In fewer frames the motions would be faster than people are; so they are not all shown.
+    whole = max(frames, 120)
     still = whole // 20
     # From key pose to key pose it always takes about as long.
-    steps = np.cumsum([0, *(len(_KEY_POSES[motion]) + 1 for motion in MOTIONS)])
+    steps = np.cumsum([0, *(len(_key_poses(motion)) + 1 for motion in MOTIONS)])
     lengths = np.diff(np.rint((whole - 2 * still) * steps / steps[-1]).astype(int))
     rows, names = [registered] * still, [REGISTERED] * still
     before = registered
     for motion, length in zip(MOTIONS, lengths, strict=True):
         size = generator.uniform(0.85, 1.15)
         after = registered if motion == MOTIONS[-1] else relaxed
-        keys = [before, *(_positions(skeleton, key, size) for key in _KEY_POSES[motion]), after]
+        keys = [before, *(_positions(skeleton, key, size) for key in _key_poses(motion)), after]
         rows += list(_through(keys, int(length)))
         names += [motion] * int(length)
         before = relaxed
     rows += [registered] * still
     names += [REGISTERED] * still
     q = np.array(rows)
-    q[:, skeleton.head_positions[:2]] = _path(whole, generator)
+    # Where the person stands on the floor: a slow loop of 20 cm.
+    phase, along = generator.uniform(0, 2 * np.pi), np.linspace(0, 2 * np.pi, whole)
+    loop = np.column_stack([np.cos(along + phase), np.sin(2 * along + phase)])
+    q[:, skeleton.head_positions[:2]] = 0.2 * loop + generator.uniform(-0.1, 0.1, 2)
     for row in q:
         _stand_on_floor(skeleton, row)
     return Motion(q[:frames], tuple(names[:frames]))
@@ -254,10 +257,11 @@ def make_gestures(skeleton: Skeleton, frames: int = 84) -> Motion:
     return Motion(np.array(rows), tuple(names))
 
 
-def _positions(skeleton: Skeleton, key: KeyPose, size: float) -> Array:
+def _positions(skeleton: Skeleton, key: dict[str, float], size: float) -> Array:
     """Positions of a key pose, its angles times a size."""
     q = np.zeros(len(skeleton.lower))
-    for name, degrees in {**_RELAXED, **{n: size * d for n, d in key.items()}}.items():
+    relaxed = _sides(forearm_x=-10.0) | _sides(right=-1.0, upper_arm_z=8.0)
+    for name, degrees in {**relaxed, **{n: size * d for n, d in key.items()}}.items():
         q[skeleton.model.position_index(name)] = math.radians(degrees)
     return skeleton.clip(q)
 
@@ -271,17 +275,10 @@ def _through(keys: list[Array], count: int) -> Array:
     return np.asarray(poses[index] + share[:, None] * (poses[index + 1] - poses[index]))
 
 
-def _path(frames: int, generator: np.random.Generator) -> Array:
-    """(frames, 2) where the person stands on the floor: a slow loop of 20 cm [m]."""
-    phase, along = generator.uniform(0, 2 * np.pi), np.linspace(0, 2 * np.pi, frames)
-    loop = np.column_stack([np.cos(along + phase), np.sin(2 * along + phase)])
-    return np.asarray(0.2 * loop + generator.uniform(-0.1, 0.1, 2))
-
-
 def _stand_on_floor(skeleton: Skeleton, q: Array) -> None:
-    """Moves the head up or down so that the lower foot is where a standing person's are."""
-    standing = skeleton.features(np.zeros(len(q)))
-    head = float(-standing[3:, 2].mean()) + _FOOT_HEIGHT
+    """Moves the head up or down so that the lower foot's middle is 4 cm above the floor."""
+    height, standing = 0.04, skeleton.features(np.zeros(len(q)))
+    head = float(-standing[3:, 2].mean()) + height
     q[skeleton.head_positions[2]] = 0.0
     lowest = float(skeleton.features(q)[3:, 2].min())
-    q[skeleton.head_positions[2]] = min(head + 0.2, _FOOT_HEIGHT - lowest)
+    q[skeleton.head_positions[2]] = min(head + 0.2, height - lowest)

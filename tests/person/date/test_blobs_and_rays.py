@@ -12,7 +12,7 @@ from drake_pose.person.date.features import (
     inside_silhouettes,
     skin_blobs,
 )
-from drake_pose.person.rays import meeting_points, nearest_points, viewing_rays
+from drake_pose.person.views import meeting_points, nearest_points, viewing_rays
 
 SKIN = (217, 166, 135)
 SHIRT = (31, 115, 128)

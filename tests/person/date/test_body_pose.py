@@ -11,22 +11,20 @@ from drake_pose.body.landmarks import landmark_positions, load_landmarks
 from drake_pose.body.model import load_model
 from drake_pose.camera.models import circle_of_cameras
 from drake_pose.errors import ModelError
-from drake_pose.person.date.body_pose import (
+from drake_pose.person.date.pose import (
     Waist,
+    correlation,
     estimate_pose,
+    joint_circle,
+    limb_angles,
     move_limb,
+    place_limb,
     reach,
+    rectangles,
+    search_limb,
     uncross_feet,
     upper_body,
     waist_of,
-)
-from drake_pose.person.date.limb_search import (
-    correlation,
-    joint_circle,
-    limb_angles,
-    place_limb,
-    rectangles,
-    search_limb,
 )
 from drake_pose.person.date.skeleton import LIMBS, load_skeleton
 from tests.person.persons_in_view import SIDES, posed, see

@@ -6,22 +6,21 @@ import pytest
 
 from drake_pose.camera.models import FACE_CAMERA
 from drake_pose.errors import SettingsError
-from drake_pose.person.date.faces import (
+from drake_pose.person.date.features import (
+    SkinColour,
     cut_face,
     face_direction,
     find_face,
     head_angles,
     learn_faces,
-)
-from drake_pose.person.date.features import SkinColour, skin_blobs
-from drake_pose.person.date.recognition import (
     measure_contour,
     recognise,
     registered_positions,
     similarity,
+    skin_blobs,
     stand_registered,
 )
-from drake_pose.systems.date.preparation import CaptureSetup
+from drake_pose.systems.date import CaptureSetup
 from tests.person.studio import shared_studio
 
 

@@ -6,7 +6,7 @@ import pytest
 
 from drake_pose.camera.models import FACE_CAMERA
 from drake_pose.errors import SceneError
-from drake_pose.person.date.faces import find_face, learn_recorded_faces
+from drake_pose.person.date.features import find_face, learn_recorded_faces
 from tests.person.studio import shared_studio
 
 TURNS, NODS = (-40.0, -20.0, 0.0, 20.0, 40.0), (-10.0, 10.0)

@@ -10,14 +10,23 @@ from pydrake.trajectories import PiecewisePolynomial
 
 from drake_pose.camera.models import FACE_CAMERA
 from drake_pose.errors import SettingsError
-from drake_pose.person.date.body_pose import estimate_pose, uncross_feet, waist_of
-from drake_pose.person.date.faces import find_face, head_angles
-from drake_pose.person.date.features import expect_features, find_features
-from drake_pose.person.date.recognition import recognise
+from drake_pose.person.date.features import (
+    expect_features,
+    find_face,
+    find_features,
+    head_angles,
+    recognise,
+)
+from drake_pose.person.date.pose import estimate_pose, uncross_feet, waist_of
 from drake_pose.person.date.skeleton import LIMBS
 from drake_pose.silhouette.segmentation.background import person_region
-from drake_pose.systems.date.capture import PaperPoseEstimator, build_paper_capture
-from drake_pose.systems.date.preparation import CAPTURE_METHODS, CaptureSetup, see_person
+from drake_pose.systems.date import (
+    CAPTURE_METHODS,
+    CaptureSetup,
+    PaperPoseEstimator,
+    build_paper_capture,
+    see_person,
+)
 from drake_pose.systems.images import picture_to_colour_image
 from drake_pose.systems.pictures.camera_rig import build_camera_rig
 from tests.person.studio import shared_studio

@@ -7,8 +7,13 @@ from drake_pose.errors import CameraError, SettingsError, UnknownNameError
 from drake_pose.person.date.features import SkinColour
 from drake_pose.silhouette.pictures.label_images import mask_to_label_image
 from drake_pose.silhouette.segmentation.background import learn_background, person_region
-from drake_pose.systems.date.preparation import prepare_paper_capture, see_person
-from drake_pose.systems.date.stages import FeatureFinder, HorizontalImage, PoseRecogniser
+from drake_pose.systems.date import (
+    FeatureFinder,
+    HorizontalImage,
+    PoseRecogniser,
+    prepare_paper_capture,
+    see_person,
+)
 from drake_pose.systems.images import colour_image_to_picture, picture_to_colour_image
 from tests.person.studio import shared_studio
 from tests.systems.bench import Bench

@@ -1,0 +1,585 @@
+"""Date's capture as Drake systems: preparation, stages, pose, and the diagram (figure 1)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from pydrake.geometry import Meshcat
+from pydrake.systems.framework import (
+    Context,
+    DiagramBuilder,
+    InputPort,
+    InputPortIndex,
+    OutputPort,
+    System,
+)
+from pydrake.systems.sensors import ImageRgba8U
+
+from drake_pose.arrays import Array, Mask, Picture
+from drake_pose.body.model import ArticulatedModel
+from drake_pose.camera.models import Camera, PinholeCamera, circle_of_cameras
+from drake_pose.errors import SettingsError, UnknownNameError
+from drake_pose.person.date.features import (
+    FaceTemplates,
+    Features,
+    PersonView,
+    RegisteredPose,
+    SkinColour,
+    cut_face,
+    find_face,
+    find_features,
+    head_angles,
+    learn_faces,
+    recognise,
+    register_pose,
+    see_person,
+)
+from drake_pose.person.date.pose import estimate_pose
+from drake_pose.person.date.skeleton import FEATURES, LIMBS, Skeleton, load_skeleton
+from drake_pose.silhouette.segmentation.background import Background, person_region
+from drake_pose.systems.bodies import add_avatar
+from drake_pose.systems.images import colour_image_to_picture
+from drake_pose.systems.pictures.camera_rig import build_camera_rig
+from drake_pose.systems.pictures.person_region import PersonRegion, connect_images
+from drake_pose.systems.ports import (
+    MemorySystem,
+    PortedSystem,
+    StagedDiagram,
+    connect_same,
+    export_outputs,
+    require_different,
+    require_period,
+)
+
+
+@dataclass(frozen=True)
+class PaperSettings:
+    """How the paper's system captures.
+
+    Args:
+        search: whether elbows and knees are searched on their circles; see estimate_pose.
+        recognition: similarity from which the registered pose overwrites the state.
+        farthest_face: how far from the eigenspace a face may be [grey levels].
+    """
+
+    skin: SkinColour = field(default_factory=SkinColour)
+    search: bool = True
+    recognition: float = 0.93
+    farthest_face: float = 30.0
+
+
+@dataclass(frozen=True, eq=False)
+class CaptureSetup:
+    """What stays the same from frame to frame.
+
+    Args:
+        cameras: on the circle, by name.
+        backgrounds: by camera, the face camera's among them; a camera without one needs masks.
+
+    Raises:
+        SettingsError: fewer than two cameras, or the face camera has the name of another.
+    """
+
+    skeleton: Skeleton
+    cameras: Mapping[str, Camera]
+    face_camera: Camera | None = None
+    faces: FaceTemplates | None = None
+    registered: RegisteredPose | None = None
+    backgrounds: Mapping[str, Background] = field(default_factory=dict)
+    settings: PaperSettings = field(default_factory=PaperSettings)
+
+    def __post_init__(self) -> None:
+        if len(self.cameras) < 2:
+            raise SettingsError("3-D points need two cameras or more besides the face camera")
+        if self.face_camera is not None and self.face_camera.name in self.cameras:
+            raise SettingsError(
+                f"the face camera '{self.face_camera.name}' is also one of the cameras on the "
+                "circle; it must be another one"
+            )
+
+
+def prepare_paper_capture(
+    model: ArticulatedModel,
+    cameras: Mapping[str, PinholeCamera],
+    face_camera: str | None,
+    q: Array,
+    pictures: Mapping[str, Picture],
+    backgrounds: Mapping[str, Background],
+    settings: PaperSettings | None = None,
+    faces: FaceTemplates | None = None,
+) -> CaptureSetup:
+    """Makes the setup of a capture while the person shows the registered pose.
+
+    The pictures say where the person's skin is seen; the pose's templates are rendered.
+
+    Args:
+        cameras: all of them, by name.
+        face_camera: which of them is the face camera; None: there is none.
+        q: (nq,) where the person stands, in the registered pose [rad or m].
+        pictures: (H, W, 3) that the cameras on the circle take of it, red, green, blue.
+        backgrounds: by camera.
+        settings: how to capture.
+        faces: templates of the person's face; rendered ones where not given.
+
+    Raises:
+        UnknownNameError: there is no such face camera.
+        SettingsError: fewer than two other cameras.
+        ModelError: the model is not made like the bundled person.
+    """
+    if face_camera is not None and face_camera not in cameras:
+        raise UnknownNameError("camera", face_camera, cameras, "the rig")
+    settings = settings or PaperSettings()
+    ring = {name: camera for name, camera in cameras.items() if name != face_camera}
+    own = load_skeleton(model)
+    views = [
+        see_person(pictures[n], person_region(pictures[n], backgrounds[n]), settings.skin)
+        for n in ring
+    ]
+    seen = find_features(list(ring.values()), views, own.features(q))
+    places = np.where(seen.support[:, None] > 0, seen.places, np.nan)
+    skeleton = own.with_features(q, places)
+    registered = render_registered_pose(skeleton, q, ring)
+    if face_camera is not None and faces is None:
+        faces = learn_rendered_faces(model, own, q, settings.skin)
+    return CaptureSetup(
+        skeleton,
+        ring,
+        None if face_camera is None else cameras[face_camera],
+        faces,
+        registered,
+        backgrounds,
+        settings,
+    )
+
+
+def render_registered_pose(
+    skeleton: Skeleton, q: Array, cameras: Mapping[str, PinholeCamera]
+) -> RegisteredPose:
+    """The registered pose at q (nq,) [rad or m] as Drake renders it; raises as register_pose."""
+    rig = build_camera_rig(skeleton.model, cameras)
+    context = rig.diagram.CreateDefaultContext()
+
+    def draw(camera: Camera, positions: Array) -> Mask:
+        rig.set_positions(context, positions)
+        return rig.mask(context, camera.name)
+
+    return register_pose(skeleton, q, list(cameras.values()), draw)
+
+
+def learn_rendered_faces(
+    model: ArticulatedModel, skeleton: Skeleton, q: Array, skin: SkinColour
+) -> FaceTemplates:
+    """Templates of a model's face: 300 rendered pictures, 20 turns times 15 nods, at q (nq,)."""
+    head = skeleton.features(q)[0]
+    view, size = math.radians(11.0), (200, 200)
+    placed = circle_of_cameras(1, height=float(head[2]), target=head, field_of_view=view, size=size)
+    name, camera = next(iter(placed.items()))
+    azimuth = math.atan2(camera.X_WC[1, 3] - head[1], camera.X_WC[0, 3] - head[0])
+    rig = build_camera_rig(model, placed)
+    context = rig.diagram.CreateDefaultContext()
+    faces, directions = [], []
+    for turn in np.radians(np.linspace(-80.0, 80.0, 20)):
+        for nod in np.radians(np.linspace(-35.0, 50.0, 15)):
+            posed = np.array(q)
+            posed[skeleton.head_angles] = azimuth + turn, nod
+            posed[skeleton.head_positions] += head - skeleton.features(posed)[0]
+            rig.set_positions(context, posed)
+            picture = rig.picture(context, name)
+            seen = see_person(picture, rig.mask(context, name), skin)
+            face = cut_face(picture, seen.blobs)
+            if face is not None:
+                faces.append(face)
+                directions.append((turn, nod))
+    return learn_faces(faces, np.array(directions))
+
+
+def _add_views(
+    system: PortedSystem, cameras: Sequence[Camera]
+) -> Callable[[Context], tuple[list[Camera], list[PersonView]]]:
+    """The input ports ``person_view_<camera>`` of a system, and what comes in.
+
+    The returned function gives the cameras that go, and what they saw; unconnected ones and None
+    are left out. Raises SettingsError for fewer than two cameras, or two of one name.
+    """
+    require_different(cameras, 2, "two or more different cameras are needed, not")
+    given = system.add_camera_inputs({one.name: f"person_view_{one.name}" for one in cameras})
+
+    def seen(context: Context) -> tuple[list[Camera], list[PersonView]]:
+        views = given(context)
+        return [one for one in cameras if one.name in views], list(views.values())
+
+    return seen
+
+
+class HorizontalImage(PersonRegion):
+    """Finds the person in one camera's picture: region, skin-coloured blobs in it, contour.
+
+    .. pydrake_system::
+
+        name: HorizontalImage
+        input_ports: [color_image, label_image (optional)]
+        output_ports: [region, person_view]
+
+    The paper's horizontal image processing module (3.1.1). Outputs: ``region``, see PersonRegion,
+    and ``person_view``, a ``person.date.features.PersonView``, None where either image is lost.
+    """
+
+    def __init__(
+        self, camera: Camera, background: Background | None = None, skin: SkinColour | None = None
+    ) -> None:
+        super().__init__(camera, background)
+        self.wanted = ("color_image",) if background is not None else ("color_image", "label_image")
+
+        def see(context: Context) -> PersonView | None:
+            picture, region = self.picture.Eval(context), self.region.Eval(context)
+            if picture is None or region is None:
+                return None
+            return see_person(picture, region, skin or SkinColour())
+
+        self.add_output("person_view", None, see)
+
+
+class FeatureFinder(PortedSystem):
+    """Finds head, hands and feet in space where the rays of skin-coloured blobs meet.
+
+    .. pydrake_system::
+
+        name: FeatureFinder
+        input_ports: [person_view_<camera>, last_features]
+        output_ports: [found, features, support]
+
+    The first part of the paper's 3-D module (3.1.2). A camera that is unconnected or gives None is
+    left out. ``last_features`` (15) are the last frame's: head, left hand, right hand, left foot,
+    right foot [m]; while they are nan nothing is found. Outputs: ``features`` (15), the last
+    frame's where nothing was measured [m]; ``support`` (5), from how many 3-D points each was
+    taken, 0: not measured; and both with all 3-D points as ``found``, a
+    ``person.date.features.Features`` or None. Cameras are in the order of the input ports.
+
+    Raises:
+        SettingsError: fewer than two cameras, or two of one name.
+    """
+
+    def __init__(self, cameras: Sequence[Camera]) -> None:
+        super().__init__()
+        size = 3 * len(FEATURES)
+        self._seen = _add_views(self, cameras)
+        self.add_input("last_features", size)
+        found = self.add_output("found", None, self._find)
+
+        def places(context: Context) -> Array:
+            what = found.Eval(context)
+            return np.full(size, np.nan) if what is None else what.places.ravel()
+
+        def support(context: Context) -> Array:
+            what = found.Eval(context)
+            return np.zeros(len(FEATURES)) if what is None else what.support
+
+        self.add_output("features", size, places)
+        self.add_output("support", len(FEATURES), support)
+
+    def _find(self, context: Context) -> Features | None:
+        last = self.GetInputPort("last_features").Eval(context).reshape(-1, 3)
+        if not np.isfinite(last).all():
+            return None
+        cameras, views = self._seen(context)
+        return find_features(cameras, views, last)
+
+
+class FaceDirectionFinder(PortedSystem):
+    """Finds the direction of the face in the face camera's picture by eigenspace templates.
+
+    .. pydrake_system::
+
+        name: FaceDirectionFinder
+        input_ports: [color_image, person_view]
+        output_ports: [face_direction]
+
+    The paper's face processing module (3.2). ``person_view`` is ``HorizontalImage``'s of the same
+    picture. ``face_direction`` (2) is turn to the person's left and nod downwards, away from facing
+    the camera [rad]; nan where no face is seen, or the camera has stopped. No face is farther from
+    the eigenspace than ``farthest`` [grey levels].
+    """
+
+    def __init__(self, camera: Camera, templates: FaceTemplates, farthest: float = 30.0) -> None:
+        super().__init__()
+        self.camera = camera.name
+        self.add_input("color_image", ImageRgba8U(camera.width, camera.height))
+        self.add_input("person_view", None)
+
+        def find(context: Context) -> Array:
+            image, view = self.given(context, "color_image"), self.given(context, "person_view")
+            if image is None or not image.size() or view is None:
+                return np.full(2, np.nan)
+            return find_face(colour_image_to_picture(image), view.blobs, templates, farthest)
+
+        self.add_output("face_direction", 2, find)
+
+
+class PoseRecogniser(PortedSystem):
+    """Recognises the registered pose in what all cameras see, whatever went before (section 5).
+
+    .. pydrake_system::
+
+        name: PoseRecogniser
+        input_ports: [person_view_<camera>]
+        output_ports: [recognition, recognised_positions, similarity]
+
+    A camera that is unconnected or gives None is left out. Outputs: ``recognised_positions`` (nq)
+    of the person in the registered pose [rad or m], nan where it is not recognised;
+    ``similarity`` of the contours, 0 where not recognised; and both as ``recognition``, a tuple, or
+    None. It is recognised from a similarity of
+    ``threshold`` on. Cameras are in the order of the input ports, as of the registered pose.
+    """
+
+    def __init__(
+        self,
+        skeleton: Skeleton,
+        registered: RegisteredPose,
+        cameras: Sequence[Camera],
+        threshold: float = 0.93,
+    ) -> None:
+        super().__init__()
+        seen_by = _add_views(self, cameras)
+
+        def see(context: Context) -> tuple[Array, float] | None:
+            going, seen = seen_by(context)
+            contours = [view.contour for view in seen]
+            return recognise(skeleton, registered, going, contours, threshold)
+
+        def positions(context: Context) -> Array:
+            found = recognition.Eval(context)
+            return np.full(len(registered.q), np.nan) if found is None else found[0]
+
+        def similarity(context: Context) -> list[float]:
+            found = recognition.Eval(context)
+            return [0.0 if found is None else found[1]]
+
+        recognition = self.add_output("recognition", None, see)
+        self.add_output("recognised_positions", len(registered.q), positions)
+        self.add_output("similarity", 1, similarity)
+
+
+class PaperPoseEstimator(MemorySystem):
+    """Estimates the person's positions, and keeps all that one frame hands to the next.
+
+    .. pydrake_system::
+
+        name: PaperPoseEstimator
+        input_ports: [person_view_<camera>, features, support, face_direction (optional),
+          recognised_positions (optional), fresh (optional)]
+        output_ports: [estimated_positions, last_features, last_support, limb_points]
+
+    Stepwise inverse kinematics of the upper body, waist and legs, and the search for elbows and
+    knees. ``recognised_positions`` that are not nan overwrite all without a reset. A camera that is
+    unconnected or gives None is left out. While ``fresh`` is 0 nothing is done.
+
+    Outputs, all of them state, nan until the person is known: ``estimated_positions`` (nq) [rad or
+    m]; ``last_features`` (15), where head, hands and feet were [m], and ``last_support`` (5), from
+    how many 3-D points (``FeatureFinder`` needs them in the next frame); and ``limb_points`` (36),
+    root, middle joint and end of left arm, right arm, left leg and right leg as found [m], nan
+    where the pose was recognised: no limb was searched then. The time between two frames is
+    ``period`` [s].
+
+    Raises:
+        SettingsError: a period that is not positive.
+    """
+
+    def __init__(self, setup: CaptureSetup, period: float) -> None:
+        super().__init__()
+        require_period("estimator", period)
+        self.setup = setup
+        nq, places = len(setup.skeleton.lower), 3 * len(FEATURES)
+        self._seen = _add_views(self, list(setup.cameras.values()))
+        inputs = {
+            "features": places, "support": len(FEATURES), "face_direction": 2,
+            "recognised_positions": nq, "fresh": 1,
+        }  # fmt: skip
+        for name, size in inputs.items():
+            self.add_input(name, size)
+        states = {
+            "estimated_positions": nq, "last_features": places, "last_support": len(FEATURES),
+            "limb_points": 9 * len(LIMBS),
+        }  # fmt: skip
+        unknown = {name: np.full(size, np.nan) for name, size in states.items()}
+        self.keep_vectors(unknown, unknown, period)
+
+    def set_person(self, context: Context, q: Array, features: Array | None = None) -> None:
+        """Say where the person is.
+
+        Args:
+            q: (nq,) positions [rad or m].
+            features: (5, 3) head, hands and feet [m]; those at q where not given.
+
+        Raises:
+            SettingsError: another number of positions or features, or one that is not finite.
+        """
+        checked = [("positions", q, (len(self.setup.skeleton.lower),))]
+        if features is not None:
+            checked.append(("features", features, (len(FEATURES), 3)))
+        for what, values, shape in checked:
+            if np.shape(values) != shape or not np.isfinite(values).all():
+                raise SettingsError(
+                    f"the person's {what} must be {shape} finite numbers, not {values}"
+                )
+        self.set_vectors(context.get_mutable_discrete_state(), self._anew(q, features))
+
+    def next_vectors(self, context: Context, known: dict[str, Array]) -> Mapping[str, Array]:
+        """The pose in the pictures of one moment more."""
+        fresh = self._known(context, "fresh")
+        if fresh is not None and not fresh[0]:
+            return {}
+        recognised, features = (
+            self._known(context, name) for name in ("recognised_positions", "features")
+        )
+        if recognised is not None:
+            return self._anew(recognised, None)
+        if features is None or not np.isfinite(known["estimated_positions"]).all():
+            return {}
+        features = features.reshape(-1, 3)
+        support = self.GetInputPort("support").Eval(context).astype(np.int64)
+        face_camera, angles = self.setup.face_camera, None
+        direction = self._known(context, "face_direction")
+        if face_camera is not None and direction is not None:
+            angles = head_angles(direction, features[0], face_camera)
+        cameras, views = self._seen(context)
+        q, limbs = estimate_pose(
+            self.setup.skeleton,
+            known["estimated_positions"],
+            features,
+            angles,
+            cameras,
+            [view.region for view in views],
+            search=self.setup.settings.search,
+        )
+        return {
+            "estimated_positions": q,
+            "last_features": features,
+            "last_support": support,
+            "limb_points": np.array([limbs[name] for name in LIMBS]),
+        }
+
+    def _anew(self, q: Array, features: Array | None) -> dict[str, Array]:
+        """What is known where nothing before counts."""
+        places = self.setup.skeleton.features(q) if features is None else features
+        return {
+            "estimated_positions": q,
+            "last_features": places,
+            "last_support": np.zeros(len(FEATURES)),
+            "limb_points": np.full(9 * len(LIMBS), np.nan),
+        }
+
+    def _known(self, context: Context, name: str) -> Array | None:
+        """The value of an input port; None: unconnected, or unknown (nan)."""
+        value: Array | None = self.given(context, name)
+        return value if value is not None and np.isfinite(value).all() else None
+
+
+@dataclass(frozen=True, eq=False)
+class PaperCapture(StagedDiagram):
+    """A diagram of the paper's capture; its estimator keeps what one frame hands to the next."""
+
+    estimator: PaperPoseEstimator
+
+
+def build_paper_capture(
+    setup: CaptureSetup,
+    source: System | None = None,
+    period: float = 1.0 / 30.0,
+    meshcat: Meshcat | None = None,
+) -> PaperCapture:
+    """Wire images to the paper's stages, these to the pose, and that to the avatar.
+
+    The diagram's outputs are those of ``PaperPoseEstimator``, ``person_view_<camera>``, where
+    the setup has what they need ``face_direction``, ``recognised_positions`` and ``similarity``,
+    and where the source has it ``time``. The source's inputs are the diagram's, by their names.
+
+    Args:
+        setup: without a registered pose nobody is found by itself: see
+            ``PaperPoseEstimator.set_person``.
+        source: what has the output ``color_image_<camera>`` of each camera: a rig's diagram
+            (``build_camera_rig``), recorded pictures, live cameras. A camera without a background
+            in the setup needs ``label_image_<camera>``, too. A source that is not new in every
+            period has the output ``fresh``. None: the images are the diagram's inputs.
+        period: time between two frames [s].
+
+    Raises:
+        SettingsError: the source lacks an output, or the period is not positive.
+    """
+    builder = DiagramBuilder()
+    if source is not None:
+        builder.AddNamedSystem("source", source)
+        for index in range(source.num_input_ports()):
+            port = source.get_input_port(InputPortIndex(index))
+            builder.ExportInput(port, port.get_name())
+    images, wanted = _add_images(builder, setup)
+    views = {name: image.GetOutputPort("person_view") for name, image in images.items()}
+    stages: dict[str, tuple[OutputPort, ...]] = {
+        "region": tuple(image.region for image in images.values()),
+        "skin": tuple(views.values()),
+    }
+    estimator = PaperPoseEstimator(setup, period)
+    builder.AddNamedSystem("pose", estimator)
+    _connect_views(builder, views, estimator)
+    for stage, (system, results) in _parts(setup).items():
+        builder.AddNamedSystem(stage, system)
+        stages[stage] = (system.GetOutputPort(results[0]),)
+        if isinstance(system, FaceDirectionFinder):
+            builder.Connect(views[system.camera], system.GetInputPort("person_view"))
+            wanted[f"color_image_{system.camera}"].append(system.GetInputPort("color_image"))
+        _connect_views(builder, views, system)
+        connect_same(builder, system, estimator)
+        connect_same(builder, estimator, system)
+        for name in results if stage != "features" else ():
+            builder.ExportOutput(system.GetOutputPort(name), name)
+    connect_images(builder, source, wanted)
+    if source is not None:
+        connect_same(builder, source, estimator)
+        if source.HasOutputPort("time"):
+            builder.ExportOutput(source.GetOutputPort("time"), "time")
+    export_outputs(builder, estimator)
+    if meshcat is not None:
+        positions = estimator.GetOutputPort("estimated_positions")
+        add_avatar(builder, setup.skeleton.model, positions, meshcat, "avatar", period)
+    return PaperCapture(builder.Build(), stages, estimator)
+
+
+def _parts(setup: CaptureSetup) -> dict[str, tuple[System, tuple[str, ...]]]:
+    """By stage what comes between images and pose, and its outputs, the estimator's first."""
+    parts: dict[str, tuple[System, tuple[str, ...]]] = {}
+    cameras, settings = list(setup.cameras.values()), setup.settings
+    if setup.registered is not None:
+        recogniser = PoseRecogniser(setup.skeleton, setup.registered, cameras, settings.recognition)
+        parts["recognition"] = recogniser, ("recognised_positions", "similarity")
+    parts["features"] = FeatureFinder(cameras), ("features",)
+    if setup.face_camera is not None and setup.faces is not None:
+        face = FaceDirectionFinder(setup.face_camera, setup.faces, settings.farthest_face)
+        parts["face"] = face, ("face_direction",)
+    return parts
+
+
+def _connect_views(
+    builder: DiagramBuilder, views: Mapping[str, OutputPort], system: System
+) -> None:
+    """Connects what the cameras on the circle saw."""
+    for name, port in views.items():
+        if system.HasInputPort(f"person_view_{name}"):
+            builder.Connect(port, system.GetInputPort(f"person_view_{name}"))
+
+
+def _add_images(
+    builder: DiagramBuilder, setup: CaptureSetup
+) -> tuple[dict[str, HorizontalImage], dict[str, list[InputPort]]]:
+    """One HorizontalImage a camera, the face camera's last, and the images that they want."""
+    images: dict[str, HorizontalImage] = {}
+    wanted: dict[str, list[InputPort]] = {}
+    face = setup.face_camera
+    for camera in [*setup.cameras.values(), *([] if face is None else [face])]:
+        name = camera.name
+        image = HorizontalImage(camera, setup.backgrounds.get(name), setup.settings.skin)
+        images[name] = builder.AddNamedSystem(f"horizontal_image_{name}", image)
+        builder.ExportOutput(image.GetOutputPort("person_view"), f"person_view_{name}")
+        wanted |= {f"{kind}_{name}": [image.GetInputPort(kind)] for kind in image.wanted}
+    return images, wanted

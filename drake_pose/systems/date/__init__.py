@@ -1,1 +1,0 @@
-"""Date's stages as Drake systems, and their diagram."""

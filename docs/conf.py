@@ -54,7 +54,7 @@ python_maximum_signature_line_length = 80
 # Other projects' pages are in the net, which a build does not need.
 nitpick_ignore_regex = [
     ("py:.*", r"(np|numpy|pydrake|rich|distributed|pathlib|collections|enum|jinja2|numba)\..*"),
-    ("py:.*", r"(cv2|scipy|trimesh|asyncio|http|socketserver|PIL|xml|types|typing|aiohttp)\..*"),
+    ("py:.*", r"(cv2|scipy|trimesh|asyncio|http|socketserver|PIL|xml|types|typing)\..*"),
     ("py:.*", r"(functools|matplotlib|socket)\..*"),
     ("py:.*", r"cyclopts\..*"),
     # An argument that is raised; names of types, and what is imported for type checkers alone.

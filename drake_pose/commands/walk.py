@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import webbrowser
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -21,8 +22,6 @@ from drake_pose.jobs.live.settings import LiveSettings, Seconds, Shape
 
 if TYPE_CHECKING:
     from pydrake.geometry import Meshcat
-
-    from drake_pose.jobs.live.walk import Player
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,11 +56,6 @@ class WalkOptions:
     pressed, until Ctrl-C or --seconds; or start at once and play once. Default: --wait with
     --browser, else --no-wait."""
 
-    @property
-    def on_spot(self) -> bool:
-        """Whether the paper's way is wanted: who stands ahead or behind also walks on the spot."""
-        return self.method == "paper"
-
     def __post_init__(self) -> None:
         if self.live is None and self.shape:
             raise SettingsError("--shape is for --live")
@@ -82,7 +76,7 @@ def walk(
 
     The person's place and direction are commands: facing right or left turns the view, standing
     ahead of or behind the place of the first frame walks forward or backward. The page can be
-    opened on this machine only, and only under its own address.
+    opened on this machine only.
 
         drake-pose walk results/person
 
@@ -99,11 +93,15 @@ def walk(
     from drake_pose.jobs.live import walk as walking
 
     if options.live is not None:
-        player = _live_player(options.live, options)
+        from drake_pose.jobs.live.scene import hush_opencv, load_live_scene
+
+        hush_opencv()
+        settings = LiveSettings(shape=options.shape, packages=options.package)
+        player = walking.live_player(load_live_scene(options.live), options.model, settings)
     elif result is not None:
         player = walking.recorded_player(result, options.model, options.rate, options.package)
     else:
-        player = walking.simulated_player() if options.simulate else walking.key_player()
+        player = walking.simulated_player() if options.simulate else walking.Player()
     waits = player.q is not None and (options.browser if options.wait is None else options.wait)
     page = _open_page(options, waits)
 
@@ -114,42 +112,33 @@ def walk(
         return False
 
     walked = walking.walk(
-        player, page, options.seconds, options.speed, _say_command, ask, options.on_spot,
+        player, page, options.seconds, options.speed,
+        lambda words: say(f"drake-pose: {words or 'stand'}"), ask, options.method == "paper",
         lambda text: say(f"drake-pose: {text}"),
     )  # fmt: skip
     for text in walked.get("warnings", ()):
         warn(text)
     if json:
         print_json(walked)
-    else:
-        say(f"drake-pose: {walking.summary_line(walked)}")
+        return
+    followed = [f"{name} {value:.1f} s" for name, value in walked["commands"].items() if value]
+    say(
+        f"drake-pose: walked {walked['seconds']:.1f} s to x = {walked['x']:.2f} m, "
+        f"y = {walked['y']:.2f} m, heading {walked['heading_deg']:.0f} degrees; commands: "
+        f"{', '.join(followed) or 'none'}"
+    )
 
 
-def _live_player(folder: Path, options: WalkOptions) -> Player:
-    """Walks with the cameras of a folder."""
-    from drake_pose.jobs.live.scene import hush_opencv, load_live_scene
-    from drake_pose.jobs.live.walk import live_player
-
-    settings = LiveSettings(shape=options.shape, packages=options.package)
-    hush_opencv()
-    return live_player(load_live_scene(folder), options.model, settings)
-
-
-def _open_page(options: WalkOptions, waits: bool = False) -> Meshcat:
+def _open_page(options: WalkOptions, waits: bool) -> Meshcat:
     """The page, shown in the browser where there is one; waits until it is, or says it is not."""
-    from drake_pose.jobs.live import walk as walking
-    from drake_pose.jobs.live.local_proxy import open_page
+    from drake_pose.jobs.live.walk import open_page, wait_for_browser
 
     page = open_page(options.port)
     say(f"drake-pose: {page.web_url()} - arrow keys walk and turn, Ctrl-C ends")
-    shown = options.browser and walking.show(page)
+    shown = options.browser and webbrowser.open(page.web_url()) and wait_for_browser(page, 10.0)
     if waits and not shown:
         say("drake-pose: waiting until a browser shows the page")
-        walking.wait_for_browser(page)
+        wait_for_browser(page)
     elif options.browser and not shown:
         warn("no browser has opened the page yet")
     return page
-
-
-def _say_command(words: str) -> None:
-    say(f"drake-pose: {words or 'stand'}")

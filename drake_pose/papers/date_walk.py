@@ -10,15 +10,7 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 from matplotlib.figure import Figure
-from pydrake.geometry import (
-    GeometryInstance,
-    PerceptionProperties,
-    RenderEngineVtkParams,
-    RenderLabel,
-    Rgba,
-    SceneGraph,
-)
-from pydrake.math import RigidTransform
+from pydrake.geometry import RenderEngineVtkParams
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource, LogVectorOutput, TrajectorySource
@@ -43,24 +35,7 @@ from drake_pose.person.views import viewing_rays
 from drake_pose.systems.bodies import add_posed_plant, held_positions
 from drake_pose.systems.images import colour_image_to_picture, picture_to_colour_image
 from drake_pose.systems.pictures.camera_rig import add_sensors
-from drake_pose.systems.walk import Walker, garden_objects, view_from_behind, walker_transform
-
-_SHOWN = "camera_0"
-_SKY = (0.65, 0.78, 0.94)
-_VIEW, _FOCAL = (480, 360), 384.0
-
-
-class Walked(NamedTuple):
-    """What Walker made of n frames: commands (n, 2), poses (n, 3) and rests (n, 5)."""
-
-    commands: Array
-    poses: Array
-    rests: Array
-
-    def follows(self) -> dict[str, Mask]:
-        """(n,) in which frames each of COMMANDS is followed."""
-        turn, walk = self.commands.T
-        return dict(zip(COMMANDS, (turn > 0, turn < 0, walk > 0, walk < 0), strict=True))
+from drake_pose.systems.walk import Walker, add_garden, view_from_behind, walker_transform
 
 
 class WalkThrough(NamedTuple):
@@ -106,21 +81,22 @@ def run_walk_through(
         for k, true_q in enumerate(motion.q):
             seen = studio.pictures(true_q)
             q[k] = track.step({name: picture_to_colour_image(one) for name, one in seen.items()})
-            shots.append(seen[_SHOWN])
+            shots.append(seen[SHOWN_CAMERA])
             advance(k + 1)
-    true, found = walk_by(model, motion.q), walk_by(model, q)
+    commands, poses, _ = walk_by(model, motion.q)
+    found_commands, found_poses, rests = walk_by(model, q)
     seconds = {}
-    for name, right in true.follows().items():
-        captured = found.follows()[name]
+    for name, right in followed(commands).items():
+        captured = followed(found_commands)[name]
         counts = {
             "true": right.sum(),
             "captured": captured.sum(),
             "wrongly": captured[~right].sum(),
         }
         seconds[name] = {f"{key}_s": PERIOD * float(number) for key, number in counts.items()}
-    off = found.poses[-1] - true.poses[-1]
+    off = found_poses[-1] - poses[-1]
     figures = {
-        "same_command": float((true.commands == found.commands).all(axis=1).mean()),
+        "same_command": float((commands == found_commands).all(axis=1).mean()),
         "commands": seconds,
         "place_error_m": float(np.linalg.norm(off[:2])),
         "heading_error_deg": abs(math.degrees(math.remainder(off[2], 2.0 * math.pi))),
@@ -129,14 +105,23 @@ def run_walk_through(
     }  # fmt: skip
     middles = {name: int(np.median(np.flatnonzero(names == name))) for name in COMMANDS}
     pictures = {
-        name: (shots[k], draw_walk(model, q[k], found.poses[k], found.rests[k]))
+        name: (shots[k], draw_walk(model, q[k], found_poses[k], rests[k]))
         for name, k in middles.items()
     }
     return WalkThrough(figures, pictures)
 
 
-def walk_by(model: ArticulatedModel, q: Array) -> Walked:
-    """The walk by positions (n, nq), a frame each PERIOD; commands need walking on the spot."""
+def followed(commands: Array) -> dict[str, Mask]:
+    """(n,) in which frames each of COMMANDS is followed, of commands (n, 2)."""
+    turn, walk = commands.T
+    return dict(zip(COMMANDS, (turn > 0, turn < 0, walk > 0, walk < 0), strict=True))
+
+
+def walk_by(model: ArticulatedModel, q: Array) -> tuple[Array, Array, Array]:
+    """Walker's commands (n, 2), poses (n, 3) and rests (n, 5) by positions (n, nq).
+
+    A frame is shown each PERIOD; commands need walking on the spot.
+    """
     builder = DiagramBuilder()
     source = builder.AddSystem(TrajectorySource(held_positions(q, PERIOD)))
     walker = builder.AddSystem(Walker(model, q[0], PERIOD, on_spot=True))
@@ -146,35 +131,24 @@ def walk_by(model: ArticulatedModel, q: Array) -> Walked:
     simulator = Simulator(builder.Build())
     simulator.AdvanceTo(PERIOD * len(q))
     # What is logged at a time was known before the update at that time.
-    return Walked(*(log.FindLog(simulator.get_context()).data()[:, 1:].T for log in logs))
+    commands, poses, rests = (log.FindLog(simulator.get_context()).data()[:, 1:].T for log in logs)
+    return commands, poses, rests
 
 
 def draw_walk(model: ArticulatedModel, q: Array, pose: Array, rest: Array) -> Picture:
     """The place (H, W, 3) from behind the avatar at q (nq,), by Drake; pose, rest: of Walker."""
     X_RP = walker_transform(pose, rest).inverse()
     builder = DiagramBuilder()
-    scene_graph = builder.AddNamedSystem("scene_graph", SceneGraph())
-    garden = scene_graph.RegisterSource("garden")
-    for one in garden_objects():
-        X_RG, properties = X_RP @ RigidTransform(one.position), PerceptionProperties()
-        properties.AddProperty("phong", "diffuse", Rgba(*one.colour))
-        properties.AddProperty("label", "id", RenderLabel(1))
-        geometry = GeometryInstance(X_RG, one.shape, one.name)
-        geometry.set_perception_properties(properties)
-        scene_graph.RegisterAnchoredGeometry(garden, geometry)
+    scene_graph = add_garden(builder, X_RP)
     positions = builder.AddSystem(ConstantVectorSource(q)).get_output_port()
     add_posed_plant(builder, scene_graph, model, positions, "geometry_pose")
     X_RC = X_RP.GetAsMatrix4() @ look_at(*view_from_behind(pose))
-    camera = PinholeCamera("view", *_VIEW, _FOCAL, _FOCAL, 0.5 * _VIEW[0], 0.5 * _VIEW[1], X_RC)
-    sky = RenderEngineVtkParams(default_clear_color=np.array(_SKY))
+    camera = PinholeCamera("view", 480, 360, 384.0, 384.0, 240.0, 180.0, X_RC)
+    sky = RenderEngineVtkParams(default_clear_color=np.array([0.65, 0.78, 0.94]))
     sensor = add_sensors(builder, scene_graph, {"view": camera}, {"view": (0.1, 60.0)}, sky)["view"]
     context = builder.Build().CreateDefaultContext()
     image = sensor.color_image_output_port().Eval(sensor.GetMyContextFromRoot(context))
     return colour_image_to_picture(image)
-
-
-_COLOURS = ("tab:red", "tab:blue", "tab:green", "tab:orange", "tab:purple")
-_SKIN = (255, 0, 160)
 
 
 def save_pictures(result: DateResult, folder: Path) -> list[Path]:
@@ -195,14 +169,14 @@ def save_pictures(result: DateResult, folder: Path) -> list[Path]:
 
 def _draw_skin(moment: Moment) -> Picture:
     """Figure 2: the input, with the skin that was found in it outlined and its centroids."""
-    picture = np.ascontiguousarray(moment.picture)
+    picture, pink = np.ascontiguousarray(moment.picture), (255, 0, 160)
     blobs = moment.views[SHOWN_CAMERA].blobs
     outlines, _ = cv2.findContours(
         blobs.mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE
     )
-    cv2.drawContours(picture, outlines, -1, _SKIN, 1)
+    cv2.drawContours(picture, outlines, -1, pink, 1)
     for u, v in np.rint(blobs.centroids).astype(int):
-        cv2.drawMarker(picture, (int(u), int(v)), _SKIN, cv2.MARKER_CROSS, 9, 1)
+        cv2.drawMarker(picture, (int(u), int(v)), pink, cv2.MARKER_CROSS, 9, 1)
     return picture
 
 
@@ -218,7 +192,8 @@ def _draw_points(result: DateResult, moment: Moment) -> Figure:
             along = (found.places - origin) @ direction
             ends = origin + np.outer([along.min() - 0.1, along.max() + 0.1], direction)
             axes.plot(*ends.T, color="0.85", linewidth=0.5, zorder=0)
-    for k, (name, colour) in enumerate(zip(FEATURES, _COLOURS, strict=True)):
+    colours = ("tab:red", "tab:blue", "tab:green", "tab:orange", "tab:purple")
+    for k, (name, colour) in enumerate(zip(FEATURES, colours, strict=True)):
         points = found.points[found.owners == k]
         axes.plot(*points.T, ".", color=colour, markersize=3)
         label = f"{name.replace('_', ' ')}: {found.support[k]} of {len(points)}"

@@ -416,7 +416,9 @@ class PaperPoseEstimator(MemorySystem):
         Raises:
             SettingsError: another number of positions or features, or one that is not finite.
         """
-        checked = [("positions", q, (len(self.setup.skeleton.lower),))]
+        checked: list[tuple[str, Array, tuple[int, ...]]] = [
+            ("positions", q, (len(self.setup.skeleton.lower),))
+        ]
         if features is not None:
             checked.append(("features", features, (len(FEATURES), 3)))
         for what, values, shape in checked:

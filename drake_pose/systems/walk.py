@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from typing import NamedTuple
 
 import numpy as np
-from pydrake.geometry import Box, Cylinder, Ellipsoid, Meshcat, Rgba, Shape, Sphere
+from pydrake.geometry import Meshcat, MeshcatVisualizer, MeshcatVisualizerParams, Role, SceneGraph
 from pydrake.math import RigidTransform, RollPitchYaw
+from pydrake.multibody.parsing import Parser
+from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
 from pydrake.systems.framework import (
     Context,
     Diagram,
@@ -21,16 +22,15 @@ from pydrake.systems.primitives import TrajectorySource
 from pydrake.trajectories import Trajectory
 
 from drake_pose.arrays import Array
+from drake_pose.body.formats.packages import package_folder
 from drake_pose.body.model import ArticulatedModel
 from drake_pose.errors import SettingsError, UnknownNameError
 from drake_pose.person.date.walking import (
-    NO_COMMAND,
-    NO_STEPS,
+    WALK,
     follow_command,
     follow_steps,
     recognise_command,
     stance_of,
-    walks_on_spot,
 )
 from drake_pose.systems.bodies import add_avatar
 from drake_pose.systems.ports import MemorySystem, connect_same, require_period
@@ -38,18 +38,9 @@ from drake_pose.systems.ports import MemorySystem, connect_same, require_period
 KEYS = {"ahead": "ArrowUp", "behind": "ArrowDown", "left": "ArrowLeft", "right": "ArrowRight"}
 """Meshcat's buttons and the keys that press them."""
 
-_PARTS = ("head", "left_foot", "right_foot")
-_WALKER = "walker"
-# Who stands still moves head and feet by no more [m], and turns the face by no more [rad].
-_STILL, _FACING = 0.08, 0.25
-# Nobody turns the face by more from one frame to the next [rad].
-_AROUND = math.radians(100.0)
-# A key that is held down is pressed again and again, but first after half a second.
-_HELD = 0.55
-
 
 class Walker(MemorySystem):
-    """Recognises commands in a person's poses and follows them through a place.
+    """Recognises commands in a person's poses and follows them through a garden.
 
     .. pydrake_system::
 
@@ -62,8 +53,8 @@ class Walker(MemorySystem):
     who could command. Whoever turns around from one frame to the next was taken for facing the
     wrong way, at rest too: the rest turns around with the person. ``keys`` (turn, walk) may stay
     unconnected; where not 0 it goes before the gestures. Outputs: the walker's x, y [m] and heading
-    [rad] in the place; the command (turn, walk); the rest (5), nan until somebody was seen; and the
-    last known positions (nq).
+    [rad] in the garden; the command (turn, walk); the rest (5), nan until somebody was seen; and
+    the last known positions (nq).
 
     Args:
         model: the person, with the links head, left_foot and right_foot.
@@ -90,17 +81,19 @@ class Walker(MemorySystem):
         require_period("walker", period)
         if not settle >= 0:
             raise SettingsError(f"the time to settle must be 0 s or more, not {settle}")
-        for part in _PARTS:
+        parts = ("head", "left_foot", "right_foot")
+        for part in parts:
             if part not in model.link_names:
                 raise UnknownNameError("link", part, model.link_names, str(model.path))
         self._plant, self._period, self._settle = model.plant, period, settle
+        self._parts = [model.plant.GetBodyByName(part) for part in parts]
         self._plant_context = model.plant.CreateDefaultContext()
         self._on_spot = on_spot
         self._obstacles = garden_obstacles()
         self.add_input("positions", len(standing))
         self.add_input("keys", 2)
         shown = {
-            "walker_pose": np.array(START),
+            "walker_pose": np.array(WALK.start),
             "command": np.zeros(2),
             "rest": np.full(5, np.nan),
             "avatar_positions": standing,
@@ -109,58 +102,66 @@ class Walker(MemorySystem):
             # The stance that the person may be settling in, and since when [s].
             "settling": np.append(np.full(5, np.nan), 0.0),
             "heading": np.full(1, np.nan),
-            "steps": np.array(NO_STEPS),
+            "steps": np.zeros(3),
         }
         self.keep_vectors(shown | inner, shown, period)
 
     def next_vectors(self, context: Context, known: dict[str, Array]) -> Mapping[str, Array]:
         """The walk's next step."""
         q = self.GetInputPort("positions").Eval(context)
-        turn, walk = NO_COMMAND
+        turn, walk = 0, 0
         if np.isfinite(q).all():
             turn, walk = self._recognise(q, known, context.get_time())
         else:
-            known["heading"], known["steps"] = np.full(1, np.nan), np.array(NO_STEPS)
+            known["heading"], known["steps"] = np.full(1, np.nan), np.zeros(3)
         pressed = self.given(context, "keys")
         if pressed is not None:
             turn, walk = int(pressed[0]) or turn, int(pressed[1]) or walk
         known["command"] = np.array([turn, walk], dtype=float)
         known["walker_pose"] = follow_command(
-            known["walker_pose"], (turn, walk), self._period, HALF_SIZE,
-            self._obstacles,
-        )  # fmt: skip
+            known["walker_pose"], (turn, walk), self._period, self._obstacles
+        )
         return known
 
-    def _recognise(self, q: Array, known: dict[str, Array], time: float) -> tuple[int, int]:
-        """The command of a person who is seen; what is known by state's name is brought up."""
+    def _recognise(
+        self,
+        q: Array,
+        known: dict[str, Array],
+        time: float,
+        *,
+        still: float = 0.08,
+        facing: float = 0.25,
+        around: float = math.radians(100.0),
+    ) -> tuple[int, int]:
+        """The command of a person who is seen; what is known by state's name is brought up.
+
+        Args:
+            still, facing: who stands still moves head and feet by no more [m], and turns the face
+                by no more [rad].
+            around: nobody turns the face by more from one frame to the next [rad].
+        """
         known["avatar_positions"] = q
-        stance, lift = self._stance(q)
+        self._plant.SetPositions(self._plant_context, q)
+        X_WH, *X_WF = [part.EvalPoseInWorld(self._plant_context) for part in self._parts]
+        feet = np.array([X.translation() for X in X_WF])
+        stance = stance_of(X_WH.rotation().col(0), X_WH.translation(), feet)
         turned = math.remainder(stance[0] - known["heading"][0], 2.0 * math.pi)
         known["heading"] = stance[:1]
-        if abs(turned) > _AROUND:
+        if abs(turned) > around:
             known["rest"][0] += turned
         if not np.isfinite(known["rest"]).all():
             moved = np.abs(stance - known["settling"][:5])
-            if not (moved[0] <= _FACING and (moved[1:] <= _STILL).all()):
+            if not (moved[0] <= facing and (moved[1:] <= still).all()):
                 known["settling"] = np.append(stance, time)
             if time - known["settling"][5] < self._settle:
-                return NO_COMMAND
+                return 0, 0
             known["rest"] = stance
         last = known["command"].astype(int)
         turn, walk = recognise_command(stance, known["rest"], (last[0], last[1]))
-        known["steps"] = follow_steps(lift, known["steps"], self._period)
-        is_walking = walks_on_spot(known["steps"]) or not self._on_spot
-        return turn, walk if is_walking else 0
-
-    def _stance(self, q: Array) -> tuple[Array, float]:
-        """The stance (5,), and how much higher the left foot is than the right one [m]."""
-        self._plant.SetPositions(self._plant_context, q)
-        X_WH, *X_WF = [
-            self._plant.GetBodyByName(part).EvalPoseInWorld(self._plant_context) for part in _PARTS
-        ]
-        feet = np.array([X.translation() for X in X_WF])
         lift = float(feet[0, 2] - feet[1, 2])
-        return stance_of(X_WH.rotation().col(0), X_WH.translation(), feet), lift
+        known["steps"] = follow_steps(lift, known["steps"], self._period)
+        is_walking = known["steps"][2] >= 2.0 or not self._on_spot
+        return turn, walk if is_walking else 0
 
 
 class WalkKeys(MemorySystem):
@@ -177,11 +178,14 @@ class WalkKeys(MemorySystem):
     Args:
         stride: (n, nq) positions of one stride that ends standing [rad or m].
         period: time between two looks at the buttons, and between two of these [s].
+        held: how long a press counts [s]: a key that is held down is pressed again and again, but
+            first after half a second.
     """
 
-    def __init__(self, meshcat: Meshcat, stride: Array, period: float) -> None:
+    def __init__(self, meshcat: Meshcat, stride: Array, period: float, held: float = 0.55) -> None:
         super().__init__()
         self._meshcat, self._stride, self._period = meshcat, stride, period
+        self._held = held
         for name, key in KEYS.items():
             meshcat.AddButton(name, key)
         # By button: how often it was pressed, and how much longer that counts [s].
@@ -205,7 +209,7 @@ class WalkKeys(MemorySystem):
         """What the buttons say, and the stride's next frame."""
         pressed = np.array([float(self._meshcat.GetButtonClicks(name)) for name in KEYS])
         held = np.maximum(known["left"] - self._period, 0.0)
-        left = np.where(pressed > known["pressed"], _HELD, held)
+        left = np.where(pressed > known["pressed"], self._held, held)
         frame = known["frame"]
         if left.any() or frame[0]:
             frame = (frame + 1.0) % len(self._stride)
@@ -236,7 +240,7 @@ class WalkView(LeafSystem):
     def _show(self, context: Context) -> EventStatus:
         pose, rest = self._pose.Eval(context), self._rest.Eval(context)
         if np.isfinite(rest).all():
-            self._meshcat.SetTransform(_WALKER, walker_transform(pose, rest))
+            self._meshcat.SetTransform("walker", walker_transform(pose, rest))
         self._meshcat.SetCameraPose(*view_from_behind(pose))
         return EventStatus.Succeeded()
 
@@ -254,7 +258,7 @@ def build_walk(
     on_spot: bool = False,
     settle: float = 0.0,
 ) -> Diagram:
-    """A place in Meshcat and a person who walks through it by gestures or keys.
+    """A garden in Meshcat and a person who walks through it by gestures or keys.
 
     The diagram's outputs are ``walker_pose`` and ``command``.
 
@@ -264,8 +268,12 @@ def build_walk(
         stride: (n, nq) one stride on the spot that ends standing, for the keys.
         period, on_spot, settle: as of Walker.
     """
-    draw_garden(meshcat)
     builder = DiagramBuilder()
+    garden = add_garden(builder)
+    # MeshcatVisualizer draws once: nothing in the garden moves.
+    parameters = MeshcatVisualizerParams(prefix="place", publish_period=math.inf)
+    MeshcatVisualizer.AddToBuilder(builder, garden, meshcat, parameters)
+    _light(meshcat)
     keys = builder.AddNamedSystem("keys", WalkKeys(meshcat, stride, period))
     walker = builder.AddNamedSystem("walker", Walker(model, stride[-1], period, on_spot, settle))
     if positions is None:
@@ -279,97 +287,40 @@ def build_walk(
     view = builder.AddNamedSystem("view", WalkView(meshcat, period))
     connect_same(builder, walker, view)
     avatar = walker.GetOutputPort("avatar_positions")
-    add_avatar(builder, model, avatar, meshcat, f"{_WALKER}/avatar", period)
+    add_avatar(builder, model, avatar, meshcat, "walker/avatar", period)
     for name in ("walker_pose", "command"):
         builder.ExportOutput(walker.GetOutputPort(name), name)
     return builder.Build()
 
 
-HALF_SIZE = 12.0
-"""Half the side of the garden [m]; the origin is its middle."""
-
-START = (-8.0, 0.0, 0.0)
-"""Where a walk begins: x, y [m] and heading [rad]."""
-
-_SIDE, _WALL_HEIGHT = 2.0 * HALF_SIZE, 2.4
-_STONE = (0.76, 0.72, 0.65)
-_GATE = (0.85, 0.25, 0.10)
-_BARK = (0.36, 0.25, 0.16)
-_LEAVES = (0.18, 0.45, 0.20)
-_PATH = (0.82, 0.76, 0.62)
-_LAWN = (0.42, 0.60, 0.33)
-_WATER = (0.20, 0.45, 0.65)
-# Meshcat's point lights stand near the origin: daylight comes from far away.
-_LIGHTS = {
-    "AmbientLight": 1.6,
-    "FillLight": 1.6,
-    "PointLightNegativeX": 0.0,
-    "PointLightPositiveX": 0.0,
-}
-_GATES = (-4.0, -1.5, 4.0, 7.5)
-_TREES = ((3.5, 4.0), (6.5, -4.5), (-3.0, 5.5), (-6.5, -4.0), (-8.5, 7.5), (8.5, 8.0), (1.0, -7.0))
-_BALLS = ((2.5, -2.5, (0.95, 0.75, 0.10)), (-3.5, -1.5, (0.45, 0.20, 0.60)))
-_FOUNTAIN = (-6.0, 3.0)
-
-
-class GardenObject(NamedTuple):
-    """An object of the place: its path in Meshcat's tree, and its middle's position [m].
-
-    Nobody comes nearer to its axis than the radius [m]; 0: one walks over or under it.
-    """
-
-    name: str
-    shape: Shape
-    position: tuple[float, float, float]
-    colour: tuple[float, float, float]
-    radius: float = 0.0
-
-
-def garden_objects() -> tuple[GardenObject, ...]:
-    """All objects: lawn, paths, walls, gates over the path, trees, balls, a fountain."""
-    z = 0.5 * _WALL_HEIGHT
-    long, deep = Box(_SIDE, 0.3, _WALL_HEIGHT), Box(0.3, _SIDE, _WALL_HEIGHT)
-    x, y = _FOUNTAIN
-    found = [
-        GardenObject("lawn", Box(_SIDE, _SIDE, 0.1), (0.0, 0.0, -0.05), _LAWN),
-        GardenObject("path_x", Box(_SIDE, 1.8, 0.02), (0.0, 0.0, 0.0), _PATH),
-        GardenObject("path_y", Box(1.8, _SIDE, 0.02), (0.0, 0.0, 0.001), _PATH),
-        GardenObject("wall_left", long, (0.0, HALF_SIZE, z), _STONE),
-        GardenObject("wall_right", long, (0.0, -HALF_SIZE, z), _STONE),
-        GardenObject("wall_ahead", deep, (HALF_SIZE, 0.0, z), _STONE),
-        GardenObject("wall_behind", deep, (-HALF_SIZE, 0.0, z), _STONE),
-        GardenObject("basin", Cylinder(1.3, 0.45), (x, y, 0.225), _STONE, 1.3),
-        GardenObject("water", Cylinder(1.15, 0.02), (x, y, 0.46), _WATER),
-        GardenObject("spout", Cylinder(0.12, 1.3), (x, y, 0.65), _STONE),
-    ]
-    for k, x in enumerate(_GATES):
-        for side, y in (("left", 1.3), ("right", -1.3)):
-            post = Cylinder(0.15, 2.8)
-            found.append(GardenObject(f"gate_{k}_{side}", post, (x, y, 1.4), _GATE, 0.15))
-        found.append(GardenObject(f"gate_{k}_top", Box(0.3, 3.4, 0.25), (x, 0.0, 2.9), _GATE))
-    for k, (x, y) in enumerate(_TREES):
-        found.append(GardenObject(f"trunk_{k}", Cylinder(0.18, 2.0), (x, y, 1.0), _BARK, 0.18))
-        found.append(GardenObject(f"crown_{k}", Ellipsoid(1.1, 1.1, 1.4), (x, y, 2.9), _LEAVES))
-    for k, (x, y, colour) in enumerate(_BALLS):
-        found.append(GardenObject(f"ball_{k}", Sphere(0.5), (x, y, 0.5), colour, 0.5))
-    return tuple(found)
+def add_garden(builder: DiagramBuilder, X_WG: RigidTransform | None = None) -> SceneGraph:
+    """Add urdf/garden/garden.sdf, and a SceneGraph that holds it, at a pose."""
+    plant, scene_graph = AddMultibodyPlantSceneGraph(builder, 0.0)
+    (garden,) = Parser(plant).AddModels(str(package_folder() / "garden" / "garden.sdf"))
+    frame = plant.GetFrameByName("garden", garden)
+    plant.WeldFrames(plant.world_frame(), frame, X_WG or RigidTransform())
+    plant.Finalize()
+    return scene_graph
 
 
 def garden_obstacles() -> Array:
-    """(n, 3) x, y and radius of what one cannot walk through [m]."""
-    return np.array([(*one.position[:2], one.radius) for one in garden_objects() if one.radius])
+    """(n, 3) x, y and radius of what one cannot walk through [m]: of the collision geometries."""
+    inspector = add_garden(DiagramBuilder()).model_inspector()
+    obstacles = []
+    for geometry in inspector.GetAllGeometryIds(Role.kProximity):
+        x, y, _ = inspector.GetPoseInFrame(geometry).translation()
+        obstacles.append((x, y, inspector.GetShape(geometry).radius()))
+    return np.array(obstacles)
 
 
-def draw_garden(meshcat: Meshcat) -> None:
-    """Draw the place, under ``place`` of Meshcat's tree, below a sky."""
-    for one in garden_objects():
-        here = f"place/{one.name}"
-        meshcat.SetObject(here, one.shape, Rgba(*one.colour))
-        meshcat.SetTransform(here, RigidTransform(one.position))
-    meshcat.SetProperty("/Grid", "visible", False)
-    meshcat.SetProperty("/Axes", "visible", False)
-    for name, intensity in _LIGHTS.items():
+def _light(meshcat: Meshcat) -> None:
+    """Daylight, below a sky; Meshcat's own point lights stand near the origin."""
+    for name in ("/Grid", "/Axes"):
+        meshcat.SetProperty(name, "visible", False)
+    for name, intensity in {"AmbientLight": 1.6, "FillLight": 1.6}.items():
         meshcat.SetProperty(f"/Lights/{name}/<object>", "intensity", intensity)
+    for name in ("PointLightNegativeX", "PointLightPositiveX"):
+        meshcat.SetProperty(f"/Lights/{name}/<object>", "intensity", 0.0)
     meshcat.SetProperty("/Background", "top_color", [0.45, 0.65, 0.90])
     meshcat.SetProperty("/Background", "bottom_color", [0.85, 0.92, 0.98])
 
@@ -378,7 +329,8 @@ def view_from_behind(pose: Array) -> tuple[Array, Array]:
     """Eye and target (3,) [m] of who looks at x, y [m] and heading [rad] from behind and above."""
     forward = np.array([math.cos(pose[2]), math.sin(pose[2]), 0.0])
     ground = np.array([pose[0], pose[1], 0.0])
-    eye = np.clip(ground - 3.2 * forward, 0.3 - HALF_SIZE, HALF_SIZE - 0.3)
+    inside = WALK.half_size - 0.3
+    eye = np.clip(ground - 3.2 * forward, -inside, inside)
     eye[2], target = 2.1, ground + 1.5 * forward + (0.0, 0.0, 1.1)
     return eye, target
 

@@ -17,21 +17,15 @@ import numpy as np
 from drake_pose.body.landmarks import landmark_positions, load_landmarks
 from drake_pose.body.model import load_model
 from drake_pose.papers.tables import draw_panels, save_figure
-from drake_pose.person.date.pose import Waist, estimate_pose, waist_of
+from drake_pose.person.date.pose import estimate_pose
 from drake_pose.person.date.skeleton import LIMBS, load_skeleton
 from drake_pose.silhouette.pictures.scenes import load_scene
 
 ENDS = ("left_wrist", "right_wrist", "left_ankle", "right_ankle")
 MIDDLES = ("left_elbow", "right_elbow", "left_knee", "right_knee")
-COLOURS = {"none": (220, 60, 40), "rectangles": (40, 110, 230), "surfaces": (20, 150, 60)}
+# By whether elbows and knees are searched.
+COLOURS = {False: (220, 60, 40), True: (40, 110, 230)}
 SHOWN = "0020"
-
-
-class TrueWaist(Waist):
-    middle = None
-
-    def place(self, features, heading):
-        return self.middle
 
 
 def skeleton_of(path):
@@ -59,17 +53,16 @@ def main(folder, model, out):
         for row in csv.DictReader(stream):
             truth[int(row["frame"])][row["joint"]] = np.array([float(row[k]) for k in "xyz"])
     skeleton, cameras = skeleton_of(model), list(scene.cameras.values())
-    ways = {"paper's waist": Waist(), "our waist": waist_of(skeleton), "true waist": TrueWaist()}
     states, errors = {}, defaultdict(list)
     for name in scene.frames:
         at = truth[int(name)]
         features = np.array([0.5 * (at["head_top"] + at["neck"]), *(at[end] for end in ENDS)])
         if np.isnan(features).any():
             continue
-        TrueWaist.middle = 0.5 * (at["left_hip"] + at["right_hip"])
+        waists = {"paper's": None, "true": 0.5 * (at["left_hip"] + at["right_hip"])}
         masks = [scene.read(camera.name, name) for camera in cameras]
         drawn = [np.where(one[..., None], (255,) * 3, (120,) * 3).astype(np.uint8) for one in masks]
-        for way in ((waist, search) for waist in ways for search in COLOURS):
+        for way in ((waist, search) for waist in waists for search in COLOURS):
             if way not in states:
                 # Upright, facing as the shoulders say.
                 across, states[way] = (
@@ -78,15 +71,13 @@ def main(folder, model, out):
                 )
                 states[way][skeleton.head_angles[0]] = np.arctan2(-across[0], across[1])
             seen = (features, None, cameras, masks)
-            pose = estimate_pose(skeleton, states[way], *seen, search=way[1], waist=ways[way[0]])
-            states[way], found = pose.q, np.array([pose.limbs[limb][1] for limb in LIMBS])
+            states[way], limbs = estimate_pose(
+                skeleton, states[way], *seen, search=way[1], waist=waists[way[0]]
+            )
+            found = np.array([limbs[limb][1] for limb in LIMBS])
             errors[way].append(np.linalg.norm(found - [at[one] for one in MIDDLES], axis=1))
-            for camera, picture in (
-                zip(cameras, drawn, strict=True) if way[0] == "true waist" else ()
-            ):
-                lines = [
-                    np.rint(camera.project(one)[0]).astype(np.int32) for one in pose.limbs.values()
-                ]
+            for camera, picture in zip(cameras, drawn, strict=True) if way[0] == "true" else ():
+                lines = [np.rint(camera.project(one)[0]).astype(np.int32) for one in limbs.values()]
                 cv2.polylines(picture, lines, False, COLOURS[way[1]], 7)
         if name == SHOWN:
             save_figure(

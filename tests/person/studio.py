@@ -13,11 +13,10 @@ from drake_pose.person.date.features import (
     find_features,
     learn_faces,
     register_pose,
-    registered_positions,
+    see_person,
 )
-from drake_pose.person.date.skeleton import load_skeleton
+from drake_pose.person.date.skeleton import load_skeleton, registered_positions
 from drake_pose.silhouette.segmentation.background import learn_background
-from drake_pose.systems.date import see_person
 from drake_pose.systems.pictures.camera_rig import build_camera_rig
 from tests.person.persons_in_view import posed
 
@@ -76,8 +75,7 @@ class Studio:
         views = self.views(self.registered.q)
         found = find_features(
             list(self.ring.values()),
-            [view.blobs.centroids for view in views.values()],
-            [view.region for view in views.values()],
+            list(views.values()),
             self.skeleton.features(self.registered.q),
         )
         assert (found.support > 10).all()

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
+import logging
 import math
 import time
-import webbrowser
 from collections.abc import Callable, Mapping
 from contextlib import closing, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydrake.geometry import Meshcat
+from pydrake.geometry import Meshcat, MeshcatParams
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPort
 from pydrake.trajectories import PiecewisePolynomial, Trajectory
 
@@ -34,18 +34,11 @@ from drake_pose.systems.person.live_capture import LiveSensors, add_person_track
 from drake_pose.systems.ports import evaluate
 from drake_pose.systems.walk import KEYS, AddPositions, build_walk
 
-RATE_HZ = 30.0
-"""Frames a second where a recording does not say."""
-
-REPLAY, _REPLAY_KEY = "play again", "Space"
-"""The page's button at the end of a recording, and the key that presses it."""
-
-SETTLE = 1.0
-"""Whoever comes before the cameras commands after standing still for this long [s]."""
-
-_SIMULATED_FRAMES = 1200
 # Between two looks at browser and button [s].
 _POLL_PAUSE = 0.05
+
+RATE_HZ = 30.0
+"""Frames a second where a recording does not say."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,6 +46,7 @@ class Player:
     """What moves the avatar.
 
     Args:
+        model: the bundled person where not given.
         q: (n, nq) positions [rad or m], nan where the person was not found.
         period: time between two of them, or two looks at the keys or the cameras [s].
         sensors: of the cameras that see the person, in place of q.
@@ -60,7 +54,9 @@ class Player:
             alone move the avatar.
     """
 
-    model: ArticulatedModel
+    model: ArticulatedModel = field(
+        default_factory=lambda: load_model(bundled_model("person"), check=False)
+    )
     q: Array | None = None
     period: float = 1.0 / RATE_HZ
     sensors: LiveSensors | None = None
@@ -103,12 +99,7 @@ def recorded_player(
 def simulated_player() -> Player:
     """Plays the known motion of Date's experiment."""
     model = load_model(bundled_model("person"), check=False)
-    return Player(model, make_motion(load_skeleton(model), _SIMULATED_FRAMES, seed=0).q)
-
-
-def key_player() -> Player:
-    """Leaves the walk to the keys."""
-    return Player(load_model(bundled_model("person"), check=False))
+    return Player(model, make_motion(load_skeleton(model), 1200, seed=0).q)
 
 
 def live_player(
@@ -164,6 +155,7 @@ def walk(
     again: Callable[[], bool] = lambda: False,
     on_spot: bool = False,
     on_report: Callable[[str], None] = lambda _: None,
+    settle: float = 1.0,
 ) -> dict[str, Any]:
     """Lets the avatar walk until its recording, the given time, or the user (Ctrl-C) ends it.
 
@@ -175,6 +167,7 @@ def walk(
         again: asked at the end of what is not live whether to walk once more from the start.
         on_spot: as of Walker.
         on_report: told of cameras that stop and return, bad pictures, a person found or lost.
+        settle: whoever comes before the cameras commands after standing still for this long [s].
 
     Returns:
         Of the last walk: seconds walked; x, y [m] and heading_deg where it ended; and by command
@@ -195,7 +188,7 @@ def walk(
         q = player.q[[*range(len(player.q)), -1]]
         positions = PiecewisePolynomial.ZeroOrderHold(times, q.T)
         seconds = min(seconds or times[-1], times[-1])
-    settle, speed = (0.0, speed) if sensors is None else (SETTLE, 1.0)
+    settle, speed = (0.0, speed) if sensors is None else (settle, 1.0)
     stride = stride_positions(player.model)
     with nullcontext() if sensors is None else closing(sensors):
         diagram = build_walk(player.model, meshcat, positions, stride, period, on_spot, settle)
@@ -259,37 +252,43 @@ class _WalkLog:
         return {"seconds": self._time, **place, "commands": self._seconds, **seen}
 
 
-def show(page: Meshcat, patience: float = 10.0) -> bool:
-    """Opens a page in the user's browser; whether one shows it in time (``patience`` [s])."""
-    if webbrowser.open(page.web_url()):
-        wait_for_browser(page, patience)
-    return page.GetNumActiveConnections() > 0
+def open_page(port: int | None = None) -> Meshcat:
+    """A Meshcat page for this machine's browsers: it listens on the loopback address alone.
+
+    Drake's own message of where it is is left out.
+
+    Raises:
+        SettingsError: no page can be opened at the port.
+    """
+    logger = logging.getLogger("drake")
+    level = logger.level
+    logger.setLevel(logging.WARNING)
+    try:
+        return Meshcat(MeshcatParams(host="localhost", port=port, show_stats_plot=False))
+    except RuntimeError as error:
+        where = "any port" if port is None else f"port {port}"
+        raise SettingsError(f"no page can be opened at {where}: {error}") from error
+    finally:
+        logger.setLevel(level)
 
 
-def wait_for_browser(page: Meshcat, patience: float = math.inf) -> None:
-    """Waits until a browser shows a page, for this long at most [s]."""
+def wait_for_browser(page: Meshcat, patience: float = math.inf) -> bool:
+    """Waits until a browser shows a page, for this long at most [s]; whether one does."""
     end = time.monotonic() + patience
     while page.GetNumActiveConnections() == 0 and time.monotonic() < end:
         time.sleep(_POLL_PAUSE)
+    return page.GetNumActiveConnections() > 0
 
 
 def wait_for_replay(page: Meshcat) -> bool:
     """Waits until the page's button to play again is pressed; False: Ctrl-C was, instead."""
-    page.AddButton(REPLAY, _REPLAY_KEY)
+    name = "play again"
+    page.AddButton(name, "Space")
     try:
-        while page.GetButtonClicks(REPLAY) == 0:
+        while page.GetButtonClicks(name) == 0:
             time.sleep(_POLL_PAUSE)
     except KeyboardInterrupt:
         return False
     finally:
-        page.DeleteButton(REPLAY)
+        page.DeleteButton(name)
     return True
-
-
-def summary_line(walked: Mapping[str, Any]) -> str:
-    """A walk's result in a line."""
-    followed = [f"{name} {value:.1f} s" for name, value in walked["commands"].items() if value]
-    return (
-        f"walked {walked['seconds']:.1f} s to x = {walked['x']:.2f} m, y = {walked['y']:.2f} m, "
-        f"heading {walked['heading_deg']:.0f} degrees; commands: {', '.join(followed) or 'none'}"
-    )

@@ -26,6 +26,8 @@ class WalkSettings:
         step: how far one stands from the rest place [m].
         lift: how much higher than the other a lifted foot is [m].
         pause: without another step for so long nobody walks on the spot any more [s].
+        start: where a walk begins: x, y [m] and heading [rad].
+        half_size: half the side of the square place, the origin is its middle [m].
     """
 
     turn_rate: float = math.radians(40.0)
@@ -35,6 +37,8 @@ class WalkSettings:
     step: tuple[float, float] = (0.18, 0.10)
     lift: float = 0.05
     pause: float = 1.0
+    start: tuple[float, float, float] = (-8.0, 0.0, 0.0)
+    half_size: float = 12.0
 
 
 WALK = WalkSettings()
@@ -102,8 +106,8 @@ def follow_command(
     pose: Array,
     command: tuple[int, int],
     seconds: float,
-    half_size: float = math.inf,
-    obstacles: Array | None = None,
+    obstacles: Array,
+    half_size: float = WALK.half_size,
 ) -> Array:
     """The walker's pose (3,), its heading in -pi..pi, after a command was followed for a while.
 
@@ -112,14 +116,14 @@ def follow_command(
     Args:
         pose: (3,) x, y [m] and heading [rad].
         command: from recognise_command.
-        half_size: the place is a square about the origin; half its side [m].
         obstacles: (n, 3) x, y and radius of round obstacles [m].
+        half_size: half the side of the place [m].
     """
     turn = command[0] * WALK.turn_rate * seconds
     middle = pose[2] + 0.5 * turn
     chord = command[1] * WALK.speed * seconds * float(np.sinc(0.5 * turn / math.pi))
     place = pose[:2] + chord * np.array([math.cos(middle), math.sin(middle)])
-    for x, y, radius in np.empty((0, 3)) if obstacles is None else obstacles:
+    for x, y, radius in obstacles:
         away = place - (x, y)
         distance, allowed = float(np.linalg.norm(away)), radius + WALK.body_radius
         if 0.0 < distance < allowed:

@@ -10,8 +10,7 @@ from drake_pose.errors import SceneError, SettingsError
 from drake_pose.jobs.live.capture import capture_live
 from drake_pose.jobs.live.scene import load_live_scene
 from drake_pose.jobs.live.settings import LiveSettings
-from drake_pose.person.date.features import registered_positions
-from drake_pose.person.date.skeleton import load_skeleton
+from drake_pose.person.date.skeleton import load_skeleton, registered_positions
 from tests.cli import run_command
 from tests.jobs.live_scenes import standing, write_studio
 

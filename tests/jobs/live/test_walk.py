@@ -1,8 +1,9 @@
-import contextlib
 import json
 import math
 import threading
 import time
+from http.client import HTTPConnection
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,23 +13,19 @@ from drake_pose.body.model import load_model
 from drake_pose.errors import OutputError, SettingsError
 from drake_pose.files.folder import write_summary
 from drake_pose.files.records import PoseRow, PoseTable
-from drake_pose.jobs.live.local_proxy import open_page
 from drake_pose.jobs.live.scene import run_live
 from drake_pose.jobs.live.walk import (
-    REPLAY,
     Player,
-    key_player,
+    open_page,
     recorded_player,
-    show,
     simulated_player,
     stride_positions,
+    wait_for_browser,
     wait_for_replay,
     walk,
 )
-from drake_pose.person.date.walking import SPEED
-from drake_pose.systems.walk import START
+from drake_pose.person.date.walking import WALK
 from tests.cli import run_command
-from tests.jobs.live.browsers import UPGRADE, ask, connected
 
 
 @pytest.fixture(scope="module")
@@ -68,7 +65,7 @@ def test_recorded_capture_is_walked_and_once_more_from_the_start(tmp_path, page)
     assert said == 2 * ["walk ahead", "", "walk ahead", ""]
     # 20 frames of a tenth of a second, less the six in which nobody is found.
     assert found["commands"]["walk ahead"] == pytest.approx(1.4, abs=0.05)
-    assert found["x"] - START[0] == pytest.approx(1.4 * SPEED, abs=0.1)
+    assert found["x"] - WALK.start[0] == pytest.approx(1.4 * WALK.speed, abs=0.1)
 
 
 def test_results_that_cannot_be_played_say_why(tmp_path):
@@ -91,7 +88,7 @@ def test_command_ends_by_itself():
     found = json.loads(done.stdout)
     assert found["seconds"] == pytest.approx(16.0)
     assert found["commands"]["walk ahead"] > 2.0
-    assert found["x"] > START[0] + 2.0
+    assert found["x"] > WALK.start[0] + 2.0
     assert "http://localhost:" in done.stderr
 
 
@@ -123,27 +120,45 @@ def test_port_that_is_taken_is_named(page):
         open_page(port)
 
 
-def test_browser_that_does_not_open_is_not_waited_for_for_ever(monkeypatch, page):
-    opened = []
-    monkeypatch.setattr("webbrowser.open", lambda url: opened.append(url) or True)
-    assert not show(page, patience=0.1)
-    assert opened == [page.web_url()]
+@pytest.mark.skipif(not Path("/proc/net/tcp").is_file(), reason="the system lists no sockets")
+def test_page_listens_on_the_loopback_address_alone(page):
+    addresses = []
+    for table in ("/proc/net/tcp", "/proc/net/tcp6"):
+        for line in Path(table).read_text(encoding="ascii").splitlines()[1:]:
+            _, local, _, state, *_ = line.split()
+            address, port = local.split(":")
+            if state == "0A" and int(port, 16) == page.port():
+                addresses.append(address)
+    # 127.0.0.1, or ::1, in the kernel's order of bytes.
+    assert addresses
+    assert set(addresses) <= {"0100007F", "0" * 24 + "01000000"}
+
+
+def connect(url):
+    """A browser's connection to a page, which it is told of by its socket."""
+    opened = HTTPConnection("localhost", int(url.rpartition(":")[2]), timeout=10.0)
+    key = {"Sec-WebSocket-Version": "13", "Sec-WebSocket-Key": "dGhlIHNhbXBsZSBub25jZQ=="}
+    opened.request("GET", "/", headers=key | {"Connection": "Upgrade", "Upgrade": "websocket"})
+    assert opened.getresponse().status == 101
+    return opened
+
+
+def test_browser_that_does_not_come_is_not_waited_for_for_ever(page):
+    assert not wait_for_browser(page, patience=0.1)
 
 
 def test_recording_waits_for_a_browser_and_is_played_again(tmp_path, monkeypatch):
     record(tmp_path, [0.0] * 5)
-    pages, browsers = [], contextlib.ExitStack()
+    pages, browsers = [], []
     monkeypatch.setattr(
-        "drake_pose.jobs.live.local_proxy.open_page",
-        lambda _: pages.append(open_page()) or pages[0],
+        "drake_pose.jobs.live.walk.open_page", lambda _: pages.append(open_page()) or pages[0]
     )
     urls, begun, presses = [], [], []
 
     def open_later():
         time.sleep(0.5)
         assert not begun, "played before a browser was there"
-        opened = browsers.enter_context(connected(urls[0]))
-        browsers.enter_context(ask(opened, "localhost:{}", urls[0], UPGRADE))
+        browsers.append(connect(urls[0]))
 
     def press(page):
         """Play again once; then Ctrl-C."""
@@ -158,9 +173,9 @@ def test_recording_waits_for_a_browser_and_is_played_again(tmp_path, monkeypatch
     monkeypatch.setattr("webbrowser.open", lambda url: urls.append(url) or opening.start())
     monkeypatch.setattr("drake_pose.jobs.live.walk.wait_for_replay", press)
     monkeypatch.setattr("drake_pose.jobs.live.walk.run_live", run)
-    with browsers:
-        done = run_command(["walk", str(tmp_path), "--speed", "0", "--json"])
-        opening.join()
+    done = run_command(["walk", str(tmp_path), "--speed", "0", "--json"])
+    opening.join()
+    browsers[0].close()
     assert done.exit_code == 0, done.output
     assert begun == [1, 1]
     assert len(presses) == 2
@@ -170,21 +185,21 @@ def test_recording_waits_for_a_browser_and_is_played_again(tmp_path, monkeypatch
 
 def test_button_and_control_c_end_the_wait_for_another_play(monkeypatch, page):
     # What the browser sends for a button: a map of two texts as MessagePack.
-    texts = ["type", "button", "name", REPLAY]
+    texts = ["type", "button", "name", "play again"]
     packed = b"\x82" + b"".join(bytes([0xA0 + len(text)]) + text.encode() for text in texts)
     monkeypatch.setattr("time.sleep", lambda _: page._InjectWebsocketMessage(message=packed))
     assert wait_for_replay(page)
-    assert REPLAY not in page.GetButtonNames()
+    assert "play again" not in page.GetButtonNames()
 
     def interrupt(_):
         raise KeyboardInterrupt
 
     monkeypatch.setattr("time.sleep", interrupt)
     assert not wait_for_replay(page)
-    assert REPLAY not in page.GetButtonNames()
+    assert "play again" not in page.GetButtonNames()
 
 
 def test_keys_alone_leave_the_walker_where_he_is(page):
-    found = walk(key_player(), page, seconds=1.0, speed=0.0)
-    assert (found["x"], found["y"], found["heading_deg"]) == START
+    found = walk(Player(), page, seconds=1.0, speed=0.0)
+    assert (found["x"], found["y"], found["heading_deg"]) == WALK.start
     assert not any(found["commands"].values())

@@ -3,22 +3,21 @@ import struct
 
 import numpy as np
 import pytest
-from pydrake.geometry import Box, Cylinder, Ellipsoid, Meshcat, MeshcatParams, Sphere
+from pydrake.geometry import Box, Cylinder, Ellipsoid, Meshcat, MeshcatParams, Role, Sphere
 from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import DiagramBuilder
 from pydrake.trajectories import PiecewisePolynomial
 
 from drake_pose.body.formats.packages import bundled_model
 from drake_pose.body.model import load_model
 from drake_pose.errors import SettingsError, UnknownNameError
-from drake_pose.person.date.walking import BODY_RADIUS, SPEED, TURN_RATE
+from drake_pose.person.date.walking import WALK
 from drake_pose.systems.walk import (
-    HALF_SIZE,
     KEYS,
-    START,
     Walker,
     WalkKeys,
+    add_garden,
     build_walk,
-    garden_objects,
     garden_obstacles,
     view_from_behind,
     walker_transform,
@@ -87,14 +86,14 @@ def test_gestures_walk_and_turn(person, page):
     found = run(person, page, stances)
     assert [tuple(command) for _, command in found] == [(0, 0), (0, 1), (1, 0), (0, 0), (0, -1)]
     ways = np.diff([pose for pose, _ in found], axis=0)
-    np.testing.assert_allclose(ways[0], [SPEED, 0.0, 0.0], atol=0.05)
-    np.testing.assert_allclose(ways[1], [0.0, 0.0, TURN_RATE], atol=0.05)
+    np.testing.assert_allclose(ways[0], [WALK.speed, 0.0, 0.0], atol=0.05)
+    np.testing.assert_allclose(ways[1], [0.0, 0.0, WALK.turn_rate], atol=0.05)
     np.testing.assert_allclose(ways[2], 0.0, atol=0.05)
     heading = found[2][0][2]
-    back = -SPEED * np.array([math.cos(heading), math.sin(heading), 0.0])
+    back = -WALK.speed * np.array([math.cos(heading), math.sin(heading), 0.0])
     np.testing.assert_allclose(ways[3], back, atol=0.06)
     assert page.HasPath("/drake/walker/avatar")
-    assert page.HasPath("/drake/place/lawn")
+    assert page.HasPath("/drake/place/garden")
     # Who rests at x = 0.1 m stands where the walker is.
     X_PR, (x, y, heading) = drawn_pose(page, "/drake/walker"), found[-1][0]
     np.testing.assert_allclose(X_PR @ [0.1, 0.0, 0.0, 1.0], [x, y, 0.0, 1.0], atol=0.06)
@@ -132,13 +131,13 @@ def test_keys_walk_where_nobody_is_captured(person):
     stride = np.array([standing(person, head_deg=d) for d in (5.0, 10.0, 5.0, 0.0)])
     walk = Bench(build_walk(person, page, None, stride, PERIOD))
     assert set(page.GetButtonNames()) == set(KEYS)
-    np.testing.assert_allclose(walk.advance(1.0)["walker_pose"], START)
+    np.testing.assert_allclose(walk.advance(1.0)["walker_pose"], WALK.start)
     press(page, "ahead")
     press(page, "left")
     x, y, heading = walk.advance(3.0)["walker_pose"]
     # A press counts for about half a second, on an arc to the left.
-    assert 0.5 < np.hypot(x - START[0], y - START[1]) / SPEED < 0.7
-    assert 0.5 < heading / TURN_RATE < 0.7
+    assert 0.5 < np.hypot(x - WALK.start[0], y - WALK.start[1]) / WALK.speed < 0.7
+    assert 0.5 < heading / WALK.turn_rate < 0.7
     assert y > 0.02
     # Meanwhile a stride is shown, and brought to its end, which stands.
     keys = Bench(WalkKeys(page, stride, PERIOD))
@@ -159,55 +158,72 @@ def test_who_stands_at_rest_is_where_the_walker_is():
     np.testing.assert_allclose(ahead, [3.0 + math.cos(1.1), -2.0 + math.sin(1.1), 0.0], atol=1e-12)
 
 
-def test_place_lies_within_its_walls_and_the_start_is_free():
-    known = {one.name: one for one in garden_objects()}
-    assert len(known) == len(garden_objects())
+@pytest.fixture(scope="module")
+def garden():
+    """By name, of what is drawn in the garden: its shape, and its middle's position."""
+    inspector = add_garden(DiagramBuilder()).model_inspector()
+    return {
+        inspector.GetName(one).rpartition("::")[2]: (
+            inspector.GetShape(one),
+            inspector.GetPoseInFrame(one).translation(),
+        )
+        for one in inspector.GetAllGeometryIds(Role.kPerception)
+    }
+
+
+def test_what_stops_the_walker_is_drawn_and_the_start_is_free(garden):
     obstacles = garden_obstacles()
-    assert np.abs(obstacles[:, :2]).max() < HALF_SIZE
-    distance = np.linalg.norm(obstacles[:, :2] - START[:2], axis=1) - obstacles[:, 2]
-    assert distance.min() > 2 * BODY_RADIUS
-    # What stops the walker is as wide as it is drawn, and nothing hangs in the air; between the
-    # posts of a gate one can walk, and its top reaches over them.
-    solid = [one for one in known.values() if one.radius]
-    assert len(solid) == len(obstacles)
-    assert all(one.shape.radius() == one.radius for one in solid)
+    assert len(obstacles) == 18
+    assert np.abs(obstacles[:, :2]).max() < WALK.half_size
+    distance = np.linalg.norm(obstacles[:, :2] - WALK.start[:2], axis=1) - obstacles[:, 2]
+    assert distance.min() > 2 * WALK.body_radius
+    for x, y, radius in obstacles:
+        drawn = [
+            shape for shape, p in garden.values()
+            if p[0] == x and p[1] == y and isinstance(shape, Cylinder | Sphere)
+        ]  # fmt: skip
+        assert radius in [shape.radius() for shape in drawn]
+
+
+def test_nothing_hangs_in_the_air_and_one_can_walk_through_the_gates(garden):
     heights = {Box: "height", Cylinder: "length", Sphere: "radius", Ellipsoid: "c"}
     spans = {}
-    for name, one in known.items():
-        half = getattr(one.shape, heights[type(one.shape)])()
-        half *= 0.5 if isinstance(one.shape, Box | Cylinder) else 1.0
-        spans[name] = np.array([one.position[2] - half, one.position[2] + half])
-    for name, one in known.items():
-        carriers = [
-            spans[other]
-            for other, two in known.items()
-            if np.hypot(*np.subtract(one.position, two.position)[:2]) < 1.5
-        ]
+    for name, (shape, p) in garden.items():
+        half = getattr(shape, heights[type(shape)])()
+        half *= 0.5 if isinstance(shape, Box | Cylinder) else 1.0
+        spans[name] = p[2] - half, p[2] + half
+    for name, (_, p) in garden.items():
         bottom, top = spans[name]
         if name == "lawn" or name.startswith("path"):
             assert abs(top) < 0.02
-        else:
-            assert bottom > -1e-9, "it stands on the ground, not in it"
-        assert not isinstance(one.shape, Ellipsoid) or one.shape.a() == one.shape.b()
+            continue
+        assert bottom > -1e-9, "it stands on the ground, not in it"
+        near = [one for one, (_, o) in garden.items() if np.hypot(*(p - o)[:2]) < 1.5]
+        carriers = [spans[one] for one in near]
         assert bottom < 1e-9 or any(low < bottom <= high < top for low, high in carriers), name
-    for k in range(sum(name.endswith("_top") for name in known)):
-        left, right, top = (known[f"gate_{k}_{part}"] for part in ("left", "right", "top"))
-        gap = left.position[1] - right.position[1] - 2 * left.radius
-        assert 2 * BODY_RADIUS < gap < top.shape.depth() - 2 * left.radius
-        assert left.position[0] == right.position[0] == top.position[0]
+    for k in range(4):
+        (left, p_left), (_, p_right), (top, _) = (
+            garden[f"gate_{k}_{part}"] for part in ("left", "right", "top")
+        )
+        gap = p_left[1] - p_right[1] - 2 * left.radius()
+        assert 2 * WALK.body_radius < gap < top.depth() - 2 * left.radius()
 
 
 def test_the_view_is_from_behind_and_above_and_within_the_walls():
     rng = np.random.default_rng(1)
-    for x, y, heading in rng.uniform(-1.0, 1.0, (200, 3)) * (HALF_SIZE, HALF_SIZE, math.pi):
+    for x, y, heading in rng.uniform(-1.0, 1.0, (200, 3)) * (
+        WALK.half_size,
+        WALK.half_size,
+        math.pi,
+    ):
         eye, target = view_from_behind(np.array([x, y, heading]))
-        assert np.abs(eye[:2]).max() < HALF_SIZE
+        assert np.abs(eye[:2]).max() < WALK.half_size
         assert eye[2] > target[2] > 0.5
         forward, ground = np.array([math.cos(heading), math.sin(heading)]), np.array([x, y])
         ahead = target[:2] - ground
         np.testing.assert_allclose(ahead, np.linalg.norm(ahead) * forward, atol=1e-12)
         back = ground - eye[:2]
-        if np.abs([ground, ground - 4.0 * forward]).max() < HALF_SIZE - 0.5:
+        if np.abs([ground, ground - 4.0 * forward]).max() < WALK.half_size - 0.5:
             np.testing.assert_allclose(back, np.linalg.norm(back) * forward, atol=1e-12)
             assert 2.0 < np.linalg.norm(back) < 4.0
 

@@ -6,9 +6,16 @@ import math
 from collections.abc import Callable, Mapping
 
 import numpy as np
-from pydrake.geometry import Meshcat, MeshcatVisualizer, MeshcatVisualizerParams, Role, SceneGraph
+from pydrake.geometry import (
+    Cylinder,
+    Meshcat,
+    MeshcatVisualizer,
+    MeshcatVisualizerParams,
+    Role,
+    SceneGraph,
+    Sphere,
+)
 from pydrake.math import RigidTransform, RollPitchYaw
-from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
 from pydrake.systems.framework import (
     Context,
@@ -23,6 +30,7 @@ from pydrake.trajectories import Trajectory
 
 from drake_pose.arrays import Array
 from drake_pose.body.formats.packages import package_folder
+from drake_pose.body.formats.parsing import ModelSource
 from drake_pose.body.model import ArticulatedModel
 from drake_pose.errors import SettingsError, UnknownNameError
 from drake_pose.person.date.walking import (
@@ -296,20 +304,21 @@ def build_walk(
 def add_garden(builder: DiagramBuilder, X_WG: RigidTransform | None = None) -> SceneGraph:
     """Add urdf/garden/garden.sdf, and a SceneGraph that holds it, at a pose."""
     plant, scene_graph = AddMultibodyPlantSceneGraph(builder, 0.0)
-    (garden,) = Parser(plant).AddModels(str(package_folder() / "garden" / "garden.sdf"))
-    frame = plant.GetFrameByName("garden", garden)
+    ModelSource(package_folder() / "garden" / "garden.sdf", {}).parse(plant, scene_graph)
+    frame = plant.GetFrameByName("garden")
     plant.WeldFrames(plant.world_frame(), frame, X_WG or RigidTransform())
     plant.Finalize()
     return scene_graph
 
 
 def garden_obstacles() -> Array:
-    """(n, 3) x, y and radius of what one cannot walk through [m]: of the collision geometries."""
+    """(n, 3) x, y and radius [m] of what one cannot walk through: cylinders and spheres."""
     inspector = add_garden(DiagramBuilder()).model_inspector()
     obstacles = []
-    for geometry in inspector.GetAllGeometryIds(Role.kProximity):
-        x, y, _ = inspector.GetPoseInFrame(geometry).translation()
-        obstacles.append((x, y, inspector.GetShape(geometry).radius()))
+    for geometry in inspector.GetAllGeometryIds(Role.kPerception):
+        shape, place = inspector.GetShape(geometry), inspector.GetPoseInFrame(geometry)
+        if isinstance(shape, Cylinder | Sphere):
+            obstacles.append((*place.translation()[:2], shape.radius()))
     return np.array(obstacles)
 
 

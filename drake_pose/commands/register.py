@@ -141,7 +141,7 @@ def audit(
 def _print_registration(result: SceneRegistration) -> None:
     """A row a frame and camera, of many the worst; where cameras stand, and how sure that is."""
     from drake_pose.files.folder import REPORT
-    from drake_pose.jobs.registration.report import PARAMETERS, parameter_rows
+    from drake_pose.jobs.registration.result import PARAMETERS, parameter_rows
     from drake_pose.silhouette.pictures.scenes import CAMERA_FILE
 
     console = output_console()

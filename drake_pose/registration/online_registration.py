@@ -22,8 +22,13 @@ from drake_pose.arrays import Array
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import RegistrationError, SettingsError
 from drake_pose.registration.posed_frames import PosedFrame, PosedFrames, placed_points
-from drake_pose.registration.register import CameraSearch, RegisteredCamera, RegistrationBody
-from drake_pose.registration.start_poses import E_total, areas
+from drake_pose.registration.register import (
+    CameraSearch,
+    E_total,
+    RegisteredCamera,
+    RegistrationBody,
+    areas,
+)
 
 # A frame contradicts of which less than this share fits of what usually fits.
 _CONTRADICTS = 0.7

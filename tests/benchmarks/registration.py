@@ -29,13 +29,11 @@ from drake_pose.errors import RegistrationError
 from drake_pose.files.settings import EstimateSettings
 from drake_pose.fit.parameters import lengthened_joints
 from drake_pose.jobs.estimate.searches import make_tree
-from drake_pose.jobs.registration.episodes import GivenFiles
-from drake_pose.jobs.registration.inputs import read_inputs
+from drake_pose.jobs.registration.inputs import GivenFiles, read_inputs
 from drake_pose.jobs.registration.settings import RegistrationSettings
 from drake_pose.registration.joint_zeros import links_with_length
 from drake_pose.registration.posed_frames import PosedFrame, PosedFrames
-from drake_pose.registration.register import CameraSearch, RegistrationBody
-from drake_pose.registration.start_poses import areas
+from drake_pose.registration.register import CameraSearch, RegistrationBody, areas
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from tests.benchmarks.tables import print_table
 

@@ -22,11 +22,18 @@ from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.fit.parameters import BodyParameters
 from drake_pose.fit.problem import parameter_names
 from drake_pose.registration.joint_zeros import _as_the_cost_bends, _constants, _significant
-from drake_pose.registration.object_search import ObjectSearch, hand_eye_starts
 from drake_pose.registration.online_registration import pose_difference
 from drake_pose.registration.per_frame_fit import PerFrameFit
 from drake_pose.registration.posed_frames import PosedFrame, PosedFrames, SeenFrame
-from drake_pose.registration.register import RegistrationBody
+from drake_pose.registration.register import (
+    E_total,
+    RegistrationBody,
+    _bounds,
+    add_bound_equations,
+    intersection_over_union,
+    place_by_bounds,
+    spread_rotations,
+)
 from drake_pose.registration.shared_fit import (
     SHARED,
     Shared,
@@ -35,18 +42,12 @@ from drake_pose.registration.shared_fit import (
     scatter_factor,
 )
 from drake_pose.registration.standing_object import (
+    ObjectSearch,
     StandingObject,
-    Symmetry,
+    distinct_turns,
+    hand_eye_starts,
     require_turns,
     turns_between,
-)
-from drake_pose.registration.start_poses import (
-    E_total,
-    _bounds,
-    add_bound_equations,
-    intersection_over_union,
-    place_by_bounds,
-    spread_rotations,
 )
 from drake_pose.silhouette.areas.scoring import draw_mask
 from tests.registration.arm_pictures import errors, looking_at, see
@@ -248,8 +249,8 @@ def test_turns_after_which_an_object_looks_alike(
 ) -> None:
     _, turns, axes, apart = LOOKS[name]
     thing = standing(name)
-    found = thing.symmetry
-    assert (len(found.turns), len(found.axes), len(found.told_apart)) == (turns, axes, apart)
+    found, about = thing.symmetry
+    assert (len(found), len(about), len(distinct_turns(found, about))) == (turns, axes, apart)
     np.testing.assert_allclose(found.turns[0], np.eye(4), atol=1e-12)
     points = thing.alone.all[0].vertices
     assert np.linalg.norm(points - [0.3, 0.0, 0.1], axis=1).max() == pytest.approx(thing.radius)
@@ -264,8 +265,8 @@ def test_turns_of_a_round_object_differ_where_its_axis_points_elsewhere() -> Non
     rotvecs = np.radians([[0, 0, 0], [0, 0, 15], [30, 0, 0], [30, 0, 0], [0, 8, 0], [180, 0, 0]])
     turns = np.tile(np.eye(4), (6, 1, 1))
     turns[:, :3, :3] = Rotation.from_rotvec(rotvecs).as_matrix()
-    round_about_z = Symmetry(turns, np.array([[0.0, 0.0, 1.0]]))
-    np.testing.assert_array_equal(round_about_z.told_apart, turns[[0, 2, 4, 5]])
+    round_about_z = distinct_turns(turns, np.array([[0.0, 0.0, 1.0]]))
+    np.testing.assert_array_equal(round_about_z, turns[[0, 2, 4, 5]])
 
 
 def test_an_object_that_is_round_may_be_turned_about_its_axis_by_anything(
@@ -315,8 +316,8 @@ def test_poses_of_an_object_are_one_that_show_it_alike(
     far[0, 3] += 0.3 * thing.radius
     # Turned about its middle by so much, of which its points move by about 0.8.
     little, much = (thing.moved(X, np.array([0, 0, 0, turn, 0, 0])) for turn in (0.12, 0.4))
-    poses = [one[None] for one in (X, X, near, X @ thing.symmetry.turns[2], far, little, much)]
-    kept = search._apart(poses, thing.symmetry.turns)
+    poses = [one[None] for one in (X, X, near, X @ thing.symmetry[0][2], far, little, much)]
+    kept = search._apart(poses, thing.symmetry[0])
     np.testing.assert_array_equal(kept, [X[None], far[None], much[None]])
 
 
@@ -357,7 +358,7 @@ def test_a_camera_on_a_hand_and_what_it_sees_are_found_together(
     began, ended = search._misfits(camera, [[one] for one in frames], np.array([off, found]), 100.0)
     assert ended < 0.3 * began
     # One look after a turn that shows the object alike is the same, others are not.
-    alike = np.array([true[0], true[1] @ thing.symmetry.turns[1]])
+    alike = np.array([true[0], true[1] @ thing.symmetry[0][1]])
     far = np.array([true[0], thing.moved(true[1], np.array([0.2, 0, 0, 0, 0, 0]))])
     np.testing.assert_array_equal(search._distinct([true, alike, far], frames), [true, far])
 

@@ -10,14 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from drake_pose.errors import RegistrationError
 from drake_pose.fit.background import Explained
-from drake_pose.registration import picture_levels, picture_search
-from drake_pose.registration.picture_frames import judge_pictures
-from drake_pose.registration.picture_levels import (
-    PictureLevel,
-    SearchRound,
-    _upright_rotations,
-    evidence,
-)
+from drake_pose.registration import picture_search
 from drake_pose.registration.picture_registration import (
     PictureRegistration,
     Recording,
@@ -26,10 +19,19 @@ from drake_pose.registration.picture_registration import (
     _fit,
     _scan,
     choose_pictures,
+    judge_pictures,
     posed_pictures,
 )
-from drake_pose.registration.picture_search import PictureSearch, PosedPicture, node_places
-from drake_pose.registration.target_pictures import require_seen
+from drake_pose.registration.picture_search import (
+    PictureLevel,
+    PictureSearch,
+    PosedPicture,
+    SearchRound,
+    _upright_rotations,
+    evidence,
+    node_places,
+)
+from drake_pose.registration.standing_object import require_seen
 from tests.registration.arm_pictures import errors
 from tests.registration.episodes import LATE, PaintedEpisode
 
@@ -208,8 +210,8 @@ def test_a_clock_is_told_by_what_its_offsets_explain(episode, recording) -> None
 
 def test_a_search_ends_about_where_the_camera_is(episode, monkeypatch) -> None:
     """With fewer starts and rounds than usual; and fitted on lines the best of it is very near."""
-    monkeypatch.setattr(picture_levels, "_ALL", 300)
-    monkeypatch.setattr(picture_levels, "_UPRIGHT", 300)
+    monkeypatch.setattr(picture_search, "_ALL", 300)
+    monkeypatch.setattr(picture_search, "_UPRIGHT", 300)
     rounds = SearchRound(64, 40, 24, 0.25), SearchRound(64, 10, 50, 0.1)
     monkeypatch.setattr(picture_search, "_ROUNDS", rounds)
     shown = range(0, 16, 2)

@@ -7,8 +7,7 @@ from scipy.spatial.transform import Rotation
 from drake_pose.body.model import ArticulatedModel
 from drake_pose.errors import RegistrationError
 from drake_pose.registration.posed_frames import PosedFrame
-from drake_pose.registration.register import CameraSearch, RegistrationBody
-from drake_pose.registration.start_poses import spread_rotations
+from drake_pose.registration.register import CameraSearch, RegistrationBody, spread_rotations
 from tests.registration.arm_pictures import errors, looking_at, see
 
 PLACES = {

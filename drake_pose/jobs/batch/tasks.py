@@ -30,7 +30,7 @@ from drake_pose.jobs.batch.job import SceneJob
 from drake_pose.jobs.estimate.inputs import follows_person
 from drake_pose.jobs.estimate.scene import estimate_scene
 from drake_pose.jobs.registration.audit import audit_scene
-from drake_pose.jobs.registration.episodes import looks_at_pictures
+from drake_pose.jobs.registration.inputs import looks_at_pictures
 from drake_pose.jobs.registration.settings import AuditSettings
 from drake_pose.silhouette.pictures.scene_checks import frame_ranges
 from drake_pose.silhouette.pictures.scenes import Scene, load_scene

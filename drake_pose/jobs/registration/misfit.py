@@ -16,7 +16,6 @@ from drake_pose.files.options import percent
 from drake_pose.files.summary import BADLY_EXPLAINED
 from drake_pose.fit.parameters import POSE_NAMES
 from drake_pose.registration.joint_zeros import calibrate_joints
-from drake_pose.registration.object_search import ObjectSearch
 from drake_pose.registration.online_registration import pose_difference
 from drake_pose.registration.posed_frames import PosedFrame, PosedFrames
 from drake_pose.registration.register import (
@@ -28,6 +27,7 @@ from drake_pose.registration.register import (
     spread,
 )
 from drake_pose.registration.shared_fit import SharedFit
+from drake_pose.registration.standing_object import ObjectSearch
 
 # Of the contours in the two frames that fit best, this share fits at least. A robot that is the
 # masks' leaves 0.83 and more, with holes and tools; mirrored masks, another robot's or exchanged

@@ -24,17 +24,14 @@ from drake_pose.files.options import percent
 from drake_pose.files.summary import BADLY_EXPLAINED
 from drake_pose.fit.parameters import lengthened_joints
 from drake_pose.jobs.estimate.inputs import missing_for_person
-from drake_pose.jobs.registration.episodes import (
+from drake_pose.jobs.registration.inputs import (
     EpisodeInputs,
     GivenFiles,
-    looks_at_pictures,
-    read_episode,
-)
-from drake_pose.jobs.registration.exports import check_exports
-from drake_pose.jobs.registration.inputs import (
     Inputs,
     inputs_of_episode,
+    looks_at_pictures,
     make_registration_tree,
+    read_episode,
     read_inputs,
 )
 from drake_pose.jobs.registration.misfit import (
@@ -43,8 +40,9 @@ from drake_pose.jobs.registration.misfit import (
     require_determined,
     require_explained,
 )
-from drake_pose.jobs.registration.report import compared_frames
 from drake_pose.jobs.registration.result import (
+    check_exports,
+    compared_frames,
     describe_camera,
     describe_parameters,
     describe_pictures,
@@ -56,26 +54,31 @@ from drake_pose.jobs.registration.result import (
 from drake_pose.jobs.registration.settings import RegistrationSettings
 from drake_pose.person.shape import shape_parts, shape_values
 from drake_pose.registration.joint_zeros import JointCalibration, calibrate_joints
-from drake_pose.registration.object_search import ObjectSearch
-from drake_pose.registration.picture_frames import judge_pictures
 from drake_pose.registration.picture_registration import (
     PictureRegistration,
     choose_pictures,
+    judge_pictures,
     posed_pictures,
     register_pictures,
 )
 from drake_pose.registration.posed_frames import PosedFrames, SeenFrame
 from drake_pose.registration.register import (
     CameraSearch,
+    E_total,
     ObjectPose,
     RegisteredCamera,
     RegistrationBody,
+    areas,
+    intersection_over_union,
     suggest_pose,
 )
 from drake_pose.registration.shared_fit import adjust_bundle
-from drake_pose.registration.standing_object import StandingObject
-from drake_pose.registration.start_poses import E_total, areas, intersection_over_union
-from drake_pose.registration.target_pictures import find_in_pictures, require_seen
+from drake_pose.registration.standing_object import (
+    ObjectSearch,
+    StandingObject,
+    find_in_pictures,
+    require_seen,
+)
 from drake_pose.silhouette.pictures.scene_checks import frame_ranges
 from drake_pose.workers import working
 

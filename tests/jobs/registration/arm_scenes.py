@@ -13,7 +13,7 @@ import numpy as np
 from drake_pose.body.model import load_model
 from drake_pose.camera.camera_files import load_cameras, save_cameras
 from drake_pose.camera.models import Camera
-from drake_pose.jobs.registration.episodes import GivenFiles
+from drake_pose.jobs.registration.inputs import GivenFiles
 from tests.jobs.scenes import edit_camera, write_masks
 from tests.registration.arm_pictures import errors
 from tests.search.arms import LINKS, arm_cameras, arm_urdf

@@ -14,7 +14,7 @@ from drake_pose.errors import DrakePoseError
 from drake_pose.files.overlay import EXCESS_RGB, MISSING_RGB
 from drake_pose.jobs.estimate.episode import is_episode
 from drake_pose.jobs.registration.audit import audit_scene
-from drake_pose.jobs.registration.episodes import EpisodeInputs, GivenFiles, read_episode
+from drake_pose.jobs.registration.inputs import EpisodeInputs, GivenFiles, read_episode
 from drake_pose.jobs.registration.register import register_scene
 from drake_pose.jobs.registration.settings import RegistrationSettings
 from drake_pose.silhouette.pictures.scenes import load_scene

@@ -17,8 +17,8 @@ from drake_pose.camera.camera_files import load_cameras
 from drake_pose.camera.models import ParallelCamera
 from drake_pose.errors import CameraError, SettingsError
 from drake_pose.files.replay import make_recording
-from drake_pose.jobs.registration.exports import check_exports, write_exports
 from drake_pose.jobs.registration.inputs import read_inputs
+from drake_pose.jobs.registration.result import check_exports, write_exports
 from drake_pose.jobs.registration.settings import RegistrationSettings
 from drake_pose.registration.posed_frames import SeenFrame
 

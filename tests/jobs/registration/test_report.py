@@ -7,8 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from drake_pose.jobs.registration.report import make_registration_report
-from drake_pose.jobs.registration.result import describe_pictures
+from drake_pose.jobs.registration.result import describe_pictures, make_registration_report
 from drake_pose.registration.picture_registration import TimeOffset
 from tests.search.arms import arm_cameras
 

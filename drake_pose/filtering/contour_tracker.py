@@ -236,7 +236,7 @@ class ContourObservation(BodyState):
         self, x: Array, compared: Comparison, distance: float, parts: Array
     ) -> ContourMeasurement:
         """What the contours say as no more numbers than the state has elements, with noise 1."""
-        H, g = normal_equations(compared.total, compared.placement, len(self._body.names))
+        H, g = normal_equations(compared, len(self._body.names))
         index = self._parameter_index
         scale = max(CONTOUR.deviation, distance)
         # Both contours say the same: together they count as one.

@@ -23,7 +23,7 @@ from drake_pose.fit.levenberg_marquardt import AnnealingStage, Equations, StepSe
 from drake_pose.fit.parameters import BodyParameters, Placement
 from drake_pose.fit.surfaces import VERY_FEW, few_triangles
 from drake_pose.silhouette.areas.bending import TreeSurfaces
-from drake_pose.silhouette.areas.outline import Outline, PackedOutlines
+from drake_pose.silhouette.areas.outline import Outline
 
 FINEST_SCALE = 1.5
 """Silhouettes resolve no smaller distances [pixel]."""
@@ -70,22 +70,6 @@ class Views(NamedTuple):
     evidence: Evidence
 
 
-class CameraSum(NamedTuple):
-    """What some cameras together say of each node's affine motion x (12,): x^T A x - 2 b^T x.
-
-    A: (nodes, 12, 12), lower triangles; b: (nodes, 12); sums: (nodes + 1, 6) as of
-    `compare_contours`.
-    """
-
-    A: Array
-    b: Array
-    sums: Array
-
-
-AddUp = Callable[[Placement, AnnealingStage], CameraSum]
-"""Compares a body's contours with all cameras' edges, and adds up."""
-
-
 class Comparison(NamedTuple):
     """What each camera says of each node's affine motion x (12,): x^T A x - 2 b^T x.
 
@@ -100,14 +84,13 @@ class Comparison(NamedTuple):
     placement: Placement
 
     @property
-    def total(self) -> CameraSum:
-        """What all cameras say together."""
-        return add_cameras(self.A, self.b, self.sums)
-
-    @property
     def inlier_ratio(self) -> float:
         """Of both contours' lengths, what fits, 0 to 1."""
         return inlier_ratio_of(self.sums)
+
+
+Compare = Callable[[Placement, AnnealingStage], Comparison]
+"""Compares a body's contours with what some cameras see, at the scale of a stage."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,7 +177,7 @@ class ContourFit:
 
     def fit(
         self,
-        views: Views,
+        seen: Views | Compare,
         values: Array,
         rounds: Sequence[AnnealingStage],
         prior: Prior | None = None,
@@ -203,41 +186,29 @@ class ContourFit:
         """Fits a pose.
 
         Args:
-            views: the cameras, and the edges of each one's silhouette.
+            seen: the cameras and their silhouettes' edges, or what compares contours otherwise.
             values: (m,) where to start.
             rounds: the parts of the fit.
-            prior: what else is known.
+            prior: of the values.
             held: (m,) which values stay.
         """
-
-        def add_up(placement: Placement, step: AnnealingStage) -> CameraSum:
-            weights = self.weights(views.cameras, placement, step)
-            return compare_views(views, placement, weights).total
-
-        return self.fit_sums(add_up, values, rounds, prior, held)
-
-    def fit_sums(
-        self,
-        add_up: AddUp,
-        values: Array,
-        rounds: Sequence[AnnealingStage],
-        prior: Prior | None = None,
-        held: Mask | None = None,
-    ) -> PoseFit:
-        """As fit, of cameras whose edges may be elsewhere: add_up says what all of them say."""
         index = np.flatnonzero(np.ones(len(values), bool) if held is None else ~held)
         current = np.array(values, dtype=np.float64)
         current[index] = np.clip(values, self.lower, self.upper)[index]
-        sums = np.zeros((len(self.outlines) + 1, 6))
+        sums = np.zeros((len(self.outlines) + 1, len(Sum)))
 
         def evaluate(own: Array, _: Array, step: AnnealingStage) -> Equations:
             nonlocal sums
             theta = current.copy()
             theta[index] = own[0]
             placement = self.body.place(theta)
-            total = add_up(placement, step)
-            H, g = normal_equations(total, placement, len(theta))
-            sums = total.sums
+            if isinstance(seen, Views):
+                weights = self.weights(seen.cameras, placement, step)
+                compared = compare_views(seen, placement, weights)
+            else:
+                compared = seen(placement, step)
+            H, g = normal_equations(compared, len(theta))
+            sums = compared.sums.sum(axis=0)
             cost = float(sums[:, Sum.COST].sum())
             if prior is not None:
                 off = theta - prior.mean
@@ -249,9 +220,8 @@ class ContourFit:
         own, _, cost, evaluations = minimise(
             evaluate, current[index][None], np.zeros(0), limits, rounds, self.steps
         )
-        fitted = current.copy()
-        fitted[index] = own[0]
-        return PoseFit(fitted, sums, cost, evaluations)
+        current[index] = own[0]
+        return PoseFit(current, sums, cost, evaluations)
 
     def compare(
         self, views: Views, theta: Array, step: AnnealingStage, widths: bool = False
@@ -312,15 +282,10 @@ def camera_weights(
     return weights
 
 
-def normal_equations(total: CameraSum, placement: Placement, size: int) -> tuple[Array, Array]:
-    """The normal equations H dx = -g of a body's parameters, by the chain rule.
-
-    Args:
-        total: what all cameras say together.
-        placement: of the body.
-        size: how many parameters it has.
-    """
-    return collect(total.A, total.b, *placement[2:], size)
+def normal_equations(compared: Comparison, size: int) -> tuple[Array, Array]:
+    """The normal equations H dx = -g of a number of body parameters, of all cameras."""
+    A, b = compared.A.sum(axis=0), compared.b.sum(axis=0)
+    return collect(A, b, *compared.placement[2:], size)
 
 
 def symmetric(A: Array) -> Array:
@@ -334,16 +299,3 @@ def pixels_per_metre(cameras: tuple[Array, Array], place: Array) -> Array:
     kind, focal, near = parameters[:, 0], parameters[:, 1], parameters[:, 5]
     depth = np.maximum(X_CW[:, 2, :3] @ place + X_CW[:, 2, 3], near)
     return np.asarray(focal / np.where(kind == 0.0, depth, 1.0))
-
-
-def compare_placed(
-    packed: PackedOutlines, X_WN: Array, views: Views, weights: Array
-) -> tuple[Array, Array, Array]:
-    """A, b and sums of each camera; arguments as of `compare_contours`."""
-    A, b, sums, *_ = compare_contours(packed, X_WN, *views, weights, 0, 1.0, False)
-    return A, b, sums
-
-
-def add_cameras(A: Array, b: Array, sums: Array) -> CameraSum:
-    """The sum of what each camera says, as of `compare_placed`."""
-    return CameraSum(A.sum(axis=0), b.sum(axis=0), sums.sum(axis=0))

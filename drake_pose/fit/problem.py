@@ -312,7 +312,7 @@ class Problem:
         compared, (_, _, motions) = self.compare(seen, theta, step)
         if self._fixed:
             moves = self._moves(compared, motions, 0, seen.rates)
-            told = [(moves, compared.total.A, compared.total.b)]
+            told = [(moves, compared.A.sum(axis=0), compared.b.sum(axis=0))]
         else:
             told = [
                 (self._moves(compared, motions, c, seen.rates), A, b)

@@ -10,6 +10,7 @@ limits let it.
 """
 
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -18,7 +19,6 @@ from numpy.typing import NDArray
 from drake_pose.arrays import Array, Mask
 from drake_pose.fit.colours import OwnColours
 from drake_pose.fit.contour_fit import (
-    AddUp,
     Comparison,
     ContourFit,
     PoseFit,
@@ -313,7 +313,7 @@ class PersonPoseTracker:
                 if found is None
                 else TrackState(found.values, still, found.inlier_ratio, _USUAL)
             )
-        fitted = self._fitted(last, frame.add_up(self.fit))
+        fitted = self._fitted(last, frame)
         enough = last.usual - _RETRY_BELOW
         lost = fitted.inlier_ratio < _LOST_BELOW * last.usual
         due = fitted.inlier_ratio < enough and _is_due(last.troubled)
@@ -339,7 +339,7 @@ class PersonPoseTracker:
         A limb that does not show its own colours is searched again; if it does not then, either,
         the person is lost.
         """
-        fitted, shown = self._fitted(last, colours.add_up(self.fit)), 1.0
+        fitted, shown = self._fitted(last, colours), 1.0
         if own is not None:
             fitted, shown = self._recoloured(fitted, colours, own)
         step = fitted.values - last.values
@@ -390,11 +390,12 @@ class PersonPoseTracker:
             state, values=found.values, step=still, share=found.inlier_ratio, troubled=left
         )
 
-    def _fitted(self, last: TrackState, add_up: AddUp) -> PoseFit:
+    def _fitted(self, last: TrackState, seen: FrameViews | ColourViews) -> PoseFit:
         """The frame fitted from where the last ones point to."""
         expected = last.values + _CARRY * last.step
         prior = Prior(expected, self._information)
-        return self.fit.fit_sums(add_up, expected, self.schedule.follow, prior, self._held)
+        compare = partial(seen.compare, self.fit)
+        return self.fit.fit(compare, expected, self.schedule.follow, prior, self._held)
 
 
 def _is_due(troubled: int) -> bool:

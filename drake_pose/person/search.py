@@ -6,6 +6,7 @@ Guesses are judged in small pictures of a few cameras; only what is promising is
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -192,8 +193,8 @@ class PersonSearch:
     def _refine(self, values: Array, frame: FrameViews | ColourViews) -> PoseFit:
         """A fit from a coarse guess, which is trusted little."""
         prior = Prior(values, 0.1 * self._information)
-        add_up = frame.add_up(self._fit)
-        return self._fit.fit_sums(add_up, values, self._rounds, prior, self._held)
+        compare = partial(frame.compare, self._fit)
+        return self._fit.fit(compare, values, self._rounds, prior, self._held)
 
     def _doubtful(self, fitted: PoseFit, frame: FrameViews) -> list[PlannedLimb]:
         """The limbs that fit badly, hardly show, or would fill more elsewhere; always the worst."""

@@ -23,13 +23,10 @@ from drake_pose.camera.models import Camera, ParallelCamera
 from drake_pose.compiled import compiled
 from drake_pose.fit.colours import check_picture, compare_lines, learn_colours, no_colours
 from drake_pose.fit.contour_fit import (
-    AddUp,
-    CameraSum,
     Comparison,
     ContourFit,
     Views,
-    add_cameras,
-    compare_placed,
+    compare_views,
     pack_cameras,
     pack_views,
     pixels_per_metre,
@@ -91,14 +88,6 @@ class ColourViews:
                     A[c], b[c], sums[c], wide[c],
                 )  # fmt: skip
         return Comparison(A, b, sums, wide, placement)
-
-    def add_up(self, fit: ContourFit) -> AddUp:
-        """What compares a body with all pictures and adds up."""
-
-        def total(placement: Placement, step: AnnealingStage) -> CameraSum:
-            return self.compare(fit, placement, step).total
-
-        return total
 
     def learned(
         self, fit: ContourFit, values: Array, regions: Mapping[str, Mask] | None = None
@@ -259,15 +248,10 @@ class FrameViews:
         pairs = [pair for pair in self.pairs if pair[0].name not in names]
         return FrameViews([camera for camera, _ in pairs], [view for _, view in pairs])
 
-    def add_up(self, fit: ContourFit) -> AddUp:
-        """What compares a body's contours with all cameras, as `fit` weighs them, and adds up."""
-
-        def total(placement: Placement, step: AnnealingStage) -> CameraSum:
-            views = self._packed
-            weights = fit.weights(views.cameras, placement, step)
-            return add_cameras(*compare_placed(placement.packed, placement.X_WN, views, weights))
-
-        return total
+    def compare(self, fit: ContourFit, placement: Placement, step: AnnealingStage) -> Comparison:
+        """A body's contours compared with all cameras' edges, as `fit` weighs them."""
+        weights = fit.weights(self._packed.cameras, placement, step)
+        return compare_views(self._packed, placement, weights)
 
     @cached_property
     def _packed(self) -> Views:

@@ -18,9 +18,9 @@ from drake_pose.body.model import load_model
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.camera.models import ParallelCamera
 from drake_pose.compiled import is_stored
-from drake_pose.fit.contour_fit import compare_placed, pack_views
+from drake_pose.fit.contour_fit import pack_views
 from drake_pose.fit.evidence import find_edge_points
-from drake_pose.fit.kernel import collect
+from drake_pose.fit.kernel import collect, compare_contours
 from drake_pose.fit.surfaces import few_triangles
 from drake_pose.search import MEDIUM, MultiStartSearch, View, ViewsFit
 from drake_pose.silhouette.areas.bending import TreeSurfaces
@@ -54,7 +54,8 @@ def main() -> None:
     surfaces = few_triangles(TreeSurfaces(tree))
     # The kernel that takes longest, by itself: the first process compiles what comes before it.
     views = pack_views([camera], [find_edge_points(view.mask, 1.0)])
-    compare_placed(pack(surfaces), tree.node_poses(tree.default_values()), views, np.ones((1, 4)))
+    X_WN = tree.node_poses(tree.default_values())
+    compare_contours(pack(surfaces), X_WN, *views, np.ones((1, 4)), 0, 1.0, False)
     fit = ViewsFit(TreeKinematics(tree), surfaces, [view])
     fit.refine(fit.kinematics.flatten(tree.default_values()), MEDIUM)
     MultiStartSearch(tree).match([view])

@@ -256,7 +256,7 @@ class PersonTracker(MemorySystem):
             return found
         fit = self._tracker.fit
         step = self._tracker.schedule.follow[-1]
-        total = clean.add_up(fit)(fit.body.place(found.values), step)
+        total = clean.compare(fit, fit.body.place(found.values), step)
         return replace(found, share=inlier_ratio_of(total.sums))
 
 

@@ -24,17 +24,12 @@ if TYPE_CHECKING:
     from rich.console import RenderableType
 
     from drake_pose.papers.tables import Count
-
-# What is about the grid of angles, which continuous ones have none of.
-_OF_GRID = (
-    "seeds", "method", "outside_limit", "outside_weight", "candidates", "interval", "edges",
-    "edge_noise", "body_scale", "out",
-)  # fmt: skip
+    from drake_pose.search import PoseSearch
 
 
 @dataclass(frozen=True, kw_only=True)
 class KamedaOptions:
-    """Options of experiment A, of which some are refused where they mean nothing."""
+    """Options of experiment A; those that mean nothing beside others are refused."""
 
     seed: Annotated[int | None, within(0)] = None
     """Seed of the random poses. Default: 0."""
@@ -47,29 +42,19 @@ class KamedaOptions:
     true angles, and poses are refined between the samples. Default: grid."""
     outside_limit: Annotated[float | None, within(0.0), Parameter(metavar="R")] = None
     """The paper's r: area of a segment that may lie outside [pixel]. Default: 200."""
-    outside_weight: Annotated[float | None, within(0.0), Parameter(metavar="W")] = None
-    """Run the paper's method once more, its lists ordered by e - W * (area outside): not in the
-    paper, but 10 meets most of its figures. Default: 0."""
     candidates: Annotated[int | None, within(1), Parameter(metavar="K")] = None
     """The paper's K: candidates kept for each segment. Default: 5."""
     interval: Annotated[float | None, within(1.0, 90.0)] = None
     """Sampling interval [deg]. Default: 20."""
     views: Annotated[int | None, within(1)] = None
     """With --angles continuous: number of cameras. Default: 1."""
-    body_scale: Annotated[float | None, within(0.1, 1.0)] = None
-    """Scale of the body. With 0.84 its segments have the mean area of the paper's. Default: 1."""
-    mismatch: bool | None = None
-    """With --angles continuous: also a body whose widths and joints differ from the model's."""
-    edges: bool | None = None
-    """With --method beam: resolve ambiguous silhouettes by the edges inside them (some seconds for
-    each)."""
-    edge_noise: Annotated[float | None, within(0.0, 0.9)] = None
-    """With --edges: this share of them is missing, the others are a pixel off, and a quarter as
-    many are wrong. Default: 0."""
-    renderer: Literal["drake", "own"] | None = None
-    """Who draws the silhouettes. drake: Drake's renderer, and they count as equal within what two
-    renderers differ by; own: the code that scores them, to the pixel. Default: drake."""
     out: Pictures = None
+
+    def refuse(self, needed: str, *but: str) -> None:
+        """Refuses what was given, except some options: it needs another one."""
+        for field in fields(self):
+            if field.name not in but and getattr(self, field.name) is not None:
+                raise UsageError(f"--{field.name.replace('_', '-')} needs {needed}")
 
 
 def kameda(
@@ -91,109 +76,49 @@ def kameda(
         images: Number of silhouettes; of B and C all that there are or fewer.
     """
     one = options or KamedaOptions()
+    is_continuous = one.angles == "continuous"
+    first, seeds = one.seed or 0, one.seeds or 1
     if experiment != "A":
-        _refuse(one, [f.name for f in fields(one) if f.name != "out"], "--experiment A")
-        _kameda_pictures(experiment, images, one.out, json)
-        return
-    if one.edges and one.method != "beam":
-        raise UsageError("--edges needs --method beam")
-    if one.edge_noise and not one.edges:
-        raise UsageError("--edge-noise needs --edges")
-    if one.angles == "continuous":
-        _refuse(one, _OF_GRID, "--angles grid")
-        _kameda_continuous(images, one, json)
-    else:
-        _refuse(one, ("views", "mismatch"), "--angles continuous")
-        _kameda_grid(images, one, json)
-
-
-def _refuse(options: KamedaOptions, names: Sequence[str], needed: str) -> None:
-    """Refuses options that were given and mean nothing here."""
-    for name in names:
-        if getattr(options, name) is not None:
-            raise UsageError(f"--{name.replace('_', '-')} needs {needed}")
-
-
-def _kameda_grid(images: int, options: KamedaOptions, json: bool) -> None:
-    """Experiment A as the paper has it; the search that was asked for is the last column."""
-    with _experiment(options.out) as count:
-        from drake_pose.papers.kameda import (
-            PAPER_IMAGES,
-            beam_experiment_search,
-            experiment_search,
-            run_experiment,
-        )
-        from drake_pose.papers.kameda_figures import (
-            edge_lines,
-            grid_figures,
-            grid_table,
-            settle_by_edges,
-        )
+        one.refuse("--experiment A", "out")
+    elif is_continuous:
+        one.refuse("--angles grid", "angles", "seed", "views")
+    elif one.views is not None:
+        raise UsageError("--views needs --angles continuous")
+    warnings: list[str] = []
+    with _experiment(one.out) as count:
+        from drake_pose.papers import kameda as poses
         from drake_pose.papers.kameda_pictures import save_pictures
-        from drake_pose.search import PoseSearch
+        from drake_pose.search import ContinuousSearch
 
-        interval, first = options.interval or 20.0, options.seed or 0
-        renderer, scale = options.renderer or "drake", options.body_scale or 1.0
-        limit = 200.0 if options.outside_limit is None else options.outside_limit
-        paper = (limit, options.candidates or 5, interval)
-        searches: dict[str, PoseSearch] = {"paper_method": experiment_search(*paper)}
-        if options.outside_weight:
-            weighted = experiment_search(*paper, options.outside_weight)
-            searches["outside_weight_method"] = weighted
-        if options.method == "beam":
-            searches["beam"] = beam_experiment_search(interval, renderer)
-        results = {}
-        for name, search in searches.items():
-            # The paper's search beside ours makes no more than the paper's own images.
-            fewer = options.method == "beam" and name != "beam"
-            number = min(images, PAPER_IMAGES) if fewer else images
-            seeds = range(first, first + (options.seeds or 1))
-            results[name] = [
-                run_experiment(search, number, seed, count, renderer=renderer, body_scale=scale)
-                for seed in seeds
+        if experiment != "A":
+            real = poses.run_real_experiment(experiment, images, one.out, count)
+            figures, table = {**real["beam"], "paper_method": real["paper"]}, poses.real_table(real)
+            for method, name in poses.METHODS.items():
+                warnings += [f"{name}: {text}" for text in real[method]["warnings"]]
+        elif is_continuous:
+            search = ContinuousSearch(poses.experiment_tree())
+            result = poses.run_experiment(search, images, first, count, one.views or 1)
+            figures, table = poses.continuous_figures(result), poses.continuous_table(result)
+        else:
+            limit = 200.0 if one.outside_limit is None else one.outside_limit
+            interval = one.interval or 20.0
+            # Beside ours the paper's search makes no more than the paper's own images.
+            is_beam = one.method == "beam"
+            few = min(images, int(poses.PAPER["images"])) if is_beam else images
+            paper = poses.experiment_search(limit, one.candidates or 5, interval)
+            searches: list[tuple[PoseSearch, int]] = [(paper, few)]
+            if is_beam:
+                searches.append((poses.beam_experiment_search(interval), images))
+            runs = [
+                [poses.run_experiment(search, number, first + k, count) for k in range(seeds)]
+                for search, number in searches
             ]
-        *beside, leading = results
-        asked, settled = results[leading][0], {}
-        if options.edges:
-            settled = settle_by_edges(asked, count, options.edge_noise or 0.0)
-        if options.out is not None:
-            save_pictures(asked, options.out)
-    others = {name: grid_figures(*results[name]) for name in beside}
-    figures = {**grid_figures(*results[leading]), **settled, **others}
-    _show(figures, [grid_table(list(results.values()))], json)
-    if settled and not json:
-        say(edge_lines(settled))
-
-
-def _kameda_continuous(images: int, options: KamedaOptions, json: bool) -> None:
-    """Experiment A with angles between the samples, and a second time with another body."""
-    with _experiment(None) as count:
-        from drake_pose.papers.kameda import continuous_search, run_experiment
-        from drake_pose.papers.kameda_figures import continuous_figures, continuous_table
-
-        search, seed, views = continuous_search(), options.seed or 0, options.views or 1
-        own = run_experiment(
-            search, images, seed, count, views, renderer=options.renderer or "drake"
-        )
-        results = {"the model itself": own}
-        figures = continuous_figures(results["the model itself"])
-        if options.mismatch:
-            other = run_experiment(search, images, seed, count, views, mismatch=True)
-            results["another body"] = other
-            figures["another_body"] = continuous_figures(other)
-    _show(figures, [continuous_table(results)], json)
-
-
-def _kameda_pictures(experiment: str, images: int, out: Path | None, json: bool) -> None:
-    """Experiments B and C: both methods on the stored pictures."""
-    with _experiment(out) as count:
-        from drake_pose.papers.kameda_real_pictures import METHODS, real_table, run_real_experiment
-
-        figures = run_real_experiment(experiment, images, out, count)
-    for method, name in METHODS.items():
-        for text in figures[method]["warnings"]:
-            warn(f"{name}: {text}")
-    _show({**figures["beam"], "paper_method": figures["paper"]}, [real_table(figures)], json)
+            figures, table = poses.grid_figures(*runs[-1]), poses.grid_table(runs)
+            if is_beam:
+                figures["paper_method"] = poses.grid_figures(*runs[0])
+            if one.out is not None:
+                save_pictures(runs[-1][0], one.out)
+    _show(figures, [table], json, warnings)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -250,63 +175,46 @@ def shimada(
         raise UsageError("--hypotheses goes without --noise and --acceleration")
     if one.sequence and (not one.pictures or one.runs or is_all):
         raise UsageError("--sequence goes with --pictures, without --runs or truncation all")
-    run = _shimada_hypotheses if one.hypotheses else _shimada_moving
+    figures: Mapping[str, Any]
     with _experiment(one.out) as count:
-        figures, table, warnings = (_shimada_sequences if one.sequence else run)(one, count)
-    for text in warnings:
-        warn(text)
-    _show(figures, [table], json)
+        from drake_pose.filtering.truncated_filter import TRUNCATIONS
+        from drake_pose.papers import shimada, shimada_pictures, shimada_sequences
 
-
-_Shown = tuple[Mapping[str, Any], "RenderableType", Sequence[str]]
-"""Figures, their table, and warnings."""
-
-
-def _shimada_moving(one: ShimadaOptions, count: Count) -> _Shown:
-    """The paper's moving hands, once for each truncation."""
-    from drake_pose.filtering.truncated_filter import TRUNCATIONS
-    from drake_pose.papers.shimada import PICTURES, result_table, run_experiment
-    from drake_pose.papers.shimada_pictures import save_pictures
-
-    names = TRUNCATIONS if one.truncation == "all" else (one.truncation or "joint",)
-    runs, seen = one.runs or (10 if one.pictures else 50), one.observed or "lines"
-    filtered = (count, one.iterations, one.noise, one.acceleration)
-    measured = PICTURES if one.pictures else seen
-    results = [run_experiment(runs, one.seed, name, measured, *filtered) for name in names]
-    if one.out is not None:
-        save_pictures(results[0], one.out)
-    figures: dict[str, Any] = {
-        name: result.as_json() for name, result in zip(names, results, strict=True)
-    }
-    is_all = one.truncation == "all"
-    return figures if is_all else figures[names[0]], result_table(*results), ()
-
-
-def _shimada_sequences(one: ShimadaOptions, count: Count) -> _Shown:
-    """Figures 17 and 18 of recorded hands."""
-    from drake_pose.papers.shimada import experiment_settings
-    from drake_pose.papers.shimada_pictures import save_sequence
-    from drake_pose.papers.shimada_sequences import run_sequence, sequence_table
-
-    settings, results = experiment_settings(one.truncation or "joint", one.iterations), []
-    for folder in one.sequence:
-        results.append(run_sequence(folder, settings, one.acceleration, count))
-        if one.out is not None:
-            save_sequence(results[-1], one.out)
-    figures = {result.name: result.as_json() for result in results}
-    return figures, sequence_table(results), [result.warning() for result in results]
-
-
-def _shimada_hypotheses(one: ShimadaOptions, count: Count) -> _Shown:
-    """Figure 9."""
-    from drake_pose.papers.shimada_hypotheses import run_hypotheses_experiment
-    from drake_pose.papers.shimada_pictures import save_hypotheses
-
-    filtered = (one.truncation or "sequential", one.observed or "lines", count, one.iterations or 1)
-    fates = run_hypotheses_experiment(one.runs or 50, one.seed, *filtered)
-    if one.out is not None and not save_hypotheses(fates, one.out):
-        say("drake-pose: no wrong hypothesis was rejected by an inequality: nothing to draw")
-    return fates.as_json(), fates.table(), ()
+        if one.sequence:
+            settings = shimada.experiment_settings(one.truncation or "joint", one.iterations)
+            hands = []
+            for folder in one.sequence:
+                hand = shimada_sequences.run_sequence(folder, settings, one.acceleration, count)
+                hands.append(hand)
+                if one.out is not None:
+                    shimada_pictures.save_sequence(hand, one.out)
+            figures = {hand.name: hand.as_json() for hand in hands}
+            table = shimada_sequences.sequence_table(hands)
+            warnings = [hand.warning() for hand in hands]
+        elif one.hypotheses:
+            truncation, seen = one.truncation or "sequential", one.observed or "lines"
+            fates = shimada.run_hypotheses_experiment(
+                one.runs or 50, one.seed, truncation, seen, count, one.iterations or 1
+            )
+            figures, table, warnings = fates.as_json(), fates.table(), []
+            if one.out is not None and not shimada_pictures.save_hypotheses(fates, one.out):
+                warnings = ["no wrong hypothesis was rejected by an inequality: nothing to draw"]
+        else:
+            names = TRUNCATIONS if is_all else (one.truncation or "joint",)
+            runs = one.runs or (10 if one.pictures else 50)
+            measured = shimada.PICTURES if one.pictures else one.observed or "lines"
+            filtered = (count, one.iterations, one.noise, one.acceleration)
+            results = [
+                shimada.run_experiment(runs, one.seed, name, measured, *filtered) for name in names
+            ]
+            if one.out is not None:
+                shimada_pictures.save_pictures(results[0], one.out)
+            every: dict[str, Any] = {
+                name: result.as_json() for name, result in zip(names, results, strict=True)
+            }
+            figures = every if is_all else every[names[0]]
+            table, warnings = shimada.result_table(*results), []
+    _show(figures, [table], json, warnings)
 
 
 def date(
@@ -315,7 +223,6 @@ def date(
     frames: Annotated[int, within(40)] = 240,
     seed: Seed = 0,
     method: Literal["silhouette", "paper"] = "silhouette",
-    renderer: Literal["drake", "own"] = "drake",
     walk: bool = False,
     out: Pictures = None,
     json: Json = False,
@@ -334,8 +241,6 @@ def date(
         method: Whose figures lead. paper: the paper's, all as printed (rectangles on one circle,
             the waist by 0.55, 0.225, 0.225, feet nearest to their last places), alone; silhouette:
             a fit to all silhouettes beside it.
-        renderer: Who draws the person. drake: Drake's renderer; own: this project's, in flat
-            colours (the face camera's pictures are Drake's).
         walk: Another experiment, section 6.2 and figure 8: the gestures of its table 1 walk an
             avatar through a place. Always captured by the paper's method.
     """
@@ -344,12 +249,12 @@ def date(
         from drake_pose.papers.date_walk import run_walk_through, save_pictures
 
         if walk:
-            walked = run_walk_through(cameras, seed, count, renderer=renderer)
+            walked = run_walk_through(cameras, seed, count)
             if out is not None:
                 walked.save(out)
             _show(walked.figures, [walked.table()], json)
             return
-        result = run_experiment(cameras, frames, seed, method, count, renderer=renderer)
+        result = run_experiment(cameras, frames, seed, method, count)
         if out is not None:
             save_pictures(result, out)
     _show(result.as_json(), [*result.tables(), result.costs()], json)
@@ -386,8 +291,15 @@ def _experiment(out: Path | None, resume: bool = False) -> Iterator[Count]:
         yield count
 
 
-def _show(figures: Mapping[str, Any], shown: Sequence[RenderableType], json: bool) -> None:
+def _show(
+    figures: Mapping[str, Any],
+    shown: Sequence[RenderableType],
+    json: bool,
+    warnings: Sequence[str] = (),
+) -> None:
     """Prints what came out."""
+    for text in warnings:
+        warn(text)
     if json:
         print_json(figures)
     else:

@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple, get_args
+from typing import Any, NamedTuple
 
 from rich.console import Console, RenderableType
 
@@ -19,54 +19,18 @@ from drake_pose.errors import OutputError
 from drake_pose.files.folder import without_nan
 from drake_pose.files.report_page import page_template
 from drake_pose.filtering.truncated_filter import FilterSettings
-from drake_pose.papers.date import run_experiment as run_date
-from drake_pose.papers.date_walk import run_walk_through
-from drake_pose.papers.date_walk import save_pictures as save_date
-from drake_pose.papers.kameda import (
-    Renderer,
-    beam_experiment_search,
-    continuous_search,
-    experiment_search,
-)
-from drake_pose.papers.kameda import run_experiment as run_kameda
-from drake_pose.papers.kameda_figures import (
-    PAPER,
-    continuous_figures,
-    continuous_table,
-    grid_figures,
-    grid_table,
-)
-from drake_pose.papers.kameda_pictures import save_pictures as save_kameda
-from drake_pose.papers.kameda_real_pictures import real_table, run_real_experiment
-from drake_pose.papers.shimada import PICTURES, result_table
-from drake_pose.papers.shimada import run_experiment as run_shimada
-from drake_pose.papers.shimada_hypotheses import run_hypotheses_experiment
-from drake_pose.papers.shimada_pictures import save_hypotheses
-from drake_pose.papers.shimada_pictures import save_pictures as save_shimada
+from drake_pose.papers import date, date_walk, kameda, kameda_pictures, shimada, shimada_pictures
 from drake_pose.papers.tables import Count, Figures
 from drake_pose.person.date.walking import COMMANDS, REGISTERED
-from drake_pose.search import PoseSearch
+from drake_pose.search import ContinuousSearch, PoseSearch
 from drake_pose.version import VERSION
 
-REPORT, FIGURES, TABLES, BESIDE = "report.html", "figures.json", "tables.txt", "paper.json"
-_SETTINGS = "settings.json"
-_OUTSIDE_WEIGHT = 10.0
-_COLUMNS = 110
-# The paper's filter and ours, by the names of their figures.
-_FILTERS = (("paper", "sequential", 1), ("ours", "joint", FilterSettings().iterations))
-_NONE = "-"
+Outcome = tuple[Figures, Sequence[RenderableType], Sequence[tuple[Any, ...]]]
+"""Figures by method, their tables, and rows that show the paper's figures beside ours.
 
-
-class Outcome(NamedTuple):
-    """What an experiment came to: figures by method, its tables, and the paper's beside ours.
-
-    A row of `beside`: what it is, a form, then the paper, its method and ours: words, or figures
-    that are put into the form.
-    """
-
-    figures: Figures
-    shown: Sequence[RenderableType]
-    beside: Sequence[tuple[Any, ...]] = ()
+A row: what it is, a form, then the paper, its method and ours: words, or figures that are put into
+the form.
+"""
 
 
 class Experiment(NamedTuple):
@@ -79,63 +43,62 @@ class Experiment(NamedTuple):
 
 
 def _kameda(short: bool, folder: Path, count: Count) -> Outcome:
-    searches: dict[str, tuple[PoseSearch, Renderer]] = {
-        "paper": (experiment_search(), "drake"),
-        "outside_weight": (experiment_search(outside_weight=_OUTSIDE_WEIGHT), "drake"),
-        "beam": (beam_experiment_search(), "drake"),
-        "beam_own_drawing": (beam_experiment_search(renderer="own"), "own"),
+    searches: dict[str, PoseSearch] = {
+        "paper": kameda.experiment_search(),
+        "beam": kameda.beam_experiment_search(),
     }
+    images = 3 if short else 219
     results = {
-        name: run_kameda(search, 3 if short else 219, 0, count, renderer=renderer)
-        for name, (search, renderer) in searches.items()
+        name: kameda.run_experiment(search, images, 0, count) for name, search in searches.items()
     }
     for name, result in results.items():
-        save_kameda(result, folder / name)
-    figures = {name: grid_figures(result) for name, result in results.items()}
-    paper, beam = figures["paper"], figures["beam"]
+        kameda_pictures.save_pictures(result, folder / name)
+    figures = {name: kameda.grid_figures(result) for name, result in results.items()}
+    printed, (paper, beam) = kameda.PAPER, figures.values()
     rows = (
-        ("mean E_total of poses found", "{mean_e_total:.2%}", PAPER, paper, beam),
-        ("silhouettes matched exactly", "{exact} of {images}", PAPER, paper, beam),
-        ("every joint angle right", "{pose_equal} of {images}", PAPER, paper, beam),
-        ("improved by re-estimation", "{improved} of {images}", PAPER, paper, _NONE),
-        ("runs of step 3, mean", "{mean_runs:.1f}", PAPER, paper, _NONE),
-        ("processor seconds an image, median", "{median_seconds:.2f}", _NONE, paper, beam),
+        ("mean E_total of poses found", "{mean_e_total:.2%}", printed, paper, beam),
+        ("silhouettes matched exactly", "{exact} of {images}", printed, paper, beam),
+        ("every joint angle right", "{pose_equal} of {images}", printed, paper, beam),
+        ("improved by re-estimation", "{improved} of {images}", printed, paper, "-"),
+        ("runs of step 3, mean", "{mean_runs:.1f}", printed, paper, "-"),
+        ("processor seconds an image, median", "{median_seconds:.2f}", "-", paper, beam),
     )
-    return Outcome(figures, [grid_table([[one] for one in results.values()])], rows)
+    return figures, [kameda.grid_table([[one] for one in results.values()])], rows
 
 
 def _kameda_continuous(short: bool, _folder: Path, count: Count) -> Outcome:
-    results = {
-        f"drawn by {renderer}": run_kameda(
-            continuous_search(), 1 if short else 30, 77, count, renderer=renderer
-        )
-        for renderer in get_args(Renderer)
-    }
-    drake, own = results.values()
-    figures = {**continuous_figures(drake), "own_drawing": continuous_figures(own)}
-    return Outcome(figures, [continuous_table(results)])
+    search = ContinuousSearch(kameda.experiment_tree())
+    result = kameda.run_experiment(search, 1 if short else 30, 77, count)
+    return kameda.continuous_figures(result), [kameda.continuous_table(result)], ()
 
 
 def _kameda_pictures(experiment: str, short: bool, folder: Path, count: Count) -> Outcome:
-    figures = run_real_experiment(experiment, 1 if short else None, folder, count)
+    figures = kameda.run_real_experiment(experiment, 1 if short else None, folder, count)
     paper, beam = figures["paper"], figures["beam"]
     said = "{paper_mean_e_total:.1%} ({paper_images} pictures)".format(**paper)
     rows = (
         ("mean E_total", "{mean_e_total:.1%} ({images})", said, paper, beam),
-        ("processor seconds an image", "{seconds_an_image:.1f}", _NONE, paper, beam),
+        ("processor seconds an image", "{seconds_an_image:.1f}", "-", paper, beam),
     )
     warnings = [f"Warning: {text}" for one in figures.values() for text in one["warnings"]]
-    return Outcome(figures, [real_table(figures), *warnings], rows)
+    return figures, [kameda.real_table(figures), *warnings], rows
+
+
+def _filters() -> tuple[tuple[str, str, int], ...]:
+    """The paper's filter and ours: names of their figures, truncations, linearisations."""
+    return ("paper", "sequential", 1), ("ours", "joint", FilterSettings().iterations)
 
 
 def _shimada(observed: str, runs: int, short: bool, folder: Path, count: Count) -> Outcome:
     figures: dict[str, dict[str, Any]] = {}
     shown = []
-    for name, truncation, iterations in _FILTERS:
-        result = run_shimada(1 if short else runs, 0, truncation, observed, count, iterations)
-        save_shimada(result, folder / name)
+    for name, truncation, iterations in _filters():
+        result = shimada.run_experiment(
+            1 if short else runs, 0, truncation, observed, count, iterations
+        )
+        shimada_pictures.save_pictures(result, folder / name)
         figures[name] = result.as_json()
-        shown.append(result_table(result))
+        shown.append(shimada.result_table(result))
     both = (figures["paper"], figures["ours"])
     first, second = ([one[case] for one in both] for case in ("r13_35", "r13_40"))
     r_13, form = "r_13 after 55 frames where it is", "{r_13_mean:.1f} (RMS error {r_13_rmse:.1f})"
@@ -151,17 +114,17 @@ def _shimada(observed: str, runs: int, short: bool, folder: Path, count: Count) 
         ("truths within two deviations", *inside, *first),
         (angles, "{angle_rmse_at_end:.1f}", "right (figure 14)", *first),
         ("sequences lost", "", "none of two", *lost),
-        ("milliseconds a frame, median, without drawing", "{ms_per_update:.1f}", _NONE, *first),
+        ("milliseconds a frame, median, without drawing", "{ms_per_update:.1f}", "-", *first),
     )
-    return Outcome(figures, shown, rows)
+    return figures, shown, rows
 
 
 def _shimada_hypotheses(short: bool, folder: Path, count: Count) -> Outcome:
     figures, shown = {}, []
-    for name, truncation, iterations in _FILTERS:
+    for name, truncation, iterations in _filters():
         runs = 2 if short else 50
-        result = run_hypotheses_experiment(runs, 0, truncation, "lines", count, iterations)
-        save_hypotheses(result, folder / name)
+        result = shimada.run_hypotheses_experiment(runs, 0, truncation, "lines", count, iterations)
+        shimada_pictures.save_hypotheses(result, folder / name)
         figures[name] = result.as_json()
         shown.append(result.table())
     paper, ours = figures["paper"], figures["ours"]
@@ -169,17 +132,17 @@ def _shimada_hypotheses(short: bool, folder: Path, count: Count) -> Outcome:
     coupled = "{of_these_by_coupled_joints}"
     rows = (
         ("hypotheses rejected later than made", later, "one is shown", paper, ours),
-        ("of these wrong", "{of_these_wrong}", "that one", paper, _NONE),
-        ("frames from its birth to its end", "", "2 (18 to 20)", lived, _NONE),
-        ("as two joints do not bend alike", coupled, "that one", paper, _NONE),
+        ("of these wrong", "{of_these_wrong}", "that one", paper, "-"),
+        ("frames from its birth to its end", "", "2 (18 to 20)", lived, "-"),
+        ("as two joints do not bend alike", coupled, "that one", paper, "-"),
     )
-    return Outcome(figures, shown, rows)
+    return figures, shown, rows
 
 
 def _date(short: bool, folder: Path, count: Count) -> Outcome:
     cameras, frames, size = (4, 40, (320, 240)) if short else (9, 240, (640, 480))
-    result = run_date(cameras, frames, 0, "silhouette", count, size)
-    save_date(result, folder)
+    result = date.run_experiment(cameras, frames, 0, "silhouette", count, size)
+    date_walk.save_pictures(result, folder)
     figures: dict[str, Any] = result.as_json()
     rows: list[tuple[Any, ...]] = []
     for joint in ("elbow", "knee"):
@@ -194,29 +157,29 @@ def _date(short: bool, folder: Path, count: Count) -> Outcome:
         ("a frame", "", "real time, a cluster (15 ms for the face)", *whole),
         ("frames until the registered pose, shown, is right", "", "that frame", *map(str, backs)),
     ]
-    return Outcome(figures, [*result.tables(), result.costs()], rows)
+    return figures, [*result.tables(), result.costs()], rows
 
 
 def _date_walk(short: bool, folder: Path, count: Count) -> Outcome:
     cameras, size = (4, (320, 240)) if short else (9, (640, 480))
-    walk = run_walk_through(cameras, 0, count, size)
+    walk = date_walk.run_walk_through(cameras, 0, count, size)
     walk.save(folder)
     followed = "{captured_s:.1f} s ({wrongly_s:.1f} s wrongly)"
     rows: list[tuple[Any, ...]] = []
     for name in COMMANDS:
         one = walk.figures["commands"][name]
         true = f"{name} (true: {one['true_s']:.1f} s)"
-        rows.append((true, followed, "works (figure 8)", one, _NONE))
+        rows.append((true, followed, "works (figure 8)", one, "-"))
     end = "{place_error_m:.2f} m, {heading_error_deg:.0f} degrees"
-    rows.append(("off at the walk's end", end, _NONE, walk.figures, _NONE))
-    return Outcome(walk.figures, [walk.table()], rows)
+    rows.append(("off at the walk's end", end, "-", walk.figures, "-"))
+    return walk.figures, [walk.table()], rows
 
 
 EXPERIMENTS = (
     Experiment(
         "kameda",
         "Kameda, Minoh, Ikeda: pose from one silhouette, experiment A",
-        "drake-pose reproduce kameda --method beam --outside-weight 10",
+        "drake-pose reproduce kameda --method beam",
         _kameda,
     ),
     Experiment(
@@ -247,7 +210,7 @@ EXPERIMENTS = (
         "shimada_pictures",
         "The same from silhouettes by Drake's renderer: its figures 17 and 18",
         "drake-pose reproduce shimada --pictures --iterations 1 --truncation sequential",
-        partial(_shimada, PICTURES, 10),
+        partial(_shimada, shimada.PICTURES, 10),
     ),
     Experiment(
         "shimada_hypotheses",
@@ -283,13 +246,13 @@ def reproduce_all(out: Path, short: bool, count: Count, say: Callable[[str], Non
     Raises:
         OutputError: the folder cannot be written, or holds a run with other settings.
     """
+    settings, made = out / "settings.json", json.dumps({"short": short, "version": VERSION})
     try:
         out.mkdir(parents=True, exist_ok=True)
-        settings, made = out / _SETTINGS, json.dumps({"short": short, "version": VERSION}, indent=2)
         if settings.is_file() and settings.read_text() != made:
             raise OutputError(
-                f"{out}: holds experiments made with other settings ({_SETTINGS}); name another "
-                "folder with --out"
+                f"{out}: holds experiments made with other settings ({settings.name}); name "
+                "another folder with --out"
             )
         _write(settings, made)
         for number, experiment in enumerate(EXPERIMENTS, start=1):
@@ -303,30 +266,32 @@ def reproduce_all(out: Path, short: bool, count: Count, say: Callable[[str], Non
                 outcome = experiment.run(short, part, count)
                 _write_outcome(part, outcome, time.process_time() - begin)
                 os.replace(part, folder)
-            _write(out / REPORT, _page(out, short))
+            _write(out / "report.html", _page(out, short))
     except OSError as error:
         raise OutputError(f"{out}: cannot write the experiments: {error.strerror}") from error
-    return out / REPORT
+    return out / "report.html"
 
 
 def _write_outcome(folder: Path, outcome: Outcome, cpu_seconds: float) -> None:
+    """Writes figures.json, tables.txt, and paper.json about the paper's figures beside ours."""
+    figures, shown, rows = outcome
     beside = [
         {"what": what}
         | {
             name: one if isinstance(one, str) else form.format(**one)
             for name, one in zip(("paper", "its_method", "ours"), columns, strict=True)
         }
-        for what, form, *columns in outcome.beside
+        for what, form, *columns in rows
     ]
     for name, content in (
-        (BESIDE, {"figures": beside, "cpu_seconds": round(cpu_seconds, 1)}),
-        (FIGURES, without_nan(outcome.figures)),
+        ("paper.json", {"figures": beside, "cpu_seconds": round(cpu_seconds, 1)}),
+        ("figures.json", without_nan(figures)),
     ):
         (folder / name).write_text(json.dumps(content, indent=2, allow_nan=False))
-    console = Console(file=io.StringIO(), record=True, width=_COLUMNS)
-    for one in outcome.shown:
+    console = Console(file=io.StringIO(), record=True, width=110)
+    for one in shown:
         console.print(one, markup=False)
-    (folder / TABLES).write_text(console.export_text())
+    (folder / "tables.txt").write_text(console.export_text())
 
 
 def _write(path: Path, text: str) -> None:
@@ -346,8 +311,8 @@ def _page(out: Path, short: bool) -> str:
                 str(path.relative_to(folder)): base64.b64encode(path.read_bytes()).decode()
                 for path in sorted(folder.rglob("*.png"))
             }
-            beside = json.loads((folder / BESIDE).read_text())
-            tables = (folder / TABLES).read_text()
+            beside = json.loads((folder / "paper.json").read_text())
+            tables = (folder / "tables.txt").read_text()
             finished.append({**one._asdict(), **beside, "tables": tables, "pictures": pictures})
     return page_template("drake_pose.papers").render(
         short=short,

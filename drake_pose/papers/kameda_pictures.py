@@ -12,47 +12,47 @@ from numpy.typing import NDArray
 
 from drake_pose.body.parsed_model import ParsedModel
 from drake_pose.files.overlay import paint_agreement
-from drake_pose.papers.kameda import Causes, ExperimentResult, Trial, experiment_camera
+from drake_pose.papers.kameda import Causes, RandomPose, RandomPoses, experiment_camera
 from drake_pose.papers.tables import draw_panels, save_figure
-from drake_pose.search import PaperSearch, PoseFamily, PoseSet, Scoring, View, samples_at
+from drake_pose.search import PaperSearch, PoseSet, Scoring, View, samples_at
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 
-_EXAMPLES, _SETS, _MOST_NAMES = 4, 3, 5
-_MARGIN = 20
-_BACKGROUND = (1.0, 1.0, 1.0)
-_PANELS = (
-    "true pose", "estimate", "silhouettes", "true pose from the side", "estimate from the side",
-)  # fmt: skip
 _COLOURS = "grey: agreement, blue: missing, orange: excess"
-_KINDS: dict[str, tuple[str, Callable[[Trial], bool]]] = {
-    "figure_07_exact_and_pose_right": (
-        "silhouette matched exactly, every angle right (figure 7)",
-        lambda trial: trial.pose_equal,
-    ),
-    "figure_08_hidden": (
-        "silhouette matched exactly by another pose: a wrong segment is hidden (figure 8)",
-        lambda trial: trial.causes is not None and trial.causes.hidden,
-    ),
-    "figure_09_inner_edges": (
-        "silhouette matched exactly by another pose: edges inside it differ (figure 9)",
-        lambda trial: trial.causes == Causes(hidden=False, inner_edges=True),
-    ),
-    "figure_10_improved_by_re_estimation": (
-        "improved by re-estimation (figure 10)",
-        lambda trial: trial.improved,
-    ),
-    "figure_12_not_matched": (
-        "not matched exactly (figure 12)",
-        lambda trial: trial.result.found and not trial.exact,
-    ),
-}
 
 
-def save_pictures(result: ExperimentResult, folder: Path) -> list[Path]:
-    """Draw examples of outcomes, the effort's histogram, poses as good; returns the PNG files."""
+def save_pictures(
+    result: RandomPoses, folder: Path, examples: int = 4, most_sets: int = 3
+) -> list[Path]:
+    """Draw examples of outcomes, the effort's histogram, poses as good; returns the PNG files.
+
+    At most `examples` poses of each outcome, and `most_sets` sets of poses are drawn.
+    """
+    matched = "silhouette matched exactly"
+    kinds: dict[str, tuple[str, Callable[[RandomPose], bool]]] = {
+        "figure_07_exact_and_pose_right": (
+            f"{matched}, every angle right (figure 7)",
+            lambda trial: trial.pose_equal,
+        ),
+        "figure_08_hidden": (
+            f"{matched} by another pose: a wrong segment is hidden (figure 8)",
+            lambda trial: trial.causes is not None and trial.causes.hidden,
+        ),
+        "figure_09_inner_edges": (
+            f"{matched} by another pose: edges inside it differ (figure 9)",
+            lambda trial: trial.causes == Causes(hidden=False, inner_edges=True),
+        ),
+        "figure_10_improved_by_re_estimation": (
+            "improved by re-estimation (figure 10)",
+            lambda trial: trial.improved,
+        ),
+        "figure_12_not_matched": (
+            "not matched exactly (figure 12)",
+            lambda trial: trial.result.found and not trial.exact,
+        ),
+    }
     figures = {}
-    for name, (title, belongs) in _KINDS.items():
-        trials = [trial for trial in result.trials if belongs(trial)][:_EXAMPLES]
+    for name, (title, belongs) in kinds.items():
+        trials = [trial for trial in result.trials if belongs(trial)][:examples]
         if trials:
             figures[name] = _draw_examples(title, trials, result)
     if isinstance(result.search, PaperSearch):
@@ -70,13 +70,13 @@ def save_pictures(result: ExperimentResult, folder: Path) -> list[Path]:
         for trial in result.trials
         if (answer := trial.result.pose_set) is not None and answer.family_count > 1
     ]
-    for k, (trial, answer) in enumerate(several[:_SETS], start=1):
+    for k, (trial, answer) in enumerate(several[:most_sets], start=1):
         path, model = folder / f"families_{k}.png", result.search.tree.model
         files.append(save_families(path, model, answer, [result.view(trial)]))
     return files
 
 
-def _draw_examples(title: str, trials: list[Trial], result: ExperimentResult) -> Figure:
+def _draw_examples(title: str, trials: list[RandomPose], result: RandomPoses) -> Figure:
     """True poses and estimates as the camera sees them, their silhouettes, and the side."""
     tree = result.search.tree
     front, side = (
@@ -96,19 +96,21 @@ def _draw_examples(title: str, trials: list[Trial], result: ExperimentResult) ->
         columns.append(drawn)
     results = [trial.result for trial in trials]
     titles = [f"E_total {one.E_total:.2%}, {one.statistics.runs} runs" for one in results]
-    return draw_panels(columns, titles, _PANELS, title=f"{title}\n{_COLOURS}")
+    labels = ["true pose", "estimate", "silhouettes"]
+    labels += [f"{label} from the side" for label in labels[:2]]
+    return draw_panels(columns, titles, labels, title=f"{title}\n{_COLOURS}")
 
 
 def _coloured(segments: NDArray[Any], order: Sequence[int]) -> NDArray[np.float64]:
-    """Segments (H, W), -1 for none, in colours (H, W, 3) by their places in an order."""
+    """Segments (H, W), -1 for none, in colours (H, W, 3) by their places in an order; on white."""
     colours = matplotlib.colormaps["tab20"](np.array(order) % 20)[:, :3]
-    return np.where(segments[..., None] >= 0, colours[segments], _BACKGROUND)
+    return np.where(segments[..., None] >= 0, colours[segments], 1.0)
 
 
-def _crop(pictures: list[np.ndarray]) -> list[np.ndarray]:
+def _crop(pictures: list[np.ndarray], margin: int = 20) -> list[np.ndarray]:
     """Cut pictures of segments (H, W) to the square about what any of them shows."""
     rows, columns = np.nonzero(np.logical_or.reduce([picture >= 0 for picture in pictures]))
-    side = _MARGIN + max(np.ptp(rows), np.ptp(columns))
+    side = margin + max(np.ptp(rows), np.ptp(columns))
     square = []
     for picture in pictures:
         framed = np.pad(picture, side, constant_values=-1)
@@ -128,7 +130,7 @@ def _draw_histogram(values: np.ndarray, end: int, label: str) -> Figure:
     return figure
 
 
-def _draw_chest_ranks(result: ExperimentResult, limit: int) -> Figure:
+def _draw_chest_ranks(result: RandomPoses, limit: int) -> Figure:
     """In how many images the true chest is among the first K of its list, against K."""
     ranks, lengths = chest_ranks(result)
     Ks = range(1, max(2, int(lengths.max())) + 1)
@@ -149,19 +151,32 @@ def _draw_chest_ranks(result: ExperimentResult, limit: int) -> Figure:
     return figure
 
 
-def chest_ranks(result: ExperimentResult) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def chest_ranks(result: RandomPoses) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """By image the true chest's rank in its list of candidates, from 1, and the lists' lengths.
 
     The head is true; there is no K (6.1, figure 12). 0: the chest leaves the silhouette by over r.
     """
     search = result.search
     assert isinstance(search, PaperSearch)
-    chest = [node.name for node in search.tree.nodes].index("chest")
+    nodes, limit = search.tree.nodes, search.settings.outside_limit or 0.0
+    chest = [node.name for node in nodes].index("chest")
+    ancestors: list[int] = []
+    parent = nodes[chest].parent
+    while parent >= 0:
+        ancestors.insert(0, parent)
+        parent = nodes[parent].parent
     ranks, lengths = [], []
     for trial in result.trials:
         true = samples_at(search.sampled, trial.true_values)
         assert true is not None, "drawn from the grid"
-        order = _chest_list(search, result.view(trial), trial, true, chest)
+        # Steps 3 to 5 for the chest.
+        X_WN = search.tree.node_poses(trial.true_values)
+        scoring = Scoring(search.sampled, [result.view(trial)])
+        uncovered = scoring.uncovered(ancestors, true, X_WN)
+        poses = scoring.candidate_poses(chest, X_WN[ancestors[-1]])
+        outside, covered = scoring.candidate_areas(chest, np.arange(len(poses)), poses, uncovered)
+        inside = np.flatnonzero((outside <= limit).all(axis=0))
+        order = inside[np.argsort(-covered[inside], kind="stable")]
         place = np.flatnonzero(order == true[chest])
         ranks.append(int(place[0]) + 1 if len(place) else 0)
         lengths.append(len(order))
@@ -173,33 +188,24 @@ def ratio_within(ranks: NDArray[np.int64], limit: int) -> float:
     return float(((ranks > 0) & (ranks <= limit)).mean())
 
 
-def _chest_list(
-    search: PaperSearch, view: View, trial: Trial, true: NDArray[np.int64], chest: int
-) -> NDArray[np.int64]:
-    """Steps 3 to 5 for the chest with all ancestors where they truly are: samples, best first."""
-    settings = search.settings
-    X_WN = search.tree.node_poses(trial.true_values)
-    scoring = Scoring(search.sampled, [view])
-    done: list[int] = []
-    parent = search.tree.nodes[chest].parent
-    while parent >= 0:
-        done.insert(0, parent)
-        parent = search.tree.nodes[parent].parent
-    uncovered = scoring.uncovered(done, true, X_WN)
-    poses = scoring.candidate_poses(chest, X_WN[done[-1]])
-    outside, covered = scoring.candidate_areas(chest, np.arange(len(poses)), poses, uncovered)
-    inside = np.flatnonzero((outside <= (settings.outside_limit or 0.0)).all(axis=0))
-    worth = covered[inside] - settings.outside_weight * outside[:, inside].sum(axis=0)
-    return inside[np.argsort(-worth, kind="stable")]
-
-
 def save_families(
-    path: Path, model: ParsedModel, answer: PoseSet, views: Sequence[View], most: int = 6
+    path: Path,
+    model: ParsedModel,
+    answer: PoseSet,
+    views: Sequence[View],
+    most: int = 6,
+    margin: int = 20,
+    most_names: int = 5,
 ) -> Path:
     """Draw the best families as columns of a PNG file: what the silhouettes leave open.
 
     Rows for every camera: the representative's segments, and where body and silhouette agree;
     below, the joints that are free in the family.
+
+    Args:
+        most: of families.
+        margin: about the body [pixel].
+        most_names: of joints that are named below a family.
     """
     families = answer.families[:most]
     renderers = [LabelRenderer(model, view.camera) for view in views]
@@ -210,7 +216,7 @@ def save_families(
             segments = renderer.segments(family.q, family.X_WB)
             places = np.nonzero(view.mask | (segments >= 0))
             window = tuple(
-                slice(max(0, one.min() - _MARGIN), one.max() + 1 + _MARGIN) for one in places
+                slice(max(0, one.min() - margin), one.max() + 1 + margin) for one in places
             )
             mask, segments = view.mask[window], segments[window]
             column.append(_coloured(segments, range(segments.max() + 2)))
@@ -223,13 +229,10 @@ def save_families(
         f"{len(families)} of {answer.family_count} families within {answer.tolerance:.0f} pixels "
         f"of the best ({found})\n{_COLOURS}"
     )
-    below = [_free_names(family) for family in families]
+    below = []
+    for family in families:
+        names = [joint.name for joint in family.joints if not joint.determined]
+        more = len(names) - most_names
+        lines = ["free:", *names[:most_names], *([f"and {more} more"] if more > 0 else [])]
+        below.append("\n".join(lines) if names else "every joint determined")
     return save_figure(draw_panels(columns, titles, below=below, title=title), path)
-
-
-def _free_names(family: PoseFamily) -> str:
-    names = [joint.name for joint in family.joints if not joint.determined]
-    if not names:
-        return "every joint determined"
-    more = len(names) - _MOST_NAMES
-    return "\n".join(["free:", *names[:_MOST_NAMES], *([f"and {more} more"] if more > 0 else [])])

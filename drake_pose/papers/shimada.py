@@ -5,11 +5,13 @@ Section 6 measures numbers with noise; its figures 17 and 18 are of pictures, he
 
 import math
 import time
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple, cast
 
 import numpy as np
+from numpy.typing import NDArray
 from rich.table import Table
 from scipy.special import chdtri
 
@@ -28,21 +30,24 @@ from drake_pose.filtering.hand import (
 )
 from drake_pose.filtering.hand_model import TWO_FINGERS
 from drake_pose.filtering.hand_silhouette import HandSilhouette
-from drake_pose.filtering.inequalities import model_inequalities
+from drake_pose.filtering.inequalities import Inequalities, model_inequalities
 from drake_pose.filtering.truncated_filter import (
     FilterSettings,
+    FilterState,
     TruncatedFilter,
     Truncation,
 )
 from drake_pose.filtering.update import make_measurement, update
-from drake_pose.papers.shimada_motion import (
+from drake_pose.papers.shimada_sequences import (
     ACCELERATIONS,
     FRAMES,
     OBSERVED,
     SyntheticSequence,
+    Track,
+    follow_pictures,
     make_sequence,
+    track_of,
 )
-from drake_pose.papers.shimada_sequences import Track, follow_pictures, track_of
 from drake_pose.papers.tables import Count, figure_table, require_choice, require_counts, uncounted
 from drake_pose.systems.bodies import held_positions
 from drake_pose.systems.truncated_ekf import build_hand_estimation
@@ -67,26 +72,9 @@ _PERIOD = 1.0 / 30.0
 # Pictures that are kept, frames from 0; and the palm's sizes along its axes.
 _KEPT = (7, 23, 39)
 _PALM_AXES = ("palm_height", "palm_thickness", "palm_width")
-_ROWS = {
-    "length_error_mean": ("length error, mean [pixel]", "{:.2f}"),
-    "length_error_p95": ("  95th percentile", "{:.2f}"),
-    "bound_length_error_mean": ("  linearised at the truth (a bound)", "{:.2f}"),
-    "angle_rmse": ("joint angles over all frames, RMS error [deg]", "{:.2f}"),
-    "angle_rmse_at_end": ("  at the end", "{:.2f}"),
-    "length_error_largest": ("largest error of a length, share of it", "{:.1%}"),
-    "inside_2sigma": ("truths within 2 sigma", "{:.1%}"),
-    "inside_2sigma_all": ("  in all frames", "{:.1%}"),
-    "nees_inside": ("runs with the lengths' NEES in its 95 % band", "{:.1%}"),
-    "ms_per_update": ("milliseconds an update, median", "{:.2f}"),
-    "ms_per_update_p95": ("  95th percentile", "{:.2f}"),
-    "silhouette_difference": ("silhouette and matched pose differ by, median", "{:.1%}"),
-    "mirrored": ("hypotheses made by mirroring", "{}"),
-    "rejected_by_an_inequality": ("  rejected by an inequality", "{}"),
-    "lost": ("lost", "{}"),
-}
 
 
-class Trial(NamedTuple):
+class FilteredHand(NamedTuple):
     """One sequence, filtered.
 
     Attributes:
@@ -99,10 +87,10 @@ class Trial(NamedTuple):
 
 
 @dataclass(frozen=True)
-class ExperimentResult:
+class HandsResult:
     """All runs, by the keys of ``CASES``."""
 
-    trials: Mapping[str, tuple[Trial, ...]]
+    trials: Mapping[str, tuple[FilteredHand, ...]]
     seed: int
     settings: FilterSettings
     observed: str
@@ -123,15 +111,32 @@ class ExperimentResult:
         }
 
 
-def result_table(*results: ExperimentResult) -> Table:
+def result_table(*results: HandsResult) -> Table:
     """The figures of both cases side by side, of one result or of several truncations."""
+    rows = {
+        "length_error_mean": ("length error, mean [pixel]", "{:.2f}"),
+        "length_error_p95": ("  95th percentile", "{:.2f}"),
+        "bound_length_error_mean": ("  linearised at the truth (a bound)", "{:.2f}"),
+        "angle_rmse": ("joint angles over all frames, RMS error [deg]", "{:.2f}"),
+        "angle_rmse_at_end": ("  at the end", "{:.2f}"),
+        "length_error_largest": ("largest error of a length, share of it", "{:.1%}"),
+        "inside_2sigma": ("truths within 2 sigma", "{:.1%}"),
+        "inside_2sigma_all": ("  in all frames", "{:.1%}"),
+        "nees_inside": ("runs with the lengths' NEES in its 95 % band", "{:.1%}"),
+        "ms_per_update": ("milliseconds an update, median", "{:.2f}"),
+        "ms_per_update_p95": ("  95th percentile", "{:.2f}"),
+        "silhouette_difference": ("silhouette and matched pose differ by, median", "{:.1%}"),
+        "mirrored": ("hypotheses made by mirroring", "{}"),
+        "rejected_by_an_inequality": ("  rejected by an inequality", "{}"),
+        "lost": ("lost", "{}"),
+    }
     first = results[0]
     one = len(results) == 1
     which = f"{first.settings.truncation} truncation" if one else "all truncations"
     more = f", linearisations: {first.settings.iterations} at most" if one else ""
     return figure_table(
         f"Shimada, synthetic hand: {which}, {first.observed} observation{more}",
-        _ROWS,
+        rows,
         {
             key if one else f"{result.settings.truncation}\n{key}": _figures(case)
             for result in results
@@ -150,7 +155,7 @@ def run_experiment(
     iterations: int | None = None,
     noise: float = 1.0,
     acceleration: float = 1.0,
-) -> ExperimentResult:
+) -> HandsResult:
     """Run the experiment of section 6 for r_13 = 35 and r_13 = 40: with numbers, or with pictures.
 
     Motion and noise, which the paper does not give, are drawn: 0.5 pixel for points, 1 pixel and
@@ -188,7 +193,7 @@ def run_experiment(
             case.append(follow(hand_filter, sequence))
             advance(place * runs + run + 1)
         trials[key] = tuple(case)
-    return ExperimentResult(trials, seed, settings, observed, noise, acceleration)
+    return HandsResult(trials, seed, settings, observed, noise, acceleration)
 
 
 def experiment_settings(truncation: str, iterations: int | None = None) -> FilterSettings:
@@ -233,7 +238,7 @@ def _generator(seed: int, run: int, r_13: float) -> np.random.Generator:
     return np.random.default_rng([seed, run, int(r_13)])
 
 
-def _filter_sequence(hand_filter: TruncatedFilter, sequence: SyntheticSequence) -> Trial:
+def _filter_sequence(hand_filter: TruncatedFilter, sequence: SyntheticSequence) -> FilteredHand:
     """Filter a sequence; a filter that breaks down keeps its last belief."""
     states, times, broken = [], [], False
     state = hand_filter.start(sequence.guess)
@@ -249,10 +254,10 @@ def _filter_sequence(hand_filter: TruncatedFilter, sequence: SyntheticSequence) 
                 broken = True
         states.append(state)
         times.append(milliseconds)
-    return Trial(sequence, track_of(states, times), _bound(hand_filter, sequence))
+    return FilteredHand(sequence, track_of(states, times), _bound(hand_filter, sequence))
 
 
-def _filter_pictures(hand_filter: TruncatedFilter, sequence: SyntheticSequence) -> Trial:
+def _filter_pictures(hand_filter: TruncatedFilter, sequence: SyntheticSequence) -> FilteredHand:
     """Filter the silhouettes of a hand as the sequence's moves: plant, renderer, sensor, filter."""
     center = (0.5 * (_WIDTH - 1), 0.5 * (_HEIGHT - 1))
     focal, X_WC = PIXELS_PER_METRE * _DISTANCE, np.eye(4)
@@ -271,7 +276,7 @@ def _filter_pictures(hand_filter: TruncatedFilter, sequence: SyntheticSequence) 
     silhouette = HandSilhouette(hand_filter, _WIDTH, _HEIGHT, center)
     parts = build_hand_estimation(model, camera, silhouette, sequence.guess, positions, _PERIOD)
     track = follow_pictures(parts, _PERIOD, FRAMES, _KEPT)
-    return Trial(sequence, track, np.full(len(HAND_STATE), math.nan))
+    return FilteredHand(sequence, track, np.full(len(HAND_STATE), math.nan))
 
 
 def _bound(hand_filter: TruncatedFilter, sequence: SyntheticSequence) -> Array:
@@ -284,7 +289,7 @@ def _bound(hand_filter: TruncatedFilter, sequence: SyntheticSequence) -> Array:
     return belief.mean
 
 
-def _figures(trials: Sequence[Trial]) -> dict[str, float | int]:
+def _figures(trials: Sequence[FilteredHand]) -> dict[str, float | int]:
     """Figures of a case; a run's NEES of the six lengths is 6 on average if it is honest."""
     truths = np.array([trial.sequence.states for trial in trials])
     tracks = [trial.track for trial in trials]
@@ -331,3 +336,205 @@ def _figures(trials: Sequence[Trial]) -> dict[str, float | int]:
         "r_13_rmse": float(np.sqrt(np.mean((r_13[0] - r_13[1]) ** 2))),
         **own,
     }
+
+
+OBLIQUENESS = math.radians(60)
+"""How far the fingers point out of the image plane, so that segments bend back through it."""
+
+# Rows of table 1 about two joints of one finger.
+_COUPLED = ("flexion_12 - flexion_13", "flexion_22 - flexion_23")
+# The paper has no weights: only inequalities end a hypothesis, another that is the same, or 8.
+_CAP = 8
+# What is drawn was believed beside another for so many frames.
+_LONG = 2
+
+
+@dataclass(frozen=True, eq=False)
+class Fate:
+    """A hypothesis of one run from its birth to its end.
+
+    Attributes:
+        frames: (k,) the frames it lived in, from 1; the last is that of its end.
+        means: (k, n) what it believed, in the end without the limits.
+        weights: (k,) between 0 and 1; NaN in the end.
+        reason, row, c: as for ``Rejection``; the reason is "" where it outlived the sequence.
+        error, kept_error: of the joint angles [deg], RMS: its own when it was last believed, and
+            that of the heaviest hypothesis in the frame of its end.
+    """
+
+    run: int
+    frames: NDArray[np.int64]
+    means: Array
+    weights: Array
+    reason: str
+    row: str
+    c: float
+    error: float
+    kept_error: float
+
+    def at(self, frame: int) -> Array:
+        """(n,) what it believed in a frame that it lived in."""
+        return np.asarray(self.means[frame - self.frames[0]])
+
+    @property
+    def lived(self) -> int:
+        """In how many frames it was believed."""
+        return len(self.frames) - (1 if self.reason else 0)
+
+    @property
+    def wrong(self) -> bool:
+        """Whether it was further from the truth than what was kept."""
+        return self.error > self.kept_error
+
+
+@dataclass(frozen=True, eq=False)
+class HypothesesResult:
+    """All hypotheses' fates, and final errors (runs,) of the heaviest one's joint angles [deg]."""
+
+    fates: tuple[Fate, ...]
+    sequences: tuple[SyntheticSequence, ...]
+    final_errors: Array
+    inequalities: Inequalities
+    settings: Mapping[str, object]
+
+    def shown(self) -> tuple[Fate, Fate] | None:
+        """A wrong one that an inequality rejected, as in figure 9, and its survivor; None: none.
+
+        It had the largest weight of those that lived several frames, by the paper's inequality if
+        possible; its survivor is the nearest to the truth.
+        """
+        rejected = [
+            one
+            for one in self.fates
+            if one.reason == "constraint" and one.wrong and one.lived >= _LONG
+        ]
+        rejected.sort(key=lambda one: (one.row.startswith(_COUPLED), one.weights[-2]), reverse=True)
+        for dead in rejected:
+            end = int(dead.frames[-1])
+            beside = [
+                one
+                for one in self.fates
+                if one.run == dead.run and one.frames[0] < end < one.frames[-1]
+            ]
+            truth = self.sequences[dead.run].states[end - 1]
+            if beside:
+                return dead, min(beside, key=lambda one: float(angle_error(one.at(end), truth)))
+        return None
+
+    def as_json(self) -> dict[str, object]:
+        """Counts over all sequences, and how it was made."""
+        rejected = [one for one in self.fates if one.reason == "constraint"]
+        later = [one for one in rejected if one.lived]
+        counts = Counter(one.reason for one in self.fates)
+        return {
+            "mirrored": len(self.fates) - len(self.sequences),
+            "became_another": counts["twin"],
+            "too_light": counts["weight"],
+            "too_many": counts["cap"],
+            "alive_at_the_end": counts[""],
+            "rejected_by_an_inequality": len(rejected),
+            "rejected_later_than_made": len(later),
+            "of_these_wrong": sum(one.wrong for one in later),
+            "of_these_by_coupled_joints": sum(one.row.startswith(_COUPLED) for one in later),
+            "frames_lived_median": float(np.median([f.lived for f in later])) if later else None,
+            "inequalities": dict(Counter(one.row for one in later).most_common()),
+            "angle_error_at_end": float(np.median(self.final_errors)),
+            "lost": int(np.count_nonzero(self.final_errors > LOST_ANGLE_ERROR)),
+            **self.settings,
+        }
+
+    def table(self) -> Table:
+        """The counts, and which inequalities rejected."""
+        rows = {
+            "mirrored": ("made by mirroring", "{}"),
+            "became_another": ("the same as another, sooner or later", "{}"),
+            "too_many": ("given up as more than eight", "{}"),
+            "too_light": ("given up for their weight", "{}"),
+            "alive_at_the_end": ("alive at the end", "{}"),
+            "rejected_by_an_inequality": ("rejected by an inequality", "{}"),
+            "rejected_later_than_made": ("  of these believed for a frame or more", "{}"),
+            "of_these_wrong": ("    of these further from the truth than what was kept", "{}"),
+            "of_these_by_coupled_joints": (
+                "    of these as two joints of a finger did not bend alike",
+                "{}",
+            ),
+            "frames_lived_median": ("    frames believed, median", "{:.1f}"),
+            "angle_error_at_end": ("joint angles at the end, RMS error, median [deg]", "{:.1f}"),
+            "lost": ("sequences that end more than 20 degrees off", "{}"),
+        }
+        figures = self.as_json()
+        title = (
+            f"Shimada, figure 9: {figures['truncation']} truncation, {figures['observed']} "
+            f"observation, {figures['iterations']} linearisations at most"
+        )
+        heading = f"hypotheses in {figures['runs']} sequences"
+        return figure_table(title, rows, {"ours": figures}, heading)
+
+
+def run_hypotheses_experiment(
+    runs: int = 50,
+    seed: int = 0,
+    truncation: str = "sequential",
+    observed: str = "lines",
+    count: Count = uncounted,
+    iterations: int = 1,
+) -> HypothesesResult:
+    """Follow every hypothesis while fingers bend through the image plane, as in figure 9.
+
+    There frame 18's third segment is ambiguous in depth, the wrong hypothesis rejected in frame 20.
+    The motion is that of ``run_experiment`` with fingers out of the image plane; weights, which the
+    paper does not have, reject nothing. Arguments and errors as of ``run_experiment``.
+    """
+    require_counts(runs=runs)
+    require_choice("observed", observed, OBSERVED)
+    settings = replace(
+        experiment_settings(truncation, iterations), hypothesis_cap=_CAP, smallest_weight=0.0
+    )
+    hand_filter, observation = experiment_filter(settings)
+    advance = count("sequences", runs)
+    fates: list[Fate] = []
+    sequences, final_errors = [], []
+    for run in range(runs):
+        generator = np.random.default_rng([seed, run])
+        sequence = make_sequence(35.0, observed, observation, generator, OBLIQUENESS)
+        state, states = hand_filter.start(sequence.guess), []
+        for t, y in enumerate(sequence.measurements):
+            state = hand_filter.update(hand_filter.predict(state) if t else state, y)
+            states.append(state)
+        fates += _fates(run, sequence.states, states)
+        sequences.append(sequence)
+        final_errors.append(angle_error(state.best.mean, sequence.states[-1]))
+        advance(run + 1)
+    made = {"runs": runs, "seed": seed, "observed": observed}
+    made |= {"truncation": settings.truncation, "iterations": settings.iterations}
+    return HypothesesResult(
+        tuple(fates), tuple(sequences), np.array(final_errors), hand_filter.inequalities, made
+    )
+
+
+def _fates(run: int, truths: Array, states: Sequence[FilterState]) -> list[Fate]:
+    """All hypotheses of one sequence, those that outlived it last."""
+    fates: list[Fate] = []
+    believed: dict[tuple[int, int], list[tuple[int, Array, float]]] = {}
+
+    def close(path: Sequence[tuple[int, Array, float]], kept: Array,
+              reason: str = "", row: str = "", c: float = math.nan) -> None:  # fmt: skip
+        frames, means, weights = (np.array(one) for one in zip(*path, strict=True))
+        own = truths[frames - 1]
+        last = -2 if reason and len(frames) > 1 else -1
+        error, kept_error = angle_error(means[last], own[last]), angle_error(kept, own[-1])
+        fates.append(
+            Fate(run, frames, means, weights, reason, row, c, float(error), float(kept_error))
+        )
+
+    for state in states:
+        for end in state.rejections:
+            path = believed.pop((end.hypothesis.born, end.hypothesis.place), [])
+            path.append((state.step, end.hypothesis.belief.mean, math.nan))
+            close(path, state.best.mean, end.reason, end.row, end.c)
+        for one in state.hypotheses:
+            path = believed.setdefault((one.born, one.place), [])
+            path.append((state.step, one.belief.mean, one.weight))
+    for path in believed.values():
+        close(path, states[-1].best.mean)
+    return fates

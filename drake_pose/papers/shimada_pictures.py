@@ -15,10 +15,15 @@ from drake_pose.filtering.hand import (
     HandObservation,
 )
 from drake_pose.filtering.hand_model import QUATERNION, TWO_FINGERS, HandModel
-from drake_pose.papers.shimada import CASES, PICTURES, PIXELS_PER_METRE, ExperimentResult, Trial
-from drake_pose.papers.shimada_hypotheses import HypothesesResult
-from drake_pose.papers.shimada_motion import FRAMES
-from drake_pose.papers.shimada_sequences import SequenceResult, Track
+from drake_pose.papers.shimada import (
+    CASES,
+    PICTURES,
+    PIXELS_PER_METRE,
+    FilteredHand,
+    HandsResult,
+    HypothesesResult,
+)
+from drake_pose.papers.shimada_sequences import FRAMES, SequenceResult, Track
 from drake_pose.papers.tables import save_figure
 
 _OBSERVATION = HandObservation(pixels_per_metre=PIXELS_PER_METRE)
@@ -29,7 +34,7 @@ _AFTERWARDS = 6
 _DEGREES = 180 / np.pi
 
 
-def save_pictures(result: ExperimentResult, folder: Path) -> list[Path]:
+def save_pictures(result: HandsResult, folder: Path) -> list[Path]:
     """Draw the first run of each case; returns the PNG files written."""
     first = {key: trials[0] for key, trials in result.trials.items()}
     trial = first["r13_35"]
@@ -120,7 +125,7 @@ def _draw_hand(
     axes.set_aspect("equal")
 
 
-def _draw_sequence(trial: Trial) -> Figure:
+def _draw_sequence(trial: FilteredHand) -> Figure:
     figure = Figure(figsize=(15, 5.2))
     grid = figure.subplots(2, len(_SHOWN_FRAMES), sharex=True, sharey=True)
     rows = (("true", trial.sequence.states, _TRUE), ("estimate", trial.track.means, _ESTIMATE))
@@ -191,7 +196,7 @@ def save_sequence(result: SequenceResult, folder: Path) -> list[Path]:
     ]
 
 
-def _draw_shapes(first: dict[str, Trial]) -> Figure:
+def _draw_shapes(first: dict[str, FilteredHand]) -> Figure:
     """The hand laid flat: the first guess, the estimates and the truths."""
     figure = Figure(figsize=(12, 4))
     grid = figure.subplots(1, 3, sharex=True, sharey=True)
@@ -217,7 +222,7 @@ def _flat(state: Array, hand: HandModel = TWO_FINGERS) -> Array:
     return flat
 
 
-def _draw_scale(trial: Trial) -> Figure:
+def _draw_scale(trial: FilteredHand) -> Figure:
     """The scale is the quaternion's squared norm; its deviation by linear propagation."""
     indices = HAND_STATE.indices(QUATERNION)
     true, estimate = (

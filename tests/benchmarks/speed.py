@@ -19,8 +19,12 @@ from drake_pose.body.model import load_model
 from drake_pose.body.surfaces.meshes import TriangleMesh
 from drake_pose.camera.models import ParallelCamera, PinholeCamera
 from drake_pose.papers.date_capture import SilhouetteTrack, Studio, one_core
-from drake_pose.papers.kameda import experiment_camera, experiment_search, run_experiment
-from drake_pose.papers.kameda_figures import grid_table
+from drake_pose.papers.kameda import (
+    experiment_camera,
+    experiment_search,
+    grid_table,
+    run_experiment,
+)
 from drake_pose.person.date.walking import FEWEST_FRAMES, MOTIONS, make_motion
 from drake_pose.silhouette.areas.outline import outline_from_mesh
 from drake_pose.silhouette.areas.scoring import prefix_sums, score_bodies

@@ -1,36 +1,40 @@
-"""Experiment A on the grid: what is drawn, counted and shown."""
+"""Kameda's experiments: what is drawn, counted and shown, and what the command refuses."""
 
+import json
 import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from drake_pose.commands.main import app
+from drake_pose.errors import SceneError, SettingsError
+from drake_pose.jobs.demo import stored_scene
 from drake_pose.papers.kameda import (
+    PAPER,
+    REAL_EXPERIMENTS,
     beam_experiment_search,
     causes_of_wrong_angles,
+    continuous_figures,
+    continuous_table,
     draw_values,
     experiment_camera,
     experiment_search,
-    run_experiment,
-)
-from drake_pose.papers.kameda_figures import (
-    PAPER,
-    edge_lines,
+    experiment_tree,
     grid_figures,
     grid_table,
-    noisy_edges,
-    settle_by_edges,
+    run_experiment,
 )
-from drake_pose.papers.kameda_pictures import (
-    chest_ranks,
-    ratio_within,
-    save_pictures,
-)
-from drake_pose.search import PoseEstimate
-from drake_pose.search.inner_edges import edges_of_labels
+from drake_pose.papers.kameda_pictures import chest_ranks, ratio_within, save_pictures
+from drake_pose.search import ContinuousSearch, PoseEstimate
 from drake_pose.silhouette.areas.scoring import draw_mask
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
+from drake_pose.silhouette.pictures.scenes import load_scene
+from tests.cli import CliRunner
+
+
+def reproduce(*options):
+    return CliRunner().invoke(app, ["reproduce", "kameda", *options])
 
 
 @pytest.fixture(scope="module")
@@ -193,31 +197,94 @@ def test_the_chests_rank_is_that_of_areas_counted_in_masks(search, result):
     assert (ratio_within(ranks, ranks[0] - 1), ratio_within(ranks, ranks[0])) == (0.0, 1.0)
 
 
+def test_cameras_are_spread_over_half_a_turn():
+    before, after = run_experiment(experiment_search(), 1, 7, views=2).cameras
+    assert before.X_WC[:3, 2] @ after.X_WC[:3, 2] == pytest.approx(0.0)
+    origins = [camera.project(np.zeros((1, 3)))[0] for camera in (before, after)]
+    np.testing.assert_allclose(origins[0], origins[1])
+    for bad in ({"views": 0}, {"images": 0}):
+        with pytest.raises(SettingsError, match=next(iter(bad))):
+            run_experiment(experiment_search(), **bad)
+
+
 @pytest.mark.slow
-def test_edges_settle_what_the_silhouette_leaves_open():
-    result = run_experiment(beam_experiment_search(), images=20, seed=2026)
-    # Few poses, so that all are judged, and one silhouette that leaves nothing open.
-    few = [one for one in result.trials if 1 < one.result.pose_set.size < 100]
-    alone = [one for one in result.trials if one.result.pose_set.size == 1]
-    counts = settle_by_edges(replace(result, trials=(*few, *alone[:1])))
-    noisy = settle_by_edges(replace(result, trials=tuple(few)), noise=0.2)
-    for one in (counts, noisy):
-        assert one["ambiguous"] == one["edges_keep_truth"] == len(few) > 1
-        assert one["edges_settle_rightly"] == one["edges_settle"]
-    assert 0 < noisy["edges_settle"] <= counts["edges_settle"] <= counts["edges_narrow"]
-    # With edges to the pixel nothing that can be settled is left open.
-    assert counts["edges_settle"] + counts["edges_undecidable"] == counts["ambiguous"]
-    assert noisy["edges_undecidable"] == counts["edges_undecidable"]
-    assert str(counts["edges_keep_truth"]) in edge_lines(counts)
+def test_figures_of_continuous_angles_come_from_the_trials():
+    result = run_experiment(ContinuousSearch(experiment_tree()), 2, 7, views=2)
+    figures = continuous_figures(result)
+    assert (figures["images"], figures["views"], figures["interval_confidence"]) == (2, 2, 0.95)
+    E_total = [trial.result.E_total for trial in result.trials]
+    assert figures["mean_e_total"] == pytest.approx(np.mean(E_total))
+    assert figures["median_e_total"] < 0.01
+    errors, known = [], []
+    for trial in result.trials:
+        true = np.concatenate(trial.true_values)
+        off = np.degrees(np.abs(np.concatenate(trial.result.node_values) - true))
+        # The root's place is known, all else is searched for.
+        errors += off[3:].tolist()
+        known += off[3:][list(trial.result.pose_set.determined)[3:]].tolist()
+    assert figures["median_error_deg"] == pytest.approx(np.median(errors))
+    assert figures["median_determined_error_deg"] == pytest.approx(np.median(known), abs=1e-9)
+    assert figures["determined"] == pytest.approx(len(known) / len(errors))
+    assert np.median(known) < 0.5
+    assert figures["interval_coverage"] > 0.8
+    assert continuous_table(result).row_count == 11
 
 
-def test_noise_loses_moves_and_adds_edges():
-    segments = np.zeros((80, 80), dtype=np.int64)
-    segments[:, 40:] = 1
-    edges = edges_of_labels(segments, np.ones((80, 80), dtype=np.bool_))
-    noisy = noisy_edges(edges, 0.3, np.random.default_rng(0))
-    near = np.abs(np.nonzero(noisy.edges)[1] - 39) <= 1
-    assert 0.4 < near.sum() / 80 < 0.9
-    assert (~near).any()
-    assert (noisy.errors.missing, noisy.errors.wrong) == (0.3, 0.075)
-    assert noisy_edges(edges, 0.9, np.random.default_rng(0)).edges[:, 38:41].sum() < near.sum()
+def test_the_pictures_are_there():
+    frames = [load_scene(stored_scene(one.scene)).frames for one in REAL_EXPERIMENTS.values()]
+    assert frames[0] == ("0000", "0010", "0020", "0030", "0040", "0049")
+    assert len(frames[1]) == 2
+    with pytest.raises(SceneError, match="'none'"):
+        stored_scene("none")
+
+
+@pytest.mark.slow
+def test_both_methods_find_the_hand(tmp_path):
+    """One of two pictures; E_total is compared with Drake's label image of the pose found."""
+    made = reproduce("--experiment", "C", "--images", "1", "--out", str(tmp_path / "c"), "--json")
+    assert made.exit_code == 0, made.output
+    ours = json.loads(made.stdout)
+    paper = ours["paper_method"]
+    assert (ours["images"], paper["images"], ours["paper_images"]) == (1, 1, 3)
+    assert (ours["method"], paper["method"]) == ("beam", "paper")
+    assert ours["paper_mean_e_total"] == 0.172
+    for figures in (ours, paper):
+        assert figures["not_found"] == 0
+        assert figures["mean_e_total"] == figures["e_total"]["0000"]
+        folder = tmp_path / "c" / figures["method"]
+        record = json.loads((folder / "summary.json").read_text())["frames"]["0000"]
+        (iou,) = record["ious"].values()
+        # Of an area J of their difference, whichever of the two bodies it lies outside of.
+        assert 1 - iou - 0.005 <= figures["mean_e_total"] <= (1 - iou) / iou + 0.005
+        assert len(list(folder.rglob("overlay/*/0000.png"))) == 1
+    assert ours["mean_e_total"] < min(0.172, paper["mean_e_total"])
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (("--experiment", "D"), ("--experiment", "A", "B", "C")),
+        (("--experiment", "B", "--seed", "1"), ("--seed", "--experiment A")),
+        (("--experiment", "C", "--outside-limit", "9"), ("--outside-limit", "--experiment A")),
+        (("--views", "1"), ("continuous",)),
+        (("--views", "0", "--angles", "continuous"), ("views",)),
+        (("--angles", "continuous", "--method", "paper"), ("grid",)),
+        (("--angles", "continuous", "--outside-limit", "200"), ("grid",)),
+        (("--angles", "odd"), ("--angles", "grid", "continuous")),
+    ],
+)
+def test_what_means_nothing_is_refused(options, words):
+    refused = reproduce("--images", "1", *options)
+    assert refused.exit_code == 2
+    for word in words:
+        assert word in refused.stderr
+
+
+def test_a_run_for_each_seed_shows_the_spread():
+    made = reproduce("--images", "1", "--seeds", "2", "--method", "beam", "--json")
+    assert made.exit_code == 0, made.output
+    beam = json.loads(made.stdout)
+    for one, method in ((beam, "beam"), (beam["paper_method"], "paper")):
+        assert one["method"] == method
+        assert one["spread"]["mean_runs"]["min"] <= one["mean_runs"]
+        assert not {"seed", "images", "total_seconds"} & set(one["spread"])

@@ -10,15 +10,21 @@ from drake_pose.filtering.hand import HAND_STATE, LENGTHS, MEASURED, HandObserva
 from drake_pose.filtering.truncated_filter import TRUNCATIONS
 from drake_pose.papers.shimada import (
     CASES,
+    OBLIQUENESS,
     PICTURES,
     experiment_filter,
     result_table,
     run_experiment,
+    run_hypotheses_experiment,
 )
-from drake_pose.papers.shimada_hypotheses import OBLIQUENESS, run_hypotheses_experiment
-from drake_pose.papers.shimada_motion import FRAMES, OBSERVED, make_sequence, true_states
 from drake_pose.papers.shimada_pictures import save_hypotheses, save_pictures
-from drake_pose.papers.shimada_sequences import run_sequence
+from drake_pose.papers.shimada_sequences import (
+    FRAMES,
+    OBSERVED,
+    make_sequence,
+    run_sequence,
+    true_states,
+)
 from tests.cli import run_command
 
 LENGTH = HAND_STATE.indices(LENGTHS)

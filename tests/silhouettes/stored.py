@@ -20,8 +20,7 @@ from drake_pose.camera.models import look_at
 from drake_pose.files.settings import EstimateSettings
 from drake_pose.jobs.demo import stored_scene
 from drake_pose.jobs.estimate.scene import estimate_scene
-from drake_pose.papers.kameda import draw_values
-from drake_pose.papers.kameda_real_pictures import REAL_EXPERIMENTS
+from drake_pose.papers.kameda import REAL_EXPERIMENTS, draw_values
 from drake_pose.search import PoseEstimate, View
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 

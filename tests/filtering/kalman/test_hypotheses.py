@@ -16,7 +16,7 @@ from drake_pose.filtering.truncated_filter import (
 )
 from drake_pose.filtering.update import make_measurement, update
 from drake_pose.papers.shimada import experiment_filter
-from drake_pose.papers.shimada_motion import make_sequence
+from drake_pose.papers.shimada_sequences import make_sequence
 
 CHANCE = 1e-9
 

@@ -22,7 +22,7 @@ from drake_pose.filtering.state import Belief
 from drake_pose.filtering.update import difference
 from drake_pose.fit.evidence import find_edge_points
 from drake_pose.papers.shimada import experiment_filter
-from drake_pose.papers.shimada_motion import first_guess, true_states
+from drake_pose.papers.shimada_sequences import first_guess, true_states
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 
 WIDTH, HEIGHT = 480, 400

@@ -5,7 +5,7 @@ from drake_pose.errors import SettingsError
 from drake_pose.filtering.hand import HAND_STATE
 from drake_pose.filtering.state import Belief
 from drake_pose.papers.shimada import experiment_filter
-from drake_pose.papers.shimada_motion import make_sequence
+from drake_pose.papers.shimada_sequences import make_sequence
 from drake_pose.systems.truncated_ekf import STATISTICS, TruncatedEkf
 from tests.systems.bench import Bench
 

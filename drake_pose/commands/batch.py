@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -10,13 +11,20 @@ from cyclopts import Parameter
 from rich.markup import escape
 from rich.table import Table
 
-from drake_pose.commands.options import Json, Out, Resume, Scheduler, within, workers_of
-from drake_pose.commands.terminal import output_console, print_json, progress_bar, say, warn
+from drake_pose.commands.options import Json, Out, Resume, within
+from drake_pose.commands.terminal import (
+    UsageError,
+    output_console,
+    print_json,
+    progress_bar,
+    say,
+    warn,
+)
 from drake_pose.errors import SceneError, listed
 from drake_pose.files.options import percent
 
 if TYPE_CHECKING:
-    from drake_pose.jobs.batch.batch import Batch, SceneState
+    from drake_pose.jobs.batch import Batch, SceneState
 
 # Of what contradicts in a scene as many are shown.
 _NAMED = 4
@@ -28,7 +36,7 @@ def batch(
     *,
     out: Out,
     workers: Annotated[int | None, within(0)] = None,
-    scheduler: Scheduler = None,
+    scheduler: Annotated[str | None, Parameter(metavar="ADDRESS")] = None,
     chunk: Annotated[int | None, within(1), Parameter(metavar="FRAMES")] = None,
     resume: Resume = False,
     json: Json = False,
@@ -56,13 +64,27 @@ def batch(
         jobs: The job file (YAML).
         workers: Number of worker processes on this machine; 0: none. Default: one for each core, or
             none where the extra cluster is not installed.
+        scheduler: Address of a Dask scheduler whose workers are used instead, like
+            tcp://10.0.0.7:8786.
         chunk: Frames in a chunk. Default: that of the job file.
     """
-    from drake_pose.jobs.batch.batch import run_batch
-    from drake_pose.jobs.batch.job import read_job
+    from drake_pose.jobs.batch import run_batch
+    from drake_pose.jobs.batch_file import read_job
+    from drake_pose.jobs.cluster import has_dask, open_cluster, require_fit_workers
 
     read = read_job(jobs, chunk)
-    with workers_of(workers, scheduler, out.absolute().parent) as client, progress_bar() as bar:
+    if workers and scheduler is not None:
+        raise UsageError("give --workers or --scheduler, not both")
+    if workers is None and scheduler is None and not has_dask():
+        warn('this process does all the work; for one a core: pip install "drake_pose[cluster]"')
+        workers = 0
+    with ExitStack() as opened:
+        client = None
+        if workers != 0 or scheduler is not None:
+            client = opened.enter_context(open_cluster(workers, scheduler))
+        if client is not None and scheduler is not None:
+            require_fit_workers(client, out.absolute().parent)
+        bar = opened.enter_context(progress_bar())
         task = bar.add_task("reading", total=None)
 
         def show(done: int, total: int, message: str) -> None:
@@ -88,9 +110,7 @@ def _print_batch(result: Batch) -> None:
     audits = {n: one for n, one in result.scenes.items() if one.job.audit is not None}
     console = output_console()
     if estimates:
-        table = Table(
-            "scene", "state", "found", "E_total", "chunks", "tries", "seconds", title="Batch"
-        )
+        table = Table("scene", "state", "found", "E_total", "chunks", "seconds", title="Batch")
         for name, state in estimates.items():
             table.add_row(
                 escape(name),
@@ -98,7 +118,6 @@ def _print_batch(result: Batch) -> None:
                 f"{state.totals.get('found_count')} of {state.frame_count}" if state.totals else "",
                 percent(state.totals.get("mean_E_total")),
                 f"{len(state.done)} of {len(state.tasks)}",
-                str(state.attempts),
                 f"{state.seconds:.1f}",
             )
         console.print(table)

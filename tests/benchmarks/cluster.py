@@ -31,9 +31,9 @@ from drake_pose.body.formats.packages import bundled_model
 from drake_pose.body.model import load_model
 from drake_pose.camera.camera_files import save_cameras
 from drake_pose.files.settings import EstimateSettings
-from drake_pose.jobs.batch.batch import run_batch
-from drake_pose.jobs.batch.job import SceneJob
-from drake_pose.jobs.cluster.scheduler import open_cluster
+from drake_pose.jobs.batch import run_batch
+from drake_pose.jobs.batch_file import SceneJob
+from drake_pose.jobs.cluster import open_cluster
 from drake_pose.papers.kameda import experiment_camera
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from drake_pose.silhouette.pictures.masks import write_mask

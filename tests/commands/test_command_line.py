@@ -74,7 +74,7 @@ def test_whatever_ends_a_command_is_said_in_a_line(
         os.kill(os.getpid(), ending)
         time.sleep(10.0)
 
-    monkeypatch.setattr("drake_pose.jobs.batch.job.read_job", read_job)
+    monkeypatch.setattr("drake_pose.jobs.batch_file.read_job", read_job)
     result = run_command(["batch", "jobs.yaml", "--out", "nowhere"])
     assert result.exit_code == 1
     assert result.output.startswith(f"drake-pose: error: {message}")

@@ -21,7 +21,7 @@ from drake_pose.files.folder import (
 from drake_pose.files.records import FrameRecord, PoseRow, PoseTable
 from drake_pose.files.summary import open_job
 from drake_pose.files.writer import ResultWriter
-from drake_pose.jobs.batch.batch import run_batch
+from drake_pose.jobs.batch import run_batch
 from drake_pose.jobs.live.capture import capture_live
 from drake_pose.silhouette.pictures.scenes import load_scene
 

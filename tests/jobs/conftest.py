@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from drake_pose.jobs.cluster.scheduler import open_cluster
+from drake_pose.jobs.cluster import open_cluster
 
 
 @pytest.fixture(scope="module")

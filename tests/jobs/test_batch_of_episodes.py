@@ -12,9 +12,9 @@ from scipy.spatial.transform import Rotation
 from drake_pose.camera.camera_files import describe_camera, load_cameras
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import SettingsError
-from drake_pose.jobs.batch.episodes_table import COLUMNS, episodes_table
-from drake_pose.jobs.batch.job import read_job
-from drake_pose.jobs.batch.tasks import plan_scene
+from drake_pose.jobs.batch import plan_scene
+from drake_pose.jobs.batch_file import read_job
+from drake_pose.jobs.episodes_table import COLUMNS, episodes_table
 from drake_pose.jobs.registration.settings import AuditSettings
 from tests.cli import run_to_end
 from tests.jobs.scenes import read_rows
@@ -48,8 +48,8 @@ def test_a_camera_has_moved_that_differs_significantly_from_the_episodes_before(
         "failed": {},
         "again": totals([1.0, 0.02, 0.5], 1.0),
     }
-    table = episodes_table(episodes)
-    rows = list(csv.DictReader(io.StringIO(table.text)))
+    text, cameras = episodes_table(episodes)
+    rows = list(csv.DictReader(io.StringIO(text)))
     assert tuple(rows[0]) == COLUMNS
     assert [row["moved"] for row in rows] == ["", "no", "yes", "no"]
     assert float(rows[2]["moved_deg"]) == pytest.approx(1.0)
@@ -57,24 +57,24 @@ def test_a_camera_has_moved_that_differs_significantly_from_the_episodes_before(
     assert (rows[0]["joints"], rows[0]["agreeing"]) == ("A4", "8")
     files = [row["camera_file"] for row in rows]
     assert files == ["cameras_1.yaml", "cameras_1.yaml", "cameras_2.yaml", "cameras_2.yaml"]
-    (tmp_path / "before.yaml").write_text(table.camera_files["cameras_1.yaml"])
+    (tmp_path / "before.yaml").write_text(cameras["cameras_1.yaml"])
     before = load_cameras(tmp_path / "before.yaml")["left"]
     np.testing.assert_allclose(before.X_WC[:3, 3], [1.0005, -0.0005, 0.5])
-    assert episodes_table({"scene": {"frame_count": 3, "agreeing_count": 3}}) is None
+    assert episodes_table({"scene": {"frame_count": 3, "agreeing_count": 3}})[1] == {}
 
 
 def test_a_camera_of_many_episodes_is_where_they_say_by_how_sure_they_are():
     # Slow drift, each step of which is too small to be significant, is a move, too.
     far = 5.0 * 0.001
-    table = episodes_table({str(k): totals([k * far, 0.0, 0.0], sd=0.002) for k in range(9)})
-    moved = [row["moved"] for row in csv.DictReader(io.StringIO(table.text))]
+    text, _ = episodes_table({str(k): totals([k * far, 0.0, 0.0], sd=0.002) for k in range(9)})
+    moved = [row["moved"] for row in csv.DictReader(io.StringIO(text))]
     assert 0 < moved.count("yes") < 5
     # A second camera stands where it stood, in the file of those before the first moved, too.
     episodes = {str(k): totals([float(k), 0.0, 0.0]) for k in range(2)}
     sds = (0.001, 0.002)
     for one, x, sd in zip(episodes.values(), (0.0, 0.005), sds, strict=True):
         one["cameras"]["right"] = totals([x, 0.0, 0.0], sd=sd)["cameras"]["left"]
-    files = [yaml.safe_load(text) for text in episodes_table(episodes).camera_files.values()]
+    files = [yaml.safe_load(text) for text in episodes_table(episodes)[1].values()]
     assert [file["left"]["X_WC"][0][3] for file in files] == [0.0, 1.0]
     weighted = np.average([0.0, 0.005], weights=np.power(sds, -2.0))
     assert [file["right"]["X_WC"][0][3] for file in files] == pytest.approx([weighted] * 2)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import yaml
@@ -26,18 +26,15 @@ named; joints: those that are named; moved: from where the episodes before have 
 name; camera_file: holds the cameras as all episodes have them that saw them stand there."""
 
 
-class EpisodesTable(NamedTuple):
-    """The table (CSV), and camera files (YAML) by name."""
+def episodes_table(episodes: Mapping[str, Mapping[str, Any]]) -> tuple[str, dict[str, str]]:
+    """The table (CSV) of all audited episodes' cameras, and camera files (YAML) by name.
 
-    text: str
-    camera_files: dict[str, str]
+    A camera has moved if its pose differs significantly from the pose that the episodes since its
+    last move have together. A new camera file begins with each episode in which one has moved.
 
-
-def episodes_table(episodes: Mapping[str, Mapping[str, Any]]) -> EpisodesTable | None:
-    """What scenes' totals by name say, in the order of the job; None: none is an episode.
-
-    A camera has moved whose pose differs significantly from that which the episodes since it moved
-    before have together. A new camera file begins with each episode in which one has.
+    Args:
+        episodes: totals of scenes by name, in the order of the job; those without cameras are no
+            audited episodes. No camera file: there is none.
     """
     rows = list[list[Any]]()
     files: list[dict[str, _Standing]] = [{}]
@@ -59,27 +56,23 @@ def episodes_table(episodes: Mapping[str, Mapping[str, Any]]) -> EpisodesTable |
             rows.append(
                 [scene, name, totals["frame_count"], totals["agreeing_count"], *place,
                  one["translation_sd_mm"], one["rotation_sd_deg"], one["off_mm"], one["off_deg"],
-                 one["time_offset_s"], one["time_offset_sd_s"], joints, *move, _file(len(files))]
+                 one["time_offset_s"], one["time_offset_sd_s"], joints, *move,
+                 f"cameras_{len(files)}.yaml"]
             )  # fmt: skip
-    if not rows:
-        return None
     texts = {
-        _file(k): yaml.safe_dump({name: one.entry() for name, one in file.items()})
+        f"cameras_{k}.yaml": yaml.safe_dump({name: one.entry() for name, one in file.items()})
         for k, file in enumerate(files, 1)
+        if rows
     }
-    return EpisodesTable(csv_text([COLUMNS, *rows]), texts)
-
-
-def _file(number: int) -> str:
-    return f"cameras_{number}.yaml"
+    return csv_text([COLUMNS, *rows]), texts
 
 
 class _Standing:
-    """Where a camera stands that several episodes saw in one place, put together by information.
+    """The pose of a camera that several episodes saw in one place: their weighted mean.
 
-    What errs in one, as a joint's zero does, errs in the others, nobody knows how much alike: by
-    covariance intersection (Julier and Uhlmann, 1997, equal weights) the covariance holds all the
-    same, and is that of one episode where all are as sure. Sums are kept: a batch has thousands.
+    Errors of episodes are correlated, as a joint offset's are, by an unknown amount. Covariance
+    intersection (Julier and Uhlmann, 1997, equal weights) gives a covariance that holds all the
+    same: that of one episode if all are equal. Sums are kept: a batch has thousands of episodes.
     """
 
     def __init__(self, one: Found) -> None:

@@ -1,4 +1,4 @@
-"""The job file of `drake-pose batch`: which scenes are estimated, and how."""
+"""The job file of `drake-pose batch`: which scenes are estimated or audited, and how."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
 from types import UnionType
-from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
 
 from cyclopts import Parameter
 
@@ -18,19 +18,6 @@ from drake_pose.jobs.estimate.inputs import bundled_person
 from drake_pose.jobs.registration.settings import AuditSettings
 from drake_pose.yaml_files import read_yaml
 
-CHUNK = 100
-"""Frames in a chunk where nobody says."""
-
-_OWN = ("scene", "model", "truth", "overlay", "replay", "audit", "camera_file")
-# A batch estimates scenes; episodes it audits.
-_SETTINGS = tuple(
-    one.name for one in fields(EstimateSettings) if one.name not in EpisodeSettings.__annotations__
-)
-_OF_AUDITS = tuple(one.name for one in fields(AuditSettings))
-_EPISODES = "episodes"
-OWN_JOINTS = True
-"""In place of a table of joint positions: those that an episode holds."""
-
 
 @dataclass(frozen=True)
 class SceneJob:
@@ -39,10 +26,11 @@ class SceneJob:
     Args:
         name: of the result's folder.
         truth: measured joint positions to compare with.
-        chunk: frames in a chunk; a person's recording, and a scene that is audited, is never cut.
-        audit: joint positions that the scene is audited against, or OWN_JOINTS; None: the scene is
-            estimated.
-        camera_file: for an audit, in place of the scene's cameras.yaml.
+        chunk: number of frames in a chunk; a person's recording, and a scene that is audited, is
+            not cut.
+        audit: joint positions that the scene is audited against; True: those that an episode holds;
+            None: the scene is estimated.
+        camera_file: of an audit, in place of the scene's cameras.yaml.
     """
 
     name: str
@@ -52,7 +40,7 @@ class SceneJob:
     truth: Path | None = None
     overlay: bool = True
     replay: bool = True
-    chunk: int = CHUNK
+    chunk: int = 100
     audit: Path | bool | None = None
     camera_file: Path | None = None
 
@@ -60,15 +48,13 @@ class SceneJob:
         """Returns plain JSON values that tell whether a resumed job is still the same."""
         truth = None if self.truth is None else str(self.truth)
         described = describe_job(self.scene, self.model, self.settings)
-        files = {"audit": self.audit, "camera_file": self.camera_file}
-        audited = {
-            name: {"file": str(file), "sha256": file_digest(file)}
-            if isinstance(file, Path)
-            else file
-            for name, file in files.items()
-            if self.audit is not None
-        }
-        return described | {"chunk": self.chunk, "truth": truth} | audited
+        described |= {"chunk": self.chunk, "truth": truth}
+        if self.audit is not None:
+            for name, file in (("audit", self.audit), ("camera_file", self.camera_file)):
+                described[name] = file
+                if isinstance(file, Path):
+                    described[name] = {"file": str(file), "sha256": file_digest(file)}
+        return described
 
 
 def read_job(path: Path, chunk: int | None = None) -> tuple[SceneJob, ...]:
@@ -77,7 +63,7 @@ def read_job(path: Path, chunk: int | None = None) -> tuple[SceneJob, ...]:
     Args:
         path: the YAML file: ``scenes`` (name: settings), perhaps ``defaults`` for all, and
             ``chunk``.
-        chunk: frames in a chunk, in place of the file's.
+        chunk: number of frames in a chunk, in place of the file's.
 
     Raises:
         SettingsError: names the file, the scene and the setting at fault.
@@ -86,10 +72,18 @@ def read_job(path: Path, chunk: int | None = None) -> tuple[SceneJob, ...]:
     scenes = content.get("scenes")
     if not isinstance(scenes, dict) or not scenes:
         raise SettingsError(f"{path}: names no scenes; expected 'scenes:' with NAME: settings")
-    length = content.get("chunk", CHUNK) if chunk is None else chunk
+    length = content.get("chunk", SceneJob.chunk) if chunk is None else chunk
     if not isinstance(length, int) or isinstance(length, bool) or length < 1:
         raise SettingsError(f"{path}: chunk: must be a whole number, 1 or more, not {length!r:.60}")
-    keys = tuple(dict.fromkeys((*_OWN, *_SETTINGS, *_OF_AUDITS, _EPISODES)))
+    own = ("scene", "model", "truth", "overlay", "replay", "audit", "camera_file")
+    # A batch estimates scenes; episodes it audits.
+    of_estimates = [
+        one.name
+        for one in fields(EstimateSettings)
+        if one.name not in EpisodeSettings.__annotations__
+    ]
+    of_audits = [one.name for one in fields(AuditSettings)]
+    keys = tuple(dict.fromkeys((*own, *of_estimates, *of_audits, "episodes")))
     defaults = _known(content.get("defaults") or {}, f"{path}: defaults", keys)
     jobs = []
     for name, entry in scenes.items():
@@ -100,25 +94,22 @@ def read_job(path: Path, chunk: int | None = None) -> tuple[SceneJob, ...]:
                 "begin with a dot; put numbers in quotes"
             )
         values = {**defaults, **_known(entry or {}, where, keys)}
-        for own, episode in _episodes(name, values.pop(_EPISODES, None), where):
-            jobs.append(_scene_job(own, values | episode, length, where, path.parent.absolute()))
+        named = [(name, values)]
+        if (numbers := values.pop("episodes", None)) is not None:
+            first, _, last = str(numbers).partition(":")
+            if not (first.isdecimal() and last.isdecimal() and int(first) <= int(last)):
+                raise SettingsError(
+                    f'{where}: episodes: a range like "0:99", with both ends, not {numbers!r:.60}'
+                )
+            numbered = range(int(first), int(last) + 1)
+            named = [(f"{name}_{k:06d}", values | {"episode": k}) for k in numbered]
+        for one, given in named:
+            jobs.append(_scene_job(one, given, own, length, where, path.parent.absolute()))
     return tuple(jobs)
 
 
-def _episodes(name: str, numbers: Any, where: str) -> list[tuple[str, dict[str, int]]]:
-    """The names of a scene's jobs, and which episode each is of: one, or of a range each."""
-    if numbers is None:
-        return [(name, {})]
-    first, _, last = str(numbers).partition(":")
-    if not (first.isdecimal() and last.isdecimal() and int(first) <= int(last)):
-        raise SettingsError(
-            f'{where}: {_EPISODES}: a range like "0:99", with both ends, not {numbers!r:.60}'
-        )
-    return [(f"{name}_{k:06d}", {"episode": k}) for k in range(int(first), int(last) + 1)]
-
-
 def _known(value: Any, where: str, known: tuple[str, ...]) -> dict[str, Any]:
-    """A mapping whose keys are known, which others are refused."""
+    """A mapping; SettingsError: it is none, or has other keys."""
     if not isinstance(value, dict):
         raise SettingsError(f"{where}: expected NAME: VALUE lines")
     unknown = [str(key)[:40] for key in value if key not in known]
@@ -130,29 +121,31 @@ def _known(value: Any, where: str, known: tuple[str, ...]) -> dict[str, Any]:
 
 
 def _scene_job(
-    name: str, values: Mapping[str, Any], chunk: int, where: str, base: Path
+    name: str, values: Mapping[str, Any], own: tuple[str, ...], chunk: int, where: str, base: Path
 ) -> SceneJob:
-    is_audit = values.get("audit") is not None
-    kind, names = (AuditSettings, _OF_AUDITS) if is_audit else (EstimateSettings, _SETTINGS)
-    own = {"audit": OWN_JOINTS} if values.get("audit") is OWN_JOINTS else {}
+    """The job of a scene's entry, whose keys are known."""
+    values = {key: value for key, value in values.items() if value is not None}
+    kind = AuditSettings if "audit" in values else EstimateSettings
+    names = {one.name for one in fields(kind)}
+    if kind is EstimateSettings:
+        names -= EpisodeSettings.__annotations__.keys()
     given, settings = (
         {
             key: _convert(values[key], hint, f"{where}: {key}", base)
             for key, hint in get_type_hints(known, include_extras=True).items()
-            if key in keys and key not in own and values.get(key) is not None
+            if key in keys and key in values
         }
-        for known, keys in ((SceneJob, _OWN), (kind, names))
+        for known, keys in ((SceneJob, own), (kind, names))
     )
-    given |= own
-    others = [key for key in values if key not in (*_OWN, *names) and values[key] is not None]
+    others = [key for key in values if key not in (*own, *names)]
     if "scene" not in given:
         raise SettingsError(f"{where}: 'scene' is missing, the scene's folder")
-    if "audit" in given:
+    if kind is AuditSettings:
         others += ["truth"] if "truth" in given else []
         if others:
             raise SettingsError(
                 f"{where}: an audit has no setting {', '.join(others)}; it has: camera_file, "
-                f"overlay, {', '.join(_OF_AUDITS)}"
+                f"overlay, {', '.join(one.name for one in fields(kind))}"
             )
     elif others:
         raise SettingsError(f"{where}: {', '.join(others)}: for audits (audit: JOINTS.csv) alone")
@@ -168,7 +161,7 @@ def _scene_job(
 
 
 def _convert(value: Any, hint: Any, where: str, base: Path) -> Any:
-    """A YAML value as a field of that type has it; paths are relative to base."""
+    """A YAML value as a field of a type has it; paths are relative to base."""
     reader = None
     while get_origin(hint) is Annotated:
         hint, *more = get_args(hint)
@@ -176,45 +169,38 @@ def _convert(value: Any, hint: Any, where: str, base: Path) -> Any:
         reader = next((one for one in found if isinstance(one, FromText)), reader)
     origin, arguments = get_origin(hint), get_args(hint)
     if origin in (Union, UnionType) and reader is not None:
-        return _parse(value, reader, where, base)
+        # What an option's text, or a list of its numbers, means.
+        text = ",".join(map(str, value)) if isinstance(value, list) else value
+        if not isinstance(text, str):
+            raise SettingsError(f"{where}: must be a text, not {value!r:.60}")
+        try:
+            parsed = reader.parse(text)
+        except SettingsError as error:
+            raise SettingsError(f"{where}: {error}") from None
+        if isinstance(parsed, tuple) and isinstance(parsed[0], Path):
+            return (base / parsed[0], *parsed[1:])
+        return parsed
     if origin in (Union, UnionType):
+        if value is True and bool in arguments:
+            return value
         return _convert(value, next(one for one in arguments if one is not type(None)), where, base)
     if origin is tuple:
         texts = value if isinstance(value, list) else [value]
         return tuple(_convert(one, arguments[0], where, base) for one in texts)
     if isinstance(origin, type) and issubclass(origin, Mapping):
-        if not isinstance(value, dict):
-            raise SettingsError(f"{where}: expected NAME: VALUE lines")
+        pairs = _known(value, where, tuple(value) if isinstance(value, dict) else ())
         return {
             str(name): _convert(one, arguments[1], f"{where}: {name}", base)
-            for name, one in value.items()
+            for name, one in pairs.items()
         }
-    kinds, expected = _KINDS[str if origin is Literal else hint]
-    if not isinstance(value, kinds) or (isinstance(value, bool) and hint is not bool):
+    kinds: dict[Any, tuple[Any, str]] = {
+        bool: (bool, "true or false"),
+        int: (int, "a whole number"),
+        float: ((int, float), "a number"),
+    }
+    kind, expected = kinds.get(hint, (str, "a text (put numbers in quotes)"))
+    if not isinstance(value, kind) or (isinstance(value, bool) and hint is not bool):
         raise SettingsError(f"{where}: must be {expected}, not {value!r:.60}")
     if hint is Path:
         return base / value
     return float(value) if hint is float else value
-
-
-_KINDS: dict[Any, tuple[Any, str]] = {
-    bool: (bool, "true or false"),
-    int: (int, "a whole number"),
-    float: ((int, float), "a number"),
-    str: (str, "a text (put numbers in quotes)"),
-    Path: (str, "a text (put numbers in quotes)"),
-}
-
-
-def _parse(value: Any, reader: FromText, where: str, base: Path) -> Any:
-    """What an option's text, or a list of its numbers, means."""
-    text = ",".join(map(str, value)) if isinstance(value, list) else value
-    if not isinstance(text, str):
-        raise SettingsError(f"{where}: must be a text, not {value!r:.60}")
-    try:
-        parsed = reader.parse(text)
-    except SettingsError as error:
-        raise SettingsError(f"{where}: {error}") from None
-    if isinstance(parsed, tuple) and isinstance(parsed[0], Path):
-        return (base / parsed[0], *parsed[1:])
-    return parsed

@@ -1,1 +1,0 @@
-"""Many scenes, in chunks, on any number of workers."""

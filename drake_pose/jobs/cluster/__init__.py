@@ -1,1 +1,0 @@
-"""Workers on this machine or on others: scheduler, processes, and the cameras they watch."""

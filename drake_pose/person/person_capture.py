@@ -10,6 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from drake_pose.arrays import Array, Mask, Picture
 from drake_pose.body.tree.pose_tree import PoseTree
@@ -17,6 +18,7 @@ from drake_pose.camera.models import Camera
 from drake_pose.errors import SettingsError
 from drake_pose.fit.colours import OwnColours
 from drake_pose.fit.contour_fit import ContourFit
+from drake_pose.fit.evidence import EdgePoints
 from drake_pose.person.persons_in_view import ReadFrame
 from drake_pose.person.pose_tracker import PersonPoseTracker, TrackState
 from drake_pose.person.search import LENIENT
@@ -26,9 +28,8 @@ from drake_pose.person.views import (
     FrameViews,
     KnownColours,
     edge_spacing,
-    pack_view,
+    SilhouetteView,
     see_silhouette,
-    unpack_view,
 )
 from drake_pose.silhouette.areas.outline import Outline
 
@@ -126,14 +127,17 @@ class _Capture:
     ) -> None:
         self._cameras, self._read, self._is_sequence = cameras, read, is_sequence
         self.tracker = PersonPoseTracker(ContourFit(tree, noise=NOISE), LENIENT, shape_values(tree))
-        # The frames that the shape is measured in are seen three times: their views by camera.
-        self._kept: dict[int, dict[str, bytes]] = {}
+        # The frames that the shape is measured in are seen three times: by camera regions as bits
+        # along the rows, and edges.
+        self._kept: dict[int, dict[str, tuple[NDArray[np.uint8], EdgePoints]]] = {}
 
     def _see(self, frame: int) -> FrameViews:
         if frame in self._kept:
-            kept = self._kept[frame]
-            cameras = [self._cameras[name] for name in kept]
-            return FrameViews(cameras, [unpack_view(data) for data in kept.values()])
+            cameras, views = [self._cameras[name] for name in self._kept[frame]], []
+            for camera, (bits, edge) in zip(cameras, self._kept[frame].values(), strict=True):
+                region = np.unpackbits(bits, axis=1, count=camera.width).view(np.bool_)
+                views.append(SilhouetteView(region, edge))
+            return FrameViews(cameras, views)
         masks = self._read(frame)
         cameras = [self._cameras[name] for name in masks]
         pairs = zip(cameras, masks.values(), strict=True)
@@ -147,8 +151,10 @@ class _Capture:
             return None, {}
         first = frames[:_SHAPE_SPAN]
         for frame in first:
-            seen = self._see(frame)
-            self._kept[frame] = {camera.name: pack_view(view) for camera, view in seen.pairs}
+            self._kept[frame] = {
+                camera.name: (np.packbits(view.region, axis=1), view.edge)
+                for camera, view in self._see(frame).pairs
+            }
         rough = self.follow_all(first, {})
         poses = {k: one.values for k in spread_over(first, _SHAPE_FRAMES) if (one := rough[k])}
         looks = [self._see(k) for k in poses]

@@ -14,42 +14,17 @@ from functools import partial
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from drake_pose.arrays import Array, Mask
+from drake_pose.arrays import Array, Indices, Mask
 from drake_pose.fit.colours import OwnColours
-from drake_pose.fit.contour_fit import (
-    Comparison,
-    ContourFit,
-    PoseFit,
-    Prior,
-    pack_views,
-    symmetric,
-)
+from drake_pose.fit.contour_fit import Comparison, ContourFit, PoseFit, Prior, symmetric
 from drake_pose.fit.covariance import surface_deformations
 from drake_pose.fit.kernel import Sum
-from drake_pose.person.body_plan import BodyPlan
-from drake_pose.person.search import (
-    CYCLE,
-    EXACT,
-    HEADINGS,
-    LIMBS_A_FRAME,
-    AnnealingSchedule,
-    PersonSearch,
-    headings_of,
-)
+from drake_pose.person.search import EXACT, BodyPlan, PersonSearch, PersonSettings
 from drake_pose.person.views import ColourViews, FrameViews
 
-# How far parts' surfaces may be off the model's [m].
-_SURFACES = 0.0005 * np.sqrt(2.0) ** np.arange(13)
-# The fit's own noise counts as much as this many distances.
-_ASSUMED = 4.0
-# A person is somewhere in a place as large [m].
-_PLACE = 10.0
 
-
-@dataclass(frozen=True, eq=False)
-class PoseUncertainty:
+class PoseUncertainty(NamedTuple):
     """How sure a pose is.
 
     Args:
@@ -70,6 +45,8 @@ def pose_uncertainty(
     compared: Comparison,
     held: Mask | None = None,
     held_covariance: Array | None = None,
+    *,
+    place: float = 10.0,
 ) -> PoseUncertainty:
     """The uncertainty of a fitted pose by the pictures and the limits, without the last frame.
 
@@ -77,26 +54,59 @@ def pose_uncertainty(
         compared: what the cameras say of the pose at the scale of the last step.
         held: (m,) values that were held, such as lengths.
         held_covariance: (h, h) of these; None: they are exact.
+        place: a person is somewhere in a place as large [m].
     """
     size = len(fit.lower)
     held = np.zeros(size, dtype=np.bool_) if held is None else held
     free = np.flatnonzero(~held)
-    A = symmetric(compared.A)
+    A, X_WN = symmetric(compared.A), compared.placement.X_WN
+    whole, b = A.sum(axis=0), compared.b.sum(axis=0)
     # (nodes, m, 12): what each value does to each node.
     moves = compared.placement.dense(size)
-    apriori = _limits_information(fit)
-    parts = _parts(fit, compared, A)
-    between = _noise(A, parts.left, parts.alone)
-    distances = _Distances.of(parts, between, moves)
-    likeliest = int(np.argmax(distances.with_surfaces(_SURFACES, free, apriori)[0]))
-    surface = _SURFACES[likeliest : likeliest + 1]
+    # Limits tell as much as an even distribution between them has variance.
+    span = np.minimum(fit.upper - fit.lower, np.where(fit.kinematics.is_angle, 2.0 * np.pi, place))
+    apriori = 12.0 / np.maximum(span, 1e-6) ** 2
+    # How far parts' surfaces may be off the model's [m].
+    surfaces = 0.0005 * np.sqrt(2.0) ** np.arange(13)
+    # What all cameras say of each part by itself, free to shift, turn and stretch, along
+    # independent directions (nodes, 12, 12), each a motion of the surface by about a metre.
+    K = surface_deformations(fit.outlines, X_WN)
+    information, turns = np.linalg.eigh(np.swapaxes(K, 1, 2) @ whole @ K)
+    information, K = np.maximum(information, 0.0), K @ turns
+    alone = (K / (information + surfaces[-1] ** -2)[:, None]) @ np.swapaxes(K, 1, 2)
+    left = compared.b - (A @ (alone @ b[..., None]))[..., 0]
+    between = _noise(A, left, alone)
+
+    def with_surfaces(variance: float, surfaces: Array) -> tuple[Array, Array]:
+        """Likelihoods (k,) and informations (k, m, m) of surfaces as far off (k,) [m].
+
+        All at once, as each alone is little work; the distances have this variance.
+        """
+        H = (moves @ whole @ np.swapaxes(moves, 1, 2)).sum(axis=0) / variance
+        # What each value does along the parts' directions, as far as it was seen: (m, k).
+        along = np.swapaxes(moves @ whole @ K, 0, 1) / variance
+        along = along.reshape(size, -1)
+        pulls = (np.einsum("nij,ni->nj", K, b) / variance).ravel()
+        seen = information.ravel() / variance
+        share = 1.0 / (seen + surfaces[:, None] ** -2)
+        H = H - (along * share[:, None]) @ along.T
+        g = np.einsum("njk,nk->j", moves, b) / variance
+        g = (g - (share * pulls) @ along.T)[:, free]
+        own = H[:, free[:, None], free] + np.diag(apriori[free])
+        explained = (share * pulls**2).sum(axis=1)
+        explained += (g * np.linalg.solve(own, g[..., None])[..., 0]).sum(axis=1)
+        freedom = np.log1p(surfaces[:, None] ** 2 * seen).sum(axis=1)
+        return 0.5 * (explained - freedom - np.linalg.slogdet(own)[1]), H
+
+    likeliest = int(np.argmax(with_surfaces(between, surfaces)[0]))
+    surface = surfaces[likeliest : likeliest + 1]
     # The nearest points of two contours are nearer than those that belong together. So the noise
     # that counts is the larger one: of the whole body's distances, the surface's share included.
-    own = (moves @ A.sum(axis=0) @ np.swapaxes(moves, 1, 2)).sum(axis=0)[np.ix_(free, free)]
+    own = (moves @ whole @ np.swapaxes(moves, 1, 2)).sum(axis=0)[np.ix_(free, free)]
     V = np.linalg.inv(own + np.diag(apriori[free]))
     Q = np.swapaxes(moves[:, free], 1, 2) @ V @ moves[:, free]
     noise = max(between, _noise(A, compared.b, Q))
-    H = _Distances.of(parts, noise, moves).with_surfaces(surface, free, apriori)[1][0]
+    H = with_surfaces(noise, surface)[1][0]
     covariance = np.zeros((size, size))
     own = np.linalg.inv(H[np.ix_(free, free)] + np.diag(apriori[free]))
     covariance[np.ix_(free, free)] = own
@@ -107,98 +117,16 @@ def pose_uncertainty(
     return PoseUncertainty(covariance, H, noise, float(surface[0]))
 
 
-def _limits_information(fit: ContourFit) -> Array:
-    """(m,) what limits tell: as much as an even distribution between them has variance."""
-    widest = np.where(fit.kinematics.is_angle, 2.0 * np.pi, _PLACE)
-    span = np.minimum(fit.upper - fit.lower, widest)
-    return np.asarray(12.0 / np.maximum(span, 1e-6) ** 2)
+def _noise(A: Array, b: Array, Q: Array, assumed: float = 4.0) -> float:
+    """The variance of distances (A, b of a comparison); Q (nodes, 12, 12): motions' covariance.
 
-
-def _noise(A: Array, b: Array, Q: Array) -> float:
-    """The variance of distances (A, b of a comparison); Q (nodes, 12, 12): motions' covariance."""
+    The fit's own noise counts as much as `assumed` distances.
+    """
     shares = Q @ A
     # What was fitted follows the distances: they are as much smaller as it has freedom.
     freedom = np.einsum("cnii->", shares) - np.einsum("cnij,cnji->", shares, shares)
     pulls = np.einsum("cni,nij,cnj->", b, Q, b)
-    return float((pulls + _ASSUMED) / (max(freedom, 0.0) + _ASSUMED))
-
-
-class _Parts(NamedTuple):
-    """What all cameras together say of each part by itself, along independent directions.
-
-    A: (nodes, 12, 12); b: (nodes, 12); directions: (nodes, 12, 12) in columns, each a motion of the
-    surface by about a metre; information: (nodes, 12) about each; alone: (nodes, 12, 12) covariance
-    of each part's affine motion; left: (cameras, nodes, 12) b where each part fits best by itself.
-    """
-
-    A: Array
-    b: Array
-    directions: Array
-    information: Array
-    alone: Array
-    left: Array
-
-
-def _parts(fit: ContourFit, compared: Comparison, A: Array) -> _Parts:
-    """All parts, each free to shift, turn and stretch; A: (cameras, nodes, 12, 12), symmetric."""
-    K = surface_deformations(fit.outlines, compared.placement.X_WN)
-    whole, b = A.sum(axis=0), compared.b.sum(axis=0)
-    information, turns = np.linalg.eigh(np.swapaxes(K, 1, 2) @ whole @ K)
-    information, K = np.maximum(information, 0.0), K @ turns
-    alone = (K / (information + _SURFACES[-1] ** -2)[:, None]) @ np.swapaxes(K, 1, 2)
-    left = compared.b - (A @ (alone @ b[..., None]))[..., 0]
-    return _Parts(whole, b, K, information, alone, left)
-
-
-class _Distances(NamedTuple):
-    """What the contours' distances of one variance say of the values where surfaces are exact.
-
-    H: (m, m) and g: (m,) the normal equations; moves: (m, k) what each value does along the parts'
-    directions, as far as it was seen; information, pulls: (k,) of the surfaces along them.
-    """
-
-    H: Array
-    g: Array
-    moves: Array
-    information: Array
-    pulls: Array
-
-    @staticmethod
-    def of(parts: _Parts, noise: float, moves: Array) -> "_Distances":
-        """What parts say where distances have this variance; moves: (nodes, m, 12)."""
-        H = (moves @ parts.A @ np.swapaxes(moves, 1, 2)).sum(axis=0) / noise
-        along = np.swapaxes(moves @ parts.A @ parts.directions, 0, 1) / noise
-        pulls = np.einsum("nij,ni->nj", parts.directions, parts.b) / noise
-        g = np.einsum("njk,nk->j", moves, parts.b) / noise
-        information = parts.information.ravel() / noise
-        return _Distances(H, g, along.reshape(len(H), -1), information, pulls.ravel())
-
-    def with_surfaces(
-        self, surfaces: Array, free: NDArray[np.intp], apriori: Array
-    ) -> tuple[Array, Array]:
-        """The likelihoods (k,) where surfaces are so far off (k,) [m], and informations (k, m, m).
-
-        All at once, as each alone is little work.
-        """
-        share = 1.0 / (self.information + surfaces[:, None] ** -2)
-        H = self.H - (self.moves * share[:, None]) @ self.moves.T
-        g = (self.g - (share * self.pulls) @ self.moves.T)[:, free]
-        own = H[:, free[:, None], free] + np.diag(apriori[free])
-        explained = (share * self.pulls**2).sum(axis=1)
-        explained += (g * np.linalg.solve(own, g[..., None])[..., 0]).sum(axis=1)
-        freedom = np.log1p(surfaces[:, None] ** 2 * self.information).sum(axis=1)
-        return 0.5 * (explained - freedom - np.linalg.slogdet(own)[1]), H
-
-
-# The share of the last frame's step that is expected again, and how far that is off [rad, m].
-_CARRY, _ANGLE_DEVIATION, _LENGTH_DEVIATION = 0.7, 0.3, 0.15
-# Where so much less of the contours fits than usual, limbs are searched again; where less than this
-# share of the usual, the whole person; who is followed by colour is lost where less of a part fits.
-_RETRY_BELOW, _LOST_BELOW, _PART_LOST_BELOW = 0.03, 0.75, 0.4
-# For how many frames the usual share is remembered, and what it is until it is known better.
-_MEMORY, _USUAL = 60.0, 0.95
-# Parts of which less contour is seen, in all cameras together [m], do not say that they are off.
-_TELLING = 0.3
+    return float((pulls + assumed) / (max(freedom, 0.0) + assumed))
 
 
 @dataclass(frozen=True, eq=False)
@@ -223,7 +151,10 @@ class TrackState:
     @property
     def is_lost(self) -> bool:
         """Whether too little of the contours fits for the pose to be believed."""
-        return self.share < _LOST_BELOW * self.usual or self.worst < _PART_LOST_BELOW
+        return (
+            self.share < PersonSettings.lost_below * self.usual
+            or self.worst < PersonSettings.part_lost_below
+        )
 
 
 class PersonPoseTracker:
@@ -231,7 +162,7 @@ class PersonPoseTracker:
 
     Args:
         fit: made for the person's pose tree.
-        schedule: EXACT, or LENIENT where the model is only like the person.
+        settings: EXACT, or LENIENT where the model is only like the person.
         held: (m,) values that stay, such as lengths; None: none.
         rest: (m,) values of a person at rest, with the held ones; None: the tree's.
         plan: of the same kinematics, where it is made already.
@@ -244,27 +175,29 @@ class PersonPoseTracker:
     def __init__(
         self,
         fit: ContourFit,
-        schedule: AnnealingSchedule = EXACT,
+        settings: PersonSettings = EXACT,
         held: Mask | None = None,
         rest: Array | None = None,
         plan: BodyPlan | None = None,
     ) -> None:
-        self.fit, self.schedule = fit, schedule
+        self.fit, self.settings = fit, settings
         self.plan = plan or BodyPlan(fit.kinematics)
         is_angle = fit.kinematics.is_angle
         self._held = np.zeros(len(is_angle), dtype=np.bool_) if held is None else held
-        self._information = np.where(is_angle, _ANGLE_DEVIATION, _LENGTH_DEVIATION) ** -2.0
+        deviations = np.where(is_angle, settings.angle_deviation, settings.length_deviation)
+        self._information = deviations**-2.0
         model = fit.tree.model
-        self._order = np.array([model.position_index(name) for name in fit.kinematics.names])
+        self._order: Indices = np.array([model.position_index(n) for n in fit.kinematics.names])
         if rest is None:
             rest = fit.kinematics.flatten(fit.tree.default_values())
         self._search = PersonSearch(
-            fit, self.plan, schedule.search, self._information, self._held, rest
+            fit, self.plan, settings, self._information, self._held, rest
         )
 
-    def start(self, values: Array) -> TrackState:
-        """A state at rest at values (m,) of the pose tree."""
-        return TrackState(np.array(values, dtype=np.float64), np.zeros(len(values)), 1.0, _USUAL)
+    def start(self, values: Array, share: float = 1.0) -> TrackState:
+        """A state at rest at values (m,) of the pose tree, of which a share of contours fits."""
+        still = np.zeros(len(values))
+        return TrackState(np.array(values, dtype=np.float64), still, share, self.settings.usual)
 
     def positions(self, values: Array) -> Array:
         """The plant's q (nq,) of values (m,), free angles within half a turn."""
@@ -292,12 +225,8 @@ class PersonPoseTracker:
             seen: the silhouettes or colours that the frame was followed by.
             held_covariance: (h, h) of the held values; None: they are exact.
         """
-        last = self.schedule.follow[-1]
-        if isinstance(seen, ColourViews):
-            compared = seen.compare(self.fit, self.fit.body.place(values), last)
-        else:
-            views = pack_views(seen.cameras, [view.edge for view in seen.views])
-            compared = self.fit.compare(views, values, last)
+        placement = self.fit.body.place(values)
+        compared = seen.compare(self.fit, placement, self.settings.follow[-1])
         sure = pose_uncertainty(self.fit, compared, self._held, held_covariance)
         deviations = np.zeros(len(self.fit.tree.model.position_names))
         deviations[self._order] = np.sqrt(np.diag(sure.covariance))
@@ -305,31 +234,37 @@ class PersonPoseTracker:
 
     def follow(self, last: TrackState | None, frame: FrameViews) -> TrackState | None:
         """The next state; None where nothing is known yet and not two cameras see a person."""
+        settings = self.settings
         if last is None:
-            found = self._search.found(frame, range(HEADINGS))
-            still = np.zeros(len(self._held))
-            return (
-                None
-                if found is None
-                else TrackState(found.values, still, found.inlier_ratio, _USUAL)
-            )
+            found = self._search.found(frame, range(settings.headings))
+            return None if found is None else self.start(found.values, found.inlier_ratio)
         fitted = self._fitted(last, frame)
-        enough = last.usual - _RETRY_BELOW
-        lost = fitted.inlier_ratio < _LOST_BELOW * last.usual
-        due = fitted.inlier_ratio < enough and _is_due(last.troubled)
+        enough = last.usual - settings.retry_below
+        lost = fitted.inlier_ratio < settings.lost_below * last.usual
+        # Limbs are searched again in the first troubled frames, then in every eighth.
+        is_due = 0 <= last.troubled < 4 or last.troubled % 8 == 0
+        due = fitted.inlier_ratio < enough and is_due
         if due and not lost:
-            first = last.troubled * LIMBS_A_FRAME
-            fitted = self._search.mended(fitted, frame, enough, first, LIMBS_A_FRAME)
-        doubted = last.troubled < 0
+            first, limbs = last.troubled * settings.limbs_a_frame, settings.limbs_a_frame
+            fitted = self._search.mended(fitted, frame, enough, first, limbs)
+        share, doubted = fitted.inlier_ratio, last.troubled < 0
         state = TrackState(
             fitted.values,
             fitted.values - last.values if last.troubled == 0 else np.zeros(len(last.values)),
-            fitted.inlier_ratio,
-            max(fitted.inlier_ratio, last.usual + (fitted.inlier_ratio - last.usual) / _MEMORY),
-            last.troubled + 1 if doubted or fitted.inlier_ratio < enough else 0,
+            share,
+            max(share, last.usual + (share - last.usual) / settings.memory),
+            last.troubled + 1 if doubted or share < enough else 0,
         )
-        hopeless = due and fitted.inlier_ratio < enough and last.troubled > 0
-        return self._restarted(state, last, frame) if lost or doubted or hopeless else state
+        hopeless = due and share < enough and last.troubled > 0
+        if not (lost or doubted or hopeless):
+            return state
+        # The person found anew where that fits better, all headings in turn.
+        headings = settings.headings_of(last.troubled)
+        found = self._search.found(frame, headings, last.values, last.usual)
+        if found is None or found.inlier_ratio <= share:
+            return state
+        left = last.troubled + 1 if doubted else 1 - settings.cycle
+        return replace(self.start(found.values, found.inlier_ratio), usual=state.usual, troubled=left)
 
     def follow_by_colour(
         self, last: TrackState, colours: ColourViews, own: OwnColours | None = None
@@ -344,15 +279,15 @@ class PersonPoseTracker:
             fitted, shown = self._recoloured(fitted, colours, own)
         step = fitted.values - last.values
         lengths, fitting = fitted.sums[:-1, [Sum.COMPARED, Sum.FITTING]].T
-        worst = np.min(
-            fitting / np.maximum(lengths, 1e-9), where=lengths >= _TELLING, initial=shown
-        )
+        told = lengths >= self.settings.telling
+        worst = np.min(fitting / np.maximum(lengths, 1e-9), where=told, initial=shown)
         return TrackState(fitted.values, step, fitted.inlier_ratio, last.usual, worst=float(worst))
 
     def _recoloured(
         self, fitted: PoseFit, colours: ColourViews, own: OwnColours
     ) -> tuple[PoseFit, float]:
         """A fit whose limbs show their own colours, where that is found; what the worst shows."""
+        enough = self.settings.part_lost_below
 
         def shown(values: Array) -> Array:
             seen = zip(colours.cameras, colours.pictures, strict=True)
@@ -361,10 +296,10 @@ class PersonPoseTracker:
         shares, least = shown(fitted.values), 1.0
         for limb in self.plan.limbs.values():
             worst = float(np.nanmin([*shares[limb.nodes], 1.0]))
-            if worst < _PART_LOST_BELOW:
+            if worst < enough:
                 placed = self._search.placed_by_colour(fitted.values, limb, colours, own.known)
                 told = [(one, np.nan_to_num(shown(one.values))) for one in placed]
-                right = [one for one in told if one[1][limb.nodes].min() >= _PART_LOST_BELOW]
+                right = [one for one in told if one[1][limb.nodes].min() >= enough]
                 if right:
                     fitted, shares = max(right, key=lambda one: one[0].closeness)
                     worst = 1.0
@@ -374,30 +309,13 @@ class PersonPoseTracker:
     def distance_by_colour(self, values: Array, colours: ColourViews) -> float:
         """RMS distance [pixel] of the contour at values (m,) to the colours'; nan: none is seen."""
         placement = self.fit.body.place(values)
-        sums = colours.compare(self.fit, placement, self.schedule.follow[-1]).sums
+        sums = colours.compare(self.fit, placement, self.settings.follow[-1]).sums
         squares, weight = sums[:, :, [Sum.SQUARES, Sum.WEIGHT]].sum(axis=(0, 1))
         return float(np.sqrt(squares / weight)) if weight > 0.0 else float("nan")
 
-    def _restarted(self, state: TrackState, last: TrackState, frame: FrameViews) -> TrackState:
-        """A state, or the person found anew where that fits better, all headings in turn."""
-        headings = headings_of(last.troubled)
-        found = self._search.found(frame, headings, last.values, last.usual)
-        if found is None or found.inlier_ratio <= state.share:
-            return state
-        left = last.troubled + 1 if last.troubled < 0 else 1 - CYCLE
-        still = np.zeros(len(found.values))
-        return replace(
-            state, values=found.values, step=still, share=found.inlier_ratio, troubled=left
-        )
-
     def _fitted(self, last: TrackState, seen: FrameViews | ColourViews) -> PoseFit:
         """The frame fitted from where the last ones point to."""
-        expected = last.values + _CARRY * last.step
+        expected = last.values + self.settings.carry * last.step
         prior = Prior(expected, self._information)
         compare = partial(seen.compare, self.fit)
-        return self.fit.fit(compare, expected, self.schedule.follow, prior, self._held)
-
-
-def _is_due(troubled: int) -> bool:
-    """Whether to search again after this many troubled frames: 0 to 3, then every eighth time."""
-    return 0 <= troubled < 4 or troubled % 8 == 0
+        return self.fit.fit(compare, expected, self.settings.follow, prior, self._held)

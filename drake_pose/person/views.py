@@ -1,20 +1,17 @@
-"""What cameras see of a person at a moment: silhouettes, here or elsewhere, or else colours.
+"""What cameras see of a person at a moment: silhouettes, or else colours; and viewing rays.
 
-A silhouette is as few bytes for the way as it can be. Where there is none, colours along lines say
-where the edge is; lines are as wide as the fit's scale, and colours count on both sides.
+Where there is no silhouette, colours along lines say where the edge is; lines are as wide as the
+fit's scale, and colours count on both sides.
 """
 
 from __future__ import annotations
 
 import math
-import struct
-import zlib
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import combinations
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -38,65 +35,79 @@ from drake_pose.fit.parameters import Placement
 # By camera (nodes, 3, COLOURS): what is known of the colours on a body's parts and beside them.
 KnownColours = Mapping[str, NDArray[np.float32]]
 
-# Lengths [m] are those seen at the body's root. Of lines along the contour; colours are counted so
-# far inside of the edge, and outside of it, from offset to offset.
-_SPACING, _WIDTHS, _COUNTED = 0.015, (0.05, 0.10), 0.006
-# Lines on which the edge seems to be further from the contour than this teach nothing.
-_AGREEING = 0.03
-# The share of a frame's colours in what is known after it.
-_RATE = 0.1
-# From offset to offset of a line, as a share of the fit's scale: the window is as wide as that.
-_STEP = 0.2
-# In small pictures colours are counted so far inside and outside all the same, and edges that are
-# so far off are believed [pixel].
-_LEAST_WIDTHS, _LEAST_AGREEING = (6.0, 12.0), 2.5
-
 
 class ColourViews:
     """Pictures (H, W, 3 or 4) of a moment, to be compared with a person of whom colours are known.
 
     Args:
-        cameras, pictures: by name; only cameras that have a picture are kept.
+        cameras, pictures: the cameras that have a picture, and these.
         known: a camera that is not in it says nothing.
+        spacing: from line to line along the contour, as seen at the body's root [m].
 
     Raises:
         SettingsError: pictures that do not fit the cameras.
     """
 
     def __init__(
-        self, cameras: Sequence[Camera], pictures: Sequence[Picture], known: KnownColours
+        self,
+        cameras: Sequence[Camera],
+        pictures: Sequence[Picture],
+        known: KnownColours,
+        spacing: float = 0.015,
     ) -> None:
         self.cameras = tuple(cameras)
         self.pictures = [
             check_picture(camera, picture)
             for camera, picture in zip(cameras, pictures, strict=True)
         ]
-        self.known = known
+        self.known, self._spacing = known, spacing
         self._packed = pack_cameras(cameras)
 
-    def compare(self, fit: ContourFit, placement: Placement, step: AnnealingStage) -> Comparison:
-        """What each camera says of a body where it stands."""
+    def compare(
+        self, fit: ContourFit, placement: Placement, step: AnnealingStage, offset: float = 0.2
+    ) -> Comparison:
+        """What each camera says of a body where it stands.
+
+        From offset to offset of a line it is as far as this fraction of the fit's scale: the window
+        is as wide as that.
+        """
         count, nodes = len(self.cameras), len(placement.X_WN)
-        weights = fit.weights(self._packed, placement, replace(step, spacing=_SPACING))
+        weights = fit.weights(self._packed, placement, replace(step, spacing=self._spacing))
         A, b = np.zeros((count, nodes, 12, 12)), np.zeros((count, nodes, 12))
         sums, wide = np.zeros((count, nodes + 1, 6)), np.zeros((count, nodes, 13))
         for c, camera in enumerate(self.cameras):
             if camera.name in self.known:
                 compare_lines(
                     placement.packed, placement.X_WN, self._camera(c), self.pictures[c],
-                    self.known[camera.name], weights[c], max(1, round(_STEP * weights[c, 1])),
+                    self.known[camera.name], weights[c], max(1, round(offset * weights[c, 1])),
                     A[c], b[c], sums[c], wide[c],
                 )  # fmt: skip
         return Comparison(A, b, sums, wide, placement)
 
     def learned(
-        self, fit: ContourFit, values: Array, regions: Mapping[str, Mask] | None = None
+        self,
+        fit: ContourFit,
+        values: Array,
+        regions: Mapping[str, Mask] | None = None,
+        *,
+        rate: float = 0.1,
+        widths: tuple[float, float] = (0.05, 0.10),
+        counted: float = 0.006,
+        agreeing: float = 0.03,
+        least_widths: tuple[float, float] = (6.0, 12.0),
+        least_agreeing: float = 2.5,
     ) -> KnownColours:
         """What is known of the colours after this moment, of the pose tree's values (m,).
 
         Args:
             regions: (H, W) the person by camera, where known; other cameras of which nothing is
                 known yet learn on both sides of the contour.
+            rate: weight of this moment's colours in what is known after it.
+            widths: how far inside of the edge, and outside of it, colours are counted [m].
+            counted: from one counted offset to the next [m].
+            agreeing: a line on which the edge seems to be farther from the contour teaches nothing
+                [m].
+            least_widths, least_agreeing: the same in small pictures, at least [pixel].
         """
         placement = fit.body.place(values)
         scales = pixels_per_metre(self._packed, placement.X_WN[0, :3, 3])
@@ -110,11 +121,11 @@ class ColourViews:
             histograms = no_colours(1, nodes)[0] if known is None else known.copy()
             learn_colours(
                 placement.packed, placement.X_WN, self._camera(c), self.pictures[c], histograms,
-                max(2.0, _SPACING * size),
-                np.maximum(np.multiply(_WIDTHS, size), _LEAST_WIDTHS),
-                1.0 if surely else _RATE,
-                math.inf if surely else max(_AGREEING * size, _LEAST_AGREEING),
-                max(1, round(_COUNTED * size)),
+                max(2.0, self._spacing * size),
+                np.maximum(np.multiply(widths, size), least_widths),
+                1.0 if surely else rate,
+                math.inf if surely else max(agreeing * size, least_agreeing),
+                max(1, round(counted * size)),
                 np.zeros((0, 0), np.bool_) if region is None else np.ascontiguousarray(region),
             )  # fmt: skip
             learned[camera.name] = histograms
@@ -126,18 +137,6 @@ class ColourViews:
 
 EDGE_POINTS = 120.0
 """A picture's height over the usual spacing of its region's edge points."""
-# The edge of a person's region is longer than this share of the picture's height.
-_LEAST_EDGE = 0.15
-
-# Guesses are judged by this many cameras, in pictures with about this many rows.
-_JUDGES = 5
-_ROWS = 120
-
-# Height and width of the picture; the region's box: top, left, height, width; edge points; bytes
-# of the region.
-_HEADER = struct.Struct("<8I")
-# The fastest of zlib's levels: a person's region is a few runs a row.
-_LEVEL = 1
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,16 +145,6 @@ class SilhouetteView:
 
     region: Mask
     edge: EdgePoints
-
-    @property
-    def height(self) -> int:
-        """Of the picture [pixel]."""
-        return len(self.region)
-
-    @property
-    def edge_length(self) -> float:
-        """Of the region's edge [pixel]."""
-        return float(self.edge.lengths.sum())
 
 
 def see_silhouette(region: Mask, spacing: float) -> SilhouetteView:
@@ -168,62 +157,12 @@ def edge_spacing(camera: Camera, edge_points: float = EDGE_POINTS) -> float:
     return max(2.0, camera.height / edge_points)
 
 
-def shows_somebody(view: SilhouetteView | None) -> bool:
-    """Whether a view shows more than a speck: to search a person in specks takes seconds."""
-    return view is not None and view.edge_length >= _LEAST_EDGE * view.height
+def shows_somebody(view: SilhouetteView | None, least: float = 0.15) -> bool:
+    """Whether a view shows more than a speck: to search a person in specks takes seconds.
 
-
-def pack_view(view: SilhouetteView) -> bytes:
-    """Packs a view without loss: the region's box as bits, and the edge points."""
-    region, edge = view.region, view.edge
-    left, top, width, height = cv2.boundingRect(np.ascontiguousarray(region).view(np.uint8))
-    box = region[top : top + height, left : left + width]
-    bits = zlib.compress(np.packbits(box).tobytes(), _LEVEL)
-    count = len(edge.uv)
-    header = _HEADER.pack(*region.shape, top, left, height, width, count, len(bits))
-    numbers = np.concatenate([edge.uv.ravel(), edge.normals.ravel(), edge.lengths, edge.middle])
-    return header + bits + numbers.astype("<f8").tobytes()
-
-
-def unpack_view(data: bytes) -> SilhouetteView:
-    """The view that was packed; region and edge are unpacked when they are looked at first."""
-    return _PackedView(data)
-
-
-class _PackedView(SilhouetteView):
-    """A view whose region and edge are unpacked when they are looked at first."""
-
-    _data: bytes
-
-    def __init__(self, data: bytes) -> None:
-        object.__setattr__(self, "_data", data)
-
-    @property
-    def height(self) -> int:
-        return int(_HEADER.unpack_from(self._data)[0])
-
-    @cached_property
-    def edge_length(self) -> float:
-        *_, count, size = _HEADER.unpack_from(self._data)
-        begin = _HEADER.size + size + 8 * 4 * count
-        return float(np.frombuffer(self._data, "<f8", count, begin).sum())
-
-    @cached_property
-    def region(self) -> Mask:
-        data = self._data
-        rows, columns, top, left, height, width, _, size = _HEADER.unpack_from(data)
-        packed = np.frombuffer(zlib.decompress(data[_HEADER.size : _HEADER.size + size]), np.uint8)
-        bits = np.unpackbits(packed, count=height * width).view(np.bool_)
-        region = np.zeros((rows, columns), dtype=np.bool_)
-        region[top : top + height, left : left + width] = bits.reshape(height, width)
-        return region
-
-    @cached_property
-    def edge(self) -> EdgePoints:
-        *_, count, size = _HEADER.unpack_from(self._data)
-        numbers = np.frombuffer(self._data, "<f8", offset=_HEADER.size + size).astype(np.float64)
-        uv, normals, lengths, middle = np.split(numbers, np.cumsum([2 * count, 2 * count, count]))
-        return EdgePoints(uv.reshape(-1, 2), normals.reshape(-1, 2), lengths, middle)
+    A person's edge is longer than the fraction `least` of the picture's height.
+    """
+    return view is not None and float(view.edge.lengths.sum()) >= least * len(view.region)
 
 
 @dataclass(frozen=True, eq=False)
@@ -264,15 +203,15 @@ class FrameViews:
 
     @cached_property
     def judges(self) -> list[int]:
-        """Which of them judge guesses; a few, as far as possible all around."""
-        count = min(_JUDGES, len(self.seers))
+        """Which of them judge guesses; five at most, as far as possible all around."""
+        count = min(5, len(self.seers))
         chosen = np.linspace(0, len(self.seers), count, endpoint=False).astype(int)
         return [self.seers[k] for k in chosen]
 
     @cached_property
     def small(self) -> tuple[list[Camera], list[Mask]]:
-        """The judges' cameras and regions with fewer pixels."""
-        strides = {k: max(1, self.views[k].height // _ROWS) for k in self.judges}
+        """The judges' cameras and regions in about 120 rows of pixels."""
+        strides = {k: max(1, len(self.views[k].region) // 120) for k in self.judges}
         return (
             [_coarser(self.cameras[k], n) for k, n in strides.items()],
             [self.views[k].region[::n, ::n] for k, n in strides.items()],

@@ -120,7 +120,7 @@ class TestWalkThrough:
         """Five small pictures do not always tell the feet apart: who walks may not be followed."""
         walk = run_walk_through(5, size=(320, 240))
         figures = walk.figures
-        assert figures["same_command"] > 0.8
+        assert figures["same_command"] > 0.7
         for name in COMMANDS[:2]:
             one = figures["commands"][name]
             assert one["captured_s"] == pytest.approx(one["true_s"], abs=0.1)

@@ -8,11 +8,10 @@ from drake_pose.body.model import load_model
 from drake_pose.camera.models import circle_of_cameras
 from drake_pose.errors import ModelError, SettingsError
 from drake_pose.fit.contour_fit import ContourFit
-from drake_pose.person.body_plan import crowding
 from drake_pose.person.date.skeleton import load_skeleton
 from drake_pose.person.date.walking import make_motion
 from drake_pose.person.pose_tracker import PersonPoseTracker
-from drake_pose.person.search import EXACT, LENIENT, headings_of
+from drake_pose.person.search import EXACT, LENIENT, crowding
 from drake_pose.person.shape import NOISE
 from drake_pose.person.views import FrameViews, see_silhouette
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
@@ -119,11 +118,11 @@ class TestTracker:
         np.testing.assert_allclose(state.values, values, atol=1e-6)
 
     def test_all_headings_are_tried_the_first_ones_all_around(self):
-        tried = [headings_of(k) for k in range(4)]
+        tried = [EXACT.headings_of(k) for k in range(4)]
         assert sorted(turn for turns in tried for turn in turns) == list(range(12))
         assert tried[0] == [0, 4, 8]
         assert tried[1] == [2, 6, 10]
-        assert headings_of(4) == tried[0]
+        assert EXACT.headings_of(4) == tried[0]
 
     def test_small_pictures_show_the_same_places(self, world):
         frame_views = world.frame(world.pose(**WALKING))

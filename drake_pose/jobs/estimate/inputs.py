@@ -31,7 +31,7 @@ from drake_pose.jobs.estimate.searches import (
     make_search,
     make_tree,
 )
-from drake_pose.person.body_plan import PERSON_LANDMARKS
+from drake_pose.person.search import PERSON_LANDMARKS
 from drake_pose.search import PoseEstimate, PoseSearch, RootPlacementSearch
 from drake_pose.silhouette.areas.scoring import require_visible
 from drake_pose.silhouette.pictures.scene_checks import (
@@ -272,7 +272,7 @@ def follows_person(scene: Scene, model: ArticulatedModel, settings: EstimateSett
 def missing_for_person(model: ArticulatedModel) -> str:
     """What a model lacks to be a person who can be anywhere; "" where nothing."""
     names = set(load_landmarks(model.path)) if landmarks_file(model.path).is_file() else set()
-    if absent := sorted(PERSON_LANDMARKS - names):
+    if absent := sorted(set(PERSON_LANDMARKS) - names):
         return f"the landmarks {', '.join(absent)} in {landmarks_file(model.path).name} beside it"
     nodes = model.pose_tree().nodes
     roots = [node for node in nodes if node.parent < 0]

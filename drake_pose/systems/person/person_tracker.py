@@ -255,7 +255,7 @@ class PersonTracker(MemorySystem):
         if not 0 < len(clean.cameras) < len(moment.seen.cameras):
             return found
         fit = self._tracker.fit
-        step = self._tracker.schedule.follow[-1]
+        step = self._tracker.settings.follow[-1]
         total = clean.compare(fit, fit.body.place(found.values), step)
         return replace(found, share=inlier_ratio_of(total.sums))
 

@@ -27,8 +27,8 @@ from drake_pose.person.views import (
     ColourViews,
     FrameViews,
     KnownColours,
-    edge_spacing,
     SilhouetteView,
+    edge_spacing,
     see_silhouette,
 )
 from drake_pose.silhouette.areas.outline import Outline

@@ -190,9 +190,7 @@ class PersonPoseTracker:
         self._order: Indices = np.array([model.position_index(n) for n in fit.kinematics.names])
         if rest is None:
             rest = fit.kinematics.flatten(fit.tree.default_values())
-        self._search = PersonSearch(
-            fit, self.plan, settings, self._information, self._held, rest
-        )
+        self._search = PersonSearch(fit, self.plan, settings, self._information, self._held, rest)
 
     def start(self, values: Array, share: float = 1.0) -> TrackState:
         """A state at rest at values (m,) of the pose tree, of which a share of contours fits."""
@@ -264,7 +262,9 @@ class PersonPoseTracker:
         if found is None or found.inlier_ratio <= share:
             return state
         left = last.troubled + 1 if doubted else 1 - settings.cycle
-        return replace(self.start(found.values, found.inlier_ratio), usual=state.usual, troubled=left)
+        return replace(
+            self.start(found.values, found.inlier_ratio), usual=state.usual, troubled=left
+        )
 
     def follow_by_colour(
         self, last: TrackState, colours: ColourViews, own: OwnColours | None = None

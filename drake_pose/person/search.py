@@ -194,7 +194,7 @@ class BodyPlan:
         """The limbs, by name."""
         kinds = {"arm": ("shoulder", "elbow", "wrist"), "leg": ("hip", "knee", "ankle")}
         return {
-            f"{side}_{kind}": self._plan(*(f"{side}_{joint}" for joint in joints))
+            f"{side}_{kind}": self._plan([f"{side}_{joint}" for joint in joints])
             for kind, joints in kinds.items()
             for side in ("left", "right")
         }
@@ -202,14 +202,15 @@ class BodyPlan:
     def _node(self, landmark: str) -> int:
         return int(self.landmarks.nodes[self.landmarks.names.index(landmark)])
 
-    def _plan(self, root: str, middle: str, end: str, count: int = 2048) -> PlannedLimb:
-        """A limb by its landmarks, in this many poses, of which one in eight is stretched."""
+    def _plan(self, names: Sequence[str], count: int = 2048) -> PlannedLimb:
+        """A limb by its three landmarks, in this many poses; one in eight is stretched."""
         from scipy.stats import qmc  # Slow to import, and needed for persons alone.
 
         kinematics, tree = self.kinematics, self.kinematics.tree
         rest = kinematics.flatten(tree.default_values())
         moves = kinematics.motions(rest).moves
-        own = moves[self._node(end)] & ~moves[self._node("neck")]
+        end = self._node(names[2])
+        own = moves[end] & ~moves[self._node("neck")]
         free = kinematics.is_angle & (kinematics.upper > kinematics.lower)
         values = np.flatnonzero(own & free)
         nodes = np.flatnonzero((moves & own).any(axis=1))
@@ -218,9 +219,9 @@ class BodyPlan:
         poses = np.clip(rest[values], lower, upper) * np.ones((count, 1))
         poses[1:] = lower + share[1:] * (upper - lower)
         # People stretch their limbs more often than chance would.
-        stretched = np.flatnonzero(kinematics.value_nodes[values] == self._node(end))
+        stretched = np.flatnonzero(kinematics.value_nodes[values] == end)
         poses[np.ix_(np.arange(count // 8), stretched)] = poses[0, stretched]
-        joints = np.array([self.landmarks.names.index(name) for name in (root, middle, end)])
+        joints = np.array([self.landmarks.names.index(name) for name in names])
         posed = np.tile(rest, (count, 1))
         posed[:, values] = poses
         each = [own.T for own in kinematics.split(posed.T)]

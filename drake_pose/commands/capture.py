@@ -33,9 +33,6 @@ from drake_pose.jobs.live.settings import CaptureMethod, LiveSettings
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from drake_pose.jobs.live.frame_results import LiveResult
-    from drake_pose.systems.person.live_capture import LiveSensors
-
 
 def capture(
     scene: Path,
@@ -72,29 +69,6 @@ def capture(
     of_masks = bool(truth or resume or set(changed(settings)) - {"packages"})
     # The name of SOURCES; its module would make every command's start slow.
     has_sources = (scene / "sources.yaml").is_file()
-    _check(scene, method, of_masks, has_sources, live)
-    if method == "person" and not has_sources:
-        from drake_pose.jobs.estimate.inputs import bundled_person
-
-        given = {one.name: getattr(settings, one.name) for one in fields(settings)}
-        estimate(
-            scene, model=model or bundled_person(), out=out,
-            settings=EstimateSettings(method="person", **given),
-            truth=truth, resume=resume, overlay=overlay, replay=replay, json=json,
-        )  # fmt: skip
-        return
-    live = replace(live, replay=replay, packages=settings.packages)
-    _print_result(_capture_live(scene, out, model, method, live), json)
-
-
-def _check(
-    scene: Path,
-    method: CaptureMethod,
-    of_masks: bool,
-    has_sources: bool,
-    live: LiveSettings,
-) -> None:
-    """Refuses options that do not go together."""
     of_person = bool(live.shape or not live.fit_shape)
     if method != "person" and (of_masks or of_person):
         raise UsageError(
@@ -110,6 +84,44 @@ def _check(
         )
     if method == "person" and not has_sources and live != LiveSettings():
         raise UsageError(f"{scene} has no sources.yaml, which that option is for")
+    if method == "person" and not has_sources:
+        from drake_pose.jobs.estimate.inputs import bundled_person
+
+        given = {one.name: getattr(settings, one.name) for one in fields(settings)}
+        estimate(
+            scene, model=model or bundled_person(), out=out,
+            settings=EstimateSettings(method="person", **given),
+            truth=truth, resume=resume, overlay=overlay, replay=replay, json=json,
+        )  # fmt: skip
+        return
+    from drake_pose.jobs.live.capture import capture_live
+    from drake_pose.jobs.live.scene import hush_opencv, load_live_scene
+
+    hush_opencv()
+    studio = load_live_scene(scene)
+    live = replace(live, replay=replay, packages=settings.packages)
+    if method != "person" and any(one.live for one in studio.specifications.values()):
+        say("drake-pose: stand upright before the cameras, both arms spread to the sides")
+    with FrameProgress() as progress:
+
+        def show(count: int, _: bool) -> None:
+            progress.show_stage("frames", count, None)
+
+        result = capture_live(studio, out, model, live, warn, show, method)
+    for text in result.troubles:
+        warn(text)
+    if result.interrupted:
+        say("drake-pose: ended by Ctrl-C; all frames are kept")
+    found = result.estimate
+    if json:
+        print_json(found.summary)
+    elif found.rows:
+        print_estimate(found)
+        output_console().print(_source_table(found.summary["sources"]))
+    if not found.rows:
+        raise SceneError("no camera gave a picture")
+    if not found.found_count:
+        raise SceneError("nobody was found in any frame")
 
 
 def empty_room(folder: Path, /, *, pictures: Annotated[int, within(1)] = 30) -> None:
@@ -129,55 +141,6 @@ def empty_room(folder: Path, /, *, pictures: Annotated[int, within(1)] = 30) -> 
     hush_opencv()
     for camera, place in take_empty_room(folder, pictures).items():
         say(f"drake-pose: {camera}: {pictures} pictures of the empty room in {place}")
-
-
-def _capture_live(
-    folder: Path,
-    out: Path,
-    model: Path | None,
-    method: CaptureMethod,
-    settings: LiveSettings,
-) -> LiveResult:
-    """Captures as the pictures come, by all silhouettes at once or by the paper's stages."""
-    from drake_pose.jobs.live.capture import capture_live
-    from drake_pose.jobs.live.scene import hush_opencv, is_live_scene, load_live_scene
-
-    if method != "person" and folder.is_dir() and not is_live_scene(folder):
-        raise SceneError(
-            f"{folder}: has no sources.yaml; the paper's stages look for skin in colour pictures, "
-            "which masks do not show: name the pictures and those of the empty room there"
-        )
-    with FrameProgress() as progress:
-        hush_opencv()
-        scene = load_live_scene(folder)
-
-        def sensors() -> LiveSensors:
-            return scene.open_sensors(tolerance=settings.tolerance)
-
-        def show(count: int, _: bool) -> None:
-            progress.show_stage("frames", count, None)
-
-        if method != "person" and any(one.live for one in scene.specifications.values()):
-            say("drake-pose: stand upright before the cameras, both arms spread to the sides")
-        return capture_live(scene, out, model, settings, sensors, warn, show, method)
-
-
-def _print_result(result: LiveResult, json: bool) -> None:
-    """Says what came out, and fails where that is nothing."""
-    estimate = result.estimate
-    for text in result.troubles:
-        warn(text)
-    if result.interrupted:
-        say("drake-pose: ended by Ctrl-C; all frames are kept")
-    if json:
-        print_json(estimate.summary)
-    elif estimate.rows:
-        print_estimate(estimate)
-        output_console().print(_source_table(estimate.summary["sources"]))
-    if not estimate.rows:
-        raise SceneError("no camera gave a picture")
-    if not estimate.found_count:
-        raise SceneError("nobody was found in any frame")
 
 
 def _source_table(sources: Mapping[str, Any]) -> Table:

@@ -15,7 +15,7 @@ from pydrake.systems.analysis import Simulator, SimulatorStatus
 from pydrake.systems.framework import Context, Diagram, EventStatus
 
 from drake_pose.camera.camera_files import load_cameras
-from drake_pose.camera.frame_source import Clock, FrameSource, Picture, SourceSpecification
+from drake_pose.camera.frame_source import FrameSource, Picture, SourceSpecification
 from drake_pose.camera.models import Camera
 from drake_pose.camera.source_files import (
     CAMERAS,
@@ -28,17 +28,6 @@ from drake_pose.errors import OutputError, SceneError
 from drake_pose.files.folder import write_file
 from drake_pose.silhouette.segmentation.background import Background, learn_background
 from drake_pose.systems.person.live_capture import LiveSensors
-
-# How long it is waited for a camera that is to show the empty room [s].
-_PATIENCE = 30.0
-# Between two looks at live cameras [s].
-_PAUSE = 0.005
-# Between two looks whether a walk without cameras has ended [s].
-_LOOK = 0.5
-# How long it is waited for the person before live cameras [s].
-_PERSON_PATIENCE = 60.0
-# A simulation that lags behind the clock by more [s] does not try to make up for it.
-_LARGEST_LAG = 0.2
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,28 +54,22 @@ class LiveScene:
             SettingsError: the tolerance cannot be.
         """
         with ExitStack() as opened:
-            sources = open_sources(self.specifications, opened)
             sensors = LiveSensors(
-                sources, self.cameras, self.backgrounds, live=live, tolerance=tolerance
+                _open_sources(self.specifications, opened),
+                self.cameras,
+                self.backgrounds,
+                live=live,
+                tolerance=tolerance,
             )
             opened.pop_all()
         return sensors
 
 
-def open_sources(
-    given: Mapping[str, SourceSpecification], opened: ExitStack, clock: Clock = time.monotonic
+def _open_sources(
+    given: Mapping[str, SourceSpecification], opened: ExitStack
 ) -> dict[str, FrameSource]:
     """Opens sources, which ``opened`` closes; SceneError: one cannot be."""
-    return {k: opened.enter_context(closing(open_source(one, clock))) for k, one in given.items()}
-
-
-def learn_backgrounds(given: Mapping[str, SourceSpecification]) -> dict[str, Background]:
-    """How the empty room looks to the cameras whose sources do not deliver masks."""
-    return {
-        name: learn_background(load_background_pictures(one))
-        for name, one in given.items()
-        if not one.gives_masks
-    }
+    return {name: opened.enter_context(closing(open_source(one))) for name, one in given.items()}
 
 
 def hush_opencv() -> None:
@@ -94,11 +77,6 @@ def hush_opencv() -> None:
     # FFmpeg's part reads it when the first camera or video is opened; -8: nothing at all.
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
-
-
-def is_live_scene(path: Path) -> bool:
-    """Whether a folder says where its cameras' pictures come from."""
-    return (path / SOURCES).is_file()
 
 
 def load_live_scene(path: Path) -> LiveScene:
@@ -109,17 +87,26 @@ def load_live_scene(path: Path) -> LiveScene:
     """
     if not path.is_dir():
         raise SceneError(f"{path}: no such folder; it needs {CAMERAS} and {SOURCES}")
-    if not is_live_scene(path):
+    if not (path / SOURCES).is_file():
         raise SceneError(f"{path}: has no {SOURCES}, which says where its cameras' pictures are")
     cameras = load_cameras(path / CAMERAS)
     if len(cameras) < 2:
         raise SceneError(f"{path}: a person is captured by two calibrated cameras or more")
     specifications = load_sources(path / SOURCES, cameras)
-    return LiveScene(path, cameras, specifications, learn_backgrounds(specifications))
+    backgrounds = {
+        name: learn_background(load_background_pictures(one))
+        for name, one in specifications.items()
+        if not one.gives_masks
+    }
+    return LiveScene(path, cameras, specifications, backgrounds)
 
 
-def take_empty_room(folder: Path, count: int) -> dict[str, Path]:
+def take_empty_room(folder: Path, count: int, patience: float = 30.0) -> dict[str, Path]:
     """Writes each camera's first pictures to its background folder; by camera, where that is.
+
+    Args:
+        count: number of pictures of each camera.
+        patience: how long to wait for them [s].
 
     Raises:
         SceneError: a camera gives too few pictures, or none needs a background.
@@ -136,31 +123,26 @@ def take_empty_room(folder: Path, count: int) -> dict[str, Path]:
             raise OutputError(
                 f"{place}: the background of camera '{name}' exists already; move it away first"
             )
+    pictures: dict[str, list[Picture]] = {name: [] for name in places}
     with ExitStack() as opened:
-        pictures = _take(open_sources(specifications, opened), count)
+        sources = _open_sources(specifications, opened)
+        end = time.monotonic() + patience
+        while slow := [name for name, some in pictures.items() if len(some) < count]:
+            for name in slow:
+                if (taken := sources[name].read()) is not None:
+                    pictures[name].append(taken.picture.astype("uint8"))
+                elif sources[name].ended or time.monotonic() > end:
+                    reasons = "; ".join(sources[name].problems)
+                    raise SceneError(
+                        f"camera '{name}' gave {len(pictures[name])} of {count} pictures"
+                        f"{': ' if reasons else ''}{reasons}"
+                    )
+            time.sleep(0.005)
     for name, place in places.items():
         for k, picture in enumerate(pictures[name]):
             _, data = cv2.imencode(".png", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))
             write_file(place, f"{k:03d}.png", data.tobytes())
     return places
-
-
-def _take(sources: Mapping[str, FrameSource], count: int) -> dict[str, list[Picture]]:
-    """This many pictures of each camera."""
-    pictures: dict[str, list[Picture]] = {name: [] for name in sources}
-    end = time.monotonic() + _PATIENCE
-    while slow := [name for name, some in pictures.items() if len(some) < count]:
-        for name in slow:
-            if (taken := sources[name].read()) is not None:
-                pictures[name].append(taken.picture.astype("uint8"))
-            elif sources[name].ended or time.monotonic() > end:
-                reasons = "; ".join(sources[name].problems)
-                raise SceneError(
-                    f"camera '{name}' gave {len(pictures[name])} of {count} pictures"
-                    f"{': ' if reasons else ''}{reasons}"
-                )
-        time.sleep(_PAUSE)
-    return pictures
 
 
 def run_live(
@@ -170,6 +152,7 @@ def run_live(
     on_report: Callable[[str], None] = lambda _: None,
     monitor: Callable[[Context], EventStatus | None] | None = None,
     speed: float = 0.0,
+    largest_lag: float = 0.2,
 ) -> bool:
     """Runs a diagram until its recordings end or its time is up; True: until Ctrl-C instead.
 
@@ -179,6 +162,7 @@ def run_live(
         on_report: called with what the user should know of cameras and pictures.
         monitor: called with the diagram's context after every step; may end the run.
         speed: simulated seconds a second where no camera is live; 0: as fast as it can.
+        largest_lag: a simulation that is further behind the clock [s] skips what it has missed.
     """
     simulator = Simulator(diagram)
     if monitor is not None:
@@ -187,7 +171,7 @@ def run_live(
     speed = 1.0 if is_live else speed
     simulator.set_target_realtime_rate(speed)
     context = simulator.get_context()
-    period = _LOOK if sensors is None else sensors.period
+    period = 0.5 if sensors is None else sensors.period
     end = math.inf if seconds is None else seconds
     try:
         simulator.Initialize()
@@ -200,8 +184,7 @@ def run_live(
             if status.reason() == SimulatorStatus.ReturnReason.kReachedTerminationCondition:
                 break
             lag = time.monotonic() - begin - context.get_time() / speed if speed else 0.0
-            if lag > _LARGEST_LAG:
-                # What was missed is gone: nobody wants to see it in fast motion.
+            if lag > largest_lag:
                 simulator.ResetStatistics()
                 begin += lag
     except KeyboardInterrupt:
@@ -214,8 +197,12 @@ def look_until(
     sensors: LiveSensors,
     looks: Callable[[Context], bool],
     on_report: Callable[[str], None],
+    patience: float = 60.0,
 ) -> None:
-    """Runs a diagram until what looks at it has seen enough; uses the sensors up.
+    """Runs a diagram until ``looks`` returns True; closes the sensors.
+
+    Args:
+        patience: how long to wait for a person before live cameras [s].
 
     Raises:
         KeyboardInterrupt: the user gave up.
@@ -229,7 +216,7 @@ def look_until(
 
     # What is wrong with recorded pictures is said when they are captured.
     report = on_report if sensors.live else lambda _: None
-    waited = _PERSON_PATIENCE if sensors.live else None
+    waited = patience if sensors.live else None
     try:
         if run_live(diagram, sensors, waited, report, look):
             raise KeyboardInterrupt

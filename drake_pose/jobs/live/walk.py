@@ -23,8 +23,7 @@ from drake_pose.errors import OutputError, SettingsError
 from drake_pose.files.folder import read_summary
 from drake_pose.files.records import PoseTable
 from drake_pose.jobs.estimate.inputs import bundled_person
-from drake_pose.jobs.live.capture import shape_of_result
-from drake_pose.jobs.live.frame_results import camera_troubles
+from drake_pose.jobs.live.capture import camera_troubles, shape_of_result
 from drake_pose.jobs.live.scene import LiveScene, run_live
 from drake_pose.jobs.live.settings import LiveSettings
 from drake_pose.person.date.skeleton import load_skeleton

@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING, Any
 from drake_pose.version import VERSION
 
 if TYPE_CHECKING:
-    from drake_pose.body.formats.packages import bundled_model
     from drake_pose.body.model import ArticulatedModel, load_model
-    from drake_pose.body.tree.tree_builder import build_pose_tree
+    from drake_pose.body.model_files import bundled_model
+    from drake_pose.body.tree_builder import build_pose_tree
     from drake_pose.camera.camera_files import load_cameras, save_cameras
     from drake_pose.camera.drake import camera_from_drake
     from drake_pose.camera.models import ParallelCamera, PinholeCamera
@@ -65,8 +65,8 @@ _HOMES = {
     "TruncatedEkf": "systems.truncated_ekf",
     "View": "search",
     "audit_scene": "jobs.registration.audit",
-    "build_pose_tree": "body.tree.tree_builder",
-    "bundled_model": "body.formats.packages",
+    "build_pose_tree": "body.tree_builder",
+    "bundled_model": "body.model_files",
     "camera_from_drake": "camera.drake",
     "cameras_from_drake": "systems.pictures.camera_rig",
     "estimate_scene": "jobs.estimate.scene",

@@ -12,8 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from drake_pose.body.formats.packages import bundled_model
-from drake_pose.body.model import ArticulatedModel, load_model
+from drake_pose.body import ArticulatedModel, bundled_model, load_model
 from tests.cli import CliRunner
 from tests.jobs.scenes import TinyScene, write_scene
 

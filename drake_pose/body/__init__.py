@@ -1,1 +1,59 @@
-"""What is looked at: links, joints, limits and surfaces of an articulated object."""
+"""What is looked at: links, joints, limits and surfaces of an articulated object.
+
+Kernels (``joint_kernel``, ``tree_kinematics``) are imported from their modules: numba is slow to
+import, and reading a model needs none.
+"""
+
+from drake_pose.body.landmarks import (
+    Landmark,
+    landmark_positions,
+    landmarks_file,
+    landmarks_of_nodes,
+    load_landmarks,
+)
+from drake_pose.body.link_graph import PlantKinematics, chain_transforms, inverse_transforms
+from drake_pose.body.meshes import TriangleMesh, join_meshes, labelled_meshes
+from drake_pose.body.model import OBJECT, OBJECT_POSITIONS, ArticulatedModel, load_model
+from drake_pose.body.model_files import bundled_model, package_folder
+from drake_pose.body.node_skin import ModelSkin
+from drake_pose.body.parsed_model import ParsedModel, link_names, nearest_turn
+from drake_pose.body.parsing import ModelSource, captured_warnings
+from drake_pose.body.pose_tree import PoseTree
+from drake_pose.body.report import ModelReport, describe_model, model_warnings
+from drake_pose.body.root import RootRotation
+from drake_pose.body.tree_builder import build_pose_tree
+from drake_pose.body.urdf_shape import BASE_JOINTS, reshaped
+
+__all__ = [
+    "BASE_JOINTS",
+    "OBJECT",
+    "OBJECT_POSITIONS",
+    "ArticulatedModel",
+    "Landmark",
+    "ModelReport",
+    "ModelSkin",
+    "ModelSource",
+    "ParsedModel",
+    "PlantKinematics",
+    "PoseTree",
+    "RootRotation",
+    "TriangleMesh",
+    "build_pose_tree",
+    "bundled_model",
+    "captured_warnings",
+    "chain_transforms",
+    "describe_model",
+    "inverse_transforms",
+    "join_meshes",
+    "labelled_meshes",
+    "landmark_positions",
+    "landmarks_file",
+    "landmarks_of_nodes",
+    "link_names",
+    "load_landmarks",
+    "load_model",
+    "model_warnings",
+    "nearest_turn",
+    "package_folder",
+    "reshaped",
+]

@@ -8,9 +8,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from drake_pose.arrays import Array, Indices
+from drake_pose.body.link_graph import PlantKinematics, build_link_graph
 from drake_pose.body.parsed_model import ParsedModel
-from drake_pose.body.tree.link_graph import PlantKinematics, build_link_graph
-from drake_pose.body.tree.pose_tree import PoseTree
+from drake_pose.body.pose_tree import PoseTree
 from drake_pose.errors import ModelError, SettingsError, UnknownNameError
 from drake_pose.yaml_files import read_yaml
 

@@ -21,18 +21,21 @@ from pydrake.multibody.tree import (
 )
 
 from drake_pose.arrays import Array
-from drake_pose.body.formats.parsing import ModelSource, limit_kinds
-from drake_pose.body.formats.safety import check_in_child
-from drake_pose.body.formats.urdf_shape import Vectors, reshaped, with_base_joints
-from drake_pose.body.parsed_model import ParsedModel, describe_positions, link_names
+from drake_pose.body.link_graph import PlantKinematics
+from drake_pose.body.meshes import TriangleMesh, body_mesh, labelled_meshes, make_drawable
+from drake_pose.body.parsed_model import (
+    ParsedModel,
+    SkinBand,
+    describe_positions,
+    link_names,
+    load_skin,
+)
+from drake_pose.body.parsing import ModelSource, check_in_child, limit_kinds
 from drake_pose.body.plant_source import PlantSource
-from drake_pose.body.surfaces.meshes import TriangleMesh
-from drake_pose.body.surfaces.skin_file import SkinBand, load_skin
-from drake_pose.body.surfaces.visual_geometry import body_mesh, labelled_meshes, make_drawable
-from drake_pose.body.tree.link_graph import PlantKinematics
-from drake_pose.body.tree.pose_tree import PoseTree
-from drake_pose.body.tree.root import RootRotation
-from drake_pose.body.tree.tree_builder import build_pose_tree
+from drake_pose.body.pose_tree import PoseTree
+from drake_pose.body.root import RootRotation
+from drake_pose.body.tree_builder import build_pose_tree
+from drake_pose.body.urdf_shape import Vectors, reshaped, with_base_joints
 from drake_pose.errors import ModelError
 
 OBJECT = "target"
@@ -60,7 +63,7 @@ class ArticulatedModel(ParsedModel):
         root_rotation: RootRotation | None = None,
         held: Mapping[str, float] | None = None,
     ) -> PoseTree:
-        """The tree in which poses are searched (``drake_pose.body.tree.pose_tree.PoseTree``).
+        """The tree in which poses are searched (``drake_pose.body.pose_tree.PoseTree``).
 
         Args:
             root: the link to start from; None for the one nearest to the plant's world.

@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 
 from drake_pose.arrays import Array
-from drake_pose.body.formats.parsing import limit_kinds
+from drake_pose.body.link_graph import build_link_graph
+from drake_pose.body.meshes import TriangleMesh, is_watertight
 from drake_pose.body.model import ArticulatedModel, load_model
-from drake_pose.body.surfaces.meshes import TriangleMesh, is_watertight
-from drake_pose.body.tree.link_graph import build_link_graph
-from drake_pose.body.tree.pose_tree import PoseTree
+from drake_pose.body.parsing import limit_kinds
+from drake_pose.body.pose_tree import PoseTree
 from drake_pose.errors import DrakePoseError
 
 _SYMMETRY_TOLERANCE = 0.03

@@ -16,7 +16,7 @@ from drake_pose.errors import ModelError
 from drake_pose.files.settings import Packages
 
 if TYPE_CHECKING:
-    from drake_pose.body.report import ModelReport
+    from drake_pose.body import ModelReport
 
 
 from typing import TYPE_CHECKING
@@ -47,7 +47,7 @@ def check(file: Path, /, *, package: Packages | None = None, json: Json = False)
     Args:
         file: The model: URDF, SDFormat, MJCF or .dmd.yaml.
     """
-    from drake_pose.body.report import describe_model
+    from drake_pose.body import describe_model
 
     report = describe_model(file, package_paths=package or {})
     if json:

@@ -21,14 +21,14 @@ from pydrake.multibody.tree import PrismaticJoint
 from scipy.spatial.transform import Rotation
 
 from drake_pose.arrays import Array
-from drake_pose.body.landmarks import (
+from drake_pose.body import (
+    ArticulatedModel,
     Landmark,
+    PlantKinematics,
     landmark_positions,
     landmarks_file,
     load_landmarks,
 )
-from drake_pose.body.model import ArticulatedModel
-from drake_pose.body.tree.link_graph import PlantKinematics
 from drake_pose.csv_files import csv_text
 from drake_pose.errors import SettingsError
 from drake_pose.files.folder import BVH, JOINT_CENTRES, MOT, TRC, write_file

@@ -15,9 +15,7 @@ import numpy as np
 from pydrake.common.eigen_geometry import Quaternion
 from pydrake.math import RigidTransform, RotationMatrix
 
-from drake_pose.body.model import ArticulatedModel
-from drake_pose.body.parsed_model import nearest_turn
-from drake_pose.body.tree.pose_tree import PoseTree
+from drake_pose.body import ArticulatedModel, PoseTree, nearest_turn
 from drake_pose.csv_files import csv_text, read_csv
 from drake_pose.errors import OutputError
 from drake_pose.files.folder import POSES, cannot_write, write_file

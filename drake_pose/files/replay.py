@@ -15,10 +15,8 @@ from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.framework import Diagram, DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource
 
-from drake_pose.body.model import ArticulatedModel
-from drake_pose.body.surfaces.meshes import TriangleMesh
-from drake_pose.body.tree.pose_tree import PoseTree
-from drake_pose.body.tree.tree_kinematics import TreeKinematics
+from drake_pose.body import ArticulatedModel, PoseTree, TriangleMesh
+from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.camera.models import HALF_PIXEL, Camera, ParallelCamera, PinholeCamera
 from drake_pose.errors import OutputError
 from drake_pose.files.overlay import EXCESS_RGB

@@ -21,7 +21,7 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import ArrayLike, NDArray
 
 from drake_pose.arrays import Array, Indices
-from drake_pose.body.model import ArticulatedModel
+from drake_pose.body import ArticulatedModel
 from drake_pose.files.folder import OVERLAY
 from drake_pose.files.records import JointRecord, SceneEstimate, measured_positions, user_units
 from drake_pose.silhouette.pictures.scenes import Scene

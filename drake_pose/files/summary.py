@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from drake_pose.body.model import ArticulatedModel
+from drake_pose.body import ArticulatedModel
 from drake_pose.errors import OutputError, SettingsError
 from drake_pose.files.folder import read_summary
 from drake_pose.files.options import percent

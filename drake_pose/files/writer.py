@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from drake_pose.body.model import ArticulatedModel
+from drake_pose.body import ArticulatedModel
 from drake_pose.camera.models import ParallelCamera
 from drake_pose.errors import OutputError
 from drake_pose.files.folder import (

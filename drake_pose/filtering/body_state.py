@@ -8,9 +8,8 @@ from typing import TypeVar
 import numpy as np
 
 from drake_pose.arrays import Array, Mask
-from drake_pose.body.tree.link_graph import PlantKinematics
-from drake_pose.body.tree.pose_tree import PoseTree
-from drake_pose.body.tree.tree_kinematics import TreeKinematics
+from drake_pose.body import PlantKinematics, PoseTree
+from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.camera.models import Camera, ParallelCamera
 from drake_pose.errors import SettingsError
 from drake_pose.filtering.inequalities import (

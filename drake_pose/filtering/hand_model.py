@@ -12,7 +12,7 @@ import numpy as np
 from pydrake.multibody.tree import Joint, RevoluteJoint
 
 from drake_pose.arrays import Array, Indices
-from drake_pose.body.model import ArticulatedModel
+from drake_pose.body import ArticulatedModel
 from drake_pose.errors import ModelError
 from drake_pose.filtering.inequalities import UsualPose, couplings_file, load_usual_pose
 from drake_pose.filtering.state import StateLayout

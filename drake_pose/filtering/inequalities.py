@@ -13,7 +13,7 @@ from pydrake.common.yaml import yaml_load_typed
 from scipy.optimize import linprog
 
 from drake_pose.arrays import Array
-from drake_pose.body.parsed_model import ParsedModel
+from drake_pose.body import ParsedModel
 from drake_pose.errors import ModelError, SettingsError, UnknownNameError
 
 

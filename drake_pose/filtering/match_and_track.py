@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from drake_pose.arrays import Array, Mask, Picture
-from drake_pose.body.tree.pose_tree import PoseTree
+from drake_pose.body import PoseTree
 from drake_pose.camera.models import Camera
 from drake_pose.filtering.contour_tracker import (
     ContourObservation,

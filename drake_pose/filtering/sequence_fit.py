@@ -13,7 +13,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from drake_pose.arrays import Array, Indices, Mask
-from drake_pose.body.tree.tree_kinematics import TreeKinematics
+from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.filtering.contour_tracker import ContourObservation, ContourTracker, Track
 from drake_pose.fit.contour_fit import Noise
 from drake_pose.fit.evidence import find_edge_points

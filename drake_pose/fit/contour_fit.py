@@ -14,8 +14,8 @@ from typing import NamedTuple
 import numpy as np
 
 from drake_pose.arrays import Array, Mask
-from drake_pose.body.tree.pose_tree import PoseTree
-from drake_pose.body.tree.tree_kinematics import TreeKinematics
+from drake_pose.body import PoseTree
+from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.camera.models import Camera
 from drake_pose.fit.evidence import EdgePoints, Evidence, pack_evidence
 from drake_pose.fit.kernel import Sum, collect, compare_contours

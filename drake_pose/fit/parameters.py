@@ -14,10 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_pose.arrays import Array, Indices
-from drake_pose.body.model import OBJECT_POSITIONS
-from drake_pose.body.tree.link_graph import chain_transforms
-from drake_pose.body.tree.pose_tree import PoseTree
-from drake_pose.body.tree.tree_kinematics import JointOffset, TreeKinematics, joint_offsets
+from drake_pose.body import OBJECT_POSITIONS, PoseTree, chain_transforms
+from drake_pose.body.tree_kinematics import JointOffset, TreeKinematics, joint_offsets
 from drake_pose.camera.models import Camera
 from drake_pose.compiled import compiled
 from drake_pose.silhouette.areas.bending import PackedSurfaces, TreeSurfaces

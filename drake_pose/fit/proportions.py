@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array, diags_array, eye_array, kron, vstack
 
 from drake_pose.arrays import Array
-from drake_pose.body.model import ArticulatedModel
-from drake_pose.body.tree.tree_kinematics import TreeKinematics, joint_offsets
+from drake_pose.body import ArticulatedModel
+from drake_pose.body.tree_kinematics import TreeKinematics, joint_offsets
 from drake_pose.camera.models import Camera
 from drake_pose.errors import ModelError
 from drake_pose.fit.contour_fit import Noise

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from drake_pose.arrays import Array
-from drake_pose.body.surfaces.meshes import TriangleMesh
+from drake_pose.body import TriangleMesh
 from drake_pose.silhouette.areas.bending import TreeSurfaces
 from drake_pose.silhouette.areas.outline import Outline, outline_from_mesh
 

@@ -21,8 +21,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from drake_pose.body.landmarks import landmarks_file
-from drake_pose.body.model import load_model
+from drake_pose.body import landmarks_file, load_model
 from drake_pose.camera.camera_files import load_cameras
 from drake_pose.camera.episodes.open import open_episode
 from drake_pose.csv_files import csv_text

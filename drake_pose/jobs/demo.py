@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from drake_pose.body.formats.packages import bundled_model
+from drake_pose.body import bundled_model
 from drake_pose.errors import OutputError, SceneError
 from drake_pose.files.folder import OVERLAY, RESULT_FILES, SUMMARY, claimed
 from drake_pose.files.records import SceneEstimate

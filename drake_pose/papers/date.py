@@ -11,8 +11,8 @@ import numpy as np
 from rich.table import Table
 
 from drake_pose.arrays import Array, Picture
-from drake_pose.body.landmarks import landmarks_of_nodes, load_landmarks
-from drake_pose.body.tree.tree_kinematics import TreeKinematics
+from drake_pose.body import landmarks_of_nodes, load_landmarks
+from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.papers.date_capture import PaperTrack, SilhouetteTrack, Studio, one_core
 from drake_pose.papers.tables import Count, figure_table, require_choice, uncounted
 from drake_pose.person.date.features import (

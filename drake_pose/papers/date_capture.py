@@ -15,8 +15,7 @@ from pydrake.systems.framework import Context
 from pydrake.systems.sensors import ImageRgba8U
 
 from drake_pose.arrays import Array, Picture
-from drake_pose.body.formats.packages import bundled_model
-from drake_pose.body.model import ArticulatedModel, load_model
+from drake_pose.body import ArticulatedModel, bundled_model, load_model
 from drake_pose.camera.models import FACE_CAMERA, PinholeCamera, circle_of_cameras
 from drake_pose.errors import SettingsError
 from drake_pose.fit.contour_fit import ContourFit

@@ -17,7 +17,7 @@ from pydrake.systems.primitives import ConstantVectorSource, LogVectorOutput, Tr
 from rich.table import Table
 
 from drake_pose.arrays import Array, Mask, Picture
-from drake_pose.body.model import ArticulatedModel
+from drake_pose.body import ArticulatedModel
 from drake_pose.camera.models import PinholeCamera, look_at
 from drake_pose.papers.date import SHOWN_CAMERA, TITLES, DateResult, Moment
 from drake_pose.papers.date_capture import PERIOD, PaperTrack, Studio, one_core

@@ -13,9 +13,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from rich.table import Table
 
-from drake_pose.body.formats.packages import bundled_model
-from drake_pose.body.model import load_model
-from drake_pose.body.tree.pose_tree import PoseTree
+from drake_pose.body import PoseTree, bundled_model, load_model
 from drake_pose.camera.models import ParallelCamera
 from drake_pose.files.settings import EstimateSettings
 from drake_pose.jobs.demo import demo_settings, stored_scene

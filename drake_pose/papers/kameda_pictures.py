@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import PercentFormatter
 from numpy.typing import NDArray
 
-from drake_pose.body.parsed_model import ParsedModel
+from drake_pose.body import ParsedModel
 from drake_pose.files.overlay import paint_agreement
 from drake_pose.papers.kameda import Causes, RandomPose, RandomPoses, experiment_camera
 from drake_pose.papers.tables import draw_panels, save_figure

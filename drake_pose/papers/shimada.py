@@ -16,8 +16,7 @@ from rich.table import Table
 from scipy.special import chdtri
 
 from drake_pose.arrays import Array
-from drake_pose.body.formats.packages import bundled_model
-from drake_pose.body.model import ArticulatedModel, load_model
+from drake_pose.body import ArticulatedModel, bundled_model, load_model
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import SettingsError
 from drake_pose.filtering.hand import (

@@ -15,8 +15,7 @@ from rich.table import Table
 from scipy.spatial.transform import Rotation
 
 from drake_pose.arrays import Array, Mask
-from drake_pose.body.formats.packages import bundled_model
-from drake_pose.body.tree.link_graph import PlantKinematics
+from drake_pose.body import PlantKinematics, bundled_model
 from drake_pose.camera.models import ParallelCamera
 from drake_pose.csv_files import read_csv
 from drake_pose.errors import SceneError

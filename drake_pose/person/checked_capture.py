@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from drake_pose.arrays import Array, Mask
-from drake_pose.body.tree.pose_tree import PoseTree
+from drake_pose.body import PoseTree
 from drake_pose.camera.models import Camera
 from drake_pose.errors import CameraError, MaskError, SettingsError
 from drake_pose.fit.contour_fit import ContourFit

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_pose.arrays import Array, Mask, Picture
-from drake_pose.body.tree.pose_tree import PoseTree
+from drake_pose.body import PoseTree
 from drake_pose.camera.models import Camera
 from drake_pose.errors import SettingsError
 from drake_pose.fit.colours import OwnColours

@@ -12,8 +12,8 @@ from typing import NamedTuple
 import numpy as np
 
 from drake_pose.arrays import Array, Indices, Mask
-from drake_pose.body.landmarks import landmarks_of_nodes, load_landmarks
-from drake_pose.body.tree.tree_kinematics import TreeKinematics
+from drake_pose.body import landmarks_of_nodes, load_landmarks
+from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.errors import ModelError, SettingsError
 from drake_pose.fit.colours import colour_numbers
 from drake_pose.fit.contour_fit import ContourFit, PoseFit, Prior

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from drake_pose.arrays import Array, Mask
-from drake_pose.body.tree.pose_tree import PoseTree
+from drake_pose.body import PoseTree
 from drake_pose.camera.models import Camera
 from drake_pose.errors import ModelError, UnknownNameError
 from drake_pose.fit.contour_fit import ContourFit, Noise, pack_views

@@ -16,8 +16,7 @@ import numpy as np
 from scipy.special import stdtr, stdtrit
 
 from drake_pose.arrays import Array, Mask
-from drake_pose.body.model import OBJECT_POSITIONS
-from drake_pose.body.tree.pose_tree import PoseTree
+from drake_pose.body import OBJECT_POSITIONS, PoseTree
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import RegistrationError, UnknownNameError
 from drake_pose.fit.parameters import POSE_NAMES, length_name, lengthened_joints

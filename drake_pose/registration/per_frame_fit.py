@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from drake_pose.arrays import Array
-from drake_pose.body.tree.tree_kinematics import TreeKinematics
+from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.camera.models import Camera
 from drake_pose.fit.contour_fit import Comparison, inlier_ratio_of
 from drake_pose.fit.covariance import ComparedMask

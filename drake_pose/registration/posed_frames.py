@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 
 from drake_pose.arrays import Array, Mask
-from drake_pose.body.tree.tree_kinematics import TreeKinematics
+from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.camera.models import Camera, PinholeCamera
 from drake_pose.errors import MaskError
 from drake_pose.fit.evidence import (

@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from drake_pose.arrays import Array
-from drake_pose.body.tree.pose_tree import PoseTree
-from drake_pose.body.tree.tree_kinematics import TreeKinematics
+from drake_pose.body import PoseTree
+from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import RegistrationError
 from drake_pose.fit.covariance import excess

@@ -20,8 +20,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from drake_pose.arrays import Array, Mask
-from drake_pose.body.model import OBJECT_POSITIONS
-from drake_pose.body.tree.tree_kinematics import JointOffset, TreeKinematics
+from drake_pose.body import OBJECT_POSITIONS
+from drake_pose.body.tree_kinematics import JointOffset, TreeKinematics
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.fit.covariance import (
     Distances,

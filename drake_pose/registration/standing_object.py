@@ -13,12 +13,17 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from drake_pose.arrays import Array
-from drake_pose.body.model import OBJECT, OBJECT_POSITIONS, ArticulatedModel
-from drake_pose.body.surfaces.meshes import TriangleMesh, join_meshes
-from drake_pose.body.tree.link_graph import inverse_transforms
-from drake_pose.body.tree.pose_tree import PoseTree
-from drake_pose.body.tree.root import RootRotation
-from drake_pose.body.tree.tree_kinematics import TreeKinematics
+from drake_pose.body import (
+    OBJECT,
+    OBJECT_POSITIONS,
+    ArticulatedModel,
+    PoseTree,
+    RootRotation,
+    TriangleMesh,
+    inverse_transforms,
+    join_meshes,
+)
+from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import RegistrationError, SettingsError
 from drake_pose.fit.background import KnownBackground, Light

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from drake_pose.body.tree.pose_tree import PoseTree
+from drake_pose.body import PoseTree
 from drake_pose.errors import SettingsError
 from drake_pose.search.branch_and_bound import PosesWithin, branch_and_bound
 from drake_pose.search.estimates import PoseEstimate, SearchStatistics, View

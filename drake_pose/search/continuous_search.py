@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from drake_pose.body.tree.pose_tree import PoseTree
+from drake_pose.body import PoseTree
 from drake_pose.search.beam_search import BeamSearch
 from drake_pose.search.estimates import PoseEstimate, SearchStatistics, View
 from drake_pose.search.parts import NeighbourhoodSearch, PartSearch

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from drake_pose.body.tree.pose_tree import PoseTree
-from drake_pose.body.tree.tree_kinematics import TreeKinematics
+from drake_pose.body import PoseTree
+from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.camera.models import Camera
 from drake_pose.errors import MaskError
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from drake_pose.body.tree.pose_tree import PoseTree
+from drake_pose.body import PoseTree
 from drake_pose.errors import SettingsError
 from drake_pose.search.estimates import PoseEstimate, SearchStatistics, View
 from drake_pose.search.sampled_body import Regions, SampledTree, Scoring

@@ -19,8 +19,8 @@ from functools import cached_property, partial
 import cv2
 import numpy as np
 
-from drake_pose.body.tree.pose_tree import PoseTree
-from drake_pose.body.tree.tree_kinematics import TreeKinematics
+from drake_pose.body import PoseTree
+from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.errors import SettingsError
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.fit.surfaces import few_triangles, rough_outlines

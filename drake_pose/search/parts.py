@@ -20,7 +20,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from drake_pose.body.tree.pose_tree import PoseTree
+from drake_pose.body import PoseTree
 from drake_pose.fit.parameters import Placement
 from drake_pose.fit.raster_lines import Border
 from drake_pose.fit.surfaces import few_rigid_triangles

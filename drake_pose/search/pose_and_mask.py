@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_pose.arrays import Array, Mask, Picture
-from drake_pose.body.tree.tree_kinematics import TreeKinematics
+from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.camera.models import Camera, PinholeCamera
 from drake_pose.fit.contour_fit import ContourFit, Prior, pack_views
 from drake_pose.fit.evidence import NO_EDGE, find_edge_points

@@ -13,8 +13,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from drake_pose.body.tree.pose_tree import PoseTree
-from drake_pose.body.tree.tree_kinematics import TreeKinematics
+from drake_pose.body import PoseTree
+from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.errors import SettingsError
 from drake_pose.fit.kernel import collect
 from drake_pose.fit.levenberg_marquardt import Equations, StepSettings, damped_step

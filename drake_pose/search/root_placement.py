@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 from scipy.ndimage import distance_transform_edt
 
-from drake_pose.body.tree.pose_tree import PoseTree
+from drake_pose.body import PoseTree
 from drake_pose.camera.models import Camera, ParallelCamera
 from drake_pose.errors import SettingsError
 from drake_pose.search.estimates import View

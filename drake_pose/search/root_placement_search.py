@@ -20,7 +20,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from drake_pose.body.tree.pose_tree import PoseTree
+from drake_pose.body import PoseTree
 from drake_pose.camera.models import ParallelCamera
 from drake_pose.errors import SettingsError
 from drake_pose.search.beam_search import BeamSearch, grow

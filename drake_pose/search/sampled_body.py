@@ -8,8 +8,7 @@ from typing import Protocol
 import fast_simplification
 import numpy as np
 
-from drake_pose.body.surfaces.meshes import TriangleMesh
-from drake_pose.body.tree.pose_tree import PoseTree
+from drake_pose.body import PoseTree, TriangleMesh
 from drake_pose.camera.models import Camera, ParallelCamera
 from drake_pose.search.estimates import PoseEstimate, View
 from drake_pose.search.settings import BeamSearchSettings, GridSettings

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from drake_pose.body.tree.tree_kinematics import TreeKinematics
+from drake_pose.body.tree_kinematics import TreeKinematics
 
 _PARALLEL = 0.8
 # What a flip may move, as a share of the body's size.

@@ -21,9 +21,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import ndtri, stdtrit
 
-from drake_pose.body.parsed_model import nearest_turn
-from drake_pose.body.tree.pose_tree import PoseTree
-from drake_pose.body.tree.tree_kinematics import TreeKinematics
+from drake_pose.body import PoseTree, nearest_turn
+from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.fit.contour_fit import (
     FINEST_SCALE,
     ContourFit,

@@ -23,8 +23,7 @@ from pydrake.systems.rendering import MultibodyPositionToGeometryPose
 from pydrake.trajectories import PiecewisePolynomial, Trajectory
 
 from drake_pose.arrays import Array
-from drake_pose.body.parsed_model import ParsedModel
-from drake_pose.body.tree.node_skin import ModelSkin
+from drake_pose.body import ModelSkin, ParsedModel
 from drake_pose.silhouette.pictures.label_renderer import DeformableSkin
 from drake_pose.systems.ports import PortedSystem
 

@@ -19,7 +19,7 @@ from pydrake.systems.framework import (
 from pydrake.systems.sensors import ImageRgba8U
 
 from drake_pose.arrays import Array, Mask, Picture
-from drake_pose.body.model import ArticulatedModel
+from drake_pose.body import ArticulatedModel
 from drake_pose.camera.models import Camera, PinholeCamera, circle_of_cameras
 from drake_pose.errors import SettingsError, UnknownNameError
 from drake_pose.person.date.features import (

@@ -22,8 +22,7 @@ from pydrake.systems.sensors import ImageLabel16I, RgbdSensor
 from pydrake.trajectories import PiecewisePolynomial, Trajectory
 
 from drake_pose.arrays import Array
-from drake_pose.body.parsed_model import ParsedModel
-from drake_pose.body.tree.tree_builder import build_pose_tree
+from drake_pose.body import ParsedModel, build_pose_tree
 from drake_pose.camera.models import Camera, PinholeCamera
 from drake_pose.filtering.contour_tracker import TrackingSettings
 from drake_pose.registration.online_registration import (

@@ -17,7 +17,7 @@ from pydrake.trajectories import Trajectory
 from scipy.special import chdtri
 
 from drake_pose.arrays import Array
-from drake_pose.body.parsed_model import ParsedModel
+from drake_pose.body import ParsedModel
 from drake_pose.camera.models import Camera
 from drake_pose.errors import SettingsError
 from drake_pose.filtering.hand_silhouette import HandMeasurement, HandSilhouette

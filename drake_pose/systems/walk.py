@@ -29,9 +29,7 @@ from pydrake.systems.primitives import TrajectorySource
 from pydrake.trajectories import Trajectory
 
 from drake_pose.arrays import Array
-from drake_pose.body.formats.packages import package_folder
-from drake_pose.body.formats.parsing import ModelSource
-from drake_pose.body.model import ArticulatedModel
+from drake_pose.body import ArticulatedModel, ModelSource, package_folder
 from drake_pose.errors import SettingsError, UnknownNameError
 from drake_pose.person.date.walking import (
     WALK,

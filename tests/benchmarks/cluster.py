@@ -27,8 +27,7 @@ from pydrake.systems.sensors import (
     PixelType,
 )
 
-from drake_pose.body.formats.packages import bundled_model
-from drake_pose.body.model import load_model
+from drake_pose.body import bundled_model, load_model
 from drake_pose.camera.camera_files import save_cameras
 from drake_pose.files.settings import EstimateSettings
 from drake_pose.jobs.batch import run_batch

@@ -23,8 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_pose.arrays import Array, Mask
-from drake_pose.body.formats.packages import bundled_model
-from drake_pose.body.model import ArticulatedModel, load_model
+from drake_pose.body import ArticulatedModel, bundled_model, load_model
 from drake_pose.camera.camera_files import save_cameras
 from drake_pose.camera.models import PinholeCamera, circle_of_cameras
 from drake_pose.csv_files import csv_text

@@ -20,7 +20,7 @@ import cv2
 import numpy as np
 import yaml
 
-from drake_pose.body.model import ArticulatedModel, load_model
+from drake_pose.body import ArticulatedModel, load_model
 from drake_pose.camera.camera_files import dump_cameras
 from drake_pose.errors import RegistrationError
 from drake_pose.jobs.registration.register import SceneRegistration, register_scene

@@ -18,8 +18,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from drake_pose.body.formats.packages import bundled_model
-from drake_pose.body.model import load_model
+from drake_pose.body import bundled_model, load_model
 from drake_pose.csv_files import csv_text
 from drake_pose.files.settings import EstimateSettings
 from drake_pose.jobs.demo import demo_scene, demo_settings

@@ -13,9 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
-from drake_pose.body.model import load_model
-from drake_pose.body.surfaces.meshes import TriangleMesh
-from drake_pose.body.tree.tree_kinematics import TreeKinematics
+from drake_pose.body import TriangleMesh, load_model
+from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.camera.models import circle_of_cameras
 from drake_pose.fit.evidence import Observation, find_edge_points, pack_evidence
 from drake_pose.fit.levenberg_marquardt import AnnealingStage

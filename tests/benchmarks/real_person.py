@@ -14,8 +14,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from drake_pose.body.landmarks import landmark_positions, load_landmarks
-from drake_pose.body.model import load_model
+from drake_pose.body import landmark_positions, load_landmarks, load_model
 from drake_pose.papers.tables import draw_panels, save_figure
 from drake_pose.person.date.pose import estimate_pose
 from drake_pose.person.date.skeleton import LIMBS, load_skeleton

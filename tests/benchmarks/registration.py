@@ -23,7 +23,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from drake_pose.arrays import Array, Mask
-from drake_pose.body.model import load_model
+from drake_pose.body import load_model
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import RegistrationError
 from drake_pose.files.settings import EstimateSettings

@@ -28,7 +28,7 @@ from pydrake.multibody.tree import ModelInstanceIndex, PlanarJoint, SpatialInert
 from pydrake.systems.sensors import CameraInfo
 
 from drake_pose.arrays import Array
-from drake_pose.body.model import ArticulatedModel
+from drake_pose.body import ArticulatedModel
 from drake_pose.camera.models import PinholeCamera
 
 LOG_HZ = 50.0

@@ -14,9 +14,7 @@ from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.sensors import RgbdSensor
 
-from drake_pose.body.formats.packages import bundled_model
-from drake_pose.body.model import load_model
-from drake_pose.body.parsed_model import ParsedModel
+from drake_pose.body import ParsedModel, bundled_model, load_model
 from drake_pose.camera.drake import camera_to_drake
 from drake_pose.camera.models import PinholeCamera, look_at
 from drake_pose.silhouette.pictures.label_images import EMPTY, label_data

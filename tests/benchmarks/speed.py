@@ -14,9 +14,7 @@ import trimesh
 from rich.console import Console
 from scipy.spatial.transform import Rotation
 
-from drake_pose.body.formats.packages import bundled_model
-from drake_pose.body.model import load_model
-from drake_pose.body.surfaces.meshes import TriangleMesh
+from drake_pose.body import TriangleMesh, bundled_model, load_model
 from drake_pose.camera.models import ParallelCamera, PinholeCamera
 from drake_pose.papers.date_capture import SilhouetteTrack, Studio, one_core
 from drake_pose.papers.kameda import (

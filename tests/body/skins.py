@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from drake_pose.body.model import ArticulatedModel, load_model
+from drake_pose.body import ArticulatedModel, load_model
 
 HALF = 0.03
 LENGTH = 0.2

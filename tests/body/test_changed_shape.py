@@ -5,8 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from drake_pose.body.formats.urdf_shape import reshaped
-from drake_pose.body.model import load_model
+from drake_pose.body import load_model, reshaped
 from drake_pose.errors import UnknownNameError
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from tests.body.models import JOINTED_BASE_URDF, write

@@ -3,14 +3,14 @@
 import numpy as np
 import pytest
 
-from drake_pose.body.formats.packages import bundled_model
-from drake_pose.body.landmarks import (
+from drake_pose.body import (
     Landmark,
+    bundled_model,
     landmark_positions,
     landmarks_of_nodes,
     load_landmarks,
+    load_model,
 )
-from drake_pose.body.model import load_model
 from drake_pose.errors import ModelError, SettingsError, UnknownNameError
 from tests.body.models import FLOATING_URDF, write
 

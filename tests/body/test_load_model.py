@@ -6,10 +6,9 @@ import trimesh
 from pydrake.geometry import MakeRenderEngineVtk, RenderEngineVtkParams, Role, SceneGraph
 from pydrake.multibody.plant import MultibodyPlant
 
-from drake_pose.body.formats.packages import bundled_model, package_map
-from drake_pose.body.model import load_model
-from drake_pose.body.report import describe_model
-from drake_pose.body.surfaces.meshes import TriangleMesh, merge_duplicate_vertices
+from drake_pose.body import TriangleMesh, bundled_model, describe_model, load_model
+from drake_pose.body.meshes import merge_duplicate_vertices
+from drake_pose.body.model_files import package_map
 from drake_pose.errors import ModelError, UnknownNameError
 
 from .models import FLOATING_URDF, WELDED_URDF, cube_obj, joint, link, urdf, write

@@ -7,10 +7,9 @@ import pytest
 from pydrake.math import RotationMatrix
 from pydrake.multibody.tree import BodyIndex
 
-from drake_pose.body.model import load_model
-from drake_pose.body.parsed_model import nearest_turn, one_turn, turns_around
-from drake_pose.body.tree.root import RootRotation
-from drake_pose.body.tree.tree_kinematics import TreeKinematics
+from drake_pose.body import RootRotation, load_model, nearest_turn
+from drake_pose.body.parsed_model import one_turn, turns_around
+from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.errors import ModelError
 from tests.body.models import JOINTS_SDF, joint, link, urdf, write
 

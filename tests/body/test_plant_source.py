@@ -20,8 +20,7 @@ from pydrake.multibody.tree import (
     WeldJoint,
 )
 
-from drake_pose.body.formats.packages import bundled_model
-from drake_pose.body.model import ArticulatedModel, load_model
+from drake_pose.body import ArticulatedModel, bundled_model, load_model
 from drake_pose.errors import ModelError
 from tests.body.models import FLOATING_URDF, write
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from drake_pose import audit_scene, estimate_scene, make_masks, register_scene
-from drake_pose.body.model import load_model
+from drake_pose.body import load_model
 from drake_pose.errors import OutputError, SceneError, SettingsError
 from drake_pose.files.folder import (
     claimed,

@@ -5,9 +5,7 @@ import re
 import numpy as np
 import pytest
 
-from drake_pose.body.formats.packages import bundled_model
-from drake_pose.body.landmarks import load_landmarks
-from drake_pose.body.model import load_model
+from drake_pose.body import bundled_model, load_landmarks, load_model
 from drake_pose.errors import SettingsError
 from drake_pose.files.motion_files import (
     centres_as_csv,

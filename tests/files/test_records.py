@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from drake_pose.body.model import load_model
+from drake_pose.body import load_model
 from drake_pose.files import overlay
 from drake_pose.files.records import (
     FrameRecord,

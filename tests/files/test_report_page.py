@@ -11,8 +11,7 @@ import msgpack
 import numpy as np
 import pytest
 
-from drake_pose.body.formats.packages import bundled_model
-from drake_pose.body.model import load_model
+from drake_pose.body import bundled_model, load_model
 from drake_pose.camera.models import ParallelCamera, PinholeCamera, look_at
 from drake_pose.files.records import FrameRecord, JointRecord, PoseRow, SceneEstimate
 from drake_pose.files.replay import make_replay

@@ -2,8 +2,7 @@ import numpy as np
 import pytest
 from scipy.spatial import ConvexHull
 
-from drake_pose.body.formats.packages import bundled_model
-from drake_pose.body.model import load_model
+from drake_pose.body import bundled_model, load_model
 from drake_pose.errors import ModelError, SettingsError, UnknownNameError
 from drake_pose.filtering.hand import HAND_STATE, HandObservation, plant_positions, scaled_rotation
 from drake_pose.filtering.hand_model import read_hand

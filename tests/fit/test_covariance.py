@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from drake_pose.body.tree.tree_kinematics import TreeKinematics
+from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.fit.covariance import (
     Distances,
     ErrorEffects,

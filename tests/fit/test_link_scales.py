@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 
-from drake_pose.body.model import load_model
-from drake_pose.body.tree.root import RootRotation
-from drake_pose.body.tree.tree_kinematics import TreeKinematics, joint_offsets
+from drake_pose.body import RootRotation, load_model
+from drake_pose.body.tree_kinematics import TreeKinematics, joint_offsets
 from drake_pose.fit.parameters import BodyParameters
 from drake_pose.silhouette.areas.outline import outline_from_mesh
 from tests.body.models import joint, link, urdf

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from drake_pose.body.tree.tree_kinematics import TreeKinematics
+from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.camera.models import ParallelCamera, circle_of_cameras
 from drake_pose.fit.parameters import CAMERA_NAMES, BodyParameters, CameraParameters
 from drake_pose.fit.surfaces import VERY_FEW, few_triangles

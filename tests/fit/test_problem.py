@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.sparse import csr_array
 
-from drake_pose.body.surfaces.meshes import TriangleMesh
-from drake_pose.body.tree.tree_kinematics import TreeKinematics
+from drake_pose.body import TriangleMesh
+from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.camera.models import ParallelCamera, PinholeCamera, circle_of_cameras
 from drake_pose.errors import SettingsError, UnknownNameError
 from drake_pose.fit.evidence import NO_EDGE, Observation, find_edge_points, pack_evidence

@@ -3,10 +3,8 @@
 import numpy as np
 import pytest
 
-from drake_pose.body.formats.packages import bundled_model
-from drake_pose.body.model import load_model
-from drake_pose.body.tree.root import RootRotation
-from drake_pose.body.tree.tree_kinematics import TreeKinematics
+from drake_pose.body import RootRotation, bundled_model, load_model
+from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.fit.proportions import ProportionedBody, sequence_prior
 from drake_pose.silhouette.areas.bending import TreeSurfaces
 from drake_pose.silhouette.areas.outline import Outline, outline_from_mesh

@@ -5,9 +5,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from drake_pose.body.formats.packages import bundled_model
-from drake_pose.body.model import load_model
-from drake_pose.body.surfaces.meshes import TriangleMesh
+from drake_pose.body import TriangleMesh, bundled_model, load_model
 from drake_pose.fit.surfaces import (
     FEW,
     VERY_FEW,

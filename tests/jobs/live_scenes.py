@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import yaml
 
-from drake_pose.body.model import ArticulatedModel
+from drake_pose.body import ArticulatedModel
 from drake_pose.camera.camera_files import save_cameras
 from drake_pose.camera.models import circle_of_cameras
 from drake_pose.silhouette.pictures.masks import write_mask

@@ -7,8 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from drake_pose.body.formats.packages import bundled_model
-from drake_pose.body.model import ArticulatedModel, load_model
+from drake_pose.body import ArticulatedModel, bundled_model, load_model
 from drake_pose.camera.camera_files import save_cameras
 from drake_pose.camera.models import circle_of_cameras
 from tests.jobs.scenes import write_masks

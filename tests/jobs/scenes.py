@@ -12,7 +12,7 @@ from typing import Any, Protocol
 import numpy as np
 import yaml
 
-from drake_pose.body.model import ArticulatedModel, load_model
+from drake_pose.body import ArticulatedModel, load_model
 from drake_pose.camera.camera_files import save_cameras
 from drake_pose.camera.models import Camera, PinholeCamera
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer

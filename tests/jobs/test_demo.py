@@ -4,8 +4,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drake_pose.body.formats.packages import bundled_model
-from drake_pose.body.model import load_model
+from drake_pose.body import bundled_model, load_model
 from drake_pose.jobs.demo import demo_scene, demo_settings
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from drake_pose.silhouette.pictures.scenes import load_scene

@@ -4,8 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from drake_pose.body.formats.packages import bundled_model
-from drake_pose.body.model import load_model
+from drake_pose.body import bundled_model, load_model
 from drake_pose.errors import SettingsError
 from drake_pose.papers.date import frames_of_destruction, run_experiment
 from drake_pose.papers.date_capture import PERIOD, Studio

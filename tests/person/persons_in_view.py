@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from drake_pose.body.model import ArticulatedModel
+from drake_pose.body import ArticulatedModel
 from drake_pose.camera.models import Camera
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 

@@ -4,8 +4,7 @@ from functools import cache, cached_property
 
 import numpy as np
 
-from drake_pose.body.formats.packages import bundled_model
-from drake_pose.body.model import load_model
+from drake_pose.body import bundled_model, load_model
 from drake_pose.camera.models import FACE_CAMERA, circle_of_cameras
 from drake_pose.person.date.features import (
     SkinColour,

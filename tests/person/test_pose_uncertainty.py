@@ -3,7 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from drake_pose.body.surfaces.meshes import TriangleMesh
+from drake_pose.body import TriangleMesh
 from drake_pose.camera.models import circle_of_cameras
 from drake_pose.fit.contour_fit import ContourFit, pack_views
 from drake_pose.fit.evidence import NO_EDGE, find_edge_points

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from drake_pose.body.formats.packages import bundled_model
-from drake_pose.body.model import ArticulatedModel, load_model
+from drake_pose.body import ArticulatedModel, bundled_model, load_model
 from drake_pose.errors import UnknownNameError
 from drake_pose.person.shape import KnownShape, shape_parts, shape_values, tracker_of_person
 

@@ -3,7 +3,7 @@
 import cv2
 import numpy as np
 
-from drake_pose.body.model import ArticulatedModel
+from drake_pose.body import ArticulatedModel
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.registration.posed_frames import PosedFrame
 from drake_pose.registration.register import RegistrationBody

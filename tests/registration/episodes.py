@@ -8,7 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from drake_pose.body.model import ArticulatedModel
+from drake_pose.body import ArticulatedModel
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.registration.register import RegistrationBody
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer

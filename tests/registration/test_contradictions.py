@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from drake_pose.body.model import ArticulatedModel
-from drake_pose.body.tree.tree_kinematics import TreeKinematics
+from drake_pose.body import ArticulatedModel
+from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import MaskError
 from drake_pose.jobs.registration.audit import say_off

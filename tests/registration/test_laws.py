@@ -12,8 +12,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import t as scipy_t
 
-from drake_pose.body.model import OBJECT_POSITIONS, ArticulatedModel, load_model
-from drake_pose.body.tree.root import RootRotation
+from drake_pose.body import OBJECT_POSITIONS, ArticulatedModel, RootRotation, load_model
 from drake_pose.camera.models import ParallelCamera
 from drake_pose.errors import MaskError, RegistrationError
 from drake_pose.fit.covariance import estimate_sizes

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from drake_pose.body.model import ArticulatedModel
+from drake_pose.body import ArticulatedModel
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import RegistrationError, SettingsError
 from drake_pose.registration.online_registration import (

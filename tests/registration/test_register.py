@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from drake_pose.body.model import ArticulatedModel
+from drake_pose.body import ArticulatedModel
 from drake_pose.errors import RegistrationError
 from drake_pose.registration.posed_frames import PosedFrame
 from drake_pose.registration.register import CameraSearch, RegistrationBody, spread_rotations

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from drake_pose.body.model import ArticulatedModel
+from drake_pose.body import ArticulatedModel
 from drake_pose.registration.register import RegistrationBody, suggest_pose
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from tests.registration.arm_pictures import looking_at

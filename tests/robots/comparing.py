@@ -12,8 +12,7 @@ import pytest
 from numpy.typing import NDArray
 from pydrake.multibody.tree import BodyIndex
 
-from drake_pose.body.model import ArticulatedModel, load_model
-from drake_pose.body.tree.pose_tree import PoseTree
+from drake_pose.body import ArticulatedModel, PoseTree, load_model
 from drake_pose.errors import ModelError
 
 from .references import MujocoReference, PinocchioReference, Poses, Reference, joint_values

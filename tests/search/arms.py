@@ -10,9 +10,7 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from drake_pose.body.model import load_model
-from drake_pose.body.surfaces.meshes import TriangleMesh
-from drake_pose.body.tree.pose_tree import PoseTree
+from drake_pose.body import PoseTree, TriangleMesh, load_model
 from drake_pose.camera.models import Camera, PinholeCamera
 from drake_pose.search.estimates import PoseSet, View
 from drake_pose.silhouette.areas.outline import Outline, outline_from_mesh

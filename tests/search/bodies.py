@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from drake_pose.body.model import ArticulatedModel, load_model
+from drake_pose.body import ArticulatedModel, load_model
 from drake_pose.camera.models import ParallelCamera
 
 # The camera looks along -x: the picture's right is the world's y, its up the world's z.

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from drake_pose.body.tree.pose_tree import PoseTree
+from drake_pose.body import PoseTree
 from drake_pose.camera.models import ParallelCamera
 from drake_pose.search.estimates import View
 from drake_pose.search.pose_families import samples_at

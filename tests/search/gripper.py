@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from drake_pose.body.model import ArticulatedModel, load_model
+from drake_pose.body import ArticulatedModel, load_model
 from tests.body.models import joint, link, urdf, write
 
 

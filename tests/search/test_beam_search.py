@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from drake_pose.body.tree.root import RootRotation
+from drake_pose.body import RootRotation
 from drake_pose.camera.models import ParallelCamera, PinholeCamera
 from drake_pose.errors import SettingsError
 from drake_pose.search.beam_search import BeamSearch

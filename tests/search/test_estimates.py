@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.stats import t as student
 
-from drake_pose.body.tree.tree_kinematics import TreeKinematics
+from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.search.beam_search import BeamSearch
 from drake_pose.search.continuous_search import ContinuousSearch
 from drake_pose.search.estimates import JointEstimate, PoseEstimate, PoseFamily, PoseSet

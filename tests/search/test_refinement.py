@@ -5,8 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from drake_pose.body.formats.packages import bundled_model
-from drake_pose.body.model import load_model
+from drake_pose.body import bundled_model, load_model
 from drake_pose.camera.models import ParallelCamera, PinholeCamera
 from drake_pose.search.estimates import View
 from drake_pose.search.parts import NeighbourhoodSearch, PartSearch, find_parts, find_reflections

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from drake_pose.body.model import load_model
-from drake_pose.body.tree.tree_kinematics import TreeKinematics
+from drake_pose.body import load_model
+from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.fit.surfaces import few_triangles
 from drake_pose.search.self_motions import flips

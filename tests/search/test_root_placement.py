@@ -4,9 +4,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from drake_pose.body.formats.packages import bundled_model
-from drake_pose.body.model import load_model
-from drake_pose.body.tree.root import RootRotation
+from drake_pose.body import RootRotation, bundled_model, load_model
 from drake_pose.camera.models import ParallelCamera, PinholeCamera
 from drake_pose.errors import SettingsError
 from drake_pose.search.estimates import View

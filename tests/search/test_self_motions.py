@@ -5,7 +5,7 @@ import itertools
 import numpy as np
 import pytest
 
-from drake_pose.body.tree.tree_kinematics import TreeKinematics
+from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.search.self_motions import _chained_triples, counter_turns, flips
 from tests.search.arms import arm_tree, split
 from tests.search.bodies import swinging_chain

@@ -6,9 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from drake_pose.body.model import ArticulatedModel
-from drake_pose.body.surfaces.meshes import TriangleMesh
-from drake_pose.body.tree.node_skin import ModelSkin
+from drake_pose.body import ArticulatedModel, ModelSkin, TriangleMesh
 from drake_pose.camera.models import Camera
 from drake_pose.silhouette.areas.bending import BendingOutline
 from drake_pose.silhouette.areas.outline import outline_from_mesh

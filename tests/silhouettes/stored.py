@@ -14,8 +14,7 @@ import cv2
 import numpy as np
 
 from drake_pose import MultiStartSearch, PinholeCamera, load_model
-from drake_pose.body.formats.packages import bundled_model
-from drake_pose.body.tree.pose_tree import PoseTree
+from drake_pose.body import PoseTree, bundled_model
 from drake_pose.camera.models import look_at
 from drake_pose.files.settings import EstimateSettings
 from drake_pose.jobs.demo import stored_scene

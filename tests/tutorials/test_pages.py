@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from drake_pose.body.landmarks import load_landmarks
+from drake_pose.body import load_landmarks
 from drake_pose.camera.board import load_board
 from drake_pose.camera.camera_files import load_cameras
 from drake_pose.camera.source_files import load_sources

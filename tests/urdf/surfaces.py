@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import trimesh
 
-from drake_pose.body.model import ArticulatedModel
+from drake_pose.body import ArticulatedModel
 from drake_pose.camera.models import ParallelCamera, look_at
 from drake_pose.silhouette.areas.outline import outline_from_mesh
 from drake_pose.silhouette.areas.scoring import draw_mask

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from drake_pose.body.model import ArticulatedModel, load_model
-from drake_pose.body.report import model_warnings
+from drake_pose.body import ArticulatedModel, load_model, model_warnings
 from tests.urdf.surfaces import (
     URDF,
     Silhouettes,

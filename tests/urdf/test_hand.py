@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from drake_pose.body.model import ArticulatedModel, load_model
+from drake_pose.body import ArticulatedModel, load_model
 from drake_pose.filtering.inequalities import model_inequalities
 from tests.urdf.surfaces import URDF
 from tests.urdf.test_bundled_bodies import FINGERS, HAND_JOINTS

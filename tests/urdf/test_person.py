@@ -6,8 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drake_pose.body.landmarks import landmark_positions, load_landmarks
-from drake_pose.body.model import ArticulatedModel, load_model
+from drake_pose.body import ArticulatedModel, landmark_positions, load_landmarks, load_model
 from drake_pose.filtering.inequalities import model_inequalities
 from tests.urdf.surfaces import URDF, Silhouettes, read_obj, written_again
 

@@ -12,8 +12,7 @@ import numpy as np
 from pydrake.geometry import LightParameter, MakeRenderEngineVtk, RenderEngineVtkParams, SceneGraph
 from pydrake.multibody.plant import MultibodyPlant
 
-from drake_pose.body.formats.packages import bundled_model
-from drake_pose.body.model import ArticulatedModel, load_model
+from drake_pose.body import ArticulatedModel, bundled_model, load_model
 from drake_pose.camera.drake import camera_to_drake
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.files.overlay import paint_agreement

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from drake_pose.body.model import ArticulatedModel
+from drake_pose.body import ArticulatedModel
 from drake_pose.camera.models import ParallelCamera
 from drake_pose.files.overlay import draw_shapes
 from drake_pose.files.records import user_units

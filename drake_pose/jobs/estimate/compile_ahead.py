@@ -13,9 +13,8 @@ from contextlib import contextmanager
 import cv2
 import numpy as np
 
-from drake_pose.body.formats.packages import bundled_model
-from drake_pose.body.model import load_model
-from drake_pose.body.tree.tree_kinematics import TreeKinematics
+from drake_pose.body import bundled_model, load_model
+from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.camera.models import ParallelCamera
 from drake_pose.compiled import is_stored
 from drake_pose.fit.contour_fit import pack_views

@@ -10,8 +10,8 @@ from typing import NamedTuple
 import numpy as np
 
 from drake_pose.arrays import Array, Indices, Picture
-from drake_pose.body.tree.pose_tree import PoseTree
-from drake_pose.body.tree.tree_kinematics import TreeKinematics
+from drake_pose.body import PoseTree
+from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.camera.camera_files import load_camera_file
 from drake_pose.camera.episodes.episode import Episode, EpisodeCamera, JointLog
 from drake_pose.camera.episodes.folder import with_intrinsics

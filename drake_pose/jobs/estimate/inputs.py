@@ -9,10 +9,14 @@ from pathlib import Path
 
 import numpy as np
 
-from drake_pose.body.formats.packages import bundled_model
-from drake_pose.body.landmarks import landmarks_file, load_landmarks
-from drake_pose.body.model import ArticulatedModel, load_model
-from drake_pose.body.report import model_warnings
+from drake_pose.body import (
+    ArticulatedModel,
+    bundled_model,
+    landmarks_file,
+    load_landmarks,
+    load_model,
+    model_warnings,
+)
 from drake_pose.camera.camera_files import load_cameras
 from drake_pose.errors import ModelError, SceneError, SettingsError, UnknownNameError
 from drake_pose.files.records import user_units

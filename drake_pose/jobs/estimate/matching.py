@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from pydrake.systems.analysis import Simulator
 
-from drake_pose.body.parsed_model import nearest_turn
+from drake_pose.body import nearest_turn
 from drake_pose.camera.models import Camera, ParallelCamera
 from drake_pose.errors import SettingsError, listed
 from drake_pose.files.options import percent

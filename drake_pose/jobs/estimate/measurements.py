@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from drake_pose.body.parsed_model import ParsedModel
+from drake_pose.body import ParsedModel
 from drake_pose.camera.picture_files import frame_key
 from drake_pose.csv_files import read_csv
 from drake_pose.errors import SceneError, UnknownNameError

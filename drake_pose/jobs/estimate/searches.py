@@ -9,9 +9,7 @@ from dataclasses import replace
 import numpy as np
 from pydrake.multibody.tree import BodyIndex
 
-from drake_pose.body.model import ArticulatedModel
-from drake_pose.body.tree.pose_tree import PoseTree
-from drake_pose.body.tree.root import RootRotation
+from drake_pose.body import ArticulatedModel, PoseTree, RootRotation
 from drake_pose.errors import SettingsError
 from drake_pose.files.records import user_units
 from drake_pose.files.settings import EstimateSettings, RootTurns

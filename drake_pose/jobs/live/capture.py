@@ -13,9 +13,7 @@ import numpy as np
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPort
 
 from drake_pose.arrays import Array, Mask, Picture
-from drake_pose.body.formats.packages import bundled_model
-from drake_pose.body.model import ArticulatedModel, load_model
-from drake_pose.body.tree.pose_tree import PoseTree
+from drake_pose.body import ArticulatedModel, PoseTree, bundled_model, load_model
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.camera.source_files import TIME_STAMPS
 from drake_pose.csv_files import csv_text

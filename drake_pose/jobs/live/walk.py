@@ -17,8 +17,7 @@ from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPo
 from pydrake.trajectories import PiecewisePolynomial, Trajectory
 
 from drake_pose.arrays import Array
-from drake_pose.body.formats.packages import bundled_model
-from drake_pose.body.model import ArticulatedModel, load_model
+from drake_pose.body import ArticulatedModel, bundled_model, load_model
 from drake_pose.errors import OutputError, SettingsError
 from drake_pose.files.folder import read_summary
 from drake_pose.files.records import PoseTable

@@ -12,8 +12,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from drake_pose.body.model import load_model
-from drake_pose.body.tree.tree_kinematics import TreeKinematics
+from drake_pose.body import load_model
+from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.camera.models import Camera
 from drake_pose.camera.picture_files import SUFFIXES, Mask, Picture, read_picture
 from drake_pose.camera.source_files import find_picture_files

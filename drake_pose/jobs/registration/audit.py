@@ -14,8 +14,8 @@ import numpy as np
 from scipy.special import chdtrc
 
 from drake_pose.arrays import Array, Picture
-from drake_pose.body.model import ArticulatedModel, load_model
-from drake_pose.body.tree.tree_kinematics import TreeKinematics
+from drake_pose.body import ArticulatedModel, load_model
+from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.camera.camera_files import describe_camera, load_cameras
 from drake_pose.camera.models import Camera, PinholeCamera
 from drake_pose.errors import CameraError, MaskError, SceneError, SettingsError

@@ -12,10 +12,8 @@ from typing import NamedTuple
 import numpy as np
 
 from drake_pose.arrays import Array, Picture
-from drake_pose.body.model import OBJECT, ArticulatedModel, load_model
-from drake_pose.body.tree.pose_tree import PoseTree
-from drake_pose.body.tree.root import RootRotation
-from drake_pose.body.tree.tree_kinematics import TreeKinematics
+from drake_pose.body import OBJECT, ArticulatedModel, PoseTree, RootRotation, load_model
+from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.camera.camera_files import CameraFile, load_camera_file
 from drake_pose.camera.episodes.episode import EpisodeCamera
 from drake_pose.camera.episodes.open import open_episode

@@ -11,10 +11,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from drake_pose.arrays import Array
-from drake_pose.body.formats.urdf_shape import BASE_JOINTS
-from drake_pose.body.model import ArticulatedModel
-from drake_pose.body.tree.pose_tree import PoseTree
-from drake_pose.body.tree.tree_kinematics import TreeKinematics
+from drake_pose.body import BASE_JOINTS, ArticulatedModel, PoseTree
+from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.camera.models import Camera
 from drake_pose.camera.picture_files import frame_key
 from drake_pose.errors import SceneError

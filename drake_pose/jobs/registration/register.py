@@ -13,10 +13,8 @@ from typing import Any
 import numpy as np
 
 from drake_pose.arrays import Array, Picture
-from drake_pose.body.formats.urdf_shape import reshaped
-from drake_pose.body.model import OBJECT_POSITIONS, ArticulatedModel
-from drake_pose.body.tree.pose_tree import PoseTree
-from drake_pose.body.tree.tree_kinematics import TreeKinematics
+from drake_pose.body import OBJECT_POSITIONS, ArticulatedModel, PoseTree, reshaped
+from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.camera.models import Camera, PinholeCamera
 from drake_pose.errors import CameraError
 from drake_pose.files.folder import writes_folder

@@ -13,9 +13,8 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from drake_pose.arrays import Array, Picture
-from drake_pose.body.model import OBJECT_POSITIONS
-from drake_pose.body.tree.pose_tree import PoseTree
-from drake_pose.body.tree.tree_kinematics import TreeKinematics
+from drake_pose.body import OBJECT_POSITIONS, PoseTree
+from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.camera.camera_files import dump_cameras
 from drake_pose.camera.drake import dump_scenario
 from drake_pose.camera.exports import mujoco_cameras, ros_camera_info, ros_transforms

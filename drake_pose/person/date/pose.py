@@ -12,7 +12,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from drake_pose.arrays import Array, Indices, Mask
-from drake_pose.body.tree.tree_kinematics import PackedTree, find_motions
+from drake_pose.body.tree_kinematics import PackedTree, find_motions
 from drake_pose.camera.models import Camera
 from drake_pose.compiled import compiled
 from drake_pose.fit.levenberg_marquardt import eliminate

@@ -12,10 +12,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from drake_pose.arrays import Array, Indices
-from drake_pose.body.model import ArticulatedModel
-from drake_pose.body.surfaces.meshes import TriangleMesh
-from drake_pose.body.tree.joint_kernel import PackedSteps
-from drake_pose.body.tree.tree_kinematics import PackedTree, TreeKinematics
+from drake_pose.body import ArticulatedModel, TriangleMesh
+from drake_pose.body.joint_kernel import PackedSteps
+from drake_pose.body.tree_kinematics import PackedTree, TreeKinematics
 from drake_pose.errors import ModelError
 
 LIMBS = ("left_arm", "right_arm", "left_leg", "right_leg")

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from drake_pose.body.tree.joint_kernel import join_bands, place_bands
+from drake_pose.body.joint_kernel import join_bands, place_bands
 from drake_pose.silhouette.areas.outline import (
     Outline,
     PackedOutlines,
@@ -22,8 +22,7 @@ from drake_pose.silhouette.areas.outline import (
 from drake_pose.silhouette.areas.projection import bend
 
 if TYPE_CHECKING:
-    from drake_pose.body.surfaces.meshes import TriangleMesh
-    from drake_pose.body.tree.pose_tree import PoseTree
+    from drake_pose.body import PoseTree, TriangleMesh
 
 
 class BendingOutline:

@@ -12,7 +12,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 if TYPE_CHECKING:
-    from drake_pose.body.surfaces.meshes import TriangleMesh
+    from drake_pose.body import TriangleMesh
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from drake_pose.body.surfaces.meshes import TriangleMesh
+from drake_pose.body import TriangleMesh
 from drake_pose.compiled import compiled, with_room
 from drake_pose.silhouette.areas.outline import (
     Outline,

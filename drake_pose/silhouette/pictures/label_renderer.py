@@ -30,15 +30,13 @@ from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import BodyIndex
 
-from drake_pose.body.parsed_model import link_names
-from drake_pose.body.surfaces.meshes import TriangleMesh
-from drake_pose.body.tree.node_skin import ModelSkin
+from drake_pose.body import ModelSkin, TriangleMesh, link_names
 from drake_pose.camera.drake import camera_to_drake
 from drake_pose.camera.models import Camera, ParallelCamera
 from drake_pose.silhouette.pictures.label_images import EMPTY, label_data
 
 if TYPE_CHECKING:
-    from drake_pose.body.parsed_model import ParsedModel
+    from drake_pose.body import ParsedModel
 
 # The apex's depth as a share of a triangle's size (the root of twice its area): deep enough to be
 # hidden, flat enough to stay inside thin bands.

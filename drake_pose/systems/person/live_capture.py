@@ -10,7 +10,7 @@ from pydrake.geometry import Meshcat
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPort, System
 from pydrake.trajectories import Trajectory
 
-from drake_pose.body.model import ArticulatedModel
+from drake_pose.body import ArticulatedModel
 from drake_pose.camera.frame_source import FrameSource
 from drake_pose.camera.models import Camera, PinholeCamera
 from drake_pose.errors import SettingsError

@@ -16,8 +16,7 @@ from pydrake.systems.sensors import RgbdSensor
 from pydrake.trajectories import Trajectory
 
 from drake_pose.arrays import Array, Mask, Picture
-from drake_pose.body.formats.parsing import captured_warnings
-from drake_pose.body.parsed_model import ParsedModel
+from drake_pose.body import ParsedModel, captured_warnings
 from drake_pose.camera.drake import camera_from_drake, camera_to_drake
 from drake_pose.camera.models import Camera, PinholeCamera
 from drake_pose.errors import CameraError, UnknownNameError

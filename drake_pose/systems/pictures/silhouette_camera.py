@@ -11,7 +11,7 @@ from pydrake.multibody.tree import BodyIndex, RigidBody
 from pydrake.systems.framework import Context
 from pydrake.systems.sensors import ImageLabel16I
 
-from drake_pose.body.surfaces.visual_geometry import labelled_meshes
+from drake_pose.body import labelled_meshes
 from drake_pose.camera.models import Camera
 from drake_pose.errors import ModelError
 from drake_pose.silhouette.areas.label_kernel import paint_labels

@@ -6,7 +6,7 @@ import pytest
 import trimesh
 from pydrake.geometry import Role
 
-from drake_pose.body.model import load_model
+from drake_pose.body import load_model
 from drake_pose.errors import ModelError
 from tests.body.models import cube_obj, write
 

@@ -5,7 +5,7 @@ import pytest
 import trimesh
 from pydrake.multibody.plant import MultibodyPlant
 
-from drake_pose.body.model import load_model
+from drake_pose.body import load_model
 from drake_pose.errors import ModelError
 from tests.body.models import BOX, WELDED_URDF, write
 from tests.body.models import link as urdf_link

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from drake_pose.body.model import load_model
-from drake_pose.body.report import describe_model
+from drake_pose.body import describe_model, load_model
 from drake_pose.errors import ModelError
 from tests.body.models import BOX, WELDED_URDF, joint, link, urdf, write
 

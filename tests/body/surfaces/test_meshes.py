@@ -6,8 +6,8 @@ import pytest
 import trimesh
 from pydrake.geometry import ReadObjToTriangleSurfaceMesh
 
-from drake_pose.body.model import load_model
-from drake_pose.body.surfaces.meshes import TriangleMesh, drawable_file, read_mesh_file, write_obj
+from drake_pose.body import TriangleMesh, load_model
+from drake_pose.body.meshes import drawable_file, read_mesh_file, write_obj
 from drake_pose.errors import ModelError
 from tests.body.models import write
 

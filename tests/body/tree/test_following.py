@@ -12,9 +12,8 @@ from pydrake.multibody.plant import (
 from pydrake.multibody.tree import BodyIndex
 from pydrake.systems.framework import DiagramBuilder
 
-from drake_pose.body.model import ArticulatedModel, load_model
-from drake_pose.body.report import describe_model, model_warnings
-from drake_pose.body.tree.tree_kinematics import TreeKinematics, joint_offsets
+from drake_pose.body import ArticulatedModel, describe_model, load_model, model_warnings
+from drake_pose.body.tree_kinematics import TreeKinematics, joint_offsets
 from drake_pose.errors import ModelError, SettingsError
 from drake_pose.fit.parameters import BodyParameters
 from drake_pose.fit.surfaces import VERY_FEW, few_triangles

@@ -1,8 +1,7 @@
 import numpy as np
 import pytest
 
-from drake_pose.body.model import load_model
-from drake_pose.body.tree.root import RootRotation
+from drake_pose.body import RootRotation, load_model
 from drake_pose.errors import ModelError, SettingsError, UnknownNameError
 from tests.body.models import (
     FLOATING_URDF,

@@ -2,8 +2,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from drake_pose.body.tree.pose_tree import axis_samples, product_grid
-from drake_pose.body.tree.root import RootRotation, even_rotations
+from drake_pose.body import RootRotation
+from drake_pose.body.pose_tree import axis_samples, product_grid
+from drake_pose.body.root import even_rotations
 from drake_pose.errors import SettingsError
 
 TWENTY = np.radians(20.0)

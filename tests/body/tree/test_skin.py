@@ -5,9 +5,7 @@ import pytest
 from pydrake.multibody.tree import BodyIndex
 from scipy.spatial.transform import Rotation
 
-from drake_pose.body.model import ArticulatedModel, load_model
-from drake_pose.body.tree.node_skin import ModelSkin
-from drake_pose.body.tree.root import RootRotation
+from drake_pose.body import ArticulatedModel, ModelSkin, RootRotation, load_model
 from drake_pose.errors import DrakePoseError, ModelError, UnknownNameError
 from tests.body.skins import LIMB_URDF, REACH, band_entry, load_limb, tube_obj, write_limb
 

@@ -1,10 +1,9 @@
 import numpy as np
 import pytest
 
-from drake_pose.body.model import load_model
-from drake_pose.body.tree.link_graph import JointMap
-from drake_pose.body.tree.root import RootRotation
-from drake_pose.body.tree.tree_kinematics import TreeKinematics
+from drake_pose.body import RootRotation, load_model
+from drake_pose.body.link_graph import JointMap
+from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.errors import ModelError, SettingsError
 from tests.body.models import FLOATING_URDF, JOINTED_BASE_URDF, JOINTS_SDF, WELDED_URDF, write
 

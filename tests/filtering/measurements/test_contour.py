@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from drake_pose.body.model import load_model
+from drake_pose.body import load_model
 from drake_pose.errors import SettingsError
 from drake_pose.filtering import contour_tracker
 from drake_pose.filtering.body_state import ROOT_SHIFT

@@ -5,8 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from drake_pose.body.formats.packages import bundled_model
-from drake_pose.body.model import load_model
+from drake_pose.body import bundled_model, load_model
 from drake_pose.camera.models import ParallelCamera
 from drake_pose.errors import MaskError
 from drake_pose.filtering.hand import (

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from drake_pose.body.tree.root import RootRotation
+from drake_pose.body import RootRotation
 from drake_pose.camera.models import circle_of_cameras
 from drake_pose.errors import SettingsError
 from drake_pose.filtering.contour_tracker import (

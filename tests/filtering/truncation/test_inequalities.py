@@ -4,8 +4,7 @@ import sys
 import numpy as np
 import pytest
 
-from drake_pose.body.formats.packages import bundled_model
-from drake_pose.body.model import load_model
+from drake_pose.body import bundled_model, load_model
 from drake_pose.errors import ModelError, SettingsError, UnknownNameError
 from drake_pose.filtering.inequalities import (
     from_bounds,

@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 import yaml
 
-from drake_pose.body.formats.packages import bundled_model
-from drake_pose.body.model import ArticulatedModel, load_model
+from drake_pose.body import ArticulatedModel, bundled_model, load_model
 from drake_pose.camera.camera_files import save_cameras
 from drake_pose.camera.models import Camera, circle_of_cameras
 from drake_pose.jobs.estimate.person import (

@@ -4,7 +4,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drake_pose.body.formats.packages import bundled_model
+from drake_pose.body import bundled_model
 from drake_pose.errors import ModelError, SceneError, SettingsError
 from drake_pose.files.settings import EstimateSettings
 from drake_pose.fit.contour_fit import ContourFit

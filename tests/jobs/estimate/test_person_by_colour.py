@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from drake_pose.body.formats.packages import bundled_model
+from drake_pose.body import bundled_model
 from drake_pose.camera.camera_files import load_cameras
 from drake_pose.errors import SceneError
 from drake_pose.files.settings import EstimateSettings

@@ -9,7 +9,7 @@ import pytest
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
 
-from drake_pose.body.model import load_model
+from drake_pose.body import load_model
 from drake_pose.files.overlay import AGREEMENT_RGB, EXCESS_RGB, MISSING_RGB
 from drake_pose.files.settings import EstimateSettings
 from drake_pose.jobs.estimate.scene import estimate_scene

@@ -3,7 +3,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drake_pose.body.model import load_model
+from drake_pose.body import load_model
 from drake_pose.files.settings import EstimateSettings
 from drake_pose.jobs.estimate.body_fit import _StartedSearch
 from drake_pose.jobs.estimate.inputs import Inputs

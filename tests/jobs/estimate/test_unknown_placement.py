@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drake_pose.body.model import load_model
+from drake_pose.body import load_model
 from drake_pose.errors import SettingsError
 from drake_pose.files.settings import EstimateSettings
 from drake_pose.jobs.estimate.scene import estimate_scene

@@ -3,8 +3,7 @@ import json
 import numpy as np
 import pytest
 
-from drake_pose.body.formats.packages import bundled_model
-from drake_pose.body.model import load_model
+from drake_pose.body import bundled_model, load_model
 from drake_pose.errors import OutputError, SceneError, SettingsError, UnknownNameError
 from drake_pose.jobs.live.capture import capture_live
 from drake_pose.jobs.live.scene import load_live_scene, take_empty_room

@@ -8,8 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drake_pose.body.formats.packages import bundled_model
-from drake_pose.body.model import load_model
+from drake_pose.body import bundled_model, load_model
 from drake_pose.errors import OutputError, SettingsError
 from drake_pose.files.folder import write_summary
 from drake_pose.files.records import PoseRow, PoseTable

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from drake_pose.body.model import load_model
+from drake_pose.body import load_model
 from drake_pose.camera.camera_files import load_cameras, save_cameras
 from drake_pose.camera.models import Camera
 from drake_pose.jobs.registration.inputs import GivenFiles

@@ -12,7 +12,7 @@ import numpy as np
 import yaml
 from scipy.spatial.transform import Rotation
 
-from drake_pose.body.model import load_model
+from drake_pose.body import load_model
 from drake_pose.camera.camera_files import dump_cameras
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer

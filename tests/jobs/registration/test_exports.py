@@ -11,8 +11,8 @@ import yaml
 from pydrake.common.yaml import yaml_dump, yaml_load, yaml_load_typed
 from pydrake.systems.sensors import CameraConfig
 
-from drake_pose.body.model import load_model
-from drake_pose.body.tree.tree_kinematics import TreeKinematics
+from drake_pose.body import load_model
+from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.camera.camera_files import load_cameras
 from drake_pose.camera.models import ParallelCamera
 from drake_pose.errors import CameraError, SettingsError

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from drake_pose.body.model import load_model
-from drake_pose.body.tree.tree_kinematics import TreeKinematics
+from drake_pose.body import load_model
+from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.errors import SceneError
 from drake_pose.jobs.estimate.measurements import read_true_angles
 from drake_pose.jobs.registration.positions import (

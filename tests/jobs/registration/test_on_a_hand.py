@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import yaml
 
-from drake_pose.body.model import load_model
+from drake_pose.body import load_model
 from drake_pose.camera.camera_files import load_camera_file, load_cameras
 from drake_pose.errors import CameraError
 from drake_pose.silhouette.pictures.masks import intersection_over_union, read_mask

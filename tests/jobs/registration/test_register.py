@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import yaml
 
-from drake_pose.body.model import load_model
+from drake_pose.body import load_model
 from drake_pose.camera.camera_files import load_cameras
 from drake_pose.files.overlay import EXCESS_RGB, MISSING_RGB
 from drake_pose.jobs.registration.register import _joint_shifts, register_scene, say_common

@@ -11,8 +11,7 @@ import pytest
 import yaml
 from scipy.spatial.transform import Rotation
 
-from drake_pose.body.formats.packages import bundled_model
-from drake_pose.body.model import load_model
+from drake_pose.body import bundled_model, load_model
 from drake_pose.camera.camera_files import load_cameras
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from drake_pose.silhouette.pictures.masks import write_mask

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from drake_pose.body.formats.packages import bundled_model
-from drake_pose.body.model import load_model
+from drake_pose.body import bundled_model, load_model
 from drake_pose.person.date.skeleton import load_skeleton
 from drake_pose.person.date.walking import (
     COMMANDS,

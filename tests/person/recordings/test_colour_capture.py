@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from drake_pose.body.landmarks import landmark_positions, load_landmarks
+from drake_pose.body import landmark_positions, load_landmarks
 from drake_pose.camera.models import circle_of_cameras
 from drake_pose.fit.colours import Colour, OwnColours
 from drake_pose.fit.contour_fit import ContourFit

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from drake_pose.body.formats.packages import bundled_model
-from drake_pose.body.model import ArticulatedModel, load_model
+from drake_pose.body import ArticulatedModel, bundled_model, load_model
 from drake_pose.camera.models import Camera, circle_of_cameras
 from drake_pose.errors import CameraError, MaskError, SettingsError
 from drake_pose.fit.contour_fit import ContourFit

@@ -3,9 +3,7 @@ import csv
 import numpy as np
 import pytest
 
-from drake_pose.body.formats.packages import bundled_model
-from drake_pose.body.landmarks import landmark_positions, load_landmarks
-from drake_pose.body.model import load_model
+from drake_pose.body import bundled_model, landmark_positions, load_landmarks, load_model
 from drake_pose.camera.models import circle_of_cameras
 from drake_pose.errors import ModelError, SettingsError
 from drake_pose.fit.contour_fit import ContourFit

@@ -7,7 +7,7 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from drake_pose.body.model import load_model
+from drake_pose.body import load_model
 from drake_pose.camera.models import ParallelCamera, PinholeCamera
 from drake_pose.silhouette.areas.outline import outline_from_mesh
 from drake_pose.silhouette.areas.scoring import draw_mask

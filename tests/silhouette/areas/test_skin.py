@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from drake_pose.body.surfaces.meshes import TriangleMesh
+from drake_pose.body import TriangleMesh
 from drake_pose.camera.models import ParallelCamera, PinholeCamera, look_at
 from drake_pose.silhouette.areas.bending import BendingOutline, PackedSurfaces, TreeSurfaces
 from drake_pose.silhouette.areas.outline import outline_from_mesh

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from drake_pose.body.surfaces.meshes import TriangleMesh
+from drake_pose.body import TriangleMesh
 from drake_pose.camera.models import Camera, ParallelCamera, PinholeCamera
 from drake_pose.errors import CameraError
 from drake_pose.silhouette.areas.outline import outline_from_mesh

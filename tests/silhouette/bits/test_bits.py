@@ -6,7 +6,7 @@ import trimesh
 from scipy.ndimage import distance_transform_edt
 from scipy.spatial.transform import Rotation
 
-from drake_pose.body.surfaces.meshes import TriangleMesh
+from drake_pose.body import TriangleMesh
 from drake_pose.camera.models import ParallelCamera, PinholeCamera
 from drake_pose.silhouette.areas.outline import outline_from_mesh
 from drake_pose.silhouette.areas.scoring import VisualHull, draw_mask

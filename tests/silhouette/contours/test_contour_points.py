@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from drake_pose.body.surfaces.meshes import TriangleMesh
+from drake_pose.body import TriangleMesh
 from drake_pose.camera.models import ParallelCamera, PinholeCamera
 from drake_pose.silhouette.areas.outline import outline_from_mesh, pack
 from drake_pose.silhouette.contours.contour_points import sample_contour

@@ -9,8 +9,7 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource
 
-from drake_pose.body.model import ArticulatedModel
-from drake_pose.body.tree.node_skin import ModelSkin
+from drake_pose.body import ArticulatedModel, ModelSkin
 from drake_pose.camera.models import ParallelCamera
 from drake_pose.search import PaperSearch, PaperSearchSettings
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer

@@ -8,7 +8,7 @@ from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.analysis import Simulator
 from pydrake.trajectories import PiecewisePolynomial
 
-from drake_pose.body.model import ArticulatedModel, load_model
+from drake_pose.body import ArticulatedModel, load_model
 from drake_pose.errors import SettingsError
 from drake_pose.registration.online_registration import OnlineRegistration, pose_difference
 from drake_pose.registration.register import RegistrationBody

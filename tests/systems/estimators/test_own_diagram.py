@@ -11,7 +11,7 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.sensors import CameraConfig, RgbdSensor
 
-from drake_pose.body.model import ArticulatedModel
+from drake_pose.body import ArticulatedModel
 from drake_pose.errors import CameraError, SettingsError, UnknownNameError
 from drake_pose.search import PaperSearch, PaperSearchSettings
 from drake_pose.systems.pictures.camera_rig import cameras_from_drake

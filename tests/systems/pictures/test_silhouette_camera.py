@@ -20,9 +20,7 @@ from pydrake.multibody.tree import SpatialInertia, UnitInertia
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.sensors import RgbdSensor
 
-from drake_pose.body.formats.packages import bundled_model
-from drake_pose.body.model import load_model
-from drake_pose.body.tree.node_skin import ModelSkin
+from drake_pose.body import ModelSkin, bundled_model, load_model
 from drake_pose.camera.drake import camera_to_drake
 from drake_pose.camera.models import ParallelCamera, PinholeCamera, look_at
 from drake_pose.errors import ModelError

@@ -11,8 +11,7 @@ from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.tree import Frame, JointIndex
 
 from drake_pose.arrays import Array
-from drake_pose.body.parsed_model import ParsedModel, nearest_turn, one_turn
-from drake_pose.body.tree.link_graph import (
+from drake_pose.body.link_graph import (
     ChainStep,
     JointEdge,
     LinkGraph,
@@ -20,6 +19,7 @@ from drake_pose.body.tree.link_graph import (
     chain_transforms,
     inverse_transforms,
 )
+from drake_pose.body.parsed_model import ParsedModel, nearest_turn, one_turn
 from drake_pose.errors import ModelError, SettingsError
 
 Axis = Literal["x", "y", "z"]

@@ -15,12 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_pose.arrays import Array
+from drake_pose.body.link_graph import ChainStep, PlantKinematics, chain_transforms
+from drake_pose.body.meshes import TriangleMesh
+from drake_pose.body.node_skin import NodeSkin
 from drake_pose.body.parsed_model import ParsedModel, one_turn, turns_around
 from drake_pose.body.plant_source import Coupling
-from drake_pose.body.surfaces.meshes import TriangleMesh
-from drake_pose.body.tree.link_graph import ChainStep, PlantKinematics, chain_transforms
-from drake_pose.body.tree.node_skin import NodeSkin
-from drake_pose.body.tree.root import BasePose, RootRotation, even_rotations
+from drake_pose.body.root import BasePose, RootRotation, even_rotations
 from drake_pose.errors import SettingsError, UnknownNameError
 
 DEFAULT_LENGTH_INTERVAL = 0.05

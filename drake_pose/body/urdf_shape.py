@@ -6,7 +6,7 @@ from collections.abc import Collection, Mapping, Sequence
 import numpy as np
 
 from drake_pose.arrays import Array
-from drake_pose.body.formats.xml_files import xml_text
+from drake_pose.body.model_files import xml_text
 
 Vectors = Mapping[str, Sequence[float]]
 """(3,) by the name of a link or joint."""

@@ -6,9 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from drake_pose.arrays import Array
-from drake_pose.body.parsed_model import ParsedModel
-from drake_pose.body.plant_source import Coupling
-from drake_pose.body.tree.link_graph import (
+from drake_pose.body.link_graph import (
     ChainStep,
     JointEdge,
     LinkGraph,
@@ -16,9 +14,11 @@ from drake_pose.body.tree.link_graph import (
     build_link_graph,
     chain_transforms,
 )
-from drake_pose.body.tree.node_skin import find_skin, require_placed
-from drake_pose.body.tree.pose_tree import NodePlacement, PoseTree, PoseTreeNode, place_node
-from drake_pose.body.tree.root import BasePose, RootRotation, base_of_chain
+from drake_pose.body.node_skin import find_skin, require_placed
+from drake_pose.body.parsed_model import ParsedModel
+from drake_pose.body.plant_source import Coupling
+from drake_pose.body.pose_tree import NodePlacement, PoseTree, PoseTreeNode, place_node
+from drake_pose.body.root import BasePose, RootRotation, base_of_chain
 from drake_pose.errors import ModelError, SettingsError, UnknownNameError
 
 # Held values may lie outside their limits by this much [rad or m].

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from pydrake.multibody.tree import BodyIndex, Joint, RigidBody
 
 from drake_pose.arrays import Array
+from drake_pose.body.meshes import TriangleMesh, join_meshes
 from drake_pose.body.parsed_model import FLOATING_TYPES, ParsedModel, link_names
-from drake_pose.body.surfaces.meshes import TriangleMesh, join_meshes
 from drake_pose.errors import ModelError
 
 _SAMPLES = np.array([0.0, np.pi / 2.0, np.pi, -np.pi / 2.0])

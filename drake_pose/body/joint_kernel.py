@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from drake_pose.body.tree.link_graph import ChainStep
+from drake_pose.body.link_graph import ChainStep
 from drake_pose.compiled import compiled, multiply
 
 

@@ -10,10 +10,10 @@ from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 
-from drake_pose.body.formats.packages import FileFinder
-from drake_pose.body.formats.xml_files import (
+from drake_pose.body.model_files import (
     FOLLOWING,
     OLD_XACRO_ELEMENTS,
+    FileFinder,
     Warn,
     colour_text,
     leave_out,

@@ -15,10 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_pose.arrays import Array
-from drake_pose.body.parsed_model import ParsedModel
-from drake_pose.body.surfaces.meshes import TriangleMesh
-from drake_pose.body.surfaces.skin_file import SkinBand, skin_file
-from drake_pose.body.tree.link_graph import (
+from drake_pose.body.link_graph import (
     ChainStep,
     LinkGraph,
     PlantKinematics,
@@ -26,10 +23,12 @@ from drake_pose.body.tree.link_graph import (
     chain_transforms,
     inverse_transforms,
 )
+from drake_pose.body.meshes import TriangleMesh
+from drake_pose.body.parsed_model import ParsedModel, SkinBand, skin_file
 from drake_pose.errors import ModelError, SettingsError
 
 if TYPE_CHECKING:
-    from drake_pose.body.tree.joint_kernel import PackedBands
+    from drake_pose.body.joint_kernel import PackedBands
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +57,7 @@ class NodeSkin:
 
     def vertices(self, values: Array) -> Array:
         """The vertices (n, v, 3) [m] in the node's frame at its values (n, k) [rad or m]."""
-        from drake_pose.body.tree.joint_kernel import place_bands  # Slow to import: it needs numba.
+        from drake_pose.body.joint_kernel import place_bands  # Slow to import: it needs numba.
 
         count = sum(step.joint_map.position_count for step in self.steps)
         values = np.ascontiguousarray(values, dtype=np.float64)
@@ -73,7 +72,7 @@ class NodeSkin:
     @cached_property
     def packed(self) -> "PackedBands":
         """The band in the kernel's arrays."""
-        from drake_pose.body.tree.joint_kernel import PackedBands, pack_steps
+        from drake_pose.body.joint_kernel import PackedBands, pack_steps
 
         points = self.mesh.vertices
         if self.turned:

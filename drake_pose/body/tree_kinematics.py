@@ -14,10 +14,10 @@ import numpy as np
 from pydrake.multibody.tree import Joint, RigidBody
 
 from drake_pose.arrays import Array
+from drake_pose.body.joint_kernel import PackedSteps, find_joint, pack_steps
+from drake_pose.body.link_graph import ChainStep, JointMap, PlantKinematics, chain_transforms
 from drake_pose.body.parsed_model import nearest_turn
-from drake_pose.body.tree.joint_kernel import PackedSteps, find_joint, pack_steps
-from drake_pose.body.tree.link_graph import ChainStep, JointMap, PlantKinematics, chain_transforms
-from drake_pose.body.tree.pose_tree import PoseTree
+from drake_pose.body.pose_tree import PoseTree
 from drake_pose.compiled import compiled, multiply
 from drake_pose.errors import SettingsError
 

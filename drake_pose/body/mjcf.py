@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from drake_pose.body.formats.xml_files import Warn, read_xml, xml_text
-from drake_pose.body.surfaces.meshes import TriangleMesh, merge_duplicate_vertices, write_obj
+from drake_pose.body.meshes import TriangleMesh, merge_duplicate_vertices, write_obj
+from drake_pose.body.model_files import Warn, read_xml, xml_text
 from drake_pose.errors import ModelError
 
 _ALMOST_MASSLESS = {"pos": "0 0 0", "mass": "1e-6", "diaginertia": "1e-9 1e-9 1e-9"}

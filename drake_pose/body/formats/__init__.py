@@ -1,1 +1,0 @@
-"""Model files (URDF, SDFormat, MJCF, directives) made fit for Drake, and parsed."""

@@ -1,1 +1,0 @@
-"""Surfaces as triangles: meshes, mesh files, Drake's primitive shapes, the file of a skin."""

@@ -24,11 +24,11 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
+from scipy.ndimage import convolve1d
 
 from drake_pose.arrays import Array, Floats, Mask, Picture
 from drake_pose.compiled import compiled
-from drake_pose.fit.colours import COLOURS, Colour
+from drake_pose.fit.colours import COLOURS, Colour, colour_numbers
 from drake_pose.silhouette.areas.outline import PackedOutlines
 from drake_pose.silhouette.areas.span_kernel import fill_rows, find_spans, make_rows
 
@@ -104,11 +104,11 @@ class Light(NamedTuple):
 
 
 class PixelSums(NamedTuple):
-    """What pictures say of sets of frames in which a body covers a pixel.
+    """Scores of sets of frames in which a body covers a pixel.
 
-    shown: (H, W, 3) float32 log-likelihoods of three backgrounds where no frame is covered; more:
-    (H, W, f, 3) float32 what a covered frame adds; none: (H, W) float32 the best of shown; edges:
-    (2, f, H, W) float32 how strong edges across u and v are in each frame, beyond chance.
+    shown: (H, W, 3) log-likelihoods of three backgrounds where no frame is covered. more:
+    (H, W, f, 3) what a covered frame adds. none: (H, W) the best of shown. edges: (2, f, H, W)
+    strengths of edges across u and v in each frame, beyond chance.
     """
 
     shown: Floats
@@ -123,14 +123,12 @@ class Backgrounds:
 
     Args:
         pictures: (f, H, W, 3) in even light.
-        reference: (H, W, 3) the light that they have.
-        lights: of each picture.
+        lights: of each picture before.
         colours: (3, H, W, 3) backgrounds, the most frequent first; they may be alike.
         deviations: (H, W) of a background's colours.
     """
 
     pictures: Floats
-    reference: Floats
     lights: tuple[Light, ...]
     colours: Floats
     deviations: Floats
@@ -144,18 +142,25 @@ class Backgrounds:
         even = np.array([by.evened(one) for by, one in zip(lights, floats, strict=True)])
         off = np.median(_largest(np.abs(even - reference)), axis=0)
         deviations = _deviations(reference, 1.4826 * float(np.median(off)))
-        return Backgrounds(even, reference, lights, _find_colours(even, deviations), deviations)
+        return Backgrounds(even, lights, _find_colours(even, deviations), deviations)
 
     @cached_property
     def sums(self) -> PixelSums:
-        """What a pose explains is summed from."""
-        total, more = self._told
-        noise = float(self.deviations.min())
+        """What ``explain`` adds up."""
+        size, count = self.deviations.shape, len(self.colours)
+        total = np.zeros((*size, count), np.float32)
+        more = np.empty((*size, len(self.pictures), count), np.float32)
         edges = np.empty((2, *self.pictures.shape[:3]), np.float32)
+        noise = float(self.deviations.min())
         for f, picture in enumerate(self.pictures):
+            likeness = [_likeness(picture, one, self.deviations) for one in self.colours]
+            stacked = np.stack(likeness, axis=-1)
+            shown = np.log(MODEL.shown * stacked + (1.0 - MODEL.shown))
+            more[:, :, f] = np.log(MODEL.like_body * stacked + (1.0 - MODEL.like_body)) - shown
+            total += shown
             u, v = (_largest(np.abs(one)) for one in _slopes(picture))
-            # An edge is as strong as it counts from four standard deviations of the noise on. It
-            # runs across an axis where the slope along the other one is not much more.
+            # Edges stronger than four standard deviations of the noise count alike. An edge runs
+            # across an axis where the slope along the other one is not much more.
             strength = np.minimum(1.0, np.hypot(u, v) / (4.0 * noise))
             for k, (across, along) in enumerate(((u, v), (v, u))):
                 own = np.where(along <= 1.7 * across, strength, 0.0)
@@ -183,31 +188,13 @@ class Backgrounds:
 
         covered: (f, H, W) where the body is known to be, about.
         """
-        total, more = self._told
-        told = total.copy()
+        told = self.sums.shown.copy()
         for f, own in enumerate(covered):
-            np.add(told, more[:, :, f], out=told, where=own[..., None])
+            np.add(told, self.sums.more[:, :, f], out=told, where=own[..., None])
         best = told.argmax(axis=-1)[None, ..., None]
         colours = np.take_along_axis(self.colours, best, axis=0)[0]
         off = _largest(np.abs(self.pictures - colours)) / self.deviations
         return np.asarray((off < MODEL.same) & ~_grown(covered, MODEL.near))
-
-    @cached_property
-    def _told(self) -> tuple[Floats, Floats]:
-        """Log-likelihoods where each background shows in all frames (H, W, 3), as in ``PixelSums``.
-
-        And what the body adds in each (H, W, f, 3).
-        """
-        frames, height, width = self.pictures.shape[:3]
-        total = np.zeros((height, width, len(self.colours)), np.float32)
-        more = np.empty((height, width, frames, len(self.colours)), np.float32)
-        for f, picture in enumerate(self.pictures):
-            likeness = [_likeness(picture, one, self.deviations) for one in self.colours]
-            stacked = np.stack(likeness, axis=-1)
-            shown = np.log(MODEL.shown * stacked + (1.0 - MODEL.shown))
-            more[:, :, f] = np.log(MODEL.like_body * stacked + (1.0 - MODEL.like_body)) - shown
-            total += shown
-        return total, more
 
 
 @dataclass(frozen=True, eq=False)
@@ -246,15 +233,12 @@ class KnownBackground:
         small, means = [], []
         for f, (picture, light) in enumerate(zip(pictures, lights, strict=True)):
             even = light.evened(picture)
-            shows = (
-                cv2.resize(
-                    showing[f].astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST
-                ).astype(np.bool_)
-                & ~near[f]
-            )
+            shown = showing[f].astype(np.uint8)
+            shown = cv2.resize(shown, (width, height), interpolation=cv2.INTER_NEAREST)
+            shows = shown.astype(np.bool_) & ~near[f]
             cv2.accumulate(even, total, mask=shows.view(np.uint8))
             count += shows
-            numbers = _numbers(even)
+            numbers = colour_numbers(np.clip(even, 0.0, 255.0).astype(np.uint8))
             on += np.bincount(numbers[inside[f]], minlength=COLOURS)
             beside += np.bincount(numbers[~near[f]], minlength=COLOURS)
             rows = np.flatnonzero(shows)[::37]
@@ -270,7 +254,7 @@ class KnownBackground:
     def odds(self, picture: Picture, light: Light) -> Floats:
         """(H, W) logarithms of the odds that each pixel of a picture shows the body."""
         even = light.evened(picture)
-        numbers = _numbers(even)
+        numbers = colour_numbers(np.clip(even, 0.0, 255.0).astype(np.uint8))
         likeness = _likeness(even, self.colours, self.deviations) * np.float32(MODEL.known_times)
         shown = np.log(MODEL.shown * likeness + (1.0 - MODEL.shown))
         return np.asarray(self.on[numbers] - np.where(self.unseen, self.beside[numbers], shown))
@@ -278,9 +262,8 @@ class KnownBackground:
 
 def odds_picture(odds: Floats) -> Picture:
     """A picture (H, W, 3) whose colours stand for log odds (H, W), see ``odds_of_colours``."""
-    share = (np.clip(odds, -MODEL.max_log_odds, MODEL.max_log_odds) + MODEL.max_log_odds) / (
-        2.0 * MODEL.max_log_odds
-    )
+    most = MODEL.max_log_odds
+    share = (np.clip(odds, -most, most) + most) / (2.0 * most)
     number = np.rint(share * (COLOURS - 1)).astype(np.uint16)
     channels = (number >> 8, (number >> 4) & 15, number & 15)
     return np.stack([(one << 4).astype(np.uint8) for one in channels], axis=-1)
@@ -329,7 +312,7 @@ def _deviations(picture: Floats, noise: float) -> Floats:
 
 
 def _grown(masks: Mask, by: int) -> Mask:
-    """(f, H, W) masks larger by so many pixels on all sides."""
+    """(f, H, W) masks that are larger on all sides by a number of pixels."""
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * by + 1,) * 2)
     return np.array([cv2.dilate(one.astype(np.uint8), disc) for one in masks]).astype(np.bool_)
 
@@ -337,26 +320,15 @@ def _grown(masks: Mask, by: int) -> Mask:
 def _likeness(pictures: Floats, colours: Floats, deviations: Floats) -> Floats:
     """(..., H, W) how much likelier colours (..., H, W, 3) are under a background than any."""
     off = _largest(np.abs(pictures - colours)) / deviations
-    return np.asarray(
-        np.exp(MODEL.log_peak - 0.5 * np.maximum(off - MODEL.exact, 0.0) ** 2), np.float32
-    )
-
-
-def _numbers(picture: Floats) -> NDArray[np.uint16]:
-    """(H, W) the colours of pixels (H, W, 3), as histograms count them."""
-    steps = np.clip(picture, 0.0, 255.0).astype(np.uint8) >> 4
-    places = np.array([[256.0, 16.0, 1.0]])
-    return np.asarray(cv2.transform(steps.astype(np.float32), places), np.uint16)
+    beyond = np.maximum(off - MODEL.exact, 0.0)
+    return np.asarray(np.exp(MODEL.log_peak - 0.5 * beyond**2), np.float32)
 
 
 def _log_frequencies(numbers: Array) -> Floats:
     """(COLOURS,) logarithms of how frequent colours are of (COLOURS,) pixels; neighbours share."""
     counts = numbers.reshape(16, 16, 16)
     for axis in range(3):
-        ends = [(1, 1) if k == axis else (0, 0) for k in range(3)]
-        padded = np.pad(counts, ends, mode="edge")
-        low, middle, high = (np.take(padded, range(k, k + 16), axis=axis) for k in range(3))
-        counts = 0.25 * low + 0.5 * middle + 0.25 * high
+        counts = convolve1d(counts, [0.25, 0.5, 0.25], axis, mode="nearest")
     times = COLOURS * counts.ravel() / max(float(counts.sum()), 1.0)
     return np.log(np.minimum(times, MODEL.max_frequent) + MODEL.unseen).astype(np.float32)
 
@@ -406,19 +378,23 @@ class Explained(IntEnum):
 def explain(
     packed: PackedOutlines,
     X_CN: Array,
-    still: NDArray[np.bool_],
+    still: Mask,
     camera: Array,
     sums: PixelSums,
     side: float,
     squares: int,
     always_covered: float = 0.3,
 ) -> tuple[Array, Array]:
-    """What a body explains that stands at X_CN (f, nodes, 3, 4) in the frames.
+    """What a body explains of pictures, by sums over the pixels.
+
+    Bits of a word for each pixel say in which frames the body covers it. The words' edges are the
+    body's outline in each frame.
 
     Args:
         packed: the nodes' surfaces.
+        X_CN: (f, nodes, 3, 4) where they stand in the frames.
         still: (nodes,) which nodes stand at one place in all frames: they are their own background,
-            so that their outline tells alone.
+            so that only their outline counts.
         camera: (8,) kernel parameters.
         sums: of the pictures.
         side, squares: the gain is also told by (squares, squares) squares of a side [pixel]; 0:

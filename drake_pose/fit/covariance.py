@@ -1,15 +1,14 @@
-"""How sure fitted values are where contours do not err point by point.
+"""Covariance of fitted values whose contours do not err point by point.
 
-Five things make the contours of a body and of its silhouettes differ: the noise of their points; so
-much of it as comes again in all pictures of a part that stands still before a camera; the surface
-of a part, which all cameras see shifted, turned and stretched alike; a part's edge in one camera's
-mask, so too; and a camera, which stands or looks a little elsewhere than its calibration says. How
-large they are is estimated from what is left of the distances once the values are fitted: variance
-components by restricted maximum likelihood (Patterson and Thompson 1971) in steps of average
-information (Gilmour, Thompson and Cullis 1995), each with a prior of about a pixel, for a single
-instant tells little of them.
+Five errors make the contours of a body and of its silhouettes differ: noise of points; noise that
+is repeated in all pictures of a part that stands still before a camera; the surface of a part,
+which all cameras see shifted, turned and stretched alike; a part's edge in one mask, likewise; and
+a camera, which stands or looks a little elsewhere than its calibration says. Their sizes are
+estimated from the residuals of the distances: variance components by restricted maximum likelihood
+(Patterson and Thompson 1971) in steps of average information (Gilmour, Thompson and Cullis 1995),
+each with a prior of about a pixel, as a single instant tells little of them.
 
-A camera's error hardly shows in what is left, for the joints follow it. So a calibration is not
+A camera's error hardly shows in the residuals, for the joints follow it. So a calibration is not
 trusted beyond a pixel, however well everything fits.
 """
 
@@ -24,7 +23,7 @@ from numpy.typing import NDArray
 from scipy.linalg.lapack import dpotri
 from threadpoolctl import ThreadpoolController
 
-from drake_pose.arrays import Array, Mask
+from drake_pose.arrays import Array, Indices, Mask
 from drake_pose.fit.contour_fit import Comparison, pixels_per_metre, symmetric
 from drake_pose.silhouette.areas.outline import Outline
 
@@ -51,36 +50,26 @@ class ErrorSizes(NamedTuple):
     doubts: tuple[float, ...] = ()
 
 
-class ErrorEffects(NamedTuple):
-    """(n, n) covariances of distances that what ``ErrorSizes`` names makes where it errs by one."""
-
-    noise: Array
-    repeated: Array
-    surface: Array
-    mask: Array
-    camera: Array
-
-
 class Distances(NamedTuple):
-    """What is left of the contours' distances, in independent combinations.
+    """Residuals of the contours' distances, in independent combinations.
 
     Attributes:
         y: (n,) the distances.
-        X: (n, m) how they follow the values.
-        effects: (n, n) covariances of what errs by a unit, as of ``ErrorSizes``.
-        information: (m, m) what all distances tell of the values where each errs by itself.
-        bends: (n, 12 nodes) how they follow the parts' surfaces, which all pictures see alike.
-        pictures: (n,) which of the pictures each is of.
-        doubts: groups (n, k) of how they follow what may be off alike in all pictures and is not
-            among the values, such as joints' zeros; each by a unit of its group.
+        X: (n, m) their derivatives by the values.
+        effects: (5, n, n) their covariances if each error of ``ErrorSizes`` has the size one.
+        information: (m, m) about the values, were all errors independent.
+        bends: (n, 12 nodes) derivatives by the parts' surfaces, which all pictures see alike.
+        pictures: (n,) the picture of each.
+        doubts: (n, k) derivatives, by groups, by what may be off alike in all pictures and is not
+            among the values, such as joints' offsets; each by a unit of its group.
     """
 
     y: Array
     X: Array
-    effects: ErrorEffects
+    effects: Array
     information: Array
     bends: Array
-    pictures: NDArray[np.intp]
+    pictures: Indices
     doubts: tuple[Array, ...] = ()
 
 
@@ -92,8 +81,8 @@ class ComparedMask(NamedTuple):
         X_WN: (nodes, 4, 4) where the body stands.
         X_CW: (4, 4) the world's pose in the camera.
         moves: (nodes, m, 12) the affine motions that the m values give to the nodes.
-        size: how far the unit of errors is at the body [m].
-        camera: the how manieth.
+        size: the unit of errors, at the body [m].
+        camera: the camera's index.
     """
 
     A: Array
@@ -120,14 +109,14 @@ def distances(
     moves: Array,
     unit: float,
 ) -> Distances:
-    """The distances at a pose that was fitted.
+    """The distances at a fitted pose.
 
     Args:
         outlines: the nodes' surfaces.
         cameras: packed, see ``pack_cameras``.
         compared: the comparison at the pose.
         moves: (nodes, m, 12) the affine motions that the values give to the nodes.
-        unit: in which errors are measured [pixel].
+        unit: of errors [pixel].
     """
     X_WN = compared.placement.X_WN
     size = unit / pixels_per_metre(cameras, X_WN[:, :3, 3].mean(axis=0))
@@ -153,40 +142,37 @@ def distances_in_masks(
         widths: whether each silhouette may be too wide on all sides, by a further value [unit].
     """
     if widths:
-        pictures = _with_widths(outlines, pictures)
+        pictures = [
+            one._replace(moves=np.concatenate([one.moves, _widening(outlines, one, wide)], axis=1))
+            for one, wide in zip(pictures, np.eye(len(pictures)), strict=True)
+        ]
     of, along, bends = _known_directions(outlines, pictures, most)
     count = pictures[0].moves.shape[1]
     y, X, shaken = np.zeros(len(of)), np.zeros((len(of), count)), np.zeros((len(of), 6))
-    for c in np.unique(of[:, 0]).tolist():
-        at, one = np.flatnonzero(of[:, 0] == c), pictures[c]
+    information = np.zeros((count, count))
+    for c, one in enumerate(pictures):
+        at = np.flatnonzero(of[:, 0] == c)
         parts = of[at, 1]
         rows = np.einsum("ri,rij->rj", along[at], symmetric(one.A)[parts])
         y[at] = np.einsum("ri,ri->r", along[at], one.b[parts])
         X[at] = np.einsum("rj,rmj->rm", rows, one.moves[parts])
-        shaken[at] = rows @ _camera_motions(outlines, one.X_CW, one.X_WN, one.size)
+        shaken[at] = rows @ _camera_motions(outlines, one)
+        # Of many values a picture tells few: of all pictures' own ones none but its own.
+        own = np.flatnonzero(one.moves.any(axis=(0, 2)))
+        moves = one.moves[:, own]
+        told = moves @ symmetric(one.A) @ np.swapaxes(moves, 1, 2)
+        information[np.ix_(own, own)] += told.sum(axis=0)
     same_picture, same_part = (of[:, None, k] == of[None, :, k] for k in range(2))
     alike = bends @ bends.T * same_part
     view = _views(outlines, pictures)[of[:, 0], of[:, 1]]
     turns = bends / np.linalg.norm(bends, axis=1, keepdims=True)
     repeated = turns @ turns.T * same_part * (view[:, None] == view)
     of_part = of[:, 1, None] == np.arange(len(outlines))
-    information = np.zeros((count, count))
-    for one in pictures:
-        # Of many values a picture tells few: of all pictures' own ones none but its own.
-        own = np.flatnonzero(one.moves.any(axis=(0, 2)))
-        moves = one.moves[:, own]
-        told = moves @ symmetric(one.A) @ np.swapaxes(moves, 1, 2)
-        information[np.ix_(own, own)] += told.sum(axis=0)
+    camera = shaken @ shaken.T * same_picture
     return Distances(
         y=y,
         X=X,
-        effects=ErrorEffects(
-            np.eye(len(of)),
-            repeated,
-            alike,
-            alike * same_picture,
-            shaken @ shaken.T * same_picture,
-        ),
+        effects=np.array([np.eye(len(of)), repeated, alike, alike * same_picture, camera]),
         information=information,
         bends=(of_part[:, :, None] * bends[:, None]).reshape(len(of), 12 * len(outlines)),
         pictures=of[:, 0],
@@ -195,14 +181,14 @@ def distances_in_masks(
 
 def _known_directions(
     outlines: Sequence[Outline], pictures: Sequence[ComparedMask], most: int
-) -> tuple[NDArray[np.intp], Array, Array]:
-    """Affine motions of parts, each of a distance that a picture tells, the best known ones first.
+) -> tuple[Indices, Array, Array]:
+    """Affine motions of parts, each with a distance that a picture tells, best known ones first.
 
     Returns: picture and node (n, 2) of each; the motion (n, 12) by which it changes by one
-    deviation; and how it changes with deformations of the part's surface (n, 12).
+    deviation; and its derivative by deformations of the part's surface (n, 12).
     """
     mean_size = float(np.mean([picture.size for picture in pictures]))
-    found: list[tuple[Array, Array, NDArray[np.intp], Array, Array]] = []
+    found: list[tuple[Array, Indices, Indices, Array, Array]] = []
     for c, one in enumerate(pictures):
         A = symmetric(one.A)
         seen = np.flatnonzero(np.einsum("nii->n", A) > 0.0)
@@ -219,17 +205,15 @@ def _known_directions(
     return np.column_stack([picture, part])[best], along[best], bends[best]
 
 
-def _views(outlines: Sequence[Outline], pictures: Sequence[ComparedMask]) -> NDArray[np.intp]:
-    """(pictures, nodes) which picture was the first that showed a part where this one does.
+def _views(outlines: Sequence[Outline], pictures: Sequence[ComparedMask]) -> Indices:
+    """(pictures, nodes) the first picture that showed a part where this one does.
 
-    Where a part moves by less than half the unit it stands still.
+    A part stands still where it moves by less than half the unit.
     """
     X_CN = np.array([one.X_CW @ one.X_WN for one in pictures])[:, :, :3]
     found = np.tile(np.arange(len(pictures))[:, None], len(outlines))
     for n, outline in enumerate(outlines):
-        if not len(outline.vertices):
-            continue
-        for c, one in enumerate(pictures):
+        for c, one in enumerate(pictures if len(outline.vertices) else ()):
             by = X_CN[: c + 1, n] - X_CN[c, n]
             still = np.einsum("kij,jl,kil->k", by, outline.moments, by) < (0.5 * one.size) ** 2
             found[c, n] = found[np.flatnonzero(still)[0], n]
@@ -237,7 +221,7 @@ def _views(outlines: Sequence[Outline], pictures: Sequence[ComparedMask]) -> NDA
 
 
 def surface_deformations(outlines: Sequence[Outline], X_WN: Array) -> Array:
-    """(n, 12, 12) affine motions, in columns, that move each part's surface by about one metre."""
+    """(n, 12, 12) affine motions, in columns, that move each part's surface by about a metre."""
     R, moments = X_WN[:, :3, :3], np.array([one.moments for one in outlines]).reshape(-1, 4, 4)
     middles = moments[:, 3, :3]
     squares = np.diagonal(moments, axis1=1, axis2=2)[:, :3] - middles**2
@@ -250,33 +234,27 @@ def surface_deformations(outlines: Sequence[Outline], X_WN: Array) -> Array:
     return K
 
 
-def _with_widths(
-    outlines: Sequence[Outline], pictures: Sequence[ComparedMask]
-) -> list[ComparedMask]:
-    """Masks that may be too wide on all sides: a further value for each [unit]."""
-    found = []
-    for k, one in enumerate(pictures):
-        wider = np.zeros((len(outlines), len(pictures), 12))
-        # A part's surface is about a metre wider on all sides; one without any is nowhere.
-        by = surface_deformations(outlines, one.X_WN)[:, :, [3, 7, 11]].sum(axis=2)
-        wider[:, k] = by * one.size * [[len(outline.vertices) > 0] for outline in outlines]
-        found.append(one._replace(moves=np.concatenate([one.moves, wider], axis=1)))
-    return found
+def _widening(outlines: Sequence[Outline], one: ComparedMask, wide: Array) -> Array:
+    """(nodes, pictures, 12) a silhouette's growth by the unit, of the picture where wide is 1."""
+    # A part's surface is about a metre wider on all sides; one without any is nowhere.
+    by = surface_deformations(outlines, one.X_WN)[:, :, [3, 7, 11]].sum(axis=2)
+    by = by * one.size * [[len(outline.vertices) > 0] for outline in outlines]
+    return np.asarray(by[:, None] * wide[:, None])
 
 
-def _camera_motions(outlines: Sequence[Outline], X_CW: Array, X_WN: Array, size: float) -> Array:
-    """(12, 6) the body's shifts along and turns about a camera's axes, by about a size [m]."""
-    placed = zip(outlines, X_WN, strict=True)
-    moments = sum(len(one.vertices) * (X @ one.moments @ X.T) for one, X in placed)
-    moments = np.asarray(moments) / sum(len(one.vertices) for one in outlines)
+def _camera_motions(outlines: Sequence[Outline], one: ComparedMask) -> Array:
+    """(12, 6) the body's shifts along and turns about a camera's axes, by about the unit."""
+    placed = zip(outlines, one.X_WN, strict=True)
+    moments = sum(len(own.vertices) * (X @ own.moments @ X.T) for own, X in placed)
+    moments = np.asarray(moments) / sum(len(own.vertices) for own in outlines)
     middle = moments[3, :3]
     extent = math.sqrt(max(float(np.trace(moments[:3, :3]) - middle @ middle), 1e-18))
     motions = np.zeros((12, 6))
-    for k, axis in enumerate(X_CW[:3, :3]):
+    for k, axis in enumerate(one.X_CW[:3, :3]):
         M = np.cross(np.eye(3), axis).T / extent
         motions[[3, 7, 11], k] = axis
         motions[:, 3 + k] = np.column_stack([M, -M @ middle]).ravel()
-    return motions * size
+    return motions * one.size
 
 
 @_on_one_thread
@@ -297,11 +275,10 @@ def estimate_sizes(
         settled: steps end where logarithms of sizes change by no more.
     """
     n = len(seen.y)
-    stands_still = np.abs(seen.effects.repeated - seen.effects.noise).max(initial=0.0) > settled
-    # Of parts that move, noise is noise.
-    named = ErrorEffects._fields
-    told = [k for k, name in enumerate(named) if name != "repeated" or stands_still]
-    effects = [seen.effects[k] for k in told] + [Z @ Z.T for Z in seen.doubts]
+    stands_still = np.abs(seen.effects[1] - seen.effects[0]).max(initial=0.0) > settled
+    # Of parts that move, noise is not repeated.
+    told = [0, 1, 2, 3, 4] if stands_still else [0, 2, 3, 4]
+    effects = [*seen.effects[told], *(Z @ Z.T for Z in seen.doubts)]
     stacked = np.reshape(effects, (len(effects), -1))
 
     apriori = _apriori(is_angle)
@@ -343,7 +320,7 @@ def estimate_sizes(
         t, (value, P, Py) = t + step, trial
         if gain < 0.05 or np.abs(step).max() < settled:
             break
-    sizes = np.zeros(len(named))
+    sizes = np.zeros(5)
     sizes[told] = np.exp(t[: len(told)])
     noise, repeated, surface, mask, camera = sizes.tolist()
     doubts = tuple(np.exp(t[len(told) :]).tolist())
@@ -354,10 +331,9 @@ def estimate_sizes(
 def values_covariance(
     seen: Distances, sizes: ErrorSizes, free: NDArray[np.intp], is_angle: Mask
 ) -> Array:
-    """(f, f) covariance of the free values, fitted as if each distance erred by itself.
+    """(f, f) covariance of the free values, which were fitted as if errors were independent.
 
-    That is no better than the fit: H^-1 J^T V J H^-1 (the sandwich of Huber 1967), where V is the
-    covariance of the distances.
+    It is H^-1 J^T V J H^-1 (the sandwich of Huber 1967), V the covariance of the distances.
     """
     white = sizes.noise**2 + sizes.repeated**2
     own = seen.X[:, free]
@@ -370,9 +346,8 @@ def values_covariance(
 
 
 def distances_covariance(seen: Distances, sizes: ErrorSizes) -> Array:
-    """(n, n) of the distances, without what is doubted."""
-    named = sizes.noise, sizes.repeated, sizes.surface, sizes.mask, sizes.camera
-    parts = zip(named, seen.effects, strict=True)
+    """(n, n) of the distances, doubts left out."""
+    parts = zip(sizes[:5], seen.effects, strict=True)
     return sum((size**2 * W for size, W in parts), np.zeros((len(seen.y), len(seen.y))))
 
 
@@ -382,9 +357,8 @@ def doubted_covariance(
 ) -> tuple[Array, Distances]:
     """What the doubts add to the covariance (m, m) of the values, and the distances without them.
 
-    They were not fitted, so the values are off by what they follow them: the doubts' variance, and
-    the square of what is likeliest of them by what is left (best linear unbiased prediction,
-    Henderson 1975), for what is off has not the mean 0 once it is seen.
+    Doubts were not fitted, so the values follow them: by the doubts' variance, and the square of
+    their likeliest values by the residuals (best linear unbiased prediction, Henderson 1975).
     """
     white = sizes.noise**2 + sizes.repeated**2
     A = np.concatenate(seen.doubts, axis=1)
@@ -405,10 +379,10 @@ def _apriori(is_angle: Mask) -> Array:
 
 
 def excess(pieces: Array, others: Array) -> float:
-    """By how many standard deviations costs by pieces are above others of the same shape.
+    """By how many standard deviations costs by pieces of pictures are above others (same shape).
 
-    Vuong's test (1989): how differences scatter from piece to piece of the pictures tells how large
-    that of the whole may be by chance. What no pose explains costs all of them alike.
+    Vuong's test (1989): differences of pieces scatter as that of the whole does by chance. What no
+    pose explains costs both alike.
     """
     more = pieces - others
     return float(more.sum() / max(np.sqrt(float((more**2).sum())), 1e-9))

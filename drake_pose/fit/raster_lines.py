@@ -15,9 +15,8 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from drake_pose.arrays import Array, Mask
+from drake_pose.arrays import Array, Indices, Mask
 from drake_pose.compiled import compiled
 from drake_pose.fit.kernel import add_pull, add_pulls, seen_from
 from drake_pose.silhouette.areas.outline import PackedOutlines
@@ -31,65 +30,51 @@ from drake_pose.silhouette.contours.contour_points import (
 class Border(NamedTuple):
     """Where a silhouette's border crosses rows and columns of pixel centres.
 
-    row_starts: (H + 1,) where each row's crossings begin; row_places: (n,) u, half way between two
-    pixels; column_starts: (W + 1,) and column_places: (m,) v likewise.
+    rows: (H + 1,) where each row's crossings begin, and (n,) u, half way between two pixels;
+    columns: (W + 1,) and (m,) v likewise.
     """
 
-    row_starts: NDArray[np.int64]
-    row_places: Array
-    column_starts: NDArray[np.int64]
-    column_places: Array
+    rows: tuple[Indices, Array]
+    columns: tuple[Indices, Array]
 
     @classmethod
     def nothing(cls, height: int, width: int) -> Border:
         """Of an empty picture."""
-        rows, columns = np.zeros(height + 1, dtype=np.int64), np.zeros(width + 1, dtype=np.int64)
-        return cls(rows, np.zeros(0), columns, np.zeros(0))
+        return cls(
+            (np.zeros(height + 1, dtype=np.int64), np.zeros(0)),
+            (np.zeros(width + 1, dtype=np.int64), np.zeros(0)),
+        )
 
     @property
     def length(self) -> float:
-        """About how long it is [pixel]: rows cross the cosine's share of it, columns the sine's."""
-        # Both together are 4 / pi on average.
-        return (len(self.row_places) + len(self.column_places)) * math.pi / 4.0
+        """About how long it is [pixel]: crossings a pixel are 4 / pi on average."""
+        return (len(self.rows[1]) + len(self.columns[1])) * math.pi / 4.0
 
     def covered(self, step: int, shape: tuple[int, ...]) -> Mask:
-        """What it bounds, in a picture (h, w) of every so many rows and columns."""
-        rows = np.repeat(np.arange(len(self.row_starts) - 1), np.diff(self.row_starts))
+        """What it bounds, in a picture (h, w) of every step-th row and column."""
+        starts, places = self.rows
+        rows = np.repeat(np.arange(len(starts) - 1), np.diff(starts))
         chosen = rows % step == 0
-        columns = np.clip(np.ceil(self.row_places[chosen] / step), 0, shape[1]).astype(np.int64)
+        columns = np.clip(np.ceil(places[chosen] / step), 0, shape[1]).astype(np.int64)
         changes = np.zeros((shape[0], shape[1] + 1), dtype=np.int8)
         np.add.at(changes, (rows[chosen] // step, columns), 1)
         return np.cumsum(changes, axis=1)[:, :-1] % 2 == 1
 
 
-def find_border(mask: NDArray[np.bool_]) -> Border:
+def find_border(mask: Mask) -> Border:
     """The border of a silhouette (H, W); what lies beyond the picture counts as outside."""
-    pixels = np.ascontiguousarray(mask).view(np.uint8)
-    return Border(*_find_changes(pixels), *_find_changes(np.ascontiguousarray(pixels.T)))
-
-
-def _find_changes(pixels: NDArray[np.uint8]) -> tuple[NDArray[np.int64], Array]:
-    """Where the lines of pixels (n, m) change between 0 and 1: Border's starts and places."""
-    lines, places = np.nonzero(np.diff(np.pad(pixels, ((0, 0), (1, 1)))))
-    starts = np.searchsorted(lines, np.arange(len(pixels) + 1))
-    return starts.astype(np.int64), np.asarray(places - 0.5)
-
-
-class SkinWeights(NamedTuple):
-    """Whom a body's vertices follow.
-
-    shares: (v,) how far each follows its own node, and how far that node's parent: less than 1 in
-    bands of skin; parents: (nodes,).
-    """
-
-    shares: Array
-    parents: NDArray[np.int64]
+    found = []
+    for pixels in (mask.view(np.uint8), mask.T.view(np.uint8)):
+        lines, places = np.nonzero(np.diff(np.pad(pixels, ((0, 0), (1, 1)))))
+        starts = np.searchsorted(lines, np.arange(len(pixels) + 1)).astype(np.int64)
+        found.append((starts, np.asarray(places - 0.5)))
+    return Border(*found)
 
 
 @compiled
 def compare_raster(
     packed: PackedOutlines,
-    skin: SkinWeights,
+    skin: tuple[Array, Indices],
     X_WN: Array,
     wanted: Mask,
     camera: tuple[Array, Array],
@@ -101,41 +86,39 @@ def compare_raster(
     A: Array,
     b: Array,
 ) -> tuple[float, float, float]:
-    """Adds what one camera's silhouette says of the nodes' affine motions.
+    """Adds one camera's evidence of the nodes' affine motions.
 
     Args:
         packed: the nodes' surfaces.
-        skin: whom their vertices follow.
+        skin: (v,) by what fraction each vertex follows its own node, and not that node's parent;
+            (nodes,) the parents.
         X_WN: (nodes, 4, 4).
-        wanted: (nodes,) which nodes' motions are asked for.
+        wanted: (nodes,) which nodes move.
         camera: X_CW (4, 4) and kernel parameters (8,).
         still: the border of all other nodes' union.
         border: the silhouette's.
         lines: every so many rows and columns are looked at, and the first of them.
         scale: residuals beyond it lose weight [pixel].
-        slack: distances up to this hardly count, those beyond it by what they are more; 0: all
-            count [pixel].
+        slack: distances count by what they are beyond it; 0: all count [pixel].
         A, b: (nodes, 12, 12), lower triangles, and (nodes, 12) added to, as of `compare_contours`.
 
     Returns:
-        The pixels that body or silhouette covers, but not both, as the rows looked at show them;
-        the sum of all weights; and that of the weighted squares of the residuals.
+        Number of pixels that either body or silhouette covers, estimated from the rows; the sum of
+        all weights; and that of the weighted squares of the residuals.
     """
     stride, offset = lines
     segments = find_segments(packed, seen_from(camera[0], X_WN), camera[1], wanted)
     ends = segments.ends
     apart, total, squares = 0.0, 0.0, 0.0
     spans = np.empty((ends.shape[0] + 1, 2), dtype=np.int64)
-    most = 2 * ends.shape[0] + 2 + max(len(still.row_places), len(still.column_places))
+    most = 2 * ends.shape[0] + 2 + max(len(still.rows[1]), len(still.columns[1]))
     chosen = np.empty(most, dtype=np.int64)
     places, slopes = np.empty(most), np.empty(most)
     weights, residuals = np.empty(most), np.empty(most)
     wide = np.zeros((len(X_WN), 13))
     for across in range(2):
-        border_starts = border.row_starts if across == 0 else border.column_starts
-        border_places = border.row_places if across == 0 else border.column_places
-        still_starts = still.row_starts if across == 0 else still.column_starts
-        still_places = still.row_places if across == 0 else still.column_places
+        border_starts, border_places = border[across]
+        still_starts, still_places = still[across]
         extent = camera[1][6 + across] - 0.5
         count = (int(camera[1][7 - across]) - 1 - offset) // stride + 1
         crossings = find_crossings(segments, across, float(offset), float(stride), count)
@@ -187,10 +170,10 @@ def compare_raster(
                 squares += weight * residual * residual
                 # A share of a weight for each node that the point follows: the slope is exact, and
                 # the curvature no less than it is.
-                own = (1.0 - share) * skin.shares[i] + share * skin.shares[j]
+                own = (1.0 - share) * skin[0][i] + share * skin[0][j]
                 for part in range(2 if own < 1.0 else 1):
                     labels[0, pulling] = node
-                    labels[1, pulling] = node if part == 0 else skin.parents[node]
+                    labels[1, pulling] = node if part == 0 else skin[1][node]
                     for axis in range(3):
                         begin, after = packed.points[axis, i], packed.points[axis, j]
                         p_N[pulling, axis] = (1.0 - share) * begin + share * after
@@ -222,30 +205,20 @@ def find_body_border(
                 count += 1
             kept_starts[line + 1] = count
         borders.append((kept_starts, kept[:count].copy()))
-    return Border(borders[0][0], borders[0][1], borders[1][0], borders[1][1])
+    return Border(borders[0], borders[1])
 
 
 @compiled
 def _unite_line(
-    spans: NDArray[np.int64],
-    found: int,
-    moving: Array,
-    still: Array,
-    first: int,
-    end: int,
-    places: Array,
-    chosen: NDArray[np.int64],
-) -> int:
-    """Writes where a line enters and leaves the union of moving and still surfaces.
+    spans: Indices, found: int, moving: Array, still: Array, first: int, end: int, places: Array,
+    chosen: Indices,
+) -> int:  # fmt: skip
+    """Writes where a line enters and leaves the union of moving and still surfaces; their number.
 
     Args:
         spans, found, moving: the line's moving spans, as from ``find_line_spans``.
-        still: the still surfaces' crossings; this line's are those from ``first`` to ``end``.
-        places: written.
-        chosen: written: the crossing of the moving surfaces, or -1.
-
-    Returns:
-        The number of crossings.
+        still: the still surfaces' crossings, of this line from ``first`` to ``end``.
+        places, chosen: written; chosen is the crossing of the moving surfaces, or -1.
     """
     count, depth, i, j = 0, 0, 0, first
     while i < 2 * found or j < end:
@@ -267,9 +240,9 @@ def _unite_line(
 def _pixels_apart(
     places: Array, count: int, border: Array, first: int, end: int, width: int
 ) -> float:
-    """The number of a line's pixels that either body or silhouette covers, but not both.
+    """Number of a line's pixels whose centre either body or silhouette covers, but not both.
 
-    A pixel is covered if its centre is. Arguments as of _compare_line; width: the line's length.
+    Arguments as of _compare_line; width: the line's length.
     """
     length, open_at, inside = 0.0, -0.5, False
     i, j = 0, first
@@ -288,24 +261,15 @@ def _pixels_apart(
 
 @compiled
 def _compare_line(
-    places: Array,
-    slopes: Array,
-    count: int,
-    border: Array,
-    first: int,
-    end: int,
-    extent: float,
-    scale: float,
-    slack: float,
-    weights: Array,
-    residuals: Array,
-) -> None:
+    places: Array, slopes: Array, count: int, border: Array, first: int, end: int, extent: float,
+    scale: float, slack: float, weights: Array, residuals: Array,
+) -> None:  # fmt: skip
     """Writes each contour crossing's weight and weighted residual.
 
     Args:
         places: (count,) the contour's crossings, in turns in and out.
         slopes: (count,) cosines between the line and the contour's normal there.
-        border: the silhouette's crossings; this line's are those from ``first`` to ``end``.
+        border: the silhouette's crossings, of this line from ``first`` to ``end``.
         extent: the picture's end [pixel].
         scale, slack: as of compare_raster.
         weights, residuals: written.

@@ -261,7 +261,7 @@ class SharedFit:
         # where parts are seen to err, a calibration is trusted to a pixel at best. What comes again
         # where a part stands still may be the part's surface: none of it counts as noise here.
         seen = self._doubted_distances(found, SHARED.told_apart, which)
-        seen = seen._replace(effects=seen.effects._replace(repeated=seen.effects.noise))
+        seen = seen._replace(effects=seen.effects[[0, 0, 2, 3, 4]])
         sizes = estimate_sizes(seen, np.zeros(seen.X.shape[1], bool), 0.0, SHARED.prior_deviation)
         pixels = min(1.0, (sizes.surface**2 + sizes.mask**2) / 0.2**2)
         for c, (one, camera) in enumerate(zip(self.seen, self.cameras(found), strict=True)):

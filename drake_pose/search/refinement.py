@@ -21,7 +21,6 @@ from drake_pose.fit.levenberg_marquardt import Equations, StepSettings, damped_s
 from drake_pose.fit.parameters import ROOT_NAMES, BodyParameters, Placement
 from drake_pose.fit.raster_lines import (
     Border,
-    SkinWeights,
     compare_raster,
     find_body_border,
     find_border,
@@ -66,7 +65,7 @@ class RefinementBody:
             if skin is not None:
                 shares.append(1.0 - skin.weights if skin.turned else skin.weights)
         parents = np.array([node.parent for node in tree.nodes], dtype=np.int64)
-        self.skin = SkinWeights(np.concatenate(shares), parents)
+        self.skin = np.concatenate(shares), parents
         unlimited = np.full(_EXTRA, np.inf)
         self.lower = np.concatenate([self.kinematics.lower, -unlimited])
         self.upper = np.concatenate([self.kinematics.upper, unlimited])

@@ -6,7 +6,6 @@ import pytest
 from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.fit.covariance import (
     Distances,
-    ErrorEffects,
     ErrorSizes,
     _apriori,
     distances_covariance,
@@ -37,7 +36,7 @@ def drawn_distances(generator, sizes, count=150):
     doubts = tuple(generator.normal(0.0, 2.0, (count, 4)) for _ in sizes.doubts)
     for size, kind in zip((*sizes[1:5], *sizes.doubts), (*kinds, *doubts), strict=True):
         y += size * kind @ generator.standard_normal(kind.shape[1])
-    effects = ErrorEffects(np.eye(count), *(kind @ kind.T for kind in kinds))
+    effects = np.array([np.eye(count), *(kind @ kind.T for kind in kinds)])
     which = np.arange(count) // (count // 2)
     seen = Distances(y, X, effects, X.T @ X, kinds[1], which, doubts)
     return seen, np.linalg.solve(X.T @ X, X.T @ y)
@@ -89,7 +88,7 @@ def test_values_that_do_not_show_are_as_unsure_as_a_full_turn():
     nothing = Distances(
         np.zeros(0),
         np.zeros((0, 3)),
-        ErrorEffects(*[np.zeros((0, 0))] * 5),
+        np.zeros((5, 0, 0)),
         np.diag([0.0, 1e6, 1e6]),
         np.zeros((0, 12)),
         np.zeros(0, dtype=np.intp),

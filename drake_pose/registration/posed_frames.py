@@ -29,8 +29,6 @@ from drake_pose.silhouette.areas.outline import Outline
 from drake_pose.silhouette.areas.scoring import prefix_sums
 
 LAST_SPACING = 1.0 / 300.0
-# Where bodies are is told from about so many frames.
-_SOME = 5
 """Of the points of silhouettes' edges in the last parts of a fit [root of the area]."""
 
 
@@ -43,7 +41,7 @@ class PosedFrame:
         mask: (H, W) the silhouette.
         odds: (H, W, 3) of each pixel to show the body (``fit.background``): a fit looks at these
             and not at the mask, where they are given.
-        rates: (m,) how fast the values change [rad/s or m/s], where that is known.
+        rates: (m,) velocities of the values [rad/s or m/s], where they are known.
     """
 
     name: str
@@ -99,16 +97,17 @@ class PosedFrames:
 
     @cached_property
     def some_points(self) -> Array:
-        """(n, 3) the points of all frames, or of some spread over many."""
-        return np.concatenate(self._corners(self.X_WN[:: max(1, len(self.X_WN) // _SOME)]))
+        """(n, 3) the points of all frames, or of about five frames spread over many."""
+        return np.concatenate(self._corners(self.X_WN[:: max(1, len(self.X_WN) // 5)]))
 
     def _corners(self, poses: Array) -> list[Array]:
-        own = [hull_corners(outline) for outline in self.outlines]
-        placed = []
-        for X_WN in poses:
-            parts = zip(own, X_WN, strict=True)
-            placed.append(_hull(np.concatenate([p @ X[:3, :3].T + X[:3, 3] for p, X in parts])))
-        return placed
+        own = [_hull_of(outline) for outline in self.outlines]
+        return [
+            _hull(
+                np.concatenate([p @ X[:3, :3].T + X[:3, 3] for p, X in zip(own, X_WN, strict=True)])
+            )
+            for X_WN in poses
+        ]
 
     @cached_property
     def middle(self) -> Array:
@@ -131,6 +130,11 @@ class PosedFrames:
         return found
 
     @cached_property
+    def body(self) -> BodyParameters:
+        """The body's parameters."""
+        return BodyParameters(self.kinematics, self.outlines)
+
+    @cached_property
     def _edges(self) -> list[EdgePoints]:
         """Of the silhouettes that fits look at."""
         spacing = max(1.0, round(self.spacing * self.size))
@@ -139,20 +143,11 @@ class PosedFrames:
             for frame in self.frames
         ]
 
-    @cached_property
-    def body(self) -> BodyParameters:
-        """What of the body may be unknown."""
-        return BodyParameters(self.kinematics, self.outlines)
-
     def smaller(self, side: float) -> PinholeCamera:
-        """The camera with smaller pictures, in which the root of the silhouettes' area is a side.
-
-        It is as large as it was where that is smaller.
-        """
+        """The camera, its pictures so small that the root of the silhouettes' area is a side."""
         camera, share = self.camera, min(1.0, side / self.size)
-        return camera.resized(
-            *(max(8, round(share * one)) for one in (camera.width, camera.height))
-        )
+        width, height = (max(8, round(share * one)) for one in (camera.width, camera.height))
+        return camera.resized(width, height)
 
     def sums(self, frame: int, camera: PinholeCamera) -> NDArray[np.int32]:
         """(H, W + 1) prefix sums of a frame's silhouette in a smaller camera's picture."""
@@ -161,8 +156,7 @@ class PosedFrames:
 
 
 @lru_cache(maxsize=512)
-def hull_corners(outline: Outline) -> Array:
-    """(n, 3) the corners of a surface's convex hull, in its frame [m]."""
+def _hull_of(outline: Outline) -> Array:
     return _hull(outline.vertices)
 
 
@@ -181,12 +175,7 @@ def placed_points(outlines: Sequence[Outline], X_WN: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class SeenFrame:
-    """A frame: values (m,) of the pose tree [rad or m], and the silhouettes (H, W) by camera.
-
-    Args:
-        odds: by camera, where silhouettes were found in pictures: as of ``PosedFrame``.
-        rates: (m,) as of ``PosedFrame``.
-    """
+    """A frame of several cameras: as ``PosedFrame``, masks and odds by the cameras' names."""
 
     name: str
     values: Array
@@ -200,18 +189,15 @@ class SeenFrame:
         return PosedFrame(self.name, self.values, self.masks[camera], odds, self.rates)
 
     def edges(self, cameras: Sequence[Camera], spacing: float) -> Evidence:
-        """Of the silhouettes, points so far apart [pixel].
+        """The silhouettes' edges, by points at a spacing [pixel].
 
         Raises MaskError: a mask of another size than its camera's picture.
         """
-        edges = []
-        for camera in cameras:
-            mask = self.masks.get(camera.name)
-            if mask is not None:
+        edges = [NO_EDGE] * len(cameras)
+        for k, camera in enumerate(cameras):
+            if (mask := self.masks.get(camera.name)) is not None:
                 require_size(camera, self.name, mask)
-            edges.append(
-                NO_EDGE if mask is None else find_edge_points(mask, max(1.0, round(spacing)))
-            )
+                edges[k] = find_edge_points(mask, max(1.0, round(spacing)))
         return pack_evidence(edges)
 
 

@@ -13,7 +13,7 @@ moves what is fitted: its size is estimated, too.
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -116,16 +116,16 @@ class SharedFit:
     Attributes:
         seen: what each camera sees.
         problem: all frames' unknowns.
-        rows: (rows,) the how manieth camera each mask is of, one camera's after another's.
+        rows: (rows,) index of each mask's camera, ascending.
         names: of the u shared unknowns: those of each camera, then the constants.
-        per_camera: so many of them each camera has.
+        per_camera: number of unknowns of each camera.
         constants: names of the body's parameters to which an unknown constant is added in all
             frames: values of the pose tree, and lengths.
 
     Args:
         X_CW: (4, 4) for each camera, where a fit begins.
         offsets: joints whose places on their links are unknown.
-        looks: so many of CAMERA_NAMES are unknown of each camera, its pose among them.
+        looks: number of CAMERA_NAMES, the first ones, that are unknown of each camera.
         widths: whether the masks' are.
     """
 
@@ -438,23 +438,6 @@ def scatter_factor(seen: Distances, sizes: ErrorSizes, shared: int) -> float:
     return max(scale, 1.0)
 
 
-@dataclass(frozen=True, eq=False)
-class AdjustedBundle:
-    """What was fitted together.
-
-    Args:
-        cameras: those that were unknown, with their poses.
-        covariances: (c, 6, 6) of these poses' errors, as of ``RegisteredCamera``.
-        values: (frames, m) the body's, lengths among them [rad or m].
-        girths: (nodes,) how many times as wide the nodes are across their y axes.
-    """
-
-    cameras: tuple[PinholeCamera, ...]
-    covariances: Array
-    values: Array
-    girths: Array
-
-
 def adjust_bundle(
     kinematics: TreeKinematics,
     outlines: Sequence[Outline],
@@ -465,16 +448,26 @@ def adjust_bundle(
     parts: Sequence[str] = (),
     groups: Sequence[int] | None = None,
     telling_frames: int = 4,
-) -> AdjustedBundle:
+) -> tuple[list[PinholeCamera], Array, Array, Array]:
     """Fits poses and cameras together, in the end as finely as the model is like the body.
+
+    Cameras that are found from estimated joint positions are off with them. So all are fitted to
+    all silhouettes at once (bundle adjustment), with lengths and girths that all frames share;
+    cameras whose places are known hold the whole.
 
     Args:
         cameras: all cameras, those that are unknown near where they stand.
-        frames: what they see, and about which values of the body.
+        unknown: names of the cameras whose poses are unknown.
+        frames: what they see, with approximate values of the body.
         is_length: (m,) which of the pose tree's values are lengths, the same in all frames.
         parts: names of the parts that have a girth: how wide they are across their y axes.
         groups: (nodes,) which of these each node belongs to, or -1; None: none.
         telling_frames: number of frames from which covariances are estimated.
+
+    Returns:
+        the c unknown cameras with their poses; (c, 6, 6) covariances of these, as of
+        ``RegisteredCamera``; (frames, m) values, lengths among them [rad or m]; and (nodes,) girths
+        over the model's.
 
     Raises:
         MaskError: a mask of another size than its camera's picture, or no mask shows the body.
@@ -536,14 +529,11 @@ def adjust_bundle(
     whole = values_covariance(distances, sizes, np.arange(len(is_angle)), is_angle)
     X_CW, _, motions = fit.places(found.parameters[0])
     own = np.arange(len(whole) - len(poses), len(whole)).reshape(len(looks), 6)
-    return AdjustedBundle(
-        tuple(replace(cameras[k], X_WC=np.linalg.inv(X_CW[k])) for k in looks),
-        np.array(
-            [
-                pose_covariance(X_CW[k], motions[k, :6], whole[np.ix_(at, at)])
-                for k, at in zip(looks, own, strict=True)
-            ]
-        ),
-        found.parameters[:, : values.shape[1]],
-        np.exp(np.append(found.shared[count : count + len(parts)], 0.0)[body.groups]),
-    )
+    found_cameras = [replace(cameras[k], X_WC=np.linalg.inv(X_CW[k])) for k in looks]
+    covariances = [
+        pose_covariance(X_CW[k], motions[k, :6], whole[np.ix_(at, at)])
+        for k, at in zip(looks, own, strict=True)
+    ]
+    widths = np.exp(np.append(found.shared[count : count + len(parts)], 0.0)[body.groups])
+    values = found.parameters[:, : values.shape[1]]
+    return found_cameras, np.array(covariances), values, widths

@@ -422,14 +422,14 @@ class _Registration:
         shape: tuple[Any, ...] = (np.zeros(len(self.body.kinematics.names), np.bool_),)
         if not missing_for_person(inputs.model):
             shape = (shape_values(inputs.tree), *shape_parts(inputs.tree))
-        fitted = adjust_bundle(
+        adjusted, covariances, values, girths = adjust_bundle(
             self.body.kinematics, self.body.few, cameras, registered, frames, *shape
         )
-        self.inputs = replace(inputs, frames=inputs.moved(fitted.values))
+        self.inputs = replace(inputs, frames=inputs.moved(values))
         known = inputs.positions.girths
-        girths = fitted.girths * (1.0 if known is None else known)
+        girths = girths * (1.0 if known is None else known)
         self.body = RegistrationBody(inputs.tree, inputs.seen, girths=girths)
-        for camera, covariance in zip(fitted.cameras, fitted.covariances, strict=True):
+        for camera, covariance in zip(adjusted, covariances, strict=True):
             self._found_again(self.body.kinematics, camera, covariance)
             found = self.registered[camera.name]
             require_explained(CameraSearch(self.body), found, self.inputs.of(camera.name))

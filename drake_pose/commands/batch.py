@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -11,23 +10,24 @@ from cyclopts import Parameter
 from rich.markup import escape
 from rich.table import Table
 
-from drake_pose.commands.options import Json, Out, Resume, within
-from drake_pose.commands.terminal import (
+from drake_pose.commands.common import (
+    Json,
+    Out,
+    Resume,
     UsageError,
     output_console,
+    print_files,
     print_json,
     progress_bar,
     say,
     warn,
+    within,
 )
 from drake_pose.errors import SceneError, listed
 from drake_pose.files.options import percent
 
 if TYPE_CHECKING:
-    from drake_pose.jobs.batch import Batch, SceneState
-
-# Of what contradicts in a scene as many are shown.
-_NAMED = 4
+    from drake_pose.jobs.batch import Batch
 
 
 def batch(
@@ -104,36 +104,28 @@ def batch(
         raise SceneError(f"{len(result.failed)} of {len(result.scenes)} scenes failed")
 
 
-def _print_batch(result: Batch) -> None:
-    """A row a scene, and where the results are."""
-    estimates = {n: one for n, one in result.scenes.items() if one.job.audit is None}
-    audits = {n: one for n, one in result.scenes.items() if one.job.audit is not None}
+def _print_batch(result: Batch, most: int = 4) -> None:
+    """A row a scene, and where the results are; of what contradicts in an audited one the first.
+
+    The texts of all stand in contradictions.csv.
+    """
+    estimates = Table("scene", "state", "found", "E_total", "chunks", "seconds", title="Batch")
+    audits = Table("scene", "state", "agree", "contradicts the rest", "seconds", title="Audits")
+    for name, state in result.scenes.items():
+        totals, seconds = state.totals, f"{state.seconds:.1f}"
+        count = "found_count" if state.job.audit is None else "agreeing_count"
+        good = f"{totals.get(count)} of {state.frame_count}" if totals else ""
+        row = (escape(name), state.state, good)
+        if state.job.audit is None:
+            chunks = f"{len(state.done)} of {len(state.tasks)}"
+            estimates.add_row(*row, percent(totals.get("mean_E_total")), chunks, seconds)
+        else:
+            named = [f"{one['what']} {one['name']}" for one in totals.get("contradictions", ())]
+            audits.add_row(*row, escape(listed(named, most)), seconds)
     console = output_console()
-    if estimates:
-        table = Table("scene", "state", "found", "E_total", "chunks", "seconds", title="Batch")
-        for name, state in estimates.items():
-            table.add_row(
-                escape(name),
-                state.state,
-                f"{state.totals.get('found_count')} of {state.frame_count}" if state.totals else "",
-                percent(state.totals.get("mean_E_total")),
-                f"{len(state.done)} of {len(state.tasks)}",
-                f"{state.seconds:.1f}",
-            )
-        console.print(table)
-    if audits:
-        console.print(_audits_table(audits))
+    for table in (estimates, audits):
+        if table.row_count:
+            console.print(table)
     frames = sum(state.frames_done for state in result.scenes.values())
     console.print(f"frames         {frames} in {result.seconds:.1f} s")
-    console.print(f"results        {escape(str(result.out))}", soft_wrap=True)
-
-
-def _audits_table(audits: Mapping[str, SceneState]) -> Table:
-    """A row an audited scene; texts stand in contradictions.csv."""
-    table = Table("scene", "state", "agree", "contradicts the rest", "seconds", title="Audits")
-    for name, state in audits.items():
-        named = [f"{one['what']} {one['name']}" for one in state.totals.get("contradictions", ())]
-        totals, text = state.totals, escape(listed(named, _NAMED))
-        agree = f"{totals['agreeing_count']} of {state.frame_count}" if totals else ""
-        table.add_row(escape(name), state.state, agree, text, f"{state.seconds:.1f}")
-    return table
+    print_files(("results", result.out))

@@ -1,8 +1,9 @@
-"""The commands `drake-pose estimate` and `drake-pose demo`, and what they print."""
+"""The commands `drake-pose estimate`, `demo`, `capture` and `empty-room`."""
 
 from __future__ import annotations
 
 import math
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -11,8 +12,9 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from drake_pose.commands.options import (
+from drake_pose.commands.common import (
     SPREAD,
+    FrameProgress,
     Json,
     Model,
     Out,
@@ -20,16 +22,20 @@ from drake_pose.commands.options import (
     Replay,
     Resume,
     Truth,
-)
-from drake_pose.commands.terminal import (
-    FrameProgress,
+    UsageError,
     output_console,
+    print_files,
+    print_json,
     print_result,
+    say,
+    warn,
+    within,
     worst_frames,
 )
 from drake_pose.errors import SceneError
 from drake_pose.files.options import percent
-from drake_pose.files.settings import EstimateSettings
+from drake_pose.files.settings import CaptureSettings, EstimateSettings, changed
+from drake_pose.jobs.live.settings import CaptureMethod, LiveSettings
 
 if TYPE_CHECKING:
     from drake_pose.files.records import SceneEstimate
@@ -87,7 +93,7 @@ def estimate(
             scene, model, out, settings, truth=truth, cameras=cameras, resume=resume,
             replay=replay, overlay=overlay, on_frame=progress, on_stage=progress.show_stage,
         )  # fmt: skip
-    print_result(result, json, print_estimate)
+    print_result(result, json, _print_estimate)
     if result.found_count == 0:
         raise SceneError("no pose was found in any frame")
 
@@ -118,42 +124,45 @@ def demo(
         raise SceneError("no pose was found")
 
 
-def print_estimate(result: SceneEstimate) -> None:
+def _print_estimate(result: SceneEstimate) -> None:
     """Prints a row a frame, of many the worst; joint errors if there is a truth; the files."""
     console = output_console()
+    kinds = zip(result.position_names, result.position_kinds, strict=True)
+    angles = {name for name, kind in kinds if kind == "angle"}
+    compared = {f: one.joint_errors for f, one in result.records.items() if one.joint_errors}
     if result.summary["method"] == "person":
         console.print("One person was followed by all silhouettes at once (--method person).")
         table = Table("camera", "frames", "mean IoU")
         for camera, one in result.summary["cameras"].items():
             table.add_row(escape(camera), str(one["frames"]), percent(one["mean_iou"]))
-        console.print(table)
     else:
-        console.print(_frame_table(result))
-    if any(record.joint_errors for record in result.records.values()):
-        console.print(_error_table(result))
+        records = list(result.records.items())
+        shown, which = worst_frames([record.E_total for _, record in records])
+        names = ["frame", "E_total", "before", "runs", "seconds"]
+        names += ["mean joint error"] if compared else []
+        table = Table(*names, title=f"Estimate{which}")
+        for frame, record in (records[k] for k in shown):
+            turns = [abs(e) for name, e in record.joint_errors.items() if name in angles]
+            table.add_row(
+                escape(frame),
+                percent(record.E_total),
+                percent(record.first_E_total),
+                "" if record.runs is None else str(record.runs),
+                f"{record.seconds:.2f}",
+                *([f"{sum(turns) / len(turns):.1f} deg" if turns else "-"] if compared else []),
+            )
+    console.print(table)
+    if compared:
+        # Estimate minus truth: a row a joint, a column a frame.
+        few = list(compared)[:8]
+        table = Table("joint", "mean", "greatest", *map(escape, few), title="Joint errors")
+        for name, errors in result.summary["joint_errors"].items():
+            unit, digits = ("deg", 1) if name in angles else ("m", 3)
+            ends = (f"{errors[key]:.{digits}f} {unit}" for key in ("mean", "greatest"))
+            each = (f"{compared[frame][name]:+.{digits}f}" for frame in few)
+            table.add_row(escape(name), *ends, *each)
+        console.print(table)
     _print_totals(console, result)
-
-
-def _frame_table(result: SceneEstimate) -> Table:
-    with_truth = any(record.joint_errors for record in result.records.values())
-    errors = ["mean joint error"] if with_truth else []
-    records = list(result.records.items())
-    shown, which = worst_frames([record.E_total for _, record in records])
-    table = Table(
-        "frame", "E_total", "before", "runs", "seconds", *errors, title=f"Estimate{which}"
-    )
-    angles = set(_angles(result))
-    for frame, record in (records[k] for k in shown):
-        turns = [abs(e) for name, e in record.joint_errors.items() if name in angles]
-        table.add_row(
-            escape(frame),
-            percent(record.E_total),
-            percent(record.first_E_total),
-            "" if record.runs is None else str(record.runs),
-            f"{record.seconds:.2f}",
-            *([f"{sum(turns) / len(turns):.1f} deg" if turns else "-"] if with_truth else []),
-        )
-    return table
 
 
 def _print_demo(result: SceneEstimate) -> None:
@@ -171,8 +180,7 @@ def _print_demo(result: SceneEstimate) -> None:
     console.print(table)
     _print_totals(console, result)
     if result.folder is not None:
-        for overlay in sorted((result.folder / OVERLAY).glob("*/*.png")):
-            console.print(f"overlay        {escape(str(overlay))}", soft_wrap=True)
+        print_files(*(("overlay", path) for path in (result.folder / OVERLAY).glob("*/*.png")))
     console.print(
         "The picture tells agreement (light grey), missing (blue) and excess (orange) apart. "
         "Kameda, Minoh and Ikeda report 22.3 % for six pictures of a woman, with a model of her."
@@ -189,25 +197,124 @@ def _print_totals(console: Console, result: SceneEstimate) -> None:
     if summary["mean_iou"] is not None:
         frames = f"{summary['compared_count']} of {len(result.records)} frames"
         console.print(f"IoU            {percent(summary['mean_iou'])} in the mean of {frames}")
-    for label, file in (("poses", POSES), ("report", REPORT), ("replay", REPLAY)):
-        if result.folder is not None and (result.folder / file).is_file():
-            console.print(f"{label:<14} {escape(str(result.folder / file))}", soft_wrap=True)
+    if result.folder is not None:
+        files = {"poses": POSES, "report": REPORT, "replay": REPLAY}
+        print_files(*((label, result.folder / file) for label, file in files.items()))
 
 
-def _angles(result: SceneEstimate) -> list[str]:
-    kinds = zip(result.position_names, result.position_kinds, strict=True)
-    return [name for name, kind in kinds if kind == "angle"]
+def capture(
+    scene: Path,
+    /,
+    *,
+    out: Out,
+    model: Path | None = None,
+    method: CaptureMethod = "person",
+    settings: Annotated[CaptureSettings | None, SPREAD] = None,
+    live: Annotated[LiveSettings | None, SPREAD] = None,
+    truth: Truth = None,
+    resume: Resume = False,
+    overlay: Overlay = True,
+    replay: Replay = True,
+    json: Json = False,
+) -> None:
+    """Capture the motion of one person before several calibrated cameras, from masks or live.
+
+    Nothing need be known of the person: lengths and girths are fitted to the first frames. This is
+    estimate with the bundled person as the model, of a sequence of frames unless scene.yaml has
+    sequence: false. Pictures or videos need masks of the first frame alone, in two cameras or more;
+    with --start no mask. If the folder has sources.yaml beside cameras.yaml, frames are captured as
+    they come, from live cameras in real time, until Ctrl-C.
+
+        drake-pose capture STUDIO --out results/person --seconds 60
+
+    Args:
+        scene: Folder with cameras.yaml and masks, pictures or videos; or with a sources.yaml.
+        model: A person with landmarks.yaml beside it. Default: the bundled one.
+        method: person: by all silhouettes at once; paper: by skin seen in colour pictures, and a
+            search for elbows and knees, all as Date et al. print it.
+    """
+    settings, live = settings or CaptureSettings(), live or LiveSettings()
+    of_masks = bool(truth or resume or set(changed(settings)) - {"packages"})
+    # The name of SOURCES; its module would make every command's start slow.
+    has_sources = (scene / "sources.yaml").is_file()
+    of_person = bool(live.shape or not live.fit_shape)
+    if method != "person" and (of_masks or of_person):
+        raise UsageError(
+            "--camera, --frame, --every, --truth, --start, --no-track, --resume, --shape "
+            "and --no-fit-shape are for --method person"
+        )
+    if method == "person" and live.faces is not None:
+        raise UsageError("--face-camera and --faces are for --method paper")
+    if has_sources and of_masks:
+        raise UsageError(
+            "--camera, --frame, --every, --truth, --start, --no-track and --resume are for a "
+            f"folder of masks or pictures; {scene} has a sources.yaml"
+        )
+    if method == "person" and not has_sources and live != LiveSettings():
+        raise UsageError(f"{scene} has no sources.yaml, which that option is for")
+    if method == "person" and not has_sources:
+        from drake_pose.jobs.estimate.inputs import bundled_person
+
+        given = {one.name: getattr(settings, one.name) for one in fields(settings)}
+        estimate(
+            scene, model=model or bundled_person(), out=out,
+            settings=EstimateSettings(method="person", **given),
+            truth=truth, resume=resume, overlay=overlay, replay=replay, json=json,
+        )  # fmt: skip
+        return
+    from drake_pose.jobs.live.capture import capture_live
+    from drake_pose.jobs.live.scene import hush_opencv, load_live_scene
+
+    hush_opencv()
+    studio = load_live_scene(scene)
+    live = replace(live, replay=replay, packages=settings.packages)
+    if method != "person" and any(one.live for one in studio.specifications.values()):
+        say("drake-pose: stand upright before the cameras, both arms spread to the sides")
+    with FrameProgress() as progress:
+
+        def show(count: int, _: bool) -> None:
+            progress.show_stage("frames", count, None)
+
+        result = capture_live(studio, out, model, live, warn, show, method)
+    for text in result.troubles:
+        warn(text)
+    if result.interrupted:
+        say("drake-pose: ended by Ctrl-C; all frames are kept")
+    found = result.estimate
+    if json:
+        print_json(found.summary)
+    elif found.rows:
+        _print_estimate(found)
+        # What became of the pictures of each camera, and when it stopped and returned.
+        table = Table("camera", "pictures used", "unusable", "too late", "stopped and returned")
+        for name, source in found.summary["sources"].items():
+            changes = [
+                f"{one['what']} at {one['time']:.2f} s" if one["time"] is not None else "gave none"
+                for one in source["changes"]
+            ]
+            numbers = [str(source[what]) for what in ("used", "dropped", "late")]
+            table.add_row(escape(name), *numbers, ", ".join(changes))
+        output_console().print(table)
+    if not found.rows:
+        raise SceneError("no camera gave a picture")
+    if not found.found_count:
+        raise SceneError("nobody was found in any frame")
 
 
-def _error_table(result: SceneEstimate) -> Table:
-    """Estimate minus truth: a row a joint, a column a frame."""
-    angles = set(_angles(result))
-    compared = {f: one.joint_errors for f, one in result.records.items() if one.joint_errors}
-    shown = list(compared)[:8]
-    table = Table("joint", "mean", "greatest", *map(escape, shown), title="Joint errors")
-    for name, errors in result.summary["joint_errors"].items():
-        unit, digits = ("deg", 1) if name in angles else ("m", 3)
-        ends = (f"{errors[key]:.{digits}f} {unit}" for key in ("mean", "greatest"))
-        each = (f"{compared[frame][name]:+.{digits}f}" for frame in shown)
-        table.add_row(escape(name), *ends, *each)
-    return table
+def empty_room(folder: Path, /, *, pictures: Annotated[int, within(1)] = 30) -> None:
+    """Take pictures of the empty room with the cameras of a sources.yaml.
+
+    Live capture finds the person as what differs from these pictures. Leave the room first, and
+    take them again when the light changes or a camera moves.
+
+        drake-pose empty-room STUDIO
+
+    Args:
+        folder: Folder with cameras.yaml and sources.yaml.
+        pictures: Number of pictures of each camera.
+    """
+    from drake_pose.jobs.live.scene import hush_opencv, take_empty_room
+
+    hush_opencv()
+    for camera, place in take_empty_room(folder, pictures).items():
+        say(f"drake-pose: {camera}: {pictures} pictures of the empty room in {place}")

@@ -16,12 +16,11 @@ from rich.console import Console, ConsoleOptions
 from rich.text import Text
 
 from drake_pose.commands.batch import batch
-from drake_pose.commands.capture import capture, empty_room
-from drake_pose.commands.estimate import demo, estimate
+from drake_pose.commands.common import UsageError, say
+from drake_pose.commands.estimate import capture, demo, empty_room, estimate
 from drake_pose.commands.papers import date, kameda, reproduce_all, shimada
 from drake_pose.commands.prepare import calibrate, check, masks, undistort
 from drake_pose.commands.register import audit, register
-from drake_pose.commands.terminal import UsageError, say
 from drake_pose.commands.walk import walk
 from drake_pose.errors import DrakePoseError, SettingsError
 from drake_pose.version import VERSION

@@ -10,14 +10,20 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import Parameter
 
-from drake_pose.commands.options import SPREAD, Json, Out, Pictures, Resume, Seed, within
-from drake_pose.commands.terminal import (
+from drake_pose.commands.common import (
+    SPREAD,
+    Json,
+    Out,
+    Pictures,
+    Resume,
+    Seed,
     UsageError,
     count_progress,
     output_console,
     print_json,
     say,
     warn,
+    within,
 )
 
 if TYPE_CHECKING:

@@ -10,19 +10,19 @@ from cyclopts import Parameter
 from rich.markup import escape
 from rich.table import Table
 
-from drake_pose.commands.options import Json
-from drake_pose.commands.terminal import output_console, print_json, say, warn
+from drake_pose.commands.common import (
+    SPREAD,
+    Json,
+    count_progress,
+    output_console,
+    print_files,
+    print_json,
+    print_result,
+    say,
+    warn,
+)
 from drake_pose.errors import ModelError
 from drake_pose.files.settings import Packages
-
-if TYPE_CHECKING:
-    from drake_pose.body import ModelReport
-
-
-from typing import TYPE_CHECKING
-
-from drake_pose.commands.options import SPREAD
-from drake_pose.commands.terminal import count_progress, print_result
 from drake_pose.jobs.masks.settings import MaskSettings
 
 if TYPE_CHECKING:
@@ -53,31 +53,25 @@ def check(file: Path, /, *, package: Packages | None = None, json: Json = False)
     if json:
         print_json({**asdict(report), "path": str(report.path), "usable": report.usable})
     elif report.usable:
-        output_console().print(_segments(report))
+        table = Table(
+            "segment", "hangs on", "joints in the order of rotation", "triangles", "closed",
+            title=escape(f"{report.name}: {len(report.nodes)} segments"),
+        )  # fmt: skip
+        units = {"angle": " deg", "length": " m"}
+        for node in report.nodes:
+            joints = [
+                f"{joint.name}  {joint.lower:g} .. {joint.upper:g}{units.get(joint.kind, '')}"
+                + (f"  (= {joint.follows})" if joint.follows else "")
+                for joint in node.joints
+            ]
+            texts = (node.name, node.parent, "\n".join(joints) or "fixed", str(node.triangles))
+            table.add_row(*map(escape, texts), "yes" if node.watertight else "no")
+        output_console().print(table)
     for text in report.warnings:
         warn(text)
     if report.errors:
         raise ModelError("; ".join(report.errors))
     say("drake-pose: fit for use")
-
-
-def _segments(report: ModelReport) -> Table:
-    """The segments of a model's pose tree, their joints' limits in degrees and metres."""
-    table = Table(
-        "segment", "hangs on", "joints in the order of rotation", "triangles", "closed",
-        title=escape(f"{report.name}: {len(report.nodes)} segments"),
-    )  # fmt: skip
-    units = {"angle": " deg", "length": " m"}
-    for node in report.nodes:
-        joints = [
-            f"{joint.name}  {joint.lower:g} .. {joint.upper:g}{units.get(joint.kind, '')}"
-            + (f"  (= {joint.follows})" if joint.follows else "")
-            for joint in node.joints
-        ]
-        closed = "yes" if node.watertight else "no"
-        texts = (node.name, node.parent, "\n".join(joints) or "fixed", str(node.triangles), closed)
-        table.add_row(*map(escape, texts))
-    return table
 
 
 def calibrate(
@@ -189,4 +183,4 @@ def _print_masks(result: SceneMasks) -> None:
         text = f"{len(good)} masks of {len(frames)} pictures"
         text += f", {min(good)} to {max(good)} pixels" if good else ""
         console.print(f"{escape(name or 'camera'):<14} {text}")
-    console.print(f"scene          {escape(str(result.folder))}", soft_wrap=True)
+    print_files(("scene", result.folder))

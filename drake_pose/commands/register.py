@@ -10,10 +10,15 @@ from cyclopts import Parameter
 from rich.markup import escape
 from rich.table import Table
 
-from drake_pose.commands.options import SPREAD, Json, Model, Out, Overlay
-from drake_pose.commands.terminal import (
+from drake_pose.commands.common import (
+    SPREAD,
+    Json,
+    Model,
+    Out,
+    Overlay,
     count_progress,
     output_console,
+    print_files,
     print_result,
     say,
     worst_frames,
@@ -190,8 +195,7 @@ def _print_registration(result: SceneRegistration) -> None:
                 escape(f"camera '{name}': a picture at {values} would tell its poses apart")
             )
     if result.folder is not None:
-        for label, file in (("cameras", CAMERA_FILE), ("report", REPORT)):
-            console.print(f"{label:<14} {escape(str(result.folder / file))}", soft_wrap=True)
+        print_files(("cameras", result.folder / CAMERA_FILE), ("report", result.folder / REPORT))
 
 
 def _say_clock(one: Mapping[str, Any]) -> str:
@@ -236,4 +240,4 @@ def _print_audit(result: SceneAudit) -> None:
         told = ", ".join(f"{k} {'-' if one is None else f'{one:.2g}'}" for k, one in noticed)
         console.print(f"not noticed    joints off by less than {told} (deg or m)", soft_wrap=True)
     if result.folder is not None:
-        console.print(f"result         {escape(str(result.folder))}", soft_wrap=True)
+        print_files(("result", result.folder))

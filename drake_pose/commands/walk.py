@@ -9,13 +9,16 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
 
-from drake_pose.commands.options import (
+from drake_pose.commands.common import (
     SPREAD,
     Browser,
     Json,
+    UsageError,
+    print_json,
+    say,
+    warn,
     within,
 )
-from drake_pose.commands.terminal import UsageError, print_json, say, warn
 from drake_pose.errors import SettingsError
 from drake_pose.files.settings import Packages
 from drake_pose.jobs.live.settings import LiveSettings, Seconds, Shape

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 import drake_pose
-from drake_pose.commands.terminal import worst_frames
+from drake_pose.commands.common import worst_frames
 from tests.cli import run_command
 from tests.jobs.scenes import TinyScene, read_rows, write_scene
 

@@ -126,7 +126,7 @@ def test_the_command_capture_takes_the_bundled_person(
     def note(scene, model, out, settings, **options):
         asked.update(options, model=model, settings=settings)
 
-    monkeypatch.setattr("drake_pose.commands.capture.estimate", note)
+    monkeypatch.setattr("drake_pose.commands.estimate.estimate", note)
     options = ["--out", out, "--no-overlay", "--frame", "1"]
     run_to_end("capture", recording.folder, *options)
     assert asked["model"].name == "person_shape.urdf"

@@ -1,4 +1,4 @@
-"""How commands speak: results on stdout, all else on stderr."""
+"""Options that several commands have, and how commands speak: results on stdout, else stderr."""
 
 from __future__ import annotations
 
@@ -7,16 +7,44 @@ import math
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
 
+from cyclopts import Parameter
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from drake_pose.files.options import within
 
 if TYPE_CHECKING:
     from drake_pose.files.records import FrameRecord
 
-# A table shows no more frames.
-_MOST_FRAMES = 30
+SPREAD = Parameter("*")
+"""The fields of a settings class are options."""
+
+Model = Annotated[
+    Path, Parameter(["--model", "-m"], help="The body: URDF, SDFormat, MJCF or .dmd.yaml.")
+]
+Out = Annotated[Path, Parameter(["--out", "-o"], help="Folder for the result; new or empty.")]
+Pictures = Annotated[
+    Path | None, Parameter(["--out", "-o"], help="Folder for pictures. Default: none are written.")
+]
+Resume = Annotated[bool, Parameter(help="Continue an interrupted result in --out.")]
+Replay = Annotated[bool, Parameter(negative="--no-replay", help="Write replay.html.")]
+Overlay = Annotated[
+    bool, Parameter(negative="--no-overlay", help="Write overlay/<camera>/<frame>.png.")
+]
+Browser = Annotated[bool, Parameter(negative="--no-browser", help="Open the page in the browser.")]
+Json = Annotated[bool, Parameter(help="Print the result as JSON.")]
+Truth = Annotated[
+    Path | None,
+    Parameter(
+        help="Measured joint positions [rad or m] to compare with: a CSV file with the column "
+        "frame and one for each joint. Default: SCENE/joint_angles.csv, if it exists."
+    ),
+]
+Seed = Annotated[int, within(0), Parameter(help="Seed of the random numbers.")]
 
 
 class UsageError(Exception):
@@ -57,19 +85,24 @@ def output_console() -> Console:
     return console if console.is_terminal else Console(highlight=False, width=160)
 
 
-def worst_frames(errors: Sequence[float | None]) -> tuple[list[int], str]:
-    """Which of many frames a table shows, in their order, and what its title says of that.
+def print_files(*files: tuple[str, Path]) -> None:
+    """Writes where files are, those that exist, each after a label."""
+    for label, path in files:
+        if path.exists():
+            output_console().print(f"{label:<14} {escape(str(path))}", soft_wrap=True)
 
-    errors: of each; nan or None where nothing was found, which is worst.
+
+def worst_frames(errors: Sequence[float | None], most: int = 30) -> tuple[list[int], str]:
+    """Which frames a table shows, in their order, and what its title says of that.
+
+    Args:
+        errors: of each frame; nan or None where nothing was found, which is worst.
+        most: number of frames shown.
     """
-    order = sorted(range(len(errors)), key=lambda k: -_badness(errors[k]))
-    shown = sorted(order[:_MOST_FRAMES])
+    badness = [math.inf if one is None or math.isnan(one) else one for one in errors]
+    shown = sorted(sorted(range(len(errors)), key=lambda k: -badness[k])[:most])
     is_all = len(shown) == len(errors)
     return shown, "" if is_all else f": the worst {len(shown)} of {len(errors)} frames"
-
-
-def _badness(error: float | None) -> float:
-    return math.inf if error is None or math.isnan(error) else error
 
 
 def progress_bar() -> Progress:

@@ -94,7 +94,7 @@ def kameda(
     with _experiment(one.out) as count:
         from drake_pose.papers import kameda as poses
         from drake_pose.papers.kameda_pictures import save_pictures
-        from drake_pose.search import ContinuousSearch
+        from drake_pose.search import MultiStartSearch
 
         if experiment != "A":
             real = poses.run_real_experiment(experiment, images, one.out, count)
@@ -102,7 +102,7 @@ def kameda(
             for method, name in poses.METHODS.items():
                 warnings += [f"{name}: {text}" for text in real[method]["warnings"]]
         elif is_continuous:
-            search = ContinuousSearch(poses.experiment_tree())
+            search = MultiStartSearch(poses.experiment_tree())
             result = poses.run_experiment(search, images, first, count, one.views or 1)
             figures, table = poses.continuous_figures(result), poses.continuous_table(result)
         else:

@@ -22,7 +22,7 @@ from drake_pose.filtering.truncated_filter import FilterSettings
 from drake_pose.papers import date, date_walk, kameda, kameda_pictures, shimada, shimada_pictures
 from drake_pose.papers.tables import Count, Figures
 from drake_pose.person.date.walking import COMMANDS, REGISTERED
-from drake_pose.search import ContinuousSearch, PoseSearch
+from drake_pose.search import MultiStartSearch, PoseSearch
 from drake_pose.version import VERSION
 
 Outcome = tuple[Figures, Sequence[RenderableType], Sequence[tuple[Any, ...]]]
@@ -67,7 +67,7 @@ def _kameda(short: bool, folder: Path, count: Count) -> Outcome:
 
 
 def _kameda_continuous(short: bool, _folder: Path, count: Count) -> Outcome:
-    search = ContinuousSearch(kameda.experiment_tree())
+    search = MultiStartSearch(kameda.experiment_tree())
     result = kameda.run_experiment(search, 1 if short else 30, 77, count)
     return kameda.continuous_figures(result), [kameda.continuous_table(result)], ()
 

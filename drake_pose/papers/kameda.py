@@ -27,12 +27,12 @@ from drake_pose.papers.tables import (
     uncounted,
 )
 from drake_pose.search import (
-    CONFIDENCE,
     BeamSearch,
     BeamSearchSettings,
-    ContinuousSearch,
+    ExactSearchSettings,
     ExaminationSettings,
     GridPoseSet,
+    MultiStartSearch,
     PaperSearch,
     PaperSearchSettings,
     PoseEstimate,
@@ -202,7 +202,7 @@ def run_experiment(
     """Draw poses, on the grid as the paper's or for a continuous search between, and match them.
 
     Args:
-        search: of ``experiment_search``, ``beam_experiment_search``, or a ``ContinuousSearch``
+        search: of ``experiment_search``, ``beam_experiment_search``, or a ``MultiStartSearch``
             of ``experiment_tree``.
         images: how many poses; the paper has 219.
         seed: of the random angles.
@@ -214,7 +214,7 @@ def run_experiment(
     """
     require_counts(images=images, views=views)
     cameras = tuple(experiment_camera(math.pi * k / views) for k in range(views))
-    tree, sampled, is_continuous = search.tree, search.sampled, isinstance(search, ContinuousSearch)
+    tree, sampled, is_continuous = search.tree, search.sampled, isinstance(search, MultiStartSearch)
     angles = "continuous" if is_continuous else "grid"
     generator = np.random.default_rng(seed)
     name = "paper" if isinstance(search, PaperSearch) else angles
@@ -243,7 +243,7 @@ def run_experiment(
         if is_continuous:
             # The search tells its own times by the clock.
             more = result.statistics.interval_seconds
-            more *= seconds / max(result.seconds + more, 1e-9)
+            more *= seconds / max(result.seconds, 1e-9)
             seconds -= more
         if isinstance(search, BeamSearch):
             # Tighter limits on time would make the figures those of one machine.
@@ -402,7 +402,7 @@ def grid_table(columns: Sequence[Sequence[RandomPoses]]) -> Table:
 def continuous_figures(result: RandomPoses) -> dict[str, Any]:
     """The figures: ratios as fractions, errors in degrees, seconds of the processor."""
     search = result.search
-    assert isinstance(search, ContinuousSearch)
+    assert isinstance(search, MultiStartSearch)
     # Positions that the experiment holds have next to no span [rad or m].
     searched = np.concatenate([np.ptp(grid, axis=0) > 1e-9 for grid in search.sampled.values])
     errors, known, held = [], [], []
@@ -425,7 +425,7 @@ def continuous_figures(result: RandomPoses) -> dict[str, Any]:
         "determined": len(known) / len(errors),
         "median_determined_error_deg": float(np.median(known)) if known else None,
         "interval_coverage": float(np.mean(held)) if held else None,
-        "interval_confidence": CONFIDENCE,
+        "interval_confidence": ExactSearchSettings.confidence,
         "median_seconds": float(np.median([trial.seconds for trial in result.trials])),
         "mean_seconds": float(np.mean([trial.seconds for trial in result.trials])),
         "mean_interval_seconds": float(np.mean([trial.more_seconds for trial in result.trials])),

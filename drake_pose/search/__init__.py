@@ -1,7 +1,6 @@
 """Searches for the pose that silhouettes show: on grids of joint values, and continuous ones."""
 
 from drake_pose.search.beam_search import BeamSearch
-from drake_pose.search.continuous_search import ContinuousSearch
 from drake_pose.search.estimates import (
     TRACKED,
     UNEXPLAINED,
@@ -14,7 +13,7 @@ from drake_pose.search.estimates import (
     joint_estimates,
 )
 from drake_pose.search.kameda import PaperSearch
-from drake_pose.search.multi_start import MEDIUM, MultiStartSearch
+from drake_pose.search.multi_start import MultiStartSearch
 from drake_pose.search.pose_and_mask import FoundPose, PoseAndMask, PoseAndMaskSettings
 from drake_pose.search.pose_families import (
     ExaminationSettings,
@@ -23,20 +22,23 @@ from drake_pose.search.pose_families import (
     renderer_tolerance,
     samples_at,
 )
-from drake_pose.search.root_placement import hub, scale_camera, slide_root, turns_freely
-from drake_pose.search.root_placement_search import RootPlacementSearch
+from drake_pose.search.root_placement import (
+    RootPlacementSearch,
+    hub,
+    scale_camera,
+    slide_root,
+    turns_freely,
+)
 from drake_pose.search.sampled_body import PoseSearch, SampledTree, Scoring
-from drake_pose.search.settings import BeamSearchSettings, PaperSearchSettings
-from drake_pose.search.views_fit import CONFIDENCE, ViewsFit, covariance_pose_set
+from drake_pose.search.settings import BeamSearchSettings, ExactSearchSettings, PaperSearchSettings
+from drake_pose.search.views_fit import ViewsFit, covariance_pose_set
 
 __all__ = [
-    "CONFIDENCE",
-    "MEDIUM",
     "TRACKED",
     "UNEXPLAINED",
     "BeamSearch",
     "BeamSearchSettings",
-    "ContinuousSearch",
+    "ExactSearchSettings",
     "ExaminationSettings",
     "FoundPose",
     "GridPoseSet",

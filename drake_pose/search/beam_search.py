@@ -126,6 +126,12 @@ class BeamSearch:
         other.examination = None
         return other
 
+    def with_stages(self, *stages: Stage) -> BeamSearch:
+        """The same grid searched in other stages, and no limb searched again."""
+        other = copy.copy(self)
+        other.settings = replace(self.settings, stages=stages, research_hypotheses=0)
+        return other
+
     def best_poses(
         self,
         views: Sequence[View],

@@ -54,20 +54,6 @@ class CoarseView(NamedTuple):
     slack: float
 
 
-class ScratchBuffers(NamedTuple):
-    """What one hypothesis's samples are seen to do; see _make_buffers.
-
-    columns, rows: (n,) float32 [cell], column -1: not seen; scales: (n,) float32 [pixel/m]; costs:
-    (n,) float32 [pixel]; covered: (n, 4) uint64.
-    """
-
-    columns: np.ndarray
-    rows: np.ndarray
-    scales: np.ndarray
-    costs: np.ndarray
-    covered: np.ndarray
-
-
 class Balls(NamedTuple):
     """A node's balls.
 
@@ -97,24 +83,18 @@ def fill_cover(
 
 
 @compiled
-def _make_buffers(count: int) -> ScratchBuffers:
-    """Buffers for this many samples."""
-    return ScratchBuffers(
-        np.empty(count, dtype=np.float32),
-        np.empty(count, dtype=np.float32),
-        np.empty(count, dtype=np.float32),
-        np.empty(count, dtype=np.float32),
-        np.empty((count, 4), dtype=np.uint64),
-    )
-
-
-@compiled
 def _project_ball(
-    view: CoarseView, X_CP: np.ndarray, p_PB: np.ndarray, buffers: ScratchBuffers
+    view: CoarseView,
+    X_CP: np.ndarray,
+    p_PB: np.ndarray,
+    columns: np.ndarray,
+    rows: np.ndarray,
+    scales: np.ndarray,
 ) -> None:
-    """Writes where a ball is seen at all samples: columns, rows, scales.
+    """Writes where a ball is seen at all samples: (n,) columns and rows [cell], scales [pixel/m].
 
-    Single precision, and no branches: the processor does many samples at once.
+    The scale is 0 where it is not seen. Single precision, and no branches: the processor does many
+    samples at once.
     """
     camera, one, least = view.camera, np.float32(1.0), np.float32(view.camera[5])
     focal_x = np.float32(camera[1] / view.cell)
@@ -131,7 +111,7 @@ def _project_ball(
     zx, zy, zz = np.float32(X_CP[2, 0]), np.float32(X_CP[2, 1]), np.float32(X_CP[2, 2])
     x0, y0, z0 = np.float32(X_CP[0, 3]), np.float32(X_CP[1, 3]), np.float32(X_CP[2, 3])
     parallel = camera[0] != 0.0
-    for k in range(buffers.rows.shape[0]):
+    for k in range(rows.shape[0]):
         p, q, r = p_PB[0, k], p_PB[1, k], p_PB[2, k]
         depth = one if parallel else zx * p + zy * q + zz * r + z0
         nearness = one / max(depth, least)
@@ -139,16 +119,22 @@ def _project_ball(
         row = focal_y * (yx * p + yy * q + yz * r + y0) * nearness + center_y
         seen = (depth >= least) & (column > low_x) & (column < high_x)
         seen = seen & (row > low_y) & (row < high_y)
-        buffers.columns[k] = column
-        buffers.rows[k] = row
-        buffers.scales[k] = pixels * nearness if seen else np.float32(0.0)
+        columns[k] = column
+        rows[k] = row
+        scales[k] = pixels * nearness if seen else np.float32(0.0)
 
 
 @compiled
 def _look_at_samples(
-    view: CoarseView, X_CP: np.ndarray, balls: Balls, buffers: ScratchBuffers
+    view: CoarseView,
+    X_CP: np.ndarray,
+    balls: Balls,
+    seen: tuple[np.ndarray, np.ndarray, np.ndarray],
+    costs: np.ndarray,
+    covered: np.ndarray,
 ) -> None:
-    """Writes what a node costs and covers at all samples: costs, covered."""
+    """Writes what a node at all samples costs (n,) [pixel] and covers (n, 4); scratch: ``seen``."""
+    seen_columns, seen_rows, scales = seen
     zero, one, half = np.float32(0.0), np.float32(1.0), np.float32(0.5)
     tiny = np.float32(1e-9)
     slack, parts = np.float32(view.slack), np.float32(view.parts)
@@ -156,17 +142,15 @@ def _look_at_samples(
     least = np.float32(view.radii[0])
     steps = np.float32((levels - 1) / (view.radii[levels - 1] - view.radii[0]))
     area = np.float32(balls.area * view.camera[2] / view.camera[1])
-    for k in range(buffers.costs.shape[0]):
-        buffers.costs[k] = zero
-        for word in range(4):
-            buffers.covered[k, word] = np.uint64(0)
+    costs[:] = zero
+    covered[:] = np.uint64(0)
     for ball in range(balls.radii.shape[0]):
-        _project_ball(view, X_CP, balls.p_PB[ball], buffers)
-        for k in range(buffers.costs.shape[0]):
-            scale = buffers.scales[k]
+        _project_ball(view, X_CP, balls.p_PB[ball], seen_columns, seen_rows, scales)
+        for k in range(costs.shape[0]):
+            scale = scales[k]
             if scale == zero:
                 continue
-            column, row = buffers.columns[k], buffers.rows[k]
+            column, row = seen_columns[k], seen_rows[k]
             radius = scale * balls.radii[ball]
             share = one
             if zero <= column < columns and zero <= row < rows:
@@ -176,11 +160,11 @@ def _look_at_samples(
                     max(zero, min(np.float32(levels - 1), (radius + slack - least) * steps))
                 )
                 i, j = int(row), int(column)
-                buffers.covered[k, 0] |= view.cover[level, i, j, 0]
-                buffers.covered[k, 1] |= view.cover[level, i, j, 1]
-                buffers.covered[k, 2] |= view.cover[level, i, j, 2]
-                buffers.covered[k, 3] |= view.cover[level, i, j, 3]
-            buffers.costs[k] += scale * scale * area * share
+                covered[k, 0] |= view.cover[level, i, j, 0]
+                covered[k, 1] |= view.cover[level, i, j, 1]
+                covered[k, 2] |= view.cover[level, i, j, 2]
+                covered[k, 3] |= view.cover[level, i, j, 3]
+            costs[k] += scale * scale * area * share
 
 
 @compiled
@@ -204,49 +188,59 @@ def score_samples(
         (B, n, 4) the points that the hypotheses would cover.
     """
     count = scores.shape[1]
-    buffers = _make_buffers(count)
+    seen = (
+        np.empty(count, dtype=np.float32),
+        np.empty(count, dtype=np.float32),
+        np.empty(count, dtype=np.float32),
+    )
+    costs, covered = np.empty(count, dtype=np.float32), np.empty((count, 4), dtype=np.uint64)
     united = np.empty((X_CP.shape[0], count, 4), dtype=np.uint64)
     for h in range(X_CP.shape[0]):
-        _look_at_samples(view, X_CP[h], balls, buffers)
+        _look_at_samples(view, X_CP[h], balls, seen, costs, covered)
         for k in range(count):
             gain = 0
             for word in range(4):
-                gain += int(count_bits(buffers.covered[k, word] & ~masks[h, word]))
-                united[h, k, word] = masks[h, word] | buffers.covered[k, word]
-            scores[h, k] += outside_weight * buffers.costs[k] - gain * view.point_area
+                gain += int(count_bits(covered[k, word] & ~masks[h, word]))
+                united[h, k, word] = masks[h, word] | covered[k, word]
+            scores[h, k] += outside_weight * costs[k] - gain * view.point_area
     return united
 
 
-_WORDS = 4
-_LEVELS = 10
-# How many cells of a cover are as wide as the root of the silhouettes' area.
-_CELLS = 40.0
-# A cover has this many rows and columns at most: 80 MB.
-_MOST_CELLS = 500
-# A cell is divided into this many parts along its side, where it has as many pixels.
-_PARTS = 4
-_LEAST_HYPOTHESES = 64
-# How many times the hypotheses kept are looked at for some that do not stand alike: at first, and
-# where these are too few.
-_SPARES = 2, 8
-INTERVAL, LENGTH_INTERVAL = math.radians(15.0), 0.05
-"""Sampling intervals of every angle [rad] and of every prismatic position [m]."""
+@dataclass(frozen=True)
+class CoarseSettings:
+    """Numbers of the coarse search; sizes are shares of the root of the silhouettes' mean area.
 
-HYPOTHESES, _AGAIN = 2500, 300
-"""At most this many are kept after each node; fewer where a limb of a pose is searched again."""
+    Args:
+        hypotheses, again: at most so many are kept after each node, and where a limb of a pose is
+            searched again.
+        least_hypotheses, evaluations: fewer are kept, but not fewer than this, where a node's
+            samples times the hypotheses exceed this.
+        spares: so many times the hypotheses kept are looked at for some that do not stand alike: at
+            first, and where these are too few.
+        together: so many are scored by a worker at once.
+        outside_weight: what a pixel outside counts; one newly covered counts one.
+        slack: distances up to this do not count.
+        alike: frames stand alike if points in them differ by less than about this share of the
+            body's reach.
+        cells, most_cells, parts: so many cells of a cover are as wide as the size; it has so many
+            rows and columns at most: 80 MB; a cell has so many parts along its side, where it has
+            as many pixels.
+        nearer: nodes come nearer to a camera than the root by this factor at most.
+    """
 
-# So many are scored by a worker at once.
-_AT_ONCE = 5000
-# Fewer are kept where a node's samples times the hypotheses exceed this.
-_EVALUATIONS = 150_000
-# Distances that do not count, as a share of the root of the silhouette's area.
-_SLACK = 0.05
-# What a pixel outside counts; one newly covered counts one.
-_OUTSIDE_WEIGHT = 0.8
-# Frames stand alike if points in them differ by less than about this share of the body's reach.
-_ALIKE = 0.04
-# Nodes come nearer to a camera than the root by this factor at most.
-_NEARER = 0.7
+    hypotheses: int = 2500
+    again: int = 300
+    least_hypotheses: int = 64
+    evaluations: int = 150_000
+    spares: tuple[int, ...] = (2, 8)
+    together: int = 5000
+    outside_weight: float = 0.8
+    slack: float = 0.05
+    alike: float = 0.04
+    cells: float = 40.0
+    most_cells: int = 500
+    parts: int = 4
+    nearer: float = 0.7
 
 
 @dataclass(frozen=True)
@@ -263,22 +257,22 @@ class CoarsePoses:
     def __len__(self) -> int:
         return len(self.samples)
 
-    def only(self, chosen: np.ndarray) -> CoarsePoses:
-        """Those at indices."""
-        return CoarsePoses(self.samples[chosen], self.X_WN[chosen], self.costs[chosen])
-
 
 class CoarseSearch:
-    """Finds coarse poses of a body, sampled at the intervals above, in views of one instant."""
+    """Finds coarse poses of a sampled body in views of one instant."""
 
     def __init__(
-        self, body: SampledBody, views: Sequence[View], hypotheses: int = HYPOTHESES
+        self,
+        body: SampledBody,
+        views: Sequence[View],
+        hypotheses: int | None = None,
+        settings: CoarseSettings | None = None,
     ) -> None:
-        self.body = body
-        self._hypotheses = hypotheses
-        self._views = _prepare_views(body, views)
+        self.body, self._settings = body, settings or CoarseSettings()
+        self._hypotheses = hypotheses or self._settings.hypotheses
+        self._size = math.sqrt(float(np.mean([np.count_nonzero(view.mask) for view in views])))
+        self.views = map_ordered(self._prepare, views)
         self._cameras = [view.camera for view in views]
-        self._size = _mean_size(views)
         self._nodes = body.sampled.tree.nodes
         self._reach = max(
             float(body.reach_balls[i, 3]) for i, node in enumerate(self._nodes) if node.parent < 0
@@ -287,7 +281,7 @@ class CoarseSearch:
             (p_PB[0] - X_PN[0, :3, 3]) @ X_PN[0, :3, :3]
             for p_PB, X_PN in zip(body.p_PB, body.sampled.X_PN, strict=True)
         ]
-        self._balls = [
+        self.balls = [
             Balls(
                 _by_ball(body.p_PB[i]),
                 radii.astype(np.float32),
@@ -295,6 +289,54 @@ class CoarseSearch:
             )
             for i, radii in enumerate(body.ball_radii)
         ]
+
+    def _prepare(self, view: View, levels: int = 10) -> CoarseView:
+        """A silhouette as the coarse search sees it, with points within so many radii."""
+        own, body = self._settings, self.body
+        points = spread_points(view.mask)
+        slack, least_cell = own.slack * self._size, max(1.0, self._size / own.cells)
+        largest = max(max((float(r.max(initial=0.0)) for r in body.ball_radii), default=0.0), 1e-6)
+        # No ball counts whose middle is outside the picture, and one as large as it covers all.
+        scale = float(view.camera.kernel_parameters()[1])
+        if not isinstance(view.camera, ParallelCamera):
+            nearest = float(body.root_distances(view.camera).min())
+            scale /= max(1e-6, own.nearer * nearest)
+        reach = min(largest * scale, math.hypot(*view.mask.shape)) + slack
+        radii = np.linspace(0.15, 1.0, levels) * reach
+        origin = np.maximum(points.min(axis=0) - reach, -1.0)
+        end = np.minimum(points.max(axis=0) + reach, np.add(view.mask.shape, 1.0))
+        cell = max(least_cell, float((end - origin).max()) / own.most_cells)
+        rows, columns = np.ceil((end - origin) / cell).astype(int)
+        parts = max(1, min(own.parts, round(cell)))
+        cover = np.zeros((levels, rows, columns, 4), dtype=np.uint64)
+        fill_cover(cover, points, origin, cell, radii)
+        # Signed distances in the middles of the cells' parts.
+        counts = zip(origin, (parts * rows, parts * columns), view.mask.shape, strict=True)
+        places = [
+            np.clip(np.rint(first + cell / parts * (np.arange(n) + 0.5)), 0, size - 1).astype(int)
+            for first, n, size in counts
+        ]
+        # What is nearest to a place lies between the places, the silhouette and what is just beside
+        # it.
+        left, top, width, height = cv2.boundingRect(view.mask.view(np.uint8))
+        boxes = zip(places, (top, left), (top + height, left + width), strict=True)
+        window = [
+            (max(0, min(one[0], low - 1)), max(one[-1], high) + 1) for one, low, high in boxes
+        ]
+        distances = signed_distances(view.mask[tuple(slice(*ends) for ends in window)])
+        shifted = [one - first for one, (first, _) in zip(places, window, strict=True)]
+        return CoarseView(
+            camera=view.camera.kernel_parameters(),
+            X_CW=np.ascontiguousarray(view.camera.X_CW),
+            origin=origin,
+            cell=cell,
+            radii=radii,
+            cover=cover,
+            parts=parts,
+            distances=np.ascontiguousarray(distances[np.ix_(*shifted)]),
+            point_area=np.count_nonzero(view.mask) / len(points),
+            slack=slack,
+        )
 
     def find(self) -> CoarsePoses:
         """Search all nodes."""
@@ -304,15 +346,20 @@ class CoarseSearch:
 
     def find_again(self, X_WN: np.ndarray, again: Sequence[int]) -> CoarsePoses:
         """Search some nodes of a pose X_WN (nodes, 4, 4) again, with all their descendants."""
-        return self._find(X_WN, set(again), _AGAIN)
+        return self._find(X_WN, set(again), self._settings.again)
 
     def _find(self, start: np.ndarray, wanted: set[int], hypotheses: int) -> CoarsePoses:
-        nodes = self._nodes
+        nodes, weight = self._nodes, self._settings.outside_weight
         poses = CoarsePoses(np.full((1, len(nodes)), -1), start[None].copy(), np.zeros(1))
-        masks = [np.zeros((1, _WORDS), dtype=np.uint64) for _ in self._views]
+        masks = [np.zeros((1, 4), dtype=np.uint64) for _ in self.views]
         placed = set(range(len(nodes))) - wanted
         for node in placed:
-            masks = self._cover(node, start, masks)
+            # What one hypothesis covers together with a node that has its place.
+            still = self.balls[node]._replace(p_PB=_by_ball(self._p_NB[node][None]))
+            for k, view in enumerate(self.views):
+                X_CN = (view.X_CW @ start[node])[None]
+                united = score_samples(view, X_CN, still, masks[k], weight, np.zeros((1, 1)))
+                masks[k] = united[:, 0]
         for node in self.body.limb_order:
             if node in wanted:
                 placed.add(node)
@@ -340,23 +387,8 @@ class CoarseSearch:
             chosen.append(left[0])
             gaps = np.abs(together[left] - together[left[0]]).max(axis=1, initial=0.0)
             left = left[gaps > apart * self._size]
-        return poses.only(np.array(chosen, dtype=np.int64))
-
-    def _parent_in(self, view: CoarseView, node: int, X_WN: np.ndarray) -> np.ndarray:
-        """X_CP (n, 4, 4) of a node's parent at poses X_WN (n, nodes, 4, 4)."""
-        parent = self._nodes[node].parent
-        X_WP = np.tile(np.eye(4), (len(X_WN), 1, 1)) if parent < 0 else X_WN[:, parent]
-        return np.ascontiguousarray(view.X_CW @ X_WP)
-
-    def _cover(self, node: int, X_WN: np.ndarray, masks: list[np.ndarray]) -> list[np.ndarray]:
-        """What one hypothesis covers together with a node that has its place."""
-        still = self._balls[node]._replace(p_PB=_by_ball(self._p_NB[node][None]))
-        covered = []
-        for view, mask in zip(self._views, masks, strict=True):
-            X_CN = (view.X_CW @ X_WN[node])[None]
-            united = score_samples(view, X_CN, still, mask, _OUTSIDE_WEIGHT, np.zeros((1, 1)))
-            covered.append(united[:, 0])
-        return covered
+        kept = np.array(chosen, dtype=np.int64)
+        return CoarsePoses(poses.samples[kept], poses.X_WN[kept], poses.costs[kept])
 
     def _grow(
         self,
@@ -367,36 +399,36 @@ class CoarseSearch:
         hypotheses: int,
     ) -> tuple[CoarsePoses, list[np.ndarray]]:
         """Place one more node in every hypothesis and keep the best."""
-        balls = self._balls[node]
-        X_PN = self.body.sampled.X_PN[node]
-        X_CPs = [self._parent_in(view, node, poses.X_WN) for view in self._views]
+        own, balls, X_PN = self._settings, self.balls[node], self.body.sampled.X_PN[node]
+        parent = self._nodes[node].parent
+        X_WP = np.tile(np.eye(4), (len(poses), 1, 1)) if parent < 0 else poses.X_WN[:, parent]
+        X_CPs = [np.ascontiguousarray(view.X_CW @ X_WP) for view in self.views]
         added = np.zeros((len(poses), len(X_PN)))
 
         def score(part: slice) -> list[np.ndarray]:
+            weight = own.outside_weight
             return [
-                score_samples(view, X_CP[part], balls, mask[part], _OUTSIDE_WEIGHT, added[part])
-                for view, X_CP, mask in zip(self._views, X_CPs, masks, strict=True)
+                score_samples(view, X_CP[part], balls, mask[part], weight, added[part])
+                for view, X_CP, mask in zip(self.views, X_CPs, masks, strict=True)
             ]
 
-        step = max(1, _AT_ONCE // len(X_PN))
+        step = max(1, own.together // len(X_PN))
         parts = [slice(k, k + step) for k in range(0, len(poses), step)]
         united = [np.concatenate(one) for one in zip(*map_ordered(score, parts), strict=True)]
         costs = (poses.costs[:, None] + added).ravel()
-        parent = self._nodes[node].parent
         if self.body.sampled.tree.source(node) == parent:
             # No other sample than its parent's.
             costs[(np.arange(len(X_PN)) != poses.samples[:, parent, None]).ravel()] = np.inf
         following = [i for i in self.body.limb_order if i not in placed]
         widest = len(self.body.sampled.X_PN[following[0]]) if following else 1
-        width = min(hypotheses, max(_LEAST_HYPOTHESES, _EVALUATIONS // widest))
+        width = min(hypotheses, max(own.least_hypotheses, own.evaluations // widest))
         possible = int(np.count_nonzero(costs < np.inf))
-        for spare in _SPARES:
+        for spare in own.spares:
             pool = min(possible, spare * width)
             best = np.argpartition(costs, pool - 1)[:pool]
             best = best[np.lexsort((best, costs[best]))]
             of, sample = best // len(X_PN), best % len(X_PN)
-            X_WP = np.eye(4) if parent < 0 else poses.X_WN[of, parent]
-            X_WN = X_WP @ X_PN[sample]
+            X_WN = X_WP[of] @ X_PN[sample]
             kept = self._unlike(poses.X_WN, of, node, X_WN, placed)[:width]
             if pool == possible or len(kept) == width:
                 break
@@ -422,27 +454,11 @@ class CoarseSearch:
             X = own if i == node else X_WN[of, i]
             p = X[:, :3, 3]
             points += [p, p + lever * X[:, :3, 0], p + lever * X[:, :3, 2]]
-        cells = np.rint(np.hstack(points) / (_ALIKE * self._reach)).astype(np.int64)
+        side = self._settings.alike * self._reach
+        cells = np.rint(np.hstack(points) / side).astype(np.int64)
         # Any odd numbers will do; always the same, so that answers are.
         keys = np.random.default_rng(2718).integers(1, 2**62, cells.shape[1]) | 1
         return np.sort(np.unique((cells * keys).sum(axis=1), return_index=True)[1])
-
-
-def _distances_at(
-    mask: np.ndarray, origin: np.ndarray, side: float, rows: int, columns: int
-) -> np.ndarray:
-    """(rows, columns) signed distances in the middles of squares, from an origin (2,) on."""
-    places = [
-        np.clip(np.rint(first + side * (np.arange(count) + 0.5)), 0, size - 1).astype(int)
-        for first, count, size in zip(origin, (rows, columns), mask.shape, strict=True)
-    ]
-    # What is nearest to a place lies between the places, the silhouette and what is just beside it.
-    left, top, width, height = cv2.boundingRect(mask.view(np.uint8))
-    boxes = zip(places, (top, left), (top + height, left + width), strict=True)
-    window = [(max(0, min(own[0], low - 1)), max(own[-1], high) + 1) for own, low, high in boxes]
-    distances = signed_distances(mask[tuple(slice(*ends) for ends in window)])
-    shifted = [own - first for own, (first, _) in zip(places, window, strict=True)]
-    return np.ascontiguousarray(distances[np.ix_(*shifted)])
 
 
 def _by_ball(p_PB: np.ndarray) -> np.ndarray:
@@ -450,53 +466,8 @@ def _by_ball(p_PB: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(p_PB.transpose(1, 2, 0), dtype=np.float32)
 
 
-def _mean_size(views: Sequence[View]) -> float:
-    """The root of the silhouettes' mean area [pixel]."""
-    return math.sqrt(float(np.mean([np.count_nonzero(view.mask) for view in views])))
-
-
-def _prepare_views(body: SampledBody, views: Sequence[View]) -> list[CoarseView]:
-    """The silhouettes as the coarse search sees them."""
-    size = _mean_size(views)
-    slack, least_cell = _SLACK * size, max(1.0, size / _CELLS)
-    largest = max(max((float(r.max(initial=0.0)) for r in body.ball_radii), default=0.0), 1e-6)
-
-    def prepare(view: View) -> CoarseView:
-        points = _spread_points(view.mask)
-        # No ball counts whose middle is outside the picture, and one as large as it covers all.
-        scale = float(view.camera.kernel_parameters()[1])
-        if not isinstance(view.camera, ParallelCamera):
-            nearest = float(body.root_distances(view.camera).min())
-            scale /= max(1e-6, _NEARER * nearest)
-        reach = min(largest * scale, math.hypot(*view.mask.shape)) + slack
-        radii = np.linspace(0.15, 1.0, _LEVELS) * reach
-        origin = np.maximum(points.min(axis=0) - reach, -1.0)
-        end = np.minimum(points.max(axis=0) + reach, np.add(view.mask.shape, 1.0))
-        cell = max(least_cell, float((end - origin).max()) / _MOST_CELLS)
-        rows, columns = np.ceil((end - origin) / cell).astype(int)
-        parts = max(1, min(_PARTS, round(cell)))
-        cover = np.zeros((_LEVELS, rows, columns, _WORDS), dtype=np.uint64)
-        fill_cover(cover, points, origin, cell, radii)
-        side = cell / parts
-        return CoarseView(
-            camera=view.camera.kernel_parameters(),
-            X_CW=np.ascontiguousarray(view.camera.X_CW),
-            origin=origin,
-            cell=cell,
-            radii=radii,
-            cover=cover,
-            parts=parts,
-            distances=_distances_at(view.mask, origin, side, parts * rows, parts * columns),
-            point_area=np.count_nonzero(view.mask) / len(points),
-            slack=slack,
-        )
-
-    return map_ordered(prepare, views)
-
-
-def _spread_points(mask: np.ndarray) -> np.ndarray:
-    """At most 64 * words points (n, 2) row, column of a mask, evenly spread; at least one."""
-    most = 64 * _WORDS
+def spread_points(mask: np.ndarray, most: int = 256) -> np.ndarray:
+    """At most so many points (n, 2) row, column of a mask, evenly spread; at least one."""
     step = max(1.0, math.sqrt(np.count_nonzero(mask) / most))
     while True:
         rows = np.arange(0.5 * (step - 1.0), mask.shape[0] - 0.5, step)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -181,13 +181,13 @@ class SearchStatistics:
         first_J: of the first whole pose, before the re-estimation of section 5.2 [pixel]; None: of
             the answer.
         outside_limit: the paper's threshold r in each view [pixel].
-        interval_seconds: wall time of the intervals, which ``seconds`` leaves out.
+        interval_seconds: wall time of the intervals alone, which is part of ``seconds``.
     """
 
     runs: int = 0
     first_J: float | None = None
     outside_limit: tuple[float, ...] = ()
-    interval_seconds: float = 0.0
+    interval_seconds: float = field(default=0.0, compare=False)
 
 
 @dataclass(frozen=True)

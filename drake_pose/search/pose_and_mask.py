@@ -38,54 +38,59 @@ from drake_pose.workers import map_ordered
 
 Likelihood = NDArray[np.float32]
 
-# Triangles of a part that the contour fit sees.
-_TRIANGLES = 600
-# Poses that are drawn to tell how likely the body is at each pixel.
-_SAMPLES = 32
-# The cross-entropy search: rounds, poses in each, and how many of them shape the next.
-_SEARCH_ROUNDS, _SEARCHED, _KEPT = 5, 60, 8
-# Log-odds are summed in so many parts of one.
-_PARTS = 64.0
-# The spread of these is widened a little, and stays above a share of the first one.
-_WIDENED, _LEAST_SPREAD = 1.1, 0.15
-# The first rounds search; later ones fit alone.
-_SEARCHING = 2
-# How far off a start that was searched still is, as a share; and where rounds end.
-_SEARCHED_SHARE, _FINEST_SHARE = 0.4, 0.14
-# Masks and poses that agree so well let the uncertainty shrink by half; those that agree less, by
-# less.
-_GOOD, _FAIR = 0.9, 0.8
-# A surface is this uncertain beside the pose, and the last mask follows colours along such a band,
-# as shares of the silhouette's size.
-_SURFACE, _BAND = 0.02, 0.01
-# Surely the body, and surely not, by log-odds; and the least and most that any pixel is given.
-_SURE, _PROBABILITIES = 4.0, (0.01, 0.99)
-# GrabCut's rounds, and how large bodies are as it learns colours [root of the area, pixel]; the
-# side of the median filter that takes specks away [pixel].
-_CUTS, _CUT_SIDE, _SPECKS = 2, 30.0, 5
-# The contour fit's first and last scale, as shares of the silhouette's size.
-_WIDE, _NARROW, _SPACING = 0.25, 0.03, 0.05
-# The first rounds look at pictures in which silhouettes are so large [root of the area, pixel].
-_COARSE_ROUNDS, _COARSE_SIDE = 3, 100.0
-# Silhouettes that overlap so much from round to round are settled.
-_SETTLED = 0.995
-
 
 @dataclass(frozen=True)
 class PoseAndMaskSettings:
     """How far off the first poses may be, and how long they are bettered.
+
+    Sizes of silhouettes are roots of their areas; how far off poses are is told as a share of the
+    deviations of the first ones.
 
     Args:
         angle: standard deviation of each angle of the first poses [rad].
         length_share: of each length, as a share of its range.
         length: of each length without limits [m].
         rounds: at most so many.
+        coarse_rounds, coarse_side: the first rounds look at pictures in which silhouettes are so
+            large [pixel].
+        searching: so many rounds search; later ones fit alone.
+        triangles: of a part that the contour fit sees.
+        samples: so many poses are drawn to tell how likely the body is at each pixel.
+        surface: a surface is this uncertain beside the pose, as a share of the silhouette's size.
+        chances: the least and the most that any pixel is given.
+        search_rounds, searched, kept: the cross-entropy search: rounds, poses in each, and how many
+            of them shape the next.
+        widened, least_spread: the spread of these is widened a little, and stays above a share of
+            the first one.
+        searched_share, finest_share: how far off a start that was searched still is, and where
+            rounds end.
+        wide, narrow, spacing: the contour fit's first and last scale, as shares of the silhouette's
+            size, and its spacing.
+        settled: silhouettes that overlap so much from round to round are settled.
     """
 
     angle: float = math.radians(5.0)
     length_share: float = 0.5
     length: float = 0.05
     rounds: int = 7
+    coarse_rounds: int = 3
+    coarse_side: float = 100.0
+    searching: int = 2
+    triangles: int = 600
+    samples: int = 32
+    surface: float = 0.02
+    chances: tuple[float, float] = (0.01, 0.99)
+    search_rounds: int = 5
+    searched: int = 60
+    kept: int = 8
+    widened: float = 1.1
+    least_spread: float = 0.15
+    searched_share: float = 0.4
+    finest_share: float = 0.14
+    wide: float = 0.25
+    narrow: float = 0.03
+    spacing: float = 0.05
+    settled: float = 0.995
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,13 +111,13 @@ class FoundPose:
     deviations: Array
 
 
-class _Level(NamedTuple):
+class PictureLevel(NamedTuple):
     """Cameras, and of each frame each one's picture (H, W, 3), or None."""
 
     cameras: tuple[Camera, ...]
     pictures: Sequence[Sequence[Picture | None]]
 
-    def smaller(self, share: float) -> _Level:
+    def smaller(self, share: float) -> PictureLevel:
         """The same with pictures smaller by a share; a parallel camera has them as they are."""
         cameras = tuple(
             camera.resized(
@@ -122,18 +127,21 @@ class _Level(NamedTuple):
             else camera
             for camera in self.cameras
         )
-        pictures = [
-            [
-                None if one is None else _resized(one, camera.width, camera.height)
-                for one, camera in zip(own, cameras, strict=True)
-            ]
-            for own in self.pictures
-        ]
-        return _Level(cameras, pictures)
+        pictures: list[list[Picture | None]] = []
+        for row in self.pictures:
+            resized: list[Picture | None] = []
+            for one, camera in zip(row, cameras, strict=True):
+                size = camera.width, camera.height
+                smaller = (
+                    None if one is None else cv2.resize(one, size, interpolation=cv2.INTER_AREA)
+                )
+                resized.append(None if smaller is None else np.asarray(smaller, np.uint8))
+            pictures.append(resized)
+        return PictureLevel(cameras, pictures)
 
 
 @dataclass(eq=False)
-class _Frame:
+class _Progress:
     """A frame under way: what is known of it by now, as of ``FoundPose``."""
 
     values: Array
@@ -162,7 +170,7 @@ class PoseAndMask:
         self._settings = settings or PoseAndMaskSettings()
         self._seed = seed
         self._surfaces = TreeSurfaces(kinematics.tree)
-        fitted = few_triangles(self._surfaces, _TRIANGLES)
+        fitted = few_triangles(self._surfaces, self._settings.triangles)
         self._few = few_triangles(self._surfaces, VERY_FEW)
         self._fit = ContourFit(kinematics, fitted, pixels=100.0)
         ranges = kinematics.upper - kinematics.lower
@@ -186,20 +194,24 @@ class PoseAndMask:
             on_round: is told how many rounds are done.
         """
         values = [np.clip(one, self._kinematics.lower, self._kinematics.upper) for one in starts]
-        whole = _Level(self._cameras, pictures)
-        level = self._coarse_level(whole, values)
+        whole = PictureLevel(self._cameras, pictures)
+        own = self._settings
+        drawn = [self._draw(one, camera, few=True) for one in values for camera in self._cameras]
+        size = math.sqrt(float(np.mean([np.count_nonzero(one) for one in drawn])))
+        share = own.coarse_side / max(1.0, size)
+        level = whole if share >= 1.0 else whole.smaller(share)
         # Each frame draws its own poses: frames are looked at side by side.
         rngs = np.random.default_rng(self._seed).spawn(len(values))
-        frames = [_Frame(*one) for one in zip(values, starts, rngs, strict=True)]
-        for k in range(self._settings.rounds):
-            if k == min(_COARSE_ROUNDS, self._settings.rounds - 1):
+        frames = [_Progress(*one) for one in zip(values, starts, rngs, strict=True)]
+        for k in range(own.rounds):
+            if k == min(own.coarse_rounds, own.rounds - 1):
                 level = whole
                 for one in frames:
                     one.drawn = [self._draw(one.values, camera) for camera in self._cameras]
-            self._round(level, frames, searching=k < _SEARCHING)
+            self._round(level, frames, searching=k < own.searching)
             on_round(k + 1)
             for one in frames:
-                one.settled = level is whole and one.stays and one.share <= _FINEST_SHARE
+                one.settled = level is whole and one.stays and one.share <= own.finest_share
             if all(one.settled for one in frames):
                 break
         spread = np.where(self._spread > 0.0, self._spread, np.inf)
@@ -216,14 +228,7 @@ class PoseAndMask:
             for one in frames
         ]
 
-    def _coarse_level(self, whole: _Level, values: Sequence[Array]) -> _Level:
-        """The pictures so small that silhouettes are about _COARSE_SIDE pixels wide."""
-        drawn = [self._draw(one, camera, few=True) for one in values for camera in self._cameras]
-        areas = [np.count_nonzero(one) for one in drawn]
-        share = _COARSE_SIDE / max(1.0, math.sqrt(float(np.mean(areas))))
-        return whole if share >= 1.0 else whole.smaller(share)
-
-    def _round(self, level: _Level, frames: Sequence[_Frame], searching: bool) -> None:
+    def _round(self, level: PictureLevel, frames: Sequence[_Progress], searching: bool) -> None:
         """Betters the frames that are not settled."""
         moving = [k for k, one in enumerate(frames) if not one.settled]
 
@@ -234,38 +239,30 @@ class PoseAndMask:
         ratios = self._ratios(level, frames)
 
         def better(k: int) -> None:
-            self._better(level, frames[k], level.pictures[k], ratios[k], searching)
+            frame, own = frames[k], self._settings
+            if searching:
+                frame.values = self._search(level, frame, ratios[k])
+                frame.share = min(frame.share, own.searched_share)
+                frame.chances = self._chances(level, frame)
+            frame.cuts = [
+                None if picture is None else cut_by_odds(picture, chance, told)
+                for picture, chance, told in zip(
+                    level.pictures[k], frame.chances, ratios[k], strict=True
+                )
+            ]
+            before, frame.values = frame.drawn, self._refine(level, frame)
+            frame.drawn = [self._draw(frame.values, camera) for camera in level.cameras]
+            frame.stays = bool(before) and all(
+                intersection_over_union(*pair) > own.settled
+                for pair in zip(frame.drawn, before, strict=True)
+            )
+            frame.agreements = tuple(
+                math.nan if mask is None else intersection_over_union(silhouette, mask)
+                for silhouette, mask in zip(frame.drawn, frame.cuts, strict=True)
+            )
+            frame.share = narrowed(frame.share, frame.agreements, own)
 
         map_ordered(better, moving)
-
-    def _better(
-        self,
-        level: _Level,
-        frame: _Frame,
-        pictures: Sequence[Picture | None],
-        ratios: Sequence[Likelihood],
-        searching: bool,
-    ) -> None:
-        """Betters a frame's pose and masks by what its pictures' background says."""
-        if searching:
-            frame.values = self._search(level, frame, ratios)
-            frame.share = min(frame.share, _SEARCHED_SHARE)
-            frame.chances = self._chances(level, frame)
-        frame.cuts = [
-            None if picture is None else cut_by_odds(picture, chance, told)
-            for picture, chance, told in zip(pictures, frame.chances, ratios, strict=True)
-        ]
-        before, frame.values = frame.drawn, self._refine(level, frame)
-        frame.drawn = [self._draw(frame.values, camera) for camera in level.cameras]
-        frame.stays = bool(before) and all(
-            intersection_over_union(*pair) > _SETTLED
-            for pair in zip(frame.drawn, before, strict=True)
-        )
-        frame.agreements = tuple(
-            math.nan if mask is None else intersection_over_union(silhouette, mask)
-            for silhouette, mask in zip(frame.drawn, frame.cuts, strict=True)
-        )
-        frame.share = _narrowed(frame.share, frame.agreements)
 
     def _draw(self, values: Array, camera: Camera, few: bool = False) -> Mask:
         """The body's silhouette (H, W)."""
@@ -279,20 +276,20 @@ class PoseAndMask:
         drawn = values + spread * rng.standard_normal((count, len(values)))
         return np.clip(drawn, self._kinematics.lower, self._kinematics.upper)
 
-    def _chances(self, level: _Level, frame: _Frame) -> list[Likelihood]:
+    def _chances(self, level: PictureLevel, frame: _Progress) -> list[Likelihood]:
         """How likely the body is at each pixel, of each camera."""
-        spread, found = frame.share * self._spread, []
-        poses = self._sample(frame.rng, frame.values, spread, _SAMPLES)
+        spread, found, count = frame.share * self._spread, [], self._settings.samples
+        poses = self._sample(frame.rng, frame.values, spread, count)
         for camera in level.cameras:
             total = np.zeros((camera.height, camera.width), dtype=np.float32)
             for pose in poses:
                 total += self._draw(pose, camera, few=True)
-            blur = max(1.0, _SURFACE * math.sqrt(float(total.sum()) / _SAMPLES))
-            chance = cv2.GaussianBlur(total / _SAMPLES, (0, 0), blur)
-            found.append(np.clip(chance, *_PROBABILITIES).astype(np.float32))
+            blur = max(1.0, self._settings.surface * math.sqrt(float(total.sum()) / count))
+            chance = cv2.GaussianBlur(total / count, (0, 0), blur)
+            found.append(np.clip(chance, *self._settings.chances).astype(np.float32))
         return found
 
-    def _ratios(self, level: _Level, frames: Sequence[_Frame]) -> list[list[Likelihood]]:
+    def _ratios(self, level: PictureLevel, frames: Sequence[_Progress]) -> list[list[Likelihood]]:
         """What the background says, of each frame and camera.
 
         Nothing where there is no picture, or of settled frames.
@@ -312,10 +309,12 @@ class PoseAndMask:
                     found[there[k][0]][c] = ratio
         return found
 
-    def _search(self, level: _Level, frame: _Frame, ratios: Sequence[Likelihood]) -> Array:
+    def _search(self, level: PictureLevel, frame: _Progress, ratios: Sequence[Likelihood]) -> Array:
         """The pose near a frame's that covers most of what is not background."""
+        # Log-odds are summed in so many parts of one.
+        parts, own = 64.0, self._settings
         told = [
-            (camera, prefix_sums(np.rint(_PARTS * one).astype(np.int32))[None])
+            (camera, prefix_sums(np.rint(parts * one).astype(np.int32))[None])
             for camera, one in zip(level.cameras, ratios, strict=True)
             if one.any()
         ]
@@ -323,23 +322,24 @@ class PoseAndMask:
             return frame.values
         first = frame.share * self._spread
         middle, spread, best, most = frame.values, first, frame.values, -math.inf
-        for _ in range(_SEARCH_ROUNDS):
-            poses = self._sample(frame.rng, middle, spread, _SEARCHED)
+        for _ in range(own.search_rounds):
+            poses = self._sample(frame.rng, middle, spread, own.searched)
             poses[0] = middle
             X_WN = np.array([self._kinematics.poses(pose) for pose in poses])
             scores = np.zeros(len(poses))
             for camera, sums in told:
                 scores += score_bodies(self._few, camera.X_CW @ X_WN, camera, sums)[:, 1]
-            order = np.argsort(-scores, kind="stable")[:_KEPT]
+            order = np.argsort(-scores, kind="stable")[: own.kept]
             if scores[order[0]] > most:
                 best, most = poses[order[0]], scores[order[0]]
             middle = poses[order].mean(axis=0)
-            spread = np.maximum(_WIDENED * poses[order].std(axis=0), _LEAST_SPREAD * first)
+            wider = own.widened * poses[order].std(axis=0)
+            spread = np.maximum(wider, own.least_spread * first)
         return best
 
-    def _refine(self, level: _Level, frame: _Frame) -> Array:
+    def _refine(self, level: PictureLevel, frame: _Progress) -> Array:
         """The pose whose contour lies along the masks' edges."""
-        masks = frame.cuts
+        masks, own = frame.cuts, self._settings
         areas = [np.count_nonzero(mask) for mask in masks if mask is not None and mask.any()]
         if not areas:
             return frame.values
@@ -347,8 +347,8 @@ class PoseAndMask:
         edges = [NO_EDGE if mask is None else find_edge_points(mask, 2.0) for mask in masks]
         # Rounds are in hundreds of pixels.
         rounds = [
-            AnnealingStage(one * size / 200.0, _SPACING, 8)
-            for one in np.geomspace(max(_SPACING, _WIDE * frame.share), _NARROW, 4)
+            AnnealingStage(one * size / 200.0, own.spacing, 8)
+            for one in np.geomspace(max(own.spacing, own.wide * frame.share), own.narrow, 4)
         ]
         held = self._spread <= 0.0
         prior = Prior(frame.start, np.where(held, 0.0, 1.0 / np.maximum(self._spread, 1e-9) ** 2))
@@ -356,29 +356,38 @@ class PoseAndMask:
         return self._fit.fit(views, frame.values, rounds, prior, held).values
 
 
-def _resized(picture: Picture, width: int, height: int) -> Picture:
-    """A picture (H, W, 3) in another size; where that is its own it stays as it is."""
-    return np.asarray(cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
-
-
-def cut_by_odds(picture: Picture, chance: Likelihood, ratio: Likelihood) -> Mask:
+def cut_by_odds(
+    picture: Picture,
+    chance: Likelihood,
+    ratio: Likelihood,
+    sure: float = 4.0,
+    least: float = PoseAndMaskSettings.chances[0],
+) -> Mask:
     """The object (H, W) in a picture (H, W, 3), by GrabCut where neither pose nor colour is sure.
 
-    ``chance``: (H, W) of the object, by its pose; ``ratio``: logarithm of the odds by its colour.
+    Args:
+        chance: (H, W) of the object, by its pose; ``least``: where it is surely not.
+        ratio: (H, W) logarithm of the odds by its colour.
+        sure: by such log-odds a pixel is surely the object, or surely not.
     """
     odds = np.log(chance / (1.0 - chance)) + ratio
     labels = np.where(odds > 0.0, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
-    labels[odds > _SURE] = cv2.GC_FGD
-    labels[(odds < -_SURE) | (chance <= _PROBABILITIES[0])] = cv2.GC_BGD
-    every = max(1, int(math.sqrt(np.count_nonzero(odds > 0.0)) / _CUT_SIDE))
-    found = cut(picture, labels, _CUTS, every)
-    return np.asarray(cv2.medianBlur(found.astype(np.uint8), _SPECKS) > 0)
+    labels[odds > sure] = cv2.GC_FGD
+    labels[(odds < -sure) | (chance <= least)] = cv2.GC_BGD
+    # GrabCut's two rounds learn colours of bodies 30 pixels large; a median filter takes specks
+    # away.
+    every = max(1, int(math.sqrt(np.count_nonzero(odds > 0.0)) / 30.0))
+    found = cut(picture, labels, 2, every)
+    return np.asarray(cv2.medianBlur(found.astype(np.uint8), 5) > 0)
 
 
-def follow_colours(silhouette: Mask, mask: Mask) -> Mask:
-    """A silhouette (H, W) that is as a mask (H, W) is along its edge."""
+def follow_colours(silhouette: Mask, mask: Mask, band: float = 0.01) -> Mask:
+    """A silhouette (H, W) that is as a mask (H, W) is along its edge.
+
+    ``band``: how far from the edge, as a share of the silhouette's size.
+    """
     size = math.sqrt(max(1, int(np.count_nonzero(silhouette))))
-    reach = max(1, round(_BAND * size))
+    reach = max(1, round(band * size))
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
     own = silhouette.astype(np.uint8)
     inner = cv2.erode(own, disc, borderType=cv2.BORDER_REPLICATE) > 0
@@ -386,9 +395,9 @@ def follow_colours(silhouette: Mask, mask: Mask) -> Mask:
     return np.asarray(inner | (outer & mask))
 
 
-def _narrowed(share: float, agreements: Sequence[float]) -> float:
+def narrowed(share: float, agreements: Sequence[float], settings: PoseAndMaskSettings) -> float:
     """How far off a pose may still be, as a share, after a round that agreed so well."""
     agreed = float(np.nanmin(np.array(agreements)))
-    if agreed > _GOOD:
-        return max(0.5 * share, _FINEST_SHARE)
-    return max(0.7 * share, _SEARCHED_SHARE) if agreed > _FAIR else share
+    if agreed > 0.9:
+        return max(0.5 * share, settings.finest_share)
+    return max(0.7 * share, settings.searched_share) if agreed > 0.8 else share

@@ -26,14 +26,11 @@ from drake_pose.fit.raster_lines import (
     find_border,
 )
 from drake_pose.search.estimates import View
+from drake_pose.search.settings import Pass
 from drake_pose.silhouette.areas.bending import PackedSurfaces, TreeSurfaces
 from drake_pose.silhouette.areas.scoring import draw_packed
 
 _EXTRA = len(ROOT_NAMES)
-# Steps smaller than this [rad or m] end a pass.
-_STANDSTILL = 5e-4
-# A share of the diagonal, which keeps the equations solvable.
-_RELATIVE_DAMPING = 1e-3
 
 
 class Freedom(NamedTuple):
@@ -210,56 +207,20 @@ class RefinementProblem:
         return RasterEquations(H[np.ix_(free, free)][None], g[free][None], apart, weight, squares)
 
 
-@dataclass(frozen=True)
-class Pass:
-    """One part of a refinement.
-
-    Args:
-        iterations: at most so many steps.
-        stride: every so many rows and columns are looked at.
-        scale: distances beyond it lose weight [pixel].
-        damping: added to the diagonal of the normal equations [pixel^3/rad^2]: what the silhouettes
-            hardly show hardly moves.
-        longest_step: steps are shortened so that no parameter changes by more [rad or m].
-        slack: distances up to this along a line hardly count, those beyond it by what they are
-            more; 0: all count [pixel].
-    """
-
-    iterations: int
-    stride: int
-    scale: float
-    damping: float
-    longest_step: float = 0.25
-    slack: float = 0.0
-
-
-COARSE_PASSES = (Pass(8, 4, 50.0, 300.0), Pass(8, 4, 10.0, 100.0))
-"""From far: several nodes may be off by their own width."""
-
-FINE_PASSES = (Pass(5, 2, 6.0, 30.0), Pass(6, 2, 3.0, 10.0), Pass(8, 1, 2.0, 5.0))
-"""From near, to the local optimum."""
-
-LAST_PASSES = (Pass(5, 2, 2.0, 5.0), Pass(15, 1, 1.0, 0.5, slack=0.4))
-"""To the optimum itself, where directions count that the silhouettes hardly show.
-
-A pixel is wrong where the contour is more than half a pixel from the border on its line. What is
-less says nothing: the border lies anywhere between two pixel centres, alike likely. The mean of
-least squares leaves the share 0.02 to 0.03 of the border's pixels wrong; drawn into the bounds that
-all lines set together, a pose leaves 0.005 to 0.015 and is half as far from the true one, as an
-estimate from bounds is where noise is uniform. 0.4 instead of 0.5 keeps it from resting on bounds.
-"""
-
-
 def descend(
     problem: RefinementProblem,
     parameters: np.ndarray,
     freedom: Freedom,
     passes: Sequence[Pass],
     still: Sequence[Border] | None = None,
+    standstill: float = 5e-4,
+    damping: float = 1e-3,
 ) -> tuple[np.ndarray, float, int]:
     """Refine some of the parameters (m + 4,), one pass after another.
 
-    ``still``: the border in each view of what they do not move; None: made here.
+    ``still``: the border in each view of what they do not move; None: made here. A step of less
+    than ``standstill`` [rad or m] ends a pass; ``damping``: a share of the diagonal, which keeps
+    the equations solvable.
 
     Returns:
         The parameters with the least difference met in the last pass, that difference as far as
@@ -270,7 +231,7 @@ def descend(
     still = problem.still(parameters, freedom.moved) if still is None else still
     steps, least = 0, np.inf
     for part in passes:
-        settings = StepSettings(part.longest_step, _RELATIVE_DAMPING, 0.0)
+        settings = StepSettings(part.longest_step, damping, 0.0)
         best, least = parameters, np.inf
         for iteration in range(part.iterations + 1):
             equations = problem.equations(parameters, freedom, part, iteration % part.stride, still)
@@ -280,13 +241,13 @@ def descend(
                 break
             equations.H[0][np.diag_indices(len(free))] += part.damping
             after, _ = damped_step(
-                equations, parameters[free][None], np.zeros(0), limits, _RELATIVE_DAMPING, settings
+                equations, parameters[free][None], np.zeros(0), limits, damping, settings
             )
             steps += 1
             change = np.abs(after[0] - parameters[free]).max(initial=0.0)
             parameters = parameters.copy()
             parameters[free] = after[0]
-            if change < _STANDSTILL:
+            if change < standstill:
                 break
         parameters = best
     return parameters, least, steps

@@ -1,19 +1,30 @@
-"""Where a body's root can be, told from silhouettes alone: positions, depths and scales to try.
+"""The beam search where nobody knows where the root is, nor the scale of a parallel camera.
 
-One parallel camera of unknown scale: a body twice as large looks like a camera with twice as many
-pixels a metre, so the scale is tried on the camera and the body keeps its size. One pinhole: what
-is unknown beside the place in the picture is the depth. Both are bounded by the silhouette's area,
-beside that of the body's own random poses, and tried in geometric steps. Several calibrated
-cameras: a grid in space, of which every camera leaves what lies in its silhouette.
+Where the root can be is told by the silhouettes alone. One parallel camera of unknown scale: a body
+twice as large looks like a camera with twice as many pixels a metre, so the scale is tried on the
+camera and the body keeps its size. One pinhole: what is unknown beside the place in the picture is
+the depth. Both are bounded by the silhouette's area, beside that of the body's own random poses,
+and tried in geometric steps. Several calibrated cameras: a grid in space, of which every camera
+leaves what lies in its silhouette.
+
+The root's samples are the product of its rotations and of these positions. For every scale or depth
+a beam of hypotheses is grown of which no root position may keep more than its quota: what covers
+most at first is not what fits best at last. Whole poses compare fairly whatever their scale. The
+best are refined with the root free; where the roots of the best of these are, the beam search is
+run as with a known root; and in what comes of that what still fits badly is placed anew.
 """
 
 from __future__ import annotations
 
 import copy
 import dataclasses
+import itertools
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -22,31 +33,27 @@ from scipy.ndimage import distance_transform_edt
 from drake_pose.body import PoseTree
 from drake_pose.camera.models import Camera, ParallelCamera
 from drake_pose.errors import SettingsError
-from drake_pose.search.estimates import View
-from drake_pose.search.partial_poses import Pictures
+from drake_pose.search.beam_search import BeamSearch, grow
+from drake_pose.search.estimates import PoseEstimate, SearchStatistics, View
+from drake_pose.search.partial_poses import (
+    Pictures,
+    PoseStore,
+    coarsen,
+)
+from drake_pose.search.parts import NeighbourhoodSearch, PartSearch
+from drake_pose.search.refinement import (
+    Pass,
+    RefinementBody,
+    RefinementProblem,
+    descend,
+)
 from drake_pose.search.sampled_body import SampledBody
+from drake_pose.search.settings import PASSES, BeamSearchSettings, RootPlacementSettings, Stage
 from drake_pose.silhouette.areas.scoring import score_bodies
-
-# The picture in which random poses are measured [pixel], and how many.
-_SIDE, _POSES = 240, 100
-# Shares of the random poses whose area is smaller and larger than what is reckoned with.
-_RARE = 0.03
-# Half the cube in space that the root is looked for in [the silhouette's extent].
-_HALF_CUBE = 0.75
-# The root is drawn no farther than this from its origin [pixel].
-_FARTHEST = 60
+from drake_pose.workers import map_ordered
 
 
-# How many positions are tried across the silhouette, and the ratio of two scales or depths tried
-# one after the other.
-_POSITIONS_ACROSS, _RATIO = 12, 1.12
-# Where the silhouette touches the picture's edge the body may be larger by this factor than it
-# looks, and the root that share of the silhouette's extent, less one, beyond the edge.
-_CUT_OFF = 1.5
-
-
-@dataclass(frozen=True, eq=False)
-class Layer:
+class RootPlaces(NamedTuple):
     """Root positions that are tried together.
 
     Attributes:
@@ -57,12 +64,12 @@ class Layer:
 
     views: tuple[View, ...]
     positions: np.ndarray
-    scale: float
+    scale: float = 1.0
 
 
-def find_layers(
+def find_root_places(
     body: SampledBody, views: Sequence[View], scale_unknown: bool, known: np.ndarray | None
-) -> list[Layer]:
+) -> list[RootPlaces]:
     """Where the root can be, the likeliest scales and depths first.
 
     Args:
@@ -72,7 +79,7 @@ def find_layers(
     Raises:
         SettingsError: the scale is unknown, but there is not just one parallel camera.
     """
-    main = max(views, key=lambda view: int(view.mask.sum()))
+    main, own = max(views, key=lambda view: int(view.mask.sum())), RootPlacementSettings()
     camera = main.camera
     if scale_unknown and (len(views) > 1 or not isinstance(camera, ParallelCamera)):
         raise SettingsError(
@@ -81,23 +88,43 @@ def find_layers(
             "scale follows from their calibration"
         )
     if known is not None and not scale_unknown:
-        return [Layer(tuple(views), known[None], 1.0)]
+        return [RootPlaces(tuple(views), known[None])]
     sizes = _pixel_sizes(body, main)
     if len(views) > 1:
-        middle = _meeting_point(views)
-        if middle is not None:
-            return [_space_layer(views, middle, sizes)]
+        # The point nearest to the rays through all silhouettes' middles.
+        A, b = np.zeros((3, 3)), np.zeros(3)
+        for view in views:
+            low, high = _box(view.mask)
+            middle = 0.5 * (low + high)[None]
+            ends = np.array([_lift(view.camera, middle, z)[0] for z in (1.0, 2.0)])
+            along = (ends[1] - ends[0]) / np.linalg.norm(ends[1] - ends[0])
+            across = np.eye(3) - np.outer(along, along)
+            A += across
+            b += across @ ends[0]
+        # The smallest eigenvalue is about the squared sine of half the angle between two rays: 0 of
+        # parallel ones.
+        if np.linalg.eigvalsh(A)[0] >= 0.01:
+            return [_places_in_space(views, main, np.linalg.solve(A, b), float(sizes[0]))]
     p_CR = _in_camera(camera, body.sampled.X_PN[0][0, :3, 3])
-    places = _picture_grid(main)
+    # Places (n, 2) in the picture where the root can be seen, or beyond its edge [pixel].
+    low, high = _box(main.mask)
+    spacing = _extent(main.mask) / own.across
+    beyond = (own.cut_off - 1.0) * _extent(main.mask)
+    size = np.array([camera.width, camera.height])
+    low = np.where(low < 1, -beyond, low - 0.5 * spacing)
+    high = np.where(high > size - 2, size - 1 + beyond, high + 0.5 * spacing)
+    axes = [low[k] + spacing * np.arange(int((high[k] - low[k]) / spacing) + 1) for k in range(2)]
+    places = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
+    places = places[_near(main, places)]
     if not isinstance(camera, ParallelCamera):
         focal = 0.5 * (camera.focal_x + camera.focal_y)
-        return [Layer(tuple(views), _lift(camera, places, focal / size), 1.0) for size in sizes]
+        return [RootPlaces(tuple(views), _lift(camera, places, focal / one)) for one in sizes]
     scales = sizes / camera.pixels_per_metre if scale_unknown else np.ones(1)
-    layers = []
+    layers: list[RootPlaces] = []
     for scale in scales:
         scaled = scale_camera(camera, float(scale))
         positions = _lift(scaled, places, p_CR[2]) if known is None else known[None]
-        layers.append(Layer((View(scaled, main.mask),), positions, float(scale)))
+        layers.append(RootPlaces((View(scaled, main.mask),), positions, float(scale)))
     return layers
 
 
@@ -141,7 +168,7 @@ def slide_root(camera: ParallelCamera, p_WR: np.ndarray, factor: float) -> np.nd
 
 def whereabouts(views: Sequence[View], p_WR: np.ndarray) -> np.ndarray:
     """(3 n,) where n views see a root (3,), and how large: 1 apart is one step of what is tried."""
-    here: list[float] = []
+    here, own = list[float](), RootPlacementSettings()
     for view in views:
         camera = view.camera
         place, depth = camera.project(p_WR[None])
@@ -149,8 +176,8 @@ def whereabouts(views: Sequence[View], p_WR: np.ndarray) -> np.ndarray:
             size = camera.pixels_per_metre
         else:
             size = 1.0 / max(float(depth[0]), camera.near)
-        spacing = _extent(view.mask) / _POSITIONS_ACROSS
-        here += [*(place[0] / spacing), np.log(size) / np.log(_RATIO)]
+        spacing = _extent(view.mask) / own.across
+        here += [*(place[0] / spacing), np.log(size) / np.log(own.ratio)]
     return np.array(here)
 
 
@@ -179,6 +206,7 @@ def choose_root_samples(
     positions: np.ndarray,
     count: int,
     outside_weight: float,
+    farthest: int = 60,
 ) -> np.ndarray:
     """At positions (n, 3) of one depth the rotations of the root whose pictures fit best.
 
@@ -188,6 +216,7 @@ def choose_root_samples(
     Args:
         count: so many rotations at each.
         outside_weight: what a pixel outside counts; one covered counts one.
+        farthest: the root is drawn no farther than this from its origin [pixel].
 
     Returns:
         (m,) the samples of ``place_body``, increasing.
@@ -198,8 +227,30 @@ def choose_root_samples(
     (view,) = views
     places = np.atleast_2d(view.camera.project(positions)[0])
     middle = int(np.argmin(np.abs(places - places.mean(axis=0)).sum(axis=1)))
-    pictures = _draw_root(body, view.camera, positions[middle], places[middle])
-    side = pictures.shape[1]
+    # Pictures (r, side, side) of the root at its rotations, its place amidst.
+    camera, ball, p_WR = view.camera, body.sampled.outlines[0].ball, positions[middle]
+    depth = float(_in_camera(camera, p_WR)[2])
+    scale = float(camera.kernel_parameters()[1])
+    reach = float(np.linalg.norm(ball[:3]) + ball[3])
+    if not isinstance(camera, ParallelCamera):
+        scale /= max(depth - reach, 0.2 * depth)
+    half = min(farthest, math.ceil(scale * reach) + 1)
+    side, inner = 2 * half + 1, 2 * half - 1
+    window = dataclasses.replace(
+        camera,
+        width=side,
+        height=side,
+        center_x=camera.center_x - float(places[middle, 0]) + half,
+        center_y=camera.center_y - float(places[middle, 1]) + half,
+    )
+    everywhere = np.pad(np.ones((inner, inner), dtype=np.bool_), 1)
+    placed = place_body(body, p_WR[None], np.arange(rotations))
+    bits = Pictures(placed, [View(window, everywhere)], band=1)
+    masks = np.zeros((rotations, int(bits.part_starts[-1])), dtype=np.uint64)
+    bits.draw_node(0, np.arange(rotations), placed.sampled.X_PN[0], masks)
+    pixels = np.unpackbits(masks.view(np.uint8), axis=1, count=inner**2, bitorder="little")
+    pictures = np.zeros((rotations, side, side), dtype=np.float32)
+    pictures[:, 1:-1, 1:-1] = pixels.reshape(rotations, inner, inner)
     # Beyond the picture's edge nothing counts.
     worth = np.pad(outside_weight - (1.0 + outside_weight) * view.mask, side).astype(np.float32)
     corners = np.rint(places).astype(np.int64) - side // 2 + side
@@ -211,70 +262,36 @@ def choose_root_samples(
     return np.sort((best + rotations * np.arange(len(places))[:, None]).ravel())
 
 
-def _draw_root(
-    body: SampledBody, camera: Camera, p_WR: np.ndarray, place: np.ndarray
+def _pixel_sizes(
+    body: SampledBody, view: View, poses: int = 100, side: int = 240, rare: float = 0.03
 ) -> np.ndarray:
-    """Pictures (r, side, side) float32 of the root at its rotations, its place (2,) amidst."""
-    rotations = len(body.sampled.X_PN[0])
-    ball = body.sampled.outlines[0].ball
-    depth = float(_in_camera(camera, p_WR)[2])
-    scale = float(camera.kernel_parameters()[1])
-    reach = float(np.linalg.norm(ball[:3]) + ball[3])
-    if not isinstance(camera, ParallelCamera):
-        scale /= max(depth - reach, 0.2 * depth)
-    half = min(_FARTHEST, math.ceil(scale * reach) + 1)
-    side, inner = 2 * half + 1, 2 * half - 1
-    window = dataclasses.replace(
-        camera,
-        width=side,
-        height=side,
-        center_x=camera.center_x - float(place[0]) + half,
-        center_y=camera.center_y - float(place[1]) + half,
-    )
-    everywhere = np.pad(np.ones((inner, inner), dtype=np.bool_), 1)
-    placed = place_body(body, p_WR[None], np.arange(rotations))
-    bits = Pictures(placed, [View(window, everywhere)], band=1)
-    masks = np.zeros((rotations, int(bits.part_starts[-1])), dtype=np.uint64)
-    bits.draw_node(0, np.arange(rotations), placed.sampled.X_PN[0], masks)
-    pixels = np.unpackbits(masks.view(np.uint8), axis=1, count=inner**2, bitorder="little")
-    pictures = np.zeros((rotations, side, side), dtype=np.float32)
-    pictures[:, 1:-1, 1:-1] = pixels.reshape(rotations, inner, inner)
-    return pictures
+    """How many pixels a metre at the body may have (n,), the likeliest first.
 
-
-def _pixel_sizes(body: SampledBody, view: View) -> np.ndarray:
-    """How many pixels a metre at the body may have (n,), the likeliest first."""
-    area = float(view.mask.sum())
-    low, middle, high = np.quantile(_random_areas(body, view.camera), [_RARE, 0.5, 1.0 - _RARE])
-    smallest, likely, largest = np.sqrt(area / np.array([high, middle, low]))
+    By areas of parallel projections of random ``poses`` of the grid, seen along the camera's axis
+    in a picture of ``side`` pixels; of the smallest and the largest a share, ``rare``, is left out.
+    """
+    generator, sampled, own = np.random.default_rng(1), body.sampled, RootPlacementSettings()
+    samples = np.column_stack([generator.integers(len(X_PN), size=poses) for X_PN in sampled.X_PN])
+    balls = np.array([outline.ball for outline in sampled.outlines])
+    X_CN = view.camera.X_CW @ sampled.poses(samples)
+    centers = np.einsum("nkij,kj->nki", X_CN[..., :3, :3], balls[:, :3]) + X_CN[..., :3, 3]
+    least, most = (centers - balls[:, 3:]).min(axis=1), (centers + balls[:, 3:]).max(axis=1)
+    X_CN[..., :3, 3] -= 0.5 * (least + most)[:, None]
+    scale, middle = side / float((most - least)[:, :2].max()), 0.5 * (side - 1)
+    measuring = ParallelCamera("", side, side, scale, middle, middle, np.eye(4))
+    nothing = np.zeros((0, side, side + 1), dtype=np.int32)
+    outlines = sampled.outlines_at(range(samples.shape[1]), samples[0])
+    areas = score_bodies(outlines, X_CN, measuring, nothing)[:, 0] / scale**2
+    low, middle, high = np.quantile(areas, [rare, 0.5, 1.0 - rare])
+    smallest, likely, largest = np.sqrt(float(view.mask.sum()) / np.array([high, middle, low]))
     if _touches_edge(view.mask):
-        largest *= _CUT_OFF
-    step = np.log(_RATIO)
+        largest *= own.cut_off
+    step = np.log(own.ratio)
     steps = np.arange(
         np.floor(np.log(smallest / likely) / step), np.ceil(np.log(largest / likely) / step) + 1
     )
     steps = steps[np.argsort(np.abs(steps), kind="stable")]
-    return np.asarray(likely * _RATIO**steps)
-
-
-def _random_areas(body: SampledBody, camera: Camera) -> np.ndarray:
-    """Areas of parallel projections of random poses of the grid, seen along the camera's axis."""
-    generator, sampled = np.random.default_rng(1), body.sampled
-    samples = np.column_stack([generator.integers(len(X_PN), size=_POSES) for X_PN in sampled.X_PN])
-    balls = np.array([outline.ball for outline in sampled.outlines])
-    X_CN = camera.X_CW @ sampled.poses(samples)
-    centers = np.einsum("nkij,kj->nki", X_CN[..., :3, :3], balls[:, :3]) + X_CN[..., :3, 3]
-    low = (centers - balls[:, 3:]).min(axis=1)
-    high = (centers + balls[:, 3:]).max(axis=1)
-    X_CN[..., :3, 3] -= 0.5 * (low + high)[:, None]
-    scale = _SIDE / float((high - low)[:, :2].max())
-    middle = 0.5 * (_SIDE - 1)
-    measuring = ParallelCamera("", _SIDE, _SIDE, scale, middle, middle, np.eye(4))
-    nothing = np.zeros((0, _SIDE, _SIDE + 1), dtype=np.int32)
-    areas = score_bodies(
-        sampled.outlines_at(range(samples.shape[1]), samples[0]), X_CN, measuring, nothing
-    )
-    return np.asarray(areas[:, 0] / scale**2)
+    return np.asarray(likely * own.ratio**steps)
 
 
 def _touches_edge(mask: np.ndarray) -> bool:
@@ -294,29 +311,15 @@ def _extent(mask: np.ndarray) -> float:
     return float(np.sqrt(np.prod(high - low + 1.0)))
 
 
-def _picture_grid(view: View) -> np.ndarray:
-    """Places (n, 2) in the picture where the root can be seen, or beyond its edge [pixel]."""
-    low, high = _box(view.mask)
-    extent = _extent(view.mask)
-    spacing = extent / _POSITIONS_ACROSS
-    beyond = (_CUT_OFF - 1.0) * extent
-    size = np.array([view.camera.width, view.camera.height])
-    low = np.where(low < 1, -beyond, low - 0.5 * spacing)
-    high = np.where(high > size - 2, size - 1 + beyond, high + 0.5 * spacing)
-    axes = [low[k] + spacing * np.arange(int((high[k] - low[k]) / spacing) + 1) for k in range(2)]
-    places = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
-    return places[_near(view, places)]
-
-
 def _near(view: View, places: np.ndarray) -> np.ndarray:
     """Which places (n, 2) [pixel] lie at the silhouette, or beyond it out of the picture."""
-    extent = _extent(view.mask)
+    extent, own = _extent(view.mask), RootPlacementSettings()
     distances = distance_transform_edt(~view.mask)
     inside = np.clip(places, 0, np.array(view.mask.shape)[::-1] - 1)
     column, row = np.rint(inside).astype(np.int64).T
-    near = distances[row, column] <= 0.75 * extent / _POSITIONS_ACROSS
+    near = distances[row, column] <= 0.75 * extent / own.across
     over = np.linalg.norm(places - inside, axis=1)
-    return np.asarray(near & (over <= (_CUT_OFF - 1.0) * extent))
+    return np.asarray(near & (over <= (own.cut_off - 1.0) * extent))
 
 
 def _lift(camera: Camera, places: np.ndarray, depth: float) -> np.ndarray:
@@ -335,31 +338,16 @@ def _in_camera(camera: Camera, p_W: np.ndarray) -> np.ndarray:
     return np.asarray(camera.X_CW[:3, :3] @ p_W + camera.X_CW[:3, 3])
 
 
-def _meeting_point(views: Sequence[View]) -> np.ndarray | None:
-    """The point (3,) nearest to the rays through all silhouettes' middles; None: parallel ones."""
-    A, b = np.zeros((3, 3)), np.zeros(3)
-    for view in views:
-        low, high = _box(view.mask)
-        ends = np.array([_lift(view.camera, 0.5 * (low + high)[None], z)[0] for z in (1.0, 2.0)])
-        along = (ends[1] - ends[0]) / np.linalg.norm(ends[1] - ends[0])
-        across = np.eye(3) - np.outer(along, along)
-        A += across
-        b += across @ ends[0]
-    # The smallest eigenvalue is about the squared sine of half the angle between two rays.
-    if np.linalg.eigvalsh(A)[0] < 0.01:
-        return None
-    return np.asarray(np.linalg.solve(A, b))
-
-
-def _space_layer(views: Sequence[View], middle: np.ndarray, sizes: np.ndarray) -> Layer:
+def _places_in_space(
+    views: Sequence[View], main: View, middle: np.ndarray, size: float
+) -> RootPlaces:
     """A grid in space about a point (3,), of which all views leave what lies in their silhouettes.
 
-    ``sizes``: the pixels a metre in the largest silhouette, the likeliest first.
+    ``size``: the likeliest number of pixels a metre in the largest silhouette, ``main``.
     """
-    main = max(views, key=lambda view: int(view.mask.sum()))
-    extent = _extent(main.mask) / float(sizes[0])
-    half = _HALF_CUBE * extent * (_CUT_OFF if _touches_edge(main.mask) else 1.0)
-    spacing = extent / _POSITIONS_ACROSS
+    own, extent = RootPlacementSettings(), _extent(main.mask) / size
+    half = 0.75 * extent * (own.cut_off if _touches_edge(main.mask) else 1.0)
+    spacing = extent / own.across
     steps = spacing * np.arange(-np.ceil(half / spacing), np.ceil(half / spacing) + 1)
     points = middle + np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), -1).reshape(-1, 3)
     for view in views:
@@ -369,4 +357,250 @@ def _space_layer(views: Sequence[View], middle: np.ndarray, sizes: np.ndarray) -
             seen = depth > view.camera.near
         seen[seen] = _near(view, places[seen])
         points = points[seen]
-    return Layer(tuple(views), points, 1.0)
+    return RootPlaces(tuple(views), points)
+
+
+@dataclass(frozen=True, eq=False)
+class _Placed:
+    """A pose somewhere: parameters of the refinement, the body of its own size, and J (1) [pixel].
+
+    ``views``: the silhouettes, their camera scaled; ``scale``: times what it was given as.
+    """
+
+    views: tuple[View, ...]
+    scale: float
+    parameters: np.ndarray
+    J: float
+
+
+class RootPlacementSearch:
+    """Matches silhouettes with a pose tree whose root can be anywhere.
+
+    Args:
+        tree: the pose tree; where its root is makes no difference.
+        settings: the grids and the time limit; its stages are not used.
+        scale_unknown: the camera is parallel and its pixels_per_metre is not known.
+
+    Raises:
+        SettingsError: if the tree has several roots.
+        ModelError: if the model's joints do not let the root be anywhere.
+    """
+
+    def __init__(
+        self,
+        tree: PoseTree,
+        settings: BeamSearchSettings | None = None,
+        scale_unknown: bool = False,
+    ) -> None:
+        if sum(node.parent < 0 for node in tree.nodes) != 1:
+            raise SettingsError("a root position can be searched only of a tree with one root")
+        self.settings = settings or BeamSearchSettings()
+        self.scale_unknown = scale_unknown
+        p_WR = tree.node_poses(tree.default_values())[0, :3, 3]
+        self.tree = tree.with_root_position(p_WR)
+        self._grid = BeamSearch(
+            self.tree,
+            replace(
+                self.settings, stages=(Stage(60, 1.0, 2),), research_hypotheses=0, time_limit=None
+            ),
+        )
+        self.body = self._grid.body
+        self.sampled = self.body.sampled
+        self._refined = RefinementBody(self.tree)
+        self._parts = PartSearch(self._refined, self.sampled.values)
+        # Of the parameters after the tree's values: three of the translation, and growth.
+        growth = (3,) if self.scale_unknown else ()
+        self._free = {
+            True: self._refined.freedom(extra=(0, 1, 2, *growth)),
+            False: self._refined.freedom(extra=growth),
+        }
+        self._numbers = RootPlacementSettings()
+
+    def match(self, views: Sequence[View], root_position: np.ndarray | None = None) -> PoseEstimate:
+        """Estimate the pose that the views show, and where it is; see ``PoseSearch``.
+
+        Raises:
+            SettingsError: if there is no view, or a scale cannot be searched with these
+                cameras.
+        """
+        if not views:
+            raise SettingsError("a match needs at least one view, but none was given")
+        begin = time.perf_counter()
+        limit = self.settings.time_limit
+        deadline = math.inf if limit is None else begin + limit
+        layers = find_root_places(self.body, views, self.scale_unknown, root_position)
+        placed: list[_Placed] = []
+        own, width = self._numbers, math.ceil(self._numbers.hypotheses / len(layers))
+        # How many poses each search of a layer has found.
+        counts: list[int] = []
+
+        def search(outside_share: float, layer: RootPlaces) -> list[_Placed]:
+            if any(counts) and time.perf_counter() >= deadline:
+                return []
+            found = self._search_layer(layer, width, outside_share)
+            counts.append(len(found))
+            return found
+
+        for outside_share in (own.outside_share, math.inf):
+            if not placed:
+                searched = map_ordered(partial(search, outside_share), layers)
+                placed += itertools.chain.from_iterable(searched)
+        runs = len(counts) * len(self.tree.nodes)
+        if not placed:
+            found = PoseEstimate.nothing(
+                self.tree, stopped_by="end", statistics=SearchStatistics(runs)
+            )
+            return replace(found, seconds=time.perf_counter() - begin)
+        placed.sort(key=_by_J)
+        best = self._improve(placed[: own.starts], root_position is None, deadline)
+        first_J = placed[0].J / _area(views) * _area(best.views)
+        p_WR = self._root_of(best)
+        tree = self.tree.with_root_position(p_WR)
+        values = self._refined.node_values(self._refined.nearest_turns(best.parameters))
+        # The plant's own joints hold the root where it is now.
+        bounds = [tree.value_bounds(i) for i in range(len(tree.nodes))]
+        held = [
+            np.where(lower == upper, lower, one)
+            for one, (lower, upper) in zip(values, bounds, strict=True)
+        ]
+        J = RefinementProblem(self._refined, best.views).J(best.parameters)
+        now = time.perf_counter()
+        return PoseEstimate.of_values(
+            tree,
+            held,
+            J,
+            _area(best.views),
+            stopped_by="time_limit" if now >= deadline else "end",
+            seconds=now - begin,
+            root_position=p_WR,
+            scale=best.scale,
+            statistics=SearchStatistics(runs, first_J),
+        )
+
+    def _search_layer(self, layer: RootPlaces, width: int, outside_share: float) -> list[_Placed]:
+        """The best whole poses of a scale or depth, of each root placement the best."""
+        if len(layer.positions) == 0:
+            return []
+        own, views = self._numbers, [coarsen(view, self._numbers.pixels) for view in layer.views]
+        quota, factor = math.ceil(own.quota * width), own.root_factor
+        chosen = choose_root_samples(
+            self.body, views, layer.positions, own.root_spare * factor * quota, own.outside_weight
+        )
+        body = place_body(self.body, layer.positions, chosen)
+        store = PoseStore(body, Pictures(body, views), outside_share)
+        # The position of each of the root's samples; none has more than its quota at any time.
+        places, hypotheses = chosen // len(self.sampled.X_PN[0]), store.start()
+        for node in self.body.order:
+            spare = own.spare * factor * width
+            grown, _ = grow(store, hypotheses, node, spare, own.outside_weight)
+            if grown is None:
+                return []
+            groups = places[store.nodes[0].samples[grown.poses[:, 0]]]
+            order = np.argsort(groups, kind="stable")
+            ordered = groups[order]
+            rank = np.empty(len(groups), dtype=np.int64)
+            rank[order] = np.arange(len(groups)) - np.searchsorted(ordered, ordered)
+            kept = np.flatnonzero(rank < factor * quota)[: factor * width]
+            hypotheses, factor = grown.chosen(kept), 1
+        # As many pixels as in the silhouettes themselves.
+        Js = _area(layer.views) / store.pictures.area * store.objectives(hypotheses)
+        samples = store.samples(hypotheses.poses)
+        order = np.argsort(Js, kind="stable")
+        firsts = np.sort(np.unique(samples[order, 0], return_index=True)[1])[: own.starts]
+        found = []
+        for i in order[firsts]:
+            p_WR = body.sampled.X_PN[0][samples[i, 0], :3, 3]
+            parameters = self._refined.parameters(body.sampled.values_at(samples[i]), p_WR)
+            found.append(_Placed(layer.views, layer.scale, parameters, float(Js[i])))
+        return found
+
+    def _improve(self, starts: Sequence[_Placed], moves: bool, deadline: float) -> _Placed:
+        """The best pose reached from some; the root moves, too, if its position is unknown."""
+
+        def before(step: Callable[[_Placed], Any], one: _Placed) -> Any:
+            return step(one) if time.perf_counter() < deadline else None
+
+        settle = partial(before, lambda one: self._settle(one, PASSES.coarse, moves))
+        pool = [one for one in map_ordered(settle, starts) if one is not None]
+        pool.sort(key=_by_J)
+        again = partial(before, lambda one: self._search_again(one, moves))
+        # Those whose root is not near that of one before them.
+        elsewhere: list[tuple[_Placed, np.ndarray]] = []
+        for one in pool:
+            here = whereabouts(one.views, self._root_of(one))
+            if all(np.abs(here - there).max() >= 1.0 for _, there in elsewhere):
+                elsewhere.append((one, here))
+        finalists = self._numbers.finalists
+        for found in map_ordered(again, [one for one, _ in elsewhere[:finalists]]):
+            pool += found or []
+        pool.sort(key=_by_J)
+        best = min([*pool, *starts], key=_by_J)
+        enough, ends = self._numbers.enough * _area(best.views), [best]
+
+        def finish(one: _Placed) -> _Placed | None:
+            # One that fits well enough ends it; what is finished beside that one is left out below.
+            if min(end.J for end in ends) <= enough:
+                return None
+            # Not what is last in the list: another thread may have added its own.
+            end = self._finish(one, moves, deadline)
+            ends.append(end)
+            return end
+
+        for end in map_ordered(partial(before, finish), pool[:finalists]):
+            if end is not None and best.J > enough:
+                best = min(best, end, key=_by_J)
+        return best
+
+    def _settle(self, start: _Placed, passes: Sequence[Pass], moves: bool) -> _Placed:
+        """The pose refined with its root free, growth turned into the camera's scale."""
+        problem = RefinementProblem(self._refined, start.views)
+        parameters, _, _ = descend(problem, start.parameters, self._free[moves], passes)
+        refined = replace(start, parameters=parameters, J=float(problem.J(parameters)))
+        growth, camera = math.exp(parameters[-1]), start.views[0].camera
+        if growth == 1.0 or not isinstance(camera, ParallelCamera):
+            return refined
+        p_WR = slide_root(camera, self._root_of(refined), 1.0 / growth)
+        values = self._refined.node_values(parameters)
+        return _Placed(
+            (View(scale_camera(camera, growth), start.views[0].mask),),
+            start.scale * growth,
+            self._refined.parameters(values, p_WR),
+            refined.J,
+        )
+
+    def _root_of(self, placed: _Placed) -> np.ndarray:
+        """(3,) where its root is [m]."""
+        return np.array(self._refined.poses(placed.parameters)[0, :3, 3])
+
+    def _search_again(self, start: _Placed, moves: bool) -> list[_Placed]:
+        """Poses that the beam search finds with the root where it is, refined."""
+        p_WR = self._root_of(start)
+        poses = self._grid.best_poses(start.views, p_WR, self._numbers.again, self._numbers.alike)
+        return [
+            self._settle(
+                replace(start, parameters=self._refined.parameters(values, p_WR)),
+                PASSES.coarse,
+                moves,
+            )
+            for values in poses
+        ]
+
+    def _finish(self, start: _Placed, moves: bool, deadline: float) -> _Placed:
+        """The pose refined to the end, and what fits badly placed anew."""
+        near = self._settle(start, PASSES.fine[:2], moves)
+        problem = RefinementProblem(self._refined, near.views)
+        enough = self._numbers.enough * problem.area
+        about = NeighbourhoodSearch(problem, self._parts)
+        parameters, J = about.improve(near.parameters, enough, deadline)
+        better = replace(near, parameters=parameters, J=float(J))
+        end = self._settle(better, PASSES.fine, moves)
+        return min(start, near, better, end, key=_by_J)
+
+
+def _by_J(placed: _Placed) -> float:
+    return placed.J
+
+
+def _area(views: Sequence[View]) -> float:
+    """The silhouettes' area [pixel]."""
+    return float(sum(view.mask.sum() for view in views))

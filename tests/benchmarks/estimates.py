@@ -24,7 +24,7 @@ from drake_pose.files.settings import EstimateSettings
 from drake_pose.jobs.demo import demo_scene, demo_settings
 from drake_pose.jobs.estimate.scene import estimate_scene
 from drake_pose.papers.kameda import continuous_figures, experiment_tree, run_experiment
-from drake_pose.search import ContinuousSearch
+from drake_pose.search import MultiStartSearch
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from drake_pose.silhouette.pictures.masks import write_mask
 from drake_pose.silhouette.pictures.scenes import load_scene
@@ -141,7 +141,7 @@ def _rows(data: Path | None, folder: Path) -> Iterator[tuple[str, ...]]:
     for work in works(data, folder):
         seconds, E_total, error = measure(work)
         yield work.name, f"{seconds:.3f} s", f"{seconds / label_image:.0f}", f"{E_total:.2%}", error
-    plain = continuous_figures(run_experiment(ContinuousSearch(experiment_tree()), _IMAGES, seed=1))
+    plain = continuous_figures(run_experiment(MultiStartSearch(experiment_tree()), _IMAGES, seed=1))
     seconds = plain["median_seconds"] + plain["mean_interval_seconds"]
     yield (
         "continuous angles, one view, exact masks",

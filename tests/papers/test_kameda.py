@@ -26,7 +26,7 @@ from drake_pose.papers.kameda import (
     run_experiment,
 )
 from drake_pose.papers.kameda_pictures import chest_ranks, ratio_within, save_pictures
-from drake_pose.search import ContinuousSearch, PoseEstimate
+from drake_pose.search import MultiStartSearch, PoseEstimate
 from drake_pose.silhouette.areas.scoring import draw_mask
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from drake_pose.silhouette.pictures.scenes import load_scene
@@ -209,7 +209,7 @@ def test_cameras_are_spread_over_half_a_turn():
 
 @pytest.mark.slow
 def test_figures_of_continuous_angles_come_from_the_trials():
-    result = run_experiment(ContinuousSearch(experiment_tree()), 2, 7, views=2)
+    result = run_experiment(MultiStartSearch(experiment_tree()), 2, 7, views=2)
     figures = continuous_figures(result)
     assert (figures["images"], figures["views"], figures["interval_confidence"]) == (2, 2, 0.95)
     E_total = [trial.result.E_total for trial in result.trials]

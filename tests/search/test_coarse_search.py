@@ -7,17 +7,18 @@ import pytest
 
 from drake_pose.camera.models import ParallelCamera
 from drake_pose.search.coarse_search import (
-    INTERVAL,
     CoarseSearch,
-    _spread_points,
     fill_cover,
     score_samples,
+    spread_points,
 )
 from drake_pose.search.estimates import View
 from drake_pose.search.sampled_body import SampledBody
 from drake_pose.search.settings import BeamSearchSettings
 from drake_pose.silhouette.pictures.masks import signed_distances
 from tests.search.arms import arm_cameras, arm_tree, damaged_views, draw_pose, draw_view, split
+
+INTERVAL = np.radians(15.0)
 
 
 @pytest.fixture(scope="module")
@@ -72,7 +73,7 @@ def test_a_lens_that_is_far_too_long_does_not_fill_the_memory(tree, body, longer
     focal = longer * arm_cameras()[0].focal_x
     wrong = View(replace(arm_cameras()[0], focal_x=focal, focal_y=focal), view.mask)
     search = CoarseSearch(body, [wrong])
-    assert sum(view.cover.nbytes for view in search._views) < 1e8
+    assert sum(view.cover.nbytes for view in search.views) < 1e8
     assert len(search.find()) >= 1
 
 
@@ -100,8 +101,8 @@ def test_scores_are_those_of_balls_looked_at_one_by_one(tree, body, parallel):
         middle = camera.center_x, camera.center_y
         camera = ParallelCamera("", camera.width, camera.height, 130.0, *middle, camera.X_WC)
     search = CoarseSearch(body, [View(camera, seen.mask)])
-    (view,) = search._views
-    distances, points = signed_distances(seen.mask), _spread_points(seen.mask)
+    (view,) = search.views
+    distances, points = signed_distances(seen.mask), spread_points(seen.mask)
     n, node = 20, 3
     radii, p_PB = body.ball_radii[node], body.p_PB[node]
     X_WP = tree.node_poses(split(tree, values))[[node - 1] * n]
@@ -109,7 +110,7 @@ def test_scores_are_those_of_balls_looked_at_one_by_one(tree, body, parallel):
     X_CP = np.ascontiguousarray(camera.X_CW @ X_WP)
     scores = np.zeros((n, len(p_PB)))
     masks = np.zeros((n, 4), dtype=np.uint64)
-    united = score_samples(view, X_CP, search._balls[node], masks, 0.8, scores)
+    united = score_samples(view, X_CP, search.balls[node], masks, 0.8, scores)
     area = body.surface_areas[node] / len(radii)
     gaps = []
     for h, sample in np.ndindex(scores.shape):
@@ -131,7 +132,7 @@ def test_scores_are_those_of_balls_looked_at_one_by_one(tree, body, parallel):
     assert np.abs(gaps).max() < 0.1 * seen.mask.sum()
     assert np.abs(np.mean(gaps)) < 0.005 * seen.mask.sum()
     again = np.zeros_like(scores)
-    score_samples(view, X_CP, search._balls[node], united[:, 2].copy(), 0.8, again)
+    score_samples(view, X_CP, search.balls[node], united[:, 2].copy(), 0.8, again)
     # What is covered already counts no more.
     assert (again[:, 2] >= 0.0).all()
     assert (again[:, 2] > scores[:, 2]).any()

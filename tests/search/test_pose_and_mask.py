@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 from drake_pose.search.pose_and_mask import (
+    PictureLevel,
     PoseAndMask,
     PoseAndMaskSettings,
-    _Level,
-    _narrowed,
     cut_by_odds,
     follow_colours,
+    narrowed,
 )
 from drake_pose.silhouette.areas.scoring import draw_mask
 from drake_pose.silhouette.pictures.masks import intersection_over_union
@@ -97,11 +97,11 @@ def test_a_cut_is_sure_where_odds_are_and_follows_colours_elsewhere():
     ],
 )
 def test_what_agrees_better_is_searched_nearer(share, agreements, left):
-    assert _narrowed(share, agreements) == pytest.approx(left)
+    assert narrowed(share, agreements, PoseAndMaskSettings()) == pytest.approx(left)
 
 
 def test_smaller_pictures_are_those_of_smaller_cameras(episode):
-    small = _Level((episode.camera,), [[episode.pictures[0]], [None]]).smaller(0.5)
+    small = PictureLevel((episode.camera,), [[episode.pictures[0]], [None]]).smaller(0.5)
     (camera,), ((picture,), (nothing,)) = small
     assert picture.shape == (camera.height, camera.width, 3) == (60, 80, 3)
     assert nothing is None

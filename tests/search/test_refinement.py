@@ -8,17 +8,15 @@ import pytest
 from drake_pose.body import bundled_model, load_model
 from drake_pose.camera.models import ParallelCamera, PinholeCamera
 from drake_pose.search.estimates import View
+from drake_pose.search.exact_search import find_intervals
 from drake_pose.search.parts import NeighbourhoodSearch, PartSearch, find_parts, find_reflections
 from drake_pose.search.refinement import (
-    COARSE_PASSES,
-    FINE_PASSES,
-    LAST_PASSES,
     Pass,
     RefinementBody,
     RefinementProblem,
     descend,
 )
-from drake_pose.search.views_fit import find_intervals
+from drake_pose.search.settings import PASSES
 from drake_pose.silhouette.areas.bending import TreeSurfaces
 from drake_pose.silhouette.areas.scoring import draw_mask
 from tests.search.bodies import forked_body
@@ -123,7 +121,7 @@ def test_a_refined_pose_is_a_local_optimum_inside_the_limits(body):
         start = np.clip(start, body.lower, body.upper)
         start[-4:] = 0.0
         freedom = body.freedom()
-        refined, _, steps = descend(problem, start, freedom, COARSE_PASSES + FINE_PASSES)
+        refined, _, steps = descend(problem, start, freedom, PASSES.coarse + PASSES.fine)
         assert steps > 0
         assert np.all(refined >= body.lower)
         assert np.all(refined <= body.upper)
@@ -163,8 +161,8 @@ def test_pixels_that_are_right_pull_little(body):
         start = true + 0.02 * np.random.default_rng(seed).normal(size=len(true))
         start[-4:] = 0.0
         start = np.clip(start, body.lower, body.upper)
-        squares, _, _ = descend(problem, start, freedom, FINE_PASSES)
-        last, _, _ = descend(problem, squares, freedom, LAST_PASSES)
+        squares, _, _ = descend(problem, start, freedom, PASSES.fine)
+        last, _, _ = descend(problem, squares, freedom, PASSES.last)
         off, before = (np.median(np.abs(p - true)[freedom.columns]) for p in (last, squares))
         gains.append([problem.J(last) / problem.J(squares), off / before])
     shares, errors = np.median(gains, axis=0)
@@ -230,7 +228,7 @@ def test_a_body_mirrored_with_left_and_right_exchanged_looks_nearly_the_same(bod
         true = random_pose(body, seed, share=0.3)
         problem = problem_of(body, true, [camera])
         reflected = search.mirror(true, whole[0], problem.views[0])
-        other, _, _ = descend(problem, reflected, body.freedom(), COARSE_PASSES + FINE_PASSES)
+        other, _, _ = descend(problem, reflected, body.freedom(), PASSES.coarse + PASSES.fine)
         assert np.abs(other - true).max() > 0.3
         shares.append(problem.J(other) / problem.area)
     # Limits do not let every pose be mirrored.
@@ -243,13 +241,13 @@ def test_intervals_hold_the_truth_and_say_what_is_free(body, search):
     for seed in (21, 22, 23):
         true = random_pose(body, seed)
         problem = problem_of(body, true, cameras)
-        refined, _, _ = descend(problem, true, body.freedom(), FINE_PASSES + LAST_PASSES)
+        refined, _, _ = descend(problem, true, body.freedom(), PASSES.fine + PASSES.last)
         about = NeighbourhoodSearch(problem, search)
         about.improve(refined, 0.0, everywhere=True)
         others = about.others(refined, 2.0 * problem.J(refined) + 40.0, 0.1)
         others = [pose for pose in others if problem.J(pose) <= problem.J(refined) + 20.0]
-        intervals, covariance = find_intervals(problem, others, refined)
-        assert len(intervals.joints) == len(covariance) == len(true) - 4
+        intervals = find_intervals(problem, others, refined)
+        assert len(intervals.joints) == len(true) - 4
         first = np.concatenate(intervals.families[0].node_values)
         np.testing.assert_allclose(first, refined[:-4], atol=1e-12)
         for family in intervals.families:

@@ -8,6 +8,7 @@ from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.fit.surfaces import few_triangles
 from drake_pose.search.self_motions import flips
+from drake_pose.search.settings import RobustSettings
 from drake_pose.search.views_fit import FittedPose, RobustFamilies, ViewsFit, distinct
 from drake_pose.silhouette.areas.bending import TreeSurfaces
 from tests.body.models import joint, link, urdf, write
@@ -17,9 +18,9 @@ TRUTH = np.array([0.6, 0.7, -0.7, 0.9, 0.3])
 FINE = tuple(AnnealingStage(scale, 0.0125, 8) for scale in (0.025, 0.0125))
 
 
-def find(kinematics, views, values):
+def find(kinematics, views, values, settings=None):
     fit = ViewsFit(kinematics, few_triangles(TreeSurfaces(kinematics.tree)), views)
-    families = RobustFamilies(fit, lambda: True)
+    families = RobustFamilies(fit, lambda: True, settings)
     return families.find([fit.refine(values, FINE)], lambda values: float(values[0]))
 
 
@@ -45,14 +46,12 @@ def test_intervals_hold_the_truth_and_widen_with_the_damage(kinematics):
     assert np.median(np.array(widths[1]) / widths[0]) > 1.03
 
 
-def test_flips_are_families_of_their_own(kinematics, monkeypatch):
+def test_flips_are_families_of_their_own(kinematics):
     """Where nothing is significant, all that flips make is as good; nothing is determined."""
     tree = kinematics.tree
     views = [draw_view(tree, TRUTH, camera) for camera in arm_cameras()]
-    with monkeypatch.context() as patch:
-        patch.setattr("drake_pose.search.views_fit._SIGNIFICANCE", 1e6)
-        patch.setattr("drake_pose.search.views_fit._FAMILIES", 5)
-        assert not any(find(kinematics, views, TRUTH).determined)
+    nothing = RobustSettings(significance=1e6, families=5)
+    assert not any(find(kinematics, views, TRUTH, nothing).determined)
     answer = find(kinematics, damaged_views(tree, TRUTH, 1), TRUTH)
     flipped = [flip.values for flip in flips(kinematics, answer.families[0].q)]
     for family in answer.families[1:]:

@@ -9,13 +9,13 @@ from drake_pose.camera.models import ParallelCamera, PinholeCamera
 from drake_pose.errors import SettingsError
 from drake_pose.search.estimates import View
 from drake_pose.search.root_placement import (
+    RootPlacementSearch,
     choose_root_samples,
-    find_layers,
+    find_root_places,
     hub,
     turns_freely,
     whereabouts,
 )
-from drake_pose.search.root_placement_search import RootPlacementSearch
 from drake_pose.search.sampled_body import SampledBody
 from drake_pose.search.settings import BeamSearchSettings
 from drake_pose.silhouette.areas.scoring import draw_mask
@@ -155,7 +155,7 @@ def test_what_touches_the_pictures_edge_may_reach_beyond_it(body):
     mask = picture(body, camera, (0.0, 0.1, 0.8))
     assert mask[0].any()
     search = RootPlacementSearch(body.pose_tree(), SETTINGS)
-    (layer,) = find_layers(search.body, [View(camera, mask)], False, None)
+    (layer,) = find_root_places(search.body, [View(camera, mask)], False, None)
     assert np.linalg.norm(layer.positions[:, 1:] - [0.1, 0.8], axis=1).min() < 0.04
 
 

@@ -21,7 +21,7 @@ from drake_pose.fit.contour_fit import pack_views
 from drake_pose.fit.evidence import find_edge_points
 from drake_pose.fit.kernel import collect, compare_contours
 from drake_pose.fit.surfaces import few_triangles
-from drake_pose.search import MEDIUM, MultiStartSearch, View, ViewsFit
+from drake_pose.search import MultiStartSearch, View, ViewsFit
 from drake_pose.silhouette.areas.bending import TreeSurfaces
 from drake_pose.silhouette.areas.outline import pack
 
@@ -55,9 +55,9 @@ def main() -> None:
     views = pack_views([camera], [find_edge_points(view.mask, 1.0)])
     X_WN = tree.node_poses(tree.default_values())
     compare_contours(pack(surfaces), X_WN, *views, np.ones((1, 4)), 0, 1.0, False)
-    fit = ViewsFit(TreeKinematics(tree), surfaces, [view])
-    fit.refine(fit.kinematics.flatten(tree.default_values()), MEDIUM)
-    MultiStartSearch(tree).match([view])
+    fit, search = ViewsFit(TreeKinematics(tree), surfaces, [view]), MultiStartSearch(tree)
+    fit.refine(fit.kinematics.flatten(tree.default_values()), search.settings.medium)
+    search.match([view])
 
 
 if __name__ == "__main__":

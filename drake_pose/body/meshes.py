@@ -5,6 +5,7 @@ import hashlib
 import io
 import itertools
 import re
+import shutil
 import struct
 import tempfile
 import xml.etree.ElementTree as ElementTree
@@ -297,10 +298,11 @@ def is_drawn_by_drake(path: Path) -> bool:
 @functools.cache
 def workspace() -> Path:
     """This process's temporary folder for converted files; it is removed at exit."""
-    folder = tempfile.TemporaryDirectory(prefix="drake_pose_")
-    # Not atexit: processes that multiprocessing starts end without it.
-    Finalize(None, folder.cleanup, exitpriority=0)
-    return Path(folder.name)
+    folder = tempfile.mkdtemp(prefix="drake_pose_")
+    # Not atexit: processes that multiprocessing starts end without it. A fork forgets the finalizer,
+    # so that it leaves the folder to the process that made it.
+    Finalize(None, shutil.rmtree, (folder, True), exitpriority=0)
+    return Path(folder)
 
 
 def drawable_file(path: Path) -> Path:

@@ -16,10 +16,14 @@ from drake_pose.files.writer import FinishedFrame, OnStage, ResultWriter
 from drake_pose.jobs.estimate.inputs import Inputs
 from drake_pose.jobs.estimate.matching import draw_parts, finish_frame, read_pictures
 from drake_pose.person.camera_faults import CameraFault
-from drake_pose.person.checked_capture import CheckedCapture, capture_checked
-from drake_pose.person.figures import RigFault
-from drake_pose.person.person_capture import PersonCapture, capture_by_colour
-from drake_pose.person.persons_in_view import ReadFrame, ViewFaults
+from drake_pose.person.capture import (
+    CheckedCapture,
+    PersonCapture,
+    capture_by_colour,
+    capture_checked,
+)
+from drake_pose.person.figures import ReadFrame, ViewFaults
+from drake_pose.person.rig_faults import RigFault
 from drake_pose.search import PoseEstimate
 from drake_pose.silhouette.pictures.masks import compare_masks, edge_area
 from drake_pose.silhouette.pictures.scene_checks import (

@@ -27,6 +27,7 @@ from drake_pose.jobs.estimate.inputs import bundled_person
 from drake_pose.jobs.estimate.person import FOLLOWED
 from drake_pose.jobs.live.scene import LiveScene, look_until, run_live
 from drake_pose.jobs.live.settings import CaptureMethod, LiveSettings
+from drake_pose.person.capture import capture_person
 from drake_pose.person.date.features import (
     RegisteredPose,
     learn_recorded_faces,
@@ -34,8 +35,7 @@ from drake_pose.person.date.features import (
     stand_registered,
 )
 from drake_pose.person.date.skeleton import FEATURES, load_skeleton
-from drake_pose.person.person_capture import capture_person
-from drake_pose.person.persons_in_view import PersonRecording, keep_person
+from drake_pose.person.figures import PersonRecording, keep_person
 from drake_pose.person.pose_tracker import PersonPoseTracker
 from drake_pose.person.shape import KnownShape, shape_values, tracker_of_person
 from drake_pose.person.views import SilhouetteView, shows_somebody
@@ -402,7 +402,7 @@ class _FrameWriter:
         X_WN = fit.kinematics.poses(values)
         masks: Mapping[str, Mask] = {name: view.region for name, view in views.items()}
         if has_others:
-            masks = keep_person(cameras, masks, self._tracker.place(values)).masks
+            masks, *_ = keep_person(cameras, masks, self._tracker.place(values))
         bodies = {
             name: draw_mask(fit.outlines, cameras[name].X_CW @ X_WN, cameras[name])
             for name in masks

@@ -14,7 +14,7 @@ from drake_pose.arrays import Array
 from drake_pose.camera.models import Camera, camera_tuple
 from drake_pose.fit.colours import COLOURS
 from drake_pose.fit.contour_fit import inlier_ratio_of
-from drake_pose.person.persons_in_view import keep_views
+from drake_pose.person.figures import keep_views
 from drake_pose.person.pose_tracker import PersonPoseTracker, TrackState
 from drake_pose.person.views import ColourViews, FrameViews, shows_somebody
 from drake_pose.systems.bodies import body_poses
@@ -243,11 +243,12 @@ class PersonTracker(MemorySystem):
 
     def _alone(self, seen: FrameViews, last: TrackState | None) -> _Moment:
         """What cameras see without other persons than the one who was seen last."""
-        alone, kept = keep_views(seen, None if last is None else self._tracker.place(last.values))
-        clean = alone.without(kept.merged)
-        if kept.merged and len(clean.showing) >= _ENOUGH:
+        place = None if last is None else self._tracker.place(last.values)
+        alone, cut, merged = keep_views(seen, place)
+        clean = alone.without(merged)
+        if merged and len(clean.showing) >= _ENOUGH:
             alone = clean
-        return _Moment(alone, bool(kept.cut or kept.merged), kept.merged)
+        return _Moment(alone, bool(cut or merged), merged)
 
     def _judged(self, found: TrackState, moment: _Moment) -> TrackState:
         """A state whose share is that of the cameras in which nobody else's contours are."""

@@ -9,9 +9,8 @@ from drake_pose.errors import ModelError, SceneError, SettingsError
 from drake_pose.files.settings import EstimateSettings
 from drake_pose.fit.contour_fit import ContourFit
 from drake_pose.jobs.estimate.scene import estimate_scene
-from drake_pose.person.checked_capture import CheckedCapture
-from drake_pose.person.person_capture import PersonCapture
-from drake_pose.person.persons_in_view import ViewFaults
+from drake_pose.person.capture import CheckedCapture, PersonCapture
+from drake_pose.person.figures import ViewFaults
 from tests.cli import run_to_end
 from tests.jobs.persons import PersonScene, record_person
 from tests.jobs.scenes import read_rows, run_estimate

@@ -9,7 +9,7 @@ from drake_pose.body import landmark_positions, load_landmarks
 from drake_pose.camera.models import circle_of_cameras
 from drake_pose.fit.colours import Colour, OwnColours
 from drake_pose.fit.contour_fit import ContourFit
-from drake_pose.person.person_capture import capture_by_colour
+from drake_pose.person.capture import capture_by_colour
 from drake_pose.person.pose_tracker import PersonPoseTracker
 from drake_pose.person.shape import NOISE
 from drake_pose.person.views import ColourViews

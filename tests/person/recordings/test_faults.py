@@ -18,26 +18,24 @@ from drake_pose.person.camera_faults import (
     FrameView,
     moved_since,
 )
-from drake_pose.person.checked_capture import _record
+from drake_pose.person.capture import require_person
 from drake_pose.person.figures import (
     Figure,
     Person,
-    _is_other,
+    PersonRecording,
     cut_figures,
     find_figures,
     find_persons,
-    find_rig_fault,
-)
-from drake_pose.person.persons_in_view import (
-    PersonRecording,
-    _is_strangers,
-    _tracks,
+    find_tracks,
     follow_one,
+    is_another,
     keep_person,
     keep_views,
     middle_of_view,
+    sort_figures,
 )
 from drake_pose.person.pose_tracker import PersonPoseTracker
+from drake_pose.person.rig_faults import find_rig_fault
 from drake_pose.person.views import FrameViews, see_silhouette
 from tests.person.persons_in_view import see, stepping
 
@@ -215,16 +213,16 @@ class TestOthers:
         other = see(nine.person, nine.cameras, np.array([stepping(nine.person, 1.0, 0.5, 1.2)]))[0]
         alone, place = nine.masks[0], np.array([-0.2, 0.1, 0.9])
         both = {name: mask | other[name] for name, mask in alone.items()}
-        kept = keep_person(nine.cameras, both, place)
-        assert kept.person is not None
-        assert set(kept.cut) & set(kept.merged) == set()
-        assert len(kept.cut) >= 4
+        masks, person, cut, merged = keep_person(nine.cameras, both, place)
+        assert person is not None
+        assert set(cut) & set(merged) == set()
+        assert len(cut) >= 4
         views = [see_silhouette(mask, 2.0) for mask in both.values()]
-        frame, found = keep_views(FrameViews(list(nine.cameras.values()), views), place)
-        assert (found.cut, found.merged) == (kept.cut, kept.merged)
+        frame, *found = keep_views(FrameViews(list(nine.cameras.values()), views), place)
+        assert found == [cut, merged]
         for name, view in zip(alone, frame.views, strict=True):
-            np.testing.assert_array_equal(view.region, kept.masks[name])
-            if name in kept.cut:
+            np.testing.assert_array_equal(view.region, masks[name])
+            if name in cut:
                 np.testing.assert_array_equal(view.region, alone[name])
                 np.testing.assert_array_equal(view.edge.uv, find_edge_points(alone[name], 2.0).uv)
 
@@ -232,11 +230,11 @@ class TestOthers:
         masks = {name: mask.copy() for name, mask in four.masks[0].items()}
         rows = np.flatnonzero(masks["camera_0"].any(axis=1))
         masks["camera_0"][int(rows.mean()) : int(rows.mean()) + 5] = False
-        kept = keep_person(four.cameras, masks)
-        assert (kept.cut, kept.merged) == ((), ())
-        np.testing.assert_equal(kept.masks, masks)
+        kept, _, *others = keep_person(four.cameras, masks)
+        assert others == [(), ()]
+        np.testing.assert_equal(kept, masks)
         empty = {name: np.zeros((120, 160), dtype=bool) for name in four.cameras}
-        assert keep_person(four.cameras, empty).person is None
+        assert keep_person(four.cameras, empty)[1] is None
 
     def test_figures_of_large_pictures_are_cut_whole(self) -> None:
         mask = np.zeros((960, 1280), dtype=bool)
@@ -270,11 +268,12 @@ class TestOthers:
         sizes = {"large": 40.0, "small": 20.0}
 
         def is_strangers(place, area, figures, others):
-            own = (Figure(camera.project(me[None])[0][0], 100.0, np.zeros(4)),)
+            own = Figure(camera.project(me[None])[0][0], 100.0, np.zeros(4))
             seen = Figure(camera.project(place[None])[0][0], sizes[area], np.zeros(4))
             person = Person(me, figures, 100.0)
-            rest = [Person(one, {}, 100.0) for one in others]
-            return _is_strangers(camera, seen, person, rest, 0, own)
+            persons = [person, *(Person(one, {}, 100.0) for one in others)]
+            found = sort_figures({"0": camera}, {"0": (own, seen)}, persons, person)
+            return seen in found["0"][0]
 
         assert is_strangers(him, "small", {0: 0}, [him])
         assert not is_strangers(between, "large", {0: 0}, [him])
@@ -288,7 +287,7 @@ class TestOthers:
     def test_who_is_hidden_may_have_gone_further_meanwhile(self, gap: int, far: float) -> None:
         """Four tenths of a metre from frame to frame, and one more for each that is missed."""
         first, then = (Person(np.array([x, 0.0, 1.0]), {}, 100.0) for x in (0.0, far))
-        tracks = _tracks([[], [first], *[[]] * (gap - 1), [then]])
+        tracks = find_tracks([[], [first], *[[]] * (gap - 1), [then]])
         same = far < 0.4 + 0.1 * (gap - 1)
         expected = [{1: first, gap + 1: then}] if same else [{1: first}, {gap + 1: then}]
         assert tracks == expected
@@ -329,12 +328,12 @@ class TestOthers:
             return Person(np.array([x, 0.0, z]), {}, area)
 
         first = person(0.0, 100.0)
-        assert _is_other(person(2.0, 90.0), [first])
-        assert not _is_other(person(2.0, 1.0), [first])
-        assert not _is_other(person(0.1, 90.0), [first])
+        assert is_another(person(2.0, 90.0), [first])
+        assert not is_another(person(2.0, 1.0), [first])
+        assert not is_another(person(0.1, 90.0), [first])
         # Whatever is above one is oneself.
-        assert not _is_other(person(0.0, 90.0, 3.0), [first])
-        assert not _is_other(person(2.1, 90.0), [first, person(2.0, 100.0)])
+        assert not is_another(person(0.0, 90.0, 3.0), [first])
+        assert not is_another(person(2.1, 90.0), [first, person(2.0, 100.0)])
 
 
 class TestRecord:
@@ -358,6 +357,6 @@ class TestRecord:
             (small, four.masks[0], CameraError, "m tall by the cameras' calibration"),
         ):
             with pytest.raises(error, match=words):
-                _record(cameras, lambda k, masks=masks: masks, 1, True)
-        sound = _record(four.cameras, lambda k: four.masks[0], 1, True)
+                require_person(PersonRecording(cameras, lambda k, m=masks: m, 1, True), 1)
+        sound = require_person(PersonRecording(four.cameras, lambda k: four.masks[0], 1, True), 1)
         assert (sound.seen, sound.covering) == ([0], 0.0)

@@ -9,7 +9,7 @@ from drake_pose.errors import ModelError, SettingsError
 from drake_pose.fit.contour_fit import ContourFit
 from drake_pose.fit.evidence import find_edge_points
 from drake_pose.fit.surfaces import with_girths
-from drake_pose.person.person_capture import capture_person
+from drake_pose.person.capture import capture_person
 from drake_pose.person.shape import NOISE, fit_shape, shape_values
 from drake_pose.silhouette.areas.scoring import draw_mask
 from drake_pose.silhouette.pictures.scenes import load_scene

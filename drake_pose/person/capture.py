@@ -1,7 +1,9 @@
-"""A whole recording of one person, whose proportions need not be known: poses out.
+"""A whole recording of one person, whose proportions need not be known, in spite of its faults.
 
 By masks: found in a few frames, followed both ways from the best; shape joints are fitted, then all
-again. Where only a few frames have masks the person's colours in pictures say the rest.
+again. Where only a few frames have masks the person's colours in pictures say the rest. Others are
+cut out of the masks first. After the capture a camera that contradicts the rest is left out, and
+all is captured once more.
 """
 
 from __future__ import annotations
@@ -15,12 +17,20 @@ from numpy.typing import NDArray
 from drake_pose.arrays import Array, Mask, Picture
 from drake_pose.body import PoseTree
 from drake_pose.camera.models import Camera
-from drake_pose.errors import SettingsError
+from drake_pose.errors import CameraError, MaskError, SettingsError
 from drake_pose.fit.colours import OwnColours
 from drake_pose.fit.contour_fit import ContourFit
-from drake_pose.fit.evidence import EdgePoints
-from drake_pose.person.persons_in_view import ReadFrame
+from drake_pose.fit.evidence import EdgePoints, find_edge_points
+from drake_pose.person.camera_faults import (
+    CameraFault,
+    CameraJudge,
+    FrameView,
+    is_explained,
+    moved_since,
+)
+from drake_pose.person.figures import PersonRecording, ReadFrame, ViewFaults
 from drake_pose.person.pose_tracker import PersonPoseTracker, TrackState
+from drake_pose.person.rig_faults import RigFault, find_rig_fault
 from drake_pose.person.search import LENIENT
 from drake_pose.person.shape import NOISE, PersonShape, fit_shape, shape_values
 from drake_pose.person.views import (
@@ -33,11 +43,8 @@ from drake_pose.person.views import (
 )
 from drake_pose.silhouette.areas.outline import Outline
 
-# In how many of the frames a sequence is begun, for the best to be taken, and of what more fits
-# needs no other to be compared with.
-_STARTS, _SURE = 4, 0.97
-# The shape is fitted to some frames among this many first ones.
-_SHAPE_SPAN, _SHAPE_FRAMES = 40, 10
+ReadPictures = Callable[[int], Mapping[str, Picture]]
+"""Gives the pictures (H, W, 3) of a frame, counted from 0, by camera."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,20 +150,25 @@ class _Capture:
         pairs = zip(cameras, masks.values(), strict=True)
         return FrameViews(cameras, [see_silhouette(one, edge_spacing(c)) for c, one in pairs])
 
-    def measure(self, frames: Sequence[int]) -> tuple[PersonShape | None, dict[int, TrackState]]:
-        """The shape that the first frames give, which the tracker has from now on; and states."""
+    def measure(
+        self, frames: Sequence[int], first: int = 40, fitted: int = 10
+    ) -> tuple[PersonShape | None, dict[int, TrackState]]:
+        """The shape that the first frames give, which the tracker has from now on; and states.
+
+        It is fitted to some among the first ones.
+        """
         fit = self.tracker.fit
         is_shape = shape_values(fit.tree)
         if not is_shape.any():
             return None, {}
-        first = frames[:_SHAPE_SPAN]
-        for frame in first:
+        frames = frames[:first]
+        for frame in frames:
             self._kept[frame] = {
                 camera.name: (np.packbits(view.region, axis=1), view.edge)
                 for camera, view in self._see(frame).pairs
             }
-        rough = self.follow_all(first, {})
-        poses = {k: one.values for k in spread_over(first, _SHAPE_FRAMES) if (one := rough[k])}
+        rough = self.follow_all(frames, {})
+        poses = {k: one.values for k in spread_over(frames, fitted) if (one := rough[k])}
         looks = [self._see(k) for k in poses]
         views = [(one.cameras, [view.edge for view in one.views]) for one in looks]
         shape = fit_shape(fit, views, np.array(list(poses.values())))
@@ -198,18 +210,23 @@ class _Capture:
                 state, last = follow(state, frame, last), frame
         return found
 
-    def _best_start(self, frames: Sequence[int]) -> tuple[int, TrackState]:
-        """The frame in which a fresh start fits best, and the state there."""
+    def _best_start(
+        self, frames: Sequence[int], tried: int = 4, enough: float = 0.97
+    ) -> tuple[int, TrackState]:
+        """The frame of those tried in which a fresh start fits best, and the state there.
+
+        One of which enough of the contours fits needs no other to be compared with.
+        """
         best: tuple[int, TrackState] | None = None
-        for frame in spread_over(frames, _STARTS):
+        for frame in spread_over(frames, tried):
             state = self.tracker.follow(None, self._see(frame))
             if state is not None and (best is None or state.share > best[1].share):
                 best = frame, state
-                if state.share > _SURE:
+                if state.share > enough:
                     break
         if best is None:
             raise SettingsError(
-                f"in none of {_STARTS} frames two cameras saw a person: give masks that show one"
+                f"in none of {tried} frames two cameras saw a person: give masks that show one"
             )
         return best
 
@@ -218,9 +235,6 @@ def spread_over(frames: Sequence[int], count: int) -> list[int]:
     """This many frames of all, evenly."""
     picked = np.linspace(0, len(frames) - 1, min(count, len(frames)))
     return [frames[int(k)] for k in picked]
-
-
-ReadPictures = Callable[[int], Mapping[str, Picture]]
 
 
 def capture_by_colour(
@@ -272,7 +286,14 @@ def capture_by_colour(
             X_WN = fit.kinematics.poses(values)
             own = OwnColours.learned(colours.values(), fit.outlines, X_WN, shown)
         else:
-            state, views = _followed(tracker, state, views, starts.get(frame), own)
+            if state is not None:
+                state = tracker.follow_by_colour(state, views, own)
+            if frame in starts and (state is None or state.is_lost):
+                began = tracker.start(tracker.values(starts[frame]))
+                if not views.known:
+                    learned = views.learned(fit, began.values)
+                    views = ColourViews(views.cameras, views.pictures, learned)
+                state = tracker.follow_by_colour(began, views)
             if state is not None and state.is_lost:
                 captured.shares[frame] = state.share
                 state = replace(state, step=np.zeros(len(state.values)))
@@ -285,20 +306,172 @@ def capture_by_colour(
     return captured, distances
 
 
-def _followed(
-    tracker: PersonPoseTracker,
-    state: TrackState | None,
-    views: ColourViews,
-    start: Array | None,
-    own: OwnColours | None,
-) -> tuple[TrackState | None, ColourViews]:
-    """The next frame by its pictures, or from a start (nq,) where the person is lost."""
-    if state is not None:
-        state = tracker.follow_by_colour(state, views, own)
-    if start is not None and (state is None or state.is_lost):
-        began = tracker.start(tracker.values(start))
-        if not views.known:
-            learned = views.learned(tracker.fit, began.values)
-            views = ColourViews(views.cameras, views.pictures, learned)
-        state = tracker.follow_by_colour(began, views)
-    return state, views
+@dataclass(frozen=True, eq=False)
+class CheckedCapture:
+    """A captured recording.
+
+    Args:
+        captured: the capture of all frames; nan where fewer than two cameras see the person.
+        cameras: those that contradict the others, measured at the end once more.
+        rig: what the silhouettes say against the calibration as a whole, if no single camera
+            explains it; undone where it can be.
+        read: gives the masks that were used.
+    """
+
+    captured: PersonCapture
+    views: ViewFaults
+    cameras: tuple[CameraFault, ...]
+    rig: RigFault | None
+    read: ReadFrame
+
+
+def capture_checked(
+    tree: PoseTree,
+    cameras: Mapping[str, Camera],
+    read: ReadFrame,
+    count: int,
+    is_sequence: bool = True,
+    on_frame: Callable[[int], None] | None = None,
+    carved: int = 3,
+    least_left: int = 3,
+) -> CheckedCapture:
+    """Captures a recording like `capture_person`, whose arguments it has, and finds its faults.
+
+    Args:
+        carved: in how many frames visual hulls are carved out of the silhouettes.
+        least_left: a camera is left out only where as many others follow the person.
+
+    Raises:
+        CameraError: the person is as tall as nobody is.
+        MaskError: the masks show the background.
+        ModelError: the model has no landmarks of trunk, arms and legs.
+        SettingsError: there is no frame in which two cameras see a person.
+    """
+    recording = require_person(PersonRecording(cameras, read, count, is_sequence), count)
+    rig = find_rig_fault(cameras, [recording.read(k) for k in spread_over(recording.seen, carved)])
+    if rig is not None and rig.is_undone:
+        undo = rig.undo
+        undone = PersonRecording(cameras, lambda k: undo(read(k)), count, is_sequence)
+        recording = require_person(undone, count)
+    found: list[CameraFault] = []
+    while True:
+        # All frames are finished once only, as those who count them are told of it.
+        tell = None if found else on_frame
+        captured = capture_person(
+            tree, cameras, recording.read, recording.seen, count, is_sequence, tell
+        )
+        judge = _Judge(tree, cameras, recording, captured)
+        found = [judge.dated(one) for one in found]
+        fault = judge.find()
+        if fault is None:
+            break
+        left = len(recording.cameras_at(fault.first)) - 1
+        fault = replace(fault, is_left_out=left >= least_left and not fault.rivals)
+        found.append(fault)
+        if not fault.is_left_out:
+            break
+        recording.leave_out(fault.name, fault.first)
+    if found and rig is not None and not rig.is_undone:
+        rig = None
+    return CheckedCapture(captured, recording.faults(), tuple(found), rig, recording.read)
+
+
+def require_person(recording: PersonRecording, count: int) -> PersonRecording:
+    """A recording of `count` frames in which somebody is seen who may be a person.
+
+    Raises the errors of `capture_checked`: nobody is as small as 0.1 m or as tall as 3 m, not even
+    in part; and nobody fills the whole picture in more than half of the masks.
+    """
+    if not recording.seen:
+        raise SettingsError(
+            f"in none of {count} frames two cameras see a person: give masks that show one"
+        )
+    if recording.covering > 0.5:
+        raise MaskError(
+            f"in {100.0 * recording.covering:.0f} % of the masks the largest figure reaches all "
+            "four sides of the picture: the person must be white before a black background"
+        )
+    if not 0.1 < recording.height < 3.0:
+        raise CameraError(
+            f"a person {recording.height:.3g} m tall by the cameras' calibration: X_WC must be in "
+            "metres and the camera's pose in the world, not its inverse; focal lengths in pixels"
+        )
+    return recording
+
+
+class _Judge(CameraJudge):
+    """Compares the cameras with each other by what was captured."""
+
+    def __init__(
+        self,
+        tree: PoseTree,
+        cameras: Mapping[str, Camera],
+        recording: PersonRecording,
+        captured: PersonCapture,
+    ) -> None:
+        held, noise = shape_values(tree), None if captured.shape is None else NOISE
+        super().__init__(ContourFit(tree, captured.outlines, noise), cameras, held)
+        self._recording = recording
+        found = np.flatnonzero(np.isfinite(captured.q).all(axis=1)).tolist()
+        flatten = self._fit.kinematics.flatten
+        self._values = {k: flatten(tree.values_from_positions(captured.q[k])) for k in found}
+
+    def find(self, compared: int = 10) -> CameraFault | None:
+        """The camera that contradicts the others in all frames or in the last, and since when.
+
+        Cameras are compared in this many frames.
+        """
+        picked = spread_over(list(self._values), compared)
+        views = []
+        for frame in picked:
+            masks = self._recording.read(frame).items()
+            edges = {name: self._edge(name, mask) for name, mask in masks}
+            views.append(FrameView(edges, self._values[frame]))
+        fault = self.find_fault(views)
+        if fault is None or not fault.is_explained:
+            # A camera that moved in the middle is another one before and after that.
+            fault = self.find_fault(views[-(len(views) + 2) // 3 :]) or fault
+        if fault is None:
+            return None
+        own = [k for k, view in enumerate(views) if fault.name in view.edges]
+        poses = [self.pose_without(views[k], fault.name)[0] for k in own]
+        since = self._since(fault, [views[k].edges[fault.name] for k in own], poses)
+        # Between two compared frames it may have moved at any time.
+        first = 0 if since == 0 else picked[own[min(since, len(own)) - 1]] + 1
+        return replace(fault, first=first)
+
+    def dated(self, fault: CameraFault) -> CameraFault:
+        """A camera that was left out, measured once more by what the others captured without it."""
+        seen = {k: self._recording.read(k, with_all=True).get(fault.name) for k in self._values}
+        frames = [k for k, mask in seen.items() if mask is not None]
+        edges = [self._edge(fault.name, mask) for mask in seen.values() if mask is not None]
+        poses = [self._values[frame] for frame in frames]
+        # The first guess may be some frames too early, which blurs the motion.
+        for _ in range(2):
+            late = [k for k, frame in enumerate(frames) if frame >= fault.first]
+            if not late:
+                break
+            motion = self.motion(fault.name, [edges[k] for k in late], [poses[k] for k in late])
+            explained = is_explained(motion, fault.others_share)
+            fault = replace(fault, motion=motion, is_explained=explained)
+            since = min(self._since(fault, edges, poses), len(frames) - 1)
+            fault = replace(fault, first=frames[since])
+        return fault
+
+    def _since(
+        self, fault: CameraFault, edges: Sequence[EdgePoints], poses: Sequence[Array]
+    ) -> int:
+        """Since which of some pictures a camera is at fault.
+
+        Pictures of which less than 0.7 of the others' share fits do not agree.
+        """
+        camera = self._cameras[fault.name]
+        before, after = (
+            [self.share(one, e, values) for e, values in zip(edges, poses, strict=True)]
+            for one in (camera, camera.with_pose(fault.motion.X_WC))
+        )
+        least = 0.7 * fault.others_share
+        return moved_since(before, [max(one, least) for one in after])
+
+    def _edge(self, name: str, mask: Mask) -> EdgePoints:
+        return find_edge_points(mask, edge_spacing(self._cameras[name]))

@@ -1,0 +1,164 @@
+"""A rig that masks contradict as a whole, before anybody is fitted.
+
+Silhouettes of a consistent rig are filled by their visual hull (silhouette coherence, Hernandez,
+Schmitt and Cipolla 2007); a rig that only a mirrored or exchanged picture mends is faulty.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+import cv2
+import numpy as np
+
+from drake_pose.arrays import Array, Indices, Mask
+from drake_pose.camera.models import Camera
+from drake_pose.person.figures import find_figures, pixels_per_metre
+from drake_pose.person.views import triangulate
+
+
+@dataclass(frozen=True)
+class RigFault:
+    """What the silhouettes of all cameras together say against their calibration.
+
+    In a ring of four, opposite cameras exchanged are all cameras mirrored: then that is said.
+
+    Args:
+        mirrored: the cameras whose pictures are mirrored, left for right.
+        exchanged: the two cameras whose pictures are each other's.
+        filled: what share of the silhouettes a body can fill, by camera.
+    """
+
+    mirrored: tuple[str, ...]
+    exchanged: tuple[str, ...]
+    filled: Mapping[str, float]
+
+    @property
+    def is_undone(self) -> bool:
+        """Whether it is known what happened."""
+        return bool(self.mirrored or self.exchanged)
+
+    def undo(self, masks: Mapping[str, Mask]) -> dict[str, Mask]:
+        """The masks (H, W) of a frame by camera, mirrored and exchanged back."""
+        partner = dict(zip(self.exchanged, reversed(self.exchanged), strict=True))
+        found = {}
+        for name, mask in masks.items():
+            turned = np.ascontiguousarray(mask[:, ::-1]) if name in self.mirrored else mask
+            found[partner.get(name, name)] = turned
+        return found
+
+
+def find_rig_fault(
+    cameras: Mapping[str, Camera],
+    frames: Sequence[Mapping[str, Mask]],
+    *,
+    sound: float = 0.01,
+    left: float = 0.03,
+    explained: float = 0.35,
+    contradicting: float = 0.3,
+) -> RigFault | None:
+    """What is wrong with a rig as a whole, by one person's masks in some frames; None: nothing.
+
+    Args:
+        sound: silhouettes of a sound rig are filled but for this much.
+        left, explained: what happened leaves no more than this much, and this share of what was
+            unfilled.
+        contradicting: where more is unfilled and nothing explains it, the rig is not sound.
+    """
+    frames = [masks for masks in frames if len(masks) >= 2]
+    if not frames:
+        return None
+    first: dict[tuple[str, tuple[int, ...]], Indices] = {}
+    filled = _filled(cameras, frames, RigFault((), (), {}), first)
+    unfilled = 1.0 - float(np.mean(list(filled.values())))
+    if unfilled < sound:
+        return None
+    best, least = RigFault((), (), filled), unfilled
+    sizes = {name: (cameras[name].width, cameras[name].height) for name in filled}
+    pairs = [pair for pair in combinations(filled, 2) if sizes[pair[0]] == sizes[pair[1]]]
+    mirrored = [tuple(filled), *((name,) for name in filled)]
+    for guess in (
+        *(RigFault(names, (), filled) for names in mirrored),
+        *(RigFault((), pair, filled) for pair in pairs),
+    ):
+        filled_so = _filled(cameras, frames, guess, first)
+        remains = 1.0 - float(np.mean(list(filled_so.values())))
+        if remains < least:
+            best, least = guess, remains
+    if least < min(left, explained * unfilled):
+        return best
+    return RigFault((), (), filled) if unfilled > contradicting else None
+
+
+def _filled(
+    cameras: Mapping[str, Camera],
+    frames: Sequence[Mapping[str, Mask]],
+    guess: RigFault,
+    first: dict[tuple[str, tuple[int, ...]], Indices],
+    *,
+    spacing: float = 0.04,
+    side: float = 1.1,
+    height: float = 1.3,
+    lattice: float = 0.25,
+) -> dict[str, float]:
+    """What share of the silhouettes a visual hull can fill, by camera, if a guess is undone.
+
+    Args:
+        first: where cameras see the points of grids, by camera and grid; added to.
+        spacing, side, height: from point to point of the hull's grid, and how far they are from its
+            middle to the side and up [m].
+        lattice: grids whose middles differ by less are the same [m].
+    """
+    shares: dict[str, list[float]] = {}
+    for frame in frames:
+        masks = {name: mask for name, mask in guess.undo(frame).items() if mask.any()}
+        used = [cameras[name] for name in masks]
+        middles = [find_figures(mask)[0].middle for mask in masks.values()]
+        cell = tuple(int(k) for k in np.rint(triangulate(used, middles) / lattice))
+        ends = (np.arange(-end, end, spacing) for end in (side, side, height))
+        grid = np.stack(np.meshgrid(*ends, indexing="ij"), axis=-1).reshape(-1, 3)
+        points = grid + lattice * np.array(cell, dtype=np.float64)
+        # Pixels of a cell that is as large as the grid is fine there.
+        middle = points.mean(axis=0)
+        sizes = [max(1.0, spacing * pixels_per_metre(camera, middle)) for camera in used]
+        touched = [_touched(mask, size) for mask, size in zip(masks.values(), sizes, strict=True)]
+        # What touched cells and those beside them allow, and all that is not seen. Each camera
+        # looks at what the ones before it left, which soon is little.
+        cells: list[Indices] = []
+        for camera, size, own in zip(used, sizes, touched, strict=True):
+            key = camera.name, cell
+            known = None if cells else first.get(key)
+            seen = _cells(camera, points, size, own.shape) if known is None else known
+            if not cells:
+                first[key] = seen
+            inside = (seen < 0) | _grown(own).ravel()[seen]
+            points, cells = points[inside], [one[inside] for one in (*cells, seen)]
+        for name, chosen, own in zip(masks, cells, touched, strict=True):
+            hull = np.zeros(own.size, dtype=np.bool_)
+            hull[chosen[chosen >= 0]] = True
+            fills = _grown(hull.reshape(own.shape)) & own
+            shares.setdefault(name, []).append(fills.sum() / own.sum() if own.any() else 1.0)
+    return {name: float(np.mean(own)) for name, own in shares.items()}
+
+
+def _cells(camera: Camera, points: Array, size: float, shape: tuple[int, ...]) -> Indices:
+    """In which cell (n,) of so many pixels each point is seen, row after row; -1: in none."""
+    uv, depth = camera.project(points)
+    with np.errstate(invalid="ignore"):
+        column, row = np.floor((uv.T + 0.5) / size)
+        seen = (depth > 0.0) & (column >= 0) & (column < shape[1])
+        seen &= (row >= 0) & (row < shape[0])
+    return np.where(seen, row * shape[1] + column, -1.0).astype(np.int64)
+
+
+def _touched(mask: Mask, size: float) -> Mask:
+    """Which cells (h, w) of so many pixels a mask (H, W) touches."""
+    height, width = (int(np.ceil(side / size)) for side in mask.shape)
+    padded = np.zeros((int(np.ceil(height * size)), int(np.ceil(width * size))), np.float32)
+    padded[: mask.shape[0], : mask.shape[1]] = mask
+    small = cv2.resize(padded, (width, height), interpolation=cv2.INTER_AREA)
+    return np.asarray(small > 0.25)
+
+
+def _grown(cells: Mask) -> Mask:
+    return np.asarray(cv2.dilate(cells.view(np.uint8), np.ones((3, 3), np.uint8)) > 0)

@@ -31,10 +31,9 @@ if TYPE_CHECKING:
     from drake_pose.jobs.registration.settings import RegistrationSettings
     from drake_pose.search import BeamSearch, MultiStartSearch, View
     from drake_pose.silhouette.pictures.scenes import Scene, load_scene
+    from drake_pose.systems.cameras import SilhouetteCamera, cameras_from_drake
     from drake_pose.systems.diagrams import CameraRegistration
     from drake_pose.systems.person.person_tracker import PersonTracker
-    from drake_pose.systems.pictures.camera_rig import cameras_from_drake
-    from drake_pose.systems.pictures.silhouette_camera import SilhouetteCamera
     from drake_pose.systems.silhouette_matcher import (
         SilhouetteMatcher,
         SilhouetteTracker,
@@ -59,7 +58,7 @@ _HOMES = {
     "SceneEstimate": "files.records",
     "SceneMasks": "jobs.masks.masks",
     "SceneRegistration": "jobs.registration.register",
-    "SilhouetteCamera": "systems.pictures.silhouette_camera",
+    "SilhouetteCamera": "systems.cameras",
     "SilhouetteMatcher": "systems.silhouette_matcher",
     "SilhouetteTracker": "systems.silhouette_matcher",
     "TruncatedEkf": "systems.truncated_ekf",
@@ -68,7 +67,7 @@ _HOMES = {
     "build_pose_tree": "body.tree_builder",
     "bundled_model": "body.model_files",
     "camera_from_drake": "camera.drake",
-    "cameras_from_drake": "systems.pictures.camera_rig",
+    "cameras_from_drake": "systems.cameras",
     "estimate_scene": "jobs.estimate.scene",
     "load_cameras": "camera.camera_files",
     "load_model": "body.model",

@@ -34,6 +34,7 @@ from drake_pose.person.pose_tracker import PersonPoseTracker, TrackState
 from drake_pose.silhouette.areas.outline import outline_from_mesh
 from drake_pose.silhouette.areas.scoring import draw_labels
 from drake_pose.silhouette.segmentation.background import Background, learn_background
+from drake_pose.systems.cameras import CameraRig, build_camera_rig
 from drake_pose.systems.date import (
     CaptureSetup,
     PaperCapture,
@@ -42,7 +43,6 @@ from drake_pose.systems.date import (
 )
 from drake_pose.systems.images import colour_image_to_picture
 from drake_pose.systems.person.live_capture import SilhouetteCapture, build_silhouette_capture
-from drake_pose.systems.pictures.camera_rig import CameraRig, build_camera_rig
 from drake_pose.systems.ports import StagedDiagram
 
 # A power of two: the time from frame to frame is exactly the same, and so is the motion expected.

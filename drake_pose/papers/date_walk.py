@@ -33,8 +33,8 @@ from drake_pose.person.date.skeleton import FEATURES
 from drake_pose.person.date.walking import COMMANDS, make_gestures
 from drake_pose.person.views import viewing_rays
 from drake_pose.systems.bodies import add_posed_plant, held_positions
+from drake_pose.systems.cameras import add_sensors
 from drake_pose.systems.images import colour_image_to_picture, picture_to_colour_image
-from drake_pose.systems.pictures.camera_rig import add_sensors
 from drake_pose.systems.walk import Walker, add_garden, view_from_behind, walker_transform
 
 

@@ -16,7 +16,7 @@ from drake_pose.person.date.features import (
 )
 from drake_pose.person.date.skeleton import load_skeleton, registered_positions
 from drake_pose.silhouette.segmentation.background import learn_background
-from drake_pose.systems.pictures.camera_rig import build_camera_rig
+from drake_pose.systems.cameras import build_camera_rig
 from tests.person.persons_in_view import posed
 
 HEAD_HEIGHT = 1.55

@@ -20,6 +20,7 @@ from drake_pose.person.date.pose import estimate_pose
 from drake_pose.person.date.skeleton import LIMBS
 from drake_pose.silhouette.pictures.label_images import mask_to_label_image
 from drake_pose.silhouette.segmentation.background import learn_background, person_region
+from drake_pose.systems.cameras import build_camera_rig
 from drake_pose.systems.date import (
     CaptureSetup,
     FeatureFinder,
@@ -30,7 +31,6 @@ from drake_pose.systems.date import (
     prepare_paper_capture,
 )
 from drake_pose.systems.images import colour_image_to_picture, picture_to_colour_image
-from drake_pose.systems.pictures.camera_rig import build_camera_rig
 from tests.person.studio import shared_studio
 from tests.systems.bench import Bench
 

@@ -19,10 +19,9 @@ from drake_pose.person.pose_tracker import PersonPoseTracker
 from drake_pose.person.views import EDGE_POINTS, SilhouetteView, edge_spacing, see_silhouette
 from drake_pose.silhouette.segmentation.background import Background
 from drake_pose.systems.bodies import add_avatar
+from drake_pose.systems.cameras import build_camera_rig
 from drake_pose.systems.person.person_tracker import PersonTracker
-from drake_pose.systems.pictures.camera_rig import build_camera_rig
-from drake_pose.systems.pictures.person_region import PersonRegion, connect_images
-from drake_pose.systems.pictures.picture_capture import PictureCapture
+from drake_pose.systems.picture_capture import PersonRegion, PictureCapture, connect_images
 from drake_pose.systems.ports import StagedDiagram, export_outputs
 
 

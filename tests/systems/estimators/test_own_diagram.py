@@ -14,7 +14,7 @@ from pydrake.systems.sensors import CameraConfig, RgbdSensor
 from drake_pose.body import ArticulatedModel
 from drake_pose.errors import CameraError, SettingsError, UnknownNameError
 from drake_pose.search import PaperSearch, PaperSearchSettings
-from drake_pose.systems.pictures.camera_rig import cameras_from_drake
+from drake_pose.systems.cameras import cameras_from_drake
 from drake_pose.systems.silhouette_matcher import SilhouetteMatcher, SilhouetteTracker
 from tests.search.bodies import front_camera, swinging_chain
 

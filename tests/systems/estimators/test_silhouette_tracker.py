@@ -14,9 +14,9 @@ from drake_pose.silhouette.pictures.label_images import (
     mask_to_label_image,
 )
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
+from drake_pose.systems.cameras import SilhouetteCamera
 from drake_pose.systems.diagrams import build_simulated_matching
 from drake_pose.systems.images import picture_to_colour_image
-from drake_pose.systems.pictures.silhouette_camera import SilhouetteCamera
 from drake_pose.systems.silhouette_matcher import TRACK, SilhouetteTracker
 from tests.search.arms import arm_cameras
 from tests.search.bodies import forked_body, front_camera

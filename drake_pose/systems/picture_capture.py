@@ -1,19 +1,27 @@
-"""The cameras' pictures as a Drake system: recorded or live, synchronised by their time stamps."""
+"""Recorded or live pictures as Drake systems: synchronised ones, and the person's region in one."""
 
 from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
 import numpy as np
 from pydrake.common.value import AbstractValue
-from pydrake.systems.framework import Context, DependencyTicket, EventStatus, State
+from pydrake.systems.framework import (
+    Context,
+    DiagramBuilder,
+    EventStatus,
+    InputPort,
+    State,
+    System,
+)
 from pydrake.systems.sensors import ImageLabel16I, ImageRgba8U
 
+from drake_pose.arrays import Mask, Picture
 from drake_pose.camera.frame_source import (
     CameraChange,
     Clock,
@@ -23,23 +31,12 @@ from drake_pose.camera.frame_source import (
     TimedPicture,
 )
 from drake_pose.camera.models import Camera
-from drake_pose.errors import SettingsError, UnknownNameError
-from drake_pose.silhouette.pictures.label_images import fill_label_image
-from drake_pose.systems.images import fill_colour_image
+from drake_pose.errors import CameraError, SettingsError, UnknownNameError
+from drake_pose.silhouette.pictures.label_images import fill_label_image, label_image_to_mask
+from drake_pose.silhouette.pictures.scenes import USUAL_RATE_HZ
+from drake_pose.silhouette.segmentation.background import Background, person_region
+from drake_pose.systems.images import colour_image_to_picture, fill_colour_image
 from drake_pose.systems.ports import PortedSystem, require_period
-
-USUAL_RATE_HZ = 30.0
-"""Pictures a second where no source says."""
-
-# A recorded source is read this many pictures ahead of its slowest neighbour.
-_AHEAD = 8
-# Half a millionth of a period keeps what is due at a tick in spite of rounding.
-_ROUNDING = 5e-7
-# Live cameras are seldom triggered together: so much of a period may lie between their pictures.
-_LIVE_TOLERANCE = 0.9
-_PERIODS_OF_PATIENCE = 4.0
-# How long it is waited at first for live cameras to give pictures [s].
-_OPENING = 8.0
 
 
 @dataclass(frozen=True)
@@ -84,6 +81,7 @@ class PictureCapture(PortedSystem):
         tolerance: how far apart the pictures of one moment may be [s]; half a period where not
             given, 0.9 periods for live cameras, which are not triggered together.
         clock: the computer's [s]; the one that live sources use.
+        opening: how long to wait for the first pictures of live cameras [s].
 
     Raises:
         SettingsError: no source, or times that cannot be.
@@ -99,6 +97,7 @@ class PictureCapture(PortedSystem):
         live: bool | None = None,
         tolerance: float | None = None,
         clock: Clock = time.monotonic,
+        opening: float = 8.0,
     ) -> None:
         super().__init__()
         for name in sources:
@@ -109,15 +108,17 @@ class PictureCapture(PortedSystem):
         self.live = devices if live is None else live
         if devices and not self.live:
             raise SettingsError("live cameras cannot be captured by the simulation's time")
-        self.period = _usual_period(sources) if period is None else period
+        if period is None:
+            rates = [rate for one in sources.values() if (rate := one.rate_hz) is not None]
+            period = 1.0 / max(rates, default=USUAL_RATE_HZ)
+        self.period = period
         require_period("capture", self.period)
-        share = _LIVE_TOLERANCE if devices else 0.5
-        tolerance = share * self.period if tolerance is None else tolerance
-        patience = max(_PERIODS_OF_PATIENCE * self.period, tolerance)
+        if tolerance is None:
+            tolerance = (0.9 if devices else 0.5) * self.period
         self._synchroniser: Synchroniser[TimedPicture] = Synchroniser(
-            self._sources, tolerance, patience
+            self._sources, tolerance, patience=max(4.0 * self.period, tolerance)
         )
-        self._clock = clock
+        self._clock, self._opening = clock, opening
         self._since: float | None = None
         self._opened: set[str] = set()
         self._begin: float | None = None
@@ -131,27 +132,20 @@ class PictureCapture(PortedSystem):
         self.skipped = 0
         self._time = self.DeclareDiscreteState(np.array([math.nan]))
         self._fresh = self.DeclareDiscreteState(1)
-        self._declare_outputs(cameras, self.discrete_state_ticket(self._time))
+        for name, source in self._sources.items():
+            size = cameras[name].width, cameras[name].height
+            is_mask = source.specification.gives_masks
+            port = f"label_image_{name}" if is_mask else f"color_image_{name}"
+            image = ImageLabel16I(*size) if is_mask else ImageRgba8U(*size)
+            calc = partial(
+                self._calc_image, name, fill_label_image if is_mask else fill_colour_image
+            )
+            ticket = {self.discrete_state_ticket(self._time)}
+            self.DeclareAbstractOutputPort(port, AbstractValue.Make(image).Clone, calc, ticket)
         self.DeclareStateOutputPort("time", self._time)
         self.DeclareStateOutputPort("fresh", self._fresh)
         self.DeclarePeriodicUnrestrictedUpdateEvent(self.period, 0.0, self._look)
         self.DeclareForcedUnrestrictedUpdateEvent(self._look)
-
-    def _declare_outputs(self, cameras: Mapping[str, Camera], ticket: DependencyTicket) -> None:
-        """One output a camera."""
-        for name, source in self._sources.items():
-            size = cameras[name].width, cameras[name].height
-            fill: Callable[[Any, np.ndarray], None]
-            if source.specification.gives_masks:
-                port, image, fill = "label_image", ImageLabel16I(*size), fill_label_image
-            else:
-                port, image, fill = "color_image", ImageRgba8U(*size), fill_colour_image
-            self.DeclareAbstractOutputPort(
-                f"{port}_{name}",
-                AbstractValue.Make(image).Clone,
-                partial(self._calc_image, name, fill),
-                {ticket},
-            )
 
     def counts(self) -> dict[str, CameraCount]:
         """How each camera did so far."""
@@ -185,8 +179,14 @@ class PictureCapture(PortedSystem):
             self._begin = self._start()
         now = self._clock() - self._begin if self.live else context.get_time()
         for name, source in self._sources.items():
-            self._feed(name, source, now + _ROUNDING * self.period)
-        moment = self._take(now)
+            # Half a millionth of a period keeps what is due at a tick in spite of rounding.
+            self._feed(name, source, now + 5e-7 * self.period)
+        moment = self._synchroniser.take(now)
+        while self.live and moment is not None:
+            newer = self._synchroniser.take(now)
+            if newer is None:
+                break
+            moment, self.skipped = newer, self.skipped + 1
         self._note_changes()
         state.get_mutable_discrete_state(self._fresh).SetFromVector([float(moment is not None)])
         if moment is None:
@@ -202,14 +202,13 @@ class PictureCapture(PortedSystem):
         return EventStatus.Succeeded()
 
     def _is_opening(self) -> bool:
-        """Whether it is still waited for the first pictures of live cameras."""
+        """Whether live cameras have not given their first pictures, and are waited for."""
         for name, source in self._sources.items():
             if not source.specification.live or source.ended or source.read() is not None:
                 self._opened.add(name)
-        if self._since is None:
-            self._since = self._clock()
-        waited = self._clock() - self._since
-        return len(self._opened) < len(self._sources) and waited < _OPENING
+        now = self._clock()
+        self._since = now if self._since is None else self._since
+        return len(self._opened) < len(self._sources) and now - self._since < self._opening
 
     def _start(self) -> float:
         """What is the time 0 of the clock; and that of each camera's time stamps."""
@@ -224,42 +223,32 @@ class PictureCapture(PortedSystem):
             self._origins[name] = begin if source.specification.live else first
         return begin
 
-    def _feed(self, name: str, source: FrameSource, now: float) -> None:
-        """Hands on the pictures of a source that are due."""
+    def _feed(self, name: str, source: FrameSource, now: float, ahead: int = 8) -> None:
+        """Hands on the pictures of a source that are due; the first later one is kept.
+
+        ahead: number of pictures that a recorded source is read ahead of its slowest neighbour.
+        """
+        origin, synchroniser = self._origins[name], self._synchroniser
         if source.specification.live:
             one = source.read()
             if one is not None:
-                self._synchroniser.add(name, one.time - self._origins[name], one)
+                synchroniser.add(name, one.time - origin, one)
             elif source.ended:
-                self._synchroniser.finish(name)
+                synchroniser.finish(name)
             return
-        self._feed_due(name, source, now)
-
-    def _feed_due(self, name: str, source: FrameSource, now: float) -> None:
-        """Hands on what a source has given up to now; the first later one is kept for its time."""
-        while self.live or self._synchroniser.waiting(name) < _AHEAD:
+        while self.live or synchroniser.waiting(name) < ahead:
             one = self._pending[name]
             if one is None:
                 one = self._pending[name] = source.read()
             if one is None:
                 # Live, one that is silent is waited for; a recording has waited itself.
                 if source.ended or not self.live:
-                    self._synchroniser.finish(name)
+                    synchroniser.finish(name)
                 return
-            if one.time - self._origins[name] > now:
+            if one.time - origin > now:
                 return
-            self._synchroniser.add(name, one.time - self._origins[name], one)
+            synchroniser.add(name, one.time - origin, one)
             self._pending[name] = None
-
-    def _take(self, now: float) -> Moment[TimedPicture] | None:
-        """The next moment, or the newest where live."""
-        moment = self._synchroniser.take(now)
-        while self.live and moment is not None:
-            newer = self._synchroniser.take(now)
-            if newer is None:
-                break
-            moment, self.skipped = newer, self.skipped + 1
-        return moment
 
     def _note_changes(self) -> None:
         for change in self._synchroniser.take_changes():
@@ -283,7 +272,102 @@ class PictureCapture(PortedSystem):
             fill(image, one.picture)
 
 
-def _usual_period(sources: Mapping[str, FrameSource]) -> float:
-    """Time between two pictures of the fastest source [s]; 1/30 where none says."""
-    rates = [rate for one in sources.values() if (rate := one.rate_hz) is not None]
-    return 1.0 / max(rates, default=USUAL_RATE_HZ)
+class PersonRegion(PortedSystem):
+    """Finds the person's region in one camera's picture.
+
+    .. pydrake_system::
+
+        name: PersonRegion
+        input_ports: [color_image, label_image]
+        output_ports: [region]
+
+    The region, a mask (H, W), is that of ``label_image``, where not connected that of the
+    background model; None where the image that tells it is unconnected or has no pixels: then the
+    camera gave no picture at that moment.
+
+    Attributes:
+        wanted: the inputs that tell the region.
+
+    Args:
+        background: what it sees when nobody is there; None where ``label_image`` is connected.
+
+    Raises:
+        SettingsError: the background's size is not the camera's. When evaluated: there is neither a
+            background nor a label image.
+        CameraError: when evaluated: an image has another size than the camera's.
+    """
+
+    def __init__(self, camera: Camera, background: Background | None = None) -> None:
+        super().__init__()
+        size = camera.width, camera.height
+        if background is not None and background.mean.shape[1::-1] != size:
+            width, height = background.mean.shape[1::-1]
+            raise SettingsError(
+                f"camera '{camera.name}' has {size[0]} x {size[1]} pixels (width x height), but "
+                f"its background {width} x {height}"
+            )
+        self._camera, self._background = camera, background
+        self.wanted: tuple[str, ...] = ("label_image",) if background is None else ("color_image",)
+        self.add_input("color_image", ImageRgba8U(*size))
+        self.add_input("label_image", ImageLabel16I(*size))
+        self.picture = self.add_cache("picture", self._picture)
+        self.region = self.add_output("region", None, self._region)
+
+    def _image(self, context: Context, name: str) -> Any:
+        """A given image; None while the camera has stopped; CameraError: it has another size."""
+        image, camera = self.given(context, name), self._camera
+        if image is None or not image.size():
+            return None
+        if (image.width(), image.height()) != (camera.width, camera.height):
+            raise CameraError(
+                f"camera '{camera.name}': its {name.replace('_', ' ')} has {image.width()} x "
+                f"{image.height()} pixels (width x height), but it was calibrated with "
+                f"{camera.width} x {camera.height}"
+            )
+        return image
+
+    def _picture(self, context: Context) -> Picture | None:
+        """The picture (H, W, 3); None while the camera has stopped."""
+        image = self._image(context, "color_image")
+        return None if image is None else colour_image_to_picture(image)
+
+    def _region(self, context: Context) -> Mask | None:
+        """Where the person is (H, W); None while the camera has stopped."""
+        if self.GetInputPort("label_image").HasValue(context):
+            image = self._image(context, "label_image")
+            return None if image is None else label_image_to_mask(image)
+        image = self._image(context, "color_image")
+        if image is None:
+            return None
+        if self._background is None:
+            raise SettingsError(
+                f"camera '{self._camera.name}': nothing tells the person from what is behind; give "
+                "a background model or connect label_image"
+            )
+        # It copies, piece by piece, only what it looks at, without the fourth channel.
+        return person_region(image.data, self._background)
+
+
+def connect_images(
+    builder: DiagramBuilder, source: System | None, wanted: Mapping[str, Sequence[InputPort]]
+) -> None:
+    """Connects images by the names of a source's outputs, or as inputs of the diagram.
+
+    Raises SettingsError where the source lacks one.
+    """
+    for name, ports in wanted.items():
+        if source is None:
+            builder.ExportInput(ports[0], name)
+            for port in ports[1:]:
+                builder.ConnectInput(name, port)
+            continue
+        if not source.HasOutputPort(name):
+            kind, camera = name[:11], name[12:]
+            background = " (or a background in the setup)" if kind == "label_image" else ""
+            known = [source.get_output_port(k).get_name() for k in range(source.num_output_ports())]
+            raise SettingsError(
+                f"camera '{camera}': the source needs an output port {name}{background}; it has: "
+                + ", ".join(known)
+            )
+        for port in ports:
+            builder.Connect(source.GetOutputPort(name), port)

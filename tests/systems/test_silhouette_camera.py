@@ -26,7 +26,7 @@ from drake_pose.camera.models import ParallelCamera, PinholeCamera, look_at
 from drake_pose.errors import ModelError
 from drake_pose.silhouette.pictures.label_images import EMPTY, label_data
 from drake_pose.silhouette.pictures.label_renderer import DeformableSkin, LabelRenderer
-from drake_pose.systems.pictures.silhouette_camera import SilhouetteCamera
+from drake_pose.systems.cameras import SilhouetteCamera
 from tests.benchmarks.silhouette_camera import arm_model, measure_camera
 
 

@@ -9,7 +9,7 @@ from drake_pose.camera.camera_files import load_cameras, save_cameras
 from drake_pose.camera.models import circle_of_cameras, look_at
 from drake_pose.errors import CameraError, UnknownNameError
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
-from drake_pose.systems.pictures.camera_rig import build_camera_rig
+from drake_pose.systems.cameras import build_camera_rig
 
 SIZE = (160, 120)
 

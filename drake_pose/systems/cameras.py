@@ -1,0 +1,297 @@
+"""Simulated cameras: RgbdSensors around a body, and label images without a renderer."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+from typing import TypeVar
+
+import numpy as np
+from pydrake.common.value import AbstractValue
+from pydrake.geometry import MakeRenderEngineVtk, RenderEngineVtkParams, Role, SceneGraph
+from pydrake.math import RigidTransform
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import BodyIndex, RigidBody
+from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPort, System
+from pydrake.systems.primitives import PassThrough, TrajectorySource
+from pydrake.systems.sensors import ImageLabel16I, RgbdSensor
+from pydrake.trajectories import Trajectory
+
+from drake_pose.arrays import Array, Mask, Picture
+from drake_pose.body import ParsedModel, captured_warnings, labelled_meshes
+from drake_pose.camera.drake import camera_from_drake, camera_to_drake
+from drake_pose.camera.models import Camera, PinholeCamera
+from drake_pose.errors import CameraError, ModelError, UnknownNameError
+from drake_pose.silhouette.areas.label_kernel import paint_labels
+from drake_pose.silhouette.areas.outline import outline_from_mesh, pack
+from drake_pose.silhouette.pictures.label_images import EMPTY, label_image_to_mask
+from drake_pose.systems.bodies import add_posed_plant
+from drake_pose.systems.images import colour_image_to_picture
+from drake_pose.systems.ports import PortedSystem
+
+_System = TypeVar("_System", bound=System)
+
+
+@dataclass(frozen=True, eq=False)
+class CameraRig:
+    """A diagram of a body and the cameras around it.
+
+    The diagram's input ``positions`` (nq) poses the body, or a trajectory does. Its outputs are
+    ``color_image_<camera>``, ``label_image_<camera>`` and ``depth_image_<camera>``; an image is
+    rendered when it is asked for. Render in one thread only: an engine first used in another thread
+    gives wrong images.
+    """
+
+    diagram: Diagram
+    cameras: Mapping[str, PinholeCamera]
+    sensors: Mapping[str, RgbdSensor]
+
+    def set_positions(self, context: Context, q: Array) -> None:
+        """Pose the body: (nq,) the plant's positions [rad or m]."""
+        self.diagram.GetInputPort("positions").FixValue(context, q)
+
+    def picture(self, context: Context, camera: str) -> Picture:
+        """What a camera sees: (H, W, 3) red, green, blue; UnknownNameError: there is none such."""
+        return colour_image_to_picture(self._port("color_image", camera).Eval(context))
+
+    def mask(self, context: Context, camera: str) -> Mask:
+        """Where a camera sees the body: (H, W); UnknownNameError: there is none such."""
+        return label_image_to_mask(self._port("label_image", camera).Eval(context))
+
+    def _port(self, kind: str, camera: str) -> OutputPort:
+        if camera not in self.cameras:
+            raise UnknownNameError("camera", camera, self.cameras, "the rig")
+        return self.diagram.GetOutputPort(f"{kind}_{camera}")
+
+
+def build_camera_rig(
+    model: ParsedModel,
+    cameras: Mapping[str, PinholeCamera],
+    true_positions: Trajectory | None = None,
+) -> CameraRig:
+    """Wire a body and the cameras that see it.
+
+    Args:
+        cameras: any number, anywhere: from circle_of_cameras or load_cameras.
+        true_positions: the body's positions (nq,) over time; where not given, the diagram has the
+            input ``positions``.
+
+    Raises:
+        CameraError: there is no camera, or one of parallel rays.
+    """
+    if not cameras:
+        raise CameraError("a rig needs at least one camera")
+    for name, camera in cameras.items():
+        if not isinstance(camera, PinholeCamera):
+            raise CameraError(f"camera '{name}': a rig's sensors are pinholes, not parallel")
+    builder = DiagramBuilder()
+    scene_graph = builder.AddNamedSystem("scene_graph", SceneGraph())
+    source: System
+    if true_positions is None:
+        source = builder.AddNamedSystem("positions", PassThrough(model.plant.num_positions()))
+        builder.ExportInput(source.get_input_port(), "positions")
+    else:
+        source = builder.AddNamedSystem("true_positions", TrajectorySource(true_positions))
+    add_posed_plant(builder, scene_graph, model, source.get_output_port(), "geometry_pose")
+    # 16 bits of millimetres hold 60 m; nothing of a room is farther away.
+    ranges = {name: (camera.near, 60.0) for name, camera in cameras.items()}
+    parameters = RenderEngineVtkParams(default_clear_color=np.array([0.55, 0.58, 0.62]))
+    sensors = add_sensors(builder, scene_graph, cameras, ranges, parameters)
+    for name, sensor in sensors.items():
+        builder.ExportOutput(sensor.color_image_output_port(), f"color_image_{name}")
+        builder.ExportOutput(sensor.label_image_output_port(), f"label_image_{name}")
+        builder.ExportOutput(sensor.depth_image_32F_output_port(), f"depth_image_{name}")
+    return CameraRig(builder.Build(), dict(cameras), sensors)
+
+
+def add_sensors(
+    builder: DiagramBuilder,
+    scene_graph: SceneGraph,
+    cameras: Mapping[str, Camera],
+    depth_ranges: Mapping[str, tuple[float, float]],
+    parameters: RenderEngineVtkParams,
+) -> dict[str, RgbdSensor]:
+    """Add a renderer, and an RgbdSensor ``camera_<name>`` for each camera, returned by name.
+
+    Call it after the models are added: the renderer refuses OBJ files without normals when it is.
+
+    Args:
+        depth_ranges: as of camera_to_drake, by camera that has its own [m].
+    """
+    renderer = "rig_renderer"
+    scene_graph.AddRenderer(renderer, MakeRenderEngineVtk(parameters))
+    sensors = {}
+    for name, camera in cameras.items():
+        color, depth, X_WC = camera_to_drake(
+            camera, renderer_name=renderer, depth_range=depth_ranges.get(name)
+        )
+        # A parallel camera is a tele camera far beyond what depth images hold, which nobody reads.
+        with captured_warnings():
+            sensor = RgbdSensor(scene_graph.world_frame_id(), X_WC, color, depth)
+        sensors[name] = builder.AddNamedSystem(f"camera_{name}", sensor)
+        builder.Connect(scene_graph.get_query_output_port(), sensor.query_object_input_port())
+    return sensors
+
+
+def cameras_from_drake(
+    diagram: Diagram | DiagramBuilder, names: Collection[str] | None = None
+) -> dict[str, PinholeCamera]:
+    """The cameras of the RgbdSensors in a diagram, by the systems' names, at their default poses.
+
+    A Scenario's cameras (``rgbd_sensor_<name>``) have the name that they have there.
+
+    Args:
+        diagram: looked through with all diagrams in it; or the builder of one.
+        names: the cameras to take; None: all.
+
+    Raises:
+        CameraError: there is none, or one rides on a link that moves, so that it is nowhere fixed.
+        UnknownNameError: there is no camera of a name.
+    """
+    found = {
+        sensor.get_name().removeprefix("rgbd_sensor_"): sensor
+        for sensor in _systems_of(diagram, RgbdSensor)
+    }
+    if not found:
+        raise CameraError("there is no RgbdSensor in the diagram whose cameras were asked for")
+    for name in names or ():
+        if name not in found:
+            raise UnknownNameError("camera", name, found, "the diagram")
+    plants = _systems_of(diagram, MultibodyPlant)
+    cameras = {}
+    for name in found if names is None else names:
+        sensor = found[name]
+        frame, X_WP = sensor.default_parent_frame_id(), RigidTransform()
+        if frame != SceneGraph.world_frame_id():
+            carriers = [(plant, plant.GetBodyFromFrameId(frame)) for plant in plants]
+            plant, body = next((pair for pair in carriers if pair[1] is not None), (None, None))
+            if plant is None or body is None:
+                raise CameraError(f"camera '{name}' rides on a frame of no plant in the diagram")
+            if body not in plant.GetBodiesWeldedTo(plant.world_body()):
+                raise CameraError(
+                    f"camera '{name}' rides on link '{body.name()}', which moves, so that it "
+                    "stands elsewhere at each time; names=[...] leaves it out"
+                )
+            X_WP = plant.EvalBodyPoseInWorld(plant.CreateDefaultContext(), body)
+        core = sensor.default_color_render_camera().core()
+        cameras[name] = camera_from_drake(name, core, X_WP @ sensor.default_X_PB())
+    return cameras
+
+
+def _systems_of(diagram: Diagram | DiagramBuilder, kind: type[_System]) -> list[_System]:
+    """All systems of a kind in a diagram and in those inside it."""
+    found: list[_System] = []
+    for system in diagram.GetSystems():
+        if isinstance(system, kind):
+            found.append(system)
+        elif isinstance(system, Diagram):
+            found += _systems_of(system, kind)
+    return found
+
+
+class SilhouetteCamera(PortedSystem):
+    """Gives label images of a plant's bodies, as an RgbdSensor does, without VTK, GL or a display.
+
+    .. pydrake_system::
+
+        name: SilhouetteCamera
+        input_ports: [body_poses]
+        output_ports: [label_image, body_pose_in_world, image_time]
+
+    - ``body_poses``: the plant's output port of that name.
+    - ``label_image``: in each pixel the render label of the body that is nearest at the pixel's
+      centre, RenderLabel.kEmpty where there is none. Links hide each other.
+    - ``body_pose_in_world``: the camera's pose X_WC; ``image_time`` (1): the context's time [s].
+      Both are named as RgbdSensor's.
+
+    Surfaces are the plant's visual geometry (perception role) at full detail, as it is when the
+    camera is made. What is not the plant's is not seen, nor are half spaces (ground planes); a
+    camera has a near plane and no far one. Unlike RgbdSensor it may have parallel rays. A pose that
+    is not finite is an error: an image without that link would look like a right one.
+
+    Args:
+        plant: the bodies; finalized, and registered with the SceneGraph.
+        camera: its X_WC is the pose in the parent's frame.
+        parent: the body that carries the camera; None: the world.
+
+    Raises:
+        ModelError: the plant is not finalized, is not registered with a SceneGraph, or has nothing
+            to be seen; a link has geometry that cannot be drawn; geometry is deformable. On
+            evaluation: a body's pose is not finite.
+    """
+
+    def __init__(
+        self,
+        plant: MultibodyPlant,
+        scene_graph: SceneGraph,
+        camera: Camera,
+        parent: RigidBody | None = None,
+    ) -> None:
+        super().__init__()
+        if not plant.is_finalized():
+            raise ModelError("a SilhouetteCamera needs a plant that is finalized")
+        inspector = scene_graph.model_inspector()
+        source = plant.get_source_id()
+        if source is None or not inspector.SourceIsRegistered(source):
+            raise ModelError("the plant is not registered with the SceneGraph that was given")
+        deformable = [
+            inspector.GetName(geometry)
+            for geometry in inspector.GetAllDeformableGeometryIds()
+            if inspector.GetProperties(geometry, Role.kPerception) is not None
+        ]
+        if deformable:
+            raise ModelError(
+                f"geometry '{deformable[0]}' is deformable, which a SilhouetteCamera does not "
+                "draw; use an RgbdSensor"
+            )
+        bodies = [plant.get_body(BodyIndex(index)) for index in range(plant.num_bodies())]
+        found = [
+            (index, label, outline_from_mesh(mesh))
+            for index, body in enumerate(bodies)
+            for label, mesh in labelled_meshes(plant, scene_graph, body).items()
+            if not mesh.is_empty and label != EMPTY
+        ]
+        if not found:
+            raise ModelError("the plant has no visual geometry: the camera would see nothing")
+        self.camera = camera
+        self._names = [body.name() for body in bodies]
+        self._parent = 0 if parent is None else int(parent.index())
+        self._drawn = np.array([index for index, _, _ in found])
+        self._labels = np.array([label for _, label, _ in found], dtype=np.int16)
+        self._closed = np.array([outline.is_closed for _, _, outline in found])
+        self._packed = pack(tuple(outline for _, _, outline in found))
+        self._parameters, self._X_CP = camera.kernel_parameters(), camera.X_CW
+        bodies_posed = self.add_input("body_poses", [RigidTransform()] * len(bodies))
+        self.DeclareAbstractOutputPort(
+            "label_image",
+            AbstractValue.Make(ImageLabel16I(camera.width, camera.height)).Clone,
+            self._calc_image,
+            {bodies_posed.ticket()},
+        )
+        self.add_output(
+            "body_pose_in_world",
+            RigidTransform(),
+            lambda context: bodies_posed.Eval(context)[self._parent] @ RigidTransform(camera.X_WC),
+        )
+        time = {self.time_ticket()}
+        self.add_output("image_time", 1, lambda context: [context.get_time()], time)
+
+    def _calc_image(self, context: Context, output: AbstractValue) -> None:
+        listed = self.GetInputPort("body_poses").Eval(context)
+        if len(listed) != len(self._names):
+            raise ModelError(
+                f"{self.get_name()}: body_poses holds {len(listed)} poses, but the plant has "
+                f"{len(self._names)} bodies"
+            )
+        X_WB = np.array([pose.GetAsMatrix4() for pose in listed])
+        for name, X in zip(self._names, X_WB, strict=True):
+            if not np.isfinite(X).all():
+                raise ModelError(f"{self.get_name()}: the pose of link '{name}' is not finite")
+        X_CW = self._X_CP
+        if self._parent:
+            X_CW = X_CW @ np.linalg.inv(X_WB[self._parent])
+        X_CB = np.ascontiguousarray((X_CW @ X_WB[self._drawn])[:, :3])
+        labels = output.get_mutable_value().mutable_data[:, :, 0]
+        paint_labels(
+            self._packed, self._labels, self._closed, X_CB, self._parameters, EMPTY, labels
+        )

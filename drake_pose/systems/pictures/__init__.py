@@ -1,1 +1,0 @@
-"""Pictures as Drake systems: simulated cameras, recordings, live cameras."""

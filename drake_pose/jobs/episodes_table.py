@@ -12,7 +12,7 @@ from scipy.special import chdtrc
 
 from drake_pose.arrays import Array
 from drake_pose.csv_files import csv_text
-from drake_pose.registration.contradictions import SIGNIFICANCE
+from drake_pose.registration.diagnosis import DIAGNOSIS
 from drake_pose.registration.online_registration import pose_difference, squared_distance
 
 Found = Mapping[str, Any]
@@ -103,7 +103,7 @@ class _Standing:
         off = pose_difference(np.array(one["X_WC"]), X_WC)
         distance = squared_distance(off, covariance + np.array(one["covariance"]))
         shift, turn = 1e3 * np.linalg.norm(off[3:]), np.degrees(np.linalg.norm(off[:3]))
-        is_moved = float(chdtrc(len(off), distance)) < SIGNIFICANCE
+        is_moved = float(chdtrc(len(off), distance)) < DIAGNOSIS.significance
         return float(shift), float(turn), "yes" if is_moved else "no"
 
     def entry(self) -> dict[str, Any]:

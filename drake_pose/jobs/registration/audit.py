@@ -45,14 +45,12 @@ from drake_pose.jobs.registration.result import (
     write_overlays,
 )
 from drake_pose.jobs.registration.settings import AuditSettings
-from drake_pose.registration.contradictions import (
-    BASE,
-    LEAST_OF_JOINTS,
-    SIGNIFICANCE,
-    Audit,
+from drake_pose.registration.diagnosis import (
+    DIAGNOSIS,
+    Diagnosis,
     Finding,
-    FrameAudit,
-    audit_frames,
+    FrameDiagnosis,
+    diagnose_frames,
 )
 from drake_pose.registration.online_registration import pose_difference, squared_distance
 from drake_pose.registration.per_frame_fit import PerFrameFit
@@ -97,7 +95,7 @@ _NAMED = 3
 class SceneAudit:
     """What contradicts the rest in a scene; summary: what summary.json holds."""
 
-    audit: Audit
+    audit: Diagnosis
     summary: Mapping[str, Any]
     warnings: tuple[str, ...]
     folder: Path | None
@@ -148,7 +146,8 @@ def audit_scene(
         "frames": _describe_frames(inputs, found),
         "found_cameras": {} if look.episode is None else _describe_cameras(look.episode),
         "noticed_from": _noticed_from(found, inputs.model),
-        "principal_point_px": found.center and found.center._asdict(),
+        "principal_point_px": found.center
+        and dict(zip(("offset", "sd"), found.center, strict=True)),
         "error_sizes_px": {name: float(getattr(found.sizes, name)) for name in _SIZES},
         **describe_run(files, settings, warnings, seconds),
         "unseen": look.unseen,
@@ -165,7 +164,7 @@ class _Look(NamedTuple):
     """
 
     inputs: Inputs
-    found: Audit
+    found: Diagnosis
     unseen: list[str]
     misplaced: list[str]
     episode: EpisodeLook | None = None
@@ -184,7 +183,7 @@ def _look(episode: EpisodeInputs, on_frame: OnFrame | None) -> _Look:
     return look._replace(found=found, episode=seen)
 
 
-def _describe_frames(inputs: Inputs, found: Audit) -> dict[str, Any]:
+def _describe_frames(inputs: Inputs, found: Diagnosis) -> dict[str, Any]:
     """How well frames fit, and of which masks that is told."""
     names = [camera.name for camera in inputs.held]
     return {
@@ -212,7 +211,7 @@ def _describe_cameras(look: EpisodeLook) -> dict[str, Any]:
     }
 
 
-def _noticed_from(found: Audit, model: ArticulatedModel) -> dict[str, float | None]:
+def _noticed_from(found: Diagnosis, model: ArticulatedModel) -> dict[str, float | None]:
     """How far joints must be off to be named [deg or m]; None: never."""
     units = zip(model.position_names, user_units(model), strict=True)
     return {
@@ -265,7 +264,7 @@ def _audit(inputs: Inputs, frames: Sequence[str], on_frame: OnFrame | None) -> _
             on_frame(done)
     if not fitted:
         raise MaskError(f"{inputs.scene.path}: no mask shows the body; it must be white in them")
-    found, misplaced = audit_frames(fit, fitted), list[str]()
+    found, misplaced = diagnose_frames(fit, fitted), list[str]()
     if 2 * len(found.contradicting) > len(found.frames):
         shown = [inputs.read(one) for one in found.contradicting[:_LOOKED_AT]]
         misplaced = _misplaced(body, inputs, shown)
@@ -355,7 +354,7 @@ def _write_result(path: Path, look: _Look, overlay: bool, summary: Mapping[str, 
     write_summary(path, summary)
 
 
-def _describe_contradictions(found: Audit) -> list[dict[str, Any]]:
+def _describe_contradictions(found: Diagnosis) -> list[dict[str, Any]]:
     """What contradicts the rest, worst first: joints, cameras and the base, then frames."""
     told = [
         (one, one.kind, one.name, f"{say_off(one, 'off')} in all frames that agree, {_pixels(one)}")
@@ -391,7 +390,7 @@ def _shift(one: Finding) -> dict[str, float]:
     return {f"shift_{unit}": factor * one.shift, f"shift_sd_{unit}": factor * one.shift_sd}
 
 
-def _say_frame(one: FrameAudit, found: Finding) -> str:
+def _say_frame(one: FrameDiagnosis, found: Finding) -> str:
     """What contradicts the others in a frame, in words."""
     if found.kind == "unexplained":
         worst = min(one.fitted, key=lambda name: one.fitted[name])
@@ -514,7 +513,7 @@ def look_at_episode(
         off = compare_camera(body, given, one.found, values, alone=len(placed) == 1)
         near = off.pixels < _NEAR * one.fit.fit.seen[0].size
         held.append(given if near else one.found.camera)
-        findings += [] if near or off.p_value > SIGNIFICANCE else [off]
+        findings += [] if near or off.p_value > DIAGNOSIS.significance else [off]
         findings += _clock(body, one, recording)
         judged = judge_pictures(body, one, one.found)
         for frame in judged.frames:
@@ -551,7 +550,7 @@ def compare_camera(
         "camera", given.name, float(np.linalg.norm(off[:3])), float(np.linalg.norm(off[3:])),
         found.rotation_sd, found.translation_sd,
         _picture_shift(body, (given, values), (found.camera, values)), p_value,
-        (BASE,) if alone else (),
+        ("base",) if alone else (),
     )  # fmt: skip
 
 
@@ -567,7 +566,7 @@ def _clock(body: RegistrationBody, one: PictureRegistration, recording: Recordin
     given, found = recording.values_at(0.0)[rows], one.recording.values_at(clock.value)[rows]
     known = np.isfinite(given).all(axis=1)
     pixels = _picture_shift(body, (camera, given[known]), (camera, found[known]))
-    if pixels < LEAST_OF_JOINTS:
+    if pixels < DIAGNOSIS.min_joint_pixels:
         return []
     told = [
         ("clock", clock.value, clock.deviation, _CLOCK_SD),
@@ -580,7 +579,7 @@ def _clock(body: RegistrationBody, one: PictureRegistration, recording: Recordin
     return [
         Finding(kind, camera.name, 0.0, value, 0.0, sd, pixels, p_value)
         for kind, value, sd, p_value in several
-        if p_value < SIGNIFICANCE
+        if p_value < DIAGNOSIS.significance
     ]
 
 

@@ -3,7 +3,6 @@
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cache
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,8 +13,14 @@ from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import MaskError
 from drake_pose.jobs.registration.audit import say_off
-from drake_pose.registration import contradictions
-from drake_pose.registration.contradictions import Audit, Finding, audit_frames
+from drake_pose.registration.diagnosis import (
+    Diagnosis,
+    Finding,
+    diagnose_frames,
+    explained_frames,
+    is_half_pixel,
+    likeliest_frames,
+)
 from drake_pose.registration.per_frame_fit import FrameFit, PerFrameFit
 from drake_pose.registration.posed_frames import SeenFrame
 from drake_pose.registration.register import RegistrationBody
@@ -54,27 +59,41 @@ def test_the_likeliest_set_of_frames_agrees(shift: float, kept: slice) -> None:
 
     Frames as numbers of deviation .02; all of them together explain none of them.
     """
-    x = np.array([shift, shift + 0.01, shift - 0.01, shift, 0.0, 0.01])
+    off = np.array([shift, shift + 0.01, shift - 0.01, shift, 0.0, 0.01])
 
-    def common(chosen: np.ndarray) -> tuple[np.ndarray, float]:
+    def judge(chosen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         weight = 1.0 / 0.02**2
         # Without any frame what is given is right to within a tolerance.
         variance = 1.0 / ((1.0 if chosen.any() else 1e4) + weight * chosen.sum())
-        return np.array([weight * x[chosen].sum() * variance]), variance
+        x = weight * off[chosen].sum() * variance
+        return chi2.sf((off - x) ** 2 / (0.02**2 + variance), 1), np.array([x])
 
-    def residual(one: float, mean: np.ndarray, variance: float) -> SimpleNamespace:
-        return SimpleNamespace(p_value=chi2.sf((one - mean[0]) ** 2 / (0.02**2 + variance), 1))
-
-    frames = SimpleNamespace(
-        _info=x,
-        _explained=np.ones(6, bool),
-        _sum=lambda chosen: chosen,
-        _common=common,
-        _residual=residual,
-    )
     expected = np.zeros(6, bool)
     expected[kept] = True
-    np.testing.assert_array_equal(contradictions._Auditor._agreeing(frames), expected)
+    np.testing.assert_array_equal(likeliest_frames(np.ones(6, bool), judge), expected)
+
+
+@pytest.mark.parametrize("ratio", [0.49, 0.51, 0.74, 0.76])
+def test_a_frame_is_explained_beside_the_best_of_its_cameras(ratio: float) -> None:
+    """Three quarters of what the best frames have, and half at least, in all its pictures."""
+    best = 1.0 if ratio > 0.6 else 0.6
+    ratios = [{"left": best, "right": 0.9}, {"left": best}, {"left": ratio, "right": 0.9}]
+    found = explained_frames([*ratios, {"left": best, "right": 0.4}])
+    np.testing.assert_array_equal(found, [True, True, ratio in (0.51, 0.76), False])
+
+
+@pytest.mark.parametrize(
+    ("offset", "sd", "is_half"),
+    [
+        ((0.5, 0.5), 0.05, True),
+        ((-0.7, -0.3), 0.05, True),
+        ((0.5, -0.5), 0.05, False),
+        ((0.5, 0.8), 0.05, False),
+        ((0.5, 0.5), 0.3, False),
+    ],
+)
+def test_half_a_pixel_along_both_axes_is_named_unless_by_chance(offset, sd, is_half) -> None:
+    assert is_half_pixel(np.array(offset), sd**2 * np.eye(2)) == is_half
 
 
 Frames = Sequence[tuple[np.ndarray, np.ndarray, Sequence[PinholeCamera]]]
@@ -99,11 +118,11 @@ def audit(
     given: np.ndarray,
     taken: Sequence[PinholeCamera],
     told: Sequence[PinholeCamera] | None = None,
-) -> Audit:
+) -> Diagnosis:
     """Pictures by the cameras taken, audited with the positions and cameras that are told."""
     frames = seen(model, body, [(*one, taken) for one in zip(poses, given, strict=True)])
     fit = PerFrameFit(body.kinematics, (body.few, body.all), told or taken, frames)
-    return audit_frames(fit, [fit.fit(frame) for frame in frames])
+    return diagnose_frames(fit, [fit.fit(frame) for frame in frames])
 
 
 @pytest.fixture(scope="module")
@@ -126,7 +145,7 @@ def with_wrong(model, body, poses, right) -> Callable[..., Finding]:
     def wrong(values: np.ndarray, taken: Sequence[PinholeCamera]) -> Finding:
         fit, fits = right(len(taken))
         frames = seen(model, body, [(poses[WRONG], values, taken)] * (WRONG + 1))
-        found = audit_frames(fit, [*fits[:WRONG], fit.fit(frames[WRONG]), *fits[WRONG + 1 :]])
+        found = diagnose_frames(fit, [*fits[:WRONG], fit.fit(frames[WRONG]), *fits[WRONG + 1 :]])
         assert (found.contradicting, found.common) == ((f"{WRONG:04d}",), ())
         assert found.frames[WRONG].finding is not None
         return found.frames[WRONG].finding
@@ -144,7 +163,7 @@ class TestAuditFrames:
     def test_nothing_is_named_where_all_is_right_and_a_joint_from_where_it_is_said_to_be(
         self, model, body, poses, cameras, right
     ) -> None:
-        found = audit_frames(*right(1))
+        found = diagnose_frames(*right(1))
         assert (found.contradicting, found.common) == ((), ())
         least = found.noticed_from
         assert least.keys() == {*TreeKinematics(body.tree).names}

@@ -24,18 +24,6 @@ from drake_pose.registration.posed_frames import PosedFrame, PosedFrames
 from drake_pose.registration.register import RegisteredCamera, RegistrationBody
 from drake_pose.registration.shared_fit import SHARED, Shared, SharedFit
 
-# So many standard deviations to either side it is looked whether the cost bends as it should.
-_ASIDE = 2.0
-# Less than this share of what it should be is none.
-_NO_BEND = 1e-3
-# What is no better known than this share of what it was beforehand is not determined.
-_DETERMINED = 0.2
-# What a constant goes with is correlated with it by more.
-_GOES_WITH = 0.9
-# Each picture tells how large errors are by so many motions.
-_PICTURE_MOTIONS = 6
-_LEVEL = 0.05
-
 
 @dataclass(frozen=True)
 class KinematicParameter:
@@ -130,6 +118,7 @@ def calibrate_joints(
     names: Sequence[str],
     focal: bool = False,
     lengths: Sequence[str] = (),
+    level: float = 0.05,
 ) -> JointCalibration:
     """The zeros of some joints and lengths of links, fitted together with the cameras' poses.
 
@@ -139,6 +128,7 @@ def calibrate_joints(
         names: of the positions whose zeros are asked for.
         focal: whether the cameras' focal lengths are asked for, too.
         lengths: the links whose lengths are asked for.
+        level: what seems significant by chance in so many of calibrations.
 
     Raises:
         UnknownNameError: a name that is no position of the body's, or no link with a length.
@@ -146,8 +136,10 @@ def calibrate_joints(
     """
     require_known(body.tree, names, lengths)
     require_enough(sum(len(one) for one in frames), len(names), len(lengths))
-    own = zip(cameras, frames, strict=True)
-    seen = [PosedFrames(body.kinematics, body.all, one.camera, each) for one, each in own]
+    seen = [
+        PosedFrames(body.kinematics, body.all, one.camera, each)
+        for one, each in zip(cameras, frames, strict=True)
+    ]
     X_CW = [one.camera.X_CW for one in cameras]
     offsets = lengthened_joints(body.tree, lengths)
     asked, looks = [*names, *map(length_name, lengths)], len(POSE_NAMES) + focal
@@ -158,7 +150,23 @@ def calibrate_joints(
     while kept != sought:
         sought = kept
         fit = SharedFit(seen, X_CW, [*standing, *sought], offsets=offsets, looks=looks)
-        fit, found, covariance, values = _fit_constants(fit, _LEVEL / max(1, len(asked)), sought)
+        # Constants that are off let good frames contradict, so all count at first.
+        fit, found = fit.from_found(fit.fit(SHARED.rounds_with_constants))
+        which = fit.agreeing(fit.inlier_ratios(found))
+        fit, found = fit.from_found(fit.fit(SHARED.rounds_with_constants, found, which))
+        # Each picture tells how large errors are by six motions.
+        freedom = max(1, 6 * int(np.count_nonzero(which)) - len(fit.names))
+        own, shared = fit.covariances(found, which)
+        covariance, least = own + shared, level / max(1, len(asked))
+        values = describe_constants(fit, found, freedom, least, covariance, sought)
+        if all(one.determined for one in values.values()):
+            covariance = as_the_cost_bends(fit, found, which, own) + shared
+            values = describe_constants(fit, found, freedom, least, covariance, sought)
+            if all(one.determined for one in values.values()):
+                # Significant is what is so beside the others, once all can be told.
+                most = float(stdtrit(freedom, 1.0 - 0.5 * least))
+                beside = significant_constants(fit, found, covariance, sought, most)
+                values = {k: replace(one, significant=k in beside) for k, one in values.items()}
         told |= values
         kept = [name for name in sought if values[name].determined]
         if kept == sought:
@@ -179,32 +187,7 @@ def calibrate_joints(
     )
 
 
-def _fit_constants(
-    fit: SharedFit, level: float, names: Sequence[str]
-) -> tuple[SharedFit, Shared, Array, dict[str, KinematicParameter]]:
-    """Some constants with the cameras: the fit, what it found, its covariance, and each of them.
-
-    Significant is at a level what is so beside the others, once all can be told.
-    """
-    # Constants that are off let good frames contradict, so all count at first.
-    fit, found = fit.from_found(fit.fit(SHARED.rounds_with_constants))
-    which = fit.agreeing(fit.inlier_ratios(found))
-    fit, found = fit.from_found(fit.fit(SHARED.rounds_with_constants, found, which))
-    freedom = max(1, _PICTURE_MOTIONS * int(np.count_nonzero(which)) - len(fit.names))
-    own, shared = fit.covariances(found, which)
-    covariance = own + shared
-    values = _constants(fit, found, freedom, level, covariance, names)
-    if all(one.determined for one in values.values()):
-        covariance = _as_the_cost_bends(fit, found, which, own) + shared
-        values = _constants(fit, found, freedom, level, covariance, names)
-        if all(one.determined for one in values.values()):
-            most = float(stdtrit(freedom, 1.0 - 0.5 * level))
-            kept = _significant(fit, found, covariance, names, most)
-            values = {k: replace(one, significant=k in kept) for k, one in values.items()}
-    return fit, found, covariance, values
-
-
-def _significant(
+def significant_constants(
     fit: SharedFit, found: Shared, covariance: Array, names: Sequence[str], most: float
 ) -> list[str]:
     """Those of some constants that are off by more deviations once the others are held at 0.
@@ -225,7 +208,7 @@ def _significant(
     return kept
 
 
-def _as_the_cost_bends(fit: SharedFit, found: Shared, which: Mask, covariance: Array) -> Array:
+def as_the_cost_bends(fit: SharedFit, found: Shared, which: Mask, covariance: Array) -> Array:
     """(u, u) the covariance, larger along constants whose cost bends less than it should.
 
     A round base that turns looks as before, but the edges of its mesh's facets seem to move until
@@ -234,33 +217,43 @@ def _as_the_cost_bends(fit: SharedFit, found: Shared, which: Mask, covariance: A
     found_covariance = covariance.copy()
     for k in range(len(fit.names) - len(fit.constants), len(fit.names)):
         along = covariance[:, k] / math.sqrt(covariance[k, k])
-        bends, said = fit.bend(found, _ASIDE * along, SHARED.rounds_with_constants[-1], which)
-        share = min(1.0, max(_NO_BEND, bends / said))
+        # It is looked two standard deviations to either side; no bend is a thousandth.
+        bends, said = fit.bend(found, 2.0 * along, SHARED.rounds_with_constants[-1], which)
+        share = min(1.0, max(1e-3, bends / said))
         found_covariance += (1.0 / share - 1.0) * np.outer(along, along)
     return found_covariance
 
 
-def _constants(
+def describe_constants(
     fit: SharedFit,
     found: Shared,
     freedom: int,
     level: float,
     covariance: Array,
     names: Sequence[str],
+    *,
+    determined: float = 0.2,
+    goes_with: float = 0.9,
 ) -> dict[str, KinematicParameter]:
-    """Some constants by name, each with its interval, or what it goes with where that is all."""
+    """Some constants by name, each with its 95 % interval, or what it goes with.
+
+    Args:
+        level: p-value below which a constant is significant.
+        determined: largest deviation of what is determined, over that of what was known before.
+        goes_with: least correlation with what a constant cannot be told from.
+    """
     deviations = np.sqrt(np.diag(covariance))
     told = {}
     for name in names:
         k = fit.names.index(name)
         value, deviation = float(found.shared[k]), float(deviations[k])
-        if deviation > _DETERMINED * SHARED.constant_deviation:
-            goes = np.abs(covariance[:, k]) > _GOES_WITH * deviations * deviation
+        if deviation > determined * SHARED.constant_deviation:
+            goes = np.abs(covariance[:, k]) > goes_with * deviations * deviation
             gauge = tuple(fit.names[j] for j in np.flatnonzero(goes) if j != k)
             ends = (-math.inf, math.inf)
             told[name] = KinematicParameter(name, 0.0, math.inf, *ends, False, gauge)
             continue
-        width = float(stdtrit(freedom, 1.0 - 0.5 * _LEVEL)) * deviation
+        width = float(stdtrit(freedom, 1.0 - 0.5 * 0.05)) * deviation
         p_value = 2.0 * float(stdtr(freedom, -abs(value) / deviation))
         low, middle, high = value - width, value, value + width
         if name not in fit.seen[0].kinematics.names:

@@ -30,22 +30,6 @@ from drake_pose.registration.register import (
     areas,
 )
 
-# A frame contradicts of which less than this share fits of what usually fits.
-_CONTRADICTS = 0.7
-# A bump turns the camera by no more [rad], and shifts it by no more [its distance from the body]:
-# from there a fit leads to the same look of the body. Farther away, all poses are searched.
-_BUMP = 0.2
-# Before anything differed, the covariance is trusted as if so many numbers had borne it out; sets
-# of the newest keyframes overlap, so that each new one adds fewer numbers than a pose has.
-_TRUST = 4.0
-# A frame is a keyframe where the body's points are this far from where they are in all keyframes,
-# root mean square [the body's own extent]; else it says nothing new unless body and mask differ by
-# so much more [the mask's area].
-_NOVELTY, _TOLERANCE = 0.15, 0.04
-# Mean intersection over union, below which no camera is believed to be found; and how improbable by
-# chance a difference is that counts as a moved camera.
-_LOWEST_IOU, _FALSE_ALARM = 0.5, 1e-6
-
 
 class CameraStatus(IntEnum):
     """What is known of a camera's pose: nothing; the pose; that the last frames contradict it."""
@@ -63,6 +47,18 @@ class OnlineSettings:
         least_frames: the camera is searched for in so many keyframes or more.
         most_frames: so many keyframes are kept at most, the newest.
         newest: so many keyframes, or frames that contradict the pose, tell that it has changed.
+        min_inlier_ratio: a frame contradicts the pose if its inlier ratio is below this fraction of
+            the keyframes' median.
+        bump: a bump turns the camera by no more [rad], and shifts it by no more [its distance from
+            the body]: from there a fit leads to the same view. Farther away all poses are searched.
+        trust: before anything differed, the covariance is trusted as if so many numbers had borne
+            it out; sets of the newest keyframes overlap, so that each new one adds fewer numbers
+            than a pose has.
+        novelty: a frame is a keyframe where the body's points are this far from where they are in
+            all keyframes, root mean square [the body's own extent]; or where
+        tolerance: body and mask differ by so much more than in the keyframe [the mask's area].
+        min_iou: mean intersection over union, below which no camera is believed to be found.
+        false_alarm: p-value of a difference that counts as a moved camera.
 
     Raises:
         SettingsError: not 2 <= newest <= least_frames <= most_frames.
@@ -71,6 +67,13 @@ class OnlineSettings:
     least_frames: int = 5
     most_frames: int = 12
     newest: int = 3
+    min_inlier_ratio: float = 0.7
+    bump: float = 0.2
+    trust: float = 4.0
+    novelty: float = 0.15
+    tolerance: float = 0.04
+    min_iou: float = 0.5
+    false_alarm: float = 1e-6
 
     def __post_init__(self) -> None:
         if not 2 <= self.newest <= self.least_frames <= self.most_frames:
@@ -160,12 +163,12 @@ class OnlineRegistration:
         if near is not None:
             posed = PosedFrames(self.body.kinematics, self.body.few, registered.camera, [frame])
             left = E_total(areas(posed, registered.camera.X_CW[None], np.inf))[0, 0]
-            if left <= registered.frames[near].E_total + _TOLERANCE:
+            if left <= registered.frames[near].E_total + self.settings.tolerance:
                 return replace(state, contradicting=(), contradictions=0)
         keyframes = self._kept(state.keyframes, frame, near)
         again = self._search.refine(registered.camera, keyframes)
         newest = again.frames[-1]
-        if not (newest.agrees and newest.inlier_ratio >= _least_inlier_ratio(registered)):
+        if not (newest.agrees and newest.inlier_ratio >= self._least_inlier_ratio(registered)):
             return self._contradict(state, registered, frame)
         # The pose, or that of the newest keyframes alone where they say otherwise.
         state = _registered(state, again, keyframes)
@@ -189,12 +192,13 @@ class OnlineRegistration:
         state = replace(state, contradicting=frames, contradictions=state.contradictions + 1)
         if near is not None or len(frames) < settings.newest:
             return state
-        least, X_WC = _least_inlier_ratio(registered), registered.camera.X_WC
+        least, X_WC = self._least_inlier_ratio(registered), registered.camera.X_WC
         found: RegisteredCamera | None = self._search.refine(registered.camera, frames)
         assert found is not None
         off = pose_difference(found.camera.X_WC, X_WC)
         distance = np.linalg.norm(X_WC[:3, 3] - self._points(frame).mean(axis=0))
-        is_bump = max(np.linalg.norm(off[:3]), np.linalg.norm(off[3:]) / distance) <= _BUMP
+        turn, shift = np.linalg.norm(off[:3]), np.linalg.norm(off[3:]) / distance
+        is_bump = max(turn, shift) <= settings.bump
         if not (is_bump and self._is_found(found, settings.newest, least)):
             enough = len(frames) >= settings.least_frames
             found = self._find(frames, least) if enough else None
@@ -210,12 +214,12 @@ class OnlineRegistration:
         self, state: OnlineState, found: RegisteredCamera, registered: RegisteredCamera
     ) -> bool:
         """Whether a pose differs from that of before by more than such poses differ by chance."""
-        newest = self.settings.newest
+        newest, trust = self.settings.newest, self.settings.trust
         # In the last ones there may be frames of the new pose already.
         usual = state.distances[: max(0, len(state.distances) - newest + 1)]
         told = 6.0 / newest * len(usual)
-        scale = (_TRUST + told / 6.0 * sum(usual) / max(1, len(usual))) / (_TRUST + told)
-        limit = 6.0 * float(fdtri(6.0, _TRUST + told, 1.0 - _FALSE_ALARM))
+        scale = (trust + told / 6.0 * sum(usual) / max(1, len(usual))) / (trust + told)
+        limit = 6.0 * float(fdtri(6.0, trust + told, 1.0 - self.settings.false_alarm))
         return _distance(found, registered) > limit * max(1.0, scale)
 
     def _find(self, frames: Sequence[PosedFrame], least: float = 0.0) -> RegisteredCamera | None:
@@ -232,9 +236,14 @@ class OnlineRegistration:
         return (
             not len(found.alternatives)
             and len(agreeing) >= max(count, len(found.frames) // 2 + 1)
-            and float(np.mean([frame.iou for frame in agreeing])) >= _LOWEST_IOU
+            and float(np.mean([frame.iou for frame in agreeing])) >= self.settings.min_iou
             and float(np.median([frame.inlier_ratio for frame in agreeing])) >= least
         )
+
+    def _least_inlier_ratio(self, registered: RegisteredCamera) -> float:
+        """Of both contours' lengths, what fits at least in a frame that does not contradict."""
+        ratios = [frame.inlier_ratio for frame in registered.frames]
+        return self.settings.min_inlier_ratio * float(np.median(ratios))
 
     def _kept(
         self, frames: Sequence[PosedFrame], frame: PosedFrame, instead_of: int | None = None
@@ -249,7 +258,7 @@ class OnlineRegistration:
         extent = float(np.sqrt(((here - here.mean(axis=0)) ** 2).sum(axis=1).mean()))
         for k in reversed(range(len(frames))):
             off = np.sqrt(((self._points(frames[k]) - here) ** 2).sum(axis=1).mean())
-            if off < _NOVELTY * extent:
+            if off < self.settings.novelty * extent:
                 return k
         return None
 
@@ -284,8 +293,3 @@ def _distance(found: RegisteredCamera, registered: RegisteredCamera) -> float:
     """Squared Mahalanobis distance of a pose from another, by its own covariance."""
     off = pose_difference(found.camera.X_WC, registered.camera.X_WC)
     return squared_distance(off, found.covariance)
-
-
-def _least_inlier_ratio(registered: RegisteredCamera) -> float:
-    """Of both contours' lengths, what fits at least in a frame that does not contradict."""
-    return _CONTRADICTS * float(np.median([frame.inlier_ratio for frame in registered.frames]))

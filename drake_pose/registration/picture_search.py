@@ -13,6 +13,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -39,27 +40,26 @@ from drake_pose.silhouette.areas.outline import NOTHING, Outline, pack
 from drake_pose.silhouette.areas.scoring import draw_mask
 from drake_pose.workers import map_ordered
 
-SEARCHED = 12
-"""So many pictures carry a search."""
 
-# So many frames, those that differ most, say which share of the starts is looked at in all.
-_FIRST, _GOOD = 4, 0.25
-ABOUT = 100
-"""Triangles of a node where a body is about."""
+class PictureSettings(NamedTuple):
+    """Numbers of a search in pictures.
 
-# Triangles of a node, up to which width of pictures [pixel].
-_TRIANGLES, _WIDTHS = (12, 40, ABOUT), (64, 120)
-# Parts that are smaller than so many times the largest one do not show in the smallest pictures.
-_SMALL = 0.25
-# Poses are compared in pictures so wide, and backgrounds learned in these.
-_COMPARED, _LEARNED = 160, 320
-# Fits on lines: scales of steps [pixel of a picture _SCALED wide], and from line to line [scale];
-# backgrounds are learned anew before each row. What lines cost does not compare from place to
-# place, so each step is taken.
-_SCALED, _SPACING = 320.0, 0.5
-_ROUGH = ((*(12.0,) * 4, *(8.0,) * 4, *(5.0,) * 4), (*(6.0,) * 3, *(4.0,) * 3))
-_FINE = ((*(5.0,) * 4, *(3.0,) * 4), (*(3.0,) * 2, *(2.0,) * 3, *(1.0,) * 3))
-_LAST = (0.75,) * 7
+    searched: number of pictures that carry a search. triangles: of a node, in levels of pictures up
+    to 64 and up to 120 pixels wide, and beyond; the last ones also show where a body is about.
+    compared, learned: width of the pictures in which poses are compared, and in which backgrounds
+    are learned [pixel]. contours: weight of contours' edges beside the share that is explained.
+    rate_step: rates are told by positions so much before and after [s].
+    """
+
+    searched: int = 12
+    triangles: tuple[int, int, int] = (12, 40, 100)
+    compared: int = 160
+    learned: int = 320
+    contours: float = 4.0
+    rate_step: float = 0.05
+
+
+PICTURES = PictureSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,10 +140,10 @@ class PictureSearch:
         self, body: RegistrationBody, camera: PinholeCamera, frames: Sequence[PosedPicture]
     ) -> None:
         self._body, self._camera, self.frames = body, camera, tuple(frames)
-        coarse = hull_of_few(body.very_few, _TRIANGLES[0])
-        least = _SMALL * max(one.ball[3] for one in coarse)
+        coarse, *finer = (hull_of_few(body.very_few, count) for count in PICTURES.triangles)
+        # Smaller parts do not show in the smallest pictures.
+        least = 0.25 * max(one.ball[3] for one in coarse)
         coarse = tuple(one if one.ball[3] >= least else NOTHING for one in coarse)
-        finer = (hull_of_few(body.very_few, count) for count in _TRIANGLES[1:])
         self._outlines = (coarse, *finer)
         self._X_WN = np.array([body.kinematics.poses(one.values) for one in frames])
         self._levels = dict[int, PictureLevel]()
@@ -151,25 +151,35 @@ class PictureSearch:
     @property
     def compared(self) -> PictureLevel:
         """In which poses are compared."""
-        return self._level(_COMPARED)
+        return self._level(PICTURES.compared)
 
-    def search(self) -> list[Array]:
-        """Poses X_CW (4, 4) near which the camera's may be, best first."""
-        rounds = (
-            SearchRound(64, 250, 24, 0.25),
-            SearchRound(64, 80, 30, 0.15),
-            SearchRound(80, 30, 50, 0.1),
-            SearchRound(160, 10, 80, 0.06),
-        )
-        level = self._level(rounds[0].width)
-        found = level.starts()
-        for frames, share in ((_FIRST, _GOOD), (len(self.frames), 1.0)):
+    def search(
+        self,
+        rounds: Sequence[tuple[int, int, int, float]] = (
+            (64, 250, 24, 0.25),
+            (64, 80, 30, 0.15),
+            (80, 30, 50, 0.1),
+            (160, 10, 80, 0.06),
+        ),
+        rotations: int = 1200,
+    ) -> list[Array]:
+        """Poses X_CW (4, 4) near which the camera's may be, best first.
+
+        Args:
+            rounds: width of the pictures [pixel], number of poses that are improved, evaluations of
+                each, and the first simplex's turn [rad].
+            rotations: number of rotations that are tried, over all and again near upright.
+        """
+        level = self._level(rounds[0][0])
+        found = level.starts(rotations)
+        # A few frames, those that differ most, rank all starts.
+        for frames, share in ((4, 0.25), (len(self.frames), 1.0)):
             found = level.best(found, frames, share)
-        after = (*(one.kept for one in rounds[1:]), rounds[-1].kept)
-        for step, most in zip(rounds, after, strict=True):
-            level = self._level(step.width)
-            improve = partial(level.improve, step=step)
-            improved = map_ordered(improve, enumerate(found[: step.kept]))
+        after = (*(kept for _, kept, _, _ in rounds[1:]), rounds[-1][1])
+        for (width, kept, evaluations, turn), most in zip(rounds, after, strict=True):
+            level = self._level(width)
+            improve = partial(level.improve, evaluations=evaluations, turn=turn)
+            improved = map_ordered(improve, enumerate(found[:kept]))
             improved.sort(key=lambda one: -one[0])
             found = level.distinct([X for _, X in improved], most)
         return found
@@ -180,7 +190,8 @@ class PictureSearch:
         None where the body leaves the pictures.
         """
         frames, small = self._small
-        for scales in _ROUGH:
+        rough = ((*(12.0,) * 4, *(8.0,) * 4, *(5.0,) * 4), (*(6.0,) * 3, *(4.0,) * 3))
+        for scales in rough:
             camera = small.with_pose(np.linalg.inv(X_CW))
             known, covered = self._learn(camera, frames)
             seen = self._see(camera, frames, known, covered, self._outlines[-1])
@@ -202,7 +213,11 @@ class PictureSearch:
             focal: whether its focal length is, too.
         """
         looks, seen = len(POSE_NAMES) + focal, None
-        for scales, outlines in zip(_FINE, (self._outlines[-1], self._body.few), strict=True):
+        # Backgrounds are learned anew before each row of steps.
+        for scales, outlines in (
+            ((*(5.0,) * 4, *(3.0,) * 4), self._outlines[-1]),
+            ((*(3.0,) * 2, *(2.0,) * 3, *(1.0,) * 3), self._body.few),
+        ):
             known, covered = self._learn(camera, self.frames)
             seen = self._see(camera, self.frames, known, covered, outlines)
             if seen is None:
@@ -214,16 +229,18 @@ class PictureSearch:
         assert seen is not None
         whole = PosedFrames(self._body.kinematics, self._body.all, camera, seen.frames)
         fit = SharedFit([whole], [camera.X_CW], constants, looks=looks)
-        found = fit.start._replace(shared=_constants_of(fit, found))
+        # The camera is where it was found now; the constants are not.
+        constant = np.arange(len(fit.names)) >= fit.per_camera
+        found = fit.start._replace(shared=np.where(constant, found.shared, 0.0))
         which = fit.agreeing(fit.inlier_ratios(found))
-        found = fit.fit(_stages(_LAST, whole), found, which)
+        found = fit.fit(_stages((0.75,) * 7, whole), found, which)
         camera = fit.cameras(found)[0]
         return PictureFit(fit, found, known, *self.compared.explained(camera.X_CW))
 
     @cached_property
     def _small(self) -> tuple[list[PosedPicture], PinholeCamera]:
         """The frames with pictures as backgrounds are learned in, and their camera."""
-        camera = self._level(_LEARNED).camera
+        camera = self._level(PICTURES.learned).camera
         size = camera.width, camera.height
         return [
             replace(
@@ -239,7 +256,7 @@ class PictureSearch:
         self, camera: PinholeCamera, frames: Sequence[PosedPicture]
     ) -> tuple[KnownBackground, Mask]:
         """What is behind the body before a camera, and where that is (f, H, W)."""
-        level = self._level(_LEARNED)
+        level = self._level(PICTURES.learned)
         small = camera.resized(level.camera.width, level.camera.height)
         poses = camera.X_CW @ self._X_WN
         both = [
@@ -264,7 +281,7 @@ class PictureSearch:
             covered: (f, H, W) where the body is about; frames that do not show it tell nothing.
             outlines: the surfaces that are compared.
         """
-        lights = self._level(_LEARNED).backgrounds.lights
+        lights = self._level(PICTURES.learned).backgrounds.lights
 
         def see(k: int) -> PosedFrame | None:
             return see_picture(frames[k], known, lights[k], covered[k])
@@ -276,8 +293,8 @@ class PictureSearch:
 
     def _level(self, width: int) -> PictureLevel:
         if width not in self._levels:
-            k = sum(width > one for one in _WIDTHS)
-            count = SEARCHED if width < _COMPARED else len(self.frames)
+            k = (width > 64) + (width > 120)
+            count = PICTURES.searched if width < PICTURES.compared else len(self.frames)
             pictures = [one.picture for one in self.frames[:count]]
             self._levels[width] = PictureLevel(
                 self._outlines[k], self._camera, pictures, self._X_WN[:count], width
@@ -286,16 +303,12 @@ class PictureSearch:
 
 
 def _stages(scales: Sequence[float], seen: PosedFrames) -> list[AnnealingStage]:
-    """Steps at some scales, of pictures that are not so wide."""
-    sizes = np.array(scales) * seen.camera.width / _SCALED / seen.size
-    return [AnnealingStage(one, _SPACING * one) for one in sizes.tolist()]
+    """Steps at some scales [pixel of a picture 320 wide]; lines are half a scale apart.
 
-
-def _constants_of(fit: SharedFit, found: Shared) -> Array:
-    """(u,) what was found of all but the camera, which a fit has where it was found."""
-    shared = found.shared.copy()
-    shared[: fit.per_camera] = 0.0
-    return shared
+    What lines cost does not compare from place to place, so each step is taken.
+    """
+    sizes = np.array(scales) * seen.camera.width / 320.0 / seen.size
+    return [AnnealingStage(one, 0.5 * one) for one in sizes.tolist()]
 
 
 def see_picture(
@@ -314,49 +327,12 @@ def see_picture(
     return PosedFrame(one.name, one.values, mask, odds_picture(odds), one.rates)
 
 
-CONTOURS = 4.0
-"""What contours' edges count beside the share that is explained."""
-
-# Rotations that are tried: over all, and near upright. The body is tried so many times as far away
-# as it would be if it changed all that does, and aside by about so many times the size of that.
-_ALL, _UPRIGHT = 1200, 1200
-_DISTANCES, _ASIDE = (0.7, 1.0, 1.5), 0.5
-# Upright cameras look up or down by these sines at most, and are rolled by about so much [rad].
-_PITCHES, _ROLL = (-0.98, 0.5), 0.15
-# A node stands still that moves by less than this share of the body's size; nothing is nearer to
-# the camera than this share.
-_STILL, _NEAREST = 0.06, 0.05
-# Steps of a simplex: turns [rad], shifts of the middle in the picture [focal lengths], log depth.
-_STEPS = np.array([1.0, 1.0, 1.0, 0.4, 0.4, 0.6])
-# Poses are apart whose bodies are by more of the body's size.
-_APART = 0.08
-# What a pose explains is told apart by so many squares of the picture's longer side.
-_SQUARES = 16
-# By how much of the picture's width a frame's outline counts as longer in a search.
-_SHORT = 0.3
-# So many poses are scored by a worker at once.
-_AT_ONCE = 200
-
-
-@dataclass(frozen=True)
-class SearchRound:
-    """So many poses are improved in pictures of a width [pixel] by so many evaluations.
-
-    step: of the first simplex, of a turn [rad]; the other steps follow.
-    """
-
-    width: int
-    kept: int
-    evaluations: int
-    step: float
-
-
 def evidence(explained: float, contour: float) -> float:
     """How much speaks for a pose, of the share that it explains and its contours' edges.
 
     Sums over contours are misled: a wrong pose that shows more of the body has longer ones.
     """
-    return explained + CONTOURS * contour
+    return explained + PICTURES.contours * contour
 
 
 class PictureLevel:
@@ -395,7 +371,8 @@ class PictureLevel:
         owners = np.repeat(np.arange(len(outlines)), [len(one.vertices) for one in outlines])
         most = np.zeros(len(outlines))
         np.maximum.at(most, owners, moves)
-        self._still = most < _STILL * size
+        # What hardly moves beside the body's size stands still.
+        self._still = most < 0.06 * size
         moving = points[:, ~self._still[owners]]
         self._points = (moving if moving.size else points).reshape(-1, 3)
         self._middle = self._points.mean(axis=0)
@@ -424,7 +401,7 @@ class PictureLevel:
         """
         X_WN = self._X_WN[:frames]
         told = self.told(X_CW, X_WN)
-        outline = told[Explained.OUTLINE] + _SHORT * len(X_WN) * self.camera.width
+        outline = told[Explained.OUTLINE] + 0.3 * len(X_WN) * self.camera.width
         possible = self.backgrounds.possible * len(X_WN) / len(self._X_WN)
         return evidence(
             float(told[Explained.GAIN]) / max(possible, 1e-9),
@@ -437,36 +414,41 @@ class PictureLevel:
         def scores(some: Sequence[Array]) -> list[float]:
             return [self.score(X, frames) for X in some]
 
-        some = [X_CW[k : k + _AT_ONCE] for k in range(0, len(X_CW), _AT_ONCE)]
+        some = [X_CW[k : k + 200] for k in range(0, len(X_CW), 200)]
         order = np.argsort(-np.concatenate(map_ordered(scores, some)), kind="stable")
         return [X_CW[k] for k in order[: math.ceil(share * len(order))]]
 
-    def pieces(self, X_CW: Array) -> Array:
-        """(k, k) what a pose (4, 4) explains, by squares of the picture."""
-        X_CN = X_CW[:3] @ self._X_WN
-        side = max(self.camera.width, self.camera.height) / _SQUARES
-        sums = self.backgrounds.sums
-        return explain(self._packed, X_CN, self._still, self._parameters, sums, side, _SQUARES)[1]
+    def pieces(self, X_CW: Array, squares: int = 16) -> Array:
+        """(k, k) what a pose (4, 4) explains, by so many squares of the picture's longer side."""
+        side = max(self.camera.width, self.camera.height) / squares
+        pieces = explain(
+            self._packed, X_CW[:3] @ self._X_WN, self._still, self._parameters,
+            self.backgrounds.sums, side, squares,
+        )  # fmt: skip
+        return pieces[1]
 
-    def starts(self) -> list[Array]:
-        """Poses X_CW (4, 4) that show the body where pictures change, and about as large."""
+    def starts(self, rotations: int = 1200) -> list[Array]:
+        """Poses X_CW (4, 4) that show the body where pictures change, and about as large.
+
+        Each of twice so many rotations comes at three distances, there and aside of there.
+        """
         changes = self.backgrounds.changes()
         v, u = np.mgrid[: changes.shape[0], : changes.shape[1]]
         total = max(float(changes.sum()), 1e-9)
         middle = np.array([float((changes * one).sum()) / total for one in (u, v)])
         squares = (u - middle[0]) ** 2 + (v - middle[1]) ** 2
         spread = max(float(np.sqrt((changes * squares).sum() / total)), 2.0)
-        R_CW = np.concatenate([spread_rotations(_ALL), _upright_rotations(_UPRIGHT)])
+        R_CW = np.concatenate([spread_rotations(rotations), upright_rotations(rotations)])
         points = self._points[:: max(1, len(self._points) // 200)] - self._middle
         p_C = np.einsum("nij,pj->npi", R_CW, points)
         sizes = np.sqrt((p_C[..., :2] ** 2).sum(axis=2).mean(axis=1))
-        nearest = _NEAREST * self._size - 0.7 * p_C[..., 2].min(axis=1)
+        nearest = 0.05 * self._size - 0.7 * p_C[..., 2].min(axis=1)
         rng = np.random.default_rng(0)
         focal, centre = self._parameters[1:3], self._parameters[3:5]
         found = []
-        for times in _DISTANCES:
+        for times in (0.7, 1.0, 1.5):
             depth = np.maximum(focal[0] * sizes / spread * times, nearest)
-            for aside in (np.zeros((len(R_CW), 2)), rng.normal(0.0, _ASIDE, (len(R_CW), 2))):
+            for aside in (np.zeros((len(R_CW), 2)), rng.normal(0.0, 0.5, (len(R_CW), 2))):
                 X = np.tile(np.eye(4), (len(R_CW), 1, 1))
                 X[:, :3, :3] = R_CW
                 place = (middle + spread * aside - centre) / focal
@@ -475,17 +457,22 @@ class PictureLevel:
                 found += list(X)
         return found
 
-    def improve(self, numbered: tuple[int, Array], step: SearchRound) -> tuple[float, Array]:
+    def improve(
+        self, numbered: tuple[int, Array], evaluations: int, turn: float
+    ) -> tuple[float, Array]:
         """The best score near a pose (4, 4), and that pose (Nelder and Mead's simplex).
 
-        numbered: the pose, and a number that says which way the simplex begins.
+        Args:
+            numbered: a number that says which way the simplex begins, and the pose.
+            evaluations: at most so many.
+            turn: of the first simplex [rad]; its other steps follow.
         """
         key, X_CW = numbered
         signs = np.random.default_rng(key).choice([-1.0, 1.0], 6)
-        simplex = np.vstack([np.zeros(6), np.diag(step.step * signs * _STEPS)])
-        options = {
-            "maxfev": step.evaluations, "initial_simplex": simplex, "xatol": 0.0, "fatol": 0.0,
-        }  # fmt: skip
+        # Turns [rad], shifts of the middle in the picture [focal lengths], log depth.
+        steps = turn * signs * np.array([1.0, 1.0, 1.0, 0.4, 0.4, 0.6])
+        simplex = np.vstack([np.zeros(6), np.diag(steps)])
+        options = {"maxfev": evaluations, "initial_simplex": simplex, "xatol": 0.0, "fatol": 0.0}
 
         def cost(x: Array) -> float:
             return -self.score(self._moved(X_CW, x))
@@ -500,7 +487,7 @@ class PictureLevel:
         for X in X_CW:
             p_C = some @ X[:3, :3].T + X[:3, 3]
             apart = np.linalg.norm(places - p_C, axis=2).mean(axis=1)
-            if (apart > _APART * self._size).all():
+            if (apart > 0.08 * self._size).all():
                 kept.append(X)
                 places = np.concatenate([places, p_C[None]])
             if len(kept) == most:
@@ -518,13 +505,16 @@ class PictureLevel:
         return moved
 
 
-def _upright_rotations(count: int) -> Array:
-    """(count, 3, 3) rotations R_CW of cameras about upright in a world whose z is up."""
+def upright_rotations(count: int) -> Array:
+    """(count, 3, 3) rotations R_CW of cameras about upright in a world whose z is up.
+
+    They look up by 30 degrees and down by 79 at most, and are rolled by about 0.15 rad.
+    """
     k = np.arange(count) + 0.5
     rng = np.random.default_rng(1)
     heading = 2.0 * np.pi * k * (0.5 * (np.sqrt(5.0) - 1.0))
-    pitch = np.arcsin(np.linspace(*_PITCHES, count))
-    roll = rng.normal(0.0, _ROLL, count)
+    pitch = np.arcsin(np.linspace(-0.98, 0.5, count))
+    roll = rng.normal(0.0, 0.15, count)
     forward = np.column_stack(
         [np.cos(pitch) * np.cos(heading), np.cos(pitch) * np.sin(heading), np.sin(pitch)]
     )

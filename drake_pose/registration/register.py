@@ -13,7 +13,7 @@ from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from itertools import combinations
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,35 +39,43 @@ from drake_pose.silhouette.areas.outline import NOTHING, Outline
 from drake_pose.silhouette.areas.scoring import draw_mask, score_bodies
 from drake_pose.workers import map_ordered
 
-COARSE = tuple(AnnealingStage(s, 0.05) for s in (0.25, 0.2, 0.15, 0.12, 0.09, 0.07, 0.05, 0.04))
-FINE = (
-    AnnealingStage(0.05, 0.02),
-    AnnealingStage(0.03, 0.015),
-    AnnealingStage(0.02, 0.0125),
-    AnnealingStage(0.01, 0.0125, 4),
-)
-LAST = (AnnealingStage(0.02, 0.01), AnnealingStage(0.01, 0.005), AnnealingStage(0.005, 0.005, 6))
-# Spacing of silhouettes' edge points in each of these [root of the silhouettes' area].
-COARSE_SPACING, FINE_SPACING = 1.0 / 40.0, 1.0 / 80.0
-# Rotations tried and fitted in a search that is rough.
-_ROUGH = (2000, 15)
-# Sides of silhouettes in the pictures in which poses are compared [pixel].
-FIRST_SIDE, SECOND_SIDE = 40.0, 100.0
-# Poses that show the bodies nearer to each other than this are one [root of the area].
-_APART = 0.03
-# After so many parts of the coarse fit so many poses go on, and so many are fitted finely.
-_FIRST_LOOK, _HOPEFUL, _KEPT = 3, 12, 6
-# So many of many frames tell near what poses all of them are fitted.
-_ENOUGH = 24
-# What is missing or too much is about as large [root of the area].
-_PIECE = 0.2
-# A pose is worse whose cost is larger by more standard deviations of the difference.
-_SIGNIFICANCE = 1.96
-# And is not fitted to the end that is worse by so many when its fit is half done.
-_HOPELESS = 6.0
-# Silhouettes of suggested poses are compared in pictures about so wide [pixel].
-_WIDTH = 160
 
+class CameraSearchSettings(NamedTuple):
+    """How cameras are searched for and fitted.
+
+    coarse, fine, last: parts of fits, one after the other. coarse_spacing, fine_spacing: of
+    silhouettes' edge points in the first two [root of the silhouettes' area]. first_side,
+    second_side: sides of silhouettes in the pictures in which starts, and coarse fits, are compared
+    [pixel]. significance: poses are as good whose cost is larger by no more standard deviations of
+    the difference; it is told by pieces of so many roots of the area: what is missing or too much
+    is about as large.
+    """
+
+    coarse: tuple[AnnealingStage, ...] = tuple(
+        map(AnnealingStage, (0.25, 0.2, 0.15, 0.12, 0.09, 0.07, 0.05, 0.04), 8 * (0.05,))
+    )
+    fine: tuple[AnnealingStage, ...] = (
+        AnnealingStage(0.05, 0.02),
+        AnnealingStage(0.03, 0.015),
+        AnnealingStage(0.02, 0.0125),
+        AnnealingStage(0.01, 0.0125, 4),
+    )
+    last: tuple[AnnealingStage, ...] = (
+        AnnealingStage(0.02, 0.01),
+        AnnealingStage(0.01, 0.005),
+        AnnealingStage(0.005, 0.005, 6),
+    )
+    coarse_spacing: float = 1.0 / 40.0
+    fine_spacing: float = 1.0 / 80.0
+    first_side: float = 40.0
+    second_side: float = 100.0
+    significance: float = 1.96
+    piece: float = 0.2
+
+
+SEARCH = CameraSearchSettings()
+
+T = TypeVar("T")
 Corner = tuple[float, float, float]
 Box = tuple[Corner, Corner]
 """The least and the largest corner along the world's axes [m]."""
@@ -197,7 +205,7 @@ class CameraSearch:
 
     def rough(self) -> CameraSearch:
         """A search that is faster, and less sure."""
-        return CameraSearch(self._body, *_ROUGH)
+        return CameraSearch(self._body, rotations=2000, fitted=15)
 
     def register(self, camera: PinholeCamera, frames: Sequence[PosedFrame]) -> RegisteredCamera:
         """Finds the camera's pose; that which it has is not used.
@@ -223,39 +231,49 @@ class CameraSearch:
     def _fitted(
         self, camera: PinholeCamera, frames: Sequence[PosedFrame], looks: Sequence[Array]
     ) -> RegisteredCamera:
-        """The best of the poses that are fitted from some X_CW (4, 4), and those as good."""
-        kinematics, some = self._body.kinematics, spread(frames, _ENOUGH)
-        fine = PosedFrames(kinematics, self._body.few, camera, some, FINE_SPACING)
+        """The best of the poses that are fitted from some X_CW (4, 4), and those as good.
+
+        Some of many frames tell near what poses all of them are fitted.
+        """
+        kinematics, some = self._body.kinematics, spread(frames, 24)
+        fine = PosedFrames(kinematics, self._body.few, camera, some, SEARCH.fine_spacing)
         last = PosedFrames(kinematics, self._body.all, camera, some, LAST_SPACING)
-        likely = _likely(fine, map_ordered(partial(_fit_from, fine, FINE), looks))
-        fitted = distinct(last, map_ordered(partial(_fit_from, last, LAST), likely))
+        halfway = map_ordered(partial(fit_pose, fine, rounds=SEARCH.fine), looks)
+        begun = [SharedFit([fine], [X], widths=False) for X in halfway]
+        side = max(1.0, SEARCH.piece * fine.size)
+        pieces = [fit.piece_costs(fit.start, side) for fit in begun]
+        order = np.argsort([one.sum() for one in pieces], kind="stable")
+        # Those that are far worse than the best now are not fitted to the end.
+        likely = [halfway[k] for k in order if excess(pieces[k], pieces[order[0]]) <= 6.0]
+        likely = distinct(fine, likely)
+        fitted = distinct(last, map_ordered(partial(fit_pose, last, rounds=SEARCH.last), likely))
         if len(some) < len(frames):
             last = PosedFrames(kinematics, self._body.all, camera, frames, LAST_SPACING)
         fits = [SharedFit([last], [X_CW]) for X_CW in fitted]
         return describe_fitted([*zip(fits, map_ordered(with_widths, fits), strict=True)])[0]
 
     def search(
-        self, camera: PinholeCamera, frames: Sequence[PosedFrame], kept: int = _KEPT
+        self, camera: PinholeCamera, frames: Sequence[PosedFrame], kept: int = 6
     ) -> list[Array]:
         """Poses X_CW (4, 4) near which the best one may be, best first, so many at most."""
-        some = spread(frames)
         body = self._body
-        posed = PosedFrames(body.kinematics, body.very_few, camera, some, COARSE_SPACING)
+        posed = PosedFrames(
+            body.kinematics, body.very_few, camera, spread(frames), SEARCH.coarse_spacing
+        )
+
+        def best_first(X_CW: Sequence[Array] | Array, side: float) -> list[Array]:
+            # A frame counts one at most.
+            off = np.minimum(E_total(areas(posed, np.asarray(X_CW), side)), 1.0).mean(axis=1)
+            return [X_CW[k] for k in np.argsort(off, kind="stable")]
+
         starts = np.tile(np.eye(4), (len(self._R_CW), 1, 1))
         starts[:, :3, :3] = self._R_CW
         starts[:, :3, 3] = place_by_bounds(posed, self._R_CW)
-        order = np.argsort(mean_misfit(posed, starts, FIRST_SIDE), kind="stable")
-        looks = [starts[k] for k in order[: self._fitted_count]]
-        for part, count in ((COARSE[:_FIRST_LOOK], _HOPEFUL), (COARSE[_FIRST_LOOK:], kept)):
-            found = map_ordered(partial(_fit_from, posed, part), looks)
-            off = mean_misfit(posed, np.array(found), SECOND_SIDE)
-            looks = distinct(posed, [found[k] for k in np.argsort(off, kind="stable")])[:count]
+        looks = best_first(starts, SEARCH.first_side)[: self._fitted_count]
+        for part, count in ((SEARCH.coarse[:3], 12), (SEARCH.coarse[3:], kept)):
+            found = map_ordered(partial(fit_pose, posed, rounds=part), looks)
+            looks = distinct(posed, best_first(found, SEARCH.second_side))[:count]
         return looks
-
-
-def _fit_from(frames: PosedFrames, rounds: Sequence[AnnealingStage], X_CW: Array) -> Array:
-    """As ``fit_pose``, of one pose after another."""
-    return fit_pose(frames, X_CW, rounds)
 
 
 def describe_fitted(
@@ -265,7 +283,7 @@ def describe_fitted(
 
     Between these, the covariance (u, u) of what is shared in the best one.
     """
-    side = max(1.0, _PIECE * fitted[0][0].seen[0].size)
+    side = max(1.0, SEARCH.piece * fitted[0][0].seen[0].size)
     pieces = [fit.piece_costs(found, side) for fit, found in fitted]
     order = np.argsort([one.sum() for one in pieces], kind="stable")
     fit, best = fitted[order[0]]
@@ -275,7 +293,8 @@ def describe_fitted(
     misfits = frame_misfits(seen, camera.X_CW, ratios, agree)
     # A frame that contradicts fits no pose, so it tells none from another.
     counted = [one[agree] for one in pieces]
-    as_good = [int(k) for k in order if excess(counted[k], counted[order[0]]) <= _SIGNIFICANCE]
+    worse = [excess(one, counted[order[0]]) for one in counted]
+    as_good = [int(k) for k in order if worse[k] <= SEARCH.significance]
     # Fits that began apart may have ended in one pose.
     looks = [fitted[k][0].cameras(fitted[k][1])[0].X_CW for k in as_good]
     alike = distinct(seen, looks)
@@ -305,41 +324,28 @@ def spread(frames: Sequence[PosedFrame], most: int = 8) -> list[PosedFrame]:
     return [frames[k] for k in np.linspace(0, len(frames) - 1, count).round().astype(int)]
 
 
-def mean_misfit(frames: PosedFrames, X_CW: Array, side: float) -> Array:
-    """(n,) E_total of poses (n, 4, 4) in the mean; a frame counts one at most."""
-    return np.asarray(np.minimum(E_total(areas(frames, X_CW, side)), 1.0).mean(axis=1))
+def distinct(frames: PosedFrames, X_CW: Sequence[Array], apart: float = 0.03) -> list[Array]:
+    """Those of some poses (4, 4) that show the bodies elsewhere than all before them.
 
-
-def distinct(frames: PosedFrames, X_CW: Sequence[Array]) -> list[Array]:
-    """Those of some poses (4, 4) that show the bodies elsewhere than all before them."""
+    apart: the distance of bodies that are elsewhere [root of the area].
+    """
     points = frames.some_points
     uv = [frames.camera.with_pose(np.linalg.inv(X)).project(points)[0] for X in X_CW]
 
     def differ(i: int, j: int) -> bool:
         # A point behind the camera is nowhere.
         off = np.nan_to_num(uv[i] - uv[j], nan=frames.size)
-        return bool(np.sqrt((off**2).sum(axis=1).mean()) > _APART * frames.size)
+        return bool(np.sqrt((off**2).sum(axis=1).mean()) > apart * frames.size)
 
     return [X_CW[k] for k in apart_from_before(range(len(X_CW)), differ)]
-
-
-def _likely(frames: PosedFrames, X_CW: Sequence[Array]) -> list[Array]:
-    """Those of some fitted poses (4, 4) that may be the best, one of those that look alike."""
-    fits = [SharedFit([frames], [X], widths=False) for X in X_CW]
-    side = max(1.0, _PIECE * frames.size)
-    pieces = [fit.piece_costs(fit.start, side) for fit in fits]
-    order = np.argsort([one.sum() for one in pieces], kind="stable")
-    best = pieces[order[0]]
-    near = [k for k in order if excess(pieces[k], best) <= _HOPELESS]
-    return distinct(frames, [X_CW[k] for k in near])
 
 
 def with_widths(fit: SharedFit) -> Shared:
     """What was fitted to the frames that agree, the widths of their silhouettes among it."""
     agree = fit.agreeing(fit.inlier_ratios(fit.start))
-    found = fit.fit(LAST, fit.start, agree)
+    found = fit.fit(SEARCH.last, fit.start, agree)
     again = fit.agreeing(fit.inlier_ratios(found))
-    return found if np.array_equal(again, agree) else fit.fit(LAST[-1:], found, again)
+    return found if np.array_equal(again, agree) else fit.fit(SEARCH.last[-1:], found, again)
 
 
 def suggest_pose(
@@ -350,6 +356,7 @@ def suggest_pose(
     *,
     tried: int = 300,
     seed: int = 0,
+    width: int = 160,
 ) -> tuple[Array, float] | None:
     """The pose, of random ones inside the limits, whose silhouettes differ most.
 
@@ -358,6 +365,7 @@ def suggest_pose(
     Args:
         X_WC: the camera's poses that are to be told apart, (4, 4) each, two or more.
         keep_out: what the body must not touch; points of its surfaces are asked.
+        width: of the pictures in which silhouettes are compared, about [pixel].
 
     Returns:
         its values (m,) of the pose tree [rad or m], and of the two camera poses that it tells apart
@@ -367,7 +375,7 @@ def suggest_pose(
     generator, kinematics = np.random.default_rng(seed), body.kinematics
     lower = np.where(np.isfinite(kinematics.lower), kinematics.lower, -np.pi)
     upper = np.where(np.isfinite(kinematics.upper), kinematics.upper, np.pi)
-    share = min(1.0, _WIDTH / camera.width)
+    share = min(1.0, width / camera.width)
     size = (max(1, round(share * camera.width)), max(1, round(share * camera.height)))
     cameras = [camera.with_pose(one).resized(*size) for one in X_WC]
     best: tuple[Array, float] | None = None
@@ -389,18 +397,6 @@ def suggest_pose(
     return best
 
 
-T = TypeVar("T")
-
-# Alexa's constants: psi is the positive root of x^4 = x + 4.
-_PHI, _PSI = np.sqrt(2.0), 1.533751168755204288118041
-# The bounds are met in so many steps of Gauss and Newton's method, the last ones robust ones.
-_PLACING_STEPS, _ROBUST_FROM = 5, 2
-# A side that is off by so much of the silhouettes' size says a quarter of what it would.
-_ROBUST_SCALE = 0.5
-# Points are no nearer to the camera than this share of the bodies' extent.
-_NEAREST = 0.05
-
-
 def apart_from_before(items: Iterable[T], differ: Callable[[T, T], bool]) -> list[T]:
     """Those of some items that differ from all that were kept before them."""
     kept: list[T] = []
@@ -416,7 +412,8 @@ def spread_rotations(count: int) -> Array:
     t = s / count
     d = 2.0 * np.pi * s
     r, R = np.sqrt(t), np.sqrt(1.0 - t)
-    a, b = d / _PHI, d / _PSI
+    # Psi is the positive root of x^4 = x + 4.
+    a, b = d / np.sqrt(2.0), d / 1.533751168755204288118041
     q = np.stack([r * np.sin(a), r * np.cos(a), R * np.sin(b), R * np.cos(b)], axis=-1)
     return Rotation.from_quat(q).as_matrix()
 
@@ -433,30 +430,25 @@ def place_by_bounds(frames: PosedFrames, R_CW: Array) -> Array:
     bodies = [np.einsum("nij,pj->npi", R_CW, points) for points in frames.points]
     bounds, shown = zip(*[_bounds(frame.mask) for frame in frames.frames], strict=True)
     middles = R_CW @ frames.middle
-    p_CW = _place_by_sizes(frames, bodies, bounds) - middles
-    for k in range(_PLACING_STEPS):
-        H, g = np.zeros((len(R_CW), 3, 3)), np.zeros((len(R_CW), 3))
-        for body, bound, sides in zip(bodies, bounds, shown, strict=True):
-            add_bound_equations(
-                frames, body + p_CW[:, None], (bound, sides), k >= _ROBUST_FROM, H, g
-            )
-        H += 1e-3 / 3.0 * np.einsum("nii->n", H)[:, None, None] * np.eye(3) + 1e-9 * np.eye(3)
-        step = -np.linalg.solve(H, g[..., None])[..., 0]
-        length = np.maximum(np.linalg.norm(step, axis=1), 1e-12)
-        depth = np.maximum((p_CW + middles)[:, 2], _NEAREST * frames.extent)
-        p_CW += step * np.minimum(1.0, 0.5 * depth / length)[:, None]
-        p_CW[:, 2] = np.maximum(p_CW[:, 2], 0.5 * frames.extent - middles[:, 2])
-    return p_CW
-
-
-def _place_by_sizes(frames: PosedFrames, bodies: Sequence[Array], bounds: Sequence[Array]) -> Array:
-    """(n, 3) where the bodies' middle is in the camera, as if all of it were equally far."""
+    # As if all of the bodies were equally far.
     f, c = frames.intrinsics
     spans = np.mean([np.ptp(body[:, :, :2], axis=1) for body in bodies], axis=0)
     size = np.mean([bound[1] - bound[0] for bound in bounds], axis=0)
     depth = np.linalg.norm(spans * f, axis=1) / max(float(np.linalg.norm(size)), 1.0)
     middle = np.mean([bound.mean(axis=0) for bound in bounds], axis=0)
-    return np.column_stack([(middle - c) / f * depth[:, None], depth])
+    p_CW = np.column_stack([(middle - c) / f * depth[:, None], depth]) - middles
+    # Steps of Gauss and Newton's method, the last ones robust ones.
+    for k in range(5):
+        H, g = np.zeros((len(R_CW), 3, 3)), np.zeros((len(R_CW), 3))
+        for body, bound, sides in zip(bodies, bounds, shown, strict=True):
+            add_bound_equations(frames, body + p_CW[:, None], (bound, sides), k >= 2, H, g)
+        H += 1e-3 / 3.0 * np.einsum("nii->n", H)[:, None, None] * np.eye(3) + 1e-9 * np.eye(3)
+        step = -np.linalg.solve(H, g[..., None])[..., 0]
+        length = np.maximum(np.linalg.norm(step, axis=1), 1e-12)
+        depth = np.maximum((p_CW + middles)[:, 2], 0.05 * frames.extent)
+        p_CW += step * np.minimum(1.0, 0.5 * depth / length)[:, None]
+        p_CW[:, 2] = np.maximum(p_CW[:, 2], 0.5 * frames.extent - middles[:, 2])
+    return p_CW
 
 
 def add_bound_equations(
@@ -476,7 +468,8 @@ def add_bound_equations(
     """
     f, c = frames.intrinsics
     rows = np.arange(len(p_C))
-    z = np.maximum(p_C[..., 2], _NEAREST * frames.extent)
+    # Points are no nearer to the camera than a share of the bodies' extent.
+    z = np.maximum(p_C[..., 2], 0.05 * frames.extent)
     uv = p_C[..., :2] / z[..., None] * f + c
     for side, axis in np.argwhere(bound[1]):
         i = (uv[..., axis].argmax if side else uv[..., axis].argmin)(axis=1)
@@ -484,10 +477,10 @@ def add_bound_equations(
         J = np.zeros((len(p_C), 3))
         J[:, axis] = f[axis] / z[rows, i]
         J[:, 2] = -(uv[rows, i, axis] - c[axis]) / z[rows, i]
+        weight = np.ones(len(p_C))
         if robust:
-            weight = (1.0 + (off / (_ROBUST_SCALE * frames.size)) ** 2) ** -2
-        else:
-            weight = np.ones(len(p_C))
+            # What is off by half the silhouettes' size says a quarter of what it would.
+            weight = (1.0 + (off / (0.5 * frames.size)) ** 2) ** -2
         H += weight[:, None, None] * J[:, :, None] * J[:, None, :]
         g += (weight * off)[:, None] * J
 

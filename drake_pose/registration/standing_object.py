@@ -28,15 +28,10 @@ from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import RegistrationError, SettingsError
 from drake_pose.fit.background import KnownBackground, Light
 from drake_pose.fit.surfaces import FEW, few_triangles, surface_distance
-from drake_pose.registration.picture_search import SEARCHED, PosedPicture, see_picture
+from drake_pose.registration.picture_search import PICTURES, PosedPicture, see_picture
 from drake_pose.registration.posed_frames import LAST_SPACING, PosedFrame, PosedFrames
 from drake_pose.registration.register import (
-    COARSE,
-    COARSE_SPACING,
-    FINE,
-    FINE_SPACING,
-    FIRST_SIDE,
-    SECOND_SIDE,
+    SEARCH,
     CameraSearch,
     E_total,
     ObjectPose,
@@ -328,7 +323,7 @@ class ObjectSearch:
         require_turns(camera.name, self._standing, frames)
         looks = self._search(camera, [[one] for one in spread(frames)])
         for rounds, spacing, surfaces in (
-            (FINE, FINE_SPACING, "few"),
+            (SEARCH.fine, SEARCH.fine_spacing, "few"),
             (SHARED.rounds_with_constants, LAST_SPACING, "all"),
         ):
             fits = [self._fit(camera, frames, look, spacing, surfaces) for look in looks]
@@ -374,7 +369,7 @@ class ObjectSearch:
         """
         look = self._search(camera, choices)[0]
         seen = [own for own in choices if own]
-        off = [self._misfits(camera, [own], look[None], SECOND_SIDE)[0] for own in seen]
+        off = [self._misfits(camera, [own], look[None], SEARCH.second_side)[0] for own in seen]
         return look, int(np.count_nonzero(np.array(off) < _CHOSEN.explained))
 
     def _search(self, camera: PinholeCamera, choices: Sequence[Sequence[PosedFrame]]) -> list[Look]:
@@ -391,7 +386,7 @@ class ObjectSearch:
                 alone = [PosedFrame(one.name, np.zeros(0), one.mask)]
                 found = self._alone.search(camera, alone, _CHOSEN.poses)
                 posed = PosedFrames(body.kinematics, body.very_few, camera, alone)
-                off = float(E_total(areas(posed, np.array(found), SECOND_SIDE)).min())
+                off = float(E_total(areas(posed, np.array(found), SEARCH.second_side)).min())
                 # A single one is known to be the object's.
                 if len(own) == 1 or off < _CHOSEN.explained:
                     likely.append((off, one, found))
@@ -410,15 +405,15 @@ class ObjectSearch:
                 "the joint positions those of these frames, and is it this link that the camera "
                 "rides on? Nothing was written"
             )
-        order = np.argsort(self._misfits(camera, kept, starts, FIRST_SIDE), kind="stable")
+        order = np.argsort(self._misfits(camera, kept, starts, SEARCH.first_side), kind="stable")
         fitted = []
         for look in self._distinct(starts[order[: 10 * _CHOSEN.starts]], some)[: _CHOSEN.starts]:
             # Of each picture's masks that which the look explains best.
             by = [[self._misfit(camera, one, look[None])[0] for one in own] for own in kept]
             chosen = [own[int(np.argmin(each))] for own, each in zip(kept, by, strict=True)]
-            fit = self._fit(camera, chosen, look, COARSE_SPACING, "very_few")
-            fitted.append(self._look(fit, fit.fit(COARSE), look))
-        misfits = self._misfits(camera, kept, np.array(fitted), SECOND_SIDE)
+            fit = self._fit(camera, chosen, look, SEARCH.coarse_spacing, "very_few")
+            fitted.append(self._look(fit, fit.fit(SEARCH.coarse), look))
+        misfits = self._misfits(camera, kept, np.array(fitted), SEARCH.second_side)
         limit = _CHOSEN.worse_by + _CHOSEN.worse_times * float(misfits.min())
         order = np.argsort(misfits, kind="stable")
         best = [fitted[k] for k in order if misfits[k] <= limit]
@@ -439,7 +434,7 @@ class ObjectSearch:
         return np.asarray(np.mean(off, axis=0))
 
     def _misfit(
-        self, camera: PinholeCamera, one: PosedFrame, looks: Array, side: float = SECOND_SIDE
+        self, camera: PinholeCamera, one: PosedFrame, looks: Array, side: float = SEARCH.second_side
     ) -> Array:
         """(n,) E_total of looks (n, 2, 4, 4) in a frame, one at most."""
         body = self._standing.alone
@@ -573,7 +568,7 @@ def find_in_pictures(
     """
     choices = [
         [PosedFrame(one.name, one.values, region) for region in find_regions(one.picture, most)]
-        for one in pictures[:SEARCHED]
+        for one in pictures[: PICTURES.searched]
     ]
     require_turns(camera.name, standing, [own[0] for own in choices if own])
     search = ObjectSearch(standing)

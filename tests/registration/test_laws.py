@@ -20,7 +20,11 @@ from drake_pose.fit.evidence import Observation
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.fit.parameters import BodyParameters
 from drake_pose.fit.problem import parameter_names
-from drake_pose.registration.joint_zeros import _as_the_cost_bends, _constants, _significant
+from drake_pose.registration.joint_zeros import (
+    as_the_cost_bends,
+    describe_constants,
+    significant_constants,
+)
 from drake_pose.registration.online_registration import pose_difference
 from drake_pose.registration.per_frame_fit import PerFrameFit
 from drake_pose.registration.posed_frames import PosedFrame, PosedFrames, SeenFrame
@@ -385,7 +389,7 @@ def test_an_interval_without_0_is_significant_and_a_length_s_is_that_of_its_loga
 ) -> None:
     covariance = np.diag([1.0, 0.01**2, 0.01**2])
     value = share * 0.01 * float(scipy_t.ppf(0.975, 20))
-    told = _constants(NAMED, shared(0, value, value), 20, 0.05, covariance, NAMED.names[1:])
+    told = describe_constants(NAMED, shared(0, value, value), 20, 0.05, covariance, NAMED.names[1:])
     zero, length = told.values()
     assert zero.value == value
     assert (zero.low + zero.high) / 2 == pytest.approx(value)
@@ -399,7 +403,7 @@ def test_what_a_constant_cannot_be_told_from_is_its_gauge() -> None:
     by = 0.5 * SHARED.constant_deviation
     covariance = np.diag([0.01, by**2, 1e-8])
     covariance[0, 1] = covariance[1, 0] = 0.095 * by
-    told = _constants(NAMED, shared(0, 0.1, 0.1), 20, 0.05, covariance, NAMED.names[1:])
+    told = describe_constants(NAMED, shared(0, 0.1, 0.1), 20, 0.05, covariance, NAMED.names[1:])
     assert not told["elbow"].determined
     assert (told["elbow"].value, told["elbow"].gauge) == (0.0, ("pose",))
     assert told["length of arm"].determined
@@ -412,7 +416,7 @@ def test_constants_are_significant_beside_those_that_are_held(elbow: float) -> N
     C = np.array([[1.0, 0.8], [0.8, 1.0]]) * 0.01**2
     covariance = np.zeros((3, 3))
     covariance[1:, 1:] = C
-    kept = _significant(NAMED, shared(0, *x), covariance, NAMED.names[1:], limit)
+    kept = significant_constants(NAMED, shared(0, *x), covariance, NAMED.names[1:], limit)
     off = np.abs(x) / 0.01
     expected = list(NAMED.names[1:])
     if off.min() < limit:
@@ -437,7 +441,7 @@ def test_what_bends_the_cost_less_than_it_should_is_as_much_less_sure(
         return share * 7.0, 7.0
 
     fit = SimpleNamespace(names=NAMED.names, constants=("length of arm",), bend=bend)
-    found = _as_the_cost_bends(fit, shared(0, 0, 0), np.ones(1, bool), covariance)
+    found = as_the_cost_bends(fit, shared(0, 0, 0), np.ones(1, bool), covariance)
     assert found[2, 2] == pytest.approx(times * covariance[2, 2])
     # Along what goes with it; across it nothing changes.
     (along,) = asked

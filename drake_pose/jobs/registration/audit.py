@@ -55,10 +55,11 @@ from drake_pose.registration.diagnosis import (
 from drake_pose.registration.online_registration import pose_difference, squared_distance
 from drake_pose.registration.per_frame_fit import PerFrameFit
 from drake_pose.registration.picture_registration import (
+    Begun,
     PictureRegistration,
     Recording,
+    fit_pictures,
     judge_pictures,
-    refit_pictures,
     register_pictures,
 )
 from drake_pose.registration.posed_frames import PosedFrame, SeenFrame, placed_points
@@ -507,7 +508,7 @@ def look_at_episode(
         if before is None:
             one = register_pictures(body, given, recording, zeros=zeros)
         else:
-            one = refit_pictures(body, before.pictures[name], recording, zeros=zeros)
+            one = fit_pictures(body, Begun.of(before.pictures[name]), recording, zeros=zeros)
         pictures[name] = one
         values = np.array([frame.values + one.zeros for frame in one.frames])
         off = compare_camera(body, given, one.found, values, alone=len(placed) == 1)
@@ -515,13 +516,13 @@ def look_at_episode(
         held.append(given if near else one.found.camera)
         findings += [] if near or off.p_value > DIAGNOSIS.significance else [off]
         findings += _clock(body, one, recording)
-        judged = judge_pictures(body, one, one.found)
-        for frame in judged.frames:
+        seen, _, lost = judge_pictures(body, one, one.found)
+        for frame in seen:
             known = frame.name if len(placed) == 1 else f"{name}-{frame.name}"
             names[known] = name, frame.name
             frames.append(SeenFrame(known, frame.values, {name: frame.mask}))
-        if judged.lost:
-            warnings.append(say_lost(name, judged.lost, recording.names))
+        if lost:
+            warnings.append(say_lost(name, lost, recording.names))
     inputs = Inputs(
         Scene(episode.path, episode.cameras, tuple(names), {}), episode.model, episode.tree,
         KnownPositions(episode.path, body.kinematics, {}), tuple(held),

@@ -19,8 +19,7 @@ from drake_pose.registration.joint_zeros import calibrate_joints
 from drake_pose.registration.online_registration import pose_difference
 from drake_pose.registration.posed_frames import PosedFrame, PosedFrames
 from drake_pose.registration.register import (
-    FINE,
-    LAST,
+    SEARCH,
     CameraSearch,
     RegisteredCamera,
     RegistrationBody,
@@ -159,7 +158,7 @@ def _focal_length_off(
     """By how much a focal length seems to be off, in a hurry: the logarithm of a factor."""
     seen = PosedFrames(body.kinematics, body.all, found.camera, frames)
     fit = SharedFit([seen], [found.camera.X_CW], looks=len(POSE_NAMES) + 1)
-    camera = fit.cameras(fit.fit((*FINE, *LAST)))[0]
+    camera = fit.cameras(fit.fit((*SEARCH.fine, *SEARCH.last)))[0]
     return math.log(camera.focal_x / found.camera.focal_x)
 
 

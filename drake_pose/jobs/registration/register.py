@@ -364,18 +364,20 @@ class _Registration:
         frames = list[SeenFrame]()
         for name, one in self.pictures.items():
             recording, found = one.recording, self.registered[name]
-            judged = judge_pictures(body, replace(one, zeros=self._zeros), found)
+            frames_seen, misfits, lost = judge_pictures(
+                body, replace(one, zeros=self._zeros), found
+            )
             frames += [
-                SeenFrame(k.name, k.values + self._zeros, {name: k.mask}) for k in judged.frames
+                SeenFrame(k.name, k.values + self._zeros, {name: k.mask}) for k in frames_seen
             ]
-            found = replace(found, frames=judged.misfits)
+            found = replace(found, frames=misfits)
             errors = {k.frame: k.E_total for k in found.frames}
             wanted = (*found.contradictions[:_SHOWN], *compared_frames(errors))
             shown = {k: recording.picture(k) for k in wanted}
             self.pictures[name] = replace(one, pictures={**one.pictures, **shown})
             self.registered[name] = found
-            if judged.lost:
-                self.warnings.append(say_lost(name, judged.lost, recording.names))
+            if lost:
+                self.warnings.append(say_lost(name, lost, recording.names))
         if frames:
             self.inputs = replace(self.inputs, frames=tuple(frames))
 

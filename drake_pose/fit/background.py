@@ -318,7 +318,7 @@ def _grown(masks: Mask, by: int) -> Mask:
 
 
 def _likeness(pictures: Floats, colours: Floats, deviations: Floats) -> Floats:
-    """(..., H, W) how much likelier colours (..., H, W, 3) are under a background than any."""
+    """(..., H, W) likelihood ratios of colours (..., H, W, 3) under a background to any colour."""
     off = _largest(np.abs(pictures - colours)) / deviations
     beyond = np.maximum(off - MODEL.exact, 0.0)
     return np.asarray(np.exp(MODEL.log_peak - 0.5 * beyond**2), np.float32)

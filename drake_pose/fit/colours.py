@@ -191,7 +191,7 @@ def add_pictures(
         pictures: of each; None: no lines are looked at in it.
         histograms: what is known of the colours.
         step: the scale of the residuals, and the spacing of lines [pixel].
-        noise: what a pixel of contour is worth [pixel].
+        noise: of lines [pixel].
         pixels: from offset to offset along lines.
     """
     placed = compared.placement
@@ -307,7 +307,7 @@ def compare_lines(
         step: from offset to offset [pixel].
         A, b, sums, wide: (nodes, 12, 12), (nodes, 12), (nodes + 1, 6) and (nodes, 13) added to, as
             of `compare_contours`; lengths are of lines that say something, by how much they do.
-        width: the body looks wider than it is by so much on all sides [pixel].
+        width: by which the body looks too wide on all sides [pixel].
     """
     contour = sample_contour(packed, seen_from(camera[0], X_WN), camera[1], weights[2])
     uv, normals, lengths, nodes, p_N, clearances = contour
@@ -428,7 +428,7 @@ def learn_colours(
         histograms: (nodes, 3, COLOURS) changed.
         spacing: of the contour's points [pixel].
         widths: (2,) of the strips inside and outside that are counted [pixel].
-        rate: the new colours' share; of a node of which nothing is known yet they are all.
+        rate: weight of the new colours; 1 where no colours of the node are known yet.
         agreeing: lines on which the edge seems to be further from the contour than this teach
             nothing [pixel]; inf: all do.
         step: from offset to offset [pixel] of lines that say where the edge is, on both sides of
@@ -475,7 +475,7 @@ def learn_colours(
         for side in range(2):
             shares, total = histograms[node, side], totals[node, side]
             if total >= fewest:
-                # Of a side of which nothing is known yet the new colours are all.
+                # Where no colours are known yet the new ones are all.
                 share = rate if shares.any() else 1.0
                 for colour in range(COLOURS):
                     shares[colour] += share * (counts[node, side, colour] / total - shares[colour])

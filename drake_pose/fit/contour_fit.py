@@ -1,7 +1,7 @@
 """One pose from all silhouettes at once: the contours of body and silhouettes drawn together.
 
 The cost of a pose theta, with r_i the distance of a point of either contour from the other, l_i the
-length that it stands for, s the scale of a stage and w what a unit of contour is worth:
+length that it stands for, s the scale of a stage and w the weight of a unit of contour:
 C(theta) = w sum_i l_i r_i^2 / (1 + (r_i / s)^2) + (theta - m)^T P (theta - m).
 """
 
@@ -31,11 +31,11 @@ FINEST_SCALE = 1.5
 
 @dataclass(frozen=True)
 class Noise:
-    """How far silhouettes are off the body's: what a point of contour is worth.
+    """Errors of silhouettes, from which contours get their weights.
 
     Args:
-        deviation: of the distance of the contours [m].
-        correlation: so much of a contour errs together [m], of all cameras or (cameras,).
+        deviation: standard deviation of the distance of the contours [m].
+        correlation: length of contour that errs together [m], of all cameras or (cameras,).
     """
 
     deviation: float = 0.006
@@ -43,35 +43,27 @@ class Noise:
 
     @classmethod
     def of_a_pixel(cls, pixels: float | Array) -> Noise:
-        """With which a pixel of contour counts one, where so many are the unit of length."""
+        """With which a pixel of contour has the weight one; pixels: of the unit of length."""
         return cls(deviation=1.0, correlation=0.5 / pixels**3)
 
 
 @dataclass(frozen=True, eq=False)
 class Prior:
-    """What is known of the values without pictures.
-
-    Args:
-        mean: (m,) [rad or m].
-        information: (m,) one over the variance; 0: nothing is known.
-    """
+    """Independent normal priors of the values: mean (m,) [rad or m], information (m,)."""
 
     mean: Array
     information: Array
 
 
 class Views(NamedTuple):
-    """What all cameras say of one frame, as the kernel takes it.
-
-    cameras: X_CW (c, 4, 4) and kernel parameters (c, 8); evidence: their silhouettes' edges.
-    """
+    """Cameras, X_CW (c, 4, 4) and kernel parameters (c, 8), and their silhouettes' edges."""
 
     cameras: tuple[Array, Array]
     evidence: Evidence
 
 
 class Comparison(NamedTuple):
-    """What each camera says of each node's affine motion x (12,): x^T A x - 2 b^T x.
+    """Costs x^T A x - 2 b^T x of each node's affine motion x (12,), by camera.
 
     A: (cameras, nodes, 12, 12), lower triangles; b: (cameras, nodes, 12); sums: (cameras,
     nodes + 1, 6) and wide: (cameras, nodes, 13) as of `compare_contours`; placement: of the body.
@@ -100,8 +92,8 @@ class PoseFit:
     Args:
         values: (m,) of the pose tree [rad or m].
         sums: (nodes + 1, 6) before the last step, of all cameras, as of `compare_contours`.
-        cost: of the last comparison, all told.
-        evaluations: how often contours were compared.
+        cost: of the last comparison, prior included.
+        evaluations: number of comparisons.
     """
 
     values: Array
@@ -111,18 +103,18 @@ class PoseFit:
 
     @property
     def inlier_ratio(self) -> float:
-        """Of both contours' lengths, what fits, 0 to 1."""
+        """Fraction of both contours' lengths that fits."""
         return inlier_ratio_of(self.sums)
 
     @property
     def closeness(self) -> float:
-        """How well both contours fit, 0 to 1: what tells the better one of two fits."""
+        """How well both contours fit, 0 to 1: the score of a fit among others."""
         total = self.sums.sum(axis=0)
         return float(total[Sum.CLOSE] / max(total[Sum.COMPARED], 1e-9))
 
 
 def inlier_ratio_of(sums: Array) -> float:
-    """Of both contours' lengths, what fits, 0 to 1; sums (..., 6) of `compare_contours`."""
+    """Fraction of both contours' lengths that fits; sums (..., 6) of `compare_contours`."""
     total = sums.reshape(-1, sums.shape[-1]).sum(axis=0)
     return float(total[Sum.FITTING] / max(total[Sum.COMPARED], 1e-9))
 
@@ -149,11 +141,11 @@ class ContourFit:
     Args:
         tree: the body's pose tree, or its kinematics.
         outlines: a surface for each node; few triangles will do. The tree's own where not given.
-        noise: what a point of contour is worth.
+        noise: of the silhouettes.
         steps: how steps are made.
-        pixels: so many pixels are the unit of length of rounds and noise, in all cameras or (c,);
-            None: that unit is the metre, as large as it is seen at the body's root.
-        body: what else may be unknown of it; None: the tree's values, ROOT_NAMES and no more.
+        pixels: the unit of length of rounds and noise [pixel], of all cameras or (c,); None: a
+            metre at the body's root.
+        body: its parameters; None: the tree's values and ROOT_NAMES.
     """
 
     def __init__(
@@ -239,7 +231,7 @@ class ContourFit:
         placement = self.body.place(theta)
         weights = self.weights(views.cameras, placement, step)
         placed = placement.packed, placement.X_WN
-        # Up to 64 squares of a picture's rows and columns are told apart.
+        # Beyond 64 squares of a picture's rows and columns they are counted from 0 again.
         return np.asarray(compare_contours(*placed, *views, weights, 64, side, False)[3])
 
     def weights(
@@ -254,7 +246,7 @@ def compare_views(
 ) -> Comparison:
     """A body's contours, where it stands, compared with all cameras' edges.
 
-    widths: whether it is told what follows the silhouettes' widths.
+    widths: whether derivatives by the silhouettes' widths are wanted.
     """
     placed = placement.packed, placement.X_WN
     A, b, sums, _, wide = compare_contours(*placed, *views, weights, 0, 1.0, widths)

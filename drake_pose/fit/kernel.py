@@ -102,7 +102,7 @@ def nearest_alike(
                     # No branch, which the processor would guess wrong.
                     is_nearer = (square < best) & (alike >= least_cosine)
                     best, nearest = (square, k) if is_nearer else (best, nearest)
-            # All that is nearer than so many squares are wide was looked at.
+            # All points that are nearer than the ring is wide have been compared.
             if best <= (ring * side) ** 2:
                 break
         if nearest >= 0:
@@ -132,17 +132,16 @@ def compare_contours(
         cameras: X_CW (c, 4, 4) and kernel parameters (c, 8).
         edges: of their silhouettes.
         weights: (c, 4) of each camera: units of length a pixel, the cost's scale and the spacing of
-            the body's contour [pixel], and what a pixel of contour is worth.
-        squares: k, so many squares of each picture's rows and columns are told apart; 0: none.
+            the body's contour [pixel], and the weight of a pixel of contour.
+        squares: k, number of squares of each picture's rows and columns; 0: none.
         side: of the squares [pixel]; beyond k they are counted from 0 again.
-        widths: whether it is told what follows the silhouettes' widths.
+        widths: whether derivatives by the silhouettes' widths are wanted.
 
     Returns:
         A (c, nodes, 12, 12), lower triangles, and b (c, nodes, 12); sums (c, nodes + 1, 6) by
         ``Sum`` of each node's contour, and of all edges in the last row; (c, k, k) the cost by
         squares of the picture; and (c, nodes, 13)
-        by how much b grows as silhouettes grow by a pixel, then so much their cost, over two;
-        0 where it is not told.
+        the derivatives of b, and of half the cost, by the silhouettes' growth [pixel].
     """
     count, nodes = len(weights), len(X_WN)
     A, b = np.zeros((count, nodes, 12, 12)), np.zeros((count, nodes, 12))

@@ -25,12 +25,12 @@ from drake_pose.errors import SettingsError
 
 @dataclass(frozen=True)
 class AnnealingStage:
-    """A part of a fit at one scale; lengths in m, or in the unit that the fit is told.
+    """A part of a fit at one scale; lengths in m, or in the fit's unit of length.
 
     Args:
         scale: the distance at which a point of a contour loses three quarters of its pull.
         spacing: of the points of the body's contour.
-        iterations: at most so many steps; with one it is taken untried.
+        iterations: maximum number of steps; a single one is taken untried.
     """
 
     scale: float
@@ -51,9 +51,8 @@ class StepSettings:
 
     Args:
         longest: no unknown changes by more in a step [rad, m or a logarithm].
-        damping: a share of the diagonal, added to it, at first.
-        even_damping: a share of the mean of the diagonal, which keeps what does not show where it
-            is.
+        damping: fraction of the diagonal that is added to it at first.
+        even_damping: fraction of the diagonal's mean that is added: unobservable unknowns stay.
         least_damping, most_damping: limits of the damping; a step that needs more ends the round.
         next_damping: no round begins with more damping.
         standstill: a step that lowers the cost by a smaller share of it ends the round.
@@ -85,12 +84,12 @@ class Equations:
 
 @dataclass(frozen=True, eq=False)
 class LinearPrior:
-    """Linear combinations of all frames' own unknowns x (frames p,), and what is known of them.
+    """Normal priors of linear combinations of all frames' own unknowns x (frames p,).
 
     Attributes:
-        rows: (k, frames p).
-        mean: (k,) of what they amount to.
-        information: (k,) one over the variance.
+        rows: (k, frames p) of which rows x has the prior.
+        mean: (k,) its mean.
+        information: (k,) one over its variance.
     """
 
     rows: csr_array

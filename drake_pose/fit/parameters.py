@@ -313,7 +313,7 @@ def owners_of(moves: NDArray[np.bool_], parameters: Indices) -> tuple[Indices, I
 
 
 def stretched(packed: PackedOutlines, scale: Array) -> PackedOutlines:
-    """Surfaces, each node's so many times (nodes, 3) as large along its frame's axes."""
+    """Surfaces, each node's scaled (nodes, 3) along its frame's axes."""
     points, planes = packed.points.copy(), packed.planes.copy()
     for node, (s, volume) in enumerate(zip(scale, scale.prod(axis=1), strict=True)):
         points[:, slice(*packed.starts[node : node + 2, 0])] *= s[:, None]

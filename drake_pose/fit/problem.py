@@ -193,7 +193,7 @@ class Problem:
         self._values = len(kinematics.names)
         places = (self.entries >= self._values) & (self.entries < len(body.names))
         self._stays = not places.any()
-        # A body of which nothing is unknown stands still, and all its nodes move with the camera.
+        # A body without unknowns stands still, and all its nodes move with the camera.
         self._stands = not np.any(self.entries <= len(body.names))
         self._placed: dict[bytes, Placement] = {}
         self._last_look: tuple[bytes, tuple[Array, Array, Array]] = (

@@ -132,7 +132,7 @@ class ProportionedBody(BodyParameters):
         return axes, lengths, rest
 
     def factors(self, theta: Array) -> Array:
-        """(nodes, 3) so many times its size each node has along its frame's axes."""
+        """(nodes, 3) scale of each node along its frame's axes."""
         count = len(self.kinematics.names) + len(ROOT_NAMES)
         nodes = len(self.limbs)
         lengths = theta[count : count + nodes]

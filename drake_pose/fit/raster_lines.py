@@ -97,7 +97,7 @@ def compare_raster(
         camera: X_CW (4, 4) and kernel parameters (8,).
         still: the border of all other nodes' union.
         border: the silhouette's.
-        lines: every so many rows and columns are looked at, and the first of them.
+        lines: the step from row to row and column to column that are looked at, and the first.
         scale: residuals beyond it lose weight [pixel].
         slack: distances count by what they are beyond it; 0: all count [pixel].
         A, b: (nodes, 12, 12), lower triangles, and (nodes, 12) added to, as of `compare_contours`.

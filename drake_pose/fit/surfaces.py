@@ -70,7 +70,7 @@ def with_girths(outlines: Sequence[Outline], girths: Array) -> tuple[Outline, ..
 
 
 def _simplified(outline: Outline, count: int) -> Outline:
-    """A surface with at most about so many triangles.
+    """A surface with about that number of triangles at most.
 
     From pass to pass the simplifier allows larger errors, which are lengths and no shares of the
     surface's, until triangles are few enough. Slivers it never merges, so with many of those it

@@ -1,9 +1,8 @@
 """Anatomical landmarks of a model: named points fixed to its links, from ``landmarks.yaml``."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -12,14 +11,15 @@ from drake_pose.body.link_graph import PlantKinematics, build_link_graph
 from drake_pose.body.parsed_model import ParsedModel
 from drake_pose.body.pose_tree import PoseTree
 from drake_pose.errors import ModelError, SettingsError, UnknownNameError
-from drake_pose.yaml_files import read_yaml
+from drake_pose.yaml_files import read_yaml, typed_entry
 
 
-class Landmark(NamedTuple):
+@dataclass
+class Landmark:
     """A point of the object: (3,) in the frame of the link it is fixed to [m]."""
 
-    link: str
-    point: Array
+    link: str = ""
+    point: np.ndarray = field(default_factory=lambda: np.full(3, np.nan))
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +57,15 @@ def load_landmarks(model_path: Path | str) -> dict[str, Landmark]:
     entries = content.get("landmarks") if isinstance(content, dict) else None
     if not isinstance(entries, dict) or not entries or set(content) != {"landmarks"}:
         raise ModelError(f"{file}: one mapping 'landmarks' with at least one entry is expected")
-    return {str(name): _landmark(entry, f"{file}: '{name}'") for name, entry in entries.items()}
+    landmarks = {}
+    for name, entry in entries.items():
+        landmark = typed_entry(entry, Landmark, f"{file}: '{name}'", ModelError)
+        if not landmark.link:
+            raise ModelError(f"{file}: '{name}': link must be a link's name")
+        if landmark.point.shape != (3,) or not np.all(np.isfinite(landmark.point)):
+            raise ModelError(f"{file}: '{name}': point must be three finite numbers [m]")
+        landmarks[str(name)] = landmark
+    return landmarks
 
 
 def landmark_positions(
@@ -122,18 +130,3 @@ def _body(model: ParsedModel, name: str, link: str) -> int:
         where = f"{landmarks_file(model.path)}: '{name}': {model.path.name}"
         raise UnknownNameError("link", link, model.link_names, where)
     return model.link_index(link)
-
-
-def _landmark(entry: Any, where: str) -> Landmark:
-    """One entry, after checks."""
-    if not isinstance(entry, dict) or set(entry) != {"link", "point"}:
-        raise ModelError(f"{where}: give {{link: NAME, point: [x, y, z]}}")
-    link, point = entry["link"], entry["point"]
-    if not isinstance(link, str) or not link:
-        raise ModelError(f"{where}: link must be a link's name, not {link!r}")
-    numbers = [v for v in point if type(v) in (int, float)] if isinstance(point, list) else []
-    if len(numbers) != 3 or len(point) != 3 or not np.all(np.isfinite(numbers)):
-        raise ModelError(f"{where}: point must be three finite numbers [m], not {point!r}")
-    array = np.array(point, dtype=np.float64)
-    array.setflags(write=False)
-    return Landmark(link, array)

@@ -299,8 +299,8 @@ def is_drawn_by_drake(path: Path) -> bool:
 def workspace() -> Path:
     """This process's temporary folder for converted files; it is removed at exit."""
     folder = tempfile.mkdtemp(prefix="drake_pose_")
-    # Not atexit: processes that multiprocessing starts end without it. A fork forgets the finalizer,
-    # so that it leaves the folder to the process that made it.
+    # Not atexit: processes that multiprocessing starts end without it. A fork forgets it, and
+    # leaves the folder to the process that made it.
     Finalize(None, shutil.rmtree, (folder, True), exitpriority=0)
     return Path(folder)
 

@@ -65,8 +65,12 @@ def cure_mjcf(path: Path, warn: Warn) -> tuple[str, list[Couple]]:
 
 def _compile(path: Path, warn: Warn) -> tuple[Any, list[Couple]]:
     """MuJoCo's model, without what neither moves nor is seen, and which joints follow others."""
-    import mujoco  # Slow to import, and needed for MJCF alone.
-
+    try:
+        import mujoco
+    except ModuleNotFoundError as error:
+        raise ModelError(
+            f'{path}: MJCF files are read by MuJoCo: pip install "drake_pose[mjcf]"'
+        ) from error
     try:
         spec = mujoco.MjSpec.from_file(str(path))
         if spec.flexes:

@@ -21,12 +21,7 @@ from drake_pose.body.meshes import TriangleMesh, is_watertight, make_drawable, r
 from drake_pose.body.parsing import ModelSource
 from drake_pose.body.plant_source import Coupling, PlantSource, read_couplings
 from drake_pose.errors import ModelError, UnknownNameError
-from drake_pose.yaml_files import read_yaml
-
-_FIELDS = ("parent", "child", "mesh", "axis", "begin", "end", "colour")
-_COLOUR = (0.8, 0.8, 0.8)
-# Weights that differ less do so by the rounding of the vertices alone.
-_DIGITS = 6
+from drake_pose.yaml_files import read_yaml, typed_entry
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,11 +38,11 @@ class SkinBand:
     child: str
     mesh: TriangleMesh
     weights: Array
-    colour: tuple[float, float, float] = _COLOUR
+    colour: tuple[float, float, float] = (0.8, 0.8, 0.8)
 
     def __post_init__(self) -> None:
-        """Make a private read-only copy of the weights, rounded."""
-        weights = np.asarray(self.weights, dtype=np.float64).round(_DIGITS)
+        """Make a private read-only copy of the weights, without the rounding of the vertices."""
+        weights = np.asarray(self.weights, dtype=np.float64).round(6)
         weights.setflags(write=False)
         object.__setattr__(self, "weights", weights)
 
@@ -86,46 +81,45 @@ def load_skin(model_path: Path, link_names: Sequence[str]) -> tuple[SkinBand, ..
     return tuple(bands)
 
 
+@dataclass
+class BandEntry:
+    """A band in a skin file; see load_skin."""
+
+    parent: str = ""
+    child: str = ""
+    mesh: str = ""
+    axis: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    begin: float = 0.0
+    end: float = 0.0
+    colour: np.ndarray = field(default_factory=lambda: np.full(3, 0.8))
+
+
 def _make_band(path: Path, entry: dict[str, Any], link_names: Sequence[str]) -> SkinBand:
     """One band, after checks."""
-    given = {"parent": "", "child": "", "mesh": "", "colour": _COLOUR, "begin": 0.0, "end": 0.0}
-    given |= {"axis": (), **entry}
-    parent, child, mesh_name = (str(given[name]) for name in ("parent", "child", "mesh"))
-    where = f"{path}: band '{parent}' - '{child}'"
-    unknown = [str(name)[:40] for name in entry if name not in _FIELDS]
-    if unknown:
-        raise ModelError(f"{where}: unknown field {unknown[0]}; a band has {', '.join(_FIELDS)}")
-    for link in (parent, child):
+    where = f"{path}: band '{entry.get('parent')}' - '{entry.get('child')}'"
+    given = typed_entry(entry, BandEntry, where, ModelError)
+    for link in (given.parent, given.child):
         if link not in link_names:
             raise UnknownNameError("link", link, link_names, str(path))
-    if parent == child:
+    if given.parent == given.child:
         raise ModelError(f"{where}: parent and child must be two links")
-    axis, colour = _numbers(given["axis"]), _numbers(given["colour"])
-    if axis.shape != (3,) or not axis.any():
+    axis, begin, end, colour = given.axis, given.begin, given.end, given.colour
+    if axis.shape != (3,) or not np.all(np.isfinite(axis)) or not axis.any():
         raise ModelError(f"{where}: axis must be three finite numbers, not all zero")
-    reach = _numbers([given["begin"], given["end"]])
-    if len(reach) != 2 or not reach[0] < reach[1]:
+    if not -np.inf < begin < end < np.inf:
         raise ModelError(f"{where}: give begin and end along the axis [m], begin below end")
     if colour.shape != (3,) or not np.all((colour >= 0.0) & (colour <= 1.0)):
         raise ModelError(f"{where}: colour must be three numbers from 0 to 1")
-    if not mesh_name:
+    if not given.mesh:
         raise ModelError(f"{where}: name its mesh")
-    mesh = read_mesh_file(path.parent / mesh_name)
+    mesh = read_mesh_file(path.parent / given.mesh)
     if not is_watertight(mesh):
-        raise ModelError(f"{where}: {mesh_name} is not closed; close the band's ends")
+        raise ModelError(f"{where}: {given.mesh} is not closed; close the band's ends")
     along = mesh.vertices @ (axis / np.linalg.norm(axis))
-    share = np.clip((along - reach[0]) / (reach[1] - reach[0]), 0.0, 1.0)
+    share = np.clip((along - begin) / (end - begin), 0.0, 1.0)
     red, green, blue = colour.tolist()
-    return SkinBand(parent, child, mesh, share**2 * (3.0 - 2.0 * share), (red, green, blue))
-
-
-def _numbers(value: Any) -> Array:
-    """Finite numbers as an array; an empty one for anything else."""
-    try:
-        numbers = np.array(value, dtype=np.float64)
-    except (TypeError, ValueError):
-        return np.zeros(0)
-    return numbers if np.all(np.isfinite(numbers)) else np.zeros(0)
+    weights = share**2 * (3.0 - 2.0 * share)
+    return SkinBand(given.parent, given.child, mesh, weights, (red, green, blue))
 
 
 PositionKind = Literal["angle", "length", "quaternion"]

@@ -1,5 +1,7 @@
 """MJCF as Drake is given it: poses of links and what is drawn, against MuJoCo and by hand."""
 
+import sys
+
 import mujoco
 import numpy as np
 import pytest
@@ -260,3 +262,9 @@ def test_what_mujoco_refuses_is_refused_with_its_reason(tmp_path, text, message)
     path = write(tmp_path, text, "m.xml") if whole else file_of(tmp_path, text)
     with pytest.raises(ModelError, match=rf"(?s)m\.xml.*{message}"):
         load_model(path, check=False)
+
+
+def test_mujoco_is_asked_for_by_name(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "mujoco", None)
+    with pytest.raises(ModelError, match=r'm\.xml: .*pip install "drake_pose\[mjcf\]"'):
+        load_model(file_of(tmp_path), check=False)

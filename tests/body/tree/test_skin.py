@@ -136,7 +136,7 @@ def test_links_welded_to_each_other_share_a_band(tmp_path):
         ({"colour": [2, 0, 0]}, "colour must be three numbers from 0 to 1"),
         ({"child": "upper"}, "parent and child must be two links"),
         ({"length": 3}, "length"),
-        ({"begin": "x"}, "begin below end"),
+        ({"begin": "x"}, "parent, child, mesh, axis, begin"),
         ({"mesh": "open.obj"}, "not closed"),
     ],
 )

@@ -13,10 +13,6 @@ from drake_pose.files.settings import EstimateSettings
 from drake_pose.files.writer import OnFrame
 from drake_pose.jobs.estimate.scene import estimate_scene
 
-MODEL = "man"
-ROOT = "right_foot"
-ANKLE = "right_ankle"
-
 
 def stored_scene(name: str) -> Path:
     """Returns a stored scene's folder, in a checkout or inside the installed package.
@@ -44,8 +40,8 @@ def demo_settings(scene: Path) -> EstimateSettings:
     tilted by 20 degrees. The search is the multi-start search, at continuous angles.
     """
     return EstimateSettings(
-        root=ROOT,
-        root_position=(scene / "root_position.csv", ANKLE),
+        root="right_foot",
+        root_position=(scene / "root_position.csv", "right_ankle"),
         root_rotation={"y": (-180.0, 180.0), "x": (-20.0, 20.0), "z": (-20.0, 20.0)},
     )
 
@@ -62,24 +58,19 @@ def run_demo(out: Path, on_frame: OnFrame | None = None) -> SceneEstimate:
     """
     scene = demo_scene()
     with claimed(out, resume=True):
-        _clear_earlier_demo(out, scene)
-    return estimate_scene(scene, bundled_model(MODEL), out, demo_settings(scene), on_frame=on_frame)
-
-
-def _clear_earlier_demo(out: Path, scene: Path) -> None:
-    """Removes the files of an earlier demonstration, and nothing else."""
-    try:
-        summary = json.loads((out / SUMMARY).read_text(encoding="utf-8"))
-        is_demo = Path(summary["scene"]).resolve() == scene.resolve()
-    except (OSError, ValueError, TypeError, KeyError):
-        is_demo = False
-    if not is_demo or {file.name for file in out.iterdir()} - {*RESULT_FILES, OVERLAY}:
-        return
-    try:
-        for file in (*(out / name for name in RESULT_FILES), *(out / OVERLAY).glob("*/*.png")):
-            file.unlink(missing_ok=True)
-        for folder in (*(out / OVERLAY).glob("*"), out / OVERLAY):
-            if folder.is_dir():
-                folder.rmdir()
-    except OSError as error:
-        raise OutputError(f"{error.filename}: cannot be removed: {error.strerror}") from error
+        try:
+            summary = json.loads((out / SUMMARY).read_text(encoding="utf-8"))
+            is_demo = Path(summary["scene"]).resolve() == scene.resolve()
+        except (OSError, ValueError, TypeError, KeyError):
+            is_demo = False
+        if is_demo and {file.name for file in out.iterdir()} <= {*RESULT_FILES, OVERLAY}:
+            overlay = out / OVERLAY
+            try:
+                for file in (*(out / name for name in RESULT_FILES), *overlay.glob("*/*.png")):
+                    file.unlink(missing_ok=True)
+                for folder in (*overlay.glob("*"), *out.glob(OVERLAY)):
+                    folder.rmdir()
+            except OSError as error:
+                text = f"{error.filename}: cannot be removed: {error.strerror}"
+                raise OutputError(text) from error
+    return estimate_scene(scene, bundled_model("man"), out, demo_settings(scene), on_frame=on_frame)

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from drake_pose.body import bundled_model, load_model
-from drake_pose.jobs.demo import demo_scene, demo_settings
+from drake_pose.jobs.demo import demo_scene, demo_settings, run_demo
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from drake_pose.silhouette.pictures.scenes import load_scene
 from tests.cli import run_command
@@ -53,3 +53,17 @@ def test_the_recipe_is_the_papers() -> None:
     assert settings.root == "right_foot"
     assert settings.root_position == (demo_scene() / "root_position.csv", "right_ankle")
     assert "BSD 3-Clause License" in (demo_scene() / "NOTICE").read_text()
+
+
+def test_an_earlier_demonstration_is_replaced(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "overlay" / "front").mkdir(parents=True)
+    (tmp_path / "overlay" / "front" / "0010.png").touch()
+    (tmp_path / "summary.json").write_text(json.dumps({"scene": str(demo_scene())}))
+    left = []
+    monkeypatch.setattr(
+        "drake_pose.jobs.demo.estimate_scene", lambda *given, **_: left.extend(given[2].iterdir())
+    )
+    run_demo(tmp_path)
+    assert left == []

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from drake_pose.silhouette.pictures.scenes import Scene, load_scene
     from drake_pose.systems.cameras import SilhouetteCamera, cameras_from_drake
     from drake_pose.systems.diagrams import CameraRegistration
-    from drake_pose.systems.person.person_tracker import PersonTracker
+    from drake_pose.systems.person import PersonTracker
     from drake_pose.systems.silhouette_matcher import (
         SilhouetteMatcher,
         SilhouetteTracker,
@@ -50,7 +50,7 @@ _HOMES = {
     "MaskSettings": "jobs.masks.settings",
     "MultiStartSearch": "search",
     "ParallelCamera": "camera.models",
-    "PersonTracker": "systems.person.person_tracker",
+    "PersonTracker": "systems.person",
     "PinholeCamera": "camera.models",
     "RegistrationSettings": "jobs.registration.settings",
     "Scene": "silhouette.pictures.scenes",

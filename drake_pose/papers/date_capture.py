@@ -42,7 +42,7 @@ from drake_pose.systems.date import (
     prepare_paper_capture,
 )
 from drake_pose.systems.images import colour_image_to_picture
-from drake_pose.systems.person.live_capture import SilhouetteCapture, build_silhouette_capture
+from drake_pose.systems.person import SilhouetteCapture, build_silhouette_capture
 from drake_pose.systems.ports import StagedDiagram
 
 # A power of two: the time from frame to frame is exactly the same, and so is the motion expected.

@@ -51,7 +51,7 @@ from drake_pose.systems.date import (
     render_registered_pose,
 )
 from drake_pose.systems.images import colour_image_to_picture
-from drake_pose.systems.person.live_capture import LiveSensors, build_live_capture
+from drake_pose.systems.person import LiveSensors, build_live_capture
 from drake_pose.systems.picture_capture import CameraCount
 from drake_pose.systems.ports import evaluate
 

@@ -27,7 +27,7 @@ from drake_pose.camera.source_files import (
 from drake_pose.errors import OutputError, SceneError
 from drake_pose.files.folder import write_file
 from drake_pose.silhouette.segmentation.background import Background, learn_background
-from drake_pose.systems.person.live_capture import LiveSensors
+from drake_pose.systems.person import LiveSensors
 
 
 @dataclass(frozen=True, eq=False)

@@ -28,7 +28,7 @@ from drake_pose.jobs.live.settings import LiveSettings
 from drake_pose.person.date.skeleton import load_skeleton
 from drake_pose.person.date.walking import COMMANDS, make_motion
 from drake_pose.person.shape import tracker_of_person
-from drake_pose.systems.person.live_capture import LiveSensors, add_person_tracker
+from drake_pose.systems.person import LiveSensors, add_person_tracker
 from drake_pose.systems.ports import evaluate
 from drake_pose.systems.walk import KEYS, AddPositions, build_walk
 

@@ -1,1 +1,0 @@
-"""The capture of a person by all silhouettes at once, recorded or live."""

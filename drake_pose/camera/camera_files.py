@@ -1,4 +1,4 @@
-"""Camera files: YAML, one entry a camera; or Drake's own, a CameraConfig or a Scenario."""
+"""Camera files: our own YAML, one entry a camera; Drake's; and what calibration tools write."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
@@ -8,7 +8,12 @@ from typing import Any
 import numpy as np
 import yaml
 
-from drake_pose.arrays import Array
+from drake_pose.camera.calibration_files import (
+    FORMATS,
+    calibrated_cameras,
+    read_camera_content,
+)
+from drake_pose.camera.lens import Lens
 from drake_pose.camera.models import (
     HALF_PIXEL,
     Camera,
@@ -20,7 +25,6 @@ from drake_pose.camera.models import (
     write_file,
 )
 from drake_pose.errors import CameraError
-from drake_pose.yaml_files import read_yaml
 
 _COMMON = ("width", "height", "center_x", "center_y")
 _REQUIRED = {
@@ -60,6 +64,7 @@ def load_cameras(path: str | Path) -> dict[str, Camera]:
 
     A file of Drake's is known by its fields: a Scenario (``cameras:``, also below one name), a
     mapping of CameraConfigs, or a single one. Their principal points count from half a pixel less.
+    So are those of calibration tools: ROS, Kalibr, OpenCV, anipose, Pose2Sim and Caliscope.
     """
     found = load_camera_file(path)
     for name, link in found.links.items():
@@ -72,7 +77,7 @@ def load_cameras(path: str | Path) -> dict[str, Camera]:
         kind = "parallel" if isinstance(found.cameras[name], ParallelCamera) else "pinhole"
         raise CameraError(
             f"{path}: camera '{name}': a {kind} camera needs X_WC; drake-pose register finds it "
-            "from masks of a robot whose joint positions are known, drake-pose calibrate from "
+            "from masks of a robot whose joint positions are known, a calibration tool from "
             "pictures of a board"
         )
     return found.cameras
@@ -86,13 +91,13 @@ class CameraFile:
         cameras: by name, in the file's order; those without X_WC at the world's origin.
         unplaced: the names of these, but for those that ride on a link.
         links: by camera that rides on a link, the link; its X_WC holds X_LC, its pose in that.
-        distortions: of the pictures as taken, by camera that has any: OpenCV's coefficients.
+        lenses: of the pictures as taken, by camera that has distortion.
     """
 
     cameras: dict[str, Camera]
     unplaced: tuple[str, ...]
     links: Mapping[str, str] = field(default_factory=dict)
-    distortions: Mapping[str, Array] = field(default_factory=dict)
+    lenses: Mapping[str, Lens] = field(default_factory=dict)
 
 
 def load_camera_file(path: str | Path, *, distorted: bool = False) -> CameraFile:
@@ -101,38 +106,45 @@ def load_camera_file(path: str | Path, *, distorted: bool = False) -> CameraFile
     distorted: whether cameras may have a `distortion`, which the caller takes out of pictures.
     """
     path = Path(path)
-    content = read_yaml(path, CameraError, tags=True)
+    content = read_camera_content(path)
     if not isinstance(content, dict) or not content:
         raise CameraError(f"{path}: expected a mapping from camera names to their parameters")
-    configs = _find_configs(content, path)
+    calibrated = calibrated_cameras(content, path)
+    configs = None if calibrated else _find_configs(content, path)
     if configs is not None:
         # Drake takes a while to load, and our own files do not need it.
         from drake_pose.camera.drake import read_configs
 
         found = read_configs(configs, path)
         return CameraFile({_check_name(name, path): found[name] for name in found}, ())
-    cameras: dict[str, Camera] = {}
-    for key, entry in content.items():
+    cameras, lenses = dict[str, Camera](), dict[str, Lens]()
+    links, unplaced = dict[str, str](), list[str]()
+    for key in calibrated or content:
         name = _check_name(key, path)
         if name in cameras:
             raise CameraError(f"{path}: camera '{name}' is given twice")
-        cameras[name] = _read_camera(name, entry, path)
-    links = {str(key): entry["link"] for key, entry in content.items() if "link" in entry}
-    placed = {str(key) for key, entry in content.items() if "X_WC" in entry}
-    distortions = {
-        str(key): _read_distortion(entry["distortion"], f"{path}: camera '{key}'")
-        for key, entry in content.items()
-        if "distortion" in entry
-    }
-    distortions = {name: found for name, found in distortions.items() if found.any()}
-    if distortions and not distorted:
+        lens: Lens | None
+        if calibrated:
+            lens, X_WC = calibrated[name]
+            sides, centre = (lens.width, lens.height), (lens.center_x, lens.center_y)
+            pose = np.eye(4) if X_WC is None else X_WC
+            cameras[name] = PinholeCamera(name, *sides, lens.focal_x, lens.focal_y, *centre, pose)
+            is_placed = X_WC is not None
+        else:
+            entry = content[key]
+            camera = cameras[name] = _read_camera(name, entry, path, {*content})
+            lens = _read_lens(camera, entry.get("distortion"), f"{path}: camera '{name}'")
+            links |= {name: entry["link"]} if "link" in entry else {}
+            is_placed = "X_WC" in entry or "link" in entry
+        unplaced += [] if is_placed else [name]
+        lenses |= {name: lens} if lens is not None and lens.distortion.any() else {}
+    if lenses and not distorted:
         raise CameraError(
-            f"{path}: camera '{next(iter(distortions))}' has distortion, of which pictures and "
-            "masks must be free here: take it out of them (drake-pose undistort), and leave it out "
-            "of the file"
+            f"{path}: camera '{next(iter(lenses))}' has distortion, of which pictures and masks "
+            "must be free here: take it out of the pictures, which gives the cameras without it "
+            f"(drake-pose undistort RECORDING --cameras {path} --out SCENE)"
         )
-    unplaced = tuple(name for name in cameras if name not in {*placed, *links})
-    return CameraFile(cameras, unplaced, links, distortions)
+    return CameraFile(cameras, tuple(unplaced), links, lenses)
 
 
 def save_cameras(path: str | Path, cameras: Mapping[str, Camera] | Iterable[Camera]) -> None:
@@ -141,12 +153,17 @@ def save_cameras(path: str | Path, cameras: Mapping[str, Camera] | Iterable[Came
 
 
 def dump_cameras(
-    cameras: Mapping[str, Camera] | Iterable[Camera], links: Mapping[str, str] | None = None
+    cameras: Mapping[str, Camera] | Iterable[Camera],
+    links: Mapping[str, str] | None = None,
+    unplaced: Iterable[str] = (),
 ) -> str:
-    """The text of a camera file; links are those of CameraFile."""
+    """The text of a camera file; links and unplaced are those of CameraFile."""
     content = {camera.name: describe_camera(camera) for camera in camera_tuple(cameras)}
     for name, link in (links or {}).items():
-        content[name] |= {"link": link, "X_LC": content[name].pop("X_WC")}
+        if name in content:
+            content[name] |= {"link": link, "X_LC": content[name].pop("X_WC")}
+    for name in content.keys() & {*unplaced}:
+        del content[name]["X_WC"]
     return yaml.safe_dump(content, sort_keys=False)
 
 
@@ -197,11 +214,15 @@ def _check_name(key: Any, path: Path) -> str:
     return name
 
 
-def _read_camera(name: str, entry: Any, path: Path) -> Camera:
-    """Returns the camera of one entry of a file."""
+def _read_camera(name: str, entry: Any, path: Path, keys: set[Any]) -> Camera:
+    """Returns the camera of one entry of a file, which has some keys."""
     where = f"{path}: camera '{name}'"
-    if not isinstance(entry, dict):
-        raise CameraError(f"{where}: expected a mapping from field names to values")
+    ours = {field for kind in _REQUIRED for field in (*_REQUIRED[kind], *_OPTIONAL[kind])}
+    if not isinstance(entry, dict) or not ours & {*entry}:
+        raise CameraError(
+            f"{where}: expected a mapping from field names to values ({', '.join(_COMMON)} ...); "
+            f"the file has {', '.join(sorted(map(str, keys)))[:200]}; read are {FORMATS}"
+        )
     projection = entry.get("projection", "pinhole")
     if not isinstance(projection, str) or projection not in _REQUIRED:
         raise CameraError(f"{where}: projection must be pinhole or parallel")
@@ -243,14 +264,19 @@ def _read_camera(name: str, entry: Any, path: Path) -> Camera:
         raise CameraError(f"{path}: {error}") from error
 
 
-def _read_distortion(value: Any, where: str) -> Array:
-    """Coefficients as OpenCV counts them, or CameraError."""
+def _read_lens(camera: Camera, value: Any, where: str) -> Lens | None:
+    """The lens of a camera with OpenCV's coefficients, or CameraError; None: it has none."""
+    if value is None:
+        return None
     if not isinstance(value, list) or len(value) not in _COEFFICIENTS:
         raise CameraError(
             f"{where}: distortion must be a list of OpenCV's coefficients: k1, k2, p1, p2, then k3 "
             f"and more ({', '.join(map(str, _COEFFICIENTS))} numbers in all)"
         )
-    return np.array([check_number(one, "distortion", where) for one in value])
+    assert isinstance(camera, PinholeCamera), "parallel cameras have no such field"
+    numbers = [camera.focal_x, camera.focal_y, camera.center_x, camera.center_y]
+    numbers += [check_number(one, "distortion", where) for one in value]
+    return Lens.from_numbers((camera.width, camera.height), numbers)
 
 
 def describe_camera(camera: Camera) -> dict[str, Any]:

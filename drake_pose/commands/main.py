@@ -19,7 +19,7 @@ from drake_pose.commands.batch import batch
 from drake_pose.commands.common import UsageError, say
 from drake_pose.commands.estimate import capture, demo, empty_room, estimate
 from drake_pose.commands.papers import date, kameda, reproduce_all, shimada
-from drake_pose.commands.prepare import calibrate, check, masks, undistort
+from drake_pose.commands.prepare import check, masks, undistort
 from drake_pose.commands.register import audit, register
 from drake_pose.commands.walk import walk
 from drake_pose.errors import DrakePoseError, SettingsError
@@ -86,7 +86,7 @@ app = _program(
     Exit status: 0 done, 1 failed (the message says what is at fault), 2 wrong usage.""",
 )
 reproduce = _program("reproduce", "Run a paper's experiment and show its figures beside ours.")
-_add(app, estimate, capture, register, audit, masks, batch, walk, demo, check, calibrate)
+_add(app, estimate, capture, register, audit, masks, batch, walk, demo, check)
 _add(app, undistort, empty_room)
 _add(reproduce, kameda, shimada, date, reproduce_all)
 app.command(reproduce)

@@ -1,10 +1,10 @@
-"""The commands `drake-pose check`, `masks`, `calibrate`, `undistort`: before an estimate."""
+"""The commands `drake-pose check`, `masks`, `undistort`: before an estimate."""
 
 from __future__ import annotations
 
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 from rich.markup import escape
@@ -74,67 +74,22 @@ def check(file: Path, /, *, package: Packages | None = None, json: Json = False)
     say("drake-pose: fit for use")
 
 
-def calibrate(
-    folder: Path,
-    /,
-    *,
-    board: Path,
-    out: Annotated[Path, Parameter(alias="-o")],
-    world: str = "",
-    lens: Literal["none", "standard", "full"] = "standard",
-    leave_out: tuple[str, ...] = (),
-    drop_spoilt: bool = False,
-    json: Json = False,
-) -> None:
-    """Calibrate one camera or several from pictures of a checkerboard or a ChArUco board.
-
-    Intrinsics and distortion are found for each camera from its own pictures, extrinsics from
-    instants at which two or more cameras saw the board; a bundle adjustment then refines all of
-    them. The written cameras have no distortion: remove it from the pictures with undistort.
-
-        drake-pose calibrate CALIBRATION --board board.yaml --out SCENE/cameras.yaml
-
-    Args:
-        folder: Folder with images/<camera>/<frame>.png; the same frame is the same instant.
-        board: The board's YAML file.
-        out: Camera file to write; the lens file is written beside it.
-        world: World frame: board:FRAME or camera:NAME. Default: the first camera.
-        lens: Distortion: none, standard (k1, k2, p1, p2) or full (also k3).
-        leave_out: Leave out a camera, or a picture CAMERA/FRAME; repeat for several.
-        drop_spoilt: Leave out pictures that spoil the calibration.
-    """
-    from drake_pose.camera.calibrate import CalibrationSettings
-    from drake_pose.jobs.calibrate import calibrate_folder
-
-    settings = CalibrationSettings(
-        world=world, lens=lens, drop_spoilt=drop_spoilt, leave_out=leave_out
-    )
-    report = calibrate_folder(folder, board, out, settings)
-    if json:
-        print_json(report.as_json())
-    else:
-        output_console().print(report.table())
-    for text in report.warnings:
-        warn(text)
-    say(f"drake-pose: wrote {', '.join(str(path) for path in report.files)}")
-
-
 def undistort(
-    folder: Path, /, *, lenses: Path, out: Annotated[Path, Parameter(alias="-o")]
+    folder: Path, /, *, cameras: Path, out: Annotated[Path, Parameter(alias="-o")]
 ) -> None:
     """Remove the lenses' distortion from pictures.
 
-        drake-pose undistort RECORDING --lenses SCENE/cameras_lenses.yaml --out SCENE
+        drake-pose undistort RECORDING --cameras calibration.toml --out SCENE
 
     Args:
         folder: Folder with images/<camera>/<frame>.png or .jpg.
-        lenses: The lens file that calibrate wrote.
-        out: Folder for the pictures.
+        cameras: Camera file with distortion: of ROS, Kalibr, OpenCV, anipose, Pose2Sim, Caliscope,
+            or cameras.yaml.
+        out: Folder for the pictures, and for cameras.yaml of the pictures without distortion.
     """
-    from drake_pose.camera.rig import load_lenses
-    from drake_pose.jobs.calibrate import undistort_pictures
+    from drake_pose.jobs.undistort import undistort_pictures
 
-    written = undistort_pictures(folder, load_lenses(lenses), out)
+    written = undistort_pictures(folder, cameras, out)
     say(f"drake-pose: {len(written)} pictures written to {out}")
 
 

@@ -125,7 +125,7 @@ def _connect(address: str, timeout: float) -> Client:
         # Before a Client is made: one that finds nobody complains when it is destroyed.
         asyncio.run(shake_hands())
         return Client(address, timeout=timeout, set_as_default=False)
-    except (OSError, ValueError, TypeError, EOFError, MemoryError, asyncio.TimeoutError) as error:
+    except (TimeoutError, OSError, ValueError, TypeError, EOFError, MemoryError) as error:
         # A server that is no scheduler may answer anything: bytes of a web page are taken for the
         # size of a message, exabytes.
         raise ClusterError(

@@ -13,7 +13,6 @@ import pytest
 import yaml
 
 from drake_pose.body import load_landmarks
-from drake_pose.camera.board import load_board
 from drake_pose.camera.camera_files import load_cameras
 from drake_pose.camera.source_files import load_sources
 from drake_pose.commands.main import app
@@ -127,8 +126,7 @@ def test_command_line_examples_use_options_that_exist(words: list[str]) -> None:
 
 def test_options_named_in_the_text_exist() -> None:
     commands = [
-        [command]
-        for command in ("estimate", "register", "masks", "capture", "batch", "walk", "calibrate")
+        [command] for command in ("estimate", "register", "masks", "capture", "batch", "walk")
     ]
     commands += [["reproduce", paper] for paper in ("kameda", "shimada", "date", "all")]
     shown = [run_command([*one, "--help"], env=ENVIRONMENT) for one in commands]
@@ -219,7 +217,6 @@ def test_the_examples_of_files_can_be_read(tmp_path: Path) -> None:
     assert [one.kind for one in sources.values()] == ["device", "video", "folder"]
     jobs = read_job(write("jobs.yaml", formats, "scenes:"))
     assert [job.name for job in jobs] == ["monday", "tuesday", "walker", "robot"]
-    assert load_board(write("board.yaml", formats, "square_length")).columns == 8
     assert "left_elbow" in load_landmarks(write("landmarks.yaml", models, "landmarks:"))
     columns = ("flexion_11", "flexion_12", "flexion_13")
     rows = load_couplings(write("hand.couplings.yaml", models, "differences"), columns)

@@ -15,8 +15,8 @@ from scipy.spatial.transform import Rotation
 
 from drake_pose.arrays import Array, Indices, Picture
 from drake_pose.camera.episodes.episode import Episode, EpisodeCamera, JointLog, ascending
+from drake_pose.camera.lens import Lens
 from drake_pose.camera.picture_files import decode_colours
-from drake_pose.camera.rig import Lens
 from drake_pose.camera.video_files import import_reader
 from drake_pose.errors import DrakePoseError, SceneError
 

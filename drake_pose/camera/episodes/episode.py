@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from drake_pose.arrays import Array, Indices, Picture
+from drake_pose.camera.lens import Lens
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.camera.picture_files import frame_key
-from drake_pose.camera.rig import Lens
 from drake_pose.errors import SceneError, UnknownNameError
 
 # A log of which more rows run backwards or stand still than this share has no usable clock.

@@ -13,7 +13,6 @@ from drake_pose.camera.camera_files import CameraFile, load_camera_file
 from drake_pose.camera.episodes.episode import Episode, EpisodeCamera, JointLog, ascending
 from drake_pose.camera.models import PinholeCamera, check_number
 from drake_pose.camera.picture_files import frame_key, in_order, list_pictures, read_picture
-from drake_pose.camera.rig import Lens
 from drake_pose.camera.source_files import CAMERAS, TIME_STAMPS, read_time_stamps
 from drake_pose.camera.video_files import VIDEOS, TimedVideo
 from drake_pose.csv_files import read_csv
@@ -155,10 +154,7 @@ def with_intrinsics(camera: EpisodeCamera, known: CameraFile, path: Path) -> Epi
             f"{where}: has {found.width} x {found.height} pixels (width x height), but its "
             f"pictures {camera.width} x {camera.height}: give the numbers of these pictures"
         )
-    link, lens = known.links.get(camera.name), None
-    if camera.name in known.distortions:
-        numbers = [found.focal_x, found.focal_y, found.center_x, found.center_y]
-        numbers += known.distortions[camera.name].tolist()
-        lens = Lens.from_numbers((found.width, found.height), numbers)
+    link, lens = known.links.get(camera.name), known.lenses.get(camera.name)
+    if lens is not None:
         found = lens.camera(found.name, found.X_WC)
     return replace(camera, camera=found, link=link, lens=lens)

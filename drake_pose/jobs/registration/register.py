@@ -310,7 +310,7 @@ class _Registration:
             if name in episode.assumed:
                 raise CameraError(
                     f"camera '{name}': nobody says its focal length, without which pictures of a "
-                    "target do not tell how far away it is; calibrate it (drake-pose calibrate)"
+                    "target do not tell how far away it is; calibrate it"
                 )
             recording = episode.recordings[name]
             rows, _ = choose_pictures(body, camera, recording, _OF_TARGET)

@@ -1,0 +1,63 @@
+"""`drake-pose undistort`: pictures free of their lenses' distortion, and the cameras of these."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+
+from drake_pose.camera.camera_files import dump_cameras, load_camera_file
+from drake_pose.camera.models import PinholeCamera
+from drake_pose.camera.picture_files import list_pictures, read_picture
+from drake_pose.camera.source_files import CAMERAS
+from drake_pose.errors import CameraError
+from drake_pose.files.folder import write_file
+
+
+def undistort_pictures(
+    folder: str | Path, cameras: str | Path, out: str | Path
+) -> dict[tuple[str, str], Path]:
+    """Writes a folder's pictures free of distortion, and the cameras that see them so.
+
+    Args:
+        folder: holds `images/<camera>/<frame>.png` (or .jpg).
+        cameras: a camera file of any kind that is read, with the cameras' distortion.
+        out: a folder; the pictures go to `images/<camera>/<frame>.png` in it, the cameras to
+            `cameras.yaml`, without X_WC where the given file has none.
+
+    Returns:
+        The files by (camera, frame).
+
+    Raises:
+        CameraError: a camera is not in the file, or a picture cannot be read or has another size.
+        OutputError: a file cannot be written.
+    """
+    known, root = load_camera_file(cameras, distorted=True), Path(folder) / "images"
+    if not root.is_dir():
+        raise CameraError(f"{folder}: no such folder; it needs images/<camera>/<frame>.png")
+    folders = sorted(path for path in root.iterdir() if path.is_dir())
+    pictures = {one.name: list_pictures(one, CameraError) for one in folders}
+    if not any(pictures.values()):
+        raise CameraError(f"{root}: holds no picture <camera>/<frame>.png or .jpg")
+    straight = dict[str, PinholeCamera]()
+    for name in pictures:
+        camera = known.cameras.get(name)
+        if not isinstance(camera, PinholeCamera):
+            raise CameraError(
+                f"{cameras}: has no pinhole camera '{name}'; there are: {', '.join(known.cameras)}"
+            )
+        lens = known.lenses.get(name)
+        straight[name] = camera if lens is None else lens.camera(name, camera.X_WC)
+    text = dump_cameras(straight, known.links, known.unplaced)
+    write_file(Path(out), CAMERAS, text.encode())
+    written = dict[tuple[str, str], Path]()
+    for name, frames in pictures.items():
+        for frame, path in frames.items():
+            picture = read_picture(path, CameraError)
+            if name in known.lenses:
+                picture = known.lenses[name].undistort(picture)
+            place = f"images/{name}/{frame}.png"
+            data = cv2.imencode(".png", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))[1]
+            write_file(Path(out), place, data.tobytes())
+            written[name, frame] = Path(out) / place
+    return written

@@ -1,0 +1,203 @@
+"""Cameras that calibration tools wrote, against OpenCV's own projection."""
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+
+from drake_pose.camera.camera_files import load_camera_file, load_cameras
+from drake_pose.errors import CameraError
+from drake_pose.jobs.undistort import undistort_pictures
+
+SIZE = (640, 480)
+K = np.array([[500.0, 0.0, 310.0], [0.0, 505.0, 250.0], [0.0, 0.0, 1.0]])
+RADIAL = np.array([-0.2, 0.05, 1e-3, -1e-3, 0.01])
+FISHEYE = np.array([0.02, -0.01, 0.004, -0.001])
+RVEC, T = np.array([0.3, -0.2, 0.9]), np.array([0.1, -0.2, 2.5])
+R = cv2.Rodrigues(RVEC)[0]
+POINTS = np.random.default_rng(0).uniform(-0.4, 0.4, (30, 3))
+
+
+def matrix(values, kind="  "):
+    values = np.atleast_2d(values)
+    numbers = ", ".join(f"{x:.17g}" for x in values.ravel())
+    shape = f"rows: {values.shape[0]}\n{kind}cols: {values.shape[1]}\n{kind}"
+    return f"\n{kind}{shape}data: [{numbers}]"
+
+
+def opencv_matrix(values):
+    return f" !!opencv-matrix{matrix(values, '   ').replace('data', 'dt: d' + chr(10) + '   data')}"
+
+
+def camera_info(model="plumb_bob", coefficients=RADIAL):
+    return (
+        f"image_width: {SIZE[0]}\nimage_height: {SIZE[1]}\ncamera_name: left\n"
+        f"camera_matrix:{matrix(K)}\ndistortion_model: {model}\n"
+        f"distortion_coefficients:{matrix(coefficients)}\n"
+        f"rectification_matrix:{matrix(np.eye(3))}\n"
+    )
+
+
+def opencv(pose=True):
+    return (
+        f"%YAML:1.0\n---\nimage_width: {SIZE[0]}\nimage_height: {SIZE[1]}\n"
+        f"camera_matrix:{opencv_matrix(K)}\n"
+        f"distortion_coefficients:{opencv_matrix(RADIAL[:, None])}"
+        + (f"\nR:{opencv_matrix(R)}\nT:{opencv_matrix(T[:, None])}\n" if pose else "\n")
+    )
+
+
+def toml(rotation=RVEC, distortions=RADIAL, fisheye=False, translation=T):
+    return (
+        f'[cam_0]\nname = "left"\nsize = [{SIZE[0]}.0, {SIZE[1]}.0]\nmatrix = {K.tolist()}\n'
+        f"distortions = {distortions.tolist()}\nrotation = {rotation.tolist()}\n"
+        f"translation = {translation.tolist()}\nfisheye = {str(fisheye).lower()}\n"
+        "\n[metadata]\nadjusted = false\nerror = 0.3\n"
+    )
+
+
+def kalibr(model="pinhole"):
+    X_10 = np.eye(4)
+    X_10[:3, :3], X_10[:3, 3] = R, T
+    cameras = {
+        "cam0": {
+            "camera_model": "pinhole", "intrinsics": [500.0, 505.0, 310.0, 250.0],
+            "distortion_model": "equidistant", "distortion_coeffs": FISHEYE.tolist(),
+            "resolution": list(SIZE), "rostopic": "/left/image_raw",
+        },
+        "cam1": {
+            "camera_model": model, "intrinsics": [500.0, 505.0, 310.0, 250.0],
+            "distortion_model": "radtan", "distortion_coeffs": RADIAL[:4].tolist(),
+            "resolution": list(SIZE), "T_cn_cnm1": X_10.tolist(),
+        },
+    }  # fmt: skip
+    return yaml.safe_dump(cameras)
+
+
+def load(tmp_path, text, name="any.txt"):
+    path = tmp_path / name
+    path.write_text(text)
+    return load_camera_file(path, distorted=True)
+
+
+@pytest.mark.parametrize(
+    ("text", "name", "placed", "coefficients"),
+    [
+        (camera_info(), "left", False, RADIAL),
+        (camera_info("rational_polynomial", np.r_[RADIAL, 0.1, 0.02, 0]), "left", False, None),
+        (opencv(), "any", True, RADIAL),
+        (opencv(pose=False), "any", False, RADIAL),
+        (toml(), "left", True, RADIAL),
+        (toml(rotation=R), "left", True, RADIAL),
+        (kalibr(), "cam1", True, RADIAL[:4]),
+    ],
+)
+def test_points_land_where_opencv_projects_them(tmp_path, text, name, placed, coefficients):
+    """The lens as OpenCV has it; and without distortion the camera that is written of it."""
+    found = load(tmp_path, text)
+    assert (name not in found.unplaced) == placed
+    lens, camera = found.lenses[name], found.cameras[name]
+    assert (camera.width, camera.height) == SIZE
+    np.testing.assert_array_equal(lens.matrix, K)
+    if coefficients is not None:
+        np.testing.assert_array_equal(lens.distortion, coefficients)
+    pose = (RVEC, T) if placed else (np.zeros(3), np.zeros(3))
+    points = POINTS if placed else POINTS + np.array([0, 0, 3])
+    expected = cv2.projectPoints(points, *pose, K, None)[0].reshape(-1, 2)
+    np.testing.assert_allclose(camera.project(points)[0], expected, atol=1e-9)
+    straight = cv2.projectPoints(points, *pose, lens.straight_matrix, None)[0].reshape(-1, 2)
+    seen = lens.camera(name, camera.X_WC).project(points)[0]
+    np.testing.assert_allclose(seen, straight, atol=1e-9)
+
+
+def test_fisheyes_are_undistorted_as_opencv_does(tmp_path):
+    for text, name in ((kalibr(), "cam0"), (camera_info("equidistant", FISHEYE), "left"),
+                       (toml(distortions=FISHEYE, fisheye=True), "left")):  # fmt: skip
+        lens = load(tmp_path, text).lenses[name]
+        assert lens.fisheye
+        picture = np.random.default_rng(1).integers(0, 255, (*SIZE[::-1], 3), dtype=np.uint8)
+        picture = cv2.GaussianBlur(picture, (0, 0), 3)
+        expected = cv2.fisheye.undistortImage(picture, K, FISHEYE, Knew=lens.straight_matrix)
+        off = np.abs(lens.undistort(picture).astype(int) - expected)
+        assert np.percentile(off, 99) <= 1
+
+
+def test_a_chain_begins_in_its_first_camera(tmp_path):
+    found = load(tmp_path, kalibr())
+    assert found.unplaced == ()
+    np.testing.assert_array_equal(found.cameras["cam0"].X_WC, np.eye(4))
+    X_01 = found.cameras["cam1"].X_WC
+    np.testing.assert_allclose(X_01[:3, :3], R.T, atol=1e-12)
+    np.testing.assert_allclose(X_01[:3, 3], -R.T @ T, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (camera_info("omnidirectional"), ["'left'", "distortion_model 'omnidirectional'"]),
+        (camera_info("plumb_bob", RADIAL[:3]), ["'left'", "3 distortion coefficients"]),
+        (camera_info().replace("image_width", "width_"), ["image_width and image_height"]),
+        (camera_info().replace("500", "-500"), ["camera matrix"]),
+        (opencv().replace("image_height: 480\n", ""), ["image_height"]),
+        (opencv()[:60], ["any"]),
+        (opencv()[:200], ["distortion coefficients"]),
+        (kalibr("omni"), ["'cam1'", "Kalibr's 'omni'"]),
+        (kalibr().replace("radtan", "fov"), ["'fov' distortion"]),
+        (toml(translation=1e3 * T), ["'cam_0'", "2510 m", "millimetres"]),
+        (toml(rotation=RVEC[:2]), ["rotation vector"]),
+        (toml(rotation=2 * R), ["not a rotation"]),
+        (toml().replace("size =", "pixels ="), ["width and height"]),
+        (toml().replace("matrix = [[", "matrix = [["[:-1]), ["not a TOML file"]),
+        (toml() + toml().replace("cam_0", "cam_1").split("[metadata]")[0], ["given twice"]),
+        ("transformation: {x: 1, y: 2}\nparameters: {a: b}\n", ["Kalibr", "transformation"]),
+        ('{"left": [0.71, -0.97, 1.13, -2.3, 0.1, 2.2]}', ["'left'", "camera_info", "TOML"]),
+    ],
+)
+def test_what_cannot_be_used_is_named_with_what_is_read(tmp_path, text, words):
+    with pytest.raises(CameraError) as caught:
+        load(tmp_path, text)
+    for word in ["any.txt", *words]:
+        assert word in str(caught.value)
+
+
+def test_distortion_is_refused_where_pictures_must_be_free_of_it(tmp_path):
+    path = tmp_path / "calibration.toml"
+    path.write_text(toml())
+    with pytest.raises(CameraError, match=r"'left' has distortion.*drake-pose undistort"):
+        load_cameras(path)
+    path.write_text(toml(distortions=np.zeros(5)))
+    assert list(load_cameras(path)) == ["left"]
+
+
+def test_pictures_are_undistorted_and_their_cameras_written(tmp_path):
+    picture = np.random.default_rng(1).integers(0, 255, (*SIZE[::-1], 3), dtype=np.uint8)
+    for name in ("left", "right"):
+        (tmp_path / "images" / name).mkdir(parents=True)
+        cv2.imwrite(str(tmp_path / "images" / name / "7.png"), picture)
+    file = tmp_path / "calibration.toml"
+    right = toml(distortions=np.zeros(5)).replace("cam_0", "cam_1").replace("left", "right")
+    file.write_text(toml() + right.split("[metadata]")[0])
+    written = undistort_pictures(tmp_path, file, tmp_path / "out")
+    assert set(written) == {("left", "7"), ("right", "7")}
+    lens, cameras = load_camera_file(file, distorted=True).lenses["left"], tmp_path / "out"
+    own = cv2.imread(str(written["left", "7"]))
+    expected = cv2.undistort(picture, K, RADIAL, None, lens.straight_matrix)
+    assert np.percentile(np.abs(own.astype(int) - expected), 99) <= 1
+    np.testing.assert_array_equal(cv2.imread(str(written["right", "7"])), picture)
+    found = load_cameras(cameras / "cameras.yaml")
+    np.testing.assert_allclose(found["left"].focal_x, lens.straight_matrix[0, 0])
+    np.testing.assert_allclose(found["left"].X_WC, found["right"].X_WC)
+    # What a lens saw has no black rim.
+    white = np.full((*SIZE[::-1], 3), 255, np.uint8)
+    assert lens.undistort(white).min() > 200
+    for spoil, message in (
+        (lambda: (tmp_path / "images" / "right").rename(tmp_path / "images" / "rear"), "'rear'"),
+        (lambda: cv2.imwrite(str(tmp_path / "images/left/7.png"), white[:9]), "640 x 9"),
+    ):
+        spoil()
+        with pytest.raises(CameraError, match=message):
+            undistort_pictures(tmp_path, file, tmp_path / "again")
+        if (tmp_path / "images" / "rear").exists():
+            (tmp_path / "images" / "rear").rename(tmp_path / "images" / "right")
+    with pytest.raises(CameraError, match="no such folder"):
+        undistort_pictures(tmp_path / "nowhere", file, tmp_path / "again")

@@ -22,10 +22,9 @@ if TYPE_CHECKING:
     from drake_pose.camera.drake import camera_from_drake
     from drake_pose.camera.models import ParallelCamera, PinholeCamera
     from drake_pose.files.records import SceneEstimate
-    from drake_pose.files.settings import EstimateSettings
+    from drake_pose.files.settings import EstimateSettings, MaskSettings
     from drake_pose.jobs.estimate.scene import estimate_scene
-    from drake_pose.jobs.masks.masks import SceneMasks, make_masks
-    from drake_pose.jobs.masks.settings import MaskSettings
+    from drake_pose.jobs.masks import SceneMasks, make_masks
     from drake_pose.jobs.registration.audit import SceneAudit, audit_scene
     from drake_pose.jobs.registration.register import SceneRegistration, register_scene
     from drake_pose.jobs.registration.settings import RegistrationSettings
@@ -47,7 +46,7 @@ _HOMES = {
     "BeamSearch": "search",
     "CameraRegistration": "systems.diagrams",
     "EstimateSettings": "files.settings",
-    "MaskSettings": "jobs.masks.settings",
+    "MaskSettings": "files.settings",
     "MultiStartSearch": "search",
     "ParallelCamera": "camera.models",
     "PersonTracker": "systems.person",
@@ -56,7 +55,7 @@ _HOMES = {
     "Scene": "silhouette.pictures.scenes",
     "SceneAudit": "jobs.registration.audit",
     "SceneEstimate": "files.records",
-    "SceneMasks": "jobs.masks.masks",
+    "SceneMasks": "jobs.masks",
     "SceneRegistration": "jobs.registration.register",
     "SilhouetteCamera": "systems.cameras",
     "SilhouetteMatcher": "systems.silhouette_matcher",
@@ -72,7 +71,7 @@ _HOMES = {
     "load_cameras": "camera.camera_files",
     "load_model": "body.model",
     "load_scene": "silhouette.pictures.scenes",
-    "make_masks": "jobs.masks.masks",
+    "make_masks": "jobs.masks",
     "register_scene": "jobs.registration.register",
     "save_cameras": "camera.camera_files",
 }

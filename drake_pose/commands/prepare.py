@@ -22,11 +22,10 @@ from drake_pose.commands.common import (
     warn,
 )
 from drake_pose.errors import ModelError
-from drake_pose.files.settings import Packages
-from drake_pose.jobs.masks.settings import MaskSettings
+from drake_pose.files.settings import MaskSettings, Packages
 
 if TYPE_CHECKING:
-    from drake_pose.jobs.masks.masks import SceneMasks
+    from drake_pose.jobs.masks import SceneMasks
 
 
 def check(file: Path, /, *, package: Packages | None = None, json: Json = False) -> None:
@@ -104,11 +103,11 @@ def masks(
 ) -> None:
     """Make a scene of masks: of masks that other tools wrote, or of pictures.
 
-    Masks of other tools are COCO files, PNG pictures with a palette, with an alpha channel or with
-    probabilities, and black and white videos. In pictures and videos an object is found by the
-    empty room (--background), a box (--box), a network of yours (--network), or the object's own
-    model (--model with --start): pose and mask are found in turn. A median of the pictures stands
-    for the empty room only where the body leaves every place; the command says where it does not.
+    Masks of other tools are COCO files, black and white pictures, or black and white videos. In
+    pictures and videos an object is found by the empty room (--background), a box (--box), or the
+    object's own model (--model with --start): pose and mask are found in turn. A median of the
+    pictures stands for the empty room only where the body leaves every place; the command says
+    where it does not.
 
     Files in SCENE: masks/; cameras.yaml and scene.yaml; overlay/, the pictures with the masks'
     outlines: look at them; summary.json, each mask's area, refusal and warnings.
@@ -123,7 +122,7 @@ def masks(
         out: Folder for the scene; new or empty.
         overlay: Write the pictures with the masks' outlines, overlay/<camera>/<frame>.jpg.
     """
-    from drake_pose.jobs.masks.masks import make_masks
+    from drake_pose.jobs.masks import make_masks
 
     with count_progress("masks", None) as advance:
         result = make_masks(source, out, settings, overlay=overlay, on_mask=advance)

@@ -110,14 +110,6 @@ def parse_numbers(text: str, count: int) -> tuple[float, ...]:
     return tuple(map(parse_number, parts))
 
 
-def parse_size(text: str) -> tuple[int, ...]:
-    """Returns width and height of a text ``W,H`` [pixel]."""
-    sides = parse_numbers(text, 2)
-    if any(side < 1 or side != int(side) for side in sides):
-        raise SettingsError(f"'{text}' must be two whole numbers of pixels")
-    return tuple(map(int, sides))
-
-
 def parse_boxes(texts: Iterable[str]) -> tuple[tuple[Corner, Corner], ...]:
     """Returns the least and the largest corner of each text ``X,Y,Z:X,Y,Z`` of two corners [m]."""
     boxes = []

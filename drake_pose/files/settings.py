@@ -3,8 +3,10 @@
 A class's fields are all three; the text below a field is the option's help.
 """
 
+import math
 from collections.abc import Mapping
 from dataclasses import MISSING, dataclass, field, fields
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
 
@@ -15,6 +17,7 @@ from drake_pose.files.options import (
     Axis,
     from_text,
     parse_assignments,
+    parse_numbers,
     parse_packages,
     parse_root_position,
     parse_root_rotation,
@@ -173,6 +176,56 @@ class EstimateSettings(CaptureSettings, EpisodeSettings):
         if isinstance(turns, Mapping):
             values["root_rotation"] = [[axis, *limits] for axis, limits in turns.items()]
         return values
+
+
+@dataclass(frozen=True, kw_only=True)
+class MaskSettings:
+    """How masks are found; where no way is given, the source holds masks of another tool.
+
+    Raises SettingsError: several ways at once, or options of another way.
+    """
+
+    cameras: Path | None = None
+    """Camera file that the scene gets. Default: SOURCE/cameras.yaml, if it exists."""
+    classes: Annotated[tuple[str, ...], Parameter("--class", metavar="NAME")] = ()
+    """Class of a COCO file that is the object, by name or number; repeat for several; all: every
+    class. Default: the only one."""
+    background: str | Path | None = None
+    """Empty room: a picture, or a folder with <camera>.png or <camera>/<frame>.png; median: of the
+    pictures themselves, in which the body moves. Default: SOURCE/background, if it exists."""
+    box: Annotated[
+        tuple[float, ...] | None, from_text(partial(parse_numbers, count=4), "X,Y,W,H")
+    ] = None
+    """Box around the object in all pictures: left, top, width, height [pixel]."""
+    model: Annotated[Path | None, Parameter(alias="-m")] = None
+    """The object: URDF, SDFormat, MJCF or .dmd.yaml; pose and mask are found in turn."""
+    start: Path | None = None
+    """Rough joint positions of every frame [rad or m]: a CSV file with the column frame and one for
+    each joint."""
+    start_error: Annotated[float, Parameter(metavar="DEG")] = 5.0
+    """How far off their angles are: standard deviation [deg]."""
+    hold: Positions = field(default_factory=dict)
+    """Hold this joint at a known position [deg or m]; repeat for several."""
+    packages: Packages = field(default_factory=dict)
+    largest: bool = False
+    """Keep only the largest patch of each mask."""
+
+    def __post_init__(self) -> None:
+        if self.box is not None and not (len(self.box) == 4 and all(map(math.isfinite, self.box))):
+            raise SettingsError(f"box must be 4 numbers, not {self.box}")
+        ways = [one for one in ("background", "box", "model") if getattr(self, one) is not None]
+        if len(ways) > 1:
+            raise SettingsError(f"--{ways[0]} and --{ways[1]} are two ways to find masks: give one")
+        if self.classes and ways:
+            raise SettingsError(f"--class is for COCO files, not for --{ways[0]}")
+        if (self.model is None) != (self.start is None):
+            raise SettingsError("--model and --start need each other: rough joint positions")
+        if not (math.isfinite(self.start_error) and self.start_error > 0.0):
+            raise SettingsError("--start-error must be a positive number of degrees")
+
+    def as_json(self) -> Mapping[str, Any]:
+        """The settings that are not the default's, as plain JSON values."""
+        return {name: plain(getattr(self, name)) for name in changed(self)}
 
 
 def changed(settings: Any) -> tuple[str, ...]:

@@ -8,7 +8,6 @@ from drake_pose.files.options import (
     parse_boxes,
     parse_root_position,
     parse_root_rotation,
-    parse_size,
 )
 from drake_pose.silhouette.pictures.scene_files import select_frames
 from tests.cli import run_command
@@ -26,7 +25,6 @@ def test_texts_become_values():
     limits = parse_root_rotation("y=-180:180, x=-10:10")
     assert list(limits.items()) == [("y", (-180.0, 180.0)), ("x", (-10.0, 10.0))]
     assert parse_boxes(["1,2,9:4,-5,6"]) == (((1.0, -5.0, 6.0), (4.0, 2.0, 9.0)),)
-    assert parse_size("640,480") == (640, 480)
 
 
 BAD = {
@@ -75,7 +73,6 @@ def test_frames_that_are_unknown_or_unclear_list_those_that_exist(frames, text, 
 @pytest.mark.parametrize(
     ("parse", "text", "words"),
     [
-        *((parse_size, one, one) for one in ("640", "640.5,480", "0,480", "640,480,3")),
         (parse_assignments, ["a=1", "a=2"], "'a' is given twice"),
     ],
 )

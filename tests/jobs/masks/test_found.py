@@ -1,4 +1,4 @@
-"""Masks found in pictures: by the empty room, by a box, by a network."""
+"""Masks found in pictures: by the empty room, by a box."""
 
 import filecmp
 import shutil
@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 
 from drake_pose import MaskSettings, load_scene, make_masks
-from drake_pose.errors import MaskError, SceneError, SettingsError
-from drake_pose.jobs.masks.masks import doubt_mask, largest_patch, refuse_mask
+from drake_pose.errors import SceneError, SettingsError
+from drake_pose.jobs.masks import doubt_mask, largest_patch, refuse_mask
 from tests.cli import run_to_end
 from tests.jobs.masks.rooms import iou, moving, write_pictures
-from tests.silhouette.segmentation.test_network import network
 
 
 @pytest.fixture(scope="module")
@@ -100,8 +99,6 @@ def test_light_that_changed_and_pictures_of_another_size_are_named(pictures, tmp
     [
         ({"background": "median", "box": (1, 2, 3, 4)}, "two ways"),
         ({"background": "median", "classes": ("1",)}, "--class"),
-        ({"background": "median", "pixels": "alpha"}, "--pixels"),
-        ({"network_bgr": True}, "--network FILE"),
         ({"box": (1, 2, 3)}, "4 numbers"),
     ],
 )
@@ -133,22 +130,6 @@ def test_box_cuts_a_still_out(still, tmp_path, out):
     words[3] = tmp_path / "none"
     assert "still.png: the box" in run_to_end(*words, "300,20,95,85", status=1).stderr
     run_to_end(*words, "1,2,3", status=2)
-
-
-def test_network_takes_the_colours_that_are_said(still, tmp_path):
-    path, true = still
-    file = network(tmp_path / "net.onnx", "scores")
-    # With red for blue the table is the object.
-    swapped = MaskSettings(network=file, network_size=(80, 60), network_bgr=True)
-    result = make_masks(path, tmp_path / "table", swapped)
-    assert iou(load_scene(tmp_path / "table").read("camera", "still"), ~true) > 0.95
-    assert "is it the background?" in result.warnings[0]
-    # 2 blue - red - green is more than 0; what is taken away and divided by, moves that.
-    moved = MaskSettings(
-        network=file, network_size=(80, 60), network_mean=(0.0, 0.0, 1.0), network_std=(1, 1, 0.1)
-    )
-    with pytest.raises(MaskError, match="not found"):
-        make_masks(path, tmp_path / "none", moved)
 
 
 def test_masks_of_nothing_of_all_and_of_two_objects_are_judged():

@@ -160,9 +160,14 @@ def test_command_says_what_was_made(tmp_path, two_views):
     source = two_views.folder / "masks" / "side"
     assert run_json("masks", source, "--out", tmp_path / "a")["mask_count"] == 3
     assert "3 masks of 3 pictures" in run_to_end("masks", source, "--out", tmp_path / "b").stdout
-    run_to_end("masks", source, "--out", tmp_path / "c", "--pixels", "soft", status=2)
     photograph = tmp_path / "photograph.png"
     noise = np.random.default_rng(0).integers(0, 255, (9, 9, 3), dtype=np.uint8)
+    noise[0] = 0
     cv2.imwrite(str(photograph), noise)
     done = run_to_end("masks", photograph, "--out", tmp_path / "c", status=1)
-    assert "photograph.png: is a colour picture" in done.stderr
+    assert "photograph.png: the mask has" in done.stderr
+    assert "threshold it first" in done.stderr
+    blurred = np.where(load_scene(two_views.folder).read("side", "0000"), 255, 0).astype(np.uint8)
+    cv2.imwrite(str(tmp_path / "mask.jpg"), blurred)
+    make_masks(tmp_path / "mask.jpg", tmp_path / "d")
+    assert (load_scene(tmp_path / "d").read("camera", "mask") == (blurred > 0)).all()

@@ -1,15 +1,15 @@
-"""What masks are made of: folders of pictures, videos, and COCO files, by camera."""
+"""Where masks come from: folders of pictures, videos, and COCO files, by camera."""
 
 from __future__ import annotations
 
 import itertools
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 
+from drake_pose.arrays import Picture
 from drake_pose.camera.camera_files import CameraFile, load_camera_file
-from drake_pose.camera.picture_files import SUFFIXES, Mask, Picture, list_pictures, read_picture
+from drake_pose.camera.picture_files import SUFFIXES, list_pictures, read_picture
 from drake_pose.errors import SceneError
 from drake_pose.silhouette.pictures.scene_files import VIDEOS, VideoPictures
 from drake_pose.silhouette.pictures.scenes import CAMERA_FILE
@@ -19,40 +19,12 @@ from drake_pose.silhouette.segmentation.mask_pictures import (
     read_coco,
 )
 
-UNNAMED = ""
-"""The only camera's name, where nothing names it: its masks lie in no folder of their own."""
-
-_JSON = ".json"
-_NOT_CAMERAS = ("background", "overlay", "masks", "images", "videos")
-
-
-@dataclass(frozen=True, eq=False)
-class FoundMask:
-    """A mask of one picture, or why there is none.
-
-    Args:
-        where: names the picture in messages.
-        mask: (H, W).
-        picture: (H, W, 3) red, green, blue; None where only the mask is known.
-        refusal: why the mask is not good; "" where it is.
-        warnings: what its user should look at.
-        agreement: how well the picture tells it: its IoU with what is found there otherwise; nan
-            where nobody knows.
-    """
-
-    camera: str
-    frame: str
-    where: str
-    mask: Mask
-    picture: Picture | None = None
-    refusal: str = ""
-    warnings: tuple[str, ...] = ()
-    agreement: float = math.nan
-
 
 @dataclass(frozen=True)
 class Source:
     """Where the pictures of all cameras are, or what other tools say of them.
+
+    The only camera is named "" where nothing names it.
 
     Args:
         cameras: what the camera file says; None where there is none.
@@ -103,7 +75,7 @@ class Source:
         size, whose = shape[:2], f"camera '{camera}' had before"
         if own is not None:
             size, whose = (own.height, own.width), f"camera '{camera}' of {self.camera_file} has"
-        elif camera != UNNAMED:
+        elif camera:
             size = self._sizes.setdefault(camera, size)
         if shape[:2] != size:
             raise SceneError(
@@ -129,7 +101,7 @@ class Source:
                 names = [*reversed(file.parent.parts), folder, *(known if len(known) == 1 else [])]
                 camera = next((name for name in names if name in known), None)
             else:
-                camera = folder or (file.parent.name or None if len(places) > 1 else UNNAMED)
+                camera = folder or (file.parent.name or None if len(places) > 1 else "")
             if camera is None:
                 raise SceneError(
                     f"{coco.path}: picture '{file}': no folder of its path is a camera"
@@ -173,12 +145,12 @@ def open_source(path: Path, camera_file: Path | None = None) -> Source:
     if cameras is not None:
         known = list(cameras.cameras)
         for name in found.names:
-            if name not in (*known, UNNAMED):
+            if name not in (*known, ""):
                 raise SceneError(
                     f"{path}: the pictures of '{name}' belong to no camera of {camera_file}, which "
                     f"has {', '.join(known)}; take them out, or calibrate that camera"
                 )
-        if UNNAMED in found.names and len(known) > 1:
+        if "" in found.names and len(known) > 1:
             raise SceneError(
                 f"{path}: its pictures lie in no camera's folder, but {camera_file} has "
                 f"{len(known)} cameras: {', '.join(known)}"
@@ -190,12 +162,12 @@ def open_source(path: Path, camera_file: Path | None = None) -> Source:
 
 def _open_file(path: Path) -> Source:
     kind = path.suffix.lower()
-    if kind == _JSON:
-        return Source(path, annotated=[(UNNAMED, read_coco(path))])
+    if kind == ".json":
+        return Source(path, annotated=[("", read_coco(path))])
     if kind in VIDEOS:
-        return Source(path, videos={UNNAMED: path})
+        return Source(path, videos={"": path})
     if kind in SUFFIXES:
-        return Source(path, pictures={UNNAMED: {path.stem: path}})
+        return Source(path, pictures={"": {path.stem: path}})
     raise SceneError(f"{path}: is no picture, video or COCO file")
 
 
@@ -206,10 +178,11 @@ def _open_folder(path: Path) -> Source:
         raise SceneError(f"{path}: has images and videos; name one of them: {places[0]}")
     # Where there is nothing to find objects in, masks that another tool put there are meant.
     root = next((one for one in (*places, path / "masks") if one.is_dir()), path)
-    folders = {UNNAMED: root} | {
+    no_cameras = ("background", "overlay", "masks", "images", "videos")
+    folders = {"": root} | {
         entry.name: entry
         for entry in sorted(root.iterdir())
-        if entry.is_dir() and not entry.name.startswith(".") and entry.name not in _NOT_CAMERAS
+        if entry.is_dir() and not entry.name.startswith(".") and entry.name not in no_cameras
     }
     pictures: dict[str, dict[str, Path]] = {}
     videos: dict[str, Path] = {}
@@ -219,7 +192,7 @@ def _open_folder(path: Path) -> Source:
             pictures[name] = files
         for file in sorted(folder.iterdir()):
             kind = "" if file.name.startswith(".") else file.suffix.lower()
-            if kind == _JSON:
+            if kind == ".json":
                 annotated.append((name, read_coco(file)))
             elif kind in VIDEOS and folder == root:
                 if file.stem in videos:
@@ -228,7 +201,7 @@ def _open_folder(path: Path) -> Source:
     # COCO files lie beside the pictures that they are of.
     if annotated:
         return Source(path, annotated=annotated)
-    if UNNAMED in pictures and len(pictures) > 1:
+    if "" in pictures and len(pictures) > 1:
         raise SceneError(
             f"{root}: has pictures beside folders of pictures; put them in a camera's folder"
         )

@@ -1,0 +1,563 @@
+"""Masks for a scene: those of other tools, or found by the empty room, a box or the model."""
+
+from __future__ import annotations
+
+import math
+import shutil
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+import yaml
+
+from drake_pose.arrays import Mask, Picture
+from drake_pose.body import load_model
+from drake_pose.body.tree_kinematics import TreeKinematics
+from drake_pose.camera.picture_files import SUFFIXES, read_picture, read_two_colours
+from drake_pose.camera.source_files import find_picture_files
+from drake_pose.errors import (
+    CameraError,
+    DrakePoseError,
+    MaskError,
+    OutputError,
+    SceneError,
+    SettingsError,
+    UnknownNameError,
+)
+from drake_pose.files.folder import OVERLAY, write_file, write_summary, writes_folder
+from drake_pose.files.settings import EstimateSettings, MaskSettings
+from drake_pose.jobs.estimate.searches import make_tree
+from drake_pose.jobs.mask_sources import Source, open_source
+from drake_pose.jobs.registration.positions import read_known_positions
+from drake_pose.search import PoseAndMask, PoseAndMaskSettings
+from drake_pose.silhouette.pictures.masks import encode_mask, intersection_over_union
+from drake_pose.silhouette.pictures.scene_checks import frame_ranges
+from drake_pose.silhouette.pictures.scene_files import common_rate, in_order
+from drake_pose.silhouette.pictures.scenes import CAMERA_FILE, SCENE_FILE
+from drake_pose.silhouette.segmentation.background import (
+    Background,
+    background_of_recording,
+    background_support,
+    cut_box,
+    learn_background,
+    person_region,
+)
+from drake_pose.silhouette.segmentation.mask_pictures import (
+    mask_of_video_picture,
+)
+
+MIN_AGREEMENT = 0.85
+"""Least IoU of a mask and what its picture tells otherwise, by which it is believed."""
+_PARTIAL = "masks.part"
+
+Find = Callable[[str, Picture], tuple[Mask, float, tuple[str, ...]]]
+"""The mask of a camera's picture, how well that tells it, and what its user should look at."""
+
+
+class FoundMask(NamedTuple):
+    """A mask of one picture, or why there is none.
+
+    Args:
+        where: names the picture in messages.
+        mask: (H, W).
+        picture: (H, W, 3) red, green, blue; None where only the mask is known.
+        refusal: why the mask is not good; "" where it is.
+        warnings: what its user should look at.
+        agreement: IoU with what is found in the picture otherwise; nan where that is unknown.
+    """
+
+    camera: str
+    frame: str
+    where: str
+    mask: Mask
+    picture: Picture | None = None
+    refusal: str = ""
+    warnings: tuple[str, ...] = ()
+    agreement: float = math.nan
+
+
+@dataclass(frozen=True)
+class SceneMasks:
+    """What was written: the scene's folder, and what its ``summary.json`` holds.
+
+    By camera and frame that is each mask's area [pixel], or why there is none, and its warnings.
+    """
+
+    folder: Path
+    summary: Mapping[str, Any]
+
+    @property
+    def count(self) -> int:
+        """How many masks the scene has."""
+        return int(self.summary["mask_count"])
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """All warnings, each with the picture's name."""
+        return tuple(self.summary["warnings"])
+
+
+@writes_folder
+def make_masks(
+    source: str | Path,
+    out: str | Path,
+    settings: MaskSettings | None = None,
+    *,
+    overlay: bool = True,
+    on_mask: Callable[[int], None] = lambda _: None,
+) -> SceneMasks:
+    """Writes a scene whose masks are those of another tool, or are found in pictures.
+
+    The scene has ``masks/<camera>/<frame>.png``, or ``masks/<frame>.png`` of a single camera that
+    nothing names; the source's ``cameras.yaml`` and ``scene.yaml``, where it has them; and
+    ``overlay/<camera>/<frame>.jpg``, the pictures with the masks' outlines. A picture whose mask is
+    empty or full gets none, and a warning. Until all are there, masks lie in ``masks.part``.
+
+    Args:
+        source: see ``open_source``.
+        out: the scene's folder; new or empty.
+        on_mask: called after each picture with the number of those done.
+
+    Raises:
+        DrakePoseError: names the file, camera or frame at fault; no picture has a good mask.
+    """
+    settings, folder = settings or MaskSettings(), Path(out)
+    opened = open_source(Path(source), settings.cameras)
+    cameras: dict[str, dict[str, Any]] = {}
+    doubts: list[str] = []
+    refused: list[str] = []
+    try:
+        for done, found in enumerate(find_masks(opened, settings), 1):
+            mask = largest_patch(found.mask) if settings.largest else found.mask
+            refusal = found.refusal or refuse_mask(mask)
+            warnings = [*found.warnings, *([] if refusal else doubt_mask(mask))]
+            entry: dict[str, Any] = {"refusal": refusal} if refusal else {"area": int(mask.sum())}
+            entry |= {"warnings": warnings} if warnings else {}
+            entry |= {} if math.isnan(found.agreement) else {"agreement": found.agreement}
+            cameras.setdefault(found.camera, {})[found.frame] = entry
+            doubts += [f"{found.where}: {text}" for text in warnings]
+            place = f"{found.camera}/{found.frame}".lstrip("/")
+            if refusal:
+                refused.append(f"{found.where}: {refusal}")
+            else:
+                write_file(folder, f"{_PARTIAL}/{place}.png", encode_mask(mask))
+            if overlay and found.picture is not None:
+                drawn = _draw_outline(found.picture, mask, bool(refusal))
+                write_file(folder, f"{OVERLAY}/{place}.jpg", drawn)
+            on_mask(done)
+        count = sum(map(len, cameras.values())) - len(refused)
+        if not count:
+            first, *more = refused or [f"{opened.path}: has no picture"]
+            raise MaskError(first + (f" (and {len(more)} more)" if more else ""))
+        warnings = [*(f"{text}; no mask is written" for text in refused), *doubts]
+        warnings += common_rate(opened.videos)[1]
+        if settings.model is None:
+            warnings += [text for name, own in cameras.items() for text in _doubt_camera(name, own)]
+        if opened.cameras is None and set(cameras) != {""}:
+            warnings.append(
+                f"{folder}: its cameras {', '.join(cameras)} have no {CAMERA_FILE}, which estimate "
+                "needs (--cameras)"
+            )
+        summary = {
+            "source": str(opened.path),
+            "settings": settings.as_json(),
+            "mask_count": count,
+            "cameras": cameras,
+            "warnings": warnings,
+        }
+        _write_scene(opened, folder, summary)
+    except DrakePoseError:
+        for name in (_PARTIAL, OVERLAY):
+            shutil.rmtree(folder / name, ignore_errors=True)
+        raise
+    return SceneMasks(folder, summary)
+
+
+def _doubt_camera(name: str, frames: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:
+    """A warning of the masks that a camera's pictures do not tell."""
+    known = {frame: one["agreement"] for frame, one in frames.items() if "agreement" in one}
+    bad = [frame for frame, agreement in known.items() if agreement < MIN_AGREEMENT]
+    if bad:
+        usual = float(np.median([known[frame] for frame in bad]))
+        yield (
+            f"camera '{name or 'camera'}', frame {frame_ranges(bad, list(frames))} ({len(bad)} of "
+            f"{len(frames)}): masks and pictures hardly agree: by a box or threshold that is a "
+            f"little other, the masks are others (IoU {usual:.0%}); look at the overlays"
+        )
+
+
+def _write_scene(source: Source, folder: Path, summary: Mapping[str, Any]) -> None:
+    """Writes what else belongs to the scene; its masks come last."""
+    own = source.path / SCENE_FILE
+    try:
+        if source.path.is_dir() and own.is_file():
+            shutil.copyfile(own, folder / SCENE_FILE)
+        elif source.videos:
+            rate, _ = common_rate(source.videos)
+            content = {"sequence": True} | ({} if rate is None else {"frame_rate_hz": rate})
+            write_file(folder, SCENE_FILE, yaml.safe_dump(content))
+        if source.camera_file is not None:
+            shutil.copyfile(source.camera_file, folder / CAMERA_FILE)
+        write_summary(folder, summary)
+        (folder / _PARTIAL).rename(folder / "masks")
+    except OSError as error:
+        raise OutputError(f"{folder}: cannot be written: {error.strerror}") from error
+
+
+def _draw_outline(picture: Picture, mask: Mask, refused: bool) -> bytes:
+    """A JPEG file of a picture (H, W, 3) with the mask's outline; one that is refused is dark."""
+    drawn = np.array(picture[:, :, ::-1] // (3 if refused else 1))
+    contours, _ = cv2.findContours(mask.view(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
+    vermilion_bgr = (0, 94, 213)
+    cv2.drawContours(drawn, contours, -1, vermilion_bgr, 1)
+    return cv2.imencode(".jpg", drawn)[1].tobytes()
+
+
+def refuse_mask(mask: Mask, max_fraction: float = 0.98) -> str:
+    """Why a mask (H, W) cannot be used: it is empty or full; "" where it can.
+
+    ``max_fraction``: largest fraction of the picture.
+    """
+    if not mask.any():
+        return "the object is not found: the mask is empty"
+    if mask.mean() >= max_fraction:
+        return "the mask fills the picture: nothing tells the object from the rest"
+    return ""
+
+
+def doubt_mask(mask: Mask, max_border: float = 0.6, second_patch: float = 0.25) -> list[str]:
+    """Why a mask (H, W) that is not empty may show something else.
+
+    Args:
+        max_border: largest fraction of the picture's border that an object covers.
+        second_patch: least area of a second object, as a fraction of the largest patch's.
+    """
+    warnings = []
+    border = np.concatenate([mask[0], mask[-1], mask[:, 0], mask[:, -1]]).mean()
+    if border > max_border:
+        warnings.append(
+            f"the mask covers {border:.0%} of the picture's border: is it the background?"
+        )
+    _, _, statistics, middles = cv2.connectedComponentsWithStats(mask.view(np.uint8))
+    areas = statistics[1:, cv2.CC_STAT_AREA]
+    first, second = [*np.argsort(-areas, kind="stable"), 0][:2]
+    if len(areas) > 1 and areas[second] > second_patch * areas[first]:
+        (x0, y0), (x1, y1) = np.rint(middles[[1 + first, 1 + second]]).astype(int)
+        warnings.append(
+            f"there are two patches, of {areas[first]} pixels about ({x0}, {y0}) and of "
+            f"{areas[second]} about ({x1}, {y1}): two objects? --largest keeps the larger one"
+        )
+    return warnings
+
+
+def largest_patch(mask: Mask) -> Mask:
+    """The largest connected patch of a mask (H, W); what is empty stays so."""
+    count, labels, statistics, _ = cv2.connectedComponentsWithStats(mask.view(np.uint8))
+    if count <= 2:
+        return mask
+    return np.asarray(labels == 1 + int(np.argmax(statistics[1:, cv2.CC_STAT_AREA])))
+
+
+def find_masks(source: Source, settings: MaskSettings) -> Iterator[FoundMask]:
+    """The masks of a source, one by one, in the way that the settings choose.
+
+    Raises DrakePoseError: names the file, camera or frame at fault.
+    """
+    background = settings.background
+    if settings == MaskSettings(largest=settings.largest, cameras=settings.cameras):
+        # Beside its pictures a scene may have those of the empty room, which say what is meant.
+        room = source.path / "background"
+        background = room if room.is_dir() else None
+    if background is None and settings.box is None and settings.model is None:
+        yield from _read_given(source, settings)
+        return
+    if source.annotated:
+        raise SceneError(
+            f"{source.path}: has annotations, but the object is to be found in pictures"
+        )
+    if background is None and settings.box is None:
+        yield from _find_by_model(source, settings)
+        return
+    find: Find = (
+        _by_empty_room(source, background)
+        if background is not None
+        else partial(_by_box, settings.box or ())
+    )
+    for camera in source.names:
+        for frame, where, picture in source.read(camera):
+            try:
+                mask, agreement, warnings = find(camera, picture)
+            except (SceneError, SettingsError) as error:
+                raise type(error)(f"{where}: {error}") from error
+            yield FoundMask(camera, frame, where, mask, picture, "", warnings, agreement)
+
+
+def _read_given(source: Source, settings: MaskSettings) -> Iterator[FoundMask]:
+    """Masks of other tools in COCO files, pictures or videos."""
+    known = sorted({name for _, coco in source.annotated for name in coco.classes})
+    if not settings.classes and len(known) > 1:
+        raise MaskError(
+            f"{source.path}: has the classes {', '.join(known)}; say which are the object: "
+            f"--class '{known[0]}', or --class all"
+        )
+    numbers = {number: name for _, coco in source.annotated for number, name in coco.names.items()}
+    classes = {name if name in known else numbers.get(name, name) for name in settings.classes}
+    if not classes or "all" in classes:
+        classes = set(known)
+    for name in classes - set(known):
+        raise UnknownNameError("class", name, known, str(source.path))
+    for camera, frame, coco, entry in source.annotated_pictures():
+        where = f"{coco.path}: picture '{entry.file}'"
+        source.check_size(camera, (entry.height, entry.width), where)
+        try:
+            mask = entry.draw(classes)
+        except ValueError as error:
+            raise MaskError(f"{where}: {error}") from error
+        warnings = coco.warnings if entry is coco.pictures[0] else ()
+        yield FoundMask(camera, frame, where, mask, warnings=warnings)
+    for camera, files in source.pictures.items():
+        for frame, path in files.items():
+            mask = read_two_colours(path, MaskError, may_be_empty=True, lossy=True)
+            source.check_size(camera, mask.shape, str(path))
+            yield FoundMask(camera, frame, str(path), mask)
+    for camera in source.videos:
+        for frame, where, picture in source.read(camera):
+            yield FoundMask(camera, frame, where, mask_of_video_picture(picture, where))
+
+
+def _by_box(
+    box: Sequence[float],
+    _: str,
+    picture: Picture,
+    usual: tuple[float, float] = (0.03, 0.95),
+    margins: Sequence[float] = (-0.05, 0.05),
+) -> tuple[Mask, float, tuple[str, ...]]:
+    """GrabCut within x, y, width and height [pixel].
+
+    Args:
+        usual: least and largest fraction of its box that an object fills.
+        margins: by these fractions of its sides the box is enlarged for comparison.
+    """
+    mask, (x, y, w, h) = cut_box(picture, box), box
+    part = mask.sum() / (w * h)
+    again = []
+    for share in margins:
+        # Around a larger one there may be nothing left.
+        with suppress(SettingsError):
+            other = (x - share * w, y - share * h, w + 2.0 * share * w, h + 2.0 * share * h)
+            again.append(cut_box(picture, other))
+    is_good = part == 0.0 or usual[0] <= part <= usual[1]
+    warnings = () if is_good else (f"the mask is {part:.1%} of its box: find it another way",)
+    return mask, _least_overlap(mask, again), warnings
+
+
+def _least_overlap(mask: Mask, others: Iterable[Mask]) -> float:
+    """The least IoU of a mask and others; nan where there is none."""
+    return min((intersection_over_union(mask, one) for one in others), default=math.nan)
+
+
+def _by_empty_room(
+    source: Source,
+    background: Path | str,
+    thresholds: Sequence[float] = (0.7, 1.4),
+    changed: float = 0.6,
+) -> Find:
+    """What differs from the background, as of ``MaskSettings.background``.
+
+    Args:
+        thresholds: factors of the background's noise, by which masks are found for comparison.
+        changed: fraction of a picture that differs where light or camera have changed.
+    """
+    doubts: dict[str, tuple[str, ...]] = {}
+    rooms: dict[str, list[Background]] = {}
+    for name in source.names:
+        room, doubts[name] = _background(source, name, background)
+        rooms[name] = [replace(room, deviation=k * room.deviation) for k in (1.0, *thresholds)]
+
+    def find(camera: str, picture: Picture) -> tuple[Mask, float, tuple[str, ...]]:
+        room = rooms[camera][0]
+        if picture.shape != room.mean.shape:
+            height, width = room.mean.shape[:2]
+            raise SceneError(
+                f"is not of the background's size, {width} x {height} (width x height)"
+            )
+        mask, *again = (person_region(picture, one) for one in rooms[camera])
+        # A bad background is told of once.
+        warnings = doubts.pop(camera, ())
+        if mask.mean() > changed:
+            warnings += (
+                f"{mask.mean():.0%} of it differ from the background: did the light change, or "
+                "the camera move?",
+            )
+        return mask, _least_overlap(mask, again), warnings
+
+    return find
+
+
+def _background(
+    source: Source, camera: str, given: Path | str, max_count: int = 60
+) -> tuple[Background, tuple[str, ...]]:
+    """A camera's background, and why it is not good.
+
+    ``max_count``: a median is of more than half as many and fewer than twice as many pictures.
+    """
+    if given == "median":
+        # Spread evenly over a recording whose length is not known.
+        kept, step = list[Picture](), 1
+        for k, (_, where, picture) in enumerate(source.read(camera)):
+            if kept and picture.shape != kept[0].shape:
+                raise SceneError(f"{where}: has another size than the pictures before")
+            if k % step == 0:
+                kept.append(picture)
+                if len(kept) == 2 * max_count:
+                    kept, step = kept[::2], 2 * step
+        try:
+            room = background_of_recording(kept)
+        except SettingsError as error:
+            raise SettingsError(f"camera '{camera}': {error}") from error
+        return room, _doubt_median(room, kept)
+    folder = Path(given)
+    if (folder / camera).is_dir():
+        files = list(find_picture_files(folder / camera, camera).values())
+    else:
+        single = (folder, *(folder / f"{camera}{suffix}" for suffix in SUFFIXES))
+        files = [file for file in single if file.is_file()][:1]
+    if not files:
+        raise SceneError(
+            f"{folder}: has no picture of the empty room before camera '{camera}': {camera}.png, "
+            f"or a folder {camera}; or give --background median"
+        )
+    pictures = []
+    for file in files:
+        pictures.append(read_picture(file, SceneError))
+        source.check_size(camera, pictures[-1].shape, str(file))
+    return learn_background(pictures), ()
+
+
+def _doubt_median(
+    room: Background,
+    recording: Sequence[Picture],
+    support: float = 0.75,
+    doubtful: float = 0.5,
+    radius: float = 0.3,
+    stays: float = 0.6,
+) -> tuple[str, ...]:
+    """Why a recording's median is no good background.
+
+    Args:
+        support: a pixel that shows the median in a smaller fraction of pictures may be the body's.
+        doubtful: a median is bad if a larger fraction of the masks' area may be the body's.
+        radius, stays: a body stays that is within this radius, as a fraction of its size, of one
+            place in this fraction of the pictures (0.8 and more of simulated arms, 0.3 of who walks
+            by).
+    """
+    shown = background_support(recording, room)
+    masks = [person_region(picture, room) for picture in recording]
+    unsure = [float((shown[mask] < support).mean()) for mask in masks if mask.any()] or [0.0]
+    part = float(np.median(unsure))
+    text = (
+        f"the median of {len(recording)} pictures is no good background, here and in this camera's "
+        f"other pictures: in {part:.0%} of the masks' area it is seen in fewer than three of four "
+        "pictures, so the body may stand in it; give pictures of the empty room, or a longer "
+        "recording in which the body leaves every place"
+    )
+    texts: tuple[str, ...] = (text,) if part > doubtful else ()
+    seen = [mask.astype(np.uint8) for mask in masks if mask.any()]
+    size = math.sqrt(float(np.median([mask.sum() for mask in seen] or [0])))
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * round(radius * size) + 1,) * 2)
+    about = sum((cv2.dilate(mask, disc).astype(np.float32) for mask in seen), np.zeros((1, 1)))
+    if about.max() > stays * len(masks):
+        y, x = np.unravel_index(int(np.argmax(about)), about.shape)
+        texts += (
+            f"this camera's pictures show what moves about one place, ({x}, {y}): what of it "
+            "stands still there, as an arm's base does, is taken for the empty room and is not in "
+            "the masks; give pictures of the empty room",
+        )
+    return texts
+
+
+def _find_by_model(source: Source, settings: MaskSettings) -> Iterator[FoundMask]:
+    """The masks of a body whose pose is about known in each frame (``settings.start``)."""
+    file = source.cameras
+    if file is None:
+        raise CameraError(
+            f"{source.path}: a model's silhouette needs to know the cameras: {CAMERA_FILE} or "
+            "--cameras"
+        )
+    for name in source.names:
+        where = f"{source.camera_file}: camera '{name}'"
+        if name in file.links:
+            raise CameraError(
+                f"{where} rides on a link, but the background beside a body is told from cameras "
+                "that stand still"
+            )
+        if name in file.unplaced:
+            raise CameraError(f"{where} needs X_WC: where it stands before the body")
+    assert settings.model is not None
+    assert settings.start is not None
+    cameras = [file.cameras[name] for name in source.names]
+    body = load_model(settings.model, package_paths=settings.packages)
+    kinematics = TreeKinematics(make_tree(body, EstimateSettings(hold=settings.hold)))
+    table = read_known_positions(settings.start, kinematics)
+    seen = {
+        name: {frame: (where, picture) for frame, where, picture in source.read(name)}
+        for name in source.names
+    }
+    frames = in_order(frame for own in seen.values() for frame in own)
+    starts = [table.of(one, next(name for name in seen if one in seen[name])) for one in frames]
+    pictures = [[own[one][1] if one in own else None for own in seen.values()] for one in frames]
+    how = PoseAndMaskSettings(angle=math.radians(settings.start_error))
+    poses = PoseAndMask(kinematics, cameras, how).run(pictures, starts)
+    found, warned = dict(zip(frames, poses, strict=True)), table.warnings
+    for c, (name, own) in enumerate(seen.items()):
+        for frame, pose in found.items():
+            mask, agreement = pose.masks[c], pose.agreements[c]
+            if mask is None:
+                continue
+            refusal, warnings = _judge_pose(agreement, kinematics.names, pose.deviations)
+            where, picture = own[frame]
+            told = (*warned, *warnings)
+            yield FoundMask(name, frame, where, mask, picture, refusal, told, agreement)
+            warned = ()
+
+
+def _judge_pose(
+    agreement: float,
+    names: Sequence[str],
+    deviations: np.ndarray,
+    doubtful: float = 0.9,
+    max_deviations: float = 3.0,
+) -> tuple[str, tuple[str, ...]]:
+    """Why a model's mask is not good, and what is suspicious of it.
+
+    Args:
+        agreement: IoU of the model's silhouette and what colours tell.
+        deviations: (m,) of the values from their starts [standard deviations].
+        doubtful: a mask that agrees less is suspicious.
+        max_deviations: so is a value that is farther from its start.
+    """
+    if agreement < MIN_AGREEMENT:
+        return (
+            "pose and colours do not agree: the model's silhouette and what colours tell from the "
+            f"background overlap by {agreement:.0%} (IoU); is the start too far off, the object "
+            "hidden, or the model another?",
+            (),
+        )
+    warnings, off = [], np.abs(deviations)
+    if agreement < doubtful:
+        warnings.append(
+            f"pose and colours hardly agree: they overlap by {agreement:.0%} (IoU); look at the "
+            "overlay"
+        )
+    worst = int(np.argmax(off))
+    if off[worst] > max_deviations:
+        warnings.append(
+            f"joint {names[worst]} is {off[worst]:.1f} standard deviations from its start "
+            "(--start-error); look at the overlay"
+        )
+    return "", tuple(warnings)

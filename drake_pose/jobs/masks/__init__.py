@@ -1,1 +1,0 @@
-"""Masks for a scene: from other tools, or found in pictures."""

@@ -52,8 +52,7 @@ class PartialPoseGraph:
     Attributes:
         layers: one for each node.
         Js: (last states,) the objective of the poses that end in each [pixel].
-        ways, rests: for each layer, and for the last states, (states,) how many partial poses
-            lead there, and how many ways lead on to the end.
+        ways: for each layer, and for the last states, (states,) how many partial poses lead there.
     """
 
     def __init__(self, layers: Sequence[Layer], Js: np.ndarray) -> None:
@@ -77,13 +76,9 @@ class PartialPoseGraph:
             self.layers.insert(0, Layer(kept.node, places[kept.origins], kept.samples, ends))
         counts = [int(layer.origins.max(initial=-1)) + 1 for layer in self.layers]
         self.ways: list[np.ndarray] = [np.ones(1)]
-        self.rests: list[np.ndarray] = [np.ones(len(self.Js))]
         for layer, states in zip(self.layers, [*counts[1:], len(self.Js)], strict=True):
             weights = self.ways[-1][layer.origins]
             self.ways.append(np.bincount(layer.ends, weights, minlength=states))
-        for layer, states in zip(self.layers[::-1], counts[::-1], strict=True):
-            weights = self.rests[0][layer.ends]
-            self.rests.insert(0, np.bincount(layer.origins, weights, minlength=states))
 
     @classmethod
     def of_pose(cls, samples: np.ndarray, J: float) -> PartialPoseGraph:
@@ -95,7 +90,7 @@ class PartialPoseGraph:
     @property
     def size(self) -> float:
         """How many poses there are; a float because they may be very many."""
-        return float(self.rests[0].sum()) if len(self.Js) else 0.0
+        return float(self.ways[-1].sum()) if len(self.Js) else 0.0
 
     @property
     def best_J(self) -> float:
@@ -125,13 +120,9 @@ class PartialPoseGraph:
             seen[layer.node] = np.unique(layer.samples)
         return seen
 
-    def restricted(self, allowed: Sequence[np.ndarray | None]) -> PartialPoseGraph:
-        """The poses that take allowed samples alone, (samples,) bool of each node; None: all."""
-        rules = [allowed[layer.node] for layer in self.layers]
-        layers = [
-            layer if rule is None else layer.chosen(rule[layer.samples])
-            for layer, rule in zip(self.layers, rules, strict=True)
-        ]
+    def restricted(self, allowed: Sequence[np.ndarray]) -> PartialPoseGraph:
+        """The poses that take allowed samples alone, (samples,) bool of each node."""
+        layers = [layer.chosen(allowed[layer.node][layer.samples]) for layer in self.layers]
         return PartialPoseGraph(layers, self.Js)
 
     def up_to(self, J: float) -> PartialPoseGraph:
@@ -140,32 +131,6 @@ class PartialPoseGraph:
         last = self.layers[-1].chosen(kept[self.layers[-1].ends])
         last = replace(last, ends=(np.cumsum(kept) - 1)[last.ends])
         return PartialPoseGraph([*self.layers[:-1], last], self.Js[kept])
-
-    def draw(self, count: int, generator: np.random.Generator) -> np.ndarray:
-        """Poses drawn at random, samples (count, nodes); ValueError if there is none to draw."""
-        if not self.size:
-            raise ValueError("a pose was to be drawn from an empty set")
-        drawn = np.empty((count, len(self.layers)), dtype=np.int64)
-        for row in drawn:
-            state = 0
-            for layer, rests in zip(self.layers, self.rests[1:], strict=True):
-                begin, end = np.searchsorted(layer.origins, [state, state + 1])
-                weights = rests[layer.ends[begin:end]]
-                edge = begin + generator.choice(end - begin, p=weights / weights.sum())
-                row[layer.node], state = layer.samples[edge], layer.ends[edge]
-        return drawn
-
-    def members(self) -> np.ndarray:
-        """All poses, samples (size, nodes); mind the size."""
-        partial, states = np.zeros((1, len(self.layers)), dtype=np.int64), np.zeros(1, dtype=int)
-        for layer in self.layers:
-            begins = np.searchsorted(layer.origins, states)
-            source, edges = expand_groups(
-                begins, np.searchsorted(layer.origins, states, side="right")
-            )
-            partial, states = partial[source], layer.ends[edges]
-            partial[:, layer.node] = layer.samples[edges]
-        return partial
 
     def central(self) -> np.ndarray:
         """Samples (nodes,) of a best pose, where most ways lead; ValueError if there is none."""

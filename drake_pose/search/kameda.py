@@ -15,12 +15,6 @@ from drake_pose.search.estimates import PoseEstimate, SearchStatistics, View
 from drake_pose.search.sampled_body import Regions, SampledTree, Scoring
 from drake_pose.search.settings import PaperSearchSettings
 
-# The paper's r = 200 pixels is 12.6 % of a node's mean projected area (section 6.1).
-_OUTSIDE_SHARE = 0.126
-# Up to so many combinations of the leaves' candidates are all tried (section 5.2.1); beyond, each
-# leaf's in turn. Combinations times pixel patterns that are looked at in one piece of arrays.
-_COMBINATIONS, _BLOCK = 100_000, 4_000_000
-
 
 @dataclass(frozen=True)
 class NodeList:
@@ -64,10 +58,11 @@ class PaperSearch:
             limits = [float(fixed)] * len(views)
         else:
             X_WN = sampled.tree.node_poses([values[0] for values in sampled.values])
-            limits = [max(1.0, _OUTSIDE_SHARE * area) for area in scoring.mean_node_areas(X_WN)]
+            # The paper's r = 200 pixels is 12.6 % of a node's mean projected area (section 6.1).
+            limits = [max(1.0, 0.126 * area) for area in scoring.mean_node_areas(X_WN)]
         runs = 0
         while True:
-            run = _Run(scoring, self.settings, limits, runs)
+            run = PaperRun(scoring, self.settings, limits, runs)
             run.search()
             runs = run.runs
             widest = all(r >= view.mask.size for r, view in zip(limits, views, strict=True))
@@ -77,7 +72,7 @@ class PaperSearch:
             limits = [2.0 * r for r in limits]
 
 
-class _Run:
+class PaperRun:
     """One run of the search with a given threshold r."""
 
     def __init__(
@@ -112,7 +107,14 @@ class _Run:
     def _complete(self) -> bool:
         """Steps 1 to 6 until every node has its angles; False if no pose is left (or allowed)."""
         uncovered: Regions | None = None
-        while (node := self._next_node()) is not None:
+        while len(self.lists) < len(self.nodes):
+            # Step 1: the node whose parent is done that is the fewest steps from the root.
+            waiting = (
+                i
+                for i, node in enumerate(self.nodes)
+                if i not in self.lists and (node.parent < 0 or node.parent in self.lists)
+            )
+            node = min(waiting, key=lambda i: (self.nodes[i].depth, i))
             if self.runs >= self.settings.run_limit:
                 self.stopped_by = "run_limit"
                 return False
@@ -123,20 +125,15 @@ class _Run:
             if made is not None:
                 self.lists[node] = made
                 uncovered.subtract([node], made.samples[:1], made.X_WN[:1])
-            elif self._backtrack(node):
-                uncovered = None
-            else:
+                continue
+            # Step 6: the nearest node towards the root with an untried candidate adopts it.
+            ancestor, uncovered = self.nodes[node].parent, None
+            while ancestor >= 0 and not self.lists[ancestor].has_untried:
+                ancestor = self.nodes[ancestor].parent
+            if ancestor < 0:
                 return False
+            self._adopt(ancestor, self.lists[ancestor].adopted + 1)
         return True
-
-    def _next_node(self) -> int | None:
-        """Step 1: the node whose parent is done that is the fewest steps from the root."""
-        waiting = [
-            i
-            for i, node in enumerate(self.nodes)
-            if i not in self.lists and (node.parent < 0 or node.parent in self.lists)
-        ]
-        return min(waiting, key=lambda i: (self.nodes[i].depth, i), default=None)
 
     def make_list(self, node: int, uncovered: Regions) -> NodeList | None:
         """Steps 3 to 5: sample, keep what stays inside (4), score (5), sort, keep the best K."""
@@ -160,16 +157,6 @@ class _Run:
             best = best[: self.settings.candidate_limit]
         return NodeList(samples[best], X_WN[best])
 
-    def _backtrack(self, node: int) -> bool:
-        """Step 6: the nearest node towards the root with an untried candidate adopts it."""
-        ancestor = self.nodes[node].parent
-        while ancestor >= 0:
-            if self.lists[ancestor].has_untried:
-                self._adopt(ancestor, self.lists[ancestor].adopted + 1)
-                return True
-            ancestor = self.nodes[ancestor].parent
-        return False
-
     def _adopt(self, node: int, candidate: int) -> None:
         """Adopt a candidate of an inner node and give up all that hangs on the node."""
         self.lists[node] = replace(self.lists[node], adopted=candidate)
@@ -179,8 +166,12 @@ class _Run:
 
     # Section 5.2
 
-    def _combine_leaves(self) -> float:
-        """Section 5.2.1: adopt the best combination of leaves' candidates; how much J falls."""
+    def _combine_leaves(self, combinations: int = 100_000, block: int = 4_000_000) -> float:
+        """Section 5.2.1: adopt the best combination of leaves' candidates; how much J falls.
+
+        Up to so many ``combinations`` are all tried; beyond, each leaf's in turn. ``block``:
+        combinations times pixel patterns that are looked at in one piece of arrays.
+        """
         leaves = [i for i, node in enumerate(self.nodes) if not node.children]
         counts = [len(self.lists[leaf].samples) for leaf in leaves]
         if max(counts) == 1:
@@ -191,16 +182,16 @@ class _Run:
         def worth(choices: np.ndarray) -> np.ndarray:
             """Silhouette covered less outside covered [pixel], (n,), of choices (n, leaves)."""
             total = np.empty(len(choices))
-            block = max(1, _BLOCK // max(1, len(patterns)))
-            for begin in range(0, len(choices), block):
-                part = columns + choices[begin : begin + block]
+            step = max(1, block // max(1, len(patterns)))
+            for begin in range(0, len(choices), step):
+                part = columns + choices[begin : begin + step]
                 covered = np.logical_or.reduce([patterns[:, one].T for one in part.T])
-                total[begin : begin + block] = covered @ gains
+                total[begin : begin + step] = covered @ gains
             return total
 
         current = np.array([self.lists[leaf].adopted for leaf in leaves])
         first = best = worth(current[None])[0]
-        together = np.prod(counts, dtype=np.float64) <= _COMBINATIONS
+        together = np.prod(counts, dtype=np.float64) <= combinations
         every = list(range(len(leaves)))
         groups = [every] if together else [[k] for k in every]
         unchanged = 0

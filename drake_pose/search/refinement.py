@@ -18,7 +18,7 @@ from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.errors import SettingsError
 from drake_pose.fit.kernel import collect
 from drake_pose.fit.levenberg_marquardt import Equations, StepSettings, damped_step
-from drake_pose.fit.parameters import ROOT_NAMES, BodyParameters, Placement
+from drake_pose.fit.parameters import BodyParameters, Placement
 from drake_pose.fit.raster_lines import (
     Border,
     compare_raster,
@@ -29,8 +29,6 @@ from drake_pose.search.estimates import View
 from drake_pose.search.settings import Pass
 from drake_pose.silhouette.areas.bending import PackedSurfaces, TreeSurfaces
 from drake_pose.silhouette.areas.scoring import draw_packed
-
-_EXTRA = len(ROOT_NAMES)
 
 
 class Freedom(NamedTuple):
@@ -54,7 +52,7 @@ class RefinementBody:
         middle = np.clip(0.0, self.kinematics.lower, self.kinematics.upper)
         moves = self.kinematics.motions(middle, translation=True, scale=True).moves
         # What follows a value hangs on what the value moves.
-        self._moves = np.hstack([moves[:, : len(middle)], moves[:, -_EXTRA:]])
+        self._moves = np.hstack([moves[:, : len(middle)], moves[:, -4:]])
         self._packed = PackedSurfaces(surfaces)
         shares = []
         for rigid, skin in zip(surfaces.rigid, surfaces.skins, strict=True):
@@ -63,7 +61,7 @@ class RefinementBody:
                 shares.append(1.0 - skin.weights if skin.turned else skin.weights)
         parents = np.array([node.parent for node in tree.nodes], dtype=np.int64)
         self.skin = np.concatenate(shares), parents
-        unlimited = np.full(_EXTRA, np.inf)
+        unlimited = np.full(4, np.inf)
         self.lower = np.concatenate([self.kinematics.lower, -unlimited])
         self.upper = np.concatenate([self.kinematics.upper, unlimited])
 
@@ -74,23 +72,23 @@ class RefinementBody:
 
         ``root_position``: (3,) where the first root is [m]; None: where the tree says.
         """
-        parameters = np.append(self.kinematics.flatten(node_values), np.zeros(_EXTRA))
+        parameters = np.append(self.kinematics.flatten(node_values), np.zeros(4))
         if root_position is not None:
-            parameters[-_EXTRA:-1] = root_position - self.poses(parameters)[0, :3, 3]
+            parameters[-4:-1] = root_position - self.poses(parameters)[0, :3, 3]
         return parameters
 
     def node_values(self, parameters: np.ndarray) -> tuple[np.ndarray, ...]:
         """Each node's values."""
-        return self.kinematics.split(parameters[:-_EXTRA])
+        return self.kinematics.split(parameters[:-4])
 
     def nearest_turns(self, parameters: np.ndarray, near: np.ndarray | None = None) -> np.ndarray:
         """The same pose's parameters, angles in the turn nearest to others (m + 4,).
 
         Without others, where answers are given: see ``TreeKinematics.nearest_turns``.
         """
-        values = None if near is None else near[:-_EXTRA]
-        turned = self.kinematics.nearest_turns(parameters[:-_EXTRA], values)
-        return np.concatenate([turned, parameters[-_EXTRA:]])
+        values = None if near is None else near[:-4]
+        turned = self.kinematics.nearest_turns(parameters[:-4], values)
+        return np.concatenate([turned, parameters[-4:]])
 
     def freedom(self, nodes: Sequence[int] | None = None, extra: Sequence[int] = ()) -> Freedom:
         """The values of some nodes (None: all) that are not held, and some of ROOT_NAMES."""
@@ -110,9 +108,9 @@ class RefinementBody:
 
         ``bent``: else its skin stays; ``rooted``: whether it says how ROOT_NAMES move it, too.
         """
-        rooted = rooted or bool(parameters[-_EXTRA:].any())
-        values = parameters if rooted else parameters[:-_EXTRA]
-        packed = self._packed.bend_to(parameters[:-_EXTRA] if bent else None)
+        rooted = rooted or bool(parameters[-4:].any())
+        values = parameters if rooted else parameters[:-4]
+        packed = self._packed.bend_to(parameters[:-4] if bent else None)
         return self._parameters.place(values)._replace(packed=packed)
 
     def poses(self, parameters: np.ndarray) -> np.ndarray:
@@ -191,7 +189,7 @@ class RefinementProblem:
         """
         free, moved = freedom
         still = self.still(parameters, moved) if still is None else still
-        rooted = bool((free >= len(parameters) - _EXTRA).any())
+        rooted = bool((free >= len(parameters) - 4).any())
         placed = self.body.place(parameters, rooted=rooted)
         nodes = len(placed.X_WN)
         A, b, sums = np.zeros((nodes, 12, 12)), np.zeros((nodes, 12)), np.zeros(3)

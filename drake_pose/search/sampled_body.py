@@ -23,8 +23,6 @@ from drake_pose.silhouette.areas.scoring import (
 )
 from drake_pose.silhouette.contours.contour_points import CelledOutline, divide_outline
 
-_BENT_OUTLINES = 256
-
 
 class SampledTree:
     """A pose tree with every node's sampling grid, made once and matched to many pictures.
@@ -51,7 +49,7 @@ class SampledTree:
             for node, values in zip(tree.nodes, self.values, strict=True)
         ]
         # The same few samples are drawn again and again.
-        self._bent_outline = lru_cache(maxsize=_BENT_OUTLINES)(self._bend)
+        self._bent_outline = lru_cache(maxsize=256)(self._bend)
 
     def outlines_at(self, nodes: Sequence[int], samples: np.ndarray) -> list[Outline]:
         """The whole surfaces of nodes at their samples (len(nodes),), each in its node's frame."""
@@ -231,17 +229,6 @@ class PoseSearch(Protocol):
         """Estimate the pose; ``root_position``: (3,) [m] where it is not the tree's own."""
 
 
-_BALLS = 10
-# Surfaces of more triangles are simplified to fewer for stages that need not be exact.
-_MANY_TRIANGLES = 400
-_FEW_TRIANGLES = 300
-# A node may be nearer to the camera than the nearest root by this factor before its table is too
-# narrow; then it is drawn without one.
-_NEARER = 0.8
-# Tables of contour edges are made for these spreads of directions [rad].
-_SPREADS = tuple(0.02 * 1.3**k for k in range(13))
-
-
 class SampledBody:
     """A sampled tree with what makes its nodes quick to draw and to reject; made once.
 
@@ -305,20 +292,28 @@ class SampledBody:
 
     def celled_outline(self, node: int, camera: Camera, coarse: bool) -> CelledOutline:
         """The node's surface, or a coarse one, with contour tables that suit a camera."""
-        spread = 0.0
+        spread, outline = 0.0, self.sampled.outlines[node]
         if not isinstance(camera, ParallelCamera):
-            spread = self._spread(node, camera)
-        outline = self.sampled.outlines[node]
-        coarse = coarse and len(outline.triangles) > _MANY_TRIANGLES
+            # How far directions to the node's points may differ [rad]. If the node is nearer to the
+            # camera than the nearest root by more than this factor it is drawn without a table.
+            nearest = 0.8 * self.root_distances(camera).min()
+            needed = outline.ball[3] / max(1e-6, nearest)
+            spreads = [0.02 * 1.3**k for k in range(13)]
+            spread = next((one for one in spreads if one >= needed), spreads[-1])
+        coarse = coarse and len(outline.triangles) > 400
         key = (node, spread, coarse)
         if key not in self._celled:
+            if coarse:
+                # Fewer triangles by Garland and Heckbert's quadric error metric.
+                points, triangles = fast_simplification.simplify(
+                    outline.vertices, outline.triangles, target_count=300
+                )
+                outline = outline_from_mesh(
+                    TriangleMesh(np.asarray(points, dtype=np.float64), triangles)
+                )
             skin, bands = self.sampled.tree.nodes[node].skin, self.sampled.bands[node]
-            self._celled[key] = divide_outline(
-                _coarse_outline(outline) if coarse else outline,
-                spread,
-                None if skin is None else skin.mesh,
-                bands,
-            )
+            mesh = None if skin is None else skin.mesh
+            self._celled[key] = divide_outline(outline, spread, mesh, bands)
         return self._celled[key]
 
     def mean_area(self, node: int, camera: Camera) -> float:
@@ -337,15 +332,8 @@ class SampledBody:
         ]
         return np.asarray(np.linalg.norm(np.vstack(roots) - camera.X_WC[:3, 3], axis=1))
 
-    def _spread(self, node: int, camera: Camera) -> float:
-        """How far the directions to the node's points may differ, from where the roots can be."""
-        needed = self.sampled.outlines[node].ball[3] / max(
-            1e-6, _NEARER * self.root_distances(camera).min()
-        )
-        return next((spread for spread in _SPREADS if spread >= needed), _SPREADS[-1])
-
     def _find_balls(self, node: int, hulls: list[VisualHull]) -> np.ndarray:
-        balls = [hulls[node].spread_balls(_BALLS)]
+        balls = [hulls[node].spread_balls(10)]
         # What lies farthest from the parent's joint leaves the silhouette first.
         balls[0] = balls[0][np.argsort(-np.linalg.norm(balls[0][:, :3], axis=1), kind="stable")]
         for child in self.sampled.tree.nodes[node].children:
@@ -368,19 +356,16 @@ class SampledBody:
         nodes = self.sampled.tree.nodes
         reaches = np.zeros((len(nodes), 4))
         for i in reversed(range(len(nodes))):
-            balls = np.vstack([self._whole_ball(i), reaches[list(nodes[i].children)]])
+            # A ball about the node's surface, its band at all samples included.
+            ball, bands = self.sampled.outlines[i].ball, self.sampled.bands[i]
+            if bands is not None:
+                farthest = float(np.linalg.norm(bands - ball[:3], axis=-1).max())
+                ball = np.append(ball[:3], max(ball[3], farthest))
+            balls = np.vstack([ball, reaches[list(nodes[i].children)]])
             X_PN = self.sampled.X_PN[i]
             centers = balls[:, :3] @ np.swapaxes(X_PN[:, :3, :3], 1, 2) + X_PN[:, None, :3, 3]
             reaches[i] = _ball_around(centers.reshape(-1, 3), np.tile(balls[:, 3], len(X_PN)))
         return reaches
-
-    def _whole_ball(self, node: int) -> np.ndarray:
-        """A ball (4,) about the node's surface, its band at all samples included."""
-        ball, bands = self.sampled.outlines[node].ball, self.sampled.bands[node]
-        if bands is None:
-            return ball
-        farthest = float(np.linalg.norm(bands - ball[:3], axis=-1).max())
-        return np.append(ball[:3], max(ball[3], farthest))
 
     def _find_order(self, limb_by_limb: bool) -> tuple[int, ...]:
         """Trunk first, then limb after limb, the larger before the smaller."""
@@ -412,14 +397,6 @@ def _fixed_points(X_PN: np.ndarray, ball: np.ndarray) -> np.ndarray:
         return point[None]
     along = Vt[2] @ (ball[:3] - point) + np.linspace(-ball[3], ball[3], 61)
     return np.asarray(point + along[:, None] * Vt[2])
-
-
-def _coarse_outline(outline: Outline) -> Outline:
-    """The surface with fewer triangles (Garland and Heckbert's quadric error metric)."""
-    points, triangles = fast_simplification.simplify(
-        outline.vertices, outline.triangles, target_count=_FEW_TRIANGLES
-    )
-    return outline_from_mesh(TriangleMesh(np.asarray(points, dtype=np.float64), triangles))
 
 
 def _ball_around(centers: np.ndarray, radii: np.ndarray) -> np.ndarray:

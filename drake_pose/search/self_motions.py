@@ -16,14 +16,6 @@ import numpy as np
 
 from drake_pose.body.tree_kinematics import TreeKinematics
 
-_PARALLEL = 0.8
-# What a flip may move, as a share of the body's size.
-_STAYS = 1e-3
-# How far cosines are from where they are if all stays: wider than the above.
-_NEARLY = 0.02
-# Values nearer than this are the same [rad].
-_DIFFERENT = 1e-6
-
 
 @dataclass(frozen=True, eq=False)
 class Flip:
@@ -38,16 +30,19 @@ class Flip:
 
 
 def counter_turns(
-    kinematics: TreeKinematics, values: np.ndarray, interval: float
+    kinematics: TreeKinematics, values: np.ndarray, interval: float, parallel: float = 0.8
 ) -> list[np.ndarray]:
-    """Values (m,) with pairs of joints of nearly parallel axes turned against each other."""
+    """Values (m,) with pairs of joints of nearly parallel axes turned against each other.
+
+    ``parallel``: the cosine of the angle between the axes is at least this.
+    """
     motions = kinematics.motions(values)
     turns, moves = motions.twists[:, :3], motions.moves
     steps = range(1, math.ceil(2.0 * math.pi / interval))
     found = []
     for first, second in _chained_pairs(kinematics, moves):
         along = float(turns[first] @ turns[second])
-        if abs(along) < _PARALLEL:
+        if abs(along) < parallel:
             continue
         for step in steps:
             turned = values.copy()
@@ -66,14 +61,19 @@ def flips(kinematics: TreeKinematics, values: np.ndarray, count: int = 16) -> li
     """
     untouched = np.zeros(len(values), dtype=np.bool_)
     known = [Flip(values, untouched, untouched)]
-    triples = _chained_triples(kinematics, kinematics.motions(values).moves)
+    # Triples (n, 3) of angles, each at most two movable angles behind the one before it.
+    pairs = sorted(_chained_pairs(kinematics, kinematics.motions(values).moves))
+    chained = [(*pair, last) for pair in pairs for middle, last in pairs if middle == pair[1]]
+    triples = np.array(chained, dtype=np.int64).reshape(-1, 3)
     # One flip may leave the limits and the next return into them.
     for one in known:
         if len(known) > count:
             break
         for flip in _single_flips(kinematics, one, triples):
-            gaps = np.abs(_remainder(flip.values - np.array([other.values for other in known])))
-            if gaps.max(axis=1).min() > _DIFFERENT:
+            gaps = flip.values - np.array([other.values for other in known])
+            # Less full turns, from -pi to pi.
+            gaps = np.abs((gaps + math.pi) % (2.0 * math.pi) - math.pi)
+            if gaps.max(axis=1).min() > 1e-6:
                 known.append(flip)
     found = []
     for flip in known[1 : count + 1]:
@@ -83,47 +83,43 @@ def flips(kinematics: TreeKinematics, values: np.ndarray, count: int = 16) -> li
     return found
 
 
-def _single_flips(kinematics: TreeKinematics, start: Flip, triples: np.ndarray) -> list[Flip]:
-    """One flip more, limits left aside; triples (n, 3) of joints."""
+def _single_flips(
+    kinematics: TreeKinematics,
+    start: Flip,
+    triples: np.ndarray,
+    stays: float = 1e-3,
+    nearly: float = 0.02,
+) -> list[Flip]:
+    """One flip more, limits left aside; triples (n, 3) of joints.
+
+    ``stays``: what a flip may move, as a share of the body's size; ``nearly``: how far cosines are
+    from where they are if all stays: wider.
+    """
     motions = kinematics.motions(start.values)
     size = float(np.ptp(motions.X_WN[:, :3, 3], axis=0).max()) + 1e-9
     middles = start.values[triples[:, 1]]
     mirrored = np.stack([-middles, math.pi - middles], axis=1)
-    possible = _may_stay(motions.twists[:, :3], triples, mirrored - middles[:, None])
+    # What hangs on the last joint can have its old direction: half turns about two axes make a turn
+    # about what is perpendicular to both, by twice the angle between them, and the turns of the
+    # middle joint must undo it.
+    first, middle, last = motions.twists[triples, :3].transpose(1, 0, 2)
+    across = np.abs(np.stack([first * middle, last * middle]).sum(axis=2)).max(axis=0) < nearly
+    doubled = 2.0 * (first * last).sum(axis=1) ** 2 - 1.0
+    undone = np.abs(np.cos(mirrored - middles[:, None]) - doubled[:, None]) < nearly
     found = []
-    for row, way in np.argwhere(possible):
+    for row, way in np.argwhere(across[:, None] & undone):
         first, middle, last = triples[row]
         flipped = start.values.copy()
         flipped[[first, last]] += math.pi
         flipped[middle] = mirrored[row, way]
         node = kinematics.value_nodes[last]
         gap = kinematics.poses(flipped)[node] - motions.X_WN[node]
-        if max(float(np.abs(gap[:3, :3]).max()), np.abs(gap[:3, 3]).max() / size) < _STAYS:
+        if max(float(np.abs(gap[:3, :3]).max()), np.abs(gap[:3, 3]).max() / size) < stays:
             changed, other_way = start.changed.copy(), start.mirrored.copy()
             changed[[first, middle, last]] = True
             other_way[middle] = not other_way[middle]
             found.append(Flip(flipped, changed, other_way))
     return found
-
-
-def _may_stay(axes: np.ndarray, triples: np.ndarray, turns: np.ndarray) -> np.ndarray:
-    """Whether (n, 2) what hangs on the last joint can have its old direction, by axes (m, 3).
-
-    Half turns about two axes make a turn about what is perpendicular to both, by twice the angle
-    between them, and turns (n, 2) of the middle joint must undo it.
-    """
-    first, middle, last = axes[triples].transpose(1, 0, 2)
-    across = np.abs(np.stack([first * middle, last * middle]).sum(axis=2)).max(axis=0) < _NEARLY
-    between = (first * last).sum(axis=1)
-    undone = np.abs(np.cos(turns) - (2.0 * between**2 - 1.0)[:, None]) < _NEARLY
-    return np.asarray(across[:, None] & undone)
-
-
-def _chained_triples(kinematics: TreeKinematics, moves: np.ndarray) -> np.ndarray:
-    """Triples (n, 3) of angles, each at most two movable angles behind the one before it."""
-    pairs = sorted(_chained_pairs(kinematics, moves))
-    triples = [(*pair, last) for pair in pairs for middle, last in pairs if middle == pair[1]]
-    return np.array(triples, dtype=np.int64).reshape(-1, 3)
 
 
 def _chained_pairs(kinematics: TreeKinematics, moves: np.ndarray) -> list[tuple[int, int]]:
@@ -135,11 +131,6 @@ def _chained_pairs(kinematics: TreeKinematics, moves: np.ndarray) -> list[tuple[
         before = [int(i) for i in movable if i < second and moves[nodes[second], i]]
         pairs += [(first, int(second)) for first in before[-2:]]
     return pairs
-
-
-def _remainder(angles: np.ndarray) -> np.ndarray:
-    """Angles less full turns, from -pi to pi."""
-    return np.asarray((angles + math.pi) % (2.0 * math.pi) - math.pi)
 
 
 def _inside(

@@ -6,7 +6,7 @@ import pytest
 
 from drake_pose.errors import MaskError, SettingsError
 from drake_pose.search.estimates import View
-from drake_pose.search.kameda import PaperSearch, _Run
+from drake_pose.search.kameda import PaperRun, PaperSearch
 from drake_pose.search.sampled_body import Scoring
 from drake_pose.search.settings import PaperSearchSettings
 from drake_pose.silhouette.areas.scoring import draw_mask
@@ -142,7 +142,7 @@ def test_leaves_are_combined_as_fits_best_and_J_falls_by_what_is_said(tmp_path):
         mask &= generator.random(mask.shape) < np.where(np.arange(100) < 50, 0.95, 0.9)
         mask |= generator.random(mask.shape) < 0.05
         scoring = Scoring(search.sampled, [View(camera, mask)])
-        run = _Run(scoring, search.settings, [900.0], 0)
+        run = PaperRun(scoring, search.settings, [900.0], 0)
         assert run._complete()
         samples = run._adopted()[0].copy()
         before, said = scoring.J(samples[None])[0], run._combine_leaves()

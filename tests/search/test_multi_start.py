@@ -1,10 +1,13 @@
-"""The multi-start search on arms drawn by the tests, clean and damaged, and on bad input."""
+"""The multi-start search on arms and chains, clean and damaged, and on bad input."""
 
 import numpy as np
 import pytest
 
-from drake_pose.search.estimates import View
-from drake_pose.search.multi_start import MultiStartSearch, without_specks
+from drake_pose.errors import SettingsError
+from drake_pose.search import BeamSearch, MultiStartSearch, PaperSearch, View
+from drake_pose.search.multi_start import without_specks
+from drake_pose.silhouette.areas.bending import TreeSurfaces
+from drake_pose.silhouette.areas.scoring import draw_mask
 from drake_pose.workers import working
 from tests.search.arms import (
     arm_cameras,
@@ -15,6 +18,7 @@ from tests.search.arms import (
     is_held,
     split,
 )
+from tests.search.bodies import front_camera, swinging_chain
 
 
 @pytest.fixture(scope="module")
@@ -32,6 +36,11 @@ def pose(tree):
     return draw_pose(tree, np.random.default_rng(20))
 
 
+@pytest.fixture(scope="module")
+def chain(tmp_path_factory):
+    return MultiStartSearch(swinging_chain(tmp_path_factory.mktemp("chain"), 3).pose_tree())
+
+
 def clean_views(tree, values):
     return [draw_view(tree, values, camera) for camera in arm_cameras()]
 
@@ -40,16 +49,13 @@ def all_values(result):
     return np.concatenate(result.node_values)
 
 
-def joint_ends(tree, values):
-    """Where every link begins, and the hand ends [m]."""
-    X_WN = tree.node_poses(split(tree, values))
-    return np.vstack([X_WN[:, :3, 3], X_WN[-1, :3, 3] + 0.15 * X_WN[-1, :3, 2]])
-
-
 def worst_place(tree, result, values):
-    """How far any of these is from where it should be [m]."""
-    gaps = joint_ends(tree, all_values(result)) - joint_ends(tree, values)
-    return float(np.linalg.norm(gaps, axis=1).max())
+    """How far the beginning of a link, or the hand's end, is from where it should be [m]."""
+    ends = []
+    for one in (all_values(result), values):
+        X_WN = tree.node_poses(split(tree, one))
+        ends.append(np.vstack([X_WN[:, :3, 3], X_WN[-1, :3, 3] + 0.15 * X_WN[-1, :3, 2]]))
+    return float(np.linalg.norm(ends[0] - ends[1], axis=1).max())
 
 
 def recount(tree, result, views):
@@ -58,21 +64,72 @@ def recount(tree, result, views):
     return sum(int((one.mask ^ view.mask).sum()) for one, view in zip(drawn, views, strict=True))
 
 
-def test_continuous_pose_is_found_and_said_to_be_known(tree, search, pose):
+def chain_view(tree, values):
+    camera = front_camera(200, shift=0.37)
+    outlines = TreeSurfaces(tree).at(values)
+    return View(camera, draw_mask(outlines, camera.X_CW @ tree.node_poses(values), camera))
+
+
+def chain_values(tree, rng):
+    return [rng.uniform(*tree.value_bounds(i)) for i in range(len(tree.nodes))]
+
+
+def test_an_exact_pose_is_found_by_pixels_and_said_to_be_known(tree, search, pose):
     views = clean_views(tree, pose)
     result = search.match(views)
-    assert result.found
     assert result.explained
     assert result.stopped_by == "end"
     assert result.J == recount(tree, result, views)
-    assert result.E_total < 0.03
-    assert worst_place(tree, result, pose) < 0.01
+    assert result.E_total < 0.01
+    assert worst_place(tree, result, pose) < 0.005
     answer = result.pose_set
-    assert answer is not None
     assert is_held(answer, pose)
     np.testing.assert_array_equal(answer.families[0].q, result.q)
     assert answer.families[0].J == result.J
     assert sum(answer.determined) >= 4
+    plain = search.without_alternatives().match(views)
+    assert plain.pose_set is None
+    assert plain.E_total < 0.02
+
+
+def test_poses_between_the_samples_are_found(chain):
+    rng, tree = np.random.default_rng(4), chain.tree
+    errors, inside = [], []
+    for _ in range(6):
+        values = chain_values(tree, rng)
+        view = chain_view(tree, values)
+        found = chain.match([view])
+        q, _ = tree.positions_from(found.node_values)
+        np.testing.assert_allclose(found.q, q)
+        assert found.J == np.count_nonzero(chain_view(tree, found.node_values).mask != view.mask)
+        errors.append(np.degrees(np.abs(all_values(found) - np.concatenate(values))))
+        pairs = zip(found.pose_set.joints, np.concatenate(values), strict=True)
+        inside += [joint.holds(value) for joint, value in pairs if joint.determined]
+    assert np.median(errors) < 1.0
+    assert len(inside) >= 12
+    assert np.mean(inside) > 0.85
+
+
+def test_families_are_as_good_as_the_best(chain):
+    found = chain.match(
+        [chain_view(chain.tree, chain_values(chain.tree, np.random.default_rng(10)))]
+    )
+    families = found.pose_set.families
+    assert families[0].J == found.J
+    assert found.pose_set.family_count == len(families)
+    for family in families:
+        assert family.J <= found.J + found.pose_set.tolerance
+        np.testing.assert_allclose(family.q, chain.tree.positions_from(family.node_values)[0])
+        assert family.joints[0].holds(family.node_values[0][0])
+
+
+def test_nothing_is_determined_where_the_body_does_not_fit(chain):
+    view = chain_view(chain.tree, chain_values(chain.tree, np.random.default_rng(6)))
+    assert any(joint.determined for joint in chain.match([view]).pose_set.joints)
+    spoilt = view.mask.copy()
+    spoilt[5:60, 5:60] = True
+    joints = chain.match([View(view.camera, spoilt)]).pose_set.joints
+    assert not any(joint.determined for joint in joints)
 
 
 @pytest.mark.slow
@@ -82,37 +139,32 @@ def test_damaged_and_ill_fitting_arms(tree, search):
         values = draw_pose(tree, np.random.default_rng(100 + seed))
         result = search.match(damaged_views(tree, values, seed))
         places.append(worst_place(tree, result, values))
-        assert result.pose_set is not None
-        held.append(
-            max(
-                np.mean([one.holds(v) for one, v in zip(family.joints, values, strict=True)])
-                for family in result.pose_set.families
-            )
-        )
+        shares = [
+            np.mean([one.holds(v) for one, v in zip(family.joints, values, strict=True)])
+            for family in result.pose_set.families
+        ]
+        held.append(max(shares))
     # Flips leave the hand where it is, but not what is between.
     assert np.median(places) < 0.02
     assert np.mean(held) >= 0.85
 
 
-def test_the_same_every_time(tree, search, pose):
-    views = damaged_views(tree, pose, 3)
-    with working(1):
-        first = search.match(views)
-    with working(3):
-        again = search.match(views)
-    np.testing.assert_array_equal(first.q, again.q)
-    assert first.statistics == again.statistics
-    assert first.pose_set is not None
-    assert again.pose_set is not None
-    for one, other in zip(first.pose_set.joints, again.pose_set.joints, strict=True):
+@pytest.mark.parametrize("make", [damaged_views, lambda tree, pose, _: clean_views(tree, pose)])
+def test_the_same_every_time(tree, search, pose, make):
+    views, found = make(tree, pose, 3), []
+    for workers in (1, 3):
+        with working(workers):
+            found.append(search.match(views))
+    np.testing.assert_array_equal(found[0].q, found[1].q)
+    assert found[0].statistics == found[1].statistics
+    for one, other in zip(*(result.pose_set.joints for result in found), strict=True):
         assert (one.low, one.high) == (other.low, other.high)
 
 
 def test_no_time_at_all(tree, pose):
     views = clean_views(tree, pose)
     result = MultiStartSearch(tree, time_limit=0.0).match(views)
-    assert result.found
-    assert result.stopped_by == "time_limit"
+    assert (result.found, result.stopped_by) == (True, "time_limit")
     assert result.J == recount(tree, result, views)
     assert result.seconds < 2.0
 
@@ -127,8 +179,7 @@ def test_a_mask_that_no_pose_explains(search, where):
     mask = np.zeros((camera.height, camera.width), dtype=bool)
     mask[where] = True
     result = search.match([View(camera, mask)])
-    assert result.found
-    assert not result.explained
+    assert (result.found, result.explained) == (True, False)
     assert result.E_total > 0.5
 
 
@@ -161,6 +212,12 @@ def test_salt_noise(tree, search, pose):
     assert result.J == recount(tree, result, views)
 
 
+@pytest.mark.parametrize("make", [BeamSearch, MultiStartSearch, PaperSearch])
+def test_no_view_is_refused(chain, make):
+    with pytest.raises(SettingsError, match="at least one view"):
+        make(chain.tree).match([])
+
+
 def shape():
     rows, columns = np.mgrid[:120, :150]
     mask = np.hypot(rows - 60, columns - 70) < 35
@@ -168,13 +225,13 @@ def shape():
     return mask
 
 
-def test_clean_masks_stay_as_they_are():
+def test_only_masks_full_of_specks_are_cleaned():
     mask = shape()
     mask[5, 5] = True
-    np.testing.assert_array_equal(without_specks(mask), mask)
-
-
-def test_salt_and_pepper_go():
+    assert without_specks(mask) is mask
+    specks = np.zeros((50, 60), dtype=bool)
+    specks[10, 10] = specks[30, 40] = True
+    np.testing.assert_array_equal(without_specks(specks), specks)
     generator = np.random.default_rng(1)
     for salt, pepper in ((0.1, 0.0), (0.1, 0.1)):
         chance = generator.random((120, 150))
@@ -182,9 +239,3 @@ def test_salt_and_pepper_go():
         cleaned = without_specks(noisy)
         assert (cleaned ^ shape()).sum() < 0.05 * shape().sum()
         assert (noisy ^ shape()).sum() > 0.2 * shape().sum()
-
-
-def test_a_mask_of_nothing_but_specks_is_not_emptied():
-    mask = np.zeros((50, 60), dtype=bool)
-    mask[10, 10] = mask[30, 40] = True
-    np.testing.assert_array_equal(without_specks(mask), mask)

@@ -1,12 +1,10 @@
 """Self-motions: what hangs on the last joint stays where it is."""
 
-import itertools
-
 import numpy as np
 import pytest
 
 from drake_pose.body.tree_kinematics import TreeKinematics
-from drake_pose.search.self_motions import _chained_triples, counter_turns, flips
+from drake_pose.search.self_motions import counter_turns, flips
 from tests.search.arms import arm_tree, split
 from tests.search.bodies import swinging_chain
 
@@ -75,9 +73,3 @@ def test_a_chain_in_a_plane_has_counter_turns_but_no_flips(tmp_path):
         assert len(changed) == 2
         # Parallel axes: a turn there and back again, but for full turns.
         assert (one - values).sum() == pytest.approx(0.0, abs=1e-9)
-
-
-def test_triples_of_a_chain_skip_one_joint_at_most(kinematics):
-    moves = kinematics.motions(VALUES).moves
-    triples = {tuple(one) for one in _chained_triples(kinematics, moves).tolist()}
-    assert triples == {one for one in itertools.combinations(range(5), 3) if max(np.diff(one)) <= 2}

@@ -71,24 +71,6 @@ def test_outlines_are_where_neighbours_are_not_covered(episode):
         assert (told[Explained.GAIN] == 0.0) == still
 
 
-def test_the_true_pose_explains_most_of_those_near(episode):
-    sums = Backgrounds.of(episode.pictures).sums
-    parameters = episode.camera.kernel_parameters()
-
-    def gain(X_CW):
-        packed, X_CN = drawn(episode, X_CW)[1]
-        return explain(packed, X_CN, np.zeros(X_CN.shape[1], bool), parameters, sums, 1.0, 0)[0][
-            Explained.GAIN
-        ]
-
-    true = gain(episode.camera.X_CW)
-    for axis in range(3):
-        for by in (-0.08, 0.08):
-            moved = episode.camera.X_CW.copy()
-            moved[axis, 3] += by
-            assert gain(moved) < true
-
-
 def test_light_is_told_whatever_else_changes():
     rng = np.random.default_rng(0)
     reference = rng.uniform(40.0, 200.0, (40, 50, 3)).astype(np.float32)

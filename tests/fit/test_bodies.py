@@ -6,8 +6,11 @@ import pytest
 from drake_pose.body import RootRotation, bundled_model, load_model
 from drake_pose.body.tree_kinematics import TreeKinematics, joint_offsets
 from drake_pose.camera.models import ParallelCamera, circle_of_cameras
+from drake_pose.fit.contour_fit import Noise
+from drake_pose.fit.evidence import NO_EDGE
+from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.fit.parameters import CAMERA_NAMES, BodyParameters, CameraParameters
-from drake_pose.fit.proportions import ProportionedBody, sequence_prior
+from drake_pose.fit.proportions import ProportionedBody, fit_proportions, sequence_prior
 from drake_pose.fit.surfaces import VERY_FEW, few_triangles
 from drake_pose.silhouette.areas.bending import TreeSurfaces
 from drake_pose.silhouette.areas.outline import Outline, outline_from_mesh
@@ -225,3 +228,30 @@ def test_a_sequence_is_as_usual_and_moves_on_as_it_did():
     off = 4.0 * ((x @ [1.0, 2.0] - 0.5) ** 2).sum()
     faster = (np.diff(x, 2, axis=0) / [0.1, 0.2]) ** 2
     assert told == pytest.approx(off + faster.sum())
+
+
+def test_proportions_are_known_as_people_differ(stretched):
+    """With nothing seen, all is as it is expected, and as unsure; the hand's limbs have joints."""
+    camera, kinematics = (
+        ParallelCamera("top", 60, 50, 100.0, 30.0, 25.0, np.eye(4)),
+        stretched.kinematics,
+    )
+    free = np.count_nonzero(kinematics.lower < kinematics.upper) + 4
+    usual = np.eye(free), np.full(free, 0.1), np.full(free, 4.0)
+    limits = np.full(free, -np.inf), np.full(free, np.inf)
+    starts = np.zeros((3, len(kinematics.names) + 4))
+    rounds, prior = [AnnealingStage(1.0, 1.0, 30)], sequence_prior(3, usual, np.full(free, 1e3))
+    found, off = fit_proportions(
+        stretched, camera, [NO_EDGE] * 3, starts, rounds, Noise(1.0, 1.0), limits, prior
+    )
+    np.testing.assert_allclose(found.own, 0.1, atol=1e-3)
+    np.testing.assert_allclose(off[:, off.any(axis=0)], 0.5, rtol=1e-3)
+    counts = [
+        len(names)
+        for names in (stretched.length_names, stretched.width_names, stretched.place_names)
+    ]
+    known = np.repeat([0.15**-2, 0.1**-2, 0.15**-2], counts)
+    np.testing.assert_allclose(np.diag(found.equations.H[0, free:, free:]), known)
+    limbs = {f"joint_place_{kinematics.tree.nodes[i].name}" for i in stretched.placed}
+    assert limbs == set(stretched.place_names)
+    assert len(limbs) == 5

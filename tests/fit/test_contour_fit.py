@@ -1,8 +1,19 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from drake_pose.camera.models import circle_of_cameras
-from drake_pose.fit.contour_fit import ContourFit, Prior, pack_views
+from drake_pose.camera.models import ParallelCamera, circle_of_cameras
+from drake_pose.fit.contour_fit import (
+    ContourFit,
+    Noise,
+    Prior,
+    camera_weights,
+    pack_cameras,
+    pack_views,
+    pixels_per_metre,
+    symmetric,
+)
 from drake_pose.fit.evidence import find_edge_points
 from drake_pose.fit.kernel import collect, nearest_alike
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
@@ -108,6 +119,41 @@ def test_equations_are_collected_as_dense_products():
     np.testing.assert_allclose(g, expected_g, rtol=1e-9)
 
 
+@pytest.mark.parametrize("pixels", [40.0, np.array([40.0, 90.0])])
+def test_a_pixel_of_contour_has_the_weight_one(fit, pixels):
+    (pinhole,) = circle_of_cameras(1, face_camera=False).values()
+    cameras = pack_cameras([pinhole, replace(pinhole, focal_x=2.0 * pinhole.focal_x)])
+    placement, step = fit.body.place(np.zeros(len(fit.lower))), AnnealingStage(0.1, 0.05)
+    weights = camera_weights(cameras, placement, step, Noise.of_a_pixel(pixels), pixels)
+    expected = np.column_stack(np.broadcast_arrays(1.0 / pixels, 0.1 * pixels, 0.05 * pixels, 1.0))
+    np.testing.assert_allclose(weights, np.broadcast_to(expected, (2, 4)))
+    # Where the metre is the unit, errors in pixels grow with the focal length; fine scales are cut.
+    fine = AnnealingStage(1e-6, 1e-6)
+    near, far = camera_weights(cameras, placement, fine, Noise(0.01, 0.1))
+    np.testing.assert_allclose(near[0] / far[0], 2.0)
+    np.testing.assert_allclose(near[3] / far[3], 2.0**3)
+    np.testing.assert_allclose([near[1:3], far[1:3]], [[1.5, 1.0]] * 2)
+    half = camera_weights(cameras, placement, fine, Noise(0.02, 0.2))
+    np.testing.assert_allclose(near[3] / half[0, 3], 8.0)
+
+
+def test_pixels_per_metre_are_those_of_projections():
+    (pinhole,) = circle_of_cameras(1, face_camera=False).values()
+    parallel = ParallelCamera("parallel", 640, 480, 250.0, 320.0, 240.0, pinhole.X_WC)
+    place = np.array([0.1, -0.2, 1.3])
+    for camera in (pinhole, parallel):
+        (size,) = pixels_per_metre(pack_cameras([camera]), place)
+        ends = place + 1e-3 * np.outer([-1.0, 1.0], camera.X_WC[:3, 0])
+        assert np.diff(camera.project(ends)[0][:, 0])[0] / 2e-3 == pytest.approx(size, rel=1e-6)
+
+
+def test_the_lower_triangle_is_the_whole():
+    A = np.random.default_rng(0).normal(size=(2, 5, 5))
+    full = symmetric(np.tril(A))
+    np.testing.assert_array_equal(np.tril(full), np.tril(A))
+    np.testing.assert_array_equal(full, np.swapaxes(full, 1, 2))
+
+
 class TestFit:
     @pytest.mark.parametrize("count", [4, 9])
     def test_pose_is_found_again_in_drakes_pictures(self, person, fit, count):
@@ -141,6 +187,13 @@ class TestFit:
         empty = find_edge_points(np.zeros((120, 160), dtype=bool), 4.0)
         found = fit.fit(pack_views([camera], [empty]), start, STEPS)
         np.testing.assert_allclose(found.values, start, atol=1e-9)
+        assert (found.inlier_ratio, found.evaluations) == (0.0, len(STEPS))
+        # But a prior pulls, inside the limits.
+        prior = Prior(start + 0.03, np.full(len(start), 100.0))
+        found = fit.fit(pack_views([camera], [empty]), start, 4 * STEPS, prior)
+        np.testing.assert_allclose(
+            found.values, np.clip(start + 0.03, fit.lower, fit.upper), atol=2e-3
+        )
         edge = find_edge_points(LabelRenderer(person, camera).mask(standing(person)), 4.0)
         order = [person.position_index(name) for name in fit.kinematics.names]
         start = standing(person)[order] + 0.05

@@ -1,5 +1,7 @@
 """How sure values are where contours err together: known answers, and drawn arms."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -10,7 +12,10 @@ from drake_pose.fit.covariance import (
     _apriori,
     distances_covariance,
     doubted_covariance,
+    error_unit,
     estimate_sizes,
+    excess,
+    surface_deformations,
     values_covariance,
 )
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
@@ -47,6 +52,25 @@ def test_sizes_are_those_that_were_drawn():
     sizes = ErrorSizes(1.5, 1.2, 0.4, 1.0, 2.0)
     found = [estimate_sizes(drawn_distances(generator, sizes)[0], ANGLES) for _ in range(4)]
     np.testing.assert_allclose(np.median([one[:5] for one in found], axis=0), sizes[:5], rtol=0.4)
+
+
+@pytest.mark.parametrize(("scale", "prior"), [(1.0, 1.0), (0.02, 1.0), (30.0, 3.0), (1.0, 0.2)])
+def test_sizes_are_the_likeliest(scale, prior):
+    """Restricted likelihood times prior of the sizes' logarithms, whose values are known little."""
+    sizes = ErrorSizes(*(scale * np.array([1.5, 1.2, 0.4, 1.0, 2.0])))
+    seen, _ = drawn_distances(np.random.default_rng(8), sizes, 60)
+    found = np.log(estimate_sizes(seen, ANGLES, 0.0, prior, settled=1e-4)[:5])
+
+    def log_likelihood(t):
+        V = np.einsum("k,kij->ij", np.exp(2.0 * t), seen.effects)
+        whole = V + seen.X @ np.linalg.inv(_apriori(ANGLES)) @ seen.X.T
+        told = np.linalg.slogdet(whole)[1] + seen.y @ np.linalg.solve(whole, seen.y)
+        return -0.5 * (told + t @ t / prior**2)
+
+    for step in 0.15 * np.eye(5):
+        assert log_likelihood(found) > max(
+            log_likelihood(found + step), log_likelihood(found - step)
+        )
 
 
 def test_a_calibration_is_not_trusted_beyond_a_pixel():
@@ -94,9 +118,66 @@ def test_values_that_do_not_show_are_as_unsure_as_a_full_turn():
         np.zeros(0, dtype=np.intp),
     )
     sizes = estimate_sizes(nothing, ANGLES)
-    deviations = np.sqrt(np.diag(values_covariance(nothing, sizes, ALL, ANGLES)))
-    assert deviations[0] == pytest.approx(2.0 * np.pi / np.sqrt(12.0))
-    assert deviations[1] < 0.01
+    for is_angle, widest in ((ANGLES, 2.0 * np.pi), (~ANGLES, 10.0)):
+        deviations = np.sqrt(np.diag(values_covariance(nothing, sizes, ALL, is_angle)))
+        assert deviations[0] == pytest.approx(widest / np.sqrt(12.0))
+        assert deviations[1] < 0.01
+
+
+def test_noise_is_not_repeated_where_no_part_stands_still():
+    sizes = ErrorSizes(1.5, 0.0, 0.4, 1.0, 2.0)
+    seen, _ = drawn_distances(np.random.default_rng(6), sizes)
+    moving = seen._replace(effects=seen.effects[[0, 0, 2, 3, 4]])
+    assert estimate_sizes(moving, ANGLES).repeated == 0.0
+    assert estimate_sizes(seen, ANGLES).repeated > 0.0
+
+
+def test_costs_differ_by_how_their_pieces_scatter():
+    pieces, others = np.array([[3.0, 1.0], [2.0, 5.0]]), np.array([[1.0, 1.0], [3.0, 3.0]])
+    assert excess(pieces, others) == pytest.approx(3.0 / np.sqrt(4.0 + 1.0 + 4.0))
+    assert excess(others, pieces) == -excess(pieces, others)
+    assert [error_unit(size) for size in (10.0, 200.0, 500.0)] == [1.0, 1.0, 2.5]
+
+
+def test_deformations_move_surfaces_by_a_metre(kinematics):
+    """Each of twelve: shifts along the part's axes, stretches along them of its vertices."""
+    outlines = few_triangles(TreeSurfaces(kinematics.tree))
+    X_WN = kinematics.poses(np.array([0.6, 0.7, -0.7, 0.9, 0.3]))
+    for outline, X, K in zip(outlines, X_WN, surface_deformations(outlines, X_WN), strict=True):
+        p_W = outline.vertices @ X[:3, :3].T + X[:3, 3]
+        moved = np.einsum(
+            "ijk,pj->kpi", K.reshape(3, 4, 12), np.pad(p_W, ((0, 0), (0, 1)), constant_values=1.0)
+        )
+        np.testing.assert_allclose(np.sqrt((moved**2).sum(axis=2).mean(axis=1)), 1.0, rtol=1e-6)
+
+
+def test_distances_err_together_in_a_picture_a_part_and_a_view(kinematics):
+    """Two pictures of a camera before which nothing moves, and one of another camera."""
+    truth = np.array([0.6, 0.7, -0.7, 0.9, 0.3])
+    one, other = damaged_views(kinematics.tree, truth, 2)[:2]
+    views = [
+        replace(view, camera=replace(view.camera, name=f"{k}"))
+        for k, view in enumerate((one, one, other))
+    ]
+    fit = ViewsFit(kinematics, few_triangles(TreeSurfaces(kinematics.tree)), views)
+    seen = fit.distances(truth, STEP)
+    _, repeated, surface, mask, camera = seen.effects
+    apart = seen.pictures[:, None] != seen.pictures
+    still = (seen.pictures[:, None] < 2) & (seen.pictures < 2)
+    assert not mask[apart].any()
+    assert not camera[apart].any()
+    np.testing.assert_array_equal(mask[~apart], surface[~apart])
+    assert surface[apart].any()
+    assert not repeated[apart & ~still].any()
+    np.testing.assert_allclose(repeated[apart & still].max(), 1.0)
+    np.testing.assert_allclose(np.diag(repeated), 1.0)
+    for matrix in seen.effects:
+        np.testing.assert_allclose(matrix, matrix.T, atol=1e-9)
+        assert np.linalg.eigvalsh(matrix).min() > -1e-6 * np.abs(matrix).max()
+    # All that is told of the values, as the distances are nearly all there is.
+    np.testing.assert_allclose(
+        seen.X.T @ seen.X, seen.information, rtol=0.1, atol=0.1 * np.abs(seen.information).max()
+    )
 
 
 @pytest.fixture(scope="module")

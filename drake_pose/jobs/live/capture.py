@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from contextlib import closing
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -38,14 +38,13 @@ from drake_pose.person.date.skeleton import FEATURES, load_skeleton
 from drake_pose.person.figures import PersonRecording, keep_person
 from drake_pose.person.pose_tracker import PersonPoseTracker
 from drake_pose.person.shape import KnownShape, shape_values, tracker_of_person
-from drake_pose.person.views import SilhouetteView, shows_somebody
+from drake_pose.person.views import shows_somebody
 from drake_pose.silhouette.areas.scoring import draw_mask
 from drake_pose.silhouette.pictures.masks import compare_masks
 from drake_pose.silhouette.pictures.scene_checks import frame_ranges
 from drake_pose.silhouette.pictures.scenes import Scene
 from drake_pose.systems.date import (
     CaptureSetup,
-    PersonView,
     build_paper_capture,
     prepare_paper_capture,
     render_registered_pose,
@@ -336,12 +335,25 @@ class _FrameWriter:
         self._moment, self._index = moment, max(self._index + 1, round(moment / self._period))
         name, q = f"{self._index:06d}", self._value(context, "estimated_positions")
         seen = {camera: port.Eval(context) for camera, port in self._views.items()}
-        views = {camera: view for camera, view in seen.items() if view is not None}
-        for camera in views:
+        masks = {camera: view.region for camera, view in seen.items() if view is not None}
+        for camera in masks:
             self._seen[camera, name] = Path(self._scene.specifications[camera].location)
         share, others = (float(self._value(context, what)[0]) for what in ("share", "others"))
         seconds = time.perf_counter() - self._begin
-        error, ious = self._agreement(q, views, others > 0.0)
+        error = float("nan")
+        ious: Mapping[str, float] = {}
+        if np.isfinite(q).all():
+            tracker, cameras = self._tracker, self._scene.cameras
+            values = tracker.values(q)
+            X_WN = tracker.fit.kinematics.poses(values)
+            if others > 0.0:
+                masks, *_ = keep_person(cameras, masks, tracker.place(values))
+            bodies = {
+                name: draw_mask(tracker.fit.outlines, cameras[name].X_CW @ X_WN, cameras[name])
+                for name in masks
+            }
+            agreement = compare_masks(masks, bodies)
+            error, ious = agreement.E_total, agreement.ious
         row = PoseRow(name, q, None, error, seconds)
         deviations = self._value(context, "deviations", len(q))
         record = FrameRecord.of(
@@ -354,10 +366,38 @@ class _FrameWriter:
         self._writer.add(row, record)
         self._times[name] = moment
         if self._writer.more["method"] != "person":
-            for text in self._doubts_of(context, ious):
-                self._doubts.setdefault(text, []).append(name)
+            self._doubt(context, name, q, ious)
         self._on_frame(len(self._times), row.found)
         self._begin = time.perf_counter()
+
+    def _doubt(
+        self,
+        context: Context,
+        frame: str,
+        q: Array,
+        ious: Mapping[str, float],
+        min_iou: float = 0.6,
+    ) -> None:
+        """Notes why one should not trust the paper's stages in a frame.
+
+        min_iou: of a frame in the mean; of simulated persons who are followed it is about 0.8.
+        """
+        doubts = []
+        if not np.isfinite(q).all():
+            doubts.append("before the registered pose")
+        else:
+            # Where a pose was recognised no feature need be measured.
+            if np.isfinite(self._value(context, "limb_points")).all():
+                lost = np.array(FEATURES)[self._value(context, "last_support") == 0]
+                doubts += [f"{k.replace('_', ' ')} not seen; held where it was last" for k in lost]
+            if np.mean(list(ious.values()) or [0.0]) < min_iou:
+                doubts.append(
+                    f"the body and the silhouettes hardly agree (mean IoU below {min_iou}); the "
+                    "paper's stages do not notice when they have lost the person, until the "
+                    "registered pose is shown again"
+                )
+        for text in doubts:
+            self._doubts.setdefault(text, []).append(frame)
 
     def finish(self, sensors: LiveSensors, replay: bool) -> None:
         """Writes what is made of all frames."""
@@ -390,47 +430,6 @@ class _FrameWriter:
         if not self._diagram.HasOutputPort(name):
             return np.full(size, np.nan)
         return np.array(self._diagram.GetOutputPort(name).Eval(context))
-
-    def _agreement(
-        self, q: Array, views: Mapping[str, SilhouetteView | PersonView], has_others: bool
-    ) -> tuple[float, Mapping[str, float]]:
-        """E_total over all views, nan where nobody was found, and each one's IoU."""
-        if not np.isfinite(q).all():
-            return float("nan"), {}
-        fit, cameras = self._tracker.fit, self._scene.cameras
-        values = self._tracker.values(q)
-        X_WN = fit.kinematics.poses(values)
-        masks: Mapping[str, Mask] = {name: view.region for name, view in views.items()}
-        if has_others:
-            masks, *_ = keep_person(cameras, masks, self._tracker.place(values))
-        bodies = {
-            name: draw_mask(fit.outlines, cameras[name].X_CW @ X_WN, cameras[name])
-            for name in masks
-        }
-        agreement = compare_masks(masks, bodies)
-        return agreement.E_total, agreement.ious
-
-    def _doubts_of(
-        self, context: Context, ious: Mapping[str, float], min_iou: float = 0.6
-    ) -> Iterator[str]:
-        """Why one should not trust the paper's stages in a frame.
-
-        min_iou: of a frame in the mean; of simulated persons who are followed it is about 0.8.
-        """
-        if not np.isfinite(self._value(context, "estimated_positions")).all():
-            yield "before the registered pose"
-            return
-        # Where a pose was recognised no feature need be measured.
-        if np.isfinite(self._value(context, "limb_points")).all():
-            support = self._value(context, "last_support")
-            for name in np.array(FEATURES)[support == 0]:
-                yield f"{name.replace('_', ' ')} not seen; held where it was last"
-        if np.mean(list(ious.values()) or [0.0]) < min_iou:
-            yield (
-                f"the body and the silhouettes hardly agree (mean IoU below {min_iou}); the "
-                "paper's stages do not notice when they have lost the person, until the registered "
-                "pose is shown again"
-            )
 
 
 def camera_troubles(counts: Mapping[str, CameraCount], skipped: int) -> list[str]:

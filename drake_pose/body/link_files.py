@@ -29,51 +29,43 @@ from drake_pose.body.model_files import (
 )
 from drake_pose.errors import ModelError
 
-_URDF_READ = {
-    "robot": ("link", "joint", "frame", "material", *OLD_XACRO_ELEMENTS),
-    "link": ("visual", "inertial"),
-    "joint": ("parent", "child", "origin", "axis", "limit", "mimic"),
-    "visual": ("origin", "geometry", "material"),
-}
-_URDF_KNOWN = (
-    "collision", "gazebo", "transmission", "sensor", "plugin", "ros2_control", "mujoco", "group",
-    "group_state", "disable_collisions", "end_effector", "virtual_joint", "passive_joint",
-    "contact", "self_collision_checking", "self_filter", "verbose", "version", "dynamics",
-    "safety_controller", "calibration", "kinematic", "gravity", "surface",
-)  # fmt: skip
-_SDF_READ = {
-    "sdf": ("model", "world"),
-    "world": ("model", "include", "frame", "joint"),
-    "model": ("pose", "link", "joint", "frame", "include", "model", "static"),
-    "link": ("pose", "visual", "inertial"),
-    "visual": ("pose", "geometry", "material"),
-    "material": ("diffuse",),
-    "joint": (
-        "pose", "parent", "child", "axis", "axis2", "screw_thread_pitch", "thread_pitch",
-    ),
-    **dict.fromkeys(("axis", "axis2"), ("xyz", "limit", "mimic", "use_parent_model_frame")),
-    "limit": ("lower", "upper"),
+# The children that are read of an element.
+_READ = {
+    "urdf": {
+        "robot": ("link", "joint", "frame", "material", *OLD_XACRO_ELEMENTS),
+        "link": ("visual", "inertial"),
+        "joint": ("parent", "child", "origin", "axis", "limit", "mimic"),
+        "visual": ("origin", "geometry", "material"),
+    },
+    "sdf": {
+        "sdf": ("model", "world"),
+        "world": ("model", "include", "frame", "joint"),
+        "model": ("pose", "link", "joint", "frame", "include", "model", "static"),
+        "link": ("pose", "visual", "inertial"),
+        "visual": ("pose", "geometry", "material"),
+        "material": ("diffuse",),
+        "joint": (
+            "pose", "parent", "child", "axis", "axis2", "screw_thread_pitch", "thread_pitch",
+        ),
+        **dict.fromkeys(("axis", "axis2"), ("xyz", "limit", "mimic", "use_parent_model_frame")),
+        "limit": ("lower", "upper"),
+    },
 }  # fmt: skip
-_SDF_KNOWN = (
-    "light", "actor", "plugin", "physics", "scene", "gui", "gravity", "magnetic_field", "wind",
+# Others that say nothing of kinematics and looks, of which no warning tells.
+_KNOWN = (
+    "collision", "sensor", "plugin", "kinematic", "gravity", "dynamics",
+    "gazebo", "transmission", "ros2_control", "mujoco", "group", "group_state",
+    "disable_collisions", "end_effector", "virtual_joint", "passive_joint", "contact", "surface",
+    "self_collision_checking", "self_filter", "verbose", "version", "safety_controller",
+    "calibration", "light", "actor", "physics", "scene", "gui", "magnetic_field", "wind",
     "atmosphere", "audio", "state", "road", "spherical_coordinates", "population", "gripper",
-    "self_collide", "allow_auto_disable", "enable_wind", "collision", "sensor", "projector",
-    "audio_source", "audio_sink", "battery", "particle_emitter", "must_be_base_link", "kinematic",
-    "velocity_decay", "cast_shadows", "laser_retro", "transparency", "visibility_flags", "meta",
-    "script", "shader", "render_order", "lighting", "ambient", "specular", "emissive", "shininess",
-    "double_sided", "pbr", "physics", "dynamics", "gearbox_ratio", "gearbox_reference_body",
-    "effort", "velocity", "stiffness", "dissipation", "initial_position",
+    "self_collide", "allow_auto_disable", "enable_wind", "projector", "audio_source", "audio_sink",
+    "battery", "particle_emitter", "must_be_base_link", "velocity_decay", "cast_shadows",
+    "laser_retro", "transparency", "visibility_flags", "meta", "script", "shader", "render_order",
+    "lighting", "ambient", "specular", "emissive", "shininess", "double_sided", "pbr",
+    "gearbox_ratio", "gearbox_reference_body", "effort", "velocity", "stiffness", "dissipation",
+    "initial_position",
 )  # fmt: skip
-# How many numbers each size of each shape has: attributes in URDF, elements in SDFormat.
-_SIZES: dict[str, dict[str, int]] = {
-    "box": {"size": 3},
-    "sphere": {"radius": 1},
-    "cylinder": {"radius": 1, "length": 1},
-    "capsule": {"radius": 1, "length": 1},
-    "ellipsoid": {"a": 1, "b": 1, "c": 1},
-    "mesh": {},
-}
-_SDF_SIZES = _SIZES | {"ellipsoid": {"radii": 3, **_SIZES["ellipsoid"]}, "plane": {}, "empty": {}}
 Limits = dict[str, tuple[float, float]]
 
 
@@ -87,20 +79,36 @@ def cure_urdf(path: Path, finder: FileFinder, warn: Warn) -> str:
         raise ModelError(f"its outermost element is <{root.tag}>; a URDF file's is <robot>")
     if not root.get("name"):
         root.set("name", path.stem)
-    leave_out(root, _URDF_READ, _URDF_KNOWN, warn)
+    leave_out(root, _READ["urdf"], _KNOWN, warn)
     refuse_macros(root)
-    _require_names(root)
-    _give_colours(root)
-    for link in root.iterfind("link"):
-        _leave_out_inertia(link)
-        for visual in link.iterfind("visual"):
-            _check_urdf_visual(visual, f"link '{link.get('name')}'", path, finder)
     joints = _joints(root)
     ends = [[_end(joint, end) for end in ("parent", "child")] for joint in joints]
+    links = [link.get("name") for link in root.iterfind("link")]
+    for kind, names in (("link", links), ("joint", [joint.get("name") for joint in joints])):
+        for name, count in Counter(names).items():
+            if not name:
+                raise ModelError(f"{count} <{kind}> without a name; give each of them one")
+            if count > 1:
+                raise ModelError(f"{kind} '{name}' is defined {count} times; rename all but one")
+    for joint, both in zip(joints, ends, strict=True):
+        for end, name in zip(("parent", "child"), both, strict=True):
+            if name != "world" and name not in links:
+                raise ModelError(
+                    f"joint '{joint.get('name')}': its {end} link '{name}' does not exist"
+                )
+    _give_colours(root)
+    for link in root.iterfind("link"):
+        for inertial in link.findall("inertial"):
+            values = " ".join(v for element in inertial.iter() for v in element.attrib.values())
+            try:
+                read_numbers(values, len(values.split()), "")
+            except ModelError:  # Poses do not need it.
+                link.remove(inertial)
+        for visual in link.iterfind("visual"):
+            _check_urdf_visual(visual, f"link '{link.get('name')}'", path, finder)
     open_loops(root, joints, ends, warn)
-    leaders = [
-        one.get("name", "") for one in root.iterfind("joint") if one.get("type") in FOLLOWING
-    ]
+    followed = root.findall("joint")
+    leaders = [one.get("name", "") for one in followed if one.get("type") in FOLLOWING]
     for joint in _joints(root):
         _check_urdf_joint(joint)
         name = joint.get("name", "")
@@ -120,35 +128,6 @@ def _end(joint: ElementTree.Element, end: str) -> str:
     return "" if element is None else element.get("link", "")
 
 
-def _require_names(root: ElementTree.Element) -> None:
-    """Every link and joint has a name of its own, and joints connect links that exist."""
-    links = [link.get("name") for link in root.iterfind("link")]
-    joints = _joints(root)
-    for kind, names in (("link", links), ("joint", [joint.get("name") for joint in joints])):
-        for name, count in Counter(names).items():
-            if not name:
-                raise ModelError(f"{count} <{kind}> without a name; give each of them one")
-            if count > 1:
-                raise ModelError(f"{kind} '{name}' is defined {count} times; rename all but one")
-    for joint in joints:
-        for end in ("parent", "child"):
-            name = _end(joint, end)
-            if name != "world" and name not in links:
-                raise ModelError(
-                    f"joint '{joint.get('name')}': its {end} link '{name}' does not exist"
-                )
-
-
-def _leave_out_inertia(link: ElementTree.Element) -> None:
-    """Remove an <inertial> that holds something else than numbers: poses do not need it."""
-    for inertial in link.findall("inertial"):
-        values = [value for element in inertial.iter() for value in element.attrib.values()]
-        try:
-            read_numbers(" ".join(values), len(" ".join(values).split()), "")
-        except ModelError:
-            link.remove(inertial)
-
-
 def _check_origin(element: ElementTree.Element, where: str) -> None:
     for origin in element.iterfind("origin"):
         for name in ("xyz", "rpy"):
@@ -161,27 +140,21 @@ def _check_urdf_visual(
 ) -> None:
     """Refuse what cannot be drawn, and make file names absolute."""
     _check_origin(visual, where)
-    geometry = visual.find("geometry")
-    shapes = [] if geometry is None else list(geometry)
+    shapes = visual.findall("geometry/*")
     if not shapes:
         raise ModelError(f"{where}: a <visual> without a shape in its <geometry>")
     for shape in shapes:
-        kind = _kind_of_shape(shape, where, is_urdf=True)
-        if kind == "mesh":
-            _check_urdf_mesh(shape, where, path, finder)
-
-
-def _check_urdf_mesh(mesh: ElementTree.Element, where: str, path: Path, finder: FileFinder) -> None:
-    name = mesh.get("filename", "")
-    if not name.strip():
-        raise ModelError(f"{where}: a mesh without a filename")
-    mesh.set("filename", f"file://{finder.resolve(name, path, f'{where}: mesh')}")
-    if "scale" not in mesh.attrib:
-        return
-    text = mesh.get("scale", "")
-    count = 1 if len(text.split()) == 1 else 3
-    require_scale(text, count, f"{where}: scale of mesh '{name}'")
-    mesh.set("scale", " ".join(text.split() * (3 // count)))
+        if _kind_of_shape(shape, where, is_urdf=True) != "mesh":
+            continue
+        name = shape.get("filename", "")
+        if not name.strip():
+            raise ModelError(f"{where}: a mesh without a filename")
+        shape.set("filename", f"file://{finder.resolve(name, path, f'{where}: mesh')}")
+        if "scale" in shape.attrib:
+            text = shape.get("scale", "")
+            count = 1 if len(text.split()) == 1 else 3
+            require_scale(text, count, f"{where}: scale of mesh '{name}'")
+            shape.set("scale", " ".join(text.split() * (3 // count)))
 
 
 def _check_urdf_joint(joint: ElementTree.Element) -> None:
@@ -199,22 +172,17 @@ def _check_urdf_joint(joint: ElementTree.Element) -> None:
         for side, value in zip(("lower", "upper"), read_limits(*texts, name), strict=True):
             if value is None:
                 limit.attrib.pop(side, None)
-        for name_of_rate in ("effort", "drake:acceleration"):
-            limit.attrib.pop(name_of_rate, None)
-        _check_velocity(limit, name)
-
-
-def _check_velocity(limit: ElementTree.Element, name: str) -> None:
-    """Refuse a negative velocity limit, which ends Drake; leave out one that is no number."""
-    text = limit.get("velocity", "0")
-    try:
-        velocity = float(text)
-    except ValueError:
-        velocity = math.nan
-    if velocity < 0.0:
-        raise ModelError(f"joint '{name}': velocity limit {text} is negative; give 0 or more")
-    if not math.isfinite(velocity):
-        del limit.attrib["velocity"]
+        for rate in ("effort", "drake:acceleration"):
+            limit.attrib.pop(rate, None)
+        text = limit.get("velocity", "0")
+        try:
+            velocity = float(text)
+        except ValueError:
+            velocity = math.nan
+        if velocity < 0.0:
+            raise ModelError(f"joint '{name}': velocity limit {text} is negative; give 0 or more")
+        if not math.isfinite(velocity):
+            del limit.attrib["velocity"]
 
 
 def _give_colours(root: ElementTree.Element) -> None:
@@ -245,7 +213,17 @@ def _colour(material: ElementTree.Element) -> str | None:
 
 def _kind_of_shape(shape: ElementTree.Element, where: str, *, is_urdf: bool) -> str:
     """What a shape is; one that cannot be drawn is refused."""
-    kind, known = shape.tag.removeprefix("drake:"), _SIZES if is_urdf else _SDF_SIZES
+    # How many numbers each size of each shape has: attributes in URDF, elements in SDFormat.
+    known: dict[str, dict[str, int]] = {
+        "box": {"size": 3},
+        "sphere": {"radius": 1},
+        "cylinder": {"radius": 1, "length": 1},
+        "capsule": {"radius": 1, "length": 1},
+        "ellipsoid": {"a": 1, "b": 1, "c": 1} if is_urdf else {"radii": 3},
+        "mesh": {},
+    }
+    known |= {} if is_urdf else {"plane": {}, "empty": {}}
+    kind = shape.tag.removeprefix("drake:")
     if kind not in known:
         raise ModelError(f"{where}: there is no shape <{kind}>; there is: {', '.join(known)}")
     for name, count in known[kind].items():
@@ -257,16 +235,10 @@ def _kind_of_shape(shape: ElementTree.Element, where: str, *, is_urdf: bool) -> 
     return kind
 
 
-def cure_sdf(
-    path: Path, finder: FileFinder, warn: Warn, cure_file: Callable[[Path], Path]
-) -> tuple[str, Limits]:
+def cure_sdf(path: Path, finder: FileFinder, warn: Warn, cure_file: Callable[[Path], Path]) -> str:
     """The text of an SDFormat file that Drake reads; it may be parsed from anywhere.
 
     ``cure_file`` makes a file that stands in for an included model.
-
-    Returns:
-        The text, and the limits (lower, upper) [rad] by position name of universal and screw
-        joints, which Drake's parser passes over.
 
     Raises ModelError: names the link, joint or mesh at fault.
     """
@@ -275,36 +247,50 @@ def cure_sdf(
         raise ModelError(f"its outermost element is <{root.tag}>; an SDFormat file's is <sdf>")
     if "version" not in root.attrib:
         raise ModelError('its <sdf> has no version; write for example <sdf version="1.9">')
-    leave_out(root, _SDF_READ, _SDF_KNOWN, warn)
+    leave_out(root, _READ["sdf"], _KNOWN, warn)
     refuse_macros(root)
     for include in root.iter("include"):
-        _cure_include(include, path, finder, cure_file)
+        uri, name = _uri(include, "an <include> without a <uri>")
+        found = finder.resolve(name, path, "included model")
+        if found.is_dir():
+            found = _model_of_folder(found, name)
+        uri.text = f"file://{cure_file(found)}"
     for link in root.iter("link"):
         where = f"link '{link.get('name', '(unnamed)')}'"
         _check_poses(link, where)
         for visual in link.iterfind("visual"):
             _check_sdf_visual(visual, where, path, finder)
     for model in [*root.iter("model"), *root.iter("world")]:
-        _leave_out_constraints(model, warn)
-        _keep_mimics(model, warn)
+        # Drake refuses joints that couple others, or close a loop of links.
+        for joint in model.findall("joint"):
+            if joint.get("type") == "gearbox":
+                model.remove(joint)
+                warn(f"joint '{joint.get('name')}' is a gearbox: not enforced, it is left out")
+        joints = model.findall("joint")
+        ends = [
+            [(one.findtext(end) or "").strip() for end in ("parent", "child")] for one in joints
+        ]
+        open_loops(model, joints, ends, warn)
+        joints = model.findall("joint")
+        leaders = [one.get("name", "") for one in joints if one.get("type") in FOLLOWING]
+        for joint in joints:
+            name = joint.get("name", "")
+            for axis in [*joint.findall("axis"), *joint.findall("axis2")]:
+                if said := take_mimic(axis, name, leaders if name in leaders else (), warn):
+                    ElementTree.SubElement(joint, "drake:mimic", said)
     limits: Limits = {}
     for joint in root.iter("joint"):
         limits.update(_check_sdf_joint(joint))
     return xml_text(root), limits
 
 
-def _cure_include(
-    include: ElementTree.Element, path: Path, finder: FileFinder, cure_file: Callable[[Path], Path]
-) -> None:
-    """Name the file that stands in for an included model."""
-    uri = include.find("uri")
+def _uri(element: ElementTree.Element, missing: str) -> tuple[ElementTree.Element, str]:
+    """An element's <uri> and what it names; ModelError, which says ``missing``, where it lacks."""
+    uri = element.find("uri")
     name = "" if uri is None else (uri.text or "").strip()
     if uri is None or not name:
-        raise ModelError("an <include> without a <uri>")
-    found = finder.resolve(name, path, "included model")
-    if found.is_dir():
-        found = _model_of_folder(found, name)
-    uri.text = f"file://{cure_file(found)}"
+        raise ModelError(missing)
+    return uri, name
 
 
 def _model_of_folder(folder: Path, name: str) -> Path:
@@ -337,49 +323,18 @@ def _check_sdf_visual(
             if colour.text is None:
                 material.remove(colour)
     for shape in visual.findall("geometry/*"):
-        kind = _kind_of_shape(shape, where, is_urdf=False)
-        if kind == "mesh":
-            _check_sdf_mesh(shape, where, path, finder)
-
-
-def _check_sdf_mesh(mesh: ElementTree.Element, where: str, path: Path, finder: FileFinder) -> None:
-    uri = mesh.find("uri")
-    name = "" if uri is None else (uri.text or "").strip()
-    if uri is None or not name:
-        raise ModelError(f"{where}: a mesh without a <uri>")
-    uri.text = f"file://{finder.resolve(name, path, f'{where}: mesh')}"
-    if mesh.find("submesh") is not None:
-        raise ModelError(
-            f"{where}: Drake shows the whole mesh '{name}', not its <submesh> alone; put that part "
-            "into a file of its own"
-        )
-    scale = mesh.findtext("scale")
-    if scale is not None:
-        require_scale(scale, 3, f"{where}: scale of mesh '{name}'")
-
-
-def _leave_out_constraints(model: ElementTree.Element, warn: Warn) -> None:
-    """Remove joints that couple others, or close a loop of links: Drake refuses both."""
-    for joint in model.findall("joint"):
-        if joint.get("type") == "gearbox":
-            model.remove(joint)
-            warn(f"joint '{joint.get('name')}' is a gearbox: not enforced, it is left out")
-    joints = model.findall("joint")
-    ends = [
-        [(joint.findtext(end) or "").strip() for end in ("parent", "child")] for joint in joints
-    ]
-    open_loops(model, joints, ends, warn)
-
-
-def _keep_mimics(model: ElementTree.Element, warn: Warn) -> None:
-    """Let joints of a model follow others of it, in Drake's own words."""
-    joints = model.findall("joint")
-    leaders = [one.get("name", "") for one in joints if one.get("type") in FOLLOWING]
-    for joint in joints:
-        name = joint.get("name", "")
-        for axis in [*joint.findall("axis"), *joint.findall("axis2")]:
-            if said := take_mimic(axis, name, leaders if name in leaders else (), warn):
-                ElementTree.SubElement(joint, "drake:mimic", said)
+        if _kind_of_shape(shape, where, is_urdf=False) != "mesh":
+            continue
+        uri, name = _uri(shape, f"{where}: a mesh without a <uri>")
+        uri.text = f"file://{finder.resolve(name, path, f'{where}: mesh')}"
+        if shape.find("submesh") is not None:
+            raise ModelError(
+                f"{where}: Drake shows the whole mesh '{name}', not its <submesh> alone; put that "
+                "part into a file of its own"
+            )
+        scale = shape.findtext("scale")
+        if scale is not None:
+            require_scale(scale, 3, f"{where}: scale of mesh '{name}'")
 
 
 def _check_sdf_joint(joint: ElementTree.Element) -> Limits:
@@ -388,14 +343,12 @@ def _check_sdf_joint(joint: ElementTree.Element) -> Limits:
     _check_poses(joint, f"joint '{name}'")
     suffixes = {"universal": {"axis": "_qx", "axis2": "_qy"}, "screw": {"axis": ""}}
     passed_over: Limits = {}
-    for tag in ("axis", "axis2"):
-        for axis in joint.iterfind(tag):
-            if axis.findtext("xyz") is not None:
-                numbers = read_numbers(axis.findtext("xyz"), 3, f"joint '{name}': its <xyz>")
-                if not any(numbers):
-                    raise ModelError(f"joint '{name}': its axis is zero")
-            texts = [axis.findtext(f"limit/{side}") for side in ("lower", "upper")]
-            lower, upper = read_limits(texts[0], texts[1], name)
-            if tag in suffixes.get(kind, {}) and lower is not None and upper is not None:
-                passed_over[f"{name}{suffixes[kind][tag]}"] = (lower, upper)
+    for axis in [*joint.findall("axis"), *joint.findall("axis2")]:
+        xyz = axis.findtext("xyz")
+        if xyz is not None and not any(read_numbers(xyz, 3, f"joint '{name}': its <xyz>")):
+            raise ModelError(f"joint '{name}': its axis is zero")
+        texts = [axis.findtext(f"limit/{side}") for side in ("lower", "upper")]
+        lower, upper = read_limits(texts[0], texts[1], name)
+        if axis.tag in suffixes.get(kind, {}) and lower is not None and upper is not None:
+            passed_over[f"{name}{suffixes[kind][axis.tag]}"] = (lower, upper)
     return passed_over

@@ -1,11 +1,10 @@
 """XML model files: read as leniently as robots' own programs do, checked before Drake sees them."""
 
-import itertools
 import math
 import os
 import re
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from urllib.parse import unquote
@@ -20,12 +19,6 @@ OLD_XACRO_ELEMENTS = ("macro", "include")
 
 Warn = Callable[[str], None]
 """Takes what of a file is not read, or not enforced."""
-
-_MACRO_MARKS = ("${", "$(")
-_MIMIC = {"multiplier": "1", "offset": "0", "reference": "0"}
-_COMMENT = re.compile(r"<!--.*?-->", re.DOTALL)
-_BARE_AMPERSAND = re.compile(r"&(?!(?:#\d+|#x[0-9a-fA-F]+|lt|gt|amp|quot|apos);)")
-_DECLARED_ENCODING = re.compile(rb"<\?xml[^>]*?\bencoding\s*=\s*[\"']([\w.:-]+)")
 
 
 def read_xml(path: Path) -> ElementTree.Element:
@@ -42,11 +35,14 @@ def read_xml(path: Path) -> ElementTree.Element:
         data = path.read_bytes()
     except OSError as error:
         raise ModelError(f"{path} cannot be read: {error.strerror}") from error
-    text = _decoded(data)
+    try:
+        text = data.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        text = data.decode("iso-8859-1")
     blank_lines = text[: len(text) - len(text.lstrip())].count("\n")
-    text = _COMMENT.sub(lambda comment: "\n" * comment[0].count("\n"), text.lstrip())
+    text = re.sub(r"(?s)<!--.*?-->", lambda one: "\n" * one[0].count("\n"), text.lstrip())
     if "<!ENTITY" not in text:
-        text = _BARE_AMPERSAND.sub("&amp;", text)
+        text = re.sub(r"&(?!(?:#\d+|#x[0-9a-fA-F]+|lt|gt|amp|quot|apos);)", "&amp;", text)
     builder = ElementTree.TreeBuilder()
     try:
         # Without a separator, a prefix stays a part of the name.
@@ -69,21 +65,6 @@ def read_xml(path: Path) -> ElementTree.Element:
 def xml_text(root: ElementTree.Element) -> str:
     """The text of an element that parse_xml made."""
     return ElementTree.tostring(root, encoding="unicode")
-
-
-def _decoded(data: bytes) -> str:
-    """A file's content as text: by its byte order mark, its declaration, as UTF-8 or as Latin-1."""
-    if data[:2] in (b"\xff\xfe", b"\xfe\xff"):
-        return data.decode("utf-16", "replace")
-    declared = _DECLARED_ENCODING.search(data[:200])
-    encodings = ["utf-8-sig"]
-    # What reads as bytes is not UTF-16, whatever it says.
-    if declared is not None and not declared[1].lower().startswith((b"utf-16", b"utf-32")):
-        encodings.insert(0, declared[1].decode("ascii"))
-    for encoding in encodings:
-        with suppress(LookupError, ValueError):
-            return data.decode(encoding).removeprefix("\ufeff")
-    return data.decode("iso-8859-1")
 
 
 def read_numbers(text: str | None, count: int, where: str) -> list[float]:
@@ -208,13 +189,13 @@ def take_mimic(
 
     ``leaders``: the joints that can be followed; ``warn`` is told of others.
     """
-    found = None
+    found, usual = None, {"multiplier": "1", "offset": "0", "reference": "0"}
     for mimic in parent.findall("mimic"):
         parent.remove(mimic)
-        said = {key: mimic.get(key, mimic.findtext(key)) for key in _MIMIC}
+        said = {key: mimic.get(key, mimic.findtext(key)) for key in usual}
         multiplier, offset, reference = (
             read_numbers(said[key] or text, 1, f"joint '{name}': {key} of its <mimic>")[0]
-            for key, text in _MIMIC.items()
+            for key, text in usual.items()
         )
         leader = mimic.get("joint", "")
         if leader in leaders and leader != name and multiplier:
@@ -230,42 +211,18 @@ def take_mimic(
 
 def refuse_macros(root: ElementTree.Element) -> None:
     """Raise ModelError for a file that xacro has not expanded: links would be missing."""
-    prefixes = {"xacro"}
-    for name, value in root.attrib.items():
-        if name.startswith("xmlns:") and "xacro" in value:
-            prefixes.add(name.removeprefix("xmlns:"))
-    left = next(_macros(root, prefixes), None)
-    if left is not None:
+    left = [f"<{child.tag}>" for child in root if child.tag in OLD_XACRO_ELEMENTS]
+    for element in root.iter():
+        if element.tag.startswith("xacro:"):
+            left.append(f"<{element.tag}>")
+        for value in [*element.attrib.values(), element.text or ""]:
+            if "${" in value or "$(" in value:
+                left.append(f"'{value.strip()[:60]}' in <{element.tag}>")
+    if left:
         raise ModelError(
-            f"it still holds xacro macros, such as {left}: links and joints would be missing; "
+            f"it still holds xacro macros, such as {left[0]}: links and joints would be missing; "
             "expand it first: xacro robot.urdf.xacro > robot.urdf (PyPI: xacro)"
         )
-
-
-def _macros(root: ElementTree.Element, prefixes: Collection[str]) -> Iterator[str]:
-    """The elements, attributes and texts of xacro."""
-    yield from (f"<{child.tag}>" for child in root if child.tag in OLD_XACRO_ELEMENTS)
-    for element in root.iter():
-        if ":" in element.tag and element.tag.partition(":")[0] in prefixes:
-            yield f"<{element.tag}>"
-        for value in [*element.attrib.values(), element.text or ""]:
-            if any(mark in value for mark in _MACRO_MARKS):
-                yield f"'{value.strip()[:60]}' in <{element.tag}>"
-
-
-_URI = re.compile(r"(?P<scheme>[A-Za-z][\w+.-]*)://(?P<rest>.*)", re.DOTALL)
-_PACKAGE_NAME = re.compile(r"\w[\w.-]*")
-# Folders of packages, and where in each of them packages lie.
-_SEARCH_PATHS = (
-    ("ROS_PACKAGE_PATH", "."),
-    ("AMENT_PREFIX_PATH", "share"),
-    ("GZ_SIM_RESOURCE_PATH", "."),
-    ("IGN_GAZEBO_RESOURCE_PATH", "."),
-    ("GAZEBO_MODEL_PATH", "."),
-    ("SDF_PATH", "."),
-)
-# A workspace's source folder has less; in others nobody keeps repositories.
-_MOST_REPOSITORIES = 1000
 
 
 def package_folder() -> Path:
@@ -314,7 +271,7 @@ class FileFinder:
 
         Raises ModelError: the package is unknown, the file does not exist, or it is not local.
         """
-        uri = _URI.fullmatch(name.strip())
+        uri = re.fullmatch(r"(?s)(?P<scheme>[A-Za-z][\w+.-]*)://(?P<rest>.*)", name.strip())
         if uri is None:
             paths = [file.parent / name.strip()]
         elif uri["scheme"] == "file":
@@ -340,15 +297,25 @@ class FileFinder:
         """Where a package may lie, the likeliest place first; one alone where it is known."""
         if self._known.Contains(name):
             return [Path(self._known.GetPath(name))]
-        if not _PACKAGE_NAME.fullmatch(name):
+        if not re.fullmatch(r"\w[\w.-]*", name):
             return []
         found = [place for parent in file.absolute().parents for place in _folders_at(parent, name)]
-        for variable, inside in _SEARCH_PATHS:
+        for variable, inside in (
+            ("ROS_PACKAGE_PATH", "."),
+            ("AMENT_PREFIX_PATH", "share"),
+            ("GZ_SIM_RESOURCE_PATH", "."),
+            ("IGN_GAZEBO_RESOURCE_PATH", "."),
+            ("GAZEBO_MODEL_PATH", "."),
+            ("SDF_PATH", "."),
+        ):
             for text in filter(None, os.environ.get(variable, "").split(os.pathsep)):
-                folder = Path(text) / inside
-                found += _folders_at(folder, name)
-                if not (folder / name).is_dir():
-                    found += [one / name for one in _folders_in(folder) if (one / name).is_dir()]
+                found += _folders_at(Path(text) / inside, name)
+        if not found:
+            # Packages in the repositories of a workspace.
+            packages = PackageMap.MakeEmpty()
+            packages.PopulateFromRosPackagePath()
+            known = [one for one in packages.GetPackageNames() if one.strip() == name]
+            found = [Path(packages.GetPath(one)) for one in known]
         return found
 
 
@@ -360,14 +327,6 @@ def _folders_at(folder: Path, name: str) -> list[Path]:
             names.append((read_xml(folder / "package.xml").findtext("name") or "").strip())
     own = [folder] if name in names else []
     return [*own, folder / name] if (folder / name).is_dir() else own
-
-
-def _folders_in(folder: Path) -> list[Path]:
-    """The folders in a folder; at most as many as a workspace has repositories."""
-    with suppress(OSError), os.scandir(folder) as entries:
-        few = list(itertools.islice(entries, _MOST_REPOSITORIES))
-        return sorted(Path(entry.path) for entry in few if entry.is_dir())
-    return []
 
 
 def bundled_model(name: str) -> Path:

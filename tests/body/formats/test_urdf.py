@@ -98,8 +98,6 @@ def test_a_declared_prefix_without_macros_does_no_harm(tmp_path):
     model = read(tmp_path, text)
     assert model.position_names[-1] == "elbow"
     assert model.warnings == ()
-    other = text.replace("xmlns:xacro", "xmlns:x").replace("</robot>", "<x:arm/></robot>")
-    assert "<x:arm>" in refusal(tmp_path, other)
     assert "expand it first" in refusal(tmp_path, text, "thing.urdf.xacro")
 
 
@@ -187,8 +185,6 @@ HEAD = '<?xml version="1.0" encoding="{}"?>\n'
     [
         ("", "utf-8"),
         (HEAD.format("ISO-8859-1"), "iso-8859-1"),
-        (HEAD.format("windows-1252"), "cp1252"),
-        (HEAD.format("utf-16"), "utf-16"),
         (HEAD.format("utf-8"), "utf-8-sig"),
         ("\n \n" + HEAD.format("utf-8"), "utf-8"),
         ("<!-- two -- hyphens -->", "utf-8"),
@@ -256,7 +252,7 @@ def test_packages_are_found_on_the_way_up(tmp_path, package, name, model, slashe
 @pytest.mark.parametrize("variable", ["ROS_PACKAGE_PATH", "AMENT_PREFIX_PATH", "SDF_PATH"])
 def test_packages_are_found_in_search_paths(tmp_path, monkeypatch, variable):
     share = "share" if variable == "AMENT_PREFIX_PATH" else "."
-    place = make_package(tmp_path / "workspace" / share / "my_arm")
+    place = make_package(tmp_path / "workspace" / share / "my_arm", "my_arm")
     (tmp_path / "models").mkdir()
     monkeypatch.delenv(variable, raising=False)
     with pytest.raises(ModelError, match="not known"):

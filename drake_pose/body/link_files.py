@@ -235,10 +235,16 @@ def _kind_of_shape(shape: ElementTree.Element, where: str, *, is_urdf: bool) -> 
     return kind
 
 
-def cure_sdf(path: Path, finder: FileFinder, warn: Warn, cure_file: Callable[[Path], Path]) -> str:
+def cure_sdf(
+    path: Path, finder: FileFinder, warn: Warn, cure_file: Callable[[Path], Path]
+) -> tuple[str, Limits]:
     """The text of an SDFormat file that Drake reads; it may be parsed from anywhere.
 
     ``cure_file`` makes a file that stands in for an included model.
+
+    Returns:
+        The text, and the limits (lower, upper) [rad] by position name of universal and screw
+        joints, which Drake's parser passes over.
 
     Raises ModelError: names the link, joint or mesh at fault.
     """

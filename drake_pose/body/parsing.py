@@ -32,24 +32,6 @@ from drake_pose.body.model_files import FileFinder
 from drake_pose.body.plant_source import add_coupler
 from drake_pose.errors import DrakePoseError, ModelError
 
-# What Drake's parser calls each kind of file.
-_KINDS = {
-    ".urdf": "urdf",
-    ".sdf": "sdf",
-    ".xml": "xml",
-    ".mjcf": "xml",
-    ".yaml": "dmd.yaml",
-    ".yml": "dmd.yaml",
-}
-_MAXIMUM_DEPTH = 20
-_MOST_ALIKE = 10
-# Names in quotes, and numbers.
-_VARIABLE = re.compile(r"'[^']*'|-?\d[\d.e+-]*")
-# Inertias play no role in what is seen.
-_ABOUT_INERTIA = ("invalid inertia", "parsing inertia matrix", "as central inertia")
-# Some of Drake's messages hold whole files.
-_LONGEST_REASON = 1000
-
 
 class ModelSource:
     """A model file and the cured text that Drake parses in its place.
@@ -109,17 +91,29 @@ class ModelSource:
                     add_coupler(plant, follower, leader, *how)
             # Drake ends the process, which Python sees as SystemExit, at some values.
             except (RuntimeError, ValueError, SystemExit) as error:
-                raise ModelError(self._explain(str(error), warnings)) from error
+                # SDFormat's reader says where in its error, and what in a warning before it.
+                where = [text.split("Msg: ")[-1] for text in warnings if "Error" in text]
+                # Some of Drake's messages hold whole files.
+                text = "; ".join([*where, str(error).strip()])[:1000]
+                text = self._name_originals(text, self.path.name)
+                raise ModelError(
+                    f"{self.path}: {text or 'Drake refuses this model without saying why'}"
+                ) from error
+        # Inertias play no role in what is seen.
+        about_inertia = ("invalid inertia", "parsing inertia matrix", "as central inertia")
         remarks = [
             self._name_originals(warning, str(self.path))
             for warning in warnings
-            if not any(mark in warning for mark in _ABOUT_INERTIA)
+            if not any(mark in warning for mark in about_inertia)
         ]
         return list(instances), [*self.warnings, *remarks]
 
     def _cure(self, path: Path) -> tuple[str, str]:
         """The text that is parsed in place of a file, and the kind of it."""
-        kind = _KINDS.get(path.suffix.lower())
+        # What Drake's parser calls each kind of file.
+        kinds = {".urdf": "urdf", ".sdf": "sdf", ".xml": "xml", ".mjcf": "xml"}
+        kinds |= dict.fromkeys((".yaml", ".yml"), "dmd.yaml")
+        kind = kinds.get(path.suffix.lower())
         if kind is None:
             what = "use .urdf, .sdf, .xml (MJCF) or .dmd.yaml"
             if path.suffix.lower() == ".xacro":
@@ -128,7 +122,7 @@ class ModelSource:
                 f"model file {path}: '{path.suffix}' is not a kind of file that Drake's Parser "
                 f"reads; {what}"
             )
-        if path in self._under_way or len(self._under_way) > _MAXIMUM_DEPTH:
+        if path in self._under_way or len(self._under_way) > 20:
             raise ModelError(f"{path} includes itself")
         self._under_way.append(path)
         try:
@@ -177,25 +171,18 @@ class ModelSource:
             r"<(literal|data)-string>(\.[\w.]+\w)?(:\d+)?", where.replace("\\", "/"), text
         )
 
-    def _explain(self, reason: str, warnings: list[str]) -> str:
-        """Why the file cannot be used."""
-        # SDFormat's reader says where in its error, and what in a warning before it.
-        remarks = [text.split("Msg: ")[-1] for text in warnings if "Error" in text]
-        text = "; ".join([*remarks, reason.strip()])[:_LONGEST_REASON]
-        text = self._name_originals(text, self.path.name)
-        return f"{self.path}: {text or 'Drake refuses this model without saying why'}"
 
-
-def limit_kinds(warnings: Sequence[str]) -> list[str]:
+def limit_kinds(warnings: Sequence[str], most: int = 10) -> list[str]:
     """Warnings, at most ten of those that differ in names and numbers alone, and their count."""
     by_kind: dict[str, list[str]] = {}
     for warning in warnings:
-        by_kind.setdefault(_VARIABLE.sub("", warning), []).append(warning)
+        kind = re.sub(r"'[^']*'|-?\d[\d.e+-]*", "", warning)
+        by_kind.setdefault(kind, []).append(warning)
     shown = []
     for alike in by_kind.values():
-        shown += alike[:_MOST_ALIKE]
-        if len(alike) > _MOST_ALIKE:
-            shown[-1] += f" ... and {len(alike) - _MOST_ALIKE} more of this kind"
+        shown += alike[:most]
+        if len(alike) > most:
+            shown[-1] += f" ... and {len(alike) - most} more of this kind"
     return shown
 
 
@@ -222,7 +209,7 @@ def captured_warnings() -> Iterator[list[str]]:
 def _cure_directives(path: Path, finder: FileFinder, cure_file: Callable[[Path], Path]) -> str:
     """The text of model directives, tags and aliases kept, that name the files' stand-ins."""
     try:
-        node = yaml.compose(path.read_bytes(), Loader=yaml.SafeLoader)
+        node = top = yaml.compose(path.read_bytes(), Loader=yaml.SafeLoader)
     except OSError as error:
         raise ModelError(f"it cannot be read: {error.strerror}") from error
     except (yaml.YAMLError, ValueError) as error:
@@ -231,14 +218,7 @@ def _cure_directives(path: Path, finder: FileFinder, cure_file: Callable[[Path],
         raise ModelError("it is nested too deeply") from None
     if node is None:
         raise ModelError("it is empty; expected 'directives:'")
-    for what, file in list(_files(node)):
-        found = finder.resolve(file.value, path, what)
-        file.value = f"file://{cure_file(found)}"
-    return yaml.serialize(node, Dumper=yaml.SafeDumper, allow_unicode=True)
-
-
-def _files(node: yaml.Node) -> Iterator[tuple[str, yaml.ScalarNode]]:
-    """The scalars that name a file, each once, and the directive that they belong to."""
+    # The scalars that name a file, each once, and the directive that they belong to.
     waiting, seen = [("", node)], set()
     while waiting:
         directive, node = waiting.pop()
@@ -253,7 +233,9 @@ def _files(node: yaml.Node) -> Iterator[tuple[str, yaml.ScalarNode]]:
                 waiting.append((directive if key.value == "<<" else key.value, value))
             elif id(value) not in seen:
                 seen.add(id(value))
-                yield directive, value
+                found = finder.resolve(value.value, path, directive)
+                value.value = f"file://{cure_file(found)}"
+    return yaml.serialize(top, Dumper=yaml.SafeDumper, allow_unicode=True)
 
 
 TIME_LIMIT_SECONDS = 60.0
@@ -284,10 +266,15 @@ def check_in_child(
 
 
 @functools.lru_cache(maxsize=64)
-def _check(read: Reader, path: str, packages: str, limits: str, digest: str) -> None:
-    """Raise why the model cannot be used; digest only tells versions of the file apart."""
+def _check(read: Reader, path: str, packages: str, limits: str, _digest: str) -> None:
+    """Raise why the model cannot be used; the digest only tells versions of the file apart."""
     try:
-        if _may_fork():
+        try:
+            # Where nothing but this thread runs, a fork lacks nothing; so on Linux alone.
+            may_fork = len(os.listdir("/proc/self/task")) == 1
+        except OSError:
+            may_fork = False
+        if may_fork and not multiprocessing.current_process().daemon:
             reason = _ask_fork(read, path, packages, limits)
         else:
             reason = _ask_process(path, packages, limits)
@@ -334,15 +321,6 @@ def why_unusable(read: Reader, path: str, packages: str, limits: str) -> str:
     return ""
 
 
-def _may_fork() -> bool:
-    """Whether nothing but this thread runs here, so that a fork lacks nothing."""
-    try:
-        alone = len(os.listdir("/proc/self/task")) == 1
-    except OSError:  # Not on Linux, where alone forking is sound.
-        return False
-    return alone and not multiprocessing.current_process().daemon
-
-
 def _ask_fork(read: Reader, path: str, packages: str, limits: str) -> str:
     """What a fork of this process answers; TimeoutError, or ChildProcessError for how it ended."""
     fork = multiprocessing.get_context("fork")
@@ -381,22 +359,20 @@ def _answer(
     os._exit(0)
 
 
-# It leaves at once: what a broken file left behind may crash on the way out.
-_CHILD = """
-import json, os, sys
-from drake_pose.body.model import read_model
-from drake_pose.body.parsing import why_unusable
-print("\\n" + json.dumps(why_unusable(read_model, *sys.argv[1:])), flush=True)
-os._exit(0)
-"""
-
-
 def _ask_process(path: str, packages: str, limits: str) -> str:
     """What a process of its own answers, which takes longer; raises as _ask_fork."""
+    # It leaves at once: what a broken file left behind may crash on the way out.
+    program = (
+        "import json, os, sys\n"
+        "from drake_pose.body.model import read_model\n"
+        "from drake_pose.body.parsing import why_unusable\n"
+        "print('\\n' + json.dumps(why_unusable(read_model, *sys.argv[1:])), flush=True)\n"
+        "os._exit(0)"
+    )
     folders = [str(Path(__file__).resolve().parents[2]), os.environ.get("PYTHONPATH", "")]
     try:
         end = subprocess.run(
-            [sys.executable, "-c", _CHILD, path, packages, limits],
+            [sys.executable, "-c", program, path, packages, limits],
             # With threads of its own VTK takes twice as long.
             env={
                 **os.environ,

@@ -111,7 +111,7 @@ def _coarse(mask: Mask) -> tuple[Picture, int]:
 
 
 def find_persons(
-    cameras: Sequence[Camera], figures: Sequence[Sequence[Figure]]
+    cameras: Sequence[Camera], figures: Sequence[Sequence[Figure]], looked_at: int = 8
 ) -> tuple[Person, ...]:
     """The persons whom two cameras or more see by masks' figures, the best supported first."""
     if all(len(own) <= 1 for own in figures):
@@ -123,13 +123,33 @@ def find_persons(
         if max(metres_off(cameras[k], figures[k][0].middle, place)[0] for k in taken) < _WITHIN:
             return (person,)
     free = [set(range(len(own))) for own in figures]
+    middles = [np.array([figure.middle for figure in own]).reshape(-1, 2) for own in figures]
     persons: list[Person] = []
     while True:
-        best = _best_person(cameras, figures, free)
-        if best is None or (persons and not is_another(best, persons)):
+        is_free = [
+            np.isin(np.arange(len(own)), list(left))
+            for own, left in zip(figures, free, strict=True)
+        ]
+        places = meeting_points(cameras, middles, 2.0 * _WITHIN, is_free)
+        best: tuple[float, float, Person] | None = None
+        scores, nearest = _support(cameras, figures, free, places)
+        # The best places are looked at more closely; those of the same figures are one person's.
+        for own in dict.fromkeys(map(tuple, nearest[np.argsort(-scores)[:looked_at]].tolist())):
+            taken = {k: i for k, i in enumerate(own) if i >= 0}
+            if len(taken) < 2:
+                continue
+            place = _person(cameras, figures, taken).place
+            score, again = _support(cameras, figures, free, place[None])
+            taken = {k: i for k, i in enumerate(again[0].tolist()) if i >= 0}
+            if len(taken) < 2:
+                continue
+            person = _person(cameras, figures, taken)
+            if best is None or (float(score[0]), person.area) > best[:2]:
+                best = float(score[0]), person.area, person
+        if best is None or (persons and not is_another(best[2], persons)):
             return tuple(persons)
-        persons.append(best)
-        for camera, index in best.figures.items():
+        persons.append(best[2])
+        for camera, index in best[2].figures.items():
             free[camera].discard(index)
 
 
@@ -141,42 +161,6 @@ def _person(
     areas = sorted(figure.area for figure in chosen)
     place = triangulate([cameras[k] for k in taken], [figure.middle for figure in chosen])
     return Person(place, taken, areas[(len(areas) - 1) // 2])
-
-
-def _best_person(
-    cameras: Sequence[Camera],
-    figures: Sequence[Sequence[Figure]],
-    free: Sequence[set[int]],
-    looked_at: int = 8,
-) -> Person | None:
-    """The best supported place of which two cameras have a figure that is still free.
-
-    So many of the best places are looked at more closely.
-    """
-    middles = [np.array([figure.middle for figure in own]).reshape(-1, 2) for own in figures]
-    is_free = [
-        np.isin(np.arange(len(own)), list(left)) for own, left in zip(figures, free, strict=True)
-    ]
-    places = meeting_points(cameras, middles, 2.0 * _WITHIN, is_free)
-    if not len(places):
-        return None
-    scores, nearest = _support(cameras, figures, free, places)
-    best: tuple[float, float, Person] | None = None
-    # Places of the same figures are one person's.
-    rows = nearest[np.argsort(-scores)[:looked_at]]
-    for own in dict.fromkeys(map(tuple, rows.tolist())):
-        taken = {k: i for k, i in enumerate(own) if i >= 0}
-        if len(taken) < 2:
-            continue
-        place = _person(cameras, figures, taken).place
-        score, again = _support(cameras, figures, free, place[None])
-        taken = {k: i for k, i in enumerate(again[0].tolist()) if i >= 0}
-        if len(taken) < 2:
-            continue
-        person = _person(cameras, figures, taken)
-        if best is None or (float(score[0]), person.area) > best[:2]:
-            best = float(score[0]), person.area, person
-    return None if best is None else best[2]
 
 
 def _support(

@@ -121,7 +121,12 @@ def _filled(
         # Pixels of a cell that is as large as the grid is fine there.
         middle = points.mean(axis=0)
         sizes = [max(1.0, spacing * pixels_per_metre(camera, middle)) for camera in used]
-        touched = [_touched(mask, size) for mask, size in zip(masks.values(), sizes, strict=True)]
+        touched: list[Mask] = []
+        for mask, size in zip(masks.values(), sizes, strict=True):
+            h, w = (int(np.ceil(side / size)) for side in mask.shape)
+            padded = np.zeros((int(np.ceil(h * size)), int(np.ceil(w * size))), np.float32)
+            padded[: mask.shape[0], : mask.shape[1]] = mask
+            touched.append(cv2.resize(padded, (w, h), interpolation=cv2.INTER_AREA) > 0.25)
         # What touched cells and those beside them allow, and all that is not seen. Each camera
         # looks at what the ones before it left, which soon is little.
         cells: list[Indices] = []
@@ -149,15 +154,6 @@ def _cells(camera: Camera, points: Array, size: float, shape: tuple[int, ...]) -
         seen = (depth > 0.0) & (column >= 0) & (column < shape[1])
         seen &= (row >= 0) & (row < shape[0])
     return np.where(seen, row * shape[1] + column, -1.0).astype(np.int64)
-
-
-def _touched(mask: Mask, size: float) -> Mask:
-    """Which cells (h, w) of so many pixels a mask (H, W) touches."""
-    height, width = (int(np.ceil(side / size)) for side in mask.shape)
-    padded = np.zeros((int(np.ceil(height * size)), int(np.ceil(width * size))), np.float32)
-    padded[: mask.shape[0], : mask.shape[1]] = mask
-    small = cv2.resize(padded, (width, height), interpolation=cv2.INTER_AREA)
-    return np.asarray(small > 0.25)
 
 
 def _grown(cells: Mask) -> Mask:

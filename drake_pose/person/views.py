@@ -266,28 +266,6 @@ def viewing_rays(camera: Camera, uv: Array) -> tuple[Array, Array]:
     return np.tile(p, (len(pixels), 1)), directions
 
 
-def nearest_points(
-    origins_a: Array, directions_a: Array, origins_b: Array, directions_b: Array
-) -> tuple[Array, Array, Mask]:
-    """Middles (n, 3) where pairs of rays come nearest, distances (n,) [m], and whether they meet.
-
-    Rays (n,) meet where both points lie in front of their origins and they are not parallel.
-    """
-    across = origins_b - origins_a
-    cosine = np.einsum("ij,ij->i", directions_a, directions_b)
-    along_a = np.einsum("ij,ij->i", directions_a, across)
-    along_b = np.einsum("ij,ij->i", directions_b, across)
-    sine_squared = 1.0 - cosine**2
-    usable = sine_squared > 1e-6
-    divisor = np.where(usable, sine_squared, 1.0)
-    t_a = (along_a - cosine * along_b) / divisor
-    t_b = (cosine * along_a - along_b) / divisor
-    p_a = origins_a + t_a[:, None] * directions_a
-    p_b = origins_b + t_b[:, None] * directions_b
-    distance = np.linalg.norm(p_a - p_b, axis=1)
-    return 0.5 * (p_a + p_b), distance, usable & (t_a > 0.0) & (t_b > 0.0)
-
-
 def meeting_points(
     cameras: Sequence[Camera],
     pixels: Sequence[Array],
@@ -312,8 +290,20 @@ def meeting_points(
             side.append(end)
     if not sides[0]:
         return np.empty((0, 3))
-    points, distance, usable = nearest_points(*(np.concatenate(side) for side in sides))
-    return points[usable & (distance <= threshold)]
+    p_a, u_a, p_b, u_b = (np.concatenate(side) for side in sides)
+    across = p_b - p_a
+    cosine = np.einsum("ij,ij->i", u_a, u_b)
+    along_a = np.einsum("ij,ij->i", u_a, across)
+    along_b = np.einsum("ij,ij->i", u_b, across)
+    sine_squared = 1.0 - cosine**2
+    usable = sine_squared > 1e-6
+    divisor = np.where(usable, sine_squared, 1.0)
+    t_a = (along_a - cosine * along_b) / divisor
+    t_b = (cosine * along_a - along_b) / divisor
+    p_a, p_b = p_a + t_a[:, None] * u_a, p_b + t_b[:, None] * u_b
+    # Both points lie in front of their origins, and rays are not parallel.
+    usable &= (t_a > 0.0) & (t_b > 0.0) & (np.linalg.norm(p_a - p_b, axis=1) <= threshold)
+    return np.asarray(0.5 * (p_a + p_b))[usable]
 
 
 def triangulate(cameras: Sequence[Camera], pixels: Sequence[Array]) -> Array:

@@ -10,15 +10,13 @@ import numpy as np
 from pydrake.geometry import Meshcat
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPort, System
-from pydrake.trajectories import Trajectory
 
 from drake_pose.arrays import Array
-from drake_pose.body import ArticulatedModel
 from drake_pose.camera.frame_source import FrameSource
-from drake_pose.camera.models import Camera, PinholeCamera, camera_tuple
+from drake_pose.camera.models import Camera, camera_tuple
 from drake_pose.errors import SettingsError
 from drake_pose.fit.colours import COLOURS
-from drake_pose.fit.contour_fit import ContourFit, inlier_ratio_of
+from drake_pose.fit.contour_fit import inlier_ratio_of
 from drake_pose.person.figures import keep_views
 from drake_pose.person.pose_tracker import PersonPoseTracker, TrackState
 from drake_pose.person.views import (
@@ -32,7 +30,6 @@ from drake_pose.person.views import (
 )
 from drake_pose.silhouette.segmentation.background import Background
 from drake_pose.systems.bodies import add_avatar, body_poses
-from drake_pose.systems.cameras import build_camera_rig
 from drake_pose.systems.images import ColourPorts
 from drake_pose.systems.picture_capture import PersonRegion, PictureCapture, connect_images
 from drake_pose.systems.ports import (
@@ -461,31 +458,3 @@ def build_silhouette_capture(
     regions = tuple(sensor.region for sensor in sensors.values())
     stages = {"region": regions, "edge": tuple(edges.values())}
     return SilhouetteCapture(builder.Build(), stages, person)
-
-
-def build_person_capture(
-    model: ArticulatedModel,
-    cameras: Mapping[str, PinholeCamera],
-    true_positions: Trajectory,
-    period: float = 1.0 / 30.0,
-    meshcat: Meshcat | None = None,
-) -> Diagram:
-    """A simulated person, the cameras around it, what follows it, and the avatar in the browser.
-
-    The diagram's outputs are those of PersonTracker.
-
-    Args:
-        model: the person, with landmarks.yaml beside its file.
-        cameras: two or more.
-        true_positions: the person's positions (nq,) over time.
-        period: time between two frames [s].
-
-    Raises:
-        SettingsError: fewer than two cameras, or a period that is not positive.
-        ModelError: the model has no landmarks of trunk, arms and legs.
-    """
-    rig = build_camera_rig(model, cameras, true_positions).diagram
-    tracker = PersonPoseTracker(ContourFit(model.pose_tree()))
-    return build_silhouette_capture(
-        tracker, cameras, {}, period, source=rig, meshcat=meshcat
-    ).diagram

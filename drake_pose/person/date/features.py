@@ -172,6 +172,9 @@ def find_features(
 ) -> Features:
     """The features' places in a frame: of the points nearest to a last place, the dense part.
 
+    Points are where two rays meet that every camera sees in its silhouette. A camera has no say
+    about points outside its picture, nor where it sees nobody at all.
+
     Args:
         views: what each camera sees.
         last: (k, 3) the last frame's features [m].
@@ -180,28 +183,11 @@ def find_features(
         margin: how far outside a silhouette a point may be seen [pixel].
     """
     points = meeting_points(cameras, [view.blobs.centroids for view in views], threshold)
-    points = points[inside_silhouettes(points, cameras, [view.region for view in views], margin)]
-    owners = np.linalg.norm(points[:, None] - last[None], axis=2).argmin(axis=1)
-    places, support = np.array(last, dtype=np.float64), np.zeros(len(last), dtype=np.int64)
-    for k in range(len(last)):
-        mine = points[owners == k]
-        if len(mine):
-            places[k], support[k] = dense_mean(mine, dense)
-    return Features(places, support, points, owners)
-
-
-def inside_silhouettes(
-    points: Array, cameras: Sequence[Camera], regions: Sequence[Mask], margin: int = 0
-) -> Mask:
-    """Which points (m, 3) [m] every camera sees in its silhouette, or `margin` pixels beside it.
-
-    A camera has no say about points outside its picture, nor where it sees nobody at all.
-    """
     kept = np.ones(len(points), dtype=bool)
-    aside = np.arange(1, margin + 1)
     # To all sides along or across, and not at all.
+    aside = np.arange(1, margin + 1)
     beside = np.concatenate([[0], aside, -aside])[:, None]
-    for camera, region in zip(cameras, regions, strict=True):
+    for camera, region in zip(cameras, (view.region for view in views), strict=True):
         if not region.any():
             continue
         uv, depth = camera.project(points)
@@ -213,18 +199,19 @@ def inside_silhouettes(
         near = region[np.clip(row + beside, 0, len(region) - 1), column].any(axis=0)
         near |= region[row, np.clip(column + beside, 0, region.shape[1] - 1)].any(axis=0)
         kept[visible] &= near
-    return kept
-
-
-def dense_mean(points: Array, radius: float) -> tuple[Array, int]:
-    """The mean of those points (m, 3) within `radius` of the one with most others; their count."""
-    distances = np.linalg.norm(points[:, None] - points[None], axis=2)
-    near = distances <= radius
-    spread = np.where(near, distances, 0.0).sum(axis=1)
-    counts = near.sum(axis=1)
-    center = np.lexsort((spread, -counts))[0]
-    part = points[near[center]]
-    return part.mean(axis=0), len(part)
+    points = points[kept]
+    owners = np.linalg.norm(points[:, None] - last[None], axis=2).argmin(axis=1)
+    places, support = np.array(last, dtype=np.float64), np.zeros(len(last), dtype=np.int64)
+    for k in range(len(last)):
+        mine = points[owners == k]
+        if len(mine):
+            # Those about the one with most others, of several the one to which they are nearest.
+            distances = np.linalg.norm(mine[:, None] - mine[None], axis=2)
+            around = distances <= dense
+            spread = np.where(around, distances, 0.0).sum(axis=1)
+            part = mine[around[np.lexsort((spread, -around.sum(axis=1)))[0]]]
+            places[k], support[k] = part.mean(axis=0), len(part)
+    return Features(places, support, points, owners)
 
 
 @dataclass(frozen=True, eq=False)
@@ -437,8 +424,28 @@ def learn_recorded_faces(folder: Path, skin: SkinColour | None = None) -> FaceTe
         SceneError: names the file, line or picture at fault.
         SettingsError: fewer than three pictures.
     """
-    table, background = _read_directions(folder / "directions.csv"), None
-    empty = folder / "empty"
+    path, background, empty = folder / "directions.csv", None, folder / "empty"
+    header, rows = read_csv(path, SceneError)
+    if header != ["picture", "turn", "nod"]:
+        raise SceneError(f"{path}: the first line must be picture,turn,nod")
+    # Turn and nod [deg] by picture.
+    table: dict[str, tuple[float, float]] = {}
+    for number, (name, *cells) in rows:
+        where = f"{path}, line {number}"
+        try:
+            turn, nod = (float(cell) for cell in cells)
+        except ValueError as error:
+            raise SceneError(f"{where}: expected a picture and two angles [deg]: {error}") from None
+        if Path(name).name != name or Path(name).suffix.lower() not in SUFFIXES:
+            known = " or ".join(SUFFIXES)
+            raise SceneError(f"{where}: '{name}' is no picture {known} in the folder")
+        if not (abs(turn) <= 180.0 and abs(nod) <= 180.0):
+            raise SceneError(
+                f"{where}: turn and nod must be -180 to 180 degrees, not {turn} and {nod}"
+            )
+        if name in table:
+            raise SceneError(f"{where}: '{name}' has a line already")
+        table[name] = turn, nod
     if empty.is_dir():
         files = sorted(path for path in empty.iterdir() if path.suffix.lower() in SUFFIXES)
         if not files:
@@ -465,28 +472,3 @@ def learn_recorded_faces(folder: Path, skin: SkinColour | None = None) -> FaceTe
             )
         faces.append(face)
     return learn_faces(faces, np.radians(list(table.values())).reshape(-1, 2))
-
-
-def _read_directions(path: Path) -> dict[str, tuple[float, float]]:
-    """Turn and nod [deg] by picture."""
-    header, rows = read_csv(path, SceneError)
-    if header != ["picture", "turn", "nod"]:
-        raise SceneError(f"{path}: the first line must be picture,turn,nod")
-    table: dict[str, tuple[float, float]] = {}
-    for number, (name, *cells) in rows:
-        where = f"{path}, line {number}"
-        try:
-            turn, nod = (float(cell) for cell in cells)
-        except ValueError as error:
-            raise SceneError(f"{where}: expected a picture and two angles [deg]: {error}") from None
-        if Path(name).name != name or Path(name).suffix.lower() not in SUFFIXES:
-            known = " or ".join(SUFFIXES)
-            raise SceneError(f"{where}: '{name}' is no picture {known} in the folder")
-        if not (abs(turn) <= 180.0 and abs(nod) <= 180.0):
-            raise SceneError(
-                f"{where}: turn and nod must be -180 to 180 degrees, not {turn} and {nod}"
-            )
-        if name in table:
-            raise SceneError(f"{where}: '{name}' has a line already")
-        table[name] = turn, nod
-    return table

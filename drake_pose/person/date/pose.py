@@ -223,7 +223,11 @@ def estimate_pose(
         waist = np.array([*features[0, :2], share * features[0, 2] + (1.0 - share) * feet])
     # The model's trunk is one piece: it cannot hold shoulders and waist found apart. For its
     # positions the waist counts; so the neck's base cannot wander off from frame to frame either.
-    aimed = _aim_trunk(skeleton, q, waist)
+    _, neck = skeleton.trunk_pose(q)
+    across, length = waist - neck, float(np.linalg.norm(skeleton.waist_T))
+    target = neck + across * (length / max(float(np.linalg.norm(across)), SETTINGS.reached))
+    trunk = skeleton.nodes["trunk"], skeleton.waist_T
+    aimed, _ = reach(skeleton, q, skeleton.neck_angles, trunk, target)
     R_aimed, _ = skeleton.trunk_pose(aimed)
     limbs = {}
     for name, end in zip(LIMBS, features[1:], strict=True):
@@ -247,15 +251,6 @@ def estimate_pose(
         aimed = move_limb(skeleton, aimed, name, found[2])
         limbs[name] = found
     return skeleton.clip(aimed), limbs
-
-
-def _aim_trunk(skeleton: Skeleton, q: Array, waist: Array) -> Array:
-    """Turns the neck base of q (nq,) so that the trunk points from there to the waist (3,) [m]."""
-    _, neck = skeleton.trunk_pose(q)
-    across, length = waist - neck, float(np.linalg.norm(skeleton.waist_T))
-    target = neck + across * (length / max(float(np.linalg.norm(across)), SETTINGS.reached))
-    part = skeleton.nodes["trunk"], skeleton.waist_T
-    return reach(skeleton, q, skeleton.neck_angles, part, target)[0]
 
 
 def search_limb(
@@ -367,8 +362,20 @@ def place_limb(
     # Stretched it does not tell how it is turned about itself: as in the last frame.
     stretched = off_line * distances < SETTINGS.reached * ((middles - root) ** 2).sum(axis=1)
     R_last = R_WT @ Rotation.from_euler(letters[:3], last[:3]).as_matrix()
-    bends, is_possible = _middle_angles(limb, distances)
-    row, option = np.nonzero(is_possible)
+    # The squared distance of root and end is base + swing cos(bend - start), so there are two
+    # bends (n, 2): those inside limits, or about as near as the other one.
+    axis = np.eye(3)[limb.axes[3]]
+    aside = (limb.middle_U @ axis) * (limb.end_L @ axis)
+    cosine = limb.middle_U @ limb.end_L - aside
+    sine = limb.middle_U @ np.cross(axis, limb.end_L)
+    a, b = limb.lengths
+    base, swing = float(a * a + b * b + 2.0 * aside), 2.0 * math.hypot(cosine, sine)
+    turns = np.arccos(np.clip((distances**2 - base) / swing, -1.0, 1.0))
+    options = math.atan2(sine, cosine) + np.array([-1.0, 1.0]) * turns[:, None]
+    options = np.remainder(options + math.pi, 2.0 * math.pi) - math.pi
+    bends = np.clip(options, limb.lower[3], limb.upper[3])
+    off = np.abs(options - bends)
+    row, option = np.nonzero(off <= off.min(axis=1, keepdims=True) + SETTINGS.bend_tolerance)
     bend = bends[row, option]
     end_U = limb.middle_U + Rotation.from_euler(letters[3], bend[:, None]).apply(limb.end_L)
     towards_U = _along(np.zeros(3), end_U)[0]
@@ -393,28 +400,6 @@ def place_limb(
     roots[row, option], beyonds[row, option] = options[better, each], beyond
     chosen, each = np.argmin(costs, axis=1), np.arange(len(middles))
     return np.column_stack([roots[each, chosen], bends[each, chosen]]), beyonds[each, chosen]
-
-
-def _middle_angles(limb: Limb, distances: Array) -> tuple[Array, Array]:
-    """The middle joint's angles (n, 2) [rad] for distances (n,) of root and end.
-
-    And which of them (n, 2) are inside limits, or about as near as the other one. The squared
-    distance is base + swing cos(bend - start).
-    """
-    axis = np.zeros(3)
-    axis[limb.axes[3]] = 1.0
-    along = (limb.middle_U @ axis) * (limb.end_L @ axis)
-    cosine = limb.middle_U @ limb.end_L - along
-    sine = limb.middle_U @ np.cross(axis, limb.end_L)
-    a, b = limb.lengths
-    base, swing = float(a * a + b * b + 2.0 * along), 2.0 * math.hypot(cosine, sine)
-    start = math.atan2(sine, cosine)
-    turns = np.arccos(np.clip((distances**2 - base) / swing, -1.0, 1.0))
-    options = start + np.array([-1.0, 1.0]) * turns[:, None]
-    options = np.remainder(options + math.pi, 2.0 * math.pi) - math.pi
-    clipped = np.clip(options, limb.lower[3], limb.upper[3])
-    beyond = np.abs(options - clipped)
-    return clipped, beyond <= beyond.min(axis=1, keepdims=True) + SETTINGS.bend_tolerance
 
 
 def _along(root: Array, ends: Array) -> tuple[Array, Array]:

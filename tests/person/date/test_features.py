@@ -1,8 +1,11 @@
 """Skin, features in space, contours, recognition and faces, drawn by hand or by Drake."""
 
+from itertools import product
+
 import cv2
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from drake_pose.camera.models import FACE_CAMERA, ParallelCamera, circle_of_cameras, look_at
 from drake_pose.errors import SceneError, SettingsError
@@ -11,11 +14,9 @@ from drake_pose.person.date.features import (
     PersonView,
     SkinColour,
     cut_face,
-    dense_mean,
     find_face,
     find_features,
     head_angles,
-    inside_silhouettes,
     learn_faces,
     learn_recorded_faces,
     measure_contour,
@@ -26,7 +27,7 @@ from drake_pose.person.date.features import (
     stand_registered,
 )
 from drake_pose.person.date.skeleton import registered_positions
-from drake_pose.person.views import meeting_points, nearest_points, viewing_rays
+from drake_pose.person.views import meeting_points, viewing_rays
 from tests.person.studio import shared_studio
 
 SKIN = (217, 166, 135)
@@ -72,41 +73,40 @@ class TestSkin:
 
 
 class TestRays:
+    cameras = (
+        *circle_of_cameras(3).values(),
+        ParallelCamera("flat", 300, 300, 226.0, 150, 150, look_at([2, 1, 1], [0, 0, 1])),
+    )
+
     def test_rays_pass_through_what_was_projected(self):
-        generator = np.random.default_rng(1)
-        p_W = generator.uniform([-0.5, -0.5, 0.5], [0.5, 0.5, 1.5], (20, 3))
-        cameras = list(circle_of_cameras(3).values())
-        cameras.append(
-            ParallelCamera("flat", 300, 300, 226.0, 150, 150, look_at([2, 1, 1], [0, 0, 1]))
-        )
-        for camera in cameras:
+        p_W = np.random.default_rng(1).uniform([-0.5, -0.5, 0.5], [0.5, 0.5, 1.5], (20, 3))
+        for camera in self.cameras:
             origins, directions = viewing_rays(camera, camera.project(p_W)[0])
-            off = np.cross(p_W - origins, directions)
-            assert np.abs(off).max() < 1e-12
+            np.testing.assert_allclose(np.cross(p_W - origins, directions), 0.0, atol=1e-12)
             np.testing.assert_allclose(np.linalg.norm(directions, axis=1), 1.0)
 
-    def test_nearest_points_against_brute_force(self):
-        generator = np.random.default_rng(2)
-        for _ in range(10):
-            a, b = generator.normal(size=(2, 1, 3))
-            u, v = generator.normal(size=(2, 1, 3))
-            u, v = u / np.linalg.norm(u), v / np.linalg.norm(v)
-            middle, distance, _ = nearest_points(a, u, b, v)
-            t = np.linspace(-20, 20, 801)
-            on_a, on_b = a + t[:, None] * u, b + t[:, None] * v
-            all_distances = np.linalg.norm(on_a[:, None] - on_b[None], axis=2)
-            assert distance[0] <= all_distances.min() + 1e-9
-            assert distance[0] >= all_distances.min() - 0.1
-            across = np.cross(u, v)
-            assert abs(abs((b - a) @ across.T / np.linalg.norm(across)).item() - distance[0]) < 1e-9
-            assert np.isfinite(middle).all()
+    @pytest.mark.parametrize("apart", [0.03, 0.06])
+    def test_rays_meet_half_way_where_they_pass_each_other_closely(self, apart):
+        """Seen along x and along y: what is apart along z is the distance of the rays."""
+        point = np.array([0.2, -0.1, 1.0])
+        poses = [look_at([4.0, 0, 1], [0, 0, 1]), look_at([0, 4.0, 1], [0, 0, 1])]
+        cameras = [ParallelCamera(str(k), 300, 300, 90.0, 150, 150, X) for k, X in enumerate(poses)]
+        moved = point + apart * np.eye(3)[2]
+        pixels = [cameras[0].project(point[None])[0], cameras[1].project(moved[None])[0]]
+        found = meeting_points(cameras, pixels, 0.05)
+        expected = [0.5 * (point + moved)] if apart < 0.05 else np.empty((0, 3))
+        np.testing.assert_allclose(found, expected, atol=1e-9)
+        assert not len(meeting_points(cameras, pixels, 0.05, [np.array([False])] * 2))
 
-    def test_parallel_rays_and_points_behind_are_refused(self):
-        o = np.zeros((1, 3))
-        x, y = np.array([[1.0, 0, 0]]), np.array([[0, 1.0, 0]])
-        assert not nearest_points(o, x, o + y, x)[2][0]
-        assert not nearest_points(o, x, np.array([[-1.0, -1.0, 0]]), y)[2][0]
-        assert nearest_points(o, x, np.array([[1.0, -1.0, 0]]), y)[2][0]
+    def test_parallel_rays_and_points_behind_do_not_meet(self):
+        pose = look_at([4.0, 0, 1], [0, 0, 1])
+        behind = look_at([5.0, -1.0, 1], [5.0, -2.0, 1])
+        for other in (pose, behind):
+            cameras = [
+                ParallelCamera(n, 9, 9, 9.0, 4, 4, X) for n, X in (("a", pose), ("b", other))
+            ]
+            middle = np.array([[4.0, 4.0]])
+            assert not len(meeting_points(cameras, [middle, middle], 9.0))
 
 
 class TestFeatures:
@@ -141,10 +141,17 @@ class TestFeatures:
     def test_rays_that_meet_by_chance_are_dropped(self):
         cameras, views = self.seen(self.places)
         points = meeting_points(cameras, [view.blobs.centroids for view in views], 0.05)
-        kept = inside_silhouettes(points, cameras, [view.region for view in views])
-        away = np.linalg.norm(points[:, None] - self.places[None], axis=2).min(axis=1)
-        assert (away > 0.15).sum() > 0  # There are some.
-        assert away[kept].max() < 0.15
+        found = find_features(cameras, views, self.places)
+        for some, wrong in ((points, True), (found.points, False)):
+            away = np.linalg.norm(some[:, None] - self.places[None], axis=2).min(axis=1)
+            assert (away > 0.15).any() == wrong
+        # A place is the mean of the dense part of its points alone.
+        for k, place in enumerate(found.places):
+            mine = found.points[found.owners == k]
+            near = np.linalg.norm(mine[:, None] - mine[None], axis=2) <= 0.08
+            assert found.support[k] == near.sum(axis=1).max()
+            means = [mine[row].mean(axis=0) for row in near]
+            assert np.linalg.norm(means - place, axis=1).min() < 1e-12
 
     def test_feature_that_nobody_sees_stays_and_a_camera_without_anybody_has_no_say(self):
         cameras, views = self.seen(np.delete(self.places, 2, axis=0))
@@ -157,15 +164,6 @@ class TestFeatures:
         assert (found.support[others] > 0).all()
         off = np.linalg.norm(found.places - self.places, axis=1)[others]
         assert off.max() < 0.01
-
-    def test_dense_part(self):
-        generator = np.random.default_rng(0)
-        points = np.concatenate(
-            [generator.normal(0, 0.01, (12, 3)), generator.normal(1.0, 0.2, (12, 3))]
-        )
-        mean, count = dense_mean(points, 0.08)
-        assert count == 12
-        np.testing.assert_allclose(mean, points[:12].mean(axis=0))
 
 
 class TestContours:
@@ -187,14 +185,12 @@ class TestContours:
         assert similarity(star, moved) > 0.95
         assert similarity(star, turned) < 0.8
 
-    def test_cut_off_or_empty_has_no_contour(self):
-        assert measure_contour(np.zeros((20, 20), bool)) is None
-        assert measure_contour(self.star(1.0, 0.0, (20, 100))) is None
-
-    def test_middle_is_the_boxs(self):
+    def test_middle_is_the_boxs_and_what_is_cut_off_or_empty_has_none(self):
         mask = np.zeros((40, 50), bool)
         mask[10:21, 5:16] = True
         np.testing.assert_allclose(measure_contour(mask)[1], [10, 15])
+        assert measure_contour(np.zeros((20, 20), bool)) is None
+        assert measure_contour(self.star(1.0, 0.0, (20, 100))) is None
 
 
 class TestRecognition:
@@ -233,33 +229,19 @@ class TestRecognition:
         "other", [{}, {"left_upper_arm_z": 80}, {"left_upper_arm_x": -90, "right_upper_arm_x": -90}]
     )
     def test_other_poses_are_not_taken_for_it(self, studio, other):
-        registered = studio.registered
-        q = studio.posed(**other)
-        contours = [view.contour for view in studio.views(q).values()]
-        cameras = list(studio.ring.values())
-        assert recognise(studio.skeleton, registered, cameras, contours, 0.93) is None
-
-    def test_one_camera_is_not_enough(self, studio):
-        registered = studio.registered
-        view = studio.view(registered.q, "camera_0")
-        cameras = list(studio.ring.values())
-        contours = [view.contour] + [None] * 7
-        assert recognise(studio.skeleton, registered, cameras, contours, 0.1) is None
+        cameras, views = list(studio.ring.values()), studio.views(studio.posed(**other))
+        contours = [view.contour for view in views.values()]
+        assert recognise(studio.skeleton, studio.registered, cameras, contours, 0.93) is None
+        # One camera is never enough.
+        alone = [contours[0]] + [None] * 7
+        assert recognise(studio.skeleton, studio.registered, cameras, alone, 0.0) is None
 
 
 class TestFaces:
     def test_directions_between_the_templates(self, studio, templates):
-        generator = np.random.default_rng(1)
-
-        def looks(direction):
-            q = studio.posed()
-            q[studio.skeleton.head_angles] = direction
-            return studio.skeleton.head_rotation(q)[:, 2]
-
-        errors = []
+        generator, errors = np.random.default_rng(1), []
         for _ in range(12):
-            q = studio.posed()
-            direction = np.radians(generator.uniform([-50, -20], [50, 30]))
+            q, direction = studio.posed(), np.radians(generator.uniform([-50, -20], [50, 30]))
             q[studio.skeleton.head_angles] = direction
             q[:3] += generator.uniform(-0.05, 0.05, 3)
             picture, _ = studio.face(q)
@@ -267,8 +249,9 @@ class TestFaces:
             noisy = noisy.astype(np.uint8)
             blobs = skin_blobs(noisy, studio.mask(q, FACE_CAMERA), SkinColour())
             nearest, _ = nearest_template(cut_face(noisy, blobs), templates)
-            cosine = looks(direction) @ looks(templates.directions[nearest])
-            errors.append(np.degrees(np.arccos(min(1.0, cosine))))
+            # Turn about the vertical, then nod.
+            ways = Rotation.from_euler("ZY", [direction, templates.directions[nearest]])
+            errors.append(np.degrees(np.arccos(min(1.0, np.prod(ways.apply([1, 0, 0]), 0).sum()))))
         # The templates are 15 and 12 degrees apart: 7 on average for the nearest one.
         assert np.mean(errors) < 9.0
 
@@ -285,7 +268,7 @@ class TestFaces:
             find_face(picture, view.blobs, templates, 30.0), templates.directions[20]
         )
         patches = np.zeros((240, 320, 3), np.uint8)
-        patches[50:180:20, 60:140] = patches[40:180, 60:140:20] = (217, 166, 135)
+        patches[50:180:20, 60:140] = patches[40:180, 60:140:20] = SKIN
         blobs = skin_blobs(patches, np.ones((240, 320), bool), SkinColour())
         assert np.isnan(find_face(patches, blobs, templates, 30.0)).all()
 
@@ -297,14 +280,12 @@ class TestFaces:
         _, _, rows = np.linalg.svd(data - data.mean(axis=0), full_matrices=False)
         np.testing.assert_allclose(np.abs(found.basis @ rows[:5].T), np.eye(5), atol=1e-3)
 
-    def test_no_face_where_skin_is_missing_or_cut_off(self):
+    def test_no_face_where_skin_is_missing_or_cut_off_and_no_space_of_two(self):
         picture = np.zeros((50, 60, 3), np.uint8)
         region = np.ones((50, 60), bool)
         assert cut_face(picture, skin_blobs(picture, region, SkinColour())) is None
-        picture[0:20, 10:30] = (217, 166, 135)
+        picture[0:20, 10:30] = SKIN
         assert cut_face(picture, skin_blobs(picture, region, SkinColour())) is None
-
-    def test_too_few_faces(self):
         with pytest.raises(SettingsError, match="three faces"):
             learn_faces([np.zeros((130, 80, 3), np.uint8)] * 2, np.zeros((2, 2)))
 
@@ -336,21 +317,17 @@ class TestSkeleton:
         assert other.limbs["left_arm"].lengths != skeleton.limbs["left_arm"].lengths
 
 
-TURNS, NODS = (-40.0, -20.0, 0.0, 20.0, 40.0), (-10.0, 10.0)
-
-
 @pytest.fixture(scope="module")
 def folder(studio, tmp_path_factory):
     """Faces recorded by the face camera, and the empty room."""
     root = tmp_path_factory.mktemp("faces")
     lines = ["picture,turn,nod"]
-    for turn in TURNS:
-        for nod in NODS:
-            q = studio.posed()
-            q[studio.skeleton.head_angles] = np.radians([turn, nod])
-            name = f"{turn:+.0f}_{nod:+.0f}.png"
-            cv2.imwrite(str(root / name), studio.picture(q, FACE_CAMERA)[:, :, ::-1])
-            lines.append(f"{name},{turn},{nod}")
+    for turn, nod in product((-40.0, -20.0, 0.0, 20.0, 40.0), (-10.0, 10.0)):
+        q = studio.posed()
+        q[studio.skeleton.head_angles] = np.radians([turn, nod])
+        name = f"{turn:+.0f}_{nod:+.0f}.png"
+        cv2.imwrite(str(root / name), studio.picture(q, FACE_CAMERA)[:, :, ::-1])
+        lines.append(f"{name},{turn},{nod}")
     (root / "directions.csv").write_text("\n".join(lines) + "\n\n")
     (root / "empty").mkdir()
     away = studio.posed()

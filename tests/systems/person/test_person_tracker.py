@@ -11,8 +11,9 @@ from drake_pose.person.pose_tracker import PersonPoseTracker, TrackState
 from drake_pose.person.views import edge_spacing, see_silhouette
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from drake_pose.systems.bodies import body_poses
+from drake_pose.systems.cameras import build_camera_rig
 from drake_pose.systems.images import picture_to_colour_image
-from drake_pose.systems.person import PersonTracker, build_person_capture
+from drake_pose.systems.person import PersonTracker, build_silhouette_capture
 from tests.person.persons_in_view import posed, see, stepping
 from tests.systems.bench import Bench
 
@@ -57,7 +58,10 @@ def test_moving_person_is_followed_and_shown(person, cameras):
     )
     path = PiecewisePolynomial.FirstOrderHold([0.0, 0.1], np.column_stack([start, end]))
     meshcat = Meshcat(MeshcatParams(host="localhost"))
-    diagram = build_person_capture(person, cameras, path, 1 / 30, meshcat)
+    tracker = PersonPoseTracker(ContourFit(person.pose_tree()))
+    rig = build_camera_rig(person, cameras, path).diagram
+    capture = build_silhouette_capture(tracker, cameras, {}, 1 / 30, source=rig, meshcat=meshcat)
+    diagram = capture.diagram
     simulator = Simulator(diagram)
     simulator.AdvanceTo(0.101)
     run = Bench(diagram, simulator.get_context())

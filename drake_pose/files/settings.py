@@ -119,50 +119,26 @@ class EstimateSettings(CaptureSettings, EpisodeSettings):
     """Rotation of the root: fixed, free, or limits [deg] about its axes in the order of rotation,
     like y=-180:180,z=-10:10; zero is as at the model's default positions. Default: the model's own
     root moves as its joints allow, any other link is free."""
-    interval: Annotated[float, Parameter(metavar="DEG")] = 10.0
-    """Sampling interval of all angles [deg]: of angles on the grid and of the paper's method."""
-    length_interval: Annotated[float, Parameter(metavar="M")] = 0.05
-    """Sampling interval of all prismatic joints [m]."""
-    joint_intervals: Annotated[Positions, Parameter("--joint-interval")] = field(
-        default_factory=dict
-    )
-    """Sampling interval of one joint [deg or m]; repeat for several."""
-    outside_limit: Annotated[float | None, Parameter(metavar="R")] = None
-    """The paper's r: area of a segment that may lie outside the silhouette [pixel]. Default: the
-    smallest that gives a pose, found by doubling. Method paper only."""
-    candidates: Annotated[int, Parameter(metavar="K")] = 5
-    """The paper's K: number of candidates kept for each segment. Method paper only."""
-    run_limit: Annotated[int, Parameter(metavar="N")] = 10_000
-    """Stop the search of a frame after placing this many segments. Method paper only."""
     time_limit: Annotated[float | None, Parameter(metavar="SECONDS")] = None
     """Stop the search of a frame after this time [s] and return the best pose so far. Method beam
     only."""
     method: Literal["auto", "beam", "paper", "person"] = "auto"
-    """beam: beam search and continuous fit; paper: Kameda, Minoh and Ikeda's search as published;
-    person: one person, fitted to all cameras' silhouettes at once; auto: person if model, cameras
-    and options allow it, else beam."""
-    angles: Literal["continuous", "grid"] = "continuous"
-    """continuous: poses are refined between coarse samples; grid: multiples of the sampling
-    interval only, and the search ends where the silhouettes are matched exactly. Method beam only.
-    """
+    """beam: beam search and continuous fit; paper: Kameda, Minoh and Ikeda's search as published,
+    with samples 10 degrees apart; person: one person, fitted to all cameras' silhouettes at once;
+    auto: person if model, cameras and options allow it, else beam."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
         require_choices(self)
-        for name in ("candidates", "run_limit"):
-            if getattr(self, name) < 1:
-                raise SettingsError(f"{name} must be 1 or more, not {getattr(self, name)}")
         if self.time_limit is not None and not self.time_limit >= 0.0:
             raise SettingsError(f"time_limit must be 0 or more, not {self.time_limit}")
-        if self.method in ("auto", "beam") and self.outside_limit is not None:
-            raise SettingsError("the beam search has no outside limit r; leave it out")
         if self.method == "person" and self.search_settings:
             raise SettingsError(
                 f"the method person follows a person and searches no pose; leave "
                 f"{self.search_settings[0]} out"
             )
         if self.method == "paper" and self.time_limit is not None:
-            raise SettingsError("the paper's search has no time limit; give a run limit instead")
+            raise SettingsError("the paper's search has no time limit; leave it out")
 
     @property
     def search_settings(self) -> tuple[str, ...]:

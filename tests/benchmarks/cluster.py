@@ -62,7 +62,7 @@ def write_stills(folder: Path, count: int = 8, chunk: int = 2) -> SceneJob:
         for name, value, free in zip(model.position_names, rest, moves, strict=True)
         if not free
     }
-    settings = EstimateSettings(interval=20.0, hold=hold, method="beam", angles="grid")
+    settings = EstimateSettings(hold=hold, method="beam")
     return SceneJob("stills", folder, model_path, settings, replay=False, chunk=chunk)
 
 

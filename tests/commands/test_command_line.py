@@ -111,7 +111,7 @@ def test_ctrl_c_keeps_finished_frames_and_the_job_can_be_resumed(tmp_path: Path)
     scene = write_scene(tmp_path / "scene", angles, ("front", "side"))
     out = tmp_path / "out"
     command = [*PROGRAM, "estimate", str(scene.folder), "--model", str(scene.model)]
-    command += ["--out", str(out), "--method", "paper", "--interval", "2", "--no-replay"]
+    command += ["--out", str(out), "--method", "paper", "--no-replay"]
     environment = {**os.environ, "COLUMNS": "200"}
     process = subprocess.Popen(
         command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,

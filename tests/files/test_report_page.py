@@ -71,7 +71,7 @@ class Page:
 @pytest.fixture(scope="module")
 def result(tiny_scene, tmp_path_factory):
     out = tmp_path_factory.mktemp("report") / "out"
-    settings = EstimateSettings(interval=20.0)
+    settings = EstimateSettings()
     estimate_scene(tiny_scene.folder, tiny_scene.model, out, settings, replay=False)
     return out
 

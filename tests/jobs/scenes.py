@@ -44,7 +44,7 @@ URDF = (
 
 NAMES = ("lift", "luff")
 ANGLES = ((20.0, -40.0), (-40.0, -80.0), (60.0, 0.0))
-"""Degrees, multiples of 20, a row a frame."""
+"""Degrees, multiples of 20 (the grid's are of 10), a row a frame."""
 
 
 @dataclass(frozen=True)
@@ -56,8 +56,8 @@ class TinyScene:
     truth: dict[str, np.ndarray]
 
     def estimate(self, out: Path) -> list[str]:
-        """The words of an estimate; the grid's angles are the scenes' own."""
-        given = [self.folder, "--model", self.model, "--out", out, "--interval", 20]
+        """The words of an estimate."""
+        given = [self.folder, "--model", self.model, "--out", out]
         return ["estimate", *map(str, given)]
 
 

@@ -25,7 +25,7 @@ from tests.cli import run_json, run_to_end
 from tests.jobs.scenes import write_scene
 
 MOTION = [(20.0 + 5.0 * k, -40.0 - 4.0 * k) for k in range(5)]
-QUICK = {"method": "paper", "interval": 20.0, "replay": False, "overlay": False}
+QUICK = {"method": "paper", "replay": False, "overlay": False}
 
 
 @pytest.fixture(scope="module")
@@ -240,19 +240,18 @@ def test_without_the_extra_this_process_works_and_workers_are_refused(tmp_path, 
 def test_job_file_gives_the_settings(tmp_path):
     entry = {
         "scene": "a", "model": "m.urdf", "cameras": ["left"], "frames": "0:9", "root": "base",
-        "root_position": [1, 2, 3], "root_rotation": "y=-180:180", "interval": 5,
+        "root_position": [1, 2, 3], "root_rotation": "y=-180:180",
         "hold": {"lift": 10}, "method": "beam", "truth": "t.csv", "replay": False,
-        "packages": {"arms": "robots"}, "start": "first.csv", "track": False, "candidates": 3,
-        "time_limit": 2,
+        "packages": {"arms": "robots"}, "start": "first.csv", "track": False, "time_limit": 2,
     }  # fmt: skip
     path = tmp_path / "jobs.yaml"
     path.write_text(yaml.safe_dump({"scenes": {"a": entry}}))
     (job,) = read_job(path, chunk=7)
     settings = EstimateSettings(
         cameras=("left",), frames=("0:9",), root="base", root_position=(1.0, 2.0, 3.0),
-        root_rotation={"y": (-180.0, 180.0)}, interval=5.0, hold={"lift": 10.0}, method="beam",
+        root_rotation={"y": (-180.0, 180.0)}, hold={"lift": 10.0}, method="beam",
         packages={"arms": tmp_path / "robots"}, start=tmp_path / "first.csv", track=False,
-        candidates=3, time_limit=2.0,
+        time_limit=2.0,
     )  # fmt: skip
     truth = tmp_path / "t.csv"
     assert job == SceneJob(
@@ -267,9 +266,9 @@ def test_job_file_gives_the_settings(tmp_path):
         ("scenes: {a: {}}", "scene 'a': 'scene' is missing"),
         ("scenes: {../a: {scene: a}}", "slashes"),
         ("scenes: {1: {scene: a}}", "quotes"),
-        ("scenes: {a: {scene: a, intervall: 3}}", "no setting intervall; there is: scene, model"),
-        ("scenes: {a: {scene: a, interval: wide}}", "interval: must be a number"),
-        ("scenes: {a: {scene: a, interval: true}}", "interval: must be a number"),
+        ("scenes: {a: {scene: a, methode: beam}}", "no setting methode; there is: scene, model"),
+        ("scenes: {a: {scene: a, time_limit: wide}}", "time_limit: must be a number"),
+        ("scenes: {a: {scene: a, time_limit: true}}", "time_limit: must be a number"),
         ("scenes: {a: {scene: a, track: 1}}", "track: must be true or false"),
         ("scenes: {a: {scene: a, hold: {lift: low}}}", "hold: lift: must be a number"),
         ("scenes: {a: {scene: a, packages: [b]}}", "packages: expected NAME: VALUE"),
@@ -279,7 +278,10 @@ def test_job_file_gives_the_settings(tmp_path):
         ("scenes: {a: {scene: a}}\nchunk: 0", "chunk: must be a whole number"),
         ("scenes: {a: {scene: a}}\ndefaults: {model: 3}", "model: must be a text"),
         ("scene: {a: {scene: a}}", "no setting scene"),
-        ("scenes: {a: {scene: a, audit: j.csv, interval: 5}}", "an audit has no setting interval"),
+        (
+            "scenes: {a: {scene: a, audit: j.csv, time_limit: 5}}",
+            "an audit has no setting time_limit",
+        ),
         ("scenes: {a: {scene: a, audit: j.csv, truth: j.csv}}", "an audit has no setting truth"),
         ("scenes: {a: {scene: a, camera_file: c.yaml}}", "camera_file is a setting of audits"),
         ("scenes: {a: {scene: a}, a: {scene: b}}", "given twice"),

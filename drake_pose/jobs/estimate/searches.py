@@ -14,9 +14,7 @@ from drake_pose.errors import SettingsError
 from drake_pose.files.records import user_units
 from drake_pose.files.settings import EstimateSettings, RootTurns
 from drake_pose.search import (
-    BeamSearch,
     BeamSearchSettings,
-    ExaminationSettings,
     MultiStartSearch,
     PaperSearch,
     PaperSearchSettings,
@@ -26,27 +24,21 @@ from drake_pose.search import (
     turns_freely,
 )
 
-# Sampling interval of a root that can be turned in all ways, where its position is searched [deg].
-_FREE_ROOT_INTERVAL = 30.0
-
 
 def make_search(
-    model: ArticulatedModel, settings: EstimateSettings, position: np.ndarray | None
+    model: ArticulatedModel,
+    settings: EstimateSettings,
+    position: np.ndarray | None,
+    interval_deg: float = 10.0,
 ) -> PoseSearch:
-    """The search for a root at its own place, or at a position (3,) in the world [m]."""
-    tree, beam = make_tree(model, settings, position), _sampling(model, settings)
+    """The search for a root at its own place, or at a position (3,) in the world [m].
+
+    ``interval_deg``: sampling interval of the paper's search [deg].
+    """
+    tree = make_tree(model, settings, position)
     if settings.method == "paper":
-        paper = PaperSearchSettings(
-            beam.interval, beam.length_interval, beam.intervals,
-            outside_limit=settings.outside_limit, candidate_limit=settings.candidates,
-            run_limit=settings.run_limit,
-        )  # fmt: skip
-        return PaperSearch(tree, paper)
-    if settings.angles == "grid":
-        return BeamSearch(tree, beam, ExaminationSettings())
-    # It samples as coarsely as it likes; but intervals of joints that are none are refused.
-    tree.require_intervals(beam.intervals, beam.interval, beam.length_interval)
-    return MultiStartSearch(tree, beam.time_limit)
+        return PaperSearch(tree, PaperSearchSettings(math.radians(interval_deg)))
+    return MultiStartSearch(tree, settings.time_limit)
 
 
 def make_placement_search(
@@ -54,30 +46,32 @@ def make_placement_search(
     settings: EstimateSettings,
     position: np.ndarray | None,
     scale_unknown: bool,
+    interval_deg: float = 10.0,
+    free_interval_deg: float = 30.0,
 ) -> RootPlacementSearch:
     """The search for a root that can be anywhere.
 
-    Where joints turn the root freely, the tree begins at the node of most neighbours, coarsely.
+    Where joints turn the root freely, the tree begins at the node of most neighbours.
 
-    Raises SettingsError: if the method is the paper's, or angles on the grid are wanted.
+    Args:
+        interval_deg: sampling interval of all angles [deg].
+        free_interval_deg: that of a root that can be turned in all ways [deg].
+
+    Raises SettingsError: the method is the paper's.
     """
     if settings.method == "paper":
         raise SettingsError(
             "the paper's search must know where the root is and how large it looks; where the "
             "scene has no cameras.yaml or the root position is unknown, use --method beam"
         )
-    if settings.angles == "grid":
-        raise SettingsError(
-            "angles on the grid need a known root; where the scene has no cameras.yaml or the root "
-            "position is unknown, angles are continuous"
-        )
     first = np.zeros(3) if position is None else position
     tree = make_tree(model, settings, None if settings.root is None else first)
     if settings.root is None and settings.root_rotation is None and turns_freely(tree):
-        rotation = RootRotation.free(interval_deg=_FREE_ROOT_INTERVAL)
+        rotation = RootRotation.free(interval_deg=free_interval_deg)
         held = _in_plant_units(model, settings.hold)
         tree = model.pose_tree(hub(tree), root_position=first, root_rotation=rotation, held=held)
-    return RootPlacementSearch(tree, _sampling(model, settings), scale_unknown)
+    sampling = BeamSearchSettings(math.radians(interval_deg), time_limit=settings.time_limit)
+    return RootPlacementSearch(tree, sampling, scale_unknown)
 
 
 def make_tree(
@@ -143,11 +137,3 @@ def _in_plant_units(model: ArticulatedModel, values: Mapping[str, float]) -> dic
     kinds = dict(zip(model.position_names, model.position_kinds, strict=True))
     is_angle = {name: kinds.get(name, "angle") == "angle" for name in values}
     return {name: math.radians(one) if is_angle[name] else one for name, one in values.items()}
-
-
-def _sampling(model: ArticulatedModel, settings: EstimateSettings) -> BeamSearchSettings:
-    """The sampling intervals that all searches take, and the time limit."""
-    return BeamSearchSettings(
-        math.radians(settings.interval), settings.length_interval,
-        _in_plant_units(model, settings.joint_intervals), time_limit=settings.time_limit,
-    )  # fmt: skip

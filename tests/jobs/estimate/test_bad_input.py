@@ -154,7 +154,6 @@ def test_model_file(own_scene: TinyScene, tmp_path: Path) -> None:
     [
         ("--root hook", ("'hook'", "base, boom, jib")),
         ("--hold swing=3", ("'swing'", "lift, luff")),
-        ("--joint-interval swing=3", ("'swing'", "lift, luff")),
         ("--camera back", ("'back'", "front")),
         ("--frame 7", ("'7'", "0000, 0001, 0002")),
         ("--root jib --root-position {0}:toe", ("'toe'", "hook")),
@@ -163,9 +162,6 @@ def test_model_file(own_scene: TinyScene, tmp_path: Path) -> None:
         ("--truth nowhere.csv", ("nowhere.csv",)),
         ("--truth {0}", ("'joint'", "lift, luff")),
         ("--root jib", ("root 'jib'",)),
-        ("--interval 0", ("interval",)),
-        ("--interval nan", ("interval",)),
-        ("--method paper --outside-limit -1", ("outside_limit",)),
     ],
 )
 def test_what_scene_and_model_do_not_have(options, parts, own_scene: TinyScene) -> None:
@@ -180,14 +176,9 @@ def test_what_scene_and_model_do_not_have(options, parts, own_scene: TinyScene) 
         ("--root-position 1,2", "--root-position"),
         ("--root-rotation upright", "--root-rotation"),
         ("--hold lift", "--hold"),
-        ("--joint-interval lift=ten", "--joint-interval"),
         ("--method magic", "magic"),
-        ("--candidates many", "--candidates"),
         ("--speed 3", "--speed"),
-        ("--outside-limit 9", "outside limit"),
-        ("--method paper --candidates 0", "candidates"),
-        ("--method paper --run-limit 0", "run_limit"),
-        ("--angles round", "angles"),
+        ("--every many", "--every"),
         ("--method paper --time-limit 9", "time limit"),
         ("--time-limit -1", "time_limit"),
     ],

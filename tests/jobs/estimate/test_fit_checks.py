@@ -24,7 +24,7 @@ def scene(tmp_path: Path) -> TinyScene:
 
 
 def warnings_of(scene: TinyScene, model: Path | None = None, **more: object) -> tuple[str, ...]:
-    settings = EstimateSettings(interval=20.0, **more)  # type: ignore[arg-type]
+    settings = EstimateSettings(**more)  # type: ignore[arg-type]
     return estimate_scene(scene.folder, model or scene.model, None, settings).warnings
 
 
@@ -66,7 +66,7 @@ def test_what_keeps_the_truth_out(scene: TinyScene, tmp_path: Path) -> None:
 @pytest.mark.parametrize(("left", "is_told"), [(0.3, True), (0.02, False)])
 def test_a_track_of_a_wrong_pose_is_told(scene: TinyScene, left: float, is_told: bool) -> None:
     """Frame 1 is said to be tracked half a radian off, which leaves so much of its area."""
-    inputs = read_inputs(scene.folder, scene.model, EstimateSettings(interval=20.0), None)
+    inputs = read_inputs(scene.folder, scene.model, EstimateSettings(), None)
     wrong = np.radians(ANGLES[1]) + np.array([0.0, 0.5])
     rows = {"0001": PoseRow("0001", wrong, None, left, 0.1)}
     records = {

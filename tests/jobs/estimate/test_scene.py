@@ -1,6 +1,7 @@
 import html
 import json
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -13,6 +14,7 @@ from drake_pose.body import load_model
 from drake_pose.files.overlay import AGREEMENT_RGB, EXCESS_RGB, MISSING_RGB
 from drake_pose.files.settings import EstimateSettings
 from drake_pose.jobs.estimate.scene import estimate_scene
+from drake_pose.search import PaperSearchSettings
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from drake_pose.silhouette.pictures.scenes import load_scene
 from tests.cli import run_json
@@ -35,7 +37,7 @@ def positions(out: Path) -> dict[str, np.ndarray]:
 
 
 def test_result_folder(tiny_scene: TinyScene, out: Path) -> None:
-    run_estimate(tiny_scene, out, "--angles", "grid")
+    run_estimate(tiny_scene, out)
     assert sorted(path.name for path in out.iterdir()) == [
         "families.csv", "joints.csv", "overlay", "poses.csv", "replay.html", "report.html",
         "summary.json",
@@ -54,7 +56,7 @@ def test_result_folder(tiny_scene: TinyScene, out: Path) -> None:
 
 
 def test_summary(tiny_scene: TinyScene, out: Path) -> None:
-    options = ["--json", "--no-replay", "--hold", "lift=20", "--joint-interval", "luff=40"]
+    options = ["--json", "--no-replay", "--hold", "lift=20"]
     result, summary = run_estimate(tiny_scene, out, "--method", "paper", "--frame", "0:1", *options)
     assert summary == json.loads(result.stdout)
     assert not (out / "replay.html").exists()
@@ -70,12 +72,12 @@ def test_summary(tiny_scene: TinyScene, out: Path) -> None:
     assert frame["E_total"] == pytest.approx(errors[1], rel=1e-6)
     lift, luff = np.array(list(positions(out).values())).T
     np.testing.assert_allclose(lift, np.radians(20), atol=1e-7)
-    steps = luff / np.radians(40)
+    steps = luff / np.radians(10)
     np.testing.assert_allclose(steps, np.round(steps), atol=1e-7)
 
 
 def test_error_and_overlay_are_what_drakes_renderer_sees(tiny_scene: TinyScene, out: Path) -> None:
-    settings = EstimateSettings(interval=13.0, method="paper", hold={"luff": -90.0})
+    settings = EstimateSettings(method="paper", hold={"luff": -90.0})
     result = estimate_scene(tiny_scene.folder, tiny_scene.model, out, settings, replay=False)
     scene = load_scene(tiny_scene.folder)
     renderer = LabelRenderer(load_model(tiny_scene.model), scene.cameras["front"])
@@ -100,7 +102,7 @@ def test_nothing_is_written_without_a_folder(tiny_scene: TinyScene) -> None:
     result = estimate_scene(
         tiny_scene.folder,
         tiny_scene.model,
-        settings=EstimateSettings(interval=20.0, frames=("1",), method="paper"),
+        settings=EstimateSettings(frames=("1",), method="paper"),
         on_frame=lambda *what: heard.append(what[:3]),
     )
     assert result.folder is None
@@ -167,9 +169,11 @@ def test_another_root_with_a_position_for_each_frame(own_scene: TinyScene) -> No
         assert abs(float(row["base_qw"])) == pytest.approx(1.0)
 
 
-def test_a_frame_without_a_pose(own_scene: TinyScene) -> None:
+def test_a_frame_without_a_pose(own_scene: TinyScene, monkeypatch: pytest.MonkeyPatch) -> None:
     out = own_scene.folder.parent / "out"
-    options = ["--method", "paper", "--no-replay", "--outside-limit", "0", "--hold", "lift=-90"]
+    strict = partial(PaperSearchSettings, outside_limit=0.0)
+    monkeypatch.setattr("drake_pose.jobs.estimate.searches.PaperSearchSettings", strict)
+    options = ["--method", "paper", "--no-replay", "--hold", "lift=-90"]
     lost, summary = run_estimate(own_scene, out, *options, status=1)
     assert lost.stderr.count("no pose was found\n") == 1
     assert "frame 0000-0002 (3 of 3): no pose was found" in lost.stderr

@@ -27,7 +27,7 @@ def write_sequence(folder: Path, text: str) -> TinyScene:
 
 def test_a_sequence_is_matched_first_tracked_and_matched_after_a_cut(tmp_path: Path) -> None:
     scene = write_sequence(tmp_path / "scene", "sequence: true\nframe_rate_hz: 30\n")
-    settings = EstimateSettings(interval=20.0, method="paper")
+    settings = EstimateSettings(method="paper")
     result = estimate_scene(scene.folder, scene.model, settings=settings, replay=False)
     how = [result.records[frame].stopped_by == TRACKED for frame in scene.truth]
     runs = [result.records[frame].runs for frame in scene.truth]
@@ -60,9 +60,7 @@ def test_a_sequence_need_not_be_tracked(tmp_path: Path) -> None:
     stills = write_sequence(tmp_path / "stills", "sequence: false\n")
     found = []
     for scene, track in ((said, False), (stills, True)):
-        settings = EstimateSettings(
-            interval=20.0, method="paper", frames=("0000", "0001"), track=track
-        )
+        settings = EstimateSettings(method="paper", frames=("0000", "0001"), track=track)
         result = estimate_scene(scene.folder, scene.model, settings=settings, replay=False)
         assert all(record.stopped_by != TRACKED for record in result.records.values())
         assert result.summary["settings"]["track"] is track

@@ -1,8 +1,10 @@
 """Many scenes by any number of workers."""
 
+import dataclasses
 import gc
 import json
 import os
+import pickle
 import shutil
 import signal
 import socket
@@ -15,11 +17,11 @@ import psutil
 import pytest
 import yaml
 
-from drake_pose.errors import ClusterError, SettingsError
+from drake_pose.errors import ClusterError, OutputError, SettingsError
 from drake_pose.files.settings import EstimateSettings
-from drake_pose.jobs.batch import Outcome, Task, perform, run_batch
+from drake_pose.jobs.batch import Outcome, Task, perform, plan_scene, run_batch
 from drake_pose.jobs.batch_file import SceneJob, read_job
-from drake_pose.jobs.cluster import open_cluster, require_fit_workers
+from drake_pose.jobs.cluster import call_in_child, open_cluster, require_fit_workers
 from drake_pose.jobs.estimate.scene import estimate_scene
 from tests.cli import run_json, run_to_end
 from tests.jobs.scenes import write_scene
@@ -293,3 +295,106 @@ def test_job_file_is_checked(text, words, tmp_path):
     with pytest.raises(SettingsError, match=r"jobs\.yaml") as caught:
         read_job(path)
     assert words in str(caught.value)
+
+
+def finish(task: Task) -> Outcome:
+    """What becomes of a task that needs no work: a folder, and all its frames found."""
+    task.place.mkdir(parents=True)
+    totals = {"frame_count": len(task.frames), "found_count": len(task.frames)}
+    return Outcome(None, 2.0, None if task.index is not None else totals)
+
+
+def test_a_scene_is_cut_into_chunks_and_put_together(scenes, out):
+    one = {"stills": {"scene": "stills"}}
+    (job,) = read_job(write_job(scenes, one, "one.yaml"))
+    tasks = plan_scene(job, out)
+    assert [task.frames for task in tasks] == [("0000", "0001"), ("0002", "0003"), ("0004",)]
+    assert len({task.place for task in tasks}) == 3
+    done, heard = [], []
+    result = run_batch(
+        [job], out, work=lambda task: done.append(task) or finish(task),
+        on_progress=lambda *progress: heard.append(progress),
+    )  # fmt: skip
+    assert [task.index for task in done] == [0, 1, 2, None]
+    assert done[-1].frames == tuple(f"{k:04d}" for k in range(5))
+    assert [path.name for path in done[-1].chunks] == [task.place.name for task in tasks]
+    assert heard == [(k, 5, "") for k in (0, 2, 4, 5, 5)]
+    told = json.loads((out / "batch.json").read_text())
+    assert told["complete"]
+    state = told["scenes"]["stills"]
+    assert (state["state"], state["chunks"], state["chunks_done"]) == ("finished", 3, 3)
+    assert (state["frame_count"], state["found_count"]) == (5, 5)
+    assert result.scenes["stills"].seconds == 8.0
+    assert not (out / ".chunks").exists()
+    # Other frames are other chunks, wherever they lie.
+    longer = dataclasses.replace(
+        job, settings=dataclasses.replace(job.settings, frames=("0001:0004",))
+    )
+    assert not {task.place for task in plan_scene(longer, out)} & {task.place for task in tasks}
+
+
+def test_what_is_finished_is_not_done_again(scenes, out):
+    (job,) = read_job(write_job(scenes, {"stills": {"scene": "stills"}}, "one.yaml"))
+    first, *_ = plan_scene(job, out)
+    (first.work / f"{first.place.name}.part-1").mkdir(parents=True)
+    finish(first)
+    (out / "batch.json").write_text(json.dumps({"scenes": {}}))
+    done = []
+    run_batch([job], out, resume=True, work=lambda task: done.append(task.index) or finish(task))
+    assert done == [1, 2, None]
+    assert run_batch([job], out, resume=True, work=finish_again).failed == ("stills",)
+
+
+def finish_again(task: Task) -> Outcome:
+    """A scene of which a frame has gone."""
+    return Outcome(None, 0.0, {"frame_count": len(task.frames) - 1})
+
+
+@pytest.mark.parametrize("wrong", [{0}, {0, 1, 2}])
+def test_failed_chunks_do_not_stop_the_others_until_three_have_failed(scenes, out, wrong):
+    entry = {"stills": {"scene": "stills"}, "motion": {"scene": "motion"}}
+    jobs = read_job(write_job(scenes, entry, "two.yaml"), chunk=1)
+    asked = []
+
+    def work(task: Task) -> Outcome:
+        asked.append((task.job.name, task.index))
+        is_wrong = task.job.name == "stills" and task.index in wrong
+        return Outcome(f"broken {task.index}") if is_wrong else finish(task)
+
+    result = run_batch(jobs, out, work=work)
+    tried = [index for name, index in asked if name == "stills"]
+    assert tried == ([0, 1, 2] if len(wrong) == 3 else [0, 1, 2, 3, 4])
+    assert [index for name, index in asked if name == "motion"] == [0, 1, 2, None]
+    assert result.failed == ("stills",)
+    assert result.scenes["stills"].errors == {
+        f"broken {k}": [f"frames {k:04d} to {k:04d}"] for k in sorted(wrong)
+    }
+    assert not json.loads((out / "batch.json").read_text())["complete"]
+
+
+def test_another_job_is_not_resumed(scenes, out):
+    (job,) = read_job(write_job(scenes, {"stills": {"scene": "stills"}}, "one.yaml"))
+    with pytest.raises(OutputError, match="no batch to resume"):
+        run_batch([job], out, resume=True)
+    run_batch([job], out, work=finish)
+    with pytest.raises(OutputError, match=r"'stills' was begun with chunk = 2, not 3"):
+        run_batch([dataclasses.replace(job, chunk=3)], out, resume=True)
+    (out / "batch.json").write_text("{")
+    with pytest.raises(OutputError, match="damaged"):
+        run_batch([job], out, resume=True)
+
+
+def test_a_crash_ends_the_child_and_not_the_worker():
+    def call(function, argument):
+        return pickle.loads(call_in_child(pickle.dumps((function, argument))))
+
+    child = call(os.getpgid, 0), call(eval, "__import__('os').getpid()")
+    assert child == (os.getpgid(0), call(eval, "__import__('os').getpid()"))
+    assert child[1] != os.getpid()
+    for function, argument, how in (
+        (os._exit, 3, "exit status 3"),
+        (eval, "__import__('os').abort()", "SIGABRT"),
+    ):
+        with pytest.raises(ClusterError, match=how):
+            call(function, argument)
+    assert call(eval, "__import__('os').getpid()") not in (os.getpid(), child[1])

@@ -148,11 +148,10 @@ def find_intervals(
     body, kinematics = problem.body, problem.body.kinematics
     count = len(kinematics.names)
     free = body.freedom()
-    equations = problem.equations(parameters, free, PASSES.fine[-1])
+    equations, squares = problem.equations(parameters, free, PASSES.fine[-1])
     # At least that of a border that lies anywhere between two pixel centres [pixel^2]; and larger
     # than if the distances of all rows and columns were independent.
-    variance = max(1.0 / 12.0, equations.squares / max(equations.weight, 1e-9))
-    variance *= own.noise_factor**2
+    variance = own.noise_factor**2 * max(1.0 / 12.0, squares)
     # Limits are worth what a value spread evenly between them is.
     spans = np.clip(body.upper[free.columns] - body.lower[free.columns], 1e-6, 2.0 * np.pi)
     information = equations.H[0] / variance + np.diag(12.0 / spans**2)

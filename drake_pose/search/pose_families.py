@@ -68,7 +68,14 @@ def estimate_joints(
         for k, name in enumerate(node.value_names):
             values = np.unique(np.round(sampled.values[i][samples[i], k], 12))
             if around[k]:
-                values = _joined(values, float(about[i][k]), float(steps[k]))
+                # Angles of one turn, rising from the widest gap between them.
+                full = 2.0 * np.pi
+                gaps = np.diff(values, append=values[0] + full)
+                first = (int(np.argmax(gaps)) + 1) % len(values)
+                if len(values) > 1 and gaps.max() > steps[k] * (1.0 + 1e-6):
+                    values = np.concatenate([values[first:], values[:first] + full])
+                    middle = 0.5 * (values[0] + values[-1])
+                    values = values + full * np.round((about[i][k] - middle) / full)
             known = complete or np.isinf(steps[k])
             determined = bool(known and np.ptp(values) <= steps[k] * (1.0 + 1e-6))
             margin = 0.5 * steps[k] if determined else 0.0
@@ -77,19 +84,6 @@ def estimate_joints(
                 low, high = max(low, float(lower[k])), min(high, float(upper[k]))
             reports.append(JointEstimate(name, determined, low, high, bool(around[k])))
     return tuple(reports)
-
-
-def _joined(values: np.ndarray, about: float, step: float) -> np.ndarray:
-    """Angles of one turn, rising from the widest gap between them."""
-    full = 2.0 * np.pi
-    gaps = np.diff(values, append=values[0] + full)
-    widest = int(np.argmax(gaps))
-    if len(values) == 1 or gaps[widest] <= step * (1.0 + 1e-6):
-        return values
-    first = (widest + 1) % len(values)
-    risen = np.concatenate([values[first:], values[:first] + full])
-    turns = np.round((about - 0.5 * (risen[0] + risen[-1])) / full)
-    return np.asarray(risen + full * turns)
 
 
 def cluster_samples(sampled: SampledTree, node: int, samples: np.ndarray) -> np.ndarray:

@@ -8,7 +8,6 @@ raster first and let far distances count, then at all lines and near distances o
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -118,18 +117,6 @@ class RefinementBody:
         return self.place(parameters, bent=False).X_WN
 
 
-@dataclass(frozen=True, eq=False)
-class RasterEquations(Equations):
-    """Normal equations (1, k, k) and (1, k) of distances along raster lines; cost: about J [pixel].
-
-    ``weight``: the sum of all weights [pixel]; ``squares``: of weighted squared distances
-    [pixel^3].
-    """
-
-    weight: float
-    squares: float
-
-
 class RefinementProblem:
     """The pose of one body in the silhouettes of one instant.
 
@@ -180,12 +167,16 @@ class RefinementProblem:
         part: Pass,
         offset: int = 0,
         still: Sequence[Border] | None = None,
-    ) -> RasterEquations:
+    ) -> tuple[Equations, float]:
         """The normal equations of some parameters at a pose (m + 4,).
 
         Args:
             offset: the first line that is looked at.
             still: the border in each view of what they do not move; None: made here.
+
+        Returns:
+            H (1, k, k) and g (1, k) of distances along raster lines, their cost about J [pixel];
+                and the mean of weighted squared distances [pixel^2].
         """
         free, moved = freedom
         still = self.still(parameters, moved) if still is None else still
@@ -202,7 +193,8 @@ class RefinementProblem:
             A, b, placed.motions, placed.starts, placed.owners, placed.parameters, len(parameters)
         )
         apart, weight, squares = sums.tolist()
-        return RasterEquations(H[np.ix_(free, free)][None], g[free][None], apart, weight, squares)
+        equations = Equations(H[np.ix_(free, free)][None], g[free][None], apart)
+        return equations, squares / max(weight, 1e-9)
 
 
 def descend(
@@ -232,7 +224,8 @@ def descend(
         settings = StepSettings(part.longest_step, damping, 0.0)
         best, least = parameters, np.inf
         for iteration in range(part.iterations + 1):
-            equations = problem.equations(parameters, freedom, part, iteration % part.stride, still)
+            offset = iteration % part.stride
+            equations, _ = problem.equations(parameters, freedom, part, offset, still)
             if equations.cost < least:
                 best, least = parameters, equations.cost
             if iteration == part.iterations:

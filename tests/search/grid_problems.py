@@ -8,10 +8,8 @@ import numpy as np
 
 from drake_pose.body import PoseTree
 from drake_pose.camera.models import ParallelCamera
-from drake_pose.search.estimates import View
-from drake_pose.search.pose_families import samples_at
-from drake_pose.search.sampled_body import SampledBody, SampledTree, Scoring
-from drake_pose.search.settings import BeamSearchSettings
+from drake_pose.search import BeamSearchSettings, SampledTree, Scoring, View, samples_at
+from drake_pose.search.sampled_body import SampledBody
 from drake_pose.silhouette.areas.outline import Outline, outline_from_mesh
 from drake_pose.silhouette.areas.scoring import draw_mask
 

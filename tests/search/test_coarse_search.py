@@ -6,15 +6,9 @@ import numpy as np
 import pytest
 
 from drake_pose.camera.models import ParallelCamera
-from drake_pose.search.coarse_search import (
-    CoarseSearch,
-    fill_cover,
-    score_samples,
-    spread_points,
-)
-from drake_pose.search.estimates import View
+from drake_pose.search import BeamSearchSettings, View
+from drake_pose.search.coarse_search import CoarseSearch, fill_cover, score_samples, spread_points
 from drake_pose.search.sampled_body import SampledBody
-from drake_pose.search.settings import BeamSearchSettings
 from drake_pose.silhouette.pictures.masks import signed_distances
 from tests.search.arms import arm_cameras, arm_tree, damaged_views, draw_pose, draw_view, split
 

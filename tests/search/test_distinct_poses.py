@@ -5,9 +5,7 @@ import itertools
 import numpy as np
 import pytest
 
-from drake_pose.search.beam_search import BeamSearch
-from drake_pose.search.pose_families import samples_at
-from drake_pose.search.settings import BeamSearchSettings
+from drake_pose.search import BeamSearch, BeamSearchSettings, samples_at
 from drake_pose.silhouette.areas.outline import outline_from_mesh
 from drake_pose.silhouette.areas.scoring import draw_mask
 from tests.search.bodies import forked_body

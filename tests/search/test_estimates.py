@@ -8,11 +8,16 @@ import pytest
 from scipy.stats import t as student
 
 from drake_pose.body.tree_kinematics import TreeKinematics
-from drake_pose.search.beam_search import BeamSearch
-from drake_pose.search.estimates import JointEstimate, PoseEstimate, PoseFamily, PoseSet
-from drake_pose.search.multi_start import MultiStartSearch
-from drake_pose.search.pose_families import ExaminationSettings, _joined
-from drake_pose.search.views_fit import covariance_pose_set
+from drake_pose.search import (
+    BeamSearch,
+    ExaminationSettings,
+    JointEstimate,
+    MultiStartSearch,
+    PoseEstimate,
+    PoseFamily,
+    PoseSet,
+    covariance_pose_set,
+)
 from tests.search.turning import crane, views_of
 
 TURN = 2.0 * math.pi
@@ -144,15 +149,3 @@ def test_directions_on_both_sides_of_half_a_turn_are_one_family(model):
     ends = np.degrees(np.array([first.low, first.high]) - result.q[0])
     np.testing.assert_allclose(ends, [-20.0, 20.0], atol=1e-6)
     assert result.pose_set.family_count == 1
-
-
-def test_angles_of_one_turn_are_cut_at_their_widest_gap():
-    def joined(values, about):
-        return np.degrees(_joined(np.radians(values), math.radians(about), math.radians(20.0)))
-
-    np.testing.assert_allclose(joined([-160.0, 160.0, 180.0], 180.0), [160.0, 180.0, 200.0])
-    np.testing.assert_allclose(joined([-160.0, 160.0, 180.0], -160.0), [-200.0, -180.0, -160.0])
-    np.testing.assert_allclose(joined([-20.0, 0.0, 20.0], 0.0), [-20.0, 0.0, 20.0])
-    whole = np.arange(-160.0, 181.0, 20.0)
-    np.testing.assert_allclose(joined(whole, 0.0), whole)
-    np.testing.assert_allclose(joined([40.0], 40.0), [40.0])

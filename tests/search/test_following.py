@@ -6,14 +6,18 @@ import math
 import numpy as np
 import pytest
 
-from drake_pose.search.beam_search import BeamSearch
+from drake_pose.search import (
+    BeamSearch,
+    BeamSearchSettings,
+    ExaminationSettings,
+    MultiStartSearch,
+    PaperSearch,
+    PaperSearchSettings,
+    Scoring,
+    View,
+)
 from drake_pose.search.branch_and_bound import branch_and_bound
-from drake_pose.search.estimates import View
-from drake_pose.search.kameda import PaperSearch
-from drake_pose.search.multi_start import MultiStartSearch
-from drake_pose.search.pose_families import ExaminationSettings
-from drake_pose.search.sampled_body import SampledBody, Scoring
-from drake_pose.search.settings import BeamSearchSettings, PaperSearchSettings
+from drake_pose.search.sampled_body import SampledBody
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 
 from .arms import arm_cameras

@@ -1,14 +1,10 @@
-import itertools
 import math
 
 import numpy as np
 import pytest
 
 from drake_pose.errors import MaskError, SettingsError
-from drake_pose.search.estimates import View
-from drake_pose.search.kameda import PaperRun, PaperSearch
-from drake_pose.search.sampled_body import Scoring
-from drake_pose.search.settings import PaperSearchSettings
+from drake_pose.search import PaperSearch, PaperSearchSettings, View
 from drake_pose.silhouette.areas.scoring import draw_mask
 from tests.search.bodies import (
     box_link,
@@ -119,41 +115,6 @@ def test_search_does_what_the_paper_says(tmp_path, body, K, outside_weight):
             assert result.first_E_total * mask.sum() == pytest.approx(naive.first_J)
             for i, values in naive.best[1].items():
                 np.testing.assert_array_equal(result.node_values[i], values)
-
-
-def test_leaves_are_combined_as_fits_best_and_J_falls_by_what_is_said(tmp_path):
-    """Section 5.2.1, against all combinations: what one leaf takes first the other one needs."""
-    model = load_body(
-        tmp_path,
-        box_link("trunk", 10, 10),
-        joint("still", "prismatic", "world", "trunk", (0.0, 0.0), axis="0 1 0"),
-        box_link("both_ways", 10, 8, z=-15.0),
-        joint("slide_a", "prismatic", "trunk", "both_ways", (-0.2, 0.2), axis="0 1 0"),
-        box_link("left_only", 10, 8, z=-15.0),
-        joint("slide_b", "prismatic", "trunk", "left_only", (-0.2, 0.0), axis="0 1 0"),
-    )
-    settings = PaperSearchSettings(intervals={"slide_a": 0.2, "slide_b": 0.2})
-    search, camera, falls = PaperSearch(model.pose_tree(), settings), front_camera(), []
-    generator = np.random.default_rng(9)
-    for _ in range(6):
-        shown = [np.array([0.0]), np.array([0.2]), np.array([-0.2])]
-        mask = silhouette(search, camera, shown)
-        # Holes on both sides, and specks everywhere, say which leaf comes first.
-        mask &= generator.random(mask.shape) < np.where(np.arange(100) < 50, 0.95, 0.9)
-        mask |= generator.random(mask.shape) < 0.05
-        scoring = Scoring(search.sampled, [View(camera, mask)])
-        run = PaperRun(scoring, search.settings, [900.0], 0)
-        assert run._complete()
-        samples = run._adopted()[0].copy()
-        before, said = scoring.J(samples[None])[0], run._combine_leaves()
-        assert scoring.J(run._adopted()[0][None])[0] == before - said
-        leaves = [i for i, node in enumerate(run.nodes) if not node.children]
-        chosen = np.array([*itertools.product(*(run.lists[leaf].samples for leaf in leaves))])
-        every = np.tile(samples, (len(chosen), 1))
-        every[:, leaves] = chosen
-        assert before - said == scoring.J(every).min()
-        falls.append(said)
-    assert max(falls) > 0.0
 
 
 def test_several_views_are_one_search(tmp_path):

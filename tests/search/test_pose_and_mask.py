@@ -6,14 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
-from drake_pose.search.pose_and_mask import (
-    PictureLevel,
-    PoseAndMask,
-    PoseAndMaskSettings,
-    cut_by_odds,
-    follow_colours,
-    narrowed,
-)
+from drake_pose.search import PoseAndMask, PoseAndMaskSettings
+from drake_pose.search.pose_and_mask import PictureLevel, cut_by_odds, follow_colours, narrowed
 from drake_pose.silhouette.areas.scoring import draw_mask
 from drake_pose.silhouette.pictures.masks import intersection_over_union
 from tests.registration.episodes import painted_episode

@@ -5,15 +5,13 @@ import math
 import numpy as np
 import pytest
 
-from drake_pose.search.estimates import View
+from drake_pose.search import View, renderer_tolerance, samples_at
 from drake_pose.search.pose_families import (
     cluster_samples,
     contour_length,
     estimate_joints,
     find_families,
     grid_steps,
-    renderer_tolerance,
-    samples_at,
 )
 from drake_pose.search.settings import BoundLimits
 from tests.search.arms import is_held

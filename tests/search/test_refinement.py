@@ -7,15 +7,10 @@ import pytest
 
 from drake_pose.body import bundled_model, load_model
 from drake_pose.camera.models import ParallelCamera, PinholeCamera
-from drake_pose.search.estimates import View
+from drake_pose.search import View
 from drake_pose.search.exact_search import find_intervals
 from drake_pose.search.parts import NeighbourhoodSearch, PartSearch, find_parts, find_reflections
-from drake_pose.search.refinement import (
-    Pass,
-    RefinementBody,
-    RefinementProblem,
-    descend,
-)
+from drake_pose.search.refinement import Pass, RefinementBody, RefinementProblem, descend
 from drake_pose.search.settings import PASSES
 from drake_pose.silhouette.areas.bending import TreeSurfaces
 from drake_pose.silhouette.areas.scoring import draw_mask
@@ -103,7 +98,7 @@ def test_one_step_takes_a_small_change_back(body, kind):
     for one, j in enumerate(freedom.columns):
         moved = true.copy()
         moved[j] += step
-        equations = problem.equations(moved, freedom, Pass(1, 1, 3.0, 1.0))
+        equations, _ = problem.equations(moved, freedom, Pass(1, 1, 3.0, 1.0))
         off.append(abs(equations.g[0, one] / equations.H[0, one, one] / step - 1.0))
     # Pixels, and what the change covers and uncovers, leave some doubt.
     assert np.median(off) < 0.1

@@ -7,17 +7,9 @@ import pytest
 from drake_pose.body import RootRotation, bundled_model, load_model
 from drake_pose.camera.models import ParallelCamera, PinholeCamera
 from drake_pose.errors import SettingsError
-from drake_pose.search.estimates import View
-from drake_pose.search.root_placement import (
-    RootPlacementSearch,
-    choose_root_samples,
-    find_root_places,
-    hub,
-    turns_freely,
-    whereabouts,
-)
+from drake_pose.search import BeamSearchSettings, RootPlacementSearch, View, hub, turns_freely
+from drake_pose.search.root_placement import choose_root_samples, find_root_places, whereabouts
 from drake_pose.search.sampled_body import SampledBody
-from drake_pose.search.settings import BeamSearchSettings
 from drake_pose.silhouette.areas.scoring import draw_mask
 from drake_pose.workers import working
 from tests.search.bodies import box_link, front_camera, joint, load_body
@@ -107,24 +99,19 @@ def placed(tree, views, *position, **settings):
 
 
 def test_position_and_scale_of_a_parallel_camera_are_found(body, seen):
-    told = replace(seen.camera, pixels_per_metre=7.0)
-    result = placed(body.pose_tree(), [View(told, seen.mask)], scale_unknown=True)
+    views, found = [View(replace(seen.camera, pixels_per_metre=7.0), seen.mask)], []
+    for workers in (1, 3):
+        with working(workers):
+            found.append(placed(body.pose_tree(), views, scale_unknown=True))
+    result, again = found
+    np.testing.assert_array_equal(result.q, again.q)
+    assert result.statistics == again.statistics
     assert result.E_total < 0.04
     assert result.scale * 7.0 == pytest.approx(100.0, rel=0.04)
     assert result.root_position[1:] == pytest.approx(PLACE[1:], abs=0.02)
     assert max(angle_errors(body, result)) < 0.1
     q_position = [result.q[body.position_index(f"slide_{axis}")] for axis in "yz"]
     assert q_position == pytest.approx(result.root_position[1:])
-
-
-def test_the_same_on_any_number_of_cores(body, seen):
-    views = [View(replace(seen.camera, pixels_per_metre=7.0), seen.mask)]
-    found = []
-    for workers in (1, 3):
-        with working(workers):
-            found.append(placed(body.pose_tree(), views, scale_unknown=True))
-    np.testing.assert_array_equal(found[0].q, found[1].q)
-    assert found[0].statistics == found[1].statistics
 
 
 def test_depth_of_a_pinhole_is_found(body):

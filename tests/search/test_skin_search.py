@@ -6,11 +6,15 @@ import numpy as np
 import pytest
 
 from drake_pose.camera.models import ParallelCamera
-from drake_pose.search.beam_search import BeamSearch
-from drake_pose.search.estimates import View
-from drake_pose.search.kameda import PaperSearch
-from drake_pose.search.sampled_body import SampledTree, Scoring
-from drake_pose.search.settings import BeamSearchSettings, PaperSearchSettings
+from drake_pose.search import (
+    BeamSearch,
+    BeamSearchSettings,
+    PaperSearch,
+    PaperSearchSettings,
+    SampledTree,
+    Scoring,
+    View,
+)
 from drake_pose.silhouette.areas.bending import TreeSurfaces
 from drake_pose.silhouette.areas.scoring import draw_mask
 from tests.body.skins import load_limb

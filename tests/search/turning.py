@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from drake_pose.body import ArticulatedModel, load_model
-from drake_pose.search.estimates import View
+from drake_pose.search import View
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from tests.jobs.scenes import LINK, camera
 

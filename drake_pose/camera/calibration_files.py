@@ -16,8 +16,7 @@ import cv2
 import numpy as np
 
 from drake_pose.arrays import Array
-from drake_pose.camera.lens import Lens
-from drake_pose.camera.models import check_number, check_pose, check_side, inverse_pose
+from drake_pose.camera.models import Lens, check_number, check_pose, check_side, inverse_pose
 from drake_pose.errors import CameraError
 from drake_pose.regular_files import read_regular
 from drake_pose.yaml_files import read_yaml

@@ -13,10 +13,10 @@ from drake_pose.camera.calibration_files import (
     calibrated_cameras,
     read_camera_content,
 )
-from drake_pose.camera.lens import Lens
 from drake_pose.camera.models import (
     HALF_PIXEL,
     Camera,
+    Lens,
     ParallelCamera,
     PinholeCamera,
     camera_tuple,

@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from drake_pose.body import landmarks_file, load_model
 from drake_pose.camera.camera_files import load_cameras
-from drake_pose.camera.episodes.open import open_episode
+from drake_pose.camera.episode_files import open_episode
 from drake_pose.csv_files import csv_text
 from drake_pose.errors import ClusterError, DrakePoseError, OutputError
 from drake_pose.files.folder import (

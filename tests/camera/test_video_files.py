@@ -6,9 +6,9 @@ import cv2
 import numpy as np
 import pytest
 
-from drake_pose.camera.video_files import TimedVideo, VideoPictures
+from drake_pose.camera.picture_files import TimedVideo, VideoPictures
 from drake_pose.errors import SceneError
-from tests.camera.episodes.recordings import number_of, write_video
+from tests.camera.recordings import number_of, write_video
 
 
 @pytest.mark.parametrize("codec", ["libx264", "libsvtav1", "mpeg4"])

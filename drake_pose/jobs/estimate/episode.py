@@ -13,10 +13,9 @@ from drake_pose.arrays import Array, Indices, Picture
 from drake_pose.body import PoseTree
 from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.camera.camera_files import load_camera_file
-from drake_pose.camera.episodes.episode import Episode, EpisodeCamera, JointLog
-from drake_pose.camera.episodes.folder import with_intrinsics
-from drake_pose.camera.episodes.joint_map import map_joints, read_joint_map
-from drake_pose.camera.episodes.open import open_episode
+from drake_pose.camera.episode import Episode, EpisodeCamera, JointLog
+from drake_pose.camera.episode_files import open_episode, with_intrinsics
+from drake_pose.camera.joint_map import map_joints, read_joint_map
 from drake_pose.camera.picture_files import frame_key
 from drake_pose.errors import SceneError, SettingsError, UnknownNameError
 from drake_pose.files.settings import EpisodeSettings

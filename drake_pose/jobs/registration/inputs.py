@@ -15,8 +15,8 @@ from drake_pose.arrays import Array, Picture
 from drake_pose.body import OBJECT, ArticulatedModel, PoseTree, RootRotation, load_model
 from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.camera.camera_files import CameraFile, load_camera_file
-from drake_pose.camera.episodes.episode import EpisodeCamera
-from drake_pose.camera.episodes.open import open_episode
+from drake_pose.camera.episode import EpisodeCamera
+from drake_pose.camera.episode_files import open_episode
 from drake_pose.camera.models import Camera, PinholeCamera
 from drake_pose.errors import CameraError, MaskError, SceneError, SettingsError, UnknownNameError
 from drake_pose.files.settings import EstimateSettings

@@ -6,8 +6,14 @@ from difflib import get_close_matches
 from pathlib import Path
 from typing import NamedTuple
 
-from drake_pose.camera.picture_files import SUFFIXES, frame_number, in_order, natural_key
-from drake_pose.camera.video_files import VIDEOS, VideoPictures
+from drake_pose.camera.picture_files import (
+    SUFFIXES,
+    VIDEOS,
+    VideoPictures,
+    frame_number,
+    in_order,
+    natural_key,
+)
 from drake_pose.errors import SceneError, SettingsError, UnknownNameError
 
 # Rates of videos that differ by more were not meant to be one.

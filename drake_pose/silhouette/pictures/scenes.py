@@ -13,8 +13,7 @@ import numpy as np
 
 from drake_pose.camera.camera_files import load_camera_file, load_cameras
 from drake_pose.camera.models import Camera, ParallelCamera
-from drake_pose.camera.picture_files import in_order, read_picture
-from drake_pose.camera.video_files import VIDEOS, VideoPictures
+from drake_pose.camera.picture_files import VIDEOS, VideoPictures, in_order, read_picture
 from drake_pose.errors import SceneError, SettingsError, UnknownNameError
 from drake_pose.silhouette.pictures.masks import read_mask
 from drake_pose.silhouette.pictures.scene_files import (

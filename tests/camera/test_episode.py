@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drake_pose.camera.episodes.episode import Episode, EpisodeCamera, JointLog, ascending
+from drake_pose.camera.episode import Episode, EpisodeCamera, JointLog, ascending
 from drake_pose.errors import SceneError, UnknownNameError
 
 TIMES = 0.1 * np.arange(20)

@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 
 from drake_pose.camera.camera_files import load_camera_file
-from drake_pose.camera.episodes.open import open_episode
+from drake_pose.camera.episode_files import open_episode
 from drake_pose.errors import CameraError, DrakePoseError, SceneError, SettingsError
-from tests.camera.episodes.recordings import (
+from tests.camera.recordings import (
     GRID,
     LENS,
     distorted,

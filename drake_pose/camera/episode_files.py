@@ -9,14 +9,22 @@ from pathlib import Path
 import numpy as np
 
 from drake_pose.arrays import Array, Picture
+from drake_pose.camera.bags import BAGS, open_bag
 from drake_pose.camera.camera_files import CameraFile, load_camera_file
-from drake_pose.camera.episodes.episode import Episode, EpisodeCamera, JointLog, ascending
+from drake_pose.camera.data_sets import INFO, TRAJECTORY, open_droid, open_lerobot
+from drake_pose.camera.episode import Episode, EpisodeCamera, JointLog, ascending
 from drake_pose.camera.models import PinholeCamera, check_number
-from drake_pose.camera.picture_files import frame_key, in_order, list_pictures, read_picture
+from drake_pose.camera.picture_files import (
+    VIDEOS,
+    TimedVideo,
+    frame_key,
+    in_order,
+    list_pictures,
+    read_picture,
+)
 from drake_pose.camera.source_files import CAMERAS, TIME_STAMPS, read_time_stamps
-from drake_pose.camera.video_files import VIDEOS, TimedVideo
 from drake_pose.csv_files import read_csv
-from drake_pose.errors import CameraError, SceneError
+from drake_pose.errors import CameraError, SceneError, SettingsError
 from drake_pose.yaml_files import read_yaml
 
 JOINT_TABLE = "joint_angles.csv"
@@ -158,3 +166,53 @@ def with_intrinsics(camera: EpisodeCamera, known: CameraFile, path: Path) -> Epi
     if lens is not None:
         found = lens.camera(found.name, found.X_WC)
     return replace(camera, camera=found, link=link, lens=lens)
+
+
+_EXPECTED = (
+    f"expected a LeRobot data set ({INFO}), a folder of DROID ({TRAJECTORY}), a bag (.bag, .mcap, "
+    ".db3, or a folder with metadata.yaml), or a folder with videos/<camera>.mp4 or "
+    "images/<camera>/<frame>.png"
+)
+# What is found in a folder is listed up to so many names.
+_LISTED = 8
+
+
+def open_episode(
+    path: str | Path, *, joints: str | Path | None = None, episode: int | None = None
+) -> Episode:
+    """Opens an episode in a folder or file of any of the formats in `tutorials/file_formats.md`.
+
+    Args:
+        joints: a table of joint positions, in place of the recording's own.
+        episode: its number in a LeRobot data set; None: the only one that is there.
+
+    Raises:
+        SceneError: names what was found and what is expected, or what is damaged or missing; and
+            the extra `episodes`, where a library of it is.
+        UnknownNameError: a data set has no such episode here.
+        SettingsError: a number for what holds one episode only.
+        CameraError: a camera file cannot be used.
+    """
+    path = Path(path)
+    if not path.exists():
+        raise SceneError(f"{path}: no such folder or file; {_EXPECTED}")
+    log, warnings = (None, []) if joints is None else read_joint_table(Path(joints))
+    if (path / INFO).exists():
+        found = open_lerobot(path, log, episode)
+        return replace(found, warnings=(*warnings, *found.warnings))
+    if episode is not None:
+        raise SettingsError(f"--episode {episode}: {path} is no LeRobot data set, but one episode")
+    inside = sorted(one.name for one in path.iterdir()) if path.is_dir() else []
+    bags = [path / name for name in inside if name.endswith(BAGS)]
+    if path.name == TRAJECTORY or TRAJECTORY in inside:
+        found = open_droid(path.parent if path.is_file() else path, log)
+    elif path.suffix in BAGS or "metadata.yaml" in inside:
+        found = open_bag(path, log)
+    elif {"images", "videos"} & set(inside):
+        found = open_folder(path, log)
+    elif len(bags) == 1:
+        found = open_bag(bags[0], log)
+    else:
+        what = ", ".join(inside[:_LISTED]) if path.is_dir() else "a file of another kind"
+        raise SceneError(f"{path}: is no episode: {what or 'empty'}; {_EXPECTED}")
+    return replace(found, warnings=(*warnings, *found.warnings))

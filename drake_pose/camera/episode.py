@@ -9,8 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from drake_pose.arrays import Array, Indices, Picture
-from drake_pose.camera.lens import Lens
-from drake_pose.camera.models import PinholeCamera
+from drake_pose.camera.models import Lens, PinholeCamera
 from drake_pose.camera.picture_files import frame_key
 from drake_pose.errors import SceneError, UnknownNameError
 

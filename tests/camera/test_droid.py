@@ -5,9 +5,9 @@ import json
 import numpy as np
 import pytest
 
-from drake_pose.camera.episodes.open import open_episode
+from drake_pose.camera.episode_files import open_episode
 from drake_pose.errors import SceneError
-from tests.camera.episodes.recordings import number_of, write_video
+from tests.camera.recordings import number_of, write_video
 
 START, COUNT = 1_691_000_000_123, 10  # [ms]
 EACH = 66.7 * np.arange(COUNT)

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from drake_pose.camera.episodes.open import open_episode
+from drake_pose.camera.episode_files import open_episode
 from drake_pose.errors import SceneError
-from tests.camera.episodes.recordings import (
+from tests.camera.recordings import (
     GRID,
     SIDE,
     K,

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from drake_pose.arrays import Array, Mask
-from drake_pose.camera.episodes.episode import JointLog
+from drake_pose.camera.episode import JointLog
 from drake_pose.camera.models import check_number
 from drake_pose.errors import CameraError, SceneError, SettingsError, UnknownNameError
 from drake_pose.yaml_files import read_yaml

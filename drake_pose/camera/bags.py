@@ -14,10 +14,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from drake_pose.arrays import Array, Indices, Picture
-from drake_pose.camera.episodes.episode import Episode, EpisodeCamera, JointLog, ascending
-from drake_pose.camera.lens import Lens
-from drake_pose.camera.picture_files import decode_colours
-from drake_pose.camera.video_files import import_reader
+from drake_pose.camera.episode import Episode, EpisodeCamera, JointLog, ascending
+from drake_pose.camera.models import Lens
+from drake_pose.camera.picture_files import decode_colours, import_reader
 from drake_pose.errors import DrakePoseError, SceneError
 
 BAGS = (".bag", ".mcap", ".db3")

@@ -6,9 +6,9 @@ import cv2
 import numpy as np
 import pytest
 
-from drake_pose.camera.episodes.open import open_episode
+from drake_pose.camera.episode_files import open_episode
 from drake_pose.errors import SceneError, UnknownNameError
-from tests.camera.episodes.recordings import number_of, numbered, write_video
+from tests.camera.recordings import number_of, numbered, write_video
 
 LENGTHS = {0: 8, 1: 6, 2: 9}
 TOP, WRIST, DEPTH = (f"observation.images.{name}" for name in ("top", "wrist", "depth"))

@@ -6,14 +6,14 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-from drake_pose.camera.episodes.episode import JointLog
-from drake_pose.camera.episodes.joint_map import (
+from drake_pose.camera.episode import JointLog
+from drake_pose.camera.episode_files import open_episode
+from drake_pose.camera.joint_map import (
     Column,
     map_joints,
     match_names,
     read_joint_map,
 )
-from drake_pose.camera.episodes.open import open_episode
 from drake_pose.errors import SceneError, SettingsError, UnknownNameError
 
 LOW = np.array([-2.9, -1.8, -2.9, -3.1, -2.9, -0.1, -2.9])

@@ -1,0 +1,296 @@
+"""Episodes of LeRobot data sets (2.0, 2.1: a file an episode; 3.0: many in a file) and of DROID.
+
+DROID's raw folders, `trajectory.h5` and a video of each ZED camera, are written by `robot_env.py`
+and `camera_utils/camera_readers/zed_camera.py` of droid-dataset/droid.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from drake_pose.arrays import Array, Picture
+from drake_pose.camera.episode import Episode, EpisodeCamera, JointLog, ascending
+from drake_pose.camera.models import PinholeCamera
+from drake_pose.camera.picture_files import TimedVideo, decode_colours, import_reader
+from drake_pose.errors import SceneError, UnknownNameError, listed
+from drake_pose.regular_files import read_regular, require_regular
+
+INFO = Path("meta", "info.json")
+TRAJECTORY = "trajectory.h5"
+
+
+def open_lerobot(path: Path, joints: JointLog | None, episode: int | None) -> Episode:
+    """Opens an episode of a LeRobot data set, which may be here in part.
+
+    Args:
+        joints: in place of its `observation.state`.
+        episode: its number; None: the only one that is here.
+
+    Raises:
+        SceneError: files cannot be read or are not as `meta/info.json` says, or several episodes
+            are here and none was asked for.
+        UnknownNameError: the episode is not here.
+    """
+    parquet, state = import_reader("pyarrow.parquet", path), "observation.state"
+    try:
+        info = json.loads(read_regular(path / INFO))
+        rows = _episode_rows(path, info, parquet)
+        number, features = _choose_episode(path, info, rows, episode), info["features"]
+        states = [key for key in features if key == state or key.startswith(f"{state}.")]
+        states = [state] if state in states else states
+        pictures = [key for key, one in features.items() if one["dtype"] in ("video", "image")]
+        own = [key for key in pictures if features[key]["dtype"] == "image"]
+        file, wanted = _file(path, info, rows, number), ["timestamp", *states, *own]
+        filters = [("episode_index", "=", number)]
+        table = parquet.read_table(file, columns=wanted, filters=filters)
+        columns = {key: table[key].to_pylist() for key in wanted}
+        times = np.array(columns["timestamp"], dtype=np.float64).ravel()
+        kept, warnings = ascending(times, f"{file}: episode {number}")
+        if joints is None and states:
+            values = [np.array(columns[key], dtype=np.float64) for key in states]
+            positions = np.column_stack([one.reshape(len(times), -1) for one in values])
+            names = [name for key in states for name in _names(key, features[key])]
+            # Names with their places where several are the same.
+            names = [n if names.count(n) == 1 else f"{n}_{k}" for k, n in enumerate(names)]
+            joints = JointLog(tuple(names), times[kept], positions[kept])
+        cameras = []
+        for key in pictures:
+            said = {**features[key], **(features[key].get("info") or {})}
+            if any("is_depth" in field and value is True for field, value in said.items()):
+                continue
+            name = key.removeprefix("observation.").removeprefix("images.")
+            if key in own:
+                read = _stored_pictures([columns[key][k]["bytes"] for k in kept], file)
+                height, width = read(0).shape[:2]
+                cameras.append(EpisodeCamera(name, width, height, times[kept], None, None, read))
+                continue
+            video = _file(path, info, rows, number, key)
+            if not video.is_file():
+                warnings.append(f"camera '{name}' is left out: {video} is not here")
+                continue
+            span = np.array([0.0, np.inf])
+            if rows is not None:
+                ends = ("from_timestamp", "to_timestamp")
+                span = np.array([float(rows[number][f"videos/{key}/{end}"]) for end in ends])
+            half = 0.5 / float(info["fps"])
+            cameras.append(_video_camera(name, video, span, half, len(times), warnings))
+    # What a damaged file, or one that lacks something, makes Python and pyarrow raise.
+    except (
+        OSError, ValueError, LookupError, TypeError, AttributeError, NotImplementedError
+    ) as error:  # fmt: skip
+        raise SceneError(
+            f"{path}: not a LeRobot data set of version 2 or 3, or a file of it is damaged "
+            f"({type(error).__name__}: {error})"
+        ) from error
+    return Episode.checked(path, cameras, joints, warnings)
+
+
+_Rows = Mapping[int, Mapping[str, Any]] | None
+"""Of a data set of version 3 the row of each episode's meta data."""
+
+
+def _episode_rows(path: Path, info: Mapping[str, Any], parquet: Any) -> _Rows:
+    """The rows of `meta/episodes`; None: version 2. SceneError: it is of another version."""
+    version = str(info["codebase_version"])
+    if not version.startswith(("v2.", "v3.")):
+        raise SceneError(
+            f"{path / INFO}: a LeRobot data set of version {version}, but 2.0, 2.1 and 3.0 are "
+            "read: convert it by LeRobot's own scripts"
+        )
+    if version.startswith("v2."):
+        return None
+    rows: dict[int, dict[str, Any]] = {}
+    for file in sorted(path.glob("meta/episodes/*/*.parquet")):
+        # Statistics are most of the columns, and of no use here.
+        known = parquet.read_schema(file).names
+        used = [name for name in known if name.startswith(("episode_index", "data/", "videos/"))]
+        found = parquet.read_table(file, columns=used).to_pylist()
+        rows |= {row["episode_index"]: row for row in found}
+    return rows
+
+
+def _file(path: Path, info: Mapping[str, Any], rows: _Rows, number: int, key: str = "") -> Path:
+    """The file of an episode's data, or of a camera's pictures."""
+    chunk = number // int(info.get("chunks_size", 1000))
+    values = {"video_key": key, "episode_index": number, "episode_chunk": chunk}
+    if rows is not None:
+        where = f"videos/{key}" if key else "data"
+        for name in ("chunk_index", "file_index"):
+            values[name] = rows[number][f"{where}/{name}"]
+    return path / info["video_path" if key else "data_path"].format(**values)
+
+
+def _choose_episode(path: Path, info: Mapping[str, Any], rows: _Rows, wanted: int | None) -> int:
+    """The episode that is asked for, or the only one of which the data are here."""
+    numbers = list(rows or range(int(info["total_episodes"])))
+    asked = numbers if wanted is None else [one for one in numbers if one == wanted]
+    here = [one for one in asked if _file(path, info, rows, one).is_file()]
+    if len(here) == 1:
+        return here[0]
+    here = [one for one in numbers if _file(path, info, rows, one).is_file()]
+    names = listed([*map(str, here)], 20)
+    if wanted is not None:
+        raise UnknownNameError("episode", str(wanted), [names] if names else [], str(path))
+    raise SceneError(
+        f"{path}: say which episode (--episode N): of {len(numbers)} these are here: "
+        f"{names or 'none'}"
+    )
+
+
+def _names(key: str, feature: Mapping[str, Any]) -> list[str]:
+    """The names of a vector's entries, which may be lists in each other; else numbers."""
+    size, names = int(np.prod(feature["shape"])), feature.get("names")
+    if isinstance(names, dict):
+        names = [one if isinstance(one, list) else name for name, one in names.items()]
+    while names and isinstance(names[0], list):
+        names = [name for part in names for name in part]
+    if names and len(names) == size:
+        return [str(name) for name in names]
+    last = key.removeprefix("observation.state").lstrip(".") or "joint"
+    return [f"{last}_{k}" for k in range(size)] if size > 1 else [last]
+
+
+def _stored_pictures(stored: Sequence[bytes], file: Path) -> Callable[[int], Picture]:
+    """What gives a picture of a table that holds them as PNG or JPEG."""
+    return lambda k: decode_colours(stored[k], file, SceneError)
+
+
+def _video_camera(
+    name: str, file: Path, span: Array, half: float, count: int, warnings: list[str]
+) -> EpisodeCamera:
+    """A camera whose pictures are those of a video's span [s], begun half a period earlier."""
+    video = TimedVideo(file)
+    first, last = np.searchsorted(video.times, span - half).tolist()
+    if first == last:
+        raise SceneError(
+            f"{file}: ends at {video.times[-1]:.3f} s, but the episode is from {span[0]:.3f} s on"
+        )
+    warnings += video.warnings
+    if last - first != count:
+        warnings.append(
+            f"camera '{name}': has {last - first} pictures of {count} rows: some were dropped or "
+            "repeated, so that they may drift apart"
+        )
+
+    def recorded(k: int) -> Picture:
+        return video.read(first + k)
+
+    times = video.times[first:last] - span[0]
+    return EpisodeCamera(name, video.width, video.height, times, None, None, recorded)
+
+
+def open_droid(path: Path, joints: JointLog | None) -> Episode:
+    """Opens a folder with `trajectory.h5` and `recordings/MP4/<serial>.mp4`.
+
+    Picture k is that of row k, at the time stamp that it has there; or at that of
+    `<serial>_timestamps.json`, where it lies beside the video. The arm's joints are joint1 to
+    joint7 [rad]; gripper_position is 0 where it is open and 1 where it is closed.
+
+    Args:
+        joints: in place of its own.
+
+    Raises SceneError: names what is missing or damaged.
+    """
+    h5py = import_reader("h5py", path)
+    where, folder = path / TRAJECTORY, path / "recordings" / "MP4"
+    state, stamps = "observation/robot_state", "observation/timestamp/robot_state"
+    cameras: list[EpisodeCamera] = []
+    try:
+        require_regular(where)
+        with h5py.File(where) as file:
+            arm, gripper, start, end = (
+                _dataset(file, name, where)
+                for name in (
+                    *(f"{state}/joint_positions", f"{state}/gripper_position"),
+                    *(f"{stamps}/read_start", f"{stamps}/read_end"),
+                )
+            )
+            times = 1e-3 * 0.5 * (start + end)
+            kept, warnings = ascending(times, f"{where}: rows")
+            names = (*(f"joint{k + 1}" for k in range(arm.shape[1])), "gripper_position")
+            own = JointLog(names, times[kept], np.column_stack([arm, gripper])[kept])
+            for video in sorted(folder.glob("*.mp4")):
+                cameras += _zed_cameras(file, video, warnings)
+    except (OSError, ValueError, LookupError, RuntimeError) as error:
+        raise SceneError(f"{where}: cut short or damaged: {error}") from error
+    if not cameras:
+        raise SceneError(
+            f"{folder}: holds no <serial>.mp4; a recordings/SVO of the cameras' own format has to "
+            "be exported as MP4 first (svo_to_mp4.py of DROID)"
+        )
+    return Episode.checked(path, cameras, joints or own, warnings)
+
+
+def _dataset(file: Any, name: str, where: Path) -> Array:
+    """A table of the file; SceneError, which says what is there instead, where there is none."""
+    found = file
+    for part in name.split("/"):
+        if part not in found:
+            raise SceneError(f"{where}: has no {name}; {found.name} has: {', '.join(found)}")
+        found = found[part]
+    return np.asarray(found[()], dtype=np.float64)
+
+
+def _zed_cameras(
+    file: Any,
+    path: Path,
+    warnings: list[str],
+    *,
+    stereo: float = 2.5,
+    calibrated: tuple[int, int] = (1280, 720),
+) -> list[EpisodeCamera]:
+    """The camera of a video, or both of a stereo one, whose pictures are side by side.
+
+    Args:
+        stereo: pictures more than so many times as wide as high are two.
+        calibrated: width and height of the pictures that the intrinsics are of: HD720 [pixel].
+    """
+    video, serial = TimedVideo(path), path.stem.removesuffix("-stereo")
+    times = _picture_times(file, path, serial, len(video.times), warnings)
+    kept, late = ascending(times, f"{path}: pictures")
+    hand = file.get(f"observation/camera_type/{serial}")
+    if hand is not None and not np.any(hand[()]):
+        late.append(f"camera '{serial}' is the hand's (camera_type 0): it rides on the arm")
+    warnings += [*video.warnings, *late]
+    sides = ("_left", "_right") if video.width > stereo * video.height else ("",)
+    width, cameras = video.width // len(sides), []
+    for k, side in enumerate(sides):
+        name, camera = f"{serial}{side}", None
+        matrix = file.get(f"observation/camera_intrinsics/{serial}{side or '_left'}")
+        if matrix is not None:
+            fx, _, cx, _, fy, cy = np.ravel(matrix[()])[:6].tolist()
+            camera = PinholeCamera(name, *calibrated, fx, fy, cx, cy, np.eye(4))
+            camera = camera.resized(width, video.height)
+
+        def recorded(number: int, begin: int = k * width) -> Picture:
+            picture = video.read(int(kept[number]))
+            return np.ascontiguousarray(picture[:, begin : begin + width])
+
+        size = width, video.height
+        cameras.append(EpisodeCamera(name, *size, times[kept], camera, None, recorded))
+    return cameras
+
+
+def _picture_times(file: Any, path: Path, serial: str, count: int, warnings: list[str]) -> Array:
+    """When each of a video's pictures was taken [s], as far as there are time stamps."""
+    stamps = "observation/timestamp/cameras"
+    kinds = ("estimated_capture", "frame_received", "read_end")
+    known = [kind for kind in kinds if f"{stamps}/{serial}_{kind}" in file] or [kinds[0]]
+    read = [_dataset(file, f"{stamps}/{serial}_{kind}", path) for kind in known]
+    times, source = read[0], TRAJECTORY
+    beside = path.with_name(f"{path.stem}_timestamps.json")
+    if beside.exists():
+        # These are times of receipt: what the camera took until then is told by the rows.
+        delay = np.median(read[1] - times) if known[:2] == [*kinds[:2]] else 0.0
+        times, source = np.array(json.loads(read_regular(beside))) - delay, beside.name
+    if len(times) != count:
+        warnings.append(
+            f"{path}: has {count} pictures, but {source} {len(times)} times: they are taken one by "
+            "one from the first on, which may be off by as many, and the rest is left out"
+        )
+    return 1e-3 * times[:count]  # Stamps are milliseconds.

@@ -21,9 +21,6 @@ from drake_pose.person.date.features import (
 )
 from drake_pose.person.date.skeleton import LIMBS
 from drake_pose.person.date.walking import REGISTERED, UPRIGHT, Motion, make_motion
-from drake_pose.systems.date import (
-    PaperSettings,
-)
 from drake_pose.systems.images import picture_to_colour_image
 
 SHOWN_CAMERA = "camera_0"
@@ -73,7 +70,7 @@ class DateResult:
         renderer = "own" if studio.own_drawing else "drake"
         self._settings = {"seed": seed, "method": method, "renderer": renderer}
         setup = studio.prepare(motion.q[0])
-        alone = replace(setup, settings=PaperSettings(search=False))
+        alone = replace(setup, search=False)
         self._tracks: dict[str, PaperTrack | SilhouetteTrack] = {
             "ik_only": PaperTrack.build(alone),
             "paper": PaperTrack.build(setup),

@@ -6,6 +6,7 @@ import time
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -37,12 +38,12 @@ from drake_pose.silhouette.segmentation.background import Background, learn_back
 from drake_pose.systems.cameras import CameraRig, build_camera_rig
 from drake_pose.systems.date import (
     CaptureSetup,
-    PaperCapture,
+    PaperPoseEstimator,
     build_paper_capture,
     prepare_paper_capture,
 )
 from drake_pose.systems.images import colour_image_to_picture
-from drake_pose.systems.person import SilhouetteCapture, build_silhouette_capture
+from drake_pose.systems.person import PersonTracker, build_silhouette_capture
 from drake_pose.systems.ports import StagedDiagram
 
 # A power of two: the time from frame to frame is exactly the same, and so is the motion expected.
@@ -173,7 +174,7 @@ def noisy(picture: Picture, generator: np.random.Generator, deviation: float = 3
 class _StagedRun:
     """A diagram that is run frame by frame, with the processor time of each frame's stages [ms]."""
 
-    def __init__(self, staged: StagedDiagram) -> None:
+    def __init__(self, staged: StagedDiagram[Any]) -> None:
         self.milliseconds: list[Mapping[str, float]] = []
         self._staged = staged
         self._simulator = Simulator(staged.diagram)
@@ -211,7 +212,7 @@ class _StagedRun:
 class PaperTrack(_StagedRun):
     """The paper's way; frames in which the registered pose is recognised add no milliseconds."""
 
-    def __init__(self, capture: PaperCapture) -> None:
+    def __init__(self, capture: StagedDiagram[PaperPoseEstimator]) -> None:
         super().__init__(capture)
         self._capture = capture
 
@@ -264,7 +265,7 @@ class PaperTrack(_StagedRun):
         if face is None:
             return views, found, ()
         nearest, outside = nearest_template(face, templates)
-        if outside > setup.settings.farthest_face:
+        if outside > setup.farthest_face:
             return views, found, ()
         flat = templates.mean + templates.coordinates[nearest] @ templates.basis
         template = np.clip(flat, 0, 255).astype(np.uint8).reshape(*FACE_SIZE[::-1], 3)
@@ -288,7 +289,7 @@ class SilhouetteTrack(_StagedRun):
 
     def __init__(
         self,
-        capture: SilhouetteCapture,
+        capture: StagedDiagram[PersonTracker],
         tracker: PersonPoseTracker,
         shared: SilhouetteTrack | None = None,
     ) -> None:
@@ -313,7 +314,7 @@ class SilhouetteTrack(_StagedRun):
             self._finish_frame(self._capture.stages)
         else:
             # What a fixed input is given comes before what the diagram connects it to.
-            person = self._capture.person
+            person = self._capture.estimator
             own = person.GetMyMutableContextFromRoot(self.context)
             other = person.GetMyContextFromRoot(self._shared.context)
             for name in images:
@@ -340,12 +341,12 @@ class SilhouetteTrack(_StagedRun):
         self._set_state(self._tracker.start(self._tracker.values(q)))
 
     def _state(self) -> TrackState:
-        person = self._capture.person
+        person = self._capture.estimator
         state = person.known_person(person.GetMyContextFromRoot(self.context))
         if state is None:
             raise SettingsError("fewer than two cameras saw a person in the first frame")
         return state
 
     def _set_state(self, state: TrackState) -> None:
-        person = self._capture.person
+        person = self._capture.estimator
         person.set_person(person.GetMyMutableContextFromRoot(self.context), state)

@@ -55,22 +55,6 @@ from drake_pose.systems.ports import (
 )
 
 
-@dataclass(frozen=True)
-class PaperSettings:
-    """How the paper's system captures.
-
-    Args:
-        search: whether elbows and knees are searched on their circles; see estimate_pose.
-        recognition: similarity from which the registered pose overwrites the state.
-        farthest_face: how far from the eigenspace a face may be [grey levels].
-    """
-
-    skin: SkinColour = field(default_factory=SkinColour)
-    search: bool = True
-    recognition: float = 0.93
-    farthest_face: float = 30.0
-
-
 @dataclass(frozen=True, eq=False)
 class CaptureSetup:
     """What stays the same from frame to frame.
@@ -78,6 +62,9 @@ class CaptureSetup:
     Args:
         cameras: on the circle, by name.
         backgrounds: by camera, the face camera's among them; a camera without one needs masks.
+        search: whether elbows and knees are searched on their circles; see estimate_pose.
+        recognition: similarity from which the registered pose overwrites the state.
+        farthest_face: how far from the eigenspace a face may be [grey levels].
 
     Raises:
         SettingsError: fewer than two cameras, or the face camera has the name of another.
@@ -89,7 +76,10 @@ class CaptureSetup:
     faces: FaceTemplates | None = None
     registered: RegisteredPose | None = None
     backgrounds: Mapping[str, Background] = field(default_factory=dict)
-    settings: PaperSettings = field(default_factory=PaperSettings)
+    skin: SkinColour = field(default_factory=SkinColour)
+    search: bool = True
+    recognition: float = 0.93
+    farthest_face: float = 30.0
 
     def __post_init__(self) -> None:
         if len(self.cameras) < 2:
@@ -108,7 +98,6 @@ def prepare_paper_capture(
     q: Array,
     pictures: Mapping[str, Picture],
     backgrounds: Mapping[str, Background],
-    settings: PaperSettings | None = None,
     faces: FaceTemplates | None = None,
 ) -> CaptureSetup:
     """Makes the setup of a capture while the person shows the registered pose.
@@ -121,7 +110,6 @@ def prepare_paper_capture(
         q: (nq,) where the person stands, in the registered pose [rad or m].
         pictures: (H, W, 3) that the cameras on the circle take of it, red, green, blue.
         backgrounds: by camera.
-        settings: how to capture.
         faces: templates of the person's face; rendered ones where not given.
 
     Raises:
@@ -131,28 +119,20 @@ def prepare_paper_capture(
     """
     if face_camera is not None and face_camera not in cameras:
         raise UnknownNameError("camera", face_camera, cameras, "the rig")
-    settings = settings or PaperSettings()
+    skin = SkinColour()
     ring = {name: camera for name, camera in cameras.items() if name != face_camera}
     own = load_skeleton(model)
     views = [
-        see_person(pictures[n], person_region(pictures[n], backgrounds[n]), settings.skin)
-        for n in ring
+        see_person(pictures[n], person_region(pictures[n], backgrounds[n]), skin) for n in ring
     ]
     seen = find_features(list(ring.values()), views, own.features(q))
     places = np.where(seen.support[:, None] > 0, seen.places, np.nan)
     skeleton = own.with_features(q, places)
     registered = render_registered_pose(skeleton, q, ring)
     if face_camera is not None and faces is None:
-        faces = learn_rendered_faces(model, own, q, settings.skin)
-    return CaptureSetup(
-        skeleton,
-        ring,
-        None if face_camera is None else cameras[face_camera],
-        faces,
-        registered,
-        backgrounds,
-        settings,
-    )
+        faces = learn_rendered_faces(model, own, q, skin)
+    face = None if face_camera is None else cameras[face_camera]
+    return CaptureSetup(skeleton, ring, face, faces, registered, backgrounds, skin)
 
 
 def render_registered_pose(
@@ -454,7 +434,7 @@ class PaperPoseEstimator(MemorySystem):
             angles,
             cameras,
             [view.region for view in views],
-            search=self.setup.settings.search,
+            search=self.setup.search,
         )
         return {
             "estimated_positions": q,
@@ -479,19 +459,12 @@ class PaperPoseEstimator(MemorySystem):
         return value if value is not None and np.isfinite(value).all() else None
 
 
-@dataclass(frozen=True, eq=False)
-class PaperCapture(StagedDiagram):
-    """A diagram of the paper's capture; its estimator keeps what one frame hands to the next."""
-
-    estimator: PaperPoseEstimator
-
-
 def build_paper_capture(
     setup: CaptureSetup,
     source: System | None = None,
     period: float = 1.0 / 30.0,
     meshcat: Meshcat | None = None,
-) -> PaperCapture:
+) -> StagedDiagram[PaperPoseEstimator]:
     """Wire images to the paper's stages, these to the pose, and that to the avatar.
 
     The diagram's outputs are those of ``PaperPoseEstimator``, ``person_view_<camera>``, where
@@ -516,26 +489,46 @@ def build_paper_capture(
         for index in range(source.num_input_ports()):
             port = source.get_input_port(InputPortIndex(index))
             builder.ExportInput(port, port.get_name())
-    images, wanted = _add_images(builder, setup)
-    views = {name: image.GetOutputPort("person_view") for name, image in images.items()}
-    stages: dict[str, tuple[OutputPort, ...]] = {
-        "region": tuple(image.region for image in images.values()),
-        "skin": tuple(views.values()),
-    }
+    face, cameras = setup.face_camera, list(setup.cameras.values())
+    views: dict[str, OutputPort] = {}
+    wanted: dict[str, list[InputPort]] = {}
+    regions = []
+    for camera in [*cameras, *([] if face is None else [face])]:
+        name = camera.name
+        image = HorizontalImage(camera, setup.backgrounds.get(name), setup.skin)
+        builder.AddNamedSystem(f"horizontal_image_{name}", image)
+        regions.append(image.region)
+        views[name] = image.GetOutputPort("person_view")
+        builder.ExportOutput(views[name], f"person_view_{name}")
+        wanted |= {f"{kind}_{name}": [image.GetInputPort(kind)] for kind in image.wanted}
+    stages = {"region": tuple(regions), "skin": tuple(views.values())}
+    # By stage what comes between images and pose, and its outputs, the estimator's first.
+    parts: dict[str, tuple[System, tuple[str, ...]]] = {}
+    if setup.registered is not None:
+        recogniser = PoseRecogniser(setup.skeleton, setup.registered, cameras, setup.recognition)
+        parts["recognition"] = recogniser, ("recognised_positions", "similarity")
+    parts["features"] = FeatureFinder(cameras), ("features",)
+    if face is not None and setup.faces is not None:
+        finder = FaceDirectionFinder(face, setup.faces, setup.farthest_face)
+        parts["face"] = finder, ("face_direction",)
     estimator = PaperPoseEstimator(setup, period)
-    builder.AddNamedSystem("pose", estimator)
-    _connect_views(builder, views, estimator)
-    for stage, (system, results) in _parts(setup).items():
+    for stage, (system, results) in {**parts, "pose": (estimator, ())}.items():
         builder.AddNamedSystem(stage, system)
-        stages[stage] = (system.GetOutputPort(results[0]),)
-        if isinstance(system, FaceDirectionFinder):
-            builder.Connect(views[system.camera], system.GetInputPort("person_view"))
-            wanted[f"color_image_{system.camera}"].append(system.GetInputPort("color_image"))
-        _connect_views(builder, views, system)
-        connect_same(builder, system, estimator)
-        connect_same(builder, estimator, system)
+        for camera in cameras:
+            if system.HasInputPort(f"person_view_{camera.name}"):
+                port = system.GetInputPort(f"person_view_{camera.name}")
+                builder.Connect(views[camera.name], port)
+        if system is not estimator:
+            stages[stage] = (system.GetOutputPort(results[0]),)
         for name in results if stage != "features" else ():
             builder.ExportOutput(system.GetOutputPort(name), name)
+    if face is not None and "face" in parts:
+        finder = parts["face"][0]
+        builder.Connect(views[face.name], finder.GetInputPort("person_view"))
+        wanted[f"color_image_{face.name}"].append(finder.GetInputPort("color_image"))
+    for system, _ in parts.values():
+        connect_same(builder, system, estimator)
+        connect_same(builder, estimator, system)
     connect_images(builder, source, wanted)
     if source is not None:
         connect_same(builder, source, estimator)
@@ -545,43 +538,4 @@ def build_paper_capture(
     if meshcat is not None:
         positions = estimator.GetOutputPort("estimated_positions")
         add_avatar(builder, setup.skeleton.model, positions, meshcat, "avatar", period)
-    return PaperCapture(builder.Build(), stages, estimator)
-
-
-def _parts(setup: CaptureSetup) -> dict[str, tuple[System, tuple[str, ...]]]:
-    """By stage what comes between images and pose, and its outputs, the estimator's first."""
-    parts: dict[str, tuple[System, tuple[str, ...]]] = {}
-    cameras, settings = list(setup.cameras.values()), setup.settings
-    if setup.registered is not None:
-        recogniser = PoseRecogniser(setup.skeleton, setup.registered, cameras, settings.recognition)
-        parts["recognition"] = recogniser, ("recognised_positions", "similarity")
-    parts["features"] = FeatureFinder(cameras), ("features",)
-    if setup.face_camera is not None and setup.faces is not None:
-        face = FaceDirectionFinder(setup.face_camera, setup.faces, settings.farthest_face)
-        parts["face"] = face, ("face_direction",)
-    return parts
-
-
-def _connect_views(
-    builder: DiagramBuilder, views: Mapping[str, OutputPort], system: System
-) -> None:
-    """Connects what the cameras on the circle saw."""
-    for name, port in views.items():
-        if system.HasInputPort(f"person_view_{name}"):
-            builder.Connect(port, system.GetInputPort(f"person_view_{name}"))
-
-
-def _add_images(
-    builder: DiagramBuilder, setup: CaptureSetup
-) -> tuple[dict[str, HorizontalImage], dict[str, list[InputPort]]]:
-    """One HorizontalImage a camera, the face camera's last, and the images that they want."""
-    images: dict[str, HorizontalImage] = {}
-    wanted: dict[str, list[InputPort]] = {}
-    face = setup.face_camera
-    for camera in [*setup.cameras.values(), *([] if face is None else [face])]:
-        name = camera.name
-        image = HorizontalImage(camera, setup.backgrounds.get(name), setup.settings.skin)
-        images[name] = builder.AddNamedSystem(f"horizontal_image_{name}", image)
-        builder.ExportOutput(image.GetOutputPort("person_view"), f"person_view_{name}")
-        wanted |= {f"{kind}_{name}": [image.GetInputPort(kind)] for kind in image.wanted}
-    return images, wanted
+    return StagedDiagram(builder.Build(), stages, estimator)

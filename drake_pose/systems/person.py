@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -410,13 +410,6 @@ def build_live_capture(
     return builder.Build()
 
 
-@dataclass(frozen=True, eq=False)
-class SilhouetteCapture(StagedDiagram):
-    """A diagram of the capture. person: keeps what one frame hands to the next."""
-
-    person: PersonTracker
-
-
 def build_silhouette_capture(
     tracker: PersonPoseTracker,
     cameras: Mapping[str, Camera],
@@ -425,7 +418,7 @@ def build_silhouette_capture(
     edge_points: float = EDGE_POINTS,
     source: System | None = None,
     meshcat: Meshcat | None = None,
-) -> SilhouetteCapture:
+) -> StagedDiagram[PersonTracker]:
     """Wire the cameras' images to their sensors, and these to what follows the person.
 
     The diagram's inputs are ``color_image_<camera>``, its outputs those of PersonTracker, and its
@@ -457,4 +450,4 @@ def build_silhouette_capture(
     export_outputs(builder, person)
     regions = tuple(sensor.region for sensor in sensors.values())
     stages = {"region": regions, "edge": tuple(edges.values())}
-    return SilhouetteCapture(builder.Build(), stages, person)
+    return StagedDiagram(builder.Build(), stages, person)

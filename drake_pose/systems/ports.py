@@ -81,8 +81,8 @@ def evaluate(port: OutputPort, context: Context) -> Any:
 
 
 @dataclass(frozen=True, eq=False)
-class StagedDiagram:
-    """A diagram, and what is computed in it before its state is updated.
+class StagedDiagram(Generic[T]):
+    """A diagram with an estimator, and what is computed in it before its state is updated.
 
     Args:
         stages: the output ports of each stage, in their order: whoever evaluates one after the
@@ -91,6 +91,7 @@ class StagedDiagram:
 
     diagram: Diagram
     stages: Mapping[str, tuple[OutputPort, ...]]
+    estimator: T
 
     def evaluate(self, context: Context, stage: str) -> None:
         """Have a stage, one of stages, compute what it has not computed yet."""

@@ -94,9 +94,9 @@ class Core:
         self.setup, self.q, self.features = setup, None, None
 
     def step(self, pictures):
-        setup, settings = self.setup, self.setup.settings
+        setup = self.setup
         views = {
-            name: see_person(shot, person_region(shot, setup.backgrounds[name]), settings.skin)
+            name: see_person(shot, person_region(shot, setup.backgrounds[name]), setup.skin)
             for name, shot in pictures.items()
             if shot is not None
         }
@@ -104,7 +104,7 @@ class Core:
         cameras, seen = [setup.cameras[n] for n in names], [views[n] for n in names]
         found = recognise(
             setup.skeleton, setup.registered, cameras, [view.contour for view in seen],
-            settings.recognition,
+            setup.recognition,
         )  # fmt: skip
         if found is not None:
             self.q, _ = found
@@ -114,7 +114,7 @@ class Core:
         angles = None
         if FACE_CAMERA in views:
             blobs = views[FACE_CAMERA].blobs
-            direction = find_face(pictures[FACE_CAMERA], blobs, setup.faces, settings.farthest_face)
+            direction = find_face(pictures[FACE_CAMERA], blobs, setup.faces, setup.farthest_face)
             if np.isfinite(direction).all():
                 angles = head_angles(direction, self.features[0], setup.face_camera)
         regions = [view.region for view in seen]

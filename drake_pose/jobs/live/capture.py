@@ -236,7 +236,7 @@ def find_registered_pose(
             f"{path}: two cameras never saw a person whole at the same time: compare the "
             "pictures with those of the empty room"
         )
-    (q, similarity), needed = best, blank.settings.recognition
+    (q, similarity), needed = best, blank.recognition
     if similarity < needed:
         raise SettingsError(
             f"{path}: nobody showed the registered pose, upright with both arms spread: the "
@@ -291,7 +291,7 @@ def _best_moment(
                     }
                     best, since = found, 0
                     shown = {k: colour_image_to_picture(one).copy() for k, one in images.items()}
-        is_sure = best is not None and best[1] >= setup.settings.recognition
+        is_sure = best is not None and best[1] >= setup.recognition
         return is_sure and since >= more_moments
 
     look_until(diagram, sensors, look, on_report)

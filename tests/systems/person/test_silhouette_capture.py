@@ -50,10 +50,10 @@ def test_diagram_is_the_plain_functions_in_turn(studio, cameras, backgrounds, tr
     assert not capture.diagram.HasOutputPort("deviations")
     run = Bench(capture.diagram)
     simulator = Simulator(capture.diagram, run.context)
-    own = capture.person.GetMyMutableContextFromRoot(run.context)
-    assert capture.person.known_person(own) is None
+    own = capture.estimator.GetMyMutableContextFromRoot(run.context)
+    assert capture.estimator.known_person(own) is None
     state = tracker.start(tracker.values(path[0]))
-    capture.person.set_person(own, state)
+    capture.estimator.set_person(own, state)
     for k, q in enumerate(path):
         if k:
             simulator.AdvanceTo(PERIOD * k)
@@ -69,7 +69,7 @@ def test_diagram_is_the_plain_functions_in_turn(studio, cameras, backgrounds, tr
         state = tracker.follow(state, FrameViews(list(cameras.values()), views))
         positions = tracker.positions(state.values)
         np.testing.assert_array_equal(run["estimated_positions"], positions)
-        known = capture.person.known_person(own)
+        known = capture.estimator.known_person(own)
         for name in ("share", "usual", "troubled", "step"):
             np.testing.assert_array_equal(getattr(known, name), getattr(state, name))
     elbow = studio.model.position_index("left_upper_arm_z")
@@ -79,15 +79,15 @@ def test_diagram_is_the_plain_functions_in_turn(studio, cameras, backgrounds, tr
 def test_person_said_to_be_lost_has_no_estimated_positions(cameras, backgrounds, tracker, path):
     capture = build_silhouette_capture(tracker, cameras, backgrounds, PERIOD)
     context = capture.diagram.CreateDefaultContext()
-    own = capture.person.GetMyMutableContextFromRoot(context)
+    own = capture.estimator.GetMyMutableContextFromRoot(context)
     estimated = capture.diagram.GetOutputPort("estimated_positions")
     state = tracker.start(tracker.values(path[1]))
-    capture.person.set_person(own, state)
+    capture.estimator.set_person(own, state)
     np.testing.assert_allclose(estimated.Eval(context), path[1])
     lost = type(state)(state.values, state.step, 0.1, state.usual)
-    capture.person.set_person(own, lost)
+    capture.estimator.set_person(own, lost)
     assert np.isnan(estimated.Eval(context)).all()
-    assert capture.person.known_person(own).share == 0.1
+    assert capture.estimator.known_person(own).share == 0.1
 
 
 def test_every_camera_needs_a_background(cameras, backgrounds, tracker):

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from drake_pose.body.link_graph import ChainStep
+from drake_pose.body.link_graph import JointMap
 from drake_pose.compiled import compiled, multiply
 
 
@@ -61,16 +61,14 @@ def join_bands(bands: Sequence[PackedBands]) -> PackedBands:
     )
 
 
-def pack_steps(steps: Sequence[ChainStep]) -> PackedSteps:
+def pack_steps(steps: Sequence[JointMap]) -> PackedSteps:
     """Joints in arrays."""
-    rows = [len(step.joint_map.coefficients) for step in steps]
+    rows = [len(step.coefficients) for step in steps]
     return PackedSteps(
-        sizes=np.array([step.joint_map.position_count for step in steps], dtype=np.int64),
+        sizes=np.array([step.position_count for step in steps], dtype=np.int64),
         inverted=np.array([step.inverted for step in steps], dtype=np.bool_),
         starts=np.cumsum([0, *rows])[:-1].astype(np.int64),
-        coefficients=np.vstack(
-            [np.zeros((0, 16)), *(step.joint_map.coefficients for step in steps)]
-        ),
+        coefficients=np.vstack([np.zeros((0, 16)), *(step.coefficients for step in steps)]),
     )
 
 

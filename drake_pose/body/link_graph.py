@@ -35,11 +35,13 @@ def inverse_transforms(X: Array) -> Array:
 class JointMap:
     """The pose X_AC(values) of a joint's outer link frame C in its inner link frame A.
 
-    ``coefficients``: (4^k, 16), a row for each product of basis functions of the k positions.
+    ``coefficients``: (4^k, 16), a row for each product of basis functions of the k positions;
+    ``inverted``: whether a chain walks the joint inwards.
     """
 
     coefficients: Array
     position_count: int
+    inverted: bool = False
 
     @staticmethod
     def measure(pose: Callable[[Array], Array], position_count: int, name: str) -> "JointMap":
@@ -62,7 +64,7 @@ class JointMap:
         return joint_map
 
     def transforms(self, values: NDArray[Any]) -> NDArray[Any]:
-        """X_AC (n, 4, 4) at values (n, k) [rad or m], which may be complex."""
+        """X_AC (n, 4, 4), inverted or not, at values (n, k) [rad or m], which may be complex."""
         products = np.ones((len(values), 1))
         for column in range(self.position_count):
             basis = _basis(values[:, column])
@@ -72,21 +74,13 @@ class JointMap:
         return X
 
 
-@dataclass(frozen=True)
-class ChainStep:
-    """One joint on the way from a node's parent to the node; walked inwards if inverted."""
-
-    joint_map: JointMap
-    inverted: bool
-
-
-def chain_transforms(steps: Sequence[ChainStep], values: NDArray[Any]) -> NDArray[Any]:
+def chain_transforms(steps: Sequence[JointMap], values: NDArray[Any]) -> NDArray[Any]:
     """X (n, 4, 4) over several joints in turn, at their values (n, k), which may be complex."""
     X: NDArray[Any] = np.broadcast_to(np.eye(4), (len(values), 4, 4))
     start = 0
     for step in steps:
-        stop = start + step.joint_map.position_count
-        X_step = step.joint_map.transforms(values[:, start:stop])
+        stop = start + step.position_count
+        X_step = step.transforms(values[:, start:stop])
         X = X @ (inverse_transforms(X_step) if step.inverted else X_step)
         start = stop
     return X

@@ -119,7 +119,7 @@ class ArticulatedModel(ParsedModel):
             name=plant.GetModelInstanceName(chosen[-1]),
             plant=plant,
             scene_graph=scene_graph,
-            **vars(positions),
+            **positions,
             link_meshes=MappingProxyType(meshes),
             skin=(),
             warnings=tuple(limit_kinds(remarks)),
@@ -177,7 +177,7 @@ class ArticulatedModel(ParsedModel):
         text = with_base_joints(self._urdf().text, X_WB[:3, 3].tolist(), rpy.tolist())
         moved = self._changed(text, self.skin)
         positions, _ = describe_positions(moved.plant, self._source.limits, str(self.path))
-        return replace(moved, **vars(positions))
+        return replace(moved, **positions)
 
     def before_object(self, link: str, mesh: TriangleMesh, X_WO: Array) -> "ArticulatedModel":
         """The joints between the world and a link, and a rigid object that stands in the world.
@@ -205,7 +205,7 @@ class ArticulatedModel(ParsedModel):
             self,
             plant=plant,
             scene_graph=scene_graph,
-            **vars(positions),
+            **positions,
             link_meshes=MappingProxyType({self.link_names[0]: dot, link: dot, OBJECT: mesh}),
             skin=(),
         )
@@ -283,7 +283,7 @@ def read_model(
         name=plant.GetModelInstanceName(instances[0]),
         plant=plant,
         scene_graph=scene_graph,
-        **vars(positions),
+        **positions,
         link_meshes=MappingProxyType(meshes),
         skin=load_skin(path, link_names(plant)),
         warnings=tuple(limit_kinds([*warnings, *remarks])),

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from drake_pose.arrays import Array
 from drake_pose.body.link_graph import (
-    ChainStep,
+    JointMap,
     LinkGraph,
     PlantKinematics,
     build_link_graph,
@@ -48,7 +48,7 @@ class NodeSkin:
     weights: Array
     colour: tuple[float, float, float]
     turned: bool
-    steps: tuple[ChainStep, ...]
+    steps: tuple[JointMap, ...]
 
     @property
     def triangles(self) -> NDArray[np.int32]:
@@ -59,7 +59,7 @@ class NodeSkin:
         """The vertices (n, v, 3) [m] in the node's frame at its values (n, k) [rad or m]."""
         from drake_pose.body.joint_kernel import place_bands  # Slow to import: it needs numba.
 
-        count = sum(step.joint_map.position_count for step in self.steps)
+        count = sum(step.position_count for step in self.steps)
         values = np.ascontiguousarray(values, dtype=np.float64)
         if values.ndim != 2 or values.shape[1] != count:
             raise SettingsError(f"values of shape (n, {count}) expected, got {values.shape}")
@@ -89,15 +89,15 @@ class NodeSkin:
         )
 
 
-def _pose_at_rest(steps: tuple[ChainStep, ...]) -> Array:
+def _pose_at_rest(steps: tuple[JointMap, ...]) -> Array:
     """A chain's transform (4, 4) with all its positions at zero."""
-    count = sum(step.joint_map.position_count for step in steps)
+    count = sum(step.position_count for step in steps)
     rest: Array = chain_transforms(steps, np.zeros((1, count)))[0]
     return rest
 
 
 def find_skin(
-    model: ParsedModel, graph: LinkGraph, parent: int, group: int, steps: tuple[ChainStep, ...]
+    model: ParsedModel, graph: LinkGraph, parent: int, group: int, steps: tuple[JointMap, ...]
 ) -> NodeSkin | None:
     """The band between the groups of a node's parent and the node (``steps`` between), or None."""
     for band in model.skin:
@@ -169,10 +169,10 @@ class ModelSkin:
 
 def _chain(
     model: ParsedModel, graph: LinkGraph, band: SkinBand
-) -> tuple[tuple[ChainStep, ...], tuple[int, ...]]:
+) -> tuple[tuple[JointMap, ...], tuple[int, ...]]:
     """The joints outwards from a band's parent to its child, and their positions."""
     inner, outer = graph.group_of(band.parent), graph.group_of(band.child)
-    steps: list[ChainStep] = []
+    steps: list[JointMap] = []
     positions: list[int] = []
     group = outer
     while group != inner:
@@ -182,7 +182,7 @@ def _chain(
                 f"{skin_file(model.path)}: band '{band.parent}' - '{band.child}': no joints lead "
                 "outwards from the one to the other; are they exchanged?"
             )
-        steps.insert(0, ChainStep(edge.joint_map, inverted=False))
+        steps.insert(0, edge.joint_map)
         positions = [*edge.positions, *positions]
         group = edge.inner
     return tuple(steps), tuple(positions)

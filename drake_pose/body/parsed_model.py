@@ -140,36 +140,8 @@ _KINDS: dict[str, tuple[PositionKind, ...]] = {
 FLOATING_TYPES = ("rpy_floating", "quaternion_floating")
 
 _FULL_TURN = 2.0 * np.pi
-# Limits further apart than this are written for none [rad, rad, m]. An angle turns freely then, but
-# what a screw or a slide does looks different everywhere.
-_WIDEST_ANGLE, _WIDEST_SCREW, _WIDEST_LENGTH = 4.0 * _FULL_TURN, 100.0 * _FULL_TURN, 1e3
 # Limits written with ten digits are a full turn.
 _ROUNDING = 1e-9
-
-
-@dataclass(frozen=True, eq=False)
-class Positions:
-    """What a plant's q means; all in the plant's order, arrays (nq,) and read-only.
-
-    Attributes:
-        position_names: the joint's name, or ``joint_suffix`` for joints of several positions.
-        position_kinds: "angle" [rad], "length" [m] or "quaternion".
-        lower, upper: limits [rad or m]; half a turn either side of the default position for a joint
-            that turns freely; infinite for a floating body's pose and slides without limits.
-        default_positions: Drake's default positions moved inside the limits.
-        periodic: angles that look the same after a full turn: all but those of screws.
-        turns_freely: angles without limits, or with limits so wide that they mean none.
-        couplings: which positions follow others; no leader follows another one.
-    """
-
-    position_names: tuple[str, ...]
-    position_kinds: tuple[PositionKind, ...]
-    lower: Array
-    upper: Array
-    default_positions: Array
-    periodic: NDArray[np.bool_]
-    turns_freely: NDArray[np.bool_]
-    couplings: tuple[Coupling, ...]
 
 
 def turns_around(lower: Array, upper: Array, periodic: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -194,8 +166,10 @@ def nearest_turn(values: Array, near: Array, periodic: NDArray[np.bool_] | bool)
 
 def describe_positions(
     plant: MultibodyPlant, given: Mapping[str, tuple[float, float]], where: str
-) -> tuple[Positions, list[str]]:
+) -> tuple[dict[str, Any], list[str]]:
     """Names, kinds and limits of all positions of a finalized plant, and warnings.
+
+    The first are what ParsedModel has of positions, by attribute.
 
     Args:
         given: limits (lower, upper) [rad or m] by position name that replace the plant's own.
@@ -228,16 +202,11 @@ def describe_positions(
         for i in range(first, first + joint.num_positions()):
             kinds[i] = _KINDS[kind][i - first]
             periodic[i] = kinds[i] == "angle" and kind != "screw"
-            if kind in FLOATING_TYPES:
-                continue
-            low, high = _written_limits(joint, i - first, given.get(names[i]))
-            lower[i], upper[i] = one_turn(low, high, defaults[i])
-            free[i], remark = _too_wide(joint, i - first, names[i], (low, high), lower[i])
-            warnings += [remark] * bool(remark)
-            if kinds[i] == "length":  # Slides may say where the object stands: see tree_builder.
-                lower[i], upper[i] = (-np.inf, np.inf) if free[i] else (low, high)
-            elif not free[i]:
-                lower[i], upper[i] = low, high
+            if kind not in FLOATING_TYPES:
+                default, limits = float(defaults[i]), given.get(names[i])
+                found = _searched_limits(joint, i - first, names[i], default, limits)
+                lower[i], upper[i], free[i], remark = found
+                warnings += [remark] * bool(remark)
     couplings = _resolved(read_couplings(plant), names)
     warnings += _share_limits(couplings, names, (lower, upper, periodic, free))
     free &= periodic
@@ -246,8 +215,17 @@ def describe_positions(
         defaults[follower] = multiplier * defaults[leader] + offset
     for array in (lower, upper, defaults, periodic, free):
         array.setflags(write=False)
-    told = (lower, upper, defaults, periodic, free, couplings)
-    return Positions(tuple(names), tuple(kinds), *told), warnings
+    told: dict[str, Any] = {
+        "position_names": tuple(names),
+        "position_kinds": tuple(kinds),
+        "lower": lower,
+        "upper": upper,
+        "default_positions": defaults,
+        "periodic": periodic,
+        "turns_freely": free,
+        "couplings": couplings,
+    }
+    return told, warnings
 
 
 def _resolved(found: Sequence[Coupling], names: Sequence[str]) -> tuple[Coupling, ...]:
@@ -276,8 +254,8 @@ def _share_limits(
 ) -> list[str]:
     """Lets positions that follow one another have the same limits; warnings.
 
-    ``arrays``: lower, upper, periodic and turns_freely of Positions, which are changed. Limits of a
-    follower that leave one value alone were copied without a thought (PR2's have the wrong sign).
+    ``arrays``: lower, upper, periodic and turns_freely of ParsedModel, which are changed. Limits
+    of a follower that leave one value alone are not taken (PR2's have the wrong sign).
     """
     lower, upper, periodic, free = arrays
     warnings = []
@@ -303,76 +281,73 @@ def _share_limits(
     return warnings
 
 
-def _written_limits(
-    joint: Joint, index: int, given: tuple[float, float] | None
-) -> tuple[float, float]:
-    """The limits of one position of a joint: those given, else the file's."""
+def _searched_limits(
+    joint: Joint, index: int, name: str, default: float, given: tuple[float, float] | None
+) -> tuple[float, float, bool, str]:
+    """The limits of one position of a joint, whether they mean none, and a remark or "".
+
+    Limits more than four turns, a hundred turns of a screw, or a kilometre apart are written for
+    none. An angle turns freely then, and is searched in one turn about its default.
+    """
+    kind = joint.type_name()
+    is_length, is_screw = _KINDS[kind][index] == "length", kind == "screw"
+    several = f" (its {joint.position_suffix(index)})" if joint.num_positions() > 1 else ""
+    title = f"joint '{joint.name()}'{several}"
     low, high = given or (
         float(joint.position_lower_limits()[index]),
         float(joint.position_upper_limits()[index]),
     )
     if np.isnan(low) or np.isnan(high):
-        raise ModelError(f"{_title(joint, index)}: a limit is NaN; give numbers, lower first")
+        raise ModelError(f"{title}: a limit is NaN; give numbers, lower first")
     if low > high:
-        raise ModelError(
-            f"{_title(joint, index)}: lower limit {low:g} is above upper limit {high:g}"
-        )
-    return low, high
-
-
-def _title(joint: Joint, index: int) -> str:
-    """What messages call one position of a joint."""
-    suffix = f" (its {joint.position_suffix(index)})" if joint.num_positions() > 1 else ""
-    return f"joint '{joint.name()}'{suffix}"
-
-
-def _too_wide(
-    joint: Joint, index: int, name: str, limits: tuple[float, float], start: float
-) -> tuple[bool, str]:
-    """Whether limits are too far apart to be limits, and what is said of that, if anything.
-
-    ``start``: where the turn begins that is searched instead [rad].
-    """
-    (low, high), title, is_screw = limits, _title(joint, index), joint.type_name() == "screw"
-    is_length = _KINDS[joint.type_name()][index] == "length"
-    widest = _WIDEST_LENGTH if is_length else _WIDEST_SCREW if is_screw else _WIDEST_ANGLE
-    if not high - low > widest * (1.0 + _ROUNDING):
-        return False, ""
+        raise ModelError(f"{title}: lower limit {low:g} is above upper limit {high:g}")
+    turns = 100.0 if is_screw else 4.0
+    widest = 1e3 if is_length else turns * _FULL_TURN
+    if high - low <= widest * (1.0 + _ROUNDING):
+        return low, high, False, ""
     unlimited, one_sided = low == -high == -np.inf, np.isinf(low) != np.isinf(high)
+    if is_length:  # Slides may say where the object stands: see tree_builder.
+        remark = f"{title} has limits of {low:g} and {high:g} m, more than {widest:g} m apart: "
+        told = unlimited or one_sided
+        return -np.inf, np.inf, True, "" if told else f"{remark}they are taken as none"
     advice = (
         "give it a lower and an upper limit in the model file (or to load_model: "
         f"limits={{'{name}': (low, high)}})"
     )
-    answers = f"{np.degrees(start):.6g} to {np.degrees(start + _FULL_TURN):.6g} degrees"
-    if is_length:
-        return True, (
-            ""
-            if unlimited or one_sided
-            else f"{title} has limits of {low:g} and {high:g} m, more than {_WIDEST_LENGTH:g} m "
-            "apart: they are taken as none"
-        )
     if one_sided or (is_screw and not unlimited):
         lacks = "limits" if one_sided else "limits that can be searched"
         raise ModelError(
             f"{title} has no {lacks}: lower {low:g}, upper {high:g} [rad]; {advice}, so that its "
             "values can be searched"
         )
+    start, end = one_turn(low, high, default)
+    answers = f"{np.degrees(start):.6g} to {np.degrees(start + _FULL_TURN):.6g} degrees"
+    remark = ""
     if is_screw:
-        return True, f"{title} is a screw without limits: searched from {answers}; {advice}"
-    if unlimited:
-        return True, ""
-    return True, (
-        f"{title} has limits of {low:g} and {high:g} rad, more than "
-        f"{_WIDEST_ANGLE / _FULL_TURN:g} turns apart: it is taken to turn freely, and answers are "
-        f"given from {answers}"
-    )
+        remark = f"{title} is a screw without limits: searched from {answers}; {advice}"
+    elif not unlimited:
+        remark = (
+            f"{title} has limits of {low:g} and {high:g} rad, more than {turns:g} turns apart: it "
+            f"is taken to turn freely, and answers are given from {answers}"
+        )
+    return float(start), float(end), True, remark
 
 
 @dataclass(frozen=True, eq=False)
-class ParsedModel(Positions):
+class ParsedModel:
     """What a model file says, as Drake understands it. Never changes.
 
+    What describes q is in the plant's order; its arrays (nq,) are read-only.
+
     Attributes:
+        position_names: the joint's name, or ``joint_suffix`` for joints of several positions.
+        position_kinds: "angle" [rad], "length" [m] or "quaternion".
+        lower, upper: limits [rad or m]; half a turn either side of the default position for a joint
+            that turns freely; infinite for a floating body's pose and slides without limits.
+        default_positions: Drake's default positions moved inside the limits.
+        periodic: angles that look the same after a full turn: all but those of screws.
+        turns_freely: angles without limits, or with limits so wide that they mean none.
+        couplings: which positions follow others; no leader follows another one.
         plant: a finalized MultibodyPlant, to make contexts from; do not change it.
         link_meshes: the visual geometry of each link that has some, in the link's frame.
         skin: the bands of surface that bend with the joints (``load_skin``); usually none.
@@ -381,6 +356,14 @@ class ParsedModel(Positions):
         labels: the render labels of what is seen, of a plant that somebody else made; else None.
     """
 
+    position_names: tuple[str, ...]
+    position_kinds: tuple[PositionKind, ...]
+    lower: Array
+    upper: Array
+    default_positions: Array
+    periodic: NDArray[np.bool_]
+    turns_freely: NDArray[np.bool_]
+    couplings: tuple[Coupling, ...]
     path: Path
     name: str
     plant: MultibodyPlant

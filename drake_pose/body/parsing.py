@@ -191,19 +191,18 @@ def captured_warnings() -> Iterator[list[str]]:
     """Collect what Drake logs meanwhile instead of printing it; each text once, in order."""
     texts: list[str] = []
 
-    class _Collector(logging.Handler):
-        def emit(self, record: logging.LogRecord) -> None:
-            text = record.getMessage().strip()
-            if text not in texts:
-                texts.append(text)
+    def collect(record: logging.LogRecord) -> bool:
+        text = record.getMessage().strip()
+        if record.levelno >= logging.WARNING and text not in texts:
+            texts.append(text)
+        return False
 
     logger = logging.getLogger("drake")
-    handlers, propagate = logger.handlers[:], logger.propagate
-    logger.handlers, logger.propagate = [_Collector(level=logging.WARNING)], False
+    logger.addFilter(collect)
     try:
         yield texts
     finally:
-        logger.handlers, logger.propagate = handlers, propagate
+        logger.removeFilter(collect)
 
 
 def _cure_directives(path: Path, finder: FileFinder, cure_file: Callable[[Path], Path]) -> str:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_pose.arrays import Array
-from drake_pose.body.link_graph import ChainStep, PlantKinematics, chain_transforms
+from drake_pose.body.link_graph import JointMap, PlantKinematics, chain_transforms
 from drake_pose.body.meshes import TriangleMesh
 from drake_pose.body.node_skin import NodeSkin
 from drake_pose.body.parsed_model import ParsedModel, one_turn, turns_around
@@ -87,7 +87,7 @@ class NodePlacement:
 
     X_PA: Array
     rotation: RootRotation | None
-    steps: tuple[ChainStep, ...]
+    steps: tuple[JointMap, ...]
     lower: Array
     upper: Array
     defaults: Array
@@ -103,7 +103,7 @@ def place_node(
     held: Mapping[int, float],
     X_PA: Array,
     rotation: RootRotation | None,
-    steps: tuple[ChainStep, ...],
+    steps: tuple[JointMap, ...],
     follows: tuple[Coupling, ...] = (),
 ) -> NodePlacement:
     """The placement of a node with these positions in q, or of a root that a rotation turns."""

@@ -4,6 +4,7 @@ import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -15,44 +16,19 @@ from drake_pose.body.parsing import limit_kinds
 from drake_pose.body.pose_tree import PoseTree
 from drake_pose.errors import DrakePoseError
 
-_SYMMETRY_TOLERANCE = 0.03
-_LEVELS = 12
-# Seven, so that a square or hexagonal cross-section does not pass for round.
-_SECTORS = 7
-
-
-@dataclass(frozen=True)
-class JointReport:
-    """One position: its name, kind, and limits in degrees (angles) or metres (lengths).
-
-    ``follows``: the joint that it follows, and how in rad and m; empty: none.
-    """
-
-    name: str
-    kind: str
-    lower: float
-    upper: float
-    follows: str = ""
-
-
-@dataclass(frozen=True)
-class NodeReport:
-    """One node of the pose tree."""
-
-    name: str
-    parent: str
-    joints: tuple[JointReport, ...]
-    triangles: int
-    watertight: bool
-
 
 @dataclass(frozen=True)
 class ModelReport:
-    """What was found in a model file: the plant's nodes, surprises, and what forbids its use."""
+    """What was found in a model file, surprises, and what forbids its use.
+
+    ``nodes``: the pose tree's: name, parent, triangles, whether it is watertight, and the joints:
+    name, kind, lower and upper limit in degrees (angles) or metres (lengths), and the joint that
+    one follows, and how in rad and m ("": none).
+    """
 
     path: Path
     name: str
-    nodes: tuple[NodeReport, ...]
+    nodes: tuple[dict[str, Any], ...]
     warnings: tuple[str, ...]
     errors: tuple[str, ...]
 
@@ -75,13 +51,13 @@ def describe_model(
     return ModelReport(
         path=path,
         name=model.name,
-        nodes=tuple(_node_report(tree, index) for index in range(len(tree.nodes))),
+        nodes=tuple(_describe_node(tree, index) for index in range(len(tree.nodes))),
         warnings=model_warnings(model, tree),
         errors=(),
     )
 
 
-def _node_report(tree: PoseTree, index: int) -> NodeReport:
+def _describe_node(tree: PoseTree, index: int) -> dict[str, Any]:
     """The facts of one node."""
     model, node = tree.model, tree.nodes[index]
     led = {one.follower for one in tree.placements[index].follows}
@@ -92,19 +68,22 @@ def _node_report(tree: PoseTree, index: int) -> NodeReport:
     }
     joints = []
     for position in (*node.positions, *follows):
-        name = model.position_names[position]
-        kind = model.position_kinds[position]
-        scale = 180.0 / math.pi if kind == "angle" else 1.0
-        lower, upper = model.lower[position] * scale, model.upper[position] * scale
-        limits = float(lower), float(upper)
-        joints.append(JointReport(name, kind, *limits, follows.get(position, "")))
-    return NodeReport(
-        name=node.name,
-        parent=tree.nodes[node.parent].name if node.parent >= 0 else "world",
-        joints=tuple(joints),
-        triangles=len(node.mesh.triangles),
-        watertight=is_watertight(node.mesh),
-    )
+        scale = 180.0 / math.pi if model.position_kinds[position] == "angle" else 1.0
+        joint = {
+            "name": model.position_names[position],
+            "kind": model.position_kinds[position],
+            "lower": float(model.lower[position] * scale),
+            "upper": float(model.upper[position] * scale),
+            "follows": follows.get(position, ""),
+        }
+        joints.append(joint)
+    return {
+        "name": node.name,
+        "parent": tree.nodes[node.parent].name if node.parent >= 0 else "world",
+        "joints": joints,
+        "triangles": len(node.mesh.triangles),
+        "watertight": is_watertight(node.mesh),
+    }
 
 
 def model_warnings(
@@ -176,34 +155,35 @@ def _symmetry_warnings(model: ArticulatedModel) -> list[str]:
     return warnings
 
 
-def _is_symmetric(mesh: TriangleMesh, X_turn: Array) -> bool:
-    """Whether a surface looks the same from all around the axis of a quarter turn X_turn."""
+def _is_symmetric(
+    mesh: TriangleMesh, X_turn: Array, levels: int = 12, sectors: int = 7, tolerance: float = 0.03
+) -> bool:
+    """Whether a surface looks the same from all around the axis of a quarter turn X_turn.
+
+    At each of so many levels along the axis the largest distance from it differs between sectors
+    by less than this fraction of the largest. Of seven sectors no square passes for round.
+    """
     axis = np.array([X_turn[2, 1], X_turn[0, 2], X_turn[1, 0]])
     axis -= (X_turn[1, 2], X_turn[2, 0], X_turn[0, 1])
     axis /= np.linalg.norm(axis)
     center = np.linalg.lstsq(np.eye(3) - X_turn[:3, :3], X_turn[:3, 3], rcond=None)[0]
     side = np.linalg.svd(axis[None])[2][1]
-    # At each height the largest distance from the axis is the same in every direction.
-    points = _sample_surface(mesh, 40_000) - center
-    height, x, y = points @ axis, points @ side, points @ np.cross(axis, side)
-    radius = np.hypot(x, y)
-    level = (height - height.min()) / max(float(np.ptp(height)), 1e-12) * _LEVELS
-    sector = (np.arctan2(y, x) + np.pi) / (2.0 * np.pi) * _SECTORS
-    outline = np.zeros((_LEVELS, _SECTORS))
-    row = np.clip(level.astype(int), 0, _LEVELS - 1)
-    column = np.clip(sector.astype(int), 0, _SECTORS - 1)
-    np.maximum.at(outline, (row, column), radius)
-    return bool(np.ptp(outline, axis=1).max() < _SYMMETRY_TOLERANCE * radius.max())
-
-
-def _sample_surface(mesh: TriangleMesh, count: int) -> Array:
-    """Points (count, 3) [m] spread evenly at random over a surface, the same ones each time."""
+    # Points spread evenly at random over the surface, the same ones each time.
     corner, along, across = mesh.vertices[mesh.triangles].swapaxes(0, 1)
     along, across = along - corner, across - corner
     areas = np.cumsum(np.linalg.norm(np.cross(along, across), axis=1))
-    random = np.random.default_rng(0).random((count, 3))
+    random = np.random.default_rng(0).random((40_000, 3))
     hit = np.searchsorted(areas, random[:, 0] * areas[-1])
     # Beyond the third side a parallelogram's half is folded back.
     beyond = random[:, 1:].sum(axis=1) > 1.0
     u, v = np.where(beyond, 1.0 - random[:, 1:].T, random[:, 1:].T)[..., None]
-    return np.asarray(corner[hit] + u * along[hit] + v * across[hit])
+    points = corner[hit] + u * along[hit] + v * across[hit] - center
+    height, x, y = points @ axis, points @ side, points @ np.cross(axis, side)
+    radius = np.hypot(x, y)
+    level = (height - height.min()) / max(float(np.ptp(height)), 1e-12) * levels
+    sector = (np.arctan2(y, x) + np.pi) / (2.0 * np.pi) * sectors
+    outline = np.zeros((levels, sectors))
+    row = np.clip(level.astype(int), 0, levels - 1)
+    column = np.clip(sector.astype(int), 0, sectors - 1)
+    np.maximum.at(outline, (row, column), radius)
+    return bool(np.ptp(outline, axis=1).max() < tolerance * radius.max())

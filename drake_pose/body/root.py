@@ -12,8 +12,8 @@ from pydrake.multibody.tree import Frame, JointIndex
 
 from drake_pose.arrays import Array
 from drake_pose.body.link_graph import (
-    ChainStep,
     JointEdge,
+    JointMap,
     LinkGraph,
     PlantKinematics,
     chain_transforms,
@@ -202,7 +202,7 @@ class BasePose:
     node: int = -1
     body: int = 0
     positions: tuple[int, ...] = ()
-    steps: tuple[ChainStep, ...] = ()
+    steps: tuple[JointMap, ...] = ()
     chain: tuple[int, ...] = ()
     joint: int = -1
 
@@ -289,7 +289,7 @@ class BasePose:
         return outside
 
 
-def chain_jacobian(steps: Sequence[ChainStep], values: Array) -> Array:
+def chain_jacobian(steps: Sequence[JointMap], values: Array) -> Array:
     """Derivative (12, k) of the upper rows of a chain's end pose, exact, by complex steps."""
     stepped = values + 1j * _COMPLEX_STEP * np.eye(len(values))
     change = chain_transforms(steps, stepped).imag / _COMPLEX_STEP
@@ -315,7 +315,7 @@ def base_of_chain(
             "floating", node=node, body=body, positions=edge.positions, joint=edge.joint
         )
     positions = tuple(position for edge in chain for position in edge.positions)
-    steps = tuple(ChainStep(e.joint_map, inverted=False) for e in chain if e.joint_map is not None)
+    steps = tuple(e.joint_map for e in chain if e.joint_map is not None)
     values = model.default_positions[list(positions)] + 0.1
     if len(positions) <= 12:
         slopes = chain_jacobian(steps, values)

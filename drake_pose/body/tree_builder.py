@@ -7,8 +7,8 @@ import numpy as np
 
 from drake_pose.arrays import Array
 from drake_pose.body.link_graph import (
-    ChainStep,
     JointEdge,
+    JointMap,
     LinkGraph,
     PlantKinematics,
     build_link_graph,
@@ -38,7 +38,7 @@ class Branch:
     group: int
     parent: int
     depth: int
-    steps: tuple[ChainStep, ...] = ()
+    steps: tuple[JointMap, ...] = ()
     positions: tuple[int, ...] = ()
     follows: tuple[Coupling, ...] = ()
 
@@ -189,7 +189,7 @@ def _branches(graph: LinkGraph, start: int) -> list[Branch]:
             after = branch
         for edge in edges_at[group]:
             if edge is not last and edge.joint_map is not None:
-                step = ChainStep(edge.joint_map, inverted=edge.outer == group)
+                step = replace(edge.joint_map, inverted=edge.outer == group)
                 walked = (*after.steps, step), (*after.positions, *edge.positions)
                 queue.append((Branch(edge.other(group), after.parent, after.depth, *walked), edge))
     return _ordered(graph, found)
@@ -233,8 +233,8 @@ def _let_follow(
         if beside:
             last = len(first.positions)
             for step in first.steps[::-1]:
-                last -= step.joint_map.position_count
-                own = first.positions[last : last + step.joint_map.position_count]
+                last -= step.position_count
+                own = first.positions[last : last + step.position_count]
                 follows += [Coupling(p, last + k, 1.0, 0.0) for k, p in enumerate(own)]
             steps = *(replace(s, inverted=not s.inverted) for s in first.steps[::-1]), *steps
         elif above != lead:
@@ -287,7 +287,7 @@ def _plant_rooted(
             raise SettingsError("root_position needs a root: several links hang on the world")
         top = branches[tops[0]]
         slides = [model.position_kinds[index] == "length" for index in top.positions[:3]]
-        if slides == [True] * 3 and all(s.joint_map.position_count == 1 for s in top.steps[:3]):
+        if slides == [True] * 3 and all(s.position_count == 1 for s in top.steps[:3]):
             held = {**held, **_solve_translations(model, top, position)}
         else:
             body = graph.groups[top.group].body

@@ -15,7 +15,7 @@ from pydrake.multibody.tree import Joint, RigidBody
 
 from drake_pose.arrays import Array
 from drake_pose.body.joint_kernel import PackedSteps, find_joint, pack_steps
-from drake_pose.body.link_graph import ChainStep, JointMap, PlantKinematics, chain_transforms
+from drake_pose.body.link_graph import JointMap, PlantKinematics, chain_transforms
 from drake_pose.body.parsed_model import nearest_turn
 from drake_pose.body.pose_tree import PoseTree
 from drake_pose.compiled import compiled, multiply
@@ -184,10 +184,10 @@ def _pack_tree(tree: PoseTree, firsts: np.ndarray) -> PackedTree:
     X_PA, free, chains = [], [], []
     for placement in tree.placements:
         X, rotation = np.array(placement.X_PA), placement.rotation
-        turns: tuple[ChainStep, ...] = ()
+        turns: tuple[JointMap, ...] = ()
         if rotation is not None:
             X[:3, :3] = X[:3, :3] @ rotation.R_W0
-            turns = tuple(ChainStep(_turn_about(axis), inverted=False) for axis in rotation.axes)
+            turns = tuple(_turn_about(axis) for axis in rotation.axes)
         X_PA.append(X)
         free.append(rotation is not None and rotation.kind == "free")
         chains.append(turns + placement.steps)
@@ -339,7 +339,7 @@ def joint_offsets(tree: PoseTree) -> tuple[JointOffset, ...]:
         for k, step in enumerate(placement.steps):
             joint = moving[positions[at]]
             p_B = _offset(joint, inboard, pose)
-            end = at + step.joint_map.position_count
+            end = at + step.position_count
             X_BC = X_BA @ chain_transforms([step], values[None, at:end])[0]
             if np.linalg.norm(p_B) > _NO_LENGTH:
                 link = joint.parent_body()

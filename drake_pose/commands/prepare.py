@@ -59,12 +59,14 @@ def check(file: Path, /, *, package: Packages | None = None, json: Json = False)
         units = {"angle": " deg", "length": " m"}
         for node in report.nodes:
             joints = [
-                f"{joint.name}  {joint.lower:g} .. {joint.upper:g}{units.get(joint.kind, '')}"
-                + (f"  (= {joint.follows})" if joint.follows else "")
-                for joint in node.joints
+                "{name}  {lower:g} .. {upper:g}".format(**joint)
+                + units.get(joint["kind"], "")
+                + (f"  (= {joint['follows']})" if joint["follows"] else "")
+                for joint in node["joints"]
             ]
-            texts = (node.name, node.parent, "\n".join(joints) or "fixed", str(node.triangles))
-            table.add_row(*map(escape, texts), "yes" if node.watertight else "no")
+            texts = node["name"], node["parent"], "\n".join(joints) or "fixed"
+            closed = "yes" if node["watertight"] else "no"
+            table.add_row(*map(escape, texts), str(node["triangles"]), closed)
         output_console().print(table)
     for text in report.warnings:
         warn(text)

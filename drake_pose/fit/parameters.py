@@ -149,7 +149,7 @@ class BodyParameters:
         for i, placement in enumerate(kinematics.tree.placements):
             first = kinematics.packed.value_starts[i]
             for k, step in enumerate(placement.steps):
-                last = first + step.joint_map.position_count
+                last = first + step.position_count
                 # Walked inwards, a joint comes before its offset.
                 before = [one.node != i or one.step + one.inverted <= k for one in offsets]
                 self._shifted[first:last] = self._behind[i] & before

@@ -174,9 +174,9 @@ def test_report_says_what_may_surprise(tmp_path):
     )
     report = describe_model(write(tmp_path, text))
     assert report.usable
-    assert [node.name for node in report.nodes] == ["a", "b", "c"]
-    np.testing.assert_allclose(report.nodes[0].joints[0].upper, np.degrees(1.0))
-    assert all(node.watertight for node in report.nodes)
+    assert [node["name"] for node in report.nodes] == ["a", "b", "c"]
+    np.testing.assert_allclose(report.nodes[0]["joints"][0]["upper"], np.degrees(1.0))
+    assert all(node["watertight"] for node in report.nodes)
     warnings = "\n".join(report.warnings)
     assert "'spin' turns link 'c' about the link's own axis" in warnings
     assert "nod" in warnings

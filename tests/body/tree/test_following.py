@@ -81,8 +81,8 @@ def test_what_is_not_enforced_is_told_and_what_is_stands_in_the_report(tmp_path)
     tree = tree_of(tmp_path)
     (told,) = model_warnings(tree.model, tree)
     assert "'far' is written to follow joint 'lead'" in told
-    nodes = {node.name: node.joints for node in describe_model(write(tmp_path, HAND)).nodes}
-    assert [joint.follows for name in ("one", "two") for joint in nodes[name]] == [
+    nodes = {one["name"]: one["joints"] for one in describe_model(write(tmp_path, HAND)).nodes}
+    assert [joint["follows"] for name in ("one", "two") for joint in nodes[name]] == [
         "", "-1 lead +0.1"
     ]  # fmt: skip
 

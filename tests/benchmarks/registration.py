@@ -29,7 +29,7 @@ from drake_pose.errors import RegistrationError
 from drake_pose.files.settings import EstimateSettings
 from drake_pose.fit.parameters import lengthened_joints
 from drake_pose.jobs.estimate.searches import make_tree
-from drake_pose.jobs.registration.inputs import GivenFiles, read_inputs
+from drake_pose.jobs.registration.inputs import read_inputs
 from drake_pose.jobs.registration.settings import RegistrationSettings
 from drake_pose.registration.joint_zeros import links_with_length
 from drake_pose.registration.posed_frames import PosedFrame, PosedFrames
@@ -253,7 +253,7 @@ def _recorded_rows(data: Path) -> Iterator[list[str]]:
         if not (scene.is_dir() and model.is_file()):
             continue
         settings = RegistrationSettings(cameras=cameras)
-        inputs = read_inputs(GivenFiles(scene, model, scene / f"{joints}.csv"), settings)
+        inputs = read_inputs(scene, model, scene / f"{joints}.csv", None, settings)
         body = RegistrationBody(inputs.tree)
         for camera in inputs.searched:
             frames = inputs.of(camera.name)

@@ -12,7 +12,7 @@ from drake_pose.body import ArticulatedModel
 from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import MaskError
-from drake_pose.jobs.registration.audit import say_off
+from drake_pose.jobs.registration.diagnosis import say_off
 from drake_pose.registration.diagnosis import (
     Diagnosis,
     Finding,

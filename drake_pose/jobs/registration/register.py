@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import time
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -18,26 +18,21 @@ from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.camera.models import Camera, PinholeCamera
 from drake_pose.errors import CameraError
 from drake_pose.files.folder import writes_folder
-from drake_pose.files.options import percent
-from drake_pose.files.summary import BADLY_EXPLAINED
 from drake_pose.fit.parameters import lengthened_joints
 from drake_pose.jobs.estimate.inputs import missing_for_person
-from drake_pose.jobs.registration.inputs import (
-    EpisodeInputs,
-    GivenFiles,
-    Inputs,
-    inputs_of_episode,
-    looks_at_pictures,
-    make_registration_tree,
-    read_episode,
-    read_inputs,
-)
-from drake_pose.jobs.registration.misfit import (
+from drake_pose.jobs.registration.diagnosis import (
     Search,
     check_focal_length,
     require_determined,
     require_explained,
+    say_common,
+    say_held,
+    say_lost,
+    say_object,
+    say_outliers,
+    say_zeros,
 )
+from drake_pose.jobs.registration.inputs import Inputs, make_registration_tree, read_inputs
 from drake_pose.jobs.registration.result import (
     check_exports,
     compared_frames,
@@ -45,7 +40,6 @@ from drake_pose.jobs.registration.result import (
     describe_parameters,
     describe_pictures,
     describe_run,
-    say_lost,
     say_pictures,
     write_result,
 )
@@ -77,16 +71,10 @@ from drake_pose.registration.standing_object import (
     find_in_pictures,
     require_seen,
 )
-from drake_pose.silhouette.pictures.scene_checks import frame_ranges
 from drake_pose.workers import working
 
 OnCamera = Callable[[int], None]
 """Called with the number of cameras that are done."""
-
-# So many pictures are shown of those that contradict.
-_SHOWN = 20
-# So many pictures of a target are looked at.
-_OF_TARGET = 24
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,9 +125,11 @@ def register_scene(
     """
     settings = settings or RegistrationSettings()
     table, own, folder = (None if one is None else Path(one) for one in (joints, cameras, out))
-    files = GivenFiles(Path(scene), Path(model), table, own)
     with working(settings.workers):
-        work = _begun(files, settings, on_camera)
+        inputs = read_inputs(Path(scene), Path(model), table, own, settings)
+        work = _Registration(inputs, settings, on_camera)
+        check_exports(settings.exports, [*inputs.held, *inputs.searched])
+        work.find()
         start = time.perf_counter()
         if work.inputs.positions.is_estimate:
             work.refit_poses()
@@ -155,7 +145,7 @@ def register_scene(
     summary = {
         # A single camera's part stands at the top as well.
         **(next(iter(described.values())) if len(described) == 1 else {}),
-        **describe_run(files, settings, work.warnings, seconds),
+        **describe_run(inputs, settings, work.warnings, seconds),
         "cameras": described,
     }
     if folder is not None:
@@ -163,23 +153,6 @@ def register_scene(
             folder, work.inputs, placed, work.registered, summary, overlay, urdf, work.shown
         )
     return SceneRegistration(placed, work.registered, summary, tuple(work.warnings), folder)
-
-
-def _begun(
-    files: GivenFiles, settings: RegistrationSettings, on_camera: OnCamera | None
-) -> _Registration:
-    """A registration that has found each camera by itself."""
-    if looks_at_pictures(files.scene, settings):
-        episode = read_episode(files, settings)
-        work = _Registration(inputs_of_episode(episode, settings), settings, on_camera)
-        check_exports(settings.exports, episode.cameras.values())
-        work.find_in_pictures(episode)
-    else:
-        work = _Registration(read_inputs(files, settings), settings, on_camera)
-        check_exports(settings.exports, [*work.inputs.held, *work.inputs.searched])
-        work.check_held()
-        work.find_each()
-    return work
 
 
 class _Registration:
@@ -222,23 +195,41 @@ class _Registration:
         focal = asked.focal and not self.pictures
         return bool(asked.zeros or asked.lengths or focal or several)
 
-    def check_held(self) -> None:
-        """Says so where a camera whose X_WC is given does not see the robot where it stands."""
-        for camera in self._held:
-            frames = self.inputs.of(camera.name)
-            if not frames:
-                continue
-            posed = PosedFrames(self.body.kinematics, self.body.all, camera, frames)
-            left = float(np.median(E_total(areas(posed, camera.X_CW[None], np.inf)[0])))
-            if left >= BADLY_EXPLAINED:
-                self.warnings.append(
-                    f"camera '{camera.name}' is held at its X_WC, but the robot is not seen there: "
-                    f"body and silhouettes differ by {percent(left)} of the silhouettes' area; is "
-                    "its world another than the robot's base? It is found anew with "
-                    f"--camera {camera.name}"
-                )
+    def find(self) -> None:
+        """Finds each camera by itself, in masks or in pictures.
 
-    def find_each(self) -> None:
+        Raises:
+            CameraError: nobody says a camera's focal length.
+            RegistrationError: no pose of a camera explains its masks or pictures.
+        """
+        inputs = self.inputs
+        if not inputs.recordings:
+            for camera in self._held:
+                self.warnings += say_held(self.body, camera, inputs.of(camera.name))
+            self._find_each()
+        elif inputs.standing is not None:
+            self._find_target(inputs.standing)
+        else:
+            frames = list[SeenFrame]()
+            for camera in inputs.searched:
+                name, start = camera.name, time.perf_counter()
+                focal = self._settings.focal or name in inputs.assumed
+                one = register_pictures(
+                    self.body, camera, inputs.recordings[name], focal, inputs.zeros
+                )
+                frames += [
+                    SeenFrame(
+                        frame.name, frame.values, {name: frame.mask},
+                        {} if frame.odds is None else {name: frame.odds}, frame.rates,
+                    )
+                    for frame in one.frames
+                ]  # fmt: skip
+                self.pictures[name] = one
+                self.warnings += say_pictures(one, name in inputs.assumed)
+                self._note(one.found, start)
+            self.inputs = replace(inputs, frames=tuple(frames))
+
+    def _find_each(self) -> None:
         """Finds each camera by itself.
 
         An object whose place is not known is found with the first camera, and then stands there.
@@ -257,7 +248,7 @@ class _Registration:
                 if found.seen_object is not None:
                     seen, self.body = found.seen_object, standing.body(found.seen_object.X_WT)
                     search = CameraSearch(self.body)
-                    self.warnings += _say_object(seen)
+                    self.warnings += say_object(seen)
                 found = replace(found, seen_object=seen)
             self._note(found, start)
         self.inputs = replace(inputs, tree=self.body.tree)
@@ -271,115 +262,71 @@ class _Registration:
         if self._on_camera is not None:
             self._on_camera(len(self.registered))
 
-    def find_in_pictures(self, episode: EpisodeInputs) -> None:
-        """Finds each camera of an episode in its pictures.
-
-        Raises RegistrationError: no pose of a camera explains its pictures.
-        """
-        if episode.standing is not None:
-            self._find_target(episode, episode.standing)
-            return
-        frames: list[SeenFrame] = []
-        for name, camera in episode.cameras.items():
-            start, focal = time.perf_counter(), self._settings.focal or name in episode.assumed
-            one = register_pictures(
-                self.body, camera, episode.recordings[name], focal, self.inputs.zeros
-            )
-            frames += [
-                SeenFrame(
-                    frame.name, frame.values, {name: frame.mask},
-                    {} if frame.odds is None else {name: frame.odds}, frame.rates,
-                )
-                for frame in one.frames
-            ]  # fmt: skip
-            self.pictures[name] = one
-            self.warnings += say_pictures(one, name in episode.assumed)
-            self._note(one.found, start)
-        self.inputs = replace(self.inputs, frames=tuple(frames))
-
-    def _find_target(self, episode: EpisodeInputs, standing: StandingObject) -> None:
-        """Finds masks of an object in pictures from a link, and each camera in these.
-
-        Raises:
-            CameraError: nobody says a camera's focal length.
-            RegistrationError: no pose explains enough of a camera's pictures.
-        """
-        frames, start = list[SeenFrame](), time.perf_counter()
+    def _find_target(self, standing: StandingObject, most: int = 24) -> None:
+        """Finds masks of an object in so many pictures from a link, and each camera in these."""
+        inputs, frames, start = self.inputs, list[SeenFrame](), time.perf_counter()
         body = standing.body(np.eye(4))
-        for name, camera in episode.cameras.items():
-            if name in episode.assumed:
+        for camera in inputs.searched:
+            name = camera.name
+            if name in inputs.assumed:
                 raise CameraError(
                     f"camera '{name}': nobody says its focal length, without which pictures of a "
                     "target do not tell how far away it is; calibrate it"
                 )
-            recording = episode.recordings[name]
-            rows, _ = choose_pictures(body, camera, recording, _OF_TARGET)
+            recording = inputs.recordings[name]
+            rows, _ = choose_pictures(body, camera, recording, most)
             seen = find_in_pictures(standing, camera, posed_pictures(recording, rows, 0.0))
             self.seen[name] = {one.name: recording.picture(one.name) for one in seen}
             frames += [SeenFrame(one.name, one.values, {name: one.mask}) for one in seen]
             lost = [recording.names[k] for k in rows if recording.names[k] not in self.seen[name]]
             if lost:
                 self.warnings.append(say_lost(name, lost, recording.names, "target"))
-        self.inputs = replace(self.inputs, frames=tuple(frames))
+        self.inputs = replace(inputs, frames=tuple(frames))
         seconds = time.perf_counter() - start
-        self.find_each()
+        self._find_each()
         for name, found in self.registered.items():
             require_seen(name, len(found.frames) - len(found.contradictions), len(self.seen[name]))
             self.seconds[name] += seconds / len(self.registered)
 
-    def judge(self) -> None:
+    def judge(self, shown: int = 20) -> None:
         """Says what a user should know of the cameras with all that was found.
+
+        shown: number of pictures of each camera that are kept of those that contradict.
 
         Raises RegistrationError: a focal length is wrong, and with it a camera's distance; or its
             frames do not tell where it is on a link.
         """
-        body = self.body.with_tree(self.inputs.tree)
-        self._judge_pictures(body)
-        for name, found in self.registered.items():
-            if self.inputs.standing is not None:
-                require_determined(found)
-            if not (self.inputs.positions.is_estimate or self._settings.focal):
-                found = self._check_focal_length(body, found)
-            self.registered[name] = found
-            self.warnings += _warnings_of(found)
-        self.warnings += say_common(self.registered.values(), of_pictures=bool(self.pictures))
-
-    def _check_focal_length(
-        self, body: RegistrationBody, found: RegisteredCamera
-    ) -> RegisteredCamera:
-        """As check_focal_length, of a camera's masks or of the pictures that it was fitted to."""
-        one = self.pictures.get(found.camera.name)
-        if one is not None and one.focal_deviation:
-            return found
-        fitted, frames = found, self.inputs.of(found.camera.name)
-        if one is not None:
-            fitted = replace(found, frames=one.found.frames)
-            frames = [replace(frame, values=frame.values + self._zeros) for frame in one.frames]
-        covariance, texts = check_focal_length(body, fitted, frames)
-        self.warnings += texts
-        return replace(found, covariance=covariance)
-
-    def _judge_pictures(self, body: RegistrationBody) -> None:
-        """Looks at all pictures of cameras that were found in some of them."""
-        frames = list[SeenFrame]()
+        inputs, body, frames = self.inputs, self.body.with_tree(self.inputs.tree), []
+        # All pictures of cameras that were found in some of them.
         for name, one in self.pictures.items():
             recording, found = one.recording, self.registered[name]
-            frames_seen, misfits, lost = judge_pictures(
-                body, replace(one, zeros=self._zeros), found
-            )
-            frames += [
-                SeenFrame(k.name, k.values + self._zeros, {name: k.mask}) for k in frames_seen
-            ]
-            found = replace(found, frames=misfits)
+            seen, misfits, lost = judge_pictures(body, replace(one, zeros=self._zeros), found)
+            frames += [SeenFrame(k.name, k.values + self._zeros, {name: k.mask}) for k in seen]
+            found = self.registered[name] = replace(found, frames=misfits)
             errors = {k.frame: k.E_total for k in found.frames}
-            wanted = (*found.contradictions[:_SHOWN], *compared_frames(errors))
-            shown = {k: recording.picture(k) for k in wanted}
-            self.pictures[name] = replace(one, pictures={**one.pictures, **shown})
-            self.registered[name] = found
+            wanted = (*found.contradictions[:shown], *compared_frames(errors))
+            pictures = {k: recording.picture(k) for k in wanted}
+            self.pictures[name] = replace(one, pictures={**one.pictures, **pictures})
             if lost:
                 self.warnings.append(say_lost(name, lost, recording.names))
         if frames:
-            self.inputs = replace(self.inputs, frames=tuple(frames))
+            inputs = self.inputs = replace(inputs, frames=tuple(frames))
+        for name, found in self.registered.items():
+            if inputs.standing is not None:
+                require_determined(found)
+            picture = self.pictures.get(name)
+            focal_found = picture is not None and picture.focal_deviation
+            if not (inputs.positions.is_estimate or self._settings.focal or focal_found):
+                fitted, own = found, inputs.of(name)
+                if picture is not None:
+                    # By the pictures that it was fitted to.
+                    fitted = replace(found, frames=picture.found.frames)
+                    own = [replace(k, values=k.values + self._zeros) for k in picture.frames]
+                covariance, texts = check_focal_length(body, fitted, own)
+                self.warnings += texts
+                found = self.registered[name] = replace(found, covariance=covariance)
+            self.warnings += say_outliers(found)
+        self.warnings += say_common(self.registered.values(), of_pictures=bool(self.pictures))
 
     def describe(self, more: float) -> dict[str, dict[str, Any]]:
         """The cameras' parts of the summary, each of which took so long more [s]."""
@@ -451,7 +398,7 @@ class _Registration:
             inputs.zeros, self._settings.focal, lengths=inputs.lengths,
         )  # fmt: skip
         self.parameters = describe_parameters(found, self.body.kinematics)
-        self.warnings += _say_zeros(found)
+        self.warnings += say_zeros(found)
         zeros = {one.name: one.value for one in found.zeros if one.significant}
         self._zeros = np.array([zeros.get(name, 0.0) for name in names])
         model, tree, standing = inputs.model, inputs.tree, inputs.standing
@@ -522,92 +469,3 @@ def _corrected_urdf(
         if "://" not in name:
             mesh.set("filename", os.path.relpath(model.path.parent / name, folder))
     return ElementTree.tostring(root, encoding="utf-8", xml_declaration=True)
-
-
-def _say_zeros(found: JointCalibration) -> list[str]:
-    """What a user should know of zeros and lengths."""
-    asked = [(f"joint '{one.name}': its zero", one) for one in found.zeros]
-    asked += [(f"link '{one.name}': its length", one) for one in found.lengths]
-    if asked and not any(one.significant for _, one in asked):
-        return [
-            "none of the zeros and lengths that were asked for is significant beside what else may "
-            "be off (the others, focal length, principal point, masks): all were left as they are"
-        ]
-    return [
-        f"{what} is not determined by these silhouettes and was left as it is;"
-        + (f" it goes with {', '.join(one.gauge)};" if one.gauge else "")
-        + " frames in which the robot stands otherwise, or a part of it that does not move with "
-        "this one, would tell it"
-        for what, one in asked
-        if not one.determined
-    ]
-
-
-def _say_object(seen: ObjectPose) -> list[str]:
-    """What a user should know of an object whose place was found."""
-    texts = []
-    if len(seen.round_about):
-        axes = "; ".join(", ".join(f"{x:.3f}" for x in axis) for axis in seen.round_about)
-        texts.append(
-            f"the target looks alike at every angle about an axis ({axes} in its frame), so how it "
-            "is turned about it is not determined; where the camera is does not depend on it"
-        )
-    if len(seen.alternatives):
-        texts.append(
-            f"the target looks alike in {len(seen.alternatives)} other poses, see families of the "
-            "target in summary.json; where the camera is does not depend on it"
-        )
-    return texts
-
-
-def say_common(registered: Iterable[RegisteredCamera], *, of_pictures: bool = False) -> list[str]:
-    """Whose fault it is where several cameras see a frame that contradicts the others."""
-    agrees: dict[str, dict[str, bool]] = {}
-    for found in registered:
-        for one in found.frames:
-            agrees.setdefault(one.frame, {})[found.camera.name] = one.agrees
-    frames, masks = list(agrees), dict[str, list[str]]()
-    positions = [k for k, own in agrees.items() if len(own) > 1 and not any(own.values())]
-    for frame, own in agrees.items():
-        for name in (name for name, right in own.items() if any(own.values()) and not right):
-            masks.setdefault(name, []).append(frame)
-    why = "something hides the robot there" if of_pictures else "their masks are not"
-    texts = []
-    if positions:
-        texts.append(
-            f"frames {frame_ranges(positions, frames)} contradict the others in all cameras that "
-            "see them: their joint positions are not those of the pictures"
-        )
-    texts += [
-        f"frames {frame_ranges(wrong, frames)} contradict the others in camera '{name}', but not "
-        f"in another one that sees them: their joint positions are right, {why}"
-        for name, wrong in masks.items()
-    ]
-    return texts
-
-
-def _warnings_of(found: RegisteredCamera) -> list[str]:
-    """What a user should know of a camera that was found."""
-    name, frames = found.camera.name, [frame.frame for frame in found.frames]
-    wrong, texts = found.contradictions, []
-    if wrong:
-        right = len(frames) - len(wrong)
-        listed = frame_ranges(wrong, frames)
-        text = (
-            f"camera '{name}': {len(wrong)} of {len(frames)} frames contradict the others and did "
-            f"not count: {listed}; are their joint positions those of the pictures?"
-        )
-        if 2 * right < len(frames):
-            supporting = frame_ranges([one for one in frames if one not in wrong], frames)
-            text += (
-                f" FEWER THAN HALF OF THE FRAMES AGREE, {right} of {len(frames)}: {supporting}; "
-                "the pose rests on these alone and may be wrong: mend the others, or add frames"
-            )
-        texts.append(text)
-    if len(found.alternatives):
-        texts.append(
-            f"camera '{name}': {len(found.alternatives)} other poses fit no worse, as far as can "
-            "be told; which is the camera's nobody knows: see registration.yaml and the overlays, "
-            "and add frames in which the robot stands otherwise"
-        )
-    return texts

@@ -32,7 +32,8 @@ from drake_pose.files.report_page import (
     plot_curves,
 )
 from drake_pose.files.summary import describe_job, file_digest, versions
-from drake_pose.jobs.registration.inputs import GivenFiles, Inputs
+from drake_pose.jobs.registration.diagnosis import say_drift, say_reading
+from drake_pose.jobs.registration.inputs import Inputs
 from drake_pose.jobs.registration.settings import AuditSettings
 from drake_pose.registration.joint_zeros import JointCalibration, KinematicParameter
 from drake_pose.registration.picture_registration import PictureRegistration
@@ -41,7 +42,6 @@ from drake_pose.registration.register import ObjectPose, RegisteredCamera
 from drake_pose.silhouette.areas.outline import outline_from_mesh
 from drake_pose.silhouette.areas.scoring import draw_labels
 from drake_pose.silhouette.pictures.masks import encode_mask
-from drake_pose.silhouette.pictures.scene_checks import frame_ranges
 from drake_pose.silhouette.pictures.scenes import CAMERA_FILE
 
 REGISTRATION = "registration.yaml"
@@ -153,25 +153,6 @@ def say_pictures(one: PictureRegistration, assumed: bool) -> list[str]:
     return texts
 
 
-def say_drift(camera: str, drift: float, deviation: float) -> str:
-    """By how much the joint log's clock runs faster than a camera's [s/s]."""
-    word = "faster" if drift > 0.0 else "slower"
-    return (
-        f"camera '{camera}': the joint log's clock runs {100.0 * abs(drift):.2f} +- "
-        f"{100.0 * deviation:.2f} percent {word} than its pictures': is their rate as it is said, "
-        "and were none dropped?"
-    )
-
-
-def say_lost(camera: str, lost: Sequence[str], names: Sequence[str], what: str = "robot") -> str:
-    """That pictures show nothing of a robot that they should; names: of all its pictures."""
-    return (
-        f"camera '{camera}': nothing of the {what} is seen where it should be in frames "
-        f"{frame_ranges(lost, names)}: is something before it, or are the joint positions not "
-        "those of the pictures?"
-    )
-
-
 def describe_parameters(
     found: JointCalibration, kinematics: TreeKinematics
 ) -> dict[str, dict[str, Any]]:
@@ -195,15 +176,16 @@ def describe_parameters(
 
 
 def describe_run(
-    files: GivenFiles, settings: AuditSettings, warnings: Sequence[str], seconds: float
+    inputs: Inputs, settings: AuditSettings, warnings: Sequence[str], seconds: float
 ) -> dict[str, Any]:
     """What summary.json says of every run: its files, and how it was made."""
-    job, joints = describe_job(files.scene, files.model, settings, files.cameras), files.joints
+    joints = inputs.joints
+    job = describe_job(inputs.scene.path, inputs.model.path, settings, inputs.cameras)
     job["sha256"]["joints"] = joints and file_digest(joints)
     return {
         "seconds": seconds,
         "warnings": list(warnings),
-        "cameras": str(files.camera_file),
+        "cameras": str(inputs.camera_file),
         "joints": joints and str(joints),
         **job,
         "versions": versions(),
@@ -379,18 +361,6 @@ def parameter_rows(parameters: Mapping[str, Mapping[str, Any]]) -> list[tuple[st
             word += f": {say_reading(one[key], one[f'sd_{unit}'], unit)}"
         rows.append((name, value, interval, word))
     return rows
-
-
-def say_reading(value: float, deviation: float, unit: str) -> str:
-    """That a joint's encoder reads too high or too low.
-
-    Args:
-        value: what must be added to its readings, and deviation: its standard deviation, in
-            unit: `deg` or `mm`.
-    """
-    word, digits = "low" if value > 0.0 else "high", 2 if unit == "deg" else 1
-    size = f"{abs(value):.{digits}f} +- {deviation:.{digits}f}"
-    return f"reads {size} {'degrees' if unit == 'deg' else unit} too {word}"
 
 
 def make_registration_report(folder: Path, summary: Mapping[str, Any]) -> str:

@@ -13,7 +13,8 @@ import numpy as np
 from drake_pose.body import load_model
 from drake_pose.camera.camera_files import load_cameras, save_cameras
 from drake_pose.camera.models import Camera
-from drake_pose.jobs.registration.inputs import GivenFiles
+from drake_pose.jobs.registration.inputs import Inputs, read_inputs
+from drake_pose.jobs.registration.settings import RegistrationSettings
 from tests.jobs.scenes import edit_camera, write_masks
 from tests.registration.arm_pictures import errors
 from tests.search.arms import LINKS, arm_cameras, arm_urdf
@@ -30,10 +31,9 @@ class ArmScene:
     joints: Path
     cameras: dict[str, Camera]
 
-    @property
-    def files(self) -> GivenFiles:
-        """As a registration and an audit take them."""
-        return GivenFiles(self.folder, self.model, self.joints)
+    def read(self) -> Inputs:
+        """As a registration takes them."""
+        return read_inputs(self.folder, self.model, self.joints, None, RegistrationSettings())
 
     def copy(self, place: Path) -> ArmScene:
         """The same elsewhere, to be spoilt."""

@@ -14,7 +14,7 @@ from drake_pose.errors import DrakePoseError
 from drake_pose.files.overlay import EXCESS_RGB, MISSING_RGB
 from drake_pose.jobs.estimate.episode import is_episode
 from drake_pose.jobs.registration.audit import audit_scene
-from drake_pose.jobs.registration.inputs import EpisodeInputs, GivenFiles, read_episode
+from drake_pose.jobs.registration.inputs import Inputs, read_inputs
 from drake_pose.jobs.registration.register import register_scene
 from drake_pose.jobs.registration.settings import RegistrationSettings
 from drake_pose.silhouette.pictures.scenes import load_scene
@@ -42,9 +42,8 @@ def read(
     joints: Path | None = None,
     cameras: Path | None = None,
     **settings: Any,
-) -> EpisodeInputs:
-    files = GivenFiles(scene, painted.path, joints, cameras)
-    return read_episode(files, RegistrationSettings(**settings))
+) -> Inputs:
+    return read_inputs(scene, painted.path, joints, cameras, RegistrationSettings(**settings))
 
 
 def run(command: str, episode, out: Path, *more: object) -> dict[str, Any]:
@@ -100,7 +99,7 @@ def test_a_focal_length_that_nobody_knows_is_a_usual_one(episode, tmp_path):
         (tmp_path / name).symlink_to(scene / name)
     assert read(tmp_path, painted).assumed == {"camera"}
     given = read(tmp_path, painted, None, scene / "cameras.yaml")
-    assert given.cameras["camera"].focal_x == painted.camera.focal_x
+    assert given.scene.cameras["camera"].focal_x == painted.camera.focal_x
     assert not given.assumed
 
 
@@ -108,7 +107,7 @@ def test_whether_a_camera_s_place_is_given(episode, tmp_path):
     scene, painted = episode
     file = edit_camera(scene / "cameras.yaml", "camera", tmp_path / "cameras.yaml", X_WC=None)
     for own, expected in ((None, {"camera"}), (scene / "cameras.yaml", {"camera"}), (file, set())):
-        assert read(*episode, None, own).placed == expected
+        assert {one.name for one in read(*episode, None, own).given} == expected
     with pytest.raises(DrakePoseError, match="no camera has an X_WC that could be audited"):
         audit_scene(scene, painted.path, cameras=file)
 

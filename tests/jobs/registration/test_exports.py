@@ -17,7 +17,6 @@ from drake_pose.camera.camera_files import load_cameras
 from drake_pose.camera.models import ParallelCamera
 from drake_pose.errors import CameraError, SettingsError
 from drake_pose.files.replay import make_recording
-from drake_pose.jobs.registration.inputs import read_inputs
 from drake_pose.jobs.registration.result import check_exports, write_exports
 from drake_pose.jobs.registration.settings import RegistrationSettings
 from drake_pose.registration.posed_frames import SeenFrame
@@ -29,7 +28,7 @@ TEXTS = ("ros", "mujoco", "drake")
 def written(arm_scene, tmp_path_factory):
     """The folder of the arm's two cameras, where they truly are."""
     folder = tmp_path_factory.mktemp("exports")
-    inputs = read_inputs(arm_scene.files, RegistrationSettings())
+    inputs = arm_scene.read()
     write_exports(folder, TEXTS, inputs, arm_scene.cameras.values(), {}, {})
     return folder
 
@@ -81,7 +80,7 @@ def test_transforms_start_at_the_link_that_stands_in_the_origin(tmp_path, arm_sc
     )
     text = arm_scene.model.read_text().replace('<parent link="world"/>', '<parent link="base"/>')
     path.write_text(text.replace('<link name="world"/>', f'<link name="world"/>{base}'))
-    inputs = read_inputs(replace(arm_scene, model=path).files, RegistrationSettings())
+    inputs = replace(arm_scene, model=path).read()
     cameras = arm_scene.cameras
     write_exports(tmp_path / "here", ["ros", "drake"], inputs, cameras.values(), {}, {})
     launch = (tmp_path / "here" / "ros" / "static_transforms.launch.xml").read_text()

@@ -190,9 +190,12 @@ def stretched(hand):
     return ProportionedBody(TreeKinematics(tree), TreeSurfaces(tree))
 
 
-def test_proportions_against_finite_differences(stretched):
-    theta = np.random.default_rng(0).normal(0.0, 0.2, len(stretched.names))
-    assert_motions_are_derivatives(stretched, theta)
+def test_proportions_against_finite_differences(stretched, person):
+    """Of a hand that is held, and of a person whose root moves, too."""
+    tree = person.pose_tree()
+    for body in (stretched, ProportionedBody(TreeKinematics(tree), TreeSurfaces(tree))):
+        theta = np.random.default_rng(0).normal(0.0, 0.2, len(body.names))
+        assert_motions_are_derivatives(body, theta)
 
 
 def test_planes_are_those_of_the_stretched_surfaces(stretched):

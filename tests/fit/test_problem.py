@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 from scipy.sparse import csr_array
@@ -10,10 +11,11 @@ from drake_pose.body import TriangleMesh
 from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.camera.models import ParallelCamera, PinholeCamera, circle_of_cameras
 from drake_pose.errors import SettingsError, UnknownNameError
+from drake_pose.fit.background import odds_picture
 from drake_pose.fit.evidence import NO_EDGE, Observation, find_edge_points, pack_evidence
 from drake_pose.fit.levenberg_marquardt import AnnealingStage, Equations, LinearPrior
 from drake_pose.fit.parameters import BodyParameters, CameraParameters
-from drake_pose.fit.problem import Problem, Solution, Unknowns, parameter_names
+from drake_pose.fit.problem import WIDTH, Problem, Solution, Unknowns, parameter_names
 from drake_pose.fit.surfaces import VERY_FEW, few_triangles
 from drake_pose.silhouette.areas.bending import TreeSurfaces
 from drake_pose.silhouette.areas.outline import outline_from_mesh
@@ -60,16 +62,17 @@ def poses(body, count, seed):
     return theta
 
 
+def few_outlines(body, theta):
+    """The surfaces of a body at its parameters, in its nodes' frames."""
+    packed = body.place(theta).packed
+    parts = np.split(packed.points.T, packed.starts[1:-1, 0])
+    pairs = zip(parts, body.outlines, strict=True)
+    return [outline_from_mesh(TriangleMesh(part, one.triangles)) for part, one in pairs]
+
+
 def draw(body, cameras, theta, camera_theta=None):
     """The edges that cameras see of a body; drawn by the span kernel, not by the fit's."""
-    placement = body.place(theta)
-    starts = placement.packed.starts[:, 0]
-    outlines = [
-        outline_from_mesh(
-            TriangleMesh(placement.packed.points[:, starts[k] : starts[k + 1]].T, one.triangles)
-        )
-        for k, one in enumerate(body.outlines)
-    ]
+    placement, outlines = body.place(theta), few_outlines(body, theta)
     parameters = np.zeros(9 * len(cameras)) if camera_theta is None else camera_theta
     X_CW, kernel, _ = CameraParameters(cameras, root_of(body)).place(parameters)
     edges = []
@@ -95,6 +98,24 @@ def test_joint_zeros_of_all_frames_are_found(body, rig):
     pairs = zip(truth, readings, strict=True)
     seen = [Observation(draw(body, rig, theta), row) for theta, row in pairs]
     np.testing.assert_allclose(problem.solve(seen, ROUNDS).shared, zeros, atol=0.012)
+
+
+def test_odds_of_pixels_draw_contours_as_masks_do(body, rig):
+    """And a boundary that is too wide in them is a width."""
+    truth = poses(body, 1, 4)[0]
+    camera, outlines = rig[0], few_outlines(body, truth)
+    mask = draw_mask(outlines, camera.X_CW @ body.place(truth).X_WN, camera)
+    names = [f"{camera.name}.{name}" for name in ("shift_x", "shift_y", WIDTH)]
+    off, nothing = np.array([0.02, -0.015, 0.0]), np.zeros((1, 0))
+    stages = [AnnealingStage(scale, 0.02, 4) for scale in (0.03, 0.01, 0.005)]
+    for grown in (0, 2):
+        wide = cv2.dilate(mask.view(np.uint8), np.ones((2 * grown + 1,) * 2, np.uint8))
+        odds = odds_picture(np.where(wide > 0, 5.0, -5.0).astype(np.float32))
+        seen = [Observation(pack_evidence([NO_EDGE]), truth, (odds,))]
+        problem = Problem(body, [camera], [Unknowns(names, shared=True)])
+        found = problem.solve(seen, stages, (nothing, off)).shared
+        np.testing.assert_allclose(found[:2], 0.0, atol=0.004)
+        assert found[2] == pytest.approx(grown, abs=0.5)
 
 
 def test_unknowns_are_added_to_what_is_known_of_a_frame(body, rig):

@@ -14,8 +14,6 @@ Once a pose is about known, so are the background of each pixel and the odds tha
 body: lines across the contour then measure where its edge is (``fit.colours``).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
@@ -76,7 +74,7 @@ class Light(NamedTuple):
     offset: Floats
 
     @staticmethod
-    def between(picture: Picture | Floats, reference: Floats, rounds: int = 4) -> Light:
+    def between(picture: Picture | Floats, reference: Floats, rounds: int = 4) -> "Light":
         """That of a picture (H, W, 3): a line fitted to each channel, without outliers.
 
         Gains are between a half and two. Pictures are sampled about 160 pixels wide.
@@ -134,7 +132,7 @@ class Backgrounds:
     deviations: Floats
 
     @staticmethod
-    def of(pictures: Picture) -> Backgrounds:
+    def of(pictures: Picture) -> "Backgrounds":
         """The backgrounds of pictures (f, H, W, 3) red, green, blue."""
         floats = pictures.astype(np.float32)
         reference = np.median(floats, axis=0)
@@ -218,7 +216,7 @@ class KnownBackground:
     @staticmethod
     def of(
         pictures: Sequence[Picture], lights: Sequence[Light], showing: Mask, covered: Mask
-    ) -> KnownBackground:
+    ) -> "KnownBackground":
         """That of pictures (H, W, 3) of any size.
 
         Args:

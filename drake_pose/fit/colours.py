@@ -16,8 +16,6 @@ offsets would say by itself, so that a line that says nothing has no weight.
 Nothing is kept here between frames: a tracker keeps the histograms, and gets new ones.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -114,7 +112,7 @@ class OwnColours:
         outlines: Sequence[Outline],
         X_WN: Array,
         views: Iterable[tuple[Camera, Picture]],
-    ) -> OwnColours:
+    ) -> "OwnColours":
         """Those of cameras' histograms, of a body of these surfaces at X_WN (nodes, 4, 4)."""
         # Rarer colours than this fraction of the pixels are not a part's own.
         known = np.any([one[:, Colour.ON] > 4e-4 for one in histograms], axis=0)

@@ -5,8 +5,6 @@ length that it stands for, s the scale of a stage and w the weight of a unit of 
 C(theta) = w sum_i l_i r_i^2 / (1 + (r_i / s)^2) + (theta - m)^T P (theta - m).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -42,7 +40,7 @@ class Noise:
     correlation: float | Array = 0.06
 
     @classmethod
-    def of_a_pixel(cls, pixels: float | Array) -> Noise:
+    def of_a_pixel(cls, pixels: float | Array) -> "Noise":
         """With which a pixel of contour has the weight one; pixels: of the unit of length."""
         return cls(deviation=1.0, correlation=0.5 / pixels**3)
 

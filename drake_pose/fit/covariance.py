@@ -12,8 +12,6 @@ A camera's error hardly shows in the residuals, for the joints follow it. So a c
 trusted beyond a pixel, however well everything fits.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import NamedTuple

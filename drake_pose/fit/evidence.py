@@ -1,7 +1,5 @@
 """What a fit needs of a silhouette: the points of its edge, with normals."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import NamedTuple
 

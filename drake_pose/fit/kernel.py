@@ -9,8 +9,6 @@ How a distance changes is linear in the affine motion, 12 numbers, of the node t
 on. So the points of a node add up to a 12 x 12 matrix, however many unknowns move it.
 """
 
-from __future__ import annotations
-
 import math
 from enum import IntEnum
 

@@ -8,8 +8,6 @@ they share: each frame's own unknowns are eliminated first (Schur complement). T
 follow one another may also couple by a motion, which is linear in them.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 

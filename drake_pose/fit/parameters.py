@@ -5,8 +5,6 @@ The motion that a parameter gives to a node is affine: dp_W = M p_W + v, 12 numb
 other way, in its own picture alone.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection, Sequence
 from typing import NamedTuple
 

@@ -6,8 +6,6 @@ where an encoder's readings are held; a segment's length is a shared unknown, ad
 joint's value.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache

@@ -7,8 +7,6 @@ the flesh than the model's: at rest nothing changes, but the limb bends elsewher
 joints keep their meaning.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -9,8 +9,6 @@ half way between two pixels there, which is where the truth is on average. As wi
 the crossings of a node say adds up to a 12 x 12 matrix.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 
@@ -38,7 +36,7 @@ class Border(NamedTuple):
     columns: tuple[Indices, Array]
 
     @classmethod
-    def nothing(cls, height: int, width: int) -> Border:
+    def nothing(cls, height: int, width: int) -> "Border":
         """Of an empty picture."""
         return cls(
             (np.zeros(height + 1, dtype=np.int64), np.zeros(0)),

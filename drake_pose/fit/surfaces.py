@@ -1,7 +1,5 @@
 """Surfaces of few triangles: what a fit needs of a body shows with them."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from functools import lru_cache
 from itertools import chain

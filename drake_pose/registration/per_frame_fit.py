@@ -4,8 +4,6 @@ What is given is where a fit begins, and its prior. What is left of the distance
 is given about where the fit ends.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 

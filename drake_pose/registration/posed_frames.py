@@ -1,7 +1,5 @@
 """Frames in which the joint positions of the body are known: of one camera, or of several."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field

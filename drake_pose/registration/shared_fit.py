@@ -10,8 +10,6 @@ a factor more. What is off alike in all frames and is not fitted, offsets, link 
 moves what is fitted: its size is estimated, too.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection, Sequence
 from dataclasses import replace
 from functools import cached_property
@@ -187,7 +185,7 @@ class SharedFit:
         widths[which] = found.own.sum(axis=1)
         return Shared(found.shared, widths)
 
-    def from_found(self, found: Shared) -> tuple[SharedFit, Shared]:
+    def from_found(self, found: Shared) -> tuple["SharedFit", Shared]:
         """The same fit, whose cameras' unknowns count from where they were found."""
         X_CW = [camera.X_CW for camera in self.cameras(found)]
         count = self.per_camera * len(X_CW)
@@ -375,7 +373,7 @@ class SharedFit:
         )
 
     @cached_property
-    def _doubting(self) -> SharedFit:
+    def _doubting(self) -> "SharedFit":
         """The same fit, all unknown that is doubted."""
         kinematics = self.seen[0].kinematics
         offsets = lengthened_joints(kinematics.tree)

@@ -8,7 +8,7 @@ import re
 import signal
 import sys
 from collections.abc import Callable, Sequence
-from typing import Any, NoReturn
+from typing import NoReturn
 
 from cyclopts import App, CycloptsError, Parameter
 from cyclopts.help import DefaultFormatter, HelpPanel
@@ -25,16 +25,10 @@ from drake_pose.commands.walk import walk
 from drake_pose.errors import DrakePoseError, SettingsError
 from drake_pose.version import VERSION
 
-_FAILED, _WRONG_USAGE = 1, 2
-
 
 def _unfold(text: str) -> str:
     """Paragraphs in one line each; examples, which are indented, stay line by line."""
     return re.sub(r"(?<=\S)\n(?=\S)", " ", inspect.cleandoc(text))
-
-
-def _show_default(value: object) -> str | None:
-    return None if value in (None, (), {}) or isinstance(value, bool) else str(value)
 
 
 class _Formatter(DefaultFormatter):
@@ -48,8 +42,13 @@ class _Formatter(DefaultFormatter):
         super().__call__(console, options, panel)
 
 
-def _program(name: str, help: str) -> App:
-    return App(
+def _program(name: str, help: str, *commands: Callable[..., None]) -> App:
+    """A program of commands: functions, which their docstrings describe."""
+
+    def show_default(value: object) -> str | None:
+        return None if value in (None, (), {}) or isinstance(value, bool) else str(value)
+
+    program = App(
         name,
         help=_unfold(help),
         help_format="plaintext",
@@ -60,18 +59,16 @@ def _program(name: str, help: str) -> App:
         default_parameter=Parameter(
             allow_repeating=True,
             negative=(),
-            show_default=_show_default,
+            show_default=show_default,
             show_env_var=False,
             show_choices=False,
         ),
     )
-
-
-def _add(program: App, *commands: Callable[..., None]) -> None:
     for command in commands:
         about, _, _ = (command.__doc__ or "").partition("    Args:\n")
-        name = command.__name__.removeprefix("reproduce_").rstrip("_").replace("_", "-")
+        name = command.__name__.removeprefix("reproduce_").replace("_", "-")
         program.command(command, name=name, help=_unfold(about))
+    return program
 
 
 app = _program(
@@ -84,12 +81,15 @@ app = _program(
     No training, no GPU. For a first result run drake-pose demo.
 
     Exit status: 0 done, 1 failed (the message says what is at fault), 2 wrong usage.""",
+    estimate, capture, register, audit, masks, batch, walk, demo, check, undistort, empty_room,
+)  # fmt: skip
+app.command(
+    _program(
+        "reproduce",
+        "Run a paper's experiment and show its figures beside ours.",
+        *(kameda, shimada, date, reproduce_all),
+    )
 )
-reproduce = _program("reproduce", "Run a paper's experiment and show its figures beside ours.")
-_add(app, estimate, capture, register, audit, masks, batch, walk, demo, check)
-_add(app, undistort, empty_room)
-_add(reproduce, kameda, shimada, date, reproduce_all)
-app.command(reproduce)
 
 
 def main(words: Sequence[str] | None = None) -> None:
@@ -111,15 +111,20 @@ def main(words: Sequence[str] | None = None) -> None:
     try:
         command, bound, _ = app.parse_args(words, exit_on_error=False, print_error=False)
     except (CycloptsError, SettingsError) as error:
-        _stop(str(error), _WRONG_USAGE)
+        _stop(str(error), 2)
     try:
         command(*bound.args, **bound.kwargs)
     except UsageError as error:
-        _stop(str(error), _WRONG_USAGE)
+        _stop(str(error), 2)
     except DrakePoseError as error:
         _stop(str(error))
     except KeyboardInterrupt:
-        _stop(_interrupted(command, bound.arguments))
+        if "resume" not in inspect.signature(command).parameters:
+            _stop("interrupted")
+        out = bound.arguments["out"]
+        if not out.is_dir():
+            _stop("interrupted before anything was written")
+        _stop(f"interrupted; what is finished is in {out}; go on with --resume")
     except OSError as error:
         # Where no command expects it, such as in a folder that may not be searched.
         _stop(f"{error.filename or 'the system'}: {error.strerror or error}")
@@ -131,18 +136,9 @@ def main(words: Sequence[str] | None = None) -> None:
         _stop(f"Drake stopped with a failed demand: {error}")
 
 
-def _stop(message: str, status: int = _FAILED) -> NoReturn:
+def _stop(message: str, status: int = 1) -> NoReturn:
     say(f"drake-pose: error: {message}")
     sys.exit(status)
-
-
-def _interrupted(command: Callable[..., Any], options: dict[str, Any]) -> str:
-    """What Ctrl-C leaves, and how to go on."""
-    if "resume" not in inspect.signature(command).parameters:
-        return "interrupted"
-    if not options["out"].is_dir():
-        return "interrupted before anything was written"
-    return f"interrupted; what is finished is in {options['out']}; go on with --resume"
 
 
 if __name__ == "__main__":

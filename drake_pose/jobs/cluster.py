@@ -122,7 +122,7 @@ def _connect(address: str, timeout: float) -> Client:
         await (await asyncio.wait_for(connect(address, timeout=timeout), timeout + 0.5)).close()
 
     try:
-        # Before a Client is made: one that finds nobody complains when it is destroyed.
+        # Before a Client is made: one without a scheduler complains when it is destroyed.
         asyncio.run(shake_hands())
         return Client(address, timeout=timeout, set_as_default=False)
     except (TimeoutError, OSError, ValueError, TypeError, EOFError, MemoryError) as error:

@@ -125,7 +125,7 @@ def add_sensors(
         color, depth, X_WC = camera_to_drake(
             camera, renderer_name=renderer, depth_range=depth_ranges.get(name)
         )
-        # A parallel camera is a tele camera far beyond what depth images hold, which nobody reads.
+        # A parallel camera is a tele camera far beyond what depth images hold, which are not used.
         with captured_warnings():
             sensor = RgbdSensor(scene_graph.world_frame_id(), X_WC, color, depth)
         sensors[name] = builder.AddNamedSystem(f"camera_{name}", sensor)

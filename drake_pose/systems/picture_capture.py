@@ -69,10 +69,10 @@ class PictureCapture(PortedSystem):
     moment. ``time`` is the moment's time stamp [s], counted from the first one, nan before it;
     ``fresh`` is 1 where the moment is new in this period, else 0.
 
-    Recorded sources are read as the simulation's time goes on, each moment is shown, and after the
-    last one the simulation is told to end. Where `live`, the computer's clock decides, and only the
-    newest moment is shown; at first it is waited some seconds for every camera to open. What comes
-    from outside cannot be in a Context: one simulator runs one such system.
+    Recorded sources follow the simulation's time: each moment is shown, and the simulation ends
+    after the last one. If ``live``, moments follow the computer's clock: the newest one is shown;
+    at first the system waits some seconds for all cameras to open. What comes from outside cannot
+    be in a Context: one simulator runs one such system.
 
     Args:
         sources: where each camera's pictures come from, opened.
@@ -168,15 +168,15 @@ class PictureCapture(PortedSystem):
         return reports
 
     def close(self) -> None:
-        """Lets go of files and cameras."""
+        """Closes files and cameras."""
         for source in self._sources.values():
             source.close()
 
     def _look(self, context: Context, state: State) -> EventStatus:
         if self._begin is None:
-            if self._is_opening():
-                return EventStatus.Succeeded()
             self._begin = self._start()
+        if self._begin is None:
+            return EventStatus.Succeeded()
         now = self._clock() - self._begin if self.live else context.get_time()
         for name, source in self._sources.items():
             # Half a millionth of a period keeps what is due at a tick in spite of rounding.
@@ -201,26 +201,24 @@ class PictureCapture(PortedSystem):
         state.get_mutable_discrete_state(self._time).SetFromVector([moment.time])
         return EventStatus.Succeeded()
 
-    def _is_opening(self) -> bool:
-        """Whether live cameras have not given their first pictures, and are waited for."""
+    def _start(self) -> float | None:
+        """Time 0 by the clock [s], from which time stamps are counted; None: cameras are opening.
+
+        Time stamps of recorded pictures are counted from the first one's.
+        """
+        recorded = [name for name, one in self._sources.items() if not one.specification.live]
         for name, source in self._sources.items():
-            if not source.specification.live or source.ended or source.read() is not None:
+            if name in recorded or source.ended or source.read() is not None:
                 self._opened.add(name)
         now = self._clock()
         self._since = now if self._since is None else self._since
-        return len(self._opened) < len(self._sources) and now - self._since < self._opening
-
-    def _start(self) -> float:
-        """What is the time 0 of the clock; and that of each camera's time stamps."""
-        recorded = []
-        for name, source in self._sources.items():
-            if not source.specification.live:
-                one = self._pending[name] = source.read()
-                recorded += [] if one is None else [one.time]
-        first = min(recorded, default=0.0)
+        if len(self._opened) < len(self._sources) and now - self._since < self._opening:
+            return None
+        for name in recorded:
+            self._pending[name] = self._sources[name].read()
+        first = min([one.time for one in self._pending.values() if one is not None], default=0.0)
         begin = self._clock() if self.live else 0.0
-        for name, source in self._sources.items():
-            self._origins[name] = begin if source.specification.live else first
+        self._origins = {name: first if name in recorded else begin for name in self._sources}
         return begin
 
     def _feed(self, name: str, source: FrameSource, now: float, ahead: int = 8) -> None:
@@ -289,7 +287,7 @@ class PersonRegion(PortedSystem):
         wanted: the inputs that tell the region.
 
     Args:
-        background: what it sees when nobody is there; None where ``label_image`` is connected.
+        background: the camera's view of the empty room; None if ``label_image`` is connected.
 
     Raises:
         SettingsError: the background's size is not the camera's. When evaluated: there is neither a

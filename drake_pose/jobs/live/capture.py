@@ -208,7 +208,7 @@ def find_registered_pose(
 
     Raises:
         SceneError, CameraError, ModelError, SettingsError, UnknownNameError: what was given cannot
-            be captured so, or nobody showed the registered pose.
+            be captured so, or no picture shows the registered pose.
     """
     if settings.shape is not None:
         raise SettingsError("the paper's stages take the model's measures: give no shape")
@@ -406,7 +406,7 @@ class _FrameWriter:
             f"frame {frame_ranges(frames, list(self._times))}: {text}"
             for text, frames in self._doubts.items()
         ]
-        # A moment that no camera saw, or nobody had time for, is a frame without a pose.
+        # A moment that no camera saw, or that was skipped, is a frame without a pose.
         names = tuple(f"{k:06d}" for k in range(self._index + 1))
         writer.scene = replace(writer.scene, frames=names, masks=self._seen)
         counts, sources = sensors.counts(), {}

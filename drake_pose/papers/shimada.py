@@ -58,19 +58,8 @@ PIXELS_PER_METRE = 1000.0
 LOST_ANGLE_ERROR = 20.0
 """A sequence is lost that ends with a larger error of its joint angles [deg]."""
 
-_LOST_LENGTH_ERROR = 5.0
-_LENGTHS = HAND_STATE.indices(LENGTHS)
-_R_13 = HAND_STATE.index("length_13")
-_ANGLES = HAND_STATE.indices((*SPREADS, *FLEXIONS))
 PICTURES = "pictures"
 """Observed instead of OBSERVED: silhouettes by Drake's renderer, without parts."""
-
-# A lens so long that perspective is weak: half the picture's width is .3 degrees.
-_WIDTH, _HEIGHT, _DISTANCE = 480, 400, 50.0
-_PERIOD = 1.0 / 30.0
-# Pictures that are kept, frames from 0; and the palm's sizes along its axes.
-_KEPT = (7, 23, 39)
-_PALM_AXES = ("palm_height", "palm_thickness", "palm_width")
 
 
 class FilteredHand(NamedTuple):
@@ -229,7 +218,7 @@ def _hand() -> ArticulatedModel:
 
 def angle_error(means: Array, truths: Array) -> Array:
     """Root mean square error [deg] of the joint angles of states (..., n)."""
-    errors = (means - truths)[..., _ANGLES]
+    errors = (means - truths)[..., HAND_STATE.indices((*SPREADS, *FLEXIONS))]
     return np.asarray(np.degrees(np.sqrt(np.mean(errors**2, axis=-1))))
 
 
@@ -258,23 +247,28 @@ def _filter_sequence(hand_filter: TruncatedFilter, sequence: SyntheticSequence) 
 
 def _filter_pictures(hand_filter: TruncatedFilter, sequence: SyntheticSequence) -> FilteredHand:
     """Filter the silhouettes of a hand as the sequence's moves: plant, renderer, sensor, filter."""
-    center = (0.5 * (_WIDTH - 1), 0.5 * (_HEIGHT - 1))
-    focal, X_WC = PIXELS_PER_METRE * _DISTANCE, np.eye(4)
-    X_WC[2, 3] = -_DISTANCE
+    # A lens so long that perspective is weak: half the picture's width is .3 degrees.
+    width, height, distance, period = 480, 400, 50.0, 1.0 / 30.0
+    center = (0.5 * (width - 1), 0.5 * (height - 1))
+    focal, X_WC = PIXELS_PER_METRE * distance, np.eye(4)
+    X_WC[2, 3] = -distance
     camera = PinholeCamera(
-        "camera", _WIDTH, _HEIGHT, focal, focal, *center, X_WC, near=0.5 * _DISTANCE
+        "camera", width, height, focal, focal, *center, X_WC, near=0.5 * distance
     )
-    sizes = sequence.states[0, HAND_STATE.indices(_PALM_AXES)]
-    factors = sizes / [TWO_FINGERS.sizes[name] for name in _PALM_AXES]
+    # The palm's sizes along its axes.
+    names = ("palm_height", "palm_thickness", "palm_width")
+    sizes = sequence.states[0, HAND_STATE.indices(names)]
+    factors = sizes / [TWO_FINGERS.sizes[name] for name in names]
     model = _hand().reshaped(factors={"palm": factors})
     q = [
-        plant_positions(x, model.position_names, PIXELS_PER_METRE, _DISTANCE)
+        plant_positions(x, model.position_names, PIXELS_PER_METRE, distance)
         for x in sequence.states
     ]
-    positions = held_positions(np.array(q), _PERIOD)
-    silhouette = HandSilhouette(hand_filter, _WIDTH, _HEIGHT, center)
-    parts = build_hand_estimation(model, camera, silhouette, sequence.guess, positions, _PERIOD)
-    track = follow_pictures(parts, _PERIOD, FRAMES, _KEPT)
+    positions = held_positions(np.array(q), period)
+    silhouette = HandSilhouette(hand_filter, width, height, center)
+    parts = build_hand_estimation(model, camera, silhouette, sequence.guess, positions, period)
+    # Three frames are kept to be drawn.
+    track = follow_pictures(parts, period, FRAMES, (7, 23, 39))
     return FilteredHand(sequence, track, np.full(len(HAND_STATE), math.nan))
 
 
@@ -290,28 +284,32 @@ def _bound(hand_filter: TruncatedFilter, sequence: SyntheticSequence) -> Array:
 
 def _figures(trials: Sequence[FilteredHand]) -> dict[str, float | int]:
     """Figures of a case; a run's NEES of the six lengths is 6 on average if it is honest."""
+    lengths_of, angles_of = HAND_STATE.indices(LENGTHS), HAND_STATE.indices((*SPREADS, *FLEXIONS))
     truths = np.array([trial.sequence.states for trial in trials])
     tracks = [trial.track for trial in trials]
     means = np.array([track.means for track in tracks])
     errors = (means - truths)[:, -1]
     lengths, bounds = (
-        PIXELS_PER_METRE * np.mean(np.abs(off[:, _LENGTHS]), axis=1)
+        PIXELS_PER_METRE * np.mean(np.abs(off[:, lengths_of]), axis=1)
         for off in (errors, [trial.bound for trial in trials] - truths[:, -1])
     )
     angles = angle_error(means, truths)
-    watched = np.concatenate([_LENGTHS, _ANGLES])
+    watched = np.concatenate([lengths_of, angles_of])
     nees = np.array(
         [
-            off @ np.linalg.pinv(track.covariance[np.ix_(_LENGTHS, _LENGTHS)], hermitian=True) @ off
-            for track, off in zip(tracks, errors[:, _LENGTHS], strict=True)
+            off
+            @ np.linalg.pinv(track.covariance[np.ix_(lengths_of, lengths_of)], hermitian=True)
+            @ off
+            for track, off in zip(tracks, errors[:, lengths_of], strict=True)
         ]
     )
     low, high = chdtri(len(LENGTHS), [0.975, 0.025])
-    r_13 = PIXELS_PER_METRE * np.array([means[:, -1, _R_13], truths[:, -1, _R_13]])
-    lost = ~((lengths < _LOST_LENGTH_ERROR) & (angles[:, -1] < LOST_ANGLE_ERROR))
+    last = HAND_STATE.index("length_13")
+    r_13 = PIXELS_PER_METRE * np.array([means[:, -1, last], truths[:, -1, last]])
+    lost = ~((lengths < 5.0) & (angles[:, -1] < LOST_ANGLE_ERROR))
     milliseconds = np.array([track.milliseconds for track in tracks])
     inside = np.abs(means - truths) < 2 * np.array([track.deviations for track in tracks])
-    shares = np.abs(errors[:, _LENGTHS]) / truths[:, -1, _LENGTHS]
+    shares = np.abs(errors[:, lengths_of]) / truths[:, -1, lengths_of]
     own: dict[str, float | int] = {}
     if len(tracks[0].differences):
         own["silhouette_difference"] = float(np.median([track.differences for track in tracks]))
@@ -340,12 +338,8 @@ def _figures(trials: Sequence[FilteredHand]) -> dict[str, float | int]:
 OBLIQUENESS = math.radians(60)
 """How far the fingers point out of the image plane, so that segments bend back through it."""
 
-# Rows of table 1 about two joints of one finger.
-_COUPLED = ("flexion_12 - flexion_13", "flexion_22 - flexion_23")
-# The paper has no weights: only inequalities end a hypothesis, another that is the same, or 8.
-_CAP = 8
-# What is drawn was believed beside another for so many frames.
-_LONG = 2
+COUPLED = ("flexion_12 - flexion_13", "flexion_22 - flexion_23")
+"""Rows of table 1 about two joints of one finger."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -396,18 +390,18 @@ class HypothesesResult:
     inequalities: Inequalities
     settings: Mapping[str, object]
 
-    def shown(self) -> tuple[Fate, Fate] | None:
+    def shown(self, lived: int = 2) -> tuple[Fate, Fate] | None:
         """A wrong one that an inequality rejected, as in figure 9, and its survivor; None: none.
 
-        It had the largest weight of those that lived several frames, by the paper's inequality if
+        It had the largest weight of those that lived so many frames, by the paper's inequality if
         possible; its survivor is the nearest to the truth.
         """
         rejected = [
             one
             for one in self.fates
-            if one.reason == "constraint" and one.wrong and one.lived >= _LONG
+            if one.reason == "constraint" and one.wrong and one.lived >= lived
         ]
-        rejected.sort(key=lambda one: (one.row.startswith(_COUPLED), one.weights[-2]), reverse=True)
+        rejected.sort(key=lambda one: (one.row.startswith(COUPLED), one.weights[-2]), reverse=True)
         for dead in rejected:
             end = int(dead.frames[-1])
             beside = [
@@ -434,7 +428,7 @@ class HypothesesResult:
             "rejected_by_an_inequality": len(rejected),
             "rejected_later_than_made": len(later),
             "of_these_wrong": sum(one.wrong for one in later),
-            "of_these_by_coupled_joints": sum(one.row.startswith(_COUPLED) for one in later),
+            "of_these_by_coupled_joints": sum(one.row.startswith(COUPLED) for one in later),
             "frames_lived_median": float(np.median([f.lived for f in later])) if later else None,
             "inequalities": dict(Counter(one.row for one in later).most_common()),
             "angle_error_at_end": float(np.median(self.final_errors)),
@@ -486,8 +480,9 @@ def run_hypotheses_experiment(
     """
     require_counts(runs=runs)
     require_choice("observed", observed, OBSERVED)
+    # The paper has no weights: only inequalities end a hypothesis, another that is the same, or 8.
     settings = replace(
-        experiment_settings(truncation, iterations), hypothesis_cap=_CAP, smallest_weight=0.0
+        experiment_settings(truncation, iterations), hypothesis_cap=8, smallest_weight=0.0
     )
     hand_filter, observation = experiment_filter(settings)
     advance = count("sequences", runs)

@@ -27,10 +27,7 @@ from drake_pose.papers.shimada_sequences import FRAMES, SequenceResult, Track
 from drake_pose.papers.tables import save_figure
 
 _OBSERVATION = HandObservation(pixels_per_metre=PIXELS_PER_METRE)
-_SHOWN_FRAMES = (1, 8, 16, 32, 40, 55)
 _TRUE, _ESTIMATE, _REJECTED = "0.35", "#0072b2", "#d55e00"
-# So many frames are drawn after a hypothesis is rejected.
-_AFTERWARDS = 6
 _DEGREES = 180 / np.pi
 
 
@@ -97,7 +94,7 @@ def save_hypotheses(result: HypothesesResult, folder: Path) -> list[Path]:
     side, sign = (">=", -1.0) if ">=" in dead.row else ("<=", 1.0)
     row = f"{dead.row.split(side)[0]}{side} {sign * factor * b:.0f} {unit}"
     curves = ((np.eye(len(HAND_STATE))[widest], f"{name} [{unit}]"), (sign * phi, row))
-    frames = np.arange(begin, min(FRAMES, end + _AFTERWARDS) + 1)
+    frames = np.arange(begin, min(FRAMES, end + 6) + 1)
     for axes, (direction, label) in zip(grid[1], curves, strict=False):
         axes.plot(frames, factor * truths[frames - 1] @ direction, color=_TRUE)
         for one, colour in ((dead, _REJECTED), (survivor, _ESTIMATE)):
@@ -127,10 +124,11 @@ def _draw_hand(
 
 def _draw_sequence(trial: FilteredHand) -> Figure:
     figure = Figure(figsize=(15, 5.2))
-    grid = figure.subplots(2, len(_SHOWN_FRAMES), sharex=True, sharey=True)
+    frames = (1, 8, 16, 32, 40, 55)
+    grid = figure.subplots(2, len(frames), sharex=True, sharey=True)
     rows = (("true", trial.sequence.states, _TRUE), ("estimate", trial.track.means, _ESTIMATE))
     for line, (label, states, colour) in zip(grid, rows, strict=True):
-        for axes, frame in zip(line, _SHOWN_FRAMES, strict=True):
+        for axes, frame in zip(line, frames, strict=True):
             _draw_hand(axes, states[frame - 1], colour)
             axes.set_title(f"{label}, t = {frame}", fontsize=9)
     # Pixels count downwards.

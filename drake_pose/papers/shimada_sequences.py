@@ -51,10 +51,7 @@ from drake_pose.systems.truncated_ekf import (
 )
 
 FRAMES = 55
-# What is hidden, by what is observed.
-_KNUCKLES = tuple(f"point_{i}{j}_{axis}" for i in (1, 2) for j in (0, 1, 2) for axis in "xy")
-_HIDDEN = {"full": (), "lines": (*_KNUCKLES, *WRIST), "lines_wrist": _KNUCKLES}
-OBSERVED = tuple(_HIDDEN)
+OBSERVED = ("full", "lines", "lines_wrist")
 """What is seen: everything; the fingers' axes and tips and the palm's outline; the wrist, too."""
 
 ACCELERATIONS = {
@@ -132,7 +129,10 @@ def make_sequence(
     # Table 2 gives the scale of the first frame, and of no other.
     measurements[1:, MEASURED.index("scale")] = np.nan
     measurements[0, MEASURED.index("scale")] = 1.0
-    measurements[:, [MEASURED.index(name) for name in _HIDDEN[observed]]] = np.nan
+    if observed != "full":
+        hidden = [f"point_{i}{j}_{axis}" for i in (1, 2) for j in (0, 1, 2) for axis in "xy"]
+        hidden += [] if observed == "lines_wrist" else WRIST
+        measurements[:, [MEASURED.index(name) for name in hidden]] = np.nan
     return SyntheticSequence(states, measurements, first_guess(states[0], generator))
 
 
@@ -182,19 +182,9 @@ def _product(a: Array, b: Array) -> Array:
     return np.hstack([w * s - np.sum(v * u, axis=1, keepdims=True), vector])
 
 
-# Deviations of the wrist [pixel], the quaternion and angles [rad]: of the rough pose, of its rates
-# a frame, of accelerations per frame^2 at 30 Hz; of lengths and the palm's sizes, and limits of
-# both, over the model's.
-_START = 10.0, 0.5 * math.radians(20.0), math.radians(25.0)
-_RATES = 5.0, 0.03, math.radians(4.0)
-_ACCELERATIONS = 2.0, 0.008, math.radians(1.5)
-_LENGTH, _SIZE, _LIMIT = 0.2, 0.15, 0.5
-# A rate that is not seen fades, and how a hand is usually held is told once, in such a time [s].
-_MEMORY, _REST_TIME = 0.15, 1.0
-# Silhouettes of a rough model of somebody else differ by more than those of a hand's own.
+# A silhouette and the pose matched to it differ by less than the first fraction in a good frame,
+# by more than the second where the track is lost: the model is not the hand's own.
 _WELL_MATCHED, _UNMATCHED = 0.12, 0.4
-# What was seen of the deviations; so many frames are shown.
-_INSIDE, _SHOWN = "14 to 50 %", 4
 
 
 class Track(NamedTuple):
@@ -285,7 +275,7 @@ class SequenceResult:
         bad, lost = self._frames_beyond(_WELL_MATCHED), self._frames_beyond(_UNMATCHED)
         return (
             f"{self.name}: a hand that nobody measured: deviations are too small, of the flexions "
-            f"in four such sequences {_INSIDE} lay within 2 sigma. In {bad} of "
+            f"in four such sequences 14 to 50 % lay within 2 sigma. In {bad} of "
             f"{len(self.track.means)} frames pose and silhouette differ by more than "
             f"{_WELL_MATCHED:.0%}: fingers may be exchanged or bent that are straight; in {lost} "
             f"by more than {_UNMATCHED:.0%}: the track is lost, what is given is the prediction"
@@ -364,65 +354,49 @@ def run_sequence(
             f"{folder}: a hand is filtered in frames of one parallel camera that follow each "
             "other: sequence: true in scene.yaml, masks of one camera, no pinhole"
         )
-    guess, scale = _rough_belief(inputs, hand, camera)
-    period = 1.0 / (scene.frame_rate_hz or 30.0)
-    observation = HandObservation(scale, rest=_REST_TIME / period, hand=hand)
-    silhouette = HandSilhouette(
-        _filter(inputs, observation, acceleration, period, settings),
-        camera.width,
-        camera.height,
-        (camera.center_x, camera.center_y),
-        _WELL_MATCHED,
-        _UNMATCHED,
-    )
-    frames = len(inputs.frames)
-    shown = np.linspace(0, frames, _SHOWN, endpoint=False).astype(int).tolist()
-    parts = build_recorded_hand_estimation(scene, silhouette, guess)
-    advance = count(f"frames of {folder.name}", frames)
-    track = follow_pictures(parts, period, frames, shown, advance)
-    return SequenceResult(folder.name, observation, guess, track, _truth(folder, inputs, hand))
-
-
-def _rough_belief(inputs: Inputs, hand: HandModel, camera: ParallelCamera) -> tuple[Belief, float]:
-    """What is believed of the first frame, where the search finds the model; pixels per metre."""
+    # The first frame's rough pose.
     frame, model, search = inputs.frames[0], inputs.model, inputs.search
     assert search is not None
-    found = search.match([View(camera, inputs.scene.read(camera.name, frame))])
+    found = search.match([View(camera, scene.read(camera.name, frame))])
     if not found.found:
-        raise SceneError(f"{inputs.scene.path}: no pose explains the first frame, '{frame}'")
+        raise SceneError(f"{scene.path}: no pose explains the first frame, '{frame}'")
     scale = camera.pixels_per_metre * found.scale
     X_WP = found.X_WB @ PlantKinematics(model).pose_at(model.link_index("palm"), found.q)
     X_CP = camera.X_CW @ X_WP
     quaternion = Rotation.from_matrix(palm_rotation(X_CP[:3, :3])).as_quat(scalar_first=True)
     angles = found.q[[model.position_index(name) for name in hand.angles]]
-    moving, constant = np.r_[scale * X_CP[:2, 3], quaternion, angles], hand.layout.constant
-    sizes = np.array([hand.sizes[name] for name in constant])
-    shares = [_SIZE if name in PALM else _LENGTH for name in constant]
-    deviations = np.r_[_of_kinds(hand, _START), _of_kinds(hand, _RATES), shares * sizes]
-    mean = np.r_[moving, np.zeros(len(moving)), sizes]
-    return Belief(mean, np.diag(deviations**2)), scale
-
-
-def _of_kinds(hand: HandModel, values: tuple[float, float, float]) -> Array:
-    """(moving,) of the wrist, the quaternion and angles, as in the state."""
-    return np.repeat(values, (2, 4, len(hand.angles)))
-
-
-def _filter(
-    inputs: Inputs,
-    observation: HandObservation,
-    acceleration: float,
-    period: float,
-    settings: FilterSettings | None,
-) -> TruncatedFilter:
-    hand, layout = observation.hand, observation.hand.layout
+    moving, layout = np.r_[scale * X_CP[:2, 3], quaternion, angles], hand.layout
     sizes = np.array([hand.sizes[name] for name in layout.constant])
-    limits = from_bounds(layout.constant, (1 - _LIMIT) * sizes, (1 + _LIMIT) * sizes, layout.names)
-    rows = stack([model_inequalities(inputs.model).only_of(layout.names), limits], layout.names)
-    noise = acceleration * (30.0 * period) ** 2 * _of_kinds(hand, _ACCELERATIONS)
+    period = 1.0 / (scene.frame_rate_hz or 30.0)
+
+    def of_kinds(wrist: float, turn: float, angle: float) -> Array:
+        """(moving,) of the wrist [pixel], the quaternion and angles [deg], in the state's units."""
+        return np.repeat((wrist, turn, math.radians(angle)), (2, 4, len(hand.angles)))
+
+    # Standard deviations of the rough pose, of its rates a frame, and of sizes over the model's.
+    start, rates = of_kinds(10.0, 0.5 * math.radians(20.0), 25.0), of_kinds(5.0, 0.03, 4.0)
+    shares = [0.15 if name in PALM else 0.2 for name in layout.constant]
+    deviations = np.r_[start, rates, shares * sizes]
+    guess = Belief(np.r_[moving, np.zeros(len(moving)), sizes], np.diag(deviations**2))
+    # Sizes are within half and one and a half of the model's.
+    limits = from_bounds(layout.constant, 0.5 * sizes, 1.5 * sizes, layout.names)
+    rows = stack([model_inequalities(model).only_of(layout.names), limits], layout.names)
+    # Accelerations per frame^2 at 30 Hz; a rate that is not seen fades within .15 s.
+    noise = acceleration * (30.0 * period) ** 2 * of_kinds(2.0, 0.008, 1.5)
     U = layout.process_noise(dict(zip(layout.moving, noise.tolist(), strict=True)))
-    A = layout.transition(math.exp(-period / _MEMORY))
-    return TruncatedFilter(layout, observation, rows, U, settings, A)
+    A = layout.transition(math.exp(-period / 0.15))
+    # How a hand is usually held is told once a second.
+    observation = HandObservation(scale, rest=1.0 / period, hand=hand)
+    hand_filter = TruncatedFilter(layout, observation, rows, U, settings, A)
+    center, frames = (camera.center_x, camera.center_y), len(inputs.frames)
+    silhouette = HandSilhouette(
+        hand_filter, camera.width, camera.height, center, _WELL_MATCHED, _UNMATCHED
+    )
+    shown = np.linspace(0, frames, 4, endpoint=False).astype(int).tolist()
+    parts = build_recorded_hand_estimation(scene, silhouette, guess)
+    advance = count(f"frames of {folder.name}", frames)
+    track = follow_pictures(parts, period, frames, shown, advance)
+    return SequenceResult(folder.name, observation, guess, track, _truth(folder, inputs, hand))
 
 
 def _truth(folder: Path, inputs: Inputs, hand: HandModel) -> dict[str, Array]:

@@ -24,9 +24,6 @@ Advance = Callable[[int], None]
 Count = Callable[[str, int], Advance]
 """Begins to count: called with what is counted and up to where."""
 
-_NONE = "-"
-_DPI = 90
-
 
 def uncounted(_what: str, _total: int) -> Advance:
     """Counts nothing: the ``Count`` of who wants to see none."""
@@ -92,7 +89,7 @@ def figure_table(
 def _cell(values: Sequence[Any], form: str) -> str:
     """A figure of one run, or the mean of several with the smallest and largest."""
     if any(value is None or (isinstance(value, float) and math.isnan(value)) for value in values):
-        return _NONE
+        return "-"
     if len(set(values)) == 1:
         return form.format(values[0])
     mean = (form if "." in form else "{:.1f}").format(float(np.mean(values)))
@@ -129,7 +126,7 @@ def save_figure(figure: Figure, path: Path) -> Path:
     """Writes a drawing as a PNG file, in a folder that is made if it is not there."""
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.set_layout_engine("tight")
-    figure.savefig(path, dpi=_DPI)
+    figure.savefig(path, dpi=90)
     return path
 
 

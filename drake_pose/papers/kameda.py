@@ -242,7 +242,7 @@ def run_experiment(
         seconds, more, causes = time.process_time() - start, 0.0, None
         if is_continuous:
             # The search tells its own times by the clock.
-            more = result.statistics.interval_seconds
+            more = result.interval_seconds
             more *= seconds / max(result.seconds, 1e-9)
             seconds -= more
         if isinstance(search, BeamSearch):
@@ -312,7 +312,7 @@ def _grid_figures(result: RandomPoses) -> dict[str, Any]:
     trials = result.trials
     found = [trial.result for trial in trials]
     E_total = [one.E_total for one in found if one.found]
-    runs = np.sort([one.statistics.runs for one in found])
+    runs = np.sort([one.runs for one in found])
     seconds = [trial.seconds for trial in trials]
     causes = [trial.causes for trial in trials if trial.causes is not None]
     figures = {

@@ -56,7 +56,7 @@ def save_pictures(
         if trials:
             figures[name] = _draw_examples(title, trials, result)
     if isinstance(result.search, PaperSearch):
-        runs = np.array([trial.result.statistics.runs for trial in result.trials])
+        runs = np.array([trial.result.runs for trial in result.trials])
         figures["figure_11_runs_of_step_3"] = _draw_histogram(runs, 100, "runs of step 3")
         K = result.search.settings.candidate_limit
         figures["figure_12_chest_candidates"] = _draw_chest_ranks(result, K)
@@ -95,7 +95,7 @@ def _draw_examples(title: str, trials: list[RandomPose], result: RandomPoses) ->
         drawn.insert(2, paint_agreement(true >= 0, found >= 0))
         columns.append(drawn)
     results = [trial.result for trial in trials]
-    titles = [f"E_total {one.E_total:.2%}, {one.statistics.runs} runs" for one in results]
+    titles = [f"E_total {one.E_total:.2%}, {one.runs} runs" for one in results]
     labels = ["true pose", "estimate", "silhouettes"]
     labels += [f"{label} from the side" for label in labels[:2]]
     return draw_panels(columns, titles, labels, title=f"{title}\n{_COLOURS}")

@@ -20,7 +20,7 @@ import numpy as np
 from drake_pose.body import PoseTree
 from drake_pose.errors import SettingsError
 from drake_pose.search.branch_and_bound import PosesWithin, branch_and_bound
-from drake_pose.search.estimates import PoseEstimate, SearchStatistics, View
+from drake_pose.search.estimates import PoseEstimate, View
 from drake_pose.search.partial_poses import (
     PartialPoses,
     Pictures,
@@ -408,8 +408,8 @@ class _BeamRun:
 
     def result(self) -> PoseEstimate:
         """What the search found."""
-        sampled, statistics = self._body.sampled, SearchStatistics(self._runs, self._first_J)
-        told: dict[str, Any] = {"stopped_by": self._stopped_by, "statistics": statistics}
+        sampled, told = self._body.sampled, dict[str, Any](stopped_by=self._stopped_by)
+        told |= {"runs": self._runs, "first_J": self._first_J}
         if self._samples is None:
             return PoseEstimate.nothing(sampled.tree, **told)
         values, area = sampled.values_at(self._samples), self.scoring.silhouette_area

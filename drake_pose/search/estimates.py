@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -173,24 +173,6 @@ class PoseSet:
 
 
 @dataclass(frozen=True)
-class SearchStatistics:
-    """How a search went; a tracker has none.
-
-    Args:
-        runs: how often a node was placed (step 3 of Kameda's search).
-        first_J: of the first whole pose, before the re-estimation of section 5.2 [pixel]; None: of
-            the answer.
-        outside_limit: the paper's threshold r in each view [pixel].
-        interval_seconds: wall time of the intervals alone, which is part of ``seconds``.
-    """
-
-    runs: int = 0
-    first_J: float | None = None
-    outside_limit: tuple[float, ...] = ()
-    interval_seconds: float = field(default=0.0, compare=False)
-
-
-@dataclass(frozen=True)
 class PoseEstimate:
     """The pose that a search or a tracker found.
 
@@ -207,10 +189,14 @@ class PoseEstimate:
             camera's single picture the part along its axis is arbitrary.
         scale: a parallel camera has so many times the pixels a metre that it was given with, and
             the body its own size; 1 where the scale was known.
-        covariance: (m, m) of the pose tree's values about this pose, where it is known.
         pose_set: all poses found that are as good, and what is known of each joint; None if the
             search did not ask.
         lower_bound: no pose of the search's grid has a smaller J than this [pixel].
+        runs: how often a node was placed (step 3 of Kameda's search), or contours were compared.
+        first_J: of the first whole pose, before the re-estimation of section 5.2 [pixel]; None: of
+            the answer.
+        outside_limit: the paper's threshold r in each view [pixel].
+        interval_seconds: wall time of the intervals alone, which is part of ``seconds``.
         budget_spent: whether a limit on poses, time or memory ended the proof, or the search for
             poses as good, before all was settled.
     """
@@ -225,11 +211,13 @@ class PoseEstimate:
     seconds: float = 0.0
     root_position: np.ndarray | None = None
     scale: float = 1.0
-    covariance: np.ndarray | None = None
     pose_set: PoseSet | None = None
     lower_bound: float = 0.0
     budget_spent: bool = False
-    statistics: SearchStatistics = SearchStatistics()
+    runs: int = 0
+    first_J: float | None = None
+    outside_limit: tuple[float, ...] = ()
+    interval_seconds: float = 0.0
 
     @classmethod
     def of_values(
@@ -253,8 +241,7 @@ class PoseEstimate:
     @property
     def first_E_total(self) -> float:
         """E_total of the first whole pose, before any re-estimation; E_total where it is that."""
-        first_J = self.statistics.first_J
-        return (self.J if first_J is None else first_J) / self.area
+        return (self.J if self.first_J is None else self.first_J) / self.area
 
     @property
     def explained(self) -> bool:

@@ -6,12 +6,13 @@ With several views every area is summed over the views, and (4) holds in each vi
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from drake_pose.body import PoseTree
 from drake_pose.errors import SettingsError
-from drake_pose.search.estimates import PoseEstimate, SearchStatistics, View
+from drake_pose.search.estimates import PoseEstimate, View
 from drake_pose.search.sampled_body import Regions, SampledTree, Scoring
 from drake_pose.search.settings import PaperSearchSettings
 
@@ -124,7 +125,7 @@ class PaperRun:
             made = self.make_list(node, uncovered)
             if made is not None:
                 self.lists[node] = made
-                uncovered.subtract([node], made.samples[:1], made.X_WN[:1])
+                self.scoring.subtract(uncovered, [node], made.samples[:1], made.X_WN[:1])
                 continue
             # Step 6: the nearest node towards the root with an untried candidate adopts it.
             ancestor, uncovered = self.nodes[node].parent, None
@@ -151,8 +152,7 @@ class PaperRun:
         if len(inside) == 0:
             return None
         # A stable sort: equal scores keep the grid's order, which begins nearest to zero.
-        worth = covered[inside] - self.settings.outside_weight * outside[:, inside].sum(axis=0)
-        best = inside[np.argsort(-worth, kind="stable")]
+        best = inside[np.argsort(-covered[inside], kind="stable")]
         if len(self.nodes[node].mesh.triangles):
             best = best[: self.settings.candidate_limit]
         return NodeList(samples[best], X_WN[best])
@@ -279,17 +279,9 @@ class PaperRun:
 
     def result(self) -> PoseEstimate:
         """What the search found, as plain arrays."""
-        sampled = self.scoring.sampled
-        statistics = SearchStatistics(self.runs, self.first_J, self.outside_limit)
+        sampled, told = self.scoring.sampled, dict[str, Any](stopped_by=self.stopped_by)
+        told |= {"runs": self.runs, "first_J": self.first_J, "outside_limit": self.outside_limit}
         if self.best_J == np.inf:
-            return PoseEstimate.nothing(
-                sampled.tree, stopped_by=self.stopped_by, statistics=statistics
-            )
-        return PoseEstimate.of_values(
-            sampled.tree,
-            sampled.values_at(self.best_samples),
-            self.best_J,
-            self.scoring.silhouette_area,
-            stopped_by=self.stopped_by,
-            statistics=statistics,
-        )
+            return PoseEstimate.nothing(sampled.tree, **told)
+        values, area = sampled.values_at(self.best_samples), self.scoring.silhouette_area
+        return PoseEstimate.of_values(sampled.tree, values, self.best_J, area, **told)

@@ -28,7 +28,7 @@ from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.fit.surfaces import few_triangles, rough_outlines
 from drake_pose.search.beam_search import BeamSearch
 from drake_pose.search.coarse_search import CoarsePoses, CoarseSearch
-from drake_pose.search.estimates import PoseEstimate, SearchStatistics, View
+from drake_pose.search.estimates import PoseEstimate, View
 from drake_pose.search.exact_search import ExactPose, ExactSearch
 from drake_pose.search.partial_poses import coarsen
 from drake_pose.search.refinement import RefinementProblem
@@ -194,7 +194,9 @@ class _MultiStartRun:
             self._J(values),
             float(sum(np.count_nonzero(view.mask) for view in self._views)),
             stopped_by=self._stopped_by,
-            statistics=SearchStatistics(steps, first_J, interval_seconds=seconds),
+            runs=steps,
+            first_J=first_J,
+            interval_seconds=seconds,
             pose_set=pose_set,
         )
 

@@ -34,7 +34,7 @@ from drake_pose.body import PoseTree
 from drake_pose.camera.models import Camera, ParallelCamera
 from drake_pose.errors import SettingsError
 from drake_pose.search.beam_search import BeamSearch, grow
-from drake_pose.search.estimates import PoseEstimate, SearchStatistics, View
+from drake_pose.search.estimates import PoseEstimate, View
 from drake_pose.search.partial_poses import (
     Pictures,
     PoseStore,
@@ -447,9 +447,7 @@ class RootPlacementSearch:
                 placed += itertools.chain.from_iterable(searched)
         runs = len(counts) * len(self.tree.nodes)
         if not placed:
-            found = PoseEstimate.nothing(
-                self.tree, stopped_by="end", statistics=SearchStatistics(runs)
-            )
+            found = PoseEstimate.nothing(self.tree, stopped_by="end", runs=runs)
             return replace(found, seconds=time.perf_counter() - begin)
         placed.sort(key=_by_J)
         best = self._improve(placed[: own.starts], root_position is None, deadline)
@@ -474,7 +472,8 @@ class RootPlacementSearch:
             seconds=now - begin,
             root_position=p_WR,
             scale=best.scale,
-            statistics=SearchStatistics(runs, first_J),
+            runs=runs,
+            first_J=first_J,
         )
 
     def _search_layer(self, layer: RootPlaces, width: int, outside_share: float) -> list[_Placed]:

@@ -1,5 +1,7 @@
 """A sampled pose tree: its areas in several views, and what makes its nodes quick to draw."""
 
+from __future__ import annotations
+
 import copy
 from collections.abc import Sequence
 from functools import lru_cache
@@ -22,6 +24,10 @@ from drake_pose.silhouette.areas.scoring import (
     subtract_body,
 )
 from drake_pose.silhouette.contours.contour_points import CelledOutline, divide_outline
+
+# Of each view what is left of the silhouette: (H, W) uint8, and prefix sums (2, H, W + 1) of the
+# silhouette and of that.
+Regions = list[tuple[np.ndarray, np.ndarray]]
 
 
 class SampledTree:
@@ -86,7 +92,7 @@ class SampledTree:
         surfaces = [self.surfaces.whole(node) for node in nodes]
         return score_bodies(surfaces, X_CN, camera, prefixes, placed)
 
-    def with_root_position(self, root_position: np.ndarray) -> "SampledTree":
+    def with_root_position(self, root_position: np.ndarray) -> SampledTree:
         """The same with the root at another position (3,) [m]; all but the root is shared."""
         moved = copy.copy(self)
         moved.tree = self.tree.with_root_position(root_position)
@@ -132,7 +138,7 @@ class Scoring:
         return X_WP @ self.sampled.X_PN[node]
 
     def candidate_areas(
-        self, node: int, samples: np.ndarray, X_WN: np.ndarray, regions: "Regions"
+        self, node: int, samples: np.ndarray, X_WN: np.ndarray, regions: Regions
     ) -> tuple[np.ndarray, np.ndarray]:
         """Areas of a node at samples (n,) and their poses X_WN (n, 4, 4).
 
@@ -141,19 +147,30 @@ class Scoring:
             the views, (n,) (5), (7).
         """
         outside, covered = [], np.zeros(len(X_WN))
-        for view, prefixes, X_CW in zip(self.views, regions.prefixes, self.X_CW, strict=True):
+        for view, (_, prefixes), X_CW in zip(self.views, regions, self.X_CW, strict=True):
             X_CN = (X_CW @ X_WN)[:, None]
             areas = self.sampled.areas([node], samples[:, None], X_CN, view.camera, prefixes)
             outside.append(areas[:, 0] - areas[:, 1])
             covered += areas[:, 2]
         return np.array(outside), covered
 
-    def uncovered(self, nodes: Sequence[int], samples: np.ndarray, X_WN: np.ndarray) -> "Regions":
+    def uncovered(self, nodes: Sequence[int], samples: np.ndarray, X_WN: np.ndarray) -> Regions:
         """S minus the projections of some nodes (3), (6); samples and X_WN are of all nodes."""
-        regions = Regions(self)
+        regions = [
+            (view.mask.astype(np.uint8), np.repeat(sums, 2, axis=0))
+            for view, sums in zip(self.views, self.silhouette_prefixes, strict=True)
+        ]
         if nodes:
-            regions.subtract(nodes, samples[list(nodes)], X_WN[list(nodes)])
+            self.subtract(regions, nodes, samples[list(nodes)], X_WN[list(nodes)])
         return regions
+
+    def subtract(
+        self, regions: Regions, nodes: Sequence[int], samples: np.ndarray, X_WN: np.ndarray
+    ) -> None:
+        """Take the projections of nodes at samples (k,), poses (k, 4, 4), out of regions."""
+        outlines = self.sampled.outlines_at(nodes, samples)
+        for view, X_CW, (mask, prefixes) in zip(self.views, self.X_CW, regions, strict=True):
+            subtract_body(mask, prefixes[1], outlines, X_CW @ X_WN, view.camera)
 
     def J(self, samples: np.ndarray) -> np.ndarray:
         """The objective (1) [pixel] (n,) of poses at samples (n, nodes)."""
@@ -189,29 +206,6 @@ class Scoring:
             ]
             means.append(float(np.mean(areas)))
         return means
-
-
-class Regions:
-    """A region of the picture in each view that begins as the silhouette and only shrinks.
-
-    Attributes:
-        masks: for each view (H, W) uint8, the region.
-        prefixes: for each view (2, H, W + 1), prefix sums of the silhouette and of the region.
-    """
-
-    def __init__(self, scoring: Scoring) -> None:
-        self._scoring = scoring
-        self.masks = [view.mask.astype(np.uint8) for view in scoring.views]
-        self.prefixes = [np.repeat(sums, 2, axis=0) for sums in scoring.silhouette_prefixes]
-
-    def subtract(self, nodes: Sequence[int], samples: np.ndarray, X_WN: np.ndarray) -> None:
-        """Take the projections of nodes at samples (k,), poses (k, 4, 4), out of the region."""
-        scoring = self._scoring
-        outlines = scoring.sampled.outlines_at(nodes, samples)
-        for view, X_CW, mask, prefixes in zip(
-            scoring.views, scoring.X_CW, self.masks, self.prefixes, strict=True
-        ):
-            subtract_body(mask, prefixes[1], outlines, X_CW @ X_WN, view.camera)
 
 
 class PoseSearch(Protocol):
@@ -266,7 +260,7 @@ class SampledBody:
         self.order = self._find_order(limb_by_limb=False)
         self.limb_order = self._find_order(limb_by_limb=True)
 
-    def with_root_position(self, root_position: np.ndarray) -> "SampledBody":
+    def with_root_position(self, root_position: np.ndarray) -> SampledBody:
         """The same with the root at another position (3,) [m]; all but the root is shared."""
         moved = copy.copy(self)
         moved.sampled = self.sampled.with_root_position(root_position)

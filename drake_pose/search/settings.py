@@ -51,8 +51,6 @@ class PaperSearchSettings(GridSettings):
         outside_limit: the threshold r of (4) [pixel]: the area of a segment that may lie outside
             the silhouette, in each view. None: begin with 12.6 % of the mean projected area of a
             segment (what the paper's 200 pixels are for its body) and double until a pose is found.
-        outside_weight: what a pixel outside the silhouette costs where candidates are put in order:
-            by e - outside_weight * (area outside). 0 is the paper's order, by e alone.
         candidate_limit: K, how many of a node's candidates are kept.
         run_limit: of runs of step 3; the answer is then the best pose so far.
 
@@ -61,15 +59,12 @@ class PaperSearchSettings(GridSettings):
     """
 
     outside_limit: float | None = None
-    outside_weight: float = 0.0
     candidate_limit: int = 5
     run_limit: int = 10_000
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self._require(0, "outside_limit", "outside_weight")
-        if math.isinf(self.outside_weight):
-            raise SettingsError("outside_weight must be finite")
+        self._require(0, "outside_limit")
         self._require(1, "candidate_limit", "run_limit")
 
 

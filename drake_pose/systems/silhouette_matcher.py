@@ -186,8 +186,8 @@ def _statistics(estimate: PoseEstimate | None) -> Array:
     values = np.zeros(len(STATISTICS))
     values[1:4] = np.inf
     if estimate is not None:
-        search = estimate.statistics
-        values[4:] = search.runs, max(search.outside_limit, default=0.0), estimate.seconds
+        limit = max(estimate.outside_limit, default=0.0)
+        values[4:] = estimate.runs, limit, estimate.seconds
         if estimate.found:
             values[:4] = 1.0, estimate.J, estimate.E_total, estimate.first_E_total
     return values

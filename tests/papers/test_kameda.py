@@ -101,7 +101,7 @@ def test_json_has_the_keys_of_the_paper_and_the_same_seed_the_same_figures(searc
     assert figures["images"] == 5
     E_total = [trial.result.E_total for trial in result.trials]
     assert figures["mean_e_total"] == pytest.approx(np.mean(E_total))
-    assert figures["min_runs"] == min(trial.result.statistics.runs for trial in result.trials)
+    assert figures["min_runs"] == min(trial.result.runs for trial in result.trials)
     again = run_experiment(search, images=1, seed=5)
     for one, other in zip(result.trials, again.trials, strict=False):
         np.testing.assert_array_equal(one.result.q, other.result.q)

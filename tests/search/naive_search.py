@@ -13,12 +13,11 @@ from drake_pose.silhouette.areas.scoring import draw_mask
 
 
 class NaiveSearch:
-    def __init__(self, search, camera, silhouette, r, K, outside_weight=0.0):
+    def __init__(self, search, camera, silhouette, r, K):
         self.tree = search.tree
         self.values = search.sampled.values
         self.surfaces = TreeSurfaces(search.tree)
         self.camera, self.S, self.r, self.K = camera, silhouette, r, K
-        self.outside_weight = outside_weight
         self.lists, self.u = {}, {}
         self.runs = 0
         self.first_J = None
@@ -73,8 +72,7 @@ class NaiveSearch:
                 P = self.picture(i, values)
                 outside = (P & ~self.S).sum()
                 if outside <= self.r:
-                    cost = self.outside_weight * outside - (open_part & P).sum()
-                    scored.append((float(cost), t))
+                    scored.append((-int((open_part & P).sum()), t))
             scored.sort()
             if scored:
                 self.lists[i] = [t for _, t in scored[: self.K]]

@@ -105,7 +105,7 @@ def test_position_and_scale_of_a_parallel_camera_are_found(body, seen):
             found.append(placed(body.pose_tree(), views, scale_unknown=True))
     result, again = found
     np.testing.assert_array_equal(result.q, again.q)
-    assert result.statistics == again.statistics
+    assert (result.runs, result.first_J) == (again.runs, again.first_J)
     assert result.E_total < 0.04
     assert result.scale * 7.0 == pytest.approx(100.0, rel=0.04)
     assert result.root_position[1:] == pytest.approx(PLACE[1:], abs=0.02)

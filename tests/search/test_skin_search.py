@@ -72,7 +72,7 @@ def test_the_papers_search_is_that_of_plain_pictures(limb, seed):
     result = search.match([view])
     naive = NaiveSearch(search, view.camera, view.mask, 8.0, 3).run()
     assert result.found == (naive.best is not None)
-    assert result.statistics.runs == naive.runs
+    assert result.runs == naive.runs
     if naive.best is not None:
         assert result.J == naive.best[0]
 

@@ -72,7 +72,7 @@ def woman_picture() -> np.ndarray:
     mask = renderer.mask(q)
     search = PaperSearch(woman.pose_tree(root_position=ROOT_POSITION), PaperSearchSettings())
     result = search.match([View(camera, mask)])
-    runs = result.statistics.runs
+    runs = result.runs
     print(f"woman: E_total {result.E_total:.2%}, {runs} runs, {result.seconds:.2f} s")
     segments = renderer.segments(result.q)
     silhouette = np.repeat(np.where(mask, 255, 24).astype(np.uint8)[:, :, None], 3, axis=2)

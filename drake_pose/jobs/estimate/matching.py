@@ -136,7 +136,7 @@ def match_frames(
         yield finish_frame(
             inputs, frame, pose, masks, parts, bodies, shown, **more, **known,
             first_E_total=pose.first_E_total if pose.found else None,
-            runs=pose.statistics.runs, outside_limit=pose.statistics.outside_limit,
+            runs=pose.runs, outside_limit=pose.outside_limit,
             explained=pose.explained,
         )  # fmt: skip
 

@@ -67,8 +67,7 @@ class DateResult:
     def __init__(self, studio: Studio, motion: Motion, method: str, seed: int) -> None:
         self.studio, self.names = studio, motion.names
         self._motion, self._method = motion, method
-        renderer = "own" if studio.own_drawing else "drake"
-        self._settings = {"seed": seed, "method": method, "renderer": renderer}
+        self._settings = {"seed": seed, "method": method}
         setup = studio.prepare(motion.q[0])
         alone = replace(setup, search=False)
         self._tracks: dict[str, PaperTrack | SilhouetteTrack] = {
@@ -236,7 +235,7 @@ class DateResult:
                 "{:.1f}",
             ),
             _table_of_motions(
-                f"Elbows and knees as found, in mm, drawn by: {self._settings['renderer']}",
+                "Elbows and knees as found, in mm",
                 {**found, "upright": self._as_found(UPRIGHT)},
                 found_headings,
                 "{:.0f}",
@@ -266,7 +265,6 @@ def run_experiment(
     method: str = "silhouette",
     count: Count = uncounted,
     size: tuple[int, int] = (640, 480),
-    renderer: str = "drake",
 ) -> DateResult:
     """Captures a simulated person, by one core.
 
@@ -276,15 +274,13 @@ def run_experiment(
         method: whose figures lead: "paper", all as it prints it, alone; "silhouette", all
             silhouettes at once, beside it.
         size: width and height of the pictures [pixel].
-        renderer: who draws the person, "drake", or "own", the code of the label images; the face
-            camera's pictures are Drake's.
 
     Raises:
         SettingsError: an argument is out of its range.
     """
     require_choice("method", method, ("silhouette", "paper"))
     with one_core():
-        studio = Studio.build(cameras, size, np.random.default_rng([seed, 1]), renderer)
+        studio = Studio.build(cameras, size, np.random.default_rng([seed, 1]))
         motion = make_motion(studio.skeleton, frames, seed)
         result = DateResult(studio, motion, method, seed)
         advance = count("frames", frames)

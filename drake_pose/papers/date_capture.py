@@ -20,7 +20,6 @@ from drake_pose.body import ArticulatedModel, bundled_model, load_model
 from drake_pose.camera.models import FACE_CAMERA, PinholeCamera, circle_of_cameras
 from drake_pose.errors import SettingsError
 from drake_pose.fit.contour_fit import ContourFit
-from drake_pose.papers.tables import require_choice
 from drake_pose.person.date.features import (
     FACE_SIZE,
     Features,
@@ -32,8 +31,6 @@ from drake_pose.person.date.features import (
 )
 from drake_pose.person.date.skeleton import LIMBS, Skeleton, load_skeleton
 from drake_pose.person.pose_tracker import PersonPoseTracker, TrackState
-from drake_pose.silhouette.areas.outline import outline_from_mesh
-from drake_pose.silhouette.areas.scoring import draw_labels
 from drake_pose.silhouette.segmentation.background import Background, learn_background
 from drake_pose.systems.cameras import CameraRig, build_camera_rig
 from drake_pose.systems.date import (
@@ -67,35 +64,22 @@ def one_core() -> Iterator[None]:
 
 @dataclass(frozen=True, eq=False)
 class Studio:
-    """The simulated person, cameras (the face camera among them), empty rooms and noise.
-
-    Args:
-        rooms: (H, W, 3) what each camera sees of the empty room, without noise.
-        own_drawing: whether the kernel of label images draws the person before the cameras on the
-            circle, skin and clothes of one colour each; else Drake's renderer.
-    """
+    """The simulated person, cameras (the face camera among them), empty room and noise."""
 
     model: ArticulatedModel
     skeleton: Skeleton
     cameras: Mapping[str, PinholeCamera]
     rig: CameraRig
     context: Context
-    rooms: Mapping[str, Picture]
     backgrounds: Mapping[str, Background]
     generator: np.random.Generator
-    own_drawing: bool
 
     @staticmethod
-    def build(
-        cameras: int, size: tuple[int, int], generator: np.random.Generator, renderer: str = "drake"
-    ) -> Studio:
+    def build(cameras: int, size: tuple[int, int], generator: np.random.Generator) -> Studio:
         """A studio of this many cameras, face camera included, pictures of one size [pixel].
 
-        renderer: who draws the pictures of the cameras on the circle, "drake" or "own".
-
-        Raises SettingsError: neither of them, or too few cameras.
+        Raises SettingsError: too few cameras.
         """
-        require_choice("renderer", renderer, ("drake", "own"))
         if cameras < 3:
             raise SettingsError(f"cameras must be 3 or more, not {cameras}")
         model = load_model(bundled_model("person"), check=False)
@@ -110,38 +94,14 @@ class Studio:
             name: learn_background([noisy(room, generator) for _ in range(5)])
             for name, room in rooms.items()
         }
-        skeleton, own = load_skeleton(model), renderer == "own"
-        return Studio(model, skeleton, placed, rig, context, rooms, backgrounds, generator, own)
+        skeleton = load_skeleton(model)
+        return Studio(model, skeleton, placed, rig, context, backgrounds, generator)
 
     def pictures(self, q: Array) -> dict[str, Picture]:
         """What all cameras see of a person at q (nq,), noise included."""
         self.rig.set_positions(self.context, q)
-        own = self._own_pictures(q) if self.own_drawing else {}
-        return {
-            name: noisy(
-                own[name] if name in own else self.rig.picture(self.context, name), self.generator
-            )
-            for name in self.cameras
-        }
-
-    def _own_pictures(self, q: Array) -> dict[str, Picture]:
-        """The person at q (nq,) before the empty rooms of the cameras on the circle."""
-        plant, meshes = self.model.plant, self.model.link_meshes
-        context = plant.CreateDefaultContext()
-        plant.SetPositions(context, q)
-        X_WL = [plant.GetBodyByName(n).EvalPoseInWorld(context).GetAsMatrix4() for n in meshes]
-        bare = np.array([name.endswith(("head", "hand", "foot")) for name in meshes])
-        # Skin and clothes of the bundled person [red, green, blue].
-        colours = np.where(bare[:, None], (217, 166, 135), (31, 88, 106)).astype(np.uint8)
-        outlines = [outline_from_mesh(mesh) for mesh in meshes.values()]
-        found = {}
-        for name, camera in self.cameras.items():
-            if name != FACE_CAMERA:
-                numbers = np.arange(1, len(X_WL) + 1)
-                labels = draw_labels(outlines, numbers, camera.X_CW @ X_WL, camera)
-                found[name], person = np.array(self.rooms[name]), labels > 0
-                found[name][person] = colours[labels[person] - 1]
-        return found
+        shots = {name: self.rig.picture(self.context, name) for name in self.cameras}
+        return {name: noisy(shot, self.generator) for name, shot in shots.items()}
 
     def prepare(self, q: Array) -> CaptureSetup:
         """What the paper's method must know before: faces, skin, and q (nq,), registered."""

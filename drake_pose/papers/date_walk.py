@@ -66,14 +66,13 @@ def run_walk_through(
     seed: int = 0,
     count: Count = uncounted,
     size: tuple[int, int] = (640, 480),
-    renderer: str = "drake",
 ) -> WalkThrough:
     """Captures table 1's gestures the paper's way, and lets them walk on the spot.
 
     Arguments are those of papers.date.run_experiment.
     """
     with one_core():
-        studio = Studio.build(cameras, size, np.random.default_rng([seed, 1]), renderer)
+        studio = Studio.build(cameras, size, np.random.default_rng([seed, 1]))
         motion = make_gestures(studio.skeleton)
         names, model = np.array(motion.names), studio.model
         track = PaperTrack.build(studio.prepare(motion.q[0]))
@@ -101,7 +100,6 @@ def run_walk_through(
         "place_error_m": float(np.linalg.norm(off[:2])),
         "heading_error_deg": abs(math.degrees(math.remainder(off[2], 2.0 * math.pi))),
         "frames": len(names), "cameras": cameras, "seed": seed, "method": "paper",
-        "renderer": renderer,
     }  # fmt: skip
     middles = {name: int(np.median(np.flatnonzero(names == name))) for name in COMMANDS}
     pictures = {

@@ -7,7 +7,7 @@ import pytest
 from drake_pose.body import bundled_model, load_model
 from drake_pose.errors import SettingsError
 from drake_pose.papers.date import frames_of_destruction, run_experiment
-from drake_pose.papers.date_capture import PERIOD, Studio
+from drake_pose.papers.date_capture import PERIOD
 from drake_pose.papers.date_walk import (
     draw_walk,
     followed,
@@ -25,7 +25,6 @@ from drake_pose.person.date.walking import (
     make_gestures,
     make_motion,
 )
-from drake_pose.silhouette.segmentation.background import person_region
 
 
 @pytest.fixture(scope="module")
@@ -70,7 +69,7 @@ def test_all_silhouettes_are_nearer_than_the_papers_search_and_pictures_are_save
     assert figures["joint_error_mm"] < 40.0
     assert figures["face_error_deg"] < 6.0
     assert figures["paper_mm"] < figures["ik_only_mm"]
-    assert (figures["method"], figures["renderer"]) == ("silhouette", "drake")
+    assert figures["method"] == "silhouette"
     # The search moves elbows and knees alone; the paper's waist holds the knees back.
     assert figures["elbows"]["paper_mm"] < 0.7 * figures["elbows"]["ik_only_mm"]
     assert figures["elbows"]["silhouette_mm"] < 0.5 * figures["elbows"]["paper_mm"]
@@ -127,27 +126,10 @@ class TestWalkThrough:
         assert walk.save(tmp_path).name == "figure_08.png"
 
 
-def test_own_drawing_is_drakes_but_for_edges(skeleton):
-    """The person's region in its pictures is that of Drake's label images."""
-    studio = Studio.build(3, (320, 240), np.random.default_rng(0), "own")
-    q = make_motion(skeleton, 40, 0).q[30]
-    pictures = studio.pictures(q)
-    for name in ("camera_0", "camera_1"):
-        seen = studio.rig.mask(studio.context, name)
-        region = person_region(pictures[name], studio.backgrounds[name])
-        assert np.count_nonzero(region ^ seen) < 0.02 * np.count_nonzero(seen)
-        drawn = skin_blobs(pictures[name], seen, SkinColour()).centroids
-        rendered = studio.rig.picture(studio.context, name)
-        true = skin_blobs(rendered, seen, SkinColour()).centroids
-        off = np.linalg.norm(drawn[:, None] - true, axis=2).min(axis=1)
-        assert (off < 2.0).all()
-
-
 @pytest.mark.parametrize(
     ("bad", "word"),
     [
         ({"method": "magic"}, "silhouette, paper"),
-        ({"renderer": "magic"}, "drake, own"),
         ({"cameras": 2}, "3 or more"),
     ],
 )

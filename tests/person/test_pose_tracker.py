@@ -33,11 +33,16 @@ class World:
 
     def off(self, values, q):
         """The largest distance of a joint centre from where it is [mm]."""
-        plan, kinematics = self.tracker.plan, self.tracker.fit.kinematics
-        places = [
-            plan.landmarks.positions(kinematics.poses(v)) for v in (values, self.tracker.values(q))
-        ]
-        return 1e3 * np.linalg.norm(places[0] - places[1], axis=1).max()
+        return joint_error(self.tracker, values, q)
+
+
+def joint_error(tracker, values, q):
+    """The largest distance of a joint centre at values from where it is at positions [mm]."""
+    places = [
+        tracker.plan.landmarks.positions(tracker.fit.kinematics.poses(v))
+        for v in (values, tracker.values(q))
+    ]
+    return 1e3 * np.linalg.norm(places[0] - places[1], axis=1).max()
 
 
 @pytest.fixture(scope="module")
@@ -77,12 +82,7 @@ class TestTracker:
         masks = [LabelRenderer(person, camera).mask(q) for camera in ring.values()]
         tracker = PersonPoseTracker(ContourFit(person.pose_tree(), noise=NOISE), LENIENT)
         seen = FrameViews([*ring.values()], [see_silhouette(mask, 4.0) for mask in masks])
-        values, plan = tracker.follow(None, seen).values, tracker.plan
-        places = [
-            plan.landmarks.positions(plan.kinematics.poses(one))
-            for one in (values, tracker.values(q))
-        ]
-        assert np.linalg.norm(places[0] - places[1], axis=1).max() < 0.03
+        assert joint_error(tracker, tracker.follow(None, seen).values, q) < 30.0
 
     def test_destroyed_track_is_right_again_without_a_registered_pose(self, world):
         q = world.pose(**WALKING, head_y=-70)
@@ -132,27 +132,23 @@ class TestTracker:
             uv, _ = world.cameras[k].project(points)
             np.testing.assert_allclose(small.project(points)[0], uv / stride, atol=1e-9)
 
-    def test_settings_are_checked(self):
-        for rounds in ({"follow": ()}, {"search": ()}):
-            with pytest.raises(SettingsError, match="round"):
-                replace(EXACT, **rounds)
+    @pytest.mark.parametrize("rounds", ["follow", "search"])
+    def test_settings_are_checked(self, rounds):
+        with pytest.raises(SettingsError, match="round"):
+            replace(EXACT, **{rounds: ()})
 
 
 class TestPlan:
     def test_limbs_move_nothing_else_and_their_poses_hold_the_limits(self, world):
         plan = world.tracker.plan
-        names = np.array(plan.kinematics.names)
         for name, limb in plan.limbs.items():
             side, kind = name.split("_")
-            parts = ("upper_arm", "forearm") if kind == "arm" else ("thigh", "shin")
-            assert all(
-                n.startswith(tuple(f"{side}_{p}" for p in parts)) for n in names[limb.values]
+            upper, lower = ("upper_arm", "forearm") if kind == "arm" else ("thigh", "shin")
+            moved = np.array(plan.kinematics.names)[limb.values].tolist()
+            assert sorted(moved) == sorted(
+                [*(f"{side}_{upper}_{a}" for a in "xyz"), f"{side}_{lower}_x"]
             )
-            assert len(limb.values) == 4
-            middle = [
-                n for n, v in enumerate(limb.values) if "forearm" in names[v] or "shin" in names[v]
-            ]
-            stretched = (limb.poses[:, middle] == 0.0).all(axis=1)
+            stretched = limb.poses[:, moved.index(f"{side}_{lower}_x")] == 0.0
             assert 0.1 < stretched.mean() < 0.2
             assert (limb.poses >= plan.kinematics.lower[limb.values]).all()
             assert (limb.poses <= plan.kinematics.upper[limb.values]).all()
@@ -179,9 +175,4 @@ def test_no_still_is_taken_for_another_pose_that_looks_alike():
     for q in make_motion(load_skeleton(person), 240, 0).q[::8]:
         views = [see_silhouette(renderer.mask(q), 4.0) for renderer in renderers]
         found = tracker.follow(None, FrameViews(cameras, views))
-        assert found is not None
-        places = [
-            tracker.plan.landmarks.positions(fit.kinematics.poses(values))
-            for values in (found.values, tracker.values(q))
-        ]
-        assert np.linalg.norm(places[0] - places[1], axis=1).max() < 0.06
+        assert joint_error(tracker, found.values, q) < 60.0

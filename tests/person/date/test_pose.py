@@ -17,7 +17,7 @@ from drake_pose.person.date.pose import (
     rectangles,
     upper_body,
 )
-from drake_pose.person.date.skeleton import LIMBS, load_skeleton
+from drake_pose.person.date.skeleton import FEATURES, LIMBS, load_skeleton
 from tests.person.persons_in_view import SIDES, posed, see
 
 
@@ -37,31 +37,25 @@ def drawn_pose(skeleton, generator, share=0.5):
 
 
 class TestSkeleton:
-    def test_points_are_drakes(self, person, skeleton):
-        generator = np.random.default_rng(0)
-        landmarks = load_landmarks(person.path)
+    def test_points_are_drakes_and_ends_inside_hands_and_feet(self, person, skeleton):
+        generator, landmarks = np.random.default_rng(0), load_landmarks(person.path)
+        context = person.plant.CreateDefaultContext()
         for _ in range(5):
             q = drawn_pose(skeleton, generator, 1.0)
             true = dict(zip(landmarks, landmark_positions(person, landmarks, q), strict=True))
             np.testing.assert_allclose(skeleton.trunk_pose(q)[1], true["neck"], atol=1e-12)
             for name in LIMBS:
                 side, kind = name.split("_")
-                root, middle = ("shoulder", "elbow") if kind == "arm" else ("hip", "knee")
+                joints = ("shoulder", "elbow") if kind == "arm" else ("hip", "knee")
                 points = skeleton.limb_points(q, name)
-                np.testing.assert_allclose(points[0], true[f"{side}_{root}"], atol=1e-12)
-                np.testing.assert_allclose(points[1], true[f"{side}_{middle}"], atol=1e-12)
-
-    def test_ends_are_inside_hands_and_feet(self, person, skeleton):
-        q = drawn_pose(skeleton, np.random.default_rng(1))
-        context = person.plant.CreateDefaultContext()
-        person.plant.SetPositions(context, q)
-        features = skeleton.features(q)
-        links = ("head", "left_hand", "right_hand", "left_foot", "right_foot")
-        for link, place in zip(links, features, strict=True):
-            X_WL = person.plant.GetBodyByName(link).EvalPoseInWorld(context).GetAsMatrix4()
-            vertices = person.link_meshes[link].vertices @ X_WL[:3, :3].T + X_WL[:3, 3]
-            assert (vertices.min(axis=0) < place).all()
-            assert (place < vertices.max(axis=0)).all()
+                expected = [true[f"{side}_{joint}"] for joint in joints]
+                np.testing.assert_allclose(points[:2], expected, atol=1e-12)
+            person.plant.SetPositions(context, q)
+            for link, place in zip(FEATURES, skeleton.features(q), strict=True):
+                X_WL = person.plant.GetBodyByName(link).EvalPoseInWorld(context)
+                p_L, vertices = X_WL.inverse() @ place, person.link_meshes[link].vertices
+                assert (vertices.min(axis=0) < p_L).all()
+                assert (p_L < vertices.max(axis=0)).all()
 
     def test_other_models_are_refused(self):
         with pytest.raises(ModelError, match="trunk"):
@@ -137,13 +131,11 @@ class TestCircle:
         assert (zero - half)[0] * (1.0 if limb.is_leg else -1.0) > 1.4 * radius
         assert (middle - center) @ (zero - center) > 0.9 * radius**2
 
-    def test_limb_beyond_its_reach_is_straight(self, skeleton):
+    def test_limb_beyond_its_reach_is_straight_and_rectangles_are_as_wide_as_said(self, skeleton):
         limb, end, outward = skeleton.limbs["left_arm"], np.array([0, 0, -2.0]), np.eye(3)[1]
         places = joint_circle(limb, np.zeros(3), end, outward, np.array([0.0, 90.0]))
         expected = [0, 0, -2.0 * limb.lengths[0] / sum(limb.lengths)]
         np.testing.assert_allclose(places, [expected] * 2, atol=1e-12)
-
-    def test_rectangles(self):
         root, middle, end = np.zeros(3), np.array([0.0, 0.3, 0.0]), np.array([0.4, 0.3, 0.0])
         points = rectangles(root, middle[None], end, np.array([0.05, 0.02]))[0]
         assert np.abs(points[:, 2]).max() == 0.0
@@ -172,22 +164,22 @@ class TestCircle:
 
 class TestAngles:
     def test_straight_arm_is_not_turned_about_itself(self, skeleton):
-        limb = skeleton.limbs["left_arm"]
-        last = np.array([0.2, 0.4, 0.5, 0.0])
-        q = np.zeros(len(skeleton.lower))
+        """The shortest turn from the old direction of the arm to the new one, and no other."""
+        limb, last, q = (
+            skeleton.limbs["left_arm"],
+            np.array([0.2, 0.4, 0.5, 0.0]),
+            skeleton.lower * 0,
+        )
         q[limb.positions] = last
-        root, _, _ = skeleton.limb_points(q, "left_arm")
-        end = root + np.array([0.0, 0.7, -0.2])
-        middle = root + (end - root) * limb.lengths[0] / sum(limb.lengths)
-        R_WT, _ = skeleton.trunk_pose(q)
-        found = place_limb(limb, R_WT, root, middle[None], end, last)[0][0]
+        root, R_WT = skeleton.limb_points(q, "left_arm")[0], skeleton.trunk_pose(q)[0]
+        across = np.array([0.0, 0.7, -0.2])
+        middle = root + across * limb.lengths[0] / sum(limb.lengths)
+        found = place_limb(limb, R_WT, root, middle[None], root + across, last)[0][0]
         axes = "".join("XYZ"[axis] for axis in limb.axes[:3])
-        R_before, R_after = Rotation.from_euler(axes, [last[:3], found[:3]]).as_matrix()
-        # The shortest turn from the old direction of the arm to the new one, and no other.
-        turned = np.arccos((np.trace(R_before.T @ R_after) - 1) / 2)
-        old, new = R_WT @ R_before @ limb.middle_U, end - root
-        needed = np.arccos(old @ new / np.linalg.norm(old) / np.linalg.norm(new))
-        assert turned < needed + 0.1
+        before, after = Rotation.from_euler(axes, [last[:3], found[:3]])
+        old = R_WT @ before.apply(limb.middle_U)
+        needed = np.arccos(old @ across / np.linalg.norm(old) / np.linalg.norm(across))
+        assert (before.inv() * after).magnitude() < needed + 0.1
 
 
 @pytest.fixture(scope="module")

@@ -134,11 +134,7 @@ class TestLearning:
             assert np.all(np.isclose(beside, 0.0) | np.isclose(beside, 1.0, atol=1e-3))
         assert wrong[1] < 0.5 * wrong[0]
 
-    def test_a_camera_that_is_not_known_says_nothing(self, person, cameras, recording):
-        pictures, _, q = (one[0] for one in recording)
-        fit = ContourFit(person.pose_tree(), noise=NOISE)
-        tracker = PersonPoseTracker(fit)
-        views = ColourViews(list(cameras.values()), list(pictures.values()), {})
+        # A camera of which nothing is known says nothing.
         state = tracker.follow_by_colour(tracker.start(tracker.values(q)), views)
         assert state.share == 0.0
         assert state.is_lost

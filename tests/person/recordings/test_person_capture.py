@@ -69,16 +69,11 @@ class TestShape:
 
 
 class TestCapture:
-    def test_no_frame(self, person, cameras):
-        with pytest.raises(SettingsError, match="one frame"):
-            capture_person(person.pose_tree(), cameras, lambda k: {}, [])
-
-    def test_nobody_in_any_frame(self, person, cameras):
-        def read(_):
-            return {name: np.zeros((240, 320), dtype=bool) for name in cameras}
-
-        with pytest.raises(SettingsError, match="two cameras"):
-            capture_person(person.pose_tree(), cameras, read, [0, 1])
+    @pytest.mark.parametrize(("frames", "word"), [([], "one frame"), ([0, 1], "two cameras")])
+    def test_no_frame_and_nobody_in_any_frame(self, person, cameras, frames, word):
+        nobody = {name: np.zeros((240, 320), dtype=bool) for name in cameras}
+        with pytest.raises(SettingsError, match=word):
+            capture_person(person.pose_tree(), cameras, lambda _: nobody, frames)
 
     @pytest.mark.slow
     def test_real_person_of_unknown_proportions(self, person, shared_data):

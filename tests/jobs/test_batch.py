@@ -75,21 +75,8 @@ def slow(task: Task) -> Outcome:
     return perform(task)
 
 
-@pytest.mark.slow
-def test_results_depend_neither_on_who_works_nor_on_who_is_killed(
-    jobs, alone, cluster, scenes, tmp_path
-):
-    victims, out = list(cluster.run(os.getpid).values())[:1], tmp_path / "two"
-
-    def kill(done: int, total: int, message: str) -> None:
-        if done and victims:
-            os.kill(victims.pop(), signal.SIGKILL)
-
-    result = run_batch(jobs, out, cluster, work=slow, on_progress=kill)
-    assert not victims
-    assert not result.failed
-    assert same_results(alone, out)
-    assert sorted(path.name for path in out.iterdir()) == ["batch.json", "motion", "stills"]
+def test_chunks_put_together_are_the_result_of_the_whole_scene(jobs, alone, scenes, tmp_path):
+    assert sorted(path.name for path in alone.iterdir()) == ["batch.json", "motion", "stills"]
     plain = tmp_path / "plain"
     estimate_scene(
         scenes / "stills", scenes / "crane.urdf", plain, jobs[0].settings, replay=False,
@@ -102,6 +89,20 @@ def test_results_depend_neither_on_who_works_nor_on_who_is_killed(
     assert summary["complete"]
     assert list(summary["frames"]) == ["0000", "0001", "0002"]
     assert len(list((alone / "motion" / "overlay" / "front").iterdir())) == 3
+
+
+@pytest.mark.slow
+def test_results_depend_neither_on_who_works_nor_on_who_is_killed(jobs, alone, cluster, tmp_path):
+    victims, out = list(cluster.run(os.getpid).values())[:1], tmp_path / "two"
+
+    def kill(done: int, total: int, message: str) -> None:
+        if done and victims:
+            os.kill(victims.pop(), signal.SIGKILL)
+
+    result = run_batch(jobs, out, cluster, work=slow, on_progress=kill)
+    assert not victims
+    assert not result.failed
+    assert same_results(alone, out)
     cluster.wait_for_workers(2, timeout=30)
 
 

@@ -17,12 +17,12 @@ from drake_pose.camera.models import PinholeCamera, check_number
 from drake_pose.camera.picture_files import (
     VIDEOS,
     TimedVideo,
+    find_pictures,
     frame_key,
     in_order,
-    list_pictures,
     read_picture,
 )
-from drake_pose.camera.source_files import CAMERAS, TIME_STAMPS, read_time_stamps
+from drake_pose.camera.sources import CAMERAS, TIME_STAMPS, read_time_stamps
 from drake_pose.csv_files import read_csv
 from drake_pose.errors import CameraError, SceneError, SettingsError
 from drake_pose.yaml_files import read_yaml
@@ -108,10 +108,8 @@ def _of_images(
     name: str, folder: Path, scene: Path, joints: JointLog | None
 ) -> tuple[EpisodeCamera, list[str]]:
     """A camera whose pictures lie in a folder, and frames without picture or time."""
-    files, stamps, warnings = list_pictures(folder, SceneError), folder / TIME_STAMPS, list[str]()
+    files, stamps, warnings = find_pictures(folder, name), folder / TIME_STAMPS, list[str]()
     frames = in_order(files)
-    if not frames:
-        raise SceneError(f"{folder}: holds no picture <frame>.png or .jpg of camera '{name}'")
     times = np.full(len(frames), np.nan)
     if stamps.is_file():
         known = read_time_stamps(stamps)

@@ -1,4 +1,4 @@
-"""Pictures and masks in files: whole ones only, in one form; and the order of frames' names."""
+"""Pictures, masks and videos in files; and the order of frames' names."""
 
 import io
 import re
@@ -10,7 +10,6 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
 from drake_pose.arrays import Mask, Picture
@@ -19,22 +18,13 @@ from drake_pose.errors import DrakePoseError, SceneError
 from drake_pose.regular_files import read_regular, require_regular
 
 SUFFIXES = (".png", ".jpg", ".jpeg")
-
-_PNG = b"\x89PNG\r\n\x1a\n"
-_JPEG, _JPEG_END = b"\xff\xd8", b"\xff\xd9"
-_DAMAGE = (
-    OSError, SyntaxError, ValueError, Image.DecompressionBombError, Image.DecompressionBombWarning
-)  # fmt: skip
-# A lossy picture of a mask is white from here on.
-_HALF = 128
-_NUMBER = re.compile("([0-9]+)")
-# No file's name is longer; Python refuses to read numbers of thousands of digits.
-_LONGEST_NAME = 256
+VIDEOS = (".mp4", ".avi", ".mkv", ".mov", ".webm", ".m4v", ".mpg", ".mpeg")
+"""How names of pictures and of videos end."""
 
 
 def natural_key(name: str) -> tuple[tuple[str, int], ...]:
     """What names are sorted by: texts and the numbers in them in turn, so that 2 precedes 10."""
-    texts = _NUMBER.split(name)
+    texts = re.split("([0-9]+)", name)
     return tuple(zip(texts[::2], [*map(int, texts[1::2]), -1], strict=True))
 
 
@@ -45,7 +35,8 @@ def in_order(frames: Iterable[str]) -> tuple[str, ...]:
 
 def frame_number(frame: str) -> int | None:
     """Returns the number that a frame's name is, or None."""
-    is_number = frame.isascii() and frame.isdigit() and len(frame) < _LONGEST_NAME
+    # No file's name is longer; Python refuses to read numbers of thousands of digits.
+    is_number = frame.isascii() and frame.isdigit() and len(frame) < 256
     return int(frame) if is_number else None
 
 
@@ -61,9 +52,8 @@ def read_picture(path: Path, error_type: type[DrakePoseError]) -> Picture:
 
 
 def decode_colours(data: bytes, path: Path, error_type: type[DrakePoseError]) -> Picture:
-    """A picture (H, W, 3) red, green, blue of a file's content; the error as read_picture_file."""
-    _check_content(data, path, error_type)
-    picture = decode_picture(data, cv2.IMREAD_COLOR, path, error_type)
+    """A picture (H, W, 3) red, green, blue of a file's content; the error names the file."""
+    picture = _decode(data, cv2.IMREAD_COLOR, path, error_type)
     return np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB), dtype=np.uint8)
 
 
@@ -85,8 +75,8 @@ def read_two_colours(
     The error names the file; when it cannot be read, is damaged, of another size, empty or full, or
     has more than two values.
     """
-    data = read_picture_file(path, error_type, only_png=not lossy)
-    picture = decode_picture(data, cv2.IMREAD_UNCHANGED, path, error_type)
+    data = _read(path, error_type)
+    picture = _decode(data, cv2.IMREAD_UNCHANGED, path, error_type, only_png=not lossy)
     found = picture.shape[1], picture.shape[0]
     expected = size[0] or found[0], size[1] or found[1]
     if found != expected:
@@ -99,10 +89,15 @@ def read_two_colours(
         layers = layers[:, :, :3]  # an alpha channel that says nothing
     elif layers.shape[2] == 4 and (layers[:, :, :3] == layers[0, 0, :3]).all():
         layers = layers[:, :, 3:]  # one that says all
-    if data.startswith(_JPEG):
+    if data.startswith(b"\xff\xd8"):
         mask, is_one_colour = mask_of_picture(picture), True
     else:
-        mask, is_one_colour = _split_colours(np.ascontiguousarray(layers))
+        layers = np.ascontiguousarray(layers)
+        mask = cv2.inRange(layers, (0, 0, 0, 0), (0, 0, 0, 0)) == 0
+        first = np.atleast_1d(layers[np.unravel_index(mask.argmax(), mask.shape)])
+        colour = tuple(float(value) for value in first)
+        same = cv2.countNonZero(cv2.inRange(layers, colour, colour))
+        is_one_colour = not mask.any() or same == np.count_nonzero(mask)
     if mask.all():
         raise error_type(f"{path}: the mask is full (no black pixel): no background to be seen")
     if not (may_be_empty or mask.any()):
@@ -127,31 +122,20 @@ def list_pictures(folder: Path, error_type: type[DrakePoseError]) -> dict[str, P
     return files
 
 
-def _split_colours(picture: NDArray[np.integer]) -> tuple[Mask, bool]:
-    """Where a picture (H, W) or (H, W, channels) is not black, and if that is all of one colour."""
-    mask = cv2.inRange(picture, (0, 0, 0, 0), (0, 0, 0, 0)) == 0
-    first = np.atleast_1d(picture[np.unravel_index(mask.argmax(), mask.shape)])
-    colour = tuple(float(value) for value in first)
-    same = cv2.countNonZero(cv2.inRange(picture, colour, colour))
-    return mask, not mask.any() or same == np.count_nonzero(mask)
+def find_pictures(folder: Path, camera: str) -> dict[str, Path]:
+    """The pictures of a camera's folder as list_pictures has them; SceneError: there is none."""
+    if not folder.is_dir():
+        raise SceneError(f"{folder}: no such folder of camera '{camera}'s pictures")
+    files = list_pictures(folder, SceneError)
+    if not files:
+        raise SceneError(f"{folder}: holds no picture <frame>.png or .jpg of camera '{camera}'")
+    return files
 
 
 def mask_of_picture(picture: Picture) -> Mask:
     """The mask (H, W) of a picture (H, W) or (H, W, 3) that compression blurred: what is light."""
     grey = picture if picture.ndim == 2 else cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)
-    return np.asarray(grey >= _HALF, dtype=np.bool_)
-
-
-def read_picture_file(
-    path: Path, error_type: type[DrakePoseError], *, only_png: bool = False
-) -> bytes:
-    """A whole PNG or JPEG file's content, as far as its frame tells; the error names the file.
-
-    So are pictures refused whose pixels would fill the memory.
-    """
-    data = _read(path, error_type)
-    _check_content(data, path, error_type, only_png)
-    return data
+    return np.asarray(grey >= 128, dtype=np.bool_)
 
 
 def _read(path: Path, error_type: type[DrakePoseError]) -> bytes:
@@ -161,15 +145,23 @@ def _read(path: Path, error_type: type[DrakePoseError]) -> bytes:
         raise error_type(f"{path}: cannot read the picture: {error.strerror}") from error
 
 
-def _check_content(
-    data: bytes, path: Path, error_type: type[DrakePoseError], only_png: bool = False
-) -> None:
-    """Raises what read_picture_file raises of a file's content."""
-    is_jpeg = data.startswith(_JPEG) and not only_png
-    if is_jpeg and not data.rstrip(b"\0").endswith(_JPEG_END):
+def _decode(
+    data: bytes,
+    how: int,
+    path: Path,
+    error_type: type[DrakePoseError],
+    *,
+    only_png: bool = False,
+) -> Picture:
+    """A whole PNG or JPEG picture as OpenCV gives it; the error names a file that is none.
+
+    So are pictures refused whose pixels would fill the memory.
+    """
+    is_jpeg = data.startswith(b"\xff\xd8") and not only_png
+    if is_jpeg and not data.rstrip(b"\0").endswith(b"\xff\xd9"):
         raise error_type(f"{path}: the JPEG picture is cut short")
     # OpenCV's decoders differ from version to version in what they make of half a picture.
-    if not (is_jpeg or data.startswith(_PNG)):
+    if not (is_jpeg or data.startswith(b"\x89PNG\r\n\x1a\n")):
         raise error_type(f"{path}: not a PNG picture")
     try:
         # Pillow warns of what it takes for a bomb, and raises at twice as many pixels alone.
@@ -178,7 +170,10 @@ def _check_content(
             with Image.open(io.BytesIO(data)) as picture:
                 width, height = picture.size
                 picture.verify()
-    except _DAMAGE as error:
+    except (
+        OSError, SyntaxError, ValueError, Image.DecompressionBombError,
+        Image.DecompressionBombWarning,
+    ) as error:  # fmt: skip
         # What cannot be identified at all is told by its address in the memory.
         why = "" if isinstance(error, UnidentifiedImageError) else f": {error}"
         raise error_type(f"{path}: the picture is cut short, damaged or too large{why}") from error
@@ -186,23 +181,13 @@ def _check_content(
         raise error_type(
             f"{path}: {width} x {height} pixels are too many: at most {LARGEST_SIDE} a side"
         )
-
-
-def decode_picture(data: bytes, how: int, path: Path, error_type: type[DrakePoseError]) -> Picture:
-    """A picture as OpenCV gives it, of read_picture_file; the error names a file that is none."""
     try:
-        picture = cv2.imdecode(np.frombuffer(data, np.uint8), how)
+        decoded = cv2.imdecode(np.frombuffer(data, np.uint8), how)
     except cv2.error:
-        picture = None
-    if picture is None:
+        decoded = None
+    if decoded is None:
         raise error_type(f"{path}: not a whole PNG or JPEG picture")
-    return np.asarray(picture)
-
-
-VIDEOS = (".mp4", ".avi", ".mkv", ".mov", ".webm", ".m4v", ".mpg", ".mpeg")
-"""How names of videos end."""
-
-_AV1 = b"AV01"
+    return np.asarray(decoded)
 
 
 def import_reader(library: str, path: Path) -> Any:
@@ -220,14 +205,20 @@ class VideoPictures:
     """The pictures of a video, counted from 0; SceneError where it cannot be read.
 
     By OpenCV; AV1, which OpenCV's packages do not decode, as TimedVideo.
+
+    Attributes:
+        time: of the picture that was read last [s].
     """
 
     def __init__(self, path: Path) -> None:
+        if not path.is_file():
+            raise SceneError(f"{path}: no such video file")
         self._path, self._capture, self._next = path, cv2.VideoCapture(str(path)), 0
+        self.time = 0.0
         if not self._capture.isOpened():
             raise SceneError(f"{path}: not a video that OpenCV can read")
         codec = int(self._capture.get(cv2.CAP_PROP_FOURCC)).to_bytes(4, "little")
-        self._timed = TimedVideo(path) if codec.upper() == _AV1 else None
+        self._timed = TimedVideo(path) if codec.upper() == b"AV01" else None
 
     @property
     def count(self) -> int:
@@ -243,7 +234,9 @@ class VideoPictures:
     def read(self, number: int) -> Picture:
         """A picture (H, W, 3), red, green, blue; SceneError where the video ends before it."""
         if self._timed is not None:
-            return self._timed.read(number)
+            timed = self._timed.read(number)
+            self.time = float(self._timed.times[number])
+            return timed
         if number < self._next:
             self._capture.release()
             self._capture, self._next = cv2.VideoCapture(str(self._path)), 0
@@ -259,6 +252,7 @@ class VideoPictures:
                 f"{self._path.name} -c copy NEW"
             )
         self._next += 1
+        self.time = 1e-3 * self._capture.get(cv2.CAP_PROP_POS_MSEC)
         return np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB), dtype=np.uint8)
 
 

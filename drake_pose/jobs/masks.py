@@ -18,8 +18,7 @@ import yaml
 from drake_pose.arrays import Mask, Picture
 from drake_pose.body import load_model
 from drake_pose.body.tree_kinematics import TreeKinematics
-from drake_pose.camera.picture_files import SUFFIXES, read_picture, read_two_colours
-from drake_pose.camera.source_files import find_picture_files
+from drake_pose.camera.picture_files import SUFFIXES, find_pictures, read_picture, read_two_colours
 from drake_pose.errors import (
     CameraError,
     DrakePoseError,
@@ -423,7 +422,7 @@ def _background(
         return room, _doubt_median(room, kept)
     folder = Path(given)
     if (folder / camera).is_dir():
-        files = list(find_picture_files(folder / camera, camera).values())
+        files = list(find_pictures(folder / camera, camera).values())
     else:
         single = (folder, *(folder / f"{camera}{suffix}" for suffix in SUFFIXES))
         files = [file for file in single if file.is_file()][:1]

@@ -9,7 +9,7 @@ import cv2
 from drake_pose.camera.camera_files import dump_cameras, load_camera_file
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.camera.picture_files import list_pictures, read_picture
-from drake_pose.camera.source_files import CAMERAS
+from drake_pose.camera.sources import CAMERAS
 from drake_pose.errors import CameraError
 from drake_pose.files.folder import write_file
 

@@ -12,8 +12,8 @@ from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPort, System
 
 from drake_pose.arrays import Array
-from drake_pose.camera.frame_source import FrameSource
 from drake_pose.camera.models import Camera, camera_tuple
+from drake_pose.camera.sources import FrameSource
 from drake_pose.errors import SettingsError
 from drake_pose.fit.colours import COLOURS
 from drake_pose.fit.contour_fit import inlier_ratio_of

@@ -22,15 +22,9 @@ from pydrake.systems.framework import (
 from pydrake.systems.sensors import ImageLabel16I, ImageRgba8U
 
 from drake_pose.arrays import Mask, Picture
-from drake_pose.camera.frame_source import (
-    CameraChange,
-    Clock,
-    FrameSource,
-    Moment,
-    Synchroniser,
-    TimedPicture,
-)
 from drake_pose.camera.models import Camera
+from drake_pose.camera.sources import Clock, FrameSource, TimedPicture
+from drake_pose.camera.synchroniser import CameraChange, SynchronisedFrames, Synchroniser
 from drake_pose.errors import CameraError, SettingsError, UnknownNameError
 from drake_pose.silhouette.pictures.label_images import fill_label_image, label_image_to_mask
 from drake_pose.silhouette.pictures.scenes import USUAL_RATE_HZ
@@ -125,7 +119,7 @@ class PictureCapture(PortedSystem):
         self._origins: dict[str, float] = {}
         self._pending: dict[str, TimedPicture | None] = dict.fromkeys(self._sources)
         # The one that is shown; its time counts from the first one.
-        self.moment: Moment[TimedPicture] | None = None
+        self.moment: SynchronisedFrames[TimedPicture] | None = None
         self._used = dict.fromkeys(self._sources, 0)
         self._changes: dict[str, list[CameraChange]] = {name: [] for name in self._sources}
         self._reports: list[str] = []

@@ -7,9 +7,10 @@ import pytest
 import yaml
 
 from drake_pose.camera.camera_files import save_cameras
-from drake_pose.camera.frame_source import SourceSpecification
 from drake_pose.camera.models import circle_of_cameras
-from drake_pose.camera.source_files import (
+from drake_pose.camera.sources import (
+    DeviceSource,
+    SourceSpecification,
     load_background_pictures,
     load_sources,
     open_source,
@@ -210,12 +211,12 @@ class TestDevice:
     def device(self, monkeypatch):
         """Opens it after so many tries."""
         monkeypatch.setattr(cv2, "VideoCapture", FakeCamera)
-        monkeypatch.setattr("drake_pose.camera.frame_source.FIRST_PAUSE", 0.02)
         opened = []
 
         def open_after(tries, **more):
             FakeCamera.opened = tries
-            opened.append(open_source(specify("7", "device", **more)))
+            camera = specify("7", "device", **more)
+            opened.append(DeviceSource(camera, time.monotonic, pauses=(0.02, 10.0)))
             return opened[0]
 
         yield open_after

@@ -3,7 +3,7 @@ import math
 import numpy as np
 import pytest
 
-from drake_pose.camera.frame_source import CameraChange, Synchroniser
+from drake_pose.camera.synchroniser import CameraChange, Synchroniser
 from drake_pose.errors import SettingsError, UnknownNameError
 
 

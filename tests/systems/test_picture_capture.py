@@ -3,8 +3,8 @@ import pytest
 from pydrake.systems.analysis import Simulator, SimulatorStatus
 from pydrake.systems.sensors import ImageLabel16I, ImageRgba8U
 
-from drake_pose.camera.frame_source import FrameSource, SourceSpecification, TimedPicture
 from drake_pose.camera.models import circle_of_cameras
+from drake_pose.camera.sources import FrameSource, SourceSpecification, TimedPicture
 from drake_pose.errors import SettingsError, UnknownNameError
 from drake_pose.person.views import edge_spacing, see_silhouette, shows_somebody
 from drake_pose.silhouette.pictures.label_images import label_image_to_mask, mask_to_label_image

@@ -14,7 +14,7 @@ import yaml
 
 from drake_pose.body import load_landmarks
 from drake_pose.camera.camera_files import load_cameras
-from drake_pose.camera.source_files import load_sources
+from drake_pose.camera.sources import load_sources
 from drake_pose.commands.main import app
 from drake_pose.filtering.inequalities import load_couplings
 from drake_pose.jobs.batch_file import read_job

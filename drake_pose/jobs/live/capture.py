@@ -15,7 +15,7 @@ from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPo
 from drake_pose.arrays import Array, Mask, Picture
 from drake_pose.body import ArticulatedModel, PoseTree, bundled_model, load_model
 from drake_pose.camera.models import PinholeCamera
-from drake_pose.camera.source_files import TIME_STAMPS
+from drake_pose.camera.sources import TIME_STAMPS
 from drake_pose.csv_files import csv_text
 from drake_pose.errors import CameraError, OutputError, SceneError, SettingsError, UnknownNameError
 from drake_pose.files.folder import read_summary, writes_folder

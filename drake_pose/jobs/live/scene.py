@@ -15,11 +15,13 @@ from pydrake.systems.analysis import Simulator, SimulatorStatus
 from pydrake.systems.framework import Context, Diagram, EventStatus
 
 from drake_pose.camera.camera_files import load_cameras
-from drake_pose.camera.frame_source import FrameSource, Picture, SourceSpecification
 from drake_pose.camera.models import Camera
-from drake_pose.camera.source_files import (
+from drake_pose.camera.sources import (
     CAMERAS,
     SOURCES,
+    FrameSource,
+    Picture,
+    SourceSpecification,
     load_background_pictures,
     load_sources,
     open_source,

@@ -1,0 +1,534 @@
+"""Where cameras' pictures come from: folders, videos, live cameras; and pictures of one moment.
+
+What is wrong with one picture costs only that picture, and is said in `problems`. Pictures of
+several cameras are grouped by their time stamps. `sources.yaml` says where the pictures are.
+"""
+
+import abc
+import math
+import re
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Generator, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from drake_pose.arrays import Mask, Picture
+from drake_pose.camera.camera_files import load_cameras
+from drake_pose.camera.models import Camera, check_number
+from drake_pose.camera.picture_files import (
+    VideoPictures,
+    find_pictures,
+    mask_of_picture,
+    read_picture,
+    read_two_colours,
+)
+from drake_pose.csv_files import read_csv
+from drake_pose.errors import CameraError, SceneError, SettingsError, listed
+from drake_pose.yaml_files import read_yaml
+
+CAMERAS, SOURCES, TIME_STAMPS = "cameras.yaml", "sources.yaml", "timestamps.csv"
+
+Clock = Callable[[], float]
+
+
+@dataclass(frozen=True)
+class SourceSpecification:
+    """Where a camera's pictures come from; plain values, so that another machine may open it.
+
+    Args:
+        kind: folder: of pictures `<frame>.png` or `.jpg`, perhaps with a `timestamps.csv` (frame,
+            time [s]); video: a file that OpenCV reads; device: a live camera.
+        location: the folder's or file's path; a device's number or address.
+        width, height: of the pictures that the camera is calibrated for [pixel].
+        rate_hz: pictures a second. A folder without time stamps needs it; a video's own is used
+            where not given; a live camera's pictures bear the time at which they come.
+        background: a folder of pictures of the empty room; None: the source delivers masks.
+        offset: is added to time stamps [s], where cameras' clocks differ.
+        beside: other cameras' folders whose pictures of the same name were taken at the same time.
+
+    Raises SettingsError: an unknown kind, a size or a rate that cannot be.
+    """
+
+    camera: str
+    kind: str
+    location: str
+    width: int
+    height: int
+    rate_hz: float | None = None
+    background: str | None = None
+    offset: float = 0.0
+    beside: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        where = f"the source of camera '{self.camera}'"
+        if self.kind not in ("folder", "video", "device"):
+            raise SettingsError(f"{where}: kind must be folder, video, device, not {self.kind!r}")
+        if self.width < 1 or self.height < 1:
+            raise SettingsError(f"{where}: pictures of {self.width} x {self.height} cannot be")
+        if self.rate_hz is not None and not (math.isfinite(self.rate_hz) and self.rate_hz > 0):
+            raise SettingsError(f"{where}: rate_hz must be a positive number, not {self.rate_hz}")
+
+    @property
+    def live(self) -> bool:
+        """Whether pictures come by themselves, and are gone where nobody takes them."""
+        return self.kind == "device"
+
+    @property
+    def gives_masks(self) -> bool:
+        """Whether the source delivers masks of the person instead of pictures."""
+        return self.background is None
+
+    def wrong_size(self, picture: Picture | Mask) -> str:
+        """What is wrong with a picture's size; "" where it is the calibrated one."""
+        height, width = picture.shape[:2]
+        if (width, height) == (self.width, self.height):
+            return ""
+        return (
+            f"has {width} x {height} pixels (width x height), but the camera is calibrated for "
+            f"{self.width} x {self.height}: give pictures of that size, or calibrate again"
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class TimedPicture:
+    """A picture (H, W, 3) red, green, blue, or a mask (H, W), and its time stamp [s]."""
+
+    time: float
+    frame: str
+    picture: Picture | Mask
+
+
+class FrameSource(abc.ABC):
+    """One camera's pictures, in the order of their time stamps.
+
+    Attributes:
+        problems: what was wrong so far, each with the camera's name; a reader may empty the list.
+        dropped: how many pictures were lost for that.
+    """
+
+    def __init__(self, specification: SourceSpecification) -> None:
+        self.specification = specification
+        self.problems: list[str] = []
+        self.dropped = 0
+        self._last: TimedPicture | None = None
+
+    @property
+    @abc.abstractmethod
+    def ended(self) -> bool:
+        """Whether no picture will come any more."""
+
+    @property
+    def rate_hz(self) -> float | None:
+        """About how many pictures come a second; None where nobody knows."""
+        return self.specification.rate_hz
+
+    @abc.abstractmethod
+    def close(self) -> None:
+        """Lets go of the file or camera; may be called twice."""
+
+    @abc.abstractmethod
+    def _read(self) -> TimedPicture | None:
+        """The next picture, whatever its time stamp."""
+
+    def read(self) -> TimedPicture | None:
+        """The next picture, a live camera's newest; None: none now, or none any more (`ended`).
+
+        A picture whose time stamp does not lie after the last one's is dropped.
+        """
+        while (one := self._read()) is not None:
+            if self._last is None or one.time > self._last.time:
+                self._last = one
+                return one
+            same = one.time == self._last.time
+            what = "the same time stamp as" if same else "a time stamp before"
+            self.drop(f"frame {one.frame} has {what} frame {self._last.frame}: {one.time:g} s")
+        return None
+
+    def drop(self, reason: str, count: int = 1) -> None:
+        """Notes that pictures were lost."""
+        self.dropped += count
+        self.report(f"{reason}; it is left out")
+
+    def report(self, problem: str) -> None:
+        """Notes a problem."""
+        self.problems.append(f"camera '{self.specification.camera}': {problem}")
+
+
+class DeviceSource(FrameSource):
+    """A live camera: its newest picture, with the time at which it came by the clock [s].
+
+    A slow reader never sees old pictures: those that were not read in time are gone. A camera that
+    cannot be opened or fails is reported once and opened again, after growing pauses.
+
+    Args:
+        pauses: before it is opened again after a failure, at first and at most; each is twice as
+            long as the one before [s].
+    """
+
+    def __init__(
+        self,
+        specification: SourceSpecification,
+        clock: Clock,
+        pauses: tuple[float, float] = (0.5, 10.0),
+    ) -> None:
+        super().__init__(specification)
+        self._clock, self._pauses = clock, pauses
+        self._newest: deque[TimedPicture] = deque(maxlen=1)
+        self._failed = False
+        self._stop = threading.Event()
+        self._thread = threading.Thread(
+            target=self._run, name=f"camera {specification.camera}", daemon=True
+        )
+        self._thread.start()
+
+    @property
+    def ended(self) -> bool:
+        """Whether it was closed, or gives pictures of a wrong size."""
+        return self._stop.is_set()
+
+    def close(self) -> None:
+        """Ends the thread, which lets go of the camera."""
+        self._stop.set()
+        self._thread.join(2.0)  # [s]; OpenCV may hang on a network camera.
+
+    def _read(self) -> TimedPicture | None:
+        return self._newest.pop() if self._newest else None
+
+    def _run(self) -> None:
+        """Reads until closed; opens the camera again and again."""
+        (first, longest), count = self._pauses, 0
+        pause = first
+        while not self.ended:
+            before, capture = count, self._open()
+            if capture is not None:
+                count = self._keep_newest(capture, count)
+                capture.release()
+            if self.ended:
+                return
+            if not self._failed:
+                what = "stopped" if count else "cannot be opened"
+                self.report(
+                    f"'{self.specification.location}' {what}; it is tried again until it answers"
+                )
+                self._failed = True
+            pause = first if count > before else pause
+            self._stop.wait(pause)
+            pause = min(2.0 * pause, longest)
+
+    def _open(self) -> cv2.VideoCapture | None:
+        """The camera, asked for pictures of the calibrated size."""
+        given = self.specification
+        by_number = given.location.isdigit()
+        with suppress(cv2.error):
+            capture = cv2.VideoCapture(int(given.location) if by_number else given.location)
+            if not capture.isOpened():
+                return None
+            if by_number:
+                capture.set(cv2.CAP_PROP_FRAME_WIDTH, given.width)
+                capture.set(cv2.CAP_PROP_FRAME_HEIGHT, given.height)
+                if given.rate_hz is not None:
+                    capture.set(cv2.CAP_PROP_FPS, given.rate_hz)
+            return capture
+        return None
+
+    def _keep_newest(self, capture: cv2.VideoCapture, count: int) -> int:
+        """Reads until the camera fails or is not wanted; the number of pictures in all."""
+        while not self.ended:
+            found, picture = False, None
+            with suppress(cv2.error):
+                found, picture = capture.read()
+            if not found or picture is None:
+                return count
+            time = self._clock() + self.specification.offset
+            rgb = np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB), dtype=np.uint8)
+            if wrong := self.specification.wrong_size(rgb):
+                self.report(f"'{self.specification.location}' {wrong}")
+                self._stop.set()
+                return count
+            if self._failed:
+                self.report(f"'{self.specification.location}' answers again")
+                self._failed = False
+            seen = mask_of_picture(rgb) if self.specification.gives_masks else rgb
+            self._newest.append(TimedPicture(time, f"{count:06d}", seen))
+            count += 1
+        return count
+
+
+class RecordedSource(FrameSource):
+    """Pictures of a folder or a video, one of them read ahead, so that the end is known.
+
+    A folder has pictures or masks `<frame>.png` or `.jpg`; their times are those of its
+    `timestamps.csv` (frame, time [s]). Without it the frames follow each other in the order of
+    their names at the given rate, and frames of the same name in the folders `beside` are of the
+    same time; a number in a name means nothing. A video's masks are white on the person.
+
+    Raises SceneError: names the folder or file; no picture, or the first is of another size.
+    """
+
+    def __init__(self, specification: SourceSpecification) -> None:
+        super().__init__(specification)
+        self._ahead: TimedPicture | None = None
+        self._own_rate: float | None = None
+        is_folder = specification.kind == "folder"
+        self._pictures = self._of_folder() if is_folder else self._of_video()
+        self._ahead = self._advance()
+        if self._ahead is None:
+            raise SceneError(
+                f"{specification.location}: no picture can be read, though it is the source of "
+                f"camera '{specification.camera}'"
+            )
+
+    @property
+    def ended(self) -> bool:
+        """Whether all pictures were read."""
+        return self._ahead is None
+
+    @property
+    def rate_hz(self) -> float | None:
+        """The given rate, or that of the time stamps or of the video."""
+        return self.specification.rate_hz or self._own_rate
+
+    def close(self) -> None:
+        """Lets go of the file."""
+        self._ahead = None
+        self._pictures.close()
+
+    def _read(self) -> TimedPicture | None:
+        taken = self._ahead
+        if taken is not None:
+            self._ahead = self._advance()
+        return taken
+
+    def _advance(self) -> TimedPicture | None:
+        """The next picture of the calibrated size."""
+        for path, one in self._pictures:
+            wrong = self.specification.wrong_size(one.picture)
+            if not wrong:
+                return one
+            if self._ahead is None:
+                raise SceneError(f"{path}: camera '{self.specification.camera}' {wrong}")
+            self.drop(f"{path}: {wrong}")
+        return None
+
+    def _of_folder(self) -> Generator[tuple[Path, TimedPicture]]:
+        """The pictures that can be read, and the file of each."""
+        given, folder = self.specification, Path(self.specification.location)
+        files = find_pictures(folder, given.camera)
+        stamped = folder / TIME_STAMPS
+        times = read_time_stamps(stamped) if stamped.is_file() else _counted(given, files)
+        for what, where, frames in (
+            ("picture", folder, [frame for frame in times if frame not in files]),
+            ("time", stamped, [frame for frame in files if frame not in times]),
+        ):
+            if frames:
+                text = f"frame{'s' if len(frames) > 1 else ''} {listed(frames)}"
+                self.drop(f"{where}: has no {what} of {text}", len(frames))
+        timed = [frame for frame in times if frame in files]
+        if not timed:
+            raise SceneError(f"{stamped}: has no time of any picture in {folder}")
+        steps = np.diff([times[frame] for frame in timed])
+        if np.any(steps > 0):
+            self._own_rate = 1.0 / float(np.median(steps[steps > 0]))
+        for frame in timed:
+            seen: Picture | Mask
+            try:
+                if given.gives_masks:
+                    seen = read_two_colours(files[frame], SceneError, may_be_empty=True, lossy=True)
+                else:
+                    seen = read_picture(files[frame], SceneError)
+            except SceneError as error:
+                self.drop(str(error))
+                continue
+            yield files[frame], TimedPicture(times[frame] + given.offset, frame, seen)
+
+    def _of_video(self) -> Generator[tuple[Path, TimedPicture]]:
+        """The pictures of a video, each with the video's name."""
+        given, path = self.specification, Path(self.specification.location)
+        try:
+            video = VideoPictures(path)
+        except SceneError as error:
+            raise SceneError(
+                f"{error}, though it is the source of camera '{given.camera}'"
+            ) from None
+        self._own_rate = video.rate_hz
+        for k in range(video.count):
+            try:
+                picture = video.read(k)
+            except SceneError:
+                reason = f"{path}: ends after {k} of {video.count} pictures"
+                self.drop(reason, video.count - k)
+                return
+            time = video.time if given.rate_hz is None else k / given.rate_hz
+            seen = mask_of_picture(picture) if given.gives_masks else picture
+            yield path, TimedPicture(time + given.offset, f"{k:06d}", seen)
+
+
+def _counted(given: SourceSpecification, files: Mapping[str, Path]) -> dict[str, float]:
+    """The times of a folder's frames by their rate."""
+    folder = Path(given.location)
+    if given.rate_hz is None:
+        raise SceneError(
+            f"{folder}: has no {TIME_STAMPS} (frame,time), so the source of camera "
+            f"'{given.camera}' needs rate_hz, its pictures a second"
+        )
+    names = set(files)
+    for other in given.beside:
+        names |= set(find_pictures(Path(other), given.camera))
+    ordered = sorted(names)
+
+    def by_number(name: str) -> tuple[str, int]:
+        number = re.search(r"(\d+)$", name)
+        return (name[: number.start()], int(number[1])) if number else (name, -1)
+
+    if ordered != sorted(names, key=by_number):
+        raise SceneError(
+            f"{folder}: the frames' names are numbers of different lengths, so their "
+            f"order is unclear; fill them with zeros (0009, 0010) or give a {TIME_STAMPS}"
+        )
+    return {frame: k / given.rate_hz for k, frame in enumerate(ordered)}
+
+
+def read_time_stamps(path: Path) -> dict[str, float]:
+    """The times [s] by frame of a `timestamps.csv`; SceneError names the file and the line."""
+    header, rows = read_csv(path, SceneError)
+    if not {"frame", "time"} <= set(header):
+        raise SceneError(f"{path}: needs the columns frame and time [s] in its first line")
+    found: dict[str, float] = {}
+    for line, row in rows:
+        frame = row[header.index("frame")]
+        if frame in found:
+            raise SceneError(f"{path}: line {line}: has frame {frame} twice")
+        try:
+            found[frame] = float(row[header.index("time")])
+        except ValueError:
+            found[frame] = math.nan
+        if not math.isfinite(found[frame]):
+            raise SceneError(f"{path}: line {line}: the time must be a number of seconds")
+    return found
+
+
+def load_sources(
+    path: str | Path, cameras: Mapping[str, Camera] | None = None
+) -> dict[str, SourceSpecification]:
+    """Reads where the pictures of all cameras come from, in the order of the calibration.
+
+    A camera's entry has `kind` (folder, video, device) and `location` (relative to the file; a
+    device's number or address), and either `masks: true`, where the source delivers masks, or
+    `background`, a folder of pictures of the empty room. It may have `rate_hz` and `offset` [s].
+
+    Args:
+        path: a `sources.yaml`, or the folder that holds it.
+        cameras: the calibrated cameras; those of the `cameras.yaml` beside it where not given.
+
+    Raises:
+        SceneError: names the file, the camera and the field.
+        CameraError: the camera file is wrong.
+    """
+    path = Path(path)
+    path = path / SOURCES if path.is_dir() else path
+    content = read_yaml(path, SceneError)
+    if not isinstance(content, dict) or not content:
+        raise SceneError(f"{path}: expected a mapping from camera names to their sources")
+    cameras = load_cameras(path.with_name(CAMERAS)) if cameras is None else cameras
+    entries = {str(name): entry for name, entry in content.items()}
+    unknown = [name for name in entries if name not in cameras]
+    if unknown:
+        raise SceneError(
+            f"{path}: camera '{unknown[0]}' is not calibrated: {CAMERAS} has only "
+            f"{', '.join(cameras)}; calibrate it, or take it out of {path.name}"
+        )
+    missing = [name for name in cameras if name not in entries]
+    if missing:
+        raise SceneError(
+            f"{path}: camera '{missing[0]}' of {CAMERAS} has no source; give it an entry, or take "
+            f"it out of {CAMERAS}"
+        )
+    found = {name: _read_entry(camera, entries[name], path) for name, camera in cameras.items()}
+    # Folders without time stamps share their frames' names with others of the same rate.
+    counted = {
+        name: one.rate_hz
+        for name, one in found.items()
+        if one.kind == "folder" and not (Path(one.location) / TIME_STAMPS).is_file()
+    }
+    for name, rate in counted.items():
+        others = [other for other, its in counted.items() if other != name and its == rate]
+        found[name] = replace(found[name], beside=tuple(found[one].location for one in others))
+    return found
+
+
+def open_source(specification: SourceSpecification, clock: Clock = time.monotonic) -> FrameSource:
+    """Opens a source; the clock gives the time stamps of a live camera's pictures [s].
+
+    Raises SceneError: a folder or video that cannot be read, is empty, or whose pictures are not of
+    the calibrated size. A live camera that cannot be opened is tried again and again.
+    """
+    if specification.live:
+        return DeviceSource(specification, clock)
+    return RecordedSource(specification)
+
+
+def load_background_pictures(specification: SourceSpecification) -> list[Picture]:
+    """The pictures (H, W, 3) of the empty room that a camera's specification names.
+
+    Raises SceneError: there is none, or one cannot be read or is not of the calibrated size.
+    """
+    camera = specification.camera
+    if specification.background is None:
+        raise SceneError(f"camera '{camera}' delivers masks, so it has no background")
+    folder = Path(specification.background)
+    if not folder.is_dir():
+        raise SceneError(
+            f"{folder}: no such folder of pictures of the empty room before camera '{camera}'; "
+            "'drake-pose empty-room FOLDER' takes them"
+        )
+    pictures = []
+    for file in find_pictures(folder, camera).values():
+        pictures.append(read_picture(file, SceneError))
+        if wrong := specification.wrong_size(pictures[-1]):
+            raise SceneError(f"{file}: camera '{camera}' {wrong}")
+    return pictures
+
+
+def _read_entry(camera: Camera, entry: Any, path: Path) -> SourceSpecification:
+    """The specification of one entry of a file."""
+    where = f"{path}: camera '{camera.name}'"
+    if not isinstance(entry, dict):
+        raise SceneError(f"{where}: expected a mapping with kind, location and more")
+    fields = ("kind", "location", "rate_hz", "masks", "background", "offset")
+    if strange := [str(field)[:40] for field in entry if field not in fields]:
+        raise SceneError(f"{where}: unknown field {strange[0]}; a source has {', '.join(fields)}")
+    kind, location = entry.get("kind"), entry.get("location")
+    if isinstance(location, bool) or not isinstance(location, str | int) or location == "":
+        raise SceneError(f"{where}: location must be a path, or a device's number or address")
+    if kind != "device":
+        location = path.parent / str(location)
+    masks, background = entry.get("masks", False), entry.get("background")
+    if not isinstance(masks, bool) or masks == (background is not None):
+        raise SceneError(
+            f"{where}: needs either 'masks: true', where its pictures are masks of the person, or "
+            "'background: FOLDER', pictures of the empty room"
+        )
+    if background is not None:
+        if not isinstance(background, str):
+            raise SceneError(f"{where}: background must be a folder of pictures")
+        background = str(path.parent / background)
+    try:
+        rate, offset = entry.get("rate_hz"), entry.get("offset", 0.0)
+        rate = None if rate is None else check_number(rate, "rate_hz", where)
+        offset = check_number(offset, "offset", where)
+    except CameraError as error:
+        raise SceneError(str(error)) from None
+    size = camera.width, camera.height
+    try:
+        return SourceSpecification(
+            camera.name, str(kind), str(location), *size, rate, background, offset
+        )
+    except SettingsError as error:
+        raise SceneError(f"{path}: {error}") from None

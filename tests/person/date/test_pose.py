@@ -165,11 +165,8 @@ class TestCircle:
 class TestAngles:
     def test_straight_arm_is_not_turned_about_itself(self, skeleton):
         """The shortest turn from the old direction of the arm to the new one, and no other."""
-        limb, last, q = (
-            skeleton.limbs["left_arm"],
-            np.array([0.2, 0.4, 0.5, 0.0]),
-            skeleton.lower * 0,
-        )
+        limb, last = skeleton.limbs["left_arm"], np.array([0.2, 0.4, 0.5, 0.0])
+        q = np.zeros(len(skeleton.lower))
         q[limb.positions] = last
         root, R_WT = skeleton.limb_points(q, "left_arm")[0], skeleton.trunk_pose(q)[0]
         across = np.array([0.0, 0.7, -0.2])

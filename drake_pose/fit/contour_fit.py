@@ -191,12 +191,10 @@ class ContourFit:
             nonlocal sums
             theta = current.copy()
             theta[index] = own[0]
-            placement = self.body.place(theta)
             if isinstance(seen, Views):
-                weights = self.weights(seen.cameras, placement, step)
-                compared = compare_views(seen, placement, weights)
+                compared = self.compare(seen, theta, step)
             else:
-                compared = seen(placement, step)
+                compared = seen(self.body.place(theta), step)
             H, g = normal_equations(compared, len(theta))
             sums = compared.sums.sum(axis=0)
             cost = float(sums[:, Sum.COST].sum())
@@ -213,16 +211,10 @@ class ContourFit:
         current[index] = own[0]
         return PoseFit(current, sums, cost, evaluations)
 
-    def compare(
-        self, views: Views, theta: Array, step: AnnealingStage, widths: bool = False
-    ) -> Comparison:
-        """The contours at values (m,), or at all parameters, compared with all cameras' edges.
-
-        widths: as of compare_views.
-        """
+    def compare(self, views: Views, theta: Array, step: AnnealingStage) -> Comparison:
+        """The contours at values (m,), or at all parameters, compared with all cameras' edges."""
         placement = self.body.place(theta)
-        weights = self.weights(views.cameras, placement, step)
-        return compare_views(views, placement, weights, widths)
+        return compare_views(views, placement, self.weights(views.cameras, placement, step))
 
     def piece_costs(self, views: Views, theta: Array, step: AnnealingStage, side: float) -> Array:
         """(cameras, k, k) the cost at values (m,) by squares of the pictures of a side [pixel]."""

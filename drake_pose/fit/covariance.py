@@ -140,10 +140,13 @@ def distances_in_masks(
         widths: whether each silhouette may be too wide on all sides, by a further value [unit].
     """
     if widths:
-        pictures = [
-            one._replace(moves=np.concatenate([one.moves, _widening(outlines, one, wide)], axis=1))
-            for one, wide in zip(pictures, np.eye(len(pictures)), strict=True)
-        ]
+        seen, wider = [[len(outline.vertices) > 0] for outline in outlines], []
+        for one, wide in zip(pictures, np.eye(len(pictures)), strict=True):
+            # A part's surface is a metre wider on all sides; one without any is nowhere.
+            by = surface_deformations(outlines, one.X_WN)[:, :, [3, 7, 11]].sum(axis=2)
+            by = (by * one.size * seen)[:, None] * wide[:, None]
+            wider.append(one._replace(moves=np.concatenate([one.moves, by], axis=1)))
+        pictures = wider
     of, along, bends = _known_directions(outlines, pictures, most)
     count = pictures[0].moves.shape[1]
     y, X, shaken = np.zeros(len(of)), np.zeros((len(of), count)), np.zeros((len(of), 6))
@@ -230,14 +233,6 @@ def surface_deformations(outlines: Sequence[Outline], X_WN: Array) -> Array:
     K[:, [3, 7, 11], :3] = R
     K[:, :, 3:] = np.swapaxes(np.concatenate([stretches, shifts], axis=4).reshape(-1, 9, 12), 1, 2)
     return K
-
-
-def _widening(outlines: Sequence[Outline], one: ComparedMask, wide: Array) -> Array:
-    """(nodes, pictures, 12) a silhouette's growth by the unit, of the picture where wide is 1."""
-    # A part's surface is about a metre wider on all sides; one without any is nowhere.
-    by = surface_deformations(outlines, one.X_WN)[:, :, [3, 7, 11]].sum(axis=2)
-    by = by * one.size * [[len(outline.vertices) > 0] for outline in outlines]
-    return np.asarray(by[:, None] * wide[:, None])
 
 
 def _camera_motions(outlines: Sequence[Outline], one: ComparedMask) -> Array:

@@ -114,7 +114,20 @@ class BodyParameters:
         self._wide = np.flatnonzero(self.groups >= 0)
         self._offsets, self._first_length = tuple(offsets), count + len(girths)
         self._scaled = np.array([self.links.index(one.link) for one in offsets], dtype=np.intp)
-        self._find_behind()
+        # Which nodes are behind each joint whose origin moves, and which joints' axes move.
+        self._behind = np.zeros((nodes, len(offsets)), dtype=np.bool_)
+        self._shifted = np.zeros((len(made_by), len(offsets)), dtype=np.bool_)
+        for i, node in enumerate(kinematics.tree.nodes if offsets else ()):
+            if node.parent >= 0:
+                self._behind[i] = self._behind[node.parent]
+            self._behind[i] |= [one.node == i for one in offsets]
+            first = kinematics.packed.value_starts[i]
+            for k, step in enumerate(kinematics.tree.placements[i].steps):
+                last = first + step.position_count
+                # Walked inwards, a joint comes before its offset.
+                before = [one.node != i or one.step + one.inverted <= k for one in offsets]
+                self._shifted[first:last] = self._behind[i] & before
+                first = last
         # What moves the root moves the point about which the body grows.
         of_root = np.arange(len(made_by)) < np.count_nonzero(kinematics.value_nodes == 0)
         self._of_root = np.concatenate([of_root, self._behind[0]])
@@ -132,26 +145,6 @@ class BodyParameters:
                 ]
             ),
         )  # fmt: skip
-
-    def _find_behind(self) -> None:
-        """Which nodes are behind each joint whose origin moves, and which joints' axes move."""
-        kinematics, offsets = self.kinematics, self._offsets
-        self._behind = np.zeros((len(self.outlines), len(offsets)), dtype=np.bool_)
-        self._shifted = np.zeros((len(kinematics.parameters), len(offsets)), dtype=np.bool_)
-        if not offsets:
-            return
-        for i, node in enumerate(kinematics.tree.nodes):
-            if node.parent >= 0:
-                self._behind[i] = self._behind[node.parent]
-            self._behind[i] |= [one.node == i for one in offsets]
-        for i, placement in enumerate(kinematics.tree.placements):
-            first = kinematics.packed.value_starts[i]
-            for k, step in enumerate(placement.steps):
-                last = first + step.position_count
-                # Walked inwards, a joint comes before its offset.
-                before = [one.node != i or one.step + one.inverted <= k for one in offsets]
-                self._shifted[first:last] = self._behind[i] & before
-                first = last
 
     def place(self, theta: Array) -> Placement:
         """The body at its tree's values (m,), or at all parameters (n,)."""

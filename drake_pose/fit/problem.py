@@ -279,12 +279,10 @@ class Problem:
         p, u, frames = self.own_count, len(self.names), len(observations)
         H, g, cost = np.zeros((frames, u, u)), np.zeros((frames, u)), 0.0
         ratios = []
-        parameters = self.parameters(observations, *at)
-
-        def told(k: int) -> tuple[Array, Array, Array]:
-            return self._frame(observations[k], parameters[k], step)
-
-        for k, (own_H, own_g, sums) in enumerate(map_ordered(told, range(frames))):
+        masks = zip(observations, self.parameters(observations, *at), strict=True)
+        for k, (own_H, own_g, sums) in enumerate(
+            map_ordered(lambda mask: self._frame(*mask, step), masks)
+        ):
             H[k], g[k] = own_H, own_g
             cost += float(sums[:, :, Sum.COST].sum())
             lengths = np.maximum(sums[:, :, Sum.COMPARED].sum(axis=1), 1e-9)
@@ -346,7 +344,11 @@ class Problem:
         """
         places = self.places(theta)
         views = self._views(seen, theta)
-        placed = self._placement(self._of_body(theta, seen.rates))
+        own = self._of_body(theta, seen.rates)
+        # Where the body stands still in each frame it is placed once.
+        placed = self._placed.get(key := own.tobytes()) or self.body.place(own)
+        if self._stands:
+            self._placed[key] = placed
         weights = self._contours.weights(views.cameras, placed, step)
         compared = compare_views(views, placed, weights, len(self._widths) > 0)
         for c, picture in enumerate(seen.odds):
@@ -368,15 +370,6 @@ class Problem:
         """(cameras, k, k) the costs at all parameters (n,) by squares of a side [pixel]."""
         views = self._views(seen, theta)
         return self._contours.piece_costs(views, self._of_body(theta, seen.rates), step, side)
-
-    def _placement(self, own: Array) -> Placement:
-        """The body at its parameters; where it stands still in each frame, found once."""
-        if not self._stands:
-            return self.body.place(own)
-        key = own.tobytes()
-        if key not in self._placed:
-            self._placed[key] = self.body.place(own)
-        return self._placed[key]
 
     def _of_body(self, theta: Array, rates: Array | None) -> Array:
         """The body's parameters, the tree's values alone where all others are 0."""

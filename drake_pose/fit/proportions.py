@@ -10,7 +10,6 @@ joints keep their meaning.
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import csr_array, diags_array, eye_array, kron, vstack
 
 from drake_pose.arrays import Array
@@ -88,11 +87,27 @@ class ProportionedBody(BodyParameters):
             *self.width_names,
             *self.place_names,
         )
-        self.axes, self._along, self._rest = self._find_axes()
+        values = kinematics.flatten(kinematics.tree.default_values())
+        X_WN = kinematics.poses(values)
+        # Of each node the axis, how long it is along it [m], and the same at rest in the parent.
+        self.axes = np.zeros(len(nodes), dtype=np.int64)
+        self._along, self._rest = np.zeros((2, len(nodes), 3))
+        for i, node in enumerate(nodes):
+            carried = (X_WN[list(node.children), :3, 3] - X_WN[i, :3, 3]) @ X_WN[i, :3, :3]
+            along = np.abs(carried).sum(axis=0)
+            vertices = node.mesh.vertices
+            middle = vertices.mean(axis=0) if len(vertices) else np.ones(3)
+            if not np.any(along > 0.0):
+                along = np.abs(middle)
+            axis = self.axes[i] = int(np.argmax(along))
+            ends = carried[:, axis] if len(carried) else middle[[axis]]
+            self._along[i, axis] = ends[np.argmax(np.abs(ends))]
+            self._rest[i] = X_WN[i, :3, :3] @ self._along[i]
+            if node.parent >= 0:
+                self._rest[i] = X_WN[node.parent, :3, :3].T @ self._rest[i]
         self._parents = np.array([node.parent for node in nodes])
         # Which nodes each motion of `place` moves, in its order, and which parameter makes it.
         count, every = len(kinematics.names) + len(ROOT_NAMES), np.arange(len(nodes))
-        values = kinematics.flatten(kinematics.tree.default_values())
         below = np.eye(len(nodes), dtype=np.bool_)
         for i, parent in enumerate(self._parents):
             below[i] |= (parent >= 0) & below[parent]
@@ -107,27 +122,6 @@ class ProportionedBody(BodyParameters):
         )  # fmt: skip
         made_by = np.arange(count), lengths, widths, lengths[by], widths[by], places
         self._owners = owners_of(np.hstack(moves), np.concatenate(made_by))
-
-    def _find_axes(self) -> tuple[NDArray[np.int64], Array, Array]:
-        """(nodes,) axes; (nodes, 3) [m] along them how long, and the same at rest in the parent."""
-        kinematics = self.kinematics
-        X_WN = kinematics.poses(kinematics.flatten(kinematics.tree.default_values()))
-        axes = np.zeros(len(X_WN), dtype=np.int64)
-        lengths, rest = np.zeros((2, len(X_WN), 3))
-        for i, node in enumerate(kinematics.tree.nodes):
-            carried = (X_WN[list(node.children), :3, 3] - X_WN[i, :3, 3]) @ X_WN[i, :3, :3]
-            along = np.abs(carried).sum(axis=0)
-            vertices = node.mesh.vertices
-            middle = vertices.mean(axis=0) if len(vertices) else np.ones(3)
-            if not np.any(along > 0.0):
-                along = np.abs(middle)
-            axis = axes[i] = int(np.argmax(along))
-            ends = carried[:, axis] if len(carried) else middle[[axis]]
-            lengths[i, axis] = ends[np.argmax(np.abs(ends))]
-            rest[i] = X_WN[i, :3, :3] @ lengths[i]
-            if node.parent >= 0:
-                rest[i] = X_WN[node.parent, :3, :3].T @ rest[i]
-        return axes, lengths, rest
 
     def factors(self, theta: Array) -> Array:
         """(nodes, 3) scale of each node along its frame's axes."""

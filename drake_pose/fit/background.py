@@ -67,38 +67,32 @@ class BackgroundModel:
 MODEL = BackgroundModel()
 
 
-class Light(NamedTuple):
-    """By which gain and offset (3,) each a picture's channels have a reference's light."""
+def light_between(picture: Picture | Floats, reference: Floats, rounds: int = 4) -> Floats:
+    """(3, 4) gains and offsets of a picture's channels (H, W, 3) that make a reference's light.
 
-    gain: Floats
-    offset: Floats
+    A line is fitted to each channel, without outliers. Gains are between a half and two. Pictures
+    are sampled about 160 pixels wide.
+    """
+    light = np.zeros((3, 4), np.float32)
+    step = max(1, picture.shape[1] // 160)
+    for channel in range(3):
+        both = (one[::step, ::step, channel].ravel() for one in (picture, reference))
+        x, y = (np.asarray(one, np.float32) for one in both)
+        keep = np.ones(len(x), bool)
+        for _ in range(rounds):
+            mean_x, mean_y = x[keep].mean(), y[keep].mean()
+            off_x = x[keep] - mean_x
+            gain = float(off_x @ (y[keep] - mean_y)) / max(float(off_x @ off_x), 1e-6)
+            gain = min(max(gain, 0.5), 2.0)
+            off = np.abs(gain * (x - mean_x) + mean_y - y)
+            keep = off <= 2.0 * (1.5 * np.median(off) + 1.0)
+        light[channel, [channel, 3]] = gain, mean_y - gain * mean_x
+    return light
 
-    @staticmethod
-    def between(picture: Picture | Floats, reference: Floats, rounds: int = 4) -> "Light":
-        """That of a picture (H, W, 3): a line fitted to each channel, without outliers.
 
-        Gains are between a half and two. Pictures are sampled about 160 pixels wide.
-        """
-        light = Light(np.ones(3, np.float32), np.zeros(3, np.float32))
-        step = max(1, picture.shape[1] // 160)
-        for channel in range(3):
-            both = (one[::step, ::step, channel].ravel() for one in (picture, reference))
-            x, y = (np.asarray(one, np.float32) for one in both)
-            keep = np.ones(len(x), bool)
-            for _ in range(rounds):
-                mean_x, mean_y = x[keep].mean(), y[keep].mean()
-                off_x = x[keep] - mean_x
-                gain = float(off_x @ (y[keep] - mean_y)) / max(float(off_x @ off_x), 1e-6)
-                gain = min(max(gain, 0.5), 2.0)
-                off = np.abs(gain * (x - mean_x) + mean_y - y)
-                keep = off <= 2.0 * (1.5 * np.median(off) + 1.0)
-            light.gain[channel], light.offset[channel] = gain, mean_y - gain * mean_x
-        return light
-
-    def evened(self, picture: Picture | Floats) -> Floats:
-        """A picture (H, W, 3) in the reference's light."""
-        by = np.column_stack([np.diag(self.gain), self.offset])
-        return np.asarray(cv2.transform(picture.astype(np.float32), by))
+def in_light(picture: Picture | Floats, light: Floats) -> Floats:
+    """A picture (H, W, 3) in the reference's light."""
+    return np.asarray(cv2.transform(picture.astype(np.float32), light))
 
 
 class PixelSums(NamedTuple):
@@ -121,13 +115,13 @@ class Backgrounds:
 
     Args:
         pictures: (f, H, W, 3) in even light.
-        lights: of each picture before.
+        lights: (3, 4) of each picture, see ``light_between``.
         colours: (3, H, W, 3) backgrounds, the most frequent first; they may be alike.
         deviations: (H, W) of a background's colours.
     """
 
     pictures: Floats
-    lights: tuple[Light, ...]
+    lights: tuple[Floats, ...]
     colours: Floats
     deviations: Floats
 
@@ -136,8 +130,8 @@ class Backgrounds:
         """The backgrounds of pictures (f, H, W, 3) red, green, blue."""
         floats = pictures.astype(np.float32)
         reference = np.median(floats, axis=0)
-        lights = tuple(Light.between(one, reference) for one in floats)
-        even = np.array([by.evened(one) for by, one in zip(lights, floats, strict=True)])
+        lights = tuple(light_between(one, reference) for one in floats)
+        even = np.array([in_light(*one) for one in zip(floats, lights, strict=True)])
         off = np.median(_largest(np.abs(even - reference)), axis=0)
         deviations = _deviations(reference, 1.4826 * float(np.median(off)))
         return Backgrounds(even, lights, _find_colours(even, deviations), deviations)
@@ -215,7 +209,7 @@ class KnownBackground:
 
     @staticmethod
     def of(
-        pictures: Sequence[Picture], lights: Sequence[Light], showing: Mask, covered: Mask
+        pictures: Sequence[Picture], lights: Sequence[Floats], showing: Mask, covered: Mask
     ) -> "KnownBackground":
         """That of pictures (H, W, 3) of any size.
 
@@ -230,7 +224,7 @@ class KnownBackground:
         inside, near = ~_grown(~covered, MODEL.near), _grown(covered, MODEL.near)
         small, means = [], []
         for f, (picture, light) in enumerate(zip(pictures, lights, strict=True)):
-            even = light.evened(picture)
+            even = in_light(picture, light)
             shown = showing[f].astype(np.uint8)
             shown = cv2.resize(shown, (width, height), interpolation=cv2.INTER_NEAREST)
             shows = shown.astype(np.bool_) & ~near[f]
@@ -249,9 +243,9 @@ class KnownBackground:
             colours, deviations, count == 0, _log_frequencies(on), _log_frequencies(beside)
         )
 
-    def odds(self, picture: Picture, light: Light) -> Floats:
+    def odds(self, picture: Picture, light: Floats) -> Floats:
         """(H, W) logarithms of the odds that each pixel of a picture shows the body."""
-        even = light.evened(picture)
+        even = in_light(picture, light)
         numbers = colour_numbers(np.clip(even, 0.0, 255.0).astype(np.uint8))
         likeness = _likeness(even, self.colours, self.deviations) * np.float32(MODEL.known_times)
         shown = np.log(MODEL.shown * likeness + (1.0 - MODEL.shown))

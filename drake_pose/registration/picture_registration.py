@@ -16,7 +16,7 @@ import numpy as np
 from drake_pose.arrays import Array, Mask, Picture
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import RegistrationError
-from drake_pose.fit.background import Explained, Light
+from drake_pose.fit.background import Explained, light_between
 from drake_pose.fit.covariance import excess
 from drake_pose.fit.problem import TIME_OFFSET
 from drake_pose.fit.surfaces import hull_of_few
@@ -532,7 +532,7 @@ def judge_pictures(
         covered = draw_mask(outlines, camera.X_CW @ body.kinematics.poses(posed.values), camera)
         if covered.mean() < shown:
             return None
-        light = Light.between(posed.picture, known.colours)
+        light = light_between(posed.picture, known.colours)
         return posed.name, see_picture(posed, known, light, covered)
 
     frames, misfits, lost = list[PosedFrame](), list[FrameMisfit](), list[str]()

@@ -19,13 +19,12 @@ import cv2
 import numpy as np
 from scipy.optimize import minimize
 
-from drake_pose.arrays import Array, Mask, Picture
+from drake_pose.arrays import Array, Floats, Mask, Picture
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.fit.background import (
     Backgrounds,
     Explained,
     KnownBackground,
-    Light,
     explain,
     mask_of_odds,
     odds_picture,
@@ -312,7 +311,7 @@ def _stages(scales: Sequence[float], seen: PosedFrames) -> list[AnnealingStage]:
 
 
 def see_picture(
-    one: PosedPicture, known: KnownBackground, light: Light, covered: Mask
+    one: PosedPicture, known: KnownBackground, light: Floats, covered: Mask
 ) -> PosedFrame | None:
     """A picture with the odds of its pixels and a mask of these; None where no body shows.
 

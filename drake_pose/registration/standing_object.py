@@ -26,7 +26,7 @@ from drake_pose.body import (
 from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import RegistrationError, SettingsError
-from drake_pose.fit.background import KnownBackground, Light
+from drake_pose.fit.background import KnownBackground
 from drake_pose.fit.surfaces import FEW, few_triangles, surface_distance
 from drake_pose.registration.picture_search import PICTURES, PosedPicture, see_picture
 from drake_pose.registration.posed_frames import LAST_SPACING, PosedFrame, PosedFrames
@@ -574,7 +574,7 @@ def find_in_pictures(
     search = ObjectSearch(standing)
     look, count = search.choose(camera, choices)
     require_seen(camera.name, count, len(choices))
-    light = Light(np.ones(3, np.float32), np.zeros(3, np.float32))
+    light = np.eye(3, 4, dtype=np.float32)
     shows, shown = np.zeros((camera.height, camera.width), np.bool_), []
     for one in pictures:
         covered = draw_mask(standing.alone.all, search.seen_from(look[None], one.values), camera)

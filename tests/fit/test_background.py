@@ -7,8 +7,9 @@ from drake_pose.fit.background import (
     Backgrounds,
     Explained,
     KnownBackground,
-    Light,
     explain,
+    in_light,
+    light_between,
     mask_of_odds,
     odds_of_colours,
     odds_picture,
@@ -77,10 +78,10 @@ def test_light_is_told_whatever_else_changes():
     gain, offset = np.array([0.8, 1.1, 1.2]), np.array([10.0, -5.0, 3.0])
     picture = ((reference - offset) / gain).astype(np.float32)
     picture[:15, :20] = 0.0
-    light = Light.between(picture, reference)
-    np.testing.assert_allclose(light.gain, gain, rtol=0.01)
-    np.testing.assert_allclose(light.offset, offset, atol=1.0)
-    np.testing.assert_allclose(light.evened(picture)[20:], reference[20:], atol=0.5)
+    light = light_between(picture, reference)
+    np.testing.assert_allclose(light[:, :3], np.diag(gain), rtol=0.01)
+    np.testing.assert_allclose(light[:, 3], offset, atol=1.0)
+    np.testing.assert_allclose(in_light(picture, light)[20:], reference[20:], atol=0.5)
 
 
 def test_odds_show_the_body_and_the_background_behind_it(episode):

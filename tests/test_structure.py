@@ -39,7 +39,7 @@ FOR_ALL = {
     "yaml_files",
 }
 
-MOST_FILES, MOST_FILE_LINES, MOST_LINES = 20, 620, 100
+MOST_FILES, MOST_FILE_LINES, MOST_LINES = 20, 600, 100
 
 FILES = sorted(PACKAGE.rglob("*.py"))
 MODULES = {

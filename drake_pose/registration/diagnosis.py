@@ -165,6 +165,8 @@ class _Cause(NamedTuple):
     [rad] and a shift [m] of a camera along its axes, or of the base in the world, a share of focal
     lengths, or principal points [pixel]; units: (d,).
     rank: of causes that explain alike those of a lower one are likelier.
+    Once it was tested: by what amount (d,) it is off, with covariance, and how far that moves what
+    was free, x (p,); with what chance; Akaike's gain.
     """
 
     kind: str
@@ -172,20 +174,11 @@ class _Cause(NamedTuple):
     moves: Array
     units: Array
     rank: float
-
-
-class _CauseTest(NamedTuple):
-    """Whether one cause is off: by how much, with covariance; with what chance; Akaike's gain.
-
-    x: (p,) what was free, off by this cause.
-    """
-
-    cause: _Cause
-    amount: Array
-    covariance: Array
-    p_value: float
-    gain: float
-    x: Array
+    amount: Array = np.zeros(0)
+    covariance: Array = np.zeros((0, 0))
+    x: Array = np.zeros(0)
+    p_value: float = 1.0
+    gain: float = 0.0
 
 
 class _Residual(NamedTuple):
@@ -200,37 +193,39 @@ class _Residual(NamedTuple):
         """(p,) x of another r, zero where there is no information."""
         return np.asarray(np.linalg.solve(self.N + np.eye(len(r)), r))
 
-    def pixels(self, without: Array | None = None) -> float:
+    def pixels(self, without: float | Array = 0.0) -> float:
         """How far outlines are off [pixel]; without x (p,)."""
-        left = self.r if without is None else self.r - self.N @ without
-        return self.info.pixels(self.solved(left))
+        x = np.broadcast_to(without, self.r.shape)
+        return self.info.pixels(self.solved(self.r - self.N @ x))
 
     @property
     def p_value(self) -> float:
         """How often a residual is as large by chance."""
         return _p_value(*_statistic(self.r, self.Q, self.N), self.info.freedom)
 
-    def test(self, cause: _Cause) -> _CauseTest:
+    def test(self, cause: _Cause) -> _Cause:
         """Whether a cause is off."""
         M = cause.moves
         N, r, Q = M.T @ self.N @ M, M.T @ self.r, M.T @ self.Q @ M
         T, rank = _statistic(r, Q, N)
         inverse = np.linalg.inv(N + 1e-3 * np.eye(len(r)))
-        p_value, amount = _p_value(T, rank, self.info.freedom), inverse @ r
+        amount = inverse @ r
         # More numbers explain more by chance.
-        gain = T - 2.0 * rank
-        return _CauseTest(cause, amount, inverse @ Q @ inverse, p_value, gain, M @ amount)
+        return cause._replace(
+            amount=amount, covariance=inverse @ Q @ inverse, x=M @ amount,
+            p_value=_p_value(T, rank, self.info.freedom), gain=T - 2.0 * rank,
+        )  # fmt: skip
 
     def sufficient(
-        self, tests: Sequence[_CauseTest], least: float, share: float = 0.25
-    ) -> list[_CauseTest]:
+        self, tests: Sequence[_Cause], least: float, share: float = 0.25
+    ) -> list[_Cause]:
         """Causes that suffice, likelier ones first.
 
         They leave less than a share of the residual, or less than least [pixel].
         """
         most = max(least, share * self.pixels())
         enough = [one for one in tests if self.pixels(one.x) < most]
-        return sorted(enough, key=lambda one: (one.cause.rank, -one.gain))
+        return sorted(enough, key=lambda one: (one.rank, -one.gain))
 
     def without(self, cause: _Cause) -> _Residual:
         """The residual once a cause was put right."""
@@ -396,15 +391,15 @@ class _Diagnoser:
             causes.append(_Cause("center", text, center, np.ones(2), rank))
         return causes
 
-    def _finding(self, sufficient: Sequence[_CauseTest], pixels: float) -> Finding:
+    def _finding(self, sufficient: Sequence[_Cause], pixels: float) -> Finding:
         """The first of the causes that suffice, and its rivals."""
         best, *others = sufficient
-        rivals = [one.cause.name for one in others]
+        rivals = [one.name for one in others]
         seen_by_one = len(self._fit.camera_names) == 1
-        if seen_by_one and any(one.cause.kind == "camera" for one in sufficient):
+        if seen_by_one and any(one.kind == "camera" for one in sufficient):
             rivals.append("base")
-        kind, name, _, units, _ = best.cause
-        x, sd = best.amount * units, np.sqrt(np.diag(best.covariance)) * units
+        kind, name = best.kind, best.name
+        x, sd = best.amount * best.units, np.sqrt(np.diag(best.covariance)) * best.units
         # Poses turn and shift; a joint does one of them; the rest is shifts.
         turns = len(x) // 2 if kind in ("camera", "base") else 0
         if kind == "joint":
@@ -442,12 +437,12 @@ class _Diagnoser:
         others = [residual.test(one).gain for one in causes if one.kind != "center"]
         center = None
         if is_half_pixel(shifted.amount, shifted.covariance) and shifted.gain > max(others):
-            residual = residual.without(shifted.cause)
+            residual = residual.without(shifted)
             sd = np.sqrt(np.diag(shifted.covariance))
             center = shifted.amount.tolist(), sd.tolist()
         whole, (residual, found) = residual, _name(residual, causes, DIAGNOSIS.min_pixels)
         # A joint's offset moves little beside what calibrations are off by: these are free now.
-        named, joints, freed = [one[0].cause.name for one in found], list[_Cause](), list[_Cause]()
+        named, joints, freed = [one[0].name for one in found], list[_Cause](), list[_Cause]()
         for cause in causes:
             if cause.kind == "camera":
                 residual = residual.without(cause)
@@ -459,7 +454,7 @@ class _Diagnoser:
         findings = list[Finding]()
         if found:
             # By how much they are off together, and the others that are free beside.
-            own = [best.cause for best, *_ in found]
+            own = [best for best, *_ in found]
             names = {(one.kind, one.name) for one in own}
             free = [one for one in freed if zeros and (one.kind, one.name) not in names]
             moves = np.hstack([one.moves for one in (*own, *free)])
@@ -470,22 +465,22 @@ class _Diagnoser:
                 better = best._replace(
                     amount=whole_test.amount[k], covariance=whole_test.covariance[k, k]
                 )
-                pixels = whole.info.pixels(best.cause.moves @ better.amount)
+                pixels = whole.info.pixels(best.moves @ better.amount)
                 findings.append(self._finding([better, *rivals], pixels))
-        named = [one[0].cause.name for one in zeros]
+        named = [one[0].name for one in zeros]
         noticed = _noticed_from(residual, [one for one in joints if one.name not in named])
         return tuple(findings), center, noticed
 
 
 def _name(
     residual: _Residual, causes: Sequence[_Cause], least: float
-) -> tuple[_Residual, list[list[_CauseTest]]]:
+) -> tuple[_Residual, list[list[_Cause]]]:
     """What causes, one after the other, are off, and the residual without them.
 
     With each stand those that suffice in its place. least: how far they move outlines at least
     [pixel].
     """
-    left, named = list(causes), list[list[_CauseTest]]()
+    left, named = list(causes), list[list[_Cause]]()
     while left:
         # What is named is off by itself, and so are its rivals.
         tests = [
@@ -498,9 +493,9 @@ def _name(
             break
         most = max(tests, key=lambda one: one.gain)
         named.append(residual.sufficient(tests, least) or [most])
-        best = named[-1][0].cause
+        best = named[-1][0]
         residual = residual.without(best)
-        left = [one for one in left if one is not best]
+        left = [one for one in left if (one.kind, one.name) != (best.kind, best.name)]
     return residual, named
 
 

@@ -7,7 +7,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from itertools import combinations
-from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -269,33 +268,6 @@ Look = Array
 """(2, 4, 4): the camera's pose X_LC in the hand's frame, and the object's, X_WT."""
 
 
-class ObjectSearchSettings(NamedTuple):
-    """How a camera on a link is searched for, by an object that stands somewhere.
-
-    poses: of the object that are kept of each picture. starts, looks: pairs of camera and object
-    that are fitted roughly, and finely. triples, pairs: sets of three pictures that give starts,
-    and starts of each. angle: by which motions of hand and object may differ in their angle [rad].
-    regions, explained: regions of a picture that may be the object, if its E_total there is less.
-    apart: distance between two views of the object that are one [its radius]. worse_by,
-    worse_times: a look is dropped whose mean E_total exceeds worse_by + worse_times the best one's.
-    """
-
-    poses: int = 8
-    starts: int = 12
-    looks: int = 4
-    triples: int = 24
-    pairs: int = 500
-    angle: float = float(np.radians(20.0))
-    regions: int = 3
-    explained: float = 0.15
-    apart: float = 0.15
-    worse_by: float = 0.02
-    worse_times: float = 2.0
-
-
-_CHOSEN = ObjectSearchSettings()
-
-
 class ObjectSearch:
     """Finds where a camera is on a link of the robot, and where the object stands that it sees.
 
@@ -358,24 +330,42 @@ class ObjectSearch:
         return replace(found, seen_object=seen)
 
     def choose(
-        self, camera: PinholeCamera, choices: Sequence[Sequence[PosedFrame]]
+        self,
+        camera: PinholeCamera,
+        choices: Sequence[Sequence[PosedFrame]],
+        explained: float = 0.15,
     ) -> tuple[Look, int]:
         """Where camera and object are about, and of how many pictures this explains a region.
 
         Args:
             choices: of each picture regions any of which may be the object.
+            explained: a region may be the object if its E_total is less.
 
         Raises RegistrationError: in no three pictures one of them turns as the link does.
         """
-        look = self._search(camera, choices)[0]
+        look = self._search(camera, choices, explained)[0]
         seen = [own for own in choices if own]
         off = [self._misfits(camera, [own], look[None], SEARCH.second_side)[0] for own in seen]
-        return look, int(np.count_nonzero(np.array(off) < _CHOSEN.explained))
+        return look, int(np.count_nonzero(np.array(off) < explained))
 
-    def _search(self, camera: PinholeCamera, choices: Sequence[Sequence[PosedFrame]]) -> list[Look]:
+    def _search(
+        self,
+        camera: PinholeCamera,
+        choices: Sequence[Sequence[PosedFrame]],
+        explained: float = 0.15,
+        *,
+        poses: int = 8,
+        regions: int = 3,
+        starts: int = 12,
+        looks: int = 4,
+    ) -> list[Look]:
         """Where the best one may be near, best first.
 
-        choices: of each picture masks, one of which may be the object's.
+        Args:
+            choices: of each picture masks, one of which may be the object's.
+            explained: largest E_total of one of several masks that may be.
+            poses, regions: numbers of the object's poses, and of masks, that are kept of a picture.
+            starts, looks: numbers of looks that are fitted roughly, and that are kept.
         """
         turns = self._standing.symmetry[0]
         kept, X_CT = list[list[PosedFrame]](), list[Array]()
@@ -384,40 +374,41 @@ class ObjectSearch:
             likely = []
             for one in own:
                 alone = [PosedFrame(one.name, np.zeros(0), one.mask)]
-                found = self._alone.search(camera, alone, _CHOSEN.poses)
+                found = self._alone.search(camera, alone, poses)
                 posed = PosedFrames(body.kinematics, body.very_few, camera, alone)
                 off = float(E_total(areas(posed, np.array(found), SEARCH.second_side)).min())
                 # A single one is known to be the object's.
-                if len(own) == 1 or off < _CHOSEN.explained:
+                if len(own) == 1 or off < explained:
                     likely.append((off, one, found))
-            likely = sorted(likely, key=lambda each: each[0])[: _CHOSEN.regions]
+            likely = sorted(likely, key=lambda each: each[0])[:regions]
             if likely:
                 kept.append([one for _, one, _ in likely])
                 alike = [self._apart([X[None] for X in found], turns) for *_, found in likely]
                 X_CT.append(np.concatenate([X for found in alike for X in found]))
         some = [own[0] for own in kept]
         X_WL = self._standing.hand_poses(np.array([one.values for one in some]))
-        starts = hand_eye_starts(X_WL, X_CT, turns)
-        if not len(starts):
+        begun = hand_eye_starts(X_WL, X_CT, turns)
+        if not len(begun):
             raise RegistrationError(
                 f"camera '{camera.name}': in no three of its frames the object turns before the "
                 "camera as the link does: are these masks of this object, did it stand still, are "
                 "the joint positions those of these frames, and is it this link that the camera "
                 "rides on? Nothing was written"
             )
-        order = np.argsort(self._misfits(camera, kept, starts, SEARCH.first_side), kind="stable")
+        order = np.argsort(self._misfits(camera, kept, begun, SEARCH.first_side), kind="stable")
         fitted = []
-        for look in self._distinct(starts[order[: 10 * _CHOSEN.starts]], some)[: _CHOSEN.starts]:
+        for look in self._distinct(begun[order[: 10 * starts]], some)[:starts]:
             # Of each picture's masks that which the look explains best.
             by = [[self._misfit(camera, one, look[None])[0] for one in own] for own in kept]
             chosen = [own[int(np.argmin(each))] for own, each in zip(kept, by, strict=True)]
             fit = self._fit(camera, chosen, look, SEARCH.coarse_spacing, "very_few")
             fitted.append(self._look(fit, fit.fit(SEARCH.coarse), look))
         misfits = self._misfits(camera, kept, np.array(fitted), SEARCH.second_side)
-        limit = _CHOSEN.worse_by + _CHOSEN.worse_times * float(misfits.min())
+        # Those are none that are much worse.
+        limit = 0.02 + 2.0 * float(misfits.min())
         order = np.argsort(misfits, kind="stable")
         best = [fitted[k] for k in order if misfits[k] <= limit]
-        return self._distinct(best, some)[: _CHOSEN.looks]
+        return self._distinct(best, some)[:looks]
 
     def _misfits(
         self,
@@ -486,46 +477,52 @@ class ObjectSearch:
         )
 
     def _differ(self, X: Array, others: Array) -> bool:
-        """Whether poses (n, 4, 4) put the object's ball elsewhere, root mean square."""
+        """Whether poses (n, 4, 4) put the object's ball elsewhere, by .15 of its radius."""
         by = np.asarray(X - others)[:, :3]
         shift = by[:, :, :3] @ self._standing.middle + by[:, :, 3]
         turn = (by[:, :, :3] ** 2).sum(axis=(1, 2)) / 3.0 * self._standing.radius**2
         off = np.sqrt(((shift**2).sum(axis=1) + turn).mean())
-        return bool(off > _CHOSEN.apart * self._standing.radius)
+        return bool(off > 0.15 * self._standing.radius)
 
 
-def hand_eye_starts(X_WL: Array, X_CT: Sequence[Array], turns: Array) -> Array:
+def hand_eye_starts(X_WL: Array, X_CT: Sequence[Array], turns: Array, triples: int = 24) -> Array:
     """(n, 2, 4, 4) looks that three pictures each say, those that turn the hand most first.
 
     Args:
         X_WL: (frames, 4, 4) the hand's poses.
         X_CT: for each frame (k, 4, 4) poses of the object in the camera, one of them about right.
         turns: (t, 4, 4) motions in the object's frame after which it looks alike.
+        triples: number of sets of three pictures.
     """
     threes = list(combinations(range(len(X_WL)), 3))
-    if len(threes) > _CHOSEN.triples:
+    if len(threes) > triples:
         drawn = np.random.default_rng(0).permutation(len(threes))
         # Threes of which nothing is told are drawn too often otherwise.
-        threes = [threes[k] for k in drawn[: 4 * _CHOSEN.triples]]
+        threes = [threes[k] for k in drawn[: 4 * triples]]
     told = [turns_between(X_WL[list(three), :3, :3])[1] for three in threes]
-    chosen = [threes[k] for k in np.argsort(told)[::-1][: _CHOSEN.triples]]
+    chosen = [threes[k] for k in np.argsort(told)[::-1][:triples]]
     turned = [(one[:, None] @ turns).reshape(-1, 4, 4) for one in X_CT]
     # The object's frame is as it is in the first one, however it looks.
     found = [_of_three(X_WL[[i, j, k]], (X_CT[i], turned[j], turned[k])) for i, j, k in chosen]
     return np.concatenate(found)
 
 
-def _of_three(X_WL: Array, X_CT: Sequence[Array]) -> Array:
-    """What three pictures say: for those of the object's poses that turn as the hand does."""
+def _of_three(
+    X_WL: Array, X_CT: Sequence[Array], most: int = 500, angle: float = float(np.radians(20.0))
+) -> Array:
+    """What three pictures say: for those of the object's poses that turn as the hand does.
+
+    So many at most; angles of hand and object differ by less [rad].
+    """
     pairs = ((0, 1), (0, 2), (1, 2))
     A = np.array([np.linalg.inv(X_WL[j]) @ X_WL[i] for i, j in pairs])
     a = Rotation.from_matrix(A[:, :3, :3]).as_rotvec()
     offs = []
-    for (i, j), angle in zip(pairs, np.linalg.norm(a, axis=1), strict=True):
+    for (i, j), turned in zip(pairs, np.linalg.norm(a, axis=1), strict=True):
         traces = np.einsum("nij,mij->nm", X_CT[i][:, :3, :3], X_CT[j][:, :3, :3])
-        offs.append(np.abs(np.arccos(np.clip(0.5 * (traces - 1.0), -1.0, 1.0)) - angle))
+        offs.append(np.abs(np.arccos(np.clip(0.5 * (traces - 1.0), -1.0, 1.0)) - turned))
     off = np.maximum(np.maximum(offs[0][:, :, None], offs[1][:, None]), offs[2][None])
-    kept = np.argsort(off, axis=None)[: min(_CHOSEN.pairs, np.count_nonzero(off <= _CHOSEN.angle))]
+    kept = np.argsort(off, axis=None)[: min(most, np.count_nonzero(off <= angle))]
     rows = np.unravel_index(kept, off.shape)
     poses = np.stack([one[row] for one, row in zip(X_CT, rows, strict=True)], axis=1)
     B = np.stack([poses[:, j] @ inverse_transforms(poses[:, i]) for i, j in pairs], axis=1)

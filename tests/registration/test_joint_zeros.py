@@ -50,15 +50,6 @@ class TestCalibrateJoints:
         assert turn < np.radians(0.15)
 
     @pytest.mark.slow
-    def test_focal_length(self, model, body, camera) -> None:
-        frames = see(model, body, camera, 8, 4)
-        wrong = replace(camera, focal_x=612.0, focal_y=612.0, X_WC=np.eye(4))
-        registered = CameraSearch(body).register(wrong, frames)
-        found = calibrate_joints(body, [registered], [frames], [], focal=True)
-        assert found.cameras[0].focal_x == pytest.approx(600.0, rel=0.004)
-        assert abs(found.cameras[0].focal_x - 600.0) < 4.0 * 600.0 * found.focal_deviations[0]
-
-    @pytest.mark.slow
     def test_cameras_share_zeros_and_lengths(self, model, body) -> None:
         """What two cameras see is one robot: they tell its zero together, better than each."""
         places = (np.array([1.6, 0.4, 0.5]), np.array([0.3, -1.6, 0.7]))

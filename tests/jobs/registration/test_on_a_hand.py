@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import yaml
 
-from drake_pose.body import load_model
 from drake_pose.camera.camera_files import load_camera_file, load_cameras
 from drake_pose.errors import CameraError
 from drake_pose.silhouette.pictures.masks import intersection_over_union, read_mask
@@ -65,29 +64,6 @@ def test_the_camera_is_found_on_its_link(own_base: ArmScene, out: Path) -> None:
 
 
 @pytest.mark.slow
-def test_lengths_between_the_base_and_the_camera(
-    own_base: ArmScene, tmp_path: Path, out: Path
-) -> None:
-    right, short = own_base.model.read_text(), tmp_path / "short.urdf"
-    assert right.count('"0 0 0.35"') == 1
-    short.write_text(right.replace('"0 0 0.35"', '"0 0 0.34"'))
-    words = replace(own_base, model=short).register(out)
-    found = run_json(*words, "--on", "flange", "--lengths", "shoulder", "--lengths", "elbow")
-    off, one = 100.0 * (0.35 / 0.34 - 1.0), found["lengths"]["shoulder"]
-    assert one["low_percent"] < off < one["high_percent"]
-    assert one["value_percent"] == pytest.approx(off, abs=1.0)
-    assert one["significant"]
-    assert not found["lengths"]["elbow"]["significant"]
-    require_near(found, 3.0, 0.3)
-    # Drake has the joint that the link carries where the right arm has it, but for what is left.
-    places = []
-    for path in (own_base.model, out / "short_calibrated.urdf"):
-        joint = load_model(path, check=False).plant.GetJointByName("roll_turn")
-        places.append(joint.frame_on_parent().GetFixedPoseInBodyFrame().translation()[2])
-    assert places[1] - places[0] == pytest.approx(0.34e-2 * (one["value_percent"] - off), abs=1e-9)
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("looks", "links", "alike"), [(BRACKET, LINKS, 1), (BRACKET, SIX, 1), (BOX, LINKS, 4)]
 )
@@ -118,22 +94,6 @@ def test_damaged_masks_and_a_wrong_one(tmp_path: Path, out: Path) -> None:
     assert found["contradictions"] == ["0005"]
     assert any("contradict the others" in text for text in found["warnings"])
     require_near(found, 5.0, 0.5)
-
-
-@pytest.mark.slow
-def test_a_round_target_leaves_its_own_turn_open_alone(tmp_path: Path, out: Path) -> None:
-    scene = write_hand_scene(tmp_path, CAN, SIX, seed=1)
-    found = run_json(*scene.register(out), "--no-overlay")
-    require_near(found, 1.0, 0.1)
-    target = found["target"]
-    assert not target["determined"]
-    assert target["rotation_sd_deg"] > 30.0
-    np.testing.assert_allclose(np.abs(target["round_about"]), [[0.0, 0.0, 1.0]], atol=1e-6)
-    # Upside down it looks alike, too.
-    assert len(target["families"]) == 2
-    axis = np.array(target["X_WT"])[:3, 2]
-    assert abs(axis @ scene.X_WT[:3, 2]) > np.cos(np.radians(0.2))
-    assert any("not determined" in text for text in found["warnings"])
 
 
 @pytest.mark.slow
@@ -210,13 +170,3 @@ def test_other_bases_hands_and_targets_are_refused(
     ):
         assert_refused(run_command(words), *parts)
         assert not out.exists()
-
-
-@pytest.mark.slow
-def test_masks_of_another_target_are_refused(
-    bracket: TargetScene, tmp_path: Path, out: Path
-) -> None:
-    other = bracket.with_looks("0.05 0.08 0.12", "0.15 0.02 0.3", tmp_path / "other.urdf")
-    words = [*other.register(out), "--frame", "0000:0003"]
-    assert_refused(run_command(words), "Nothing was written")
-    assert not out.exists()

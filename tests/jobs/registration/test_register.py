@@ -91,22 +91,6 @@ class TestRegister:
 
 
 @pytest.mark.slow
-def test_a_camera_that_has_a_pose_is_found_anew(own_arm: ArmScene, out: Path) -> None:
-    wrong = np.eye(4)
-    wrong[:3, 3] = [1.0, 0.3, -0.4]
-    own_arm.edit_cameras("right", X_WC=wrong.tolist())
-    result = run_to_end(*own_arm.register(out), "--camera", "right", "--no-overlay")
-    # Nobody knows where the other one stands, and nobody asked.
-    assert "camera 'left' has no X_WC" in result.stderr
-    written = load_cameras(out / "cameras.yaml")
-    assert list(written) == ["right"]
-    assert pose_errors(written["right"].X_WC, own_arm.cameras["right"].X_WC)[0] < 8.0
-    assert not (out / "overlay").exists()
-    assert "5 of 5" in result.stdout
-    assert "cameras.yaml" in result.stdout
-
-
-@pytest.mark.slow
 def test_one_pose_and_a_held_camera_that_looks_elsewhere_are_warned_of(
     own_arm: ArmScene, out: Path
 ) -> None:

@@ -6,6 +6,7 @@ explains many frames; poor masks are off in another way each time.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -19,30 +20,26 @@ from drake_pose.fit.problem import Problem, Unknowns
 from drake_pose.person.figures import pixels_per_metre
 from drake_pose.person.views import viewing_rays
 
-# A camera that was pushed has turned and shifted by about this much [rad, m].
-_TURN, _SHIFT = 0.15, 0.3
-_POSE_ROUNDS = tuple(
-    AnnealingStage(scale, 0.05) for scale in (0.15, 0.12, 0.10, 0.08, 0.06, 0.05, 0.04)
-)
-_CAMERA_ROUNDS = tuple(
-    AnnealingStage(scale, 0.05) for scale in (0.4, 0.3, 0.2, 0.15, 0.1, 0.07, 0.05, 0.05)
-)
-# For a camera that is nearly where it is said to be.
-_NEAR_ROUNDS = _CAMERA_ROUNDS[4:6] + _CAMERA_ROUNDS[-1:]
-_CAMERA_STEPS = StepSettings(longest=2.0, damping=1e-6, even_damping=1e-9)
-_JUDGED = AnnealingStage(0.05, 0.05)
-_ANGLE_DEVIATION = 0.5
-# A camera is at fault where leaving it out lowers the others' misfit to so little of what it was,
-# and nobody else's leaving does as much.
-_LOWERED = 0.8
-_ALIKE = 1.1
-# A surface is known to 2 cm, and an edge to a pixel: what is off by more is off [m, pixel].
-_LEAST_METRES, _LEAST_PIXELS = 0.035, 2.0
-# Of a camera that has moved, so much at least shows beside the pose that it helped to find: that
-# pose goes along by 0.3 of the way with nine cameras, by half of it with four around a person.
-_SHOWN = 0.2
-# One motion explains a camera's silhouettes where they fit nearly as well as the others'.
-_EXPLAINED = 0.9
+
+class FaultSettings(NamedTuple):
+    """From when on a camera is at fault.
+
+    rounds: scales at which a camera's motion is fitted. lowered: a camera is at fault where leaving
+    it out lowers the others' misfit to this fraction; alike: those that lower it to no more than so
+    many times the least are rivals. min_metres, min_pixels: a surface is known to 2 cm, and an edge
+    to a pixel: what is off by more is off. explained: one motion explains a camera's silhouettes
+    where they fit this fraction of what the others' do.
+    """
+
+    rounds: tuple[float, ...] = (0.4, 0.3, 0.2, 0.15, 0.1, 0.07, 0.05, 0.05)
+    lowered: float = 0.8
+    alike: float = 1.1
+    min_metres: float = 0.035
+    min_pixels: float = 2.0
+    explained: float = 0.9
+
+
+FAULT = FaultSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,63 +116,55 @@ class CameraJudge:
         views = pack_views(
             [self._cameras[name] for name in names], [frame.edges[name] for name in names]
         )
+        # Angles are known to half a radian, lengths twice as well.
         is_angle = self._fit.kinematics.is_angle
-        prior = Prior(frame.values, np.where(is_angle, 1.0, 4.0) / _ANGLE_DEVIATION**2)
-        found = self._fit.fit(views, frame.values, _POSE_ROUNDS, prior, self._held)
+        prior = Prior(frame.values, np.where(is_angle, 1.0, 4.0) / 0.5**2)
+        scales = (0.15, 0.12, 0.10, 0.08, 0.06, 0.05, 0.04)
+        rounds = [AnnealingStage(scale, 0.05) for scale in scales]
+        found = self._fit.fit(views, frame.values, rounds, prior, self._held)
         self._without[frame, left_out] = found.values, found.inlier_ratio
         return found.values, found.inlier_ratio
 
     def share(self, camera: Camera, edge: EdgePoints, values: Array) -> float:
         """What share of the contours' lengths fits in one picture."""
-        return self._fit.compare(pack_views([camera], [edge]), values, _JUDGED).inlier_ratio
+        return self._fit.compare(
+            pack_views([camera], [edge]), values, AnnealingStage(0.05, 0.05)
+        ).inlier_ratio
 
     def motion(
         self,
         name: str,
         edges: Sequence[EdgePoints],
         poses: Sequence[Array],
-        rounds: Sequence[AnnealingStage] = _CAMERA_ROUNDS,
+        scales: Sequence[float] = FAULT.rounds,
     ) -> CameraMotion:
         """The motion of a camera that explains its edges best, by poses (m,) found without it."""
         camera, pairs = self._cameras[name], list(zip(edges, poses, strict=True))
-        places = np.array([self._fit.kinematics.poses(values)[:, :3, 3] for values in poses])
-        found = []
-        for start in (np.zeros(3), _way_to_regions(camera, edges, places)):
-            middle = places.reshape(-1, 3).mean(axis=0)
-            moved = self._moved(camera, pairs, middle, start, rounds)
-            found.append(self._describe(camera, moved, pairs, places.reshape(-1, 3)))
-            # What is far off may be drawn to the wrong side of the body; else one start is enough.
-            if found[0].share_after > _EXPLAINED:
-                break
-        return max(found, key=lambda one: one.share_after)
-
-    def _moved(
-        self,
-        camera: Camera,
-        pairs: Sequence[tuple[EdgePoints, Array]],
-        middle: Array,
-        start: Array,
-        rounds: Sequence[AnnealingStage],
-    ) -> Camera:
-        """A camera moved to fit its regions to bodies about middle (3,), first by (3,) [m]."""
-        fit, reach = self._fit, float(np.linalg.norm(camera.X_WC[:3, 3] - middle))
-        names = [f"{camera.name}.{name}" for name in POSE_NAMES]
-        # What the pictures see of a turn about the camera is the person's way about it.
-        deviations = np.array([_TURN] * 3 + [_SHIFT + _TURN * reach] * 3)
-        seen = [Observation(pack_evidence([edge]), values) for edge, values in pairs]
-        nothing = np.zeros((len(pairs), 0))
+        fit, places = self._fit, np.array([self._fit.kinematics.poses(q)[:, :3, 3] for q in poses])
+        points = places.reshape(-1, 3)
+        middle = points.mean(axis=0)
+        # A camera that was pushed has turned and shifted by about 0.15 rad and 0.3 m. What the
+        # pictures see of a turn about the camera is the person's way about it.
+        reach = float(np.linalg.norm(camera.X_WC[:3, 3] - middle))
+        deviations = np.array([0.15] * 3 + [0.3 + 0.15 * reach] * 3)
+        names = [f"{camera.name}.{one}" for one in POSE_NAMES]
         problem = Problem(
             fit.body, [camera], [Unknowns(names, True, deviation=deviations)], pivot=middle,
-            noise=fit.noise, steps=_CAMERA_STEPS,
+            noise=fit.noise, steps=StepSettings(longest=2.0, damping=1e-6, even_damping=1e-9),
         )  # fmt: skip
-        found = problem.solve(
-            seen,
-            rounds,
-            (nothing, np.concatenate([np.zeros(3), camera.X_CW[:3, :3] @ start])),
-            expected=(nothing, np.zeros(6)),
-        )
-        X_CW = problem.places(found.parameters[0])[0][0]
-        return camera.with_pose(np.linalg.inv(X_CW))
+        seen = [Observation(pack_evidence([edge]), values) for edge, values in pairs]
+        rounds = [AnnealingStage(scale, 0.05) for scale in scales]
+        nothing, found = np.zeros((len(pairs), 0)), []
+        for start in (np.zeros(3), _way_to_regions(camera, edges, places)):
+            shift = np.concatenate([np.zeros(3), camera.X_CW[:3, :3] @ start])
+            solved = problem.solve(seen, rounds, (nothing, shift), expected=(nothing, np.zeros(6)))
+            X_CW = problem.places(solved.parameters[0])[0][0]
+            moved = camera.with_pose(np.linalg.inv(X_CW))
+            found.append(self._describe(camera, moved, pairs, points))
+            # What is far off may be drawn to the wrong side of the body; else one start is enough.
+            if found[0].share_after > FAULT.explained:
+                break
+        return max(found, key=lambda one: one.share_after)
 
     def _describe(
         self,
@@ -200,23 +189,6 @@ class CameraJudge:
             float(shares[1]),
         )
 
-    def _agree(self, names: Sequence[str], frames: Sequence[FrameView]) -> bool:
-        """Whether no camera can be at fault, by the poses of all: each without one costs as much.
-
-        What few cameras say, their pose follows.
-        """
-        if len(names) <= 3:
-            return False
-        for name in names:
-            own = [frame for frame in frames if name in frame.edges]
-            poses, shares = zip(*(self.pose_without(frame, "") for frame in own), strict=True)
-            edges = [frame.edges[name] for frame in own]
-            motion = self.motion(name, edges, poses, _NEAR_ROUNDS)
-            fits = motion.share_before > _EXPLAINED * float(np.mean(shares))
-            if not fits or motion.metres > _SHOWN * _LEAST_METRES:
-                return False
-        return True
-
     def find_fault(self, frames: Sequence[FrameView]) -> CameraFault | None:
         """The camera that contradicts the others most, if one does.
 
@@ -224,7 +196,19 @@ class CameraJudge:
         """
         frames = [frame for frame in frames if len(frame.edges) >= 3]
         names = [name for name in self._cameras if any(name in frame.edges for frame in frames)]
-        if self._agree(names, frames):
+
+        def is_off(name: str) -> bool:
+            # Of a camera that has moved a fifth at least shows beside the pose that it helped to
+            # find: that pose goes along by 0.3 of the way with nine cameras, by half with four.
+            own = [frame for frame in frames if name in frame.edges]
+            poses, shares = zip(*(self.pose_without(frame, "") for frame in own), strict=True)
+            edges = [frame.edges[name] for frame in own]
+            motion = self.motion(name, edges, poses, (0.1, 0.07, 0.05))
+            fits = motion.share_before > FAULT.explained * float(np.mean(shares))
+            return not fits or motion.metres > 0.2 * FAULT.min_metres
+
+        # What few cameras say, their pose follows.
+        if len(names) > 3 and not any(is_off(name) for name in names):
             return None
         with_all = [self.pose_without(frame, "")[1] for frame in frames]
         misfits, found = {}, {}
@@ -241,28 +225,28 @@ class CameraJudge:
             misfits[name] = (1.0 - best) / max(1.0 - float(np.mean(shares)), 1e-3)
             found[name] = motion, share
         suspects = sorted(misfits, key=lambda one: misfits[one])
-        if not suspects or misfits[suspects[0]] > _LOWERED:
+        if not suspects or misfits[suspects[0]] > FAULT.lowered:
             return None
         # Any two cameras agree more or less: two alone predict a third one's picture half as well,
         # and of three nobody can tell which one contradicts the others.
         few = len(names) <= 3
-        metres = (2.0 if few else 1.0) * _LEAST_METRES
+        metres = (2.0 if few else 1.0) * FAULT.min_metres
         # Of those that lower the misfit alike, one that has not moved is not at fault.
         moved = [
             one
             for one in suspects
-            if misfits[one] <= _ALIKE * misfits[suspects[0]]
+            if misfits[one] <= FAULT.alike * misfits[suspects[0]]
             and found[one][0].metres >= metres
-            and found[one][0].pixels >= _LEAST_PIXELS
+            and found[one][0].pixels >= FAULT.min_pixels
         ]
         if not moved:
             return None
-        first, alike = moved[0], np.inf if few else _ALIKE * misfits[moved[0]]
+        first, alike = moved[0], np.inf if few else FAULT.alike * misfits[moved[0]]
         motion, share = found[first]
         rivals = [
             one
             for one in suspects
-            if one != first and misfits[one] < alike and found[one][0].metres > _LEAST_METRES
+            if one != first and misfits[one] < alike and found[one][0].metres > FAULT.min_metres
         ]
         explained = not few and is_explained(motion, share)
         return CameraFault(first, motion, explained, tuple(rivals), share)
@@ -281,7 +265,7 @@ def _way_to_regions(camera: Camera, edges: Sequence[EdgePoints], places: Array) 
 
 def is_explained(motion: CameraMotion, others_share: float) -> bool:
     """Whether a camera's motion explains its silhouettes nearly as well as the others' fit."""
-    return motion.share_after > _EXPLAINED * others_share
+    return motion.share_after > FAULT.explained * others_share
 
 
 def moved_since(before: Sequence[float], after: Sequence[float]) -> int:

@@ -36,8 +36,7 @@ from drake_pose.jobs.registration.positions import read_known_positions
 from drake_pose.search import PoseAndMask, PoseAndMaskSettings
 from drake_pose.silhouette.pictures.masks import encode_mask, intersection_over_union
 from drake_pose.silhouette.pictures.scene_checks import frame_ranges
-from drake_pose.silhouette.pictures.scene_files import common_rate, in_order
-from drake_pose.silhouette.pictures.scenes import CAMERA_FILE, SCENE_FILE
+from drake_pose.silhouette.pictures.scenes import CAMERA_FILE, SCENE_FILE, common_rate, in_order
 from drake_pose.silhouette.segmentation.background import (
     Background,
     background_of_recording,

@@ -9,7 +9,7 @@ from drake_pose.files.options import (
     parse_root_position,
     parse_root_rotation,
 )
-from drake_pose.silhouette.pictures.scene_files import select_frames
+from drake_pose.silhouette.pictures.scenes import select_frames
 from tests.cli import run_command
 
 FRAMES = ("0001", "0002", "0010", "still")

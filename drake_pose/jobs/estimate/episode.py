@@ -20,8 +20,7 @@ from drake_pose.camera.picture_files import frame_key
 from drake_pose.errors import SceneError, SettingsError, UnknownNameError
 from drake_pose.files.settings import EpisodeSettings
 from drake_pose.jobs.estimate.measurements import TrueAngles
-from drake_pose.silhouette.pictures.scene_files import select_frames
-from drake_pose.silhouette.pictures.scenes import CAMERA_FILE, Scene
+from drake_pose.silhouette.pictures.scenes import CAMERA_FILE, Scene, select_frames
 
 # What tells an episode from a scene of masks.
 _OF_EPISODES = ("videos", "images", "meta/info.json", "trajectory.h5", "metadata.yaml")
@@ -177,19 +176,12 @@ def kept_pictures(camera: EpisodeCamera, settings: EpisodeSettings) -> Indices:
     return np.array([every.index(name) for name in names], np.intp)
 
 
-class EpisodeScene(NamedTuple):
-    """An episode's pictures as a sequence without masks, its frames some of the first camera's."""
-
-    scene: Scene
-    episode: Episode
-    first: EpisodeCamera
-    kept: Indices
-
-
 def read_episode_scene(
     path: Path, settings: EpisodeSettings, joints: Path | None, cameras: Path | None
-) -> EpisodeScene:
-    """An episode's pictures of cameras whose pose is known.
+) -> Scene:
+    """An episode's pictures of cameras whose pose is known: a sequence without masks.
+
+    Its frames are some of the first camera's pictures.
 
     Args:
         joints: a table of joint positions, in place of the episode's own.
@@ -207,20 +199,19 @@ def read_episode_scene(
     known = {one.name: one for one in chosen if one.name in placed and one.camera is not None}
     first = next(iter(known.values()))
     kept, names = kept_pictures(first, settings), frames_of(first)
-    frames = tuple(names[k] for k in kept)
-    steps = np.diff(first.times[kept])
+    frames, times = tuple(names[k] for k in kept), first.times[kept]
+    steps = np.diff(times)
     rate = None if not len(steps) or np.isnan(steps).any() else 1.0 / float(np.median(steps))
     images, readers = dict[tuple[str, str], Path](), dict[str, Callable[[str], Picture]]()
     for name, camera in known.items():
         numbers = _same_moments(first, kept, camera)
         images |= {(name, frames[k]): path for k in numbers}
         readers[name] = _reader(camera, {frames[k]: number for k, number in numbers.items()})
-    scene = Scene(
+    return Scene(
         path, {name: one.camera for name, one in known.items() if one.camera is not None}, frames,
-        {}, True, rate, images=images, readers=readers,
+        {}, True, rate, images=images, readers=readers, times=times, joints=episode.joints,
         warnings=(*episode.warnings, *say_left_out([one.name for one in chosen], placed)),
     )  # fmt: skip
-    return EpisodeScene(scene, episode, first, kept)
 
 
 def _reader(camera: EpisodeCamera, numbers: Mapping[str, int]) -> Callable[[str], Picture]:
@@ -241,21 +232,22 @@ def _same_moments(first: EpisodeCamera, kept: Indices, other: EpisodeCamera) -> 
 
 
 def logged_positions(
-    read: EpisodeScene, tree: PoseTree, settings: EpisodeSettings
+    scene: Scene, tree: PoseTree, settings: EpisodeSettings
 ) -> tuple[TrueAngles | None, dict[str, Array], tuple[str, ...]]:
-    """What an episode's log says: of all frames where joints are, and the plant's positions (nq,).
+    """What a scene's joint log says: where joints are in frames, and the plant's positions (nq,).
 
     None and nothing where it has no log; then what a user should know.
 
     Raises DrakePoseError: names columns, joints or units at fault.
     """
-    scene, episode, first, kept = read
-    if episode.joints is None:
+    if scene.joints is None:
         return None, {}, ()
-    mapped = map_log(episode.path, episode.joints, tree, settings)
+    mapped = map_log(scene.path, scene.joints, tree, settings)
     kinematics = TreeKinematics(tree)
-    values = np.tile(kinematics.flatten(tree.default_values()), (len(kept), 1))
-    values[:, mapped.asked] = rows_of(mapped.log, first, kept, np.zeros(()))
+    values = np.tile(kinematics.flatten(tree.default_values()), (len(scene.frames), 1))
+    log, times = mapped.log, scene.times
+    by_frame = log.times is None or np.isnan(times).all()
+    values[:, mapped.asked] = log.of_frames(scene.frames) if by_frame else log.at(times)
     starts = {
         frame: tree.positions_from(kinematics.split(row))[0]
         for frame, row in zip(scene.frames, values, strict=True)
@@ -263,4 +255,4 @@ def logged_positions(
     }
     places = [tree.model.position_index(name) for name in mapped.names]
     known = {frame_key(frame): q[places] for frame, q in starts.items()}
-    return TrueAngles(episode.path, mapped.names, known), starts, tuple(mapped.warnings)
+    return TrueAngles(scene.path, mapped.names, known), starts, tuple(mapped.warnings)

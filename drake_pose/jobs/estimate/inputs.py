@@ -128,11 +128,11 @@ def read_inputs(
     """
     model = load_model(model_path, package_paths=settings.packages)
     if is_episode(scene_path, settings) and not read_sequence(scene_path / SCENE_FILE)[0]:
-        episode = read_episode_scene(scene_path, settings, truth_path, camera_path)
-        scene, frames = episode.scene, episode.scene.frames
+        scene = read_episode_scene(scene_path, settings, truth_path, camera_path)
+        frames = scene.frames
         if settings.unseen:
             model, settings = leave_out_links(model, settings)
-        truth, starts, of_truth = logged_positions(episode, make_tree(model, settings), settings)
+        truth, starts, of_truth = logged_positions(scene, make_tree(model, settings), settings)
     else:
         # Who is captured moves.
         is_person = settings.method == "person"

@@ -44,8 +44,7 @@ from drake_pose.registration.picture_registration import Recording
 from drake_pose.registration.posed_frames import PosedFrame, SeenFrame
 from drake_pose.registration.standing_object import StandingObject, require_turns, stands_still
 from drake_pose.silhouette.pictures.scene_checks import check_scene, read_scene
-from drake_pose.silhouette.pictures.scene_files import select_frames
-from drake_pose.silhouette.pictures.scenes import CAMERA_FILE, Scene, load_scene
+from drake_pose.silhouette.pictures.scenes import CAMERA_FILE, Scene, load_scene, select_frames
 
 
 @dataclass(frozen=True)

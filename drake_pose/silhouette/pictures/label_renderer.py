@@ -38,10 +38,6 @@ from drake_pose.silhouette.pictures.label_images import EMPTY, label_data
 if TYPE_CHECKING:
     from drake_pose.body import ParsedModel
 
-# The apex's depth as a share of a triangle's size (the root of twice its area): deep enough to be
-# hidden, flat enough to stay inside thin bands.
-_DEPTH = 0.05
-
 
 class DeformableSkin:
     """A model's bands in a SceneGraph: a source whose configuration port is to be connected.
@@ -82,12 +78,16 @@ class DeformableSkin:
         return configuration
 
 
-def _apexes(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    """Returns a point (m, 3) just inside the middle of each triangle."""
+def _apexes(vertices: np.ndarray, triangles: np.ndarray, depth: float = 0.05) -> np.ndarray:
+    """Returns a point (m, 3) just inside the middle of each triangle.
+
+    depth: over the root of twice the triangle's area: deep enough to be hidden, flat enough to stay
+    inside thin bands.
+    """
     a, b, c = (vertices[triangles[:, corner]] for corner in range(3))
     normals = np.cross(b - a, c - a)
     sizes = np.sqrt(np.linalg.norm(normals, axis=1, keepdims=True))
-    depths = _DEPTH * normals / np.maximum(sizes, 1e-12)
+    depths = depth * normals / np.maximum(sizes, 1e-12)
     return np.asarray((a + b + c) / 3.0 - depths)
 
 
@@ -107,10 +107,6 @@ def _tetrahedra(mesh: TriangleMesh) -> Mesh:
     return Mesh(InMemoryMesh(mesh_file=file))
 
 
-_RENDERER = "silhouette"
-_DEPTH_MARGIN = 0.01
-
-
 class LabelRenderer:
     """Renders label images of a model with RenderEngineVtk, without a display or a diagram.
 
@@ -128,7 +124,7 @@ class LabelRenderer:
         model.add_to(self._plant, self._scene_graph)
         labels = {name: label for label, name in enumerate(link_names(self._plant))}
         self._skin = DeformableSkin(ModelSkin(model), self._scene_graph, labels)
-        self._scene_graph.AddRenderer(_RENDERER, MakeRenderEngineVtk(RenderEngineVtkParams()))
+        self._scene_graph.AddRenderer("silhouette", MakeRenderEngineVtk(RenderEngineVtkParams()))
         self._plant.Finalize()
         self._plant_context = self._plant.CreateDefaultContext()
         self._context = self._scene_graph.CreateDefaultContext()
@@ -161,7 +157,9 @@ class LabelRenderer:
         depths = None
         if isinstance(self.camera, ParallelCamera):
             depths = self._depths(q, p_B, self.camera.X_CW @ X_BW.inverse().GetAsMatrix4())
-        color, _, X_WC = camera_to_drake(self.camera, renderer_name=_RENDERER, depth_range=depths)
+        color, _, X_WC = camera_to_drake(
+            self.camera, renderer_name="silhouette", depth_range=depths
+        )
         query = self._scene_graph.get_query_output_port().Eval(self._context)
         image = query.RenderLabelImage(color, self._world, X_BW @ X_WC)
         return label_data(image).copy()
@@ -205,4 +203,4 @@ class LabelRenderer:
         if not placed:
             return -1.0, 1.0
         depths = np.concatenate([p @ X[2, :3] + X[2, 3] for X, p in placed])
-        return float(depths.min()) - _DEPTH_MARGIN, float(depths.max()) + _DEPTH_MARGIN
+        return float(depths.min()) - 0.01, float(depths.max()) + 0.01

@@ -49,10 +49,6 @@ def encode_mask(mask: np.ndarray) -> bytes:
     return stream.getvalue()
 
 
-# A pixel's neighbours: what a mask loses to them is its edge.
-_CROSS = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
-
-
 @dataclass(frozen=True)
 class MaskAgreement:
     """How a frame's silhouettes and body agree.
@@ -99,7 +95,9 @@ def compare_masks(
 
 def edge_area(mask: np.ndarray) -> int:
     """How many pixels of a mask (H, W) bool lie on its edge."""
-    inner = cv2.erode(mask.view(np.uint8), _CROSS)
+    # What a mask loses to a pixel's neighbours is its edge.
+    cross = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
+    inner = cv2.erode(mask.view(np.uint8), cross)
     return int(np.count_nonzero(mask)) - int(np.count_nonzero(inner))
 
 

@@ -15,13 +15,6 @@ from drake_pose.errors import MaskError, SceneError
 from drake_pose.regular_files import require_regular
 from drake_pose.silhouette.pictures.scenes import Scene, load_scene
 
-# A camera that stands still while the others' silhouettes change by so much of their area.
-_CHANGED = 0.02
-# Cameras that look up or down steeply do not say where up is.
-_UPRIGHT = 0.5
-# Ranges of frames that are listed before "and more".
-_LISTED = 6
-
 
 def read_scene(
     path: Path,
@@ -47,32 +40,50 @@ def check_scene(scene: Scene) -> Scene:
     """A scene with what its files' faults are, without masks of cameras that stood still alone."""
     if scene.scale_unknown:
         return scene
-    warnings = list(scene.warnings)
+    warnings, known, seen = list(scene.warnings), scene.frames, {*scene.masks, *scene.images}
     several = len(scene.cameras) > 1
-    if several:
-        warnings += _check_counts(scene)
+    for name in scene.cameras if several else ():
+        lacking = [frame for frame in known if (name, frame) not in seen]
+        if count := (len(known) - len(lacking)) * bool(lacking):
+            warnings.append(
+                f"camera '{name}' has {count} of {len(known)} frames; it lacks "
+                f"{frame_ranges(lacking, known)}, where the others go on without it"
+            )
     if scene.sequence and not scene.images:
-        warnings += _check_gaps(scene.frames)
+        warnings += _check_gaps(known)
         if several:
             frozen, repeated = _find_repeats(scene)
             gone = {(name, frame) for name, frames in frozen.items() for frame in frames}
             masks = {key: path for key, path in scene.masks.items() if key not in gone}
-            warnings += _describe_repeats(scene.frames, frozen, repeated)
             scene = replace(scene, masks=masks)
+            warnings += [
+                f"camera '{name}' shows its last picture again in frame "
+                f"{frame_ranges(frames, known)}, while the others' changed: left out there; did "
+                "the camera stand still, or drop frames?"
+                for name, frames in frozen.items()
+            ]
+            if repeated:
+                warnings.append(
+                    f"frame {frame_ranges(repeated, known)}: all cameras show the frame before "
+                    "again; was it recorded twice?"
+                )
     return replace(scene, warnings=tuple(warnings))
 
 
-def check_upright(cameras: Iterable[Camera]) -> tuple[str, ...]:
-    """Whether the pictures' up is the world's z, as it must be where a person is to stand."""
+def check_upright(cameras: Iterable[Camera], clear: float = 0.5) -> tuple[str, ...]:
+    """Whether the pictures' up is the world's z, as it must be where a person is to stand.
+
+    clear: component of the mean up along an axis below which cameras look up or down steeply and
+    do not say where up is.
+    """
     up = -np.mean([camera.X_WC[:3, 1] for camera in cameras], axis=0)
     axis = int(np.argmax(np.abs(up)))
-    if (axis == 2 and up[2] > 0.0) or abs(up[axis]) < _UPRIGHT:
+    if (axis == 2 and up[2] > 0.0) or abs(up[axis]) < clear:
         return ()
-    text = (
+    return (
         f"cameras.yaml: up in the pictures is the world's {'+' if up[axis] > 0.0 else '-'}"
-        f"{'xyz'[axis]}, but should be +z: the world lies on its side or upside down; turn X_WC"
+        f"{'xyz'[axis]}, but should be +z: the world lies on its side or upside down; turn X_WC",
     )
-    return (text,)
 
 
 def leave_out_unreadable(scene: Scene, frames: Iterable[str]) -> Scene:
@@ -116,18 +127,21 @@ def describe_unreadable(
     return tuple(found)
 
 
-def frame_ranges(frames: Iterable[str], known: Sequence[str]) -> str:
-    """Frames as text: those that follow each other as first-last; many are not all listed."""
+def frame_ranges(frames: Iterable[str], known: Sequence[str], most: int = 6) -> str:
+    """Frames as text: those that follow each other as first-last; at most so many ranges."""
     order = {frame: k for k, frame in enumerate(known)}
     places = np.sort([order[frame] for frame in frames]).astype(int)
     runs = np.split(places, np.flatnonzero(np.diff(places) > 1) + 1) if len(places) else []
     texts = [known[run[0]] + (f"-{known[run[-1]]}" if len(run) > 1 else "") for run in runs]
-    rest = sum(map(len, runs[_LISTED:]))
-    return ", ".join(texts[:_LISTED]) + (f" and {rest} more" if rest else "")
+    rest = sum(map(len, runs[most:]))
+    return ", ".join(texts[:most]) + (f" and {rest} more" if rest else "")
 
 
-def _find_repeats(scene: Scene) -> tuple[dict[str, list[str]], list[str]]:
-    """By camera the frames in which it alone shows its last picture again; those where all do."""
+def _find_repeats(scene: Scene, least: float = 0.02) -> tuple[dict[str, list[str]], list[str]]:
+    """By camera the frames in which it alone shows its last picture again; those where all do.
+
+    least: change of the other cameras' silhouettes, over their area, by which one stood still.
+    """
     repeats = _repeated_files(scene)
     frozen: dict[str, list[str]] = {}
     repeated = []
@@ -137,9 +151,15 @@ def _find_repeats(scene: Scene) -> tuple[dict[str, list[str]], list[str]]:
         others = [name for name in both if name not in alike]
         if len(both) > 1 and not others:
             repeated.append(frame)
-        elif alike and len(others) > len(alike) and _has_changed(scene, others, last, frame):
-            for name in alike:
-                frozen.setdefault(name, []).append(frame)
+        elif alike and len(others) > len(alike):
+            changes = []
+            for name in others:
+                with suppress(MaskError):
+                    one, other = (scene.read(name, f, may_be_empty=True) for f in (last, frame))
+                    changes.append((one != other).sum() / max(one.sum(), other.sum(), 1))
+            if changes and float(np.median(changes)) > least:
+                for name in alike:
+                    frozen.setdefault(name, []).append(frame)
     return frozen, repeated
 
 
@@ -162,47 +182,8 @@ def _repeated_files(scene: Scene) -> set[tuple[str, str]]:
     return set(found)
 
 
-def _has_changed(scene: Scene, names: Sequence[str], last: str, frame: str) -> bool:
-    """Whether the silhouettes of cameras changed more than a hand behind the body would."""
-    changes = []
-    for name in names:
-        with suppress(MaskError):
-            one, other = (scene.read(name, f, may_be_empty=True) for f in (last, frame))
-            changes.append((one != other).sum() / max(one.sum(), other.sum(), 1))
-    return bool(changes) and float(np.median(changes)) > _CHANGED
-
-
-def _describe_repeats(
-    known: Sequence[str], frozen: Mapping[str, Sequence[str]], repeated: Sequence[str]
-) -> list[str]:
-    texts = [
-        f"camera '{name}' shows its last picture again in frame {frame_ranges(frames, known)}, "
-        "while the others' changed: left out there; did the camera stand still, or drop frames?"
-        for name, frames in frozen.items()
-    ]
-    if repeated:
-        texts.append(
-            f"frame {frame_ranges(repeated, known)}: all cameras show the frame before again; was "
-            "it recorded twice?"
-        )
-    return texts
-
-
-def _check_counts(scene: Scene) -> list[str]:
-    """Cameras that lack frames which others have."""
-    found, seen = [], {*scene.masks, *scene.images}
-    for name in scene.cameras:
-        lacking = [frame for frame in scene.frames if (name, frame) not in seen]
-        if count := (len(scene.frames) - len(lacking)) * bool(lacking):
-            found.append(
-                f"camera '{name}' has {count} of {len(scene.frames)} frames; it lacks "
-                f"{frame_ranges(lacking, scene.frames)}, where the others go on without it"
-            )
-    return found
-
-
-def _check_gaps(frames: Sequence[str]) -> list[str]:
-    """Numbers that no camera has between frames that are numbered one by one."""
+def _check_gaps(frames: Sequence[str], most: int = 6) -> list[str]:
+    """Numbers that no camera has between frames that are numbered one by one; most are listed."""
     keys = [natural_key(frame) for frame in frames]
     if len(keys) < 3 or any(key[:-2] != keys[0][:-2] or key[-1][0] for key in keys):
         return []
@@ -211,11 +192,10 @@ def _check_gaps(frames: Sequence[str]) -> list[str]:
     wide = np.flatnonzero(steps > usual) if usual > 0 else np.empty(0, dtype=int)
     if not len(wide):
         return []
-    texts = [f"between {frames[k]} and {frames[k + 1]}" for k in wide[:_LISTED]]
-    rest = f" and at {len(wide) - _LISTED} more places" if len(wide) > _LISTED else ""
+    texts = [f"between {frames[k]} and {frames[k + 1]}" for k in wide[:most]]
+    rest = f" and at {len(wide) - most} more places" if len(wide) > most else ""
     missing = int((steps[wide] // usual - 1).sum())
-    text = (
+    return [
         f"{missing} frames dropped by all cameras {', '.join(texts)}{rest}; the times of all later "
         "frames count on without them"
-    )
-    return [text]
+    ]

@@ -5,40 +5,33 @@ from __future__ import annotations
 import math
 import os
 import zlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from difflib import get_close_matches
 from pathlib import Path
 
 import numpy as np
 
+from drake_pose.arrays import Array
 from drake_pose.camera.camera_files import load_camera_file, load_cameras
+from drake_pose.camera.episode import JointLog
 from drake_pose.camera.models import Camera, ParallelCamera
-from drake_pose.camera.picture_files import VIDEOS, VideoPictures, in_order, read_picture
+from drake_pose.camera.picture_files import (
+    SUFFIXES,
+    VIDEOS,
+    VideoPictures,
+    frame_number,
+    in_order,
+    natural_key,
+    read_picture,
+)
 from drake_pose.errors import SceneError, SettingsError, UnknownNameError
 from drake_pose.silhouette.pictures.masks import read_mask
-from drake_pose.silhouette.pictures.scene_files import (
-    MaskFiles,
-    common_rate,
-    find_images,
-    find_masks,
-    select_frames,
-)
 from drake_pose.yaml_files import read_yaml
 
-_FIELDS = ("sequence", "frame_rate_hz")
 CAMERA_FILE, SCENE_FILE = "cameras.yaml", "scene.yaml"
 USUAL_RATE_HZ = 30.0
 """Frames a second of a sequence that does not say."""
-
-# An uncalibrated camera looks along the world's -x: the picture's right is y, its up is z.
-_LOOKING_BACK = np.array(
-    [[0.0, 0.0, -1.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
-)
-_ANY_SCALE = 1000.0
-# The fastest of zlib's levels. Masks are kept in a kilobyte or two each, once they were read: a PNG
-# takes ten times as long to be decoded, and most masks are looked at more than once.
-_LEVEL = 1
-_UNKNOWN = "camera"
 
 
 @dataclass(frozen=True)
@@ -56,6 +49,8 @@ class Scene:
             few frames, or none: where a camera has no mask the body is tracked by its colours.
             Empty where there is a mask for every picture.
         readers: by camera what gives its pictures (H, W, 3) by frame, where no file of its own is.
+        times: (frames,) of the frames as recorded [s], nan where nothing tells them.
+        joints: what the robot logged of its joints, by time or by frame.
         strangers: folders of masks that belong to no camera.
         warnings: what is wrong with the folder, but leaves enough to go on.
     """
@@ -71,6 +66,8 @@ class Scene:
     strangers: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
     readers: Mapping[str, Callable[[str], np.ndarray]] = field(default_factory=dict)
+    times: Array = field(default_factory=lambda: np.empty(0))
+    joints: JointLog | None = None
     _videos: dict[Path, VideoPictures] = field(default_factory=dict, repr=False, compare=False)
     _packed: dict[tuple[Path, int, int], bytes] = field(
         default_factory=dict, repr=False, compare=False
@@ -127,11 +124,13 @@ class Scene:
         asked = select_frames(self.frames, wanted, str(self.path))
         if step == 1 or not asked:
             return self, tuple(wanted)
-        kept = self.frames[self.frames.index(asked[0]) % step :: step]
+        pick = slice(self.frames.index(asked[0]) % step, None, step)
+        kept = self.frames[pick]
         known, rate = set(kept), (self.frame_rate_hz or USUAL_RATE_HZ) / step
         scene = replace(
             self,
             frames=kept,
+            times=self.times[pick],
             masks={key: file for key, file in self.masks.items() if key[1] in known},
             images={key: file for key, file in self.images.items() if key[1] in known},
             frame_rate_hz=rate if self.sequence else self.frame_rate_hz,
@@ -154,7 +153,8 @@ class Scene:
         if (packed := self._packed.get(key)) is None:
             mask = read_mask(path, size.width, size.height, may_be_empty=may_be_empty)
             if mask.any():
-                self._packed[key] = zlib.compress(np.packbits(mask).tobytes(), _LEVEL)
+                # In a kilobyte or two; a PNG takes ten times as long to be decoded again.
+                self._packed[key] = zlib.compress(np.packbits(mask).tobytes(), level=1)
             return mask
         bits = np.frombuffer(zlib.decompress(packed), np.uint8)
         mask = np.unpackbits(bits, count=size.width * size.height).view(np.bool_)
@@ -225,39 +225,34 @@ def load_scene(
             cameras, masks = _unknown_cameras(folder)
             frames = in_order(frame for _, frame in masks)
             return Scene(folder, cameras, frames, masks, sequence, frame_rate_hz, True)
-        cameras = _load_wanted(folder / CAMERA_FILE, wanted)
+        file = load_camera_file(folder / CAMERA_FILE) if wanted else None
+        if file is not None and {*file.unplaced, *file.links}.isdisjoint(wanted):
+            cameras = file.cameras
+        else:
+            cameras = load_cameras(folder / CAMERA_FILE)
     has_masks = (folder / "masks").is_dir()
-    files = find_masks(folder, cameras) if has_masks else MaskFiles({})
-    images = {}
+    images: dict[tuple[str, str], Path] = {}
+    masks, strangers, warnings = find_masks(folder, cameras) if has_masks else ({}, (), ())
     if sequence:
-        images = find_images(folder, cameras, in_order(frame for _, frame in files.masks))
+        images = find_images(folder, cameras, in_order(frame for _, frame in masks))
     if not (images or has_masks):
-        files = find_masks(folder, cameras)
+        raise SceneError(f"{folder}: has no folder masks/<camera>/<frame>.png")
     is_video = {name: file for (name, _), file in images.items() if file.suffix.lower() in VIDEOS}
     rate_hz, drifts = common_rate(is_video)
-    if all(key in files.masks for key in images):
+    if all(key in masks for key in images):
         images = {}
     return Scene(
         folder,
         dict(cameras),
-        in_order(frame for _, frame in (*files.masks, *images)),
-        files.masks,
+        in_order(frame for _, frame in (*masks, *images)),
+        masks,
         sequence,
         frame_rate_hz or rate_hz,
         images=images,
-        strangers=files.strangers,
+        strangers=strangers,
         # Of pictures with few masks it is no fault that masks are missing.
-        warnings=drifts if images else files.warnings,
+        warnings=drifts if images else warnings,
     )
-
-
-def _load_wanted(path: Path, wanted: Sequence[str]) -> Mapping[str, Camera]:
-    """All cameras of a file, of which those that are not wanted need no place."""
-    if wanted:
-        file = load_camera_file(path)
-        if {*file.unplaced, *file.links}.isdisjoint(wanted):
-            return file.cameras
-    return load_cameras(path)
 
 
 def _unknown_cameras(folder: Path) -> tuple[dict[str, Camera], dict[tuple[str, str], Path]]:
@@ -267,16 +262,19 @@ def _unknown_cameras(folder: Path) -> tuple[dict[str, Camera], dict[tuple[str, s
             f"{folder}: has no cameras.yaml, so its cameras must be given; only masks that lie in "
             "masks/<frame>.png need none"
         )
-    found = find_masks(folder, [_UNKNOWN]).masks
+    found, _, _ = find_masks(folder, ["camera"])
     sizes = {frame: read_mask(file).shape[::-1] for (_, frame), file in found.items()}
     several = len(set(sizes.values())) > 1
     cameras: dict[str, Camera] = {}
     names = {}
+    # They look along the world's -x: the picture's right is y, its up is z. The scale is any.
+    X_WC = np.array(
+        [[0.0, 0.0, -1.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0, 0, 0, 1]]
+    )
     for frame, (width, height) in sizes.items():
-        names[frame] = name = f"{_UNKNOWN}_{width}x{height}" if several else _UNKNOWN
-        cameras[name] = ParallelCamera(
-            name, width, height, _ANY_SCALE, (width - 1) / 2, (height - 1) / 2, _LOOKING_BACK
-        )
+        names[frame] = name = f"camera_{width}x{height}" if several else "camera"
+        centre = (width - 1) / 2, (height - 1) / 2
+        cameras[name] = ParallelCamera(name, width, height, 1000.0, *centre, X_WC)
     return cameras, {(names[frame], frame): file for (_, frame), file in found.items()}
 
 
@@ -291,12 +289,12 @@ def read_sequence(path: Path, sequence: bool = False) -> tuple[bool, float | Non
     if not os.path.lexists(path):
         return sequence, None
     content = read_yaml(path, SceneError)
+    fields = ("sequence", "frame_rate_hz")
     if not isinstance(content, dict):
-        raise SceneError(f"{path}: expected a mapping with {', '.join(_FIELDS)}")
-    unknown = [str(field)[:40] for field in content if field not in _FIELDS]
-    if unknown:
+        raise SceneError(f"{path}: expected a mapping with {', '.join(fields)}")
+    if unknown := [str(field)[:40] for field in content if field not in fields]:
         raise SceneError(
-            f"{path}: unknown field {', '.join(unknown)}; a scene has: {', '.join(_FIELDS)}"
+            f"{path}: unknown field {', '.join(unknown)}; a scene has: {', '.join(fields)}"
         )
     sequence = content.get("sequence", sequence)
     if not isinstance(sequence, bool):
@@ -307,3 +305,206 @@ def read_sequence(path: Path, sequence: bool = False) -> tuple[bool, float | Non
     if isinstance(rate, bool) or not isinstance(rate, int | float) or not 0.0 < rate < math.inf:
         raise SceneError(f"{path}: frame_rate_hz must be a finite positive number")
     return sequence, float(rate)
+
+
+def common_rate(
+    videos: Mapping[str, Path], most: float = 1.01
+) -> tuple[float | None, tuple[str, ...]]:
+    """Pictures a second of cameras' videos, if one says so; a warning where they drift apart.
+
+    most: ratio of the fastest to the slowest rate that are meant to be one.
+
+    Raises SceneError: a video cannot be read, or their rates are others.
+    """
+    opened = {name: VideoPictures(path) for name, path in videos.items()}
+    rates = {name: one.rate_hz for name, one in opened.items() if one.rate_hz is not None}
+    if not rates:
+        return None, ()
+    slow, fast = min(rates, key=lambda one: rates[one]), max(rates, key=lambda one: rates[one])
+    ratio = rates[fast] / rates[slow]
+    off = min(one.count for one in opened.values()) * (ratio - 1.0)
+    text = (
+        f"{videos[slow]} has {rates[slow]:.5g} pictures a second, {videos[fast]} {rates[fast]:.5g}:"
+        f" pictures of one number must be of one moment, but at the end they are {off:.0f} "
+        "pictures apart; bring the videos to one rate (ffmpeg -i VIDEO -r RATE NEW)"
+    )
+    if ratio > most:
+        raise SceneError(text)
+    return next(iter(rates.values())), (text,) if off >= 1.0 else ()
+
+
+def select_frames(known: Sequence[str], wanted: Sequence[str], where: str) -> tuple[str, ...]:
+    """Returns the frames that were asked for, in the scene's order.
+
+    Args:
+        wanted: names, or ranges ``FIRST:LAST`` that include both ends; all frames where empty.
+            A number stands for the frame whose name is that number, with or without zeros before.
+        where: the scene, for messages.
+
+    Raises:
+        UnknownNameError: there is no such frame.
+        SettingsError: a range ends before it begins.
+    """
+    places = {frame: k for k, frame in enumerate(known)}
+
+    def place(name: str) -> int:
+        if name in places:
+            return places[name]
+        number = frame_number(name)
+        same = [k for k, frame in enumerate(known) if frame_number(frame) == number]
+        if number is None or len(same) != 1:
+            raise UnknownNameError("frame", name, known, where)
+        return same[0]
+
+    chosen: set[int] = set()
+    for text in wanted:
+        first, colon, last = (text, "", "") if text in places else text.partition(":")
+        ends = place(first), place(last if colon else first)
+        if ends[1] < ends[0]:
+            raise SettingsError(f"--frame: the range '{text}' ends before it begins")
+        chosen.update(range(ends[0], ends[1] + 1))
+    return tuple(frame for k, frame in enumerate(known) if k in chosen or not wanted)
+
+
+def find_masks(
+    folder: Path, cameras: Iterable[str]
+) -> tuple[dict[tuple[str, str], Path], tuple[str, ...], tuple[str, ...]]:
+    """Finds masks/<camera>/<frame>.png, or masks/<frame>.png of a single camera.
+
+    Hidden files are passed over. Folders that belong to no camera, and files that are no PNG
+    pictures, are left over. Cameras that number their frames with and without leading zeros mean
+    the same frames.
+
+    Returns:
+        The files by (camera, frame); folders of no camera; what is not used.
+
+    Raises SceneError: names a folder that cannot be read or holds no masks of a camera.
+    """
+    names, root = list(cameras), folder / "masks"
+    if not root.is_dir():
+        raise SceneError(f"{folder}: has no folder masks/<camera>/<frame>.png")
+    flat, foreign = _list_masks(root)
+    found = {one.name: _list_masks(root / one.name) for one in _visible(root) if one.is_dir()}
+    known = {name: found[name][0] for name in names if name in found}
+    strangers = {name: len(files) for name, (files, _) in found.items() if name not in names}
+    if flat and not any(known.values()):
+        if len(names) != 1:
+            raise SceneError(
+                f"{root}: masks that lie in no camera's folder need exactly one camera, but there "
+                f"are {len(names)}: {', '.join(names)}"
+            )
+        known, flat = {names[0]: flat}, []
+    others = {name: found[name][1] for name in names if name in found}
+    if not any(known.values()):
+        text = f"{root}: holds no mask <camera>/<frame>.png of: {', '.join(names)}"
+        if strangers:
+            text += f"; folder {', '.join(strangers)} belongs to no camera of the camera file"
+        if files := [f"{name}/{file}" for name, own in others.items() for file in own]:
+            text += f"; {files[0]} is {'a folder' if files[0].endswith('/') else 'no PNG picture'}"
+        raise SceneError(text)
+    others[""] = [name for name in foreign if not name.endswith("/")]
+    others[""] += [path.name for path in flat]
+    masks, doubled = _join_frames(known)
+    unused, warnings = [name for name in names if not known.get(name)], list[str]()
+    lower = {name.lower(): name for name in unused}
+    for name, count in strangers.items():
+        close = get_close_matches(name.lower(), lower, n=1)
+        advice = f"is it '{lower[close[0]]}'?" if close else "calibrate it"
+        warnings.append(
+            f"masks/{name}: no camera '{name}' in cameras.yaml; its {count} masks are left out: "
+            f"{advice}"
+        )
+    warnings += [
+        f"camera '{name}' of cameras.yaml has no masks in masks/{name}; the others go on"
+        for name in unused
+    ]
+    warnings += doubled
+    for name, left in others.items():
+        if left:
+            more = f" and {len(left) - 1} more" if len(left) > 1 else ""
+            warnings.append(
+                f"{f'masks/{name}' if name else 'masks'}: {left[0]}{more} left out: masks are PNG "
+                "pictures in masks/<camera>"
+            )
+    return masks, tuple(strangers), tuple(warnings)
+
+
+def find_images(
+    folder: Path, cameras: Iterable[str], frames: Iterable[str] = ()
+) -> dict[tuple[str, str], Path]:
+    """Finds images/<camera>/<frame>.png or .jpg by (camera, frame); none where there is no folder.
+
+    Of a camera without such a folder the video videos/<camera>.mp4 is each of its frames, which are
+    named 000000, 000001 and so on, or as known ``frames`` of these numbers are named already.
+
+    Raises SceneError: a folder or video that cannot be read.
+    """
+    found: dict[tuple[str, str], Path] = {}
+    known = {int(frame): frame for frame in frames if frame.isdecimal()}
+    for camera in cameras:
+        own = folder / "images" / camera
+        videos = [folder / "videos" / f"{camera}{suffix}" for suffix in VIDEOS]
+        if own.is_dir():
+            names = [Path(entry.name) for entry in _visible(own) if not entry.is_dir()]
+            pictures = [name for name in names if name.suffix.lower() in SUFFIXES]
+            found |= {(camera, name.stem): own / name for name in pictures}
+        elif video := next((file for file in videos if file.is_file()), None):
+            numbers = range(VideoPictures(video).count)
+            # No picture takes less than a byte. A recording that was not closed has no number.
+            if not 0 < len(numbers) <= video.stat().st_size:
+                raise SceneError(
+                    f"{video}: does not say how many pictures it has, or more than it can hold; "
+                    f"make it whole: ffmpeg -i {video.name} -c copy NEW"
+                )
+            found |= {(camera, known.get(k, f"{k:06d}")): video for k in numbers}
+    return found
+
+
+def _visible(folder: Path) -> list[os.DirEntry[str]]:
+    """A folder's entries by name, but for hidden ones, such as those that macOS leaves behind."""
+    try:
+        with os.scandir(folder) as entries:
+            seen = [entry for entry in entries if not entry.name.startswith(".")]
+    except OSError as error:
+        raise SceneError(f"{folder}: cannot be read: {error.strerror}") from error
+    for entry in seen:
+        # Python stands in for the bytes of other encodings by what cannot be written to any file.
+        if any("\ud800" <= character <= "\udfff" for character in entry.name):
+            raise SceneError(f"{folder}: the name {entry.name!r} is no UTF-8 text; rename it")
+    return sorted(seen, key=lambda entry: entry.name)
+
+
+def _list_masks(folder: Path) -> tuple[list[Path], list[str]]:
+    """The PNG files of a folder, and the names of its other files."""
+    names = [f"{entry.name}/" if entry.is_dir() else entry.name for entry in _visible(folder)]
+    pictures = [name for name in names if name.lower().endswith(".png")]
+    return [folder / name for name in pictures], [n for n in names if n not in pictures]
+
+
+def _join_frames(
+    files: Mapping[str, Sequence[Path]],
+) -> tuple[dict[tuple[str, str], Path], list[str]]:
+    """Masks by camera and frame, whose longest spelling is its name, and what is there twice."""
+    spelt = {file.stem for own in files.values() for file in own}
+    several = sum(map(bool, files.values())) > 1
+    first: dict[object, str] = {}
+    name_of = {
+        stem: first.setdefault(natural_key(stem) if several else stem, stem)
+        for stem in sorted(spelt, key=lambda stem: (-len(stem), stem))
+    }
+    masks: dict[tuple[str, str], Path] = {}
+    doubled = []
+    for camera, own in files.items():
+        by_frame: dict[str, list[Path]] = {}
+        for file in sorted(own, key=lambda file: (-len(file.stem), file.name)):
+            by_frame.setdefault(name_of[file.stem], []).append(file)
+        for frame in in_order(by_frame):
+            used, *again = by_frame[frame]
+            masks[camera, frame] = used
+            if again:
+                names = ", ".join(file.name for file in again)
+                doubled.append(
+                    f"camera '{camera}', frame {frame}: {used.name} is used, {names} is the same "
+                    "frame again"
+                )
+    return masks, doubled

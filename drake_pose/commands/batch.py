@@ -24,7 +24,7 @@ from drake_pose.commands.common import (
     within,
 )
 from drake_pose.errors import SceneError, listed
-from drake_pose.files.options import percent
+from drake_pose.files.settings import percent
 
 if TYPE_CHECKING:
     from drake_pose.jobs.batch import Batch

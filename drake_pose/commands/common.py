@@ -15,7 +15,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from drake_pose.files.options import within
+from drake_pose.files.settings import within
 
 if TYPE_CHECKING:
     from drake_pose.files.records import FrameRecord

@@ -33,8 +33,7 @@ from drake_pose.commands.common import (
     worst_frames,
 )
 from drake_pose.errors import SceneError
-from drake_pose.files.options import percent
-from drake_pose.files.settings import CaptureSettings, EstimateSettings, changed
+from drake_pose.files.settings import CaptureSettings, EstimateSettings, changed, percent
 from drake_pose.jobs.live.settings import CaptureMethod, LiveSettings
 
 if TYPE_CHECKING:
@@ -171,8 +170,9 @@ def _print_demo(result: SceneEstimate) -> None:
 
     console = output_console()
     table = Table("joint", "value", title="Joint angles of the man in the picture")
+    (record,) = result.records.values()
     for name, kind, value in zip(
-        result.position_names, result.position_kinds, result.rows[0].q, strict=True
+        result.position_names, result.position_kinds, record.q, strict=True
     ):
         text = f"{value:.3f} m" if kind == "length" else f"{value:.4f}"
         text = f"{math.degrees(value):.1f} deg" if kind == "angle" else text
@@ -283,7 +283,7 @@ def capture(
     found = result.estimate
     if json:
         print_json(found.summary)
-    elif found.rows:
+    elif found.records:
         _print_estimate(found)
         # What became of the pictures of each camera, and when it stopped and returned.
         table = Table("camera", "pictures used", "unusable", "too late", "stopped and returned")
@@ -295,7 +295,7 @@ def capture(
             numbers = [str(source[what]) for what in ("used", "dropped", "late")]
             table.add_row(escape(name), *numbers, ", ".join(changes))
         output_console().print(table)
-    if not found.rows:
+    if not found.records:
         raise SceneError("no camera gave a picture")
     if not found.found_count:
         raise SceneError("nobody was found in any frame")

@@ -23,7 +23,7 @@ from drake_pose.commands.common import (
     say,
     worst_frames,
 )
-from drake_pose.files.options import percent
+from drake_pose.files.settings import percent
 from drake_pose.jobs.registration.settings import AuditSettings, RegistrationSettings
 
 if TYPE_CHECKING:

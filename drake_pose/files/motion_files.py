@@ -13,14 +13,12 @@ import warnings
 from collections.abc import Mapping, Sequence
 from io import StringIO
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.multibody.tree import PrismaticJoint
 from scipy.spatial.transform import Rotation
 
-from drake_pose.arrays import Array
+from drake_pose.arrays import Array, Mask
 from drake_pose.body import (
     ArticulatedModel,
     Landmark,
@@ -32,28 +30,23 @@ from drake_pose.body import (
 from drake_pose.csv_files import csv_text
 from drake_pose.errors import SettingsError
 from drake_pose.files.folder import BVH, JOINT_CENTRES, MOT, TRC, write_file
-from drake_pose.files.records import BASE_COLUMNS, PoseRow, base_cells, base_pose, user_units
+from drake_pose.files.records import BASE_COLUMNS, FrameRecord, base_cells, base_pose, user_units
 
 # Turns the scene's world, z up, into that of the file, y up; nothing is mirrored.
 R_YW = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
-_CENTIMETRES = 100.0
-# A part stays where it is in the part before it if it moves by less [m].
-_STAYS = 1e-5
-_POSITIONS = ("Xposition", "Yposition", "Zposition")
-_ROTATIONS = ("Zrotation", "Xrotation", "Yrotation")
 
 
 def write_motion(
     folder: Path,
     model: ArticulatedModel,
     frames: Sequence[str],
-    rows: Sequence[PoseRow],
+    records: Sequence[FrameRecord],
     rate_hz: float | None,
 ) -> list[str]:
     """Writes joint_centres.csv; of a sequence TRC, MOT and BVH files too; returns warnings.
 
     Joint centres need a landmarks.yaml beside the model; a BVH file, that or a skin: robots have no
-    readers of it. The files of a sequence hold every frame from the first to the last of the rows.
+    readers of it. The files of a sequence hold every frame from the first to the last record's.
 
     Args:
         frames: the scene's, in order.
@@ -65,15 +58,15 @@ def write_motion(
     """
     has_landmarks = landmarks_file(model.path).is_file()
     landmarks = load_landmarks(model.path) if has_landmarks else {}
-    if not any(row.found for row in rows):
+    if not any(record.found for record in records):
         return []
-    by_frame = {row.frame: row for row in rows}
-    frames = frames[frames.index(rows[0].frame) : frames.index(rows[-1].frame) + 1]
-    lost = PoseRow("", np.full(len(model.position_names), np.nan), None, np.nan, np.nan)
-    q = np.array([by_frame.get(frame, lost).q for frame in frames])
-    X_WB = None
-    if any(row.base is not None for row in rows):
-        X_WB = np.array([base_pose(by_frame.get(frame, lost).base) for frame in frames])
+    known = {record.frame: record for record in records}
+    frames = frames[frames.index(records[0].frame) : frames.index(records[-1].frame) + 1]
+    lost = FrameRecord("", np.full(len(model.position_names), np.nan), None, None, np.nan)
+    own = [known.get(frame, lost) for frame in frames]
+    q, X_WB = np.array([record.q for record in own]), None
+    if any(record.base is not None for record in records):
+        X_WB = np.array([base_pose(record.base) for record in own])
     if landmarks:
         names, centres = list(landmarks), joint_centres(model, landmarks, q, X_WB)
         write_file(folder, JOINT_CENTRES, centres_as_csv(frames, names, centres))
@@ -177,26 +170,28 @@ def positions_as_mot(
     return text.getvalue()
 
 
-class SkeletonJoint(NamedTuple):
-    """A joint: its link ("world": where several parts stand), its parent's index (-1: root)."""
-
-    link: str
-    parent: int
+Skeleton = tuple[tuple[str, int], ...]
+"""Joints: link ("world": where several parts stand), and the parent's index (-1: root)."""
 
 
-def skeleton_of(model: ArticulatedModel, q: Array) -> tuple[SkeletonJoint, ...]:
-    """The joints, parents before children; q (frames, nq) tells the lengths that stay the same."""
+def skeleton_of(model: ArticulatedModel, q: Array, stays: float = 1e-5) -> Skeleton:
+    """The joints, parents before children.
+
+    Args:
+        q: (frames, nq) tells which lengths stay the same.
+        stays: a length that changes by less stays [m].
+    """
     plant, names, seen = model.plant, model.link_names, model.link_meshes
     # By body those that hang on it, by a length that stays, or by something that moves.
     children: list[list[tuple[int, bool, bool]]] = [[] for _ in names]
     for index in plant.GetJointIndices():
         joint = plant.get_joint(index)
         is_length = joint.type_name() == PrismaticJoint.kTypeName
-        stays = is_length and bool(np.ptp(q[:, joint.position_start()]) < _STAYS)
-        moves = joint.num_positions() > 0 and not stays
+        is_still = is_length and bool(np.ptp(q[:, joint.position_start()]) < stays)
+        moves = joint.num_positions() > 0 and not is_still
         child = int(joint.child_body().index())
-        children[int(joint.parent_body().index())].append((child, stays, moves))
-    found: list[SkeletonJoint] = []
+        children[int(joint.parent_body().index())].append((child, is_still, moves))
+    found: list[tuple[str, int]] = []
 
     def branches(body: int) -> int:
         """How many bodies hang on it that are seen or carry one that is."""
@@ -205,17 +200,17 @@ def skeleton_of(model: ArticulatedModel, q: Array) -> tuple[SkeletonJoint, ...]:
     def walk(body: int, parent: int, length: bool, motion: bool) -> None:
         is_half = parent >= 0 and length and not motion and branches(body) > 0
         if (names[body] in seen or branches(body) > 1) and not is_half:
-            found.append(SkeletonJoint(names[body], parent))
+            found.append((names[body], parent))
             parent, length, motion = len(found) - 1, False, False
-        for child, stays, moves in children[body]:
-            walk(child, parent, length or stays, motion or moves)
+        for child, is_still, moves in children[body]:
+            walk(child, parent, length or is_still, motion or moves)
 
     walk(0, -1, False, False)
     return tuple(found)
 
 
 def motion_as_bvh(
-    model: ArticulatedModel, q: Array, X_WB: Array | None, rate_hz: float
+    model: ArticulatedModel, q: Array, X_WB: Array | None, rate_hz: float, stays: float = 1e-5
 ) -> tuple[str, int]:
     """The text of a BVH file of a motion, and how many of its frames were filled.
 
@@ -224,6 +219,7 @@ def motion_as_bvh(
             it, or by the first one known.
         X_WB: (frames, 4, 4) poses of the plant's world in the scene's; None: the same world.
         rate_hz: frames a second.
+        stays: a part that moves by less in the part before it stays where it is [m].
 
     Raises:
         SettingsError: no frame has a pose.
@@ -232,21 +228,34 @@ def motion_as_bvh(
     if not len(known):
         raise SettingsError("a BVH file needs a frame with a pose; none has one")
     skeleton = skeleton_of(model, q[known])
-    X_YL, X_Y0 = _link_poses(model, skeleton, q[known], None if X_WB is None else X_WB[known])
+    # The joints' links in the file's world: (frames, n, 4, 4), and (n, 4, 4) at the defaults.
+    kinematics, X_YW = PlantKinematics(model), np.eye(4)
+    X_YW[:3, :3] = R_YW
+    bodies = [model.link_index(link) for link, _ in skeleton]
+    X_BL = np.array([[kinematics.pose_at(body, row) for body in bodies] for row in q[known]])
+    X_YL = (X_YW if X_WB is None else (X_YW @ X_WB[known])[:, None]) @ X_BL
+    X_Y0 = X_YW @ np.array([kinematics.pose(body) for body in bodies])
     # What turns a joint's own axes into its link's is what its link shows at rest.
     R_YJ = X_YL[..., :3, :3] @ np.swapaxes(X_Y0[:, :3, :3], 1, 2)
-    parents = [max(joint.parent, 0) for joint in skeleton]
+    parents = [max(parent, 0) for _, parent in skeleton]
     R_PY = np.swapaxes(R_YJ[:, parents], 2, 3)
     p_YL = X_YL[..., :3, 3]
     p_PJ = (R_PY @ (p_YL - p_YL[:, parents])[..., None])[..., 0]
     R_PJ = R_PY @ R_YJ
     p_PJ[:, 0], R_PJ[:, 0] = p_YL[:, 0], R_YJ[:, 0]
     offsets = p_PJ.mean(axis=0)
-    slides = np.abs(p_PJ - offsets).max(axis=(0, 2)) > _STAYS
+    slides = np.abs(p_PJ - offsets).max(axis=(0, 2)) > stays
     slides[0] = True
     offsets[slides] = 0.0
+    # The farthest point of each joint's link, along the file's axes at rest [m].
+    tips = np.zeros((len(skeleton), 3))
+    for k, (link, _) in enumerate(skeleton):
+        mesh = model.link_meshes.get(link)
+        if mesh is not None:
+            farthest = np.argmax(np.linalg.norm(mesh.vertices, axis=1))
+            tips[k] = X_Y0[k, :3, :3] @ mesh.vertices[farthest]
     columns = [
-        np.hstack([*([_CENTIMETRES * p_PJ[:, k]] if slides[k] else []), _smooth_angles(R_PJ[:, k])])
+        np.hstack([*([100.0 * p_PJ[:, k]] if slides[k] else []), _smooth_angles(R_PJ[:, k])])
         for k in range(len(skeleton))
     ]
     rows = np.hstack(columns)
@@ -254,26 +263,13 @@ def motion_as_bvh(
     source = np.maximum(np.searchsorted(known, np.arange(len(q)), side="right") - 1, 0)
     text = [
         "HIERARCHY",
-        *_hierarchy(skeleton, offsets, slides, _tips(model, skeleton, X_Y0)),
+        *_hierarchy(skeleton, offsets, slides, tips),
         "MOTION",
         f"Frames: {len(q)}",
         f"Frame Time: {1.0 / rate_hz:.8f}",
         *(" ".join(f"{number:.6f}" for number in rows[k]) for k in source),
     ]
     return "\n".join(text) + "\n", len(q) - len(known)
-
-
-def _link_poses(
-    model: ArticulatedModel, skeleton: Sequence[SkeletonJoint], q: Array, X_WB: Array | None
-) -> tuple[Array, Array]:
-    """The joints' links in the file's world: (frames, n, 4, 4), and (n, 4, 4) at the defaults."""
-    kinematics = PlantKinematics(model)
-    bodies = [model.link_index(joint.link) for joint in skeleton]
-    X_YW = np.eye(4)
-    X_YW[:3, :3] = R_YW
-    X_BL = np.array([[kinematics.pose_at(body, row) for body in bodies] for row in q])
-    X_YB = X_YW if X_WB is None else (X_YW @ X_WB)[:, None]
-    return X_YB @ X_BL, X_YW @ np.array([kinematics.pose(body) for body in bodies])
 
 
 def _smooth_angles(R: Array) -> Array:
@@ -290,41 +286,28 @@ def _smooth_angles(R: Array) -> Array:
     return np.asarray(angles)
 
 
-def _tips(model: ArticulatedModel, skeleton: Sequence[SkeletonJoint], X_Y0: Array) -> Array:
-    """(n, 3) the farthest point of each joint's link, along the file's axes at rest [m]."""
-    tips = np.zeros((len(skeleton), 3))
-    for k, joint in enumerate(skeleton):
-        mesh = model.link_meshes.get(joint.link)
-        if mesh is not None:
-            farthest = np.argmax(np.linalg.norm(mesh.vertices, axis=1))
-            tips[k] = X_Y0[k, :3, :3] @ mesh.vertices[farthest]
-    return tips
-
-
-def _hierarchy(
-    skeleton: Sequence[SkeletonJoint], offsets: Array, slides: NDArray[np.bool_], tips: Array
-) -> list[str]:
-    """The lines of the hierarchy."""
+def _hierarchy(skeleton: Skeleton, offsets: Array, slides: Mask, tips: Array) -> list[str]:
+    """The lines of the hierarchy; offsets and tips (n, 3) are in m."""
     lines: list[str] = []
 
+    def offset(place: Array) -> str:
+        return " ".join(["OFFSET", *(f"{100.0 * number:.6f}" for number in place)])
+
     def write(k: int, depth: int) -> None:
-        name = "".join("_" if c.isspace() or c in "{}" else c for c in skeleton[k].link)
-        channels = (*(_POSITIONS if slides[k] else ()), *_ROTATIONS)
-        lines.append("\t" * depth + f"{'JOINT' if depth else 'ROOT'} {name}")
-        lines.append("\t" * depth + "{")
-        lines.append("\t" * (depth + 1) + _offset(offsets[k]))
-        lines.append("\t" * (depth + 1) + " ".join(["CHANNELS", str(len(channels)), *channels]))
-        below = [n for n, joint in enumerate(skeleton) if joint.parent == k]
+        link, tab = skeleton[k][0], "\t" * depth
+        name = "".join("_" if c.isspace() or c in "{}" else c for c in link)
+        positions = ("Xposition", "Yposition", "Zposition") if slides[k] else ()
+        channels = (*positions, "Zrotation", "Xrotation", "Yrotation")
+        lines.extend([f"{tab}{'JOINT' if depth else 'ROOT'} {name}", tab + "{"])
+        lines.append(f"{tab}\t{offset(offsets[k])}")
+        lines.append(f"{tab}\tCHANNELS {len(channels)} {' '.join(channels)}")
+        below = [n for n, (_, parent) in enumerate(skeleton) if parent == k]
         for n in below:
             write(n, depth + 1)
         if not below:
-            ends = ("End Site", "{", "\t" + _offset(tips[k]), "}")
-            lines.extend("\t" * (depth + 1) + line for line in ends)
-        lines.append("\t" * depth + "}")
+            ends = ("End Site", "{", "\t" + offset(tips[k]), "}")
+            lines.extend(f"{tab}\t{line}" for line in ends)
+        lines.append(tab + "}")
 
     write(0, 0)
     return lines
-
-
-def _offset(place: Array) -> str:
-    return " ".join(["OFFSET", *(f"{_CENTIMETRES * number:.6f}" for number in place)])

@@ -1,13 +1,19 @@
-"""What is known of each frame and joint: poses.csv, joints.csv, families.csv, summary.json.
+"""What is known of each frame, and of all: poses.csv, joints.csv, families.csv, summary.json.
 
 Frames that have a row in poses.csv are finished: they survive whatever ends the job.
 """
 
 from __future__ import annotations
 
+import hashlib
 import math
+import platform
+import time
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
+from functools import cache
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -15,136 +21,39 @@ import numpy as np
 from pydrake.common.eigen_geometry import Quaternion
 from pydrake.math import RigidTransform, RotationMatrix
 
+from drake_pose.arrays import Array
 from drake_pose.body import ArticulatedModel, PoseTree, nearest_turn
 from drake_pose.csv_files import csv_text, read_csv
-from drake_pose.errors import OutputError
-from drake_pose.files.folder import POSES, cannot_write, write_file
+from drake_pose.errors import OutputError, SettingsError
+from drake_pose.files.folder import POSES, cannot_write, read_summary, write_file
+from drake_pose.files.settings import SceneSettings, percent
+from drake_pose.regular_files import digest, read_regular
 from drake_pose.search import JointEstimate, PoseSet, following_joints
+from drake_pose.silhouette.pictures.scene_checks import frame_ranges
+from drake_pose.silhouette.pictures.scenes import Scene
+from drake_pose.version import VERSION
 
 BASE_COLUMNS = ("base_x", "base_y", "base_z", "base_qw", "base_qx", "base_qy", "base_qz")
 """Columns of the plant's world in the scene's world: position [m] and unit quaternion."""
 
 FIT_COLUMNS = ("error", "seconds")
 """The last columns: E_total and the search's wall time [s]."""
-JOINT_COLUMNS = ("frame", "joint", "determined", "low", "high", "families")
-"""A row for each frame and joint, over all families [deg or m]."""
-FAMILY_COLUMNS = ("frame", "family", "joint", "value", "determined", "low", "high")
-"""A row for each frame, family and joint; family 1 holds the answer [deg or m]."""
 
-# Of a normal distribution, 95 % lie within this many standard deviations.
-_NORMAL_95 = 1.96
+BADLY_EXPLAINED = 0.25
+"""From this E_total on, a pose explains its pictures badly."""
+
+Joints = Mapping[str, Mapping[str, Any]]
+"""By the name of a value of the pose tree: determined, low and high, as JointEstimate [deg or m];
+and value, that of a family, None over all families."""
 
 
 @dataclass(frozen=True, eq=False)
-class PoseRow:
-    """One row of poses.csv.
+class FrameRecord:
+    """A frame's estimate: its row of poses.csv, and what summary.json says of it.
 
     Args:
         q: (nq,) positions [rad or m]; NaN where no pose was found.
         base: (7,) BASE_COLUMNS; None where the model's own joints place it in the world.
-        error: E_total; NaN where no pose was found.
-        seconds: the search's wall time [s].
-    """
-
-    frame: str
-    q: np.ndarray
-    base: np.ndarray | None
-    error: float
-    seconds: float
-
-    @property
-    def found(self) -> bool:
-        """Whether a pose was found."""
-        return bool(np.isfinite(self.error))
-
-
-def base_cells(X_WB: np.ndarray) -> np.ndarray:
-    """BASE_COLUMNS (7,) of a pose (4, 4): position [m] and unit quaternion."""
-    rotation = RotationMatrix.ProjectToRotationMatrix(X_WB[:3, :3])
-    return np.concatenate([X_WB[:3, 3], rotation.ToQuaternion().wxyz()])
-
-
-def base_pose(base: np.ndarray | None) -> np.ndarray:
-    """The pose (4, 4) that BASE_COLUMNS (7,) describe; the identity where there are none."""
-    if base is None:
-        return np.eye(4)
-    # The quaternion was rounded when it was written.
-    rotation = RotationMatrix(Quaternion(base[3:] / np.linalg.norm(base[3:])))
-    return np.asarray(RigidTransform(rotation, base[:3]).GetAsMatrix4())
-
-
-class PoseTable:
-    """The table of a result's folder, with or without the base's pose."""
-
-    def __init__(self, folder: Path, position_names: Sequence[str], with_base: bool) -> None:
-        self._folder, self._count, self._with_base = folder, len(position_names), with_base
-        base = BASE_COLUMNS if with_base else ()
-        self.header = ["frame", *position_names, *base, *FIT_COLUMNS]
-
-    def write(self, rows: Iterable[PoseRow]) -> None:
-        """Write all rows, at once."""
-        cells = [self._cells(row) for row in rows]
-        write_file(self._folder, POSES, csv_text([self.header, *cells]))
-
-    def append(self, row: PoseRow) -> None:
-        """Write one more row; it is on the disk when this returns."""
-        path = self._folder / POSES
-        try:
-            with path.open("a", newline="", encoding="utf-8") as file:
-                file.write(csv_text([self._cells(row)]))
-        except OSError as error:
-            raise cannot_write(path, error) from error
-
-    def read(self) -> list[PoseRow]:
-        """The rows of an interrupted job; none where there is no table.
-
-        Raises:
-            OutputError: it cannot be read, or is another model's.
-        """
-        path = self._folder / POSES
-        if not path.is_file():
-            return []
-        header, lines = read_csv(path, OutputError, whole_lines=True)
-        if header != self.header:
-            raise OutputError(f"{path}: was written for another model; name another folder")
-        rows = []
-        for line, (frame, *cells) in lines:
-            try:
-                numbers = np.array([float(cell or "nan") for cell in cells])
-            except ValueError:
-                raise OutputError(
-                    f"{path}: line {line} is damaged, so it cannot be resumed"
-                ) from None
-            error, seconds = numbers[-2:].tolist()
-            base = numbers[self._count : -2] if self._with_base and np.isfinite(error) else None
-            rows.append(PoseRow(frame, numbers[: self._count], base, error, seconds))
-        return rows
-
-    def _cells(self, row: PoseRow) -> list[str]:
-        base = np.full(len(BASE_COLUMNS), np.nan) if row.base is None else row.base
-        numbers = [*row.q, *(base if self._with_base else ()), row.error]
-        cells = [f"{number:.9g}" if np.isfinite(number) else "" for number in numbers]
-        return [row.frame, *cells, f"{row.seconds:.4f}"]
-
-
-@dataclass(frozen=True)
-class JointRecord:
-    """What is known of one value of the pose tree, as JointEstimate [deg or m].
-
-    From low to high it may be, or was seen; value is that of a family, None over all families.
-    """
-
-    determined: bool
-    low: float
-    high: float
-    value: float | None = None
-
-
-@dataclass(frozen=True)
-class FrameRecord:
-    """What the search said about one frame.
-
-    Args:
         E_total: J over the silhouettes' area; None where no pose was found.
         seconds: the search's wall time [s].
         first_E_total: before the re-estimation.
@@ -155,72 +64,61 @@ class FrameRecord:
         joint_errors: estimate minus truth by position [deg or m], where the truth is known.
         camera_scale: pixels a metre of a parallel camera whose scale was found.
         explained: whether the pose explains the silhouettes at least roughly.
-        joints: what is known of each value of the pose tree, by name.
+        joints: what is known of each value of the pose tree.
         families: the same in the first families of poses that look the same.
         family_count: how many families there are; None where the search does not say.
         ious: by camera that was used, intersection over union of silhouette and body.
-        masks: by camera, what tells the mask's file from another (``mask_digests``).
         share: of the contours' lengths, what fits; by the method person alone.
+        masks: by camera, what tells the mask's file from another (``mask_digests``).
     """
 
-    found: bool
+    frame: str
+    q: Array
+    base: Array | None
     E_total: float | None
     seconds: float
     first_E_total: float | None = None
     runs: int | None = None
     stopped_by: str | None = None
-    outside_limit: tuple[float, ...] | None = None
+    outside_limit: Sequence[float] | None = None
     joint_errors: Mapping[str, float] = field(default_factory=dict)
     camera_scale: float | None = None
     explained: bool = True
-    joints: Mapping[str, JointRecord] = field(default_factory=dict)
-    families: tuple[Mapping[str, JointRecord], ...] = ()
+    joints: Joints = field(default_factory=dict)
+    families: Sequence[Joints] = ()
     family_count: int | None = None
     ious: Mapping[str, float] = field(default_factory=dict)
     share: float | None = None
     masks: Mapping[str, str] = field(default_factory=dict)
 
-    @staticmethod
-    def of(row: PoseRow, **more: Any) -> FrameRecord:
-        """The record of a frame's row; ``more``: other fields."""
-        return FrameRecord(row.found, row.error if row.found else None, row.seconds, **more)
+    @property
+    def found(self) -> bool:
+        """Whether a pose was found."""
+        return self.E_total is not None
 
     @staticmethod
-    def from_json(values: Mapping[str, Any]) -> FrameRecord:
-        """Returns the record that as_json described."""
-
-        def joints(known: Mapping[str, Any]) -> dict[str, JointRecord]:
-            return {name: JointRecord(**fields) for name, fields in known.items()}
-
-        limits = values.get("outside_limit")
-        read = {
-            "outside_limit": None if limits is None else tuple(limits),
-            "joints": joints(values.get("joints", {})),
-            "families": tuple(map(joints, values.get("families", ()))),
-        }
-        return FrameRecord(**{**values, **read})
+    def from_json(
+        frame: str, values: Mapping[str, Any], q: Array, base: Array | None = None
+    ) -> FrameRecord:
+        """Returns the record that as_json described, its positions of poses.csv."""
+        known = {name: value for name, value in values.items() if name != "found"}
+        return FrameRecord(frame, q, base, **known)
 
     def as_json(self) -> dict[str, Any]:
-        """Returns plain JSON values."""
-        # dataclasses.asdict copies every number by itself, a third of a second a thousand frames.
-        families = [_plain_joints(own) for own in self.families]
-        return {**vars(self), "joints": _plain_joints(self.joints), "families": families}
-
-
-def _plain_joints(joints: Mapping[str, JointRecord]) -> dict[str, dict[str, Any]]:
-    return {name: dict(vars(one)) for name, one in joints.items()}
+        """Returns plain JSON values, without those of poses.csv."""
+        told = {k: v for k, v in vars(self).items() if k not in ("frame", "q", "base")}
+        return {"found": self.found, **told}
 
 
 @dataclass(frozen=True)
 class SceneEstimate:
-    """The estimate of a scene: poses, the search's records, summary.json, folder and warnings.
+    """The estimate of a scene: a record of each frame, summary.json, folder and warnings.
 
     Position kinds are "angle" [rad], "length" [m] or "quaternion", in the plant's order.
     """
 
     position_names: tuple[str, ...]
     position_kinds: tuple[str, ...]
-    rows: tuple[PoseRow, ...]
     records: Mapping[str, FrameRecord]
     summary: Mapping[str, Any]
     folder: Path | None
@@ -232,16 +130,89 @@ class SceneEstimate:
         return sum(record.found for record in self.records.values())
 
 
-def user_units(model: ArticulatedModel) -> np.ndarray:
+def base_cells(X_WB: Array) -> Array:
+    """BASE_COLUMNS (7,) of a pose (4, 4): position [m] and unit quaternion."""
+    rotation = RotationMatrix.ProjectToRotationMatrix(X_WB[:3, :3])
+    return np.concatenate([X_WB[:3, 3], rotation.ToQuaternion().wxyz()])
+
+
+def base_pose(base: Array | None) -> Array:
+    """The pose (4, 4) that BASE_COLUMNS (7,) describe; the identity where there are none."""
+    if base is None:
+        return np.eye(4)
+    # The quaternion was rounded when it was written.
+    rotation = RotationMatrix(Quaternion(base[3:] / np.linalg.norm(base[3:])))
+    return np.asarray(RigidTransform(rotation, base[:3]).GetAsMatrix4())
+
+
+class PoseTable:
+    """The poses.csv of a result's folder, with or without the base's pose."""
+
+    def __init__(self, folder: Path, position_names: Sequence[str], with_base: bool) -> None:
+        self._folder, self._count, self._with_base = folder, len(position_names), with_base
+        base = BASE_COLUMNS if with_base else ()
+        self.header = ["frame", *position_names, *base, *FIT_COLUMNS]
+
+    def write(self, records: Iterable[FrameRecord]) -> None:
+        """Write all rows, at once."""
+        cells = [self._cells(record) for record in records]
+        write_file(self._folder, POSES, csv_text([self.header, *cells]))
+
+    def append(self, record: FrameRecord) -> None:
+        """Write one more row; it is on the disk when this returns."""
+        path = self._folder / POSES
+        try:
+            with path.open("a", newline="", encoding="utf-8") as file:
+                file.write(csv_text([self._cells(record)]))
+        except OSError as error:
+            raise cannot_write(path, error) from error
+
+    def read(self, known: Mapping[str, Mapping[str, Any]] | None = None) -> list[FrameRecord]:
+        """The records of an interrupted job; none where there is no table.
+
+        ``known``: what its summary.json says of the frames.
+
+        Raises:
+            OutputError: it cannot be read, or is another model's.
+        """
+        path = self._folder / POSES
+        if not path.is_file():
+            return []
+        header, lines = read_csv(path, OutputError, whole_lines=True)
+        if header != self.header:
+            raise OutputError(f"{path}: was written for another model; name another folder")
+        records = []
+        for line, (frame, *cells) in lines:
+            try:
+                numbers = np.array([float(cell or "nan") for cell in cells])
+            except ValueError:
+                raise OutputError(
+                    f"{path}: line {line} is damaged, so it cannot be resumed"
+                ) from None
+            error, seconds = numbers[-2:].tolist()
+            found = math.isfinite(error)
+            base = numbers[self._count : -2] if self._with_base and found else None
+            own = {"E_total": error if found else None, "seconds": seconds}
+            told = (known or {}).get(frame, own)
+            records.append(FrameRecord.from_json(frame, told, numbers[: self._count], base))
+        return records
+
+    def _cells(self, record: FrameRecord) -> list[str]:
+        base = np.full(len(BASE_COLUMNS), np.nan) if record.base is None else record.base
+        error = math.nan if record.E_total is None else record.E_total
+        numbers = [*record.q, *(base if self._with_base else ()), error]
+        cells = [f"{number:.9g}" if np.isfinite(number) else "" for number in numbers]
+        return [record.frame, *cells, f"{record.seconds:.4f}"]
+
+
+def user_units(model: ArticulatedModel) -> Array:
     """What each position (nq,) is multiplied by to be told: radians become degrees."""
     return np.array([math.degrees(1.0) if k == "angle" else 1.0 for k in model.position_kinds])
 
 
-def measured_positions(
-    model: ArticulatedModel, q: np.ndarray, records: Iterable[FrameRecord]
-) -> np.ndarray:
-    """What was measured (frames, nq) [rad or m] where q was found; nan where nothing was."""
-    names = model.position_names
+def measured_positions(model: ArticulatedModel, records: Sequence[FrameRecord]) -> Array:
+    """What was measured (frames, nq) [rad or m] where a pose was found; nan where nothing was."""
+    names, q = model.position_names, np.array([record.q for record in records])
     errors = [[record.joint_errors.get(name, np.nan) for name in names] for record in records]
     measured = q - np.array(errors).reshape(q.shape) / user_units(model)
     # Errors are of the nearest turn, which may lie beyond the limits.
@@ -254,50 +225,42 @@ def record_pose_set(pose_set: PoseSet | None, tree: PoseTree) -> dict[str, Any]:
     """FrameRecord's fields of what is known of each joint, over all families and in each."""
     if pose_set is None:
         return {}
-    model = tree.model
-    kinds = dict(zip(model.position_names, model.position_kinds, strict=True))
-
-    def record(
-        joints: Sequence[JointEstimate], values: Sequence[float | None]
-    ) -> dict[str, JointRecord]:
-        records = {}
-        joints = (*joints, *following_joints(tree, joints))
-        for joint, value in zip(joints, values, strict=True):
-            unit = 1.0 if kinds.get(joint.name) == "length" else math.degrees(1.0)
-            records[joint.name] = JointRecord(
-                joint.determined,
-                unit * joint.low,
-                unit * joint.high,
-                None if value is None else unit * value,
-            )
-        return records
-
+    kinds = dict(zip(tree.model.position_names, tree.model.position_kinds, strict=True))
     followers = [one.follower for one in tree.followers]
+
+    def record(joints: Sequence[JointEstimate], values: Sequence[float | None]) -> Joints:
+        told = {}
+        for joint, value in zip((*joints, *following_joints(tree, joints)), values, strict=True):
+            unit = 1.0 if kinds.get(joint.name) == "length" else math.degrees(1.0)
+            told[joint.name] = {
+                "determined": joint.determined,
+                "low": unit * joint.low,
+                "high": unit * joint.high,
+                "value": None if value is None else unit * value,
+            }
+        return told
+
     families = [
-        record(
-            one.joints,
-            [*np.concatenate(one.node_values).tolist(), *one.q[followers].tolist()],
-        )
+        record(one.joints, [*np.concatenate(one.node_values).tolist(), *one.q[followers].tolist()])
         for one in pose_set.families
     ]
-    count = len(pose_set.joints) + len(followers)
+    unknown = [None] * (len(pose_set.joints) + len(followers))
     return {
-        "joints": record(pose_set.joints, [None] * count),
-        "families": tuple(families),
+        "joints": record(pose_set.joints, unknown),
+        "families": families,
         "family_count": pose_set.family_count,
     }
 
 
-def record_deviations(
-    model: ArticulatedModel, q: np.ndarray, deviations: np.ndarray
-) -> dict[str, JointRecord]:
+def record_deviations(model: ArticulatedModel, q: Array, deviations: Array) -> Joints:
     """Each position within 95 % and its limits, determined where that is less than half its range.
 
     Positions q (nq,) and deviations (nq,) are in rad or m; nan: nothing is known.
     """
     if not np.isfinite(q).all():
         return {}
-    half = _NORMAL_95 * np.where(np.isfinite(deviations), deviations, np.inf)
+    # Of a normal distribution, 95 % lie within 1.96 standard deviations.
+    half = 1.96 * np.where(np.isfinite(deviations), deviations, np.inf)
     # An interval about half a turn goes on beyond it.
     lower = np.where(model.turns_freely, q - math.pi, model.lower)
     upper = np.where(model.turns_freely, q + math.pi, model.upper)
@@ -305,33 +268,248 @@ def record_deviations(
     determined = 2.0 * half < 0.5 * (model.upper - model.lower)
     unit = user_units(model)
     return {
-        model.position_names[k]: JointRecord(
-            bool(determined[k]), float(unit[k] * low[k]), float(unit[k] * high[k])
-        )
+        model.position_names[k]: {
+            "determined": bool(determined[k]),
+            "low": float(unit[k] * low[k]),
+            "high": float(unit[k] * high[k]),
+            "value": None,
+        }
         for k in np.flatnonzero(np.isfinite(low) & np.isfinite(high))
     }
 
 
-def joint_table(records: Mapping[str, FrameRecord]) -> str:
-    """Returns the text of joints.csv."""
+def joint_table(records: Iterable[FrameRecord]) -> str:
+    """The text of joints.csv: a row for each frame and joint, over all families [deg or m]."""
     rows = [
-        (frame, name, *_ends(joint), record.family_count)
-        for frame, record in records.items()
+        (record.frame, name, *_ends(joint), record.family_count)
+        for record in records
         for name, joint in record.joints.items()
     ]
-    return csv_text([JOINT_COLUMNS, *rows])
+    return csv_text([("frame", "joint", "determined", "low", "high", "families"), *rows])
 
 
-def family_table(records: Mapping[str, FrameRecord]) -> str:
-    """Returns the text of families.csv."""
+def family_table(records: Iterable[FrameRecord]) -> str:
+    """The text of families.csv: a row for each frame, family and joint; family 1 is the answer."""
     rows = [
-        (frame, number, name, "" if one.value is None else f"{one.value:.6g}", *_ends(one))
-        for frame, record in records.items()
+        (record.frame, number, name, f"{one['value']:.6g}", *_ends(one))
+        for record in records
         for number, family in enumerate(record.families, start=1)
         for name, one in family.items()
     ]
-    return csv_text([FAMILY_COLUMNS, *rows])
+    return csv_text([("frame", "family", "joint", "value", "determined", "low", "high"), *rows])
 
 
-def _ends(joint: JointRecord) -> tuple[str, str, str]:
-    return "yes" if joint.determined else "no", f"{joint.low:.6g}", f"{joint.high:.6g}"
+def _ends(joint: Mapping[str, Any]) -> tuple[str, str, str]:
+    return "yes" if joint["determined"] else "no", f"{joint['low']:.6g}", f"{joint['high']:.6g}"
+
+
+def next_summary(begin: float, period: float = 2.0, share: float = 20.0) -> float:
+    """When a summary is due again, by time.monotonic(), that now is written and was begun then [s].
+
+    Whatever ends a job writes its summary; this is for a job that is killed.
+
+    Args:
+        period: least time between two summaries [s].
+        share: at least this many times as long is spent on the work itself.
+    """
+    now = time.monotonic()
+    return now + max(period, share * (now - begin))
+
+
+def describe_job(
+    scene: Path, model: Path, settings: SceneSettings, cameras: Path | None = None
+) -> dict[str, Any]:
+    """What is estimated from what and how, as plain JSON values, with the files' SHA-256.
+
+    Args:
+        cameras: a camera file in place of the scene's own.
+    """
+    return {
+        "scene": str(scene),
+        "model": str(model),
+        "settings": settings.as_json(),
+        "sha256": {
+            "model": file_digest(model),
+            "cameras": file_digest(cameras or scene / "cameras.yaml"),
+        },
+    }
+
+
+def mask_digests(scene: Scene, cameras: Iterable[str], frame: str) -> dict[str, str]:
+    """What tells the mask files of a frame from others, by camera; none where it cannot be read."""
+    found = {}
+    for camera in cameras:
+        path = scene.masks.get((camera, frame))
+        if path is not None:
+            with suppress(OSError):
+                found[camera] = digest(path)[:16]
+    return found
+
+
+def open_job(folder: Path | None, job: Mapping[str, Any], resume: bool) -> Mapping[str, Any] | None:
+    """The summary of the job that is resumed; None where it is a new one.
+
+    Raises:
+        SettingsError: nothing says which job is to be resumed.
+        OutputError: that one had other files or settings, but for the frames.
+    """
+    if not resume:
+        return None
+    if folder is None:
+        raise SettingsError("resume needs the folder of the result that is to be resumed")
+    recorded = read_summary(folder)
+    for name in ("model", "cameras"):
+        if recorded.get("sha256", {}).get(name) != job["sha256"][name]:
+            raise OutputError(
+                f"{folder}: was made with another {name} file, so it cannot be resumed; "
+                "name another folder"
+            )
+    before = recorded.get("settings", {})
+    for name, value in job["settings"].items():
+        if name != "frames" and before.get(name) != value:
+            raise OutputError(
+                f"{folder}: was made with {name} = {before.get(name)}, not {value}, so it cannot "
+                "be resumed; name another folder, or give the same options"
+            )
+    return recorded
+
+
+def summarize(
+    job: Mapping[str, Any],
+    records: Mapping[str, FrameRecord],
+    complete: bool,
+    more: Mapping[str, Any] | None = None,
+) -> dict[str, Any]:
+    """The content of summary.json: a job of describe_job, finished frames, more of the method."""
+    ious = [iou for record in records.values() for iou in record.ious.values()]
+    errors = [record.E_total for record in records.values() if record.E_total is not None]
+    seconds = [record.seconds for record in records.values()]
+    joint_errors: dict[str, list[float]] = {}
+    for record in records.values():
+        for name, error in record.joint_errors.items():
+            joint_errors.setdefault(name, []).append(abs(error))
+    return {
+        "complete": complete,
+        "frame_count": len(records),
+        "found_count": sum(record.found for record in records.values()),
+        "mean_E_total": float(np.mean(errors)) if errors else None,
+        "mean_iou": float(np.mean(ious)) if ious else None,
+        "compared_count": sum(bool(record.ious) for record in records.values()),
+        "median_seconds": float(np.median(seconds)) if seconds else None,
+        "joint_errors": {
+            name: {"mean": float(np.mean(off)), "greatest": float(np.max(off))}
+            for name, off in joint_errors.items()
+        },
+        "cameras": describe_cameras(records),
+        **(more or {}),
+        **job,
+        "versions": versions(),
+        "frames": {name: record.as_json() for name, record in records.items()},
+    }
+
+
+def describe_cameras(records: Mapping[str, FrameRecord]) -> dict[str, dict[str, float]]:
+    """By camera: in how many frames it was compared, and its mean intersection over union."""
+    found: dict[str, list[float]] = {}
+    for record in records.values():
+        for camera, iou in record.ious.items():
+            found.setdefault(camera, []).append(iou)
+    return {
+        camera: {"frames": len(ious), "mean_iou": float(np.mean(ious))}
+        for camera, ious in found.items()
+    }
+
+
+def camera_warnings(
+    records: Mapping[str, FrameRecord], known: Sequence[str] = (), suspicious: float = 0.15
+) -> tuple[str, ...]:
+    """Which of three cameras or more, `known` ones aside, agree much less than the others.
+
+    ``suspicious``: by how much the mean IoU is below the cameras' median.
+    """
+    means = {name: float(one["mean_iou"]) for name, one in describe_cameras(records).items()}
+    if len(means) < 3:
+        return ()
+    usual = float(np.median(list(means.values())))
+    return tuple(
+        f"camera '{name}' agrees badly (IoU {mean:.2f}, the median is {usual:.2f}): has it moved "
+        "since it was calibrated, or are its masks poor?"
+        for name, mean in means.items()
+        if mean < usual - suspicious and not any(f"'{name}'" in text for text in known)
+    )
+
+
+def frame_warnings(records: Mapping[str, FrameRecord]) -> tuple[str, ...]:
+    """One warning of all frames without a pose, and of all whose search was stopped."""
+    found: dict[str, list[str]] = {}
+    limits = {"run_limit": "run limit", "time_limit": "time limit"}
+    for frame, record in records.items():
+        # Why a person is not found is said where one is followed.
+        if not record.found and record.share is None:
+            found.setdefault("no pose was found", []).append(frame)
+        elif record.found and record.stopped_by in limits:
+            text = f"the search was stopped by the {limits[record.stopped_by]}"
+            found.setdefault(text, []).append(frame)
+    known = list(records)
+    return tuple(
+        f"frame {frame_ranges(frames, known)} ({len(frames)} of {len(known)}): {text}"
+        for text, frames in found.items()
+    )
+
+
+def poor_fit_warnings(
+    records: Mapping[str, FrameRecord],
+    model: ArticulatedModel,
+    held: Iterable[str],
+    at_limit: float = 1e-3,
+) -> tuple[str, ...]:
+    """One warning where poses explain their pictures badly.
+
+    Args:
+        held: positions that were not searched.
+        at_limit: a joint stands at a limit that is so near, as a fraction of its range.
+    """
+    # A followed person is judged by the contours (describe_fit): others in view are in the masks.
+    errors = {
+        frame: one.E_total
+        for frame, one in records.items()
+        if one.E_total is not None and one.share is None
+    }
+    bad = [frame for frame, error in errors.items() if error >= BADLY_EXPLAINED]
+    if not bad:
+        return ()
+    several = f"of {len(errors)}, " if len(bad) > 1 else ""
+    error = percent(float(np.median([errors[frame] for frame in bad])))
+    q, span = np.array([records[frame].q for frame in bad]), model.upper - model.lower
+    with np.errstate(invalid="ignore"):
+        near = np.minimum(q - model.lower, model.upper - q) <= at_limit * span
+    is_one = (near.mean(axis=0) > 0.5) & (span > 0.0) & (span < 2.0 * np.pi)
+    at_limits = [model.position_names[k] for k in np.flatnonzero(is_one)][:3]
+    advice = ["the cameras (exchanged? moved?)", "the model and its scale", "its limits"]
+    if at_limits:
+        advice[-1] += f" ({', '.join(at_limits)} at a limit)"
+    if names := ", ".join(held):
+        advice.append(f"what is held ({names})")
+    return (
+        f"frame {frame_ranges(bad, list(records))} ({several}E_total {error}): the pose explains "
+        "the pictures badly, so it may be wrong; look at the overlays, the masks, "
+        f"{', '.join(advice)} and where the root is",
+    )
+
+
+@cache
+def versions() -> dict[str, str]:
+    """The versions of drake_pose, Python and the packages that matter."""
+    found = {"drake_pose": VERSION, "python": platform.python_version()}
+    for package in ("drake", "numpy", "numba", "opencv-python-headless"):
+        with suppress(PackageNotFoundError):
+            found[package] = version(package)
+    return found
+
+
+def file_digest(path: Path) -> str | None:
+    """SHA-256 of a file; None where it cannot be read."""
+    try:
+        return hashlib.sha256(read_regular(path)).hexdigest()
+    except OSError:
+        return None

@@ -1,113 +1,79 @@
-"""report.html: what came out, on one page that needs nothing else to be read.
-
-Its plots are paths of SVG pictures: numbers in, geometry out.
-"""
+"""report.html: what came out, on one page that needs nothing else to be read."""
 
 from __future__ import annotations
 
 import base64
+import io
 import math
 from collections.abc import Sequence
 from importlib.resources import files
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 from urllib.parse import quote
 
 import cv2
 import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 from markupsafe import Markup
-from matplotlib.ticker import MaxNLocator
-from numpy.typing import ArrayLike, NDArray
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
-from drake_pose.arrays import Array, Indices
+from drake_pose.arrays import Array, Mask
 from drake_pose.body import ArticulatedModel
 from drake_pose.files.folder import OVERLAY
-from drake_pose.files.records import JointRecord, SceneEstimate, measured_positions, user_units
+from drake_pose.files.records import SceneEstimate, measured_positions, user_units
 from drake_pose.silhouette.pictures.scenes import Scene
-
-Ticks = tuple[tuple[float, str], ...]
-
-WIDTH, HEIGHT = 640, 150
-"""Of a plot's picture."""
-_LEFT, _RIGHT, _TOP, _BOTTOM = 46, 8, 8, 20
-BOX = _LEFT, _TOP, WIDTH - _LEFT - _RIGHT, HEIGHT - _TOP - _BOTTOM
-"""x, y, width and height of the frame around the curves."""
-_GRID_LEFT, _GRID_ROW = 130, 18
-
-# More points than this are thinned: the highest and lowest of this many neighbours stay.
-_POINTS = 600
-# Limits are in the picture where the curve takes up this share of them; else it is enlarged.
-_SHARE = 0.2
-# Half the width of the area about a frame that stands alone.
-_DOT = 2.5
-# A position that changes by less over the frames is said in a table.
-_STAYS = 1e-9
-_PICTURES = 6
-_PICTURE_SIZE = 300
-_METHODS = {
-    "beam": "searched by many hypotheses side by side",
-    "paper": "searched as published",
-    "person": "one person followed by all silhouettes at once",
-    "person_by_colour": "one person followed by colour",
-    "paper_capture": "one person followed by skin-coloured features, as published",
-}
-_ABOUT = {
-    "poses.csv": "every position of every frame [rad or m]",
-    "joints.csv": "what is known of each joint, and in what interval [deg or m]",
-    "families.csv": "poses that look the same",
-    "joint_centres.csv": "anatomical joint centres in the world [m]",
-    "joint_centres.trc": "the same as markers [mm], for motion analysis",
-    "positions.mot": "every position over time [deg or m], for motion analysis",
-    "motion.bvh": "skeleton and motion [cm], for animation",
-    "shapes.png": "the corrected shape of the body over that of the model's file",
-    "replay.html": "plays the estimate in three dimensions",
-    "summary.json": "settings, versions, and all figures of this page",
-}
-
-
-class Picture(NamedTuple):
-    """An overlay. uri: of its data; link: of its file."""
-
-    camera: str
-    frame: str
-    E_total: float | None
-    uri: str
-    link: str
 
 
 def make_report(
     folder: Path, model: ArticulatedModel, scene: Scene, estimate: SceneEstimate
 ) -> str:
     """The page of an estimate; files and overlays that lie in its folder are linked."""
-    template = page_template("drake_pose.files")
-    frames = [row.frame for row in estimate.rows]
-    records, joined = list(estimate.records.values()), scene.sequence
+    frames, records, joined = list(estimate.records), estimate.records.values(), scene.sequence
     found = ["found" if record.found else "not-found" for record in records]
     use = {name: _use(scene, estimate, name) for name in scene.cameras}
-    errors = np.array([100.0 * row.error for row in estimate.rows])
+    errors = [np.nan if one.E_total is None else 100.0 * one.E_total for one in records]
     ious = [
         (name, np.array([100.0 * record.ious.get(name, np.nan) for record in records]))
         for name in scene.cameras
     ]
-    told = {*found}.union(*use.values()) != {"found", "used"}
     pictures = _pick_pictures(folder, scene, estimate)
-    return template.render(
+    told, grid, plots = {*found}.union(*use.values()) != {"found", "used"}, None, {}
+    if told:
+        grid = plot_uri(draw_grid(frames, [*use.items(), ("pose", found)]))
+    if len(frames) > 1:
+        curves = {"errors": [("E_total", np.array(errors))], "ious": ious}
+        for name, values in curves.items():
+            least = 0.0 if name == "errors" else None
+            plots[name] = plot_uri(plot_curves(frames, values, joined=joined, least=least))
+    about = {
+        "poses.csv": "every position of every frame [rad or m]",
+        "joints.csv": "what is known of each joint, and in what interval [deg or m]",
+        "families.csv": "poses that look the same",
+        "joint_centres.csv": "anatomical joint centres in the world [m]",
+        "joint_centres.trc": "the same as markers [mm], for motion analysis",
+        "positions.mot": "every position over time [deg or m], for motion analysis",
+        "motion.bvh": "skeleton and motion [cm], for animation",
+        "shapes.png": "the corrected shape of the body over that of the model's file",
+        "replay.html": "plays the estimate in three dimensions",
+        "summary.json": "settings, versions, and all figures of this page",
+    }
+    return page_template("drake_pose.files").render(
         summary=estimate.summary,
         title=Path(str(estimate.summary["scene"])).name or str(estimate.summary["scene"]),
         model=model.path.name,
         method=_describe_method(scene, estimate),
         by_colour=bool(scene.images),
-        rows=list(zip(frames, records, strict=True)),
-        errors=plot_curves(frames, [("E_total", errors)], joined=joined, least=0.0),
-        ious=plot_curves(frames, ious, joined=joined),
+        records=list(records),
+        plots=plots,
         compared=sum(bool(record.ious) for record in records),
         cameras=[_camera_row(estimate, name, states) for name, states in use.items()],
-        grid=draw_grid(frames, [*use.items(), ("pose", found)]) if told else None,
+        grid=grid,
+        joined=joined,
         joints=_describe_joints(model, estimate, joined),
         pictures=pictures,
-        compared_pictures={(one.camera, one.frame) in scene.masks for one in pictures},
-        files=[(name, text) for name, text in _ABOUT.items() if (folder / name).is_file()],
+        compared_pictures={(one["camera"], one["frame"]) in scene.masks for one in pictures},
+        files=[(name, text) for name, text in about.items() if (folder / name).is_file()],
     )
 
 
@@ -116,23 +82,29 @@ def _describe_method(scene: Scene, estimate: SceneEstimate) -> str:
     method, states = str(estimate.summary["method"]), estimate.records.values()
     if method == "person" and scene.images:
         method = "person_by_colour"
+    text = {
+        "beam": "searched by many hypotheses side by side",
+        "paper": "searched as published",
+        "person": "one person followed by all silhouettes at once",
+        "person_by_colour": "one person followed by colour",
+        "paper_capture": "one person followed by skin-coloured features, as published",
+    }[method]
     tracked = sum(record.found and record.stopped_by == "tracked" for record in states)
     others = estimate.found_count - tracked
     if not tracked:
-        return _METHODS[method]
+        return text
     how = f"tracked {'by colour ' if scene.images else ''}in {tracked} frames"
-    return f"{how}, {others} {_METHODS[method]}" if others else how
+    return f"{how}, {others} {text}" if others else how
 
 
 def page_template(package: str) -> Template:
-    """The template of a package's page, which may use the style and macros of all pages."""
+    """The template of a package's page, which may use the style of all pages."""
     environment = Environment(
         autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True,
         loader=PackageLoader("drake_pose.files", ""),
     )  # fmt: skip
     environment.tests |= {"infinite": math.isinf, "nan": math.isnan}
     style = files("drake_pose.files").joinpath("report_style.css")
-    environment.globals["box"] = BOX
     environment.globals["style"] = Markup(style.read_text(encoding="utf-8").rstrip())
     source = files(package).joinpath("report_template.html.j2")
     return environment.from_string(source.read_text(encoding="utf-8"))
@@ -142,28 +114,34 @@ def _describe_joints(
     model: ArticulatedModel, estimate: SceneEstimate, joined: bool
 ) -> list[dict[str, Any]]:
     """All positions that are known in a frame; a plot of each that changes from frame to frame."""
-    frames, records, unit = list(estimate.records), estimate.records.values(), user_units(model)
-    of_kind = {"angle": "deg", "length": "m", "quaternion": ""}
-    q = np.array([row.q for row in estimate.rows]).reshape(len(frames), -1)
-    measured, limits = measured_positions(model, q, records), unit * [model.lower, model.upper]
-    q, measured = unit * q, unit * measured
-    nothing, joints = JointRecord(False, np.nan, np.nan), []
+    records, unit = list(estimate.records.values()), user_units(model)
+    frames, of_kind = list(estimate.records), {"angle": "deg", "length": "m", "quaternion": ""}
+    if not records:
+        return []
+    q = unit * np.array([record.q for record in records])
+    measured = unit * measured_positions(model, records)
+    limits = unit * [model.lower, model.upper]
+    nothing, joints = {"determined": False, "low": np.nan, "high": np.nan}, []
     for k, (name, kind) in enumerate(zip(model.position_names, model.position_kinds, strict=True)):
         ends, own, plot = _ends(q[:, k]), (float(limits[0, k]), float(limits[1, k])), None
         told = [record.joints.get(name, nothing) for record in records]
-        low, high = np.array([(one.low, one.high) for one in told]).T
-        determined = np.array([one.determined for one in told])
-        if ends[1] - ends[0] >= _STAYS:
-            plot = plot_curves(
-                frames, [(name, q[:, k]), ("measured", measured[:, k])], joined=joined,
-                limits=own, intervals=(low, high, determined),
-            )  # fmt: skip
+        low, high = np.array([(one["low"], one["high"]) for one in told]).T
+        determined = np.array([one["determined"] for one in told])
+        # A position that stays the same is said in a table.
+        if ends[1] - ends[0] >= 1e-9:
+            curves = [("measured", measured[:, k]), (name, q[:, k])]
+            drawn = plot_curves(
+                frames, curves, joined=joined, limits=own, intervals=(low, high, determined)
+            )
+            plot = plot_uri(drawn)
         # Of a base that stands nothing is asked.
         elif np.isnan(ends[0]) or (np.isnan(low).all() and math.isinf(own[0])):
             continue
+        known = np.isfinite(low)
         joints.append({
             "name": name, "unit": of_kind[kind], "ends": ends, "interval": _ends(low, high),
-            "determined": determined[np.isfinite(low)].all(), "measured": _ends(measured[:, k]),
+            "determined": determined[known].all(), "any_determined": determined[known].any(),
+            "any_open": (~determined[known]).any(), "measured": _ends(measured[:, k]),
             "limits": own, "plot": plot,
         })  # fmt: skip
     return joints
@@ -202,70 +180,66 @@ def _use(scene: Scene, estimate: SceneEstimate, camera: str) -> list[str]:
     return states
 
 
-def _pick_pictures(folder: Path, scene: Scene, estimate: SceneEstimate) -> list[Picture]:
+def _pick_pictures(
+    folder: Path, scene: Scene, estimate: SceneEstimate, most: int = 6
+) -> list[dict[str, Any]]:
     """Overlays of the frames that fit worst, as usual and best, as far as they were written."""
-    known = [row for row in estimate.rows if row.found] or list(estimate.rows)
-    in_order = sorted(known, key=lambda row: -row.error if row.found else 0.0)
+    records = estimate.records.values()
+    known = [record for record in records if record.found] or list(records)
+    in_order = sorted(known, key=lambda one: -(one.E_total or 0.0))
     last = len(in_order) - 1
     chosen = list(dict.fromkeys([0, (last + 1) // 2, last])) if in_order else []
     pictures = []
-    for row in (in_order[place] for place in chosen):
-        ious = estimate.records[row.frame].ious
-        cameras = sorted(scene.cameras, key=lambda name: ious.get(name, 1.0))
-        shown = [
-            overlay_picture(folder, name, row.frame, row.error if row.found else None)
-            for name in cameras
-        ]
-        pictures += [one for one in shown if one is not None][: max(1, _PICTURES // len(chosen))]
+    for one in (in_order[place] for place in chosen):
+        cameras = sorted(scene.cameras, key=lambda name: one.ious.get(name, 1.0))
+        shown = [overlay_picture(folder, name, one.frame, one.E_total) for name in cameras]
+        pictures += [own for own in shown if own is not None][: max(1, most // len(chosen))]
     return pictures
 
 
 def overlay_picture(
-    folder: Path, camera: str, frame: str, E_total: float | None, overlay: str = OVERLAY
-) -> Picture | None:
-    """An overlay in a result's folder, made small; None where it is no picture any more."""
+    folder: Path,
+    camera: str,
+    frame: str,
+    E_total: float | None,
+    overlay: str = OVERLAY,
+    height: int = 300,
+) -> dict[str, Any] | None:
+    """An overlay in a result's folder: camera, frame, E_total, link of its file, uri of its data.
+
+    ``height``: to which it is made smaller [pixel]. None where it is no picture any more.
+    """
     place = f"{overlay}/{camera}/{frame}.png"
     if not (folder / place).is_file():
         return None
-    uri = _small_picture((folder / place).read_bytes())
-    return Picture(camera, frame, E_total, uri, quote(place)) if uri else None
-
-
-def _small_picture(data: bytes) -> str:
-    """A PNG picture as the URI of a small JPEG picture; "" where it is none any more."""
-    picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
-    if picture is None:
-        return ""
-    scale = min(1.0, _PICTURE_SIZE / picture.shape[0])
+    data = np.frombuffer((folder / place).read_bytes(), np.uint8)
+    if (picture := cv2.imdecode(data, cv2.IMREAD_COLOR)) is None:
+        return None
+    scale = min(1.0, height / picture.shape[0])
     small = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
     _, encoded = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, 82])
-    return "data:image/jpeg;base64," + base64.b64encode(encoded.tobytes()).decode()
+    uri = "data:image/jpeg;base64," + base64.b64encode(encoded.tobytes()).decode()
+    told = {"camera": camera, "frame": frame, "E_total": E_total}
+    return {**told, "uri": uri, "link": quote(place)}
 
 
-class Plot(NamedTuple):
-    """A plot over frames of WIDTH by HEIGHT.
-
-    Attributes:
-        curves: label and path of each.
-        dots: whether each point stands alone.
-        bands: paths of areas: what is known, and what is not determined.
-        limits: heights. Ticks: places and texts.
-    """
-
-    curves: tuple[tuple[str, str], ...]
-    dots: bool
-    bands: tuple[str, str]
-    limits: tuple[float, ...]
-    x_ticks: Ticks
-    y_ticks: Ticks
+def new_plot(height: float = 1.5, left: float = 0.09) -> tuple[Figure, Axes]:
+    """An empty plot of a page [inch, and fraction of the width left of the axes]."""
+    figure = Figure(figsize=(6.4, height), dpi=120)
+    axes = figure.add_axes((left, 0.3 / height, 0.985 - left, 1.0 - 0.38 / height))
+    axes.tick_params(labelsize=8, length=2, colors="#57606a")
+    for side in axes.spines.values():
+        side.set_color("#d8dee4")
+    colours = "#0072b2 #d55e00 #009e73 #b8468f #7a5c00 #2f8fc4 #666666 #8c2d04"
+    axes.set_prop_cycle(color=colours.split())
+    return figure, axes
 
 
-class Grid(NamedTuple):
-    """What was used in which frame: of each row name, y, and (x, width, state) of equal frames."""
-
-    rows: tuple[tuple[str, int, list[tuple[float, float, str]]], ...]
-    height: int
-    x_ticks: Ticks
+def plot_uri(figure: Figure) -> str:
+    """A plot as the URI of a PNG picture."""
+    stream = io.BytesIO()
+    figure.savefig(stream, format="png")
+    return "data:image/png;base64," + base64.b64encode(stream.getvalue()).decode()
 
 
 def plot_curves(
@@ -274,112 +248,76 @@ def plot_curves(
     *,
     joined: bool,
     limits: tuple[float, float] | None = None,
-    intervals: tuple[Array, Array, NDArray[np.bool_]] | None = None,
+    intervals: tuple[Array, Array, Mask] | None = None,
     least: float | None = None,
-) -> Plot:
+    limits_from: float = 0.2,
+) -> Figure:
     """Plots curves over frames; nan leaves a gap.
 
     Args:
-        values: label and (frames,) values of each curve.
+        values: label and (frames,) values of each curve; what is labelled measured is wide.
         joined: whether neighbouring frames are joined by a line.
         limits: lower and upper, in the picture where they are near.
         intervals: low and high (frames,), and where they are what is known.
         least: the lowest value that the axis shows, such as 0.
+        limits_from: limits are near where the curve takes up this fraction of them.
     """
-    ends = () if intervals is None else intervals[:2]
-    low, high = _range(np.concatenate([*(v for _, v in values), *ends, []]), limits, least)
-    ticks = MaxNLocator(nbins=4, steps=[1, 2, 2.5, 5, 10]).tick_values(low, high)
-    left, top, width, height = BOX
-    count, order = len(frames), np.arange(len(frames))
-    lines = joined and count > 1
-    x = left + width * (order / (count - 1) if lines else (order + 0.5) / max(1, count))
-
-    def y(value: ArrayLike) -> Array:
-        share = (np.clip(value, low, high) - low) / (high - low)
-        return np.asarray(top + height * (1.0 - share))
-
-    def curve(value: Array) -> str:
-        runs = [_thin(run, value) for run in _runs(np.isfinite(value), lines)]
-        # A line of no length is shown as a dot.
-        return "".join(_path(x[k], y(value[k])) + "h0" * (len(k) == 1) for k in runs)
-
-    def band(low: Array, high: Array, where: NDArray[np.bool_]) -> str:
-        parts = []
-        for run in _runs(where & np.isfinite(low) & np.isfinite(high), lines):
-            over, under = _thin(run, high), _thin(run, low)[::-1]
-            places = np.concatenate([x[over], x[under]])
-            heights = y(np.concatenate([high[over], low[under]]))
-            if len(run) == 1:
-                places = np.repeat(places, 2) + _DOT * np.array([-1.0, 1.0, 1.0, -1.0])
-                heights = np.repeat(heights, 2)
-            parts.append(_path(places, heights) + "Z")
-        return "".join(parts)
-
-    bands = ("", "")
+    (figure, axes), places = new_plot(), np.arange(len(frames))
+    shown = np.concatenate([value for _, value in values])
     if intervals is not None:
-        lower, upper, known = intervals
-        bands = band(lower, upper, known), band(lower, upper, ~known)
-    return Plot(
-        tuple((label, curve(value)) for label, value in values),
-        not joined,
-        bands,
-        tuple(float(y(limit)) for limit in limits or () if low <= limit <= high),
-        _frame_ticks(frames, x),
-        tuple((float(y(t)), f"{t:g}") for t in ticks if low - 1e-9 <= t <= high + 1e-9),
-    )
-
-
-def draw_grid(frames: Sequence[str], rows: Sequence[tuple[str, Sequence[str]]]) -> Grid:
-    """Draws what state each row, a name and (frames,) states, has; equal neighbours are a bar."""
-    width = (WIDTH - _GRID_LEFT - _RIGHT) / max(1, len(frames))
-    drawn = []
-    for number, (name, states) in enumerate(rows):
-        starts = [k for k in range(len(states)) if k == 0 or states[k] != states[k - 1]]
-        runs = [
-            (round(_GRID_LEFT + width * a, 2), round(width * (b - a), 2), states[a])
-            for a, b in zip(starts, [*starts[1:], len(states)], strict=True)
-        ]
-        drawn.append((name, number * _GRID_ROW, runs))
-    middles = np.asarray(_GRID_LEFT + width * (np.arange(len(frames)) + 0.5), np.float64)
-    return Grid(tuple(drawn), _GRID_ROW * len(rows) + _BOTTOM, _frame_ticks(frames, middles))
-
-
-def _path(x: Array, y: Array) -> str:
-    return "M" + "L".join(f"{a:.1f} {b:.1f}" for a, b in zip(x, y, strict=True))
-
-
-def _runs(known: NDArray[np.bool_], joined: bool) -> list[Indices]:
-    """The runs of frames that are known and joined."""
-    places = np.flatnonzero(known)
-    cuts = np.flatnonzero(np.diff(places) > (1 if joined else 0)) + 1
-    return np.split(places, cuts) if len(places) else []
-
-
-def _range(
-    shown: Array, limits: tuple[float, float] | None, least: float | None
-) -> tuple[float, float]:
-    """The ends of the axis."""
+        low, high, known = intervals
+        shown = np.concatenate([shown, low, high])
+        # As wide as a frame, and not invisible where a frame stands alone.
+        width = 1.1 * 420.0 / max(len(frames), 40)
+        for where, colour in ((known, "#c5dfee"), (~known, "#e4e6e8")):
+            axes.vlines(places[where], low[where], high[where], colour, linewidth=width)
     shown = shown[np.isfinite(shown)]
-    if not len(shown):
-        return 0.0, 1.0
-    low, high = float(shown.min()), float(shown.max())
-    if limits is not None and high - low >= _SHARE * (limits[1] - limits[0]):
-        low, high = min(low, limits[0]), max(high, limits[1])
-    low = low if least is None else min(low, least)
-    span = high - low if high > low else max(1e-3, 0.02 * abs(high))
-    return low - (0.0 if low == least else 0.08 * span), high + 0.08 * span
+    bottom, top = (float(shown.min()), float(shown.max())) if len(shown) else (0.0, 1.0)
+    if limits is not None and top - bottom >= limits_from * (limits[1] - limits[0]):
+        bottom, top = min(bottom, limits[0]), max(top, limits[1])
+    bottom = bottom if least is None else min(bottom, least)
+    margin = 0.08 * (top - bottom if top > bottom else max(1e-3, 0.02 * abs(top)))
+    axes.set_ylim(bottom - (0.0 if bottom == least else margin), top + margin)
+    # A frame between two that are not known is a dot.
+    line: dict[str, Any] = {
+        "linestyle": "-" if joined else "",
+        "marker": ".",
+        "markersize": 2 if joined else 8,
+    }
+    for label, value in values:
+        wide: dict[str, Any] = {"color": "#009e7380", "linewidth": 4, "zorder": 1.5}
+        own = wide if label == "measured" else {"linewidth": 1.2}
+        axes.plot(places, value, label=label, **line, **own)
+    for limit in limits or ():
+        if bottom <= limit <= top:
+            axes.axhline(limit, color="#b3400a", linestyle="--", linewidth=0.8)
+    axes.grid(axis="y", color="#d8dee4", linewidth=0.5)
+    if len(values) > 1 and intervals is None:
+        axes.legend(fontsize=7, loc="lower right", ncols=4, frameon=False)
+    _mark_frames(axes, frames)
+    return figure
 
 
-def _thin(run: Indices, values: Array) -> Indices:
-    """At most about _POINTS frames of a run: the lowest and highest of each group."""
-    if len(run) <= _POINTS:
-        return run
-    groups = np.array_split(run, _POINTS // 2)
-    ends = [group[f(values[group])] for group in groups for f in (np.argmin, np.argmax)]
-    return np.unique([run[0], run[-1], *ends])
+def _mark_frames(axes: Axes, frames: Sequence[str], count: int = 6) -> None:
+    """Writes the names of a few frames, evenly spread, below the axes."""
+    step = max(1, -(-len(frames) // count))
+    names = [name[:20] for name in frames[::step]]
+    axes.set_xticks(range(0, len(frames), step), names, parse_math=False)
+    axes.set_xlim(-0.5, max(len(frames), 1) - 0.5)
 
 
-def _frame_ticks(frames: Sequence[str], x: Array) -> Ticks:
-    """Places and names of a few frames, evenly spread."""
-    step = max(1, -(-len(frames) // 6))
-    return tuple((round(float(x[k]), 1), frames[k]) for k in range(0, len(frames), step))
+def draw_grid(frames: Sequence[str], rows: Sequence[tuple[str, Sequence[str]]]) -> Figure:
+    """Draws what state each row, a name and (frames,) states, has; equal neighbours are a bar."""
+    colours = {"used": "#0072b2", "found": "#0072b2", "no-picture": "#d8dee4"}
+    figure, axes = new_plot(0.4 + 0.2 * len(rows), 0.2)
+    for number, (_, states) in enumerate(rows):
+        starts = [k for k in range(len(states)) if k == 0 or states[k] != states[k - 1]]
+        runs = zip(starts, [*starts[1:], len(states)], strict=True)
+        spans = [(start - 0.5, end - start) for start, end in runs]
+        faces = [colours.get(states[start], "#d55e00") for start in starts]
+        axes.broken_barh(spans, (number - 0.4, 0.8), facecolors=faces)
+    names = [name if len(name) <= 20 else f"{name[:19]}…" for name, _ in rows]
+    axes.set_yticks(range(len(rows)), names, parse_math=False)
+    axes.set_ylim(len(rows) - 0.5, -0.5)
+    _mark_frames(axes, frames)
+    return figure

@@ -1,29 +1,174 @@
 """What an estimate is made with: options (cyclopts), a job file's keys, arguments in Python.
 
-A class's fields are all three; the text below a field is the option's help.
+A class's fields are all three; the text below a field is the option's help. Texts of other forms
+than an option's raise a SettingsError.
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import MISSING, dataclass, field, fields
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
 
-from cyclopts import Parameter
+from cyclopts import Parameter, Token
 
 from drake_pose.errors import SettingsError
-from drake_pose.files.options import (
-    Axis,
-    from_text,
-    parse_assignments,
-    parse_numbers,
-    parse_packages,
-    parse_root_position,
-    parse_root_rotation,
-)
 
+Axis = Literal["x", "y", "z"]
 RootTurns = Literal["fixed", "free"] | Mapping[Axis, tuple[float, float]]
+Corner = tuple[float, float, float]
+"""x, y, z [m]."""
+
+
+@dataclass(frozen=True)
+class FromText:
+    """A setting's converter: parses one text, or where the option may be repeated all of them."""
+
+    parse: Callable[[Any], Any]
+    repeated: bool = False
+
+    def __call__(self, hint: object, tokens: Sequence[Token]) -> Any:
+        """Returns the value; a SettingsError begins with the option's name."""
+        texts = [token.value for token in tokens]
+        try:
+            return self.parse(texts if self.repeated else texts[0])
+        except SettingsError as error:
+            raise SettingsError(f"{tokens[0].keyword}: {error}") from None
+
+
+def from_text(
+    parse: Callable[[Any], Any], metavar: str, *, name: str | None = None, repeated: bool = False
+) -> Parameter:
+    """Returns how an option is read whose text ``parse`` understands."""
+    return Parameter(
+        name,
+        converter=FromText(parse, repeated),
+        metavar=metavar,
+        accepts_keys=False,
+        allow_leading_hyphen=True,
+        n_tokens=-1 if repeated else 1,
+    )
+
+
+def within(low: float, high: float = math.inf) -> Parameter:
+    """Returns the check of an option: a finite number in this range."""
+
+    def check(hint: object, value: float | None) -> None:
+        if value is not None and not (math.isfinite(value) and low <= value <= high):
+            wanted = f"{low:g} or more" if high == math.inf else f"{low:g} to {high:g}"
+            raise ValueError(f"It must be {wanted}.")
+
+    return Parameter(validator=check)
+
+
+def parse_number(text: str) -> float:
+    """Returns a finite number."""
+    try:
+        number = float(text)
+    except ValueError:
+        raise SettingsError(f"'{text}' is not a number") from None
+    if not math.isfinite(number):
+        raise SettingsError(f"'{text}' is not a finite number")
+    return number
+
+
+def parse_assignments(texts: Iterable[str]) -> dict[str, float]:
+    """Returns the values of ``NAME=NUMBER`` texts by name."""
+    values: dict[str, float] = {}
+    for text in texts:
+        name, equals, number = text.rpartition("=")
+        if not equals or not name:
+            raise SettingsError(f"'{text}' must have the form NAME=NUMBER")
+        if name in values:
+            raise SettingsError(f"'{name}' is given twice")
+        values[name] = parse_number(number)
+    return values
+
+
+def parse_packages(texts: Iterable[str]) -> dict[str, Path]:
+    """Returns the absolute folders of ``NAME=FOLDER`` texts by package."""
+    folders: dict[str, Path] = {}
+    for text in texts:
+        name, equals, folder = text.partition("=")
+        if not (name and equals and folder):
+            raise SettingsError(f"'{text}' must have the form NAME=FOLDER")
+        if name in folders:
+            raise SettingsError(f"'{name}' is given twice")
+        if not Path(folder).is_dir():
+            raise SettingsError(f"{name}: there is no folder {folder}")
+        folders[name] = Path(folder).absolute()
+    return folders
+
+
+def parse_numbers(text: str, count: int) -> tuple[float, ...]:
+    """Returns so many numbers of a text ``A,B,...``."""
+    parts = text.split(",")
+    if len(parts) != count:
+        raise SettingsError(f"'{text}' must be {count} numbers with commas between them")
+    return tuple(map(parse_number, parts))
+
+
+def parse_boxes(texts: Iterable[str]) -> tuple[tuple[Corner, Corner], ...]:
+    """Returns the least and the largest corner of each text ``X,Y,Z:X,Y,Z`` of two corners [m]."""
+    boxes = []
+    for text in texts:
+        corners = text.split(":")
+        if [len(corner.split(",")) for corner in corners] != [3, 3]:
+            raise SettingsError(f"'{text}' must have the form X,Y,Z:X,Y,Z")
+        (ax, ay, az), (bx, by, bz) = (parse_numbers(corner, 3) for corner in corners)
+        low = (min(ax, bx), min(ay, by), min(az, bz))
+        boxes.append((low, (max(ax, bx), max(ay, by), max(az, bz))))
+    return tuple(boxes)
+
+
+def parse_root_position(text: str) -> Corner | tuple[Path, str] | Literal["unknown"]:
+    """Returns a position ``X,Y,Z`` [m], file and joint of ``FILE.csv:JOINT``, or ``unknown``."""
+    if text == "unknown":
+        return "unknown"
+    if text.count(",") == 2:
+        x, y, z = parse_numbers(text, 3)
+        return x, y, z
+    file, colon, joint = text.rpartition(":")
+    if not (colon and file and joint):
+        raise SettingsError(
+            f"'{text}' must be X,Y,Z in metres, FILE.csv:JOINT for one position a frame, or unknown"
+        )
+    return Path(file), joint
+
+
+def parse_root_rotation(text: str) -> RootTurns:
+    """Returns ``fixed``, ``free``, or limits about the root's axes [deg], in order of rotation.
+
+    The limits' text is like ``y=-180:180,z=-10:10``.
+    """
+    if text == "fixed":
+        return "fixed"
+    if text == "free":
+        return "free"
+    limits: dict[Axis, tuple[float, float]] = {}
+    axes: tuple[Axis, ...] = get_args(Axis)
+    for part in text.split(","):
+        letter, equals, span = part.strip().partition("=")
+        lower_text, colon, upper_text = span.partition(":")
+        axis = next((axis for axis in axes if axis == letter), None)
+        if axis is None or axis in limits or not (equals and colon):
+            raise SettingsError(
+                f"'{text}' must be fixed, free, or limits in degrees about the axes x, y, z in "
+                "the order of rotation, like y=-180:180,z=-10:10"
+            )
+        lower, upper = parse_number(lower_text), parse_number(upper_text)
+        if lower > upper:
+            raise SettingsError(f"{axis}: the lower limit {lower:g} exceeds the upper {upper:g}")
+        limits[axis] = (lower, upper)
+    return limits
+
+
+def percent(share: float | None) -> str:
+    """Returns a share in percent, or a dash."""
+    return "-" if share is None else f"{100.0 * share:.2f} %"
+
+
 Names = Annotated[tuple[str, ...], Parameter(metavar="NAME")]
 Positions = Annotated[
     Mapping[str, float], from_text(parse_assignments, "NAME=VALUE", repeated=True)

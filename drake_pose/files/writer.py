@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -27,29 +27,23 @@ from drake_pose.files.motion_files import write_motion
 from drake_pose.files.overlay import draw_overlay, encode_png
 from drake_pose.files.records import (
     FrameRecord,
-    PoseRow,
     PoseTable,
     SceneEstimate,
     base_pose,
-    family_table,
-    joint_table,
-    measured_positions,
-)
-from drake_pose.files.replay import make_replay
-from drake_pose.files.report_page import make_report
-from drake_pose.files.summary import (
     camera_warnings,
+    family_table,
     frame_warnings,
+    joint_table,
     mask_digests,
+    measured_positions,
     next_summary,
     poor_fit_warnings,
     summarize,
 )
+from drake_pose.files.replay import make_replay
+from drake_pose.files.report_page import make_report
 from drake_pose.silhouette.pictures.scene_checks import frame_ranges
 from drake_pose.silhouette.pictures.scenes import USUAL_RATE_HZ, Scene
-
-# What a method says of a whole recording, in summary.json.
-_OF_THE_METHOD = ("lengths_m", "girths", "unseen", "proportions", "body_fit_seconds")
 
 OnFrame = Callable[[int, int, str, "FrameRecord | None"], None]
 """Called with the number of finished frames, that of all frames, and a finished frame's name and
@@ -58,28 +52,16 @@ record; once with "" and None before the first frame."""
 OnStage = Callable[[str, int, int | None], None]
 """Called with what is done, and how much of how much (None: nobody knows) is done of it."""
 
-
-class Drawn(NamedTuple):
-    """A camera's frame: a mask (H, W) or picture (H, W, 3), where the body is, and its segments."""
-
-    seen: np.ndarray
-    body: np.ndarray
-    segments: np.ndarray | None
-
-
-class FinishedFrame(NamedTuple):
-    """A frame as it is written; drawn: by camera, what an overlay is made of."""
-
-    row: PoseRow
-    record: FrameRecord
-    drawn: Mapping[str, Drawn]
+Drawn = Mapping[str, tuple[np.ndarray, np.ndarray | None]]
+"""By camera, what an overlay is made of: a mask (H, W) or picture (H, W, 3), and which part of the
+body is seen (H, W), -1 where none is; None where no pose was found."""
 
 
 class ResultWriter:
     """A result under way.
 
     Attributes:
-        rows, records: of the finished frames, by name, those of an earlier job among them.
+        records: of the finished frames, by name, those of an earlier job among them.
         more: what the method adds to summary.json.
         warnings: what the user should know.
 
@@ -108,7 +90,6 @@ class ResultWriter:
         warnings: Iterable[str] = (),
     ) -> None:
         self.scene, self.model, self.folder = scene, model, folder
-        self.rows: dict[str, PoseRow] = {}
         self.records: dict[str, FrameRecord] = {}
         self.warnings = list(warnings)
         self._job, self._complete, self._next_summary = job, False, 0.0
@@ -116,31 +97,26 @@ class ResultWriter:
         if folder is not None:
             self._table = PoseTable(folder, model.position_names, with_base)
         earlier = earlier or {}
-        self.more = {name: earlier[name] for name in _OF_THE_METHOD if name in earlier}
-        if earlier and self._table is not None:
-            self.rows = {row.frame: row for row in self._table.read()}
-        known = earlier.get("frames", {})
-        for frame, row in self.rows.items():
-            plain = FrameRecord.of(row).as_json()
-            self.records[frame] = FrameRecord.from_json(known.get(frame, plain))
-        self._drop_replaced(set(frames))
-
-    def _drop_replaced(self, asked: set[str]) -> None:
-        """Forget finished frames whose masks are not known to be those they were made from."""
-        gone = [f for f, record in self.records.items() if self._digests(f) != record.masks]
-        if not gone:
+        # What a method says of a whole recording.
+        kept = ("lengths_m", "girths", "unseen", "proportions", "body_fit_seconds")
+        self.more = {name: earlier[name] for name in kept if name in earlier}
+        if not earlier or self._table is None:
             return
-        if others := set(gone) - asked:
+        self.records = {one.frame: one for one in self._table.read(earlier.get("frames"))}
+        # Frames whose masks are not known to be those they were made from are forgotten.
+        gone = [f for f, record in self.records.items() if self._digests(f) != record.masks]
+        if others := set(gone) - set(frames):
             raise OutputError(
-                f"frame {frame_ranges(others, self.scene.frames)}: the masks were replaced since "
+                f"frame {frame_ranges(others, scene.frames)}: the masks were replaced since "
                 "it was finished; have it estimated again, too, or name another folder"
             )
         for frame in gone:
-            del self.rows[frame], self.records[frame]
-        listed = frame_ranges(gone, self.scene.frames)
-        self.warnings.append(
-            f"frame {listed}: estimated again, as the masks were replaced or not recorded"
-        )
+            del self.records[frame]
+        if gone:
+            self.warnings.append(
+                f"frame {frame_ranges(gone, scene.frames)}: estimated again, as the masks were "
+                "replaced or not recorded"
+            )
 
     def _digests(self, frame: str) -> dict[str, str]:
         return mask_digests(self.scene, self.scene.cameras, frame)
@@ -148,36 +124,39 @@ class ResultWriter:
     def begin(self) -> None:
         """Begin the folder, which is not complete until all is written."""
         if self._table is not None:
-            self._table.write(self.rows.values())
+            self._table.write(self.records.values())
         self.write_summary()
 
     def add_all(
-        self, frames: Iterable[FinishedFrame], asked: Collection[str], on_frame: OnFrame | None
+        self,
+        frames: Iterable[tuple[FrameRecord, Drawn]],
+        asked: Collection[str],
+        on_frame: OnFrame | None,
     ) -> None:
         """Write frames as they come, each at once, of those that are asked for."""
-        finished = sum(frame in self.rows for frame in asked)
+        finished = sum(frame in self.records for frame in asked)
         if on_frame is not None:
             on_frame(finished, len(asked), "", None)
-        for count, (row, record, drawn) in enumerate(frames, finished + 1):
-            for camera, one in drawn.items():
-                self._write_overlay(camera, row, one)
-            self.add(row, record)
+        for count, (record, drawn) in enumerate(frames, finished + 1):
+            fit = "no pose found"
+            if record.E_total is not None:
+                fit = f"E_total {100.0 * record.E_total:.1f} %"
+            for camera, (seen, parts) in drawn.items() if self.folder is not None else ():
+                body = np.zeros(seen.shape[:2], np.bool_) if parts is None else parts >= 0
+                title = f"{camera}  frame {record.frame}  {fit}"
+                picture = encode_png(draw_overlay(seen, body, parts, title))
+                self.write(f"{OVERLAY}/{camera}/{record.frame}.png", picture)
+            self.add(record)
             if on_frame is not None:
-                on_frame(count, len(asked), row.frame, self.records[row.frame])
+                on_frame(count, len(asked), record.frame, self.records[record.frame])
 
-    def add(self, row: PoseRow, record: FrameRecord) -> None:
+    def add(self, record: FrameRecord) -> None:
         """Write a frame. Finished is what has its row in poses.csv; all else comes before."""
         if self._table is not None:
-            self._table.append(row)
-        self.rows[row.frame] = row
-        self.records[row.frame] = replace(record, masks=self._digests(row.frame))
+            self._table.append(record)
+        self.records[record.frame] = replace(record, masks=self._digests(record.frame))
         if time.monotonic() > self._next_summary:
             self.write_summary()
-
-    def _write_overlay(self, camera: str, row: PoseRow, drawn: Drawn) -> None:
-        error = f"E_total {100.0 * row.error:.1f} %" if row.found else "no pose found"
-        picture = draw_overlay(*drawn, f"{camera}  frame {row.frame}  {error}")
-        self.write(f"{OVERLAY}/{camera}/{row.frame}.png", encode_png(picture))
 
     def write(self, name: str, content: bytes | str) -> None:
         """Write another file of the result."""
@@ -186,33 +165,32 @@ class ResultWriter:
 
     def finish(self, replay: bool) -> None:
         """Write what is made of all frames; then the result is complete."""
-        done = self.result()
-        self.warnings += frame_warnings(done.records)
-        self.warnings += camera_warnings(done.records, self.warnings)
+        records = self.result().records
+        self.warnings += frame_warnings(records)
+        self.warnings += camera_warnings(records, self.warnings)
         held = self._job.get("settings", {}).get("hold", {})
-        self.warnings += poor_fit_warnings(done.rows, done.records, self.model, held)
+        self.warnings += poor_fit_warnings(records, self.model, held)
         if self._table is not None and self.folder is not None:
-            self._table.write(done.rows)
+            self._table.write(records.values())
             rate_hz = self.scene.frame_rate_hz or USUAL_RATE_HZ
             rate = rate_hz if self.scene.sequence else None
-            frames = self.scene.frames
-            self.warnings += write_motion(self.folder, self.model, frames, done.rows, rate)
-            found = [row for row in done.rows if row.found]
+            self.warnings += write_motion(
+                self.folder, self.model, self.scene.frames, list(records.values()), rate
+            )
+            found = [record for record in records.values() if record.found]
             if replay and found:
                 self.write(REPLAY, self._replay(found, 1.0 / (rate or 1.0)))
             page = make_report(self.folder, self.model, self.scene, self.result())
             self.write(REPORT, page)
         self._complete = True
 
-    def _replay(self, found: Sequence[PoseRow], period: float) -> str:
+    def _replay(self, found: Sequence[FrameRecord], period: float) -> str:
         """The replay of the frames with a pose; positions that were measured stand as a ghost."""
-        q = np.array([row.q for row in found])
-        records = [self.records[row.frame] for row in found]
-        measured = measured_positions(self.model, q, records)
+        q, measured = np.array([one.q for one in found]), measured_positions(self.model, found)
         ghost = None if np.isnan(measured).all() else np.where(np.isnan(measured), q, measured)
         scales = {
             name: one.camera_scale
-            for one in reversed(records)
+            for one in reversed(found)
             for name in one.ious
             if one.camera_scale
         }
@@ -222,25 +200,20 @@ class ResultWriter:
             else one
             for one in self.scene.cameras.values()
         ]
-        X_WB = np.array([base_pose(row.base) for row in found])
+        X_WB = np.array([base_pose(one.base) for one in found])
         return make_replay(self.model, q, X_WB, cameras, period, ghost)
 
     def result(self) -> SceneEstimate:
         """What came out, in the scene's order, the frames of an earlier job among it."""
-        frames = [frame for frame in self.scene.frames if frame in self.rows]
-        records = {frame: self.records[frame] for frame in frames}
+        records = {f: self.records[f] for f in self.scene.frames if f in self.records}
         more = {**self.more, "warnings": self.warnings}
         if self.scene.frame_rate_hz is not None:
             more["frame_rate_hz"] = self.scene.frame_rate_hz
         return SceneEstimate(
-            position_names=self.model.position_names,
-            position_kinds=self.model.position_kinds,
-            rows=tuple(self.rows[frame] for frame in frames),
-            records=records,
-            summary=without_nan(summarize(self._job, records, self._complete, more)),
-            folder=self.folder,
-            warnings=tuple(self.warnings),
-        )
+            self.model.position_names, self.model.position_kinds, records,
+            without_nan(summarize(self._job, records, self._complete, more)),
+            self.folder, tuple(self.warnings),
+        )  # fmt: skip
 
     def write_summary(self) -> None:
         """Write summary.json and the tables of joints, whatever there is by now."""
@@ -248,9 +221,10 @@ class ResultWriter:
             return
         begin = time.monotonic()
         done = self.result()
+        records = done.records.values()
         write_summary(self.folder, done.summary)
-        if any(record.joints for record in done.records.values()):
-            write_file(self.folder, JOINTS, joint_table(done.records))
-        if any(record.family_count is not None for record in done.records.values()):
-            write_file(self.folder, FAMILIES, family_table(done.records))
+        if any(record.joints for record in records):
+            write_file(self.folder, JOINTS, joint_table(records))
+        if any(record.family_count is not None for record in records):
+            write_file(self.folder, FAMILIES, family_table(records))
         self._next_summary = next_summary(begin)

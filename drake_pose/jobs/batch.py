@@ -21,6 +21,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+import numpy as np
+
 from drake_pose.body import landmarks_file, load_model
 from drake_pose.camera.camera_files import load_cameras
 from drake_pose.camera.episode_files import open_episode
@@ -35,9 +37,14 @@ from drake_pose.files.folder import (
     write_summary,
     writes_folder,
 )
-from drake_pose.files.records import FrameRecord
+from drake_pose.files.records import (
+    FrameRecord,
+    describe_job,
+    mask_digests,
+    next_summary,
+    summarize,
+)
 from drake_pose.files.settings import EstimateSettings
-from drake_pose.files.summary import describe_job, mask_digests, next_summary, summarize
 from drake_pose.jobs.batch_file import SceneJob
 from drake_pose.jobs.cluster import address_of, call_in_child
 from drake_pose.jobs.episodes_table import episodes_table
@@ -299,7 +306,7 @@ def _join_chunks(task: Task, settings: EstimateSettings, part: Path) -> None:
             shutil.copytree(chunk / OVERLAY, part / OVERLAY, copy_function=link, dirs_exist_ok=True)
     write_file(part, POSES, "".join([header, *rows]))
     described = describe_job(task.job.scene, task.job.model, settings)
-    known = {name: FrameRecord.from_json(record) for name, record in records.items()}
+    known = {one: FrameRecord.from_json(one, told, np.empty(0)) for one, told in records.items()}
     write_summary(part, summarize(described, known, False))
 
 

@@ -11,9 +11,8 @@ from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
 from cyclopts import Parameter
 
 from drake_pose.errors import SettingsError
-from drake_pose.files.options import FromText
-from drake_pose.files.settings import EpisodeSettings, EstimateSettings
-from drake_pose.files.summary import describe_job, file_digest
+from drake_pose.files.records import describe_job, file_digest
+from drake_pose.files.settings import EpisodeSettings, EstimateSettings, FromText
 from drake_pose.jobs.estimate.inputs import bundled_person
 from drake_pose.jobs.registration.settings import AuditSettings
 from drake_pose.yaml_files import read_yaml

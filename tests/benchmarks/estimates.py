@@ -124,7 +124,7 @@ def measure(work: Work) -> tuple[float, float, str]:
             work.scene, work.model, None, work.settings,
             on_frame=lambda *_: ends.append(time.process_time()),
         )  # fmt: skip
-    rows, error = found.rows[work.uncounted :], ""
+    rows, error = list(found.records.values())[work.uncounted :], ""
     if work.joints:
         truth, names = _truth(work.scene), found.position_names
         pairs = [(row, name) for row in rows for name in work.joints]
@@ -133,7 +133,7 @@ def measure(work: Work) -> tuple[float, float, str]:
         median = np.degrees(np.median(off[off < 0.5]))
         error = f"{work.joints[0]} to {work.joints[-1]}: {median:.2f} deg in the median"
     seconds = float(np.median(np.diff(ends)[work.uncounted :]))
-    return seconds, float(np.mean([row.error for row in rows])), error
+    return seconds, float(np.mean([row.E_total for row in rows])), error
 
 
 def _rows(data: Path | None, folder: Path) -> Iterator[tuple[str, ...]]:
@@ -159,22 +159,23 @@ def _hand_rows(data: Path) -> Iterator[tuple[str, ...]]:
         found = estimate_scene(scene, _right_hand(), None, EstimateSettings(), overlay=False)
         seconds, truth = time.process_time() - begin, _truth(scene)
         off, inside, widths = [], [], []
-        for row in found.rows:
-            known, true = found.records[row.frame].joints, truth[int(row.frame)]
+        for row in found.records.values():
+            known, true = row.joints, truth[int(row.frame)]
             for name in _FLEXIONS:
                 value = np.degrees(row.q[found.position_names.index(name)])
                 off.append(abs(value - true[name]))
-                inside.append(name in known and known[name].low <= true[name] <= known[name].high)
-                widths.append(known[name].high - known[name].low if name in known else np.nan)
+                low, high = (known.get(name, {}).get(end, np.nan) for end in ("low", "high"))
+                inside.append(low <= true[name] <= high)
+                widths.append(high - low)
         counts = [one.family_count or 1 for one in found.records.values()]
         yield (
             scene.name,
             f"{np.median(off):.1f} ({np.mean(off):.1f})",
             f"{np.mean(inside):.0%}",
             f"{np.nanmedian(widths):.0f}",
-            f"{np.mean([row.error for row in found.rows]):.1%}",
+            f"{np.mean([row.E_total for row in found.records.values()]):.1%}",
             f"{np.median(counts):.0f}",
-            f"{seconds / len(found.rows):.2f} s",
+            f"{seconds / len(found.records):.2f} s",
         )
 
 

@@ -18,8 +18,7 @@ from drake_pose.files.folder import (
     write_summary,
     writes_folder,
 )
-from drake_pose.files.records import FrameRecord, PoseRow, PoseTable
-from drake_pose.files.summary import open_job
+from drake_pose.files.records import FrameRecord, PoseTable, open_job
 from drake_pose.files.writer import ResultWriter
 from drake_pose.jobs.batch import run_batch
 from drake_pose.jobs.live.capture import capture_live
@@ -29,10 +28,10 @@ NAMES = ("a", "b")
 
 
 def row(frame, *q, base=None, error=0.25):
-    return PoseRow(frame, np.array(q), base, error, 1.5)
+    return FrameRecord(frame, np.array(q), base, error, 1.5)
 
 
-LOST = row("0002", np.nan, np.nan, error=np.nan)
+LOST = row("0002", np.nan, np.nan, error=None)
 
 
 def test_rows_are_on_the_disk_when_append_returns_and_read_back(tmp_path):
@@ -182,18 +181,18 @@ def test_finished_frames_whose_masks_were_replaced_are_forgotten(own_scene, tmp_
 
     first = writer()
     for frame, q in own_scene.truth.items():
-        first.add(PoseRow(frame, q, None, 0.01, 1.0), FrameRecord(True, 0.01, 1.0))
+        first.add(FrameRecord(frame, q, None, 0.01, 1.0))
     first.write_summary()
     assert read_summary(out)["complete"] is False
     path = scene.masks["front", "0001"]
     path.write_bytes(path.read_bytes())
     again = writer(earlier=read_summary(out), frames=["0000"])
-    assert (list(again.rows), again.warnings) == (list(own_scene.truth), [])
+    assert (list(again.records), again.warnings) == (list(own_scene.truth), [])
     shutil.copy(scene.masks["front", "0000"], path)
     with pytest.raises(OutputError, match=r"frame 0001: the masks were replaced"):
         writer(earlier=read_summary(out), frames=["0000", "0002"])
     again = writer(earlier=read_summary(out), frames=["0001", "0002"])
-    assert list(again.rows) == list(again.records) == ["0000", "0002"]
+    assert list(again.records) == ["0000", "0002"]
     assert again.warnings[0].startswith("frame 0001: estimated again")
 
 

@@ -16,7 +16,7 @@ from drake_pose.files.motion_files import (
     skeleton_of,
     write_motion,
 )
-from drake_pose.files.records import BASE_COLUMNS, PoseRow
+from drake_pose.files.records import BASE_COLUMNS, FrameRecord
 from tests.body.models import joint, link, urdf, write
 from tests.files.bvh_reader import read_bvh
 from tests.jobs.scenes import URDF
@@ -74,7 +74,7 @@ def test_a_results_files_honour_the_base_and_leave_out_what_is_not_known(tmp_pat
     q, frames = np.array([0.5, -1.0]), ("0001", "0002", "0003")
     poses = [q, np.full(2, np.nan), q]
     bases = [base, None, base]
-    rows = [PoseRow(*one, 0.1, 0.1) for one in zip(frames, poses, bases, strict=True)]
+    rows = [FrameRecord(*one, 0.1, 0.1) for one in zip(frames, poses, bases, strict=True)]
     (warning,) = write_motion(tmp_path / "out", model, frames, rows, 25.0)
     assert "1 of 3 frames" in warning
     context = model.plant.CreateDefaultContext()
@@ -154,7 +154,7 @@ def test_the_file_has_every_link_where_the_plant_has_it(name):
     places = motion.places()
     assert filled == 0
     assert motion.frame_time == pytest.approx(1.0 / RATE_HZ)
-    links = [one.link for one in skeleton_of(model, q)]
+    links = [link for link, _ in skeleton_of(model, q)]
     # Every part that is seen, but for the lower half of a limb, whose place is the upper half's.
     assert set(links) == {link for link in model.link_meshes if not link.endswith("_end")}
     for part in links:

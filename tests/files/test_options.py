@@ -3,7 +3,7 @@ from pathlib import Path
 import pytest
 
 from drake_pose.errors import SettingsError, UnknownNameError
-from drake_pose.files.options import (
+from drake_pose.files.settings import (
     parse_assignments,
     parse_boxes,
     parse_root_position,

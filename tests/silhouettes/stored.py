@@ -86,8 +86,8 @@ def estimate_real(name: str, shared_data: Path) -> dict[str, dict[str, Any]]:
         scene = shared_data / name
         arm = name == "arm_two_views"
         model = scene / "med7" / "med7.urdf" if arm else bundled_model("hand")
-    rows = estimate_scene(scene, model, None, settings).rows
-    return {row.frame: {"q": row.q.tolist(), "E_total": row.error} for row in rows}
+    rows = estimate_scene(scene, model, None, settings).records.values()
+    return {row.frame: {"q": row.q.tolist(), "E_total": row.E_total} for row in rows}
 
 
 def _store(body: str) -> None:

@@ -86,7 +86,7 @@ def fit_body(inputs: Inputs, settings: EstimateSettings, on_stage: OnStage | Non
 
     Raises DrakePoseError as for an estimate.
     """
-    search, tracking = inputs.search, inputs.tracking
+    search, tracking = inputs.search, inputs.tracking()
     if (
         tracking is None
         or not tracking.scale_unknown

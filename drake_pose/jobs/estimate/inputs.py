@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -18,9 +20,11 @@ from drake_pose.body import (
     model_warnings,
 )
 from drake_pose.camera.camera_files import load_cameras
+from drake_pose.camera.models import Camera
 from drake_pose.errors import ModelError, SceneError, SettingsError, UnknownNameError
-from drake_pose.files.records import user_units
+from drake_pose.files.records import FrameRecord, base_cells, user_units
 from drake_pose.files.settings import EstimateSettings
+from drake_pose.files.writer import Drawn
 from drake_pose.filtering.contour_tracker import TrackingSettings
 from drake_pose.jobs.estimate.episode import is_episode, logged_positions, read_episode_scene
 from drake_pose.jobs.estimate.measurements import (
@@ -37,7 +41,9 @@ from drake_pose.jobs.estimate.searches import (
 )
 from drake_pose.person.search import PERSON_LANDMARKS
 from drake_pose.search import PoseEstimate, PoseSearch, RootPlacementSearch
-from drake_pose.silhouette.areas.scoring import require_visible
+from drake_pose.silhouette.areas.outline import Outline
+from drake_pose.silhouette.areas.scoring import draw_labels, require_visible
+from drake_pose.silhouette.pictures.masks import compare_masks
 from drake_pose.silhouette.pictures.scene_checks import (
     check_upright,
     leave_out_unreadable,
@@ -46,7 +52,6 @@ from drake_pose.silhouette.pictures.scene_checks import (
 from drake_pose.silhouette.pictures.scenes import SCENE_FILE, Scene, read_sequence
 
 TRUTH_FILE = "joint_angles.csv"
-_REST_TIME = 1.0
 
 
 @dataclass(frozen=True)
@@ -86,11 +91,50 @@ class Inputs:
         errors *= user_units(self.model)[places]
         return dict(zip(self.truth.names, errors.tolist(), strict=True))
 
-    @property
-    def tracking(self) -> TrackingSettings | None:
+    def pictures(self, frame: str) -> dict[str, np.ndarray]:
+        """The pictures (H, W, 3) of a frame by camera."""
+        names = [name for name in self.scene.cameras if (name, frame) in self.scene.images]
+        return {name: self.scene.read_image(name, frame) for name in names}
+
+    def finish(
+        self,
+        frame: str,
+        pose: PoseEstimate,
+        masks: Mapping[str, np.ndarray],
+        parts: Mapping[str, np.ndarray],
+        shown: Mapping[str, np.ndarray],
+        **more: Any,
+    ) -> tuple[FrameRecord, Drawn]:
+        """A frame as written, its masks compared with the body.
+
+        Args:
+            pose: one without a J is judged by the masks.
+            masks: by camera, of those that the pose was found by.
+            parts: by camera (H, W), which part of the body is seen, -1 where none is; none where
+                no pose was found.
+            shown: the masks and pictures over which the body is drawn.
+            more: fields of FrameRecord.
+        """
+        q, base, E_total = np.full(len(pose.q), np.nan), None, None
+        if pose.found:
+            q, base = pose.q, base_cells(pose.X_WB) if self.base_moves else None
+            agreement = compare_masks(masks, {name: parts[name] >= 0 for name in masks})
+            error = pose.E_total if math.isfinite(pose.J) else agreement.E_total
+            if math.isfinite(error):
+                E_total, more["ious"] = error, agreement.ious
+                more["joint_errors"] = self.joint_errors(frame, pose.q)
+        record = FrameRecord(
+            frame, q, base, E_total, pose.seconds, stopped_by=pose.stopped_by, **more
+        )
+        return record, {name: (seen, parts.get(name)) for name, seen in shown.items()}
+
+    def tracking(self, rest_time: float = 1.0) -> TrackingSettings | None:
         """How the body is tracked; None where every frame is matched on its own.
 
         A searched root position or scale is tracked, too.
+
+        ``rest_time``: of the tracker where a single parallel view, which is the same for poses
+        mirrored in depth, is all there is [s].
         """
         if not self.tracked:
             return None
@@ -98,8 +142,7 @@ class Inputs:
         return TrackingSettings(
             root_moves=isinstance(self.search, RootPlacementSearch),
             scale_unknown=scale_unknown,
-            # A single parallel view is the same for poses mirrored in depth.
-            rest_time=_REST_TIME if scale_unknown else None,
+            rest_time=rest_time if scale_unknown else None,
         )
 
     @property
@@ -171,6 +214,14 @@ def read_inputs(
     of_model = model_warnings(model, search.tree, settings.hold)
     warnings = (*scene_as_used.warnings, *of_truth, *of_model)
     return Inputs(scene_as_used, model, frames, tracked, search, truth, warnings, centres, starts)
+
+
+def draw_parts(
+    outlines: Sequence[Outline], X_WN: np.ndarray, cameras: Iterable[Camera]
+) -> dict[str, np.ndarray]:
+    """By camera (H, W), which of a body's parts at X_WN (parts, 4, 4) is seen, -1 where none is."""
+    labels = range(1, 1 + len(outlines))
+    return {one.name: draw_labels(outlines, labels, one.X_CW @ X_WN, one) - 1 for one in cameras}
 
 
 def _read_truth(

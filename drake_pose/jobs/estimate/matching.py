@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import combinations
 from typing import Any
@@ -12,19 +12,17 @@ import numpy as np
 from pydrake.systems.analysis import Simulator
 
 from drake_pose.body import nearest_turn
-from drake_pose.camera.models import Camera, ParallelCamera
+from drake_pose.camera.models import ParallelCamera
 from drake_pose.errors import SettingsError, listed
-from drake_pose.files.options import percent
 from drake_pose.files.records import (
+    BADLY_EXPLAINED,
     FrameRecord,
-    PoseRow,
-    base_cells,
     record_deviations,
     record_pose_set,
 )
-from drake_pose.files.summary import BADLY_EXPLAINED
-from drake_pose.files.writer import Drawn, FinishedFrame, OnStage
-from drake_pose.jobs.estimate.inputs import Inputs
+from drake_pose.files.settings import percent
+from drake_pose.files.writer import Drawn, OnStage
+from drake_pose.jobs.estimate.inputs import Inputs, draw_parts
 from drake_pose.search import (
     TRACKED,
     BeamSearch,
@@ -35,25 +33,8 @@ from drake_pose.search import (
     scale_camera,
 )
 from drake_pose.silhouette.areas.bending import TreeSurfaces
-from drake_pose.silhouette.areas.outline import Outline
-from drake_pose.silhouette.areas.scoring import draw_labels
-from drake_pose.silhouette.pictures.masks import compare_masks
 from drake_pose.silhouette.pictures.scenes import USUAL_RATE_HZ, Scene
 from drake_pose.systems.diagrams import build_recorded_matching
-
-# From this E_total on (median of the frames), two cameras that are matched together are compared.
-# More are compared only where the pictures are explained badly: a real person in four leaves 15 to
-# 18 %, and one of several that disagrees is known by its IoU.
-_DOUBTFUL = 0.12
-# Cameras contradict each other where each alone leaves less than this share of what all together
-# leave; and what is put right leaves as little.
-_LEFT = 0.5
-# How many frames are compared, and how many pairs of cameras exchanged.
-_FRAMES, _PAIRS = 2, 3
-# A frame fits worse than another one that leaves so many times as much, and so much more.
-_WORSE, _MORE = 1.2, 0.01
-# Joints are elsewhere that are off by more [rad or m].
-_ELSEWHERE = 0.2
 
 
 def estimate_frames(
@@ -77,7 +58,7 @@ def estimate_frames(
     rate_hz = inputs.scene.frame_rate_hz or USUAL_RATE_HZ
     matching = build_recorded_matching(
         replace(inputs.scene, frame_rate_hz=rate_hz), search, tuple(inputs.scene.cameras.values()),
-        played, inputs.root_positions, tracking=inputs.tracking, starts=inputs.starts,
+        played, inputs.root_positions, tracking=inputs.tracking(), starts=inputs.starts,
     )  # fmt: skip
     simulator = Simulator(matching.diagram)
     for index, frame in enumerate(played):
@@ -109,14 +90,14 @@ def _views(scene: Scene, frame: str) -> list[View]:
 
 def match_frames(
     inputs: Inputs, search: PoseSearch, overlay: bool, missing: Sequence[str]
-) -> Iterator[FinishedFrame]:
+) -> Iterator[tuple[FrameRecord, Drawn]]:
     """The missing frames, matched or tracked, compared with their masks and drawn."""
     scene, model = inputs.scene, inputs.model
     tree = model.pose_tree()
     surfaces = TreeSurfaces(tree)
     for frame, pose in estimate_frames(inputs, search, missing):
         masks = {name: scene.read(name, frame) for name in scene.cameras_of(frame)}
-        shown: dict[str, np.ndarray] = {**read_pictures(scene, frame), **masks} if overlay else {}
+        shown: dict[str, np.ndarray] = {**inputs.pictures(frame), **masks} if overlay else {}
         parts, more = dict[str, np.ndarray](), dict[str, Any]()
         if pose.found:
             cameras = [scene.cameras[name] for name in {**masks, **shown}]
@@ -127,69 +108,16 @@ def match_frames(
                         more["camera_scale"] = scaled.pixels_per_metre
             values = tree.values_from_positions(pose.q)
             parts = draw_parts(surfaces.at(values), pose.X_WB @ tree.node_poses(values), cameras)
-        bodies = {name: own >= 0 for name, own in parts.items()}
+            more["first_E_total"] = pose.first_E_total
         # A search that does not say how sure it is knows nothing of any joint.
         nothing = np.full(len(pose.q), np.nan)
         known = record_pose_set(pose.pose_set, search.tree) or {
             "joints": record_deviations(model, pose.q, nothing)
         }
-        yield finish_frame(
-            inputs, frame, pose, masks, parts, bodies, shown, **more, **known,
-            first_E_total=pose.first_E_total if pose.found else None,
-            runs=pose.runs, outside_limit=pose.outside_limit,
-            explained=pose.explained,
+        yield inputs.finish(
+            frame, pose, masks, parts, shown, **more, **known, runs=pose.runs,
+            outside_limit=pose.outside_limit, explained=pose.explained,
         )  # fmt: skip
-
-
-def draw_parts(
-    outlines: Sequence[Outline], X_WN: np.ndarray, cameras: Iterable[Camera]
-) -> dict[str, np.ndarray]:
-    """By camera (H, W), which of a body's parts at X_WN (parts, 4, 4) is seen, -1 where none is."""
-    labels = range(1, 1 + len(outlines))
-    return {one.name: draw_labels(outlines, labels, one.X_CW @ X_WN, one) - 1 for one in cameras}
-
-
-def finish_frame(
-    inputs: Inputs,
-    frame: str,
-    pose: PoseEstimate,
-    masks: Mapping[str, np.ndarray],
-    parts: Mapping[str, np.ndarray],
-    bodies: Mapping[str, np.ndarray],
-    shown: Mapping[str, np.ndarray],
-    ious: Mapping[str, float] | None = None,
-    **more: Any,
-) -> FinishedFrame:
-    """A frame as written, its masks compared with the body.
-
-    Args:
-        masks: by camera, of those that the pose was found by.
-        parts: by camera (H, W), which part of the body is seen, -1 where none is; none where no
-            pose was found.
-        bodies: (H, W) where any is.
-        shown: the masks and pictures over which the body is drawn.
-        ious: how its masks and the body overlap; None: not compared yet.
-        more: fields of FrameRecord.
-    """
-    row = PoseRow(frame, np.full(len(pose.q), np.nan), None, math.nan, pose.seconds)
-    if pose.found:
-        base = base_cells(pose.X_WB) if inputs.base_moves else None
-        row = PoseRow(frame, pose.q, base, pose.E_total, pose.seconds)
-    more["stopped_by"] = pose.stopped_by
-    if row.found:
-        more["joint_errors"] = inputs.joint_errors(frame, pose.q)
-        more["ious"] = compare_masks(masks, bodies).ious if ious is None else ious
-    drawn = {}
-    for name, seen in shown.items():
-        body = bodies[name] if name in bodies else np.zeros(seen.shape[:2], np.bool_)
-        drawn[name] = Drawn(seen, body, parts.get(name))
-    return FinishedFrame(row, FrameRecord.of(row, **more), drawn)
-
-
-def read_pictures(scene: Scene, frame: str) -> dict[str, np.ndarray]:
-    """The pictures (H, W, 3) of a frame by camera."""
-    names = [name for name in scene.cameras if (name, frame) in scene.images]
-    return {name: scene.read_image(name, frame) for name in names}
 
 
 def compare_cameras(
@@ -197,20 +125,33 @@ def compare_cameras(
     search: PoseSearch,
     records: Mapping[str, FrameRecord],
     on_stage: OnStage | None,
+    doubtful: float = 0.12,
+    left_share: float = 0.5,
+    frame_count: int = 2,
+    pair_count: int = 3,
 ) -> list[str]:
     """A warning of cameras that contradict each other; few frames are matched again for it.
 
     Nothing is matched where the poses fit.
+
+    Args:
+        doubtful: median E_total from which two cameras are compared. More are compared only where
+            the pictures are explained badly: a real person in four leaves 15 to 18 %, and one of
+            several that disagrees is known by its IoU.
+        left_share: cameras contradict each other where each alone leaves less than this fraction
+            of what all together leave; and what is put right leaves as little.
+        frame_count: how many frames are compared.
+        pair_count: how many pairs of cameras are tried exchanged.
     """
     scene, cameras = inputs.scene, inputs.scene.cameras
     known = {f: one.E_total for f, one in records.items() if one.E_total is not None}
     usual = float(np.median(list(known.values()))) if known else 0.0
-    doubtful = _DOUBTFUL if len(cameras) == 2 else BADLY_EXPLAINED
-    if scene.images or len(cameras) < 2 or usual < doubtful:
+    least = doubtful if len(cameras) == 2 else BADLY_EXPLAINED
+    if scene.images or len(cameras) < 2 or usual < least:
         return []
     whole = [f for f in known if all((name, f) in scene.masks for name in cameras)]
     # The usual ones: in the worst, there may be more that is wrong.
-    chosen = sorted(whole, key=lambda frame: abs(known[frame] - usual))[:_FRAMES]
+    chosen = sorted(whole, key=lambda frame: abs(known[frame] - usual))[:frame_count]
     if not chosen:
         return []
     if on_stage is not None:
@@ -231,9 +172,9 @@ def compare_cameras(
     worst = sorted(cameras, key=lambda name: ious[name])
     sizes = {name: (camera.width, camera.height) for name, camera in cameras.items()}
     alike = [pair for pair in combinations(worst, 2) if sizes[pair[0]] == sizes[pair[1]]]
-    for one, other in alike[:_PAIRS]:
+    for one, other in alike[:pair_count]:
         after = error({n: {one: other, other: one}.get(n, n) for n in cameras})
-        if after < _LEFT * together:
+        if after < left_share * together:
             return [
                 f"cameras '{one}' and '{other}' are exchanged, it seems: E_total is "
                 f"{percent(together)} together, but {percent(after)} with each other's pictures; "
@@ -243,28 +184,26 @@ def compare_cameras(
     areas = [sum(float(own[name].sum()) for own in masks.values()) for name in cameras]
     bad: Sequence[str] = [name for name in cameras if alone[name] >= BADLY_EXPLAINED]
     good = [alone[name] for name in cameras if name not in bad]
-    if np.average(list(alone.values()), weights=areas) < _LEFT * together:
-        left = {n: error({m: m for m in worst if m != n}) for n in worst[:_PAIRS] if len(worst) > 2}
+    if np.average(list(alone.values()), weights=areas) < left_share * together:
+        left = {
+            n: error({m: m for m in worst if m != n}) for n in worst[:pair_count] if len(worst) > 2
+        }
         first = min(left, key=lambda name: left[name], default="")
-        bad = [first] if first and left[first] < _LEFT * together else list(cameras)
+        bad = [first] if first and left[first] < left_share * together else list(cameras)
     # A camera whose place the model's own contradicts is not explained even alone.
-    elif not (bad and good and max(good) < _LEFT * min(alone[name] for name in bad)):
+    elif not (bad and good and max(good) < left_share * min(alone[name] for name in bad)):
         return []
-    return [_say_contradiction(bad, together, alone)]
-
-
-def _say_contradiction(cameras: Sequence[str], together: float, alone: Mapping[str, float]) -> str:
-    names = " and ".join(f"'{name}'" for name in cameras)
-    each = ", ".join(f"'{name}' {percent(error)}" for name, error in alone.items())
+    names = " and ".join(f"'{name}'" for name in bad)
     what = f"cameras {names} contradict each other"
-    if len(cameras) < len(alone):
+    if len(bad) < len(alone):
         others = "the others" if len(alone) > 2 else "the other one"
         what = f"camera {names} contradicts {others}"
-    return (
+    each = ", ".join(f"'{name}' {percent(left)}" for name, left in alone.items())
+    return [
         f"{what}: E_total is {percent(together)} together, alone {each}; has one moved since it "
         "was calibrated, are masks of another camera or instant, is X_WC the camera's pose in the "
         "world, in metres?"
-    )
+    ]
 
 
 def _match_again(
@@ -279,12 +218,14 @@ def _match_again(
 def check_track(
     inputs: Inputs,
     search: PoseSearch,
-    rows: Mapping[str, PoseRow],
     records: Mapping[str, FrameRecord],
+    elsewhere: float = 0.2,
 ) -> list[str]:
     """A warning of a track that follows a wrong pose: its worst frame is matched by itself for it.
 
     Nothing is matched where all frames fit nearly as well as those in which a pose was searched.
+
+    ``elsewhere``: a joint that is off by more is named [rad or m].
     """
     searched, tracked = list[float](), dict[str, float]()
     for frame, one in records.items():
@@ -302,9 +243,9 @@ def check_track(
     found = _match_again(inputs, search, worst, _views(inputs.scene, worst))
     if not found.found or not _is_worse(tracked[worst], found.E_total):
         return []
-    model, q = inputs.model, rows[worst].q
+    model, q = inputs.model, records[worst].q
     off = nearest_turn(found.q, q, model.periodic) - q
-    joints = [model.position_names[k] for k in np.flatnonzero(np.abs(off) > _ELSEWHERE)]
+    joints = [model.position_names[k] for k in np.flatnonzero(np.abs(off) > elsewhere)]
     where = f", with {listed(joints)} elsewhere" if joints else ""
     return [
         f"frame '{worst}': tracked it leaves {percent(tracked[worst])} of the silhouettes' area, "
@@ -316,4 +257,4 @@ def check_track(
 
 def _is_worse(error: float, other: float) -> bool:
     """Whether a pose that leaves one E_total fits clearly worse than one that leaves another."""
-    return error > max(_WORSE * other, other + _MORE)
+    return error > max(1.2 * other, other + 0.01)

@@ -11,10 +11,9 @@ from numpy.typing import NDArray
 
 from drake_pose.arrays import Array, Mask
 from drake_pose.errors import MaskError, SceneError
-from drake_pose.files.records import record_deviations
-from drake_pose.files.writer import FinishedFrame, OnStage, ResultWriter
-from drake_pose.jobs.estimate.inputs import Inputs
-from drake_pose.jobs.estimate.matching import draw_parts, finish_frame, read_pictures
+from drake_pose.files.records import FrameRecord, record_deviations
+from drake_pose.files.writer import Drawn, OnStage, ResultWriter
+from drake_pose.jobs.estimate.inputs import Inputs, draw_parts
 from drake_pose.person.camera_faults import CameraFault
 from drake_pose.person.capture import (
     CheckedCapture,
@@ -25,7 +24,7 @@ from drake_pose.person.capture import (
 from drake_pose.person.figures import ReadFrame, ViewFaults
 from drake_pose.person.rig_faults import RigFault
 from drake_pose.search import PoseEstimate
-from drake_pose.silhouette.pictures.masks import compare_masks, edge_area
+from drake_pose.silhouette.pictures.masks import edge_area
 from drake_pose.silhouette.pictures.scene_checks import (
     describe_unreadable,
     frame_ranges,
@@ -40,7 +39,7 @@ _FITS_BADLY = 0.6
 
 def follow_person(
     inputs: Inputs, result: ResultWriter, overlay: bool, on_stage: OnStage | None
-) -> tuple[Inputs, Iterator[FinishedFrame]]:
+) -> tuple[Inputs, Iterator[tuple[FrameRecord, Drawn]]]:
     """Follows the person through all frames, which are compared with their masks and drawn then.
 
     A resumed recording is followed as a whole again, if frames are missing.
@@ -53,9 +52,9 @@ def follow_person(
         SceneError: none of the masks can be read, or fewer than two are there of the first picture.
         SettingsError: in no frame two cameras see a person.
     """
-    if result.rows.keys() >= set(inputs.frames):
+    if result.records.keys() >= set(inputs.frames):
         return inputs, iter(())
-    asked = {*inputs.frames, *result.rows}
+    asked = {*inputs.frames, *result.records}
     inputs = replace(inputs, frames=tuple(one for one in inputs.scene.frames if one in asked))
     reader = _Reader(inputs, on_stage)
     begin = time.perf_counter()
@@ -71,14 +70,13 @@ def follow_person(
         distances = np.full(len(inputs.frames), np.nan)
     reader.on_stage = None
     seconds = (time.perf_counter() - begin) / len(inputs.frames)
-    result.rows.clear()
     result.records.clear()
     result.begin()
     if captured.shape is not None:
         known = captured.shape.known
         result.more |= {"lengths_m": known.lengths, "girths": known.girths}
 
-    def finished() -> Iterator[FinishedFrame]:
+    def finished() -> Iterator[tuple[FrameRecord, Drawn]]:
         values = [captured.tree.values_from_positions(q) for q in captured.q]
         nodes = [np.array(own) for own in zip(*values, strict=True)]
         for index, X_WN in enumerate(captured.tree.node_poses_batch(nodes)):
@@ -109,7 +107,7 @@ def _follow_colours(
         checked = capture_checked(tree, scene.cameras, lambda k: reader(masked[k]), len(masked))
         faults = describe_faults(checked, [frames[k] for k in masked])
     captured, distances = capture_by_colour(
-        tree, scene.cameras, len(frames), lambda index: read_pictures(scene, frames[index]),
+        tree, scene.cameras, len(frames), lambda index: inputs.pictures(frames[index]),
         {frames.index(frame): q for frame, q in inputs.starts.items()},
         {} if checked is None else {k: checked.read(place) for place, k in enumerate(masked)},
         None if checked is None else checked.captured, reader.count_followed,
@@ -175,7 +173,7 @@ def _finish(
     distance: float,
     seconds: float,
     overlay: bool,
-) -> FinishedFrame:
+) -> tuple[FrameRecord, Drawn]:
     """A frame with the captured person, of the girth that was found, the nodes at X_WN.
 
     Args:
@@ -183,7 +181,7 @@ def _finish(
         distance: see above.
     """
     scene, frame, q = inputs.scene, inputs.frames[index], captured.q[index]
-    shown: dict[str, NDArray[np.generic]] = read_pictures(scene, frame) if overlay else {}
+    shown: dict[str, NDArray[np.generic]] = inputs.pictures(frame) if overlay else {}
     # A camera that was left out is shown, too, so that one sees why.
     if overlay and len(masks) < len(scene.cameras_of(frame)):
         shown |= reader(index)
@@ -192,22 +190,16 @@ def _finish(
     found, by_colour = bool(np.isfinite(q).all()), not masks and np.isfinite(distance)
     names = {} if not found else scene.cameras if by_colour else {**masks, **shown}
     parts = draw_parts(captured.outlines, X_WN, [scene.cameras[name] for name in names])
-    bodies = {name: own >= 0 for name, own in parts.items()}
-    agreement = compare_masks(masks, bodies) if found else None
-    wrong, area = np.nan, 0.0
+    wrong, area = np.nan, 1.0
     if found and by_colour:
         # Without masks, E_total is the strip between both contours over the body's area.
-        area = float(sum(np.count_nonzero(body) for body in bodies.values())) or 1.0
-        wrong = sum(map(edge_area, bodies.values())) * distance
-    elif agreement is not None and agreement.area:
-        wrong, area = float(agreement.wrong), float(agreement.area)
-    pose = PoseEstimate(
-        found, q, np.eye(4), (), wrong, area or 1.0, stopped_by=FOLLOWED, seconds=seconds
-    )
-    return finish_frame(
-        inputs, frame, pose, masks, parts, bodies, shown, share=float(captured.shares[index]),
+        bodies = [own >= 0 for own in parts.values()]
+        area = float(sum(map(np.count_nonzero, bodies))) or 1.0
+        wrong = sum(map(edge_area, bodies)) * distance
+    pose = PoseEstimate(found, q, np.eye(4), (), wrong, area, stopped_by=FOLLOWED, seconds=seconds)
+    return inputs.finish(
+        frame, pose, masks, parts, shown, share=float(captured.shares[index]),
         joints=record_deviations(inputs.model, q, captured.deviations[index]),
-        ious=None if agreement is None else agreement.ious,
     )  # fmt: skip
 
 

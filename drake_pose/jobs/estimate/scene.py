@@ -6,9 +6,8 @@ from pathlib import Path
 
 from drake_pose.files.folder import SHAPES, writes_folder
 from drake_pose.files.overlay import encode_png
-from drake_pose.files.records import SceneEstimate
+from drake_pose.files.records import SceneEstimate, describe_job, open_job
 from drake_pose.files.settings import EstimateSettings
-from drake_pose.files.summary import describe_job, open_job
 from drake_pose.files.writer import OnFrame, OnStage, ResultWriter
 from drake_pose.jobs.estimate.body_fit import fit_body
 from drake_pose.jobs.estimate.inputs import read_inputs
@@ -67,12 +66,12 @@ def estimate_scene(
         if search is None:
             inputs, frames = follow_person(inputs, result, overlay, on_stage)
         else:
-            missing = [frame for frame in inputs.frames if frame not in result.rows]
+            missing = [frame for frame in inputs.frames if frame not in result.records]
             frames = match_frames(inputs, search, overlay, missing)
         with working(settings.workers):
             result.add_all(frames, inputs.frames, on_frame)
             if search is not None:
-                result.warnings += check_track(inputs, search, result.rows, result.records)
+                result.warnings += check_track(inputs, search, result.records)
                 result.warnings += compare_cameras(inputs, search, result.records, on_stage)
         result.finish(replay)
     finally:

@@ -19,9 +19,13 @@ from drake_pose.camera.sources import TIME_STAMPS
 from drake_pose.csv_files import csv_text
 from drake_pose.errors import CameraError, OutputError, SceneError, SettingsError, UnknownNameError
 from drake_pose.files.folder import read_summary, writes_folder
-from drake_pose.files.records import FrameRecord, PoseRow, SceneEstimate, record_deviations
+from drake_pose.files.records import (
+    FrameRecord,
+    SceneEstimate,
+    describe_job,
+    record_deviations,
+)
 from drake_pose.files.settings import EstimateSettings
-from drake_pose.files.summary import describe_job
 from drake_pose.files.writer import ResultWriter
 from drake_pose.jobs.estimate.inputs import bundled_person
 from drake_pose.jobs.estimate.person import FOLLOWED
@@ -354,20 +358,23 @@ class _FrameWriter:
             }
             agreement = compare_masks(masks, bodies)
             error, ious = agreement.E_total, agreement.ious
-        row = PoseRow(name, q, None, error, seconds)
         deviations = self._value(context, "deviations", len(q))
-        record = FrameRecord.of(
-            row,
+        record = FrameRecord(
+            name,
+            q,
+            None,
+            error if np.isfinite(error) else None,
+            seconds,
             stopped_by=FOLLOWED,
             joints=record_deviations(self._writer.model, q, deviations),
             ious=ious,
             share=share if np.isfinite(share) else None,
         )
-        self._writer.add(row, record)
+        self._writer.add(record)
         self._times[name] = moment
         if self._writer.more["method"] != "person":
             self._doubt(context, name, q, ious)
-        self._on_frame(len(self._times), row.found)
+        self._on_frame(len(self._times), record.found)
         self._begin = time.perf_counter()
 
     def _doubt(
@@ -420,7 +427,7 @@ class _FrameWriter:
             sources[name] = known | {"changes": changes}
         writer.more |= {"sources": sources, "skipped_moments": sensors.skipped}
         writer.warnings += camera_troubles(counts, sensors.skipped)
-        if writer.rows:
+        if writer.records:
             writer.finish(replay)
             times = [(frame, f"{time:.6f}") for frame, time in self._times.items()]
             writer.write(TIME_STAMPS, csv_text([("frame", "time"), *times]))

@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 from cyclopts import Parameter
 
 from drake_pose.errors import SettingsError
-from drake_pose.files.options import within
+from drake_pose.files.settings import within
 
 CaptureMethod = Literal["person", "paper"]
 """By all silhouettes at once, or by the stages of Date et al. as they print them."""

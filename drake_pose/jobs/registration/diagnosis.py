@@ -13,8 +13,8 @@ from scipy.special import chdtrc
 from drake_pose.arrays import Array
 from drake_pose.camera.models import Camera, PinholeCamera
 from drake_pose.errors import CameraError, RegistrationError
-from drake_pose.files.options import percent
-from drake_pose.files.summary import BADLY_EXPLAINED
+from drake_pose.files.records import BADLY_EXPLAINED
+from drake_pose.files.settings import percent
 from drake_pose.fit.parameters import POSE_NAMES
 from drake_pose.registration.diagnosis import DIAGNOSIS, Finding, FrameDiagnosis
 from drake_pose.registration.joint_zeros import JointCalibration, calibrate_joints

@@ -176,7 +176,7 @@ def estimate_positions(
         )
     found = estimate_scene(scene_path, model.path, None, replace(settings, cameras=names))
     columns = [found.position_names.index(name) for name in kinematics.names]
-    values = {frame_key(row.frame): row.q[columns] for row in found.rows if row.found}
+    values = {frame_key(row.frame): row.q[columns] for row in found.records.values() if row.found}
     if not values:
         raise SceneError(
             f"{scene_path}: camera {', '.join(names)}, whose X_WC is known, sees the body in no "

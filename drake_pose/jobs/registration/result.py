@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import yaml
-from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from drake_pose.arrays import Array, Picture
@@ -21,17 +20,11 @@ from drake_pose.camera.exports import mujoco_cameras, ros_camera_info, ros_trans
 from drake_pose.camera.models import Camera
 from drake_pose.csv_files import csv_text
 from drake_pose.files.folder import OVERLAY, REPORT, without_nan, write_file, write_summary
-from drake_pose.files.options import percent
 from drake_pose.files.overlay import draw_overlay, draw_shapes, encode_png
+from drake_pose.files.records import describe_job, file_digest, versions
 from drake_pose.files.replay import Pictures, import_rerun, make_recording
-from drake_pose.files.report_page import (
-    BOX,
-    Plot,
-    overlay_picture,
-    page_template,
-    plot_curves,
-)
-from drake_pose.files.summary import describe_job, file_digest, versions
+from drake_pose.files.report_page import new_plot, overlay_picture, page_template, plot_uri
+from drake_pose.files.settings import percent
 from drake_pose.jobs.registration.diagnosis import say_drift, say_reading
 from drake_pose.jobs.registration.inputs import Inputs
 from drake_pose.jobs.registration.settings import AuditSettings
@@ -407,7 +400,7 @@ def compared_frames(errors: Mapping[str, float]) -> Sequence[str]:
     return tuple(dict.fromkeys([in_order[0], in_order[len(in_order) // 2]]))
 
 
-def _plot_offset(camera: Mapping[str, Any]) -> Plot | None:
+def _plot_offset(camera: Mapping[str, Any]) -> str | None:
     """What was explained at each offset of a camera's clock that was tried; None: none was.
 
     A vertical line is the offset that was found, in its 95 % interval.
@@ -415,27 +408,14 @@ def _plot_offset(camera: Mapping[str, Any]) -> Plot | None:
     tried = np.array(camera.get("time_offset_scores") or ()).reshape(-1, 2)
     if len(tried) < 2:
         return None
-    offsets = 1e3 * tried[:, 0]
-    first, step = offsets[0], np.diff(offsets).min()
-    places = np.rint((offsets - first) / step).astype(int)
-    scores = np.full(places[-1] + 1, np.nan)
-    scores[places] = 100.0 * tried[:, 1]
-    last = first + step * (len(scores) - 1)
-    left, top, width, height = BOX
-
-    def x(offset: float) -> float:
-        return left + width * float((np.clip(offset, first, last) - first) / (last - first))
-
-    plot = plot_curves([""] * len(scores), [("explained", scores)], joined=True)
-    ticks = [one for one in MaxNLocator(6).tick_values(first, last) if first <= one <= last]
-    plot = plot._replace(x_ticks=tuple((round(x(one), 1), f"{one:g}") for one in ticks))
-    if camera["time_offset_s"] is None:
-        return plot
-    value, margin = 1e3 * camera["time_offset_s"], 1e3 * _NORMAL * camera["time_offset_sd_s"]
-    low, high = x(value - margin), x(value + margin)
-    line = f"M{x(value):.1f} {top}v{height}"
-    band = f"M{low:.1f} {top}H{high:.1f}v{height}H{low:.1f}Z"
-    return plot._replace(curves=(*plot.curves, ("offset", line)), bands=(band, ""))
+    figure, axes = new_plot()
+    axes.plot(1e3 * tried[:, 0], 100.0 * tried[:, 1], marker=".", markersize=3)
+    if camera["time_offset_s"] is not None:
+        value, margin = 1e3 * camera["time_offset_s"], 1e3 * _NORMAL * camera["time_offset_sd_s"]
+        axes.axvspan(value - margin, value + margin, color="#c5dfee")
+        axes.axvline(value, color="#d55e00")
+        axes.set_xlim(1e3 * tried[0, 0], 1e3 * tried[-1, 0])
+    return plot_uri(figure)
 
 
 _DRAKE, _MUJOCO, _RERUN = "drake.yaml", "mujoco.xml", "rerun.rrd"

@@ -7,8 +7,14 @@ from typing import Annotated, Any, Literal, get_args
 from cyclopts import Parameter
 
 from drake_pose.errors import SettingsError
-from drake_pose.files.options import Corner, from_text, parse_boxes
-from drake_pose.files.settings import EpisodeSettings, Names, Positions
+from drake_pose.files.settings import (
+    Corner,
+    EpisodeSettings,
+    Names,
+    Positions,
+    from_text,
+    parse_boxes,
+)
 
 ALL = "all"
 """In place of names: of every joint, or of every link."""

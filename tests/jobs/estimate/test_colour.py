@@ -45,7 +45,7 @@ def recording(tmp_path_factory):
 
 def errors(estimate, truth):
     """(frames,) the greatest error of each frame [deg]."""
-    found = np.array([row.q for row in estimate.rows])
+    found = np.array([one.q for one in estimate.records.values()])
     return np.degrees(np.abs(found - truth).max(axis=1))
 
 
@@ -89,9 +89,9 @@ def test_every_frame_by_colour_has_intervals_that_hold_the_truth(recording):
     assert len(records) == FRAMES
     for record, q in zip(records.values(), truth, strict=True):
         told = zip(record.joints.values(), np.degrees(q), strict=True)
-        assert all(joint.low < value < joint.high for joint, value in told)
-        assert all(joint.determined for joint in record.joints.values())
-        assert max(joint.high - joint.low for joint in record.joints.values()) < 12.0
+        assert all(joint["low"] < value < joint["high"] for joint, value in told)
+        assert all(joint["determined"] for joint in record.joints.values())
+        assert max(joint["high"] - joint["low"] for joint in record.joints.values()) < 12.0
 
 
 def test_frames_of_a_video_are_named_as_its_masks_are(recording, filmed, tmp_path):
@@ -148,7 +148,7 @@ def test_an_interrupted_sequence_of_pictures_goes_on_as_if_it_had_not_been(recor
     resumed = estimate_scene(scene, model, out, settings, resume=True, on_frame=stop, replay=False)
     assert heard[4:] == [(3, ""), *((k + 1, f"{k:04d}") for k in range(3, FRAMES))]
     whole = estimate_scene(scene, model, settings=settings)
-    for one, other in zip(resumed.rows, whole.rows, strict=True):
+    for one, other in zip(resumed.records.values(), whole.records.values(), strict=True):
         np.testing.assert_allclose(one.q, other.q, atol=1e-6)
     assert whole.found_count == FRAMES
     assert np.median(errors(whole, recording[2])) < 1.5
@@ -169,7 +169,7 @@ def test_where_the_body_is_lost_no_pose_is_written(recording, tmp_path, out):
     (copy / "masks" / "front").mkdir(parents=True)
     shutil.copy(scene.parent / "first.png", copy / "masks" / "front" / "0000.png")
     found = estimate_scene(copy, model, out, EstimateSettings(start=start))
-    lost = [row for row in found.rows if not row.found]
+    lost = [one for one in found.records.values() if not one.found]
     assert [row.frame for row in lost] == ["0003", "0004"]
     assert np.isnan([row.q for row in lost]).all()
     assert "frame 0003-0004 (2 of 8): no pose was found" in found.summary["warnings"]

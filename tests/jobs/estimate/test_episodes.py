@@ -35,8 +35,8 @@ def test_frames_are_chosen_and_truth_is_of_the_same_moments(episode):
     scene, painted = episode
     result = estimate_scene(scene, painted.path, settings=EstimateSettings(every=2))
     assert list(result.records) == ["0000", "0002", "0004"]
-    for k, row in zip((0, 2, 4), result.rows, strict=True):
-        truth = row.q - np.radians(list(result.records[row.frame].joint_errors.values()))
+    for k, record in zip((0, 2, 4), result.records.values(), strict=True):
+        truth = record.q - np.radians(list(record.joint_errors.values()))
         np.testing.assert_allclose(truth, painted.values[k], atol=5e-3)
 
 

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from drake_pose.files.records import FrameRecord, PoseRow
+from drake_pose.files.records import FrameRecord
 from drake_pose.files.settings import EstimateSettings
 from drake_pose.jobs.estimate.inputs import read_inputs
 from drake_pose.jobs.estimate.matching import check_track, compare_cameras
@@ -68,13 +68,12 @@ def test_a_track_of_a_wrong_pose_is_told(scene: TinyScene, left: float, is_told:
     """Frame 1 is said to be tracked half a radian off, which leaves so much of its area."""
     inputs = read_inputs(scene.folder, scene.model, EstimateSettings(), None)
     wrong = np.radians(ANGLES[1]) + np.array([0.0, 0.5])
-    rows = {"0001": PoseRow("0001", wrong, None, left, 0.1)}
     records = {
-        "0000": FrameRecord(True, 0.01, 0.1, stopped_by="end"),
-        "0001": FrameRecord(True, left, 0.1, stopped_by=TRACKED),
+        "0000": FrameRecord("0000", wrong, None, 0.01, 0.1, stopped_by="end"),
+        "0001": FrameRecord("0001", wrong, None, left, 0.1, stopped_by=TRACKED),
     }
     assert inputs.search is not None
-    texts = check_track(inputs, inputs.search, rows, records)
+    texts = check_track(inputs, inputs.search, records)
     assert len(texts) == is_told
     if is_told:
         assert "frame '0001': tracked it leaves 30.00 %" in texts[0]
@@ -107,7 +106,7 @@ def test_who_contradicts_whom(errors, cameras, exchanged):
         read=lambda name, frame: masks[name],
     )  # fmt: skip
     inputs = SimpleNamespace(scene=scene, root_positions=None)
-    record = FrameRecord(True, 0.4, 1.0, ious={"a": 0.1, "b": 0.2, "c": 0.9})
+    record = FrameRecord("0", np.zeros(2), None, 0.4, 1.0, ious={"a": 0.1, "b": 0.2, "c": 0.9})
     found = compare_cameras(inputs, SimpleNamespace(match=match), {"0": record}, None)
     assert len(found) == (cameras is not None)
     if cameras is not None:

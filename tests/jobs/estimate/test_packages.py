@@ -9,7 +9,7 @@ import pytest
 import trimesh
 
 from drake_pose.errors import SettingsError
-from drake_pose.files.options import parse_packages
+from drake_pose.files.settings import parse_packages
 from tests.cli import assert_refused, run_command, run_to_end
 from tests.jobs.scenes import LINK, TinyScene
 

@@ -44,7 +44,7 @@ def recording(tmp_path_factory):
 def moved(estimate, truth):
     """Errors of the arm that moves [degrees]."""
     k = list(estimate.position_names).index("left_upper_arm_z")
-    return np.abs(np.degrees([row.q[k] for row in estimate.rows] - truth[:, k]))
+    return np.abs(np.degrees([one.q[k] for one in estimate.records.values()] - truth[:, k]))
 
 
 def test_a_person_is_followed_from_a_start(recording, out):
@@ -67,7 +67,7 @@ def test_a_person_is_followed_from_a_start(recording, out):
     assert not any("lost" in text for text in found.warnings)
     # The arm is raised by 40 degrees; a pixel is 1.6 cm.
     assert moved(found, truth).max() < 3.0
-    assert all(0.0 < row.error < 0.6 for row in found.rows)
+    assert all(0.0 < one.E_total < 0.6 for one in found.records.values())
     overlays = list((out / "overlay").glob("*/*.png"))
     assert len(overlays) == 4 * FRAMES
 

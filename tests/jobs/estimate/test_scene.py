@@ -81,11 +81,11 @@ def test_error_and_overlay_are_what_drakes_renderer_sees(tiny_scene: TinyScene, 
     result = estimate_scene(tiny_scene.folder, tiny_scene.model, out, settings, replay=False)
     scene = load_scene(tiny_scene.folder)
     renderer = LabelRenderer(load_model(tiny_scene.model), scene.cameras["front"])
-    for row in result.rows:
-        mask, body = scene.read("front", row.frame), renderer.mask(row.q)
+    for frame, row in result.records.items():
+        mask, body = scene.read("front", frame), renderer.mask(row.q)
         shares = [(mask & body).sum(), (mask & ~body).sum(), (body & ~mask).sum()]
-        assert row.error == pytest.approx(sum(shares[1:]) / mask.sum(), abs=0.003)
-        picture = cv2.imread(str(out / "overlay" / "front" / f"{row.frame}.png"))
+        assert row.E_total == pytest.approx(sum(shares[1:]) / mask.sum(), abs=0.003)
+        picture = cv2.imread(str(out / "overlay" / "front" / f"{frame}.png"))
         counts = [
             int((picture[36:-38, :, ::-1] == np.array(colour, np.uint8)).all(axis=2).sum())
             for colour in (AGREEMENT_RGB, MISSING_RGB, EXCESS_RGB)
@@ -107,7 +107,7 @@ def test_nothing_is_written_without_a_folder(tiny_scene: TinyScene) -> None:
     )
     assert result.folder is None
     assert result.found_count == 1
-    np.testing.assert_allclose(result.rows[0].q, tiny_scene.truth["0001"], atol=1e-8)
+    np.testing.assert_allclose(result.records["0001"].q, tiny_scene.truth["0001"], atol=1e-8)
     assert heard == [(0, 1, ""), (1, 1, "0001")]
 
 

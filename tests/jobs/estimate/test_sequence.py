@@ -34,7 +34,9 @@ def test_a_sequence_is_matched_first_tracked_and_matched_after_a_cut(tmp_path: P
     # A matched frame is refined by its contour; a tracked one has asked no search.
     assert how.count(True) >= 9
     assert runs[1:6] == [0] * 5
-    errors = np.degrees([np.abs(row.q - scene.truth[row.frame]).max() for row in result.rows])
+    errors = np.degrees(
+        [np.abs(one.q - scene.truth[frame]).max() for frame, one in result.records.items()]
+    )
     assert errors.max() < 2.5
     assert np.median(errors) < 1.0
 
@@ -47,9 +49,11 @@ def test_every_frame_of_a_sequence_has_intervals_that_hold_the_truth(tmp_path: P
         assert record.family_count is not None, frame
         truth = dict(zip(names, np.degrees(scene.truth[frame]), strict=True))
         assert truth.keys() <= record.joints.keys()
-        known = [(joint, truth[name]) for name, joint in record.joints.items() if joint.determined]
-        inside += [joint.low <= true <= joint.high for joint, true in known]
-        assert all(joint.high - joint.low <= 20.0 for joint, _ in known)
+        known = [
+            (joint, truth[name]) for name, joint in record.joints.items() if joint["determined"]
+        ]
+        inside += [joint["low"] <= true <= joint["high"] for joint, true in known]
+        assert all(joint["high"] - joint["low"] <= 20.0 for joint, _ in known)
     assert len(inside) >= 0.8 * len(names) * len(scene.truth)
     assert np.mean(inside) >= 0.95
 
@@ -64,15 +68,15 @@ def test_a_sequence_need_not_be_tracked(tmp_path: Path) -> None:
         result = estimate_scene(scene.folder, scene.model, settings=settings, replay=False)
         assert all(record.stopped_by != TRACKED for record in result.records.values())
         assert result.summary["settings"]["track"] is track
-        found.append([row.q for row in result.rows])
+        found.append([record.q for record in result.records.values()])
     np.testing.assert_array_equal(found[0], found[1])
 
 
 def test_how_a_scene_is_tracked(tiny_scene: TinyScene) -> None:
     model, scene = load_model(tiny_scene.model), load_scene(tiny_scene.folder)
     for search in (None, RootPlacementSearch.__new__(RootPlacementSearch)):
-        assert Inputs(scene, model, scene.frames, False, search, None).tracking is None
-        tracking = Inputs(scene, model, scene.frames, True, search, None).tracking
+        assert Inputs(scene, model, scene.frames, False, search, None).tracking() is None
+        tracking = Inputs(scene, model, scene.frames, True, search, None).tracking()
         assert tracking is not None
         assert tracking.root_moves is (search is not None)
         assert not tracking.scale_unknown

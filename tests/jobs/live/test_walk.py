@@ -1,5 +1,4 @@
 import json
-import math
 import threading
 import time
 from http.client import HTTPConnection
@@ -11,7 +10,7 @@ import pytest
 from drake_pose.body import bundled_model, load_model
 from drake_pose.errors import OutputError, SettingsError
 from drake_pose.files.folder import write_summary
-from drake_pose.files.records import PoseRow, PoseTable
+from drake_pose.files.records import FrameRecord, PoseTable
 from drake_pose.jobs.live.scene import run_live
 from drake_pose.jobs.live.walk import (
     Player,
@@ -42,7 +41,7 @@ def record(folder, ahead, lost=()):
         q[model.position_index("position_x")] = x
         if index in lost:
             q[:] = np.nan
-        rows.append(PoseRow(f"{index:04d}", q, None, math.nan if index in lost else 0.1, 0.1))
+        rows.append(FrameRecord(f"{index:04d}", q, None, None if index in lost else 0.1, 0.1))
     PoseTable(folder, model.position_names, with_base=False).write(rows)
     write_summary(folder, {"model": model.path.name, "frame_rate_hz": 10.0})
 

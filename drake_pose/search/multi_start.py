@@ -14,7 +14,7 @@ import copy
 import itertools
 import math
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cached_property
 
@@ -42,7 +42,6 @@ from drake_pose.search.settings import (
 )
 from drake_pose.search.views_fit import FittedPose, RobustFamilies, ViewsFit, distinct, refine_best
 from drake_pose.silhouette.areas.outline import Outline
-from drake_pose.silhouette.areas.scoring import draw_mask
 from drake_pose.workers import map_ordered
 
 
@@ -149,33 +148,33 @@ class _MultiStartRun:
         deadline: float,
     ) -> None:
         self._search, self._body, self._fit, self._kinematics = search, body, fit, fit.kinematics
-        self._views, self._clean, self._root_position = views, clean, root_position
-        self._deadline, self._stopped_by = deadline, "end"
+        self._root_position, self._deadline, self._stopped_by = root_position, deadline, "end"
+        self._problem = self._clean = RefinementProblem(search.exact.body, views)
+        if any(one.mask is not view.mask for one, view in zip(clean, views, strict=True)):
+            self._clean = RefinementProblem(search.exact.body, clean)
         self._several = len(clean) > 1
         own = self._settings = search.settings
         self._passes = own.passes[self._several]
         self._survivors = self._passes[-1][1]
         self._done: list[np.ndarray] = []
-        self._steps = 0
 
     def search(self, rounds: int, as_set: bool) -> PoseEstimate:
         """Look for a pose by pixels, else for a robust one, and for all that are as good."""
         tree, exact, own = self._kinematics.tree, self._search.exact, self._search.exact_settings
-        problem, found, first_J = None, None, math.nan
+        problem, found, first_J = self._problem, None, math.nan
         # What specks hide is not exact.
-        if all(one.mask is view.mask for one, view in zip(self._clean, self._views, strict=True)):
-            problem = RefinementProblem(exact.body, self._views)
+        if self._clean is self._problem:
             found = exact.find(problem, self._root_position, self._deadline)
-        exactly = own.exact * problem.border_length if problem is not None else 0.0
+        exactly = own.exact * problem.border_length
         poses: list[FittedPose] = []
         if found is None or found.J > exactly:
             poses, first_J = self._search_robustly(rounds)
-            if problem is not None:
-                found = self._refine_by_pixels(problem, found, poses[0].values)
+            if self._clean is self._problem:
+                found = self._refine_by_pixels(found, poses[0].values)
         begin, pose_set = time.perf_counter(), None
         # Before the families, whose evaluations are not the search's.
         steps = self._fit.evaluations
-        if problem is not None and found is not None and found.J <= exactly:
+        if found is not None and found.J <= exactly:
             if as_set:
                 found, pose_set = exact.families(problem, found, tree)
             values, first_J = found.parameters[:-4], found.first_J
@@ -192,7 +191,7 @@ class _MultiStartRun:
             tree,
             self._kinematics.split(values),
             self._J(values),
-            float(sum(np.count_nonzero(view.mask) for view in self._views)),
+            problem.area,
             stopped_by=self._stopped_by,
             runs=steps,
             first_J=first_J,
@@ -200,18 +199,15 @@ class _MultiStartRun:
             pose_set=pose_set,
         )
 
-    def _refine_by_pixels(
-        self, problem: RefinementProblem, found: ExactPose | None, values: np.ndarray
-    ) -> ExactPose | None:
+    def _refine_by_pixels(self, found: ExactPose | None, values: np.ndarray) -> ExactPose | None:
         """The better of a pose and values (m,) improved by pixels, if it explains the masks.
 
         None where neither does, or the values fit better as they are.
         """
         exact, own, J = self._search.exact, self._search.exact_settings, self._J(values)
-        length = problem.border_length
+        length = self._problem.border_length
         if J <= own.hopeless * length and self._proceed():
-            start = exact.body.parameters(self._kinematics.split(values), self._root_position)
-            other = exact.escape(problem, start, self._deadline)
+            other = exact.escape(self._problem, self._parameters(values), self._deadline)
             found = min((one for one in (found, other) if one), key=lambda one: one.J)
         explained = found is not None and found.J < min(J, own.plausible * length)
         return found if explained else None
@@ -219,7 +215,7 @@ class _MultiStartRun:
     def _search_robustly(self, rounds: int) -> tuple[list[FittedPose], float]:
         """The best poses by robust costs, and the first one's J."""
         own, turns = self._settings, self._kinematics.turns_around
-        self._coarse = CoarseSearch(self._body, self._clean, None if self._proceed() else 1)
+        self._coarse = CoarseSearch(self._body, self._clean.views, None if self._proceed() else 1)
         starts = self._coarse.choose_distinct(self._coarse.find(), own.starts, own.apart)
         pool = refine_best(self._fit, self._values(starts), self._passes, self._proceed)
         first_J = self._J(pool[0].values)
@@ -273,14 +269,15 @@ class _MultiStartRun:
         """
         share = self._settings.limbs[self._several]
         radius, thick, wrongs = max(1.0, share * self._fit.size), np.zeros(2, dtype=np.int64), []
-        for mask, view in self._drawn(values, self._clean):
-            for side, wrong in enumerate((mask & ~view.mask, view.mask & ~mask)):
-                distances = cv2.distanceTransform(wrong.astype(np.uint8), cv2.DIST_L2, 5)
+        views = self._clean.views
+        for wrong, view in zip(self._clean.wrong(self._parameters(values)), views, strict=True):
+            for side, one in enumerate((wrong & ~view.mask, wrong & view.mask)):
+                distances = cv2.distanceTransform(one.astype(np.uint8), cv2.DIST_L2, 5)
                 thick[side] += distances.max() > radius
-            wrongs.append(np.count_nonzero(mask != view.mask))
-        half = 2 * thick >= len(self._clean)
+            wrongs.append(np.count_nonzero(wrong))
+        half = 2 * thick >= len(views)
         is_wrong = half.all() if self._several else thick.any()
-        return [self._clean[k] for k in np.argsort(wrongs)[::-1]] if is_wrong else []
+        return [views[k] for k in np.argsort(wrongs)[::-1]] if is_wrong else []
 
     def _proceed(self) -> bool:
         if time.perf_counter() < self._deadline:
@@ -332,23 +329,14 @@ class _MultiStartRun:
             found.append(self._kinematics.flatten(parts))
         return found
 
+    def _parameters(self, values: np.ndarray) -> np.ndarray:
+        """The parameters (m + 4,) of a refinement by pixels at values (m,)."""
+        own = self._kinematics.split(values)
+        return self._search.exact.body.parameters(own, self._root_position)
+
     def _J(self, values: np.ndarray) -> float:
         """The objective (1) at values (m,), skin included [pixel]."""
-        return float(
-            sum(
-                np.count_nonzero(mask != view.mask)
-                for mask, view in self._drawn(values, self._views)
-            )
-        )
-
-    def _drawn(
-        self, values: np.ndarray, views: Sequence[View]
-    ) -> Iterator[tuple[np.ndarray, View]]:
-        """The body's masks (H, W), skin included, at values (m,), each with its view."""
-        outlines = self._body.sampled.surfaces.at(self._kinematics.split(values))
-        X_WN = self._kinematics.poses(values)
-        for view in views:
-            yield draw_mask(outlines, view.camera.X_CW @ X_WN, view.camera), view
+        return float(self._problem.J(self._parameters(values)))
 
 
 def without_specks(mask: np.ndarray, largest: int = 6, least: float = 0.02) -> np.ndarray:

@@ -48,7 +48,7 @@ def test_the_default_search_is_as_good_as_stored(body: str) -> None:
     stored = np.array([row["E_total"] for row in rows])
     worse = {k: (errors[k], stored[k]) for k in np.flatnonzero(errors > _TENTH * stored + _LEAST)}
     assert len(worse) <= _BY_CHANCE, worse
-    assert np.median(errors) <= _TENTH * np.median(stored) + _LEAST
+    assert np.median(errors) <= min(_TENTH * np.median(stored) + _LEAST, 0.01)
 
 
 @pytest.mark.slow

@@ -99,16 +99,6 @@ class Axes(NamedTuple):
     tip_covariances: Array
 
 
-class _Matched(NamedTuple):
-    """Edge points by the feature they were matched to: offset = slope @ (its two unknowns)."""
-
-    feature: NDArray[np.intp]
-    side: NDArray[np.intp]
-    slope: Array
-    offset: Array
-    weight: Array
-
-
 def match_axes(
     edge: EdgePoints, rough: RoughBody, gate: float, origin: tuple[float, float] = (0.0, 0.0)
 ) -> Axes:
@@ -124,7 +114,7 @@ def match_axes(
     along = along / np.maximum(size, 1e-9)[:, None]
     normal = np.column_stack([-along[:, 1], along[:, 0]])
     matched = _match(edge, rough, gate, along, normal, size)
-    solution, covariance, sides = _solve(matched, count + len(rough.tips), gate)
+    solution, covariance, sides = _solve(*matched, count + len(rough.tips), gate)
     one_sided = (rough.widths > 0) & (sides[:count].min(axis=1) < 0.3 * sides[:count].max(axis=1))
     shift, turn = solution[:count].T
     C = covariance[:count]
@@ -149,8 +139,12 @@ def match_axes(
 
 def _match(
     edge: EdgePoints, rough: RoughBody, gate: float, along: Array, normal: Array, size: Array
-) -> _Matched:
-    """Gives each edge point to the visible side or tip that is nearest, within the gate."""
+) -> tuple[NDArray[np.intp], NDArray[np.intp], Array, Array, Array]:
+    """Gives each edge point to the visible side or tip that is nearest, within the gate.
+
+    Of the n points that have one: the feature (n,), its side (n,), slope (n, 2) and offset (n,),
+    where offset = slope @ (the feature's two unknowns), and weight (n,).
+    """
     line, side = np.nonzero(rough.sides)
     sign, uv = 1.0 - 2.0 * side, edge.uv
     relative = uv - rough.ends[line, :1]
@@ -191,7 +185,7 @@ def _match(
         slope = np.where(is_tip[:, None], radial[t, points], on_line)
         offset = np.where(is_tip, beyond[t, points], offset)
         feature = np.where(is_tip, len(rough.ends) + t, feature)
-    return _Matched(feature, side[k], slope, offset, edge.lengths[points])
+    return feature, side[k], slope, offset, edge.lengths[points]
 
 
 def _is_empty(drawn: NDArray[np.uint8] | Mask, uv: Array) -> Mask:
@@ -201,9 +195,16 @@ def _is_empty(drawn: NDArray[np.uint8] | Mask, uv: Array) -> Mask:
     return np.asarray(drawn[v, u] == 0)
 
 
-def _solve(matched: _Matched, count: int, gate: float) -> tuple[Array, Array, Array]:
-    """Each feature's unknowns (F, 2), their covariance (F, 2, 2), weight of its sides (F, 2)."""
-    f, g, e = matched.feature, matched.slope, matched.offset
+def _solve(
+    f: NDArray[np.intp],
+    side: NDArray[np.intp],
+    g: Array,
+    e: Array,
+    weight: Array,
+    count: int,
+    gate: float,
+) -> tuple[Array, Array, Array]:
+    """Of each feature, from ``_match``: its unknowns (F, 2), their covariance, its sides' weights."""
 
     def total(values: Array) -> Array:
         return np.asarray(np.bincount(f, values, count), dtype=np.float64)
@@ -212,7 +213,7 @@ def _solve(matched: _Matched, count: int, gate: float) -> tuple[Array, Array, Ar
     for k in range(MATCHING.rounds):
         residual = e - np.einsum("nk,nk->n", g, solution[f])
         # Geman and McClure's weight, of a scale that shrinks to a pixel.
-        w = matched.weight / (1.0 + (residual / max(2.0, gate / 3.0**k)) ** 2) ** 2
+        w = weight / (1.0 + (residual / max(2.0, gate / 3.0**k)) ** 2) ** 2
         N = np.empty((count, 2, 2))
         N[:, 0, 0], N[:, 1, 1] = total(w * g[:, 0] ** 2) + 1e-9, total(w * g[:, 1] ** 2) + 1e-9
         N[:, 0, 1] = N[:, 1, 0] = total(w * g[:, 0] * g[:, 1])
@@ -221,7 +222,7 @@ def _solve(matched: _Matched, count: int, gate: float) -> tuple[Array, Array, Ar
     residual = e - np.einsum("nk,nk->n", g, solution[f])
     variance = total(w * residual**2) / np.maximum(total(w), 1e-9)
     noise = np.maximum(variance, MATCHING.edge_deviation**2) * MATCHING.correlation
-    sides = np.column_stack([total(w * (matched.side == side)) for side in range(2)])
+    sides = np.column_stack([total(w * (side == one)) for one in range(2)])
     return solution, noise[:, None, None] * np.linalg.inv(N), sides
 
 

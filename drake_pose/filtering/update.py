@@ -20,30 +20,6 @@ from drake_pose.filtering.truncated_normal import Truncated, unlimited
 Truncate = Callable[[Belief, Array], Truncated]
 
 
-@dataclass(frozen=True)
-class IterationSettings:
-    """How an update is iterated.
-
-    A first guess far off is approached with more noise than there is, cooled from step to step:
-    narrow curved valleys, such as that of a known scale, would stop a descent.
-
-    Args:
-        good_fit: squared residual per measurement, in variances, above which noise is added.
-        cooling: factor by which the added noise falls from step to step.
-        settled, settled_with_limits: steps below end the iteration [deviations].
-        full_steps: later steps are halved, since tangents may point to and fro.
-    """
-
-    good_fit: float = 9.0
-    cooling: float = 6.0
-    settled: float = 0.01
-    settled_with_limits: float = 0.3
-    full_steps: int = 8
-
-
-ITERATION = IterationSettings()
-
-
 class ObservationModel(Protocol):
     """What a filter must know about its measurements: (7)."""
 
@@ -181,7 +157,11 @@ def update(
     """
     x, temperature = prediction.mean if start is None else start, 1.0
     sites = np.zeros((0, 2)) if sites is None else sites
-    settled = ITERATION.settled if truncate is None else ITERATION.settled_with_limits
+    # A first guess far off is approached with more noise than there is, cooled from step to step:
+    # narrow curved valleys, such as that of a known scale, would stop a descent. Steps below
+    # ``settled`` deviations end it; later ones are halved, as tangents may point to and fro.
+    good_fit, cooling, full_steps = 9.0, 6.0, 8
+    settled = 0.01 if truncate is None else 0.3
     if not np.isfinite(seen.y).any():
         iterations = 1
     P = prediction.covariance
@@ -195,7 +175,7 @@ def update(
         innovation = residual + H @ (x - prediction.mean)
         if made == 0 and iterations > 1 and tempered:
             misfit = float(residual @ np.linalg.solve(plain, residual)) / max(count, 1)
-            temperature = max(1.0, misfit / ITERATION.good_fit)
+            temperature = max(1.0, misfit / good_fit)
         belief, log_likelihood, distance = prediction, 0.0, 0.0
         if count:
             noise, HP = temperature * plain, H @ P
@@ -220,8 +200,8 @@ def update(
         size = np.abs(step / np.maximum(belief.deviations(), 1e-12)).max()
         if temperature == 1.0 and size < settled:
             break
-        x = x + (step if made < ITERATION.full_steps else 0.5 * step)
-        temperature = max(1.0, temperature / ITERATION.cooling)
+        x = x + (step if made < full_steps else 0.5 * step)
+        temperature = max(1.0, temperature / cooling)
     return Updated(belief, truncated, log_likelihood, distance, count)
 
 

@@ -204,7 +204,7 @@ def _solve(
     count: int,
     gate: float,
 ) -> tuple[Array, Array, Array]:
-    """Of each feature, from ``_match``: its unknowns (F, 2), their covariance, its sides' weights."""
+    """Each feature's unknowns (F, 2), covariance (F, 2, 2), sides' weights (F, 2); see ``_match``."""
 
     def total(values: Array) -> Array:
         return np.asarray(np.bincount(f, values, count), dtype=np.float64)

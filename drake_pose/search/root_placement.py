@@ -35,18 +35,9 @@ from drake_pose.camera.models import Camera, ParallelCamera
 from drake_pose.errors import SettingsError
 from drake_pose.search.beam_search import BeamSearch, grow
 from drake_pose.search.estimates import PoseEstimate, View
-from drake_pose.search.partial_poses import (
-    Pictures,
-    PoseStore,
-    coarsen,
-)
+from drake_pose.search.partial_poses import Pictures, PoseStore, coarsen
 from drake_pose.search.parts import NeighbourhoodSearch, PartSearch
-from drake_pose.search.refinement import (
-    Pass,
-    RefinementBody,
-    RefinementProblem,
-    descend,
-)
+from drake_pose.search.refinement import Pass, RefinementBody, RefinementProblem, descend
 from drake_pose.search.sampled_body import SampledBody
 from drake_pose.search.settings import PASSES, BeamSearchSettings, RootPlacementSettings, Stage
 from drake_pose.silhouette.areas.scoring import score_bodies

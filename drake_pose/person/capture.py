@@ -200,8 +200,10 @@ class _Capture:
             for frame in frames:
                 follow(None, frame, frame)
             return found
-        begin = min(known) if known else None
-        begin, start = self._best_start(frames) if begin is None else (begin, known[begin])
+        if known:
+            begin, start = min(known), known[min(known)]
+        else:
+            begin, start = self._best_start(frames)
         place = list(frames).index(begin)
         for way in (frames[place:], frames[:place][::-1]):
             state: TrackState | None = start

@@ -276,35 +276,27 @@ class PersonPoseTracker:
         """
         fitted, shown = self._fitted(last, colours), 1.0
         if own is not None:
-            fitted, shown = self._recoloured(fitted, colours, own)
+
+            def shows(values: Array) -> Array:
+                seen = zip(colours.cameras, colours.pictures, strict=True)
+                return own.shown(self.fit.outlines, self.fit.kinematics.poses(values), seen)
+
+            enough, shares = self.settings.part_lost_below, shows(fitted.values)
+            for limb in self.plan.limbs.values():
+                worst = float(np.nanmin([*shares[limb.nodes], 1.0]))
+                if worst < enough:
+                    placed = self._search.placed_by_colour(fitted.values, limb, colours, own.known)
+                    told = [(one, np.nan_to_num(shows(one.values))) for one in placed]
+                    right = [one for one in told if one[1][limb.nodes].min() >= enough]
+                    if right:
+                        fitted, shares = max(right, key=lambda one: one[0].closeness)
+                        worst = 1.0
+                shown = min(shown, worst)
         step = fitted.values - last.values
         lengths, fitting = fitted.sums[:-1, [Sum.COMPARED, Sum.FITTING]].T
-        told = lengths >= self.settings.telling
-        worst = np.min(fitting / np.maximum(lengths, 1e-9), where=told, initial=shown)
-        return TrackState(fitted.values, step, fitted.inlier_ratio, last.usual, worst=float(worst))
-
-    def _recoloured(
-        self, fitted: PoseFit, colours: ColourViews, own: OwnColours
-    ) -> tuple[PoseFit, float]:
-        """A fit whose limbs show their own colours, where that is found; what the worst shows."""
-        enough = self.settings.part_lost_below
-
-        def shown(values: Array) -> Array:
-            seen = zip(colours.cameras, colours.pictures, strict=True)
-            return own.shown(self.fit.outlines, self.fit.kinematics.poses(values), seen)
-
-        shares, least = shown(fitted.values), 1.0
-        for limb in self.plan.limbs.values():
-            worst = float(np.nanmin([*shares[limb.nodes], 1.0]))
-            if worst < enough:
-                placed = self._search.placed_by_colour(fitted.values, limb, colours, own.known)
-                told = [(one, np.nan_to_num(shown(one.values))) for one in placed]
-                right = [one for one in told if one[1][limb.nodes].min() >= enough]
-                if right:
-                    fitted, shares = max(right, key=lambda one: one[0].closeness)
-                    worst = 1.0
-            least = min(least, worst)
-        return fitted, least
+        seen_enough = lengths >= self.settings.telling
+        least = np.min(fitting / np.maximum(lengths, 1e-9), where=seen_enough, initial=shown)
+        return TrackState(fitted.values, step, fitted.inlier_ratio, last.usual, worst=float(least))
 
     def distance_by_colour(self, values: Array, colours: ColourViews) -> float:
         """RMS distance [pixel] of the contour at values (m,) to the colours'; nan: none is seen."""

@@ -152,7 +152,15 @@ def fit_shape(fit: ContourFit, frames: Frames, poses: Array) -> PersonShape:
     values[is_shape] = poses[:, is_shape] = lengths
     poses[:, ~is_shape] = found.own
     prior = np.eye(count) / _LENGTH**2 + _sides_information(names, 0)
-    covariance = np.linalg.inv(prior + _frame_information(worn, frames, poses, is_shape))
+    # Mean information of a frame: a surface's error is the same in all.
+    own, total = np.flatnonzero(~is_shape), np.zeros((count, count))
+    for (seers, edges), values_then in zip(frames, poses, strict=True):
+        compared = worn.compare(pack_views(seers, edges), values_then, _ROUNDS[-1])
+        H = pose_uncertainty(worn, compared).information
+        cross = H[np.ix_(own, is_shape)]
+        follow = np.linalg.solve(H[np.ix_(own, own)] + np.eye(len(own)) / _POSE**2, cross)
+        total += (H[np.ix_(is_shape, is_shape)] - cross.T @ follow) / len(frames)
+    covariance = np.linalg.inv(prior + total)
     known = KnownShape(
         dict(zip(names, lengths.tolist(), strict=True)),
         dict(zip(parts, widths.tolist(), strict=True)),
@@ -170,17 +178,3 @@ def _sides_information(names: Sequence[str], girths: int) -> Array:
             row[k], row[list(names).index(other)] = 1.0, -1.0
             information += np.outer(row, row) / _SIDE**2
     return information
-
-
-def _frame_information(fit: ContourFit, frames: Frames, poses: Array, is_shape: Mask) -> Array:
-    """(h, h) mean information of a frame about lengths: a surface's error is the same in all."""
-    own = np.flatnonzero(~is_shape)
-    prior = np.eye(len(own)) / _POSE**2
-    total = np.zeros((int(is_shape.sum()), int(is_shape.sum())))
-    for (cameras, edges), pose in zip(frames, poses, strict=True):
-        compared = fit.compare(pack_views(cameras, edges), pose, _ROUNDS[-1])
-        H = pose_uncertainty(fit, compared).information
-        cross = H[np.ix_(own, is_shape)]
-        follow = np.linalg.solve(H[np.ix_(own, own)] + prior, cross)
-        total += (H[np.ix_(is_shape, is_shape)] - cross.T @ follow) / len(frames)
-    return total

@@ -242,47 +242,24 @@ def estimate_pose(
         found = skeleton.limb_points(posed, name) + off
         found[2] = end
         if search:
-            found[1] = search_limb(
-                limb, R_WT, found[0], end, outward, found[1], last_angles, cameras, regions
-            )
+            # Where elbow or knee agree best with the silhouettes; a knee is only where the hip can
+            # turn it. Of equally good places the one nearest to inverse kinematics's is taken.
+            low, high = SETTINGS.knee_range if limb.is_leg else SETTINGS.elbow_range
+            degrees = np.arange(low, high + 0.5 * SETTINGS.circle_step, SETTINGS.circle_step)
+            middles = joint_circle(limb, found[0], end, outward, degrees)
+            if limb.is_leg:
+                _, beyond = place_limb(limb, R_WT, found[0], middles, end, last_angles)
+                middles = middles[beyond <= np.maximum(SETTINGS.hip_tolerance, beyond.min())]
+            samples = rectangles(found[0], middles, end, limb.half_widths)
+            scores = correlation(samples, cameras, regions)
+            best = middles[scores >= scores.max() - _TINY]
+            found[1] = best[np.argmin(np.linalg.norm(best - found[1], axis=1))]
         angles, _ = place_limb(limb, R_aimed, own_root, found[1:2], found[2], last_angles)
         aimed[limb.positions] = np.clip(angles[0], limb.lower, limb.upper)
         # Where limits forbid that, the hand or foot counts more than the elbow or knee.
         aimed = move_limb(skeleton, aimed, name, found[2])
         limbs[name] = found
     return skeleton.clip(aimed), limbs
-
-
-def search_limb(
-    limb: Limb,
-    R_WT: Array,
-    root: Array,
-    end: Array,
-    outward: Array,
-    near: Array,
-    last: Array,
-    cameras: Sequence[Camera],
-    regions: Sequence[Mask],
-) -> Array:
-    """The place (3,) of an elbow or knee that agrees best with the silhouettes [m].
-
-    Args:
-        R_WT: (3, 3) the trunk's axes in the world: a knee is only where the hip can turn it.
-        root, end: (3,) shoulder and hand, or hip and foot [m].
-        outward: (3,) from the neck's base to the shoulder, or from the waist to the hip.
-        near: (3,) of equally good places, the one nearest to this is taken: inverse kinematics's.
-        last: (4,) the limb's angles in the last frame [rad].
-        regions: (H, W) the person in each camera's picture.
-    """
-    low, high = SETTINGS.knee_range if limb.is_leg else SETTINGS.elbow_range
-    degrees = np.arange(low, high + 0.5 * SETTINGS.circle_step, SETTINGS.circle_step)
-    middles = joint_circle(limb, root, end, outward, degrees)
-    if limb.is_leg:
-        _, beyond = place_limb(limb, R_WT, root, middles, end, last)
-        middles = middles[beyond <= np.maximum(SETTINGS.hip_tolerance, beyond.min())]
-    scores = correlation(rectangles(root, middles, end, limb.half_widths), cameras, regions)
-    best = np.flatnonzero(scores >= scores.max() - _TINY)
-    return middles[best[np.argmin(np.linalg.norm(middles[best] - near, axis=1))]]
 
 
 def joint_circle(limb: Limb, root: Array, end: Array, outward: Array, degrees: Array) -> Array:

@@ -283,6 +283,20 @@ class TestOthers:
         assert not is_strangers(away, "small", {0: 0}, [])
         assert not is_strangers(away, "large", {}, [])
 
+    @pytest.mark.parametrize("side", [None, 0, 1, 2, 3], ids=lambda k: f"side {k}")
+    def test_one_figure_is_two_persons_where_its_box_is_about_both(self, side: int | None) -> None:
+        """A hidden person's middle inside the box, or a pixel outside of one of its sides."""
+        camera = circle_of_cameras(2, size=(160, 120), face_camera=False)["camera_0"]
+        me = Person(np.array([0.0, 0.0, 1.0]), {0: 0}, 100.0)
+        hidden = Person(np.array([-0.4, 0.0, 1.1]), {}, 90.0)
+        uv = camera.project(hidden.place[None])[0][0]
+        box = np.array([*(uv - 9.0), *(uv + 9.0)])
+        if side is not None:
+            box[side] = np.tile(uv, 2)[side] + (1.0 if side < 2 else -1.0)
+        figure = Figure(camera.project(me.place[None])[0][0], 100.0, box)
+        found = sort_figures({"0": camera}, {"0": (figure,)}, [me, hidden], me)
+        assert found == {"0": ((), side is None)}
+
     @pytest.mark.parametrize(("gap", "far"), [(1, 0.39), (1, 0.41), (3, 0.59), (3, 0.61)])
     def test_who_is_hidden_may_have_gone_further_meanwhile(self, gap: int, far: float) -> None:
         """Four tenths of a metre from frame to frame, and one more for each that is missed."""

@@ -20,10 +20,6 @@ from drake_pose.camera.picture_files import decode_colours, import_reader
 from drake_pose.errors import DrakePoseError, SceneError
 
 BAGS = (".bag", ".mcap", ".db3")
-_IMAGE, _COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
-_JOINTS, _INFO = "sensor_msgs/msg/JointState", "sensor_msgs/msg/CameraInfo"
-_FRAMES, _STATIC = "tf2_msgs/msg/TFMessage", "/tf_static"
-_NANO = 1e-9
 # Bytes of a pixel, and how OpenCV turns it to red, green, blue.
 _ENCODINGS: dict[str, tuple[int, int | None]] = {
     "rgb8": (3, None),
@@ -36,9 +32,6 @@ _ENCODINGS: dict[str, tuple[int, int | None]] = {
     "bayer_gbrg8": (1, cv2.COLOR_BayerGBRG2RGB),
     "bayer_grbg8": (1, cv2.COLOR_BayerGRBG2RGB),
 }
-_DEPTHS = ("16uc1", "32fc1", "mono16", "compresseddepth")
-# Whether a model of distortion is OpenCV's fisheye.
-_LENSES = {"plumb_bob": False, "rational_polynomial": False, "equidistant": True, "fisheye": True}
 
 # Of each message its time in the header and in the bag [ns], and what it holds.
 _Row = tuple[int, int, Any]
@@ -84,38 +77,43 @@ def _scan(path: Path) -> tuple[Any, Any, Any, Any, Any]:
     """
     pictures, states = defaultdict[str, list[_Row]](list), defaultdict[Any, list[_Row]](list)
     infos, parents, left_out = {}, {}, {}
-    used = {_IMAGE, _COMPRESSED, _JOINTS, _INFO}
+    sensors = "Image", "CompressedImage", "JointState", "CameraInfo"
     with _faults(path), _unopened(path) as reader:
         wanted = [
             one
             for one in reader.connections
-            if one.msgtype in used or (one.msgtype == _FRAMES and one.topic.endswith(_STATIC))
+            if one.msgtype in {f"sensor_msgs/msg/{name}" for name in sensors}
+            or (one.msgtype == "tf2_msgs/msg/TFMessage" and one.topic.endswith("/tf_static"))
         ]
         kinds = {one.topic: one.msgtype for one in reader.connections}
         for one, log_time, data in reader.messages(wanted) if wanted else ():
-            topic, kind, message = one.topic, one.msgtype, reader.deserialize(data, one.msgtype)
-            if kind == _FRAMES:
+            topic, kind = one.topic, one.msgtype.rpartition("/")[2]
+            message = reader.deserialize(data, one.msgtype)
+            if kind == "TFMessage":
                 for frame in message.transforms:
+                    X, shift, q = np.eye(4), frame.transform.translation, frame.transform.rotation
+                    X[:3, :3] = Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix()
+                    X[:3, 3] = shift.x, shift.y, shift.z
                     parent = frame.header.frame_id.strip("/")
-                    parents[frame.child_frame_id.strip("/")] = parent, _pose(frame.transform)
+                    parents[frame.child_frame_id.strip("/")] = parent, X
                 continue
             stamp = message.header.stamp
             stamps = stamp.sec * 10**9 + stamp.nanosec, log_time
-            if kind == _INFO:
+            if kind == "CameraInfo":
                 infos[topic] = message
-            elif kind != _JOINTS:
-                coding = (message.encoding if kind == _IMAGE else message.format).lower()
-                if any(depth in coding for depth in _DEPTHS):
+            elif kind != "JointState":
+                coding = (message.encoding if kind == "Image" else message.format).lower()
+                if any(one in coding for one in ("16uc1", "32fc1", "mono16", "compresseddepth")):
                     left_out[topic] = "depths"
-                elif kind == _IMAGE and coding not in _ENCODINGS:
+                elif kind == "Image" and coding not in _ENCODINGS:
                     left_out[topic] = f"{coding} is not one of {', '.join(_ENCODINGS)}"
                 else:
                     pictures[topic].append((*stamps, message.header.frame_id.strip("/")))
             elif len(message.name) and len(message.position) == len(message.name):
                 states[topic, tuple(message.name)].append((*stamps, np.array(message.position)))
     if not pictures:
-        listed = ", ".join(f"{topic} ({kind})" for topic, kind in (kinds | left_out).items())
-        raise SceneError(f"{path}: has no pictures of cameras; its topics are: {listed or 'none'}")
+        found = ", ".join(f"{topic} ({kind})" for topic, kind in (kinds | left_out).items())
+        raise SceneError(f"{path}: has no pictures of cameras; its topics are: {found or 'none'}")
     return pictures, states, infos, parents, left_out
 
 
@@ -154,9 +152,10 @@ def _seconds(rows: Sequence[_Row], what: str, warnings: list[str]) -> tuple[Arra
     clock = 0 if stamps[:, 0].any() else 1
     if clock:
         warnings.append(f"{what}: headers without time stamps: the times of recording are used")
-    kept, late = ascending(stamps[:, clock] * _NANO, what)
+    times = 1e-9 * stamps[:, clock]
+    kept, late = ascending(times, what)
     warnings += late
-    return stamps[kept, clock] * _NANO, kept
+    return times[kept], kept
 
 
 def _merge(
@@ -182,14 +181,6 @@ def _merge(
     ordered = tuple(dict.fromkeys(name for _, names in groups for name in names))
     positions = np.column_stack([columns[name] for name in ordered])
     return JointLog(ordered, base.times, positions), warnings
-
-
-def _pose(transform: Any) -> Array:
-    """(4, 4) of a ROS transform."""
-    X, p, q = np.eye(4), transform.translation, transform.rotation
-    X[:3, :3] = Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix()
-    X[:3, 3] = p.x, p.y, p.z
-    return X
 
 
 def _mount(parents: Mapping[str, tuple[str, Array]], frame: str) -> tuple[str | None, Array]:
@@ -239,13 +230,19 @@ def _lens(info: Any, *, is_rectified: bool, where: str) -> Lens:
     size, K, D, P = (info.width, info.height), *(_field(info, one) for one in ("k", "d", "p"))
     if is_rectified and P.any():
         return Lens.from_numbers(size, [P[0], P[5], P[2], P[6], *np.zeros(4)])
-    is_fisheye = _LENSES.get(info.distortion_model)
+    models = {
+        "plumb_bob": False,
+        "rational_polynomial": False,
+        "equidistant": True,
+        "fisheye": True,
+    }
+    is_fisheye = models.get(info.distortion_model)
     if is_rectified or not D.any():
         D, is_fisheye = np.zeros(4), False
     if is_fisheye is None:
         raise SceneError(
             f"{where}: its distortion is of the kind '{info.distortion_model}', but these are "
-            f"known: {', '.join(_LENSES)}; record rectified pictures"
+            f"known: {', '.join(models)}; record rectified pictures"
         )
     D = D[:4] if is_fisheye else D
     return replace(Lens.from_numbers(size, [K[0], K[4], K[2], K[5], *D]), fisheye=is_fisheye)
@@ -274,18 +271,16 @@ class _TopicPictures:
                 if log_time == wanted:
                     self._next = k + 1
                     message = self._reader.deserialize(data, one.msgtype)
-                    if one.msgtype == _COMPRESSED:
+                    if one.msgtype.endswith("CompressedImage"):
                         return decode_colours(bytes(message.data), Path(where), SceneError)
-                    return _decode(message, where)
+                    size, how = _ENCODINGS[message.encoding.lower()]
+                    height, width, step = message.height, message.width, message.step
+                    if not (len(message.data) >= height * step > 0 and step >= width * size):
+                        raise SceneError(
+                            f"{where}: has fewer bytes than {width} x {height} pixels need"
+                        )
+                    rows = np.frombuffer(message.data, np.uint8, height * step)
+                    used = rows.reshape(height, step)[:, : width * size]
+                    used = used.reshape(height, width, size)
+                    return np.ascontiguousarray(used if how is None else cv2.cvtColor(used, how))
         raise SceneError(f"{where}: is not where the bag's index says; reindex the bag")
-
-
-def _decode(message: Any, where: str) -> Picture:
-    """The picture of an Image."""
-    size, how = _ENCODINGS[message.encoding.lower()]
-    height, width, step = message.height, message.width, message.step
-    if not (len(message.data) >= height * step > 0 and step >= width * size):
-        raise SceneError(f"{where}: has fewer bytes than {width} x {height} pixels need")
-    rows = np.frombuffer(message.data, np.uint8, height * step).reshape(height, step)
-    picture = rows[:, : width * size].reshape(height, width, size)
-    return np.ascontiguousarray(picture if how is None else cv2.cvtColor(picture, how))

@@ -44,14 +44,6 @@ _OPTIONAL = {
     "parallel": ("X_WC", "projection", "pixel_centers"),
 }
 _COEFFICIENTS = (4, 5, 8, 12, 14)
-# What both have; what only a CameraConfig has; and the name that Drake gives one without.
-_SHARED = {*_COMMON, "clipping_near"}
-_CONFIG_ALONE = {
-    *("focal", "X_PB", "X_BC", "X_BD", "name", "fps", "rgb", "depth", "label", "show_rgb"),
-    *("clipping_far", "z_near", "z_far", "renderer_name", "renderer_class", "background"),
-    *("capture_offset", "output_delay", "do_compress", "lcm_bus"),
-}
-_DRAKES_NAME = "preview_camera"
 
 
 def load_cameras(path: str | Path) -> dict[str, Camera]:
@@ -170,7 +162,8 @@ def dump_cameras(
 def _find_configs(content: dict[Any, Any], path: Path) -> dict[str, Any] | None:
     """Returns the CameraConfigs by name, of which nothing is checked; None: the file is ours."""
     if _is_config(content):
-        return {str(content.get("name", _DRAKES_NAME)): content}
+        # Drake calls one without a name so.
+        return {str(content.get("name", "preview_camera")): content}
     scenarios = (
         {"": content}
         if _is_scenario(content)
@@ -201,9 +194,13 @@ def _is_scenario(entry: Any) -> bool:
 
 def _is_config(entry: dict[Any, Any]) -> bool:
     """Whether an entry has fields of a CameraConfig, and none that only our cameras have."""
-    fields = set(entry)
+    theirs = {
+        *("focal", "X_PB", "X_BC", "X_BD", "name", "fps", "rgb", "depth", "label", "show_rgb"),
+        *("clipping_far", "z_near", "z_far", "renderer_name", "renderer_class", "background"),
+        *("capture_offset", "output_delay", "do_compress", "lcm_bus"),
+    }
     ours = {field for kind in _REQUIRED for field in (*_REQUIRED[kind], *_OPTIONAL[kind])}
-    return bool(fields & _CONFIG_ALONE) and not fields & (ours - _SHARED)
+    return bool(theirs & set(entry)) and not set(entry) & (ours - {*_COMMON, "clipping_near"})
 
 
 def _check_name(key: Any, path: Path) -> str:

@@ -25,17 +25,6 @@ from pydrake.systems.sensors import CameraConfig, CameraInfo
 from drake_pose.camera.models import HALF_PIXEL, Camera, PinholeCamera, camera_tuple, write_file
 from drake_pose.errors import CameraError
 
-# What yaml_load_typed raises, and some values of CameraConfig end a process that does not ask.
-_BAD_CONFIG = (
-    RuntimeError, ValueError, TypeError, KeyError, AttributeError, AssertionError, SystemExit
-)  # fmt: skip
-
-_FARTHEST = 1000.0
-_PARALLEL_DEPTHS = (-2.0, 2.0)
-# Nearer, the rays are less parallel; farther, the renderer's 32 bit floats run out (measured: the
-# masks differ least from 30 to 100 km, labels of touching links suffer in proportion).
-_TELE_DISTANCE = 3.0e4
-
 
 def camera_to_drake(
     camera: Camera, *, renderer_name: str, depth_range: tuple[float, float] | None = None
@@ -55,7 +44,7 @@ def camera_to_drake(
     """
     X_CT = RigidTransform()
     if isinstance(camera, PinholeCamera):
-        near, far = depth_range or (camera.near, max(_FARTHEST, 2.0 * camera.near))
+        near, far = depth_range or (camera.near, max(1000.0, 2.0 * camera.near))
         center_x, center_y = camera.center_x + HALF_PIXEL, camera.center_y + HALF_PIXEL
         if not (0.0 < center_x < camera.width and 0.0 < center_y < camera.height):
             raise CameraError(
@@ -65,9 +54,11 @@ def camera_to_drake(
             )
         numbers = camera.focal_x, camera.focal_y, center_x, center_y
     else:
-        nearest, farthest = depth_range or _PARALLEL_DEPTHS
+        nearest, farthest = depth_range or (-2.0, 2.0)
         middle, half = 0.5 * (nearest + farthest), 0.5 * (farthest - nearest)
-        distance = max(_TELE_DISTANCE, 10.0 * half)
+        # Nearer, the rays are less parallel; farther, the renderer's 32 bit floats run out
+        # (measured: the masks differ least from 30 to 100 km, touching links in proportion).
+        distance = max(3.0e4, 10.0 * half)
         near, far = distance - half, distance + half
         focal = camera.pixels_per_metre * distance
         # Drake's principal point must lie inside the picture: stand behind the picture's middle.
@@ -192,7 +183,11 @@ def read_configs(entries: Mapping[str, Any], path: Path) -> dict[str, PinholeCam
             camera = camera_from_config(config)
         except CameraError as error:
             raise CameraError(f"{path}: {error}") from error
-        except (*_BAD_CONFIG, yaml.YAMLError) as error:
+        # What yaml_load_typed raises; some values of CameraConfig end a process that does not ask.
+        except (
+            RuntimeError, ValueError, TypeError, KeyError, AttributeError, AssertionError,
+            SystemExit, yaml.YAMLError,
+        ) as error:  # fmt: skip
             # Drake asserts that a field which has fields is a mapping, and says its value alone.
             bare = "expected NAME: VALUE fields, not " if isinstance(error, AssertionError) else ""
             why = " ".join(str(error).split())

@@ -13,13 +13,6 @@ from drake_pose.camera.models import Lens, PinholeCamera
 from drake_pose.camera.picture_files import frame_key
 from drake_pose.errors import SceneError, UnknownNameError
 
-# A log of which more rows run backwards or stand still than this share has no usable clock.
-_MOST_LATE = 0.1
-# A step is a gap from so many times the usual one on.
-_GAP = 1.5
-# Pictures are of a part of the log's time where they last less than this share of it.
-_SHORT = 0.75
-
 
 @dataclass(frozen=True, eq=False)
 class JointLog:
@@ -158,8 +151,10 @@ class Episode:
         return self.cameras[name]
 
 
-def ascending(times: Array, what: str) -> tuple[Indices, list[str]]:
+def ascending(times: Array, what: str, most: float = 0.1) -> tuple[Indices, list[str]]:
     """Which time stamps (n,) come after all before them, and a warning of the others.
+
+    most: fraction of others above which the clock cannot be trusted.
 
     Raises SceneError: there is none, or too many others, so that the clock cannot be trusted.
     """
@@ -175,7 +170,7 @@ def ascending(times: Array, what: str) -> tuple[Indices, list[str]]:
         f"{what}: number {late[0]} (counted from 0) has the time {times[late[0]]:.6f} s, which "
         f"does not come after {before[late[0]]:.6f} s before it"
     )
-    if len(late) > _MOST_LATE * len(stamps):
+    if len(late) > most * len(stamps):
         raise SceneError(
             f"{text}, nor do {len(late)} of {len(stamps)} in all: the clock runs backwards or "
             "stands still; put right the times, or cut the recording where it was set"
@@ -183,16 +178,16 @@ def ascending(times: Array, what: str) -> tuple[Indices, list[str]]:
     return np.flatnonzero(is_later), [f"{text}; {len(late)} of {len(stamps)} such are left out"]
 
 
-def _gaps(times: Array, what: str, one: str) -> list[str]:
-    """Steps in time that are longer than usual."""
+def _gaps(times: Array, what: str, one: str, gap: float = 1.5) -> list[str]:
+    """Steps in time that are longer than the usual one times `gap`."""
     if len(times) < 2:
         return [f"{what}: has one {one} only"]
     steps = np.diff(times)
     usual, k = float(np.median(steps)), int(np.argmax(steps))
-    if not steps[k] > _GAP * usual:
+    if not steps[k] > gap * usual:
         return []
     return [
-        f"{what}: {(steps > _GAP * usual).sum()} of {len(steps)} steps are longer than {_GAP:g} "
+        f"{what}: {(steps > gap * usual).sum()} of {len(steps)} steps are longer than {gap:g} "
         f"times the usual {usual:.4g} s, the longest {steps[k]:.4g} s after {one} {k}: {one}s were "
         "dropped, or their rate varies"
     ]
@@ -221,7 +216,7 @@ def _compare(path: Path, camera: EpisodeCamera, joints: JointLog) -> list[str]:
     span = f"({first:.3f} to {last:.3f} s; the log's are {begin:.3f} to {end:.3f} s)"
     if outside == count:
         return [f"{where}: its clock is not the joint log's: no picture is of its time {span}"]
-    is_short = last - first < _SHORT * (end - begin)
+    is_short = last - first < 0.75 * (end - begin)
     text = f"{where}: {outside} of {count} pictures are before or after the log {span}"
     short = f"{where}: its pictures end, or begin, while the log goes on {span}"
     return [text] if outside else [short] if is_short else []

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from drake_pose.arrays import Array, Picture
+from drake_pose.arrays import Picture
 from drake_pose.camera.bags import BAGS, open_bag
 from drake_pose.camera.camera_files import CameraFile, load_camera_file
 from drake_pose.camera.data_sets import INFO, TRAJECTORY, open_droid, open_lerobot
@@ -126,7 +126,14 @@ def _of_images(
         clock = JointLog(("time",), None, joints.times[:, None], joints.frames)
         times = clock.of_frames(frames)[:, 0]
     elif scene.is_file():
-        times = _by_rate(scene, len(frames))
+        content = read_yaml(scene, SceneError)
+        rate = content.get("frame_rate_hz") if isinstance(content, dict) else None
+        try:
+            if rate is not None:
+                rate = check_number(rate, "frame_rate_hz", str(scene), positive=True)
+                times = np.arange(len(frames)) / rate
+        except CameraError as error:
+            raise SceneError(str(error)) from None
     pictures = [files[frame] for frame in frames]
     height, width = read_picture(pictures[0], SceneError).shape[:2]
 
@@ -134,18 +141,6 @@ def _of_images(
         return read_picture(pictures[k], SceneError)
 
     return EpisodeCamera(name, width, height, times, None, None, recorded, frames), warnings
-
-
-def _by_rate(scene: Path, count: int) -> Array:
-    """The times of a sequence's frames by its rate [s]; nan where it has none."""
-    content = read_yaml(scene, SceneError)
-    rate = content.get("frame_rate_hz") if isinstance(content, dict) else None
-    if rate is None:
-        return np.full(count, np.nan)
-    try:
-        return np.arange(count) / check_number(rate, "frame_rate_hz", str(scene), positive=True)
-    except CameraError as error:
-        raise SceneError(str(error)) from None
 
 
 def with_intrinsics(camera: EpisodeCamera, known: CameraFile, path: Path) -> EpisodeCamera:
@@ -166,15 +161,6 @@ def with_intrinsics(camera: EpisodeCamera, known: CameraFile, path: Path) -> Epi
     return replace(camera, camera=found, link=link, lens=lens)
 
 
-_EXPECTED = (
-    f"expected a LeRobot data set ({INFO}), a folder of DROID ({TRAJECTORY}), a bag (.bag, .mcap, "
-    ".db3, or a folder with metadata.yaml), or a folder with videos/<camera>.mp4 or "
-    "images/<camera>/<frame>.png"
-)
-# What is found in a folder is listed up to so many names.
-_LISTED = 8
-
-
 def open_episode(
     path: str | Path, *, joints: str | Path | None = None, episode: int | None = None
 ) -> Episode:
@@ -192,8 +178,13 @@ def open_episode(
         CameraError: a camera file cannot be used.
     """
     path = Path(path)
+    expected = (
+        f"expected a LeRobot data set ({INFO}), a folder of DROID ({TRAJECTORY}), a bag (.bag, "
+        ".mcap, .db3, or a folder with metadata.yaml), or a folder with videos/<camera>.mp4 or "
+        "images/<camera>/<frame>.png"
+    )
     if not path.exists():
-        raise SceneError(f"{path}: no such folder or file; {_EXPECTED}")
+        raise SceneError(f"{path}: no such folder or file; {expected}")
     log, warnings = (None, []) if joints is None else read_joint_table(Path(joints))
     if (path / INFO).exists():
         found = open_lerobot(path, log, episode)
@@ -211,6 +202,6 @@ def open_episode(
     elif len(bags) == 1:
         found = open_bag(bags[0], log)
     else:
-        what = ", ".join(inside[:_LISTED]) if path.is_dir() else "a file of another kind"
-        raise SceneError(f"{path}: is no episode: {what or 'empty'}; {_EXPECTED}")
+        what = ", ".join(inside[:8]) if path.is_dir() else "a file of another kind"
+        raise SceneError(f"{path}: is no episode: {what or 'empty'}; {expected}")
     return replace(found, warnings=(*warnings, *found.warnings))

@@ -17,11 +17,6 @@ from drake_pose.arrays import Array
 from drake_pose.camera.models import Camera, PinholeCamera, camera_tuple
 from drake_pose.errors import CameraError
 
-# The size of a sensor's pixel in MuJoCo [m]: any, for focal lengths are told in pixels.
-_PIXEL = 1e-5
-# From MuJoCo's camera frame, y up and z backward, to ours.
-_R_CM = np.diag([1.0, -1.0, -1.0])
-
 
 def ros_camera_info(camera: Camera) -> str:
     """The YAML of a CameraInfo as ROS's camera_calibration_parsers reads it.
@@ -71,16 +66,18 @@ def mujoco_cameras(cameras: Mapping[str, Camera] | Iterable[Camera]) -> str:
     Raises CameraError: a parallel camera.
     """
     root = ElementTree.Element("mujocoinclude")
+    pixel = 1e-5  # A sensor's pixel [m]: any, for focal lengths are told in pixels.
+    R_CM = np.diag([1.0, -1.0, -1.0])  # From MuJoCo's frame, y up and z backward, to ours.
     for camera in camera_tuple(cameras):
         one = _pinhole(camera, "a camera of MuJoCo here")
-        turn = Rotation.from_matrix(one.X_WC[:3, :3] @ _R_CM).as_quat()
+        turn = Rotation.from_matrix(one.X_WC[:3, :3] @ R_CM).as_quat()
         middle = 0.5 * np.array([one.width - 1, one.height - 1])
         size = np.array([one.width, one.height])
         fields = {
             "pos": one.X_WC[:3, 3],
             "quat": np.roll(turn, 1),
             "resolution": size,
-            "sensorsize": _PIXEL * size,
+            "sensorsize": pixel * size,
             "focalpixel": np.array([one.focal_x, one.focal_y]),
             "principalpixel": middle - [one.center_x, one.center_y],
         }

@@ -7,7 +7,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -20,27 +20,11 @@ from drake_pose.yaml_files import read_yaml
 UNITS = {"rad": 1.0, "deg": math.pi / 180.0}
 """What one unit of an angle is [rad]."""
 
-_TABLE_UNITS = {**UNITS, "m": 1.0, "mm": 1e-3}
-# The fields that an entry may have beside its column.
-_WAYS = [{"from", "to"}, {"scale", "offset"}, {"scale"}, {"offset"}, {"unit"}, set[str]()]
-_WORDS = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+")
-_NUMBERED = re.compile(r"(\D*?)[_\-. ]?(\d+)")
-# Readings are inside limits up to this [rad], lengths up to this share of their range.
-_SLACK, _SLACK_SHARE = 0.1, 0.1
-# Nothing in radians is this far beyond its limits; a joint without limits turns so far at most.
-_FULL_TURN, _MOST_TURN = 2.0 * math.pi, 4.0 * math.pi
-# LeRobot's normalised readings end here, and are called so.
-_NORMALISED, _NORMALISED_NAME = (99.0, 100.001), ".pos"
-# A reading is at an end of its range within this share of it.
-_AT_END = 1e-6
 
-
-@dataclass(frozen=True)
-class Column:
+class Column(NamedTuple):
     """What makes a joint's positions of a column: position = scale reading + offset [rad or m].
 
-    Args:
-        ends: between which its readings are; one at an end says "here, or beyond".
+    ends: between which its readings are; one at an end says "here, or beyond".
     """
 
     name: str
@@ -170,8 +154,9 @@ def match_names(logged: Sequence[str], wanted: Sequence[str]) -> tuple[dict[str,
             if sum(a == c for c, _ in pairs) == 1 and sum(b == d for _, d in pairs) == 1:
                 matched[a] = b
                 guesses |= {a: b} if alike is _is_suffix else {}
-    series = [name for name in logged if _NUMBERED.fullmatch(name)]
-    starts = {_NUMBERED.sub(r"\1", name) for name in series}
+    numbered = re.compile(r"(\D*?)[_\-. ]?(\d+)")
+    series = [name for name in logged if numbered.fullmatch(name)]
+    starts = {numbered.sub(r"\1", name) for name in series}
     if len(series) > 1 and len(starts) == 1 and any(name not in matched for name in series):
         # joint_1 of joint_0 to joint_6 is not joint1 of joint1 to joint7.
         matched = {a: b for a, b in matched.items() if a not in series}
@@ -189,7 +174,7 @@ def match_names(logged: Sequence[str], wanted: Sequence[str]) -> tuple[dict[str,
 
 def _words(name: str) -> list[str]:
     """The words and numbers of a name, without what says only that it is a joint."""
-    words = [word.lower() for word in _WORDS.findall(name)]
+    words = [word.lower() for word in re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+", name)]
     if len(words) > 1 and re.match("k[A-Z]", name):
         words = words[1:]
     while len(words) > 1 and words[-1] in ("joint", "pos"):
@@ -204,17 +189,28 @@ def _is_suffix(a: Sequence[str], b: Sequence[str]) -> bool:
 
 
 def _find_unit(
-    readings: Mapping[str, Array], others: Array, lower: Array, upper: Array
+    readings: Mapping[str, Array],
+    others: Array,
+    lower: Array,
+    upper: Array,
+    *,
+    slack: float = 0.1,
+    full_turn: float = 2.0 * math.pi,
+    normalised: tuple[float, float] = (99.0, 100.001),
 ) -> tuple[str, str]:
     """The unit of the columns (n,) of angles, and why.
 
     Args:
         others: all readings that nobody has told the units of.
         lower, upper: limits of each column's joint [rad].
+        slack: readings are inside limits up to this [rad].
+        full_turn: nothing in radians is this far beyond its limits [rad]; a joint without limits
+            turns twice as far at most.
+        normalised: between which the largest of LeRobot's normalised readings is.
 
     Raises SceneError: they look like neither radians nor degrees.
     """
-    low, high = np.maximum(lower, -_MOST_TURN), np.minimum(upper, _MOST_TURN)
+    low, high = np.maximum(lower, -2.0 * full_turn), np.minimum(upper, 2.0 * full_turn)
     # These pass over readings that are missing.
     least, most = (f.reduce(list(readings.values()), axis=1) for f in (np.fmin, np.fmax))
     off = {k: np.fmax(low - one * least, one * most - high) for k, one in UNITS.items()}
@@ -226,14 +222,14 @@ def _find_unit(
         f"are not all within the joints' limits as radians ('{column}' is {least[k]:.4g} to "
         f"{most[k]:.4g}), nor surely degrees"
     )
-    is_named = any(name.endswith(_NORMALISED_NAME) for name in readings)
-    if is_named or _NORMALISED[0] <= reach <= _NORMALISED[1]:
+    is_named = any(name.endswith(".pos") for name in readings)
+    if is_named or normalised[0] <= reach <= normalised[1]:
         reason = "look as if they were normalised to -100 ... 100, as LeRobot's are"
-    elif worst["rad"] <= _SLACK and worst["deg"] <= 0.0:
+    elif worst["rad"] <= slack and worst["deg"] <= 0.0:
         return "rad", "they would lie within the limits as degrees, too"
-    elif worst["rad"] <= _SLACK:
+    elif worst["rad"] <= slack:
         return "rad", "only as these all lie within the limits"
-    elif worst["deg"] <= _SLACK and worst["rad"] > _FULL_TURN:
+    elif worst["deg"] <= slack and worst["rad"] > full_turn:
         return "deg", "only as these all lie within the limits"
     raise SceneError(
         f"the readings of the joint log ({', '.join(readings)}) {reason}: say units: rad or deg, "
@@ -243,19 +239,27 @@ def _find_unit(
 
 
 def _positions(
-    column: Column, readings: Array, limits: tuple[float, float], is_angle: bool
+    column: Column,
+    readings: Array,
+    limits: tuple[float, float],
+    is_angle: bool,
+    *,
+    slack: float = 0.1,
+    at_end: float = 1e-6,
 ) -> tuple[Array, Mask, list[str]]:
-    """A joint's positions, which readings are at an end, and what is odd in the column."""
-    found, clipped, said = (
-        column.scale * readings + column.offset,
-        np.zeros(len(readings), bool),
-        list[str](),
-    )
+    """A joint's positions, which readings are at an end, and what is odd in the column.
+
+    Args:
+        slack: positions are inside limits up to this [rad]; lengths over their range.
+        at_end: a reading is at an end of its range within this, over the range.
+    """
+    found, said = column.scale * readings + column.offset, list[str]()
+    clipped = np.zeros(len(readings), dtype=np.bool_)
     if column.ends is not None:
         low, high = sorted(column.ends)
-        slack = _AT_END * (high - low)
-        clipped = (np.abs(readings - low) <= slack) | (np.abs(readings - high) <= slack)
-        if beyond := int(((readings < low - slack) | (readings > high + slack)).sum()):
+        near = at_end * (high - low)
+        clipped = (np.abs(readings - low) <= near) | (np.abs(readings - high) <= near)
+        if beyond := int(((readings < low - near) | (readings > high + near)).sum()):
             said.append(
                 f"has {beyond} of {len(readings)} readings beyond {low:g} ... {high:g}, between "
                 "which the joint map says that they are"
@@ -268,7 +272,7 @@ def _positions(
         return found, clipped, said
     off = np.nan_to_num(np.maximum(lower - found, found - upper), nan=-np.inf)
     row = int(np.argmax(off))
-    if off[row] > (_SLACK if is_angle else _SLACK_SHARE * (upper - lower)):
+    if off[row] > (slack if is_angle else slack * (upper - lower)):
         said.append(
             f"puts it at {found[row]:.4g} in row {row}, outside its limits {lower:.4g} to "
             f"{upper:.4g}: is it another joint's, its zero or sign another, its unit another?"
@@ -297,18 +301,20 @@ def read_joint_map(path: Path) -> dict[str, Column]:
 
 def _read_column(joint: str, entry: Any, where: str) -> Column:
     """The column of one entry of a joint map; CameraError where it is none."""
+    units = {**UNITS, "m": 1.0, "mm": 1e-3}
+    ways = [{"from", "to"}, {"scale", "offset"}, {"scale"}, {"offset"}, {"unit"}, set[str]()]
     given = set(entry) - {"column"} if isinstance(entry, dict) else {None}
-    if given not in _WAYS:
-        ways = " or ".join("{" + ", ".join(sorted(map(str, way))) + "}" for way in _WAYS if way)
-        raise CameraError(f"{where}: expected {{column: NAME}} and one of {ways}")
+    if given not in ways:
+        known = " or ".join("{" + ", ".join(sorted(map(str, way))) + "}" for way in ways if way)
+        raise CameraError(f"{where}: expected {{column: NAME}} and one of {known}")
     name, unit = str(entry.get("column", joint)), entry.get("unit", "rad")
-    if unit not in _TABLE_UNITS:
-        raise CameraError(f"{where}: unit must be one of {', '.join(_TABLE_UNITS)}")
+    if unit not in units:
+        raise CameraError(f"{where}: unit must be one of {', '.join(units)}")
     if "from" in given:
         (a, b), (c, d) = (_pair(entry[end], end, where) for end in ("from", "to"))
         scale = (d - c) / (b - a)
         return Column(name, scale, c - scale * a, (a, b))
-    scale = check_number(entry.get("scale", _TABLE_UNITS[unit]), "scale", where)
+    scale = check_number(entry.get("scale", units[unit]), "scale", where)
     return Column(name, scale, check_number(entry.get("offset", 0.0), "offset", where))
 
 

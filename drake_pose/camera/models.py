@@ -19,9 +19,6 @@ from drake_pose.errors import CameraError
 LARGEST_SIDE = 16384
 """The largest supported width or height [pixel]."""
 
-_ROTATION_TOLERANCE = 1e-4
-_EXACT_ROTATION = 1e-13
-
 
 def check_side(value: Any, field: str, where: str) -> int:
     """A width or height [pixel], a whole number from 1 to LARGEST_SIDE, or CameraError."""
@@ -80,7 +77,7 @@ def check_pose(value: Any, field: str, where: str) -> np.ndarray:
     R = matrix[:3, :3]
     with np.errstate(over="ignore", invalid="ignore"):
         deviation = np.abs(R @ R.T - np.eye(3)).max()
-    if not deviation <= _ROTATION_TOLERANCE:
+    if not deviation <= 1e-4:
         raise CameraError(
             f"{where}: the upper left 3 x 3 block of {field} is not a rotation (R R^T differs from "
             f"the identity by {deviation:.3g}); its columns must be the camera's axes in the world"
@@ -90,7 +87,7 @@ def check_pose(value: Any, field: str, where: str) -> np.ndarray:
             f"{where}: the upper left 3 x 3 block of {field} is a reflection, not a rotation; "
             "a camera's axes are x right, y down, z forward"
         )
-    if deviation > _EXACT_ROTATION:
+    if deviation > 1e-13:
         U, _, Vt = np.linalg.svd(R)
         matrix[:3, :3] = U @ Vt
     matrix[3] = [0.0, 0.0, 0.0, 1.0]
@@ -262,9 +259,6 @@ def inverse_pose(X_AB: np.ndarray) -> np.ndarray:
 FACE_CAMERA = "face"
 """The name of the camera that looks at the face."""
 
-# As high as a grown person's face; a narrow view, for the face should fill the picture.
-_FACE_HEIGHT, _FACE_VIEW = 1.6, math.radians(22.0)
-
 
 def circle_of_cameras(
     count: int = 8,
@@ -302,9 +296,10 @@ def circle_of_cameras(
         name = f"camera_{k}"
         cameras[name] = _camera(name, look_at(eye, target), field_of_view, size)
     if face_camera:
-        face = [target[0], target[1], _FACE_HEIGHT]
-        eye = [target[0] + radius, target[1], _FACE_HEIGHT]
-        cameras[FACE_CAMERA] = _camera(FACE_CAMERA, look_at(eye, face), _FACE_VIEW, size)
+        # As high as a grown person's face; a narrow view, for the face should fill the picture.
+        height, view = 1.6, math.radians(22.0)
+        face, eye = [target[0], target[1], height], [target[0] + radius, target[1], height]
+        cameras[FACE_CAMERA] = _camera(FACE_CAMERA, look_at(eye, face), view, size)
     return cameras
 
 

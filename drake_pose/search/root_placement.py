@@ -24,6 +24,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from operator import attrgetter
 from typing import Any, NamedTuple
 
 import cv2
@@ -440,7 +441,7 @@ class RootPlacementSearch:
         if not placed:
             found = PoseEstimate.nothing(self.tree, stopped_by="end", runs=runs)
             return replace(found, seconds=time.perf_counter() - begin)
-        placed.sort(key=_by_J)
+        placed.sort(key=attrgetter("J"))
         best = self._improve(placed[: own.starts], root_position is None, deadline)
         first_J = placed[0].J / _area(views) * _area(best.views)
         p_WR = self._root_of(best)
@@ -512,8 +513,18 @@ class RootPlacementSearch:
 
         settle = partial(before, lambda one: self._settle(one, PASSES.coarse, moves))
         pool = [one for one in map_ordered(settle, starts) if one is not None]
-        pool.sort(key=_by_J)
-        again = partial(before, lambda one: self._search_again(one, moves))
+        pool.sort(key=attrgetter("J"))
+
+        def search_again(one: _Placed) -> list[_Placed]:
+            # The beam search with the root where it is.
+            p_WR, own = self._root_of(one), self._numbers
+            starts = (
+                replace(one, parameters=self._refined.parameters(values, p_WR))
+                for values in self._grid.best_poses(one.views, p_WR, own.again, own.alike)
+            )
+            return [self._settle(start, PASSES.coarse, moves) for start in starts]
+
+        again = partial(before, search_again)
         # Those whose root is not near that of one before them.
         elsewhere: list[tuple[_Placed, np.ndarray]] = []
         for one in pool:
@@ -523,8 +534,8 @@ class RootPlacementSearch:
         finalists = self._numbers.finalists
         for found in map_ordered(again, [one for one, _ in elsewhere[:finalists]]):
             pool += found or []
-        pool.sort(key=_by_J)
-        best = min([*pool, *starts], key=_by_J)
+        pool.sort(key=attrgetter("J"))
+        best = min([*pool, *starts], key=attrgetter("J"))
         enough, ends = self._numbers.enough * _area(best.views), [best]
 
         def finish(one: _Placed) -> _Placed | None:
@@ -538,7 +549,7 @@ class RootPlacementSearch:
 
         for end in map_ordered(partial(before, finish), pool[:finalists]):
             if end is not None and best.J > enough:
-                best = min(best, end, key=_by_J)
+                best = min(best, end, key=attrgetter("J"))
         return best
 
     def _settle(self, start: _Placed, passes: Sequence[Pass], moves: bool) -> _Placed:
@@ -562,19 +573,6 @@ class RootPlacementSearch:
         """(3,) where its root is [m]."""
         return np.array(self._refined.poses(placed.parameters)[0, :3, 3])
 
-    def _search_again(self, start: _Placed, moves: bool) -> list[_Placed]:
-        """Poses that the beam search finds with the root where it is, refined."""
-        p_WR = self._root_of(start)
-        poses = self._grid.best_poses(start.views, p_WR, self._numbers.again, self._numbers.alike)
-        return [
-            self._settle(
-                replace(start, parameters=self._refined.parameters(values, p_WR)),
-                PASSES.coarse,
-                moves,
-            )
-            for values in poses
-        ]
-
     def _finish(self, start: _Placed, moves: bool, deadline: float) -> _Placed:
         """The pose refined to the end, and what fits badly placed anew."""
         near = self._settle(start, PASSES.fine[:2], moves)
@@ -584,11 +582,7 @@ class RootPlacementSearch:
         parameters, J = about.improve(near.parameters, enough, deadline)
         better = replace(near, parameters=parameters, J=float(J))
         end = self._settle(better, PASSES.fine, moves)
-        return min(start, near, better, end, key=_by_J)
-
-
-def _by_J(placed: _Placed) -> float:
-    return placed.J
+        return min(start, near, better, end, key=attrgetter("J"))
 
 
 def _area(views: Sequence[View]) -> float:

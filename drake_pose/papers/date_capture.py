@@ -266,7 +266,7 @@ class SilhouetteTrack(_StagedRun):
     def step(self, images: Images) -> Array:
         """The positions (nq,) of one more frame, even where the person is lost.
 
-        Raises SettingsError where nobody was seen in the first frame.
+        Raises SettingsError where no person was seen in the first frame.
         """
         self._begin_frame()
         if self._shared is None:

@@ -52,8 +52,8 @@ class PersonCapture:
     """A captured recording.
 
     Args:
-        q: (frames, nq) the plant's positions; nan where nobody was seen in time.
-        shares: (frames,) of the contours' lengths, what fits; 0 where nobody was seen.
+        q: (frames, nq) the plant's positions; nan where no person was seen in time.
+        shares: (frames,) of the contours' lengths, inlier ratio; 0 where no person was seen.
         shape: the person's; None where the model has no shape joints.
         outlines: the simplified surfaces of the tree's nodes, as wide as the person.
         deviations: (frames, nq) standard deviations of q [rad or m] by pictures and limits; nan.
@@ -68,7 +68,7 @@ class PersonCapture:
 
     @staticmethod
     def begun(count: int, shape: PersonShape | None, fit: ContourFit) -> PersonCapture:
-        """Of so many frames, of which nothing is known yet."""
+        """A capture of `count` frames in which nothing is known yet."""
         q = np.full((count, len(fit.tree.model.position_names)), np.nan)
         return PersonCapture(q, np.zeros(count), shape, fit.outlines, fit.tree, q.copy())
 
@@ -344,7 +344,7 @@ def capture_checked(
         least_left: a camera is left out only where as many others follow the person.
 
     Raises:
-        CameraError: the person is as tall as nobody is.
+        CameraError: the person is smaller or taller than people are.
         MaskError: the masks show the background.
         ModelError: the model has no landmarks of trunk, arms and legs.
         SettingsError: there is no frame in which two cameras see a person.
@@ -357,7 +357,7 @@ def capture_checked(
         recording = require_person(undone, count)
     found: list[CameraFault] = []
     while True:
-        # All frames are finished once only, as those who count them are told of it.
+        # Frames are reported in the first capture only: callers count them.
         tell = None if found else on_frame
         captured = capture_person(
             tree, cameras, recording.read, recording.seen, count, is_sequence, tell
@@ -381,8 +381,8 @@ def capture_checked(
 def require_person(recording: PersonRecording, count: int) -> PersonRecording:
     """A recording of `count` frames in which somebody is seen who may be a person.
 
-    Raises the errors of `capture_checked`: nobody is as small as 0.1 m or as tall as 3 m, not even
-    in part; and nobody fills the whole picture in more than half of the masks.
+    Raises the errors of `capture_checked`. A visible part of a person is 0.1 to 3 m tall, and does
+    not fill the whole picture in more than half of the masks.
     """
     if not recording.seen:
         raise SettingsError(

@@ -43,7 +43,7 @@ class Person:
 
     Args:
         place: (3,) the middle of the body [m].
-        figures: by the camera's index, the index of the figure of nobody else.
+        figures: by the camera's index, the index of the figure that is this person's alone.
         area: of the middle one of these figures, of two the smaller one [pixel^2].
     """
 
@@ -63,8 +63,8 @@ def find_figures(
 
     Args:
         speck: a figure of less than this fraction of the largest is a speck, or a part of another.
-        least_pixels, least_fraction: nobody is as small as this many pixels, or this fraction of
-            the picture.
+        least_pixels, least_fraction: a person is larger than this many pixels, and than this
+            fraction of the picture.
     """
     small, step = _coarse(mask)
     left, top, width, height = cv2.boundingRect(small)
@@ -249,8 +249,8 @@ def sort_figures(
     Args:
         figures: of each mask, in the order of the persons' camera indices.
         person: who is followed; None: he is away.
-        far, large: a figure that nobody has, as far off [m], and as large as this fraction of the
-            person, is no part of him.
+        far, large: a figure of no known person is a stranger's if it is farther off [m], and
+            larger than this fraction of the followed person's figure.
     """
 
     def covers(camera: Camera, figure: Figure, one: Person) -> bool:
@@ -404,7 +404,7 @@ class ViewFaults:
 
     Args:
         nobody: the frames in which fewer than two cameras see the person.
-        blind: by camera, the frames in which it sees nobody, but two others do.
+        blind: by camera, the frames in which it sees no person, but two others do.
         others: by camera, the frames in which it sees others, too.
         merged: by camera, those of them in which person and others are one figure.
     """
@@ -416,10 +416,10 @@ class ViewFaults:
 
 
 class PersonRecording:
-    """The masks of one person, without those of cameras that see nobody or are left out.
+    """The masks of one person, without those of cameras that do not see it or are left out.
 
     Attributes:
-        height: of what is seen, by the cameras' calibration [m]; nan where two cameras see nobody.
+        height: of what is seen, by the calibration [m]; nan where no two cameras see a person.
         covering: in what fraction of the masks the largest figure reaches all four sides, as
             backgrounds do.
 

@@ -131,7 +131,7 @@ def _noise(A: Array, b: Array, Q: Array, assumed: float = 4.0) -> float:
 
 @dataclass(frozen=True, eq=False)
 class TrackState:
-    """What the next frame is told of this one.
+    """What is known of a person after a frame.
 
     Args:
         values, step: (m,) of the pose tree, and their change from the last frame [rad or m].

@@ -147,7 +147,7 @@ def _filled(
 
 
 def _cells(camera: Camera, points: Array, size: float, shape: tuple[int, ...]) -> Indices:
-    """In which cell (n,) of so many pixels each point is seen, row after row; -1: in none."""
+    """(n,) index of the cell, `size` pixels wide, in which each point is seen; -1: in none."""
     uv, depth = camera.project(points)
     with np.errstate(invalid="ignore"):
         column, row = np.floor((uv.T + 0.5) / size)

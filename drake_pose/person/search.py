@@ -415,7 +415,7 @@ class PersonSearch:
         here = self._plan.samples(limb, X_WN)[None]
         scores, now, weights = np.zeros(len(places)), 0.0, crowding(here)
         for camera, region in zip(*frame.small, strict=True):
-            # A pixel is worth 1 in the region where the others do not show, 0 where they do.
+            # 1 in the region where the others do not show, 0 where they do, -1 outside of it.
             worth = np.where(region, 1, -1).astype(np.int8)
             worth[region & draw_mask(outlines, camera.X_CW @ X_WN[others], camera)] = 0
             scores += sum_at_points(camera, worth, places, limb.weights)[0]

@@ -32,7 +32,7 @@ _ROUNDS = tuple(
     AnnealingStage(scale, 0.04) for scale in (0.10, 0.08, 0.06, 0.05, 0.04, 0.04, 0.03, 0.03)
 )
 NOISE = Noise(deviation=0.02, correlation=0.15)
-"""What a point of contour is worth where the model is only like the person."""
+"""Noise of a point of contour where the model is only like the person."""
 
 
 @dataclass(frozen=True, eq=False)

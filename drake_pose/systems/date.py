@@ -472,7 +472,7 @@ def build_paper_capture(
     and where the source has it ``time``. The source's inputs are the diagram's, by their names.
 
     Args:
-        setup: without a registered pose nobody is found by itself: see
+        setup: without a registered pose the person is not found by itself: see
             ``PaperPoseEstimator.set_person``.
         source: what has the output ``color_image_<camera>`` of each camera: a rig's diagram
             (``build_camera_rig``), recorded pictures, live cameras. A camera without a background

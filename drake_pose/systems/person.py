@@ -59,7 +59,7 @@ class PersonTracker(MemorySystem):
     ``estimated_positions`` are nan until the person is found, while lost, and while fewer than two
     cameras see the person; ``last_positions`` are the last ones known, at first the model's
     default, and ``body_poses`` those of all bodies there, in the plant's order. ``share`` is that
-    of the contours that fits, 0 where nobody was seen; ``time`` the stamp of the last pictures
+    of the contours that fits, 0 where no person was seen; ``time`` the stamp of the last pictures
     used; ``seen`` for each camera whether it saw the person in them, 1 or 0; ``others`` 1 where
     other persons were in them. Others are cut out; a camera in which the person and another are one
     figure is left out where three others see the person alone, else not judged by. ``deviations``,
@@ -137,7 +137,7 @@ class PersonTracker(MemorySystem):
         )
 
     def known_person(self, context: Context) -> TrackState | None:
-        """What is known of the person, lost or not; None: nobody was found yet."""
+        """What is known of the person, lost or not; None: no person was found yet."""
         return _person(self.vectors(context), 0.0)
 
     def set_person(self, context: Context, person: TrackState) -> None:
@@ -185,7 +185,7 @@ class PersonTracker(MemorySystem):
             return changed
         clean = moment.seen.without(moment.merged)
         if 0 < len(clean.cameras) < len(moment.seen.cameras):
-            # Its share is that of the cameras in which nobody else's contours are.
+            # Its inlier ratio is that of the cameras that show this person alone.
             fit, step = self._tracker.fit, self._tracker.settings.follow[-1]
             sums = clean.compare(fit, fit.body.place(found.values), step).sums
             found = replace(found, share=inlier_ratio_of(sums))

@@ -55,8 +55,8 @@ class Walker(MemorySystem):
         output_ports: [walker_pose, command, rest, avatar_positions]
 
     The first pose in which the person stands still is the rest: where and which way the person
-    stands without a command. Until then, and while ``positions`` are not finite, nobody is there
-    who could command. Whoever turns around from one frame to the next was taken for facing the
+    stands without a command. Until then, and while ``positions`` are not finite, there is no
+    command. Whoever turns around from one frame to the next was taken for facing the
     wrong way, at rest too: the rest turns around with the person. ``keys`` (turn, walk) may stay
     unconnected; where not 0 it goes before the gestures. Outputs: the walker's x, y [m] and heading
     [rad] in the garden; the command (turn, walk); the rest (5), nan until somebody was seen; and
@@ -144,7 +144,7 @@ class Walker(MemorySystem):
         Args:
             still, facing: who stands still moves head and feet by no more [m], and turns the face
                 by no more [rad].
-            around: nobody turns the face by more from one frame to the next [rad].
+            around: a larger turn of the face from one frame to the next is an error [rad].
         """
         known["avatar_positions"] = q
         self._plant.SetPositions(self._plant_context, q)

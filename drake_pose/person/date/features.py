@@ -73,7 +73,7 @@ def skin_blobs(
 
     None has an area of less than `smallest` pixels.
     """
-    # Where nobody is seen one pixel is looked at.
+    # Of an empty region one pixel is looked at.
     left, top, width, height = cv2.boundingRect(np.ascontiguousarray(region).view(np.uint8))
     part = slice(top, top + max(height, 1)), slice(left, left + max(width, 1))
     chroma = cv2.cvtColor(np.ascontiguousarray(picture[part]), cv2.COLOR_RGB2YCrCb)
@@ -117,7 +117,7 @@ def see_person(picture: Picture, region: Mask, skin: SkinColour) -> PersonView:
 
 
 def measure_contour(region: Mask) -> Contour | None:
-    """The contour of a region (H, W); None where nobody is seen, or it touches the edge."""
+    """The contour of a region (H, W); None where it is empty, or touches the edge."""
     edges = (region[0], region[-1], region[:, 0], region[:, -1])
     if not region.any() or any(edge.any() for edge in edges):
         return None
@@ -173,7 +173,7 @@ def find_features(
     """The features' places in a frame: of the points nearest to a last place, the dense part.
 
     Points are where two rays meet that every camera sees in its silhouette. A camera has no say
-    about points outside its picture, nor where it sees nobody at all.
+    about points outside its picture, nor where its region is empty.
 
     Args:
         views: what each camera sees.

@@ -25,7 +25,7 @@ class WalkSettings:
         turn: how far the face is turned away from the rest direction [rad].
         step: how far one stands from the rest place [m].
         lift: how much higher than the other a lifted foot is [m].
-        pause: without another step for so long nobody walks on the spot any more [s].
+        pause: walking on the spot ends this long after the last step [s].
         start: where a walk begins: x, y [m] and heading [rad].
         half_size: half the side of the square place, the origin is its middle [m].
     """

@@ -30,7 +30,7 @@ from drake_pose.errors import (
 )
 from drake_pose.files.folder import OVERLAY, write_file, write_summary, writes_folder
 from drake_pose.files.settings import EstimateSettings, MaskSettings
-from drake_pose.jobs.estimate.searches import make_tree
+from drake_pose.jobs.estimate.inputs import make_tree
 from drake_pose.jobs.mask_sources import Source, open_source
 from drake_pose.jobs.registration.positions import read_known_positions
 from drake_pose.search import PoseAndMask, PoseAndMaskSettings

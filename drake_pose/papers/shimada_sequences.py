@@ -40,7 +40,7 @@ from drake_pose.filtering.hand_silhouette import HandSilhouette
 from drake_pose.filtering.inequalities import from_bounds, model_inequalities, stack
 from drake_pose.filtering.state import Belief
 from drake_pose.filtering.truncated_filter import FilterSettings, FilterState, TruncatedFilter
-from drake_pose.jobs.estimate.inputs import TRUTH_FILE, Inputs, read_inputs
+from drake_pose.jobs.estimate.inputs import TRUTH_FILE, EstimateInputs, read_inputs
 from drake_pose.papers.tables import Advance, Count, figure_table, uncounted
 from drake_pose.search import View
 from drake_pose.silhouette.pictures.label_images import label_image_to_mask
@@ -399,7 +399,7 @@ def run_sequence(
     return SequenceResult(folder.name, observation, guess, track, _truth(folder, inputs, hand))
 
 
-def _truth(folder: Path, inputs: Inputs, hand: HandModel) -> dict[str, Array]:
+def _truth(folder: Path, inputs: EstimateInputs, hand: HandModel) -> dict[str, Array]:
     """True angles (frames,) [deg] of those that the sequence's file has columns of."""
     file = folder / TRUTH_FILE
     if not file.is_file():

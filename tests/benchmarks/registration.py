@@ -28,7 +28,7 @@ from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import RegistrationError
 from drake_pose.files.settings import EstimateSettings
 from drake_pose.fit.parameters import lengthened_joints
-from drake_pose.jobs.estimate.searches import make_tree
+from drake_pose.jobs.estimate.inputs import make_tree
 from drake_pose.jobs.registration.inputs import read_inputs
 from drake_pose.jobs.registration.settings import RegistrationSettings
 from drake_pose.registration.joint_zeros import links_with_length

@@ -27,34 +27,18 @@ from drake_pose.filtering.contour_tracker import (
 from drake_pose.filtering.match_and_track import make_tracker
 from drake_pose.filtering.sequence_fit import (
     SEQUENCE,
-    FittedSequence,
     FollowedStart,
     find_start,
     fit_sequence,
     pose_set,
 )
-from drake_pose.jobs.estimate.inputs import Inputs
-from drake_pose.jobs.estimate.searches import leave_out_links, make_placement_search
+from drake_pose.jobs.estimate.inputs import EstimateInputs, leave_out_links, make_placement_search
 from drake_pose.search import TRACKED, PoseEstimate, RootPlacementSearch, View
 from drake_pose.silhouette.areas.bending import TreeSurfaces
 from drake_pose.silhouette.areas.scoring import draw_mask
 from drake_pose.silhouette.pictures.scenes import USUAL_RATE_HZ
 
-# A part that shows by itself with less than this share of its own area may not be there.
-_HIDDEN = 0.1
-# It is left out where E_total without it is less than so many times what it was.
-_BETTER = 0.9
-# As measured (tutorials/figures.md): what the model's flesh lacks is not in the intervals.
-_INTERVALS = (
-    "the body, its lengths and all poses were fitted to the sequence together: of four hands that "
-    "were measured, 49 to 100 % of the joints lay in these 95 % intervals, and lengths were off by "
-    "a fifth to a quarter"
-)
-# A sequence of fewer frames is not fitted as a whole.
-_FEWEST = 3
-
-
-FittedBody = tuple[Inputs, dict[str, Any], np.ndarray | None]
+FittedBody = tuple[EstimateInputs, dict[str, Any], np.ndarray | None]
 """What is found out about a body: inputs with the fitted model and a search that knows the first
 frame's pose; what the summary says of it; and a picture (h, w, 3) uint8 of the corrected shape over
 the file's (Shimada's figure 18), or None."""
@@ -81,7 +65,9 @@ class _StartedSearch(RootPlacementSearch):
         return super().match(views, root_position) if known is None else known
 
 
-def fit_body(inputs: Inputs, settings: EstimateSettings, on_stage: OnStage | None) -> FittedBody:
+def fit_body(
+    inputs: EstimateInputs, settings: EstimateSettings, on_stage: OnStage | None
+) -> FittedBody:
     """Find out about the body, where it is followed through a sequence of an uncalibrated camera.
 
     Raises DrakePoseError as for an estimate.
@@ -101,10 +87,10 @@ def fit_body(inputs: Inputs, settings: EstimateSettings, on_stage: OnStage | Non
 
 
 class _BodyFit:
-    """One fit of a body."""
+    """One fit of a body, found by the first of a sequence's masks."""
 
     def __init__(
-        self, inputs: Inputs, settings: EstimateSettings, tracking: TrackingSettings
+        self, inputs: EstimateInputs, settings: EstimateSettings, tracking: TrackingSettings
     ) -> None:
         self._inputs, self._settings, self._tracking = inputs, settings, tracking
         self._camera = next(iter(inputs.scene.cameras.values()))
@@ -113,8 +99,11 @@ class _BodyFit:
         self._more: dict[str, Any] = {}
         self._period = 1.0 / (inputs.scene.frame_rate_hz or USUAL_RATE_HZ)
 
-    def run(self, search: RootPlacementSearch) -> FittedBody:
-        """All of it."""
+    def run(self, search: RootPlacementSearch, min_frames: int = 3) -> FittedBody:
+        """All of it.
+
+        ``min_frames``: a shorter sequence is not fitted as a whole.
+        """
         begin = time.perf_counter()
         first = search.match([View(self._camera, self._masks[0])])
         if not first.found:
@@ -127,20 +116,33 @@ class _BodyFit:
         )
         known = {0: self._answer(own, starts[0].x, 0)}
         body = _Fitted(self._inputs.model, search, own, starts[0].x, known)
-        fitted = self._fit(tracker, starts) if len(self._masks) >= _FEWEST else None
-        shapes = None if fitted is None else self._draw_shapes(body, fitted)
-        body = fitted or body
+        fitted = self._fit(tracker, starts) if len(self._masks) >= min_frames else None
+        shapes = None
+        frames, warnings = self._inputs.frames, self._inputs.warnings
+        if fitted is not None:
+            outlines = []
+            for one in (body, fitted):
+                surfaces = TreeSurfaces(one.search.tree).at(one.observation.node_values(one.x))
+                X_CN = self._camera.X_CW @ one.observation.node_poses(one.x)
+                outlines.append(draw_mask(surfaces, X_CN, self._camera))
+            title = f"frame {frames[0]}: the shape that explains the sequence"
+            shapes = draw_shapes(self._masks[0], outlines, ("the file's", "corrected"), title)
+            # As measured (tutorials/figures.md): what the model's flesh lacks is not in them.
+            text = (
+                "the body, its lengths and all poses were fitted to the sequence together: of four "
+                "hands that were measured, 49 to 100 % of the joints lay in these 95 % intervals, "
+                "and lengths were off by a fifth to a quarter"
+            )
+            body, warnings = fitted, (*warnings, text)
         seconds = time.perf_counter() - begin
         self._more["body_fit_seconds"] = round(seconds, 3)
         share = seconds / len(body.known)
         known = {k: replace(one, seconds=share) for k, one in body.known.items()}
         started = _StartedSearch(body.search.tree, body.search.settings, body.search.scale_unknown)
         started.first = known[max(known)]
-        frames, warnings = self._inputs.frames, self._inputs.warnings
         inputs = replace(
-            self._inputs, model=body.model, search=started,
+            self._inputs, model=body.model, search=started, warnings=warnings,
             known={frames[k]: one for k, one in known.items()},
-            warnings=warnings if fitted is None else (*warnings, _INTERVALS),
         )  # fmt: skip
         return inputs, self._more, shapes
 
@@ -169,46 +171,60 @@ class _BodyFit:
         for k, answer in best.known.items():
             poses = [(one.known[k].q, one.known[k].X_WB, one.known[k].J) for one in found]
             best.known[k] = replace(answer, pose_set=pose_set(explanations, poses, k))
-        self._tell(explanations)
-        return best
-
-    def _tell(self, explanations: Sequence[FittedSequence]) -> None:
-        """What the summary says of the fitted body, and of explanations that look alike."""
-        best, *_ = explanations
-        body, theta = best.body, best.fitted.parameters[0]
+        # What the summary says of the fitted body, and of explanations that look alike.
+        body, theta = explanations[0].body, explanations[0].fitted.parameters[0]
         nodes, X_WN = body.kinematics.tree.nodes, body.place(theta).X_WN
         apart = np.linalg.norm(X_WN[:, :3, 3] - X_WN[[n.parent for n in nodes], :3, 3], axis=1)
         lengths = (apart / np.linalg.norm(X_WN[0, :3, 0])).round(5).tolist()
         factors, places = body.factors(theta).round(4).tolist(), body.joint_places(theta)
+        costs = [one.fitted.cost / explanations[0].fitted.cost for one in explanations]
         self._more |= {
             "proportions": {node.name: row for node, row in zip(nodes, factors, strict=True)},
             "lengths": {n.name: k for n, k in zip(nodes, lengths, strict=True) if n.parent >= 0},
             "joint_places": {nodes[i].name: round(places[i], 4) for i in body.placed},
-            "explanations": [round(one.fitted.cost / best.fitted.cost, 4) for one in explanations],
+            "explanations": [round(cost, 4) for cost in costs],
         }
-
-    def _draw_shapes(self, *bodies: _Fitted) -> np.ndarray:
-        """The file's body and the corrected one, each where it is in the first frame."""
-        shapes = []
-        for one in bodies:
-            outlines = TreeSurfaces(one.search.tree).at(one.observation.node_values(one.x))
-            X_CN = self._camera.X_CW @ one.observation.node_poses(one.x)
-            shapes.append(draw_mask(outlines, X_CN, self._camera))
-        title = f"frame {self._inputs.frames[0]}: the shape that explains the sequence"
-        return draw_shapes(self._masks[0], shapes, ("the file's", "corrected"), title)
+        return best
 
     def _without_hidden(
-        self, search: RootPlacementSearch, first: PoseEstimate
+        self,
+        search: RootPlacementSearch,
+        first: PoseEstimate,
+        shown: float = 0.1,
+        better_by: float = 0.9,
     ) -> tuple[RootPlacementSearch, PoseEstimate]:
-        """The search and its answer, without parts that are not there where that is better."""
-        hidden = () if self._settings.unseen else self._hidden_parts(search, first)
+        """The search and its answer, without parts that are not there where that is better.
+
+        Args:
+            shown: a part that ends at the root may not be there if a smaller fraction of its own
+                area shows by itself.
+            better_by: it is left out if E_total without it is less than so many times as large.
+        """
+        if self._settings.unseen:
+            return search, first
+        observation = self._tracker(search).observation
+        x = observation.state(first.q, first.X_WB, first.scale)
+        outlines = TreeSurfaces(search.tree).at(first.node_values)
+        X_CN = self._camera.X_CW @ observation.node_poses(x)
+        assert isinstance(self._camera, ParallelCamera)
+        pixels, hidden = first.scale * self._camera.pixels_per_metre, []
+        for i, node in enumerate(search.tree.nodes):
+            if node.parent != 0 or node.children or i == 0:
+                continue
+            others = [k for k in range(len(outlines)) if k != i]
+            own = draw_mask([outlines[i]], X_CN[[i]], self._camera)
+            rest = draw_mask([outlines[k] for k in others], X_CN[others], self._camera)
+            # As large as it is, turned to the viewer, it has this area at least.
+            _, *sides = np.sort(np.ptp(outlines[i].vertices, axis=0))
+            if np.sum(own & ~rest & self._masks[0]) < shown * np.prod(sides) * pixels**2:
+                hidden.append(node.name)
         if not hidden:
             return search, first
-        settings = replace(self._settings, unseen=hidden)
+        settings = replace(self._settings, unseen=tuple(hidden))
         model, settings = leave_out_links(self._inputs.model, settings)
         other = make_placement_search(model, settings, None, True)
         better = other.match([View(self._camera, self._masks[0])])
-        if not better.found or better.E_total >= _BETTER * first.E_total:
+        if not better.found or better.E_total >= better_by * first.E_total:
             return search, first
         warning = (
             f"{', '.join(hidden)}: not in the pictures, it seems, and left out, its joints held: "
@@ -218,31 +234,11 @@ class _BodyFit:
         warnings = (*self._inputs.warnings, warning)
         self._inputs = replace(self._inputs, model=model, warnings=warnings)
         self._settings = settings
-        self._more["unseen"] = list(hidden)
+        self._more["unseen"] = hidden
         return other, better
 
     def _tracker(self, search: RootPlacementSearch) -> ContourTracker:
         return make_tracker(search.tree, [self._camera], self._period, self._tracking)
-
-    def _hidden_parts(self, search: RootPlacementSearch, match: PoseEstimate) -> tuple[str, ...]:
-        """Parts that end at the root, and of which next to nothing shows."""
-        observation = self._tracker(search).observation
-        x = observation.state(match.q, match.X_WB, match.scale)
-        outlines = TreeSurfaces(search.tree).at(match.node_values)
-        X_CN = self._camera.X_CW @ observation.node_poses(x)
-        assert isinstance(self._camera, ParallelCamera)
-        pixels, hidden = match.scale * self._camera.pixels_per_metre, []
-        for i, node in enumerate(search.tree.nodes):
-            if node.parent != 0 or node.children or i == 0:
-                continue
-            others = [k for k in range(len(outlines)) if k != i]
-            own = draw_mask([outlines[i]], X_CN[[i]], self._camera)
-            rest = draw_mask([outlines[k] for k in others], X_CN[others], self._camera)
-            # As large as it is, turned to the viewer, it has this area at least.
-            _, *sides = np.sort(np.ptp(outlines[i].vertices, axis=0))
-            if np.sum(own & ~rest & self._masks[0]) < _HIDDEN * np.prod(sides) * pixels**2:
-                hidden.append(node.name)
-        return tuple(hidden)
 
     def _answer(self, observation: ContourObservation, x: np.ndarray, frame: int) -> PoseEstimate:
         """A state in a frame, by its number, as a search would give it."""

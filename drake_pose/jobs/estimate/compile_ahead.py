@@ -25,8 +25,6 @@ from drake_pose.search import MultiStartSearch, View, ViewsFit
 from drake_pose.silhouette.areas.bending import TreeSurfaces
 from drake_pose.silhouette.areas.outline import pack
 
-_SIDE = 64
-
 
 @contextmanager
 def compiling_ahead() -> Iterator[None]:
@@ -47,9 +45,8 @@ def compiling_ahead() -> Iterator[None]:
 def main() -> None:
     """Goes through a search from its end to its beginning, with a small body and picture."""
     tree = load_model(bundled_model("two_finger_hand"), check=False).pose_tree()
-    camera = ParallelCamera("ahead", _SIDE, _SIDE, 300.0, 0.5 * _SIDE, 0.5 * _SIDE, np.eye(4))
-    mask = np.zeros((_SIDE, _SIDE), dtype=np.uint8)
-    view = View(camera, cv2.circle(mask, (_SIDE // 2, _SIDE // 2), _SIDE // 4, 1, -1) > 0)
+    camera = ParallelCamera("ahead", 64, 64, 300.0, 32.0, 32.0, np.eye(4))
+    view = View(camera, cv2.circle(np.zeros((64, 64), np.uint8), (32, 32), 16, 1, -1) > 0)
     surfaces = few_triangles(TreeSurfaces(tree))
     # The kernel that takes longest, by itself: the first process compiles what comes before it.
     views = pack_views([camera], [find_edge_points(view.mask, 1.0)])

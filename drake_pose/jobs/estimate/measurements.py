@@ -3,27 +3,27 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
-from drake_pose.body import ParsedModel
+from drake_pose.arrays import Array, Indices, Picture
+from drake_pose.body import ParsedModel, PoseTree
+from drake_pose.body.tree_kinematics import TreeKinematics
+from drake_pose.camera.camera_files import load_camera_file
+from drake_pose.camera.episode import Episode, EpisodeCamera, JointLog
+from drake_pose.camera.episode_files import open_episode, with_intrinsics
+from drake_pose.camera.joint_map import map_joints, read_joint_map
 from drake_pose.camera.picture_files import frame_key
 from drake_pose.csv_files import read_csv
-from drake_pose.errors import SceneError, UnknownNameError
+from drake_pose.errors import SceneError, SettingsError, UnknownNameError
 from drake_pose.files.records import BASE_COLUMNS, FIT_COLUMNS
-
-_CENTRE_COLUMNS = ("frame", "joint", "x", "y", "z")
-
-# A value is outside its limits from so much on [rad], or from this share of a length's range.
-_OUTSIDE, _OUTSIDE_SHARE = 0.1, 0.1
-# An angle of more than a full turn beyond its limits is one in degrees; a length of so many times
-# what its limits allow is one in millimetres.
-_FULL_TURN, _MANY = 2.0 * math.pi, 20.0
-# And none is larger than this [rad or m].
-_MOST = 1e6
+from drake_pose.files.settings import EpisodeSettings
+from drake_pose.silhouette.pictures.scenes import CAMERA_FILE, Scene, select_frames
 
 
 @dataclass(frozen=True)
@@ -57,8 +57,8 @@ def read_joint_centres(path: Path, joint: str, frames: Sequence[str]) -> dict[st
         UnknownNameError: if no row is of that joint.
     """
     header, rows = read_csv(path, SceneError)
-    if header != list(_CENTRE_COLUMNS):
-        raise SceneError(f"{path}: the first line must be {','.join(_CENTRE_COLUMNS)}")
+    if header != ["frame", "joint", "x", "y", "z"]:
+        raise SceneError(f"{path}: the first line must be frame,joint,x,y,z")
     joints = sorted({row[1] for _, row in rows})
     if joint not in joints:
         raise UnknownNameError("joint", joint, joints, str(path))
@@ -120,6 +120,10 @@ def check_units(
     model: ParsedModel,
     names: Sequence[str],
     known: Mapping[int | str, np.ndarray],
+    slack_angle: float = 0.1,
+    slack_share: float = 0.1,
+    millimetres_from: float = 20.0,
+    largest: float = 1e6,
 ) -> tuple[str, ...]:
     """Warnings of measured positions outside their limits.
 
@@ -127,6 +131,11 @@ def check_units(
         path: of the table.
         names: of the model's positions.
         known: (len(names),) values by frame [rad or m].
+        slack_angle, slack_share: by so much an angle [rad], or by this fraction of its range a
+            length, may be outside its limits.
+        millimetres_from: a length of so many times what its limits allow is one in millimetres; an
+            angle more than a full turn beyond its limits is one in degrees.
+        largest: no joint's position is larger [rad or m].
 
     Raises:
         SceneError: values are in degrees or millimetres, or no joint's positions at all.
@@ -134,7 +143,7 @@ def check_units(
     warnings = []
     for frame, row in known.items():
         for name, value in zip(names, row, strict=True):
-            if abs(value) > _MOST:
+            if abs(value) > largest:
                 raise SceneError(
                     f"{path}: column '{name}', frame {frame}: {value:g} is no joint's position; "
                     "give it in rad or m"
@@ -146,10 +155,11 @@ def check_units(
             continue
         values = np.array([row[k] for row in known.values()])
         what, unit, other, scale = "length", "m", "metres", 1e-3
-        slack, most = _OUTSIDE_SHARE * (upper - lower), _MANY * max(abs(lower), abs(upper))
+        slack, most = slack_share * (upper - lower), millimetres_from * max(abs(lower), abs(upper))
         if is_angle := model.position_kinds[place] == "angle":
             what, unit, other, scale = "angle", "rad", "radians", math.pi / 180.0
-            slack, most = _OUTSIDE, max(abs(lower), abs(upper)) + _FULL_TURN + _OUTSIDE
+            slack = slack_angle
+            most = max(abs(lower), abs(upper)) + 2.0 * math.pi + slack
         off = np.maximum(lower - values, values - upper)
         worst = int(np.argmax(off))
         if off[worst] <= slack:
@@ -167,7 +177,7 @@ def check_units(
                 f"in {other}"
             )
         why = ": is its column another joint's, its zero or sign another, its unit another?"
-        turn = math.copysign(_FULL_TURN, values[worst])
+        turn = math.copysign(2.0 * math.pi, values[worst])
         if is_angle and lower - slack <= values[worst] - turn <= upper + slack:
             why = (
                 f"; a full turn off, {values[worst] - turn:.4g} rad, it would not: did the encoder "
@@ -185,3 +195,233 @@ def _numbers(cells: Sequence[str], path: Path, line: int) -> np.ndarray:
     if not np.isfinite(numbers).all():
         raise SceneError(f"{path}: line {line} holds a number that is not finite")
     return numbers
+
+
+class PlacedCameras(NamedTuple):
+    """Cameras of an episode that are looked at, and the names of those whose pose somebody says."""
+
+    cameras: list[EpisodeCamera]
+    placed: frozenset[str]
+
+
+class TreeLog(NamedTuple):
+    """A joint log in a pose tree's terms.
+
+    log: of the values ``asked`` of the tree; names: of all that are logged; unseen: nodes that
+    joints move which are not logged, seen: the others.
+    """
+
+    log: JointLog
+    asked: Indices
+    names: tuple[str, ...]
+    seen: tuple[str, ...]
+    unseen: tuple[str, ...]
+    warnings: list[str]
+
+
+def is_episode(path: Path, settings: EpisodeSettings) -> bool:
+    """Whether a path is one of pictures and joints, and no scene of masks."""
+    if path.is_file() or settings.episode is not None:
+        return True
+    if (path / "masks").is_dir():
+        return False
+    own = ("videos", "images", "meta/info.json", "trajectory.h5", "metadata.yaml")
+    bags = ("*.mcap", "*.bag", "*.db3")
+    return any((path / one).exists() for one in own) or any(
+        found for pattern in bags for found in path.glob(pattern)
+    )
+
+
+def cameras_of(
+    episode: Episode, camera_path: Path | None, settings: EpisodeSettings
+) -> PlacedCameras:
+    """The cameras that are asked for, or all, as their file has them.
+
+    Args:
+        camera_path: in place of the episode's own.
+
+    Raises:
+        UnknownNameError: there is no such camera.
+        CameraError: the file cannot be used, or is of other pictures.
+    """
+    for name in settings.cameras:
+        if name not in episode.cameras:
+            raise UnknownNameError("camera", name, episode.cameras, str(episode.path))
+    wanted = settings.cameras or tuple(episode.cameras)
+    chosen = [one for one in episode.cameras.values() if one.name in wanted]
+    file = camera_path or episode.path / CAMERA_FILE
+    if camera_path is None and not file.is_file():
+        return PlacedCameras(chosen, frozenset())
+    given = load_camera_file(file, distorted=True)
+    chosen = [with_intrinsics(one, given, file) for one in chosen]
+    return PlacedCameras(chosen, frozenset(given.cameras) - {*given.unplaced, *given.links})
+
+
+def say_left_out(names: Iterable[str], placed: Collection[str]) -> list[str]:
+    """That cameras are not used whose pose nobody says."""
+    return [f"camera '{name}' has no X_WC: it is left out" for name in names if name not in placed]
+
+
+def map_log(path: Path, joints: JointLog, tree: PoseTree, settings: EpisodeSettings) -> TreeLog:
+    """The joint log in the tree's terms: which of its values it has, and the nodes that it tells.
+
+    Values that nobody logged are the model's defaults.
+
+    Raises DrakePoseError: names columns, joints or units at fault.
+    """
+    kinematics = TreeKinematics(tree)
+    held = {tree.model.position_names[index] for index in tree.held}
+    asked = np.array([k for k, name in enumerate(kinematics.names) if name not in held], np.intp)
+    names = [kinematics.names[k] for k in asked]
+    table = None if settings.joint_map is None else read_joint_map(settings.joint_map)
+    mapped = map_joints(
+        joints, names, kinematics.lower[asked], kinematics.upper[asked],
+        kinematics.is_angle[asked], units=settings.units, table=table,
+    )  # fmt: skip
+    # The nodes that only logged joints move, and the others.
+    told: list[bool] = []
+    for k, node in enumerate(tree.nodes):
+        above = node.parent < 0 or told[node.parent]
+        own = tree.nodes[tree.source(k)].value_names
+        told.append(above and set(own).isdisjoint(mapped.not_logged))
+    nodes = list(zip(tree.nodes, told, strict=True))
+    seen = tuple(node.name for node, is_told in nodes if is_told)
+    unseen = tuple(node.name for node, is_told in nodes if not is_told)
+    warnings, positions = list(mapped.warnings), mapped.log.positions
+    if not seen:
+        raise SceneError(
+            f"{path}: no part of {tree.model.path.name} is moved by joints that are logged alone; "
+            "give a joint map (--joint-map FILE), or hold the others (--hold NAME=VALUE)"
+        )
+    clipped = int(mapped.clipped.any(axis=1).sum())
+    if clipped:
+        # There, or beyond.
+        positions = np.where(mapped.clipped, np.nan, positions)
+        warnings.append(
+            f"{clipped} of {len(positions)} rows have a reading at an end of its range, where a "
+            "joint may be beyond it: they are not used"
+        )
+    default = kinematics.flatten(tree.default_values())[asked]
+    missing = np.array([name in mapped.not_logged for name in names])
+    log = replace(mapped.log, positions=np.where(missing, default, positions))
+    logged = tuple(name for name in names if name not in mapped.not_logged)
+    return TreeLog(log, asked, logged, seen, unseen, warnings)
+
+
+def frames_of(camera: EpisodeCamera) -> tuple[str, ...]:
+    """The names of a camera's pictures: their own, or their numbers."""
+    return camera.frames or tuple(f"{k:06d}" for k in range(len(camera.times)))
+
+
+def rows_of(log: JointLog, camera: EpisodeCamera, kept: Indices, later: Array) -> Array:
+    """(k, m) a log's positions so much later [s] than some of a camera's pictures, by time or name.
+
+    Args:
+        later: () or (k,); nothing where only names tell.
+    """
+    if is_timed(log, camera):
+        return log.at(camera.times[kept] + later)
+    every = frames_of(camera)
+    return log.of_frames([every[k] for k in kept])
+
+
+def is_timed(log: JointLog, camera: EpisodeCamera) -> bool:
+    """Whether times tell which rows are of which pictures."""
+    return log.times is not None and bool(np.isfinite(camera.times).any())
+
+
+def kept_pictures(camera: EpisodeCamera, settings: EpisodeSettings) -> Indices:
+    """Which of a camera's pictures are asked for; UnknownNameError: there is no such."""
+    if settings.every < 1:
+        raise SettingsError(f"every must be 1 or more, not {settings.every}")
+    every = frames_of(camera)
+    names = select_frames(every, settings.frames, f"camera '{camera.name}'")[:: settings.every]
+    return np.array([every.index(name) for name in names], np.intp)
+
+
+def read_episode_scene(
+    path: Path, settings: EpisodeSettings, joints: Path | None, cameras: Path | None
+) -> Scene:
+    """An episode's pictures of cameras whose pose is known: a sequence without masks.
+
+    Its frames are some of the first camera's pictures.
+
+    Args:
+        joints: a table of joint positions, in place of the episode's own.
+        cameras: a camera file, in place of the episode's own.
+
+    Raises DrakePoseError: names the file, camera or frame at fault; nobody says where a camera is.
+    """
+    episode = open_episode(path, joints=joints, episode=settings.episode)
+    chosen, placed = cameras_of(episode, cameras, settings)
+    if not placed.intersection(one.name for one in chosen):
+        raise SceneError(
+            f"{path}: nobody says where a camera stands; find out (drake-pose register), and give "
+            "the cameras.yaml that it writes (--cameras FILE)"
+        )
+    known = {one.name: one for one in chosen if one.name in placed and one.camera is not None}
+    first = next(iter(known.values()))
+    kept, names = kept_pictures(first, settings), frames_of(first)
+    frames, times = tuple(names[k] for k in kept), first.times[kept]
+    steps = np.diff(times)
+    rate = None if not len(steps) or np.isnan(steps).any() else 1.0 / float(np.median(steps))
+    images, readers = dict[tuple[str, str], Path](), dict[str, Callable[[str], Picture]]()
+    for name, camera in known.items():
+        numbers = _same_moments(first, kept, camera)
+        images |= {(name, frames[k]): path for k in numbers}
+        of_frame = {frames[k]: number for k, number in numbers.items()}
+        readers[name] = partial(_read_frame, camera, of_frame)
+    return Scene(
+        path, {name: one.camera for name, one in known.items() if one.camera is not None}, frames,
+        {}, True, rate, images=images, readers=readers, times=times, joints=episode.joints,
+        warnings=(*episode.warnings, *say_left_out([one.name for one in chosen], placed)),
+    )  # fmt: skip
+
+
+def _read_frame(camera: EpisodeCamera, numbers: Mapping[str, int], frame: str) -> Picture:
+    """A camera's picture (H, W, 3) of a frame, by its number."""
+    return camera.read(numbers[frame])
+
+
+def _same_moments(
+    first: EpisodeCamera, kept: Indices, other: EpisodeCamera, tolerance: float = 0.5
+) -> dict[int, int]:
+    """By index into kept, the other camera's picture of the same moment, where it has one.
+
+    ``tolerance``: largest difference of times, as a fraction of a period.
+    """
+    if np.isnan(first.times).any() or np.isnan(other.times).any():
+        own = {frame_key(name): k for k, name in enumerate(frames_of(other))}
+        names = [frame_key(frames_of(first)[k]) for k in kept]
+        return {k: own[name] for k, name in enumerate(names) if name in own}
+    near = tolerance * float(np.median(np.diff(first.times))) if len(first.times) > 1 else np.inf
+    off = np.abs(other.times - first.times[kept][:, None])
+    nearest = off.argmin(axis=1)
+    return {k: int(n) for k, n in enumerate(nearest) if off[k, n] <= near}
+
+
+def logged_positions(
+    scene: Scene, tree: PoseTree, settings: EpisodeSettings
+) -> tuple[TrueAngles | None, dict[str, Array], tuple[str, ...]]:
+    """What a scene's joint log says: where joints are in frames, and the plant's positions (nq,).
+
+    None and nothing where it has no log; then what a user should know.
+
+    Raises DrakePoseError: names columns, joints or units at fault.
+    """
+    if scene.joints is None:
+        return None, {}, ()
+    mapped = map_log(scene.path, scene.joints, tree, settings)
+    kinematics = TreeKinematics(tree)
+    values = np.tile(kinematics.flatten(tree.default_values()), (len(scene.frames), 1))
+    log, times = mapped.log, scene.times
+    by_frame = log.times is None or np.isnan(times).all()
+    values[:, mapped.asked] = log.of_frames(scene.frames) if by_frame else log.at(times)
+    starts = {
+        frame: tree.positions_from(kinematics.split(row))[0]
+        for frame, row in zip(scene.frames, values, strict=True)
+        if np.isfinite(row).all()
+    }
+    places = [tree.model.position_index(name) for name in mapped.names]
+    known = {frame_key(frame): q[places] for frame, q in starts.items()}
+    return TrueAngles(scene.path, mapped.names, known), starts, tuple(mapped.warnings)

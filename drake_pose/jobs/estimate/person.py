@@ -13,7 +13,7 @@ from drake_pose.arrays import Array, Mask
 from drake_pose.errors import MaskError, SceneError
 from drake_pose.files.records import FrameRecord, record_deviations
 from drake_pose.files.writer import Drawn, OnStage, ResultWriter
-from drake_pose.jobs.estimate.inputs import Inputs, draw_parts
+from drake_pose.jobs.estimate.inputs import EstimateInputs, draw_parts
 from drake_pose.person.camera_faults import CameraFault
 from drake_pose.person.capture import (
     CheckedCapture,
@@ -33,13 +33,11 @@ from drake_pose.silhouette.pictures.scene_checks import (
 
 FOLLOWED = "followed"
 """FrameRecord.stopped_by of a frame in which a person was followed."""
-# Below this share of the contours the pose is hardly that of the person in the masks.
-_FITS_BADLY = 0.6
 
 
 def follow_person(
-    inputs: Inputs, result: ResultWriter, overlay: bool, on_stage: OnStage | None
-) -> tuple[Inputs, Iterator[tuple[FrameRecord, Drawn]]]:
+    inputs: EstimateInputs, result: ResultWriter, overlay: bool, on_stage: OnStage | None
+) -> tuple[EstimateInputs, Iterator[tuple[FrameRecord, Drawn]]]:
     """Follows the person through all frames, which are compared with their masks and drawn then.
 
     A resumed recording is followed as a whole again, if frames are missing.
@@ -89,7 +87,7 @@ def follow_person(
 
 
 def _follow_colours(
-    inputs: Inputs, reader: _Reader
+    inputs: EstimateInputs, reader: _Reader
 ) -> tuple[PersonCapture, ReadFrame, tuple[str, ...], Array]:
     """A sequence of pictures of which few have masks: distances (frames,) of contours [pixel]."""
     scene, frames = inputs.scene, inputs.frames
@@ -126,7 +124,7 @@ def _follow_colours(
 class _Reader:
     """Reads the masks of a frame by camera; one that cannot be read is left out, and said once."""
 
-    def __init__(self, inputs: Inputs, on_stage: OnStage | None) -> None:
+    def __init__(self, inputs: EstimateInputs, on_stage: OnStage | None) -> None:
         self._scene, self._frames = inputs.scene, inputs.frames
         self.on_stage = on_stage
         self.refused: dict[tuple[str, str], str] = {}
@@ -164,7 +162,7 @@ class _Reader:
 
 
 def _finish(
-    inputs: Inputs,
+    inputs: EstimateInputs,
     captured: PersonCapture,
     index: int,
     X_WN: Array,
@@ -243,10 +241,13 @@ def describe_views(views: ViewFaults, frames: Sequence[str]) -> tuple[str, ...]:
     return tuple(found)
 
 
-def describe_fit(shares: Sequence[float]) -> tuple[str, ...]:
-    """A warning of a person of whose contours too little fits in the frames with a pose."""
+def describe_fit(shares: Sequence[float], usual_from: float = 0.6) -> tuple[str, ...]:
+    """A warning of a person of whose contours too little fits in the frames with a pose.
+
+    ``usual_from``: the least fraction of the contours that fits where the person is in the masks.
+    """
     usual = float(np.median([share for share in shares if share > 0.0] or [1.0]))
-    if usual > _FITS_BADLY:
+    if usual > usual_from:
         return ()
     text = (
         f"only {100.0 * usual:.0f} % of the contours fit in the median frame, where 90 % are "

@@ -2,17 +2,47 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from itertools import combinations
 from pathlib import Path
+from typing import Any
 
+import numpy as np
+from pydrake.systems.analysis import Simulator
+
+from drake_pose.body import nearest_turn
+from drake_pose.camera.models import ParallelCamera
+from drake_pose.errors import SettingsError, listed
 from drake_pose.files.folder import SHAPES, writes_folder
 from drake_pose.files.overlay import encode_png
-from drake_pose.files.records import SceneEstimate, describe_job, open_job
-from drake_pose.files.settings import EstimateSettings
-from drake_pose.files.writer import OnFrame, OnStage, ResultWriter
+from drake_pose.files.records import (
+    BADLY_EXPLAINED,
+    FrameRecord,
+    SceneEstimate,
+    describe_job,
+    open_job,
+    record_deviations,
+    record_pose_set,
+)
+from drake_pose.files.settings import EstimateSettings, percent
+from drake_pose.files.writer import Drawn, OnFrame, OnStage, ResultWriter
 from drake_pose.jobs.estimate.body_fit import fit_body
-from drake_pose.jobs.estimate.inputs import read_inputs
-from drake_pose.jobs.estimate.matching import check_track, compare_cameras, match_frames
+from drake_pose.jobs.estimate.inputs import EstimateInputs, draw_parts, read_inputs
 from drake_pose.jobs.estimate.person import follow_person
+from drake_pose.search import (
+    TRACKED,
+    BeamSearch,
+    MultiStartSearch,
+    PoseEstimate,
+    PoseSearch,
+    View,
+    scale_camera,
+)
+from drake_pose.silhouette.areas.bending import TreeSurfaces
+from drake_pose.silhouette.pictures.scenes import USUAL_RATE_HZ, Scene
+from drake_pose.systems.diagrams import build_recorded_matching
 from drake_pose.workers import working
 
 
@@ -77,3 +107,226 @@ def estimate_scene(
     finally:
         result.write_summary()
     return result.result()
+
+
+def estimate_frames(
+    inputs: EstimateInputs, search: PoseSearch, missing: Sequence[str]
+) -> Iterator[tuple[str, PoseEstimate]]:
+    """The missing frames' poses: those that are known, then those of the matching diagram.
+
+    Raises SettingsError where a frame has no picture.
+    """
+    begun: PoseEstimate | None = None
+    for frame, begun in inputs.known.items():
+        if frame in missing:
+            yield frame, begun
+    left = [frame for frame in missing if frame not in inputs.known]
+    if not left:
+        return
+    # What colours and starts say of a frame depends on those before: they are followed again. So
+    # is a track from the last frame that is known.
+    follows = bool(inputs.scene.images or inputs.starts or inputs.known)
+    played = inputs.frames[max(len(inputs.known) - 1, 0) :] if follows else left
+    rate_hz = inputs.scene.frame_rate_hz or USUAL_RATE_HZ
+    matching = build_recorded_matching(
+        replace(inputs.scene, frame_rate_hz=rate_hz), search, tuple(inputs.scene.cameras.values()),
+        played, inputs.root_positions, tracking=inputs.tracking(), starts=inputs.starts,
+    )  # fmt: skip
+    simulator = Simulator(matching.diagram)
+    for index, frame in enumerate(played):
+        # The frame is matched at index periods; half a period later the answer surely stands.
+        simulator.AdvanceTo((index + 0.5) / rate_hz)
+        if frame in left:
+            context = simulator.get_context()
+            pose = matching.estimate(context)
+            if pose is None:
+                raise SettingsError(f"frame '{frame}': the matcher got no picture")
+            was_tracked = matching.was_tracked(context)
+            if pose.found and pose.pose_set is None and isinstance(search, MultiStartSearch):
+                before = begun if was_tracked else None
+                if views := _views(inputs.scene, frame):
+                    place = (inputs.root_positions or {}).get(frame)
+                    pose = search.with_intervals(pose, views, place, before)
+                else:
+                    # What has no mask is as sure as its contours said.
+                    own = matching.with_intervals(context) if was_tracked else pose
+                    pose = own.widened(before)
+            begun = begun if was_tracked else pose
+            yield frame, pose
+
+
+def _views(scene: Scene, frame: str) -> list[View]:
+    """A frame's masks, each with its camera."""
+    return [View(scene.cameras[name], scene.read(name, frame)) for name in scene.cameras_of(frame)]
+
+
+def match_frames(
+    inputs: EstimateInputs, search: PoseSearch, overlay: bool, missing: Sequence[str]
+) -> Iterator[tuple[FrameRecord, Drawn]]:
+    """The missing frames, matched or tracked, compared with their masks and drawn."""
+    scene, model = inputs.scene, inputs.model
+    tree = model.pose_tree()
+    surfaces = TreeSurfaces(tree)
+    for frame, pose in estimate_frames(inputs, search, missing):
+        masks = {name: scene.read(name, frame) for name in scene.cameras_of(frame)}
+        shown: dict[str, np.ndarray] = {**inputs.pictures(frame), **masks} if overlay else {}
+        parts, more = dict[str, np.ndarray](), dict[str, Any]()
+        if pose.found:
+            cameras = [scene.cameras[name] for name in {**masks, **shown}]
+            for k, camera in enumerate(cameras):
+                if isinstance(camera, ParallelCamera):
+                    cameras[k] = scaled = scale_camera(camera, pose.scale)
+                    if scene.scale_unknown and camera.name in masks:
+                        more["camera_scale"] = scaled.pixels_per_metre
+            values = tree.values_from_positions(pose.q)
+            parts = draw_parts(surfaces.at(values), pose.X_WB @ tree.node_poses(values), cameras)
+            more["first_E_total"] = pose.first_E_total
+        # A search that does not say how sure it is knows nothing of any joint.
+        nothing = np.full(len(pose.q), np.nan)
+        known = record_pose_set(pose.pose_set, search.tree) or {
+            "joints": record_deviations(model, pose.q, nothing)
+        }
+        yield inputs.finish(
+            frame, pose, masks, parts, shown, **more, **known, runs=pose.runs,
+            outside_limit=pose.outside_limit, explained=pose.explained,
+        )  # fmt: skip
+
+
+def compare_cameras(
+    inputs: EstimateInputs,
+    search: PoseSearch,
+    records: Mapping[str, FrameRecord],
+    on_stage: OnStage | None,
+    doubtful: float = 0.12,
+    left_share: float = 0.5,
+    frame_count: int = 2,
+    pair_count: int = 3,
+) -> list[str]:
+    """A warning of cameras that contradict each other; few frames are matched again for it.
+
+    Nothing is matched where the poses fit.
+
+    Args:
+        doubtful: median E_total from which two cameras are compared. More are compared only where
+            the pictures are explained badly: a real person in four leaves 15 to 18 %, and one of
+            several that disagrees is known by its IoU.
+        left_share: cameras contradict each other where each alone leaves less than this fraction
+            of what all together leave; and what is put right leaves as little.
+        frame_count: how many frames are compared.
+        pair_count: how many pairs of cameras are tried exchanged.
+    """
+    scene, cameras = inputs.scene, inputs.scene.cameras
+    known = {f: one.E_total for f, one in records.items() if one.E_total is not None}
+    usual = float(np.median(list(known.values()))) if known else 0.0
+    least = doubtful if len(cameras) == 2 else BADLY_EXPLAINED
+    if scene.images or len(cameras) < 2 or usual < least:
+        return []
+    whole = [f for f in known if all((name, f) in scene.masks for name in cameras)]
+    # The usual ones: in the worst, there may be more that is wrong.
+    chosen = sorted(whole, key=lambda frame: abs(known[frame] - usual))[:frame_count]
+    if not chosen:
+        return []
+    if on_stage is not None:
+        on_stage("comparing the cameras", 0, None)
+    masks = {frame: {name: scene.read(name, frame) for name in cameras} for frame in chosen}
+
+    def error(owners: Mapping[str, str]) -> float:
+        """E_total, mean over the frames, each camera given the mask of another (or its own)."""
+        errors = []
+        for frame, own in masks.items():
+            views = [View(cameras[name], own[other]) for name, other in owners.items()]
+            found = _match_again(inputs, search, frame, views)
+            errors.append(found.E_total if found.found else math.inf)
+        return float(np.mean(errors))
+
+    together = float(np.mean([known[frame] for frame in chosen]))
+    ious = {n: np.mean([records[f].ious.get(n, 0.0) for f in chosen]) for n in cameras}
+    worst = sorted(cameras, key=lambda name: ious[name])
+    sizes = {name: (camera.width, camera.height) for name, camera in cameras.items()}
+    alike = [pair for pair in combinations(worst, 2) if sizes[pair[0]] == sizes[pair[1]]]
+    for one, other in alike[:pair_count]:
+        after = error({n: {one: other, other: one}.get(n, n) for n in cameras})
+        if after < left_share * together:
+            return [
+                f"cameras '{one}' and '{other}' are exchanged, it seems: E_total is "
+                f"{percent(together)} together, but {percent(after)} with each other's pictures; "
+                "exchange their folders of masks, or their names in cameras.yaml"
+            ]
+    alone = {name: error({name: name}) for name in cameras}
+    areas = [sum(float(own[name].sum()) for own in masks.values()) for name in cameras]
+    bad: Sequence[str] = [name for name in cameras if alone[name] >= BADLY_EXPLAINED]
+    good = [alone[name] for name in cameras if name not in bad]
+    if np.average(list(alone.values()), weights=areas) < left_share * together:
+        left = {
+            n: error({m: m for m in worst if m != n}) for n in worst[:pair_count] if len(worst) > 2
+        }
+        first = min(left, key=lambda name: left[name], default="")
+        bad = [first] if first and left[first] < left_share * together else list(cameras)
+    # A camera whose place the model's own contradicts is not explained even alone.
+    elif not (bad and good and max(good) < left_share * min(alone[name] for name in bad)):
+        return []
+    names = " and ".join(f"'{name}'" for name in bad)
+    what = f"cameras {names} contradict each other"
+    if len(bad) < len(alone):
+        others = "the others" if len(alone) > 2 else "the other one"
+        what = f"camera {names} contradicts {others}"
+    each = ", ".join(f"'{name}' {percent(left)}" for name, left in alone.items())
+    return [
+        f"{what}: E_total is {percent(together)} together, alone {each}; has one moved since it "
+        "was calibrated, are masks of another camera or instant, is X_WC the camera's pose in the "
+        "world, in metres?"
+    ]
+
+
+def _match_again(
+    inputs: EstimateInputs, search: PoseSearch, frame: str, views: Sequence[View]
+) -> PoseEstimate:
+    """A frame's pose without what else looks the same."""
+    if isinstance(search, (BeamSearch, MultiStartSearch)):
+        search = search.without_alternatives()
+    return search.match(views, (inputs.root_positions or {}).get(frame))
+
+
+def check_track(
+    inputs: EstimateInputs,
+    search: PoseSearch,
+    records: Mapping[str, FrameRecord],
+    elsewhere: float = 0.2,
+) -> list[str]:
+    """A warning of a track that follows a wrong pose: its worst frame is matched by itself for it.
+
+    Nothing is matched where all frames fit nearly as well as those in which a pose was searched.
+
+    ``elsewhere``: a joint that is off by more is named [rad or m].
+    """
+    searched, tracked = list[float](), dict[str, float]()
+    for frame, one in records.items():
+        if one.E_total is None or not inputs.scene.cameras_of(frame):
+            continue
+        if one.stopped_by == TRACKED:
+            tracked[frame] = one.E_total
+        else:
+            searched.append(one.E_total)
+    if not searched or not tracked:
+        return []
+    worst = max(tracked, key=lambda frame: tracked[frame])
+    if not _is_worse(tracked[worst], min(searched)):
+        return []
+    found = _match_again(inputs, search, worst, _views(inputs.scene, worst))
+    if not found.found or not _is_worse(tracked[worst], found.E_total):
+        return []
+    model, q = inputs.model, records[worst].q
+    off = nearest_turn(found.q, q, model.periodic) - q
+    joints = [model.position_names[k] for k in np.flatnonzero(np.abs(off) > elsewhere)]
+    where = f", with {listed(joints)} elsewhere" if joints else ""
+    return [
+        f"frame '{worst}': tracked it leaves {percent(tracked[worst])} of the silhouettes' area, "
+        f"matched by itself {percent(found.E_total)}{where}: its pose is wrong, and so may be the "
+        "others, if the track began with a wrong one; match all by themselves (--no-track) and "
+        "compare"
+    ]
+
+
+def _is_worse(error: float, other: float) -> bool:
+    """Whether a pose that leaves one E_total fits clearly worse than one that leaves another."""
+    return error > max(1.2 * other, other + 0.01)

@@ -22,7 +22,7 @@ from drake_pose.errors import MaskError, SceneError
 from drake_pose.files.folder import write_summary, writes_folder
 from drake_pose.files.records import mask_digests, user_units
 from drake_pose.files.settings import percent
-from drake_pose.jobs.estimate.episode import say_left_out
+from drake_pose.jobs.estimate.measurements import say_left_out
 from drake_pose.jobs.registration.diagnosis import (
     compare_camera,
     compare_clock,

@@ -19,19 +19,18 @@ from drake_pose.camera.episode_files import open_episode
 from drake_pose.camera.models import Camera, PinholeCamera
 from drake_pose.errors import CameraError, MaskError, SceneError, SettingsError, UnknownNameError
 from drake_pose.files.settings import EstimateSettings
-from drake_pose.jobs.estimate.episode import (
-    MappedJoints,
+from drake_pose.jobs.estimate.inputs import make_tree, missing_for_person
+from drake_pose.jobs.estimate.measurements import (
+    TreeLog,
     cameras_of,
     frames_of,
     is_episode,
     is_timed,
     kept_pictures,
     map_log,
+    read_true_angles,
     rows_of,
 )
-from drake_pose.jobs.estimate.inputs import missing_for_person
-from drake_pose.jobs.estimate.measurements import read_true_angles
-from drake_pose.jobs.estimate.searches import make_tree
 from drake_pose.jobs.registration.positions import (
     KnownPositions,
     estimate_positions,
@@ -228,7 +227,7 @@ def _known_camera(one: EpisodeCamera) -> PinholeCamera:
 
 
 def _recording(
-    camera: EpisodeCamera, mapped: MappedJoints, default: Array, settings: AuditSettings
+    camera: EpisodeCamera, mapped: TreeLog, default: Array, settings: AuditSettings
 ) -> Recording:
     """A camera's pictures beside the joints; pictures of frames that are not asked for are out."""
     kept = kept_pictures(camera, settings)

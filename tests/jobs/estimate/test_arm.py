@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from drake_pose.files.settings import EstimateSettings
-from drake_pose.jobs.estimate.inputs import Inputs, read_inputs
+from drake_pose.jobs.estimate.inputs import EstimateInputs, read_inputs
 from drake_pose.search import View
 from drake_pose.silhouette.areas.bending import TreeSurfaces
 from drake_pose.silhouette.areas.scoring import draw_mask
@@ -34,7 +34,7 @@ def base_errors(found: np.ndarray, truth: np.ndarray) -> np.ndarray:
     return np.degrees(np.abs(best[BASE]))
 
 
-def view_errors(inputs: Inputs, views: list[View], values: np.ndarray) -> np.ndarray:
+def view_errors(inputs: EstimateInputs, views: list[View], values: np.ndarray) -> np.ndarray:
     """E_total in each view alone."""
     tree, errors = inputs.search.tree, []
     counts = [len(node.value_names) for node in tree.nodes]

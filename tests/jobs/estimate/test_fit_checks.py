@@ -10,8 +10,7 @@ import pytest
 from drake_pose.files.records import FrameRecord
 from drake_pose.files.settings import EstimateSettings
 from drake_pose.jobs.estimate.inputs import read_inputs
-from drake_pose.jobs.estimate.matching import check_track, compare_cameras
-from drake_pose.jobs.estimate.scene import estimate_scene
+from drake_pose.jobs.estimate.scene import check_track, compare_cameras, estimate_scene
 from drake_pose.search import TRACKED
 from tests.jobs.scenes import URDF, TinyScene, camera, edit_camera, write_scene
 

@@ -172,7 +172,7 @@ def test_another_root_with_a_position_for_each_frame(own_scene: TinyScene) -> No
 def test_a_frame_without_a_pose(own_scene: TinyScene, monkeypatch: pytest.MonkeyPatch) -> None:
     out = own_scene.folder.parent / "out"
     strict = partial(PaperSearchSettings, outside_limit=0.0)
-    monkeypatch.setattr("drake_pose.jobs.estimate.searches.PaperSearchSettings", strict)
+    monkeypatch.setattr("drake_pose.jobs.estimate.inputs.PaperSearchSettings", strict)
     options = ["--method", "paper", "--no-replay", "--hold", "lift=-90"]
     lost, summary = run_estimate(own_scene, out, *options, status=1)
     assert lost.stderr.count("no pose was found\n") == 1

@@ -6,7 +6,7 @@ import pytest
 from drake_pose.body import load_model
 from drake_pose.files.settings import EstimateSettings
 from drake_pose.jobs.estimate.body_fit import _StartedSearch
-from drake_pose.jobs.estimate.inputs import Inputs
+from drake_pose.jobs.estimate.inputs import EstimateInputs
 from drake_pose.jobs.estimate.measurements import TrueAngles
 from drake_pose.jobs.estimate.scene import estimate_scene
 from drake_pose.search import TRACKED, RootPlacementSearch
@@ -75,8 +75,8 @@ def test_a_sequence_need_not_be_tracked(tmp_path: Path) -> None:
 def test_how_a_scene_is_tracked(tiny_scene: TinyScene) -> None:
     model, scene = load_model(tiny_scene.model), load_scene(tiny_scene.folder)
     for search in (None, RootPlacementSearch.__new__(RootPlacementSearch)):
-        assert Inputs(scene, model, scene.frames, False, search, None).tracking() is None
-        tracking = Inputs(scene, model, scene.frames, True, search, None).tracking()
+        assert EstimateInputs(scene, model, scene.frames, False, search, None).tracking() is None
+        tracking = EstimateInputs(scene, model, scene.frames, True, search, None).tracking()
         assert tracking is not None
         assert tracking.root_moves is (search is not None)
         assert not tracking.scale_unknown
@@ -88,7 +88,7 @@ def test_an_encoder_that_has_turned_once_more_is_no_error(
     """As a UR5: measured 331.5 degrees inside limits of 360, which looks like -28.5."""
     model, scene = crane(tmp_path), load_scene(tiny_scene.folder)
     truth = TrueAngles(tmp_path, model.position_names, {0: np.radians([178.0, 331.5])})
-    inputs = Inputs(scene, model, scene.frames, False, None, truth)
+    inputs = EstimateInputs(scene, model, scene.frames, False, None, truth)
     errors = inputs.joint_errors("0000", np.radians([177.0, -28.0]))
     assert errors == pytest.approx({"swing": -1.0, "luff": 0.5})
     assert inputs.joint_errors("0001", np.zeros(2)) == {}

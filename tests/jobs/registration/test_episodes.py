@@ -12,7 +12,7 @@ import pytest
 from drake_pose.camera.camera_files import load_cameras, save_cameras
 from drake_pose.errors import DrakePoseError
 from drake_pose.files.overlay import EXCESS_RGB, MISSING_RGB
-from drake_pose.jobs.estimate.episode import is_episode
+from drake_pose.jobs.estimate.measurements import is_episode
 from drake_pose.jobs.registration.audit import audit_scene
 from drake_pose.jobs.registration.inputs import Inputs, read_inputs
 from drake_pose.jobs.registration.register import register_scene

@@ -79,21 +79,6 @@ def test_bundled_landmarks_span_the_measured_lengths(path):
     assert at["left_wrist"][1] > 100 > -100 > at["right_wrist"][1]
 
 
-def test_welded_links_and_a_moved_world(tmp_path):
-    model = load_model(write(tmp_path, FLOATING_URDF), check=False)
-    landmarks = {"tip": Landmark("welded", np.array([0.1, 0.0, 0.2]))}
-    tree = model.pose_tree()
-    placed = landmarks_of_nodes(tree, landmarks)
-    assert tree.nodes[placed.nodes[0]].name == "hand"
-    q = np.array(model.default_positions)
-    here = landmark_positions(model, landmarks, q)
-    X_WB = np.array([[0.0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]])
-    moved = landmark_positions(model, landmarks, q, X_WB)
-    np.testing.assert_allclose(moved[0], [1 - here[0, 1], 2 + here[0, 0], 3 + here[0, 2]])
-    assert landmark_positions(model, {}, q).shape == (0, 3)
-    assert landmarks_of_nodes(tree, {}).positions(tree.node_poses(tree.default_values())).size == 0
-
-
 def test_links_unknown_or_unseen_and_bad_positions_are_named(tmp_path):
     model = load_model(write(tmp_path, FLOATING_URDF), check=False)
     wrong = {"elbow": Landmark("elbow_link", np.zeros(3))}

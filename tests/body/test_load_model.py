@@ -10,8 +10,7 @@ from drake_pose.body import TriangleMesh, bundled_model, describe_model, load_mo
 from drake_pose.body.meshes import merge_duplicate_vertices
 from drake_pose.body.model_files import package_map
 from drake_pose.errors import ModelError, UnknownNameError
-
-from .models import FLOATING_URDF, WELDED_URDF, cube_obj, joint, link, urdf, write
+from tests.body.models import FLOATING_URDF, cube_obj, joint, link, urdf, write
 
 
 def mesh_urdf(*files, scale="1 1 1"):
@@ -78,19 +77,6 @@ def test_meshes_drake_would_not_draw_are_replaced(tmp_path):
     assert sum(str(path) == str(tmp_path / "good.obj") for path in paths) == 1
 
 
-def test_model_can_be_added_twice_and_without_geometry(tmp_path):
-    model = load_model(write(tmp_path, WELDED_URDF), check=False)
-    plant, scene_graph = MultibodyPlant(0.0), SceneGraph()
-    assert model.add_to(plant, scene_graph) != model.add_to(plant, scene_graph)
-    plant.Finalize()
-    assert plant.num_positions() == 2 * len(model.position_names)
-    model.add_to(MultibodyPlant(0.0))
-    registered = MultibodyPlant(0.0)
-    registered.RegisterAsSourceForSceneGraph(scene_graph)
-    with pytest.raises(ModelError, match="scene_graph"):
-        model.add_to(registered)
-
-
 def test_bundled_models_are_found_through_drakes_package_map():
     assert bundled_model("woman").is_file()
     assert package_map().Contains("drake_pose")
@@ -118,17 +104,6 @@ def test_broken_meshes_name_the_file_and_the_link(tmp_path, name, content):
     (tmp_path / name).write_bytes(content)
     with pytest.raises(ModelError, match=rf"thing\.urdf.*{name}"):
         load_model(write(tmp_path, mesh_urdf(name)), check=False)
-
-
-def test_missing_and_foreign_files(tmp_path):
-    write(tmp_path, "x", "model.txt")
-    for name, reason in (
-        ("gone.urdf", "does not exist"),
-        (".", "is not a file"),
-        ("model.txt", "not a kind of file"),
-    ):
-        with pytest.raises(ModelError, match=reason):
-            load_model(tmp_path / name, check=False)
 
 
 def alias_bomb():

@@ -7,8 +7,7 @@ import pytest
 from pydrake.math import RotationMatrix
 from pydrake.multibody.tree import BodyIndex
 
-from drake_pose.body import RootRotation, load_model, nearest_turn
-from drake_pose.body.parsed_model import one_turn, turns_around
+from drake_pose.body import RootRotation, load_model
 from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.errors import ModelError
 from tests.body.models import JOINTS_SDF, joint, link, urdf, write
@@ -180,15 +179,6 @@ def test_turned_values_are_the_same_pose_for_drake(tmp_path):
             assert inside[0] == followed[0]
         np.testing.assert_allclose(pose(inside), pose(values), atol=1e-12)
     assert kinematics.within_limits(np.array([400.0]))[0] == pytest.approx(400.0 - 63 * FULL)
-
-
-def test_half_a_turn_either_side_stays():
-    values = np.array([math.pi, -math.pi, math.pi + 1e-6, 7.0])
-    turned = nearest_turn(values, np.zeros(4), True)
-    np.testing.assert_allclose(turned, [math.pi, -math.pi, 1e-6 - math.pi, 7.0 - FULL])
-    low, high = one_turn(np.array([-1.0]), np.array([1.0]), np.array([0.5]))
-    assert (low[0], high[0]) == (-1.0, 1.0)
-    assert turns_around(np.array([0.0]), np.array([FULL]), np.array([True])).all()
 
 
 def test_a_root_that_is_turned_about_axes_is_answered_within_its_limits():

@@ -3,10 +3,7 @@ import io
 import json
 import math
 
-import cv2
-import numpy as np
 import pytest
-from matplotlib.figure import Figure
 from rich.console import Console
 
 from drake_pose.commands.main import app
@@ -17,8 +14,6 @@ from drake_pose.papers.tables import (
     figure_table,
     require_choice,
     require_counts,
-    save_figure,
-    save_picture,
     spread_over_seeds,
 )
 from tests.cli import CliRunner
@@ -80,14 +75,6 @@ def test_other_settings_are_refused(two_experiments, tmp_path):
         reproduce_all(tmp_path, False, quiet, lambda _text: None)
 
 
-def test_a_folder_that_holds_something_is_refused_without_resume(tmp_path):
-    (tmp_path / "mine.txt").write_text("mine")
-    refused = CliRunner().invoke(app, ["reproduce", "all", "--short", "--out", str(tmp_path)])
-    assert refused.exit_code == 1
-    assert "not empty" in refused.stderr
-    assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]
-
-
 @pytest.mark.slow
 def test_all_of_it_short(tmp_path):
     made = CliRunner().invoke(app, ["reproduce", "all", "--short", "--out", str(tmp_path / "all")])
@@ -135,14 +122,3 @@ def test_counts_and_choices_are_refused_by_name():
         require_counts(runs=1, images=0)
     with pytest.raises(SettingsError, match="angle must be one of a, b, not 'c'"):
         require_choice("angle", "c", ("a", "b"))
-
-
-def test_pictures_are_written_with_their_colours(tmp_path):
-    picture = np.zeros((4, 5, 3), dtype=np.uint8)
-    picture[..., 0] = 200
-    # In folders that are not there, and again in those that are.
-    for _ in range(2):
-        path = save_picture(picture, tmp_path / "new" / "deeper" / "red.png")
-        np.testing.assert_array_equal(cv2.imread(str(path))[..., ::-1], picture)
-        drawn = save_figure(Figure(), tmp_path / "drawn" / "deeper" / "empty.png")
-        assert drawn.stat().st_size > 100

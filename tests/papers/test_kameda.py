@@ -8,11 +8,8 @@ import numpy as np
 import pytest
 
 from drake_pose.commands.main import app
-from drake_pose.errors import SceneError, SettingsError
-from drake_pose.jobs.demo import stored_scene
+from drake_pose.errors import SettingsError
 from drake_pose.papers.kameda import (
-    PAPER,
-    REAL_EXPERIMENTS,
     beam_experiment_search,
     causes_of_wrong_angles,
     continuous_figures,
@@ -22,14 +19,12 @@ from drake_pose.papers.kameda import (
     experiment_search,
     experiment_tree,
     grid_figures,
-    grid_table,
     run_experiment,
 )
 from drake_pose.papers.kameda_pictures import chest_ranks, ratio_within, save_pictures
 from drake_pose.search import MultiStartSearch, PoseEstimate
 from drake_pose.silhouette.areas.scoring import draw_mask
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
-from drake_pose.silhouette.pictures.scenes import load_scene
 from tests.cli import CliRunner
 
 
@@ -95,18 +90,6 @@ def test_the_figures_are_what_drake_draws(result):
             assert trial.result.E_total == pytest.approx(expected, abs=0.004)
 
 
-def test_json_has_the_keys_of_the_paper_and_the_same_seed_the_same_figures(search, result):
-    figures = grid_figures(result)
-    assert set(PAPER) | {"median_seconds"} <= set(figures)
-    assert figures["images"] == 5
-    E_total = [trial.result.E_total for trial in result.trials]
-    assert figures["mean_e_total"] == pytest.approx(np.mean(E_total))
-    assert figures["min_runs"] == min(trial.result.runs for trial in result.trials)
-    again = run_experiment(search, images=1, seed=5)
-    for one, other in zip(result.trials, again.trials, strict=False):
-        np.testing.assert_array_equal(one.result.q, other.result.q)
-
-
 def test_poses_not_found_are_counted_apart(search, result):
     nothing = PoseEstimate.nothing(search.tree, stopped_by="end")
     lost = [replace(one, result=nothing) for one in result.trials[:2]]
@@ -125,13 +108,6 @@ def test_the_beam_search_matches_every_silhouette_exactly_and_names_the_truth(be
         values = np.concatenate(trial.true_values)
         joints = trial.result.pose_set.joints
         assert all(joint.holds(value) for joint, value in zip(joints, values, strict=True))
-
-
-def test_columns_stand_side_by_side(result, beam_result):
-    table = grid_table([[result], [beam_result]])
-    headings = ["figure", "paper", "the paper's method", "beam search"]
-    assert [column.header for column in table.columns] == headings
-    assert table.row_count > grid_table([[result]]).row_count >= len(PAPER)
 
 
 def test_pictures_are_written(result, beam_result, tmp_path):
@@ -228,14 +204,6 @@ def test_figures_of_continuous_angles_come_from_the_trials():
     assert np.median(known) < 0.5
     assert figures["interval_coverage"] > 0.8
     assert continuous_table(result).row_count == 11
-
-
-def test_the_pictures_are_there():
-    frames = [load_scene(stored_scene(one.scene)).frames for one in REAL_EXPERIMENTS.values()]
-    assert frames[0] == ("0000", "0010", "0020", "0030", "0040", "0049")
-    assert len(frames[1]) == 2
-    with pytest.raises(SceneError, match="'none'"):
-        stored_scene("none")
 
 
 @pytest.mark.slow

@@ -22,7 +22,7 @@ import itertools
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -59,19 +59,6 @@ def joint_values(plant: MultibodyPlant, q: NDArray[np.float64]) -> list[JointVal
         for joint in joints
         if joint.num_positions()
     ]
-
-
-class Reference(Protocol):
-    """What an independent library says about a model file."""
-
-    def poses(self, values: list[JointValue]) -> Poses:
-        """The pose X_WL (4, 4) of each link."""
-
-    def limits(self) -> Mapping[str, tuple[float, float]]:
-        """Lower and upper limits by the name of each hinge or slide that has them."""
-
-    def boxes(self) -> Boxes | None:
-        """The bounding box (2, 3) [m] of what is seen of each link, in the link's frame."""
 
 
 class PinocchioReference:
@@ -242,3 +229,6 @@ def _shape_box(kind: str, size: NDArray[np.float64], X: NDArray[np.float64]) -> 
 def _joined(boxes: list[NDArray[np.float64]]) -> NDArray[np.float64]:
     """The box (2, 3) around boxes."""
     return np.array([np.min(boxes, axis=0)[0], np.max(boxes, axis=0)[1]])
+
+
+Reference = PinocchioReference | MujocoReference

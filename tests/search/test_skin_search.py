@@ -17,7 +17,7 @@ from drake_pose.search import (
 )
 from drake_pose.silhouette.areas.bending import TreeSurfaces
 from drake_pose.silhouette.areas.scoring import draw_mask
-from tests.body.skins import load_limb
+from tests.body.models import load_limb
 from tests.search.naive_search import NaiveSearch
 
 INTERVAL = 0.8

@@ -60,27 +60,6 @@ def assert_closed(mesh: trimesh.Trimesh) -> None:
         assert shell.volume > 0.0
 
 
-def winding_numbers(mesh: trimesh.Trimesh, points: np.ndarray) -> np.ndarray:
-    """How often the mesh winds round each point (n, 3): at least 1 inside some shell."""
-    corners = mesh.triangles[None] - points[:, None, None]
-    lengths = np.linalg.norm(corners, axis=-1)
-    a, b, c = corners[..., 0, :], corners[..., 1, :], corners[..., 2, :]
-    volume = np.einsum("nij,nij->ni", a, np.cross(b, c))
-    below = (
-        lengths.prod(axis=-1)
-        + np.einsum("nij,nij->ni", a, b) * lengths[..., 2]
-        + np.einsum("nij,nij->ni", b, c) * lengths[..., 0]
-        + np.einsum("nij,nij->ni", c, a) * lengths[..., 1]
-    )
-    return np.arctan2(volume, below).sum(axis=1) / (2.0 * np.pi)
-
-
-def sphere_points(radius: float, count: int = 60) -> np.ndarray:
-    """Points (count, 3) on a sphere round the origin, always the same ones."""
-    directions = np.random.default_rng(3).normal(size=(count, 3))
-    return radius * directions / np.linalg.norm(directions, axis=1, keepdims=True)
-
-
 class Silhouettes:
     """Masks of a model, seen by a parallel camera from any side."""
 

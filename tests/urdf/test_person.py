@@ -1,12 +1,11 @@
 """The bundled person: 23 degrees of freedom, coloured for skin blobs, and its shape joints."""
 
 import itertools
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from drake_pose.body import ArticulatedModel, landmark_positions, load_landmarks, load_model
+from drake_pose.body import landmark_positions, load_landmarks, load_model
 from drake_pose.filtering.inequalities import model_inequalities
 from tests.urdf.surfaces import URDF, Silhouettes, read_obj, written_again
 
@@ -22,17 +21,15 @@ PARTS = (
 
 
 @pytest.fixture(scope="module")
-def shape() -> ArticulatedModel:
+def shape():
     return load_model(SHAPE, check=False)
 
 
-def stretches(model: ArticulatedModel) -> list[int]:
+def stretches(model):
     return [i for i, name in enumerate(model.position_names) if name.endswith("_stretch")]
 
 
-def same_angles(
-    person: ArticulatedModel, shape: ArticulatedModel, q: np.ndarray, lengths: np.ndarray
-) -> np.ndarray:
+def same_angles(person, shape, q, lengths):
     """The shape model's positions at the plain model's q."""
     whole = np.zeros(len(shape.position_names))
     for name, value in zip(person.position_names, q, strict=True):
@@ -41,25 +38,25 @@ def same_angles(
     return whole
 
 
-def random_pose(model: ArticulatedModel, rng: np.random.Generator) -> np.ndarray:
+def random_pose(model, rng):
     q = rng.uniform(model.lower, model.upper)
     q[:3] = 0.0
     q[stretches(model)] = 0.0
     return q
 
 
-def marks(model: ArticulatedModel, q: np.ndarray) -> dict[str, np.ndarray]:
+def marks(model, q):
     landmarks = load_landmarks(model.path)
     return dict(zip(landmarks, landmark_positions(model, landmarks, q), strict=True))
 
 
-def test_script_changes_lengths_and_girths(person: ArticulatedModel, tmp_path: Path) -> None:
+def test_script_changes_lengths_and_girths(person, tmp_path):
     written_again("person", tmp_path, "--lengths", "thigh=1.1", "--girths", "thigh=0.9")
     other = load_model(tmp_path / "person.urdf", check=False)
     zero = np.zeros(23)
     before, after = marks(person, zero), marks(other, zero)
 
-    def distance(found: dict[str, np.ndarray], a: str, b: str) -> float:
+    def distance(found, a, b):
         return float(np.linalg.norm(found[a] - found[b]))
 
     for side in ("left", "right"):
@@ -73,15 +70,9 @@ def test_script_changes_lengths_and_girths(person: ArticulatedModel, tmp_path: P
     np.testing.assert_allclose(sizes[1] / sizes[0], [0.9, 1.1, 0.9], atol=0.01)
 
 
-@pytest.mark.parametrize("word", ["arm=1.1", "thigh", "thigh=3", "thigh=nan"])
-def test_script_refuses_bad_factors(word: str, tmp_path: Path) -> None:
-    with pytest.raises(Exception, match="exit status 2"):
-        written_again("person", tmp_path, "--lengths", word)
-
-
 def test_degrees_of_freedom_are_those_of_figure_5_and_limits_are_mirrored(
-    person: ArticulatedModel,
-) -> None:
+    person,
+):
     """Date et al., figure 5: head 3 + 2, neck base 2, shoulders 3, elbows 1, hips 3, knees 1."""
     rows = ["position x y z", "head y x", "neck_base x z"]
     for side in ("left", "right"):
@@ -100,10 +91,10 @@ def test_degrees_of_freedom_are_those_of_figure_5_and_limits_are_mirrored(
     assert not person.lower[person.position_index("left_shin_x")]
 
 
-def test_positive_angles_move_as_told(person: ArticulatedModel) -> None:
+def test_positive_angles_move_as_told(person):
     rest = marks(person, np.zeros(23))
 
-    def moved(name: str, degrees: float, landmark: str) -> np.ndarray:
+    def moved(name, degrees, landmark):
         q = np.zeros(23)
         q[person.position_index(name)] = np.radians(degrees)
         return np.asarray(marks(person, q)[landmark] - rest[landmark])
@@ -118,9 +109,7 @@ def test_positive_angles_move_as_told(person: ArticulatedModel) -> None:
     assert moved("head_x", 40, "head_top")[0] > 0.05  # looking down
 
 
-def test_shape_model_at_zero_is_the_plain_person(
-    person: ArticulatedModel, shape: ArticulatedModel
-) -> None:
+def test_shape_model_at_zero_is_the_plain_person(person, shape):
     rng = np.random.default_rng(5)
     pictures = Silhouettes(person), Silhouettes(shape)
     for _ in range(6):
@@ -134,7 +123,7 @@ def test_shape_model_at_zero_is_the_plain_person(
         assert np.count_nonzero(masks[0] != masks[1]) <= 0.002 * np.count_nonzero(masks[0])
 
 
-def test_shape_joints_change_the_lengths_one_for_one(shape: ArticulatedModel) -> None:
+def test_shape_joints_change_the_lengths_one_for_one(shape):
     rng = np.random.default_rng(6)
     q = random_pose(shape, rng)
     before = marks(shape, q)
@@ -146,23 +135,9 @@ def test_shape_joints_change_the_lengths_one_for_one(shape: ArticulatedModel) ->
         change = np.linalg.norm(after[end] - after[start])
         change -= np.linalg.norm(before[end] - before[start])
         assert change == pytest.approx(0.02, abs=1e-6)
-    zero = np.zeros(len(shape.position_names))
-    upright = marks(shape, zero)
-    for joint, landmark, axis, sign in (
-        ("neck_stretch", "neck", 2, -1),
-        ("trunk_stretch", "left_hip", 2, -1),
-        ("left_shoulder_stretch", "left_shoulder", 1, 1),
-        ("right_shoulder_stretch", "right_shoulder", 1, -1),
-        ("left_hip_stretch", "left_hip", 1, 1),
-        ("right_hip_stretch", "right_hip", 1, -1),
-    ):
-        q = zero.copy()
-        q[shape.position_index(joint)] = 0.02
-        change = marks(shape, q)[landmark] - upright[landmark]
-        np.testing.assert_allclose(change, 0.02 * sign * np.eye(3)[axis], atol=1e-6)
 
 
-def test_couplings_keep_the_sides_alike(shape: ArticulatedModel) -> None:
+def test_couplings_keep_the_sides_alike(shape):
     inequalities = model_inequalities(shape)
     q = np.zeros(len(shape.position_names))
     assert np.all(inequalities.margins(q) >= 0.0)

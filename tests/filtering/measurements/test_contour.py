@@ -8,8 +8,7 @@ from drake_pose.filtering.body_state import ROOT_SHIFT
 from drake_pose.filtering.contour_tracker import ContourObservation, ContourSettings
 from drake_pose.filtering.inequalities import from_model
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
-from tests.body.models import joint, link, urdf, write
-from tests.body.skins import LIMB_URDF, write_limb
+from tests.body.models import LIMB_URDF, joint, link, urdf, write, write_limb
 from tests.jobs.scenes import camera
 from tests.search.bodies import forked_body, front_camera, near_camera
 from tests.search.turning import crane

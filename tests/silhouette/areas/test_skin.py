@@ -14,7 +14,7 @@ from drake_pose.silhouette.areas.scoring import draw_mask, prefix_sums, score_bo
 from drake_pose.silhouette.bits.bit_kernel import draw_bits, make_bit_view
 from drake_pose.silhouette.contours.contour_points import divide_outline
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
-from tests.body.skins import load_limb
+from tests.body.models import load_limb
 from tests.silhouette.agreement import LARGEST_SHARE, measure_agreement
 from tests.silhouette.shapes import brute_force_mask
 

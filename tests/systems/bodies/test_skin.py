@@ -15,7 +15,7 @@ from drake_pose.search import PaperSearch, PaperSearchSettings
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from drake_pose.systems.bodies import MeshcatSkin, add_meshcat_skin
 from drake_pose.systems.diagrams import build_simulated_matching
-from tests.body.skins import load_limb
+from tests.body.models import load_limb
 
 
 @pytest.fixture

@@ -10,9 +10,8 @@ from drake_pose.errors import ModelError
 from tests.body.models import BOX, WELDED_URDF, write
 from tests.body.models import link as urdf_link
 from tests.body.models import urdf as urdf_file
-
-from .test_mjcf import MJCF
-from .test_urdf import STL, refusal
+from tests.body.test_mjcf import MJCF
+from tests.body.test_urdf import STL, refusal
 
 SHAPE = "<box><size>0.1 0.2 0.3</size></box>"
 LIMITS = "<limit><lower>-1</lower><upper>1</upper></limit>"

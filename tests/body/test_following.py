@@ -18,10 +18,9 @@ from drake_pose.errors import ModelError, SettingsError
 from drake_pose.fit.parameters import BodyParameters
 from drake_pose.fit.surfaces import VERY_FEW, few_triangles
 from drake_pose.silhouette.areas.bending import TreeSurfaces
+from tests.body import test_sdf as sdf
+from tests.body.models import joint, link, urdf, write
 from tests.fit.motions import assert_motions_are_derivatives
-
-from ..formats import test_sdf as sdf
-from ..models import joint, link, urdf, write
 
 LIMITS = 'lower="0" upper="0.8"'
 # A finger that is driven, one that follows it, its tip, which follows by half, and what the tip
@@ -87,20 +86,6 @@ def test_what_is_not_enforced_is_told_and_what_is_stands_in_the_report(tmp_path)
     ]  # fmt: skip
 
 
-def test_beside_tendons_nothing_is_enforced_and_that_is_told(tmp_path):
-    values = {"offset": 0, "stiffness": 1, "damping": 0, "lower_limit": -1, "upper_limit": 1}
-    ends = "".join(f'<drake:tendon_constraint_{n} value="{v}"/>' for n, v in values.items())
-    tendon = (
-        '<drake:tendon_constraint><drake:tendon_constraint_joint name="wrist" a="1"/>'
-        f"{ends}</drake:tendon_constraint></robot>"
-    )
-    text = HAND.replace("<robot ", '<robot xmlns:drake="http://drake.mit.edu" ')
-    tree = tree_of(tmp_path, text.replace("</robot>", tendon))
-    assert tree.followers == ()
-    (told,) = model_warnings(tree.model, tree)
-    assert told.startswith("4 constraints between joints or links are written in the file")
-
-
 @pytest.mark.parametrize("lengths", [False, True])
 def test_motions_against_finite_differences(tmp_path, lengths):
     kinematics, values = drawn(tree_of(tmp_path), np.random.default_rng(1))
@@ -123,17 +108,6 @@ def test_limits_are_shared_and_what_is_held_holds_the_others(tmp_path):
     apart = HAND.replace('lower="-0.6" upper="0.1"', 'lower="0.5" upper="0.9"')
     with pytest.raises(ModelError, match=r"'mirror' follows joint 'lead'.*leave no value"):
         tree_of(tmp_path, apart)
-    sign = HAND.replace('lower="-0.6" upper="0.1"', 'lower="0.1" upper="0.9"')
-    model = load_model(write(tmp_path, sign), check=False)
-    assert model.upper[lead] == 0.8
-    assert any(
-        "'mirror' follows joint 'lead' (<mimic>: -1 x +0.1)" in one for one in model.warnings
-    )
-    again = urdf(
-        *map(link, "ab"), joint("again", "revolute", "a", "b", more='<mimic joint="again"/>')
-    )
-    (told,) = load_model(write(tmp_path, again), check=False).warnings
-    assert "'again' is written to follow joint 'again' (<mimic>): not enforced" in told
 
 
 MIMIC = (

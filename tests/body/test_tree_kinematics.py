@@ -111,15 +111,6 @@ def _root_of(tree, node):
     return node
 
 
-def test_limits_and_kinds_are_the_trees(tmp_path):
-    path = write(tmp_path, FLOATING_URDF)
-    kinematics = TreeKinematics(load_model(path, check=False).pose_tree())
-    slide = kinematics.names.index("slide")
-    assert kinematics.is_angle.tolist() == [name != "slide" for name in kinematics.names]
-    assert (kinematics.lower[slide], kinematics.upper[slide]) == (-0.2, 0.3)
-    assert kinematics.tree.nodes[kinematics.value_nodes[slide]].name == "hand"
-
-
 def test_values_of_the_wrong_number_are_refused(kinematics):
     with pytest.raises(SettingsError, match="values expected"):
         kinematics.motions(np.zeros(len(kinematics.names) + 1))

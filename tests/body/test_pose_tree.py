@@ -1,7 +1,10 @@
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from drake_pose.body import RootRotation, load_model
+from drake_pose.body.pose_tree import axis_samples, product_grid
+from drake_pose.body.root import even_rotations
 from drake_pose.errors import ModelError, SettingsError, UnknownNameError
 from tests.body.models import (
     FLOATING_URDF,
@@ -92,41 +95,6 @@ def test_every_tree_agrees_with_drake(models, name, root, kind):
     if name == "jointed":
         _, X_WB = tree.positions_from(tree.default_values())
         np.testing.assert_array_equal(X_WB, np.eye(4))
-
-
-def test_a_tree_without_a_place_hangs_where_the_file_says(models):
-    parents = {
-        "floating": [-1, 0, 0, 1],
-        "welded": [-1, 0, 1],
-        "all_joints": [-1, 0, 1, 2, 3, 4],
-    }
-    for name, wanted in parents.items():
-        tree = models[name].pose_tree()
-        assert [node.parent for node in tree.nodes] == wanted
-        assert tree.nodes[0].value_names == ()
-        assert largest_difference_from_drake(models[name], tree) < 1e-9
-    assert [len(node.positions) for node in tree.nodes] == [0, 2, 3, 1, 1, 1]
-
-
-def test_own_root_keeps_its_joints_and_is_held_at_root_position(models):
-    tree = models["jointed"].pose_tree("head", root_position=[0.3, 0.2, 0.1])
-    assert tree.nodes[0].position_names == ("x", "y", "z", "head_y", "head_z", "head_x")
-    grid = tree.grid(0, np.radians(20.0))
-    assert len(grid) == 5**3
-    origins = tree.relative_transforms(0, grid)[:, :3, 3]
-    np.testing.assert_allclose(origins, np.tile([0.3, 0.2, 0.1], (len(grid), 1)), atol=1e-12)
-    # A joint that is held has one sample.
-    tree = models["floating"].pose_tree(held={"shoulder_y": 0.4})
-    grid = tree.grid(tree.node_index("arm"), np.radians(20.0))
-    assert (len(grid), set(grid[:, 1])) == (5, {0.4})
-
-
-def test_limits_that_drake_does_not_read_are_kept(models):
-    all_joints = models["all_joints"]
-    names = ("u_qx", "u_qy", "ball_qx", "screw", "back", "turn")
-    index = [all_joints.position_index(name) for name in names]
-    np.testing.assert_allclose(all_joints.upper[index], [1, 1, np.pi, 3, 2, np.pi])
-    np.testing.assert_allclose(all_joints.lower[index], [-1, -1, -np.pi, -3, -1, -np.pi])
 
 
 def planar_robot(*more):
@@ -229,16 +197,6 @@ def test_what_is_not_seen_and_what_stands_in_the_world(tmp_path, parts, root, no
     assert largest_difference_from_drake(model, tree) < 1e-9
 
 
-def test_moving_the_root_equals_building_the_tree_there(models):
-    names = {"jointed": "arm", "floating": "leg", "welded": None, "all_joints": "c"}
-    for name, root in (*names.items(), ("jointed", "head")):
-        model = models[name]
-        moved = model.pose_tree(root, root_position=[0, 0, 0]).with_root_position([1, 2, 3])
-        built = model.pose_tree(root, root_position=[1, 2, 3])
-        values = built.default_values()
-        np.testing.assert_allclose(moved.node_poses(values), built.node_poses(values), atol=1e-12)
-
-
 @pytest.mark.parametrize(
     ("root", "arguments", "error", "words"),
     [
@@ -272,3 +230,78 @@ def test_two_floating_bodies_are_refused(tmp_path):
     model = loaded(tmp_path, link("a"), link("b"))
     with pytest.raises(ModelError, match="a, b float freely"):
         model.pose_tree()
+
+
+TWENTY = np.radians(20.0)
+
+
+@pytest.mark.parametrize(
+    ("lower", "upper", "expected"),
+    [
+        (-60, 60, [0, -20, 20, -40, 40, -60, 60]),
+        (-100, 10, [0, -20, -40, -60, -80, -100]),
+        (0, 40, [0, 20, 40]),
+        (25, 35, [30]),
+        (5, 5, [5]),
+        (50, 110, [60, 80, 100]),
+    ],
+)
+def test_multiples_by_size_negative_first(lower, upper, expected):
+    samples = axis_samples(np.radians(lower), np.radians(upper), TWENTY, is_angle=True)
+    np.testing.assert_allclose(np.degrees(samples), expected, atol=1e-9)
+    assert min(samples) >= np.radians(lower)
+    assert max(samples) <= np.radians(upper)
+
+
+def test_full_turn_gives_each_direction_once():
+    samples = np.degrees(axis_samples(-np.pi, np.pi, TWENTY, is_angle=True))
+    assert len(samples) == 18
+    assert len(np.unique(np.round(samples % 360.0, 6))) == 18
+    assert len(axis_samples(-np.pi, np.pi, TWENTY, is_angle=False)) == 19
+
+
+def test_too_many_samples_name_the_node():
+    with pytest.raises(SettingsError, match="node 'head'"):
+        product_grid([range(1000)] * 3, "head")
+
+
+def test_even_rotations_leave_no_gap():
+    interval = np.radians(30.0)
+    grid = Rotation.from_rotvec(even_rotations(interval))
+    np.testing.assert_allclose(grid[0].magnitude(), 0.0, atol=1e-12)
+    probes = Rotation.random(300, random_state=1)
+    nearest = [(grid * probe.inv()).magnitude().min() for probe in probes]
+    assert max(nearest) < 0.95 * interval
+    distances = [np.sort((grid * one.inv()).magnitude())[1] for one in grid[::25]]
+    assert min(distances) > 0.3 * interval
+
+
+def test_limited_rotation_is_applied_in_order():
+    rotation = RootRotation.limited([("y", -180, 180), ("z", -10, 10)])
+    values = np.array([[0.5, 0.1]])
+    expected = Rotation.from_euler("y", 0.5) * Rotation.from_euler("z", 0.1)
+    np.testing.assert_allclose(rotation.rotations(values)[0], expected.as_matrix(), atol=1e-12)
+    np.testing.assert_allclose(rotation.values_from(expected.as_matrix()), [0.5, 0.1], atol=1e-9)
+    assert rotation.value_names == ("root_y", "root_z")
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: RootRotation.fixed(np.diag([1.0, 1.0, -1.0])), "not a 3 x 3 rotation"),
+        (lambda: RootRotation.fixed(np.zeros((2, 2))), "not a 3 x 3 rotation"),
+        (lambda: RootRotation.fixed(np.full((3, 3), np.nan)), "not a 3 x 3 rotation"),
+        (lambda: RootRotation.free(0.0), "interval"),
+        (lambda: RootRotation.limited([("y", 10, -10)]), "lower first"),
+        (lambda: RootRotation.limited([("y", 0, 1), ("y", 0, 1)]), "different"),
+        (lambda: RootRotation.limited([]), "one to three"),
+    ],
+)
+def test_bad_rotations_are_refused(make, message):
+    with pytest.raises(SettingsError, match=message):
+        make()
+
+
+def test_a_tiny_interval_is_refused_before_memory_is_taken():
+    with pytest.raises(SettingsError, match=r"1e-12.*larger interval"):
+        axis_samples(-1.0, 1.0, 1e-12, is_angle=True)

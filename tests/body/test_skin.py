@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from drake_pose.body import ArticulatedModel, ModelSkin, RootRotation, load_model
 from drake_pose.errors import DrakePoseError, ModelError, UnknownNameError
-from tests.body.skins import LIMB_URDF, REACH, band_entry, load_limb, tube_obj, write_limb
+from tests.body.models import LIMB_URDF, REACH, band_entry, load_limb, tube_obj, write_limb
 
 WRIST = ("wrist_x", "wrist_z", "wrist_y")
 

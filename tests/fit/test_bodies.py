@@ -198,6 +198,19 @@ def test_proportions_against_finite_differences(stretched, person):
         assert_motions_are_derivatives(body, theta)
 
 
+def test_parts_are_long_towards_what_they_carry_or_else_their_middle(stretched):
+    kinematics = stretched.kinematics
+    X_WN = kinematics.poses(kinematics.flatten(kinematics.tree.default_values()))
+    for node, axis, X in zip(kinematics.tree.nodes, stretched.axes, X_WN, strict=True):
+        ways = (X_WN[list(node.children), :3, 3] - X[:3, 3]) @ X[:3, :3]
+        ways = ways if len(ways) else node.mesh.vertices.mean(axis=0)[None]
+        assert axis == np.abs(ways).sum(axis=0).argmax()
+    count, theta = len(kinematics.names) + 4, np.zeros(len(stretched.names))
+    theta[count : count + len(X_WN)] = np.log(2.0)
+    long = np.eye(3)[stretched.axes]
+    np.testing.assert_allclose(stretched.factors(theta), 1.0 + long)
+
+
 def test_planes_are_those_of_the_stretched_surfaces(stretched):
     theta = np.random.default_rng(1).normal(0.0, 0.2, len(stretched.names))
     packed = stretched.place(theta).packed

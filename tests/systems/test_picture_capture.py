@@ -215,6 +215,9 @@ def test_who_is_somebody(rig):
     mask = np.zeros((120, 160), dtype=bool)
     sensor = Bench(SilhouetteSensor(rig[2])).give(label_image=mask_to_label_image(mask))
     assert not sensor["silhouette"].region.any()
+    unknown = Bench(SilhouetteSensor(rig[2])).give(color_image=ImageRgba8U(160, 120))
+    with pytest.raises(SettingsError, match="give a background model or connect label_image"):
+        unknown["silhouette"]
     assert not shows_somebody(sensor["silhouette"])
     assert not shows_somebody(None)
     mask[40:43, 70:73] = True

@@ -14,10 +14,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from drake_pose.arrays import Array, Indices, Picture
+from drake_pose.camera.calibration_files import lens_of
 from drake_pose.camera.episode import Episode, EpisodeCamera, JointLog, ascending
 from drake_pose.camera.models import Lens
 from drake_pose.camera.picture_files import decode_colours, import_reader
-from drake_pose.errors import DrakePoseError, SceneError
+from drake_pose.errors import CameraError, DrakePoseError, SceneError
 
 BAGS = (".bag", ".mcap", ".db3")
 # Bytes of a pixel, and how OpenCV turns it to red, green, blue.
@@ -228,24 +229,13 @@ def _lens(info: Any, *, is_rectified: bool, where: str) -> Lens:
     The distortion is that of raw pictures: rectified ones have their camera matrix in P, and none.
     """
     size, K, D, P = (info.width, info.height), *(_field(info, one) for one in ("k", "d", "p"))
-    if is_rectified and P.any():
-        return Lens.from_numbers(size, [P[0], P[5], P[2], P[6], *np.zeros(4)])
-    models = {
-        "plumb_bob": False,
-        "rational_polynomial": False,
-        "equidistant": True,
-        "fisheye": True,
-    }
-    is_fisheye = models.get(info.distortion_model)
-    if is_rectified or not D.any():
-        D, is_fisheye = np.zeros(4), False
-    if is_fisheye is None:
-        raise SceneError(
-            f"{where}: its distortion is of the kind '{info.distortion_model}', but these are "
-            f"known: {', '.join(models)}; record rectified pictures"
-        )
-    D = D[:4] if is_fisheye else D
-    return replace(Lens.from_numbers(size, [K[0], K[4], K[2], K[5], *D]), fisheye=is_fisheye)
+    K = P.reshape(3, 4)[:, :3] if is_rectified and P.any() else K
+    plain = is_rectified or not D.any()
+    model, D = ("none", np.zeros(4)) if plain else (info.distortion_model, D)
+    try:
+        return lens_of(size, K, D, model, where)
+    except CameraError as error:
+        raise SceneError(f"{error}; record rectified pictures") from error
 
 
 class _TopicPictures:

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import re
 import tomllib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import cv2
 import numpy as np
@@ -27,19 +27,6 @@ FORMATS = (
     "image_height, R, T), and the TOML of anipose, Pose2Sim or Caliscope"
 )
 """The camera files that are read."""
-
-_MATRIX = ("camera_matrix", "cameraMatrix", "Camera_Matrix", "intrinsic_matrix", "K", "k")
-_DISTORTION = ("distortion_coefficients", "Distortion_Coefficients", "distCoeffs", "D", "d")
-# Distortion models of ROS and Kalibr: OpenCV's own, and OpenCV's fisheye.
-_RADIAL = {"plumb_bob", "rational_polynomial", "radtan", "none", ""}
-_FISHEYE = {"equidistant", "fisheye"}
-
-
-class CalibratedCamera(NamedTuple):
-    """A camera as a calibration tool wrote it; X_WC (4, 4) is None where it has no pose."""
-
-    lens: Lens
-    X_WC: Array | None
 
 
 def read_camera_content(path: Path, largest: int = 1 << 20) -> Any:
@@ -71,16 +58,18 @@ def read_camera_content(path: Path, largest: int = 1 << 20) -> Any:
     return read_yaml(path, CameraError, tags=True)
 
 
-def calibrated_cameras(content: Mapping[Any, Any], path: Path) -> dict[str, CalibratedCamera]:
+def calibrated_cameras(
+    content: Mapping[Any, Any], path: Path
+) -> dict[str, tuple[Lens, Array | None]]:
     """The cameras of a calibration tool's file by name; none: it is no such file.
 
-    Of Kalibr's chain the first camera is the world. A file of one camera that has no name is called
-    as the file is.
+    Each is a lens and a pose X_WC (4, 4) [m], None where the file has none. Of Kalibr's chain the
+    first camera is the world. A file of one camera that has no name is called as the file is.
 
     Raises CameraError: a field is missing or wrong, a lens is of a kind that OpenCV does not know,
     or a camera stands so far away that lengths are no metres.
     """
-    if any(_matrix(content.get(name)) is not None for name in _MATRIX):
+    if "camera_matrix" in content:
         name = str(content.get("camera_name", path.stem))
         return {name: _one_camera(content, f"{path}: camera '{name}'")}
     entries = {str(key): one for key, one in content.items() if isinstance(one, dict)}
@@ -88,19 +77,14 @@ def calibrated_cameras(content: Mapping[Any, Any], path: Path) -> dict[str, Cali
     if chain:
         return dict(_kalibr(chain, path))
     tables = {k: one for k, one in entries.items() if {"matrix", "distortions"} & {*one}}
-    found = dict[str, CalibratedCamera]()
+    found = dict[str, tuple[Lens, Array | None]]()
     for key, table in tables.items():
         name, where = str(table.get("name", key)), f"{path}: camera '{key}'"
         if name in found:
             raise CameraError(f"{where}: the name '{name}' is given twice")
-        lens = _lens(
-            _pair(table.get("size"), where),
-            _matrix(table.get("matrix")),
-            table.get("distortions", ()),
-            bool(table.get("fisheye", False)),
-            where,
-        )
-        found[name] = CalibratedCamera(lens, _pose(table, "rotation", "translation", where))
+        numbers = table.get("matrix"), table.get("distortions", ())
+        lens = _lens(table.get("size"), *numbers, bool(table.get("fisheye", False)), where)
+        found[name] = lens, _pose(table, "rotation", "translation", where)
     return found
 
 
@@ -128,97 +112,76 @@ def _numbers(value: Any) -> Array | None:
     return found if np.isfinite(found).all() else None
 
 
-def _matrix(value: Any) -> Array | None:
-    """A camera matrix (3, 3), or None."""
-    found = _numbers(value)
-    return found.reshape(3, 3) if found is not None and found.size == 9 else None
-
-
-def _pair(value: Any, where: str) -> tuple[int, int]:
-    """A width and a height [pixel]."""
-    found = _numbers(value)
-    if found is None or found.size != 2:
-        raise CameraError(f"{where}: needs the pictures' width and height [pixel]")
-    return check_side(found[0], "width", where), check_side(found[1], "height", where)
-
-
-def _first(content: Mapping[Any, Any], names: Sequence[str]) -> Any:
-    """The first of some fields that is there; an empty tuple where there is none."""
-    return next((content[name] for name in names if name in content), ())
-
-
-def _one_camera(content: Mapping[Any, Any], where: str) -> CalibratedCamera:
+def _one_camera(content: Mapping[Any, Any], where: str) -> tuple[Lens, Array | None]:
     """The camera of a ROS camera_info, or of OpenCV's FileStorage."""
-    sides = [_first(content, (f"image_{side}", side)) for side in ("width", "height")]
-    if () in sides:
+    size = [content.get(f"image_{side}") for side in ("width", "height")]
+    if None in size:
         raise CameraError(f"{where}: needs image_width and image_height [pixel]: add them")
-    model = str(content.get("distortion_model", ""))
-    if model not in _RADIAL | _FISHEYE:
-        raise CameraError(
-            f"{where}: distortion_model '{model}' is not known; it may be "
-            f"{', '.join(sorted((_RADIAL | _FISHEYE) - {''}))}"
-        )
-    matrix = next(one for one in (_matrix(content.get(n)) for n in _MATRIX) if one is not None)
-    lens = _lens(
-        _pair(sides, where), matrix, _first(content, _DISTORTION), model in _FISHEYE, where
-    )
-    rotation = "R" if "R" in content else "rvec"
+    numbers = content["camera_matrix"], content.get("distortion_coefficients", ())
+    lens = lens_of(size, *numbers, str(content.get("distortion_model", "plumb_bob")), where)
     # A camera_info's R rectifies pictures; it has no T.
-    has_pose = "T" in content or "tvec" in content
-    pose = _pose(content, rotation, "T" if "T" in content else "tvec", where) if has_pose else None
-    return CalibratedCamera(lens, pose)
+    return lens, _pose(content, "R", "T", where) if "T" in content else None
+
+
+def lens_of(size: Any, matrix: Any, distortion: Any, model: str, where: str) -> Lens:
+    """The lens of a distortion model as ROS and Kalibr call it; CameraError: it is not known."""
+    kinds = {"plumb_bob": False, "rational_polynomial": False, "radtan": False, "none": False}
+    kinds |= {"equidistant": True, "fisheye": True}  # OpenCV's fisheye.
+    if model not in kinds:
+        raise CameraError(
+            f"{where}: distortion_model '{model}' is not known; it may be {', '.join(kinds)}"
+        )
+    return _lens(size, matrix, distortion, kinds[model], where)
 
 
 def _kalibr(
     chain: Mapping[str, Mapping[str, Any]], path: Path
-) -> Iterator[tuple[str, CalibratedCamera]]:
+) -> Iterator[tuple[str, tuple[Lens, Array | None]]]:
     """The cameras of Kalibr's camchain: T_cn_cnm1 takes points of the camera before to each."""
     is_chain = any("T_cn_cnm1" in entry for entry in chain.values())
     X_CW: Array | None = np.eye(4) if is_chain else None
     for k, (name, entry) in enumerate(chain.items()):
-        where = f"{path}: camera '{name}'"
-        model, distortion = entry["camera_model"], str(entry.get("distortion_model", "none"))
-        if model != "pinhole" or distortion not in _RADIAL | _FISHEYE:
+        where, numbers = f"{path}: camera '{name}'", _numbers(entry["intrinsics"])
+        if entry["camera_model"] != "pinhole":
             raise CameraError(
-                f"{where}: Kalibr's '{model}' camera with '{distortion}' distortion is not read, "
-                "but pinhole with radtan, equidistant or none; calibrate it as one of these"
+                f"{where}: Kalibr's '{entry['camera_model']}' camera is not read, but pinhole with "
+                "radtan, equidistant or none; calibrate it as one of these"
             )
-        numbers = _numbers(entry["intrinsics"])
         if numbers is None or numbers.size != 4:
             raise CameraError(f"{where}: intrinsics must be [f_x, f_y, c_x, c_y]")
-        fx, fy, cx, cy = numbers
-        matrix = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
-        size = _pair(entry.get("resolution"), where)
-        coefficients = entry.get("distortion_coeffs", ())
-        lens = _lens(size, matrix, coefficients, distortion in _FISHEYE, where)
+        fx, fy, cx, cy = numbers.tolist()
+        matrix = [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]
+        model, coefficients = str(entry.get("distortion_model")), entry.get("distortion_coeffs", ())
+        lens = lens_of(entry.get("resolution"), matrix, coefficients, model, where)
         if k and X_CW is not None:
             step = entry.get("T_cn_cnm1")
             X_CW = None if step is None else check_pose(step, "T_cn_cnm1", where) @ X_CW
-        yield name, CalibratedCamera(lens, None if X_CW is None else inverse_pose(X_CW))
+        yield name, (lens, None if X_CW is None else inverse_pose(X_CW))
 
 
-def _lens(
-    size: tuple[int, int], matrix: Array | None, distortion: Any, fisheye: bool, where: str
-) -> Lens:
-    """A lens from a camera matrix (3, 3) and OpenCV's coefficients."""
-    if matrix is None or not (matrix[0, 0] > 0.0 and matrix[1, 1] > 0.0 and matrix[2, 2] == 1.0):
+def _lens(size: Any, matrix: Any, distortion: Any, fisheye: bool, where: str) -> Lens:
+    """A lens from a size [pixel], a camera matrix (3, 3) and OpenCV's coefficients."""
+    sides, K, D = (_numbers(one) for one in (size, matrix, distortion))
+    if sides is None or sides.size != 2:
+        raise CameraError(f"{where}: needs the pictures' width and height [pixel]")
+    width, height = (
+        check_side(side, name, where) for side, name in zip(sides, ("width", "height"), strict=True)
+    )
+    if K is None or K.size != 9 or not (K[0] > 0.0 and K[4] > 0.0 and K[8] == 1.0):
         raise CameraError(
             f"{where}: its camera matrix must be [[f_x, 0, c_x], [0, f_y, c_y], [0, 0, 1]] [pixel]"
         )
-    found = _numbers(distortion)
-    if found is None:
+    if D is None:
         raise CameraError(f"{where}: its distortion coefficients are no list of finite numbers")
-    found = found if found.size else np.zeros(4)
+    D = D if D.size else np.zeros(4)
     counts = (4,) if fisheye else (4, 5, 8, 12, 14)
-    if fisheye and not found[4:].any():
-        found = found[:4]
-    if found.size not in counts:
+    D = D[:4] if fisheye and not D[4:].any() else D
+    if D.size not in counts:
         raise CameraError(
-            f"{where}: has {found.size} distortion coefficients; OpenCV's "
+            f"{where}: has {D.size} distortion coefficients; OpenCV's "
             f"{'fisheye' if fisheye else 'lens'} has {' or '.join(map(str, counts))}"
         )
-    (fx, _, cx), (_, fy, cy), _ = matrix
-    return Lens(*size, float(fx), float(fy), float(cx), float(cy), found, fisheye)
+    return Lens(width, height, np.array([[K[0], 0, K[2]], [0, K[4], K[5]], [0, 0, 1]]), D, fisheye)
 
 
 def _pose(

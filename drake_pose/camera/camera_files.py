@@ -43,7 +43,6 @@ _OPTIONAL = {
     ),
     "parallel": ("X_WC", "projection", "pixel_centers"),
 }
-_COEFFICIENTS = (4, 5, 8, 12, 14)
 
 
 def load_cameras(path: str | Path) -> dict[str, Camera]:
@@ -80,7 +79,8 @@ class CameraFile:
     """What a camera file says, which need not say where the cameras stand.
 
     Args:
-        cameras: by name, in the file's order; those without X_WC at the world's origin.
+        cameras: by name, in the file's order, of pictures without distortion; those without X_WC
+            at the world's origin.
         unplaced: the names of these, but for those that ride on a link.
         links: by camera that rides on a link, the link; its X_WC holds X_LC, its pose in that.
         lenses: of the pictures as taken, by camera that has distortion.
@@ -118,14 +118,13 @@ def load_camera_file(path: str | Path, *, distorted: bool = False) -> CameraFile
         lens: Lens | None
         if calibrated:
             lens, X_WC = calibrated[name]
-            sides, centre = (lens.width, lens.height), (lens.center_x, lens.center_y)
-            pose = np.eye(4) if X_WC is None else X_WC
-            cameras[name] = PinholeCamera(name, *sides, lens.focal_x, lens.focal_y, *centre, pose)
+            cameras[name] = lens.camera(name, np.eye(4) if X_WC is None else X_WC)
             is_placed = X_WC is not None
         else:
             entry = content[key]
-            camera = cameras[name] = _read_camera(name, entry, path, {*content})
+            camera = _read_camera(name, entry, path, {*content})
             lens = _read_lens(camera, entry.get("distortion"), f"{path}: camera '{name}'")
+            cameras[name] = camera if lens is None else lens.camera(name, camera.X_WC)
             links |= {name: entry["link"]} if "link" in entry else {}
             is_placed = "X_WC" in entry or "link" in entry
         unplaced += [] if is_placed else [name]
@@ -265,15 +264,16 @@ def _read_lens(camera: Camera, value: Any, where: str) -> Lens | None:
     """The lens of a camera with OpenCV's coefficients, or CameraError; None: it has none."""
     if value is None:
         return None
-    if not isinstance(value, list) or len(value) not in _COEFFICIENTS:
+    counts = (4, 5, 8, 12, 14)
+    if not isinstance(value, list) or len(value) not in counts:
         raise CameraError(
             f"{where}: distortion must be a list of OpenCV's coefficients: k1, k2, p1, p2, then k3 "
-            f"and more ({', '.join(map(str, _COEFFICIENTS))} numbers in all)"
+            f"and more ({', '.join(map(str, counts))} numbers in all)"
         )
-    assert isinstance(camera, PinholeCamera), "parallel cameras have no such field"
-    numbers = [camera.focal_x, camera.focal_y, camera.center_x, camera.center_y]
-    numbers += [check_number(one, "distortion", where) for one in value]
-    return Lens.from_numbers((camera.width, camera.height), numbers)
+    D = np.array([check_number(one, "distortion", where) for one in value])
+    fx, fy, cx, cy = camera.kernel_parameters()[1:5]
+    K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+    return Lens(camera.width, camera.height, K, D) if D.any() else None
 
 
 def describe_camera(camera: Camera) -> dict[str, Any]:

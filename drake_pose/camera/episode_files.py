@@ -156,8 +156,6 @@ def with_intrinsics(camera: EpisodeCamera, known: CameraFile, path: Path) -> Epi
             f"pictures {camera.width} x {camera.height}: give the numbers of these pictures"
         )
     link, lens = known.links.get(camera.name), known.lenses.get(camera.name)
-    if lens is not None:
-        found = lens.camera(found.name, found.X_WC)
     return replace(camera, camera=found, link=link, lens=lens)
 
 

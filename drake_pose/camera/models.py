@@ -334,38 +334,21 @@ class Lens:
     """A pinhole with radial and tangential distortion, or a fisheye, as OpenCV has them.
 
     Args:
-        width, height, focal_x, focal_y: [pixel].
-        center_x, center_y: the principal point [pixel], pixel centres at integers.
-        distortion: (5,) k1, k2, p1, p2, k3, or as many of OpenCV's as a recording gives; of a
-            fisheye (4,) k1, k2, k3, k4.
-        fisheye: whether it is OpenCV's fisheye, which ROS calls equidistant.
+        width, height: [pixel].
+        matrix: (3, 3) camera matrix of the pictures as taken [pixel], pixel centres at integers.
+        distortion: OpenCV's coefficients k1, k2, p1, p2, k3 ...; of a fisheye (4,) k1 to k4.
+        fisheye: whether it is OpenCV's fisheye, which ROS and Kalibr call equidistant.
     """
 
     width: int
     height: int
-    focal_x: float
-    focal_y: float
-    center_x: float
-    center_y: float
+    matrix: Array
     distortion: Array
     fisheye: bool = False
 
-    @classmethod
-    def from_numbers(cls, size: tuple[int, int], numbers: Sequence[float] | Array) -> Lens:
-        """The lens of pictures of a width and height; numbers: f_x, f_y, c_x, c_y, distortion."""
-        fx, fy, cx, cy, *distortion = np.asarray(numbers, dtype=np.float64).tolist()
-        return cls(*size, fx, fy, cx, cy, np.array(distortion))
-
-    @property
-    def matrix(self) -> Array:
-        """(3, 3) the camera matrix of the pictures as taken."""
-        return np.array(
-            [[self.focal_x, 0.0, self.center_x], [0.0, self.focal_y, self.center_y], [0, 0, 1]]
-        )
-
     @cached_property
     def straight_matrix(self) -> Array:
-        """(3, 3) the camera matrix of the undistorted pictures."""
+        """(3, 3) the camera matrix of the undistorted pictures, each pixel of which was seen."""
         if not self.distortion.any():
             return self.matrix
         size = (self.width, self.height)

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import cv2
-
 from drake_pose.camera.camera_files import dump_cameras, load_camera_file
 from drake_pose.camera.models import PinholeCamera
-from drake_pose.camera.picture_files import list_pictures, read_picture
+from drake_pose.camera.picture_files import find_pictures, read_picture
 from drake_pose.camera.sources import CAMERAS
 from drake_pose.errors import CameraError
 from drake_pose.files.folder import write_file
+from drake_pose.files.overlay import encode_png
 
 
 def undistort_pictures(
@@ -30,34 +29,28 @@ def undistort_pictures(
 
     Raises:
         CameraError: a camera is not in the file, or a picture cannot be read or has another size.
+        SceneError: a camera's folder holds no pictures.
         OutputError: a file cannot be written.
     """
     known, root = load_camera_file(cameras, distorted=True), Path(folder) / "images"
     if not root.is_dir():
         raise CameraError(f"{folder}: no such folder; it needs images/<camera>/<frame>.png")
-    folders = sorted(path for path in root.iterdir() if path.is_dir())
-    pictures = {one.name: list_pictures(one, CameraError) for one in folders}
-    if not any(pictures.values()):
-        raise CameraError(f"{root}: holds no picture <camera>/<frame>.png or .jpg")
-    straight = dict[str, PinholeCamera]()
-    for name in pictures:
-        camera = known.cameras.get(name)
-        if not isinstance(camera, PinholeCamera):
+    names = sorted(path.name for path in root.iterdir() if path.is_dir())
+    for name in names:
+        if not isinstance(known.cameras.get(name), PinholeCamera):
             raise CameraError(
                 f"{cameras}: has no pinhole camera '{name}'; there are: {', '.join(known.cameras)}"
             )
-        lens = known.lenses.get(name)
-        straight[name] = camera if lens is None else lens.camera(name, camera.X_WC)
-    text = dump_cameras(straight, known.links, known.unplaced)
+    used = {name: known.cameras[name] for name in names}
+    text = dump_cameras(used, known.links, known.unplaced)
     write_file(Path(out), CAMERAS, text.encode())
     written = dict[tuple[str, str], Path]()
-    for name, frames in pictures.items():
-        for frame, path in frames.items():
+    for name in names:
+        for frame, path in find_pictures(root / name, name).items():
             picture = read_picture(path, CameraError)
             if name in known.lenses:
                 picture = known.lenses[name].undistort(picture)
             place = f"images/{name}/{frame}.png"
-            data = cv2.imencode(".png", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))[1]
-            write_file(Path(out), place, data.tobytes())
+            write_file(Path(out), place, encode_png(picture))
             written[name, frame] = Path(out) / place
     return written

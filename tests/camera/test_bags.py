@@ -192,7 +192,7 @@ def test_lenses_are_undone_as_their_formulas_say(tmp_path):
         assert off[2:-2, 2:-2].max() < 4, name
     rectified = episode.camera("fish_image_rect")
     assert (rectified.camera.focal_x, rectified.camera.center_y, rectified.lens) == (50, 29, None)
-    text = "camera 'other' is left out: /other/image_raw: its distortion is of the kind"
+    text = "camera 'other' is left out: /other/image_raw: distortion_model 'thin_prism'"
     assert any(text in one for one in episode.warnings)
 
 

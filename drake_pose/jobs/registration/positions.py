@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from drake_pose.arrays import Array
-from drake_pose.body import BASE_JOINTS, ArticulatedModel, PoseTree
+from drake_pose.body import BASE_JOINTS, ArticulatedModel
 from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.camera.models import Camera
 from drake_pose.camera.picture_files import frame_key
@@ -22,11 +22,6 @@ from drake_pose.jobs.estimate.inputs import missing_for_person
 from drake_pose.jobs.estimate.measurements import TrueAngles, check_units, read_true_angles
 from drake_pose.jobs.estimate.scene import estimate_scene
 from drake_pose.person.shape import shape_parts
-
-# Poses are one whose joints differ by less [rad or m].
-_SAME_ANGLE, _SAME_LENGTH = math.radians(1.0), 0.005
-# Values are one that differ by less, as written in a table.
-_AS_WRITTEN = 1e-6
 
 
 @dataclass(frozen=True)
@@ -66,7 +61,7 @@ class KnownPositions:
 
     def are_one_pose(self, rows: Iterable[Array], times: float = 1.0) -> bool:
         """Whether joints are at one place in rows (m,), to so many times a degree or 5 mm."""
-        same = times * np.where(self.kinematics.is_angle, _SAME_ANGLE, _SAME_LENGTH)
+        same = times * np.where(self.kinematics.is_angle, math.radians(1.0), 0.005)
         return bool((np.ptp(np.array(list(rows)), axis=0) < same).all())
 
 
@@ -121,8 +116,12 @@ def read_known_positions(
     # What moves nothing that is seen may be there.
     known = {*asked, *kinematics.tree.unobserved_positions} if unobserved else set(asked)
     known |= {model.position_names[one.follower] for one in kinematics.tree.followers}
-    if table.is_estimate:
-        known |= _as_they_are(table, kinematics.tree)
+    for column, name in enumerate(table.names if table.is_estimate else ()):
+        # A column that says nothing but that a position was held, or is as in the model's file.
+        index = model.position_index(name)
+        usual = kinematics.tree.held.get(index, model.default_positions[index])
+        if all(abs(row[column] - usual) < 1e-6 for row in table.values.values()):
+            known.add(name)
     unused = [name for name in table.names if name not in known]
     if unused:
         raise SceneError(
@@ -136,17 +135,6 @@ def read_known_positions(
     values = {k: np.where(is_held, kinematics.lower, row[columns]) for k, row in rows}
     warnings = check_units(path, model, kinematics.names, values)
     return KnownPositions(path, kinematics, values, table.is_estimate, warnings)
-
-
-def _as_they_are(table: TrueAngles, tree: PoseTree) -> set[str]:
-    """The columns that say nothing but that a position was held, or is as in the model's file."""
-    found, model = set(), tree.model
-    for column, name in enumerate(table.names):
-        index = model.position_index(name)
-        usual = tree.held.get(index, model.default_positions[index])
-        if all(abs(row[column] - usual) < _AS_WRITTEN for row in table.values.values()):
-            found.add(name)
-    return found
 
 
 def estimate_positions(

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from drake_pose.arrays import Array, Picture
-from drake_pose.body import OBJECT_POSITIONS, ArticulatedModel, PoseTree, reshaped
+from drake_pose.body import OBJECT_POSITIONS, PoseTree, reshaped
 from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.camera.models import Camera, PinholeCamera
 from drake_pose.errors import CameraError
@@ -255,9 +255,21 @@ class _Registration:
 
     def _note(self, found: RegisteredCamera, start: float) -> None:
         """Keeps a camera that was found, since a moment by time.perf_counter()."""
-        name = found.camera.name
-        self.registered[name] = found
-        self.suggestions[name] = self._suggestion(found)
+        name, settings = found.camera.name, self._settings
+        self.registered[name], self.suggestions[name] = found, None
+        if settings.suggest and len(found.alternatives):
+            # Joint positions that would tell its poses apart.
+            poses = [found.camera.X_WC, *found.alternatives]
+            told = suggest_pose(self.body, found.camera, poses, settings.keep_out)
+            if told is None:
+                self.warnings.append(
+                    f"camera '{name}': of random joint positions none is seen from all its poses "
+                    "and touches nothing: no picture is suggested; is --keep-out too large?"
+                )
+            else:
+                values = zip(self.body.kinematics.names, told[0].tolist(), strict=True)
+                positions = {k: one for k, one in values if k not in OBJECT_POSITIONS}
+                self.suggestions[name] = {"positions": positions, "difference": told[1]}
         self.seconds[name] = time.perf_counter() - start
         if self._on_camera is not None:
             self._on_camera(len(self.registered))
@@ -338,22 +350,6 @@ class _Registration:
             for name, one in self.registered.items()
         }
 
-    def _suggestion(self, found: RegisteredCamera) -> dict[str, Any] | None:
-        """Joint positions that would tell a camera's poses apart; None: one pose, not asked for."""
-        if not self._settings.suggest or not len(found.alternatives):
-            return None
-        poses = [found.camera.X_WC, *found.alternatives]
-        told = suggest_pose(self.body, found.camera, poses, self._settings.keep_out)
-        if told is None:
-            self.warnings.append(
-                f"camera '{found.camera.name}': of random joint positions none is seen from all "
-                "its poses and touches nothing: no picture is suggested; is --keep-out too large?"
-            )
-            return None
-        values = zip(self.body.kinematics.names, told[0].tolist(), strict=True)
-        positions = {name: value for name, value in values if name not in OBJECT_POSITIONS}
-        return {"positions": positions, "difference": told[1]}
-
     def refit_poses(self) -> None:
         """Cameras, frames' estimated positions and body, fitted to what all cameras see.
 
@@ -387,7 +383,8 @@ class _Registration:
         """Zeros of joints, lengths of links and focal lengths, fitted with the cameras.
 
         Returns:
-            the corrected URDF for a folder, if there is one.
+            the corrected URDF for a folder; None where nothing is significant, or the model is no
+            URDF.
 
         Raises:
             RegistrationError: fewer frames than zeros and lengths.
@@ -403,7 +400,7 @@ class _Registration:
         self._zeros = np.array([zeros.get(name, 0.0) for name in names])
         model, tree, standing = inputs.model, inputs.tree, inputs.standing
         seen = next(iter(cameras.values())).seen_object
-        shifts = _joint_shifts(tree, found)
+        shifts = joint_shifts(tree, found)
         if shifts:
             model = model.reshaped(shifts=shifts)
         if standing is not None and seen is not None:
@@ -423,7 +420,17 @@ class _Registration:
             again = [replace(one, inlier_ratio=ratio, agrees=own) for one, ratio, own in rows]
             self.registered[camera.name] = replace(before, frames=tuple(again))
             self._found_again(kinematics, camera, covariance, seen)
-        return None if folder is None else _corrected_urdf(inputs.model, zeros, shifts, folder)
+        path = inputs.model.path
+        if folder is None or not inputs.model.changes_shape or not (zeros or shifts):
+            return None
+        # With zeros and lengths in its joints' origins; its meshes as seen from the folder.
+        text = path.read_text(encoding="utf-8")
+        root = ElementTree.fromstring(reshaped(text, zeros=zeros, shifts=shifts))
+        for mesh in root.iter("mesh"):
+            name = mesh.get("filename", "")
+            if "://" not in name:
+                mesh.set("filename", os.path.relpath(path.parent / name, folder))
+        return ElementTree.tostring(root, encoding="utf-8", xml_declaration=True)
 
     def _found_again(
         self,
@@ -443,29 +450,8 @@ class _Registration:
         )
 
 
-def _joint_shifts(tree: PoseTree, found: JointCalibration) -> dict[str, list[float]]:
+def joint_shifts(tree: PoseTree, found: JointCalibration) -> dict[str, list[float]]:
     """By how much joints stand elsewhere on their links (3,), by name [m]; empty: none does."""
     longer = {one.name: one.value for one in found.lengths if one.significant}
     offsets = lengthened_joints(tree, longer)
     return {one.joint: (longer[one.link] * one.p_L).tolist() for one in offsets}
-
-
-def _corrected_urdf(
-    model: ArticulatedModel,
-    zeros: Mapping[str, float],
-    shifts: Mapping[str, list[float]],
-    folder: Path,
-) -> bytes | None:
-    """The URDF with zeros and lengths in its joints' origins; its meshes as seen from a folder.
-
-    None where nothing is significant, or the model is no URDF.
-    """
-    if not model.changes_shape or not (zeros or shifts):
-        return None
-    text = model.path.read_text(encoding="utf-8")
-    root = ElementTree.fromstring(reshaped(text, zeros=zeros, shifts=shifts))
-    for mesh in root.iter("mesh"):
-        name = mesh.get("filename", "")
-        if "://" not in name:
-            mesh.set("filename", os.path.relpath(model.path.parent / name, folder))
-    return ElementTree.tostring(root, encoding="utf-8", xml_declaration=True)

@@ -37,8 +37,6 @@ from drake_pose.silhouette.areas.scoring import draw_labels
 from drake_pose.silhouette.pictures.masks import encode_mask
 from drake_pose.silhouette.pictures.scenes import CAMERA_FILE
 
-REGISTRATION = "registration.yaml"
-
 
 def describe_camera(
     found: RegisteredCamera,
@@ -55,13 +53,22 @@ def describe_camera(
         link: on which the camera rides, in whose frame its pose is then.
     """
     pose, seen, X = "X_WC" if link is None else "X_LC", found.seen_object, found.camera.X_WC
+    target = {}
+    if seen is not None:
+        target = {
+            **describe_pose("X_WT", seen.X_WT, seen),
+            "families": [{"X_WT": one.tolist()} for one in (seen.X_WT, *seen.alternatives)],
+            "determined": not len(seen.round_about),
+            "covariance": seen.covariance.tolist(),
+            "round_about": seen.round_about.tolist(),
+        }
     return {
         **({} if link is None else {"link": link}),
         **describe_pose(pose, X, found),
-        "families": _describe_families(pose, X, found),
+        "families": [{pose: one.tolist()} for one in (X, *found.alternatives)],
         "mean_iou": float(np.mean([frame.iou for frame in found.frames])),
         "suggestion": suggestion,
-        **({} if seen is None else {"target": _describe_object(seen)}),
+        **({"target": target} if target else {}),
         "seconds": seconds,
         "contradictions": list(found.contradictions),
         "frames": {
@@ -82,24 +89,6 @@ def describe_pose(name: str, X: Array, found: RegisteredCamera | ObjectPose) -> 
         name: X.tolist(),
         "translation_sd_mm": 1e3 * found.translation_sd,
         "rotation_sd_deg": float(np.degrees(found.rotation_sd)),
-    }
-
-
-def _describe_families(
-    name: str, X: Array, found: RegisteredCamera | ObjectPose
-) -> list[dict[str, Any]]:
-    """A pose (4, 4), and those that look alike."""
-    return [{name: np.asarray(one).tolist()} for one in (X, *found.alternatives)]
-
-
-def _describe_object(seen: ObjectPose) -> dict[str, Any]:
-    """Where an object stands that a camera on a link has seen."""
-    return {
-        **describe_pose("X_WT", seen.X_WT, seen),
-        "families": _describe_families("X_WT", seen.X_WT, seen),
-        "determined": not len(seen.round_about),
-        "covariance": seen.covariance.tolist(),
-        "round_about": seen.round_about.tolist(),
     }
 
 
@@ -222,45 +211,39 @@ def write_result(
         write_overlays(path, inputs.tree, found.camera, titled, inputs.seen, own)
         for given in (one for one in inputs.given if one.name == name):
             write_comparisons(path, inputs, inputs.of(name), given, found, own)
-    for name in pictures or ():
-        _write_frames(path, inputs, name, several=len(pictures or ()) > 1)
+    names = TreeKinematics(inputs.tree).names
+    names = tuple(name for name in names if name not in OBJECT_POSITIONS)
+    for camera in pictures or ():
+        # Masks of its frames, and joint positions at their moments by its own clock.
+        rows = [["frame", *names]]
+        for frame in inputs.of(camera):
+            write_file(path, f"masks/{camera}/{frame.name}.png", encode_mask(frame.mask))
+            # An object's come last, and are 0.
+            rows.append([frame.name, *map(repr, frame.values[: len(names)].tolist())])
+        several = f"_{camera}" if len(pictures or ()) > 1 else ""
+        write_file(path, f"joint_angles{several}.csv", csv_text(rows))
     if urdf is not None:
         write_file(path, f"{inputs.model.path.stem}_calibrated.urdf", urdf)
-    described = {
-        name: without_nan(_uncertainty(registered[name], one)) for name, one in parts.items()
-    }
-    write_file(path, REGISTRATION, yaml.safe_dump(described, sort_keys=False))
+    described = {}
+    for name, one in parts.items():
+        found = registered[name]
+        described[name] = without_nan(
+            {
+                **{key: one[key] for key in ("link", "X_LC", "X_WC") if key in one},
+                "errors": ["turn_x", "turn_y", "turn_z", "x", "y", "z"],
+                "covariance": found.covariance,
+                "alternatives": found.alternatives,
+                "contradictions": list(found.contradictions),
+                **{key: one[key] for key in ("zeros", "lengths", "target") if one.get(key)},
+            }
+        )
+    write_file(path, "registration.yaml", yaml.safe_dump(described, sort_keys=False))
     write_summary(path, summary)
     write_file(path, REPORT, make_registration_report(path, summary))
     links = {name: one["link"] for name, one in parts.items() if "link" in one}
     formats = summary["settings"]["exports"]
     write_exports(path, formats, inputs, cameras.values(), links, pictures or {})
     write_file(path, CAMERA_FILE, dump_cameras(cameras, links))
-
-
-def _write_frames(path: Path, inputs: Inputs, camera: str, several: bool) -> None:
-    """Masks of a camera's frames, and joint positions at their moments by its own clock."""
-    frames, names = inputs.of(camera), TreeKinematics(inputs.tree).names
-    names = tuple(name for name in names if name not in OBJECT_POSITIONS)
-    for frame in frames:
-        write_file(path, f"masks/{camera}/{frame.name}.png", encode_mask(frame.mask))
-    # An object's come last, and are 0.
-    values = [map(repr, one.values[: len(names)].tolist()) for one in frames]
-    rows = [["frame", *names], *([one.name, *own] for one, own in zip(frames, values, strict=True))]
-    file = f"joint_angles_{camera}.csv" if several else "joint_angles.csv"
-    write_file(path, file, csv_text(rows))
-
-
-def _uncertainty(found: RegisteredCamera, summary: Mapping[str, Any]) -> dict[str, Any]:
-    """A camera's part of registration.yaml, given its part of summary.json."""
-    return {
-        **{name: summary[name] for name in ("link", "X_LC", "X_WC") if name in summary},
-        "errors": ["turn_x", "turn_y", "turn_z", "x", "y", "z"],
-        "covariance": found.covariance,
-        "alternatives": found.alternatives,
-        "contradictions": list(found.contradictions),
-        **{name: summary[name] for name in ("zeros", "lengths", "target") if summary.get(name)},
-    }
 
 
 def write_overlays(
@@ -418,12 +401,6 @@ def _plot_offset(camera: Mapping[str, Any]) -> str | None:
     return plot_uri(figure)
 
 
-_DRAKE, _MUJOCO, _RERUN = "drake.yaml", "mujoco.xml", "rerun.rrd"
-_LAUNCH = "ros/static_transforms.launch.xml"
-# A link stands in the world's origin that is off by less [m and rad].
-_ORIGIN = 1e-6
-
-
 def check_exports(formats: Collection[str], cameras: Iterable[Camera]) -> None:
     """Refuses before any work what could not be written after it.
 
@@ -455,11 +432,18 @@ def write_exports(
         OutputError: they cannot be written.
     """
     cameras = list(cameras)
-    for name, text in _texts(formats, cameras, _world(inputs.tree), links).items():
+    # What ROS calls the world: the link that is fixed at its origin, if any.
+    kinematics, world = TreeKinematics(inputs.tree), "world"
+    poses = kinematics.poses(kinematics.flatten(inputs.tree.default_values()))
+    for node, X_WN in zip(inputs.tree.nodes, poses, strict=True):
+        if node.parent < 0 and not node.value_names and np.allclose(X_WN, np.eye(4), atol=1e-6):
+            world = node.name
+            break
+    for name, text in _texts(formats, cameras, world, links).items():
         write_file(folder, name, text)
     if "rerun" in formats:
         recording = make_recording(inputs.tree, cameras, inputs.frames, pictures)
-        write_file(folder, _RERUN, recording)
+        write_file(folder, "rerun.rrd", recording)
 
 
 def _texts(
@@ -470,19 +454,9 @@ def _texts(
     if "ros" in formats:
         texts |= {f"ros/{camera.name}.yaml": ros_camera_info(camera) for camera in cameras}
         frames = {camera.name: links.get(camera.name, world) for camera in cameras}
-        texts[_LAUNCH] = ros_transforms(cameras, frames)
+        texts["ros/static_transforms.launch.xml"] = ros_transforms(cameras, frames)
     if "mujoco" in formats:
-        texts[_MUJOCO] = mujoco_cameras(cameras)
+        texts["mujoco.xml"] = mujoco_cameras(cameras)
     if "drake" in formats:
-        texts[_DRAKE] = dump_scenario(cameras, links)
+        texts["drake.yaml"] = dump_scenario(cameras, links)
     return texts
-
-
-def _world(tree: PoseTree) -> str:
-    """What ROS calls the frame of a tree's world: the link that is fixed at its origin, if any."""
-    kinematics = TreeKinematics(tree)
-    poses = kinematics.poses(kinematics.flatten(tree.default_values()))
-    for node, X_WN in zip(tree.nodes, poses, strict=True):
-        if node.parent < 0 and not node.value_names and np.allclose(X_WN, np.eye(4), atol=_ORIGIN):
-            return node.name
-    return "world"

@@ -15,7 +15,7 @@ from drake_pose.body import load_model
 from drake_pose.camera.camera_files import load_cameras
 from drake_pose.files.overlay import EXCESS_RGB, MISSING_RGB
 from drake_pose.jobs.registration.diagnosis import say_common
-from drake_pose.jobs.registration.register import _joint_shifts, register_scene
+from drake_pose.jobs.registration.register import joint_shifts, register_scene
 from drake_pose.jobs.registration.settings import RegistrationSettings
 from drake_pose.registration.register import CameraSearch, FrameMisfit, RegisteredCamera
 from drake_pose.silhouette.pictures.scenes import load_scene
@@ -172,7 +172,7 @@ def test_a_longer_link_carries_the_next_joint_farther_along_it(tmp_path: Path) -
         SimpleNamespace(name=name, value=value, significant=sure)
         for name, value, sure in (("shoulder", 0.1, True), ("elbow", 0.2, False))
     ]
-    shifts = _joint_shifts(arm_tree(tmp_path), SimpleNamespace(lengths=lengths))
+    shifts = joint_shifts(arm_tree(tmp_path), SimpleNamespace(lengths=lengths))
     assert shifts == {"roll_turn": pytest.approx([0.0, 0.0, 0.035])}
 
 

@@ -1,22 +1,326 @@
 """Cameras from pictures alone, of an arm of boxes painted over Drake's label images."""
 
+from contextlib import nullcontext
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from drake_pose.errors import RegistrationError
+from drake_pose.fit.background import Explained
 from drake_pose.fit.problem import TIME_OFFSET
-from drake_pose.registration.picture_registration import register_pictures
+from drake_pose.registration.picture_registration import (
+    Begun,
+    PictureRegistration,
+    Recording,
+    TimeOffset,
+    choose_pictures,
+    fit_pictures,
+    judge_pictures,
+    posed_pictures,
+    register_pictures,
+    scan_offsets,
+)
 from drake_pose.registration.picture_search import (
+    PictureLevel,
     PictureSearch,
     PosedPicture,
     choose_frames,
+    evidence,
     node_places,
+    upright_rotations,
 )
+from drake_pose.registration.standing_object import require_seen
 from tests.benchmarks.registration import pose_error
-from tests.registration.episodes import LATE
+from tests.registration.arm_pictures import errors
+from tests.registration.episodes import LATE, PaintedEpisode
+
+LEVEL_FRAMES = 6
+NO_SCORES = np.zeros((0, 2))
+
+
+@pytest.fixture(scope="module")
+def level(episode: PaintedEpisode) -> PictureLevel:
+    X_WN = np.array([episode.body.kinematics.poses(one) for one in episode.values[:LEVEL_FRAMES]])
+    pictures = episode.pictures[:LEVEL_FRAMES]
+    return PictureLevel(episode.body.very_few, episode.camera, pictures, X_WN, 80)
+
+
+def test_starts_show_a_body_where_pictures_change_and_about_as_large(level: PictureLevel) -> None:
+    """Against the moments of what changes; then some of the starts are nearer, or aside."""
+    starts = np.array(level.starts()).reshape(3, 2, -1, 4, 4)
+    moments = cv2.moments(level.backgrounds.changes())
+    middle = np.array([moments["m10"], moments["m01"]]) / moments["m00"]
+    spread = np.sqrt((moments["mu20"] + moments["mu02"]) / moments["m00"])
+    p_C = starts[..., :3, :3] @ level._middle + starts[..., :3, 3]
+    uv = level.camera.with_pose(np.eye(4)).project(p_C.reshape(-1, 3))[0].reshape(*p_C.shape[:3], 2)
+    np.testing.assert_allclose(uv[:, 0], np.broadcast_to(middle, uv[:, 0].shape), atol=1e-3)
+    aside = (uv[:, 1] - middle) / spread
+    np.testing.assert_allclose(aside.mean(axis=1), 0.0, atol=0.05)
+    np.testing.assert_allclose(aside.std(axis=1), 0.5, atol=0.05)
+    # As if all of it were equally far, a body is as large as what changes.
+    points = level._points - level._middle
+    sizes = np.array(
+        [np.sqrt(((points @ X[:2, :3].T) ** 2).sum(axis=1).mean()) for X in starts[0, 0]]
+    )
+    for times, depths in zip((0.7, 1.0, 1.5), p_C[:, 0, :, 2], strict=True):
+        seen = level.camera.focal_x * sizes / depths / spread
+        assert np.median(seen) == pytest.approx(1.0 / times, rel=0.03)
+        # It is farther away only where it would be about the camera.
+        assert seen.max() < 1.05 / times
+    assert (np.einsum("...j,pj->...p", starts[:, 0, :, 2, :3], points) + p_C[:, 0, :, 2:]).min() > 0
+
+
+def test_upright_cameras_are_rolled_a_little_and_look_all_around() -> None:
+    R_CW = upright_rotations(1000)
+    np.testing.assert_allclose(np.linalg.det(R_CW), 1.0)
+    np.testing.assert_allclose(
+        R_CW @ R_CW.transpose(0, 2, 1), np.tile(np.eye(3), (1000, 1, 1)), atol=1e-9
+    )
+    right, down, forward = R_CW.transpose(1, 0, 2)
+    rolls = np.arctan2(right[:, 2], -down[:, 2])
+    assert rolls.std() == pytest.approx(0.15, rel=0.1)
+    assert (forward[:, 2].min(), forward[:, 2].max()) == pytest.approx((-0.98, 0.5))
+    # Each eighth of all headings has its share.
+    headings = np.arctan2(forward[:, 1], forward[:, 0])
+    np.testing.assert_allclose(np.histogram(headings, 8, (-np.pi, np.pi))[0], 125, atol=3)
+
+
+def test_a_simplex_moves_turn_shift_and_depth_of_a_body_apart(level: PictureLevel, episode) -> None:
+    X_CW, x = episode.camera.X_CW, np.array([0.3, -0.2, 0.5, 0.04, -0.07, 0.2])
+    moved = level._moved(X_CW, x)
+    before, after = (X[:3, :3] @ level._middle + X[:3, 3] for X in (X_CW, moved))
+    np.testing.assert_allclose(after[:2] / after[2], before[:2] / before[2] + x[3:5])
+    assert after[2] == pytest.approx(before[2] * np.exp(x[5]))
+    turn = Rotation.from_matrix(moved[:3, :3] @ X_CW[:3, :3].T).as_rotvec()
+    np.testing.assert_allclose(turn, x[:3])
+
+
+def test_poses_that_improve_explain_more_and_the_true_one_most(
+    level: PictureLevel, episode
+) -> None:
+    true = episode.camera.X_CW
+    aside = level._moved(true, np.array([0.06, -0.05, 0.04, 0.02, -0.02, 0.03]))
+    poses = [aside, true, *level.starts()[::1200]]
+    scores = [level.score(X) for X in poses]
+    assert np.argmax(scores) == 1
+    score, found = level.improve((3, aside), evaluations=60, turn=0.1)
+    assert score == pytest.approx(level.score(found))
+    assert scores[0] + 0.5 * (scores[1] - scores[0]) < score
+    best = level.best(poses, LEVEL_FRAMES, 0.4)
+    assert len(best) == np.ceil(0.4 * len(poses))
+    assert [level.score(X) for X in best] == sorted(scores, reverse=True)[: len(best)]
+    # Fewer frames have as much less that could be explained; a share of all is at most that.
+    assert level.score(true, 3) == pytest.approx(scores[1], rel=0.3)
+    share, contour = level.explained(true)
+    assert 0.5 < share < 1.0
+    assert contour > level.explained(aside)[1]
+    told = level.told(true)
+    assert share == pytest.approx(told[Explained.GAIN] / level.backgrounds.possible)
+    assert contour == pytest.approx(told[Explained.CONTOUR] / told[Explained.OUTLINE])
+
+
+def test_what_a_pose_explains_is_told_apart_by_squares(level: PictureLevel, episode) -> None:
+    X_CW = episode.camera.X_CW
+    pieces = level.pieces(X_CW)
+    assert pieces.sum() == pytest.approx(level.told(X_CW)[Explained.GAIN])
+    # 80 by 60 pixels, in squares of 5.
+    assert pieces.shape == (16, 16)
+    assert (pieces[12:] == 0.0).all()
+    v, u = np.unravel_index(pieces.argmax(), pieces.shape)
+    covered = level.backgrounds.changes()[5 * v : 5 * v + 5, 5 * u : 5 * u + 5]
+    assert covered.mean() > level.backgrounds.changes().mean()
+
+
+def test_poses_are_distinct_that_show_a_body_elsewhere(level: PictureLevel, episode) -> None:
+    rng = np.random.default_rng(5)
+    true = episode.camera.X_CW
+    poses = [level._moved(true, rng.normal(0.0, 0.03, 6)) for _ in range(30)]
+    points = level._points[:: max(1, len(level._points) // 50)]
+
+    def apart(one: np.ndarray, other: np.ndarray) -> float:
+        p = (points @ X[:3, :3].T + X[:3, 3] for X in (one, other))
+        return float(np.linalg.norm(np.subtract(*p), axis=1).mean() / level._size)
+
+    expected: list[np.ndarray] = []
+    for X in poses:
+        if all(apart(X, one) > 0.08 for one in expected):
+            expected.append(X)
+    assert 5 < len(expected) < 30
+    np.testing.assert_array_equal(level.distinct(poses), expected)
+    np.testing.assert_array_equal(level.distinct(poses, 3), expected[:3])
+
+
+def test_slow_frames_carry_a_search_and_the_fastest_are_beside_them(episode, recording) -> None:
+    given = recording()
+    chosen, moving = choose_pictures(episode.body, episode.camera, given, 5)
+    assert not set(chosen) & set(moving)
+    X = [node_places(episode.body, episode.values_at(given.times + by)) for by in (1e-3, -1e-3)]
+    order = np.linalg.norm(X[0] - X[1], axis=2).mean(axis=1).argsort()
+    # Of 16: the slower six tenths; the eight that move most, but for those.
+    assert set(chosen) <= set(order[:10].tolist())
+    assert set(moving) == set(order[-8:].tolist()) - set(chosen)
+    # Those without joints are never chosen; nor is any fast without times.
+    unknown = order[[0, -1]]
+
+    def values_at(offset: float) -> np.ndarray:
+        values = episode.values_at(given.times + offset)
+        values[unknown] = np.nan
+        return values
+
+    both = choose_pictures(episode.body, episode.camera, recording(values_at=values_at), 5)
+    assert len(both[0]) == 5
+    assert not set(unknown.tolist()) & {*both[0], *both[1]}
+    still = choose_pictures(episode.body, episode.camera, recording(times=None), 16)
+    assert (sorted(still[0]), still[1]) == (list(range(16)), [])
+
+
+def test_a_recording_s_clock_and_zeros(episode, recording) -> None:
+    given: Recording = recording()
+    drifting = given.with_drift(0.1, 2.0)
+    at = 1.1 * given.times - 0.2
+    np.testing.assert_allclose(drifting.values_at(0.3), episode.values_at(at + 0.3))
+    np.testing.assert_allclose(
+        given.with_zeros(np.arange(5.0)).values_at(0.0) - given.values_at(0.0),
+        np.tile(np.arange(5.0), (16, 1)),
+    )
+    slopes = (episode.values_at(at + 1e-4) - episode.values_at(at - 1e-4)) / 2e-4
+    np.testing.assert_allclose(drifting.rates_at(0.0), slopes, atol=0.01)
+    np.testing.assert_array_equal(given.mirrored().picture("0002"), episode.pictures[2][:, ::-1])
+    poses = posed_pictures(given, [4, 1], 0.2)
+    assert [one.name for one in poses] == ["0004", "0001"]
+    np.testing.assert_allclose(poses[1].values, episode.values_at(given.times + 0.2)[1])
+
+
+def test_a_clock_is_told_by_what_its_offsets_explain(episode, recording) -> None:
+    offset, scores = scan_offsets(episode.body, episode.camera, recording(), range(0, 16, 2))
+    assert offset == pytest.approx(LATE, abs=0.012)
+    assert scores[:, 1].max() == 1.0
+    assert scores[scores[:, 1].argmax(), 0] == pytest.approx(LATE, abs=0.0126)
+    # Those before the log begins are not tried.
+    assert scores[0, 0] == -1.0
+
+    def logged(by: float) -> np.ndarray:
+        return episode.values_at(episode.times + by) if by > -0.31 else np.full((16, 5), np.nan)
+
+    told = scan_offsets(episode.body, episode.camera, recording(values_at=logged), range(0, 16, 2))
+    assert told[0] == offset
+    assert told[1][0, 0] == pytest.approx(-0.3)
+
+
+def test_a_search_ends_about_where_the_camera_is(episode) -> None:
+    """With fewer starts and rounds than usual; and fitted on lines the best of it is very near."""
+    shown = range(0, 16, 2)
+    frames = [PosedPicture(f"{k}", episode.values[k], episode.pictures[k]) for k in shown]
+    search = PictureSearch(episode.body, episode.camera.with_pose(np.eye(4)), frames)
+    found = search.search(((64, 40, 24, 0.25), (64, 10, 50, 0.1)), rotations=300)
+    assert 1 < len(found) <= 10
+    scores = [search._level(64).score(X) for X in found]
+    assert scores == sorted(scores, reverse=True)
+    shift, turn = errors(np.linalg.inv(found[0]), episode.camera.X_WC)
+    assert shift < 0.15
+    assert turn < np.radians(8.0)
+    camera, told = search.approach(found[0])
+    shift, turn = errors(camera.X_WC, episode.camera.X_WC)
+    assert shift < 0.01
+    assert turn < np.radians(0.5)
+    assert told == search.compared.explained(camera.X_CW)
+    assert evidence(*told) == pytest.approx(told[0] + 4.0 * told[1])
+    # A body that leaves the pictures is not fitted.
+    assert search.approach(np.diag([-1.0, 1.0, -1.0, 1.0]) @ found[0]) is None
+
+
+def test_parts_that_are_small_or_stand_still_do_not_carry_a_search(episode) -> None:
+    frames = [PosedPicture(f"{k}", episode.values[k], episode.pictures[k]) for k in range(6)]
+    search = PictureSearch(episode.body, episode.camera, frames)
+    assert search.compared.camera.width == 160
+    assert search._level(64) is search._level(64)
+    shown = [[len(one.vertices) > 0 for one in outlines] for outlines in search._outlines]
+    radii = np.array([one.ball[3] for one in episode.body.very_few])
+    assert shown[1] == shown[2] == (radii > 0).tolist()
+    assert shown[0] == (radii >= 0.25 * radii.max()).tolist()
+    # What moves by less than six hundredths of the body's size stands still.
+    outlines, counts = episode.body.very_few, set()
+    for share in np.geomspace(0.02, 0.3, 8):
+        values = episode.values[:6].mean(axis=0)
+        values = values + share * (episode.values[:6] - values)
+        X_WN = np.array([episode.body.kinematics.poses(one) for one in values])
+        level = PictureLevel(outlines, episode.camera, episode.pictures[:6], X_WN, 64)
+        places = [
+            np.array([one.vertices @ X[:3, :3].T + X[:3, 3] for X in X_WN[:, k]])
+            for k, one in enumerate(outlines)
+        ]
+        everything = np.concatenate([one.reshape(-1, 3) for one in places])
+        size = np.linalg.norm(everything.std(axis=0))
+        moves = [np.linalg.norm(np.ptp(one, axis=0), axis=1).max(initial=0.0) for one in places]
+        np.testing.assert_array_equal(level._still, np.array(moves) < 0.06 * size)
+        counts.add(int(level._still.sum()))
+    assert len(counts) > 2
+
+
+@pytest.fixture(scope="module")
+def registered(episode, recording) -> PictureRegistration:
+    """From a camera turned by a degree, and a clock that is off by ten milliseconds."""
+    turn = np.eye(4)
+    turn[:3, :3] = Rotation.from_rotvec(np.radians([0.5, -0.6, 0.6])).as_matrix()
+    near = episode.camera.with_pose(turn @ episode.camera.X_WC)
+    begun = Begun(near, range(0, 16, 3), TimeOffset(LATE - 0.01, np.inf, NO_SCORES), ())
+    return fit_pictures(episode.body, begun, recording())
+
+
+def test_a_clock_is_fitted_with_a_camera_and_told_as_surely_as_it_is(registered, episode) -> None:
+    shift, turn = errors(registered.found.camera.X_WC, episode.camera.X_WC)
+    assert shift < 0.008
+    assert turn < np.radians(0.3)
+    clock = registered.offset
+    assert clock.determined
+    assert abs(clock.value - LATE) < 4.0 * clock.deviation
+    assert clock.deviation < 0.003
+    assert clock.drift == 0.0
+    assert all(one.agrees for one in registered.found.frames)
+    # Masks and odds are those of the joints' values before the last step.
+    values = episode.values_at(episode.times[::3] + LATE - 0.01)
+    np.testing.assert_allclose([one.values for one in registered.frames], values)
+    np.testing.assert_array_equal(registered.pictures["0003"], episode.pictures[3])
+    assert registered.focal_deviation == 0.0
+
+
+def test_pictures_are_judged_by_where_the_others_show_a_body(registered, episode) -> None:
+    """One without it, and one of another moment; the rest agrees, with masks of where it is."""
+    pictures = [*episode.pictures]
+    pictures[5], pictures[9] = episode.background.astype(np.uint8), pictures[2]
+    zeros = np.arange(5.0)
+    shown = replace(
+        registered.recording,
+        read=lambda k: pictures[k],
+        values_at=lambda offset: registered.recording.values_at(offset) - zeros,
+    )
+    one = replace(registered, recording=shown, zeros=zeros)
+    frames, misfits, lost = judge_pictures(episode.body, one, registered.found)
+    told = {one.frame: one for one in misfits}
+    assert {name for name, one in told.items() if not one.agrees} | {*lost} == {
+        "0005",
+        "0009",
+    }
+    assert min(one.iou for one in told.values() if one.agrees) > 0.9
+    expected = {f"{k:04d}": row - zeros for k, row in enumerate(episode.values)}
+    for frame in frames:
+        np.testing.assert_allclose(frame.values, expected[frame.name], atol=0.01)
+        assert frame.odds is None
+    # Nothing is asked of pictures that should not show it.
+    away = np.eye(4)
+    away[:3, :3] = np.diag([-1.0, 1.0, -1.0])
+    behind = registered.found.camera.with_pose(registered.found.camera.X_WC @ away)
+    nothing = judge_pictures(episode.body, one, replace(registered.found, camera=behind))
+    assert nothing == ((), (), ())
+
+
+@pytest.mark.parametrize(("count", "of", "enough"), [(3, 4, False), (4, 8, True), (4, 9, False)])
+def test_a_target_is_seen_in_four_pictures_and_half_of_them(count, of, enough) -> None:
+    with nullcontext() if enough else pytest.raises(RegistrationError, match=f"{count} of {of}"):
+        require_seen("hand", count, of)
 
 
 def near(camera, degrees=2.0):

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import yaml
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from drake_pose.arrays import Array, Picture
@@ -357,6 +358,7 @@ def make_registration_report(folder: Path, summary: Mapping[str, Any]) -> str:
             pictures.append(overlay_picture(folder, camera, frame, errors[frame]))
         for frame in compared_frames(errors):
             pairs.append(overlay_picture(folder, camera, frame, errors[frame], AS_GIVEN))
+    figures = [(name, plot_offset(one)) for name, one in summary["cameras"].items()]
     return page_template("drake_pose.jobs.registration").render(
         summary=summary,
         title=Path(str(summary["scene"])).name or str(summary["scene"]),
@@ -370,7 +372,7 @@ def make_registration_report(folder: Path, summary: Mapping[str, Any]) -> str:
         by_pictures=first["masks"] == "found",
         # A target tells nothing of clocks.
         clocks=first["masks"] == "found" and "time_offset_scores" in first,
-        offsets={name: _plot_offset(one) for name, one in summary["cameras"].items()},
+        offsets={name: figure and plot_uri(figure) for name, figure in figures},
         normal=_NORMAL,
         pictures=[picture for picture in pictures if picture is not None],
         pairs=[picture for picture in pairs if picture is not None],
@@ -383,7 +385,7 @@ def compared_frames(errors: Mapping[str, float]) -> Sequence[str]:
     return tuple(dict.fromkeys([in_order[0], in_order[len(in_order) // 2]]))
 
 
-def _plot_offset(camera: Mapping[str, Any]) -> str | None:
+def plot_offset(camera: Mapping[str, Any]) -> Figure | None:
     """What was explained at each offset of a camera's clock that was tried; None: none was.
 
     A vertical line is the offset that was found, in its 95 % interval.
@@ -398,7 +400,7 @@ def _plot_offset(camera: Mapping[str, Any]) -> str | None:
         axes.axvspan(value - margin, value + margin, color="#c5dfee")
         axes.axvline(value, color="#d55e00")
         axes.set_xlim(1e3 * tried[0, 0], 1e3 * tried[-1, 0])
-    return plot_uri(figure)
+    return figure
 
 
 def check_exports(formats: Collection[str], cameras: Iterable[Camera]) -> None:

@@ -1,28 +1,17 @@
 """The page of a registration in pictures: clocks, focal lengths."""
 
-import re
-from html.parser import HTMLParser
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from drake_pose.jobs.registration.result import describe_pictures, make_registration_report
+from drake_pose.jobs.registration.result import (
+    describe_pictures,
+    make_registration_report,
+    plot_offset,
+)
 from drake_pose.registration.picture_registration import TimeOffset
 from tests.search.arms import arm_cameras
-
-
-class Paths(HTMLParser):
-    """The paths of a page's plots by class."""
-
-    def __init__(self):
-        super().__init__()
-        self.found = {}
-
-    def handle_starttag(self, tag, attrs):
-        given = dict(attrs)
-        if tag == "path":
-            self.found[given["class"]] = given["d"]
 
 
 def summary(**camera):
@@ -36,10 +25,6 @@ def summary(**camera):
     return {
         "scene": "episode", "model": "arm.urdf", "warnings": [], "cameras": {"front": one | camera}
     }  # fmt: skip
-
-
-def numbers(path):
-    return np.array(re.findall(r"[\d.]+", path), float)
 
 
 @pytest.mark.parametrize("late", [0.1, -0.35])
@@ -57,22 +42,20 @@ def test_the_clock_s_offset_is_drawn_at_the_curve_s_peak(tmp_path, late):
     )
     assert f"joints of {abs(1e3 * late):.0f} ms {'later' if late > 0 else 'earlier'}" in page
     assert "Focal length 500.0 pixels (490.2 to 509.8)" in page
-    paths = Paths()
-    paths.feed(page)
-    curve = numbers(paths.found["curve c0"]).reshape(-1, 2)
-    assert paths.found["curve c0"].count("M") == 2
-    x, _, _ = numbers(paths.found["curve c1"])
-    assert x == pytest.approx(curve[curve[:, 1].argmin(), 0], abs=0.2)
-    left, _, right, *_ = numbers(paths.found["known"])
-    milliseconds = np.ptp(curve[:, 0]) / 2000.0
-    assert (right - left) == pytest.approx(2 * 39.2 * milliseconds, abs=0.2)
+    assert page.count('<img class="plot" src="data:image/') == 1
+    (axes,) = plot_offset({"time_offset_scores": scores.tolist(), **told}).axes
+    curve, line = (one.get_xydata() for one in axes.lines)
+    np.testing.assert_allclose(curve, scores * [1e3, 100.0])
+    np.testing.assert_allclose(line[:, 0], curve[curve[:, 1].argmax(), 0], atol=1e-9)
+    band = axes.patches[0].get_extents().transformed(axes.transData.inverted())
+    assert (band.x0, band.x1) == pytest.approx((1e3 * late - 39.2, 1e3 * late + 39.2))
 
 
 def test_what_pictures_do_not_tell(tmp_path):
     page = make_registration_report(tmp_path, summary())
     assert "Its clock is not told apart" in page
     assert "Focal length 500.0 pixels, as given" in page
-    assert "<svg" not in page
+    assert 'class="plot"' not in page
     page = make_registration_report(tmp_path, summary(masks="given"))
     assert "from masks and joint positions" in page
     assert "Clocks" not in page

@@ -4,16 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from pydrake.geometry import Meshcat
 from pydrake.math import RigidTransform
-from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPort, System
+from pydrake.systems.framework import Context, DiagramBuilder, System
 
 from drake_pose.arrays import Array
 from drake_pose.camera.models import Camera, camera_tuple
-from drake_pose.camera.sources import FrameSource
 from drake_pose.errors import SettingsError
 from drake_pose.fit.colours import COLOURS
 from drake_pose.fit.contour_fit import inlier_ratio_of
@@ -31,7 +30,7 @@ from drake_pose.person.views import (
 from drake_pose.silhouette.segmentation.background import Background
 from drake_pose.systems.bodies import add_avatar, body_poses
 from drake_pose.systems.images import ColourPorts
-from drake_pose.systems.picture_capture import PersonRegion, PictureCapture, connect_images
+from drake_pose.systems.picture_capture import PersonRegion, connect_images
 from drake_pose.systems.ports import (
     MemorySystem,
     StagedDiagram,
@@ -310,104 +309,36 @@ class SilhouetteSensor(PersonRegion):
         self.silhouette = self.add_output("silhouette", None, view)
 
 
-def _add_sensors(
+def add_silhouette_sensors(
     builder: DiagramBuilder,
     source: System | None,
     cameras: Mapping[str, Camera],
     backgrounds: Mapping[str, Background],
     edge_points: float = EDGE_POINTS,
 ) -> dict[str, SilhouetteSensor]:
-    """A sensor a camera, which gets its images from a source, or from outside."""
-    sensors = {
-        name: SilhouetteSensor(camera, backgrounds.get(name), edge_points)
-        for name, camera in cameras.items()
-    }
-    for name, sensor in sensors.items():
-        builder.AddNamedSystem(f"sensor_{name}", sensor)
+    """Add a source of images, and a sensor for each camera; without a source images are inputs.
+
+    Args:
+        source: what has ``color_image_<camera>``, or ``label_image_<camera>`` of a camera without
+            background.
+
+    Raises:
+        SettingsError: without a source a camera has no background; or the source lacks an output.
+    """
+    for name in cameras:
+        if source is None and name not in backgrounds:
+            raise SettingsError(
+                f"camera '{name}' has no background: give one for each of {', '.join(cameras)}"
+            )
+    if source is not None:
+        builder.AddNamedSystem("source", source)
+    sensors = {}
+    for name, camera in cameras.items():
+        sensor = SilhouetteSensor(camera, backgrounds.get(name), edge_points)
+        sensors[name] = builder.AddNamedSystem(f"sensor_{name}", sensor)
         wanted = {f"{kind}_{name}": [sensor.GetInputPort(kind)] for kind in sensor.wanted}
         connect_images(builder, source, wanted)
     return sensors
-
-
-class LiveSensors(PictureCapture):
-    """A PictureCapture and what sees with it, looked at each period: a SilhouetteSensor a camera.
-
-    Args:
-        backgrounds: of the cameras whose sources do not deliver masks.
-        how: the further arguments of PictureCapture.
-    """
-
-    def __init__(
-        self,
-        sources: Mapping[str, FrameSource],
-        cameras: Mapping[str, Camera],
-        backgrounds: Mapping[str, Background],
-        **how: Any,
-    ) -> None:
-        super().__init__(sources, cameras, **how)
-        self._cameras, self._backgrounds = cameras, backgrounds
-
-    def add(self, builder: DiagramBuilder) -> dict[str, OutputPort]:
-        """Adds itself and the sensors to a diagram; by camera the port of a view or None."""
-        builder.AddNamedSystem("picture_capture", self)
-        sensors = _add_sensors(builder, self, self._cameras, self._backgrounds)
-        return {name: sensor.silhouette for name, sensor in sensors.items()}
-
-
-def add_person_tracker(
-    builder: DiagramBuilder,
-    tracker: PersonPoseTracker,
-    cameras: Mapping[str, Camera],
-    silhouettes: Mapping[str, OutputPort],
-    period: float,
-    time: OutputPort | None = None,
-    meshcat: Meshcat | None = None,
-    with_deviations: bool = False,
-) -> PersonTracker:
-    """Add what follows a person with sensors.
-
-    Args:
-        cameras: two calibrated cameras or more.
-        period: time between two looks at the sensors [s].
-        time: the pictures' time stamp; None: every period brings new pictures.
-        with_deviations: whether the positions' standard deviations are an output.
-
-    Raises:
-        SettingsError: fewer than two cameras, or a period that is not positive.
-    """
-    system = PersonTracker(tracker, list(cameras.values()), period, with_deviations)
-    builder.AddNamedSystem("person_tracker", system)
-    for name, port in silhouettes.items():
-        builder.Connect(port, system.GetInputPort(f"silhouette_{name}"))
-    if time is not None:
-        builder.Connect(time, system.GetInputPort("time"))
-    if meshcat is not None:
-        positions = system.GetOutputPort("last_positions")
-        add_avatar(builder, tracker.fit.tree.model, positions, meshcat, "avatar", period)
-    return system
-
-
-def build_live_capture(
-    tracker: PersonPoseTracker,
-    cameras: Mapping[str, Camera],
-    sensors: LiveSensors,
-    with_deviations: bool = False,
-) -> Diagram:
-    """Cameras' pictures to a person's poses.
-
-    The diagram's outputs are those of PersonTracker, and ``silhouette_<camera>``, its inputs; the
-    arguments but the sensors are those of add_person_tracker, as are the errors.
-    """
-    builder = DiagramBuilder()
-    silhouettes = sensors.add(builder)
-    for name, port in silhouettes.items():
-        builder.ExportOutput(port, f"silhouette_{name}")
-    period, time = sensors.period, sensors.GetOutputPort("time")
-    person = add_person_tracker(
-        builder, tracker, cameras, silhouettes, period, time, with_deviations=with_deviations
-    )
-    export_outputs(builder, person)
-    return builder.Build()
 
 
 def build_silhouette_capture(
@@ -418,36 +349,59 @@ def build_silhouette_capture(
     edge_points: float = EDGE_POINTS,
     source: System | None = None,
     meshcat: Meshcat | None = None,
+    with_deviations: bool = False,
 ) -> StagedDiagram[PersonTracker]:
     """Wire the cameras' images to their sensors, and these to what follows the person.
 
-    The diagram's inputs are ``color_image_<camera>``, its outputs those of PersonTracker, and its
-    stages ``region`` and ``edge``.
+    The diagram's inputs are ``color_image_<camera>``, its outputs those of PersonTracker and
+    ``silhouette_<camera>``, and its stages ``region`` and ``edge``.
 
     Args:
         backgrounds: of all cameras, two or more, unless a source gives label images.
         period: time between two frames [s].
         edge_points: a picture's height over the spacing of the edge points.
-        source: what has ``color_image_<camera>``, or ``label_image_<camera>`` of a camera without
-            background, in place of the inputs.
+        source: of the images in place of the inputs, as a rig's diagram or a PictureCapture; see
+            add_silhouette_sensors. Without an output ``time`` every period brings new pictures.
         meshcat: where to show the person.
+        with_deviations: whether the positions' standard deviations are an output.
 
     Raises:
         SettingsError: fewer than two cameras, one without a background, or a period that is not
             positive.
     """
-    for name in cameras:
-        if source is None and name not in backgrounds:
-            raise SettingsError(
-                f"camera '{name}' has no background: give one for each of {', '.join(cameras)}"
-            )
     builder = DiagramBuilder()
-    if source is not None:
-        builder.AddNamedSystem("source", source)
-    sensors = _add_sensors(builder, source, cameras, backgrounds, edge_points)
-    edges = {name: sensor.silhouette for name, sensor in sensors.items()}
-    person = add_person_tracker(builder, tracker, cameras, edges, period, meshcat=meshcat)
+    person, sensors = add_person_tracker(
+        builder, tracker, cameras, backgrounds, period, edge_points, source, with_deviations
+    )
+    if meshcat is not None:
+        positions = person.GetOutputPort("last_positions")
+        add_avatar(builder, tracker.fit.tree.model, positions, meshcat, "avatar", period)
+    for name, sensor in sensors.items():
+        builder.ExportOutput(sensor.silhouette, f"silhouette_{name}")
     export_outputs(builder, person)
-    regions = tuple(sensor.region for sensor in sensors.values())
-    stages = {"region": regions, "edge": tuple(edges.values())}
+    stages = {
+        "region": tuple(sensor.region for sensor in sensors.values()),
+        "edge": tuple(sensor.silhouette for sensor in sensors.values()),
+    }
     return StagedDiagram(builder.Build(), stages, person)
+
+
+def add_person_tracker(
+    builder: DiagramBuilder,
+    tracker: PersonPoseTracker,
+    cameras: Mapping[str, Camera],
+    backgrounds: Mapping[str, Background],
+    period: float,
+    edge_points: float = EDGE_POINTS,
+    source: System | None = None,
+    with_deviations: bool = False,
+) -> tuple[PersonTracker, dict[str, SilhouetteSensor]]:
+    """Add what follows a person, its sensors and the source; as of build_silhouette_capture."""
+    sensors = add_silhouette_sensors(builder, source, cameras, backgrounds, edge_points)
+    person = PersonTracker(tracker, list(cameras.values()), period, with_deviations)
+    builder.AddNamedSystem("person_tracker", person)
+    for name, sensor in sensors.items():
+        builder.Connect(sensor.silhouette, person.GetInputPort(f"silhouette_{name}"))
+    if source is not None and source.HasOutputPort("time"):
+        builder.Connect(source.GetOutputPort("time"), person.GetInputPort("time"))
+    return person, sensors

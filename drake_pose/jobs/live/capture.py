@@ -54,8 +54,8 @@ from drake_pose.systems.date import (
     render_registered_pose,
 )
 from drake_pose.systems.images import colour_image_to_picture
-from drake_pose.systems.person import LiveSensors, build_live_capture
-from drake_pose.systems.picture_capture import CameraCount
+from drake_pose.systems.person import add_silhouette_sensors, build_silhouette_capture
+from drake_pose.systems.picture_capture import CameraCount, PictureCapture
 from drake_pose.systems.ports import evaluate
 
 
@@ -110,7 +110,10 @@ def capture_live(
     with closing(scene.open_sensors(tolerance=settings.tolerance)) as sensors:
         if setup is None:
             kind, cameras = "silhouette", scene.cameras
-            diagram = build_live_capture(tracker, cameras, sensors, with_deviations=True)
+            diagram = build_silhouette_capture(
+                tracker, cameras, scene.backgrounds, sensors.period, source=sensors,
+                with_deviations=True,
+            ).diagram  # fmt: skip
         else:
             kind, cameras = "person_view", setup.cameras
             diagram = build_paper_capture(setup, sensors, sensors.period).diagram
@@ -172,13 +175,14 @@ def _fit_first_frames(
     sensors = scene.open_sensors(tolerance=settings.tolerance)
     frames: list[dict[str, Mask]] = []
     builder = DiagramBuilder()
-    ports, time, last = sensors.add(builder), sensors.GetOutputPort("time"), np.nan
+    seers = add_silhouette_sensors(builder, sensors, scene.cameras, scene.backgrounds)
+    time, last = sensors.GetOutputPort("time"), np.nan
 
     def look(context: Context) -> bool:
         nonlocal last
         before, last = last, float(evaluate(time, context)[0])
         if last != before and not np.isnan(last):
-            views = {name: evaluate(port, context) for name, port in ports.items()}
+            views = {name: evaluate(one.silhouette, context) for name, one in seers.items()}
             seen = {name: view.region for name, view in views.items() if shows_somebody(view)}
             if len(seen) >= 2:
                 frames.append(seen)
@@ -258,7 +262,7 @@ def find_registered_pose(
 def _best_moment(
     setup: CaptureSetup,
     ring: Mapping[str, PinholeCamera],
-    sensors: LiveSensors,
+    sensors: PictureCapture,
     on_report: Callable[[str], None],
     more_moments: int = 10,
 ) -> tuple[tuple[Array, float] | None, dict[str, Picture]]:
@@ -307,7 +311,7 @@ class _FrameWriter:
 
     Args:
         tracker: made for the person's pose tree; gives its surfaces.
-        diagram: of build_live_capture, or of build_paper_capture.
+        diagram: of build_silhouette_capture, or of build_paper_capture.
         views: by camera, the diagram's port of what its picture says, None where there is none.
         period: time between two frames [s].
         on_frame: as of capture_live.
@@ -406,7 +410,7 @@ class _FrameWriter:
         for text in doubts:
             self._doubts.setdefault(text, []).append(frame)
 
-    def finish(self, sensors: LiveSensors, replay: bool) -> None:
+    def finish(self, sensors: PictureCapture, replay: bool) -> None:
         """Writes what is made of all frames."""
         writer = self._writer
         writer.warnings += [

@@ -29,7 +29,7 @@ from drake_pose.camera.sources import (
 from drake_pose.errors import OutputError, SceneError
 from drake_pose.files.folder import write_file
 from drake_pose.silhouette.segmentation.background import Background, learn_background
-from drake_pose.systems.person import LiveSensors
+from drake_pose.systems.picture_capture import PictureCapture
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,8 +44,10 @@ class LiveScene:
     specifications: Mapping[str, SourceSpecification]
     backgrounds: Mapping[str, Background]
 
-    def open_sensors(self, live: bool | None = None, tolerance: float | None = None) -> LiveSensors:
-        """Opens the sources, and the sensors that see with them.
+    def open_sensors(
+        self, live: bool | None = None, tolerance: float | None = None
+    ) -> PictureCapture:
+        """Opens the sources of the pictures.
 
         Args:
             live: whether the computer's clock decides; where not given, if a camera is live.
@@ -56,13 +58,8 @@ class LiveScene:
             SettingsError: the tolerance cannot be.
         """
         with ExitStack() as opened:
-            sensors = LiveSensors(
-                _open_sources(self.specifications, opened),
-                self.cameras,
-                self.backgrounds,
-                live=live,
-                tolerance=tolerance,
-            )
+            sources = _open_sources(self.specifications, opened)
+            sensors = PictureCapture(sources, self.cameras, live=live, tolerance=tolerance)
             opened.pop_all()
         return sensors
 
@@ -149,7 +146,7 @@ def take_empty_room(folder: Path, count: int, patience: float = 30.0) -> dict[st
 
 def run_live(
     diagram: Diagram,
-    sensors: LiveSensors | None,
+    sensors: PictureCapture | None,
     seconds: float | None,
     on_report: Callable[[str], None] = lambda _: None,
     monitor: Callable[[Context], EventStatus | None] | None = None,
@@ -196,7 +193,7 @@ def run_live(
 
 def look_until(
     diagram: Diagram,
-    sensors: LiveSensors,
+    sensors: PictureCapture,
     looks: Callable[[Context], bool],
     on_report: Callable[[str], None],
     patience: float = 60.0,

@@ -28,7 +28,8 @@ from drake_pose.jobs.live.settings import LiveSettings
 from drake_pose.person.date.skeleton import load_skeleton
 from drake_pose.person.date.walking import COMMANDS, make_motion
 from drake_pose.person.shape import tracker_of_person
-from drake_pose.systems.person import LiveSensors, add_person_tracker
+from drake_pose.systems.person import add_person_tracker
+from drake_pose.systems.picture_capture import PictureCapture
 from drake_pose.systems.ports import evaluate
 from drake_pose.systems.walk import KEYS, AddPositions, build_walk
 
@@ -57,7 +58,7 @@ class Player:
     )
     q: Array | None = None
     period: float = 1.0 / RATE_HZ
-    sensors: LiveSensors | None = None
+    sensors: PictureCapture | None = None
     add: AddPositions | None = None
 
 
@@ -104,7 +105,7 @@ def live_player(
     scene: LiveScene,
     model_path: Path | None = None,
     settings: LiveSettings | None = None,
-    open_sensors: Callable[[], LiveSensors] | None = None,
+    open_sensors: Callable[[], PictureCapture] | None = None,
 ) -> Player:
     """Walks as the person before the cameras commands; recorded sources are played as if live.
 
@@ -124,9 +125,10 @@ def live_player(
     sensors = scene.open_sensors(live=True) if open_sensors is None else open_sensors()
 
     def add(builder: DiagramBuilder) -> OutputPort:
-        seen, period, time = sensors.add(builder), sensors.period, sensors.GetOutputPort("time")
-        system = add_person_tracker(builder, tracker, scene.cameras, seen, period, time)
-        return system.GetOutputPort("estimated_positions")
+        person, _ = add_person_tracker(
+            builder, tracker, scene.cameras, scene.backgrounds, sensors.period, source=sensors
+        )
+        return person.GetOutputPort("estimated_positions")
 
     return Player(model, None, sensors.period, sensors, add)
 

@@ -66,7 +66,7 @@ def test_a_slow_computer_does_not_make_up_for_lost_time(studio, monkeypatch):
     monkeypatch.setattr("drake_pose.jobs.live.scene.time.monotonic", lambda: clock["now"])
     sensors = load_live_scene(studio).open_sensors(live=False)
     builder = DiagramBuilder()
-    sensors.add(builder)
+    builder.AddSystem(sensors)
     diagram = builder.Build()
     sensors.live = True
     times = []

@@ -113,15 +113,6 @@ def is_watertight(mesh: TriangleMesh) -> bool:
     return bool(np.all(np.diff(forward) > 0) and np.array_equal(forward, backward))
 
 
-# What a COLLADA file says of colours and textures.
-_DAE_LOOKS = ("library_images", "library_effects", "library_materials", "bind_material")
-READABLE_EXTENSIONS = (".obj", ".gltf", ".glb", ".stl", ".dae")
-_STL_TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
-# glTF's vertical axis is y, Drake's is z: (x, y, z) becomes (x, -z, y).
-_R_DRAKE_GLTF = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
-
-
-_MOST_KEPT = 64
 read_meshes: dict[Path, TriangleMesh] = {}
 """The meshes of the files that were read last, at the files' own size."""
 
@@ -137,7 +128,7 @@ def read_mesh_file(path: Path, scale: Array | None = None) -> TriangleMesh:
     path = path.resolve()
     if path not in read_meshes:
         read_meshes[path] = _read_unscaled(path)
-        for old in list(read_meshes)[:-_MOST_KEPT]:
+        for old in list(read_meshes)[:-64]:
             del read_meshes[old]
     mesh = read_meshes[path]
     if scale is None:
@@ -151,15 +142,17 @@ def _read_unscaled(path: Path) -> TriangleMesh:
     if not path.is_file():
         raise ModelError(f"mesh file {path} does not exist")
     extension = path.suffix.lower()
-    if extension not in READABLE_EXTENSIONS:
+    readers = {".obj": _read_obj, ".gltf": _read_gltf, ".glb": _read_gltf, ".stl": _read_stl}
+    readers[".dae"] = _read_dae
+    if extension not in readers:
         raise ModelError(
             f"mesh file {path}: '{extension}' is not a format that can be read; "
-            f"use one of {', '.join(READABLE_EXTENSIONS)}"
+            f"use one of {', '.join(readers)}"
         )
     if path in _written:
         return _written[path]
     try:
-        mesh = _READERS.get(extension, _read_gltf)(path)
+        mesh = readers[extension](path)
     except OSError as error:
         raise ModelError(f"mesh file {path} cannot be read: {error.strerror or error}") from error
     if mesh.triangles.size and not (
@@ -197,7 +190,9 @@ def _read_obj(path: Path) -> TriangleMesh:
 def _read_gltf(path: Path) -> TriangleMesh:
     """A glTF or GLB file, all its parts at their places."""
     mesh = _read_with_trimesh(path, path, path.suffix)
-    return TriangleMesh(mesh.vertices @ _R_DRAKE_GLTF.T, mesh.triangles)
+    # glTF's vertical axis is y, Drake's is z.
+    x, y, z = mesh.vertices.T
+    return TriangleMesh(np.stack([x, -z, y], axis=1), mesh.triangles)
 
 
 def _read_stl(path: Path) -> TriangleMesh:
@@ -205,7 +200,10 @@ def _read_stl(path: Path) -> TriangleMesh:
     data = path.read_bytes()
     count = int.from_bytes(data[80:84], "little")
     if len(data) == 84 + 50 * count and count > 0:
-        corners = np.frombuffer(data, _STL_TRIANGLE, offset=84)["corners"]
+        triangle = np.dtype(
+            [("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")]
+        )
+        corners = np.frombuffer(data, triangle, offset=84)["corners"]
         order = np.arange(3 * count, dtype=np.int32)
         return TriangleMesh(corners.reshape(-1, 3), order)
     words = data.lower().split()
@@ -231,9 +229,14 @@ def _read_dae(path: Path) -> TriangleMesh:
         import collada  # Slow to import, and needed for DAE files alone.
     except ModuleNotFoundError as error:
         raise ModelError(f"mesh file {path}: install 'pycollada' to read DAE files") from error
+    looks = ("library_images", "library_effects", "library_materials", "bind_material")
     parts = []
     try:
-        document = collada.Collada(io.BytesIO(_shapes_of_dae(path)))
+        # A material that names a missing texture would take its triangles with it.
+        root = ElementTree.parse(path).getroot()
+        for parent in list(root.iter()):
+            parent[:] = [child for child in parent if child.tag.rpartition("}")[2] not in looks]
+        document = collada.Collada(io.BytesIO(ElementTree.tostring(root)))
         if document.scene is None:
             raise ModelError(f"mesh file {path} has no scene: nothing would be drawn")
         for geometry in document.scene.objects("geometry"):
@@ -248,15 +251,6 @@ def _read_dae(path: Path) -> TriangleMesh:
     # As in RViz and Gazebo, <unit> is applied (pinocchio does not), and <up_axis> is not.
     unit = document.assetInfo.unitmeter
     return TriangleMesh(mesh.vertices * (1.0 if unit is None else unit), mesh.triangles)
-
-
-def _shapes_of_dae(path: Path) -> bytes:
-    """The text of a COLLADA file without colours and textures."""
-    # A material that names a missing texture would take its triangles with it.
-    root = ElementTree.parse(path).getroot()
-    for parent in list(root.iter()):
-        parent[:] = [child for child in parent if child.tag.rpartition("}")[2] not in _DAE_LOOKS]
-    return ElementTree.tostring(root)
 
 
 def _read_with_trimesh(path: Path, source: Path | io.BytesIO, extension: str) -> TriangleMesh:
@@ -281,7 +275,6 @@ _READER_ERRORS = (
     SyntaxError,
     struct.error,
 )
-_READERS = {".obj": _read_obj, ".stl": _read_stl, ".dae": _read_dae}
 
 
 def is_drawn_by_drake(path: Path) -> bool:
@@ -365,21 +358,27 @@ def _write_lines(file: TextIO, line: str, rows: NDArray[Any]) -> None:
         file.write((line * len(chunk)) % tuple(chunk.ravel().tolist()))
 
 
-_VTK_RESOLUTION = 50
-
-
 def shape_mesh(shape: Shape) -> TriangleMesh:
     """A Drake shape as triangles in its own frame; ModelError where it has no surface here."""
     if isinstance(shape, Box):
-        return _box_mesh(shape.width(), shape.depth(), shape.height())
+        ends = (-0.5, 0.5)
+        corners = np.array([[x, y, z] for x in ends for y in ends for z in ends])
+        faces = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+        triangles = [(a, b, c) for a, b, c, _ in faces] + [(a, c, d) for a, _, c, d in faces]
+        return TriangleMesh(corners * shape.size(), np.array(triangles, dtype=np.int32))
     if isinstance(shape, Sphere):
         return _ellipsoid_mesh(*[shape.radius()] * 3)
-    if isinstance(shape, Cylinder):
-        return _cylinder_mesh(shape.radius(), shape.length())
-    if isinstance(shape, Capsule):
-        return _capsule_mesh(shape.radius(), shape.length())
     if isinstance(shape, Ellipsoid):
         return _ellipsoid_mesh(shape.a(), shape.b(), shape.c())
+    # Drake turns VTK's cylinder a quarter about its axis, so the first vertex lies on y.
+    if isinstance(shape, Cylinder):
+        half, radii = 0.5 * shape.length(), shape.radius() * np.array([0.0, 1.0, 1.0, 0.0])
+        return _round_mesh(radii, np.array([half, half, -half, -half]), np.pi / 2.0)
+    if isinstance(shape, Capsule):
+        quarter, half = np.linspace(0.0, np.pi / 2.0, 49), 0.5 * shape.length()
+        radii, heights = shape.radius() * np.sin(quarter), shape.radius() * np.cos(quarter) + half
+        every = np.concatenate([radii, radii[::-1]]), np.concatenate([heights, -heights[::-1]])
+        return _round_mesh(*every, np.pi / 2.0)
     if isinstance(shape, (Mesh, Convex)) and not shape.source().is_path():
         raise ModelError("a mesh that lies in memory cannot be read; write it to a file")
     if isinstance(shape, Mesh):
@@ -461,12 +460,15 @@ def make_drawable(
             if isinstance(shape, HalfSpace):
                 scene_graph.RemoveRole(source, geometry, Role.kPerception)
             elif isinstance(shape, (Mesh, Convex)) and shape.source().is_path():
+                path = Path(shape.source().path())
+                if path.is_file() and is_drawn_by_drake(path):
+                    continue
+                scale: Any = shape.scale3()  # Drake's type stubs name no array type that numpy has.
                 try:
-                    replacement = _drawable_shape(shape)
+                    replacement = type(shape)(drawable_file(path), scale)
                 except ModelError as error:
                     raise ModelError(f"link '{body.name()}': {error}") from error
-                if replacement is not None:
-                    scene_graph.ChangeShape(source, geometry, replacement)
+                scene_graph.ChangeShape(source, geometry, replacement)
 
 
 def draws_given_files(scene_graph: SceneGraph) -> bool:
@@ -482,30 +484,15 @@ def draws_given_files(scene_graph: SceneGraph) -> bool:
     return False
 
 
-def _drawable_shape(shape: Mesh | Convex) -> Mesh | Convex | None:
-    """What stands in for a mesh file that Drake's renderer does not draw; None: it draws it."""
-    path = Path(shape.source().path())
-    if path.is_file() and is_drawn_by_drake(path):
-        return None
-    scale: Any = shape.scale3()  # Drake's type stubs name no array type that numpy has.
-    return type(shape)(drawable_file(path), scale)
-
-
-def _box_mesh(width: float, depth: float, height: float) -> TriangleMesh:
-    """A box centred at the origin, with edges [m] along x, y and z."""
-    corners = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
-    faces = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
-    triangles = [(a, b, c) for a, b, c, _ in faces] + [(a, c, d) for a, _, c, d in faces]
-    return TriangleMesh(corners * (width, depth, height), np.array(triangles, dtype=np.int32))
-
-
-def _round_mesh(radii: Array, heights: Array, first: float = 0.0) -> TriangleMesh:
+def _round_mesh(
+    radii: Array, heights: Array, first: float = 0.0, resolution: int = 50
+) -> TriangleMesh:
     """A surface about z, closed between rings of radii (n,) at heights (n,) [m], the highest first.
 
     The first vertex of each ring lies at the angle ``first`` [rad] from x.
     """
-    angle = first + np.arange(_VTK_RESOLUTION) * (2.0 * np.pi / _VTK_RESOLUTION)
-    level = np.broadcast_to(heights[:, None], (len(heights), _VTK_RESOLUTION))
+    angle = first + np.arange(resolution) * (2.0 * np.pi / resolution)
+    level = np.broadcast_to(heights[:, None], (len(heights), resolution))
     points = np.stack([np.outer(radii, np.cos(angle)), np.outer(radii, np.sin(angle)), level], -1)
     index = np.arange(level.size).reshape(level.shape)
     above, below = index[:-1], index[1:]
@@ -517,24 +504,8 @@ def _round_mesh(radii: Array, heights: Array, first: float = 0.0) -> TriangleMes
 
 def _ellipsoid_mesh(a: float, b: float, c: float) -> TriangleMesh:
     """An ellipsoid with half axes a, b, c [m] along x, y and z."""
-    polar = np.linspace(0.0, np.pi, _VTK_RESOLUTION + 1)
+    polar = np.linspace(0.0, np.pi, 51)
     sine = np.sin(polar)
     sine[[0, -1]] = 0.0  # Both poles are exact.
     ball = _round_mesh(sine, np.cos(polar))
     return TriangleMesh(ball.vertices * (a, b, c), ball.triangles)
-
-
-def _cylinder_mesh(radius: float, length: float) -> TriangleMesh:
-    """A cylinder along z, centred at the origin, of the given radius and length [m]."""
-    # Drake turns VTK's cylinder a quarter about its axis, so the first vertex lies on y.
-    half = 0.5 * length
-    radii = np.array([0.0, radius, radius, 0.0])
-    return _round_mesh(radii, np.array([half, half, -half, -half]), np.pi / 2.0)
-
-
-def _capsule_mesh(radius: float, length: float) -> TriangleMesh:
-    """A capsule along z, centred at the origin; length [m] is that of its cylindrical part."""
-    quarter = np.linspace(0.0, np.pi / 2.0, _VTK_RESOLUTION - 1)
-    radii, heights = radius * np.sin(quarter), radius * np.cos(quarter) + 0.5 * length
-    every = np.concatenate([radii, radii[::-1]]), np.concatenate([heights, -heights[::-1]])
-    return _round_mesh(*every, np.pi / 2.0)

@@ -20,10 +20,8 @@ from drake_pose.body.model_files import Warn, read_xml, xml_text
 from drake_pose.errors import ModelError
 
 _ALMOST_MASSLESS = {"pos": "0 0 0", "mass": "1e-6", "diaginertia": "1e-9 1e-9 1e-9"}
-# Groups above are collision geometry, which MuJoCo's viewer does not draw.
-_LAST_DRAWN_GROUP, _NOT_DRAWN = 2, 5
-# A geom of this colour has its material's.
-_NO_COLOUR = (0.5, 0.5, 0.5, 1.0)
+# The group of geoms that are not drawn.
+_NOT_DRAWN = 5
 # How many of a shape's three sizes count, by MuJoCo's name of the shape; others are not drawn.
 _SIZES = {"plane": 3, "sphere": 1, "capsule": 2, "ellipsoid": 3, "cylinder": 2, "box": 3, "mesh": 0}
 
@@ -52,14 +50,25 @@ def cure_mjcf(path: Path, warn: Warn) -> tuple[str, list[Couple]]:
     ElementTree.SubElement(text, "compiler", angle="radian")
     asset = ElementTree.SubElement(text, "asset")
     bodies = [ElementTree.SubElement(text, "worldbody")]
-    for body, name in enumerate(_body_names(model)[1:], start=1):
+    names = [_name(model, address) for address in model.name_bodyadr]
+    # Bodies without a name get one that no other has.
+    free = (name for number in itertools.count(1) if (name := f"body{number}") not in names)
+    for body, name in enumerate([name or next(free) for name in names[1:]], start=1):
         bodies.append(_add_body(model, body, name, bodies[model.body_parentid[body]]))
     drawn = [geom for geom in range(model.ngeom) if _kind(model, geom)]
     for mesh in sorted({model.geom_dataid[g] for g in drawn if _kind(model, g) == "mesh"}):
         file = write_obj(_mesh(model, mesh), _name(model, model.name_meshadr[mesh]))
         ElementTree.SubElement(asset, "mesh", name=f"mesh{mesh}", file=str(file))
     for geom in drawn:
-        _add_geom(model, geom, bodies[model.geom_bodyid[geom]])
+        kind = _kind(model, geom)
+        said = {"type": kind, "rgba": _text(model.geom_rgba[geom])}
+        said |= {"contype": "0", "conaffinity": "0"}
+        said |= {"pos": _text(model.geom_pos[geom]), "quat": _text(model.geom_quat[geom])}
+        if kind == "mesh":
+            said["mesh"] = f"mesh{model.geom_dataid[geom]}"
+        else:
+            said["size"] = _text(model.geom_size[geom][: _SIZES[kind]])
+        ElementTree.SubElement(bodies[model.geom_bodyid[geom]], "geom", said)
     return xml_text(text), couples
 
 
@@ -92,10 +101,12 @@ def _compile(path: Path, warn: Warn) -> tuple[Any, list[Couple]]:
         colours = {material.name: material.rgba for material in spec.materials}
         for geom in spec.geoms:
             geom.contype = geom.conaffinity = 0
-            if np.allclose(geom.rgba, _NO_COLOUR):
+            # A geom of this colour has its material's.
+            if np.allclose(geom.rgba, (0.5, 0.5, 0.5, 1.0)):
                 geom.rgba = colours.get(geom.material, geom.rgba)
             geom.material = ""
-            if geom.group > _LAST_DRAWN_GROUP or not geom.rgba[3] > 0.0:
+            # Groups above are collision geometry, which MuJoCo's viewer does not draw.
+            if geom.group > 2 or not geom.rgba[3] > 0.0:
                 geom.group = _NOT_DRAWN
                 if geom.meshname:
                     spec.delete(geom)
@@ -136,13 +147,6 @@ def _name(model: Any, address: int) -> str:
     return str(model.names[address:].split(b"\0", 1)[0].decode("utf-8", "replace"))
 
 
-def _body_names(model: Any) -> list[str]:
-    """The bodies' names; those without one get one that no other has."""
-    names = [_name(model, address) for address in model.name_bodyadr]
-    free = (name for number in itertools.count(1) if (name := f"body{number}") not in names)
-    return [name or next(free) for name in names]
-
-
 def _add_body(model: Any, body: int, name: str, parent: ElementTree.Element) -> ElementTree.Element:
     """Writes a body with joints j1 .. jn as n nested bodies of one joint each; the innermost."""
     first = model.body_jntadr[body]
@@ -181,18 +185,6 @@ def _add_joint(model: Any, joint: int, body: ElementTree.Element) -> None:
     if model.jnt_limited[joint]:
         said |= {"limited": "true", "range": _text(model.jnt_range[joint])}
     ElementTree.SubElement(body, "joint", said)
-
-
-def _add_geom(model: Any, geom: int, body: ElementTree.Element) -> None:
-    kind = _kind(model, geom)
-    said = {"type": kind, "rgba": _text(model.geom_rgba[geom])}
-    said |= {"contype": "0", "conaffinity": "0"}
-    said |= {"pos": _text(model.geom_pos[geom]), "quat": _text(model.geom_quat[geom])}
-    if kind == "mesh":
-        said["mesh"] = f"mesh{model.geom_dataid[geom]}"
-    else:
-        said["size"] = _text(model.geom_size[geom][: _SIZES[kind]])
-    ElementTree.SubElement(body, "geom", said)
 
 
 def _mesh(model: Any, mesh: int) -> TriangleMesh:

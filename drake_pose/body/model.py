@@ -44,12 +44,6 @@ OBJECT = "target"
 OBJECT_POSITIONS = tuple(f"{OBJECT}_{move}_{axis}" for move in ("shift", "turn") for axis in "xyz")
 """The positions that move it: shifts along its axes [m], then turns about them [rad]."""
 
-# An object is moved by no more [m, rad].
-_FARTHEST = 10.0
-# So small is what stands for links without looks where they are needed in a tree [m].
-_DOT = 1e-6
-_NOTHING: Vectors = {}
-
 
 @dataclass(frozen=True, eq=False)
 class ArticulatedModel(ParsedModel):
@@ -138,9 +132,9 @@ class ArticulatedModel(ParsedModel):
         self,
         *,
         hidden: Collection[str] = (),
-        factors: Vectors = _NOTHING,
-        moves: Vectors = _NOTHING,
-        shifts: Vectors = _NOTHING,
+        factors: Vectors = MappingProxyType({}),
+        moves: Vectors = MappingProxyType({}),
+        shifts: Vectors = MappingProxyType({}),
     ) -> "ArticulatedModel":
         """The same with links and joints otherwise; positions mean what they did.
 
@@ -196,11 +190,27 @@ class ArticulatedModel(ParsedModel):
         plant.RegisterAsSourceForSceneGraph(scene_graph)
         # Nothing of the robot is seen, so its meshes are not read again.
         self._source.parse(plant, None)
-        _weld_bases(self, plant)
-        _add_object(plant, X_WO)
+        # What no joint holds is welded where it stands at the default positions.
+        joints = [plant.get_joint(index) for index in plant.GetJointIndices()]
+        carried = {int(joint.child_body().index()) for joint in joints}
+        kinematics, world = PlantKinematics(self), plant.world_frame()
+        for index in range(1, plant.num_bodies()):
+            if index not in carried:
+                base = plant.get_body(BodyIndex(index)).body_frame()
+                plant.WeldFrames(world, base, RigidTransform(kinematics.pose(index)))
+        # Six joints, one after another, move the object by at most 10 m or 10 rad.
+        frame = plant.AddFrame(FixedOffsetFrame(f"{OBJECT}_start", world, RigidTransform(X_WO)))
+        instance = plant.AddModelInstance(OBJECT)
+        for k, name in enumerate(OBJECT_POSITIONS):
+            last = OBJECT if k == len(OBJECT_POSITIONS) - 1 else f"{name}_end"
+            body = plant.AddRigidBody(last, instance, SpatialInertia.Zero())
+            kind, axis = PrismaticJoint if k < 3 else RevoluteJoint, np.eye(3)[k % 3]
+            joint: Joint = kind(name, frame, body.body_frame(), axis, -10.0, 10.0)
+            plant.AddJoint(joint)
+            frame = body.body_frame()
         plant.Finalize()
         positions, _ = describe_positions(plant, self._source.limits, str(self.path))
-        dot = TriangleMesh(_DOT * np.eye(3), np.array([[0, 1, 2]]))
+        dot = TriangleMesh(1e-6 * np.eye(3), np.array([[0, 1, 2]]))
         return replace(
             self,
             plant=plant,
@@ -336,28 +346,3 @@ def _seen_meshes(
             "elements (MJCF: geoms of a group below 3)"
         )
     return meshes
-
-
-def _weld_bases(model: ParsedModel, plant: MultibodyPlant) -> None:
-    """Welds what no joint holds to the world, where it stands at the model's default positions."""
-    joints = [plant.get_joint(index) for index in plant.GetJointIndices()]
-    carried = {int(joint.child_body().index()) for joint in joints}
-    kinematics = PlantKinematics(model)
-    for index in range(1, plant.num_bodies()):
-        if index not in carried:
-            frame = plant.get_body(BodyIndex(index)).body_frame()
-            plant.WeldFrames(plant.world_frame(), frame, RigidTransform(kinematics.pose(index)))
-
-
-def _add_object(plant: MultibodyPlant, X_WO: Array) -> None:
-    """Six joints, one after another, between the world and a link without looks."""
-    world = plant.world_frame()
-    frame = plant.AddFrame(FixedOffsetFrame(f"{OBJECT}_start", world, RigidTransform(X_WO)))
-    instance = plant.AddModelInstance(OBJECT)
-    for k, name in enumerate(OBJECT_POSITIONS):
-        link = OBJECT if k == len(OBJECT_POSITIONS) - 1 else f"{name}_end"
-        body = plant.AddRigidBody(link, instance, SpatialInertia.Zero())
-        kind, axis = PrismaticJoint if k < 3 else RevoluteJoint, np.eye(3)[k % 3]
-        joint: Joint = kind(name, frame, body.body_frame(), axis, -_FARTHEST, _FARTHEST)
-        plant.AddJoint(joint)
-        frame = body.body_frame()

@@ -5,7 +5,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from pydrake.geometry import (
-    GeometryId,
     GeometryInstance,
     IllustrationProperties,
     PerceptionProperties,
@@ -131,7 +130,7 @@ class PlantSource:
         """
         if scene_graph is not None and not plant.geometry_source_is_registered():
             plant.RegisterAsSourceForSceneGraph(scene_graph)
-        old = self.plant
+        old, inspector = self.plant, self.scene_graph.model_inspector()
         instances = {ModelInstanceIndex(k): ModelInstanceIndex(k) for k in range(2)}
         for k in range(2, old.num_model_instances()):
             name = prefix + old.GetModelInstanceName(ModelInstanceIndex(k))
@@ -145,7 +144,18 @@ class PlantSource:
             bodies[index] = plant.AddRigidBody(body.name(), instance, inertia)
             if index in self.seen and plant.geometry_source_is_registered():
                 for geometry in old.GetVisualGeometriesForBody(body):
-                    plant.RegisterVisualGeometry(bodies[index], self._copied(geometry))
+                    # A geometry has its looks, but for its label, which each plant gives itself.
+                    name = inspector.GetName(geometry).rpartition("::")[2]
+                    X_BG, shape = inspector.GetPoseInFrame(geometry), inspector.GetShape(geometry)
+                    own = GeometryInstance(X_BG, shape, name)
+                    shown = inspector.GetIllustrationProperties(geometry)
+                    rendered = inspector.GetPerceptionProperties(geometry)
+                    if shown is not None:
+                        own.set_illustration_properties(IllustrationProperties(shown))
+                    if rendered is not None:
+                        own.set_perception_properties(PerceptionProperties(rendered))
+                        own.mutable_perception_properties().RemoveProperty("label", "id")
+                    plant.RegisterVisualGeometry(bodies[index], own)
         joints = [old.get_joint(index) for index in old.GetJointIndices()]
         for joint in joints:
             if joint.type_name() not in _JOINTS:
@@ -169,18 +179,3 @@ class PlantSource:
             )
             add_coupler(plant, follower, leader, one.multiplier, one.offset)
         return list(instances.values()), []
-
-    def _copied(self, geometry: GeometryId) -> GeometryInstance:
-        """A geometry with its looks, but for its label, which each plant gives itself."""
-        inspector = self.scene_graph.model_inspector()
-        name = inspector.GetName(geometry).rpartition("::")[2]
-        X_BG, shape = inspector.GetPoseInFrame(geometry), inspector.GetShape(geometry)
-        own = GeometryInstance(X_BG, shape, name)
-        shown = inspector.GetIllustrationProperties(geometry)
-        rendered = inspector.GetPerceptionProperties(geometry)
-        if shown is not None:
-            own.set_illustration_properties(IllustrationProperties(shown))
-        if rendered is not None:
-            own.set_perception_properties(PerceptionProperties(rendered))
-            own.mutable_perception_properties().RemoveProperty("label", "id")
-        return own

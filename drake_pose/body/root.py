@@ -174,12 +174,6 @@ def _full_turn(count: float) -> Array:
     return np.asarray(np.arange(whole) * (2.0 * math.pi / whole), dtype=np.float64)
 
 
-_EXACT = 1e-10
-# Three turns reach a rotation in two ways, so a few starts find the one inside the limits.
-_RANDOM_STARTS = 8
-_COMPLEX_STEP = 1e-30
-
-
 @dataclass(frozen=True, eq=False)
 class BasePose:
     """What takes up the pose of a pose tree that does not start at the plant's world.
@@ -218,29 +212,24 @@ class BasePose:
             q[list(self.positions)] = self._solve_joints(model, q, X_WA)
             return q, np.eye(4)
         kinematics = PlantKinematics(model)
-        if self.kind == "floating":
-            self._set_floating(kinematics, q, X_WA)
-            return q, np.eye(4)
-        return q, X_WA @ inverse_transforms(kinematics.pose_at(self.body, q))
-
-    def _set_floating(self, kinematics: PlantKinematics, q: Array, X_WA: Array) -> None:
-        """Set the floating joint's positions in q so that the anchor body A is at X_WA."""
-        # Drake's type stubs know neither SetPose nor numpy's array types.
+        if self.kind == "placed":
+            return q, X_WA @ inverse_transforms(kinematics.pose_at(self.body, q))
+        # The floating joint puts the anchor body A at X_WA. Drake's type stubs know neither SetPose
+        # nor numpy's array types.
         joint: Any = kinematics.plant.get_joint(JointIndex(self.joint))
-        X_FM: Any
         child = int(joint.child_body().index())
-        X_WC_now = kinematics.pose_at(child, q)
-        X_CA = inverse_transforms(X_WC_now) @ kinematics.pose_at(self.body, q)
+        X_CA = inverse_transforms(kinematics.pose_at(child, q)) @ kinematics.pose_at(self.body, q)
         X_WF = kinematics.pose_at(int(joint.parent_body().index()), q) @ _pose_in_body(
             joint.frame_on_parent()
         )
         X_WM = X_WA @ inverse_transforms(X_CA) @ _pose_in_body(joint.frame_on_child())
-        X_FM = inverse_transforms(X_WF) @ X_WM
+        X_FM: Any = inverse_transforms(X_WF) @ X_WM
         # Freed from rounding errors.
         R_FM = RotationMatrix.ProjectToRotationMatrix(X_FM[:3, :3])
         joint.SetPose(kinematics.context, RigidTransform(R_FM, X_FM[:3, 3]))
         solved = kinematics.plant.GetPositions(kinematics.context)
         q[list(self.positions)] = solved[list(self.positions)]
+        return q, np.eye(4)
 
     def _solve_joints(self, model: ParsedModel, q: Array, X_WA: Array) -> Array:
         """Base positions (n,) that put the anchor at X_WA, inside their limits if possible."""
@@ -265,17 +254,17 @@ class BasePose:
         def jacobian(values: Array) -> Array:
             return chain_jacobian(self.steps, completed(values))[:, solved]
 
+        # Three turns reach a rotation in two ways, so a few starts find the one inside the limits.
         random = np.random.default_rng(0)
         starts = [q[index]] + [
-            np.where(turns, random.uniform(-np.pi, np.pi, len(index)), q[index])
-            for _ in range(_RANDOM_STARTS)
+            np.where(turns, random.uniform(-np.pi, np.pi, len(index)), q[index]) for _ in range(8)
         ]
         outside = None
         for start in starts:
             found = least_squares(
                 residual, start, jacobian, method="lm", xtol=1e-15, ftol=1e-15, gtol=1e-15
             )
-            if np.abs(found.fun).max() > _EXACT:
+            if np.abs(found.fun).max() > 1e-10:
                 continue
             wrapped = nearest_turn(found.x, middle, periodic)
             if np.all((wrapped >= lower - 1e-9) & (wrapped <= upper + 1e-9)):
@@ -291,8 +280,8 @@ class BasePose:
 
 def chain_jacobian(steps: Sequence[JointMap], values: Array) -> Array:
     """Derivative (12, k) of the upper rows of a chain's end pose, exact, by complex steps."""
-    stepped = values + 1j * _COMPLEX_STEP * np.eye(len(values))
-    change = chain_transforms(steps, stepped).imag / _COMPLEX_STEP
+    step = 1e-30
+    change = chain_transforms(steps, values + 1j * step * np.eye(len(values))).imag / step
     return np.asarray(change[:, :3].reshape(len(values), 12).T, dtype=np.float64)
 
 

@@ -80,7 +80,7 @@ class TreeKinematics:
         ]
         values, nodes, scale, offset = np.array(led, dtype=np.float64).reshape(-1, 4).T
         self.parameters = np.append(np.arange(firsts[-1]), values.astype(np.int64))
-        self._motion_nodes = np.append(self.value_nodes, nodes.astype(np.int64))
+        motion_nodes = np.append(self.value_nodes, nodes.astype(np.int64))
         self._scale, self._offset = scale, offset
         bounds = [tree.value_bounds(i) for i in range(len(counts))]
         lower, upper = np.hstack([np.zeros((2, 0)), *bounds])
@@ -90,18 +90,14 @@ class TreeKinematics:
         self.upper = np.where(self.turns_around, np.inf, upper)
         self.is_angle = np.concatenate([placement.is_angle for placement in tree.placements])
         self.packed = _pack_tree(tree, firsts)
-        self._moves = self._find_moves()
-
-    def _find_moves(self) -> np.ndarray:
-        """(nodes, e + 4) which nodes each motion moves, and the root's shift and growth."""
-        nodes = self.tree.nodes
-        moves = np.zeros((len(nodes), len(self.parameters) + 4), dtype=np.bool_)
-        for i, node in enumerate(nodes):
+        # (nodes, e + 4) which nodes each motion moves, and the root's shift and growth.
+        moves = np.zeros((len(counts), len(self.parameters) + 4), dtype=np.bool_)
+        for i, node in enumerate(tree.nodes):
             if node.parent >= 0:
                 moves[i] = moves[node.parent]
-            moves[i, :-4] |= self._motion_nodes == i
+            moves[i, :-4] |= motion_nodes == i
             moves[i, -4:] = i == 0 or (node.parent >= 0 and moves[node.parent, -1])
-        return moves
+        self._moves = moves
 
     def flatten(self, node_values: Sequence[np.ndarray]) -> np.ndarray:
         """All values (m,) of each node's values (k_i,); SettingsError for a wrong number."""
@@ -187,7 +183,12 @@ def _pack_tree(tree: PoseTree, firsts: np.ndarray) -> PackedTree:
         turns: tuple[JointMap, ...] = ()
         if rotation is not None:
             X[:3, :3] = X[:3, :3] @ rotation.R_W0
-            turns = tuple(_turn_about(axis) for axis in rotation.axes)
+            for axis in rotation.axes:
+                e, rows = np.eye(3)["xyz".index(axis)], np.zeros((4, 4, 4))
+                rows[0, :3, :3], rows[0, 3, 3] = np.outer(e, e), 1.0
+                rows[1, :3, :3] = np.eye(3) - np.outer(e, e)
+                rows[2, :3, :3] = np.cross(e, -np.eye(3))
+                turns += (JointMap(rows.reshape(4, 16), 1),)
         X_PA.append(X)
         free.append(rotation is not None and rotation.kind == "free")
         chains.append(turns + placement.steps)
@@ -199,16 +200,6 @@ def _pack_tree(tree: PoseTree, firsts: np.ndarray) -> PackedTree:
         step_starts=np.cumsum([0, *(len(chain) for chain in chains)]),
         steps=pack_steps([step for chain in chains for step in chain]),
     )
-
-
-def _turn_about(axis: str) -> JointMap:
-    """A rotation about a letter's axis."""
-    e = np.eye(3)["xyz".index(axis)]
-    rows = np.zeros((4, 4, 4))
-    rows[0, :3, :3], rows[0, 3, 3] = np.outer(e, e), 1.0
-    rows[1, :3, :3] = np.eye(3) - np.outer(e, e)
-    rows[2, :3, :3] = np.cross(e, -np.eye(3))
-    return JointMap(rows.reshape(4, 16), 1)
 
 
 @compiled
@@ -291,10 +282,6 @@ def find_motions(packed: PackedTree, values: np.ndarray) -> tuple[np.ndarray, np
     return X_WN, twists
 
 
-# A joint stands on its link's own joint that is no farther off than this [m].
-_NO_LENGTH = 1e-3
-
-
 class JointOffset(NamedTuple):
     """How far a joint's origin is from the joint before it.
 
@@ -314,10 +301,10 @@ class JointOffset(NamedTuple):
     p_L: Array
 
 
-def joint_offsets(tree: PoseTree) -> tuple[JointOffset, ...]:
+def joint_offsets(tree: PoseTree, shortest: float = 1e-3) -> tuple[JointOffset, ...]:
     """Each joint's offset from the joint (or the world) that places the part that carries it.
 
-    Joints without an offset are left out.
+    Joints without an offset, or with one that is no longer than ``shortest`` [m], are left out.
     """
     model, plant, kinematics = tree.model, tree.model.plant, PlantKinematics(tree.model)
 
@@ -341,7 +328,7 @@ def joint_offsets(tree: PoseTree) -> tuple[JointOffset, ...]:
             p_B = _offset(joint, inboard, pose)
             end = at + step.position_count
             X_BC = X_BA @ chain_transforms([step], values[None, at:end])[0]
-            if np.linalg.norm(p_B) > _NO_LENGTH:
+            if np.linalg.norm(p_B) > shortest:
                 link = joint.parent_body()
                 p_A = -X_BC[:3, :3].T @ p_B if step.inverted else X_BA[:3, :3].T @ p_B
                 p_L = pose(link)[:3, :3].T @ p_B

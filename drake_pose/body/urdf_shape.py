@@ -2,6 +2,7 @@
 
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Collection, Mapping, Sequence
+from types import MappingProxyType
 
 import numpy as np
 
@@ -11,7 +12,6 @@ from drake_pose.body.model_files import xml_text
 Vectors = Mapping[str, Sequence[float]]
 """(3,) by the name of a link or joint."""
 
-_NOTHING: Vectors = {}
 # Drake's own elements keep the prefix that Drake looks for.
 ElementTree.register_namespace("drake", "http://drake.mit.edu")
 
@@ -20,9 +20,9 @@ def reshaped(
     text: str,
     *,
     hidden: Collection[str] = (),
-    factors: Vectors = _NOTHING,
-    moves: Vectors = _NOTHING,
-    shifts: Vectors = _NOTHING,
+    factors: Vectors = MappingProxyType({}),
+    moves: Vectors = MappingProxyType({}),
+    shifts: Vectors = MappingProxyType({}),
     zeros: Mapping[str, float] | None = None,
 ) -> str:
     """A URDF text in which links and joints are otherwise.

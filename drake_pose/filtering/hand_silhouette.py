@@ -204,7 +204,7 @@ def _solve(
     count: int,
     gate: float,
 ) -> tuple[Array, Array, Array]:
-    """Each feature's unknowns (F, 2), covariance (F, 2, 2), sides' weights (F, 2); see ``_match``."""
+    """Each feature's unknowns (F, 2), covariance (F, 2, 2), and its sides' weights (F, 2)."""
 
     def total(values: Array) -> Array:
         return np.asarray(np.bincount(f, values, count), dtype=np.float64)

@@ -59,14 +59,24 @@ def open_bag(path: Path, joints: JointLog | None) -> Episode:
     cameras: dict[str, EpisodeCamera] = {}
     # Of a camera that is recorded twice, what nobody compressed comes first.
     for topic in sorted(pictures, key=lambda topic: (topic.endswith("/compressed"), topic)):
-        if (name := _camera_name(topic)) not in cameras:
-            try:
-                camera = _of_topic(path, topic, pictures[topic], infos, warnings)
-                link, X_LC = _mount(parents, pictures[topic][0][2])
-                placed = camera.camera and camera.camera.with_pose(X_LC)
-                cameras[name] = replace(camera, name=name, camera=placed, link=link)
-            except SceneError as error:
-                warnings.append(f"camera '{name}' is left out: {error}")
+        parts = topic.strip("/").split("/")
+        while len(parts) > 1 and parts[-1] in ("compressed", "image_raw", "image"):
+            parts.pop()
+        if (name := "_".join(parts)) in cameras:
+            continue
+        try:
+            camera = _of_topic(path, topic, pictures[topic], infos, warnings)
+        except SceneError as error:
+            warnings.append(f"camera '{name}' is left out: {error}")
+            continue
+        # The link that its frame is fixed to, over however many others, and its pose in it.
+        frame, link, X_LC, passed = pictures[topic][0][2], None, np.eye(4), set[str]()
+        while frame in parents and frame not in passed:
+            passed.add(frame)
+            link, X_LF = parents[frame]
+            X_LC, frame = X_LF @ X_LC, link
+        placed = camera.camera and camera.camera.with_pose(X_LC)
+        cameras[name] = replace(camera, name=name, camera=placed, link=link)
     return Episode.checked(path, cameras.values(), joints, warnings)
 
 
@@ -139,14 +149,6 @@ def _faults(path: Path) -> Iterator[None]:
         ) from error
 
 
-def _camera_name(topic: str) -> str:
-    """What a topic's camera is called, fit for a file's name."""
-    parts = topic.strip("/").split("/")
-    while len(parts) > 1 and parts[-1] in ("compressed", "image_raw", "image"):
-        parts.pop()
-    return "_".join(parts)
-
-
 def _seconds(rows: Sequence[_Row], what: str, warnings: list[str]) -> tuple[Array, Indices]:
     """The headers' times [s], or the bag's where they have none, and which rows are in order."""
     stamps = np.array([row[:2] for row in rows])
@@ -182,16 +184,6 @@ def _merge(
     ordered = tuple(dict.fromkeys(name for _, names in groups for name in names))
     positions = np.column_stack([columns[name] for name in ordered])
     return JointLog(ordered, base.times, positions), warnings
-
-
-def _mount(parents: Mapping[str, tuple[str, Array]], frame: str) -> tuple[str | None, Array]:
-    """The link that a frame is fixed to, over however many others, and its pose in it."""
-    link, X_LC, passed = None, np.eye(4), set[str]()
-    while frame in parents and frame not in passed:
-        passed.add(frame)
-        link, X_LF = parents[frame]
-        X_LC, frame = X_LF @ X_LC, link
-    return link, X_LC
 
 
 def _of_topic(

@@ -53,18 +53,13 @@ def test_round_trip_is_exact(tmp_path):
         np.testing.assert_array_equal(camera.X_WC, written[name].X_WC)
 
 
-def test_projection_may_be_spelled_out(tmp_path):
-    text = f"7: {{projection: parallel, {SIDES}, pixels_per_metre: 1e2, X_WC: {EYE}}}"
-    camera = load_cameras(write(tmp_path, text))["7"]
+def test_principal_points_may_be_counted_as_drake_does(tmp_path):
+    for kind in ("focal_x: 60, focal_y: 61", "projection: parallel, pixels_per_metre: 1e2"):
+        text = f"{{{kind}, pixel_centers: drake, {SIDES}, X_WC: {EYE}}}"
+        camera = load_cameras(write(tmp_path, f"7: {text}"))["7"]
+        assert (camera.center_x, camera.center_y) == (31.0, 23.0)
     assert isinstance(camera, ParallelCamera)
     assert camera.pixels_per_metre == 100.0
-
-
-def test_principal_points_may_be_counted_as_drake_does(tmp_path):
-    for kind in ("focal_x: 60, focal_y: 61", "projection: parallel, pixels_per_metre: 9"):
-        text = f"{{{kind}, pixel_centers: drake, {SIDES}, X_WC: {EYE}}}"
-        camera = load_cameras(write(tmp_path, f"cam: {text}"))["cam"]
-        assert (camera.center_x, camera.center_y) == (31.0, 23.0)
 
 
 @pytest.mark.parametrize(
@@ -188,11 +183,8 @@ def test_a_config_is_known_wherever_it_stands(text, tmp_path):
 def test_a_scenario(tmp_path):
     cameras = load_cameras(write(tmp_path, SCENARIO))
     assert list(cameras) == ["front", "side", "plain"]
-    side, plain = cameras["side"], cameras["plain"]
-    assert isinstance(side, PinholeCamera)
-    assert isinstance(plain, PinholeCamera)
-    assert (side.focal_x, side.focal_y, side.center_x) == (500.0, 500.0, 300.0)
-    require_same(plain, CameraConfig())
+    np.testing.assert_array_equal(cameras["side"].kernel_parameters()[1:4], [500.0, 500.0, 300.0])
+    require_same(cameras["plain"], CameraConfig())
 
 
 def test_scenarios_that_are_written_are_read_and_known_to_drake(tmp_path):
@@ -251,15 +243,6 @@ def test_what_a_camera_cannot_be(old, new, message, tmp_path):
 def test_scenarios_that_cannot_be_read(text, message, tmp_path):
     with pytest.raises(CameraError, match=message):
         load_cameras(write(tmp_path, text))
-
-
-def test_cameras_that_drake_does_not_know():
-    parallel = ParallelCamera("above", 10, 10, 5.0, 5.0, 5.0, np.eye(4))
-    with pytest.raises(CameraError, match=r"'above'.*parallel"):
-        dump_scenario([parallel])
-    outside = PinholeCamera("off", 10, 10, 5.0, 5.0, -3.0, 5.0, np.eye(4))
-    with pytest.raises(CameraError, match=r"'off'.*principal point"):
-        dump_scenario([outside])
 
 
 PLACE = RigidTransform(Quaternion(np.array([0.5, -0.7, 0.4, 0.3]) / np.sqrt(0.99)), [0.3, -0.2, 1])
@@ -332,7 +315,14 @@ def test_mujoco_sees_points_at_the_same_pixels(tmp_path):
     np.testing.assert_allclose(np.column_stack([u, v]) - 0.5, expected, atol=1e-3)
 
 
-@pytest.mark.parametrize("export", [ros_camera_info, lambda one: mujoco_cameras([one])])
-def test_parallel_cameras_are_refused(export):
-    with pytest.raises(CameraError, match=r"'flat'.*parallel"):
-        export(PARALLEL)
+def test_cameras_that_others_do_not_know_are_refused():
+    for export in (
+        ros_camera_info,
+        lambda one: mujoco_cameras([one]),
+        lambda one: dump_scenario([one]),
+    ):
+        with pytest.raises(CameraError, match=r"'flat'.*parallel"):
+            export(PARALLEL)
+    outside = PinholeCamera("off", 10, 10, 5.0, 5.0, -3.0, 5.0, np.eye(4))
+    with pytest.raises(CameraError, match=r"'off'.*principal point"):
+        dump_scenario([outside])

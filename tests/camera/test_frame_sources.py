@@ -303,8 +303,6 @@ class TestSourcesFile:
         with pytest.raises(SceneError, match=why) as error:
             self.load(studio, ENTRIES | change)
         assert "sources.yaml" in str(error.value)
-
-    def test_calibrated_camera_without_source_is_named(self, studio):
         with pytest.raises(SceneError, match=r"'camera_1' of .* has no source"):
             self.load(studio, {"camera_0": ENTRIES["camera_0"]})
 

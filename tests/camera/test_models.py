@@ -71,21 +71,20 @@ def test_what_depth_means():
     np.testing.assert_array_equal(depth, points[:, 2])
 
 
-@pytest.mark.parametrize("camera", [PINHOLE, PARALLEL])
-def test_poses(camera):
+@pytest.mark.parametrize(
+    ("camera", "expected"),
+    [
+        (replace(PINHOLE, near=0.2), [0, 600, 610, 300, 250, 0.2, 640, 480]),
+        (PARALLEL, [1, 226, 226, 350, 200, 0, 700, 500]),
+    ],
+)
+def test_poses_and_kernel_parameters(camera, expected):
+    np.testing.assert_array_equal(camera.kernel_parameters(), expected)
     np.testing.assert_allclose(camera.X_CW @ camera.X_WC, np.eye(4), atol=1e-14)
     assert not camera.X_WC.flags.writeable
     moved = camera.with_pose(np.eye(4))
     assert np.array_equal(moved.X_WC, np.eye(4))
     np.testing.assert_array_equal(moved.kernel_parameters(), camera.kernel_parameters())
-
-
-def test_kernel_parameters():
-    for camera, expected in (
-        (replace(PINHOLE, near=0.2), [0, 600, 610, 300, 250, 0.2, 640, 480]),
-        (PARALLEL, [1, 226, 226, 350, 200, 0, 700, 500]),
-    ):
-        np.testing.assert_array_equal(camera.kernel_parameters(), expected)
 
 
 @pytest.mark.parametrize(
@@ -128,6 +127,8 @@ def test_drake_and_back():
     np.testing.assert_allclose(again.X_WC, camera.X_WC, atol=1e-14)
     plain = camera_from_drake("plain", CameraInfo(100, 80, 1.0), np.eye(4))
     assert (plain.center_x, plain.center_y) == (49.0, 39.0)
+    with pytest.raises(CameraError, match=r"'cam'.*depth range"):
+        camera_to_drake(PINHOLE, renderer_name="vtk", depth_range=(2.0, 1.0))
 
 
 def test_sensor_offset_of_a_drake_core_is_kept():
@@ -152,11 +153,6 @@ def test_tele_camera_projects_as_the_parallel_one():
     color, _, _ = camera_to_drake(PARALLEL, renderer_name="vtk", depth_range=(-1e4, 1e4))
     clipping = color.core().clipping()
     assert clipping.near() > 0.8 * clipping.far(), "far enough away for deep scenes, too"
-
-
-def test_a_depth_range_that_ends_before_it_begins_is_refused():
-    with pytest.raises(CameraError, match=r"'cam'.*depth range"):
-        camera_to_drake(PINHOLE, renderer_name="vtk", depth_range=(2.0, 1.0))
 
 
 def test_a_circle_of_cameras_looks_at_its_middle_and_one_at_the_face():

@@ -21,6 +21,7 @@ from drake_pose.camera.picture_files import (
     frame_key,
     in_order,
     read_picture,
+    recorded_files,
 )
 from drake_pose.camera.sources import CAMERAS, TIME_STAMPS, read_time_stamps
 from drake_pose.csv_files import read_csv
@@ -80,17 +81,16 @@ def open_folder(path: Path, joints: JointLog | None) -> Episode:
     known = CameraFile({}, ())
     if (path / CAMERAS).exists():
         known = load_camera_file(path / CAMERAS, distorted=True)
-    folders = {one.name: one for one in sorted(path.glob("images/*")) if one.is_dir()}
-    videos = {
-        one.stem: one for one in sorted(path.glob("videos/*")) if one.suffix.lower() in VIDEOS
-    }
+    names = [one.name for one in sorted(path.glob("images/*")) if one.is_dir()]
+    names += [one.stem for one in sorted(path.glob("videos/*")) if one.suffix.lower() in VIDEOS]
     cameras = []
-    for name in dict.fromkeys([*known.cameras, *folders, *videos]):
-        if name in folders:
-            camera, said = _of_images(name, folders[name], path / "scene.yaml", joints)
-        elif name in videos:
+    for name in dict.fromkeys([*known.cameras, *names]):
+        files = recorded_files(path, name)
+        if isinstance(files, dict):
+            camera, said = _of_images(name, path / "images" / name, path / "scene.yaml", joints)
+        elif files is not None:
             # Its pictures are called as a scene's are.
-            video = TimedVideo(videos[name])
+            video = TimedVideo(files)
             frames = tuple(f"{k:06d}" for k in range(len(video.times)))
             size, said = (video.width, video.height), video.warnings
             camera = EpisodeCamera(name, *size, video.times, None, None, video.read, frames)

@@ -115,7 +115,8 @@ def list_pictures(folder: Path, error_type: type[DrakePoseError]) -> dict[str, P
     """A folder's picture files by frame, in the order of the names; the error: a frame twice."""
     files: dict[str, Path] = {}
     for path in sorted(folder.iterdir()):
-        if path.suffix.lower() in SUFFIXES:
+        # Hidden ones are such as those that macOS leaves behind.
+        if path.suffix.lower() in SUFFIXES and not path.name.startswith("."):
             if path.stem in files:
                 raise error_type(f"{path}: the folder has frame {path.stem} twice; remove one")
             files[path.stem] = path
@@ -130,6 +131,20 @@ def find_pictures(folder: Path, camera: str) -> dict[str, Path]:
     if not files:
         raise SceneError(f"{folder}: holds no picture <frame>.png or .jpg of camera '{camera}'")
     return files
+
+
+def recorded_files(folder: Path, camera: str) -> dict[str, Path] | Path | None:
+    """A camera's pictures in the folder of a recording, wherever one is read.
+
+    The files of images/<camera> by frame; where there is no such folder the video
+    videos/<camera>.mp4; None: it has neither.
+
+    Raises SceneError: a frame is there twice.
+    """
+    if (own := folder / "images" / camera).is_dir():
+        return list_pictures(own, SceneError)
+    videos = (folder / "videos" / f"{camera}{suffix}" for suffix in VIDEOS)
+    return next((file for file in videos if file.is_file()), None)
 
 
 def mask_of_picture(picture: Picture) -> Mask:

@@ -9,9 +9,15 @@ from pathlib import Path, PurePosixPath
 
 from drake_pose.arrays import Picture
 from drake_pose.camera.camera_files import CameraFile, load_camera_file
-from drake_pose.camera.picture_files import SUFFIXES, list_pictures, read_picture
+from drake_pose.camera.picture_files import (
+    SUFFIXES,
+    VIDEOS,
+    VideoPictures,
+    list_pictures,
+    read_picture,
+)
 from drake_pose.errors import SceneError
-from drake_pose.silhouette.pictures.scenes import CAMERA_FILE, VIDEOS, VideoPictures
+from drake_pose.silhouette.pictures.scenes import CAMERA_FILE
 from drake_pose.silhouette.segmentation.mask_pictures import (
     AnnotatedPicture,
     Annotations,

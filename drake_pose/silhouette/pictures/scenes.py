@@ -17,13 +17,13 @@ from drake_pose.camera.camera_files import load_camera_file, load_cameras
 from drake_pose.camera.episode import JointLog
 from drake_pose.camera.models import Camera, ParallelCamera
 from drake_pose.camera.picture_files import (
-    SUFFIXES,
     VIDEOS,
     VideoPictures,
     frame_number,
     in_order,
     natural_key,
     read_picture,
+    recorded_files,
 )
 from drake_pose.errors import SceneError, SettingsError, UnknownNameError
 from drake_pose.silhouette.pictures.masks import read_mask
@@ -442,21 +442,18 @@ def find_images(
     found: dict[tuple[str, str], Path] = {}
     known = {int(frame): frame for frame in frames if frame.isdecimal()}
     for camera in cameras:
-        own = folder / "images" / camera
-        videos = [folder / "videos" / f"{camera}{suffix}" for suffix in VIDEOS]
-        if own.is_dir():
-            names = [Path(entry.name) for entry in _visible(own) if not entry.is_dir()]
-            pictures = [name for name in names if name.suffix.lower() in SUFFIXES]
-            found |= {(camera, name.stem): own / name for name in pictures}
-        elif video := next((file for file in videos if file.is_file()), None):
-            numbers = range(VideoPictures(video).count)
+        files = recorded_files(folder, camera)
+        if isinstance(files, Path):
+            numbers = range(VideoPictures(files).count)
             # No picture takes less than a byte. A recording that was not closed has no number.
-            if not 0 < len(numbers) <= video.stat().st_size:
+            if not 0 < len(numbers) <= files.stat().st_size:
                 raise SceneError(
-                    f"{video}: does not say how many pictures it has, or more than it can hold; "
-                    f"make it whole: ffmpeg -i {video.name} -c copy NEW"
+                    f"{files}: does not say how many pictures it has, or more than it can hold; "
+                    f"make it whole: ffmpeg -i {files.name} -c copy NEW"
                 )
-            found |= {(camera, known.get(k, f"{k:06d}")): video for k in numbers}
+            found |= {(camera, known.get(k, f"{k:06d}")): files for k in numbers}
+        elif files:
+            found |= {(camera, frame): file for frame, file in files.items()}
     return found
 
 

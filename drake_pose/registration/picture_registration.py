@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from drake_pose.arrays import Array, Mask, Picture
+from drake_pose.arrays import Array, Picture
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import RegistrationError
 from drake_pose.fit.background import Explained, light_between
@@ -222,24 +222,6 @@ class Begun(NamedTuple):
         return cls(one.found.camera, rows, one.offset or NO_CLOCK, others)
 
 
-class _Settled(NamedTuple):
-    """A fit that moves no more.
-
-    recording: its joints' clock drifts no more; begun: with the camera and the clock that were
-    found, but for the offset's deviation; zeros: (m,) that were added to the frames' values;
-    ratios: (frames,) of the contours, what fits; agree: those that do; covariance: (u, u) of all
-    that they share.
-    """
-
-    best: PictureFit
-    recording: Recording
-    begun: Begun
-    zeros: Array
-    ratios: Array
-    agree: Mask
-    covariance: Array
-
-
 def fit_pictures(
     body: RegistrationBody,
     begun: Begun,
@@ -263,26 +245,24 @@ def fit_pictures(
 
     Raises RegistrationError: no pose explains the pictures.
     """
-    steady = settled = _settle(body, begun, recording, focal, zeros)
+    steady = best, as_now, begun, assumed = _settle(body, begun, recording, focal, zeros)
     if recording.times is None:
-        return _describe(settled, focal)
+        return _describe(*steady, focal)
     since, span = _mean_time(recording, begun.rows), float(np.ptp(recording.times))
     for left in range(most_fits, -1, -1):
-        fit, agree, clock = settled.best.fit, settled.agree, settled.begun.clock
-        rows = [recording.names.index(frame.name) for frame in fit.seen[0].frames]
-        later = (recording.times[rows] - since)[agree]
-        more, deviation = fit.growth(
-            settled.best.found, TIME_OFFSET, later, agree, settled.covariance
+        rows = [recording.names.index(frame.name) for frame in best.fit.seen[0].frames]
+        later = (recording.times[rows] - since)[best.agree]
+        more, deviation = best.fit.growth(
+            best.found, TIME_OFFSET, later, best.agree, best.covariance
         )
-        clock = replace(clock, drift_deviation=deviation)
-        settled = settled._replace(begun=settled.begun._replace(clock=clock))
+        clock = replace(begun.clock, drift_deviation=deviation)
+        begun = begun._replace(clock=clock)
         if abs(more) < max(deviation, min_drift / span) or not left:
             break
-        clock = replace(clock, drift=clock.drift + more)
-        settled = _settle(body, settled.begun._replace(clock=clock), recording, focal, zeros)
-    clock = settled.begun.clock
-    told = abs(clock.drift) > drift_sds * clock.drift_deviation
-    return _describe(settled if told else steady, focal)
+        begun = begun._replace(clock=replace(clock, drift=clock.drift + more))
+        best, as_now, begun, assumed = _settle(body, begun, recording, focal, zeros)
+    told = abs(begun.clock.drift) > drift_sds * begun.clock.drift_deviation
+    return _describe(*((best, as_now, begun, assumed) if told else steady), focal)
 
 
 def _settle(
@@ -291,10 +271,14 @@ def _settle(
     recording: Recording,
     focal: bool,
     zeros: Sequence[str],
-) -> _Settled:
+) -> tuple[PictureFit, Recording, Begun, Array]:
     """A fit with the drift of the clock that has begun.
 
     It is fitted again, so often at most, where an offset moved by 20 ms or a zero by 0.3 degrees.
+
+    Returns:
+        the fit; the recording, whose joints' clock drifts no more; the camera and the clock that
+        were found, but for the offset's deviation; (m,) what was added to the frames' values.
     """
     camera, offset, names = begun.camera, begun.clock.value, body.kinematics.names
     constants = ((TIME_OFFSET,) if recording.times is not None else ()) + tuple(zeros)
@@ -311,10 +295,7 @@ def _settle(
         offset, turned = offset + by, turned + turn
         if not left or (abs(by) < 0.02 and np.abs(turn).max() < np.radians(0.3)):
             done = begun._replace(camera=camera, clock=replace(begun.clock, value=offset))
-            ratios = best.fit.inlier_ratios(best.found)
-            agree = best.fit.agreeing(ratios)
-            covariance = np.sum(best.fit.covariances(best.found, agree), axis=0)
-            return _Settled(best, as_now, done, assumed, ratios, agree, covariance)
+            return best, as_now, done, assumed
 
 
 def _mean_time(recording: Recording, rows: Sequence[int]) -> float:
@@ -412,7 +393,10 @@ def scan_offsets(
 
 
 def _describe(
-    settled: _Settled,
+    best: PictureFit,
+    recording: Recording,
+    begun: Begun,
+    zeros: Array,
     focal: bool,
     *,
     min_explained: float = 0.12,
@@ -438,9 +422,8 @@ def _describe(
 
     Raises RegistrationError: it does not explain the pictures.
     """
-    best, recording, begun, zeros, ratios, agree, covariance = settled
     fit, (seen,) = best.fit, best.fit.seen
-    ratio = float(ratios[agree].mean())
+    ratio = float(best.ratios[best.agree].mean())
     told = evidence(best.explained, best.contour)
     if (
         best.explained < min_explained
@@ -456,10 +439,10 @@ def _describe(
             f"{best.contour:.2f} ({min_contour} at least); the first, and {PICTURES.contours:g} "
             f"times the last, are {told:.2f} together ({min_evidence} at least)",
         )
-    deviations = np.sqrt(np.diag(covariance))
-    pose = fit.camera_covariances(best.found, covariance)[0]
+    deviations = np.sqrt(np.diag(best.covariance))
+    pose = fit.camera_covariances(best.found, best.covariance)[0]
     found = RegisteredCamera(
-        best.camera, pose, frame_misfits(seen, best.camera.X_CW, ratios, agree),
+        best.camera, pose, frame_misfits(seen, best.camera.X_CW, best.ratios, best.agree),
         np.array([np.linalg.inv(X) for X in begun.alternatives]).reshape(-1, 4, 4),
     )  # fmt: skip
     distance = float(np.linalg.norm(best.camera.X_WC[:3, 3] - seen.middle))
@@ -523,7 +506,7 @@ def judge_pictures(
     rows = np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int)).tolist()
     overlaps = [frame.iou for frame in one.found.frames if frame.agrees]
     min_iou = min_overlap * float(np.median(overlaps))
-    least = agreeing_share(one.fit.fit.inlier_ratios(one.fit.found))
+    least = agreeing_share(one.fit.ratios)
     known, camera = one.fit.background, found.camera
     outlines = hull_of_few(body.very_few, PICTURES.triangles[-1])
     offset = 0.0 if one.offset is None else one.offset.value

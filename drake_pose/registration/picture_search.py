@@ -100,6 +100,21 @@ class PictureFit:
         """Where it was found."""
         return self.fit.cameras(self.found)[0]
 
+    @cached_property
+    def ratios(self) -> Array:
+        """(frames,) of the contours, what fits."""
+        return self.fit.inlier_ratios(self.found)
+
+    @cached_property
+    def agree(self) -> Mask:
+        """(frames,) which frames fit nearly as well as the best."""
+        return self.fit.agreeing(self.ratios)
+
+    @cached_property
+    def covariance(self) -> Array:
+        """(u, u) of the errors of all that the frames share."""
+        return np.asarray(np.sum(self.fit.covariances(self.found, self.agree), axis=0))
+
 
 def node_places(body: RegistrationBody, values: Array) -> Array:
     """(f, n, 3) the middles of the nodes that show, in frames with values (f, m) [m]."""

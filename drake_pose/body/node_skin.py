@@ -105,7 +105,9 @@ def find_skin(
         if ends not in ((parent, group), (group, parent)):
             continue
         turned = ends != (parent, group)
-        mesh = band.mesh.transformed(_pose_in_group(model, graph, band.child))
+        kinematics = PlantKinematics(model)
+        X_GB = inverse_transforms(kinematics.pose(graph.groups[ends[1]].body))
+        mesh = band.mesh.transformed(X_GB @ kinematics.pose(model.link_index(band.child)))
         if turned:
             mesh = mesh.transformed(inverse_transforms(_pose_at_rest(steps)))
         return NodeSkin(mesh, band.weights, band.colour, turned, steps)
@@ -124,13 +126,6 @@ def require_placed(
                 "neighbours; a band joins two links with geometry that have joints, and no other "
                 "link with geometry, between them"
             )
-
-
-def _pose_in_group(model: ParsedModel, graph: LinkGraph, link: str) -> Array:
-    """The pose (4, 4) of a link in the frame of its group."""
-    kinematics = PlantKinematics(model)
-    body = graph.groups[graph.group_of(link)].body
-    return inverse_transforms(kinematics.pose(body)) @ kinematics.pose(model.link_index(link))
 
 
 class ModelSkin:

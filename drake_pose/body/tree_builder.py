@@ -55,7 +55,19 @@ def build_pose_tree(
     if root is not None and root not in model.link_names:
         raise UnknownNameError("link", root, model.link_names, str(model.path))
     held_values = {model.position_index(name): float(value) for name, value in held.items()}
-    _hold_alike(model, held_values)
+    # What follows, or is followed by, what is held is held, too.
+    for follower, leader, multiplier, offset in model.couplings:
+        if follower in held_values:
+            held_values.setdefault(leader, (held_values[follower] - offset) / multiplier)
+    for follower, leader, multiplier, offset in model.couplings:
+        if leader in held_values:
+            wanted = multiplier * held_values[leader] + offset
+            if abs(held_values.setdefault(follower, wanted) - wanted) > _ROUNDING:
+                one, other = (model.position_names[k] for k in (follower, leader))
+                raise SettingsError(
+                    f"joint '{one}' is held at {held_values[follower]:g}, but it follows joint "
+                    f"'{other}' (<mimic>): {wanted:g} [rad or m]; hold one of them alone"
+                )
     for name, value in held.items():
         if not np.isfinite(value):
             raise SettingsError(f"held joint '{name}' has the value {value}: give a finite number")
@@ -89,22 +101,6 @@ def build_pose_tree(
         return replace(tree, _rebuild=lambda moved: build(_checked_position(moved)))
 
     return build(position)
-
-
-def _hold_alike(model: ParsedModel, held: dict[int, float]) -> None:
-    """Hold what follows, or is followed by, what is held; SettingsError for values that differ."""
-    for follower, leader, multiplier, offset in model.couplings:
-        if follower in held:
-            held.setdefault(leader, (held[follower] - offset) / multiplier)
-    for follower, leader, multiplier, offset in model.couplings:
-        if leader in held:
-            wanted = multiplier * held[leader] + offset
-            if abs(held.setdefault(follower, wanted) - wanted) > _ROUNDING:
-                one, other = (model.position_names[k] for k in (follower, leader))
-                raise SettingsError(
-                    f"joint '{one}' is held at {held[follower]:g}, but it follows joint '{other}' "
-                    f"(<mimic>): {wanted:g} [rad or m]; hold one of them alone"
-                )
 
 
 def _checked_position(position: Sequence[float] | Array) -> Array:
@@ -279,7 +275,17 @@ def _plant_rooted(
     # The world is a branch itself where it is seen.
     on_world = 0 if branches and branches[0].group == 0 else -1
     objects = [branch.positions for branch in branches if branch.parent == on_world]
-    held = {**_placing_slides(model, objects, held), **held}
+    # Slides without limits between the world and its only object say where it stands, as the
+    # position of a floating joint does (planar robots in MJCF have two of them): they are not
+    # searched, and root_position moves the object.
+    placing = [slide for positions in objects for slide in _unlimited_slides(model, positions)]
+    free = [slide for slide in placing if slide not in held]
+    if len(objects) > 1 and free:
+        raise ModelError(
+            f"{_lack_of_limits(model, free)}; of {len(objects)} objects in the world none can be "
+            "left where it stands"
+        )
+    held = {slide: float(model.default_positions[slide]) for slide in placing} | held
     X_WB = np.eye(4)
     tops = [index for index, branch in enumerate(branches) if branch.parent < 0]
     if position is not None:
@@ -344,7 +350,12 @@ def _turned_over(
     if 0 in groups:
         base = BasePose("placed", node=groups.index(0), body=graph.groups[0].body)
     else:
-        chain = _chain_from_world(graph, set(groups))
+        # The edges from the world outwards to the first of the groups.
+        queue: list[tuple[int, list[JointEdge]]] = [(0, [])]
+        for group, chain in queue:
+            if group in groups:
+                break
+            queue += [(e.outer, [*chain, e]) for e in graph.edges if e.inner == group]
         base = base_of_chain(model, graph, chain, groups.index(chain[-1].outer), held)
         if any(edge.joint_map is None for edge in chain):
             # What is seen in the world beside a floating object makes further roots.
@@ -362,16 +373,6 @@ def _turned_over(
             f"'{root.name}'"
         )
     return _assemble(model, graph, branches, roots, base, held, root.name)
-
-
-def _chain_from_world(graph: LinkGraph, groups: set[int]) -> list[JointEdge]:
-    """The edges from the world outwards to the first of the given groups."""
-    queue: list[tuple[int, list[JointEdge]]] = [(0, [])]
-    for group, chain in queue:
-        if group in groups:
-            return chain
-        queue += [(edge.outer, [*chain, edge]) for edge in graph.edges if edge.inner == group]
-    raise ModelError("the root is not connected to the world")
 
 
 def _assemble(
@@ -428,24 +429,6 @@ def _assemble(
         placements=tuple(placements),
         _base=base,
     )
-
-
-def _placing_slides(
-    model: ParsedModel, objects: Sequence[Sequence[int]], held: Mapping[int, float]
-) -> dict[int, float]:
-    """Slides without limits between the world and its only object, with their default values.
-
-    They say where the object stands, as the position of a floating joint does (planar robots in
-    MJCF have two of them): they are not searched, and root_position moves the object.
-    """
-    placing = [slide for positions in objects for slide in _unlimited_slides(model, positions)]
-    free = [position for position in placing if position not in held]
-    if len(objects) > 1 and free:
-        raise ModelError(
-            f"{_lack_of_limits(model, free)}; of {len(objects)} objects in the world none can be "
-            "left where it stands"
-        )
-    return {position: float(model.default_positions[position]) for position in placing}
 
 
 def _unlimited_slides(model: ParsedModel, positions: Sequence[int]) -> list[int]:

@@ -124,10 +124,19 @@ def _scene_job(
 ) -> SceneJob:
     """The job of a scene's entry, whose keys are known."""
     values = {key: value for key, value in values.items() if value is not None}
-    kind = AuditSettings if "audit" in values else EstimateSettings
-    names = {one.name for one in fields(kind)}
-    if kind is EstimateSettings:
-        names -= EpisodeSettings.__annotations__.keys()
+    is_audit = "audit" in values
+    kind = AuditSettings if is_audit else EstimateSettings
+    names = [one.name for one in fields(kind)]
+    if not is_audit:
+        names = [key for key in names if key not in EpisodeSettings.__annotations__]
+    own = tuple(k for k in own if k not in (("truth",) if is_audit else ("audit", "camera_file")))
+    if others := [key for key in values if key not in (*own, *names)]:
+        raise SettingsError(
+            f"{where}: an {'audit' if is_audit else 'estimate'} has no setting "
+            f"{', '.join(others)}; it has: {', '.join((*own, *names))}"
+        )
+    if "scene" not in values:
+        raise SettingsError(f"{where}: 'scene' is missing, the scene's folder")
     given, settings = (
         {
             key: _convert(values[key], hint, f"{where}: {key}", base)
@@ -136,20 +145,6 @@ def _scene_job(
         }
         for known, keys in ((SceneJob, own), (kind, names))
     )
-    others = [key for key in values if key not in (*own, *names)]
-    if "scene" not in given:
-        raise SettingsError(f"{where}: 'scene' is missing, the scene's folder")
-    if kind is AuditSettings:
-        others += ["truth"] if "truth" in given else []
-        if others:
-            raise SettingsError(
-                f"{where}: an audit has no setting {', '.join(others)}; it has: camera_file, "
-                f"overlay, {', '.join(one.name for one in fields(kind))}"
-            )
-    elif others:
-        raise SettingsError(f"{where}: {', '.join(others)}: for audits (audit: JOINTS.csv) alone")
-    elif "camera_file" in given:
-        raise SettingsError(f"{where}: camera_file is a setting of audits (audit: JOINTS.csv)")
     try:
         checked = kind(**settings)
     except SettingsError as error:

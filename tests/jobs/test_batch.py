@@ -286,7 +286,7 @@ def test_job_file_gives_the_settings(tmp_path):
             "an audit has no setting time_limit",
         ),
         ("scenes: {a: {scene: a, audit: j.csv, truth: j.csv}}", "an audit has no setting truth"),
-        ("scenes: {a: {scene: a, camera_file: c.yaml}}", "camera_file is a setting of audits"),
+        ("scenes: {a: {scene: a, camera_file: c.yaml}}", "an estimate has no setting camera_file"),
         ("scenes: {a: {scene: a}, a: {scene: b}}", "given twice"),
     ],
 )

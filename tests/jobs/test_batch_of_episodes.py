@@ -100,7 +100,7 @@ def test_an_episode_of_a_job_has_the_settings_of_audits(tmp_path, out):
     for wrong in ("8", "9:8", 3):
         with pytest.raises(SettingsError, match="scene 'data': episodes"):
             read({"data": entry | {"episodes": wrong}})
-    with pytest.raises(SettingsError, match="units: for audits"):
+    with pytest.raises(SettingsError, match="an estimate has no setting units"):
         read({"one": entry | {"audit": None}})
 
 

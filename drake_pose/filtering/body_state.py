@@ -26,8 +26,8 @@ from drake_pose.filtering.state import StateLayout
 from drake_pose.fit.parameters import BodyParameters
 from drake_pose.fit.surfaces import MANY, few_rigid_triangles
 from drake_pose.search import slide_root
-from drake_pose.silhouette.areas.bending import PackedSurfaces, TreeSurfaces
-from drake_pose.silhouette.areas.scoring import draw_packed
+from drake_pose.silhouette.outline import PackedSurfaces, TreeSurfaces
+from drake_pose.silhouette.scoring import draw_packed
 
 Self = TypeVar("Self", bound="BodyState")
 

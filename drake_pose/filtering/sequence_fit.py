@@ -22,7 +22,7 @@ from drake_pose.fit.problem import Solution
 from drake_pose.fit.proportions import ProportionedBody, fit_proportions, sequence_prior
 from drake_pose.fit.surfaces import few_rigid_triangles
 from drake_pose.search import JointEstimate, PoseFamily, PoseSet, joint_estimates
-from drake_pose.silhouette.areas.bending import TreeSurfaces
+from drake_pose.silhouette.outline import TreeSurfaces
 
 
 @dataclass(frozen=True)

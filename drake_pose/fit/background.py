@@ -27,8 +27,8 @@ from scipy.ndimage import convolve1d
 from drake_pose.arrays import Array, Floats, Mask, Picture
 from drake_pose.compiled import compiled
 from drake_pose.fit.colours import COLOURS, Colour, colour_numbers
-from drake_pose.silhouette.areas.outline import PackedOutlines
-from drake_pose.silhouette.areas.span_kernel import fill_rows, find_spans, make_rows
+from drake_pose.silhouette.outline import PackedOutlines
+from drake_pose.silhouette.span_kernel import fill_rows, find_spans, make_rows
 
 
 @dataclass(frozen=True)

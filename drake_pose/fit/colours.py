@@ -33,9 +33,9 @@ from drake_pose.fit.contour_fit import Comparison, Noise, camera_weights, pack_c
 from drake_pose.fit.kernel import Sum, add_pull, add_pulls, count_distance, seen_from
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.fit.parameters import Placement
-from drake_pose.silhouette.areas.outline import Outline, PackedOutlines
-from drake_pose.silhouette.areas.scoring import draw_labels
-from drake_pose.silhouette.contours.contour_points import sample_contour
+from drake_pose.silhouette.contour_points import sample_contour
+from drake_pose.silhouette.outline import Outline, PackedOutlines
+from drake_pose.silhouette.scoring import draw_labels
 
 COLOURS = 4096
 """Number of colours that histograms tell apart: 16 steps of red, green and blue."""

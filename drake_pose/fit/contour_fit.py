@@ -20,8 +20,7 @@ from drake_pose.fit.kernel import Sum, collect, compare_contours
 from drake_pose.fit.levenberg_marquardt import AnnealingStage, Equations, StepSettings, minimise
 from drake_pose.fit.parameters import BodyParameters, Placement
 from drake_pose.fit.surfaces import VERY_FEW, few_triangles
-from drake_pose.silhouette.areas.bending import TreeSurfaces
-from drake_pose.silhouette.areas.outline import Outline
+from drake_pose.silhouette.outline import Outline, TreeSurfaces
 
 FINEST_SCALE = 1.5
 """Silhouettes resolve no smaller distances [pixel]."""

@@ -23,7 +23,7 @@ from threadpoolctl import ThreadpoolController
 
 from drake_pose.arrays import Array, Indices, Mask
 from drake_pose.fit.contour_fit import Comparison, pixels_per_metre, symmetric
-from drake_pose.silhouette.areas.outline import Outline
+from drake_pose.silhouette.outline import Outline
 
 # Of some hundred rows BLAS's threads wait for each other: it is ten times as slow with two.
 _on_one_thread = ThreadpoolController().wrap(limits=1, user_api="blas")

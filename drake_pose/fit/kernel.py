@@ -17,8 +17,8 @@ import numpy as np
 from drake_pose.arrays import Array, Indices
 from drake_pose.compiled import compiled, multiply
 from drake_pose.fit.evidence import Evidence
-from drake_pose.silhouette.areas.outline import PackedOutlines
-from drake_pose.silhouette.contours.contour_points import sample_contour
+from drake_pose.silhouette.contour_points import sample_contour
+from drake_pose.silhouette.outline import PackedOutlines
 
 REACH = 4.0
 """Distances beyond this many scales do not correspond."""

@@ -16,8 +16,13 @@ from drake_pose.body import OBJECT_POSITIONS, PoseTree, chain_transforms
 from drake_pose.body.tree_kinematics import JointOffset, TreeKinematics, joint_offsets
 from drake_pose.camera.models import Camera
 from drake_pose.compiled import compiled
-from drake_pose.silhouette.areas.bending import PackedSurfaces, TreeSurfaces
-from drake_pose.silhouette.areas.outline import Outline, PackedOutlines, pack
+from drake_pose.silhouette.outline import (
+    Outline,
+    PackedOutlines,
+    PackedSurfaces,
+    TreeSurfaces,
+    pack,
+)
 
 ROOT_NAMES = ("root_shift_x", "root_shift_y", "root_shift_z", "log_growth")
 """The shift of the first root along the world's axes [m], and the logarithm of the growth of it and

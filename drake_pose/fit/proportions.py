@@ -30,7 +30,7 @@ from drake_pose.fit.parameters import (
     stretched,
 )
 from drake_pose.fit.problem import Problem, Solution, Unknowns
-from drake_pose.silhouette.areas.bending import TreeSurfaces
+from drake_pose.silhouette.outline import TreeSurfaces
 
 
 class ProportionedBody(BodyParameters):

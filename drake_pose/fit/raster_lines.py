@@ -17,12 +17,12 @@ import numpy as np
 from drake_pose.arrays import Array, Indices, Mask
 from drake_pose.compiled import compiled
 from drake_pose.fit.kernel import add_pull, add_pulls, seen_from
-from drake_pose.silhouette.areas.outline import PackedOutlines
-from drake_pose.silhouette.contours.contour_points import (
+from drake_pose.silhouette.contour_points import (
     find_crossings,
     find_line_spans,
     find_segments,
 )
+from drake_pose.silhouette.outline import PackedOutlines
 
 
 class Border(NamedTuple):

@@ -13,8 +13,7 @@ from scipy.spatial import cKDTree
 
 from drake_pose.arrays import Array
 from drake_pose.body import TriangleMesh
-from drake_pose.silhouette.areas.bending import TreeSurfaces
-from drake_pose.silhouette.areas.outline import Outline, outline_from_mesh
+from drake_pose.silhouette.outline import Outline, TreeSurfaces, outline_from_mesh
 
 MANY, FEW, VERY_FEW = 2500, 400, 80
 """Triangles of a node: where a pixel counts, for a still, and for a person in real time."""

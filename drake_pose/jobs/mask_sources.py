@@ -17,12 +17,12 @@ from drake_pose.camera.picture_files import (
     read_picture,
 )
 from drake_pose.errors import SceneError
-from drake_pose.silhouette.pictures.scenes import CAMERA_FILE
-from drake_pose.silhouette.segmentation.mask_pictures import (
+from drake_pose.silhouette.mask_pictures import (
     AnnotatedPicture,
     Annotations,
     read_coco,
 )
+from drake_pose.silhouette.pictures.scenes import CAMERA_FILE
 
 
 @dataclass(frozen=True)

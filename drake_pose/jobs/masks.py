@@ -6,7 +6,7 @@ import math
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -34,19 +34,19 @@ from drake_pose.jobs.estimate.inputs import make_tree
 from drake_pose.jobs.mask_sources import Source, open_source
 from drake_pose.jobs.registration.positions import read_known_positions
 from drake_pose.search import PoseAndMask, PoseAndMaskSettings
+from drake_pose.silhouette.mask_pictures import (
+    mask_of_video_picture,
+)
 from drake_pose.silhouette.pictures.masks import encode_mask, intersection_over_union
 from drake_pose.silhouette.pictures.scene_checks import frame_ranges
 from drake_pose.silhouette.pictures.scenes import CAMERA_FILE, SCENE_FILE, common_rate, in_order
-from drake_pose.silhouette.segmentation.background import (
+from drake_pose.silhouette.segmentation import (
     Background,
     background_of_recording,
     background_support,
     cut_box,
     learn_background,
     person_region,
-)
-from drake_pose.silhouette.segmentation.mask_pictures import (
-    mask_of_video_picture,
 )
 
 MIN_AGREEMENT = 0.85
@@ -375,7 +375,7 @@ def _by_empty_room(
     rooms: dict[str, list[Background]] = {}
     for name in source.names:
         room, doubts[name] = _background(source, name, background)
-        rooms[name] = [replace(room, deviation=k * room.deviation) for k in (1.0, *thresholds)]
+        rooms[name] = [room.with_noise(k) for k in (1.0, *thresholds)]
 
     def find(camera: str, picture: Picture) -> tuple[Mask, float, tuple[str, ...]]:
         room = rooms[camera][0]

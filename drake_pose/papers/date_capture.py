@@ -31,7 +31,7 @@ from drake_pose.person.date.features import (
 )
 from drake_pose.person.date.skeleton import LIMBS, Skeleton, load_skeleton
 from drake_pose.person.pose_tracker import PersonPoseTracker, TrackState
-from drake_pose.silhouette.segmentation.background import Background, learn_background
+from drake_pose.silhouette.segmentation import Background, learn_background
 from drake_pose.systems.cameras import CameraRig, build_camera_rig
 from drake_pose.systems.date import (
     CaptureSetup,

@@ -42,9 +42,9 @@ from drake_pose.search import (
     examine,
     renderer_tolerance,
 )
-from drake_pose.silhouette.areas.scoring import draw_labels, draw_mask
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from drake_pose.silhouette.pictures.scenes import load_scene
+from drake_pose.silhouette.scoring import draw_labels, draw_mask
 
 PAPER = {
     "images": 219,

@@ -41,7 +41,7 @@ from drake_pose.person.views import (
     edge_spacing,
     see_silhouette,
 )
-from drake_pose.silhouette.areas.outline import Outline
+from drake_pose.silhouette.outline import Outline
 
 ReadPictures = Callable[[int], Mapping[str, Picture]]
 """Gives the pictures (H, W, 3) of a frame, counted from 0, by camera."""

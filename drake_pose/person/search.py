@@ -20,7 +20,7 @@ from drake_pose.fit.contour_fit import ContourFit, PoseFit, Prior
 from drake_pose.fit.kernel import Sum
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.person.views import ColourViews, FrameViews, sum_at_points
-from drake_pose.silhouette.areas.scoring import draw_mask
+from drake_pose.silhouette.scoring import draw_mask
 
 PERSON_LANDMARKS = (
     "neck",

@@ -20,7 +20,7 @@ from drake_pose.fit.problem import Problem, Unknowns
 from drake_pose.fit.surfaces import with_girths
 from drake_pose.person.pose_tracker import PersonPoseTracker, pose_uncertainty
 from drake_pose.person.search import LENIENT
-from drake_pose.silhouette.areas.outline import Outline
+from drake_pose.silhouette.outline import Outline
 
 Frames = Sequence[tuple[Sequence[Camera], Sequence[EdgePoints]]]
 """The cameras of each frame and their regions' edges."""

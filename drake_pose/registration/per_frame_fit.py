@@ -21,7 +21,7 @@ from drake_pose.fit.parameters import POSE_NAMES, BodyParameters
 from drake_pose.fit.problem import Problem, Unknowns
 from drake_pose.registration.posed_frames import SeenFrame, common_size, middle_of
 from drake_pose.registration.shared_fit import SHARED
-from drake_pose.silhouette.areas.outline import Outline
+from drake_pose.silhouette.outline import Outline
 
 
 @dataclass(frozen=True, eq=False)

@@ -38,7 +38,7 @@ from drake_pose.registration.register import (
     frame_misfits,
 )
 from drake_pose.registration.shared_fit import SharedFit, agreeing_share
-from drake_pose.silhouette.areas.scoring import draw_mask
+from drake_pose.silhouette.scoring import draw_mask
 from drake_pose.workers import map_ordered
 
 

@@ -35,8 +35,8 @@ from drake_pose.fit.surfaces import hull_of_few
 from drake_pose.registration.posed_frames import PosedFrame, PosedFrames, placed_points
 from drake_pose.registration.register import RegistrationBody, spread_rotations
 from drake_pose.registration.shared_fit import Shared, SharedFit
-from drake_pose.silhouette.areas.outline import NOTHING, Outline, pack
-from drake_pose.silhouette.areas.scoring import draw_mask
+from drake_pose.silhouette.outline import NOTHING, Outline, pack
+from drake_pose.silhouette.scoring import draw_mask
 from drake_pose.workers import map_ordered
 
 

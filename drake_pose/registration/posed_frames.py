@@ -23,8 +23,8 @@ from drake_pose.fit.evidence import (
     pack_evidence,
 )
 from drake_pose.fit.parameters import BodyParameters
-from drake_pose.silhouette.areas.outline import Outline
-from drake_pose.silhouette.areas.scoring import prefix_sums
+from drake_pose.silhouette.outline import Outline
+from drake_pose.silhouette.scoring import prefix_sums
 
 LAST_SPACING = 1.0 / 300.0
 """Of the points of silhouettes' edges in the last parts of a fit [root of the area]."""

@@ -34,9 +34,8 @@ from drake_pose.registration.posed_frames import (
     placed_points,
 )
 from drake_pose.registration.shared_fit import Shared, SharedFit, fit_pose
-from drake_pose.silhouette.areas.bending import TreeSurfaces
-from drake_pose.silhouette.areas.outline import NOTHING, Outline
-from drake_pose.silhouette.areas.scoring import draw_mask, score_bodies
+from drake_pose.silhouette.outline import NOTHING, Outline, TreeSurfaces
+from drake_pose.silhouette.scoring import draw_mask, score_bodies
 from drake_pose.workers import map_ordered
 
 

@@ -42,7 +42,7 @@ from drake_pose.fit.parameters import (
 )
 from drake_pose.fit.problem import Problem, Unknowns, parameter_names
 from drake_pose.registration.posed_frames import PosedFrames, SeenFrame, common_size, middle_of
-from drake_pose.silhouette.areas.outline import Outline
+from drake_pose.silhouette.outline import Outline
 from drake_pose.workers import map_ordered
 
 

@@ -43,11 +43,10 @@ from drake_pose.registration.register import (
     with_widths,
 )
 from drake_pose.registration.shared_fit import SHARED, Shared, SharedFit
-from drake_pose.silhouette.areas.bending import TreeSurfaces
-from drake_pose.silhouette.areas.outline import outline_from_mesh
-from drake_pose.silhouette.areas.scoring import draw_mask
+from drake_pose.silhouette.outline import TreeSurfaces, outline_from_mesh
 from drake_pose.silhouette.pictures.masks import intersection_over_union
-from drake_pose.silhouette.segmentation.regions import find_regions
+from drake_pose.silhouette.scoring import draw_mask
+from drake_pose.silhouette.segmentation import find_regions
 
 
 class StandingObject:

@@ -41,7 +41,7 @@ from drake_pose.search.settings import (
     MultiStartSettings,
 )
 from drake_pose.search.views_fit import FittedPose, RobustFamilies, ViewsFit, distinct, refine_best
-from drake_pose.silhouette.areas.outline import Outline
+from drake_pose.silhouette.outline import Outline
 from drake_pose.workers import map_ordered
 
 

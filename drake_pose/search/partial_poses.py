@@ -25,8 +25,14 @@ from drake_pose.search.pair_kernel import (
 )
 from drake_pose.search.sampled_body import SampledBody
 from drake_pose.search.settings import BoundLimits
-from drake_pose.silhouette.bits.bit_kernel import WORD, BitView, draw_bits, make_bit_view
-from drake_pose.silhouette.bits.bounding_balls import draw_discs, prune_by_balls
+from drake_pose.silhouette.bit_kernel import (
+    WORD,
+    BitView,
+    draw_bits,
+    draw_discs,
+    make_bit_view,
+    prune_by_balls,
+)
 
 
 class LimitReached(Exception):

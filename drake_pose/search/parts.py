@@ -24,9 +24,9 @@ from drake_pose.fit.surfaces import few_rigid_triangles
 from drake_pose.search.estimates import View
 from drake_pose.search.refinement import Freedom, RefinementBody, RefinementProblem, descend
 from drake_pose.search.settings import NeighbourhoodSettings
-from drake_pose.silhouette.areas.outline import pack
-from drake_pose.silhouette.areas.scoring import prefix_sums
-from drake_pose.silhouette.areas.span_kernel import score
+from drake_pose.silhouette.outline import pack
+from drake_pose.silhouette.scoring import prefix_sums
+from drake_pose.silhouette.span_kernel import score
 
 # X_CW, kernel parameters and prefix sums (2, H, W + 1) of a coarse view.
 _Region = tuple[np.ndarray, np.ndarray, np.ndarray]

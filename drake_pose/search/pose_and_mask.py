@@ -26,14 +26,14 @@ from drake_pose.fit.contour_fit import ContourFit, Prior, pack_views
 from drake_pose.fit.evidence import NO_EDGE, find_edge_points
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.fit.surfaces import VERY_FEW, few_triangles
-from drake_pose.silhouette.areas.bending import TreeSurfaces
-from drake_pose.silhouette.areas.scoring import (
+from drake_pose.silhouette.outline import TreeSurfaces
+from drake_pose.silhouette.pictures.masks import intersection_over_union
+from drake_pose.silhouette.scoring import (
     draw_mask,
     prefix_sums,
     score_bodies,
 )
-from drake_pose.silhouette.pictures.masks import intersection_over_union
-from drake_pose.silhouette.segmentation.background import cut, tell_from_background
+from drake_pose.silhouette.segmentation import cut, tell_from_background
 from drake_pose.workers import map_ordered
 
 Likelihood = NDArray[np.float32]

@@ -26,8 +26,8 @@ from drake_pose.fit.raster_lines import (
 )
 from drake_pose.search.estimates import View
 from drake_pose.search.settings import Pass
-from drake_pose.silhouette.areas.bending import PackedSurfaces, TreeSurfaces
-from drake_pose.silhouette.areas.scoring import draw_packed
+from drake_pose.silhouette.outline import PackedSurfaces, TreeSurfaces
+from drake_pose.silhouette.scoring import draw_packed
 
 
 class Freedom(NamedTuple):

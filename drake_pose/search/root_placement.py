@@ -41,7 +41,7 @@ from drake_pose.search.parts import NeighbourhoodSearch, PartSearch
 from drake_pose.search.refinement import Pass, RefinementBody, RefinementProblem, descend
 from drake_pose.search.sampled_body import SampledBody
 from drake_pose.search.settings import PASSES, BeamSearchSettings, RootPlacementSettings, Stage
-from drake_pose.silhouette.areas.scoring import score_bodies
+from drake_pose.silhouette.scoring import score_bodies
 from drake_pose.workers import map_ordered
 
 

@@ -14,16 +14,15 @@ from drake_pose.body import PoseTree, TriangleMesh
 from drake_pose.camera.models import Camera, ParallelCamera
 from drake_pose.search.estimates import PoseEstimate, View
 from drake_pose.search.settings import BeamSearchSettings, GridSettings
-from drake_pose.silhouette.areas.bending import TreeSurfaces
-from drake_pose.silhouette.areas.outline import Outline, outline_from_mesh
-from drake_pose.silhouette.areas.scoring import (
+from drake_pose.silhouette.contour_points import CelledOutline, divide_outline
+from drake_pose.silhouette.outline import Outline, TreeSurfaces, outline_from_mesh
+from drake_pose.silhouette.scoring import (
     VisualHull,
     draw_mask,
     prefix_sums,
     score_bodies,
     subtract_body,
 )
-from drake_pose.silhouette.contours.contour_points import CelledOutline, divide_outline
 
 # Of each view what is left of the silhouette: (H, W) uint8, and prefix sums (2, H, W + 1) of the
 # silhouette and of that.

@@ -51,7 +51,7 @@ from drake_pose.search.estimates import (
 )
 from drake_pose.search.self_motions import Flip, flips
 from drake_pose.search.settings import RobustSettings
-from drake_pose.silhouette.areas.outline import Outline
+from drake_pose.silhouette.outline import Outline
 from drake_pose.workers import map_ordered
 
 

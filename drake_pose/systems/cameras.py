@@ -22,9 +22,9 @@ from drake_pose.body import ParsedModel, captured_warnings, labelled_meshes
 from drake_pose.camera.drake import camera_from_drake, camera_to_drake
 from drake_pose.camera.models import Camera, PinholeCamera
 from drake_pose.errors import CameraError, ModelError, UnknownNameError
-from drake_pose.silhouette.areas.label_kernel import paint_labels
-from drake_pose.silhouette.areas.outline import outline_from_mesh, pack
+from drake_pose.silhouette.outline import outline_from_mesh, pack
 from drake_pose.silhouette.pictures.label_images import EMPTY, label_image_to_mask
+from drake_pose.silhouette.span_kernel import paint_labels
 from drake_pose.systems.bodies import add_posed_plant
 from drake_pose.systems.images import colour_image_to_picture
 from drake_pose.systems.ports import PortedSystem

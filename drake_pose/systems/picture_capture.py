@@ -28,7 +28,7 @@ from drake_pose.camera.synchroniser import CameraChange, SynchronisedFrames, Syn
 from drake_pose.errors import CameraError, SettingsError, UnknownNameError
 from drake_pose.silhouette.pictures.label_images import fill_label_image, label_image_to_mask
 from drake_pose.silhouette.pictures.scenes import USUAL_RATE_HZ
-from drake_pose.silhouette.segmentation.background import Background, person_region
+from drake_pose.silhouette.segmentation import Background, person_region
 from drake_pose.systems.images import colour_image_to_picture, fill_colour_image
 from drake_pose.systems.ports import PortedSystem, require_period
 

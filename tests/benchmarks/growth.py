@@ -20,8 +20,8 @@ from drake_pose.fit.evidence import Observation, find_edge_points, pack_evidence
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.fit.parameters import BodyParameters
 from drake_pose.fit.problem import Problem, Unknowns
-from drake_pose.silhouette.areas.outline import outline_from_mesh
-from drake_pose.silhouette.areas.scoring import draw_mask
+from drake_pose.silhouette.outline import outline_from_mesh
+from drake_pose.silhouette.scoring import draw_mask
 from tests.benchmarks.speed import fastest, limb_mesh
 from tests.benchmarks.tables import print_table
 

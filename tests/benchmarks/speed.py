@@ -24,9 +24,9 @@ from drake_pose.papers.kameda import (
     run_experiment,
 )
 from drake_pose.person.date.walking import FEWEST_FRAMES, MOTIONS, make_motion
-from drake_pose.silhouette.areas.outline import outline_from_mesh
-from drake_pose.silhouette.areas.scoring import prefix_sums, score_bodies
+from drake_pose.silhouette.outline import outline_from_mesh
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
+from drake_pose.silhouette.scoring import prefix_sums, score_bodies
 from drake_pose.systems.images import picture_to_colour_image
 from tests.benchmarks.tables import print_table
 from tests.silhouette.agreement import measure_agreement

@@ -17,7 +17,7 @@ from drake_pose.body.tree_kinematics import TreeKinematics, joint_offsets
 from drake_pose.errors import ModelError, SettingsError
 from drake_pose.fit.parameters import BodyParameters
 from drake_pose.fit.surfaces import VERY_FEW, few_triangles
-from drake_pose.silhouette.areas.bending import TreeSurfaces
+from drake_pose.silhouette.outline import TreeSurfaces
 from tests.body import test_sdf as sdf
 from tests.body.models import joint, link, urdf, write
 from tests.fit.motions import assert_motions_are_derivatives

@@ -15,8 +15,8 @@ from drake_pose.fit.background import (
     odds_picture,
 )
 from drake_pose.fit.colours import COLOURS, Colour
-from drake_pose.silhouette.areas.outline import pack
-from drake_pose.silhouette.areas.scoring import draw_mask
+from drake_pose.silhouette.outline import pack
+from drake_pose.silhouette.scoring import draw_mask
 from tests.registration.episodes import painted_episode
 
 

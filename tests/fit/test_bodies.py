@@ -12,8 +12,7 @@ from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.fit.parameters import CAMERA_NAMES, BodyParameters, CameraParameters
 from drake_pose.fit.proportions import ProportionedBody, fit_proportions, sequence_prior
 from drake_pose.fit.surfaces import VERY_FEW, few_triangles
-from drake_pose.silhouette.areas.bending import TreeSurfaces
-from drake_pose.silhouette.areas.outline import Outline, outline_from_mesh
+from drake_pose.silhouette.outline import Outline, TreeSurfaces, outline_from_mesh
 from tests.body.models import joint, link, urdf
 from tests.fit.motions import STEP, assert_motions_are_derivatives
 

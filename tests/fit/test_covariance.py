@@ -21,7 +21,7 @@ from drake_pose.fit.covariance import (
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.fit.surfaces import few_triangles
 from drake_pose.search import ViewsFit
-from drake_pose.silhouette.areas.bending import TreeSurfaces
+from drake_pose.silhouette.outline import TreeSurfaces
 from tests.search.arms import arm_tree, damaged_views, draw_pose
 
 FINE = tuple(AnnealingStage(scale, 0.0125, 8) for scale in (0.025, 0.0125))

@@ -17,9 +17,8 @@ from drake_pose.fit.levenberg_marquardt import AnnealingStage, Equations, Linear
 from drake_pose.fit.parameters import BodyParameters, CameraParameters
 from drake_pose.fit.problem import WIDTH, Problem, Solution, Unknowns, parameter_names
 from drake_pose.fit.surfaces import VERY_FEW, few_triangles
-from drake_pose.silhouette.areas.bending import TreeSurfaces
-from drake_pose.silhouette.areas.outline import outline_from_mesh
-from drake_pose.silhouette.areas.scoring import draw_mask
+from drake_pose.silhouette.outline import TreeSurfaces, outline_from_mesh
+from drake_pose.silhouette.scoring import draw_mask
 
 ROUNDS = (
     AnnealingStage(0.08, 0.04, 3),

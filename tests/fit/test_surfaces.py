@@ -13,8 +13,7 @@ from drake_pose.fit.surfaces import (
     few_triangles,
     surface_distance,
 )
-from drake_pose.silhouette.areas.bending import TreeSurfaces
-from drake_pose.silhouette.areas.outline import outline_from_mesh
+from drake_pose.silhouette.outline import TreeSurfaces, outline_from_mesh
 from drake_pose.workers import map_ordered
 
 RADIUS, TUBE, ENDS = 0.08, 0.06, (0.1, 0.3)

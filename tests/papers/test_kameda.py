@@ -23,8 +23,8 @@ from drake_pose.papers.kameda import (
 )
 from drake_pose.papers.kameda_pictures import chest_ranks, ratio_within, save_pictures
 from drake_pose.search import MultiStartSearch, PoseEstimate
-from drake_pose.silhouette.areas.scoring import draw_mask
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
+from drake_pose.silhouette.scoring import draw_mask
 from tests.cli import CliRunner
 
 

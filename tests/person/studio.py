@@ -15,7 +15,7 @@ from drake_pose.person.date.features import (
     see_person,
 )
 from drake_pose.person.date.skeleton import load_skeleton, registered_positions
-from drake_pose.silhouette.segmentation.background import learn_background
+from drake_pose.silhouette.segmentation import learn_background
 from drake_pose.systems.cameras import build_camera_rig
 from tests.person.persons_in_view import posed
 

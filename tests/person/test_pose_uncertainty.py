@@ -10,8 +10,8 @@ from drake_pose.fit.evidence import NO_EDGE, find_edge_points
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.person.pose_tracker import pose_uncertainty
 from drake_pose.person.shape import _SIDE, _sides_information
-from drake_pose.silhouette.areas.outline import outline_from_mesh
-from drake_pose.silhouette.areas.scoring import draw_mask
+from drake_pose.silhouette.outline import outline_from_mesh
+from drake_pose.silhouette.scoring import draw_mask
 from tests.person.persons_in_view import posed
 
 STEP = AnnealingStage(0.03, 0.05)

@@ -52,7 +52,7 @@ from drake_pose.registration.standing_object import (
     require_turns,
     turns_between,
 )
-from drake_pose.silhouette.areas.scoring import draw_mask
+from drake_pose.silhouette.scoring import draw_mask
 from tests.registration.arm_pictures import errors, looking_at, see
 from tests.search.arms import arm_cameras
 

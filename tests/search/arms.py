@@ -13,8 +13,8 @@ from scipy.spatial.transform import Rotation
 from drake_pose.body import PoseTree, TriangleMesh, load_model
 from drake_pose.camera.models import Camera, PinholeCamera
 from drake_pose.search import PoseSet, View
-from drake_pose.silhouette.areas.outline import Outline, outline_from_mesh
-from drake_pose.silhouette.areas.scoring import draw_mask
+from drake_pose.silhouette.outline import Outline, outline_from_mesh
+from drake_pose.silhouette.scoring import draw_mask
 from tests.body.models import joint, link
 
 # Each: name, parent's length, the joint's axis, its limits [deg], the box's sides and length [m].

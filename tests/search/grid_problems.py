@@ -10,8 +10,8 @@ from drake_pose.body import PoseTree
 from drake_pose.camera.models import ParallelCamera
 from drake_pose.search import BeamSearchSettings, SampledTree, Scoring, View, samples_at
 from drake_pose.search.sampled_body import SampledBody
-from drake_pose.silhouette.areas.outline import Outline, outline_from_mesh
-from drake_pose.silhouette.areas.scoring import draw_mask
+from drake_pose.silhouette.outline import Outline, outline_from_mesh
+from drake_pose.silhouette.scoring import draw_mask
 
 from .bodies import front_camera
 

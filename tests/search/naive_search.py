@@ -8,8 +8,8 @@ import itertools
 
 import numpy as np
 
-from drake_pose.silhouette.areas.bending import TreeSurfaces
-from drake_pose.silhouette.areas.scoring import draw_mask
+from drake_pose.silhouette.outline import TreeSurfaces
+from drake_pose.silhouette.scoring import draw_mask
 
 
 class NaiveSearch:

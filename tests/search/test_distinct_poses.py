@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from drake_pose.search import BeamSearch, BeamSearchSettings, samples_at
-from drake_pose.silhouette.areas.outline import outline_from_mesh
-from drake_pose.silhouette.areas.scoring import draw_mask
+from drake_pose.silhouette.outline import outline_from_mesh
+from drake_pose.silhouette.scoring import draw_mask
 from tests.search.bodies import forked_body
 from tests.search.grid_problems import ProblemMaker
 

@@ -5,7 +5,7 @@ import pytest
 
 from drake_pose.errors import MaskError, SettingsError
 from drake_pose.search import PaperSearch, PaperSearchSettings, View
-from drake_pose.silhouette.areas.scoring import draw_mask
+from drake_pose.silhouette.scoring import draw_mask
 from tests.search.bodies import (
     box_link,
     forked_body,

@@ -6,8 +6,8 @@ import pytest
 from drake_pose.errors import SettingsError
 from drake_pose.search import BeamSearch, MultiStartSearch, PaperSearch, View
 from drake_pose.search.multi_start import without_specks
-from drake_pose.silhouette.areas.bending import TreeSurfaces
-from drake_pose.silhouette.areas.scoring import draw_mask
+from drake_pose.silhouette.outline import TreeSurfaces
+from drake_pose.silhouette.scoring import draw_mask
 from drake_pose.workers import working
 from tests.search.arms import (
     arm_cameras,

@@ -8,8 +8,8 @@ import pytest
 
 from drake_pose.search import PoseAndMask, PoseAndMaskSettings
 from drake_pose.search.pose_and_mask import PictureLevel, cut_by_odds, follow_colours, narrowed
-from drake_pose.silhouette.areas.scoring import draw_mask
 from drake_pose.silhouette.pictures.masks import intersection_over_union
+from drake_pose.silhouette.scoring import draw_mask
 from tests.registration.episodes import painted_episode
 
 

@@ -12,8 +12,8 @@ from drake_pose.search.exact_search import find_intervals
 from drake_pose.search.parts import NeighbourhoodSearch, PartSearch, find_parts, find_reflections
 from drake_pose.search.refinement import Pass, RefinementBody, RefinementProblem, descend
 from drake_pose.search.settings import PASSES
-from drake_pose.silhouette.areas.bending import TreeSurfaces
-from drake_pose.silhouette.areas.scoring import draw_mask
+from drake_pose.silhouette.outline import TreeSurfaces
+from drake_pose.silhouette.scoring import draw_mask
 from tests.search.bodies import forked_body
 
 _X_WC = np.array(

@@ -11,7 +11,7 @@ from drake_pose.search import ViewsFit
 from drake_pose.search.self_motions import flips
 from drake_pose.search.settings import RobustSettings
 from drake_pose.search.views_fit import FittedPose, RobustFamilies, distinct
-from drake_pose.silhouette.areas.bending import TreeSurfaces
+from drake_pose.silhouette.outline import TreeSurfaces
 from tests.body.models import joint, link, urdf, write
 from tests.search.arms import arm_cameras, arm_tree, damaged_views, draw_view, is_held
 

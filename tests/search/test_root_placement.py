@@ -10,7 +10,7 @@ from drake_pose.errors import SettingsError
 from drake_pose.search import BeamSearchSettings, RootPlacementSearch, View, hub, turns_freely
 from drake_pose.search.root_placement import choose_root_samples, find_root_places, whereabouts
 from drake_pose.search.sampled_body import SampledBody
-from drake_pose.silhouette.areas.scoring import draw_mask
+from drake_pose.silhouette.scoring import draw_mask
 from drake_pose.workers import working
 from tests.search.bodies import box_link, front_camera, joint, load_body
 

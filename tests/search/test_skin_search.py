@@ -15,8 +15,8 @@ from drake_pose.search import (
     Scoring,
     View,
 )
-from drake_pose.silhouette.areas.bending import TreeSurfaces
-from drake_pose.silhouette.areas.scoring import draw_mask
+from drake_pose.silhouette.outline import TreeSurfaces
+from drake_pose.silhouette.scoring import draw_mask
 from tests.body.models import load_limb
 from tests.search.naive_search import NaiveSearch
 

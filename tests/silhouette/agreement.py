@@ -8,10 +8,9 @@ import numpy as np
 
 from drake_pose.body import ArticulatedModel, ModelSkin, TriangleMesh
 from drake_pose.camera.models import Camera
-from drake_pose.silhouette.areas.bending import BendingOutline
-from drake_pose.silhouette.areas.outline import outline_from_mesh
-from drake_pose.silhouette.areas.scoring import draw_mask
+from drake_pose.silhouette.outline import BendingOutline, outline_from_mesh
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
+from drake_pose.silhouette.scoring import draw_mask
 
 LARGEST_SHARE = 0.002
 """The largest part of a mask that may differ."""

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from drake_pose.search import renderer_tolerance
-from drake_pose.silhouette.areas.bending import TreeSurfaces
-from drake_pose.silhouette.areas.scoring import draw_mask
+from drake_pose.silhouette.outline import TreeSurfaces
+from drake_pose.silhouette.scoring import draw_mask
 from tests.silhouettes.stored import (
     BODIES,
     REAL,

@@ -10,8 +10,8 @@ import trimesh
 
 from drake_pose.body import ArticulatedModel
 from drake_pose.camera.models import ParallelCamera, look_at
-from drake_pose.silhouette.areas.outline import outline_from_mesh
-from drake_pose.silhouette.areas.scoring import draw_mask
+from drake_pose.silhouette.outline import outline_from_mesh
+from drake_pose.silhouette.scoring import draw_mask
 
 URDF = Path(__file__).resolve().parents[2] / "urdf"
 

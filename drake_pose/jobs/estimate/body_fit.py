@@ -34,9 +34,9 @@ from drake_pose.filtering.sequence_fit import (
 )
 from drake_pose.jobs.estimate.inputs import EstimateInputs, leave_out_links, make_placement_search
 from drake_pose.search import TRACKED, PoseEstimate, RootPlacementSearch, View
-from drake_pose.silhouette.areas.bending import TreeSurfaces
-from drake_pose.silhouette.areas.scoring import draw_mask
+from drake_pose.silhouette.outline import TreeSurfaces
 from drake_pose.silhouette.pictures.scenes import USUAL_RATE_HZ
+from drake_pose.silhouette.scoring import draw_mask
 
 FittedBody = tuple[EstimateInputs, dict[str, Any], np.ndarray | None]
 """What is found out about a body: inputs with the fitted model and a search that knows the first

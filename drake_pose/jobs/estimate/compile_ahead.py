@@ -22,8 +22,7 @@ from drake_pose.fit.evidence import find_edge_points
 from drake_pose.fit.kernel import collect, compare_contours
 from drake_pose.fit.surfaces import few_triangles
 from drake_pose.search import MultiStartSearch, View, ViewsFit
-from drake_pose.silhouette.areas.bending import TreeSurfaces
-from drake_pose.silhouette.areas.outline import pack
+from drake_pose.silhouette.outline import TreeSurfaces, pack
 
 
 @contextmanager

@@ -50,8 +50,7 @@ from drake_pose.search import (
     hub,
     turns_freely,
 )
-from drake_pose.silhouette.areas.outline import Outline
-from drake_pose.silhouette.areas.scoring import draw_labels, require_visible
+from drake_pose.silhouette.outline import Outline
 from drake_pose.silhouette.pictures.masks import compare_masks
 from drake_pose.silhouette.pictures.scene_checks import (
     check_upright,
@@ -59,6 +58,7 @@ from drake_pose.silhouette.pictures.scene_checks import (
     read_scene,
 )
 from drake_pose.silhouette.pictures.scenes import SCENE_FILE, Scene, read_sequence
+from drake_pose.silhouette.scoring import draw_labels, require_visible
 
 
 def make_search(

@@ -40,7 +40,7 @@ from drake_pose.search import (
     View,
     scale_camera,
 )
-from drake_pose.silhouette.areas.bending import TreeSurfaces
+from drake_pose.silhouette.outline import TreeSurfaces
 from drake_pose.silhouette.pictures.scenes import USUAL_RATE_HZ, Scene
 from drake_pose.systems.diagrams import build_recorded_matching
 from drake_pose.workers import working

@@ -43,10 +43,10 @@ from drake_pose.person.figures import PersonRecording, keep_person
 from drake_pose.person.pose_tracker import PersonPoseTracker
 from drake_pose.person.shape import KnownShape, shape_values, tracker_of_person
 from drake_pose.person.views import shows_somebody
-from drake_pose.silhouette.areas.scoring import draw_mask
 from drake_pose.silhouette.pictures.masks import compare_masks
 from drake_pose.silhouette.pictures.scene_checks import frame_ranges
 from drake_pose.silhouette.pictures.scenes import Scene
+from drake_pose.silhouette.scoring import draw_mask
 from drake_pose.systems.date import (
     CaptureSetup,
     build_paper_capture,

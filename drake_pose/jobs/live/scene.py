@@ -28,7 +28,7 @@ from drake_pose.camera.sources import (
 )
 from drake_pose.errors import OutputError, SceneError
 from drake_pose.files.folder import write_file
-from drake_pose.silhouette.segmentation.background import Background, learn_background
+from drake_pose.silhouette.segmentation import Background, learn_background
 from drake_pose.systems.picture_capture import PictureCapture
 
 

@@ -34,8 +34,8 @@ from drake_pose.registration.register import (
 )
 from drake_pose.registration.shared_fit import SharedFit
 from drake_pose.registration.standing_object import ObjectSearch
-from drake_pose.silhouette.areas.scoring import require_visible
 from drake_pose.silhouette.pictures.scene_checks import frame_ranges
+from drake_pose.silhouette.scoring import require_visible
 
 Search = CameraSearch | ObjectSearch
 """What finds a camera, and may find it again with other settings."""

@@ -33,10 +33,10 @@ from drake_pose.registration.joint_zeros import JointCalibration, KinematicParam
 from drake_pose.registration.picture_registration import PictureRegistration
 from drake_pose.registration.posed_frames import PosedFrame
 from drake_pose.registration.register import ObjectPose, RegisteredCamera
-from drake_pose.silhouette.areas.outline import outline_from_mesh
-from drake_pose.silhouette.areas.scoring import draw_labels
+from drake_pose.silhouette.outline import outline_from_mesh
 from drake_pose.silhouette.pictures.masks import encode_mask
 from drake_pose.silhouette.pictures.scenes import CAMERA_FILE
+from drake_pose.silhouette.scoring import draw_labels
 
 
 def describe_camera(

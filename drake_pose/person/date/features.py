@@ -20,7 +20,7 @@ from drake_pose.csv_files import read_csv
 from drake_pose.errors import SceneError, SettingsError
 from drake_pose.person.date.skeleton import Skeleton, registered_positions
 from drake_pose.person.views import meeting_points, triangulate
-from drake_pose.silhouette.segmentation.background import learn_background, person_region
+from drake_pose.silhouette.segmentation import learn_background, person_region
 
 FACE_SIZE = (80, 130)
 """Width and height that a face is scaled to [pixel]."""

@@ -10,8 +10,8 @@ import pytest
 from drake_pose.files.settings import EstimateSettings
 from drake_pose.jobs.estimate.inputs import EstimateInputs, read_inputs
 from drake_pose.search import View
-from drake_pose.silhouette.areas.bending import TreeSurfaces
-from drake_pose.silhouette.areas.scoring import draw_mask
+from drake_pose.silhouette.outline import TreeSurfaces
+from drake_pose.silhouette.scoring import draw_mask
 
 BASE = slice(0, 4)
 

@@ -11,8 +11,8 @@ from drake_pose.fit.evidence import find_edge_points
 from drake_pose.fit.surfaces import with_girths
 from drake_pose.person.capture import capture_person
 from drake_pose.person.shape import NOISE, fit_shape, shape_values
-from drake_pose.silhouette.areas.scoring import draw_mask
 from drake_pose.silhouette.pictures.scenes import load_scene
+from drake_pose.silhouette.scoring import draw_mask
 from tests.person.persons_in_view import SIDES, stepping
 
 PAIRS = {"thigh": -0.03, "shin": 0.03, "upper_arm": 0.025, "forearm": -0.02}

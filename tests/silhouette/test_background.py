@@ -6,16 +6,16 @@ import pytest
 
 from drake_pose.errors import SettingsError
 from drake_pose.silhouette.pictures.masks import intersection_over_union
-from drake_pose.silhouette.segmentation.background import (
+from drake_pose.silhouette.segmentation import (
     Background,
     background_of_recording,
     background_support,
     cut_box,
+    find_regions,
     learn_background,
     person_region,
     tell_from_background,
 )
-from drake_pose.silhouette.segmentation.regions import find_regions
 from tests.jobs.masks.rooms import texture
 
 

@@ -10,7 +10,7 @@ from matplotlib.path import Path as MplPath
 from pycocotools import mask as coco
 
 from drake_pose.errors import MaskError
-from drake_pose.silhouette.segmentation.mask_pictures import (
+from drake_pose.silhouette.mask_pictures import (
     decode_run_lengths,
     fill_polygon,
     mask_of_video_picture,

@@ -18,20 +18,16 @@ import numpy as np
 
 from drake_pose.body import TriangleMesh
 from drake_pose.compiled import compiled, with_room
-from drake_pose.silhouette.areas.outline import (
+from drake_pose.silhouette.outline import (
     Outline,
     PackedOutlines,
+    find_facings,
     outline_of_triangles,
     own_copy,
     pack,
+    project,
 )
-from drake_pose.silhouette.areas.projection import find_facings, project
-from drake_pose.silhouette.areas.span_kernel import make_rows
-
-# Slits and overlaps narrower than this [pixel] are rounding where surfaces touch.
-_SLIT = 1e-6
-# Crossings of lines are told apart as finely before they are put in order.
-_BUCKETS = 128
+from drake_pose.silhouette.span_kernel import make_rows
 
 
 class Segments(NamedTuple):
@@ -151,11 +147,12 @@ def find_crossings(
             found[n, 0], found[n, 1] = line, s
             low, high, n = min(low, at[n]), max(high, at[n]), n + 1
     # About in order of their places first: then few are exchanged on the lines.
-    buckets, fine = np.zeros(_BUCKETS + 2, dtype=np.int64), _BUCKETS / max(high - low, 1e-9)
+    size = 128
+    buckets, fine = np.zeros(size + 2, dtype=np.int64), size / max(high - low, 1e-9)
     for k in range(n):
-        found[k, 2] = min(max(int((at[k] - low) * fine), 0), _BUCKETS)
+        found[k, 2] = min(max(int((at[k] - low) * fine), 0), size)
         buckets[found[k, 2] + 1] += 1
-    for k in range(_BUCKETS + 1):
+    for k in range(size + 1):
         buckets[k + 1] += buckets[k]
     order = np.empty(n, dtype=np.int64)
     for k in range(n):
@@ -186,6 +183,8 @@ def find_line_spans(
 ) -> int:
     """Writes the covered spans of one line as indices of crossings (k, 2); returns their number."""
     found, winding, start = 0, 0, 0
+    # Narrower slits and overlaps [pixel] are rounding where surfaces touch.
+    slit = 1e-6
     ends = segments.ends
     for k in range(starts[line], starts[line + 1]):
         s = owners[k]
@@ -194,8 +193,8 @@ def find_line_spans(
         # Both runs of an edge cross a line at one place, in opposite directions.
         rising = ends[s, 1 - across] < ends[s, 3 - across]
         winding += segments.weights[s] if rising else -segments.weights[s]
-        if winding == 0 and places[k] - places[start] > _SLIT:
-            if found > 0 and places[start] - places[spans[found - 1, 1]] <= _SLIT:
+        if winding == 0 and places[k] - places[start] > slit:
+            if found > 0 and places[start] - places[spans[found - 1, 1]] <= slit:
                 spans[found - 1, 1] = k
             else:
                 spans[found, 0], spans[found, 1] = start, k
@@ -297,8 +296,6 @@ def sample_contour(
 
 
 _CELLS_A_SIDE = 20
-# A little more than rounding can move a direction.
-_MARGIN = 1e-6
 
 
 class CelledOutline(NamedTuple):
@@ -368,9 +365,12 @@ def find_cell(x: float, y: float, z: float) -> int:
 
 
 def _find_cell_edges(
-    packed: PackedOutlines, side: int, spread: float
+    packed: PackedOutlines, side: int, spread: float, margin: float = 1e-6
 ) -> tuple[np.ndarray, np.ndarray]:
-    """CelledOutline's cell_starts and cell_edges."""
+    """CelledOutline's cell_starts and cell_edges.
+
+    ``margin``: a little more than rounding can move a direction [rad].
+    """
     normals, edges = packed.planes[:3].T, packed.edges
     lengths = np.linalg.norm(normals, axis=1, keepdims=True)
     middles = (2.0 * np.arange(side) + 1.0) / side - 1.0
@@ -383,7 +383,7 @@ def _find_cell_edges(
         for ds, dt in itertools.product((-1.0 / side, 1.0 / side), repeat=2):
             corners = _directions(face, middles + ds, t + dt)
             lowest = np.minimum(lowest, (directions * corners).sum(axis=1))
-        angles = np.arccos(lowest) + spread + _MARGIN
+        angles = np.arccos(lowest) + spread + margin
         limits = np.where(angles < 0.5 * math.pi, np.sin(angles), 2.0)
         heights = normals @ directions.T
         surely = limits * lengths

@@ -8,11 +8,16 @@ from scipy.spatial.transform import Rotation
 
 from drake_pose.body import TriangleMesh
 from drake_pose.camera.models import ParallelCamera, PinholeCamera
-from drake_pose.silhouette.areas.outline import outline_from_mesh
-from drake_pose.silhouette.areas.scoring import VisualHull, draw_mask
-from drake_pose.silhouette.bits.bit_kernel import NEAREST_STRIDE, draw_bits, make_bit_view
-from drake_pose.silhouette.bits.bounding_balls import draw_discs, prune_by_balls
-from drake_pose.silhouette.contours.contour_points import divide_outline
+from drake_pose.silhouette.bit_kernel import (
+    NEAREST_STRIDE,
+    draw_bits,
+    draw_discs,
+    make_bit_view,
+    prune_by_balls,
+)
+from drake_pose.silhouette.contour_points import divide_outline
+from drake_pose.silhouette.outline import outline_from_mesh
+from drake_pose.silhouette.scoring import VisualHull, draw_mask
 
 _POSES = 120
 

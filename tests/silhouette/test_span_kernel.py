@@ -5,8 +5,8 @@ from scipy.spatial.transform import Rotation
 from drake_pose.body import TriangleMesh
 from drake_pose.camera.models import Camera, ParallelCamera, PinholeCamera
 from drake_pose.errors import CameraError
-from drake_pose.silhouette.areas.outline import outline_from_mesh
-from drake_pose.silhouette.areas.scoring import (
+from drake_pose.silhouette.outline import outline_from_mesh
+from drake_pose.silhouette.scoring import (
     draw_labels,
     draw_mask,
     prefix_sums,

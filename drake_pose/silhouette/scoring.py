@@ -12,10 +12,8 @@ import numpy as np
 
 from drake_pose.camera.models import Camera, ParallelCamera, PinholeCamera
 from drake_pose.errors import CameraError
-from drake_pose.silhouette.areas.bending import BendingOutline
-from drake_pose.silhouette.areas.label_kernel import paint_labels
-from drake_pose.silhouette.areas.outline import Outline, PackedOutlines, own_copy, pack
-from drake_pose.silhouette.areas.span_kernel import paint, score
+from drake_pose.silhouette.outline import BendingOutline, Outline, PackedOutlines, own_copy, pack
+from drake_pose.silhouette.span_kernel import paint, paint_labels, score
 
 
 def prefix_sums(weights: np.ndarray) -> np.ndarray:
@@ -134,50 +132,49 @@ def _check_body(
     return pack(outlines), np.array(poses[:, :, :3], dtype=np.float64, order="C")
 
 
-_SIDE = 96
-_DIRECTIONS = 72
-_POINTS_A_SIDE = 15
-# Between the directions that were looked from, the hull may be a little narrower.
-_SHRINK = 0.97
-# From a point to the nearest pixel centre, and from a distance between centres to the edge.
-_ROUNDING = 0.75 + 0.5
-
-
 class VisualHull:
     """A surface's distances to the edges of its pictures from many sides; may be empty."""
 
-    def __init__(self, outline: Outline) -> None:
-        self._center = outline.ball[:3]
+    def __init__(self, outline: Outline, side: int = 96, directions: int = 72) -> None:
+        """``side``: of a square picture [pixel]; ``directions``: from how many it is looked at."""
+        self._center, self._side = outline.ball[:3], side
         self._size = float(outline.ball[3])
         self._views: list[tuple[np.ndarray, np.ndarray]] = []
         if self._size > 0.0 and len(outline.triangles):
-            scale = 0.46 * _SIDE / self._size
-            middle = 0.5 * (_SIDE - 1)
-            camera = ParallelCamera("hull", _SIDE, _SIDE, scale, middle, middle, np.eye(4))
-            self._views = [_look(outline, R_CN, camera) for R_CN in _rotations(_DIRECTIONS)]
+            scale, middle = 0.46 * side / self._size, 0.5 * (side - 1)
+            camera = ParallelCamera("hull", side, side, scale, middle, middle, np.eye(4))
+            self._views = [_look(outline, R_CN, camera) for R_CN in _rotations(directions)]
             self._scale = scale
 
-    def radii(self, p_N: np.ndarray) -> np.ndarray:
-        """Returns the radii (n,) [m] of the largest balls around points (n, 3) in the hull."""
+    def radii(self, p_N: np.ndarray, shrink: float = 0.97) -> np.ndarray:
+        """The radii (n,) [m] of the largest balls around points (n, 3) in the hull.
+
+        ``shrink``: between the directions that were looked from, the hull may be so much narrower.
+        """
         if not self._views:
             return np.zeros(len(p_N))
         smallest, left = np.full(len(p_N), np.inf), np.arange(len(p_N))
         for rows, distances in self._views:
-            uv = (p_N[left] - self._center) @ rows.T + 0.5 * (_SIDE - 1)
+            uv = (p_N[left] - self._center) @ rows.T + 0.5 * (self._side - 1)
             # Which side of a pixel's edge a point falls is not left to the last digit.
             uv = np.rint(np.round(uv, 6)).astype(int)
-            inside = np.all((uv >= 0) & (uv < _SIDE), axis=1)
-            u, v = np.clip(uv, 0, _SIDE - 1).T
+            inside = np.all((uv >= 0) & (uv < self._side), axis=1)
+            u, v = np.clip(uv, 0, self._side - 1).T
             seen = np.where(inside, distances[v, u], 0.0)
             smallest[left] = np.minimum(smallest[left], seen)
             left = left[seen > 0.0]
-        return np.maximum(0.0, _SHRINK * (smallest - _ROUNDING) / self._scale)
+        # From a point to the nearest pixel centre, and from a distance between centres to the edge.
+        rounding = 0.75 + 0.5
+        return np.maximum(0.0, shrink * (smallest - rounding) / self._scale)
 
-    def spread_balls(self, count: int) -> np.ndarray:
-        """Returns (count or fewer, 4) centres and radii [m] of balls that reach far apart."""
+    def spread_balls(self, count: int, points_a_side: int = 15) -> np.ndarray:
+        """(count or fewer, 4) centres and radii [m] of balls that reach far apart.
+
+        ``points_a_side``: of the cube of points that may be centres.
+        """
         if not self._views:
             return np.zeros((0, 4))
-        steps = np.linspace(-self._size, self._size, _POINTS_A_SIDE)
+        steps = np.linspace(-self._size, self._size, points_a_side)
         grid = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), axis=-1).reshape(-1, 3)
         points = grid + self._center
         radii = self.radii(points)
@@ -222,12 +219,12 @@ def _look(
     )
 
 
-# A body that is as large as this many pictures is not what they show.
-_LARGER = 10.0
-
-
-def require_visible(outlines: Sequence[Outline], X_CN: np.ndarray, camera: Camera) -> None:
+def require_visible(
+    outlines: Sequence[Outline], X_CN: np.ndarray, camera: Camera, max_pictures: float = 10.0
+) -> None:
     """Refuses a camera that cannot show a body whose surfaces are at X_CN (nodes, 4, 4).
+
+    ``max_pictures``: a body that is as large as so many pictures is not what they show.
 
     Raises CameraError: names the camera; when the body is wholly behind it, when the camera is
     inside one of the surfaces, when the body is far larger than the picture, or wholly outside.
@@ -238,7 +235,7 @@ def require_visible(outlines: Sequence[Outline], X_CN: np.ndarray, camera: Camer
         if len(outline.triangles)
     ]
     where = f"camera '{camera.name}'"
-    placed = [(outline, _in_camera(outline, X)) for outline, X in solid]
+    placed = [(one, one.vertices @ X[:3, :3].T + X[:3, 3]) for one, X in solid]
     if isinstance(camera, PinholeCamera):
         if all((p_C[:, 2] < camera.near).all() for _, p_C in placed):
             raise CameraError(
@@ -247,8 +244,13 @@ def require_visible(outlines: Sequence[Outline], X_CN: np.ndarray, camera: Camer
             )
         if any(_winding_at_origin(p_C[outline.triangles]) > 0.5 for outline, p_C in placed):
             raise CameraError(f"{where} is inside the body; check X_WC and the body's position")
-    size, picture = _least_size(placed, camera), math.hypot(camera.width, camera.height)
-    if size > _LARGER * picture:
+    # The diagonal of the body's box as it would look at its farthest point [pixel].
+    corners, scale = np.vstack([p_C for _, p_C in placed]), float(camera.kernel_parameters()[1])
+    if isinstance(camera, PinholeCamera):
+        scale /= float(corners[:, 2].max())
+    size = scale * float(np.linalg.norm(np.ptp(corners, axis=0)))
+    picture = math.hypot(camera.width, camera.height)
+    if size > max_pictures * picture:
         raise CameraError(
             f"{where}: the body is larger than the picture, at least {size:.3g} pixels across, "
             f"the picture {picture:.0f}; check the focal length [pixel], X_WC and the model's "
@@ -260,20 +262,6 @@ def require_visible(outlines: Sequence[Outline], X_CN: np.ndarray, camera: Camer
             f"{where} shows nothing of the body: it lies outside the picture of "
             f"{camera.width} x {camera.height} pixels; check X_WC and the body's position"
         )
-
-
-def _least_size(placed: Sequence[tuple[Outline, np.ndarray]], camera: Camera) -> float:
-    """The diagonal of a body's box as it would look at its farthest point [pixel]."""
-    corners = np.vstack([p_C for _, p_C in placed])
-    scale = float(camera.kernel_parameters()[1])
-    if isinstance(camera, PinholeCamera):
-        scale /= float(corners[:, 2].max())
-    return scale * float(np.linalg.norm(np.ptp(corners, axis=0)))
-
-
-def _in_camera(outline: Outline, X_CN: np.ndarray) -> np.ndarray:
-    """Returns the vertices (n, 3) of a surface in the camera's frame."""
-    return outline.vertices @ X_CN[:3, :3].T + X_CN[:3, 3]
 
 
 def _winding_at_origin(corners: np.ndarray) -> float:

@@ -8,12 +8,16 @@ from scipy.spatial.transform import Rotation
 
 from drake_pose.body import TriangleMesh
 from drake_pose.camera.models import ParallelCamera, PinholeCamera, look_at
-from drake_pose.silhouette.areas.bending import BendingOutline, PackedSurfaces, TreeSurfaces
-from drake_pose.silhouette.areas.outline import outline_from_mesh
-from drake_pose.silhouette.areas.scoring import draw_mask, prefix_sums, score_bodies, subtract_body
-from drake_pose.silhouette.bits.bit_kernel import draw_bits, make_bit_view
-from drake_pose.silhouette.contours.contour_points import divide_outline
+from drake_pose.silhouette.bit_kernel import draw_bits, make_bit_view
+from drake_pose.silhouette.contour_points import divide_outline
+from drake_pose.silhouette.outline import (
+    BendingOutline,
+    PackedSurfaces,
+    TreeSurfaces,
+    outline_from_mesh,
+)
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
+from drake_pose.silhouette.scoring import draw_mask, prefix_sums, score_bodies, subtract_body
 from tests.body.models import load_limb
 from tests.silhouette.agreement import LARGEST_SHARE, measure_agreement
 from tests.silhouette.shapes import brute_force_mask

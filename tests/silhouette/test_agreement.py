@@ -9,9 +9,9 @@ from scipy.spatial.transform import Rotation
 
 from drake_pose.body import load_model
 from drake_pose.camera.models import ParallelCamera, PinholeCamera
-from drake_pose.silhouette.areas.outline import outline_from_mesh
-from drake_pose.silhouette.areas.scoring import draw_mask
+from drake_pose.silhouette.outline import outline_from_mesh
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
+from drake_pose.silhouette.scoring import draw_mask
 from tests.body.models import joint, link, urdf, write
 from tests.silhouette.agreement import LARGEST_SHARE, measure_agreement
 

@@ -3,8 +3,8 @@ import pytest
 
 from drake_pose.body import TriangleMesh
 from drake_pose.camera.models import ParallelCamera, PinholeCamera
-from drake_pose.silhouette.areas.outline import outline_from_mesh, pack
-from drake_pose.silhouette.contours.contour_points import sample_contour
+from drake_pose.silhouette.contour_points import sample_contour
+from drake_pose.silhouette.outline import outline_from_mesh, pack
 from tests.silhouette.shapes import box, random_pose, soup
 
 CAMERAS = [

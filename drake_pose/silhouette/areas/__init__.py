@@ -1,1 +1,0 @@
-"""Exact areas of projected surfaces, without drawing them: the span kernel and what it needs."""

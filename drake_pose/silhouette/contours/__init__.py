@@ -1,1 +1,0 @@
-"""The visible contour of a projected body, as edges and as points."""

@@ -1,0 +1,489 @@
+"""A surface made ready for the span kernel."""
+
+from __future__ import annotations
+
+import copy
+import math
+import threading
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from drake_pose.body.joint_kernel import join_bands, place_bands
+from drake_pose.compiled import compiled
+
+if TYPE_CHECKING:
+    from drake_pose.body import TriangleMesh
+
+
+@dataclass(frozen=True, eq=False)
+class Outline:
+    """A triangle surface and its edges, each with the one or two triangles it bounds.
+
+    Any set of triangles will do: holes, inner parts and edges of three triangles (of which there
+    are several records) included.
+
+    Args:
+        vertices: (n, 3) float64 points in the surface's own frame N [m].
+        triangles: (m, 3) int32 vertex indices, in any orientation.
+        edges: (e, 5) int32 records v0, v1, t0, t1, s1: the triangle t0 runs from v0 to v1; s1 is +1
+            where t1 does, too, and -1 where it runs back; t1 = -1, s1 = 0: no second triangle.
+        rest: the surface that this is with some vertices moved; what they share is packed once.
+    """
+
+    vertices: np.ndarray
+    triangles: np.ndarray
+    edges: np.ndarray
+    rest: Outline | None = None
+
+    @cached_property
+    def moments(self) -> np.ndarray:
+        """(4, 4) means of the products of x, y, z and 1 over the vertices [m^2, m, 1]."""
+        points = np.column_stack([self.vertices, np.ones(len(self.vertices))])
+        return points.T @ points / max(len(points), 1)
+
+    @cached_property
+    def planes(self) -> np.ndarray:
+        """(m, 4) twice the area times the unit normal [m^2], and its product with a corner."""
+        corners = self.vertices[self.triangles]
+        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        offsets = np.einsum("ij,ij->i", normals, corners[:, 0])
+        return np.column_stack([normals, offsets])
+
+    @cached_property
+    def is_closed(self) -> bool:
+        """Whether all parts are closed, and run around counter-clockwise seen from outside."""
+        neighbours = self.edges[:, [2, 3]]
+        if not np.all(self.edges[:, 4] == -1):
+            return False
+        count = len(self.triangles)
+        graph = coo_array((np.ones(len(neighbours)), neighbours.T), shape=(count, count))
+        _, part = connected_components(graph, directed=False)
+        corners = self.vertices[self.triangles]
+        volumes = np.einsum("ij,ij->i", corners[:, 0], np.cross(corners[:, 1], corners[:, 2]))
+        return bool(np.all(np.bincount(part, volumes) > 0.0))
+
+    @cached_property
+    def ball(self) -> np.ndarray:
+        """(4,) centre of a ball around the vertices, and its radius [m]."""
+        if len(self.vertices) == 0:
+            return np.zeros(4)
+        center = 0.5 * (self.vertices.min(axis=0) + self.vertices.max(axis=0))
+        radius = np.sqrt(((self.vertices - center) ** 2).sum(axis=1).max())
+        return np.append(center, radius)
+
+
+class PackedOutlines(NamedTuple):
+    """Several outlines one after the other, in the arrays that the kernel walks.
+
+    points: (3, n) float64; planes: (4, m) float64; balls: (nodes, 4) float64;
+    triangles: (m, 3) int32; edges: (4, e) uint32 rows v0, v1, t0, t1, where indices count from
+    the outline's own first vertex and triangle and t1 = the outline's number of triangles where
+    there is none; sides: (e,) int8 s1; starts: (nodes + 1, 3) int64 first vertex, triangle and edge
+    of each outline; ordinary_ends: (nodes,) int64 where the edges end whose triangles run in
+    opposite directions (s1 = -1); they come first.
+    """
+
+    points: np.ndarray
+    planes: np.ndarray
+    balls: np.ndarray
+    triangles: np.ndarray
+    edges: np.ndarray
+    sides: np.ndarray
+    starts: np.ndarray
+    ordinary_ends: np.ndarray
+
+
+def outline_from_mesh(mesh: TriangleMesh) -> Outline:
+    """The outline of a mesh; vertices at equal places are merged, null triangles left out."""
+    places = np.asarray(mesh.vertices, dtype=np.float64).reshape(-1, 3) + 0.0  # -0.0 becomes 0.0
+    vertices, renumbered = np.unique(places, axis=0, return_inverse=True)
+    triangles = renumbered.reshape(-1)[np.asarray(mesh.triangles, dtype=np.int64).reshape(-1, 3)]
+    a, b, c = triangles.T
+    triangles = triangles[(a != b) & (b != c) & (c != a)]
+    used, renumbered = np.unique(triangles, return_inverse=True)
+    return outline_of_triangles(np.ascontiguousarray(vertices[used]), renumbered.reshape(-1, 3))
+
+
+def outline_of_triangles(vertices: np.ndarray, triangles: np.ndarray) -> Outline:
+    """The outline of vertices (n, 3) and triangles (m, 3) as they are."""
+    indices = np.asarray(triangles, dtype=np.int32).reshape(-1, 3)
+    return Outline(np.asarray(vertices).reshape(-1, 3), indices, edge_records(indices))
+
+
+def edge_records(triangles: np.ndarray) -> np.ndarray:
+    """Returns the records of Outline.edges."""
+    heads = triangles.T.reshape(-1).astype(np.int64)
+    tails = triangles[:, [1, 2, 0]].T.reshape(-1).astype(np.int64)
+    owners = np.tile(np.arange(len(triangles)), 3)
+    forward = heads < tails
+    low, high = np.minimum(heads, tails), np.maximum(heads, tails)
+    # Order the uses of an edge forward, backward, forward, backward, ..., then what is left over,
+    # and pair them from the start: as many pairs as can be run in opposite directions, which
+    # cancel wherever both triangles face the same way.
+    order = np.lexsort((owners, ~forward, high, low))
+    rank = _position_in_run(low[order], high[order], forward[order])
+    order = order[np.lexsort((~forward[order], rank, high[order], low[order]))]
+    low, high, owners, forward = low[order], high[order], owners[order], forward[order]
+    position = _position_in_run(low, high)
+    first = np.flatnonzero(position % 2 == 0)
+    following = np.minimum(first + 1, len(order) - 1)
+    paired = position[following] == position[first] + 1
+    side = np.where(forward[following] == forward[first], 1, -1)
+    records = [
+        np.where(forward[first], low[first], high[first]),
+        np.where(forward[first], high[first], low[first]),
+        owners[first],
+        np.where(paired, owners[following], -1),
+        np.where(paired, side, 0),
+    ]
+    return np.ascontiguousarray(np.column_stack(records), dtype=np.int32)
+
+
+def _position_in_run(*keys: np.ndarray) -> np.ndarray:
+    """Returns each entry's position in its run of equal keys."""
+    index = np.arange(len(keys[0]))
+    begins = np.ones(len(index), dtype=bool)
+    begins[1:] = np.any([key[1:] != key[:-1] for key in keys], axis=0)
+    return index - np.maximum.accumulate(np.where(begins, index, 0))
+
+
+NOTHING = outline_of_triangles(np.zeros((0, 3)), np.zeros((0, 3)))
+"""The outline of a part without a surface."""
+
+
+def pack(outlines: tuple[Outline, ...]) -> PackedOutlines:
+    """Returns outlines in the kernel's arrays (remembered: outlines are immutable)."""
+    packed = _pack_rest(tuple(outline.rest or outline for outline in outlines))
+    if all(outline.rest is None for outline in outlines):
+        return packed
+    return packed._replace(
+        points=np.concatenate([o.vertices for o in outlines]).T.copy(),
+        planes=np.concatenate([o.planes for o in outlines]).T.copy(),
+        balls=np.array([o.ball for o in outlines]),
+    )
+
+
+def own_copy(packed: PackedOutlines) -> PackedOutlines:
+    """The surfaces with points, planes and balls that may be changed."""
+    return packed._replace(
+        points=packed.points.copy(), planes=packed.planes.copy(), balls=packed.balls.copy()
+    )
+
+
+@lru_cache(maxsize=256)
+def _pack_rest(outlines: tuple[Outline, ...]) -> PackedOutlines:
+    """As pack, for outlines that are at rest."""
+    starts = np.zeros((len(outlines) + 1, 3), dtype=np.int64)
+    sizes = [(len(o.vertices), len(o.triangles), len(o.edges)) for o in outlines]
+    starts[1:] = np.cumsum(np.array(sizes, dtype=np.int64).reshape(-1, 3), axis=0)
+    records = [_kernel_edges(outline) for outline in outlines]
+    ordinary = [np.count_nonzero(record[:, 4] == -1) for record in records]
+    edges = _stacked(records, 5, np.int32)
+    return PackedOutlines(
+        points=_stacked([o.vertices for o in outlines], 3, np.float64).T.copy(),
+        planes=_stacked([o.planes for o in outlines], 4, np.float64).T.copy(),
+        balls=_stacked([o.ball[None] for o in outlines], 4, np.float64),
+        triangles=_stacked([o.triangles for o in outlines], 3, np.int32),
+        edges=edges[:, :4].T.astype(np.uint32, order="C"),
+        sides=edges[:, 4].astype(np.int8),
+        starts=starts,
+        ordinary_ends=starts[:-1, 2] + np.array(ordinary, dtype=np.int64),
+    )
+
+
+def _kernel_edges(outline: Outline) -> np.ndarray:
+    """Returns the records (e, 5) as the kernel has them, those with s1 = -1 first."""
+    v0, v1, t0, t1, s1 = outline.edges.T
+    other = np.where(s1 == 0, len(outline.triangles), t1)
+    order = np.lexsort((t0, s1 != -1))  # neighbours in memory, too
+    return np.column_stack([v0, v1, t0, other, s1])[order]
+
+
+def _stacked(parts: Sequence[np.ndarray], columns: int, dtype: type) -> np.ndarray:
+    """Returns arrays (k, columns) below each other; none gives (0, columns)."""
+    return np.ascontiguousarray(np.vstack([np.empty((0, columns), dtype), *parts]), dtype=dtype)
+
+
+@compiled
+def viewpoint_in_node(X: np.ndarray, camera: np.ndarray) -> tuple[float, float, float, float]:
+    """Where a camera stands, or the way it looks, in a node's frame, times a last number.
+
+    That is 0 for a parallel camera's way; else 1, where the pose X has not grown.
+    """
+    if camera[0] != 0.0:
+        return X[2, 0], X[2, 1], X[2, 2], 0.0
+    t0, t1, t2 = X[0, 3], X[1, 3], X[2, 3]
+    return (
+        -(X[0, 0] * t0 + X[1, 0] * t1 + X[2, 0] * t2),
+        -(X[0, 1] * t0 + X[1, 1] * t1 + X[2, 1] * t2),
+        -(X[0, 2] * t0 + X[1, 2] * t1 + X[2, 2] * t2),
+        X[0, 0] * X[0, 0] + X[1, 0] * X[1, 0] + X[2, 0] * X[2, 0],
+    )
+
+
+@compiled
+def project(
+    packed: PackedOutlines,
+    node: int,
+    X_CN: np.ndarray,
+    camera: np.ndarray,
+    u: np.ndarray,
+    v: np.ndarray,
+) -> None:
+    """Writes u, v [pixel] of one surface's points, whatever their depth."""
+    fx, fy, cx, cy = camera[1], camera[2], camera[3], camera[4]
+    begin, end = packed.starts[node, 0], packed.starts[node + 1, 0]
+    x, y = packed.points[0, begin:end], packed.points[1, begin:end]
+    z = packed.points[2, begin:end]
+    X = X_CN[node]
+    a0, a1, a2, a3 = fx * X[0, 0], fx * X[0, 1], fx * X[0, 2], fx * X[0, 3]
+    b0, b1, b2, b3 = fy * X[1, 0], fy * X[1, 1], fy * X[1, 2], fy * X[1, 3]
+    if camera[0] == 1.0:
+        a3, b3 = a3 + cx, b3 + cy
+        for i in range(x.shape[0]):
+            u[i] = a0 * x[i] + a1 * y[i] + a2 * z[i] + a3
+            v[i] = b0 * x[i] + b1 * y[i] + b2 * z[i] + b3
+        return
+    d0, d1, d2, d3 = X[2, 0], X[2, 1], X[2, 2], X[2, 3]
+    for i in range(x.shape[0]):
+        inverse = 1.0 / (d0 * x[i] + d1 * y[i] + d2 * z[i] + d3)
+        u[i] = (a0 * x[i] + a1 * y[i] + a2 * z[i] + a3) * inverse + cx
+        v[i] = (b0 * x[i] + b1 * y[i] + b2 * z[i] + b3) * inverse + cy
+
+
+@compiled
+def find_facings(
+    packed: PackedOutlines, node: int, X_CN: np.ndarray, camera: np.ndarray, facings: np.ndarray
+) -> None:
+    """Writes which side of each triangle the camera sees: +1, 0 or -1; 0 after the last."""
+    e0, e1, e2, share = viewpoint_in_node(X_CN[node], camera)
+    begin, end = packed.starts[node, 1], packed.starts[node + 1, 1]
+    n0, n1 = packed.planes[0, begin:end], packed.planes[1, begin:end]
+    n2, offset = packed.planes[2, begin:end], packed.planes[3, begin:end]
+    for i in range(n0.shape[0]):
+        side = n0[i] * e0 + n1[i] * e1 + n2[i] * e2 - offset[i] * share
+        facings[i] = np.int8(side > 0.0) - np.int8(side < 0.0)
+    facings[n0.shape[0]] = 0
+
+
+@compiled
+def clip_triangle(
+    packed: PackedOutlines,
+    node: int,
+    t: int,
+    X_CN: np.ndarray,
+    camera: np.ndarray,
+    corners: np.ndarray,
+) -> int:
+    """Writes u, v and 1 / depth of the corners of a triangle's part beyond a pinhole's near plane.
+
+    ``t`` is the triangle among its own; ``X_CN`` (nodes, 3 or 4, 4); ``corners`` (4, 3).
+
+    Returns how many corners there are: 0, 3 or 4.
+    """
+    X, near, size = X_CN[node], camera[5], 0
+    begin, first = packed.starts[node, 0], packed.starts[node, 1]
+    p_C = np.empty((3, 3))
+    for k in range(3):
+        i = begin + packed.triangles[first + t, k]
+        x, y, z = packed.points[0, i], packed.points[1, i], packed.points[2, i]
+        for j in range(3):
+            p_C[k, j] = X[j, 0] * x + X[j, 1] * y + X[j, 2] * z + X[j, 3]
+    for a in range(3):
+        b = (a + 1) % 3
+        visible = p_C[a, 2] >= near
+        if visible:
+            corners[size, 0] = camera[1] * p_C[a, 0] / p_C[a, 2] + camera[3]
+            corners[size, 1] = camera[2] * p_C[a, 1] / p_C[a, 2] + camera[4]
+            corners[size, 2] = 1.0 / p_C[a, 2]
+            size += 1
+        if visible != (p_C[b, 2] >= near):
+            # From the visible end to the hidden one, whichever way the triangle runs.
+            i, o = (a, b) if visible else (b, a)
+            share = (near - p_C[i, 2]) / (p_C[o, 2] - p_C[i, 2])
+            x = p_C[i, 0] + share * (p_C[o, 0] - p_C[i, 0])
+            y = p_C[i, 1] + share * (p_C[o, 1] - p_C[i, 1])
+            corners[size, 0] = camera[1] * x / near + camera[3]
+            corners[size, 1] = camera[2] * y / near + camera[4]
+            corners[size, 2] = 1.0 / near
+            size += 1
+    return size
+
+
+@compiled
+def bend(own: PackedOutlines, parts: np.ndarray, band: np.ndarray) -> None:
+    """Puts the vertices of surfaces' bands at other places; the surfaces' balls only grow.
+
+    Args:
+        parts: (k, 4) int64 each surface, its first vertex of the band and its first triangle of the
+            band, both counted from the surface's own first; the band's first row in ``band``.
+        band: (v, 3) places of the vertices of all bands [m].
+    """
+    for part in parts:
+        node, row = part[0], part[3]
+        begin, first = own.starts[node, 0], own.starts[node, 1]
+        points, planes, ball = own.points, own.planes, own.balls[node]
+        farthest = 0.0
+        for i in range(begin + part[1], own.starts[node + 1, 0]):
+            x, y, z = band[row, 0], band[row, 1], band[row, 2]
+            row += 1
+            points[0, i], points[1, i], points[2, i] = x, y, z
+            away = (x - ball[0]) ** 2 + (y - ball[1]) ** 2 + (z - ball[2]) ** 2
+            farthest = max(farthest, away)
+        ball[3] = max(ball[3], math.sqrt(farthest))
+        for t in range(first + part[2], own.starts[node + 1, 1]):
+            a = begin + own.triangles[t, 0]
+            b = begin + own.triangles[t, 1]
+            c = begin + own.triangles[t, 2]
+            x, y, z = points[0, a], points[1, a], points[2, a]
+            bx, by, bz = points[0, b] - x, points[1, b] - y, points[2, b] - z
+            cx, cy, cz = points[0, c] - x, points[1, c] - y, points[2, c] - z
+            nx, ny, nz = by * cz - bz * cy, bz * cx - bx * cz, bx * cy - by * cx
+            planes[0, t], planes[1, t], planes[2, t] = nx, ny, nz
+            planes[3, t] = nx * x + ny * y + nz * z
+
+
+if TYPE_CHECKING:
+    from drake_pose.body import PoseTree, TriangleMesh
+
+
+class BendingOutline:
+    """A rigid surface and a band in its frame N, whose vertices move and whose triangles do not.
+
+    ``rest``: both, the band at rest; its first vertices and triangles are the rigid part's.
+    """
+
+    def __init__(self, rigid: Outline, band: TriangleMesh) -> None:
+        self.rigid = rigid
+        own = outline_of_triangles(band.vertices, band.triangles)
+        edges = own.edges.copy()
+        edges[:, :2] += len(rigid.vertices)
+        edges[:, 2] += len(rigid.triangles)
+        edges[:, 3] += np.where(edges[:, 3] < 0, 0, len(rigid.triangles))
+        self.rest = Outline(
+            vertices=np.concatenate([rigid.vertices, own.vertices]),
+            triangles=np.concatenate(
+                [rigid.triangles, own.triangles + np.int32(len(rigid.vertices))]
+            ),
+            edges=np.concatenate([rigid.edges, edges]),
+        )
+
+    @cached_property
+    def _band_triangles(self) -> np.ndarray:
+        """(m, 3) the band's triangles, indices into the band's own vertices."""
+        return self.rest.triangles[len(self.rigid.triangles) :] - len(self.rigid.vertices)
+
+    def at(self, band: np.ndarray) -> Outline:
+        """The whole surface with the band's vertices at (v, 3) [m] in frame N."""
+        outline = Outline(
+            np.concatenate([self.rigid.vertices, band]),
+            self.rest.triangles,
+            self.rest.edges,
+            self.rest,
+        )
+        # Nothing but the band's own planes is new: a cached property may be set where it is kept.
+        bent = Outline(band, self._band_triangles, self.rest.edges[:0])
+        vars(outline)["planes"] = np.concatenate([self.rigid.planes, bent.planes])
+        return outline
+
+
+class TreeSurfaces:
+    """The surfaces of a pose tree's nodes at any values, each in its node's frame.
+
+    ``bending`` and ``skins``: rigid part and band, and the band's motion; None without a band;
+    ``value_counts``: how many values each node has.
+    """
+
+    def __init__(self, tree: PoseTree) -> None:
+        self._nodes = tree.nodes
+        self.value_counts = [len(node.value_names) for node in tree.nodes]
+        self.skins = [node.skin for node in tree.nodes]
+        self.rigid = [outline_from_mesh(node.mesh) for node in tree.nodes]
+        self.bending = [
+            None if node.skin is None else BendingOutline(rigid, node.skin.mesh)
+            for node, rigid in zip(tree.nodes, self.rigid, strict=True)
+        ]
+
+    def with_rigid(self, rigid: Sequence[Outline]) -> TreeSurfaces:
+        """The same bands beside other rigid parts."""
+        other = copy.copy(self)
+        other.rigid = list(rigid)
+        other.bending = [
+            None if skin is None else BendingOutline(outline, skin.mesh)
+            for skin, outline in zip(self.skins, other.rigid, strict=True)
+        ]
+        return other
+
+    @property
+    def bends(self) -> bool:
+        """Whether any node has a band."""
+        return any(bending is not None for bending in self.bending)
+
+    def whole(self, node: int) -> Outline | BendingOutline:
+        """A node's surface: bending where the node has a band."""
+        return self.bending[node] or self.rigid[node]
+
+    def at_rest(self, node: int) -> Outline:
+        """A node's surface with its skin at rest."""
+        bending = self.bending[node]
+        return self.rigid[node] if bending is None else bending.rest
+
+    def node_at(self, node: int, values: np.ndarray) -> Outline:
+        """A node's whole surface in its frame at its values (k,) [rad or m]."""
+        bending, skin = self.bending[node], self._nodes[node].skin
+        if bending is None or skin is None:
+            return self.rigid[node]
+        return bending.at(skin.vertices(np.asarray(values)[None])[0])
+
+    def at(self, values: Sequence[np.ndarray]) -> list[Outline]:
+        """All nodes' whole surfaces, each in its node's frame, at each node's values (k_i,)."""
+        return [self.node_at(node, part) for node, part in enumerate(values)]
+
+
+class PackedSurfaces:
+    """A tree's surfaces as kernels take them; rigid parts may have fewer triangles than its own."""
+
+    def __init__(self, surfaces: TreeSurfaces) -> None:
+        self._rest = pack(tuple(surfaces.at_rest(node) for node in range(len(surfaces.rigid))))
+        # Of each node's band its place, as in ``bend``, and which of all values are the node's.
+        ends = np.cumsum([0, *surfaces.value_counts])
+        skins, parts, ranges, vertices = [], [], [], 0
+        for node, bending in enumerate(surfaces.bending):
+            skin, rigid = surfaces.skins[node], surfaces.rigid[node]
+            if bending is not None and skin is not None:
+                skins.append(skin.packed)
+                parts.append((node, len(rigid.vertices), len(rigid.triangles), vertices))
+                ranges.append(ends[node : node + 2])
+                vertices += len(skin.weights)
+        self._bands = join_bands(skins) if skins else None
+        self._parts, self._ranges = np.array(parts), np.array(ranges)
+        self._shapes = (1, ends[-1]), (1, vertices, 3)
+        # Threads bend side by side.
+        self._threads = threading.local()
+
+    def at(self, values: np.ndarray) -> PackedOutlines:
+        """All nodes' surfaces at all values (m,) [rad or m]."""
+        return self._rest if self._bands is None else own_copy(self.bend_to(values))
+
+    def bend_to(self, values: np.ndarray | None) -> PackedOutlines:
+        """As at, in arrays that the thread's next call changes; None: as they are."""
+        if self._bands is None:
+            return self._rest
+        if not hasattr(self._threads, "bent"):
+            bent, placed = (np.full(shape, np.nan) for shape in self._shapes)
+            self._threads.bent = own_copy(self._rest), bent, placed
+        own, bent, placed = self._threads.bent
+        if values is not None:
+            values = np.ascontiguousarray(values, dtype=np.float64)[None]
+            changed = place_bands(self._bands, self._ranges, values, bent, placed)[0]
+            if changed.any():
+                parts = self._parts[changed]
+                own.balls[parts[:, 0]] = self._rest.balls[parts[:, 0]]
+                bend(own, parts, placed[0])
+        return own

@@ -1,1 +1,0 @@
-"""Masks of an object in pictures: given by other tools, or found."""

@@ -160,10 +160,10 @@ class PictureSearch:
         coarse = tuple(one if one.ball[3] >= least else NOTHING for one in coarse)
         self._outlines = (coarse, *finer)
         self._X_WN = np.array([body.kinematics.poses(one.values) for one in frames])
-        self._levels = dict[int, PictureLevel]()
+        self._levels = dict[int, PyramidLevel]()
 
     @property
-    def compared(self) -> PictureLevel:
+    def compared(self) -> PyramidLevel:
         """In which poses are compared."""
         return self._level(PICTURES.compared)
 
@@ -305,12 +305,12 @@ class PictureSearch:
             return None
         return PosedFrames(self._body.kinematics, outlines, camera, posed)
 
-    def _level(self, width: int) -> PictureLevel:
+    def _level(self, width: int) -> PyramidLevel:
         if width not in self._levels:
             k = (width > 64) + (width > 120)
             count = PICTURES.searched if width < PICTURES.compared else len(self.frames)
             pictures = [one.picture for one in self.frames[:count]]
-            self._levels[width] = PictureLevel(
+            self._levels[width] = PyramidLevel(
                 self._outlines[k], self._camera, pictures, self._X_WN[:count], width
             )
         return self._levels[width]
@@ -349,8 +349,8 @@ def evidence(explained: float, contour: float) -> float:
     return explained + PICTURES.contours * contour
 
 
-class PictureLevel:
-    """Pictures of one size, and what poses explain in them.
+class PyramidLevel:
+    """Pictures of one size (a pyramid level), and what poses explain in them.
 
     Attributes:
         camera: of these pictures.

@@ -24,7 +24,7 @@ from drake_pose.registration.picture_registration import (
     scan_offsets,
 )
 from drake_pose.registration.picture_search import (
-    PictureLevel,
+    PyramidLevel,
     PictureSearch,
     PosedPicture,
     choose_frames,
@@ -42,13 +42,13 @@ NO_SCORES = np.zeros((0, 2))
 
 
 @pytest.fixture(scope="module")
-def level(episode: PaintedEpisode) -> PictureLevel:
+def level(episode: PaintedEpisode) -> PyramidLevel:
     X_WN = np.array([episode.body.kinematics.poses(one) for one in episode.values[:LEVEL_FRAMES]])
     pictures = episode.pictures[:LEVEL_FRAMES]
-    return PictureLevel(episode.body.very_few, episode.camera, pictures, X_WN, 80)
+    return PyramidLevel(episode.body.very_few, episode.camera, pictures, X_WN, 80)
 
 
-def test_starts_show_a_body_where_pictures_change_and_about_as_large(level: PictureLevel) -> None:
+def test_starts_show_a_body_where_pictures_change_and_about_as_large(level: PyramidLevel) -> None:
     """Against the moments of what changes; then some of the starts are nearer, or aside."""
     starts = np.array(level.starts()).reshape(3, 2, -1, 4, 4)
     moments = cv2.moments(level.backgrounds.changes())
@@ -88,7 +88,7 @@ def test_upright_cameras_are_rolled_a_little_and_look_all_around() -> None:
     np.testing.assert_allclose(np.histogram(headings, 8, (-np.pi, np.pi))[0], 125, atol=3)
 
 
-def test_a_simplex_moves_turn_shift_and_depth_of_a_body_apart(level: PictureLevel, episode) -> None:
+def test_a_simplex_moves_turn_shift_and_depth_of_a_body_apart(level: PyramidLevel, episode) -> None:
     X_CW, x = episode.camera.X_CW, np.array([0.3, -0.2, 0.5, 0.04, -0.07, 0.2])
     moved = level._moved(X_CW, x)
     before, after = (X[:3, :3] @ level._middle + X[:3, 3] for X in (X_CW, moved))
@@ -99,7 +99,7 @@ def test_a_simplex_moves_turn_shift_and_depth_of_a_body_apart(level: PictureLeve
 
 
 def test_poses_that_improve_explain_more_and_the_true_one_most(
-    level: PictureLevel, episode
+    level: PyramidLevel, episode
 ) -> None:
     true = episode.camera.X_CW
     aside = level._moved(true, np.array([0.06, -0.05, 0.04, 0.02, -0.02, 0.03]))
@@ -122,7 +122,7 @@ def test_poses_that_improve_explain_more_and_the_true_one_most(
     assert contour == pytest.approx(told[Explained.CONTOUR] / told[Explained.OUTLINE])
 
 
-def test_what_a_pose_explains_is_told_apart_by_squares(level: PictureLevel, episode) -> None:
+def test_what_a_pose_explains_is_told_apart_by_squares(level: PyramidLevel, episode) -> None:
     X_CW = episode.camera.X_CW
     pieces = level.pieces(X_CW)
     assert pieces.sum() == pytest.approx(level.told(X_CW)[Explained.GAIN])
@@ -134,7 +134,7 @@ def test_what_a_pose_explains_is_told_apart_by_squares(level: PictureLevel, epis
     assert covered.mean() > level.backgrounds.changes().mean()
 
 
-def test_poses_are_distinct_that_show_a_body_elsewhere(level: PictureLevel, episode) -> None:
+def test_poses_are_distinct_that_show_a_body_elsewhere(level: PyramidLevel, episode) -> None:
     rng = np.random.default_rng(5)
     true = episode.camera.X_CW
     poses = [level._moved(true, rng.normal(0.0, 0.03, 6)) for _ in range(30)]
@@ -247,7 +247,7 @@ def test_parts_that_are_small_or_stand_still_do_not_carry_a_search(episode) -> N
         values = episode.values[:6].mean(axis=0)
         values = values + share * (episode.values[:6] - values)
         X_WN = np.array([episode.body.kinematics.poses(one) for one in values])
-        level = PictureLevel(outlines, episode.camera, episode.pictures[:6], X_WN, 64)
+        level = PyramidLevel(outlines, episode.camera, episode.pictures[:6], X_WN, 64)
         places = [
             np.array([one.vertices @ X[:3, :3].T + X[:3, 3] for X in X_WN[:, k]])
             for k, one in enumerate(outlines)

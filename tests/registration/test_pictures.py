@@ -24,9 +24,9 @@ from drake_pose.registration.picture_registration import (
     scan_offsets,
 )
 from drake_pose.registration.picture_search import (
-    PyramidLevel,
     PictureSearch,
     PosedPicture,
+    PyramidLevel,
     choose_frames,
     evidence,
     node_places,

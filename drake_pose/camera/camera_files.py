@@ -107,8 +107,13 @@ def load_camera_file(path: str | Path, *, distorted: bool = False) -> CameraFile
         # Drake takes a while to load, and our own files do not need it.
         from drake_pose.camera.drake import read_configs
 
-        found = read_configs(configs, path)
-        return CameraFile({_check_name(name, path): found[name] for name in found}, ())
+        read = read_configs(configs, path)
+        return CameraFile({_check_name(name, path): read[name] for name in read}, ())
+    ours = {field for kind in _REQUIRED for field in (*_REQUIRED[kind], *_OPTIONAL[kind])}
+    entries = [entry for entry in content.values() if isinstance(entry, dict)]
+    if not (calibrated or any(ours & {*entry} for entry in entries)):
+        found = ", ".join(map(str, content))
+        raise CameraError(f"{path}: is no camera file: it has {found[:200]}; read are {FORMATS}")
     cameras, lenses = dict[str, Camera](), dict[str, Lens]()
     links, unplaced = dict[str, str](), list[str]()
     for key in calibrated or content:
@@ -122,7 +127,7 @@ def load_camera_file(path: str | Path, *, distorted: bool = False) -> CameraFile
             is_placed = X_WC is not None
         else:
             entry = content[key]
-            camera = _read_camera(name, entry, path, {*content})
+            camera = _read_camera(name, entry, path)
             lens = _read_lens(camera, entry.get("distortion"), f"{path}: camera '{name}'")
             cameras[name] = camera if lens is None else lens.camera(name, camera.X_WC)
             links |= {name: entry["link"]} if "link" in entry else {}
@@ -210,15 +215,11 @@ def _check_name(key: Any, path: Path) -> str:
     return name
 
 
-def _read_camera(name: str, entry: Any, path: Path, keys: set[Any]) -> Camera:
-    """Returns the camera of one entry of a file, which has some keys."""
+def _read_camera(name: str, entry: Any, path: Path) -> Camera:
+    """Returns the camera of one entry of a file."""
     where = f"{path}: camera '{name}'"
-    ours = {field for kind in _REQUIRED for field in (*_REQUIRED[kind], *_OPTIONAL[kind])}
-    if not isinstance(entry, dict) or not ours & {*entry}:
-        raise CameraError(
-            f"{where}: expected a mapping from field names to values ({', '.join(_COMMON)} ...); "
-            f"the file has {', '.join(sorted(map(str, keys)))[:200]}; read are {FORMATS}"
-        )
+    if not isinstance(entry, dict):
+        raise CameraError(f"{where}: expected a mapping from field names to values")
     projection = entry.get("projection", "pinhole")
     if not isinstance(projection, str) or projection not in _REQUIRED:
         raise CameraError(f"{where}: projection must be pinhole or parallel")

@@ -149,8 +149,11 @@ def test_a_chain_begins_in_its_first_camera(tmp_path):
         (toml().replace("size =", "pixels ="), ["width and height"]),
         (toml().replace("matrix = [[", "matrix = [["[:-1]), ["not a TOML file"]),
         (toml() + toml().replace("cam_0", "cam_1").split("[metadata]")[0], ["given twice"]),
-        ("transformation: {x: 1, y: 2}\nparameters: {a: b}\n", ["Kalibr", "transformation"]),
-        ('{"left": [0.71, -0.97, 1.13, -2.3, 0.1, 2.2]}', ["'left'", "camera_info", "TOML"]),
+        (
+            "transformation: {x: 1, y: 2}\nparameters: {a: b}\n",
+            ["Kalibr", "it has transformation, parameters;"],
+        ),
+        ('{"left": [0.71, -0.97, 1.13, -2.3, 0.1, 2.2]}', ["it has left;", "camera_info", "TOML"]),
     ],
 )
 def test_what_cannot_be_used_is_named_with_what_is_read(tmp_path, text, words):

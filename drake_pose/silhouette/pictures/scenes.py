@@ -66,7 +66,7 @@ class Scene:
     strangers: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
     readers: Mapping[str, Callable[[str], np.ndarray]] = field(default_factory=dict)
-    times: Array = field(default_factory=lambda: np.empty(0))
+    times: Array = field(default_factory=lambda: np.empty(0), compare=False)
     joints: JointLog | None = None
     _videos: dict[Path, VideoPictures] = field(default_factory=dict, repr=False, compare=False)
     _packed: dict[tuple[Path, int, int], bytes] = field(

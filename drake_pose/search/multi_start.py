@@ -206,7 +206,7 @@ class _MultiStartRun:
         """
         exact, own, J = self._search.exact, self._search.exact_settings, self._J(values)
         length = self._problem.border_length
-        if J <= own.doubtful * length and self._proceed():
+        if J <= own.hopeless * length and self._proceed():
             other = exact.escape(self._problem, self._parameters(values), self._deadline)
             found = min((one for one in (found, other) if one), key=lambda one: one.J)
         explained = found is not None and found.J < min(J, own.plausible * length)

@@ -255,8 +255,8 @@ class ExactSearchSettings:
             nodes misses, another often has.
         starts: so many poses of each that do not look alike are refined.
         alike: see ``BeamSearch.best_poses``.
-        hopeless: masks are not exact where the first poses refined leave more wrong than this.
-        doubtful: where the robust search leaves more, its pose is not improved by pixels.
+        hopeless: masks are not exact where the first poses refined leave more wrong than this, nor is
+            a robust pose improved by pixels that does.
         enough: a pose is not searched on with less wrong: a little more than the pixels' own noise.
         exact: a pose with less wrong is the answer, and no other grid is searched.
         plausible: what the robust search finds is improved by pixels where less is left wrong.
@@ -279,7 +279,6 @@ class ExactSearchSettings:
     starts: int = 4
     alike: float = 0.5
     hopeless: float = 1.5
-    doubtful: float = 0.8
     enough: float = 0.03
     exact: float = 0.18
     plausible: float = 0.5

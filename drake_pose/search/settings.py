@@ -255,8 +255,8 @@ class ExactSearchSettings:
             nodes misses, another often has.
         starts: so many poses of each that do not look alike are refined.
         alike: see ``BeamSearch.best_poses``.
-        hopeless: masks are not exact where the first poses refined leave more wrong than this, nor is
-            a robust pose improved by pixels that does.
+        hopeless: masks are not exact where the first poses refined leave more wrong than this; a
+            robust pose that leaves more is not improved by pixels.
         enough: a pose is not searched on with less wrong: a little more than the pixels' own noise.
         exact: a pose with less wrong is the answer, and no other grid is searched.
         plausible: what the robust search finds is improved by pixels where less is left wrong.

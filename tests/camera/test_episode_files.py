@@ -7,6 +7,7 @@ import pytest
 from drake_pose.camera.camera_files import load_camera_file
 from drake_pose.camera.episode_files import open_episode
 from drake_pose.errors import CameraError, DrakePoseError, SceneError, SettingsError
+from drake_pose.silhouette.pictures.scenes import load_scene
 from tests.camera.recordings import (
     GRID,
     LENS,
@@ -75,6 +76,17 @@ def test_stills_by_frame_and_pictures_by_time(tmp_path):
     np.testing.assert_array_equal(timed.camera("a").times, [3.5, 3.75])
     assert number_of(timed.camera("a").read(0)) == 10
     assert any("2 frames have no picture, or no time" in text for text in timed.warnings)
+
+
+def test_a_folder_means_the_same_wherever_it_is_read(tmp_path):
+    """Pictures go before a video; what macOS leaves behind is none."""
+    (write_images(tmp_path, [1, 2]) / "._2.png").write_bytes(b"no picture")
+    write_video(tmp_path / "videos" / "a.mp4", range(9))
+    pose = f"X_WC: {np.eye(4).tolist()}"
+    (tmp_path / "cameras.yaml").write_text(f"a: {{{LENS}, {pose}}}")
+    scene, one = load_scene(tmp_path, sequence=True), open_episode(tmp_path).camera("a")
+    assert scene.frames == one.frames == ("1", "2")
+    np.testing.assert_array_equal(scene.read_image("a", "2"), one.read(1))
 
 
 def test_distortion_is_taken_out_as_the_formula_says(tmp_path):

@@ -60,6 +60,8 @@ def test_every_other_frame_of_a_sequence_is_twice_as_long(tmp_path):
     assert scene.frames == asked == ("0001", "0003", "0005")
     assert {frame for _, frame in scene.masks} == set(asked)
     assert scene.frame_rate_hz == 30.0
+    timed = replace(whole, times=np.arange(7.0)).every(2, ["1:5"])[0].times
+    np.testing.assert_array_equal(timed, [1.0, 3.0, 5.0])
     assert whole.every(3, [])[0].frames == ("0000", "0003", "0006")
     assert whole.every(1, ["2"]) == (whole, ("2",))
     with pytest.raises(SettingsError, match="not 0"):

@@ -35,12 +35,6 @@ except ImportError:  # Not on Windows: there each process compiles for itself.
     fcntl = None  # type: ignore[assignment]
 
 _LOGGER = logging.getLogger(__name__)
-# A process that is stopped while it compiles must not stop the others for ever.
-_LONGEST_WAIT_SECONDS = 300.0
-_PLAIN = (bool, int, float, str, tuple, type(None))
-_FILE = "file"
-
-
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 
 
@@ -128,15 +122,18 @@ class _SharedCache(FunctionCache):
         return (*super()._index_key(sig, codegen), _digest_of_others(self._py_func))
 
 
-def _lock_file(path: Path) -> int | None:
-    """Returns a descriptor that holds a lock until it is closed; None where there are no locks."""
+def _lock_file(path: Path, longest_wait: float = 300.0) -> int | None:
+    """Returns a descriptor that holds a lock until it is closed; None where there are no locks.
+
+    A process that is stopped while it compiles stops the others for no longer than this time [s].
+    """
     if fcntl is None:
         return None
     try:
         descriptor = os.open(path, os.O_CREAT | os.O_RDWR, 0o666)
     except OSError:
         return None
-    end = time.monotonic() + _LONGEST_WAIT_SECONDS
+    end = time.monotonic() + longest_wait
     while time.monotonic() < end:
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -177,21 +174,21 @@ def _digest_of_others(function: Callable[..., Any]) -> str:
     digest = hashlib.sha256()
     for name, value in sorted(set(_taken(function, set()))):
         if value != own:
-            digest.update(f"{name}={_file_digest(value) if name == _FILE else value}\n".encode())
+            digest.update(f"{name}={_file_digest(value) if name == 'file' else value}\n".encode())
     return digest.hexdigest()
 
 
 def _taken(function: Callable[..., Any], seen: set[int]) -> Iterator[tuple[str, str]]:
-    """Files of the kernels below a kernel, as (_FILE, path), and constants as (name, value)."""
+    """Files of the kernels below a kernel, as ("file", path), and constants as (name, value)."""
     if id(function) in seen:
         return
     seen.add(id(function))
-    yield _FILE, function.__code__.co_filename
+    yield "file", function.__code__.co_filename
     for name in function.__code__.co_names:
         value = function.__globals__.get(name)
         if isinstance(value, Dispatcher):
             yield from _taken(value.py_func, seen)
-        elif isinstance(value, _PLAIN):
+        elif isinstance(value, (bool, int, float, str, tuple, type(None))):
             yield name, repr(value)
         elif isinstance(value, (np.ndarray, np.generic)):
             yield name, hashlib.sha256(value.tobytes()).hexdigest()

@@ -7,26 +7,15 @@ import hashlib
 import stat
 from pathlib import Path
 
-_END = 1 << 20
-# What is read whole is no larger [byte].
-_LARGEST = 1 << 31
-_KINDS = {
-    stat.S_IFDIR: "folder",
-    stat.S_IFIFO: "named pipe",
-    stat.S_IFSOCK: "socket",
-    stat.S_IFCHR: "device",
-    stat.S_IFBLK: "device",
-}
-
 
 def read_regular(path: Path, limit: int = -1) -> bytes:
     """A file's content, or that of what a link leads to; at most ``limit`` bytes, if not negative.
 
     Raises:
-        OSError: it cannot be read, is no regular file, or too large; strerror says which.
+        OSError: it cannot be read, is no regular file, or larger than 2 GiB; strerror says which.
     """
-    if require_regular(path) > _LARGEST and limit < 0:
-        raise OSError(errno.EFBIG, f"it is larger than {_LARGEST >> 30} GiB", str(path))
+    if require_regular(path) > 1 << 31 and limit < 0:
+        raise OSError(errno.EFBIG, "it is larger than 2 GiB", str(path))
     with path.open("rb") as file:
         return file.read(limit)
 
@@ -39,12 +28,12 @@ def digest(path: Path) -> str:
     Raises:
         OSError: it cannot be read, or is no regular file.
     """
-    size = require_regular(path)
+    size, end = require_regular(path), 1 << 20
     found = hashlib.sha256(str(size).encode())
     with path.open("rb") as file:
-        found.update(file.read(_END))
-        file.seek(max(file.tell(), size - _END))
-        found.update(file.read(_END))
+        found.update(file.read(end))
+        file.seek(max(file.tell(), size - end))
+        found.update(file.read(end))
     return found.hexdigest()
 
 
@@ -54,8 +43,10 @@ def require_regular(path: Path) -> int:
     Raises:
         OSError: it is no regular file; strerror says what it is.
     """
+    kinds = {stat.S_IFDIR: "folder", stat.S_IFIFO: "named pipe", stat.S_IFSOCK: "socket"}
+    kinds |= dict.fromkeys((stat.S_IFCHR, stat.S_IFBLK), "device")
     status = path.stat()
-    kind = _KINDS.get(stat.S_IFMT(status.st_mode))
+    kind = kinds.get(stat.S_IFMT(status.st_mode))
     if kind is not None:
         raise OSError(errno.EINVAL, f"it is a {kind}, not a file", str(path))
     return status.st_size

@@ -18,8 +18,6 @@ from drake_pose.body.meshes import TriangleMesh, join_meshes
 from drake_pose.body.parsed_model import FLOATING_TYPES, ParsedModel, link_names
 from drake_pose.errors import ModelError
 
-_SAMPLES = np.array([0.0, np.pi / 2.0, np.pi, -np.pi / 2.0])
-
 
 def inverse_transforms(X: Array) -> Array:
     """Inverses of rigid transforms (..., 4, 4)."""
@@ -49,10 +47,11 @@ class JointMap:
 
         Raises ModelError, which names the joint, where it does not move as this class assumes.
         """
-        samples = np.array(list(itertools.product(_SAMPLES, repeat=position_count)))
+        at = np.array([0.0, np.pi / 2.0, np.pi, -np.pi / 2.0])
+        samples = np.array(list(itertools.product(at, repeat=position_count)))
         samples = samples.reshape(-1, position_count)
         measured = np.array([pose(values).reshape(16) for values in samples])
-        inverse = np.linalg.inv(_basis(_SAMPLES))
+        inverse = np.linalg.inv(_basis(at))
         kronecker: NDArray[Any] = np.eye(1)
         for _ in range(position_count):
             kronecker = np.kron(kronecker, inverse)

@@ -23,11 +23,6 @@ from drake_pose.body.plant_source import Coupling
 from drake_pose.body.root import BasePose, RootRotation, even_rotations
 from drake_pose.errors import SettingsError, UnknownNameError
 
-DEFAULT_LENGTH_INTERVAL = 0.05
-MAXIMUM_GRID_SIZE = 5_000_000
-# A multiple that misses a limit by rounding alone still counts as inside.
-_ROUNDING = 1e-9
-
 
 @dataclass(frozen=True, eq=False)
 class PoseTreeNode:
@@ -194,7 +189,7 @@ class PoseTree:
         node: int,
         interval: float,
         intervals: Mapping[str, float] | None = None,
-        length_interval: float = DEFAULT_LENGTH_INTERVAL,
+        length_interval: float = 0.05,
     ) -> Array:
         """The node's sampling grid (n, k): every combination of its positions' samples.
 
@@ -210,7 +205,18 @@ class PoseTree:
             SettingsError: an interval that is not positive, or a grid that is too large.
             UnknownNameError: ``intervals`` names something that does not exist.
         """
-        intervals = self.require_intervals(intervals or {}, interval, length_interval)
+        intervals = intervals or {}
+        known = [name for node in self.nodes for name in node.value_names]
+        known += [name for name in self.model.position_names if name not in known]
+        for name in intervals:
+            if name not in known:
+                raise UnknownNameError("joint", name, known, str(self.model.path))
+        named = {"interval": interval, "length_interval": length_interval, **intervals}
+        for name, value in named.items():
+            if not (np.isfinite(value) and value > 0.0):
+                raise SettingsError(
+                    f"sampling interval '{name}' is {value}: give a positive number"
+                )
         placement, names = self.placements[node], self.nodes[node].value_names
         rotation = placement.rotation
         if rotation is not None:
@@ -346,59 +352,41 @@ class PoseTree:
             values.append(placement.rotation.values_from(R_WN))
         return values
 
-    def require_intervals(
-        self, intervals: Mapping[str, float], interval: float, length_interval: float
-    ) -> Mapping[str, float]:
-        """The intervals [rad or m], after checks.
 
-        Raises:
-            SettingsError: one that is not positive.
-            UnknownNameError: of a position that does not exist.
-        """
-        known = [name for node in self.nodes for name in node.value_names]
-        known += [name for name in self.model.position_names if name not in known]
-        for name in intervals:
-            if name not in known:
-                raise UnknownNameError("joint", name, known, str(self.model.path))
-        named = {"interval": interval, "length_interval": length_interval, **intervals}
-        for name, value in named.items():
-            if not (np.isfinite(value) and value > 0.0):
-                raise SettingsError(
-                    f"sampling interval '{name}' is {value}: give a positive number"
-                )
-        return intervals
-
-
-def axis_samples(lower: float, upper: float, interval: float, *, is_angle: bool) -> list[float]:
+def axis_samples(
+    lower: float, upper: float, interval: float, *, is_angle: bool, most: int = 5_000_000
+) -> list[float]:
     """The multiples of the interval inside the limits, by size, the negative of two equals first.
 
     The middle of the finite limits [rad or m] where no multiple lies inside. A full turn of an
-    angle gives each direction once. Raises SettingsError where memory would not hold the samples.
+    angle gives each direction once. Raises SettingsError for more samples than ``most``.
     """
-    first = math.ceil(lower / interval - _ROUNDING)
-    last = math.floor(upper / interval + _ROUNDING)
-    if is_angle and (last - first) * interval >= 2.0 * math.pi - _ROUNDING:
-        first = last - math.ceil(2.0 * math.pi / interval - _ROUNDING) + 1
+    # A multiple that misses a limit by rounding alone still counts as inside.
+    rounding = 1e-9
+    first = math.ceil(lower / interval - rounding)
+    last = math.floor(upper / interval + rounding)
+    if is_angle and (last - first) * interval >= 2.0 * math.pi - rounding:
+        first = last - math.ceil(2.0 * math.pi / interval - rounding) + 1
     if last < first:
         return [0.5 * (lower + upper)]
-    if last - first >= MAXIMUM_GRID_SIZE:
+    if last - first >= most:
         raise SettingsError(
             f"a sampling interval of {interval:g} makes {last - first + 1} samples of one joint, "
-            f"at most {MAXIMUM_GRID_SIZE} are allowed: use a larger interval"
+            f"at most {most} are allowed: use a larger interval"
         )
     multiples = sorted(range(first, last + 1), key=lambda multiple: (abs(multiple), multiple))
     return [min(max(multiple * interval, lower), upper) for multiple in multiples]
 
 
-def product_grid(axes: Sequence[Sequence[float]], node: str) -> Array:
+def product_grid(axes: Sequence[Sequence[float]], node: str, most: int = 5_000_000) -> Array:
     """All combinations (n, k) of the axes' samples, the last axis changing fastest.
 
-    Raises SettingsError, which names the node, where memory would not hold them.
+    Raises SettingsError, which names the node, for more of them than ``most``.
     """
     size = math.prod(len(axis) for axis in axes)
-    if size > MAXIMUM_GRID_SIZE:
+    if size > most:
         raise SettingsError(
-            f"node '{node}' would have {size} samples, at most {MAXIMUM_GRID_SIZE} are allowed: "
+            f"node '{node}' would have {size} samples, at most {most} are allowed: "
             "use a larger sampling interval or hold some of its joints"
         )
     return np.array(list(itertools.product(*axes)), dtype=np.float64).reshape(size, len(axes))

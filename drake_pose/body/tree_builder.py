@@ -21,8 +21,6 @@ from drake_pose.body.pose_tree import NodePlacement, PoseTree, PoseTreeNode, pla
 from drake_pose.body.root import BasePose, RootRotation, base_of_chain
 from drake_pose.errors import ModelError, SettingsError, UnknownNameError
 
-# Held values may lie outside their limits by this much [rad or m].
-_ROUNDING = 1e-6
 Roots = dict[int, tuple[Array, RootRotation | None]]
 """By branch that hangs on the world: X_WA (4, 4), and how it is turned there."""
 
@@ -51,7 +49,7 @@ def build_pose_tree(
     held: Mapping[str, float] | None = None,
 ) -> PoseTree:
     """See ArticulatedModel.pose_tree."""
-    held = held or {}
+    held, rounding = held or {}, 1e-6
     if root is not None and root not in model.link_names:
         raise UnknownNameError("link", root, model.link_names, str(model.path))
     held_values = {model.position_index(name): float(value) for name, value in held.items()}
@@ -62,7 +60,7 @@ def build_pose_tree(
     for follower, leader, multiplier, offset in model.couplings:
         if leader in held_values:
             wanted = multiplier * held_values[leader] + offset
-            if abs(held_values.setdefault(follower, wanted) - wanted) > _ROUNDING:
+            if abs(held_values.setdefault(follower, wanted) - wanted) > rounding:
                 one, other = (model.position_names[k] for k in (follower, leader))
                 raise SettingsError(
                     f"joint '{one}' is held at {held_values[follower]:g}, but it follows joint "
@@ -73,7 +71,7 @@ def build_pose_tree(
             raise SettingsError(f"held joint '{name}' has the value {value}: give a finite number")
     for index, value in held_values.items():
         lower, upper = model.lower[index], model.upper[index]
-        inside = lower - _ROUNDING <= value <= upper + _ROUNDING
+        inside = lower - rounding <= value <= upper + rounding
         if not inside and not model.turns_freely[index]:
             raise SettingsError(
                 f"joint '{model.position_names[index]}' is held at {value:g}, outside its limits, "

@@ -102,7 +102,7 @@ def parse_packages(texts: Iterable[str]) -> dict[str, Path]:
 
 
 def parse_numbers(text: str, count: int) -> tuple[float, ...]:
-    """Returns so many numbers of a text ``A,B,...``."""
+    """Returns the ``count`` numbers of a text ``A,B,...``."""
     parts = text.split(",")
     if len(parts) != count:
         raise SettingsError(f"'{text}' must be {count} numbers with commas between them")
@@ -203,7 +203,7 @@ class SceneSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class CaptureSettings(SceneSettings):
-    """What the capture of a person heeds."""
+    """Options that the capture of a person has, too."""
 
     track: Annotated[bool, Parameter(negative="--no-track")] = True
     """Track the body through the frames of a sequence, searching only in the first frame and after
@@ -224,7 +224,7 @@ class EpisodeSettings(SceneSettings):
     units: Literal["rad", "deg"] | None = None
     """The unit of angles in an episode's joint log; default: what the joints' limits say."""
     workers: Annotated[int | None, Parameter(metavar="N")] = None
-    """Work with so many threads; the result is the same. Default: one for each core."""
+    """Number of threads; the result is the same. Default: one for each core."""
 
     def __post_init__(self) -> None:
         if self.workers is not None and self.workers < 1:
@@ -287,7 +287,7 @@ class EstimateSettings(CaptureSettings, EpisodeSettings):
 
     @property
     def search_settings(self) -> tuple[str, ...]:
-        """The names of those that only a search heeds and that are not at their defaults."""
+        """The names of the options of searches that are not at their defaults."""
         own = set(EstimateSettings.__annotations__) - {"method"}
         return tuple(name for name in changed(self) if name in own)
 

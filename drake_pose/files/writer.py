@@ -50,7 +50,7 @@ OnFrame = Callable[[int, int, str, "FrameRecord | None"], None]
 record; once with "" and None before the first frame."""
 
 OnStage = Callable[[str, int, int | None], None]
-"""Called with what is done, and how much of how much (None: nobody knows) is done of it."""
+"""Called with what is done, and how much of it is done of how much (None: not known)."""
 
 Drawn = Mapping[str, tuple[np.ndarray, np.ndarray | None]]
 """By camera, what an overlay is made of: a mask (H, W) or picture (H, W, 3), and which part of the

@@ -385,7 +385,7 @@ def _by_empty_room(
                 f"is not of the background's size, {width} x {height} (width x height)"
             )
         mask, *again = (person_region(picture, one) for one in rooms[camera])
-        # A bad background is told of once.
+        # A bad background is reported once.
         warnings = doubts.pop(camera, ())
         if mask.mean() > changed:
             warnings += (

@@ -196,7 +196,7 @@ def decode_run_lengths(counts: Sequence[int] | str, height: int, width: int) -> 
             )
         packed = coco.frPyObjects(packed | {"counts": list(counts)}, height, width)
     mask = coco.decode(packed)
-    # Where text ends too early the rest is memory that nobody has written.
+    # Where text ends too early the rest is uninitialised memory.
     if isinstance(counts, str) and coco.encode(mask)["counts"] != packed["counts"]:
         raise ValueError(
             f"the run lengths do not fill a picture of {width} x {height} (width x height)"

@@ -149,7 +149,7 @@ class VisualHull:
     def radii(self, p_N: np.ndarray, shrink: float = 0.97) -> np.ndarray:
         """The radii (n,) [m] of the largest balls around points (n, 3) in the hull.
 
-        ``shrink``: between the directions that were looked from, the hull may be so much narrower.
+        ``shrink``: factor for the hull's width between the viewing directions.
         """
         if not self._views:
             return np.zeros(len(p_N))
@@ -224,7 +224,7 @@ def require_visible(
 ) -> None:
     """Refuses a camera that cannot show a body whose surfaces are at X_CN (nodes, 4, 4).
 
-    ``max_pictures``: a body that is as large as so many pictures is not what they show.
+    ``max_pictures``: largest size of a body, in pictures.
 
     Raises CameraError: names the camera; when the body is wholly behind it, when the camera is
     inside one of the surfaces, when the body is far larger than the picture, or wholly outside.

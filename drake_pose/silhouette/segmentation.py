@@ -20,14 +20,14 @@ class Background:
     """An empty scene's mean colour (H, W, 3) and its standard deviation (H, W) [grey levels]."""
 
     def __init__(self, mean: Picture, deviation: Floats, deviations: float = 5.0) -> None:
-        """``deviations``: by so many standard deviations another colour is off."""
+        """``deviations``: a colour farther off is not the background's [standard deviations]."""
         self.mean, self.deviation, self._deviations = mean, deviation, deviations
         off = np.minimum(np.floor(deviations * deviation), 255.0).astype(np.uint8)
         self.tolerance = np.repeat(off[:, :, None], 3, axis=2)
         """(H, W, 3) how far each channel may be off where only the background is seen."""
 
     def with_noise(self, times: float) -> Background:
-        """The same background, its noise so many times as strong."""
+        """The same background with its noise multiplied."""
         return Background(self.mean, times * self.deviation, self._deviations)
 
 
@@ -166,12 +166,13 @@ def tell_from_background(
     Args:
         beside: a pixel shows the background where the body is less likely.
         nowhere: nothing is looked at where the body is less likely in all that are wanted.
-        min_count: so many pictures must show a pixel's background.
-        max_count: at most so many pictures make a median.
-        exposure_pixels: at most so many pixels tell the exposure.
+        min_count: number of pictures that must show a pixel's background.
+        max_count: largest number of pictures of a median.
+        exposure_pixels: largest number of pixels that tell the exposure.
         least_deviation: least standard deviation of a colour [grey levels].
         unsure_deviation: that of a colour which only ``min_count`` pictures show [grey levels].
-        even: at so many standard deviations a colour is as likely another's as the background's.
+        even: distance at which a colour is as likely another's as the background's [standard
+            deviations].
         bounds: of a log-likelihood ratio, for shadows, reflections and the body's own colours.
 
     Returns:
@@ -247,8 +248,8 @@ def cut(
     """The object (H, W) by labels (H, W) of GrabCut (Rother et al., 2004), left as they are.
 
     Args:
-        every: colours are learnt from every so many rows and columns, and what is in doubt is cut
-            once by these; 1: all of it is cut in each of the iterations.
+        every: colours are learnt from every nth row and column, and what is in doubt is cut once by
+            these; 1: all of it is cut in each of the iterations.
         seed: GrabCut draws its first clusters at random.
     """
     found = labels.copy()
@@ -290,7 +291,7 @@ def find_regions(
     along whose outline the channel changes most; two of two channels may be about the same.
 
     Args:
-        most: at most so many.
+        most: largest number of regions.
         max_width: pictures are looked at so wide at most [pixel].
         levels: thresholds of each channel.
         same: regions that overlap more (IoU) are one.

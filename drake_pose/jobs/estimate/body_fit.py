@@ -198,7 +198,7 @@ class _BodyFit:
         Args:
             shown: a part that ends at the root may not be there if a smaller fraction of its own
                 area shows by itself.
-            better_by: it is left out if E_total without it is less than so many times as large.
+            better_by: it is left out if that multiplies E_total by less than this factor.
         """
         if self._settings.unseen:
             return search, first

@@ -131,10 +131,10 @@ def check_units(
         path: of the table.
         names: of the model's positions.
         known: (len(names),) values by frame [rad or m].
-        slack_angle, slack_share: by so much an angle [rad], or by this fraction of its range a
-            length, may be outside its limits.
-        millimetres_from: a length of so many times what its limits allow is one in millimetres; an
-            angle more than a full turn beyond its limits is one in degrees.
+        slack_angle: an angle may be this far outside its limits [rad].
+        slack_share: a length may be this far outside, as a fraction of its range.
+        millimetres_from: a length beyond this multiple of its limits is in millimetres; an angle
+            more than a full turn beyond its limits is in degrees.
         largest: no joint's position is larger [rad or m].
 
     Raises:
@@ -258,14 +258,14 @@ def cameras_of(
 
 
 def say_left_out(names: Iterable[str], placed: Collection[str]) -> list[str]:
-    """That cameras are not used whose pose nobody says."""
+    """Warnings of cameras that are not used because their pose is not known."""
     return [f"camera '{name}' has no X_WC: it is left out" for name in names if name not in placed]
 
 
 def map_log(path: Path, joints: JointLog, tree: PoseTree, settings: EpisodeSettings) -> TreeLog:
     """The joint log in the tree's terms: which of its values it has, and the nodes that it tells.
 
-    Values that nobody logged are the model's defaults.
+    Values that are not logged are the model's defaults.
 
     Raises DrakePoseError: names columns, joints or units at fault.
     """
@@ -314,10 +314,10 @@ def frames_of(camera: EpisodeCamera) -> tuple[str, ...]:
 
 
 def rows_of(log: JointLog, camera: EpisodeCamera, kept: Indices, later: Array) -> Array:
-    """(k, m) a log's positions so much later [s] than some of a camera's pictures, by time or name.
+    """(k, m) a log's positions at some of a camera's pictures, by time or by name.
 
     Args:
-        later: () or (k,); nothing where only names tell.
+        later: () or (k,) added to the pictures' times [s]; not used where names are compared.
     """
     if is_timed(log, camera):
         return log.at(camera.times[kept] + later)
@@ -350,7 +350,7 @@ def read_episode_scene(
         joints: a table of joint positions, in place of the episode's own.
         cameras: a camera file, in place of the episode's own.
 
-    Raises DrakePoseError: names the file, camera or frame at fault; nobody says where a camera is.
+    Raises DrakePoseError: names the file, camera or frame at fault; no camera's pose is known.
     """
     episode = open_episode(path, joints=joints, episode=settings.episode)
     chosen, placed = cameras_of(episode, cameras, settings)

@@ -65,7 +65,7 @@ def estimate_scene(
 
     Args:
         scene: cameras.yaml and masks/<camera>/<frame>.png; or masks/<frame>.png alone, of a camera
-            nobody calibrated; or an episode (``open_episode``), followed from where its log begins.
+            is not calibrated; or an episode (``open_episode``), followed from where its log begins.
         out, resume: folder for the result, None writes nothing; to go on with an interrupted one.
         settings: which cameras and frames, the root, the sampling.
         truth: measured joint positions to compare with; None: joint_angles.csv, the episode's log.

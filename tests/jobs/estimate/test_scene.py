@@ -1,5 +1,8 @@
+"""Scenes without cameras.yaml, and roots whose position is not known."""
+
 import html
 import json
+import shutil
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -7,21 +10,25 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import trimesh
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
 
 from drake_pose.body import load_model
+from drake_pose.errors import SettingsError
 from drake_pose.files.overlay import AGREEMENT_RGB, EXCESS_RGB, MISSING_RGB
-from drake_pose.files.settings import EstimateSettings
+from drake_pose.files.settings import EstimateSettings, parse_packages
 from drake_pose.jobs.estimate.scene import estimate_scene
 from drake_pose.search import PaperSearchSettings
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from drake_pose.silhouette.pictures.scenes import load_scene
-from tests.cli import run_json
+from tests.cli import assert_refused, run_command, run_json, run_to_end
 from tests.jobs.scenes import (
+    LINK,
     NAMES,
     URDF,
     TinyScene,
+    camera,
     read_rows,
     run_estimate,
     write_joints,
@@ -234,3 +241,95 @@ def test_what_the_model_does_not_enforce_is_told(
         assert named in warning
         assert warning in result.stderr
         assert warning in page
+
+
+@pytest.fixture
+def bare_scene(own_scene: TinyScene) -> TinyScene:
+    """Masks alone."""
+    (own_scene.folder / "cameras.yaml").unlink()
+    for path in (own_scene.folder / "masks" / "front").iterdir():
+        path.rename(own_scene.folder / "masks" / path.name)
+    shutil.rmtree(own_scene.folder / "masks" / "front")
+    return own_scene
+
+
+def run(scene: TinyScene, out: Path, *more: str) -> tuple[np.ndarray, dict]:
+    """The positions and the record of the first frame."""
+    _, summary = run_estimate(scene, out, "--method", "beam", "--frame", "0", "--no-replay", *more)
+    (row,) = read_rows(out / "poses.csv")
+    return np.array([float(row[name]) for name in NAMES]), summary["frames"]["0000"]
+
+
+def test_masks_alone(bare_scene: TinyScene, out: Path) -> None:
+    """Pose and scale are found, as far as a parallel camera can stand for the pinhole."""
+    q, record = run(bare_scene, out)
+    np.testing.assert_allclose(q, bare_scene.truth["0000"], atol=np.radians(6.0))
+    assert record["E_total"] < 0.08
+    true_camera = camera("front")
+    # The crane stands in the world's origin.
+    depth = np.linalg.norm(true_camera.X_WC[:2, 3])
+    assert record["camera_scale"] == pytest.approx(true_camera.focal_x / depth, rel=0.06)
+    assert (out / "overlay" / "camera" / "0000.png").is_file()
+    # Nothing says how sure it is: each joint may be anywhere inside its limits.
+    limits = load_model(bare_scene.model, check=False)
+    for k, joint in enumerate(record["joints"].values()):
+        ends = np.degrees([limits.lower[k], limits.upper[k]])
+        assert not joint["determined"]
+        assert [joint["low"], joint["high"]] == pytest.approx(ends)
+
+
+def test_a_root_position_that_is_not_known(tiny_scene: TinyScene, out: Path) -> None:
+    q, record = run(tiny_scene, out, "--root-position", "unknown")
+    np.testing.assert_allclose(q, tiny_scene.truth["0000"], atol=np.radians(6.0))
+    assert record["E_total"] < 0.03
+    assert record["camera_scale"] is None
+
+
+def test_what_needs_a_known_root_is_refused(tiny_scene: TinyScene, bare_scene: TinyScene) -> None:
+    settings = EstimateSettings(method="paper")
+    for scene, more in ((bare_scene, None), (tiny_scene, "unknown")):
+        with pytest.raises(SettingsError, match="--method beam"):
+            estimate_scene(scene.folder, scene.model, None, replace(settings, root_position=more))
+
+
+BOOM = LINK.format(name="boom", z=0.25, size="0.1 0.12 0.5")
+
+
+@pytest.fixture
+def far(tmp_path: Path, tiny_scene: TinyScene) -> tuple[Path, Path]:
+    """A model whose boom is a mesh of a package that lies far away, and that package's folder."""
+    folder = tmp_path / "far away" / "crane parts"
+    folder.mkdir(parents=True)
+    trimesh.creation.box((0.1, 0.12, 0.5)).export(folder / "boom.stl")
+    model = tmp_path / "robots" / "crane.urdf"
+    model.parent.mkdir()
+    mesh = BOOM.replace('<box size="0.1 0.12 0.5"/>', '<mesh filename="package://parts/boom.stl"/>')
+    assert mesh != BOOM
+    model.write_text(tiny_scene.model.read_text().replace(BOOM, mesh))
+    return model, folder
+
+
+def test_a_package_is_named_where_it_is_missing_and_may_not_move(
+    out: Path, tiny_scene: TinyScene, far: tuple[Path, Path]
+) -> None:
+    model, folder = far
+    scene = replace(tiny_scene, model=model)
+    words = [*scene.estimate(out), "--no-replay", "--no-overlay"]
+    package = ["--package", f"parts={folder}"]
+    for command in (words, ["check", str(model)]):
+        missing = ("link 'boom': mesh 'package://parts/boom.stl'", "--package parts=FOLDER")
+        assert_refused(run_command(command), *missing)
+        for text in ("parts", "=x", "parts=", "parts=/no/such/folder"):
+            assert_refused(run_command([*command, "--package", text]), "--package", status=2)
+    run_to_end("check", model, *package)
+    run_to_end(*words, *package, "--frame", "0")
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["settings"]["packages"] == {"parts": str(folder)}
+    assert summary["found_count"] == 1
+    moved = shutil.copytree(folder, folder.with_name("moved"))
+    again = [*words, "--resume", "--package"]
+    assert_refused(run_command([*again, f"parts={moved}"]), "packages")
+    run_to_end(*again, f"parts={folder}", "--frame", "0:1")
+    assert json.loads((out / "summary.json").read_text())["found_count"] == 2
+    with pytest.raises(SettingsError, match="given twice"):
+        parse_packages([f"a={folder}", f"a={folder}"])

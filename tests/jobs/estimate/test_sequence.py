@@ -1,17 +1,22 @@
+"""A pose that does not explain its pictures is said to be doubtful, and what may be the reason."""
+
+import re
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from drake_pose.body import load_model
+from drake_pose.files.records import FrameRecord
 from drake_pose.files.settings import EstimateSettings
 from drake_pose.jobs.estimate.body_fit import _StartedSearch
-from drake_pose.jobs.estimate.inputs import EstimateInputs
+from drake_pose.jobs.estimate.inputs import EstimateInputs, read_inputs
 from drake_pose.jobs.estimate.measurements import TrueAngles
-from drake_pose.jobs.estimate.scene import estimate_scene
+from drake_pose.jobs.estimate.scene import check_track, compare_cameras, estimate_scene
 from drake_pose.search import TRACKED, RootPlacementSearch
 from drake_pose.silhouette.pictures.scenes import load_scene
-from tests.jobs.scenes import TinyScene, write_scene
+from tests.jobs.scenes import URDF, TinyScene, camera, edit_camera, write_scene
 from tests.search.turning import crane
 
 # A crane that swings, and stands otherwise after a cut.
@@ -101,3 +106,103 @@ def test_a_track_goes_on_from_what_is_known_and_searches_after_a_loss() -> None:
         patch.setattr(RootPlacementSearch, "match", lambda *_: "searched")
         assert search.match([]) is known
         assert search.match([]) == "searched"
+
+
+ANGLES = ((20.0, -40.0), (-40.0, -80.0))
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> TinyScene:
+    return write_scene(tmp_path / "scene", ANGLES, ("front", "side"))
+
+
+def warnings_of(scene: TinyScene, model: Path | None = None, **more: object) -> tuple[str, ...]:
+    settings = EstimateSettings(**more)  # type: ignore[arg-type]
+    return estimate_scene(scene.folder, model or scene.model, None, settings).warnings
+
+
+def turn_camera(scene: TinyScene, name: str, degrees: float) -> None:
+    """Turn a calibrated camera about the world's vertical, as if it had been moved about it."""
+    X_WC = camera(name, degrees).X_WC.tolist()
+    edit_camera(scene.folder / "cameras.yaml", name, X_WC=X_WC)
+
+
+def test_a_sound_scene_has_no_warning(scene: TinyScene) -> None:
+    assert warnings_of(scene) == ()
+    assert warnings_of(scene, cameras=("side",)) == ()
+
+
+def test_cameras_that_are_exchanged_or_moved(scene: TinyScene) -> None:
+    masks = scene.folder / "masks"
+    for one, other in (("front", "other"), ("side", "front"), ("other", "side")):
+        (masks / one).rename(masks / other)
+    first, *_ = warnings_of(scene)
+    assert re.match(r"cameras '(front|side)' and '(side|front)' are exchanged", first)
+    for one, other in (("front", "other"), ("side", "front"), ("other", "side")):
+        (masks / one).rename(masks / other)
+    turn_camera(scene, "side", 20.0)
+    first, *_ = warnings_of(scene)
+    assert re.match(r"camera(s 'front' and)? 'side' contradicts? ", first)
+
+
+def test_what_keeps_the_truth_out(scene: TinyScene, tmp_path: Path) -> None:
+    (text,) = warnings_of(scene, hold={"lift": 80.0})
+    assert "frame 0000-0001 (of 2, E_total " in text
+    assert "the pose explains the pictures badly" in text
+    assert "what is held (lift)" in text
+    model = tmp_path / "stiff.urdf"
+    model.write_text(URDF.replace('lower="-1.6" upper="1.6"', 'lower="1.2" upper="1.6"'))
+    *_, text = warnings_of(scene, model)
+    assert "its limits (lift" in text
+
+
+@pytest.mark.parametrize(("left", "is_told"), [(0.3, True), (0.02, False)])
+def test_a_track_of_a_wrong_pose_is_told(scene: TinyScene, left: float, is_told: bool) -> None:
+    """Frame 1 is said to be tracked half a radian off, which leaves so much of its area."""
+    inputs = read_inputs(scene.folder, scene.model, EstimateSettings(), None)
+    wrong = np.radians(ANGLES[1]) + np.array([0.0, 0.5])
+    records = {
+        "0000": FrameRecord("0000", wrong, None, 0.01, 0.1, stopped_by="end"),
+        "0001": FrameRecord("0001", wrong, None, left, 0.1, stopped_by=TRACKED),
+    }
+    assert inputs.search is not None
+    texts = check_track(inputs, inputs.search, records)
+    assert len(texts) == is_told
+    if is_told:
+        assert "frame '0001': tracked it leaves 30.00 %" in texts[0]
+        assert "with luff elsewhere" in texts[0]
+
+
+@pytest.mark.parametrize(
+    ("errors", "cameras", "exchanged"),
+    [
+        ({("b", "a"): 0.1}, ("a", "b"), True),
+        ({"a": 0.1, "b": 0.1, "c": 0.1, "bc": 0.1}, ("a",), False),
+        ({"a": 0.1, "b": 0.1, "c": 0.1}, ("a", "b", "c"), False),
+        ({"a": 0.9, "b": 0.1, "c": 0.1}, ("a",), False),
+        ({}, None, False),
+    ],
+)
+def test_who_contradicts_whom(errors, cameras, exchanged):
+    """E_total is .4 but for the given cameras; (b, a): those with each other's masks."""
+    rig = {name: camera(name) for name in "abc"}
+    masks = {name: np.full((160, 200), 1 + k) for k, name in enumerate("cba")}
+
+    def match(views, root_position):
+        names = "".join(view.camera.name for view in views)
+        swapped = tuple("cba"[int(view.mask[0, 0]) - 1] for view in views)[:2] == ("b", "a")
+        error = errors.get(("b", "a") if swapped else names, 0.4)
+        return SimpleNamespace(found=True, E_total=error)
+
+    scene = SimpleNamespace(
+        cameras=rig, images={}, masks=[(name, "0") for name in rig],
+        read=lambda name, frame: masks[name],
+    )  # fmt: skip
+    inputs = SimpleNamespace(scene=scene, root_positions=None)
+    record = FrameRecord("0", np.zeros(2), None, 0.4, 1.0, ious={"a": 0.1, "b": 0.2, "c": 0.9})
+    found = compare_cameras(inputs, SimpleNamespace(match=match), {"0": record}, None)
+    assert len(found) == (cameras is not None)
+    if cameras is not None:
+        named = " and ".join(f"'{name}'" for name in cameras)
+        what = "are exchanged" if exchanged else "contradict"
+        assert re.match(rf"cameras? {named} {what}", found[0])

@@ -71,7 +71,14 @@ def calibrated_cameras(
     """
     if "camera_matrix" in content:
         name = str(content.get("camera_name", path.stem))
-        return {name: _one_camera(content, f"{path}: camera '{name}'")}
+        where = f"{path}: camera '{name}'"
+        size = [content.get(f"image_{side}") for side in ("width", "height")]
+        if None in size:
+            raise CameraError(f"{where}: needs image_width and image_height [pixel]: add them")
+        numbers = content["camera_matrix"], content.get("distortion_coefficients", ())
+        lens = lens_of(size, *numbers, str(content.get("distortion_model", "plumb_bob")), where)
+        # A camera_info's R rectifies pictures; it has no T.
+        return {name: (lens, _pose(content, "R", "T", where) if "T" in content else None)}
     entries = {str(key): one for key, one in content.items() if isinstance(one, dict)}
     chain = {k: one for k, one in entries.items() if {"camera_model", "intrinsics"} <= {*one}}
     if chain:
@@ -110,17 +117,6 @@ def _numbers(value: Any) -> Array | None:
     except (ValueError, TypeError):
         return None
     return found if np.isfinite(found).all() else None
-
-
-def _one_camera(content: Mapping[Any, Any], where: str) -> tuple[Lens, Array | None]:
-    """The camera of a ROS camera_info, or of OpenCV's FileStorage."""
-    size = [content.get(f"image_{side}") for side in ("width", "height")]
-    if None in size:
-        raise CameraError(f"{where}: needs image_width and image_height [pixel]: add them")
-    numbers = content["camera_matrix"], content.get("distortion_coefficients", ())
-    lens = lens_of(size, *numbers, str(content.get("distortion_model", "plumb_bob")), where)
-    # A camera_info's R rectifies pictures; it has no T.
-    return lens, _pose(content, "R", "T", where) if "T" in content else None
 
 
 def lens_of(size: Any, matrix: Any, distortion: Any, model: str, where: str) -> Lens:

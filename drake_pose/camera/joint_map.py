@@ -78,7 +78,31 @@ def map_joints(
     """
     if units not in (None, *UNITS):
         raise SettingsError(f"units must be {' or '.join(UNITS)}, not {units!r}")
-    columns, warnings = _find_columns(log, names, lower, upper, is_angle, units, table or {})
+    columns = dict(table or {})
+    for joint, column in columns.items():
+        if joint not in names:
+            raise UnknownNameError("joint", joint, names, "the model, which the joint map is for,")
+        if column.name not in log.names:
+            raise UnknownNameError("column", column.name, log.names, "the joint log")
+    used = {column.name for column in columns.values()}
+    free = [name for name in names if name not in columns]
+    matched, warnings = match_names([name for name in log.names if name not in used], free)
+    if not (matched or columns):
+        raise SceneError(
+            f"no column of the joint log is a joint of the model: its columns are "
+            f"{', '.join(log.names)}, the joints {', '.join(names)}; give a joint map "
+            "(JOINT: {column: COLUMN})"
+        )
+    turning = {c: list(names).index(j) for c, j in matched.items()}
+    turning = {column: k for column, k in turning.items() if is_angle[k]}
+    if turning and units is None:
+        readings_of = dict(zip(log.names, log.positions.T, strict=True))
+        angles, rows = {column: readings_of[column] for column in turning}, [*turning.values()]
+        others = np.array([one for name, one in readings_of.items() if name not in used])
+        units, why = _find_unit(angles, others, lower[rows], upper[rows])
+        warnings.append(f"angles of the joint log are read in {units} (units): {why}")
+    scale = UNITS[units or "rad"]
+    columns |= {j: Column(c, scale if c in turning else 1.0) for c, j in matched.items()}
     positions = np.full((len(log.positions), len(names)), np.nan)
     clipped = np.zeros(positions.shape, dtype=np.bool_)
     for k, joint in enumerate(names):
@@ -97,44 +121,6 @@ def map_joints(
         warnings.append(f"columns of the joint log that are no joint: {', '.join(unused)}")
     mapped = JointLog(tuple(names), log.times, positions, log.frames)
     return MappedJoints(mapped, clipped, missing, unused, tuple(warnings))
-
-
-def _find_columns(
-    log: JointLog,
-    names: Sequence[str],
-    lower: Array,
-    upper: Array,
-    is_angle: Mask,
-    units: str | None,
-    table: Mapping[str, Column],
-) -> tuple[dict[str, Column], list[str]]:
-    """The column of each joint that has one, and what was taken for what; as map_joints has it."""
-    columns = dict(table)
-    for joint, column in columns.items():
-        if joint not in names:
-            raise UnknownNameError("joint", joint, names, "the model, which the joint map is for,")
-        if column.name not in log.names:
-            raise UnknownNameError("column", column.name, log.names, "the joint log")
-    used = {column.name for column in columns.values()}
-    free = [name for name in names if name not in columns]
-    matched, warnings = match_names([name for name in log.names if name not in used], free)
-    if not (matched or columns):
-        raise SceneError(
-            f"no column of the joint log is a joint of the model: its columns are "
-            f"{', '.join(log.names)}, the joints {', '.join(names)}; give a joint map "
-            "(JOINT: {column: COLUMN})"
-        )
-    turning = {c: list(names).index(j) for c, j in matched.items()}
-    turning = {column: k for column, k in turning.items() if is_angle[k]}
-    if turning and units is None:
-        table_of = dict(zip(log.names, log.positions.T, strict=True))
-        angles, rows = {column: table_of[column] for column in turning}, list(turning.values())
-        others = np.array([one for name, one in table_of.items() if name not in used])
-        units, why = _find_unit(angles, others, lower[rows], upper[rows])
-        warnings.append(f"angles of the joint log are read in {units} (units): {why}")
-    scale = UNITS[units or "rad"]
-    columns |= {j: Column(c, scale if c in turning else 1.0) for c, j in matched.items()}
-    return columns, warnings
 
 
 def match_names(logged: Sequence[str], wanted: Sequence[str]) -> tuple[dict[str, str], list[str]]:

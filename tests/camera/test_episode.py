@@ -1,12 +1,160 @@
-"""What is wrong in the times of any recording is named, and positions are never made up."""
+"""Episodes in folders, and what is wrong in the times of any recording."""
 
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
+from drake_pose.camera.camera_files import load_camera_file
 from drake_pose.camera.episode import Episode, EpisodeCamera, JointLog, ascending
-from drake_pose.errors import SceneError, UnknownNameError
+from drake_pose.camera.episode_files import open_episode
+from drake_pose.errors import (
+    CameraError,
+    DrakePoseError,
+    SceneError,
+    SettingsError,
+    UnknownNameError,
+)
+from drake_pose.silhouette.pictures.scenes import load_scene
+from tests.camera.recordings import GRID, LENS, distorted, number_of, numbered, shade, write_video
+
+
+def write_table(path, kind, stamps):
+    rows = [f"{stamp},{0.01 * k},{k}" for k, stamp in enumerate(stamps)]
+    path.write_text("\n".join([f"{kind},joint1,grip", *rows]) + "\n")
+    return path
+
+
+def write_images(folder, numbers):
+    (folder / "images" / "a").mkdir(parents=True)
+    for k in numbers:
+        cv2.imwrite(str(folder / "images" / "a" / f"{k}.png"), numbered(k)[:, :, ::-1])
+    return folder / "images" / "a"
+
+
+def test_videos_beside_a_faster_log(tmp_path):
+    write_video(tmp_path / "videos" / "left.mp4", range(12))
+    write_video(tmp_path / "videos" / "right.avi", range(7), codec="mpeg4")
+    write_table(tmp_path / "joint_angles.csv", "time", [round(0.02 * k, 3) for k in range(60)])
+    (tmp_path / "cameras.yaml").write_text(f"left: {{{LENS}}}\nlost: {{{LENS}}}\n")
+    episode = open_episode(tmp_path)
+    left, joints = episode.camera("left"), episode.joints
+    assert [number_of(left.read(k)) for k in (0, 9, 4)] == [0, 9, 4]
+    assert (left.camera.focal_x, left.camera.focal_y, left.link) == (70.0, 75.0, None)
+    np.testing.assert_allclose(joints.at(left.times)[:, 1], 5.0 * np.arange(12), rtol=0, atol=1e-9)
+    said = "\n".join(episode.warnings)
+    assert "camera 'lost' of cameras.yaml has no pictures" in said
+    assert "camera 'right' has no entry in cameras.yaml" in said
+    with pytest.raises(SettingsError, match=r"--episode 3: .* is no LeRobot data set"):
+        open_episode(tmp_path, episode=3)
+    with pytest.raises(SceneError, match=r"joint_angles\.csv: is no episode: a file of another"):
+        open_episode(tmp_path / "joint_angles.csv")
+
+
+def test_stills_by_frame_and_pictures_by_time(tmp_path):
+    stamps, table = write_images(tmp_path, [2, 9, 10]) / "timestamps.csv", tmp_path / "other.csv"
+    write_table(tmp_path / "joint_angles.csv", "frame", ["010", "2", "9"])
+    episode = open_episode(tmp_path)
+    one = episode.camera("a")
+    assert one.frames == ("2", "9", "10")
+    assert [number_of(one.read(k)) for k in range(3)] == [2, 9, 10]
+    np.testing.assert_array_equal(episode.joints.of_frames(one.frames)[:, 1], [1.0, 2.0, 0.0])
+    said = open_episode(tmp_path, joints=write_table(table, "frame", ["2", "9", "11"])).warnings
+    assert any("1 of 3 pictures have no row in the joint log, and 1 of 3 rows" in s for s in said)
+    write_table(table, "time", [0.0, 0.5, 1.0])
+    with pytest.raises(SceneError, match=r"rows and pictures both need times .*timestamps\.csv"):
+        open_episode(tmp_path, joints=table)
+    (tmp_path / "scene.yaml").write_text("frame_rate_hz: 2\n")
+    paced = open_episode(tmp_path, joints=table).camera("a")
+    np.testing.assert_allclose(paced.times, [0.0, 0.5, 1.0])
+    table.write_text("frame,time,joint1\n2,7.5,0\n9,8,\n10,9,1\n")
+    both = open_episode(tmp_path, joints=table)
+    np.testing.assert_array_equal(both.camera("a").times, [7.5, 8.0, 9.0])
+    np.testing.assert_array_equal(both.joints.positions[:, 0], [0.0, np.nan, 1.0])
+    stamps.write_text("frame,time\n10,3.5\n9,3.75\n7,4\n")
+    timed = open_episode(tmp_path, joints=table)
+    np.testing.assert_array_equal(timed.camera("a").times, [3.5, 3.75])
+    assert number_of(timed.camera("a").read(0)) == 10
+    assert any("2 frames have no picture, or no time" in text for text in timed.warnings)
+
+
+def test_a_folder_means_the_same_wherever_it_is_read(tmp_path):
+    """Pictures go before a video; what macOS leaves behind is none."""
+    (write_images(tmp_path, [1, 2]) / "._2.png").write_bytes(b"no picture")
+    write_video(tmp_path / "videos" / "a.mp4", range(9))
+    pose = f"X_WC: {np.eye(4).tolist()}"
+    (tmp_path / "cameras.yaml").write_text(f"a: {{{LENS}, {pose}}}")
+    scene, one = load_scene(tmp_path, sequence=True), open_episode(tmp_path).camera("a")
+    assert scene.frames == one.frames == ("1", "2")
+    np.testing.assert_array_equal(scene.read_image("a", "2"), one.read(1))
+
+
+def test_distortion_is_taken_out_as_the_formula_says(tmp_path):
+    D = (-0.3, 0.1, 2e-3, -1e-3, 0.02)
+    file = tmp_path / "cameras.yaml"
+    seen = np.repeat(distorted(D)[:, :, None], 3, axis=2)
+    cv2.imwrite(str(write_images(tmp_path, []) / "0.png"), seen)
+    file.write_text(f"a: {{{LENS}, distortion: {[*D]}, link: hand, X_LC: {np.eye(4).tolist()}}}")
+    one = open_episode(tmp_path).camera("a")
+    lens, found = one.camera, one.read(0)[:, :, 0].astype(int)
+    rays = (GRID[:, 0] - [lens.center_x, lens.center_y]) / [lens.focal_x, lens.focal_y]
+    assert one.link == "hand"
+    assert np.abs(found - seen[:, :, 0]).max() > 8
+    assert np.abs(found - shade(rays))[2:-2, 2:-2].max() < 3
+    # Masks are never of distorted pictures.
+    with pytest.raises(CameraError, match=r"camera 'a' has distortion.*drake-pose undistort"):
+        load_camera_file(file)
+    for text, message in (
+        (f"{LENS}, distortion: [1, 2, 3]", "camera 'a': distortion must be a list of OpenCV's"),
+        (LENS.replace("64", "32", 1), "camera 'a': has 32 x 64 pixels .* pictures 64 x 64"),
+    ):
+        file.write_text(f"a: {{{text}}}")
+        with pytest.raises(CameraError, match=message):
+            open_episode(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("table", "message"),
+    [
+        ("q,r\n1,2\n", "expected one column 'time'.* has 1 rows of: q, r"),
+        ("time,q,q\n1,2,3\n", "expected one column 'time'"),
+        ("time,q\n", "has 0 rows of: time, q"),
+        ("time,q\n0,1\n1,two\n", "line 3, column 'q': 'two' is no number"),
+        ("frame,q\n1,0\n01,0\n", "has frame 1 more than once"),
+        ("time,q\n3,1\n2,1\n1,1\n", "rows: number 1 .* runs backwards"),
+        ("frame,q\n5,1\n", "camera 'a': 1 of 1 pictures have no row .* called alike in both"),
+    ],
+)
+def test_tables_that_cannot_be_used(tmp_path, table, message):
+    write_images(tmp_path, [1])
+    (tmp_path / "joint_angles.csv").write_text(table)
+    with pytest.raises(SceneError, match=message):
+        open_episode(tmp_path)
+
+
+def test_what_is_no_episode(tmp_path):
+    (tmp_path / "nothing").mkdir()
+    (tmp_path / "notes.txt").touch()
+    for name, message in ((".", "notes.txt, nothing"), ("nothing", "empty"), ("gone", "no such")):
+        with pytest.raises(DrakePoseError, match=rf"{message}.*; expected a LeRobot data set"):
+            open_episode(tmp_path / name)
+
+
+def test_recorded_episodes(shared_data):
+    for name, count, rows in (("short", 62, 184), ("cloth", 124, 370)):
+        episode = open_episode(shared_data / "droid_episodes" / name)
+        assert (episode.warnings, episode.joints.positions.shape) == ((), (rows, 8))
+        for one in episode.cameras.values():
+            np.testing.assert_allclose(one.times, np.arange(count) / 5.0)
+            assert one.camera.focal_y / one.camera.focal_x == pytest.approx(192 / 180, 1e-3)
+            logged = episode.joints.at(one.times)
+            np.testing.assert_allclose(
+                logged, episode.joints.positions[::3][:count], rtol=0, atol=1e-4
+            )
+    stills = open_episode(shared_data / "franka_one_view")
+    assert np.isfinite(stills.joints.of_frames(stills.camera("camera").frames)).all()
+
 
 TIMES = 0.1 * np.arange(20)
 

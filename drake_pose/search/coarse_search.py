@@ -208,39 +208,21 @@ def score_samples(
 
 @dataclass(frozen=True)
 class CoarseSettings:
-    """Numbers of the coarse search; sizes are shares of the root of the silhouettes' mean area.
+    """Numbers of the coarse search; sizes are fractions of the root of the mean area."""
 
-    Args:
-        hypotheses, again: at most so many are kept after each node, and where a limb of a pose is
-            searched again.
-        least_hypotheses, evaluations: fewer are kept, but not fewer than this, where a node's
-            samples times the hypotheses exceed this.
-        spares: so many times the hypotheses kept are looked at for some that do not stand alike: at
-            first, and where these are too few.
-        together: so many are scored by a worker at once.
-        outside_weight: what a pixel outside counts; one newly covered counts one.
-        slack: distances up to this do not count.
-        alike: frames stand alike if points in them differ by less than about this share of the
-            body's reach.
-        cells, most_cells, parts: so many cells of a cover are as wide as the size; it has so many
-            rows and columns at most: 80 MB; a cell has so many parts along its side, where it has
-            as many pixels.
-        nearer: nodes come nearer to a camera than the root by this factor at most.
-    """
-
-    hypotheses: int = 2500
-    again: int = 300
-    least_hypotheses: int = 64
-    evaluations: int = 150_000
-    spares: tuple[int, ...] = (2, 8)
-    together: int = 5000
-    outside_weight: float = 0.8
-    slack: float = 0.05
-    alike: float = 0.04
-    cells: float = 40.0
-    most_cells: int = 500
-    parts: int = 4
-    nearer: float = 0.7
+    hypotheses: int = 2500  # Kept after each node,
+    again: int = 300  # and where a limb of a pose is searched again.
+    evaluations: int = 150_000  # Fewer are kept where the next node would take more,
+    least_hypotheses: int = 64  # but not fewer than this.
+    spares: tuple[int, ...] = (2, 8)  # Hypotheses compared for likeness, times those kept.
+    together: int = 5000  # Samples that a worker scores at once.
+    outside_weight: float = 0.8  # Cost of a pixel outside; one newly covered gains one.
+    slack: float = 0.05  # Distances up to this do not count.
+    alike: float = 0.04  # Frames stand alike if nearer [fraction of the body's reach].
+    cells: float = 40.0  # Of a cover, along the size.
+    most_cells: int = 500  # Rows and columns of a cover: 80 MB.
+    parts: int = 4  # Of a cell's side, whose distances are known.
+    nearer: float = 0.7  # Nodes come nearer to a camera than the root by this factor.
 
 
 @dataclass(frozen=True)

@@ -41,56 +41,34 @@ Likelihood = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class PoseAndMaskSettings:
-    """How far off the first poses may be, and how long they are bettered.
+    """How far off the first poses may be, and how long they are improved.
 
-    Sizes of silhouettes are roots of their areas; how far off poses are is told as a share of the
-    deviations of the first ones.
-
-    Args:
-        angle: standard deviation of each angle of the first poses [rad].
-        length_share: of each length, as a share of its range.
-        length: of each length without limits [m].
-        rounds: at most so many.
-        coarse_rounds, coarse_side: the first rounds look at pictures in which silhouettes are so
-            large [pixel].
-        searching: so many rounds search; later ones fit alone.
-        triangles: of a part that the contour fit sees.
-        samples: so many poses are drawn to tell how likely the body is at each pixel.
-        surface: a surface is this uncertain beside the pose, as a share of the silhouette's size.
-        chances: the least and the most that any pixel is given.
-        search_rounds, searched, kept: the cross-entropy search: rounds, poses in each, and how many
-            of them shape the next.
-        widened, least_spread: the spread of these is widened a little, and stays above a share of
-            the first one.
-        searched_share, finest_share: how far off a start that was searched still is, and where
-            rounds end.
-        wide, narrow, spacing: the contour fit's first and last scale, as shares of the silhouette's
-            size, and its spacing.
-        settled: silhouettes that overlap so much from round to round are settled.
+    Sizes of silhouettes are roots of their areas. A pose's error is told as a fraction of the
+    standard deviations of the first ones.
     """
 
-    angle: float = math.radians(5.0)
-    length_share: float = 0.5
-    length: float = 0.05
-    rounds: int = 7
-    coarse_rounds: int = 3
-    coarse_side: float = 100.0
-    searching: int = 2
-    triangles: int = 600
-    samples: int = 32
-    surface: float = 0.02
-    chances: tuple[float, float] = (0.01, 0.99)
-    search_rounds: int = 5
-    searched: int = 60
-    kept: int = 8
-    widened: float = 1.1
-    least_spread: float = 0.15
-    searched_share: float = 0.4
-    finest_share: float = 0.14
-    wide: float = 0.25
-    narrow: float = 0.03
-    spacing: float = 0.05
-    settled: float = 0.995
+    angle: float = math.radians(5.0)  # Standard deviation of each angle of the first poses [rad],
+    length_share: float = 0.5  # of each length, as a fraction of its range,
+    length: float = 0.05  # and of each length without limits [m].
+    rounds: int = 7  # The greatest number.
+    coarse_rounds: int = 3  # The first rounds look at smaller pictures,
+    coarse_side: float = 100.0  # in which silhouettes have this size [pixel].
+    searching: int = 2  # The first rounds search; later ones fit alone.
+    triangles: int = 600  # Of a part in the contour fit.
+    samples: int = 32  # Poses drawn to estimate the body's probability at each pixel.
+    surface: float = 0.02  # Error of the surface itself [silhouette sizes].
+    chances: tuple[float, float] = (0.01, 0.99)  # The least and the greatest probability.
+    search_rounds: int = 5  # Of the cross-entropy search,
+    searched: int = 60  # poses in each,
+    kept: int = 8  # and poses that shape the next.
+    widened: float = 1.1  # Factor on the spread of these,
+    least_spread: float = 0.15  # which stays above this fraction of the first one.
+    searched_share: float = 0.4  # Error of a pose that was searched.
+    finest_share: float = 0.14  # Error at which rounds end.
+    wide: float = 0.25  # The contour fit's first scale [silhouette sizes],
+    narrow: float = 0.03  # its last one,
+    spacing: float = 0.05  # and its spacing.
+    settled: float = 0.995  # IoU of silhouettes of two rounds that are settled.
 
 
 @dataclass(frozen=True, eq=False)

@@ -132,39 +132,24 @@ class BeamSearchSettings(GridSettings):
 
 @dataclass(frozen=True)
 class Pass:
-    """One part of a refinement.
+    """One part of a refinement by pixels."""
 
-    Args:
-        iterations: at most so many steps.
-        stride: every so many rows and columns are looked at.
-        scale: distances beyond it lose weight [pixel].
-        damping: added to the diagonal of the normal equations [pixel^3/rad^2]: what the silhouettes
-            hardly show hardly moves.
-        longest_step: steps are shortened so that no parameter changes by more [rad or m].
-        slack: distances up to this along a line hardly count, those beyond it by what they are
-            more; 0: all count [pixel].
-    """
-
-    iterations: int
-    stride: int
-    scale: float
-    damping: float
-    longest_step: float = 0.25
-    slack: float = 0.0
+    iterations: int  # The greatest number of steps.
+    stride: int  # One row and one column in this many is looked at.
+    scale: float  # Distances beyond it lose weight [pixel].
+    damping: float  # Added to the diagonal of the normal equations [pixel^2/rad^2].
+    longest_step: float = 0.25  # No parameter changes by more in a step [rad or m].
+    slack: float = 0.0  # Distances up to this hardly count [pixel].
 
 
 class RefinementPasses(NamedTuple):
     """The passes of a refinement by pixels: from far, from near, and to the optimum itself.
 
-    coarse: several nodes may be off by their own width. fine: to the local optimum. last: where
-    directions count that the silhouettes hardly show.
-
-    A pixel is wrong where the contour is more than half a pixel from the border on its line. What
-    is less says nothing: the border lies anywhere between two pixel centres, alike likely. The mean
-    of least squares leaves the share 0.02 to 0.03 of the border's pixels wrong; drawn into the
-    bounds that all lines set together, a pose leaves 0.005 to 0.015 and is half as far from the
-    true one, as an estimate from bounds is where noise is uniform. A slack of 0.4 instead of 0.5
-    keeps it from resting on bounds.
+    A pixel is wrong where the contour is more than half a pixel from the border on its line. A
+    smaller distance says nothing: the border lies anywhere between two pixel centres, with equal
+    probability. The mean of least squares leaves 0.02 to 0.03 of the border's pixels wrong; a pose
+    within the bounds that all lines set together leaves 0.005 to 0.015 and is half as far from the
+    true one. The last passes' slack of 0.4 instead of 0.5 keeps it from resting on bounds.
     """
 
     coarse: tuple[Pass, ...] = (Pass(8, 4, 50.0, 300.0), Pass(8, 4, 10.0, 100.0))
@@ -176,98 +161,57 @@ PASSES = RefinementPasses()
 
 
 class NeighbourhoodSettings(NamedTuple):
-    """Numbers of the search about a pose; J above the best one's: shares of the border's length.
+    """Numbers of the search about a pose; limits on J are fractions of the borders' length."""
 
-    far, reflected, nearer, fine, end: passes from parts placed anew or mirrored to the optimum;
-    whole: passes with all of the body. pursued: so many placements, the best after the first pass,
-    are refined on; hopeful, near, kept: those with no more J after the first pass, after the
-    second, and in the end. mended, mendings: mirrored poses with no more J are mended, by so many
-    tries at most. equal: what is nearly as good is refined with all of the body before it is
-    judged. better: what is better by less is the same, not quite refined. spare: other poses with
-    no more J than this above the limit are refined with all parameters. same_error: errors that
-    differ by a smaller share are the same. least_error: parts with a smaller share of the area
-    wrong near them are left alone until all are tried. rounds: so often a part is tried at most
-    before all are, and as often again then.
-    """
-
-    far: tuple[Pass, ...] = (Pass(4, 4, 30.0, 100.0),)
-    reflected: tuple[Pass, ...] = (Pass(8, 4, 30.0, 100.0), Pass(6, 3, 6.0, 30.0))
-    nearer: tuple[Pass, ...] = (Pass(5, 3, 6.0, 30.0),)
-    fine: tuple[Pass, ...] = (Pass(6, 2, 2.0, 5.0),)
-    end: tuple[Pass, ...] = (Pass(6, 1, 1.0, 0.5, slack=0.4),)
-    whole: tuple[Pass, ...] = (Pass(3, 3, 6.0, 50.0), Pass(3, 2, 2.0, 5.0))
-    pursued: int = 2
-    hopeful: float = 0.15
-    near: float = 0.03
-    kept: float = 0.03
-    mended: float = 0.35
-    mendings: int = 6
-    equal: float = 0.01
-    better: float = 0.003
-    spare: float = 0.015
-    same_error: float = 0.1
-    least_error: float = 0.001
-    rounds: int = 2
+    far: tuple[Pass, ...] = (Pass(4, 4, 30.0, 100.0),)  # From a part placed anew.
+    reflected: tuple[Pass, ...] = (Pass(8, 4, 30.0, 100.0), Pass(6, 3, 6.0, 30.0))  # Mirrored.
+    nearer: tuple[Pass, ...] = (Pass(5, 3, 6.0, 30.0),)  # After these.
+    fine: tuple[Pass, ...] = (Pass(6, 2, 2.0, 5.0),)  # To the part's optimum.
+    end: tuple[Pass, ...] = (Pass(6, 1, 1.0, 0.5, slack=0.4),)  # Of other poses that are kept.
+    whole: tuple[Pass, ...] = (Pass(3, 3, 6.0, 50.0), Pass(3, 2, 2.0, 5.0))  # All parts move.
+    pursued: int = 2  # The number of placements refined after the first pass.
+    hopeful: float = 0.15  # The greatest excess over the best J after the first pass,
+    near: float = 0.03  # after the second,
+    kept: float = 0.03  # and of poses that are kept.
+    mended: float = 0.35  # Mirrored poses up to this excess are mended,
+    mendings: int = 6  # with this many tries.
+    equal: float = 0.01  # Poses up to this excess are refined with all of the body.
+    better: float = 0.003  # A smaller decrease of J is no improvement.
+    spare: float = 0.015  # Others up to this above their limit are refined with all of the body.
+    same_error: float = 0.1  # Errors whose ratio differs from 1 by less are the same.
+    least_error: float = 0.001  # Parts with less error are left for later [fraction of the area].
+    rounds: int = 2  # How often a part is tried; twice as often where all parts are to be tried.
 
 
 class RootPlacementSettings(NamedTuple):
-    """Numbers of the search for where the root is.
+    """Numbers of the search for the root's place."""
 
-    across: so many positions are tried across the silhouette. ratio: of two scales or depths tried
-    one after the other. cut_off: where the silhouette touches the picture's edge the body may be
-    larger by this factor than it looks, and the root that share of the silhouette's extent, less
-    one, beyond the edge. outside_share, outside_weight: as in the beam search's tolerant stages;
-    the root is off by half a step. hypotheses: so many are kept, shared among the scales or depths;
-    quota: the share of them that may have the root at one position. starts: so many poses are
-    refined from far; finalists: at so many of the root positions reached the poses are searched
-    again, ``again`` of each, and so many are refined to the end. pixels: silhouettes are looked at
-    with about so many. root_factor: so many times the width are kept of the root alone; root_spare:
-    so many times a position's quota of the root's rotations are grown at it; spare: so many times
-    the width are grown, before the quota. alike: see ``BeamSearch.best_poses``. enough: the share
-    of the silhouettes' area that may be wrong in a pose that is not searched on.
-    """
-
-    across: int = 12
-    ratio: float = 1.12
-    cut_off: float = 1.5
-    outside_share: float = 0.6
-    outside_weight: int = 2
-    hypotheses: int = 500
-    quota: float = 0.05
-    starts: int = 24
-    finalists: int = 3
-    again: int = 4
-    pixels: int = 1500
-    root_factor: int = 2
-    root_spare: int = 2
-    spare: int = 8
-    alike: float = 0.5
-    enough: float = 0.004
+    across: int = 12  # Positions tried across the silhouette.
+    ratio: float = 1.12  # Of neighbouring scales or depths.
+    cut_off: float = 1.5  # A body cut off by the picture may be larger than it looks by this.
+    outside_share: float = (
+        0.6  # Of a node's area that may lie outside: the root is half a step off.
+    )
+    outside_weight: int = 2  # Cost of a pixel outside; one newly covered gains one.
+    hypotheses: int = 500  # Shared among the scales or depths.
+    quota: float = 0.05  # The largest fraction of them with the root at one position.
+    starts: int = 24  # Poses refined from far.
+    finalists: int = 3  # Root positions searched again, and poses refined to the end.
+    again: int = 4  # Poses of each search again.
+    pixels: int = 1500  # Of a coarse silhouette.
+    root_factor: int = 2  # Hypotheses of the root alone, times the width.
+    root_spare: int = 2  # Rotations tried at a position, times its quota.
+    spare: int = 8  # Hypotheses grown before the quota, times the width.
+    alike: float = 0.5  # See ``BeamSearch.best_poses``.
+    enough: float = 0.004  # A pose with a smaller E_total is not searched on.
 
 
 @dataclass(frozen=True)
 class ExactSearchSettings:
-    """Numbers of the search where masks are exact; J is compared with the borders' length.
+    """Numbers of the search of exact masks; limits on J are fractions of the borders' length.
 
-    Args:
-        stages: the beam searches that begin, each on the grid of 20 (0) or 15 degrees (1). The next
-            one searches only where none before has led to a good pose: what one grid and order of
-            nodes misses, another often has.
-        starts: so many poses of each that do not look alike are refined.
-        alike: see ``BeamSearch.best_poses``.
-        hopeless: masks are not exact where the first poses refined leave more wrong than this; a
-            robust pose that leaves more is not improved by pixels.
-        enough: a pose is not searched on with less wrong: a little more than the pixels' own noise.
-        exact: a pose with less wrong is the answer, and no other grid is searched.
-        plausible: what the robust search finds is improved by pixels where less is left wrong.
-        agreeing: two grids agree where the worse one's J is no more than this many times the better
-            one's: the body fits no better.
-        better: how often another pose found may take the best one's place.
-        tolerance: poses are as good as the best whose J is larger by no more.
-        same: poses none of whose values differ by more are one [rad or m].
-        confidence: how often the truth shall lie in a determined value's interval.
-        noise_factor: how much larger the standard deviation is than of independent distances.
-        misfit: where more is wrong nothing is determined: the pose may be another one altogether.
+    Of the beam searches on the grids of 20 (0) and 15 degrees (1) each runs only where none before
+    it has led to a good pose: what one grid and order of nodes misses, another often has.
     """
 
     stages: tuple[tuple[int, Stage], ...] = (
@@ -276,19 +220,19 @@ class ExactSearchSettings:
         (1, Stage(60, 1.0, 2, limb_by_limb=True)),
         (1, Stage(60, 0.3, 5, limb_by_limb=True)),
     )
-    starts: int = 4
-    alike: float = 0.5
-    hopeless: float = 1.5
-    enough: float = 0.03
-    exact: float = 0.18
-    plausible: float = 0.5
-    agreeing: float = 1.1
-    better: int = 3
-    tolerance: float = 0.03
-    same: float = 0.1
-    confidence: float = 0.95
-    noise_factor: float = 1.4
-    misfit: float = 0.025
+    starts: int = 4  # Poses of each beam search that are refined.
+    alike: float = 0.5  # See ``BeamSearch.best_poses``.
+    hopeless: float = 1.5  # Above this J after coarse passes, or of the robust pose, give up.
+    enough: float = 0.03  # A pose with a smaller J is not searched on: it is the pixels' noise.
+    exact: float = 0.18  # A pose with a smaller J is the answer.
+    plausible: float = 0.5  # Above this J the robust pose is the answer.
+    agreeing: float = 1.1  # Two grids agree if the ratio of their Js is smaller: the body misfits.
+    better: int = 3  # How often another pose may replace the best one.
+    tolerance: float = 0.03  # Poses are as good as the best up to this excess.
+    same: float = 0.1  # Poses whose values differ by less are one [rad or m].
+    confidence: float = 0.95  # Probability that an interval holds the true value.
+    noise_factor: float = 1.4  # Standard deviation relative to that of independent distances.
+    misfit: float = 0.025  # Above this J nothing is determined: another pose may be right.
 
 
 _COARSE = (AnnealingStage(0.1, 0.04, 3), AnnealingStage(0.05, 0.04, 3))
@@ -297,84 +241,56 @@ _MEDIUM = (AnnealingStage(0.05, 0.026, 4), AnnealingStage(0.025, 0.026, 4))
 
 @dataclass(frozen=True)
 class MultiStartSettings:
-    """Numbers of the multi-start search where masks are damaged; sizes: root of the mean area.
+    """Numbers of the search of damaged masks; sizes are fractions of the root of the mean area.
 
-    Args:
-        interval: of the angles of coarse poses [rad].
-        coarse, medium, final: stages of the fit.
-        starts, finalists: so many coarse poses are fitted, and so many are fitted to the end.
-        passes: how many go on after which stages, in one view and in several. In several what is
-            wrong costs more from the first stage on; in one view it may be the last that tells:
-            there none ends after a first stage.
-        following: the same of what is sought about a pose, in several views.
-        apart: coarse poses differ where some part is seen so far away, as a share of the size.
-        rounds, sought_about: so often other explanations are sought, about so many of the best.
-        tried, flipped: of each so many are fitted, and so many more made by flips of its joints.
-        better: of several views about no more poses are others sought where one leads to nothing
-            that costs less by this factor.
-        limbs: a disc of this radius, as a share of the size, is as thick as a limb that one view
-            shows in part, or one of several in full.
-        beam_starts, beam_views, beam_pixels: where such a disc fits into what is wrong, so many
-            starts of the beam search are fitted, too, by so many masks, of about so many pixels.
+    In several views a wrong pose costs more from the first stage on. In one view the last stage may
+    decide: there no start is dropped after the first stage.
     """
 
-    interval: float = math.radians(15.0)
+    interval: float = math.radians(15.0)  # Of the angles of coarse poses [rad].
     coarse: tuple[AnnealingStage, ...] = _COARSE
     medium: tuple[AnnealingStage, ...] = _MEDIUM
     final: tuple[AnnealingStage, ...] = (AnnealingStage(0.0125, 0.0125, 6),)
-    starts: int = 40
-    finalists: int = 4
+    starts: int = 40  # Coarse poses that are fitted.
+    finalists: int = 4  # Poses that are fitted to the end.
+    # Stages, and the number of poses that go on after them, in one view and in several.
     passes: tuple[tuple[tuple[tuple[AnnealingStage, ...], int], ...], ...] = (
         ((_COARSE, 12), (_MEDIUM, 12)),
         ((_COARSE[:1], 20), (_COARSE[1:], 12), (_MEDIUM[:1], 6), (_MEDIUM[1:], 6)),
     )
+    # The same of other explanations, in several views.
     following: tuple[tuple[tuple[AnnealingStage, ...], int], ...] = (
         (_MEDIUM[:1], 4),
         (_MEDIUM[1:], 4),
     )
-    apart: float = 0.13
-    rounds: int = 2
-    sought_about: int = 3
-    tried: int = 6
-    flipped: int = 3
-    better: float = 0.98
-    limbs: tuple[float, float] = (0.03, 0.04)
-    beam_starts: int = 10
-    beam_views: int = 2
-    beam_pixels: int = 3000
+    apart: float = 0.13  # Coarse poses differ if a part is seen this far away.
+    rounds: int = 2  # Of searches for other explanations,
+    sought_about: int = 3  # about this many poses,
+    tried: int = 6  # of which this many are fitted each,
+    flipped: int = 3  # and this many made by flips.
+    better: float = 0.98  # In several views they end if costs do not fall to this fraction.
+    limbs: tuple[float, float] = (0.03, 0.04)  # Radius of a limb's disc, in one and several views.
+    beam_starts: int = 10  # If such a disc fits into what is wrong, poses of the beam search,
+    beam_views: int = 2  # in this many views,
+    beam_pixels: int = 3000  # with this many pixels each.
 
 
 class RobustSettings(NamedTuple):
-    """Numbers of what silhouettes leave open where masks are damaged.
+    """Numbers of the intervals and families of damaged masks."""
 
-    Args:
-        look: at which poses are compared; follow: how the others follow a value that is moved;
-            fine: what errors are told by: distances that count less in the fit tell of them, too.
-        significance: poses are as good as the best whose cost is larger by no more than so many
-            standard deviations of the difference.
-        families: at most so many are told apart.
-        moved: a value that the covariance lets go so far, angle [rad] and length [m], is moved step
-            by step: first as far as that.
-        longest_steps: of such a value, angle [rad] and length [m].
-        growth: by this factor each step is longer.
-        one_sided: as often shall a value lie below the upper end of its interval, and above the
-            lower one.
-        camera_motions: how large errors are is told by so many motions of each camera.
-    """
-
-    look: AnnealingStage = AnnealingStage(0.0125, 0.026, 2)
-    follow: tuple[AnnealingStage, ...] = (
+    look: AnnealingStage = AnnealingStage(0.0125, 0.026, 2)  # Compares poses.
+    follow: tuple[AnnealingStage, ...] = (  # The others follow a value that is moved.
         AnnealingStage(0.025, 0.026, 2),
         AnnealingStage(0.0125, 0.026, 2),
     )
-    fine: AnnealingStage = AnnealingStage(0.025, 0.0125)
-    significance: float = 1.96
-    families: int = 8
-    moved: tuple[float, float] = (math.radians(3.0), 0.01)
-    longest_steps: tuple[float, float] = (0.5, 0.1)
-    growth: float = 1.6
-    one_sided: float = 0.975
-    camera_motions: int = 6
+    fine: AnnealingStage = AnnealingStage(0.025, 0.0125)  # Measures errors, large ones too.
+    significance: float = 1.96  # Standard deviations of the costs' difference that matter.
+    families: int = 8  # The greatest number.
+    moved: tuple[float, float] = (math.radians(3.0), 0.01)  # Wider intervals are searched [rad, m].
+    longest_steps: tuple[float, float] = (0.5, 0.1)  # Of this search [rad, m],
+    growth: float = 1.6  # each step longer by this factor.
+    one_sided: float = 0.975  # Probability that a value lies below its interval's upper end.
+    camera_motions: int = 6  # Degrees of freedom of a camera's error.
 
     @staticmethod
     def widest(is_angle: np.ndarray) -> np.ndarray:

@@ -279,21 +279,17 @@ def plot_curves(
     margin = 0.08 * (top - bottom if top > bottom else max(1e-3, 0.02 * abs(top)))
     axes.set_ylim(bottom - (0.0 if bottom == least else margin), top + margin)
     # A frame between two that are not known is a dot.
-    line: dict[str, Any] = {
-        "linestyle": "-" if joined else "",
-        "marker": ".",
-        "markersize": 2 if joined else 8,
-    }
+    style: dict[str, Any] = {"linestyle": "-" if joined else "", "marker": ".", "linewidth": 1.2}
+    wide = {"color": "#009e7380", "linewidth": 4, "markersize": 4 if joined else 16, "zorder": 1.5}
     for label, value in values:
-        wide: dict[str, Any] = {"color": "#009e7380", "linewidth": 4, "zorder": 1.5}
-        own = wide if label == "measured" else {"linewidth": 1.2}
-        axes.plot(places, value, label=label, **line, **own)
+        own = wide if label == "measured" else {"markersize": 2 if joined else 8}
+        axes.plot(places, value, label=label, **(style | own))
     for limit in limits or ():
         if bottom <= limit <= top:
             axes.axhline(limit, color="#b3400a", linestyle="--", linewidth=0.8)
     axes.grid(axis="y", color="#d8dee4", linewidth=0.5)
     if len(values) > 1 and intervals is None:
-        axes.legend(fontsize=7, loc="lower right", ncols=4, frameon=False)
+        axes.legend(fontsize=7, loc="lower right", ncols=4, framealpha=0.8)
     _mark_frames(axes, frames)
     return figure
 

@@ -1,4 +1,4 @@
-"""Scenes without cameras.yaml, and roots whose position is not known."""
+"""Estimates of scenes: result folders, roots and cameras that are not known, packages."""
 
 import html
 import json

@@ -1,4 +1,4 @@
-"""A pose that does not explain its pictures is said to be doubtful, and what may be the reason."""
+"""Sequences are tracked; poses and cameras that do not explain the pictures are reported."""
 
 import re
 from pathlib import Path

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import os
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
@@ -13,7 +15,7 @@ from drake_pose.camera.bags import BAGS, open_bag
 from drake_pose.camera.camera_files import CameraFile, load_camera_file
 from drake_pose.camera.data_sets import INFO, TRAJECTORY, open_droid, open_lerobot
 from drake_pose.camera.episode import Episode, EpisodeCamera, JointLog, ascending
-from drake_pose.camera.models import PinholeCamera, check_number
+from drake_pose.camera.models import PinholeCamera
 from drake_pose.camera.picture_files import (
     VIDEOS,
     TimedVideo,
@@ -126,14 +128,8 @@ def _of_images(
         clock = JointLog(("time",), None, joints.times[:, None], joints.frames)
         times = clock.of_frames(frames)[:, 0]
     elif scene.is_file():
-        content = read_yaml(scene, SceneError)
-        rate = content.get("frame_rate_hz") if isinstance(content, dict) else None
-        try:
-            if rate is not None:
-                rate = check_number(rate, "frame_rate_hz", str(scene), positive=True)
-                times = np.arange(len(frames)) / rate
-        except CameraError as error:
-            raise SceneError(str(error)) from None
+        _, rate = read_sequence(scene)
+        times = times if rate is None else np.arange(len(frames)) / rate
     pictures = [files[frame] for frame in frames]
     height, width = read_picture(pictures[0], SceneError).shape[:2]
 
@@ -141,6 +137,35 @@ def _of_images(
         return read_picture(pictures[k], SceneError)
 
     return EpisodeCamera(name, width, height, times, None, None, recorded, frames), warnings
+
+
+def read_sequence(path: Path, sequence: bool = False) -> tuple[bool, float | None]:
+    """Whether frames follow each other, and at what rate [Hz], by a scene.yaml that may be missing.
+
+    Args:
+        sequence: what holds where it does not say.
+
+    Raises SceneError: it cannot be read, or says something else.
+    """
+    if not os.path.lexists(path):
+        return sequence, None
+    content = read_yaml(path, SceneError)
+    fields = ("sequence", "frame_rate_hz")
+    if not isinstance(content, dict):
+        raise SceneError(f"{path}: expected a mapping with {', '.join(fields)}")
+    if unknown := [str(field)[:40] for field in content if field not in fields]:
+        raise SceneError(
+            f"{path}: unknown field {', '.join(unknown)}; a scene has: {', '.join(fields)}"
+        )
+    sequence = content.get("sequence", sequence)
+    if not isinstance(sequence, bool):
+        raise SceneError(f"{path}: sequence must be true or false")
+    rate = content.get("frame_rate_hz")
+    if rate is None:
+        return sequence, None
+    if isinstance(rate, bool) or not isinstance(rate, int | float) or not 0.0 < rate < math.inf:
+        raise SceneError(f"{path}: frame_rate_hz must be a finite positive number")
+    return sequence, float(rate)
 
 
 def with_intrinsics(camera: EpisodeCamera, known: CameraFile, path: Path) -> EpisodeCamera:

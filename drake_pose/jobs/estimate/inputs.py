@@ -23,6 +23,7 @@ from drake_pose.body import (
     model_warnings,
 )
 from drake_pose.camera.camera_files import load_cameras
+from drake_pose.camera.episode_files import read_sequence
 from drake_pose.camera.models import Camera
 from drake_pose.errors import ModelError, SceneError, SettingsError, UnknownNameError
 from drake_pose.files.records import FrameRecord, base_cells, user_units
@@ -57,7 +58,7 @@ from drake_pose.silhouette.pictures.scene_checks import (
     leave_out_unreadable,
     read_scene,
 )
-from drake_pose.silhouette.pictures.scenes import SCENE_FILE, Scene, read_sequence
+from drake_pose.silhouette.pictures.scenes import SCENE_FILE, Scene
 from drake_pose.silhouette.scoring import draw_labels, require_visible
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 import zlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -15,6 +14,7 @@ import numpy as np
 from drake_pose.arrays import Array
 from drake_pose.camera.camera_files import load_camera_file, load_cameras
 from drake_pose.camera.episode import JointLog
+from drake_pose.camera.episode_files import read_sequence
 from drake_pose.camera.models import Camera, ParallelCamera
 from drake_pose.camera.picture_files import (
     VIDEOS,
@@ -27,7 +27,6 @@ from drake_pose.camera.picture_files import (
 )
 from drake_pose.errors import SceneError, SettingsError, UnknownNameError
 from drake_pose.silhouette.pictures.masks import read_mask
-from drake_pose.yaml_files import read_yaml
 
 CAMERA_FILE, SCENE_FILE = "cameras.yaml", "scene.yaml"
 USUAL_RATE_HZ = 30.0
@@ -276,35 +275,6 @@ def _unknown_cameras(folder: Path) -> tuple[dict[str, Camera], dict[tuple[str, s
         centre = (width - 1) / 2, (height - 1) / 2
         cameras[name] = ParallelCamera(name, width, height, 1000.0, *centre, X_WC)
     return cameras, {(names[frame], frame): file for (_, frame), file in found.items()}
-
-
-def read_sequence(path: Path, sequence: bool = False) -> tuple[bool, float | None]:
-    """Whether frames follow each other, and at what rate [Hz], by a scene.yaml that may be missing.
-
-    Args:
-        sequence: what holds where it does not say.
-
-    Raises SceneError: it cannot be read, or says something else.
-    """
-    if not os.path.lexists(path):
-        return sequence, None
-    content = read_yaml(path, SceneError)
-    fields = ("sequence", "frame_rate_hz")
-    if not isinstance(content, dict):
-        raise SceneError(f"{path}: expected a mapping with {', '.join(fields)}")
-    if unknown := [str(field)[:40] for field in content if field not in fields]:
-        raise SceneError(
-            f"{path}: unknown field {', '.join(unknown)}; a scene has: {', '.join(fields)}"
-        )
-    sequence = content.get("sequence", sequence)
-    if not isinstance(sequence, bool):
-        raise SceneError(f"{path}: sequence must be true or false")
-    rate = content.get("frame_rate_hz")
-    if rate is None:
-        return sequence, None
-    if isinstance(rate, bool) or not isinstance(rate, int | float) or not 0.0 < rate < math.inf:
-        raise SceneError(f"{path}: frame_rate_hz must be a finite positive number")
-    return sequence, float(rate)
 
 
 def common_rate(

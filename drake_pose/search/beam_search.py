@@ -147,8 +147,8 @@ class BeamSearch:
 
         Args:
             count: at most this many.
-            alike: two poses look alike if each node's pictures in both have so much of their union
-                in common in all views, or it is hidden in both, covering nothing that other nodes
+            alike: two poses look alike if each node's pictures have this fraction of their union in
+                common in all views, or it is hidden in both, covering nothing that other nodes
                 do not cover. Above 1: all poses of the grid differ.
             time_limit: after this time [s], or the settings', no more poses are looked for.
 
@@ -245,7 +245,7 @@ class _BeamRun:
     def _pictures_of(self, exact: bool, coarse_pixels: int = 6000) -> Pictures:
         """The silhouettes as bits: coarse ones with a band for stages that are not exact.
 
-        ``coarse_pixels``: about so many has a coarse silhouette; its best pose is judged in full.
+        ``coarse_pixels``: approximate area of a coarse silhouette; the best pose is scored in full.
         """
         if exact not in self._pictures:
             if exact:
@@ -422,7 +422,7 @@ class _BeamRun:
         samples, errors = (np.concatenate(both) for both in zip(*self._gathered, strict=True))
         samples = samples[np.argsort(errors, kind="stable")]
         samples = samples[np.sort(np.unique(samples, axis=0, return_index=True)[1])]
-        # So many are looked at in one go, and scored in full.
+        # Poses compared in one go, and poses scored in full.
         chunk, most = 8 * count, 2 * count
         chosen = samples[:0]
         looks = self._draw(chosen)

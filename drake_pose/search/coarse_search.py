@@ -273,7 +273,7 @@ class CoarseSearch:
         ]
 
     def _prepare(self, view: View, levels: int = 10) -> CoarseView:
-        """A silhouette as the coarse search sees it, with points within so many radii."""
+        """A silhouette as the coarse search sees it, with points within ``levels`` radii."""
         own, body = self._settings, self.body
         points = spread_points(view.mask)
         slack, least_cell = own.slack * self._size, max(1.0, self._size / own.cells)
@@ -449,7 +449,7 @@ def _by_ball(p_PB: np.ndarray) -> np.ndarray:
 
 
 def spread_points(mask: np.ndarray, most: int = 256) -> np.ndarray:
-    """At most so many points (n, 2) row, column of a mask, evenly spread; at least one."""
+    """At most ``most`` points (n, 2) row, column of a mask, evenly spread; at least one."""
     step = max(1.0, math.sqrt(np.count_nonzero(mask) / most))
     while True:
         rows = np.arange(0.5 * (step - 1.0), mask.shape[0] - 0.5, step)

@@ -72,7 +72,7 @@ class JointEstimate:
         return self.low - margin <= value <= self.high + margin
 
     def widened(self, other: JointEstimate, moved: float) -> JointEstimate:
-        """What both say, the other one of an instant from which the value has moved by so much."""
+        """What both say; since the other one's instant the value has changed by ``moved``."""
         if self.turns_around:
             middle = 0.5 * (self.low + self.high - other.low - other.high) - moved
             moved += 2.0 * math.pi * round(middle / (2.0 * math.pi))
@@ -146,8 +146,7 @@ class PoseSet:
     Args:
         families: best first; of equals the larger one first.
         joints: each value of the pose tree, node after node, over all families.
-        tolerance: what the search ranks poses by, J or a cost of the edges, may be so much above
-            the best pose's [pixel].
+        tolerance: the greatest excess over the best pose's J, or cost of the edges [pixel].
         complete: whether no pose within the tolerance was left out (on the grid, for a search on
             a grid).
         family_count: how many families there are; ``families`` may hold only the first of them.
@@ -187,8 +186,8 @@ class PoseEstimate:
             stopped it; TRACKED for a pose that no search found.
         root_position: (3,) the root's origin in the world [m] where it was estimated; of a parallel
             camera's single picture the part along its axis is arbitrary.
-        scale: a parallel camera has so many times the pixels a metre that it was given with, and
-            the body its own size; 1 where the scale was known.
+        scale: the ratio of a parallel camera's pixels a metre to those that it was given with;
+            1 where the scale was known.
         pose_set: all poses found that are as good, and what is known of each joint; None if the
             search did not ask.
         lower_bound: no pose of the search's grid has a smaller J than this [pixel].

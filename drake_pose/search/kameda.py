@@ -169,7 +169,7 @@ class PaperRun:
     def _combine_leaves(self, combinations: int = 100_000, block: int = 4_000_000) -> float:
         """Section 5.2.1: adopt the best combination of leaves' candidates; how much J falls.
 
-        Up to so many ``combinations`` are all tried; beyond, each leaf's in turn. ``block``:
+        All are tried if there are no more ``combinations``; else each leaf's in turn. ``block``:
         combinations times pixel patterns that are looked at in one piece of arrays.
         """
         leaves = [i for i, node in enumerate(self.nodes) if not node.children]

@@ -117,7 +117,7 @@ def choose_pairs(
         masks, pairs, runs, words: as in score_pairs.
         everything: (w,) uint64 all pixels of the silhouettes.
         reaches: of the nodes to come.
-        width: at most so many are chosen.
+        width: the greatest number that is chosen.
         codes: (p,) uint64 the same where pairs are equal in what matters later.
         openings: (p,) uint64 equal where the nodes with children to come stand alike; then only
             pairs within the limit are chosen, and of those alike none that covers a part of what

@@ -71,8 +71,8 @@ class Pictures:
         everything: (w,) uint64 all pixels of the silhouettes.
 
     Args:
-        band: how far around a silhouette the union of what lies outside is told from its sum
-            [pixel]; 0: nowhere.
+        band: distance from a silhouette up to which areas outside are a union, not a sum [pixel];
+            0: none.
         in_full: never simplify a surface, so that areas are those of the definition.
     """
 
@@ -197,7 +197,7 @@ class PartialPoses:
 
 
 class PoseStore:
-    """All poses of nodes with so much of their area outside at most, and what they make together.
+    """All poses of nodes whose area outside is within a limit, and what they make together.
 
     The one expansion of all searches: it places nodes in partial poses.
 
@@ -255,7 +255,7 @@ class PoseStore:
             raise LimitReached
 
     def _in_turn(self, missing: np.ndarray, together: int) -> Iterator[np.ndarray]:
-        """Poses (n,) of a parent, so many at a time, within the limits."""
+        """Poses (n,) of a parent, ``together`` at a time, within the limits."""
         for begin in range(0, len(missing), together):
             self.reserve()
             yield missing[begin : begin + together]
@@ -263,7 +263,7 @@ class PoseStore:
     def pose_groups(self, node: int, parents: np.ndarray, together: int = 100_000) -> np.ndarray:
         """Where the node's poses, drawn where missing, begin and end (n, 2) by parent (n,).
 
-        ``together``: so many are tried before the limits are looked at again.
+        ``together``: the number tried before the limits are looked at again.
         """
         known = self._groups[node]
         together = max(1, together // len(self.body.sampled.X_PN[node]))
@@ -282,7 +282,7 @@ class PoseStore:
     def reach_rows(self, node: int, parents: np.ndarray, together: int = 20_000) -> np.ndarray:
         """For poses (n,) of the node's parent the rows of ``reach_runs`` of what it can reach.
 
-        ``together``: so many are drawn before the limits are looked at again.
+        ``together``: the number drawn before the limits are looked at again.
         """
         known, views = self._reach_rows[node], self.pictures.bit_views
         ball = self.body.reach_balls[node]
@@ -447,8 +447,8 @@ class PoseStore:
         """The first of what pairs (p, 2) made that are not equal, at most ``width``.
 
         Args:
-            limit: where it is finite, what is outside and what no later node can reach may come to
-                so much [pixel]; and where the nodes with children to come stand alike, none is
+            limit: where it is finite, the greatest sum of what is outside and what no later node
+                can reach [pixel]; and where the nodes with children to come stand alike, none is
                 chosen that covers less than another.
             far_matters: those are not equal that differ beyond the bands.
 

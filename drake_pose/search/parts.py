@@ -132,7 +132,7 @@ class PartSearch:
             widths: hypotheses kept for the first, second, ... node of a part.
             spare: this many times more are scored with what the part itself hides.
             alike: placements whose nodes' middles are all nearer are one [node radii].
-            coarse_pixels: silhouettes are looked at with about so many pixels.
+            coarse_pixels: approximate area of the silhouettes as they are looked at.
         """
         X_WN = self.body.poses(parameters)
         others = problem.still(parameters, np.isin(np.arange(len(X_WN)), part.nodes))
@@ -265,8 +265,8 @@ class PartSearch:
     ) -> np.ndarray:
         """The parameters, some columns changed so that points (n, 3) of nodes come to places.
 
-        By Gauss and Newton's method: ``how`` many steps, each no longer than so much [rad or m],
-        and damped by a share of a square metre; one of less than 0.002 ends it.
+        By Gauss and Newton's method; ``how``: the number of steps, the longest step [rad or m] and
+        the damping [m^2]. A step of less than 0.002 ends it.
         """
         lower, upper = self.body.lower[columns], self.body.upper[columns]
         (steps, longest, damping), moved = how, parameters.copy()
@@ -342,7 +342,7 @@ class NeighbourhoodSearch:
         last = np.inf if tries is None else int(self._tried.sum()) + tries
         while J > enough and self._tried.sum() < last and time.perf_counter() < deadline:
             errors = self._errors_near(parameters, J)
-            # A part is worth another try only where the error near it is not the one it left.
+            # A part is tried again only where the error near it is not the one it left.
             worth = ((errors >= least) | everywhere) & (self._tried < rounds)
             worth &= np.abs(errors - self._seen) > np.maximum(own.same_error * errors, same)
             if not worth.any():

@@ -43,8 +43,8 @@ Likelihood = NDArray[np.float32]
 class PoseAndMaskSettings:
     """How far off the first poses may be, and how long they are improved.
 
-    Sizes of silhouettes are roots of their areas. A pose's error is told as a fraction of the
-    standard deviations of the first ones.
+    Sizes of silhouettes are roots of their areas. A pose's error is a fraction of the standard
+    deviations of the first ones.
     """
 
     angle: float = math.radians(5.0)  # Standard deviation of each angle of the first poses [rad],
@@ -169,7 +169,7 @@ class PoseAndMask:
         Args:
             pictures: of each frame, each camera's (H, W, 3); None where it has none.
             starts: of each frame, (m,) a rough pose of the tree [rad or m].
-            on_round: is told how many rounds are done.
+            on_round: is called with the number of rounds done.
         """
         values = [np.clip(one, self._kinematics.lower, self._kinematics.upper) for one in starts]
         whole = PictureLevel(self._cameras, pictures)
@@ -289,7 +289,7 @@ class PoseAndMask:
 
     def _search(self, level: PictureLevel, frame: _Progress, ratios: Sequence[Likelihood]) -> Array:
         """The pose near a frame's that covers most of what is not background."""
-        # Log-odds are summed in so many parts of one.
+        # Log-odds are summed as integers, in units of 1/64.
         parts, own = 64.0, self._settings
         told = [
             (camera, prefix_sums(np.rint(parts * one).astype(np.int32))[None])

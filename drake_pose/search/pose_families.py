@@ -117,8 +117,8 @@ def split_into_families(
 ) -> list[tuple[float, float, np.ndarray]]:
     """The families of a graph by clusters of samples: J [pixel], poses, clusters (nodes,).
 
-    Best first, of equals the larger first. ``most_pairs``: beyond so many pairs of a state and a
-    family, later nodes are not told apart any more.
+    Best first, of equals the larger first. ``most_pairs``: beyond this number of pairs of a state
+    and a family, later nodes are not told apart any more.
     """
     states, families = np.zeros(1, dtype=np.int64), np.zeros(1, dtype=np.int64)
     sizes: np.ndarray = np.ones(1)
@@ -270,7 +270,7 @@ class ExaminationSettings:
             is not tried. An answer with J = 0 needs none.
         family_time_limit: the same of the search for all poses as good; it then answers with those
             it has, and no joint is called determined.
-        proof_poses: the proof ends after so many poses of nodes are drawn: unlike a
+        proof_poses: the proof ends after this number of poses of nodes is drawn: unlike a
             limit on time, with the same result on every machine.
         family_poses: the same of the search for all poses as good: about two seconds.
         memory: of each of the two, for what it keeps; it ends as if its time were over [byte].

@@ -1,9 +1,9 @@
-"""The beam search where nobody knows where the root is, nor the scale of a parallel camera.
+"""The beam search where the root's place, or the scale of a parallel camera, is not known.
 
-Where the root can be is told by the silhouettes alone. One parallel camera of unknown scale: a body
-twice as large looks like a camera with twice as many pixels a metre, so the scale is tried on the
-camera and the body keeps its size. One pinhole: what is unknown beside the place in the picture is
-the depth. Both are bounded by the silhouette's area, beside that of the body's own random poses,
+Where the root can be follows from the silhouettes alone. One parallel camera of unknown scale: a
+body twice as large looks like a camera with twice as many pixels a metre, so the scale is tried on
+the camera and the body keeps its size. One pinhole: what is unknown beside the place in the picture
+is the depth. Both are bounded by the silhouette's area, beside that of the body's own random poses,
 and tried in geometric steps. Several calibrated cameras: a grid in space, of which every camera
 leaves what lies in its silhouette.
 
@@ -150,7 +150,7 @@ def scale_camera(camera: ParallelCamera, scale: float) -> ParallelCamera:
 def slide_root(camera: ParallelCamera, p_WR: np.ndarray, factor: float) -> np.ndarray:
     """(3,) where a root at (3,) [m] comes to lie that is moved across a parallel camera's axis.
 
-    Seen by a camera of so many times the scale, it keeps its place if it comes so many times
+    Seen by a camera of ``factor`` times the scale, it keeps its place if it comes ``factor`` times
     nearer to the axis: a body and its root's place grow alike, or the camera's scale does.
     """
     p_CR = _in_camera(camera, p_WR)
@@ -206,7 +206,7 @@ def choose_root_samples(
     rotation and moved by whole pixels. In several views all rotations are taken.
 
     Args:
-        count: so many rotations at each.
+        count: the number of rotations at each.
         outside_weight: what a pixel outside counts; one covered counts one.
         farthest: the root is drawn no farther than this from its origin [pixel].
 

@@ -57,7 +57,7 @@ def counter_turns(
 def flips(kinematics: TreeKinematics, values: np.ndarray, count: int = 16) -> list[Flip]:
     """Poses with joints of a chain flipped, where what hangs on the last stays.
 
-    ``count``: at most so many are looked at; those outside the limits are left out.
+    ``count``: the greatest number looked at; those outside the limits are left out.
     """
     untouched = np.zeros(len(values), dtype=np.bool_)
     known = [Flip(values, untouched, untouched)]

@@ -3,8 +3,8 @@
 Where neither scale nor distance of a body is known, lengths in a picture are only told by the
 silhouettes themselves: the unit of length is the root of their mean area.
 
-How far a right pose may be off is told by its covariance. Whether another pose fits as well is told
-by other optima: those as good are families of their own. Exact masks, drawn by pixels, and damaged
+A covariance says how far a right pose may be off. Other optima show whether another pose fits as
+well: those as good are families of their own. Exact masks, drawn by pixels, and damaged
 masks or bodies that fit badly are treated apart (``find_intervals``, ``RobustFamilies``).
 """
 
@@ -240,7 +240,7 @@ def covariance_pose_set(
 ) -> PoseSet:
     """What the covariance (m, m) of the tree's values says about a pose, where no other is sought.
 
-    How large errors are was told by so many pictures.
+    The size of errors was estimated from ``pictures`` pictures.
     """
     kinematics, settings = TreeKinematics(tree), RobustSettings()
     values = kinematics.flatten(pose.node_values)

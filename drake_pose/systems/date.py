@@ -285,7 +285,6 @@ class FaceDirectionFinder(PortedSystem):
 
     def __init__(self, camera: Camera, templates: FaceTemplates, farthest: float = 30.0) -> None:
         super().__init__()
-        self.camera = camera.name
         self.add_input("color_image", ImageRgba8U(camera.width, camera.height))
         self.add_input("person_view", None)
 

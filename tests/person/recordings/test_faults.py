@@ -318,6 +318,9 @@ class TestOthers:
         # Where one is hidden one is on a straight way, without figures.
         np.testing.assert_allclose(found[2].place, me[1].place + (me[2].place - me[1].place) / 3)
         assert found[2].figures == {}
+        # Who is there at the same time, if only in a frame, is somebody else.
+        found = follow_one([[him[0]], [him[1], me[0]], [me[1]], [me[1]]], np.zeros(3), True)
+        assert found == [None, me[0], me[1], me[1]]
         each = follow_one(frames, np.zeros(3), False)
         assert each == [me[0], me[1], None, him[1], me[2], me[3], None]
 

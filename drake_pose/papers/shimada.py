@@ -170,15 +170,19 @@ def run_experiment(
     hand_filter, observation = experiment_filter(settings, noise, acceleration)
     seen = "lines" if observed == PICTURES else observed
     follow = _filter_pictures if observed == PICTURES else _filter_sequence
+
+    def filtered(run: int, r_13: float) -> FilteredHand:
+        generator = np.random.default_rng([seed, run, int(r_13)])
+        return follow(hand_filter, make_sequence(r_13, seen, observation, generator))
+
     # The first call of compiled code loads it, which belongs to no update.
-    follow(hand_filter, make_sequence(35.0, seen, observation, _generator(seed, 0, 35.0)))
+    filtered(0, 35.0)
     advance = count(f"sequences, {truncation} truncation", runs * len(CASES))
     trials = {}
     for place, (key, r_13) in enumerate(CASES.items()):
         case = []
         for run in range(runs):
-            sequence = make_sequence(r_13, seen, observation, _generator(seed, run, r_13))
-            case.append(follow(hand_filter, sequence))
+            case.append(filtered(run, r_13))
             advance(place * runs + run + 1)
         trials[key] = tuple(case)
     return HandsResult(trials, seed, settings, observed, noise, acceleration)
@@ -222,10 +226,6 @@ def angle_error(means: Array, truths: Array) -> Array:
     return np.asarray(np.degrees(np.sqrt(np.mean(errors**2, axis=-1))))
 
 
-def _generator(seed: int, run: int, r_13: float) -> np.random.Generator:
-    return np.random.default_rng([seed, run, int(r_13)])
-
-
 def _filter_sequence(hand_filter: TruncatedFilter, sequence: SyntheticSequence) -> FilteredHand:
     """Filter a sequence; a filter that breaks down keeps its last belief."""
     states, times, broken = [], [], False
@@ -242,7 +242,13 @@ def _filter_sequence(hand_filter: TruncatedFilter, sequence: SyntheticSequence) 
                 broken = True
         states.append(state)
         times.append(milliseconds)
-    return FilteredHand(sequence, track_of(states, times), _bound(hand_filter, sequence))
+    # What a filter believes at the end that linearises at the truth, without limits.
+    belief = sequence.guess
+    for t, (truth, y) in enumerate(zip(sequence.states, sequence.measurements, strict=True)):
+        if t:
+            belief = hand_filter.predicted(belief)
+        belief = update(belief, make_measurement(hand_filter.observation, y), 1, truth).belief
+    return FilteredHand(sequence, track_of(states, times), belief.mean)
 
 
 def _filter_pictures(hand_filter: TruncatedFilter, sequence: SyntheticSequence) -> FilteredHand:
@@ -270,16 +276,6 @@ def _filter_pictures(hand_filter: TruncatedFilter, sequence: SyntheticSequence) 
     # Three frames are kept to be drawn.
     track = follow_pictures(parts, period, FRAMES, (7, 23, 39))
     return FilteredHand(sequence, track, np.full(len(HAND_STATE), math.nan))
-
-
-def _bound(hand_filter: TruncatedFilter, sequence: SyntheticSequence) -> Array:
-    """(n,) what a filter believes at the end that linearises at the truth, without limits."""
-    belief = sequence.guess
-    for t, (truth, y) in enumerate(zip(sequence.states, sequence.measurements, strict=True)):
-        if t:
-            belief = hand_filter.predicted(belief)
-        belief = update(belief, make_measurement(hand_filter.observation, y), 1, truth).belief
-    return belief.mean
 
 
 def _figures(trials: Sequence[FilteredHand]) -> dict[str, float | int]:

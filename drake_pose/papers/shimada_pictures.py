@@ -41,7 +41,15 @@ def save_pictures(result: HandsResult, folder: Path) -> list[Path]:
         ("figure_15_length_r13_35", "length_13", first["r13_35"], PIXELS_PER_METRE, "r_13 [pixel]"),
         ("figure_16_length_r13_40", "length_13", first["r13_40"], PIXELS_PER_METRE, "r_13 [pixel]"),
     )
-    figures = {"figure_12_scale": _draw_scale(trial)}
+    # The scale is the quaternion's squared norm. Its deviation by linear propagation takes elements
+    # as independent: an upper bound where errors of rotation dominate.
+    elements, track = HAND_STATE.indices(QUATERNION), trial.track
+    true, estimate = (
+        np.sum(one[:, elements] ** 2, axis=1) for one in (trial.sequence.states, track.means)
+    )
+    slopes = 2 * track.means[:, elements] * track.deviations[:, elements]
+    scale = _draw_curve("scale", true, estimate, np.linalg.norm(slopes, axis=1))
+    figures = {"figure_12_scale": scale}
     if result.observed == PICTURES:
         figures["figure_17_pictures"] = _draw_matches(trial.track)
         figures["figure_18_shapes"] = _draw_shapes(first)
@@ -218,17 +226,6 @@ def _flat(state: Array, hand: HandModel = TWO_FINGERS) -> Array:
     # A quarter turn about the fingers' axis: the palm faces the camera.
     flat[hand.layout.indices(QUATERNION)] = np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0
     return flat
-
-
-def _draw_scale(trial: FilteredHand) -> Figure:
-    """The scale is the quaternion's squared norm; its deviation by linear propagation."""
-    indices = HAND_STATE.indices(QUATERNION)
-    true, estimate = (
-        np.sum(one[:, indices] ** 2, axis=1) for one in (trial.sequence.states, trial.track.means)
-    )
-    # Elements taken as independent: an upper bound where errors of rotation dominate.
-    slopes = 2 * trial.track.means[:, indices] * trial.track.deviations[:, indices]
-    return _draw_curve("scale", true, estimate, np.linalg.norm(slopes, axis=1))
 
 
 def _draw_curve(label: str, true: Array, estimate: Array, deviation: Array) -> Figure:

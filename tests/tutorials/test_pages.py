@@ -131,7 +131,9 @@ def test_options_named_in_the_text_exist() -> None:
     commands += [["reproduce", paper] for paper in ("kameda", "shimada", "date", "all")]
     shown = [run_command([*one, "--help"], env=ENVIRONMENT) for one in commands]
     known = {word for one in shown for word in re.findall(r"--[a-z][a-z-]*", one.output)}
-    named = {word for text in SHOWN.values() for word in re.findall(r"`(--[a-z][a-z-]*)", text)}
+    # CHANGELOG names options that left, too.
+    texts = [text for name, text in SHOWN.items() if name != "CHANGELOG.md"]
+    named = {word for text in texts for word in re.findall(r"`(--[a-z][a-z-]*)", text)}
     assert {"--json", "--resume", "--package"} <= named
     assert named - known - {"--help"} == set()
 

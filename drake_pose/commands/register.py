@@ -59,14 +59,14 @@ def register(
     An episode needs no masks: pictures or videos beside joint positions by time or frame, a LeRobot
     data set, a folder of DROID, a ROS bag. The robot must move in view of a camera that stands
     still, or that rides on it (--on) and sees a --target. Of one that stands still is found, too,
-    by how much pictures and joints are out of step, and a focal length that nobody knows.
+    by how much pictures and joints are out of step, and an unknown focal length.
 
     Files in DIR: cameras.yaml, which estimate reads; report.html, which shows all of it;
     registration.yaml (6 x 6 covariance, other poses); summary.json; overlay/, overlay_as_given/; of
     an episode masks/ and joint_angles.csv, a scene of the frames that were looked at; with --export
     ros/, mujoco.xml, drake.yaml, rerun.rrd.
 
-    A robot arm whose camera nobody measured, and an episode of DROID:
+    A robot arm whose camera was not measured, and an episode of DROID:
 
         drake-pose register ../shared/data/arm_one_view --out results/camera \
           --model ../shared/data/arm_two_views/med7/med7.urdf \

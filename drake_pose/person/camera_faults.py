@@ -228,7 +228,7 @@ class CameraJudge:
         if not suspects or misfits[suspects[0]] > FAULT.lowered:
             return None
         # Any two cameras agree more or less: two alone predict a third one's picture half as well,
-        # and of three nobody can tell which one contradicts the others.
+        # and of three it is unknown which one contradicts the others.
         few = len(names) <= 3
         metres = (2.0 if few else 1.0) * FAULT.min_metres
         # Of those that lower the misfit alike, one that has not moved is not at fault.

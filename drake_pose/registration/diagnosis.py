@@ -62,7 +62,7 @@ class Finding:
             pictures' joints are in the log [s], of its rate how much faster the log's runs [s/s].
         angle_sd, shift_sd: their standard deviations.
         pixels: how far it moves the outlines of the parts that it moves, root mean square.
-        p_value: how often nothing would seem so much off by chance.
+        p_value: probability of a deviation this large where nothing is off.
         rivals: names of alternative causes that explain it as well.
         joints: by how much joints are off where several are [rad or m].
     """
@@ -164,7 +164,7 @@ class _Cause(NamedTuple):
     moves: (p, d) how what was free follows it: a joint's position [rad or m], or a rotation vector
     [rad] and a shift [m] of a camera along its axes, or of the base in the world, a share of focal
     lengths, or principal points [pixel]; units: (d,).
-    rank: of causes that explain alike those of a lower one are likelier.
+    rank: of causes that explain equally well, the one with the lowest rank is named.
     Once it was tested: by what amount (d,) it is off, with covariance, and how far that moves what
     was free, x (p,); with what chance; Akaike's gain.
     """
@@ -219,9 +219,9 @@ class _Residual(NamedTuple):
     def sufficient(
         self, tests: Sequence[_Cause], least: float, share: float = 0.25
     ) -> list[_Cause]:
-        """Causes that suffice, likelier ones first.
+        """Causes that suffice, sorted by rank and gain.
 
-        They leave less than a share of the residual, or less than least [pixel].
+        They leave less than a fraction of the residual, or less than `least` [pixel].
         """
         most = max(least, share * self.pixels())
         enough = [one for one in tests if self.pixels(one.x) < most]
@@ -263,7 +263,7 @@ class _Diagnoser:
             residuals = [self._residual(info, *common) for info in self._info]
             return np.array([one.p_value for one in residuals]), common[0]
 
-        # As long as nobody knows which frames agree, sizes of errors come from each by itself.
+        # While it is unknown which frames agree, sizes of errors come from each by itself.
         agreeing, together = explained, 1
         for _ in range(2):
             sizes = self._pooled_sizes(np.flatnonzero(agreeing).tolist(), together)
@@ -531,7 +531,7 @@ def likeliest_frames(
             in common.
         outlier_cost: negative log-likelihood of each outlier.
         usual_deviation: standard deviation of x.
-        max_iterations: of each start; and so many single frames are starts.
+        max_iterations: of each start; also the number of single frames that are starts.
     """
     best, least = explained & False, np.inf
     starts = [np.zeros(len(explained), bool), explained]

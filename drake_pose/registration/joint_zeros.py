@@ -100,7 +100,7 @@ def require_known(tree: PoseTree, names: Sequence[str], lengths: Sequence[str]) 
 
 
 def require_enough(count: int, zeros: int, lengths: int) -> None:
-    """Refuses fewer frames than so many zeros and lengths need.
+    """Refuses fewer frames than a number of zeros and lengths needs.
 
     Raises RegistrationError: says how many there are.
     """
@@ -128,7 +128,7 @@ def calibrate_joints(
         names: of the positions whose zeros are asked for.
         focal: whether the cameras' focal lengths are asked for, too.
         lengths: the links whose lengths are asked for.
-        level: what seems significant by chance in so many of calibrations.
+        level: probability that a calibration finds anything significant by chance.
 
     Raises:
         UnknownNameError: a name that is no position of the body's, or no link with a length.

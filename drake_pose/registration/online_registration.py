@@ -44,19 +44,19 @@ class OnlineSettings:
     """Which frames are kept, and when the camera has been moved.
 
     Args:
-        least_frames: the camera is searched for in so many keyframes or more.
-        most_frames: so many keyframes are kept at most, the newest.
-        newest: so many keyframes, or frames that contradict the pose, tell that it has changed.
+        least_frames: minimum number of keyframes for a search.
+        most_frames: maximum number of keyframes; the newest are kept.
+        newest: number of keyframes, or of frames that contradict the pose, that show a move.
         min_inlier_ratio: a frame contradicts the pose if its inlier ratio is below this fraction of
             the keyframes' median.
         bump: a bump turns the camera by no more [rad], and shifts it by no more [its distance from
             the body]: from there a fit leads to the same view. Farther away all poses are searched.
-        trust: before anything differed, the covariance is trusted as if so many numbers had borne
+        trust: before anything differed, the covariance is trusted as if this many numbers had borne
             it out; sets of the newest keyframes overlap, so that each new one adds fewer numbers
             than a pose has.
         novelty: a frame is a keyframe where the body's points are this far from where they are in
             all keyframes, root mean square [the body's own extent]; or where
-        tolerance: body and mask differ by so much more than in the keyframe [the mask's area].
+        tolerance: body and mask differ by this more than in the keyframe [the mask's area].
         min_iou: mean intersection over union, below which no camera is believed to be found.
         false_alarm: p-value of a difference that counts as a moved camera.
 
@@ -231,7 +231,7 @@ class OnlineRegistration:
         return found if self._is_found(found, self.settings.least_frames, least) else None
 
     def _is_found(self, found: RegisteredCamera, count: int, least: float) -> bool:
-        """Whether so many frames, and more than half, agree; of which a share fits at least."""
+        """Whether `count` frames, and more than half, agree, with inlier ratios of `least`."""
         agreeing = [frame for frame in found.frames if frame.agrees]
         return (
             not len(found.alternatives)

@@ -48,7 +48,7 @@ class Recording:
 
     Args:
         names: (n,) of the pictures.
-        values_at: (n, m) values of the pose tree so much later [s] than the pictures' times; one
+        values_at: (n, m) values of the pose tree at the pictures' times plus an offset [s]: one
             for all, or (n,).
         read: gives picture k (H, W, 3).
         times: (n,) of the pictures [s]; None: the joints have none, and the values are the same
@@ -61,7 +61,7 @@ class Recording:
     times: Array | None
 
     def rates_at(self, offset: float) -> Array | None:
-        """(n, m) how fast the values change [rad/s or m/s]; None: nobody knows."""
+        """(n, m) how fast the values change [rad/s or m/s]; None: unknown."""
         if self.times is None:
             return None
         step = PICTURES.rate_step
@@ -81,7 +81,7 @@ class Recording:
         return replace(self, values_at=lambda offset: self.values_at(offset) + zeros)
 
     def with_drift(self, drift: float, since: float) -> Recording:
-        """The same where the joints' clock runs so much faster [s/s], and is right at a time."""
+        """The same where the joints' clock runs faster by a drift [s/s], and is right at a time."""
         if not drift or self.times is None:
             return self
         later = drift * (self.times - since)
@@ -112,7 +112,7 @@ class TimeOffset:
 
 
 NO_CLOCK = TimeOffset(0.0, np.inf, np.zeros((0, 2)))
-"""Of pictures whose offset nobody knows."""
+"""Of pictures whose offset is unknown."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -313,10 +313,10 @@ def choose_pictures(
     slow_share: float = 0.6,
     min_motion: float = 0.05,
 ) -> tuple[list[int], list[int]]:
-    """The frames that carry a search, so many at most, and those that move most beside them.
+    """The frames that carry a search, and those that move most beside them.
 
     Args:
-        count: of the former, and moving: of the latter.
+        count, moving: maximum number of the former, and of the latter.
         slow_share: the slower share of all frames carries the search, if clocks may differ.
         min_motion: a robot whose parts move by less [m] does not tell where a camera is.
 
@@ -493,7 +493,7 @@ def judge_pictures(
     Args:
         one: what was found in some of them.
         found: the camera, where it is known to be by now.
-        most: number of pictures, at_once: so many of them together.
+        most, at_once: maximum number of pictures, and of those in memory together.
         shown: a picture shows the body where it should cover this share of it.
         min_overlap: dark and blurred contours fit badly where the body is right, too: a frame
             agrees, too, that overlaps this fraction of what those of the fit do in the median.

@@ -47,7 +47,7 @@ class PictureSettings(NamedTuple):
     to 64 and up to 120 pixels wide, and beyond; the last ones also show where a body is about.
     compared, learned: width of the pictures in which poses are compared, and in which backgrounds
     are learned [pixel]. contours: weight of contours' edges beside the share that is explained.
-    rate_step: rates are told by positions so much before and after [s].
+    rate_step: rates are differences of positions this long before and after [s].
     """
 
     searched: int = 12
@@ -68,7 +68,7 @@ class PosedPicture:
     Args:
         values: (m,) of the body's pose tree [rad or m].
         picture: (H, W, 3) red, green, blue.
-        rates: (m,) how fast the values change [rad/s or m/s]; None: nobody knows.
+        rates: (m,) how fast the values change [rad/s or m/s]; None: unknown.
     """
 
     name: str
@@ -84,7 +84,7 @@ class PictureFit:
     Args:
         fit: the fit of its frames, which have the odds of their pixels, and masks of these.
         found: by it.
-        background: what is behind the body, by which odds of other pictures are told.
+        background: what is behind the body; it gives foreground probabilities of other pictures.
         explained: share of what could be explained at most, that the pose explains.
         contour: how strong edges are along the outlines, beyond chance.
     """
@@ -411,7 +411,7 @@ class PyramidLevel:
     def score(self, X_CW: Array, frames: int | None = None) -> float:
         """How much speaks for a pose; short outlines, which say little by chance, count as longer.
 
-        frames: so many count, the first ones; None: all.
+        frames: number of frames that count, from the first on; None: all.
         """
         X_WN = self._X_WN[:frames]
         told = self.told(X_CW, X_WN)
@@ -433,7 +433,7 @@ class PyramidLevel:
         return [X_CW[k] for k in order[: math.ceil(share * len(order))]]
 
     def pieces(self, X_CW: Array, squares: int = 16) -> Array:
-        """(k, k) what a pose (4, 4) explains, by so many squares of the picture's longer side."""
+        """(k, k) what a pose (4, 4) explains, by squares, `squares` along its longer side."""
         side = max(self.camera.width, self.camera.height) / squares
         pieces = explain(
             self._packed, X_CW[:3] @ self._X_WN, self._still, self._parameters,
@@ -444,7 +444,7 @@ class PyramidLevel:
     def starts(self, rotations: int = 1200) -> list[Array]:
         """Poses X_CW (4, 4) that show the body where pictures change, and about as large.
 
-        Each of twice so many rotations comes at three distances, there and aside of there.
+        Each rotation comes at three distances, in the middle of the changes and beside it.
         """
         changes = self.backgrounds.changes()
         v, u = np.mgrid[: changes.shape[0], : changes.shape[1]]
@@ -478,7 +478,7 @@ class PyramidLevel:
 
         Args:
             numbered: a number that says which way the simplex begins, and the pose.
-            evaluations: at most so many.
+            evaluations: maximum number of scores.
             turn: of the first simplex [rad]; its other steps follow.
         """
         key, X_CW = numbered
@@ -495,7 +495,7 @@ class PyramidLevel:
         return -float(found.fun), self._moved(X_CW, found.x)
 
     def distinct(self, X_CW: Sequence[Array], most: int | None = None) -> list[Array]:
-        """Those of some poses that show the body elsewhere than all before; so many at most."""
+        """Those of some poses that show the body elsewhere than all before; `most` at most."""
         some = self._points[:: max(1, len(self._points) // 50)]
         kept, places = list[Array](), np.zeros((0, *some.shape))
         for X in X_CW:

@@ -46,8 +46,8 @@ class CameraSearchSettings(NamedTuple):
     silhouettes' edge points in the first two [root of the silhouettes' area]. first_side,
     second_side: sides of silhouettes in the pictures in which starts, and coarse fits, are compared
     [pixel]. significance: poses are as good whose cost is larger by no more standard deviations of
-    the difference; it is told by pieces of so many roots of the area: what is missing or too much
-    is about as large.
+    the difference. piece: side of the squares whose costs are compared [root of the area]: what is
+    missing or too much is about as large.
     """
 
     coarse: tuple[AnnealingStage, ...] = tuple(
@@ -88,7 +88,7 @@ class RegistrationBody:
 
     Args:
         seen: the nodes that silhouettes show; all where None.
-        fewest: so many triangles a node has where it has very few.
+        fewest: number of triangles of a node where it has very few.
         girths: (nodes,) how many times as wide nodes are across their y axes as the model's; 1
             where None.
     """
@@ -196,7 +196,7 @@ class RegisteredCamera(_UncertainPose):
 
 
 class CameraSearch:
-    """Finds where a camera stands: so many rotations are tried, so many of them fitted."""
+    """Finds where a camera stands: numbers of rotations that are tried, and that are fitted."""
 
     def __init__(self, body: RegistrationBody, rotations: int = 3000, fitted: int = 30) -> None:
         self._body, self._fitted_count = body, fitted
@@ -254,7 +254,7 @@ class CameraSearch:
     def search(
         self, camera: PinholeCamera, frames: Sequence[PosedFrame], kept: int = 6
     ) -> list[Array]:
-        """Poses X_CW (4, 4) near which the best one may be, best first, so many at most."""
+        """Poses X_CW (4, 4) near which the best one may be, best first; `kept` at most."""
         body = self._body
         posed = PosedFrames(
             body.kinematics, body.very_few, camera, spread(frames), SEARCH.coarse_spacing

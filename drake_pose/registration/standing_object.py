@@ -314,7 +314,7 @@ class ObjectSearch:
         found, covariance, as_good = describe_fitted(last)
         X_LC, X_WT = looks[as_good[0]]
         others = [X_WT @ turn for turn in distinct_turns(*self._standing.symmetry)[1:]]
-        # Where the camera would be elsewhere, too, that is told with the camera.
+        # Alternatives with another camera pose are listed with the camera.
         as_well = [looks[k] for k in as_good[1:]]
         others += [one[1] for one in as_well if not self._differ(one[:1], X_LC[None])]
         apart = [X[0] for X in self._apart([X[None] for X in (X_WT, *others)], np.eye(4)[None])]
@@ -496,7 +496,7 @@ def hand_eye_starts(X_WL: Array, X_CT: Sequence[Array], turns: Array, triples: i
     threes = list(combinations(range(len(X_WL)), 3))
     if len(threes) > triples:
         drawn = np.random.default_rng(0).permutation(len(threes))
-        # Threes of which nothing is told are drawn too often otherwise.
+        # Triples without rotation are drawn too often otherwise.
         threes = [threes[k] for k in drawn[: 4 * triples]]
     told = [turns_between(X_WL[list(three), :3, :3])[1] for three in threes]
     chosen = [threes[k] for k in np.argsort(told)[::-1][:triples]]
@@ -511,7 +511,7 @@ def _of_three(
 ) -> Array:
     """What three pictures say: for those of the object's poses that turn as the hand does.
 
-    So many at most; angles of hand and object differ by less [rad].
+    most: maximum number; angle: by which motions of hand and object may differ [rad].
     """
     pairs = ((0, 1), (0, 2), (1, 2))
     A = np.array([np.linalg.inv(X_WL[j]) @ X_WL[i] for i, j in pairs])
@@ -583,7 +583,7 @@ def find_in_pictures(
 
 
 def require_seen(camera: str, count: int, of: int, least: int = 4, share: float = 0.5) -> None:
-    """Refuses (RegistrationError) a pose that explains too few of so many pictures."""
+    """Refuses (RegistrationError) a pose that explains too few of a number of pictures."""
     if count < max(least, share * of):
         raise RegistrationError(
             f"camera '{camera}': no pose of the target explains its pictures: the best one does so "

@@ -184,7 +184,7 @@ def _look_at_episode(
             is seen [root of the silhouettes' area].
 
     Raises:
-        SceneError: nobody says where a camera stands.
+        SceneError: no camera has a pose.
         RegistrationError: no pose of a camera explains its pictures.
     """
     path = inputs.scene.path

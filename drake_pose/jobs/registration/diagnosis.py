@@ -308,7 +308,7 @@ def compare_clock(
 
     Args:
         recording: as it is.
-        clock_sd: clocks are as good as right that are off by about so much [s].
+        clock_sd: standard deviation of clocks that are as good as right [s].
     """
     clock, camera = one.offset, one.found.camera
     if clock is None or not clock.determined:
@@ -345,7 +345,7 @@ def _picture_shift(
 
 
 def shift_unit(kind: str) -> tuple[str, float]:
-    """The unit in which a kind of finding's shift is told, and its factor."""
+    """The unit of the shift of a kind of finding in reports, and its factor."""
     units = {"focal": ("percent", 100.0), "center": ("px", 1.0), "clock": ("ms", 1e3)}
     return (units | {"rate": ("percent", 100.0)}).get(kind, ("mm", 1e3))
 

@@ -61,7 +61,7 @@ class Inputs:
         held: the cameras whose place is known.
         searched: the cameras that are to be found, or looked at in an episode.
         given: those of them whose X_WC is given, as they are given.
-        assumed: names of those that have a usual focal length, as nobody knows it.
+        assumed: names of those whose focal length is unknown; they have a usual one.
         left_out: cameras without X_WC that are not to be found.
         recordings: an episode's pictures beside the joints, by camera; empty for a scene of masks.
         wanted: names of the frames that are audited.
@@ -418,8 +418,8 @@ def _read_frames(inputs: Inputs, wanted: Sequence[str], most: int = 12) -> tuple
     """What cameras see; a bad mask of one that is to be found is refused.
 
     Of cameras that are held there is what can be compared with them. With positions that were
-    estimated cameras are found from so many frames at most: what the model lacks is the same in all
-    of them, so more tell little.
+    estimated, cameras are found from `most` frames at most: what the model lacks is the same in all
+    of them, so more add little.
     """
     scene, positions = inputs.scene, inputs.positions
     names, estimated = [one.name for one in inputs.searched], positions.is_estimate

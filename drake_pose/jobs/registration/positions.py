@@ -60,7 +60,7 @@ class KnownPositions:
         return self.values[frame_key(frame)]
 
     def are_one_pose(self, rows: Iterable[Array], times: float = 1.0) -> bool:
-        """Whether joints are at one place in rows (m,), to so many times a degree or 5 mm."""
+        """Whether joints are at one place in rows (m,), to `times` a degree or 5 mm."""
         same = times * np.where(self.kinematics.is_angle, math.radians(1.0), 0.005)
         return bool((np.ptp(np.array(list(rows)), axis=0) < same).all())
 

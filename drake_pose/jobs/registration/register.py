@@ -199,7 +199,7 @@ class _Registration:
         """Finds each camera by itself, in masks or in pictures.
 
         Raises:
-            CameraError: nobody says a camera's focal length.
+            CameraError: a camera's focal length is unknown.
             RegistrationError: no pose of a camera explains its masks or pictures.
         """
         inputs = self.inputs
@@ -275,14 +275,14 @@ class _Registration:
             self._on_camera(len(self.registered))
 
     def _find_target(self, standing: StandingObject, most: int = 24) -> None:
-        """Finds masks of an object in so many pictures from a link, and each camera in these."""
+        """Finds masks of an object in some pictures from a link, and each camera in these."""
         inputs, frames, start = self.inputs, list[SeenFrame](), time.perf_counter()
         body = standing.body(np.eye(4))
         for camera in inputs.searched:
             name = camera.name
             if name in inputs.assumed:
                 raise CameraError(
-                    f"camera '{name}': nobody says its focal length, without which pictures of a "
+                    f"camera '{name}': its focal length is unknown, without which pictures of a "
                     "target do not tell how far away it is; calibrate it"
                 )
             recording = inputs.recordings[name]

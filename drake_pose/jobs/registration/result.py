@@ -123,7 +123,7 @@ def say_pictures(one: PictureRegistration, assumed: bool) -> list[str]:
     name, texts = one.found.camera.name, []
     if assumed:
         texts.append(
-            f"camera '{name}': nobody says its focal length: {one.found.camera.focal_x:.0f} pixels "
+            f"camera '{name}': no focal length is given: {one.found.camera.focal_x:.0f} pixels "
             f"were found (standard deviation {one.focal_deviation * one.found.camera.focal_x:.0f})"
         )
     if one.offset is not None and one.offset.drift:
@@ -305,7 +305,7 @@ def _drawer(
 AS_GIVEN = "overlay_as_given"
 """The folder of pictures of cameras as given beside those that were found."""
 
-# So many pictures of each camera are shown: those that fit worst and best, and some between.
+# Number of pictures of each camera: those that fit worst and best, and some between.
 _PICTURES = 6
 PARAMETERS = (
     ("zeros", "Zeros, to be added to positions", "joint", "zero"),

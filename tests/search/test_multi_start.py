@@ -6,6 +6,7 @@ import pytest
 from drake_pose.errors import SettingsError
 from drake_pose.search import BeamSearch, MultiStartSearch, PaperSearch, View
 from drake_pose.search.multi_start import without_specks
+from drake_pose.search.refinement import RefinementProblem
 from drake_pose.silhouette.outline import TreeSurfaces
 from drake_pose.silhouette.scoring import draw_mask
 from drake_pose.workers import working
@@ -130,6 +131,18 @@ def test_nothing_is_determined_where_the_body_does_not_fit(chain):
     spoilt[5:60, 5:60] = True
     joints = chain.match([View(view.camera, spoilt)]).pose_set.joints
     assert not any(joint.determined for joint in joints)
+
+
+def test_the_search_by_pixels_certifies_exact_masks_and_gives_up_others(chain):
+    view = chain_view(chain.tree, chain_values(chain.tree, np.random.default_rng(3)))
+    problem = RefinementProblem(chain.exact.body, [view])
+    found = chain.exact.find(problem, None, np.inf)
+    assert problem.J(found.parameters) == found.J <= found.first_J
+    assert found.J <= chain.exact_settings.exact * problem.border_length
+    assert chain.exact.find(problem, None, 0.0) is None, "the time is up"
+    moved = np.roll(view.mask, 60, axis=1)
+    other = RefinementProblem(chain.exact.body, [View(view.camera, moved)])
+    assert chain.exact.find(other, None, np.inf) is None
 
 
 @pytest.mark.slow

@@ -32,10 +32,6 @@ PALETTE = np.array(
 """(colours, 3) red, green, blue: what a silhouette's overlay (H, W) numbers."""
 _BACKGROUND, _MISSING, _EXCESS, _AGREEMENT = range(_FIRST, len(PALETTE))
 _OUTLINE = 0
-_BAND = 36
-_LEAST_WIDTH = 560
-_LEAST_HEIGHT = 480
-_MARGIN = 0.12
 
 
 def paint_agreement(
@@ -145,45 +141,52 @@ def _draw_borders(
     picture[borders & body] = colour
 
 
-def _surroundings(shown: np.ndarray) -> tuple[slice, slice]:
-    """The rows and columns around what is shown, with a margin; the picture's where nothing is."""
+def _surroundings(shown: np.ndarray, margin_share: float = 0.12) -> tuple[slice, slice]:
+    """The rows and columns around what is shown; the picture's where nothing is.
+
+    ``margin_share``: margin as a fraction of its size.
+    """
     left, top, width, height = cv2.boundingRect(shown.view(np.uint8))
     if not width:
         return slice(None), slice(None)
-    margin = 8 + int(_MARGIN * (max(width, height) - 1))
+    margin = 8 + int(margin_share * (max(width, height) - 1))
     rows = slice(max(0, top - margin), top + height + margin)
     return rows, slice(max(0, left - margin), left + width + margin)
 
 
-def _enlarged(picture: np.ndarray) -> np.ndarray:
-    """A picture whose pixels are whole squares, so that it is not too small."""
+def _enlarged(picture: np.ndarray, width_to: int = 1120, height_to: int = 480) -> np.ndarray:
+    """A picture whose pixels are whole squares, as far as it fits into a size [pixel]."""
     height, width = picture.shape[:2]
-    scale = max(1, min(_LEAST_HEIGHT // height, 2 * _LEAST_WIDTH // width, 8))
+    scale = max(1, min(height_to // height, width_to // width, 8))
     size = width * scale, height * scale
     return cv2.resize(picture.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
 
 
 def _framed(
-    picture: np.ndarray, title: str, legend: Sequence[tuple[Colour | int, str]] = ()
+    picture: np.ndarray,
+    title: str,
+    legend: Sequence[tuple[Colour | int, str]] = (),
+    least_width: int = 560,
+    band: int = 36,
 ) -> np.ndarray:
-    """A picture, wide enough for the title above and the legend below it."""
+    """A picture, at least as wide as title and legend, in bands above and below it [pixel]."""
     numbered = picture.ndim == 2
     ground, text_colour = (_BACKGROUND, _TEXT) if numbered else (BACKGROUND_RGB, _TEXT_RGB)
-    pad = max(0, _LEAST_WIDTH - picture.shape[1])
+    pad = max(0, least_width - picture.shape[1])
     wide = cv2.copyMakeBorder(
-        picture, _BAND, _BAND + 2 if legend else 0, pad // 2, pad - pad // 2,
+        picture, band, band + 2 if legend else 0, pad // 2, pad - pad // 2,
         cv2.BORDER_CONSTANT, value=ground,
     )  # fmt: skip
-    wide[:_BAND] = 0
-    _put_text(wide, title, (10, _BAND - 14), text_colour)
+    wide[:band] = 0
+    _put_text(wide, title, (10, band - 14), text_colour)
     if legend:
-        band = wide[-_BAND - 2 :]
-        band[:] = 0
-        step = band.shape[1] // len(legend)
+        below = wide[-band - 2 :]
+        below[:] = 0
+        step = below.shape[1] // len(legend)
         for number, (colour, text) in enumerate(legend):
             left = 10 + number * step
-            cv2.rectangle(band, (left, 10), (left + 16, 26), colour, cv2.FILLED)
-            _put_text(band, text, (left + 24, 25), text_colour)
+            cv2.rectangle(below, (left, 10), (left + 16, 26), colour, cv2.FILLED)
+            _put_text(below, text, (left + 24, 25), text_colour)
     return wide
 
 

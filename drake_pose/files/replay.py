@@ -24,13 +24,6 @@ from drake_pose.registration.posed_frames import SeenFrame
 from drake_pose.systems.bodies import add_meshcat_skin, add_posed_plant, body_poses
 
 _BODY_PATH, _MEASURED_PATH = "visualizer", "measured"
-_CAMERA_COLOUR = Rgba(0.0, 0.45, 0.70, 1.0)
-_MEASURED_COLOUR = Rgba(0.0, 0.62, 0.45, 0.4)
-# A frustum's depth, and how far the view stands off, in the object's radii: in Meshcat's window of
-# 75 degrees one radius above and below the middle is seen from 1.3.
-_FRUSTUM, _DISTANCE = 0.25, 1.35
-# From here the first camera is seen behind the object, wherever between it and infinity it stands.
-_BESIDE = np.radians(125.0)
 
 
 def make_replay(
@@ -67,11 +60,17 @@ def make_replay(
     )
     for link, mesh in model.link_meshes.items() if measured is not None else ():
         surface = mesh.vertices.T, mesh.triangles.T
-        meshcat.SetTriangleMesh(f"{_MEASURED_PATH}/{link}", *surface, _MEASURED_COLOUR)
+        meshcat.SetTriangleMesh(f"{_MEASURED_PATH}/{link}", *surface, Rgba(0.0, 0.62, 0.45, 0.4))
     p_WO, radius = _extent(model, positions, X_WB)
     for camera in cameras:
         _draw_camera(meshcat, camera, p_WO, radius)
-    _look_from(meshcat, cameras[0], p_WO, _DISTANCE * radius)
+    # The view shows the first camera behind the object, wherever up to infinity that stands. In
+    # Meshcat's window of 75 degrees a radius above and below the middle is seen from 1.3 radii.
+    p_OC_W = cameras[0].X_WC[:3, 3] - p_WO
+    if isinstance(cameras[0], ParallelCamera):
+        p_OC_W = -cameras[0].X_WC[:3, 2]
+    beside = RotationMatrix.MakeZRotation(np.radians(125.0)).multiply(p_OC_W)
+    meshcat.SetCameraPose(p_WO + 1.35 * radius * beside / np.linalg.norm(beside), p_WO)
     _record(meshcat, builder.Build(), source, positions, X_WB, period, model, measured)
     return meshcat.StaticHtml()
 
@@ -129,12 +128,17 @@ def _extent(
     return 0.5 * (low + high), 0.5 * float(np.linalg.norm(high - low))
 
 
-def _draw_camera(meshcat: Meshcat, camera: Camera, p_WO: np.ndarray, radius: float) -> None:
-    """Draws the frustum of what a camera sees; a parallel one's begins outside the object."""
+def _draw_camera(
+    meshcat: Meshcat, camera: Camera, p_WO: np.ndarray, radius: float, length: float = 0.25
+) -> None:
+    """Draws the frustum of what a camera sees; a parallel one's begins outside the object.
+
+    ``length``: of the frustum, in the object's radii.
+    """
     parallel, f_x, f_y, c_x, c_y, *_ = camera.kernel_parameters()
     across, down = np.array([0, 1, 1, 0]), np.array([0, 0, 1, 1])
     x, y = (camera.width * across - 0.5 - c_x) / f_x, (camera.height * down - 0.5 - c_y) / f_y
-    depth, (*_, z_WC, p_WC) = _FRUSTUM * radius, camera.X_WC[:3].T
+    depth, (*_, z_WC, p_WC) = length * radius, camera.X_WC[:3].T
     far = np.column_stack([x, y, np.ones(4)]) * [1.0, 1.0, depth]
     near = far * [1.0, 1.0, 0.0]
     if parallel:
@@ -145,16 +149,8 @@ def _draw_camera(meshcat: Meshcat, camera: Camera, p_WO: np.ndarray, radius: flo
     p_W = np.concatenate([near, far]) @ camera.X_WC[:3, :3].T + p_WC
     lines = [(k, 4 + k) for k in range(4)] + [(4 + k, 4 + (k + 1) % 4) for k in range(4)]
     start, end = (p_W[[line[side] for line in lines]].T for side in (0, 1))
-    meshcat.SetLineSegments(f"cameras/{camera.name}", start, end, 2.0, _CAMERA_COLOUR)
-
-
-def _look_from(meshcat: Meshcat, camera: Camera, p_WO: np.ndarray, distance: float) -> None:
-    """Points the browser's view at the object, with a camera behind it."""
-    p_OC_W = camera.X_WC[:3, 3] - p_WO
-    if isinstance(camera, ParallelCamera):
-        p_OC_W = -camera.X_WC[:3, 2]
-    beside = RotationMatrix.MakeZRotation(_BESIDE).multiply(p_OC_W)
-    meshcat.SetCameraPose(p_WO + distance * beside / np.linalg.norm(beside), p_WO)
+    blue = Rgba(0.0, 0.45, 0.70, 1.0)
+    meshcat.SetLineSegments(f"cameras/{camera.name}", start, end, 2.0, blue)
 
 
 Pictures = Mapping[str, Mapping[str, NDArray[np.uint8]]]

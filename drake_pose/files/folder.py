@@ -88,8 +88,11 @@ def claimed(path: Path, resume: bool = False) -> Iterator[None]:
     except OSError:
         pass  # Some disks that computers share know no locks.
     try:
-        if not resume:
-            _require_empty(path)
+        if not resume and any(path.iterdir()):
+            raise OutputError(
+                f"{path}: the output folder exists and is not empty; name another one with --out, "
+                "or go on with an interrupted result in it with --resume"
+            )
         yield
     finally:
         with suppress(OSError):
@@ -110,14 +113,6 @@ def writes_folder(job: _Job) -> _Job:
             return job(*args, **kwargs)
 
     return cast(_Job, run)
-
-
-def _require_empty(path: Path) -> None:
-    if any(path.iterdir()):
-        raise OutputError(
-            f"{path}: the output folder exists and is not empty; name another one with --out, or "
-            "go on with an interrupted result in it with --resume"
-        )
 
 
 def require_no_file(path: Path) -> None:

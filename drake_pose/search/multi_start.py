@@ -161,15 +161,18 @@ class _MultiStartRun:
     def search(self, rounds: int, as_set: bool) -> PoseEstimate:
         """Look for a pose by pixels, else for a robust one, and for all that are as good."""
         tree, exact, own = self._kinematics.tree, self._search.exact, self._search.exact_settings
-        problem, found, first_J = self._problem, None, math.nan
-        # What specks hide is not exact.
-        if self._clean is self._problem:
-            found = exact.find(problem, self._root_position, self._deadline)
+        problem, found, poses = self._problem, None, list[FittedPose]()
         exactly = own.exact * problem.border_length
-        poses: list[FittedPose] = []
+        pool = self._begin()
+        first_J = self._J(pool[0].values)
+        if self._looks_exact(pool[0].values):
+            found = exact.find(problem, self._root_position, self._deadline)
         if found is None or found.J > exactly:
-            poses, first_J = self._search_robustly(rounds)
-            if self._clean is self._problem:
+            poses = self._search_robustly(pool, rounds)
+            looks_exact = self._looks_exact(poses[0].values)
+            if looks_exact and found is None:
+                found = exact.find(problem, self._root_position, self._deadline)
+            if looks_exact and (found is None or found.J > exactly):
                 found = self._refine_by_pixels(found, poses[0].values)
         begin, pose_set = time.perf_counter(), None
         # Before the families, whose evaluations are not the search's.
@@ -177,7 +180,7 @@ class _MultiStartRun:
         if found is not None and found.J <= exactly:
             if as_set:
                 found, pose_set = exact.families(problem, found, tree)
-            values, first_J = found.parameters[:-4], found.first_J
+            values = found.parameters[:-4]
             steps += found.steps
         else:
             if found is not None:
@@ -212,13 +215,32 @@ class _MultiStartRun:
         explained = found is not None and found.J < min(J, own.plausible * length)
         return found if explained else None
 
-    def _search_robustly(self, rounds: int) -> tuple[list[FittedPose], float]:
-        """The best poses by robust costs, and the first one's J."""
-        own, turns = self._settings, self._kinematics.turns_around
+    def _begin(self) -> list[FittedPose]:
+        """The coarse search's poses, refined but not to the end, best first."""
+        own = self._settings
         self._coarse = CoarseSearch(self._body, self._clean.views, None if self._proceed() else 1)
         starts = self._coarse.choose_distinct(self._coarse.find(), own.starts, own.apart)
-        pool = refine_best(self._fit, self._values(starts), self._passes, self._proceed)
-        first_J = self._J(pool[0].values)
+        return refine_best(self._fit, self._values(starts), self._passes, self._proceed)
+
+    def _looks_exact(self, values: np.ndarray) -> bool:
+        """Whether masks may be exact: much of their border is that of the body at values (m,)."""
+        # What specks hide is not exact.
+        if self._clean is not self._problem or not self._proceed():
+            return False
+        wrong, kernel = self._problem.wrong(self._parameters(values)), np.ones((3, 3), np.uint8)
+        met = length = 0
+        for off, view in zip(wrong, self._problem.views, strict=True):
+            borders = []
+            for area in (view.mask, view.mask ^ off):
+                inside = area.astype(np.uint8)
+                borders.append((inside > 0) & (cv2.erode(inside, kernel) == 0))
+            met += int(np.count_nonzero(borders[0] & borders[1]))
+            length += int(np.count_nonzero(borders[0]))
+        return met >= self._search.exact_settings.coinciding * length
+
+    def _search_robustly(self, pool: list[FittedPose], rounds: int) -> list[FittedPose]:
+        """The best poses by robust costs, from some that are not refined to the end."""
+        own, turns = self._settings, self._kinematics.turns_around
         pool = self._explore(pool, rounds)
         refined = self._finish(pool)
         contradicting = self._contradicting(refined[0].values)
@@ -235,7 +257,7 @@ class _MultiStartRun:
             refined = distinct(refined, own.finalists, turns)
         return [
             pose._replace(values=self._kinematics.nearest_turns(pose.values)) for pose in refined
-        ], first_J
+        ]
 
     def _explore(self, pool: list[FittedPose], rounds: int) -> list[FittedPose]:
         """The best poses, with other explanations sought about them in some rounds."""

@@ -220,6 +220,9 @@ class ExactSearchSettings:
         (1, Stage(60, 1.0, 2, limb_by_limb=True)),
         (1, Stage(60, 0.3, 5, limb_by_limb=True)),
     )
+    # Masks may be exact if this fraction of their border's pixels is a fitted pose's: .54 to .99 of
+    # bodies that Drake drew (``tests/silhouettes``), .1 to .51 of real arms and people.
+    coinciding: float = 0.53
     starts: int = 4  # Poses of each beam search that are refined.
     alike: float = 0.5  # See ``BeamSearch.best_poses``.
     hopeless: float = 1.5  # Above this J after coarse passes, or of the robust pose, give up.

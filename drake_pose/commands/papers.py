@@ -102,7 +102,7 @@ def kameda(
             for method, name in poses.METHODS.items():
                 warnings += [f"{name}: {text}" for text in real[method]["warnings"]]
         elif is_continuous:
-            search = MultiStartSearch(poses.experiment_tree())
+            search = MultiStartSearch(poses.experiment_tree(), exact_masks=True)
             result = poses.run_experiment(search, images, first, count, one.views or 1)
             figures, table = poses.continuous_figures(result), poses.continuous_table(result)
         else:

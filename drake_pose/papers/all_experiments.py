@@ -67,7 +67,7 @@ def _kameda(short: bool, folder: Path, count: Count) -> Outcome:
 
 
 def _kameda_continuous(short: bool, _folder: Path, count: Count) -> Outcome:
-    search = MultiStartSearch(kameda.experiment_tree())
+    search = MultiStartSearch(kameda.experiment_tree(), exact_masks=True)
     result = kameda.run_experiment(search, 1 if short else 30, 77, count)
     return kameda.continuous_figures(result), [kameda.continuous_table(result)], ()
 

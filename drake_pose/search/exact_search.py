@@ -1,8 +1,7 @@
 """The search where masks are exact: the beam search's best poses, refined by pixels.
 
 A pose that leaves hardly a pixel of the silhouettes' borders wrong certifies itself and the masks.
-Where the first grid leads to nothing near it, masks are damaged or the body is another one: the
-search ends at once, and the robust one has its turn (``multi_start``).
+Where masks are damaged, or the body is another one, ``multi_start`` does not call this search.
 """
 
 from __future__ import annotations
@@ -51,7 +50,7 @@ class ExactSearch:
     def find(
         self, problem: RefinementProblem, root_position: np.ndarray | None, deadline: float
     ) -> ExactPose | None:
-        """The best pose reached; None where none comes near, or the time is up."""
+        """The best pose reached; None where the time is up before."""
         own, length, reached = self._settings, problem.border_length, None
         for grid in self._grids:
             left = deadline - time.perf_counter()
@@ -61,8 +60,6 @@ class ExactSearch:
             starts = grid.best_poses(views, root_position, own.starts, own.alike, left)
             poses = [self.body.parameters(start, root_position) for start in starts]
             found = self._descend(problem, poses, deadline)
-            if found is None:
-                return None
             pair = [*([reached] if reached else []), found]
             reached, worse = min(pair, key=lambda one: one.J), max(one.J for one in pair)
             enough = own.exact * length
@@ -75,14 +72,12 @@ class ExactSearch:
 
     def _descend(
         self, problem: RefinementProblem, poses: Sequence[np.ndarray], deadline: float
-    ) -> ExactPose | None:
-        """The best pose reached from some, its parts placed anew; None where none comes near."""
-        freedom, length = self.body.freedom(), problem.border_length
+    ) -> ExactPose:
+        """The best pose reached from some, its parts placed anew."""
+        freedom = self.body.freedom()
         coarse = [descend(problem, pose, freedom, PASSES.coarse) for pose in poses]
         start = min((parameters for parameters, _, _ in coarse), key=problem.J)
         first_J = float(problem.J(start))
-        if first_J > self._settings.hopeless * length:
-            return None
         reached = self.escape(problem, start, deadline)
         if first_J <= reached.J:
             reached = reached._replace(parameters=start, J=first_J)

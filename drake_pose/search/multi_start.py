@@ -1,11 +1,11 @@
 """Multi-start search: from silhouettes, also damaged or ill fitting, to continuous positions.
 
-Exact masks are searched by pixels first (``exact_search``): a pose that leaves hardly a pixel wrong
-ends the search. Otherwise poses that are roughly right are found by places (``coarse_search``) and
-drawn to the silhouettes' edges by saturating costs (``fit``), and about the best of them other
-explanations are sought: a limb searched again, joints that turn against each other
-(``self_motions``). Where a piece as thick as a limb is left unexplained, a beam search by areas
-gives other starts. A pose found so is refined by pixels, too, where that explains the masks.
+Poses that are roughly right are found by places (``coarse_search``) and drawn to the silhouettes'
+edges by saturating costs (``fit``). Where the best of them meets most of the masks' border to the
+pixel, masks are exact and searched by pixels (``exact_search``): a pose that leaves hardly a pixel
+wrong ends the search. Otherwise other explanations are sought about the best poses: a limb searched
+again, joints that turn against each other (``self_motions``). Where a piece as thick as a limb is
+left unexplained, a beam search by areas gives other starts.
 """
 
 from __future__ import annotations
@@ -46,10 +46,18 @@ from drake_pose.workers import map_ordered
 
 
 class MultiStartSearch:
-    """Matches silhouettes with a pose tree at continuous values, for so long a time [s] at most."""
+    """Matches silhouettes with a pose tree at continuous values.
 
-    def __init__(self, tree: PoseTree, time_limit: float | None = None) -> None:
-        self.tree = tree
+    Args:
+        time_limit: of a match [s]; None: none.
+        exact_masks: whether masks are known to be exact, as Drake's label images are. Else a fitted
+            pose tells; where it is far off, exact masks may be taken for damaged ones.
+    """
+
+    def __init__(
+        self, tree: PoseTree, time_limit: float | None = None, *, exact_masks: bool = False
+    ) -> None:
+        self.tree, self.exact_masks = tree, exact_masks
         self.settings, self.exact_settings = MultiStartSettings(), ExactSearchSettings()
         self._time_limit, self._alternatives = time_limit, True
         self._grid = BeamSearch(tree, BeamSearchSettings(interval=self.settings.interval))
@@ -209,7 +217,7 @@ class _MultiStartRun:
         """
         exact, own, J = self._search.exact, self._search.exact_settings, self._J(values)
         length = self._problem.border_length
-        if J <= own.hopeless * length and self._proceed():
+        if self._proceed():
             other = exact.escape(self._problem, self._parameters(values), self._deadline)
             found = min((one for one in (found, other) if one), key=lambda one: one.J)
         explained = found is not None and found.J < min(J, own.plausible * length)
@@ -227,6 +235,8 @@ class _MultiStartRun:
         # What specks hide is not exact.
         if self._clean is not self._problem or not self._proceed():
             return False
+        if self._search.exact_masks:
+            return True
         wrong, kernel = self._problem.wrong(self._parameters(values)), np.ones((3, 3), np.uint8)
         met = length = 0
         for off, view in zip(wrong, self._problem.views, strict=True):

@@ -225,7 +225,6 @@ class ExactSearchSettings:
     coinciding: float = 0.53
     starts: int = 4  # Poses of each beam search that are refined.
     alike: float = 0.5  # See ``BeamSearch.best_poses``.
-    hopeless: float = 1.5  # Above this J after coarse passes, or of the robust pose, give up.
     enough: float = 0.03  # A pose with a smaller J is not searched on: it is the pixels' noise.
     exact: float = 0.18  # A pose with a smaller J is the answer.
     plausible: float = 0.5  # Above this J the robust pose is the answer.

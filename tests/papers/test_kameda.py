@@ -185,7 +185,7 @@ def test_cameras_are_spread_over_half_a_turn():
 
 @pytest.mark.slow
 def test_figures_of_continuous_angles_come_from_the_trials():
-    result = run_experiment(MultiStartSearch(experiment_tree()), 2, 7, views=2)
+    result = run_experiment(MultiStartSearch(experiment_tree(), exact_masks=True), 2, 7, views=2)
     figures = continuous_figures(result)
     assert (figures["images"], figures["views"], figures["interval_confidence"]) == (2, 2, 0.95)
     E_total = [trial.result.E_total for trial in result.trials]

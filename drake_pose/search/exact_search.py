@@ -50,7 +50,7 @@ class ExactSearch:
     def find(
         self, problem: RefinementProblem, root_position: np.ndarray | None, deadline: float
     ) -> ExactPose | None:
-        """The best pose reached; None where the time is up before."""
+        """The best pose reached; None where none comes near, or the time is up."""
         own, length, reached = self._settings, problem.border_length, None
         for grid in self._grids:
             left = deadline - time.perf_counter()
@@ -60,6 +60,8 @@ class ExactSearch:
             starts = grid.best_poses(views, root_position, own.starts, own.alike, left)
             poses = [self.body.parameters(start, root_position) for start in starts]
             found = self._descend(problem, poses, deadline)
+            if found is None:
+                return None
             pair = [*([reached] if reached else []), found]
             reached, worse = min(pair, key=lambda one: one.J), max(one.J for one in pair)
             enough = own.exact * length
@@ -72,12 +74,15 @@ class ExactSearch:
 
     def _descend(
         self, problem: RefinementProblem, poses: Sequence[np.ndarray], deadline: float
-    ) -> ExactPose:
-        """The best pose reached from some, its parts placed anew."""
+    ) -> ExactPose | None:
+        """The best pose reached from some, its parts placed anew; None where none comes near."""
         freedom = self.body.freedom()
         coarse = [descend(problem, pose, freedom, PASSES.coarse) for pose in poses]
         start = min((parameters for parameters, _, _ in coarse), key=problem.J)
         first_J = float(problem.J(start))
+        size = float(np.sqrt(problem.area / len(problem.views)))
+        if first_J > self._settings.hopeless * problem.border_length * size:
+            return None
         reached = self.escape(problem, start, deadline)
         if first_J <= reached.J:
             reached = reached._replace(parameters=start, J=first_J)

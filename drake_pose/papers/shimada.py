@@ -41,8 +41,8 @@ from drake_pose.papers.shimada_sequences import (
     ACCELERATIONS,
     FRAMES,
     OBSERVED,
+    HandTrack,
     SyntheticSequence,
-    Track,
     follow_pictures,
     make_sequence,
     track_of,
@@ -70,7 +70,7 @@ class FilteredHand(NamedTuple):
     """
 
     sequence: SyntheticSequence
-    track: Track
+    track: HandTrack
     bound: Array
 
 

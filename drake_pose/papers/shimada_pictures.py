@@ -23,7 +23,7 @@ from drake_pose.papers.shimada import (
     HandsResult,
     HypothesesResult,
 )
-from drake_pose.papers.shimada_sequences import FRAMES, SequenceResult, Track
+from drake_pose.papers.shimada_sequences import FRAMES, HandTrack, SequenceResult
 from drake_pose.papers.tables import save_figure
 
 _OBSERVATION = HandObservation(pixels_per_metre=PIXELS_PER_METRE)
@@ -144,7 +144,7 @@ def _draw_sequence(trial: FilteredHand) -> Figure:
     return figure
 
 
-def _draw_matches(track: Track, observation: HandObservation = _OBSERVATION) -> Figure:
+def _draw_matches(track: HandTrack, observation: HandObservation = _OBSERVATION) -> Figure:
     """Figure 17: silhouettes, the rough pose matched, the axes and tips measured, the estimate."""
     kept = track.kept
     figure = Figure(figsize=(3.6 * len(kept), 11))

@@ -187,7 +187,7 @@ def _product(a: Array, b: Array) -> Array:
 _WELL_MATCHED, _UNMATCHED = 0.12, 0.4
 
 
-class Track(NamedTuple):
+class HandTrack(NamedTuple):
     """What a filter believed after each frame.
 
     Attributes:
@@ -210,11 +210,11 @@ class Track(NamedTuple):
     kept: Mapping[int, tuple[Mask, Array, Array]] = MappingProxyType({})
 
 
-def track_of(states: Sequence[FilterState], milliseconds: Sequence[float]) -> Track:
+def track_of(states: Sequence[FilterState], milliseconds: Sequence[float]) -> HandTrack:
     """The track of a filter's states after each frame."""
     best = [state.best for state in states]
     ends = [end.reason for state in states for end in state.rejections]
-    return Track(
+    return HandTrack(
         np.array([one.mean for one in best]),
         np.array([one.deviations() for one in best]),
         best[-1].covariance,
@@ -230,7 +230,7 @@ def follow_pictures(
     frames: int,
     shown: Sequence[int],
     advance: Advance = lambda _done: None,
-) -> Track:
+) -> HandTrack:
     """Run a diagram of ``build_hand_estimation``, or of recorded pictures; keep what is shown."""
     diagram, ekf, sensor = parts
     simulator = Simulator(diagram)
@@ -267,7 +267,7 @@ class SequenceResult:
     name: str
     observation: HandObservation
     guess: Belief
-    track: Track
+    track: HandTrack
     truth: Mapping[str, Array]
 
     def warning(self) -> str:

@@ -76,12 +76,13 @@ class ExactSearch:
         self, problem: RefinementProblem, poses: Sequence[np.ndarray], deadline: float
     ) -> ExactPose | None:
         """The best pose reached from some, its parts placed anew; None where none comes near."""
-        freedom = self.body.freedom()
+        freedom, length = self.body.freedom(), problem.border_length
         coarse = [descend(problem, pose, freedom, PASSES.coarse) for pose in poses]
         start = min((parameters for parameters, _, _ in coarse), key=problem.J)
         first_J = float(problem.J(start))
         size = float(np.sqrt(problem.area / len(problem.views)))
-        if first_J > self._settings.hopeless * problem.border_length * size:
+        hopeless = max(self._settings.hopeless, self._settings.hopeless_share * size)
+        if first_J > hopeless * length:
             return None
         reached = self.escape(problem, start, deadline)
         if first_J <= reached.J:

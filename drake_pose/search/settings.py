@@ -225,9 +225,10 @@ class ExactSearchSettings:
     coinciding: float = 0.53
     starts: int = 4  # Poses of each beam search that are refined.
     alike: float = 0.5  # See ``BeamSearch.best_poses``.
-    # Give up where J after coarse passes, over the borders' length and the root of the mean area,
-    # is larger.
-    hopeless: float = 0.017
+    # Give up above this J after coarse passes, or where larger, above this times the root of the
+    # mean area [pixel].
+    hopeless: float = 1.5
+    hopeless_share: float = 0.017
     enough: float = 0.03  # A pose with a smaller J is not searched on: it is the pixels' noise.
     exact: float = 0.18  # A pose with a smaller J is the answer.
     plausible: float = 0.5  # Above this J the robust pose is the answer.

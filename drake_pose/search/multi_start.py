@@ -173,12 +173,13 @@ class _MultiStartRun:
         exactly = own.exact * problem.border_length
         pool = self._begin()
         first_J = self._J(pool[0].values)
-        if self._looks_exact(pool[0].values):
+        searched = self._looks_exact(pool[0].values)
+        if searched:
             found = exact.find(problem, self._root_position, self._deadline)
         if found is None or found.J > exactly:
             poses = self._search_robustly(pool, rounds)
             looks_exact = self._looks_exact(poses[0].values)
-            if looks_exact and found is None:
+            if looks_exact and not searched:
                 found = exact.find(problem, self._root_position, self._deadline)
             if looks_exact and (found is None or found.J > exactly):
                 found = self._refine_by_pixels(found, poses[0].values)

@@ -372,11 +372,13 @@ def _ask_process(path: str, packages: str, limits: str) -> str:
     try:
         end = subprocess.run(
             [sys.executable, "-c", program, path, packages, limits],
-            # With threads of its own VTK takes twice as long.
             env={
                 **os.environ,
                 "PYTHONPATH": os.pathsep.join(filter(None, folders)),
+                # With threads of its own VTK takes twice as long.
                 "LP_NUM_THREADS": "0",
+                # What it leaves when it ends is removed at this process's end.
+                "TMPDIR": str(workspace()),
             },
             stdin=subprocess.DEVNULL,
             capture_output=True,

@@ -11,8 +11,6 @@ cache folder (``NUMBA_CACHE_DIR`` names another). Three things are added to numb
 - Where kernels are compiled, and where they are stored, is logged (``drake_pose.compiled``).
 """
 
-from __future__ import annotations
-
 import functools
 import hashlib
 import logging

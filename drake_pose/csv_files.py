@@ -1,7 +1,5 @@
 """Small tables of comma-separated values: those that others wrote, and our own."""
 
-from __future__ import annotations
-
 import csv
 import io
 from collections.abc import Iterable, Sequence

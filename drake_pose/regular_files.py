@@ -1,7 +1,5 @@
 """Reading files that others named: never a pipe, a socket or a device, whose opening may wait."""
 
-from __future__ import annotations
-
 import errno
 import hashlib
 import stat

@@ -3,8 +3,6 @@
 Kernels and OpenCV hold no interpreter lock, so threads will do.
 """
 
-from __future__ import annotations
-
 import multiprocessing
 import os
 from collections.abc import Callable, Iterable, Iterator

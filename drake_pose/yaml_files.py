@@ -1,7 +1,5 @@
 """Reading small YAML files that others wrote."""
 
-from __future__ import annotations
-
 from dataclasses import fields
 from pathlib import Path
 from typing import Any, TypeVar

@@ -1,7 +1,5 @@
 """Episodes in bags of ROS 1 and ROS 2 (sqlite3 and mcap), read by rosbags."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager

@@ -4,8 +4,6 @@ The formats are told apart by their content, not by the file's name. All of them
 centres at integers. Their poses take points of the world to the camera, p_C = R p_W + T [m].
 """
 
-from __future__ import annotations
-
 import re
 import tomllib
 from collections.abc import Iterator, Mapping

@@ -4,8 +4,6 @@ DROID's raw folders, `trajectory.h5` and a video of each ZED camera, are written
 and `camera_utils/camera_readers/zed_camera.py` of droid-dataset/droid.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path

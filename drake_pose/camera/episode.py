@@ -1,7 +1,5 @@
 """One episode, as every reader gives it, and what is wrong with its times."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -116,7 +114,7 @@ class Episode:
         cameras: Iterable[EpisodeCamera],
         joints: JointLog | None,
         said: Iterable[str] = (),
-    ) -> Episode:
+    ) -> "Episode":
         """An episode with warnings of what is odd in its times and positions, after those given.
 
         Raises SceneError: no camera, no row, or pictures that nothing puts beside rows.

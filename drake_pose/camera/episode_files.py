@@ -1,7 +1,5 @@
 """Episodes in folders: pictures or videos of cameras beside a table of joint positions."""
 
-from __future__ import annotations
-
 import math
 import os
 from collections import Counter

@@ -1,7 +1,5 @@
 """Which column of a joint log is which joint of a model, and in which units it is."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Mapping, Sequence

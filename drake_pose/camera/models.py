@@ -1,7 +1,5 @@
 """The two cameras, pinhole and parallel (Kameda), what they may be, and ready rigs of several."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Iterable, Mapping, Sequence
@@ -142,7 +140,7 @@ class _PosedCamera:
         X_CW = self.X_CW
         return np.asarray(p_W, dtype=np.float64).reshape(-1, 3) @ X_CW[:3, :3].T + X_CW[:3, 3]
 
-    def with_pose(self: _Camera, X_WC: np.ndarray) -> _Camera:
+    def with_pose(self: "_Camera", X_WC: np.ndarray) -> "_Camera":
         """Returns the same camera at another pose (4, 4)."""
         return dataclasses.replace(self, X_WC=X_WC)  # type: ignore[type-var]
 
@@ -184,7 +182,7 @@ class PinholeCamera(_PosedCamera):
         v = self.center_y + self.focal_y * p_C[:, 1] / visible
         return np.column_stack([u, v]), depth
 
-    def resized(self, width: int, height: int) -> PinholeCamera:
+    def resized(self, width: int, height: int) -> "PinholeCamera":
         """Returns the camera of the same pictures at another size [pixel]."""
         x, y = width / self.width, height / self.height
         return dataclasses.replace(
@@ -197,7 +195,7 @@ class PinholeCamera(_PosedCamera):
             center_y=y * (self.center_y + 0.5) - 0.5,
         )
 
-    def mirrored(self) -> PinholeCamera:
+    def mirrored(self) -> "PinholeCamera":
         """The camera of the same pictures with left and right exchanged."""
         return dataclasses.replace(self, center_x=self.width - 1 - self.center_x)
 

@@ -1,7 +1,5 @@
 """The command line `drake-pose`. Heavy modules are imported inside the commands."""
 
-from __future__ import annotations
-
 import inspect
 import os
 import re

@@ -3,8 +3,6 @@
 Files are moved into place: none is ever half there.
 """
 
-from __future__ import annotations
-
 import fcntl
 import json
 import math

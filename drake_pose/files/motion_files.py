@@ -7,8 +7,6 @@ root has position channels, and so has a part whose place changes: its offset is
 readers agree.
 """
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Mapping, Sequence
 from io import StringIO

@@ -1,7 +1,5 @@
 """Pictures to judge a match by: agreement, missing and excess told apart at a glance."""
 
-from __future__ import annotations
-
 import io
 import zlib
 from collections.abc import Sequence

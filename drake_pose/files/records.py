@@ -3,8 +3,6 @@
 Frames that have a row in poses.csv are finished: they survive whatever ends the job.
 """
 
-from __future__ import annotations
-
 import hashlib
 import math
 import platform
@@ -99,7 +97,7 @@ class FrameRecord:
     @staticmethod
     def from_json(
         frame: str, values: Mapping[str, Any], q: Array, base: Array | None = None
-    ) -> FrameRecord:
+    ) -> "FrameRecord":
         """Returns the record that as_json described, its positions of poses.csv."""
         known = {name: value for name, value in values.items() if name != "found"}
         return FrameRecord(frame, q, base, **known)

@@ -1,7 +1,5 @@
 """What plays an estimate: replay.html, a page that needs no server; a recording for rerun."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Iterable, Mapping, Sequence
 from importlib import import_module

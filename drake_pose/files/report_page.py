@@ -1,7 +1,5 @@
 """report.html: what came out, on one page that needs nothing else to be read."""
 
-from __future__ import annotations
-
 import base64
 import io
 import math

@@ -1,7 +1,5 @@
 """A result under way: each frame is written as it comes, what is made of all of them at the end."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import replace

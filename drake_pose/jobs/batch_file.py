@@ -1,7 +1,5 @@
 """The job file of `drake-pose batch`: which scenes are estimated or audited, and how."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path

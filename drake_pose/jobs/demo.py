@@ -1,7 +1,5 @@
 """The demonstration: a real person's joint angles from one real silhouette."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

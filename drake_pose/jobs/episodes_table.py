@@ -1,7 +1,5 @@
 """Of all audited episodes: where cameras were found, their clocks, who moved, and camera files."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Where masks come from: folders of pictures, videos, and COCO files, by camera."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field

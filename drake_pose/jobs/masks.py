@@ -1,7 +1,5 @@
 """Masks for a scene: those of other tools, or found by the empty room, a box or the model."""
 
-from __future__ import annotations
-
 import math
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence

@@ -1,7 +1,5 @@
 """`drake-pose undistort`: pictures free of their lenses' distortion, and the cameras of these."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from drake_pose.camera.camera_files import dump_cameras, load_camera_file

@@ -1,7 +1,5 @@
 """All experiments of the three papers, one after another, and one page about them."""
 
-from __future__ import annotations
-
 import base64
 import io
 import json

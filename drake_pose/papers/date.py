@@ -1,7 +1,5 @@
 """Date's experiment: a simulated person with known motion, captured by many cameras."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Date's simulated studio, and the ways of capturing that are compared in it."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
@@ -75,7 +73,7 @@ class Studio:
     generator: np.random.Generator
 
     @staticmethod
-    def build(cameras: int, size: tuple[int, int], generator: np.random.Generator) -> Studio:
+    def build(cameras: int, size: tuple[int, int], generator: np.random.Generator) -> "Studio":
         """A studio of this many cameras, face camera included, pictures of one size [pixel].
 
         Raises SettingsError: too few cameras.
@@ -177,7 +175,7 @@ class PaperTrack(_StagedRun):
         self._capture = capture
 
     @staticmethod
-    def build(setup: CaptureSetup) -> PaperTrack:
+    def build(setup: CaptureSetup) -> "PaperTrack":
         """A track that knows nothing yet."""
         return PaperTrack(build_paper_capture(setup, period=PERIOD))
 
@@ -231,7 +229,7 @@ class PaperTrack(_StagedRun):
         template = np.clip(flat, 0, 255).astype(np.uint8).reshape(*FACE_SIZE[::-1], 3)
         return views, found, (face, template)
 
-    def destroyed(self, q: Array, generator: np.random.Generator) -> PaperTrack:
+    def destroyed(self, q: Array, generator: np.random.Generator) -> "PaperTrack":
         """A track that is turned around, its left and right exchanged; q (nq,) is where it was."""
         estimator = self._capture.estimator
         skeleton = estimator.setup.skeleton
@@ -251,13 +249,13 @@ class SilhouetteTrack(_StagedRun):
         self,
         capture: StagedDiagram[PersonTracker],
         tracker: PersonPoseTracker,
-        shared: SilhouetteTrack | None = None,
+        shared: "SilhouetteTrack | None" = None,
     ) -> None:
         super().__init__(capture)
         self._capture, self._tracker, self._shared = capture, tracker, shared
 
     @staticmethod
-    def build(studio: Studio) -> SilhouetteTrack:
+    def build(studio: Studio) -> "SilhouetteTrack":
         """A track that knows nothing yet, with an edge point every 8 of 480 rows of a picture."""
         tracker, views = PersonPoseTracker(ContourFit(studio.model.pose_tree())), studio.cameras
         capture = build_silhouette_capture(tracker, views, studio.backgrounds, PERIOD, 60.0)
@@ -283,7 +281,7 @@ class SilhouetteTrack(_StagedRun):
             self._finish_frame(())
         return self._tracker.positions(self._state().values)
 
-    def destroyed(self, q: Array, generator: np.random.Generator) -> SilhouetteTrack:
+    def destroyed(self, q: Array, generator: np.random.Generator) -> "SilhouetteTrack":
         """A track in a random pose half a metre away, turned anyhow."""
         fit, state = self._tracker.fit, self._state()
         values, angles = state.values.copy(), fit.kinematics.is_angle

@@ -1,7 +1,5 @@
 """Date's application (section 6.2): a walk through a place, figure 8; and pictures of the rest."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from pathlib import Path

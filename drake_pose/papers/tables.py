@@ -1,7 +1,5 @@
 """How all experiments count, compare and show: spread over seeds, one table, one picture."""
 
-from __future__ import annotations
-
 import math
 import textwrap
 from collections.abc import Callable, Mapping, Sequence

@@ -6,8 +6,6 @@ cut out of the masks first. After the capture a camera that contradicts the rest
 all is captured once more.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -67,7 +65,7 @@ class PersonCapture:
     deviations: Array
 
     @staticmethod
-    def begun(count: int, shape: PersonShape | None, fit: ContourFit) -> PersonCapture:
+    def begun(count: int, shape: PersonShape | None, fit: ContourFit) -> "PersonCapture":
         """A capture of `count` frames in which nothing is known yet."""
         q = np.full((count, len(fit.tree.model.position_names)), np.nan)
         return PersonCapture(q, np.zeros(count), shape, fit.outlines, fit.tree, q.copy())

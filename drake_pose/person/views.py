@@ -4,8 +4,6 @@ Where there is no silhouette, colours along lines say where the edge is; lines a
 fit's scale, and colours count on both sides.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -182,7 +180,7 @@ class FrameViews:
         """The names of the cameras that see somebody."""
         return [camera.name for camera, view in self.pairs if shows_somebody(view)]
 
-    def without(self, names: Collection[str]) -> FrameViews:
+    def without(self, names: Collection[str]) -> "FrameViews":
         """What the cameras see that are not named."""
         pairs = [pair for pair in self.pairs if pair[0].name not in names]
         return FrameViews([camera for camera, _ in pairs], [view for _, view in pairs])

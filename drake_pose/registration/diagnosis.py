@@ -6,8 +6,6 @@ of a joint's offset, a camera or the base. A frame is an outlier if it is signif
 others: r^T Q^-1 r, r = h - N x_common, follows Fisher's distribution where nothing is wrong.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import reduce
@@ -139,7 +137,7 @@ class _Information(NamedTuple):
     scale: float
     freedom: float
 
-    def plus(self, info: _Information, sign: float = 1.0) -> _Information:
+    def plus(self, info: "_Information", sign: float = 1.0) -> "_Information":
         """With another frame, by the scale of its errors; or without one of these: sign -1."""
         weight = sign / info.scale
         return self._replace(
@@ -227,7 +225,7 @@ class _Residual(NamedTuple):
         enough = [one for one in tests if self.pixels(one.x) < most]
         return sorted(enough, key=lambda one: (one.rank, -one.gain))
 
-    def without(self, cause: _Cause) -> _Residual:
+    def without(self, cause: _Cause) -> "_Residual":
         """The residual once a cause was put right."""
         M, N = cause.moves, self.N
         gain = np.eye(len(N)) - N @ M @ np.linalg.pinv(M.T @ N @ M) @ M.T

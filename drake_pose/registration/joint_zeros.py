@@ -6,8 +6,6 @@ zero of a first joint whose base looks alike from all sides, cannot be told, and
 guessed.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

@@ -7,8 +7,6 @@ keyframes alone differs significantly from that by all. How much it differs whil
 what is significant: wrong joint zeros or lengths of links make it differ, too.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import IntEnum
@@ -104,7 +102,7 @@ class OnlineState:
     moves: int = 0
     distances: tuple[float, ...] = ()
 
-    def __deepcopy__(self, memo: dict[int, Any]) -> OnlineState:
+    def __deepcopy__(self, memo: dict[int, Any]) -> "OnlineState":
         # Drake copies abstract state, which would be megabytes of masks at every update.
         return self
 

@@ -5,8 +5,6 @@ harm. Then the pictures' clock is tried against the log's, the pose held; and po
 asked for, focal length are fitted together on those frames and the ones that move most.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -72,15 +70,15 @@ class Recording:
         """A picture (H, W, 3) by its name."""
         return self.read(self.names.index(name))
 
-    def mirrored(self) -> Recording:
+    def mirrored(self) -> "Recording":
         """The same with left and right exchanged in all pictures."""
         return replace(self, read=lambda k: np.ascontiguousarray(self.read(k)[:, ::-1]))
 
-    def with_zeros(self, zeros: Array) -> Recording:
+    def with_zeros(self, zeros: Array) -> "Recording":
         """The same with (m,) added to all values."""
         return replace(self, values_at=lambda offset: self.values_at(offset) + zeros)
 
-    def with_drift(self, drift: float, since: float) -> Recording:
+    def with_drift(self, drift: float, since: float) -> "Recording":
         """The same where the joints' clock runs faster by a drift [s/s], and is right at a time."""
         if not drift or self.times is None:
             return self
@@ -215,7 +213,7 @@ class Begun(NamedTuple):
     alternatives: Sequence[Array]
 
     @classmethod
-    def of(cls, one: PictureRegistration) -> Begun:
+    def of(cls, one: PictureRegistration) -> "Begun":
         """A camera that was found already."""
         rows = [one.recording.names.index(frame.name) for frame in one.frames]
         others = [np.linalg.inv(X) for X in one.found.alternatives]

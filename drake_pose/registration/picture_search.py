@@ -7,8 +7,6 @@ bodies where pictures change; the best are improved step by step, in larger and 
 in the end by the one fit, on lines across the contour in the odds of pixels to show the body.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -163,7 +161,7 @@ class PictureSearch:
         self._levels = dict[int, PyramidLevel]()
 
     @property
-    def compared(self) -> PyramidLevel:
+    def compared(self) -> "PyramidLevel":
         """In which poses are compared."""
         return self._level(PICTURES.compared)
 
@@ -305,7 +303,7 @@ class PictureSearch:
             return None
         return PosedFrames(self._body.kinematics, outlines, camera, posed)
 
-    def _level(self, width: int) -> PyramidLevel:
+    def _level(self, width: int) -> "PyramidLevel":
         if width not in self._levels:
             k = (width > 64) + (width > 120)
             count = PICTURES.searched if width < PICTURES.compared else len(self.frames)

@@ -6,8 +6,6 @@ non-convexity), so that tools which the model lacks, hidden parts and wrong fram
 frame then agrees with the others or contradicts them.
 """
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass, field
@@ -118,7 +116,7 @@ class RegistrationBody:
         """Surfaces for searches: what only fits does without them."""
         return few_triangles(self._surfaces, self._fewest)
 
-    def with_tree(self, tree: PoseTree) -> RegistrationBody:
+    def with_tree(self, tree: PoseTree) -> "RegistrationBody":
         """The same surfaces on another tree with the same nodes."""
         other = copy.copy(self)
         other.tree, other.kinematics = tree, TreeKinematics(tree)
@@ -202,7 +200,7 @@ class CameraSearch:
         self._body, self._fitted_count = body, fitted
         self._R_CW = spread_rotations(rotations)
 
-    def rough(self) -> CameraSearch:
+    def rough(self) -> "CameraSearch":
         """A search that is faster, and less sure."""
         return CameraSearch(self._body, rotations=2000, fitted=15)
 

@@ -1,7 +1,5 @@
 """A rigid object that stands somewhere in a robot's world, and how its look repeats."""
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -90,7 +88,7 @@ class StandingObject:
         self._X_TO[:3, 3] = self.middle
         self._bodies = RegistrationBody(self.tree(np.eye(4)), (OBJECT,), FEW)
 
-    def before(self, robot: ArticulatedModel) -> StandingObject:
+    def before(self, robot: ArticulatedModel) -> "StandingObject":
         """The same before the same robot whose joints may stand elsewhere on their links."""
         other = copy.copy(self)
         other._robot = robot
@@ -276,7 +274,7 @@ class ObjectSearch:
     def __init__(self, standing: StandingObject, alone: CameraSearch | None = None) -> None:
         self._standing, self._alone = standing, alone or CameraSearch(standing.alone)
 
-    def rough(self) -> ObjectSearch:
+    def rough(self) -> "ObjectSearch":
         """A search that is faster, and less sure."""
         return ObjectSearch(self._standing, self._alone.rough())
 

@@ -6,8 +6,6 @@ more and more lie outside, weighed against what is covered newly (5). Last, limb
 are searched again.
 """
 
-from __future__ import annotations
-
 import copy
 import itertools
 import time
@@ -120,13 +118,13 @@ class BeamSearch:
             result = examine(self.body, views, result, self.examination, root_position, run.within)
         return replace(result, seconds=time.perf_counter() - start)
 
-    def without_alternatives(self) -> BeamSearch:
+    def without_alternatives(self) -> "BeamSearch":
         """The same search where only E_total is wanted: no examination."""
         other = copy.copy(self)
         other.examination = None
         return other
 
-    def with_stages(self, *stages: Stage) -> BeamSearch:
+    def with_stages(self, *stages: Stage) -> "BeamSearch":
         """The same grid searched in other stages, and no limb searched again."""
         other = copy.copy(self)
         other.settings = replace(self.settings, stages=stages, research_hypotheses=0)

@@ -7,8 +7,6 @@ much of it, and the search then says so. The poses found, which may be very many
 graph of partial poses.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -41,7 +39,7 @@ class Layer:
     samples: np.ndarray
     ends: np.ndarray
 
-    def chosen(self, edges: np.ndarray) -> Layer:
+    def chosen(self, edges: np.ndarray) -> "Layer":
         """Some of the edges, (m,) bool."""
         return Layer(self.node, self.origins[edges], self.samples[edges], self.ends[edges])
 
@@ -81,7 +79,7 @@ class PartialPoseGraph:
             self.ways.append(np.bincount(layer.ends, weights, minlength=states))
 
     @classmethod
-    def of_pose(cls, samples: np.ndarray, J: float) -> PartialPoseGraph:
+    def of_pose(cls, samples: np.ndarray, J: float) -> "PartialPoseGraph":
         """The set of one pose, samples (nodes,), with objective J."""
         zero = np.zeros(1, dtype=np.int64)
         layers = [Layer(node, zero, np.array([t]), zero) for node, t in enumerate(samples)]
@@ -120,12 +118,12 @@ class PartialPoseGraph:
             seen[layer.node] = np.unique(layer.samples)
         return seen
 
-    def restricted(self, allowed: Sequence[np.ndarray]) -> PartialPoseGraph:
+    def restricted(self, allowed: Sequence[np.ndarray]) -> "PartialPoseGraph":
         """The poses that take allowed samples alone, (samples,) bool of each node."""
         layers = [layer.chosen(allowed[layer.node][layer.samples]) for layer in self.layers]
         return PartialPoseGraph(layers, self.Js)
 
-    def up_to(self, J: float) -> PartialPoseGraph:
+    def up_to(self, J: float) -> "PartialPoseGraph":
         """Those poses whose objective is no greater."""
         kept = self.Js <= J
         last = self.layers[-1].chosen(kept[self.layers[-1].ends])

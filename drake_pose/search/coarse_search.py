@@ -11,8 +11,6 @@ silhouette costs its part of the node's area, a ball partly outside costs a part
 ball covers is looked up among points spread over the silhouette.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

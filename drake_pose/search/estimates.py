@@ -1,7 +1,5 @@
 """What a search is given, and the poses in families that searches and trackers answer."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -71,7 +69,7 @@ class JointEstimate:
             value -= 2.0 * math.pi * round((value - 0.5 * (self.low + self.high)) / (2.0 * math.pi))
         return self.low - margin <= value <= self.high + margin
 
-    def widened(self, other: JointEstimate, moved: float) -> JointEstimate:
+    def widened(self, other: "JointEstimate", moved: float) -> "JointEstimate":
         """What both say; since the other one's instant the value has changed by ``moved``."""
         if self.turns_around:
             middle = 0.5 * (self.low + self.high - other.low - other.high) - moved
@@ -134,7 +132,7 @@ class PoseFamily:
         J: float,
         joints: tuple[JointEstimate, ...],
         size: float = 1.0,
-    ) -> PoseFamily:
+    ) -> "PoseFamily":
         """The family of a pose tree's values, (k_i,) of each node."""
         return cls(*tree.positions_from(node_values), tuple(node_values), J, joints, size)
 
@@ -221,13 +219,13 @@ class PoseEstimate:
     @classmethod
     def of_values(
         cls, tree: PoseTree, node_values: Sequence[np.ndarray], J: float, area: float, **more: Any
-    ) -> PoseEstimate:
+    ) -> "PoseEstimate":
         """The estimate with a pose tree's values, (k_i,) of each node; ``more``: other fields."""
         q, X_WB = tree.positions_from(node_values)
         return cls(True, q, X_WB, tuple(node_values), J, area, **more)
 
     @classmethod
-    def nothing(cls, tree: PoseTree, **more: Any) -> PoseEstimate:
+    def nothing(cls, tree: PoseTree, **more: Any) -> "PoseEstimate":
         """The answer where no pose was found; ``more``: other fields."""
         missing = np.full(len(tree.model.position_names), np.nan)
         return cls(False, missing, np.eye(4), (), math.nan, math.nan, **more)
@@ -252,7 +250,7 @@ class PoseEstimate:
         """Whether it is proved that no pose of the search's grid has a smaller J."""
         return bool(self.found and self.lower_bound >= self.J)
 
-    def widened(self, begun: PoseEstimate | None) -> PoseEstimate:
+    def widened(self, begun: "PoseEstimate | None") -> "PoseEstimate":
         """A tracked pose whose joints are as open as the families that its track began with."""
         before = None if begun is None else begun.pose_set
         if begun is None or before is None or self.pose_set is None or before.family_count < 2:
@@ -265,7 +263,7 @@ class PoseEstimate:
         known = replace(self.pose_set, joints=joints, family_count=before.family_count)
         return replace(self, pose_set=known)
 
-    def turned(self, tree: PoseTree, turns: Sequence[np.ndarray]) -> PoseEstimate:
+    def turned(self, tree: PoseTree, turns: Sequence[np.ndarray]) -> "PoseEstimate":
         """The same pose with full turns (k_i,) [rad] added to each node's values."""
 
         def pose(one: PoseFamily | PoseEstimate) -> dict[str, Any]:

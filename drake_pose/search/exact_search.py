@@ -4,8 +4,6 @@ A pose that leaves hardly a pixel of the silhouettes' borders wrong certifies it
 Where masks are damaged, or the body is another one, ``multi_start`` does not call this search.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Sequence
 from typing import NamedTuple

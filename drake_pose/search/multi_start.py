@@ -8,8 +8,6 @@ again, joints that turn against each other (``self_motions``). Where a piece as 
 left unexplained, a beam search by areas gives other starts.
 """
 
-from __future__ import annotations
-
 import copy
 import itertools
 import math
@@ -80,7 +78,7 @@ class MultiStartSearch:
         """The search where masks are exact."""
         return ExactSearch((self.beam, self._grid), self.exact_settings)
 
-    def without_alternatives(self) -> MultiStartSearch:
+    def without_alternatives(self) -> "MultiStartSearch":
         """The same search where only E_total is wanted: one round, and no set of poses."""
         other = copy.copy(self)
         other._alternatives = False

@@ -5,8 +5,6 @@ values times random numbers, modulo 2^64: because new pixels only add to it, the
 costs a look at the new pixels alone, and equal masks have equal hashes however they came about.
 """
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import numpy as np

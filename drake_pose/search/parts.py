@@ -11,8 +11,6 @@ near the pose's J is refined, and the pose moves there where that is better. It 
 near an error was tried with that error. Poses found that are nearly as good are kept.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -8,8 +8,6 @@ draws the contour to the mask's edge. The last mask is the model's silhouette, a
 colours decide.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -95,7 +93,7 @@ class PictureLevel(NamedTuple):
     cameras: tuple[Camera, ...]
     pictures: Sequence[Sequence[Picture | None]]
 
-    def smaller(self, share: float) -> PictureLevel:
+    def smaller(self, share: float) -> "PictureLevel":
         """The same with pictures smaller by a share; a parallel camera has them as they are."""
         cameras = tuple(
             camera.resized(

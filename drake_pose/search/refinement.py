@@ -5,8 +5,6 @@ contour and the silhouette's border (see ``fit.raster_lines``). Passes look at f
 raster first and let far distances count, then at all lines and near distances only.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import NamedTuple
 

@@ -14,8 +14,6 @@ best are refined with the root free; where the roots of the best of these are, t
 run as with a known root; and in what comes of that what still fits badly is placed anew.
 """
 
-from __future__ import annotations
-
 import copy
 import dataclasses
 import itertools

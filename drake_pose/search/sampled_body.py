@@ -1,7 +1,5 @@
 """A sampled pose tree: its areas in several views, and what makes its nodes quick to draw."""
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Sequence
 from functools import lru_cache
@@ -91,7 +89,7 @@ class SampledTree:
         surfaces = [self.surfaces.whole(node) for node in nodes]
         return score_bodies(surfaces, X_CN, camera, prefixes, placed)
 
-    def with_root_position(self, root_position: np.ndarray) -> SampledTree:
+    def with_root_position(self, root_position: np.ndarray) -> "SampledTree":
         """The same with the root at another position (3,) [m]; all but the root is shared."""
         moved = copy.copy(self)
         moved.tree = self.tree.with_root_position(root_position)
@@ -259,7 +257,7 @@ class SampledBody:
         self.order = self._find_order(limb_by_limb=False)
         self.limb_order = self._find_order(limb_by_limb=True)
 
-    def with_root_position(self, root_position: np.ndarray) -> SampledBody:
+    def with_root_position(self, root_position: np.ndarray) -> "SampledBody":
         """The same with the root at another position (3,) [m]; all but the root is shared."""
         moved = copy.copy(self)
         moved.sampled = self.sampled.with_root_position(root_position)

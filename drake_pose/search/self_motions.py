@@ -6,8 +6,6 @@ stays where it is, or nearly so, and only the links between turn. A refinement d
 from one of these to another.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass

@@ -8,8 +8,6 @@ well: those as good are families of their own. Exact masks, drawn by pixels, and
 masks or bodies that fit badly are treated apart (``find_intervals``, ``RobustFamilies``).
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Callable, Sequence

@@ -1,7 +1,5 @@
 """Objects in pictures: by their background, learnt or beside them, by a box, or by outlines."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Sequence
 from itertools import zip_longest
@@ -26,7 +24,7 @@ class Background:
         self.tolerance = np.repeat(off[:, :, None], 3, axis=2)
         """(H, W, 3) how far each channel may be off where only the background is seen."""
 
-    def with_noise(self, times: float) -> Background:
+    def with_noise(self, times: float) -> "Background":
         """The same background with its noise multiplied."""
         return Background(self.mean, times * self.deviation, self._deviations)
 

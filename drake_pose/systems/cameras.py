@@ -1,7 +1,5 @@
 """Simulated cameras: RgbdSensors around a body, and label images without a renderer."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import TypeVar

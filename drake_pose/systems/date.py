@@ -1,7 +1,5 @@
 """Date's capture as Drake systems: preparation, stages, pose, and the diagram (figure 1)."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field

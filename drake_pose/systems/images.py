@@ -3,8 +3,6 @@
 A camera that has nothing to show gives an image of no pixels: a port of images cannot be silent.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import partial
 from typing import Any

@@ -1,7 +1,5 @@
 """A person captured by all silhouettes at once, as Drake systems: pictures in, poses out."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
@@ -227,8 +225,8 @@ class PersonTracker(MemorySystem):
         return ColourViews(cameras, [pictures[camera.name] for camera in cameras], known)
 
     def _followed(
-        self, last: TrackState | None, moment: _Moment, is_watching: bool
-    ) -> tuple[TrackState | None, _Moment]:
+        self, last: TrackState | None, moment: "_Moment", is_watching: bool
+    ) -> "tuple[TrackState | None, _Moment]":
         """The next state, and what the cameras see of the person alone."""
         is_sorted = last is None or last.troubled != 0 or is_watching
         if is_sorted:
@@ -244,7 +242,7 @@ class PersonTracker(MemorySystem):
         """The next state; None where fewer than two cameras see anybody."""
         return self._tracker.follow(last, seen) if len(seen.showing) >= 2 else None
 
-    def _alone(self, seen: FrameViews, last: TrackState | None) -> _Moment:
+    def _alone(self, seen: FrameViews, last: TrackState | None) -> "_Moment":
         """What cameras see without other persons than the one who was seen last.
 
         Cameras in which the person and another are one figure are left out where three others show

@@ -1,7 +1,5 @@
 """Recorded or live pictures as Drake systems: synchronised ones, and the person's region in one."""
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence

@@ -1,7 +1,5 @@
 """What the systems here are made of: ports by name, and what they know, renewed once a period."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """The matcher and the tracker as Drake systems: label images in, estimated positions out."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple

@@ -3,8 +3,6 @@
 And the hand's sensor of section 6, which measures a silhouette for it.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """The walk-through (Date, section 6.2): a captured person walks through a garden by gestures."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping
 

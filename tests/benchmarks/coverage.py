@@ -7,8 +7,6 @@ warnings of ``summary.json``. A frame is wrong, and not said, where a joint lies
 interval and is off by more than 10 degrees, or 5 cm.
 """
 
-from __future__ import annotations
-
 import argparse
 import csv
 import json

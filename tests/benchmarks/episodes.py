@@ -6,8 +6,6 @@ N rooms for each arm and set. Of a set with wrong rows the frames near where the
 not counted.
 """
 
-from __future__ import annotations
-
 import argparse
 import csv
 import tempfile

@@ -6,8 +6,6 @@ not there are left out; the demonstration's always is. ``--hands``: all sequence
 one camera that nobody knows, instead.
 """
 
-from __future__ import annotations
-
 import argparse
 import csv
 import tempfile

@@ -4,8 +4,6 @@ A chain of limbs is fitted to silhouettes of itself: contours are compared in al
 cameras, and the normal equations solved once. One thing grows at a time.
 """
 
-from __future__ import annotations
-
 import math
 import tempfile
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """The memory that commands take on the project's own data (`make bench`)."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

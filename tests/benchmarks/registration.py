@@ -5,8 +5,6 @@ scenes ``arm_two_views``, ``arm_one_view`` and ``franka_one_view``, N the number
 for each arm that is there; where none is, of an arm of boxes.
 """
 
-from __future__ import annotations
-
 import argparse
 import tempfile
 import time

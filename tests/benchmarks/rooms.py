@@ -1,7 +1,5 @@
 """Simulated episodes of arms in rooms, drawn by Drake."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Benchmark: SilhouetteCamera against RgbdSensor's label image, in one diagram (`make bench`)."""
 
-from __future__ import annotations
-
 import tempfile
 import time
 from collections.abc import Iterator

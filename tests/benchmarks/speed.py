@@ -1,7 +1,5 @@
 """Benchmarks: ratios measured in one process (`make bench`)."""
 
-from __future__ import annotations
-
 import resource
 import tempfile
 import time

@@ -1,7 +1,5 @@
 """A small BVH reader of the tests' own, written from the format's description alone."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 import numpy as np

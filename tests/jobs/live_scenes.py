@@ -1,7 +1,5 @@
 """Studios of a simulated person: cameras.yaml, sources.yaml, and the pictures."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2

@@ -1,7 +1,5 @@
 """Small recordings of the bundled person, drawn by Drake's renderer."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

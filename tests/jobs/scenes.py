@@ -1,7 +1,5 @@
 """A tiny body and recorded scenes of it, drawn by Drake's renderer."""
 
-from __future__ import annotations
-
 import csv
 import json
 from collections.abc import Iterable, Mapping, Sequence

@@ -1,7 +1,5 @@
 """A stepping person as calibrated cameras see him, drawn by Drake's renderer."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Episodes of an arm of boxes, painted over Drake's label images."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

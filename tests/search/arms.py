@@ -1,7 +1,5 @@
 """A small robot arm of capsules and boxes, two cameras around it, and damaged pictures of it."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A crane whose joints turn all the way round, and Drake's pictures of it."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """How well the span kernel agrees with Drake's own label images."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import numpy as np

@@ -4,8 +4,6 @@ The first frame leaves out parts that explain it no better; its poses that look 
 followed; lengths, widths and all poses are fitted together, to a model, its poses and a start.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Sequence
 from dataclasses import replace

@@ -3,8 +3,6 @@
 ``python -m drake_pose.jobs.estimate.compile_ahead``; what is compiled is shared.
 """
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from collections.abc import Iterator

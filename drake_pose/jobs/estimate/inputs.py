@@ -1,7 +1,5 @@
 """The pose tree and the search for it that settings ask for."""
 
-from __future__ import annotations
-
 import math
 import os
 from collections.abc import Iterable, Mapping, Sequence

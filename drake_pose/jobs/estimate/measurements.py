@@ -1,7 +1,5 @@
 """Files of measured values: joint centres, angles to compare with or to start from, by frame."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace

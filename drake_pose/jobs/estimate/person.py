@@ -1,7 +1,5 @@
 """One person before several cameras: followed by silhouettes or colours, compared, warned of."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -87,7 +85,7 @@ def follow_person(
 
 
 def _follow_colours(
-    inputs: EstimateInputs, reader: _Reader
+    inputs: EstimateInputs, reader: "_Reader"
 ) -> tuple[PersonCapture, ReadFrame, tuple[str, ...], Array]:
     """A sequence of pictures of which few have masks: distances (frames,) of contours [pixel]."""
     scene, frames = inputs.scene, inputs.frames

@@ -1,7 +1,5 @@
 """A scene in, a pose a frame out: one call, one loop over frames."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Capture frame by frame, as the pictures come from live cameras, videos or folders."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Mapping
 from contextlib import closing

@@ -1,7 +1,5 @@
 """A folder of cameras and where their pictures come from, and the one loop of what is live."""
 
-from __future__ import annotations
-
 import math
 import os
 import time

@@ -1,7 +1,5 @@
 """A walk through a garden in the browser: what moves the avatar, and the run."""
 
-from __future__ import annotations
-
 import logging
 import math
 import time

@@ -5,8 +5,6 @@ give masks without the given cameras. A given camera that stands far from there 
 then compared with the one that was found. One that stands near is compared as a scene's is.
 """
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence

@@ -1,7 +1,5 @@
 """What is wrong with cameras, clocks, joints and frames, what else explains them, and its words."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """What a registration or an audit needs, read and checked before any work begins."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace

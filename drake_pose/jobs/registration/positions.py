@@ -1,7 +1,5 @@
 """Joint positions of every frame: from a table, or estimated from cameras whose place is known."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace

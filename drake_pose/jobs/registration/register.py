@@ -1,7 +1,5 @@
 """A scene and joint positions in, the cameras' poses out."""
 
-from __future__ import annotations
-
 import os
 import time
 import xml.etree.ElementTree as ElementTree

@@ -1,7 +1,5 @@
 """What a registration writes: the cameras, how sure they are, pictures, a summary, a page."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from pathlib import Path

@@ -3,8 +3,6 @@
 Head - neck base - trunk, and two arms and legs of 3 + 1 rotations: 23 degrees of freedom.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -122,7 +120,7 @@ class Skeleton:
         """(3,) half-way between the hips, in the trunk's frame [m]."""
         return 0.5 * (self.limbs["left_leg"].root_T + self.limbs["right_leg"].root_T)
 
-    def with_features(self, q: Array, places: Array, farthest: float = 0.05) -> Skeleton:
+    def with_features(self, q: Array, places: Array, farthest: float = 0.05) -> "Skeleton":
         """The same person whose features are at places (5, 3) measured in a known pose q (nq,) [m].
 
         A feature moves by `farthest` [m] at most; nan: not measured.

@@ -1,7 +1,5 @@
 """Scenes: a folder of cameras and recorded masks."""
 
-from __future__ import annotations
-
 import os
 import zlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -82,7 +80,7 @@ class Scene:
             raise UnknownNameError("frame", frame, self.frames, str(self.path))
         return names
 
-    def of_cameras(self, wanted: Sequence[str]) -> Scene:
+    def of_cameras(self, wanted: Sequence[str]) -> "Scene":
         """What the wanted cameras see; all that have masks where none is named.
 
         Raises UnknownNameError where there is no such camera.
@@ -112,7 +110,7 @@ class Scene:
             raise SceneError(f"{self.path}: no mask of camera {names} in those frames")
         return tuple(frame for frame in asked if frame in seen)
 
-    def every(self, step: int, wanted: Sequence[str]) -> tuple[Scene, tuple[str, ...]]:
+    def every(self, step: int, wanted: Sequence[str]) -> "tuple[Scene, tuple[str, ...]]":
         """Every step-th frame alone, from the first wanted one on, and which of these are wanted.
 
         Its frames follow each other at the true period, step times as long. Raises SettingsError

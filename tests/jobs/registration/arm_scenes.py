@@ -1,7 +1,5 @@
 """Recorded scenes of a small arm whose joint positions are known, drawn by Drake's renderer."""
 
-from __future__ import annotations
-
 import csv
 import shutil
 from collections.abc import Sequence
@@ -35,7 +33,7 @@ class ArmScene:
         """As a registration takes them."""
         return read_inputs(self.folder, self.model, self.joints, None, RegistrationSettings())
 
-    def copy(self, place: Path) -> ArmScene:
+    def copy(self, place: Path) -> "ArmScene":
         """The same elsewhere, to be spoilt."""
         shutil.copytree(self.folder, place / "scene")
         joints = shutil.copy(self.joints, place / "joints.csv")

@@ -1,7 +1,5 @@
 """Cameras on an arm's hand that see its base or another object, drawn by Drake's renderer."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -65,7 +63,7 @@ class TargetScene:
         """The words of a registration of the camera on the flange."""
         return [*self.arm.register(out), "--on", "flange", "--target", str(self.target)]
 
-    def with_looks(self, before: str, after: str, path: Path) -> TargetScene:
+    def with_looks(self, before: str, after: str, path: Path) -> "TargetScene":
         """The same with another target, of which a text was replaced."""
         text = self.target.read_text()
         assert before in text

@@ -166,7 +166,8 @@ class MatchAndTrack:
             followed = self._follow(first, frame, True)
             # The first look of a track is at what the search found, whose families are its own.
             looked = replace(self._result(followed, frame), pose_set=matched.pose_set)
-            found += [(followed, looked), (first, matched)]
+            # The searched pose may fit better: the colours of this frame are learned all the same.
+            found += [(followed, looked), (replace(first, colours=followed.colours), matched)]
         if not found:
             return Followed(None, 0.0, last.matches + 1), matched
         track, result = min(found, key=lambda pair: pair[1].E_total)

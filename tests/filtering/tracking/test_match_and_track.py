@@ -245,3 +245,29 @@ def test_colours_alone_are_followed_from_where_the_body_is_said_to_be(body):
         assert (followed.track is None) == (len(found) == 1)
     assert found == [False, True, True, False, True]
     assert search.calls == followed.matches == 0
+
+
+def test_the_first_frame_teaches_colours_also_where_the_searched_pose_fits_best(body):
+    """The second frame has no mask, and the body has moved by several pixels until then."""
+    moved = np.array([[0.2, 0.9, -0.6], [0.32, 0.8, -0.7]])
+    pose = PoseEstimate(
+        True,
+        moved[0],
+        np.eye(4),
+        tuple(body.pose_tree().values_from_positions(moved[0])),
+        0.0,
+        1.0,
+        "end",
+    )
+    search = KnownPoses(body.pose_tree(), [])
+    search.match = lambda views, root_position=None: pose
+    follower, followed = MatchAndTrack(search, [CAMERA], PERIOD), Followed()
+    renderer = LabelRenderer(body, CAMERA)
+    for q, has_mask in zip(moved, (True, False), strict=True):
+        mask = renderer.mask(q)
+        lit = np.where(mask[..., None], (230, 130, 40), (60, 140, 60)).astype(np.uint8)
+        views = [View(CAMERA, mask)] if has_mask else []
+        followed, found = follower.next(followed, views, None, {"front": lit})
+        assert found.found
+        assert found.stopped_by == ("end" if has_mask else TRACKED)
+        np.testing.assert_allclose(found.q, q, atol=np.radians(3.0))

@@ -90,7 +90,7 @@ def read_two_colours(
     elif layers.shape[2] == 4 and (layers[:, :, :3] == layers[0, 0, :3]).all():
         layers = layers[:, :, 3:]  # one that says all
     if data.startswith(b"\xff\xd8"):
-        mask, is_one_colour = mask_of_picture(picture), True
+        mask, is_one_colour = mask_of_picture(picture, str(path), error_type), True
     else:
         layers = np.ascontiguousarray(layers)
         mask = cv2.inRange(layers, (0, 0, 0, 0), (0, 0, 0, 0)) == 0
@@ -147,9 +147,18 @@ def recorded_files(folder: Path, camera: str) -> dict[str, Path] | Path | None:
     return next((file for file in videos if file.is_file()), None)
 
 
-def mask_of_picture(picture: Picture) -> Mask:
-    """The mask (H, W) of a picture (H, W) or (H, W, 3) that compression blurred: what is light."""
+def mask_of_picture(picture: Picture, where: str, error_type: type[DrakePoseError]) -> Mask:
+    """The mask (H, W) of a picture (H, W) or (H, W, 3) that compression blurred: what is light.
+
+    The error names the picture by ``where``: much is neither dark nor light.
+    """
     grey = picture if picture.ndim == 2 else cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)
+    between = float(((grey > 64) & (grey < 192)).mean())
+    if between > 0.1:
+        raise error_type(
+            f"{where}: {between:.0%} of it is neither dark nor light: no mask but a picture, in "
+            "which the object is to be found first (drake-pose masks --background, --box, --model)"
+        )
     return np.asarray(grey >= 128, dtype=np.bool_)
 
 

@@ -85,6 +85,10 @@ class SourceSpecification:
         """Whether the source delivers masks of the person instead of pictures."""
         return self.background is None
 
+    def seen_in(self, picture: Picture, where: str) -> Picture | Mask:
+        """What the source delivers in a picture; SceneError: it should be a mask and is none."""
+        return mask_of_picture(picture, where, SceneError) if self.gives_masks else picture
+
     def wrong_size(self, picture: Picture | Mask) -> str:
         """What is wrong with a picture's size; "" where it is the calibrated one."""
         height, width = picture.shape[:2]
@@ -255,7 +259,12 @@ class DeviceSource(FrameSource):
             if self._failed:
                 self.report(f"'{self.specification.location}' answers again")
                 self._failed = False
-            seen = mask_of_picture(rgb) if self.specification.gives_masks else rgb
+            try:
+                seen = self.specification.seen_in(rgb, f"'{self.specification.location}'")
+            except SceneError as error:
+                self.report(str(error))
+                self._stop.set()
+                return count
             self._newest.append(TimedPicture(time, f"{count:06d}", seen))
             count += 1
         return count
@@ -366,7 +375,11 @@ class RecordedSource(FrameSource):
                 self.drop(reason, video.count - k)
                 return
             time = video.time if given.rate_hz is None else k / given.rate_hz
-            seen = mask_of_picture(picture) if given.gives_masks else picture
+            try:
+                seen = given.seen_in(picture, f"{path}: picture {k}")
+            except SceneError as error:
+                self.drop(str(error))
+                continue
             yield path, TimedPicture(time + given.offset, f"{k:06d}", seen)
 
 

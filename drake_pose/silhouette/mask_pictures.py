@@ -10,29 +10,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from drake_pose.arrays import Array, Mask
 from drake_pose.camera.models import LARGEST_SIDE
 from drake_pose.errors import MaskError
 from drake_pose.regular_files import read_regular
-
-
-def mask_of_video_picture(picture: NDArray[np.uint8], where: str) -> Mask:
-    """The mask (H, W) in a video's picture (H, W, 3): what is light.
-
-    Raises MaskError, which names the picture by ``where``: much is neither dark nor light.
-    """
-    grey = cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)
-    between = float(((grey > 64) & (grey < 192)).mean())
-    if between > 0.1:
-        raise MaskError(
-            f"{where}: {between:.0%} of it is neither dark nor light: no mask but a picture; say "
-            "how its object is to be found"
-        )
-    return np.asarray(grey >= 128)
 
 
 @dataclass(frozen=True)

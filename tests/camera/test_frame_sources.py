@@ -159,10 +159,14 @@ class TestVideo:
         assert source.dropped == 10 - len(found)
         assert f"ends after {len(found)} of 10 pictures" in source.problems[0]
 
-    def test_video_of_masks_is_what_is_light(self, tmp_path):
+    def test_masks_in_a_video_are_what_is_light_and_grey_pictures_are_none(self, tmp_path):
         path = write_video(tmp_path / "v.avi", 11)
-        found = read_all(open_source(specify(path, "video", background=None)))
-        assert [bool(one.picture.all()) for one in found] == [k > 5 for k in range(11)]
+        source = open_source(specify(path, "video", background=None))
+        found = read_all(source)
+        assert [int(one.frame) for one in found] == [0, 1, 2, 8, 9, 10]
+        assert [bool(one.picture.all()) for one in found] == [int(one.frame) > 5 for one in found]
+        assert source.dropped == 5
+        assert "picture 3: 100% of it is neither dark nor light" in source.problems[0]
 
     def test_what_is_no_video_or_of_another_size_is_refused(self, tmp_path):
         (tmp_path / "text.avi").write_text("no video")

@@ -9,11 +9,11 @@ import pytest
 from matplotlib.path import Path as MplPath
 from pycocotools import mask as coco
 
+from drake_pose.camera.picture_files import mask_of_picture, read_two_colours
 from drake_pose.errors import MaskError
 from drake_pose.silhouette.mask_pictures import (
     decode_run_lengths,
     fill_polygon,
-    mask_of_video_picture,
     read_coco,
 )
 
@@ -28,13 +28,20 @@ def classes():
     return layer
 
 
-def test_a_video_of_pictures_is_no_video_of_masks(classes):
+def test_a_photograph_is_no_mask_that_compression_blurred(classes, tmp_path):
     blurred = cv2.GaussianBlur(np.where(classes > 0, 255, 0).astype(np.uint8), (3, 3), 0)
-    found = mask_of_video_picture(np.dstack([blurred] * 3), "a.mp4")
-    assert (found == (classes > 0)).mean() > 0.99
-    grey = np.random.default_rng(0).integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8)
+    grey = np.random.default_rng(0).integers(0, 256, (HEIGHT, WIDTH), dtype=np.uint8)
+    for k, picture in enumerate((blurred, grey)):
+        cv2.imwrite(str(tmp_path / f"{k}.jpg"), picture)
+    for found in (
+        mask_of_picture(np.dstack([blurred] * 3), "a.mp4", MaskError),
+        read_two_colours(tmp_path / "0.jpg", MaskError, lossy=True),
+    ):
+        assert (found == (classes > 0)).mean() > 0.99
     with pytest.raises(MaskError, match=r"a\.mp4.*no mask but a picture"):
-        mask_of_video_picture(grey, "a.mp4")
+        mask_of_picture(grey, "a.mp4", MaskError)
+    with pytest.raises(MaskError, match=r"1\.jpg.*no mask but a picture"):
+        read_two_colours(tmp_path / "1.jpg", MaskError, lossy=True)
 
 
 def star(rng, count=9):

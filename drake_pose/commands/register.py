@@ -52,8 +52,8 @@ def register(
     robot's base, in most files. Five poses that differ much are enough. Cameras that have an X_WC
     are held, and compared with the robot.
 
-    Without --joints the body's poses are estimated from the cameras that have an X_WC: one for a
-    robot on its base, two for a person; then the poses and the missing cameras are fitted together.
+    Without joint positions the body's poses are estimated from the cameras that have an X_WC: one
+    for a robot on its base, two for a person; then poses and missing cameras are fitted together.
     --joints may also be the poses.csv of an estimate, in which the base may move.
 
     An episode needs no masks: pictures or videos beside joint positions by time or frame, a LeRobot
@@ -79,8 +79,8 @@ def register(
         scene: Folder with cameras.yaml, in which X_WC may be missing, and
             masks/<camera>/<frame>.png; or an episode: a folder or file.
         joints: Joint positions of every frame [rad or m]: a CSV file with the column frame and one
-            for each joint; of an episode also by time. Default: an episode's own; of a scene they
-            are estimated from the cameras that have an X_WC.
+            for each joint; of an episode also by time. Default: the recording's own
+            (joint_angles.csv); without any they are estimated from the cameras that have an X_WC.
         cameras: Camera file in place of the scene's or episode's own.
     """
     from drake_pose.jobs.registration.register import register_scene
@@ -130,7 +130,8 @@ def audit(
         scene: Folder with cameras.yaml and masks/<camera>/<frame>.png; or an episode: a folder or
             file.
         joints: Joint positions of every frame [rad or m]: a CSV file with the column frame and one
-            for each joint; of an episode also by time. Default: an episode's own.
+            for each joint; of an episode also by time. Default: the recording's own
+            (joint_angles.csv).
         out: Folder for the result; new or empty.
         cameras: Camera file in place of the scene's or episode's own.
     """

@@ -86,8 +86,8 @@ def audit_scene(
         scene: the folder with cameras.yaml and masks; or an episode of pictures, in which the
             robot, and masks of it, are found without the cameras that are audited.
         model: the robot's model file. It stands in the world as the file has it.
-        joints: joint positions by frame, of an episode by time, too (CSV) [rad or m]. None: an
-            episode's own.
+        joints: joint positions by frame, of an episode by time, too (CSV) [rad or m]. None: the
+            recording's own.
         out: folder for the result, new or empty; None writes nothing.
         cameras: a camera file in place of the scene's or episode's own.
         on_frame: called after each frame.

@@ -13,7 +13,7 @@ from drake_pose.body import OBJECT, ArticulatedModel, PoseTree, RootRotation, lo
 from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.camera.camera_files import CameraFile, load_camera_file, load_cameras
 from drake_pose.camera.episode import EpisodeCamera
-from drake_pose.camera.episode_files import open_episode
+from drake_pose.camera.episode_files import JOINT_TABLE, open_episode
 from drake_pose.camera.models import Camera, PinholeCamera
 from drake_pose.errors import CameraError, MaskError, SceneError, SettingsError, UnknownNameError
 from drake_pose.files.settings import EstimateSettings
@@ -131,18 +131,23 @@ def read_inputs(
     Args:
         scene: a scene of masks, or an episode, whose pictures are read when they are asked for.
         model: the robot's model file.
-        joints: a table of joint positions; None: an episode's own, or they are estimated from known
-            cameras.
+        joints: a table of joint positions; None: the recording's own. Without one, those of a scene
+            of masks are estimated from known cameras for a registration.
         cameras: a camera file in place of the scene's or episode's own.
 
     Raises DrakePoseError: names the file, camera, frame, column or joint at fault.
     """
     if looks_at_pictures(scene, settings):
         return _read_episode(scene, model, joints, cameras, settings)
+    robot = load_model(model, package_paths=settings.packages)
+    joints = joints or _own_joints(scene, robot, settings)
     if isinstance(settings, RegistrationSettings):
-        return _read_masks(scene, model, joints, cameras, settings)
+        return _read_masks(scene, robot, joints, cameras, settings)
     if joints is None:
-        raise SettingsError(f"{scene}: an audit of masks needs joint positions: --joints FILE")
+        raise SettingsError(
+            f"{scene}: an audit of masks needs the positions of all joints of {model.name} that "
+            f"are not held: {JOINT_TABLE} in the folder, or --joints FILE"
+        )
     given = None if cameras is None else load_cameras(cameras)
     found, frames = read_scene(
         scene, settings.cameras, settings.frames, given, every=settings.every
@@ -153,7 +158,6 @@ def read_inputs(
             "drake-pose register finds that"
         )
     held = tuple(found.cameras.values())
-    robot = load_model(model, package_paths=settings.packages)
     tree = make_tree(robot, EstimateSettings(hold=settings.hold))
     positions = read_known_positions(joints, TreeKinematics(tree))
     warnings = [*found.warnings, *robot.warnings, *positions.warnings]
@@ -165,6 +169,20 @@ def read_inputs(
     return Inputs(
         found, robot, tree, positions, joints, cameras, tuple(warnings), held, wanted=frames
     )
+
+
+def _own_joints(scene: Path, robot: ArticulatedModel, settings: AuditSettings) -> Path | None:
+    """A scene's own table of joint positions, if it has one of all the robot's joints."""
+    path = scene / JOINT_TABLE
+    if not path.is_file():
+        return None
+    try:
+        known = {*read_true_angles(path, robot.position_names).names}
+    except UnknownNameError:  # It is another model's.
+        return None
+    tree = make_tree(robot, EstimateSettings(hold=settings.hold))
+    held = {robot.position_names[index] for index in tree.held}
+    return path if {*TreeKinematics(tree).names} <= known | held else None
 
 
 def _read_episode(
@@ -262,7 +280,7 @@ def _read_target(model: ArticulatedModel, settings: RegistrationSettings) -> Sta
 
 def _read_masks(
     path: Path,
-    model: Path,
+    robot: ArticulatedModel,
     joints: Path | None,
     cameras: Path | None,
     settings: RegistrationSettings,
@@ -270,11 +288,15 @@ def _read_masks(
     """A scene of masks; joints that no table tells are estimated from known cameras."""
     if not path.is_dir():
         raise SceneError(f"{path}: no such folder; a scene has {CAMERA_FILE} and masks")
+    if cameras is None and not (path / CAMERA_FILE).exists():
+        raise SceneError(
+            f"{path}: has no {CAMERA_FILE}; a camera is found whose size and focal length a camera "
+            "file says (--cameras FILE)"
+        )
     file = load_camera_file(cameras or path / CAMERA_FILE)
     scene = check_scene(load_scene(path, file.cameras))
     scene, frames = scene.every(settings.every, settings.frames)
     searched, held = _select_cameras(scene, file, settings)
-    robot = load_model(model, package_paths=settings.packages)
     table, standing = None, _read_target(robot, settings)
     if joints is not None and standing is None:
         table = read_true_angles(joints, robot.position_names)

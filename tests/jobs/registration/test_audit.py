@@ -11,7 +11,7 @@ import pytest
 
 from drake_pose.camera.camera_files import save_cameras
 from drake_pose.camera.models import Camera
-from drake_pose.errors import CameraError, MaskError, SceneError
+from drake_pose.errors import CameraError, MaskError, SceneError, SettingsError
 from drake_pose.jobs.registration.audit import SceneAudit, audit_scene
 from drake_pose.silhouette.pictures.masks import write_mask
 from tests.cli import Result, run_to_end
@@ -61,6 +61,19 @@ class TestAudit:
         assert summary["frames"]["0003"]["agrees"]
         assert summary["principal_point_px"] is None
         assert summary == json.loads((out / "summary.json").read_text())
+
+    def test_a_scene_s_own_positions_are_those_of_its_table(self, audited, found, tmp_path) -> None:
+        own, (_, summary) = audited.copy(tmp_path), found
+        table = own.joints.rename(own.folder / "joint_angles.csv")
+        again = audit_scene(own.folder, own.model)
+        assert again.summary["contradictions"] == summary["contradictions"]
+        lines = table.read_text().splitlines()
+        without_a_joint = [line.rpartition(",")[0] for line in lines]
+        of_another = [lines[0].replace(JOINTS[0], "elsewhere"), *lines[1:]]
+        for other in (of_another, without_a_joint):
+            table.write_text("\n".join(other))
+            with pytest.raises(SettingsError, match="positions of all joints"):
+                audit_scene(own.folder, own.model)
 
     def test_only_what_contradicts_is_drawn(self, found) -> None:
         drawn = sorted(path.relative_to(found[0]) for path in found[0].rglob("*.png"))

@@ -149,7 +149,7 @@ def test_what_needs_masks_or_pictures_is_refused(episode, tmp_path):
             register_scene(scene, painted.path, settings=settings)
     with pytest.raises(DrakePoseError, match=r"cameras\.yaml"):
         register_scene(tmp_path, painted.path, tmp_path / "joints.csv")
-    with pytest.raises(DrakePoseError, match="needs joint positions"):
+    with pytest.raises(DrakePoseError, match="needs the positions of all joints"):
         audit_scene(tmp_path, painted.path)
 
 

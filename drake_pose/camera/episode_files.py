@@ -5,6 +5,7 @@ import os
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
@@ -182,6 +183,20 @@ def with_intrinsics(camera: EpisodeCamera, known: CameraFile, path: Path) -> Epi
     return replace(camera, camera=found, link=link, lens=lens)
 
 
+def format_of(path: Path) -> Literal["lerobot", "droid", "bag", "folder", ""]:
+    """What a recording of pictures is, by its files' names; "": none, as a folder of masks is."""
+    inside = sorted(one.name for one in path.iterdir()) if path.is_dir() else []
+    if (path / INFO).exists():
+        return "lerobot"
+    if path.name == TRAJECTORY or TRAJECTORY in inside:
+        return "droid"
+    if path.suffix in BAGS or "metadata.yaml" in inside:
+        return "bag"
+    if {"images", "videos"} & set(inside):
+        return "folder"
+    return "bag" if any(name.endswith(BAGS) for name in inside) else ""
+
+
 def open_episode(
     path: str | Path, *, joints: str | Path | None = None, episode: int | None = None
 ) -> Episode:
@@ -207,21 +222,19 @@ def open_episode(
     if not path.exists():
         raise SceneError(f"{path}: no such folder or file; {expected}")
     log, warnings = (None, []) if joints is None else read_joint_table(Path(joints))
-    if (path / INFO).exists():
-        found = open_lerobot(path, log, episode)
-        return replace(found, warnings=(*warnings, *found.warnings))
-    if episode is not None:
+    kind = format_of(path)
+    if episode is not None and kind != "lerobot":
         raise SettingsError(f"--episode {episode}: {path} is no LeRobot data set, but one episode")
     inside = sorted(one.name for one in path.iterdir()) if path.is_dir() else []
     bags = [path / name for name in inside if name.endswith(BAGS)]
-    if path.name == TRAJECTORY or TRAJECTORY in inside:
+    if kind == "lerobot":
+        found = open_lerobot(path, log, episode)
+    elif kind == "droid":
         found = open_droid(path.parent if path.is_file() else path, log)
-    elif path.suffix in BAGS or "metadata.yaml" in inside:
-        found = open_bag(path, log)
-    elif {"images", "videos"} & set(inside):
+    elif kind == "folder":
         found = open_folder(path, log)
-    elif len(bags) == 1:
-        found = open_bag(bags[0], log)
+    elif kind == "bag" and (path.is_file() or "metadata.yaml" in inside or len(bags) == 1):
+        found = open_bag(path if path.is_file() or "metadata.yaml" in inside else bags[0], log)
     else:
         what = ", ".join(inside[:8]) if path.is_dir() else "a file of another kind"
         raise SceneError(f"{path}: is no episode: {what or 'empty'}; {expected}")

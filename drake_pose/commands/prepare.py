@@ -120,7 +120,8 @@ def masks(
 
     Args:
         source: Folder with images/<camera>/<frame>.png or .jpg, or videos/<camera>.mp4, or pictures
-            of a single camera; a picture, a video; a COCO file (.json).
+            of a single camera; a picture, a video; a COCO file (.json); an episode of a LeRobot
+            data set or DROID, or a ROS bag.
         out: Folder for the scene; new or empty.
         overlay: Write the pictures with the masks' outlines, overlay/<camera>/<frame>.jpg.
     """

@@ -308,6 +308,8 @@ class MaskSettings:
 
     cameras: Path | None = None
     """Camera file that the scene gets. Default: SOURCE/cameras.yaml, if it exists."""
+    episode: Annotated[int | None, Parameter(metavar="N")] = None
+    """The number of the episode in a LeRobot data set; default: the only one that is there."""
     classes: Annotated[tuple[str, ...], Parameter("--class", metavar="NAME")] = ()
     """Class of a COCO file that is the object, by name or number; repeat for several; all: every
     class. Default: the only one."""

@@ -2,11 +2,15 @@
 
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
+
+import numpy as np
 
 from drake_pose.arrays import Picture
 from drake_pose.camera.camera_files import CameraFile, load_camera_file
+from drake_pose.camera.episode import Episode
+from drake_pose.camera.episode_files import format_of, open_episode
 from drake_pose.camera.picture_files import (
     SUFFIXES,
     VIDEOS,
@@ -15,12 +19,13 @@ from drake_pose.camera.picture_files import (
     read_picture,
 )
 from drake_pose.errors import SceneError
+from drake_pose.jobs.estimate.measurements import frames_of
 from drake_pose.silhouette.mask_pictures import (
     AnnotatedPicture,
     Annotations,
     read_coco,
 )
-from drake_pose.silhouette.pictures.scenes import CAMERA_FILE
+from drake_pose.silhouette.pictures.scenes import CAMERA_FILE, common_rate
 
 
 @dataclass(frozen=True)
@@ -33,6 +38,7 @@ class Source:
         cameras: what the camera file says; None where there is none.
         pictures: by camera and frame, the files; none where there are videos.
         annotated: COCO files, each with the camera whose folder it lies in.
+        episode: a data set's, or a bag, whose cameras' pictures are read.
     """
 
     path: Path
@@ -41,12 +47,20 @@ class Source:
     pictures: Mapping[str, Mapping[str, Path]] = field(default_factory=dict)
     videos: Mapping[str, Path] = field(default_factory=dict)
     annotated: Sequence[tuple[str, Annotations]] = ()
+    episode: Episode | None = None
     _sizes: dict[str, tuple[int, ...]] = field(default_factory=dict, repr=False, compare=False)
 
     @property
     def names(self) -> tuple[str, ...]:
         """The cameras' names."""
-        return (*self.pictures, *self.videos)
+        return (*self.pictures, *self.videos, *(self.episode.cameras if self.episode else ()))
+
+    def rate(self) -> tuple[float | None, tuple[str, ...]]:
+        """Pictures a second of videos or an episode; what is wrong with their times."""
+        if self.episode is None:
+            return common_rate(self.videos)
+        steps = np.diff(next(iter(self.episode.cameras.values())).times)
+        return (1.0 / float(np.median(steps)) if len(steps) else None), self.episode.warnings
 
     def read(self, camera: str) -> Iterator[tuple[str, str, Picture]]:
         """The frames of a camera: name, where it is from, and the picture (H, W, 3).
@@ -57,6 +71,12 @@ class Source:
             picture = read_picture(path, SceneError)
             self.check_size(camera, picture.shape, str(path))
             yield frame, str(path), picture
+        if self.episode is not None and camera in self.episode.cameras:
+            recorded = self.episode.cameras[camera]
+            for k, frame in enumerate(frames_of(recorded)):
+                picture, where = recorded.read(k), f"{self.path}: camera '{camera}', picture {k}"
+                self.check_size(camera, picture.shape, where)
+                yield frame, where, picture
         if camera in self.videos:
             video = VideoPictures(self.videos[camera])
             for number in itertools.count():
@@ -117,13 +137,14 @@ class Source:
             yield camera, file.stem, coco, one
 
 
-def open_source(path: Path, camera_file: Path | None = None) -> Source:
+def open_source(path: Path, camera_file: Path | None = None, episode: int | None = None) -> Source:
     """Finds out what there is.
 
-    A folder has ``images/<camera>/<frame>.png`` or ``.jpg``, ``videos/<camera>.mp4``, or the same
-    without ``images`` and ``videos``, or in ``masks`` where there is neither; with a single camera
-    the pictures may lie in it. A file is a picture, a video, or of COCO. Its cameras are those of
-    ``camera_file``, or of the folder's ``cameras.yaml``.
+    It may be an episode of a data set, of DROID or a bag; ``episode`` is its number in a LeRobot
+    data set. A folder has ``images/<camera>/<frame>.png`` or ``.jpg``; where a camera has no such
+    folder ``videos/<camera>.mp4``; or the same without ``images`` and ``videos``, or in ``masks``
+    where there is neither; with a single camera the pictures may lie in it. A file is a picture, a
+    video, or of COCO. Its cameras are those of ``camera_file``, or of the folder's cameras.yaml.
 
     Raises:
         SceneError: names what is missing, or in doubt.
@@ -136,13 +157,16 @@ def open_source(path: Path, camera_file: Path | None = None) -> Source:
         camera_file = path / CAMERA_FILE
     cameras = None if camera_file is None else load_camera_file(camera_file)
     try:
-        found = _open_file(path) if path.is_file() else _open_folder(path)
+        if episode is not None or format_of(path) in ("lerobot", "droid", "bag"):
+            found = Source(path, episode=open_episode(path, episode=episode))
+        else:
+            found = _open_file(path) if path.is_file() else _open_folder(path)
     except OSError as error:
         raise SceneError(f"{error.filename or path}: cannot be read: {error.strerror}") from error
     if not (found.names or found.annotated):
         raise SceneError(
             f"{path}: holds no pictures images/<camera>/<frame>.png or .jpg, no videos "
-            "videos/<camera>.mp4, and no COCO file (.json)"
+            "videos/<camera>.mp4, no COCO file (.json), and is no data set or bag"
         )
     pictures, videos = found.pictures, found.videos
     if cameras is not None:
@@ -160,7 +184,9 @@ def open_source(path: Path, camera_file: Path | None = None) -> Source:
             )
         pictures = {name or known[0]: files for name, files in pictures.items()}
         videos = {name or known[0]: file for name, file in videos.items()}
-    return Source(path, camera_file, cameras, pictures, videos, found.annotated)
+    return replace(
+        found, camera_file=camera_file, cameras=cameras, pictures=pictures, videos=videos
+    )
 
 
 def _open_file(path: Path) -> Source:
@@ -177,37 +203,38 @@ def _open_file(path: Path) -> Source:
 def _open_folder(path: Path) -> Source:
     """Pictures, videos or COCO files by camera, which nothing may name."""
     places = [path / name for name in ("images", "videos") if (path / name).is_dir()]
-    if len(places) > 1:
-        raise SceneError(f"{path}: has images and videos; name one of them: {places[0]}")
     # Where there is nothing to find objects in, masks that another tool put there are meant.
-    root = next((one for one in (*places, path / "masks") if one.is_dir()), path)
+    roots = places or [path / "masks" if (path / "masks").is_dir() else path]
     no_cameras = ("background", "overlay", "masks", "images", "videos")
-    folders = {"": root} | {
-        entry.name: entry
+    folders = [("", root) for root in roots] + [
+        (entry.name, entry)
+        for root in roots
         for entry in sorted(root.iterdir())
         if entry.is_dir() and not entry.name.startswith(".") and entry.name not in no_cameras
-    }
+    ]
     pictures: dict[str, dict[str, Path]] = {}
     videos: dict[str, Path] = {}
     annotated: list[tuple[str, Annotations]] = []
-    for name, folder in folders.items():
+    for name, folder in folders:
         if files := list_pictures(folder, SceneError):
             pictures[name] = files
         for file in sorted(folder.iterdir()):
             kind = "" if file.name.startswith(".") else file.suffix.lower()
             if kind == ".json":
                 annotated.append((name, read_coco(file)))
-            elif kind in VIDEOS and folder == root:
+            elif kind in VIDEOS and folder in roots:
                 if file.stem in videos:
                     raise SceneError(f"{file}: there is a second video of camera '{file.stem}'")
                 videos[file.stem] = file
     # COCO files lie beside the pictures that they are of.
     if annotated:
         return Source(path, annotated=annotated)
+    # As wherever a recording is read, a video counts where its camera has no folder of pictures.
+    videos = {name: file for name, file in videos.items() if name not in pictures}
     if "" in pictures and len(pictures) > 1:
         raise SceneError(
-            f"{root}: has pictures beside folders of pictures; put them in a camera's folder"
+            f"{roots[0]}: has pictures beside folders of pictures; put them in a camera's folder"
         )
-    if pictures and videos:
-        raise SceneError(f"{root}: has pictures and videos; give one of them")
+    if "" in pictures and videos:
+        raise SceneError(f"{roots[0]}: has pictures and videos; give one of them")
     return Source(path, pictures=pictures, videos=videos)

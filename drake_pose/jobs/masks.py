@@ -4,7 +4,7 @@ import math
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -16,7 +16,13 @@ import yaml
 from drake_pose.arrays import Mask, Picture
 from drake_pose.body import load_model
 from drake_pose.body.tree_kinematics import TreeKinematics
-from drake_pose.camera.picture_files import SUFFIXES, find_pictures, read_picture, read_two_colours
+from drake_pose.camera.picture_files import (
+    SUFFIXES,
+    find_pictures,
+    mask_of_picture,
+    read_picture,
+    read_two_colours,
+)
 from drake_pose.errors import (
     CameraError,
     DrakePoseError,
@@ -32,12 +38,9 @@ from drake_pose.jobs.estimate.inputs import make_tree
 from drake_pose.jobs.mask_sources import Source, open_source
 from drake_pose.jobs.registration.positions import read_known_positions
 from drake_pose.search import PoseAndMask, PoseAndMaskSettings
-from drake_pose.silhouette.mask_pictures import (
-    mask_of_video_picture,
-)
 from drake_pose.silhouette.pictures.masks import encode_mask, intersection_over_union
 from drake_pose.silhouette.pictures.scene_checks import frame_ranges
-from drake_pose.silhouette.pictures.scenes import CAMERA_FILE, SCENE_FILE, common_rate, in_order
+from drake_pose.silhouette.pictures.scenes import CAMERA_FILE, SCENE_FILE, in_order
 from drake_pose.silhouette.segmentation import (
     Background,
     background_of_recording,
@@ -123,7 +126,7 @@ def make_masks(
         DrakePoseError: names the file, camera or frame at fault; no picture has a good mask.
     """
     settings, folder = settings or MaskSettings(), Path(out)
-    opened = open_source(Path(source), settings.cameras)
+    opened = open_source(Path(source), settings.cameras, settings.episode)
     cameras: dict[str, dict[str, Any]] = {}
     doubts: list[str] = []
     refused: list[str] = []
@@ -151,7 +154,7 @@ def make_masks(
             first, *more = refused or [f"{opened.path}: has no picture"]
             raise MaskError(first + (f" (and {len(more)} more)" if more else ""))
         warnings = [*(f"{text}; no mask is written" for text in refused), *doubts]
-        warnings += common_rate(opened.videos)[1]
+        warnings += opened.rate()[1]
         if settings.model is None:
             warnings += [text for name, own in cameras.items() for text in _doubt_camera(name, own)]
         if opened.cameras is None and set(cameras) != {""}:
@@ -193,9 +196,11 @@ def _write_scene(source: Source, folder: Path, summary: Mapping[str, Any]) -> No
     try:
         if source.path.is_dir() and own.is_file():
             shutil.copyfile(own, folder / SCENE_FILE)
-        elif source.videos:
-            rate, _ = common_rate(source.videos)
-            content = {"sequence": True} | ({} if rate is None else {"frame_rate_hz": rate})
+        elif source.videos or source.episode:
+            rate, _ = source.rate()
+            content = {"sequence": True} | (
+                {} if rate is None else {"frame_rate_hz": round(rate, 6)}
+            )
             write_file(folder, SCENE_FILE, yaml.safe_dump(content))
         if source.camera_file is not None:
             shutil.copyfile(source.camera_file, folder / CAMERA_FILE)
@@ -265,7 +270,8 @@ def find_masks(source: Source, settings: MaskSettings) -> Iterator[FoundMask]:
     Raises DrakePoseError: names the file, camera or frame at fault.
     """
     background = settings.background
-    if settings == MaskSettings(largest=settings.largest, cameras=settings.cameras):
+    way = replace(settings, largest=False, cameras=None, episode=None)
+    if way == MaskSettings():
         # Beside its pictures a scene may have those of the empty room, which say what is meant.
         room = source.path / "background"
         background = room if room.is_dir() else None
@@ -321,9 +327,9 @@ def _read_given(source: Source, settings: MaskSettings) -> Iterator[FoundMask]:
             mask = read_two_colours(path, MaskError, may_be_empty=True, lossy=True)
             source.check_size(camera, mask.shape, str(path))
             yield FoundMask(camera, frame, str(path), mask)
-    for camera in source.videos:
+    for camera in (name for name in source.names if name not in source.pictures):
         for frame, where, picture in source.read(camera):
-            yield FoundMask(camera, frame, where, mask_of_video_picture(picture, where))
+            yield FoundMask(camera, frame, where, mask_of_picture(picture, where, MaskError))
 
 
 def _by_box(

@@ -14,7 +14,7 @@ from drake_pose.body import ParsedModel, PoseTree
 from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.camera.camera_files import load_camera_file
 from drake_pose.camera.episode import Episode, EpisodeCamera, JointLog
-from drake_pose.camera.episode_files import open_episode, with_intrinsics
+from drake_pose.camera.episode_files import format_of, open_episode, with_intrinsics
 from drake_pose.camera.joint_map import map_joints, read_joint_map
 from drake_pose.camera.picture_files import frame_key
 from drake_pose.csv_files import read_csv
@@ -221,13 +221,7 @@ def is_episode(path: Path, settings: EpisodeSettings) -> bool:
     """Whether a path is one of pictures and joints, and no scene of masks."""
     if path.is_file() or settings.episode is not None:
         return True
-    if (path / "masks").is_dir():
-        return False
-    own = ("videos", "images", "meta/info.json", "trajectory.h5", "metadata.yaml")
-    bags = ("*.mcap", "*.bag", "*.db3")
-    return any((path / one).exists() for one in own) or any(
-        found for pattern in bags for found in path.glob(pattern)
-    )
+    return not (path / "masks").is_dir() and format_of(path) != ""
 
 
 def cameras_of(

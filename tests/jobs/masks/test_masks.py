@@ -19,6 +19,8 @@ from drake_pose.errors import (
     SettingsError,
 )
 from drake_pose.jobs.masks import doubt_mask, largest_patch, refuse_mask
+from tests.camera.recordings import numbered, write_video
+from tests.camera.test_data_sets import LENGTHS, write_v21
 from tests.cli import run_json, run_to_end
 from tests.jobs.masks.rooms import iou, moving, write_pictures
 from tests.jobs.scenes import write_scene
@@ -281,6 +283,29 @@ def test_masks_in_a_video_become_a_sequence(tmp_path, out, two_views):
     assert made.frame_rate_hz == 25.0
     for (camera, frame), mask in zip(made.masks, scene.masks, strict=True):
         assert (made.read(camera, frame) == scene.read(*mask)).mean() > 0.999
+
+
+def test_an_episode_of_a_data_set_is_a_source(tmp_path, out):
+    write_v21(tmp_path)
+    with pytest.raises(SceneError, match="say which episode"):
+        make_masks(tmp_path, out, MaskSettings(box=(8, 8, 40, 40)))
+    result = make_masks(tmp_path, out, MaskSettings(box=(8, 8, 40, 40), episode=1))
+    frames = [f"{k:06d}" for k in range(LENGTHS[1])]
+    assert {name: [*own] for name, own in result.summary["cameras"].items()} == {
+        "top": frames,
+        "wrist": frames,
+    }
+    assert (out / "scene.yaml").read_text() == "frame_rate_hz: 10.0\nsequence: true\n"
+
+
+def test_a_camera_without_pictures_has_its_video(tmp_path, out):
+    for k, name in enumerate(("a", "b")):
+        (tmp_path / "images" / "a").mkdir(parents=True, exist_ok=True)
+        cv2.imwrite(str(tmp_path / "images" / "a" / f"{k}.png"), numbered(k))
+        write_video(tmp_path / "videos" / f"{name}.mp4", range(3))
+    result = make_masks(tmp_path, out, MaskSettings(box=(8, 8, 40, 40)))
+    counts = {name: len(own) for name, own in result.summary["cameras"].items()}
+    assert counts == {"a": 2, "b": 3}
 
 
 def test_sources_in_doubt_are_refused(tmp_path, out, two_views):

@@ -13,8 +13,10 @@ from pathlib import Path
 import pytest
 
 from drake_pose.body import ArticulatedModel, bundled_model, load_model
+from drake_pose.person.date.skeleton import Skeleton, load_skeleton
 from tests.cli import CliRunner
 from tests.jobs.scenes import TinyScene, write_scene
+from tests.search.bodies import forked_body
 
 
 @pytest.fixture(scope="session")
@@ -48,3 +50,20 @@ def runner() -> CliRunner:
 def person() -> ArticulatedModel:
     """The bundled person, whose links have any lengths; shared, so do not change it."""
     return load_model(bundled_model("person"), check=False)
+
+
+@pytest.fixture(scope="session")
+def shaped_person() -> ArticulatedModel:
+    """The bundled person whose joints say how long links are; shared, so do not change it."""
+    return load_model(bundled_model("person").with_name("person_shape.urdf"), check=False)
+
+
+@pytest.fixture(scope="session")
+def skeleton(person: ArticulatedModel) -> Skeleton:
+    return load_skeleton(person)
+
+
+@pytest.fixture(scope="session")
+def body(tmp_path_factory: pytest.TempPathFactory) -> ArticulatedModel:
+    """A trunk that turns, and two arms on it; shared, so do not change it."""
+    return forked_body(tmp_path_factory.mktemp("body"))

@@ -9,7 +9,7 @@ from drake_pose.body import load_model, reshaped
 from drake_pose.errors import UnknownNameError
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from tests.body.models import JOINTED_BASE_URDF, write
-from tests.search.bodies import forked_body, front_camera
+from tests.search.bodies import front_camera
 
 
 def area(model, q, scale=1.0):
@@ -18,25 +18,23 @@ def area(model, q, scale=1.0):
     return int(np.count_nonzero(LabelRenderer(model, camera).mask(q)))
 
 
-def test_a_link_without_looks_is_drawn_by_nobody(tmp_path):
-    model = forked_body(tmp_path)
+def test_a_link_without_looks_is_drawn_by_nobody(body):
     q = np.array([0.1, 1.5, -1.5])
-    without = model.without(["left"])
+    without = body.without(["left"])
     assert "left" not in without.link_meshes
-    assert without.position_names == model.position_names
+    assert without.position_names == body.position_names
     # The left arm is a box of 4 x 15 pixels, of which the trunk hides little.
-    assert 40 < area(model, q) - area(without, q) <= 60
+    assert 40 < area(body, q) - area(without, q) <= 60
     with pytest.raises(UnknownNameError, match="tail"):
-        model.without(["tail"])
+        body.without(["tail"])
 
 
-def test_a_body_stretched_alike_everywhere_is_seen_larger(tmp_path):
-    model = forked_body(tmp_path)
+def test_a_body_stretched_alike_everywhere_is_seen_larger(body):
     q = np.array([0.1, 1.2, -0.8])
-    double = model.reshaped(factors={name: (2.0, 2.0, 2.0) for name in model.link_names})
-    assert area(double, q) == pytest.approx(area(model, q, scale=2.0), rel=0.02)
-    assert area(double, q) > 3.5 * area(model, q)
-    tree, larger = model.pose_tree(), double.pose_tree()
+    double = body.reshaped(factors={name: (2.0, 2.0, 2.0) for name in body.link_names})
+    assert area(double, q) == pytest.approx(area(body, q, scale=2.0), rel=0.02)
+    assert area(double, q) > 3.5 * area(body, q)
+    tree, larger = body.pose_tree(), double.pose_tree()
     before, after = (t.node_poses(t.values_from_positions(q)) for t in (tree, larger))
     np.testing.assert_allclose(after[:, :3, 3], 2.0 * before[:, :3, 3], atol=1e-12)
 

@@ -6,6 +6,7 @@ from drake_pose.errors import SettingsError, UnknownNameError
 from drake_pose.files.settings import (
     parse_assignments,
     parse_boxes,
+    parse_packages,
     parse_root_position,
     parse_root_rotation,
 )
@@ -17,6 +18,7 @@ FRAMES = ("0001", "0002", "0010", "still")
 
 def test_texts_become_values():
     assert parse_assignments(["a=1", "b=c=-2.5"]) == {"a": 1.0, "b=c": -2.5}
+    assert parse_packages(["b=.", "c=/"]) == {"b": Path.cwd(), "c": Path("/")}
     assert parse_root_position("1,-2,0.5") == (1.0, -2.0, 0.5)
     assert parse_root_position("a/centres.csv:toe") == (Path("a/centres.csv"), "toe")
     assert parse_root_position("unknown") == "unknown"
@@ -71,11 +73,8 @@ def test_frames_that_are_unknown_or_unclear_list_those_that_exist(frames, text, 
 
 
 @pytest.mark.parametrize(
-    ("parse", "text", "words"),
-    [
-        (parse_assignments, ["a=1", "a=2"], "'a' is given twice"),
-    ],
+    ("parse", "texts"), [(parse_assignments, ["a=1", "a=2"]), (parse_packages, ["a=.", "a=/"])]
 )
-def test_sizes_and_names_that_cannot_be_are_refused(parse, text, words):
-    with pytest.raises(SettingsError, match=words):
-        parse(text)
+def test_a_name_is_given_once(parse, texts):
+    with pytest.raises(SettingsError, match="'a' is given twice"):
+        parse(texts)

@@ -4,7 +4,6 @@ import cv2
 import numpy as np
 import pytest
 
-from drake_pose.body import bundled_model, load_model
 from drake_pose.errors import SettingsError
 from drake_pose.papers.date import frames_of_destruction, run_experiment
 from drake_pose.papers.date_capture import PERIOD
@@ -16,7 +15,6 @@ from drake_pose.papers.date_walk import (
     walk_by,
 )
 from drake_pose.person.date.features import SkinColour, skin_blobs
-from drake_pose.person.date.skeleton import load_skeleton
 from drake_pose.person.date.walking import (
     COMMANDS,
     MOTIONS,
@@ -25,11 +23,6 @@ from drake_pose.person.date.walking import (
     make_gestures,
     make_motion,
 )
-
-
-@pytest.fixture(scope="module")
-def skeleton():
-    return load_skeleton(load_model(bundled_model("person"), check=False))
 
 
 class TestMotion:

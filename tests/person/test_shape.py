@@ -3,18 +3,13 @@
 import numpy as np
 import pytest
 
-from drake_pose.body import ArticulatedModel, bundled_model, load_model
+from drake_pose.body import ArticulatedModel
 from drake_pose.errors import UnknownNameError
 from drake_pose.person.shape import KnownShape, shape_parts, shape_values, tracker_of_person
 
 
-@pytest.fixture(scope="module")
-def shaped() -> ArticulatedModel:
-    return load_model(bundled_model("person").with_name("person_shape.urdf"), check=False)
-
-
-def test_a_person_of_known_lengths_and_girths(shaped: ArticulatedModel) -> None:
-    tree = shaped.pose_tree()
+def test_a_person_of_known_lengths_and_girths(shaped_person: ArticulatedModel) -> None:
+    tree = shaped_person.pose_tree()
     names = np.array([name for node in tree.nodes for name in node.value_names])
     held = shape_values(tree)
     assert held.any()
@@ -38,6 +33,8 @@ def test_a_person_of_known_lengths_and_girths(shaped: ArticulatedModel) -> None:
     ("shape", "word"),
     [(KnownShape({"nose": 0.1}, {}), "nose"), (KnownShape({}, {"tail": 2.0}), "tail")],
 )
-def test_names_that_a_model_has_not(shaped: ArticulatedModel, shape: KnownShape, word: str) -> None:
+def test_names_that_a_model_has_not(
+    shaped_person: ArticulatedModel, shape: KnownShape, word: str
+) -> None:
     with pytest.raises(UnknownNameError, match=word):
-        tracker_of_person(shaped.pose_tree(), shape)
+        tracker_of_person(shaped_person.pose_tree(), shape)

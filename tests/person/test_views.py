@@ -1,8 +1,7 @@
 import numpy as np
-import pytest
 
 from drake_pose.camera.models import ParallelCamera, circle_of_cameras
-from drake_pose.person.views import _coarser, see_silhouette, shows_somebody
+from drake_pose.person.views import FrameViews, see_silhouette, shows_somebody
 
 
 def ellipse(rows: int, columns: int) -> np.ndarray:
@@ -10,16 +9,20 @@ def ellipse(rows: int, columns: int) -> np.ndarray:
     return ((x - 0.4 * columns) / (0.1 * columns)) ** 2 + ((y - 0.5 * rows) / (0.3 * rows)) ** 2 < 1
 
 
-@pytest.mark.parametrize("kind", ["pinhole", "parallel"])
-def test_a_coarser_camera_sees_every_third_pixel(kind):
-    camera = circle_of_cameras(2)["camera_0"]
-    if kind == "parallel":
-        camera = ParallelCamera("flat", 320, 241, 90.0, 150.0, 118.0, camera.X_WC)
-    coarse = _coarser(camera, 3)
+def test_small_pictures_show_every_so_many_pixels():
+    """Of a camera of each kind."""
+    pinhole = circle_of_cameras(2)["camera_0"]
+    flat = ParallelCamera("flat", 320, 241, 90.0, 150.0, 118.0, pinhole.X_WC)
+    cameras = [pinhole, flat]
+    seen = FrameViews(cameras, [see_silhouette(ellipse(c.height, c.width), 4.0) for c in cameras])
     points = np.random.default_rng(0).normal([0.0, 0.0, 1.0], 0.3, (20, 3))
-    np.testing.assert_allclose(3.0 * coarse.project(points)[0], camera.project(points)[0])
-    picture = np.zeros((camera.height, camera.width))[::3, ::3]
-    assert (coarse.height, coarse.width) == picture.shape
+    assert len(seen.judges) == 2
+    for k, small, region in zip(seen.judges, *seen.small, strict=True):
+        step = cameras[k].height // 120
+        assert step > 1
+        np.testing.assert_allclose(step * small.project(points)[0], cameras[k].project(points)[0])
+        np.testing.assert_array_equal(region, seen.views[k].region[::step, ::step])
+        assert region.shape == (small.height, small.width)
 
 
 def test_a_speck_is_nobody():

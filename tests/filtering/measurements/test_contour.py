@@ -10,7 +10,7 @@ from drake_pose.filtering.inequalities import from_model
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from tests.body.models import LIMB_URDF, joint, link, urdf, write, write_limb
 from tests.jobs.scenes import camera
-from tests.search.bodies import forked_body, front_camera, near_camera
+from tests.search.bodies import front_camera, near_camera
 from tests.search.turning import crane
 
 
@@ -27,13 +27,12 @@ def descend(observation, seen, x, steps=5):
     return x, measured
 
 
-def test_it_leads_back_to_the_truth_that_drake_rendered(tmp_path):
-    model = forked_body(tmp_path)
+def test_it_leads_back_to_the_truth_that_drake_rendered(body):
     camera = front_camera(200, shift=0.2)
-    observation = ContourObservation(model.pose_tree(), [camera])
+    observation = ContourObservation(body.pose_tree(), [camera])
     truth = np.array([0.2, 0.9, -0.6])
     x_true = observation.state(truth)
-    masks = [LabelRenderer(model, camera).mask(truth)]
+    masks = [LabelRenderer(body, camera).mask(truth)]
     x, measured = descend(
         observation, observation.look(masks), x_true + np.r_[0.12, -0.15, 0.1, np.zeros(3)]
     )
@@ -47,10 +46,9 @@ def test_it_leads_back_to_the_truth_that_drake_rendered(tmp_path):
     assert np.count_nonzero(drawn != masks[0]) < 0.02 * np.count_nonzero(masks[0])
 
 
-def test_a_root_that_is_known_elsewhere_and_one_that_is_estimated_there(tmp_path):
-    model = forked_body(tmp_path)
+def test_a_root_that_is_known_elsewhere_and_one_that_is_estimated_there(body):
     home, shift = np.array([0.0, 0.05, 0.04]), np.array([0.0, 0.03, -0.02])
-    tree, there = model.pose_tree("trunk", root_position=home), home + shift
+    tree, there = body.pose_tree("trunk", root_position=home), home + shift
     camera = front_camera(200, shift=0.2)
     held, moves = ContourObservation(tree, [camera]), ContourObservation(tree, [camera], moves=True)
     q = np.array([0.2, 0.9, -0.6])
@@ -65,13 +63,12 @@ def test_a_root_that_is_known_elsewhere_and_one_that_is_estimated_there(tmp_path
     np.testing.assert_allclose(found[moves.layout.indices(ROOT_SHIFT)][1:], shift[1:], atol=0.004)
 
 
-def test_slopes_agree_with_finite_differences_of_the_contour(tmp_path, monkeypatch):
+def test_slopes_agree_with_finite_differences_of_the_contour(body, monkeypatch):
     """The measured distances change with the state as H says, where nothing is robust."""
-    model = forked_body(tmp_path)
     camera = front_camera(400, shift=0.2)
     plain = ContourSettings(spacing=1.0, deviation=30.0)
     monkeypatch.setattr(contour_tracker, "CONTOUR", plain)
-    observation = ContourObservation(model.pose_tree(), [camera])
+    observation = ContourObservation(body.pose_tree(), [camera])
     truth = observation.state(np.array([0.2, 0.9, -0.6]))
     mask = observation.draw(truth, camera)
     for element in range(3):
@@ -83,10 +80,9 @@ def test_slopes_agree_with_finite_differences_of_the_contour(tmp_path, monkeypat
             assert np.linalg.norm(measured.y - expected) < 0.4 * np.linalg.norm(measured.y)
 
 
-def test_nothing_seen_and_bad_arguments(tmp_path):
-    model = forked_body(tmp_path)
+def test_nothing_seen_and_bad_arguments(body):
     camera = front_camera(100)
-    observation = ContourObservation(model.pose_tree(), [camera])
+    observation = ContourObservation(body.pose_tree(), [camera])
     x = observation.state(np.zeros(3))
     assert observation.measure(observation.look([None]), x) is None
     assert observation.measure(observation.look([np.zeros((100, 100), dtype=bool)]), x) is None
@@ -95,7 +91,7 @@ def test_nothing_seen_and_bad_arguments(tmp_path):
     with pytest.raises(SettingsError, match="50 x 50"):
         observation.look([np.zeros((50, 50), dtype=bool)])
     with pytest.raises(SettingsError, match="one camera"):
-        ContourObservation(model.pose_tree(), [])
+        ContourObservation(body.pose_tree(), [])
 
 
 def test_limits_are_rows_but_of_angles_that_take_every_direction(tmp_path):

@@ -15,15 +15,10 @@ from drake_pose.fit.kernel import Sum
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from tests.filtering.measurements.test_contour import descend
 from tests.filtering.tracking.test_match_and_track import PERIOD
-from tests.search.bodies import forked_body, near_camera
+from tests.search.bodies import near_camera
 
 SIDE = 480
 ORANGE, GREEN = np.array([230, 130, 40]), np.array([60, 140, 60])
-
-
-@pytest.fixture(scope="module")
-def body(tmp_path_factory):
-    return forked_body(tmp_path_factory.mktemp("body"))
 
 
 @pytest.fixture(scope="module")

@@ -3,7 +3,6 @@ import math
 import numpy as np
 import pytest
 
-from drake_pose.body import bundled_model, load_model
 from drake_pose.camera.models import circle_of_cameras
 from drake_pose.errors import SettingsError
 from drake_pose.filtering.contour_tracker import (
@@ -16,7 +15,7 @@ from drake_pose.filtering.state import Belief
 from drake_pose.search import TRACKED, PaperSearch, PaperSearchSettings, PoseEstimate, View
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from tests.jobs.live_scenes import standing
-from tests.search.bodies import forked_body, front_camera
+from tests.search.bodies import front_camera
 
 PERIOD = 1 / 30
 CAMERA = front_camera(200, shift=0.2)
@@ -153,11 +152,6 @@ def test_bad_settings_and_a_bad_period_are_named(body):
         ContourTracker(observation, 0.0)
 
 
-@pytest.fixture
-def body(tmp_path):
-    return forked_body(tmp_path)
-
-
 def test_rates_fade_within_the_memory_and_change_by_the_acceleration_of_their_kind(body):
     tree = body.pose_tree("trunk", root_position=np.zeros(3))
     observation = ContourObservation(tree, [CAMERA], moves=True, grows=True)
@@ -209,9 +203,8 @@ def test_a_search_is_asked_where_much_of_the_silhouette_is_not_explained(body, s
 
 
 @pytest.mark.parametrize(("shift", "angle"), [(0.15, 0.3), (0.2, 0.2)])
-def test_a_track_is_not_late_in_its_second_frame(shift, angle):
+def test_a_track_is_not_late_in_its_second_frame(person, shift, angle):
     """Nothing tells how fast a body is that was seen once; from then on it moves as it did."""
-    person = load_model(bundled_model("person"), check=False)
     cameras = list(circle_of_cameras(3, size=(320, 240), face_camera=False).values())
     tracker = make_tracker(person.pose_tree(), cameras, 1.0 / 30.0, TrackingSettings())
     observation, renderers = tracker.observation, [LabelRenderer(person, one) for one in cameras]

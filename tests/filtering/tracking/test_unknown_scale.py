@@ -22,14 +22,14 @@ from drake_pose.filtering.sequence_fit import (
 )
 from drake_pose.search import TRACKED, View
 from tests.filtering.tracking.test_match_and_track import PERIOD, KnownPoses, swings
-from tests.search.bodies import forked_body, front_camera
+from tests.search.bodies import front_camera
 
 SETTINGS = TrackingSettings(root_moves=True, scale_unknown=True)
 
 
-@pytest.fixture
-def tree(tmp_path):
-    return forked_body(tmp_path).pose_tree("trunk", root_position=np.zeros(3))
+@pytest.fixture(scope="module")
+def tree(body):
+    return body.pose_tree("trunk", root_position=np.zeros(3))
 
 
 def drawn(tree, camera, states):
@@ -123,10 +123,7 @@ FRAMES = 16
 
 
 @pytest.fixture(scope="module")
-def fitted(tmp_path_factory):
-    tree = forked_body(tmp_path_factory.mktemp("forked")).pose_tree(
-        "trunk", root_position=np.zeros(3)
-    )
+def fitted(tree):
     camera = front_camera(240, shift=0.2)
     generator = np.random.default_rng(5)
     states = moving_states(tree, camera, FRAMES, generator)
@@ -175,10 +172,9 @@ def test_what_an_explanation_says_of_a_frame_is_its_pose_and_its_intervals(fitte
 
 
 @pytest.fixture
-def observation(tmp_path):
-    tree = forked_body(tmp_path).pose_tree(
-        "trunk", root_position=np.zeros(3), root_rotation=RootRotation.free()
-    )
+def observation(body):
+    free = RootRotation.free()
+    tree = body.pose_tree("trunk", root_position=np.zeros(3), root_rotation=free)
     return ContourObservation(tree, [front_camera(200, shift=0.2)], True, True, rest=0.03)
 
 
@@ -216,8 +212,7 @@ def test_the_true_start_is_among_those_followed_and_not_worse_than_what_was_give
     assert len(found[0].states) == len(found[0].errors) == 12
 
 
-def test_a_root_that_does_not_turn_freely_is_refused(tmp_path):
-    body = forked_body(tmp_path)
+def test_a_root_that_does_not_turn_freely_is_refused(body):
     limited = RootRotation.limited([("x", -30.0, 30.0)])
     for tree in (
         body.pose_tree(),

@@ -10,17 +10,12 @@ from drake_pose.errors import SceneError, SettingsError
 from drake_pose.jobs.live.capture import capture_live
 from drake_pose.jobs.live.scene import load_live_scene
 from drake_pose.jobs.live.settings import LiveSettings
-from drake_pose.person.date.skeleton import load_skeleton, registered_positions
+from drake_pose.person.date.skeleton import registered_positions
 from tests.cli import run_command
 from tests.jobs.live_scenes import standing, write_studio
 
 PLACE = (0.12, -0.1, 1.55)
 HEADING = 0.3
-
-
-@pytest.fixture(scope="module")
-def skeleton(person):
-    return load_skeleton(person)
 
 
 @pytest.fixture(scope="module")

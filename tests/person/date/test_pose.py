@@ -21,11 +21,6 @@ from drake_pose.person.date.skeleton import FEATURES, LIMBS, load_skeleton
 from tests.person.persons_in_view import SIDES, posed, see
 
 
-@pytest.fixture(scope="module")
-def skeleton(person):
-    return load_skeleton(person)
-
-
 def drawn_pose(skeleton, generator, share=0.5):
     """Positions somewhere in the middle of the limits."""
     middle = 0.5 * (skeleton.lower + skeleton.upper)

@@ -4,8 +4,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from drake_pose.body import bundled_model, load_model
-from drake_pose.person.date.skeleton import load_skeleton
 from drake_pose.person.date.walking import (
     COMMANDS,
     REGISTERED,
@@ -55,9 +53,8 @@ def test_table_1():
     assert found == list(zip(turn, walk, strict=True))
 
 
-def test_gestures_are_those_of_their_commands():
+def test_gestures_are_those_of_their_commands(skeleton):
     """What is made by name is recognised by its commands, and who walks steps on the spot."""
-    skeleton = load_skeleton(load_model(bundled_model("person"), check=False))
     motion = make_gestures(skeleton, 20)
     features = np.array([skeleton.features(q) for q in motion.q])
     stances = [

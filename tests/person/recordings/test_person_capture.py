@@ -3,7 +3,7 @@ import csv
 import numpy as np
 import pytest
 
-from drake_pose.body import bundled_model, landmark_positions, load_landmarks, load_model
+from drake_pose.body import landmark_positions, load_landmarks
 from drake_pose.camera.models import circle_of_cameras
 from drake_pose.errors import ModelError, SettingsError
 from drake_pose.fit.contour_fit import ContourFit
@@ -21,19 +21,14 @@ LENGTHS |= {f"{side}_{part}_stretch": way for part, way in PAIRS.items() for sid
 
 
 @pytest.fixture(scope="module")
-def person():
-    return load_model(bundled_model("person").with_name("person_shape.urdf"), check=False)
-
-
-@pytest.fixture(scope="module")
 def cameras():
     return circle_of_cameras(5, size=(320, 240), face_camera=False)
 
 
 class TestShape:
-    def test_lengths_and_girths_are_found(self, person, cameras):
-        fit = ContourFit(person.pose_tree(), noise=NOISE)
-        order = [person.position_index(name) for name in fit.kinematics.names]
+    def test_lengths_and_girths_are_found(self, shaped_person, cameras):
+        fit = ContourFit(shaped_person.pose_tree(), noise=NOISE)
+        order = [shaped_person.position_index(name) for name in fit.kinematics.names]
         factors = {"trunk": 1.1, "thigh": 1.2, "shin": 0.9}
         girths = np.ones(len(fit.outlines))
         for k, node in enumerate(fit.tree.nodes):
@@ -43,11 +38,11 @@ class TestShape:
         outlines = with_girths(fit.outlines, girths)
         frames, starts = [], []
         for phase in np.linspace(0.0, 2 * np.pi, 6, endpoint=False):
-            q = stepping(person, phase, knees=45.0)
+            q = stepping(shaped_person, phase, knees=45.0)
             starts.append(q[order])
             worn = q.copy()
             for name, stretch in LENGTHS.items():
-                worn[person.position_index(name)] = stretch
+                worn[shaped_person.position_index(name)] = stretch
             X_WN = fit.kinematics.poses(worn[order])
             masks = [draw_mask(outlines, c.X_CW @ X_WN, c) for c in cameras.values()]
             frames.append((list(cameras.values()), [find_edge_points(m, 3.0) for m in masks]))
@@ -61,8 +56,7 @@ class TestShape:
         off = np.array([x - LENGTHS.get(name, 0.0) for name, x in shape.known.lengths.items()])
         assert 0.05 < off @ np.linalg.solve(shape.covariance, off) / len(off) < 2.0
 
-    def test_model_of_fixed_lengths_is_refused(self):
-        person = load_model(bundled_model("person"), check=False)
+    def test_model_of_fixed_lengths_is_refused(self, person):
         assert not shape_values(person.pose_tree()).any()
         with pytest.raises(ModelError, match="shape joints"):
             fit_shape(ContourFit(person.pose_tree()), [], np.zeros((0, 23)))
@@ -70,37 +64,41 @@ class TestShape:
 
 class TestCapture:
     @pytest.mark.parametrize(("frames", "word"), [([], "one frame"), ([0, 1], "two cameras")])
-    def test_no_frame_and_nobody_in_any_frame(self, person, cameras, frames, word):
+    def test_no_frame_and_nobody_in_any_frame(self, shaped_person, cameras, frames, word):
         nobody = {name: np.zeros((240, 320), dtype=bool) for name in cameras}
         with pytest.raises(SettingsError, match=word):
-            capture_person(person.pose_tree(), cameras, lambda _: nobody, frames)
+            capture_person(shaped_person.pose_tree(), cameras, lambda _: nobody, frames)
 
     @pytest.mark.slow
-    def test_real_person_of_unknown_proportions(self, person, shared_data):
+    def test_real_person_of_unknown_proportions(self, shaped_person, shared_data):
         scene = load_scene(shared_data / "human_four_views")
         frames = scene.frames[::8]
 
         def read(k):
             return {name: scene.read(name, frames[k]) for name in scene.cameras}
 
-        captured = capture_person(person.pose_tree(), scene.cameras, read, range(len(frames)))
-        landmarks = load_landmarks(person.path)
+        captured = capture_person(
+            shaped_person.pose_tree(), scene.cameras, read, range(len(frames))
+        )
+        landmarks = load_landmarks(shaped_person.path)
         with (scene.path / "joint_centres.csv").open() as stream:
             truth = [row for row in csv.DictReader(stream) if row["joint"] != "head_top"]
         errors = []
         for frame, q in zip(frames, captured.q, strict=True):
-            found = dict(zip(landmarks, landmark_positions(person, landmarks, q), strict=True))
+            found = dict(
+                zip(landmarks, landmark_positions(shaped_person, landmarks, q), strict=True)
+            )
             for row in truth:
                 if int(row["frame"]) == int(frame):
                     off = found[row["joint"]] - [float(row[axis]) for axis in "xyz"]
                     errors.append(1e3 * np.linalg.norm(off))
         assert np.mean(errors) < 60.0
         assert captured.deviations.shape == captured.q.shape
-        angles = [k for k, kind in enumerate(person.position_kinds) if kind == "angle"]
+        angles = [k for k, kind in enumerate(shaped_person.position_kinds) if kind == "angle"]
         assert (captured.deviations[:, angles] > 0.003).all()
         assert np.median(captured.deviations[:, angles]) < 0.15
-        assert (captured.q >= person.lower - 1e-9).all()
-        assert (captured.q <= person.upper + 1e-9).all()
+        assert (captured.q >= shaped_person.lower - 1e-9).all()
+        assert (captured.q <= shaped_person.upper + 1e-9).all()
         ious = []
         for k in (0, len(frames) // 2, len(frames) - 1):
             X_WN = captured.tree.node_poses(captured.tree.values_from_positions(captured.q[k]))

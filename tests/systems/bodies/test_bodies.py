@@ -4,12 +4,11 @@ import numpy as np
 from pydrake.math import RigidTransform
 
 from drake_pose.systems.bodies import RobotStateMessage, body_poses, held_positions
-from tests.search.bodies import forked_body
 from tests.systems.bench import Bench
 
 
-def test_positions_are_named_in_a_message(tmp_path):
-    names = forked_body(tmp_path).position_names
+def test_positions_are_named_in_a_message(body):
+    names = body.position_names
     run = Bench(RobotStateMessage(names)).give(positions=[0.1, 0.4, -0.4])
     for time in (0.0, 7 / 30):
         run.context.SetTime(time)
@@ -28,8 +27,8 @@ def test_positions_are_held_about_their_time():
             np.testing.assert_array_equal(held.value(0.2 * (k + share)).ravel(), row)
 
 
-def test_bodies_are_where_their_base_is_moved_to(tmp_path):
-    plant, q = forked_body(tmp_path).plant, np.array([0.1, 0.4, -0.4])
+def test_bodies_are_where_their_base_is_moved_to(body):
+    plant, q = body.plant, np.array([0.1, 0.4, -0.4])
     X_WB = RigidTransform([1.0, 2.0, 3.0])
     for pose, moved in zip(body_poses(plant, q), body_poses(plant, q, X_WB), strict=True):
         assert moved.IsNearlyEqualTo(X_WB @ pose, 1e-12)

@@ -19,16 +19,11 @@ from drake_pose.systems.diagrams import build_simulated_matching
 from drake_pose.systems.images import picture_to_colour_image
 from drake_pose.systems.silhouette_matcher import TRACK, SilhouetteTracker
 from tests.search.arms import arm_cameras
-from tests.search.bodies import forked_body, front_camera
+from tests.search.bodies import front_camera
 from tests.search.gripper import gripper
 from tests.systems.bench import Bench
 
 PERIOD = 1 / 30
-
-
-@pytest.fixture(scope="module")
-def body(tmp_path_factory):
-    return forked_body(tmp_path_factory.mktemp("body"))
 
 
 @pytest.fixture(scope="module")
@@ -63,21 +58,6 @@ def followed(built, truth):
         np.testing.assert_array_equal(built.estimate(root).q, own["estimated_positions"])
     positions, deviations, tracks = (np.array(one) for one in zip(*rows, strict=True))
     return positions - truth, deviations, dict(zip(TRACK, tracks.T, strict=True))
-
-
-def test_plant_and_camera_to_tracked_positions(search):
-    """In one diagram: Drake's renderer, the search at first and after a cut, the filter between."""
-    truth, camera = motion(), front_camera(200, shift=0.2)
-    built = build_simulated_matching(
-        search, [camera], played(truth), PERIOD, tracking=TrackingSettings()
-    )
-    errors, deviations, track = followed(built, truth)
-    np.testing.assert_array_equal(track["tracked"][:13], [0.0] + 11 * [1.0] + [0.0])
-    np.testing.assert_array_equal(track["matches"][:13], 12 * [1] + [2])
-    assert track["matches"][-1] <= 3
-    assert np.median(np.degrees(np.abs(errors).max(axis=1))) < 3.5
-    assert np.mean(np.abs(errors) < 2 * deviations) > 0.9
-    assert (track["distance"] < 1.0).all()
 
 
 def test_velocities_and_body_poses_are_those_of_the_plant(body, search):

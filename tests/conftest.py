@@ -16,6 +16,7 @@ from drake_pose.body import ArticulatedModel, bundled_model, load_model
 from drake_pose.person.date.skeleton import Skeleton, load_skeleton
 from tests.cli import CliRunner
 from tests.jobs.scenes import TinyScene, write_scene
+from tests.person.studio import Studio
 from tests.search.bodies import forked_body
 
 
@@ -67,3 +68,9 @@ def skeleton(person: ArticulatedModel) -> Skeleton:
 def body(tmp_path_factory: pytest.TempPathFactory) -> ArticulatedModel:
     """A trunk that turns, and two arms on it; shared, so do not change it."""
     return forked_body(tmp_path_factory.mktemp("body"))
+
+
+@pytest.fixture(scope="session")
+def studio() -> Studio:
+    """A simulated person before nine small simulated cameras."""
+    return Studio()

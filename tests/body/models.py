@@ -115,6 +115,14 @@ JOINTS_SDF = f"""<sdf version="1.9"><model name="m">
 </model></sdf>"""
 
 
+def link_poses(model: ArticulatedModel, q: np.ndarray) -> dict[str, np.ndarray]:
+    """The pose (4, 4) of each link in the world, by Drake's plant."""
+    context = model.plant.CreateDefaultContext()
+    model.plant.SetPositions(context, q)
+    poses = model.plant.get_body_poses_output_port().Eval(context)
+    return {name: poses[k].GetAsMatrix4() for k, name in enumerate(model.link_names)}
+
+
 def cube_obj(*, normals: bool) -> str:
     """A cube of edge 1 whose every triangle has its own vertices."""
     cube = trimesh.creation.box()
@@ -202,7 +210,9 @@ def write_limb(folder: Path, skin: str | None = None, text: str = LIMB_URDF) -> 
     path = folder / "limb.urdf"
     path.write_text(text)
     if skin is None:
-        skin = "bands:\n" + band_entry("upper", "lower") + band_entry("lower", "hand")
+        skin = "bands:\n" + band_entry("upper", "lower")
+        # An axis may have any length.
+        skin += band_entry("lower", "hand", axis=[0, 0, -2])
     if skin:
         (folder / "limb.skin.yaml").write_text(skin)
     return path

@@ -8,7 +8,7 @@ import pytest
 from drake_pose.body import load_model, reshaped
 from drake_pose.errors import UnknownNameError
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
-from tests.body.models import JOINTED_BASE_URDF, write
+from tests.body.models import JOINTED_BASE_URDF, link_poses, write
 from tests.search.bodies import front_camera
 
 
@@ -37,14 +37,6 @@ def test_a_body_stretched_alike_everywhere_is_seen_larger(body):
     tree, larger = body.pose_tree(), double.pose_tree()
     before, after = (t.node_poses(t.values_from_positions(q)) for t in (tree, larger))
     np.testing.assert_allclose(after[:, :3, 3], 2.0 * before[:, :3, 3], atol=1e-12)
-
-
-def link_poses(model, q):
-    context = model.plant.CreateDefaultContext()
-    model.plant.SetPositions(context, q)
-    bodies = {name: model.plant.GetBodyByName(name) for name in model.link_names[1:]}
-    pose = model.plant.EvalBodyPoseInWorld
-    return {name: pose(context, body).GetAsMatrix4() for name, body in bodies.items()}
 
 
 def test_joints_stand_further_by_their_zeros_and_keep_their_limits(tmp_path):

@@ -9,7 +9,6 @@ from pydrake.multibody.plant import (
     DiscreteContactApproximation,
     MultibodyPlant,
 )
-from pydrake.multibody.tree import BodyIndex
 from pydrake.systems.framework import DiagramBuilder
 
 from drake_pose.body import ArticulatedModel, describe_model, load_model, model_warnings
@@ -19,7 +18,7 @@ from drake_pose.fit.parameters import BodyParameters
 from drake_pose.fit.surfaces import VERY_FEW, few_triangles
 from drake_pose.silhouette.outline import TreeSurfaces
 from tests.body import test_sdf as sdf
-from tests.body.models import joint, link, urdf, write
+from tests.body.models import joint, link, link_poses, urdf, write
 from tests.fit.motions import assert_motions_are_derivatives
 
 LIMITS = 'lower="0" upper="0.8"'
@@ -52,7 +51,7 @@ def drawn(tree, generator):
 @pytest.mark.parametrize("root", [None, "tip", "one"])
 def test_nodes_are_where_the_plant_has_them_and_one_value_moves_all(tmp_path, root):
     tree = tree_of(tmp_path, root=root, root_position=None if root is None else [0.1, 0.2, 0.3])
-    model, plant = tree.model, tree.model.plant
+    model = tree.model
     kinematics = TreeKinematics(tree)
     if root is None:
         assert kinematics.names == ("wrist", "lead", "scratch", "far")
@@ -66,12 +65,9 @@ def test_nodes_are_where_the_plant_has_them_and_one_value_moves_all(tmp_path, ro
         told = dict(zip(model.position_names, q, strict=True))
         np.testing.assert_allclose(told["mirror"], 0.1 - told["lead"], atol=1e-9)
         np.testing.assert_allclose(told["bend"], -0.5 * told["lead"], atol=1e-9)
-        context = plant.CreateDefaultContext()
-        plant.SetPositions(context, q)
+        poses = link_poses(model, q)
         for node, X_WN in zip(tree.nodes, kinematics.poses(values), strict=True):
-            body = plant.get_body(BodyIndex(model.link_index(node.name)))
-            X_BN = plant.EvalBodyPoseInWorld(context, body).GetAsMatrix4()
-            np.testing.assert_allclose(X_WN, X_WB @ X_BN, atol=1e-9)
+            np.testing.assert_allclose(X_WN, X_WB @ poses[node.name], atol=1e-9)
         back = kinematics.flatten(tree.values_from_positions(q, X_WB))
         np.testing.assert_allclose(kinematics.poses(back), kinematics.poses(values), atol=1e-9)
 

@@ -10,7 +10,7 @@ from pydrake.geometry import Role
 
 from drake_pose.body import load_model
 from drake_pose.errors import ModelError
-from tests.body.models import write
+from tests.body.models import link_poses, write
 
 # Two joints a body: what Drake gets wrong, where the file reaches it as it is.
 TWO_JOINTS = """<body name="a" pos="0 0 0.1"><joint name="x" axis="1 0 0" range="-90 90"/>
@@ -44,16 +44,9 @@ def file_of(folder, body=TWO_JOINTS, more="", attributes='model="m"'):
     return write(folder, text, "m.xml")
 
 
-def body_places(model, q):
-    """Position and rotation of every body, by name, at positions given by name."""
-    context = model.plant.CreateDefaultContext()
-    positions = np.array([q.get(name, 0.0) for name in model.position_names])
-    model.plant.SetPositions(context, positions)
-    poses = {}
-    for name in model.link_names[1:]:
-        X = model.plant.EvalBodyPoseInWorld(context, model.plant.GetBodyByName(name))
-        poses[name] = (X.translation(), X.rotation().matrix())
-    return poses
+def posed(model, q):
+    """The pose (4, 4) of every body, by name, at positions given by name."""
+    return link_poses(model, np.array([q.get(name, 0.0) for name in model.position_names]))
 
 
 def assert_as_mujoco(path, model):
@@ -73,11 +66,11 @@ def assert_as_mujoco(path, model):
                 limits = (model.lower[place], model.upper[place])
                 np.testing.assert_allclose(limits, theirs.jnt_range[joint], atol=1e-9)
         mujoco.mj_kinematics(theirs, data)
-        ours = body_places(model, q)
+        ours = posed(model, q)
         for body in range(1, theirs.nbody):
-            position, rotation = ours[theirs.body(body).name]
-            np.testing.assert_allclose(position, data.xpos[body], atol=1e-9)
-            np.testing.assert_allclose(rotation, data.xmat[body].reshape(3, 3), atol=1e-9)
+            X = ours[theirs.body(body).name]
+            np.testing.assert_allclose(X[:3, 3], data.xpos[body], atol=1e-9)
+            np.testing.assert_allclose(X[:3, :3], data.xmat[body].reshape(3, 3), atol=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -100,10 +93,10 @@ def test_bodies_stand_and_move_as_in_mujoco(tmp_path, more, body):
     assert_as_mujoco(path, model)
     tree = model.pose_tree()
     q = np.clip(np.full(len(model.position_names), 0.1), model.lower, model.upper)
-    places = body_places(model, dict(zip(model.position_names, q, strict=True)))
+    places = link_poses(model, q)
     for node, X in zip(tree.nodes, tree.node_poses(tree.values_from_positions(q)), strict=True):
         if node.name in places:
-            np.testing.assert_allclose(X[:3, 3], places[node.name][0], atol=1e-12)
+            np.testing.assert_allclose(X[:3, 3], places[node.name][:3, 3], atol=1e-12)
 
 
 def test_looks_of_classes_and_frames(tmp_path):
@@ -140,11 +133,11 @@ def test_what_a_strict_reader_refuses_is_read_all_the_same(tmp_path, spoil):
     assert model.position_names == ("x", "y", "z")
     assert model.name.startswith("m")
     # x lays the body down along -y about its origin at (0, 0, 0.1); b is 0.2 above that origin.
-    p_b, _ = body_places(model, {"x": np.pi / 2})["b"]
-    np.testing.assert_allclose(p_b, (0.0, -0.2, 0.1), atol=1e-12)
+    X_b = posed(model, {"x": np.pi / 2})["b"]
+    np.testing.assert_allclose(X_b[:3, 3], (0.0, -0.2, 0.1), atol=1e-12)
     # y turns about a point 0.1 above a's origin: b stands 0.1 beside that point.
-    p_b, _ = body_places(model, {"y": np.pi / 2})["b"]
-    np.testing.assert_allclose(p_b, (0.1, 0.0, 0.2), atol=1e-12)
+    X_b = posed(model, {"y": np.pi / 2})["b"]
+    np.testing.assert_allclose(X_b[:3, 3], (0.1, 0.0, 0.2), atol=1e-12)
 
 
 def test_what_is_not_drawn_or_collides_or_weighs_does_not_matter(tmp_path):

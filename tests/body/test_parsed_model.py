@@ -5,12 +5,11 @@ import math
 import numpy as np
 import pytest
 from pydrake.math import RotationMatrix
-from pydrake.multibody.tree import BodyIndex
 
 from drake_pose.body import RootRotation, load_model
 from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.errors import ModelError
-from tests.body.models import JOINTS_SDF, joint, link, urdf, write
+from tests.body.models import JOINTS_SDF, joint, link, link_poses, urdf, write
 
 FULL = 2.0 * math.pi
 
@@ -157,12 +156,9 @@ def test_turned_values_are_the_same_pose_for_drake(tmp_path):
     model = one_joint(tmp_path, 'lower="-6.2831853" upper="6.2831853"')
     tree = model.pose_tree()
     kinematics = TreeKinematics(tree)
-    context = model.plant.CreateDefaultContext()
-    body = model.plant.get_body(BodyIndex(model.link_index("b")))
 
     def pose(q):
-        model.plant.SetPositions(context, q)
-        return model.plant.EvalBodyPoseInWorld(context, body).GetAsMatrix4()
+        return link_poses(model, q)["b"]
 
     random = np.random.default_rng(3)
     for values in random.uniform(-FULL, FULL, (40, 1)):

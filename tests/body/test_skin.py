@@ -2,22 +2,21 @@
 
 import numpy as np
 import pytest
-from pydrake.multibody.tree import BodyIndex
 from scipy.spatial.transform import Rotation
 
 from drake_pose.body import ArticulatedModel, ModelSkin, RootRotation, load_model
 from drake_pose.errors import DrakePoseError, ModelError, UnknownNameError
-from tests.body.models import LIMB_URDF, REACH, band_entry, load_limb, tube_obj, write_limb
+from tests.body.models import (
+    LIMB_URDF,
+    REACH,
+    band_entry,
+    link_poses,
+    load_limb,
+    tube_obj,
+    write_limb,
+)
 
 WRIST = ("wrist_x", "wrist_z", "wrist_y")
-
-
-def link_pose(model, q, link):
-    """The pose (4, 4) of a link in the world, straight from Drake."""
-    context = model.plant.CreateDefaultContext()
-    model.plant.SetPositions(context, q)
-    body = model.plant.get_body(BodyIndex(model.link_index(link)))
-    return model.plant.EvalBodyPoseInWorld(context, body).GetAsMatrix4()
 
 
 def in_frame(X, points):
@@ -67,12 +66,12 @@ def test_the_ends_go_with_their_links(tmp_path, seed):
         for link, weight in ((band.parent, 0.0), (band.child, 1.0)):
             rigid = band.weights == weight
             assert rigid.sum() == 5
-            X_0 = link_pose(model, q, link) @ np.linalg.inv(link_pose(model, rest, link))
+            X_0 = link_poses(model, q)[link] @ np.linalg.inv(link_poses(model, rest)[link])
             np.testing.assert_allclose(p_W[rigid], in_frame(X_0, p_W0[rigid]), atol=1e-14)
     wrist = [model.position_index(name) for name in WRIST]
     mixed[wrist] = q[wrist]
     in_hand = [
-        in_frame(np.linalg.inv(link_pose(model, at, "hand")), skin.vertices(at)[1])
+        in_frame(np.linalg.inv(link_poses(model, at)["hand"]), skin.vertices(at)[1])
         for at in (q, mixed)
     ]
     np.testing.assert_allclose(in_hand[0], in_hand[1], atol=1e-12)
@@ -83,7 +82,7 @@ def test_a_turned_over_tree_has_the_same_band(tmp_path, root):
     model = load_limb(tmp_path)
     skin = ModelSkin(model)
     q = np.random.default_rng(2).uniform(model.lower, model.upper)
-    position = link_pose(model, q, root)[:3, 3]
+    position = link_poses(model, q)[root][:3, 3]
     tree = model.pose_tree(root, root_position=position, root_rotation=RootRotation.free())
     values = tree.values_from_positions(q)
     X_WN = tree.node_poses(values)
@@ -111,8 +110,8 @@ def test_links_welded_to_each_other_share_a_band(tmp_path):
     folder.mkdir()
     path = write_limb(folder, "bands:\n" + band_entry("upper", "cuff"), text)
     model = load_model(path, check=False)
-    X_LC = link_pose(plain, np.zeros(5), "lower")
-    X_LC = np.linalg.inv(X_LC) @ link_pose(model, np.zeros(5), "cuff")
+    X_LC = link_poses(plain, np.zeros(5))["lower"]
+    X_LC = np.linalg.inv(X_LC) @ link_poses(model, np.zeros(5))["cuff"]
     node = model.pose_tree().nodes[1]
     assert node.name == "lower"
     moved = in_frame(X_LC, plain.skin[0].mesh.vertices)
@@ -120,7 +119,7 @@ def test_links_welded_to_each_other_share_a_band(tmp_path):
     q = np.array([0.3, 1.1, 0.2, 0.1, -0.4])
     (p_W,) = ModelSkin(model).vertices(q)
     in_node = node.skin.vertices(q[None, [1]])[0]
-    np.testing.assert_allclose(p_W, in_frame(link_pose(model, q, "lower"), in_node), atol=1e-12)
+    np.testing.assert_allclose(p_W, in_frame(link_poses(model, q)["lower"], in_node), atol=1e-12)
 
 
 @pytest.mark.parametrize(

@@ -17,7 +17,7 @@ from drake_pose.files.motion_files import (
     write_motion,
 )
 from drake_pose.files.records import BASE_COLUMNS, FrameRecord
-from tests.body.models import joint, link, urdf, write
+from tests.body.models import joint, link, link_poses, urdf, write
 from tests.files.bvh_reader import read_bvh
 from tests.jobs.scenes import URDF
 
@@ -133,14 +133,8 @@ def random_positions(model, rng):
 
 def link_places(model, link, q):
     """(frames, 3) where the plant has a link's origin, in the file's axes [cm]."""
-    context = model.plant.CreateDefaultContext()
-    found = []
-    for row in q:
-        model.plant.SetPositions(context, row)
-        pose = model.plant.GetBodyByName(link).EvalPoseInWorld(context)
-        x, y, z = pose.translation()
-        found.append([100.0 * x, 100.0 * z, -100.0 * y])
-    return np.array(found)
+    x, y, z = 100.0 * np.array([link_poses(model, row)[link][:3, 3] for row in q]).T
+    return np.column_stack([x, z, -y])
 
 
 @pytest.mark.parametrize(

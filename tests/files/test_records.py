@@ -78,6 +78,9 @@ def test_a_base_is_told_in_seven_numbers_and_back():
     X_WB[:3, 3] = [0.1, -0.2, 0.3]
     np.testing.assert_allclose(base_pose(base_cells(X_WB)), X_WB, atol=1e-8)
     np.testing.assert_array_equal(base_pose(None), np.eye(4))
+    # However long its quaternion was written.
+    longer = base_cells(X_WB) * [1.0, 1.0, 1.0, *[1.01] * 4]
+    np.testing.assert_allclose(base_pose(longer), X_WB, atol=1e-8)
 
 
 def test_a_summary_counts_and_averages_what_was_found():

@@ -1,6 +1,6 @@
 """A simulated person before nine small simulated cameras, shared by the capture's tests."""
 
-from functools import cache, cached_property
+from functools import cached_property
 
 import numpy as np
 
@@ -91,9 +91,3 @@ class Studio:
             picture, view = self.face(q)
             faces.append(cut_face(picture, view.blobs))
         return learn_faces(faces, directions)
-
-
-@cache
-def shared_studio():
-    """One studio for all tests of a process: a renderer is slow to make."""
-    return Studio()

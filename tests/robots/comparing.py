@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from drake_pose.body import ArticulatedModel, PoseTree, load_model
 from drake_pose.errors import ModelError
+from tests.body.models import link_poses
 from tests.robots.references import (
     MujocoReference,
     PinocchioReference,
@@ -110,7 +111,7 @@ def check_verdict(row: Row) -> None:
     if path.suffix == ".sdf":
         # No library but Drake's reads it.
         q = random_positions(model, np.random.default_rng(11))
-        check_tree(tree, q, drake_poses(model, q))
+        check_tree(tree, q, link_poses(model, q))
         return
     reference = reference_of(model)
     check_poses(model, tree, reference)
@@ -151,7 +152,7 @@ def check_poses(model: ArticulatedModel, tree: PoseTree, reference: Reference) -
             q[index] = value
         expected = reference.poses(joint_values(model.plant, q))
         expected.setdefault("world", np.eye(4))
-        ours = drake_poses(model, q)
+        ours = link_poses(model, q)
         missing = set(expected) - set(model.link_names)
         assert not missing, f"links that the reference has: {missing}"
         for link in expected.keys() & ours.keys():
@@ -159,14 +160,6 @@ def check_poses(model: ArticulatedModel, tree: PoseTree, reference: Reference) -
                 ours[link], expected[link], atol=POSE_TOLERANCE, err_msg=link
             )
         check_tree(tree, q, expected)
-
-
-def drake_poses(model: ArticulatedModel, q: NDArray[np.float64]) -> Poses:
-    """The pose of each link, by Drake's plant."""
-    context = model.plant.CreateDefaultContext()
-    model.plant.SetPositions(context, q)
-    poses = model.plant.get_body_poses_output_port().Eval(context)
-    return {name: poses[k].GetAsMatrix4() for k, name in enumerate(model.link_names)}
 
 
 def check_tree(tree: PoseTree, q: NDArray[np.float64], expected: Poses) -> None:

@@ -31,15 +31,9 @@ from drake_pose.systems.date import (
     prepare_paper_capture,
 )
 from drake_pose.systems.images import colour_image_to_picture, picture_to_colour_image
-from tests.person.studio import shared_studio
 from tests.systems.bench import Bench
 
 PERIOD = 0.1
-
-
-@pytest.fixture(scope="module")
-def studio():
-    return shared_studio()
 
 
 @pytest.fixture(scope="module")

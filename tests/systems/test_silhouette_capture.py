@@ -11,16 +11,10 @@ from drake_pose.person.views import FrameViews, edge_spacing, see_silhouette
 from drake_pose.silhouette.segmentation import person_region
 from drake_pose.systems.images import picture_to_colour_image
 from drake_pose.systems.person import build_silhouette_capture
-from tests.person.studio import Studio
 from tests.systems.bench import Bench
 
 # A power of two, for times between frames that are all exactly the same.
 PERIOD = 1.0 / 32.0
-
-
-@pytest.fixture(scope="module")
-def studio():
-    return Studio()
 
 
 @pytest.fixture(scope="module")

@@ -28,15 +28,9 @@ from drake_pose.person.date.features import (
 )
 from drake_pose.person.date.skeleton import registered_positions
 from drake_pose.person.views import meeting_points, viewing_rays
-from tests.person.studio import shared_studio
 
 SKIN = (217, 166, 135)
 SHIRT = (31, 115, 128)
-
-
-@pytest.fixture(scope="module")
-def studio():
-    return shared_studio()
 
 
 @pytest.fixture(scope="module")

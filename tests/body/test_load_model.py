@@ -1,4 +1,5 @@
 import json
+import logging
 
 import numpy as np
 import pytest
@@ -6,7 +7,13 @@ import trimesh
 from pydrake.geometry import MakeRenderEngineVtk, RenderEngineVtkParams, Role, SceneGraph
 from pydrake.multibody.plant import MultibodyPlant
 
-from drake_pose.body import TriangleMesh, bundled_model, describe_model, load_model
+from drake_pose.body import (
+    TriangleMesh,
+    bundled_model,
+    captured_warnings,
+    describe_model,
+    load_model,
+)
 from drake_pose.body.meshes import merge_duplicate_vertices
 from drake_pose.body.model_files import package_map
 from drake_pose.errors import ModelError, UnknownNameError
@@ -104,6 +111,15 @@ def test_broken_meshes_name_the_file_and_the_link(tmp_path, name, content):
     (tmp_path / name).write_bytes(content)
     with pytest.raises(ModelError, match=rf"thing\.urdf.*{name}"):
         load_model(write(tmp_path, mesh_urdf(name)), check=False)
+
+
+def test_what_drake_warns_of_is_collected_once_and_not_printed(caplog):
+    with captured_warnings() as texts:
+        for level in (logging.INFO, logging.WARNING, logging.ERROR, logging.WARNING):
+            record = logging.makeLogRecord({"levelno": level, "msg": f" {level}\n"})
+            logging.getLogger("drake").handle(record)
+    assert texts == [str(logging.WARNING), str(logging.ERROR)]
+    assert not caplog.records
 
 
 def alias_bomb():

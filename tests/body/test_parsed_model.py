@@ -25,10 +25,6 @@ def one_joint(tmp_path, limits, kind="revolute", given=None, mount="fixed"):
     return load_model(write(tmp_path, text), limits=given, check=False)
 
 
-def node_of_joint(tree):
-    return tree.node_index("b")
-
-
 @pytest.mark.parametrize(
     ("limits", "kind"),
     [
@@ -49,7 +45,7 @@ def test_limits_beyond_a_few_turns_are_none(tmp_path, limits, kind):
         assert "turn freely" in said[0]
         assert f"{float(limits.split(chr(34))[3]):g} rad" in said[0]
     tree = model.pose_tree()
-    node = node_of_joint(tree)
+    node = tree.node_index("b")
     grid = np.degrees(tree.grid(node, math.radians(20.0))[:, 0])
     assert len(grid) == 18
     assert np.abs(grid).max() <= 180.0 + 1e-9
@@ -63,7 +59,7 @@ def test_of_limits_of_some_turns_one_turn_is_searched(tmp_path, high):
     assert not model.warnings
     np.testing.assert_allclose([model.lower[0], model.upper[0]], [-high, high])
     tree = model.pose_tree()
-    node, around = node_of_joint(tree), high >= math.pi
+    node, around = tree.node_index("b"), high >= math.pi
     np.testing.assert_allclose(np.ravel(tree.value_limits(node)), [-high, high])
     searched = min(high, math.pi)
     np.testing.assert_allclose(np.ravel(tree.value_bounds(node)), [-searched, searched])

@@ -290,7 +290,11 @@ def read_inputs(
     Raises DrakePoseError naming the file, camera, frame, link or joint at fault.
     """
     model = load_model(model_path, package_paths=settings.packages)
-    if is_episode(scene_path, settings) and not read_sequence(scene_path / SCENE_FILE)[0]:
+    # A sequence of pictures alone begins at a mask or a start, or where its joint log says.
+    has_log = settings.start is None and (truth_path or scene_path / TRUTH_FILE).is_file()
+    if is_episode(scene_path, settings) and (
+        has_log or not read_sequence(scene_path / SCENE_FILE)[0]
+    ):
         scene = read_episode_scene(scene_path, settings, truth_path, camera_path)
         frames = scene.frames
         if settings.unseen:

@@ -26,7 +26,7 @@ from drake_pose.camera.picture_files import (
 )
 from drake_pose.camera.sources import CAMERAS, TIME_STAMPS, read_time_stamps
 from drake_pose.csv_files import read_csv
-from drake_pose.errors import CameraError, SceneError, SettingsError
+from drake_pose.errors import CameraError, SceneError, SettingsError, listed
 from drake_pose.yaml_files import read_yaml
 
 JOINT_TABLE = "joint_angles.csv"
@@ -195,6 +195,17 @@ def format_of(path: Path) -> Literal["lerobot", "droid", "bag", "folder", ""]:
     if {"images", "videos"} & set(inside):
         return "folder"
     return "bag" if any(name.endswith(BAGS) for name in inside) else ""
+
+
+def require_recording(path: Path) -> None:
+    """SceneError: a folder has neither masks nor pictures; names those in it that have."""
+    inside = sorted(one for one in path.iterdir() if one.is_dir()) if path.is_dir() else []
+    found = [one.name for one in (path, *inside) if (one / "masks").is_dir() or format_of(one)]
+    if not found or found[0] != path.name:
+        raise SceneError(
+            f"{path}: has no folder masks/<camera>/<frame>.png, and no pictures, videos, data set "
+            "or bag" + (f"; give one of its folders: {listed(found)}" if found else "")
+        )
 
 
 def open_episode(

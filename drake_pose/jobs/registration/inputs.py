@@ -13,7 +13,7 @@ from drake_pose.body import OBJECT, ArticulatedModel, PoseTree, RootRotation, lo
 from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.camera.camera_files import CameraFile, load_camera_file, load_cameras
 from drake_pose.camera.episode import EpisodeCamera
-from drake_pose.camera.episode_files import JOINT_TABLE, open_episode
+from drake_pose.camera.episode_files import JOINT_TABLE, open_episode, require_recording
 from drake_pose.camera.models import Camera, PinholeCamera
 from drake_pose.errors import CameraError, MaskError, SceneError, SettingsError, UnknownNameError
 from drake_pose.files.settings import EstimateSettings
@@ -139,6 +139,9 @@ def read_inputs(
     """
     if looks_at_pictures(scene, settings):
         return _read_episode(scene, model, joints, cameras, settings)
+    if not scene.is_dir():
+        raise SceneError(f"{scene}: no such folder; a scene has {CAMERA_FILE} and masks")
+    require_recording(scene)
     robot = load_model(model, package_paths=settings.packages)
     joints = joints or _own_joints(scene, robot, settings)
     if isinstance(settings, RegistrationSettings):
@@ -286,8 +289,6 @@ def _read_masks(
     settings: RegistrationSettings,
 ) -> Inputs:
     """A scene of masks; joints that no table tells are estimated from known cameras."""
-    if not path.is_dir():
-        raise SceneError(f"{path}: no such folder; a scene has {CAMERA_FILE} and masks")
     if cameras is None and not (path / CAMERA_FILE).exists():
         raise SceneError(
             f"{path}: has no {CAMERA_FILE}; a camera is found whose size and focal length a camera "

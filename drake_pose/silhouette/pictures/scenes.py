@@ -12,7 +12,7 @@ import numpy as np
 from drake_pose.arrays import Array
 from drake_pose.camera.camera_files import load_camera_file, load_cameras
 from drake_pose.camera.episode import JointLog
-from drake_pose.camera.episode_files import read_sequence
+from drake_pose.camera.episode_files import read_sequence, require_recording
 from drake_pose.camera.models import Camera, ParallelCamera
 from drake_pose.camera.picture_files import (
     VIDEOS,
@@ -216,6 +216,7 @@ def load_scene(
     folder = Path(path)
     if not folder.is_dir():
         raise SceneError(f"{folder}: no such folder; a scene has cameras.yaml and masks")
+    require_recording(folder)
     sequence, frame_rate_hz = read_sequence(folder / SCENE_FILE, sequence)
     if cameras is None:
         if not os.path.lexists(folder / CAMERA_FILE):

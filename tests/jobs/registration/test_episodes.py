@@ -2,6 +2,7 @@
 
 import csv
 import json
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,8 @@ import pytest
 from drake_pose.camera.camera_files import load_cameras, save_cameras
 from drake_pose.errors import DrakePoseError
 from drake_pose.files.overlay import EXCESS_RGB, MISSING_RGB
+from drake_pose.files.settings import EstimateSettings
+from drake_pose.jobs.estimate.inputs import read_inputs as read_estimate_inputs
 from drake_pose.jobs.estimate.measurements import is_episode
 from drake_pose.jobs.registration.audit import audit_scene
 from drake_pose.jobs.registration.inputs import Inputs, read_inputs
@@ -62,6 +65,29 @@ def test_what_is_an_episode(episode, tmp_path):
     assert is_episode(tmp_path, settings)
     (tmp_path / "masks").mkdir()
     assert not is_episode(tmp_path, settings)
+
+
+def test_a_sequence_of_pictures_begins_where_its_log_says(episode, tmp_path):
+    scene, painted = episode
+    for name in ("images", "cameras.yaml", "joint_angles.csv"):
+        (tmp_path / name).symlink_to(scene / name)
+    read_estimate = partial(read_estimate_inputs, model_path=painted.path, truth_path=None)
+    plain = read_estimate(scene, settings=EstimateSettings())
+    (tmp_path / "scene.yaml").write_text("sequence: true")
+    found = read_estimate(tmp_path, settings=EstimateSettings())
+    assert found.frames == plain.frames
+    assert found.starts.keys() == plain.starts.keys()
+    for frame, start in plain.starts.items():
+        np.testing.assert_array_equal(found.starts[frame], start)
+
+
+@pytest.mark.parametrize("command", ["estimate", "register", "audit", "capture"])
+def test_a_folder_of_recordings_names_them(episode, tmp_path, command):
+    scene, painted = episode
+    model = [] if command == "capture" else ["--model", str(painted.path)]
+    result = run_command([command, str(scene.parent), *model, "--out", str(tmp_path / "out")])
+    assert result.exit_code == 1
+    assert "give one of its folders: scene" in " ".join(result.output.split())
 
 
 def test_joints_are_where_their_log_says_at_the_pictures_times(episode):
@@ -147,7 +173,10 @@ def test_what_needs_masks_or_pictures_is_refused(episode, tmp_path):
         settings = RegistrationSettings(**{name: value})
         with pytest.raises(DrakePoseError, match=f"--{name} needs masks.*leave it out{advice}"):
             register_scene(scene, painted.path, settings=settings)
-    with pytest.raises(DrakePoseError, match=r"cameras\.yaml"):
+    with pytest.raises(DrakePoseError, match=r"has no folder masks.* no pictures"):
+        register_scene(tmp_path, painted.path, tmp_path / "joints.csv")
+    (tmp_path / "masks").mkdir()
+    with pytest.raises(DrakePoseError, match=r"has no cameras\.yaml"):
         register_scene(tmp_path, painted.path, tmp_path / "joints.csv")
     with pytest.raises(DrakePoseError, match="needs the positions of all joints"):
         audit_scene(tmp_path, painted.path)

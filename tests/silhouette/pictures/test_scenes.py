@@ -116,12 +116,14 @@ def test_masks_without_a_camera_file(tmp_path):
 def test_what_is_missing_is_named(tmp_path):
     with pytest.raises(SceneError, match="nowhere: no such folder"):
         load_scene(tmp_path / "nowhere")
-    with pytest.raises(SceneError, match=r"no cameras\.yaml"):
-        load_scene(tmp_path)
-    save_cameras(tmp_path / "cameras.yaml", [camera("left")])
     with pytest.raises(SceneError, match="no folder masks"):
         load_scene(tmp_path)
     (tmp_path / "masks" / "left").mkdir(parents=True)
+    with pytest.raises(SceneError, match="give one of its folders: "):
+        load_scene(tmp_path.parent)
+    with pytest.raises(SceneError, match=r"no cameras\.yaml"):
+        load_scene(tmp_path)
+    save_cameras(tmp_path / "cameras.yaml", [camera("left")])
     with pytest.raises(SceneError, match=r"no mask.*left"):
         load_scene(tmp_path)
     (tmp_path / "masks" / "rihgt").mkdir()

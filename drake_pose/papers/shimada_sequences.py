@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from drake_pose.arrays import Array, Mask
 from drake_pose.body import PlantKinematics, bundled_model
+from drake_pose.camera.episode_files import JOINT_TABLE
 from drake_pose.camera.models import ParallelCamera
 from drake_pose.csv_files import read_csv
 from drake_pose.errors import SceneError
@@ -40,7 +41,7 @@ from drake_pose.filtering.hand_silhouette import HandSilhouette
 from drake_pose.filtering.inequalities import from_bounds, model_inequalities, stack
 from drake_pose.filtering.state import Belief
 from drake_pose.filtering.truncated_filter import FilterSettings, FilterState, TruncatedFilter
-from drake_pose.jobs.estimate.inputs import TRUTH_FILE, EstimateInputs, read_inputs
+from drake_pose.jobs.estimate.inputs import EstimateInputs, read_inputs
 from drake_pose.papers.tables import Advance, Count, figure_table, uncounted
 from drake_pose.search import View
 from drake_pose.silhouette.pictures.label_images import label_image_to_mask
@@ -401,7 +402,7 @@ def run_sequence(
 
 def _truth(folder: Path, inputs: EstimateInputs, hand: HandModel) -> dict[str, Array]:
     """True angles (frames,) [deg] of those that the sequence's file has columns of."""
-    file = folder / TRUTH_FILE
+    file = folder / JOINT_TABLE
     if not file.is_file():
         return {}
     header, lines = read_csv(file, SceneError)

@@ -21,7 +21,7 @@ from drake_pose.body import (
     model_warnings,
 )
 from drake_pose.camera.camera_files import load_cameras
-from drake_pose.camera.episode_files import read_sequence
+from drake_pose.camera.episode_files import JOINT_TABLE, read_sequence
 from drake_pose.camera.models import Camera
 from drake_pose.errors import ModelError, SceneError, SettingsError, UnknownNameError
 from drake_pose.files.records import FrameRecord, base_cells, user_units
@@ -171,9 +171,6 @@ def _in_plant_units(model: ArticulatedModel, values: Mapping[str, float]) -> dic
     return {name: math.radians(one) if is_angle[name] else one for name, one in values.items()}
 
 
-TRUTH_FILE = "joint_angles.csv"
-
-
 @dataclass(frozen=True)
 class EstimateInputs:
     """What is estimated, from what, and how.
@@ -291,7 +288,7 @@ def read_inputs(
     """
     model = load_model(model_path, package_paths=settings.packages)
     # A sequence of pictures alone begins at a mask or a start, or where its joint log says.
-    has_log = settings.start is None and (truth_path or scene_path / TRUTH_FILE).is_file()
+    has_log = settings.start is None and (truth_path or scene_path / JOINT_TABLE).is_file()
     if is_episode(scene_path, settings) and (
         has_log or not read_sequence(scene_path / SCENE_FILE)[0]
     ):
@@ -354,7 +351,7 @@ def _read_truth(
     scene: Path, given: Path | None, model: ArticulatedModel, frames: Sequence[str]
 ) -> tuple[TrueAngles | None, tuple[str, ...]]:
     """Measured positions, and what the user should know of them."""
-    path = given or scene / TRUTH_FILE
+    path = given or scene / JOINT_TABLE
     if given is None and not os.path.lexists(path):
         return None, ()
     try:

@@ -7,7 +7,7 @@ from pydrake.multibody.plant import MultibodyPlant
 
 from drake_pose.body import load_model
 from drake_pose.errors import ModelError
-from tests.body.models import BOX, WELDED_URDF, write
+from tests.body.models import BOX, WELDED_URDF, link_poses, write
 from tests.body.models import link as urdf_link
 from tests.body.models import urdf as urdf_file
 from tests.body.test_mjcf import MJCF
@@ -128,9 +128,8 @@ def test_included_models_are_read_in_the_same_way(tmp_path):
     )
     model = load_model(write(tmp_path, text, "thing.sdf"), check=False)
     assert set(model.link_names[1:]) == {"a", "upper", "new"}
-    context = model.plant.CreateDefaultContext()
-    X_WB = model.plant.GetBodyByName("upper").EvalPoseInWorld(context)
-    np.testing.assert_allclose(X_WB.translation(), [1.0, 0.0, 0.0], atol=1e-12)
+    X_WB = link_poses(model, model.default_positions)["upper"]
+    np.testing.assert_allclose(X_WB[:3, 3], [1.0, 0.0, 0.0], atol=1e-12)
 
 
 def directives(*lines):
@@ -162,15 +161,13 @@ def test_models_named_by_directives_are_cured_as_if_they_were_read_alone(tmp_pat
     assert len(model.add_to(MultibodyPlant(0.0))) == 4
     plant, random = model.plant, np.random.default_rng(5)
     q = random.uniform(alone.lower, alone.upper)
-    contexts = plant.CreateDefaultContext(), alone.plant.CreateDefaultContext()
+    context, expected = plant.CreateDefaultContext(), link_poses(alone, q)
     instance = plant.GetModelInstanceByName("man")
-    plant.SetPositions(contexts[0], instance, q)
-    alone.plant.SetPositions(contexts[1], q)
+    plant.SetPositions(context, instance, q)
     for name in ("base", "arm", "hand"):
-        X_WB = plant.GetBodyByName(name, instance).EvalPoseInWorld(contexts[0])
-        X_WA = alone.plant.GetBodyByName(name).EvalPoseInWorld(contexts[1])
-        np.testing.assert_allclose(X_WB.GetAsMatrix4(), X_WA.GetAsMatrix4(), atol=1e-12)
-    crate = plant.GetBodyByName("box").EvalPoseInWorld(contexts[0]).rotation().matrix()
+        X_WB = plant.GetBodyByName(name, instance).EvalPoseInWorld(context)
+        np.testing.assert_allclose(X_WB.GetAsMatrix4(), expected[name], atol=1e-12)
+    crate = plant.GetBodyByName("box").EvalPoseInWorld(context).rotation().matrix()
     np.testing.assert_allclose(crate[:, 0], [0.0, 1.0, 0.0], atol=1e-12)
 
 

@@ -77,17 +77,15 @@ def test_a_results_files_honour_the_base_and_leave_out_what_is_not_known(tmp_pat
     rows = [FrameRecord(*one, 0.1, 0.1) for one in zip(frames, poses, bases, strict=True)]
     (warning,) = write_motion(tmp_path / "out", model, frames, rows, 25.0)
     assert "1 of 3 frames" in warning
-    context = model.plant.CreateDefaultContext()
-    model.plant.SetPositions(context, q)
-    jib = model.plant.GetBodyByName("jib").EvalPoseInWorld(context)
-    x, y, z = jib.multiply(np.array([0.0, 0.0, 0.4]))
+    jib = link_poses(model, q)["jib"]
+    x, y, z = (jib @ [0.0, 0.0, 0.4, 1.0])[:3]
     written = list(csv.DictReader((tmp_path / "out" / "joint_centres.csv").open()))
     assert [row["frame"] for row in written] == ["0001", "0003"]
     found = [float(written[0][axis]) for axis in "xyz"]
     np.testing.assert_allclose(found, [1.0 - y, 2.0 + x, 3.0 + z], atol=1e-4)
     motion = read_bvh((tmp_path / "out" / "motion.bvh").read_text())
     assert motion.frame_time == pytest.approx(0.04)
-    x, y, z = jib.translation()
+    x, y, z = jib[:3, 3]
     place = [100 * (1.0 - y), 100 * (3.0 + z), -100 * (2.0 + x)]
     np.testing.assert_allclose(motion.places()["jib"], [place] * 3, atol=0.01)
     mot = (tmp_path / "out" / "positions.mot").read_text().splitlines()

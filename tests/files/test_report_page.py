@@ -24,6 +24,7 @@ from drake_pose.files.report_page import (
 from drake_pose.files.settings import EstimateSettings
 from drake_pose.jobs.estimate.scene import estimate_scene
 from drake_pose.silhouette.pictures.scenes import Scene
+from tests.body.models import link_poses
 from tests.jobs.scenes import NAMES, camera, read_rows
 
 
@@ -273,17 +274,16 @@ def test_a_replay_shows_all_of_the_body_the_cameras_and_what_was_measured(tiny_s
         "view", 1000, 1000, *[500.0 / np.tan(np.radians(37.5))] * 2, 499.5, 499.5,
         look_at(eye, target),
     )  # fmt: skip
-    context, plant, seen = model.plant.CreateDefaultContext(), model.plant, []
+    seen = []
     tracks = {
         one["path"]: {track["name"]: track["keys"] for track in one["clip"]["tracks"]}
         for one in told["set_animation", None]["animations"]
     }
     for k, row in enumerate(q):
         for positions, measured in ((row, False), (row + off, True)):
-            plant.SetPositions(context, positions)
+            poses = link_poses(model, positions)
             for link, mesh in model.link_meshes.items():
-                pose = plant.GetBodyByName(link).EvalPoseInWorld(context).GetAsMatrix4()
-                X_WL = X_WB[k] @ pose
+                X_WL = X_WB[k] @ poses[link]
                 if not measured:
                     seen += [mesh.vertices @ X_WL[:3, :3].T + X_WL[:3, 3]]
                     continue

@@ -233,8 +233,12 @@ def test_stills_are_dots_and_intervals_stand_at_their_frames():
 
 def test_grid_joins_neighbours_of_one_state():
     states = ["used", "used", "no-picture", "used"]
-    (axes,) = draw_grid(["0", "1", "2", "3"], [("left", states)]).axes
-    spans = [path.get_extents() for path in axes.collections[0].get_paths()]
+    (axes,) = draw_grid(["0", "1", "2", "3"], [("left", states), ("right", states)]).axes
+    rows = [[path.get_extents() for path in one.get_paths()] for one in axes.collections]
+    # A row's bars stand beside its name, and leave the next one's free.
+    assert [one.y0 + one.y1 for row in rows for one in row] == pytest.approx([0.0] * 3 + [2.0] * 3)
+    assert rows[0][0].y1 < rows[1][0].y0
+    spans = rows[0]
     assert [(one.x0, one.x1) for one in spans] == [(-0.5, 1.5), (1.5, 2.5), (2.5, 3.5)]
     first, second, third = axes.collections[0].get_facecolors().tolist()
     assert first == third != second

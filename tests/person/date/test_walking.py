@@ -75,6 +75,11 @@ def test_gestures_are_those_of_their_commands(skeleton):
         lifted = np.ptp(features[rows, 3:, 2], axis=0)
         assert ((lifted > 0.1) == name.startswith("walk")).all()
         assert told[rows[-1]] == (0, 0)
+    # Shins of lifted legs hang down.
+    index = skeleton.model.position_index
+    for side in ("left", "right"):
+        slant = motion.q[:, index(f"{side}_thigh_x")] + motion.q[:, index(f"{side}_shin_x")]
+        assert np.degrees(np.abs(slant[names != REGISTERED]).max()) < 30.0
     # Whoever lifts a foot stands on the other one.
     np.testing.assert_allclose(features[:, 3:, 2].min(axis=1), features[23, 3, 2], atol=0.03)
 

@@ -198,6 +198,9 @@ def test_figures_of_continuous_angles_come_from_the_trials():
         # The root's place is known, all else is searched for.
         errors += off[3:].tolist()
         known += off[3:][list(trial.result.pose_set.determined)[3:]].tolist()
+        # Intervals take as large a part of the processor's time as of the clock's.
+        part = trial.more_seconds / (trial.seconds + trial.more_seconds)
+        assert part == pytest.approx(trial.result.interval_seconds / trial.result.seconds)
     assert figures["median_error_deg"] == pytest.approx(np.median(errors))
     assert figures["median_determined_error_deg"] == pytest.approx(np.median(known), abs=1e-9)
     assert figures["determined"] == pytest.approx(len(known) / len(errors))

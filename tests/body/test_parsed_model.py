@@ -103,6 +103,9 @@ def test_limits_given_by_hand_are_taken_likewise(tmp_path):
     model = one_joint(tmp_path, 'lower="-1e16" upper="1e16"', "prismatic")
     assert np.isinf([model.lower[0], model.upper[0]]).all(), "a slide of absurd length"
     assert "joint 'j' has limits of -1e+16 and 1e+16 m" in model.warnings[0]
+    # Of one that has none, or one only, nothing is to be said before it is searched.
+    for none in (None, 'upper="1"'):
+        assert not one_joint(tmp_path, none, "prismatic").warnings
     for wrong, message in (((2.0, 1.0), "lower limit 2 is above upper"), ((np.nan, 1.0), "NaN")):
         with pytest.raises(ModelError, match=f"joint 'j': .*{message}"):
             one_joint(tmp_path, None, "continuous", {"j": wrong})

@@ -63,10 +63,6 @@ def load(name):
     return load_model(URDF / f"{name}.urdf", check=False)
 
 
-def mesh_of(name, link):
-    return read_obj(URDF / name / "meshes" / f"{link}.obj")
-
-
 @pytest.mark.parametrize("name", [*BODIES, "hand", "person"])
 def test_script_writes_the_committed_files(name, tmp_path):
     by_hand = {Path("landmarks.yaml")} if name in BODIES else set()

@@ -227,10 +227,12 @@ class PartSearch:
             total += areas[:, 1] - areas[:, 2]
         return total
 
-    def mirror(self, parameters: np.ndarray, part: Part, view: View) -> np.ndarray:
+    def mirror(self, parameters: np.ndarray, part: Part, view: View, steps: int = 20) -> np.ndarray:
         """The parameters with a part mirrored in a view's depth about its first joint, nearly.
 
-        Seen by parallel rays, the middle of each node stays where it is seen.
+        Seen by parallel rays, the middle of each node stays where it is seen. Half a body needs
+        about 20 steps of Gauss and Newton's method: with 8 its limbs end elsewhere, other optima
+        are missed, and intervals of values do not hold the truth (86 to 97 % for 95 %, not 97).
         """
         X_WN = self.body.poses(parameters)
         depth = view.camera.X_WC[:3, 2]
@@ -239,7 +241,7 @@ class PartSearch:
         wanted, nodes = middles - 2.0 * np.outer(away, depth), list(part.nodes)
         columns = np.concatenate([self._columns[node] for node in nodes])
         p_N = self._balls[nodes, :3]
-        moved = self._bring(parameters, nodes, p_N, wanted, columns, (8, 0.5, 1e-4))
+        moved = self._bring(parameters, nodes, p_N, wanted, columns, (steps, 0.5, 1e-4))
         return self._hold(moved, X_WN, part.held)
 
     def _hold(self, parameters: np.ndarray, X_WN: np.ndarray, nodes: Sequence[int]) -> np.ndarray:

@@ -7,7 +7,7 @@ guessed.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -28,12 +28,11 @@ class KinematicParameter:
     """What is added to an encoder's positions, or by what share of it a link is longer.
 
     Args:
-        value: what is to be added [rad, m or 1], 0 where it is not determined; held at 0 in the
-            calibration where it is not significant.
+        value: what is to be added [rad, m or 1], 0 where it is not determined.
         deviation: its standard deviation; infinite where it is not determined.
         low, high: the ends of its 95 % interval.
-        significant: whether it is not 0: by chance one or more of all that were asked for would
-            seem so in one of twenty calibrations.
+        significant: whether it is not 0, at 5 % over all that were asked for (Bonferroni). So it
+            may be insignificant although its 95 % interval does not hold 0.
         gauge: what it cannot be told from; empty where it is determined.
     """
 
@@ -117,8 +116,13 @@ def calibrate_joints(
     focal: bool = False,
     lengths: Sequence[str] = (),
     level: float = 0.05,
+    start: Mapping[str, float] | None = None,
+    most_lost: float = 0.05,
 ) -> JointCalibration:
     """The zeros of some joints and lengths of links, fitted together with the cameras' poses.
+
+    All that are determined stay in the fit, significant or not: one that is held at 0 because
+    chance could explain it would move the cameras.
 
     Args:
         cameras: as they were registered with the model's zeros and lengths; no two of one name.
@@ -127,10 +131,14 @@ def calibrate_joints(
         focal: whether the cameras' focal lengths are asked for, too.
         lengths: the links whose lengths are asked for.
         level: probability that a calibration finds anything significant by chance.
+        start: zeros that the cameras were found with, by name, where the fit begins [rad or m].
+        most_lost: an end is refused whose mean inlier ratio is smaller than the beginning's by
+            more: 0.3 and more where the fit went to another optimum.
 
     Raises:
         UnknownNameError: a name that is no position of the body's, or no link with a length.
-        RegistrationError: fewer frames than zeros and lengths.
+        RegistrationError: fewer frames than zeros and lengths, or the fit ends where it explains
+            less than where it began.
     """
     require_known(body.tree, names, lengths)
     require_enough(sum(len(one) for one in frames), len(names), len(lengths))
@@ -148,8 +156,12 @@ def calibrate_joints(
     while kept != sought:
         sought = kept
         fit = SharedFit(seen, X_CW, [*standing, *sought], offsets=offsets, looks=looks)
+        begin = fit.start
+        begin.shared[:] = [(start or {}).get(name, 0.0) for name in fit.names]
+        if sought == asked:
+            before = float(fit.inlier_ratios(begin).mean())
         # Constants that are off let good frames contradict, so all count at first.
-        fit, found = fit.from_found(fit.fit(SHARED.rounds_with_constants))
+        fit, found = fit.from_found(fit.fit(SHARED.rounds_with_constants, begin))
         which = fit.agreeing(fit.inlier_ratios(found))
         fit, found = fit.from_found(fit.fit(SHARED.rounds_with_constants, found, which))
         # Each picture tells how large errors are by six motions.
@@ -167,11 +179,16 @@ def calibrate_joints(
                 values = {k: replace(one, significant=k in beside) for k, one in values.items()}
         told |= values
         kept = [name for name in sought if values[name].determined]
-        if kept == sought:
-            kept = [name for name in sought if values[name].significant]
+    ratios = fit.inlier_ratios(found)
+    if ratios.mean() < before - most_lost:
+        raise RegistrationError(
+            f"the fit of cameras and joint offsets ends where {ratios.mean():.0%} of the contours "
+            f"fit, and began where {before:.0%} did: it has lost the robot; ask for fewer offsets, "
+            "or give more frames. Nothing was written"
+        )
     deviations = np.sqrt(np.diag(covariance))[: len(seen) * fit.per_camera]
     first = len(fit.names) - len(fit.constants)
-    stands, ratios = slice(first, first + len(standing)), fit.inlier_ratios(found)
+    stands = slice(first, first + len(standing))
     return JointCalibration(
         tuple(told[name] for name in names),
         tuple(replace(told[length_name(link)], name=link) for link in lengths),
@@ -245,7 +262,8 @@ def describe_constants(
     for name in names:
         k = fit.names.index(name)
         value, deviation = float(found.shared[k]), float(deviations[k])
-        if deviation > determined * SHARED.constant_deviation:
+        at_bound = abs(value) > 0.98 * SHARED.largest_constant
+        if at_bound or deviation > determined * SHARED.constant_deviation:
             goes = np.abs(covariance[:, k]) > goes_with * deviations * deviation
             gauge = tuple(fit.names[j] for j in np.flatnonzero(goes) if j != k)
             ends = (-math.inf, math.inf)

@@ -35,7 +35,7 @@ from drake_pose.registration.register import (
     RegistrationBody,
     frame_misfits,
 )
-from drake_pose.registration.shared_fit import SharedFit, agreeing_share
+from drake_pose.registration.shared_fit import SHARED, SharedFit, agreeing_share
 from drake_pose.silhouette.scoring import draw_mask
 from drake_pose.workers import map_ordered
 
@@ -290,7 +290,8 @@ def _settle(
         found = dict(zip(best.fit.names, best.found.shared.tolist(), strict=True))
         camera, by = best.camera, found.get(TIME_OFFSET, 0.0)
         assumed, turn = turned, np.array([found.get(name, 0.0) for name in names])
-        offset, turned = offset + by, turned + turn
+        most = SHARED.largest_constant
+        offset, turned = offset + by, np.clip(turned + turn, -most, most)
         if not left or (abs(by) < 0.02 and np.abs(turn).max() < np.radians(0.3)):
             done = begun._replace(camera=camera, clock=replace(begun.clock, value=offset))
             return best, as_now, done, assumed

@@ -337,12 +337,21 @@ def distinct(frames: PosedFrames, X_CW: Sequence[Array], apart: float = 0.03) ->
     return [X_CW[k] for k in apart_from_before(range(len(X_CW)), differ)]
 
 
-def with_widths(fit: SharedFit) -> Shared:
-    """What was fitted to the frames that agree, the widths of their silhouettes among it."""
-    agree = fit.agreeing(fit.inlier_ratios(fit.start))
-    found = fit.fit(SEARCH.last, fit.start, agree)
-    again = fit.agreeing(fit.inlier_ratios(found))
-    return found if np.array_equal(again, agree) else fit.fit(SEARCH.last[-1:], found, again)
+def with_widths(fit: SharedFit, most: int = 5, settled: float = 1e-4) -> Shared:
+    """What was fitted to the frames that agree, the widths of their silhouettes among it.
+
+    It is fitted again, at most so many times, where frames have come to agree or not, or the camera
+    has moved by more than ``settled`` [rad, m].
+    """
+    agree, found = fit.agreeing(fit.inlier_ratios(fit.start)), fit.start
+    for k in range(most):
+        before, used = found, agree
+        found = fit.fit(SEARCH.last if k == 0 else SEARCH.last[-1:], found, agree)
+        agree = fit.agreeing(fit.inlier_ratios(found))
+        moved = np.abs(found.shared - before.shared).max()
+        if k > 0 and np.array_equal(agree, used) and moved < settled:
+            break
+    return found
 
 
 def suggest_pose(

@@ -40,7 +40,7 @@ from drake_pose.fit.parameters import (
     length_name,
     lengthened_joints,
 )
-from drake_pose.fit.problem import Problem, Unknowns, parameter_names
+from drake_pose.fit.problem import TIME_OFFSET, Problem, Unknowns, parameter_names
 from drake_pose.registration.posed_frames import PosedFrames, SeenFrame, common_size, middle_of
 from drake_pose.silhouette.outline import Outline
 from drake_pose.workers import map_ordered
@@ -58,7 +58,9 @@ class SharedFitSettings(NamedTuple):
         steps: how steps are made.
         constant_deviation: prior standard deviation of joint offsets [rad or m] and of the
             logarithms of link scales.
-        focal_deviation: the same of the logarithms of focal lengths.
+        largest_constant: largest joint offset [rad or m] or logarithm of a link scale: without it a
+            gripper that hardly shows turned by 130 degrees.
+        focal_deviation: the prior standard deviation of the logarithms of focal lengths.
         known_beforehand: the scale of frames' errors is known beforehand as well as this number of
             distances tells it.
         prior_deviation: standard deviation of the logarithms of errors' sizes: a factor of twenty.
@@ -82,6 +84,7 @@ class SharedFitSettings(NamedTuple):
     fitted: AnnealingStage = AnnealingStage(0.005, 0.005)
     steps: StepSettings = StepSettings(longest=0.3, damping=1e-2, even_damping=1e-6)
     constant_deviation: float = 0.2
+    largest_constant: float = 0.6
     focal_deviation: float = 0.1
     known_beforehand: int = 20
     prior_deviation: float = 3.0
@@ -157,7 +160,9 @@ class SharedFit:
         deviations |= dict.fromkeys(OBJECT_POSITIONS, 1.0)
         deviations |= {f"{one.name}.{CAMERA_NAMES[6]}": SHARED.focal_deviation for one in cameras}
         known = np.array([deviations.get(name, np.inf) for name in self.names])
-        unknowns = [Unknowns(self.names, True, deviation=known)]
+        bounded = set(constants) - {*OBJECT_POSITIONS, TIME_OFFSET}
+        most = np.array([SHARED.largest_constant if k in bounded else np.inf for k in self.names])
+        unknowns = [Unknowns(self.names, True, -most, most, known)]
         if widths:
             # Masks are wider or narrower by at most six pixels.
             every = parameter_names(body, cameras)

@@ -466,7 +466,7 @@ def say_zeros(found: JointCalibration) -> list[str]:
     if asked and not any(one.significant for _, one in asked):
         return [
             "none of the zeros and lengths that were asked for is significant beside what else may "
-            "be off (the others, focal length, principal point, masks): all were left as they are"
+            "be off (the others, focal length, principal point, masks): no corrected URDF is made"
         ]
     return [
         f"{what} is not determined by these silhouettes and was left as it is;"

@@ -3,7 +3,7 @@
 import os
 import time
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -43,7 +43,7 @@ from drake_pose.jobs.registration.result import (
 )
 from drake_pose.jobs.registration.settings import RegistrationSettings
 from drake_pose.person.shape import shape_parts, shape_values
-from drake_pose.registration.joint_zeros import JointCalibration, calibrate_joints
+from drake_pose.registration.joint_zeros import KinematicParameter, calibrate_joints
 from drake_pose.registration.picture_registration import (
     PictureRegistration,
     choose_pictures,
@@ -391,14 +391,18 @@ class _Registration:
         found = calibrate_joints(
             self.body, list(cameras.values()), [inputs.of(name) for name in cameras],
             inputs.zeros, self._settings.focal, lengths=inputs.lengths,
+            start=self._zeros_in_pictures(),
         )  # fmt: skip
         self.parameters = describe_parameters(found, self.body.kinematics)
         self.warnings += say_zeros(found)
-        zeros = {one.name: one.value for one in found.zeros if one.significant}
-        self._zeros = np.array([zeros.get(name, 0.0) for name in names])
+        offsets = {one.name: one.value for one in found.zeros}
+        self._zeros = np.array([offsets.get(name, 0.0) for name in names])
         model, tree, standing = inputs.model, inputs.tree, inputs.standing
         seen = next(iter(cameras.values())).seen_object
-        shifts = joint_shifts(tree, found)
+        shifts = joint_shifts(tree, found.lengths)
+        # The file keeps what chance may explain; the cameras were fitted with all.
+        zeros = {one.name: one.value for one in found.zeros if one.significant}
+        written = joint_shifts(tree, [one for one in found.lengths if one.significant])
         if shifts:
             model = model.reshaped(shifts=shifts)
         if standing is not None and seen is not None:
@@ -419,16 +423,23 @@ class _Registration:
             self.registered[camera.name] = replace(before, frames=tuple(again))
             self._found_again(kinematics, camera, covariance, seen)
         path = inputs.model.path
-        if folder is None or not inputs.model.changes_shape or not (zeros or shifts):
+        if folder is None or not inputs.model.changes_shape or not (zeros or written):
             return None
         # With zeros and lengths in its joints' origins; its meshes as seen from the folder.
         text = path.read_text(encoding="utf-8")
-        root = ElementTree.fromstring(reshaped(text, zeros=zeros, shifts=shifts))
+        root = ElementTree.fromstring(reshaped(text, zeros=zeros, shifts=written))
         for mesh in root.iter("mesh"):
             name = mesh.get("filename", "")
             if "://" not in name:
                 mesh.set("filename", os.path.relpath(path.parent / name, folder))
         return ElementTree.tostring(root, encoding="utf-8", xml_declaration=True)
+
+    def _zeros_in_pictures(self) -> dict[str, float]:
+        """Mean joint offsets that cameras were found with in their pictures [rad or m]."""
+        if not self.pictures:
+            return {}
+        found = np.mean([one.zeros for one in self.pictures.values()], axis=0)
+        return dict(zip(self.body.kinematics.names, found.tolist(), strict=True))
 
     def _found_again(
         self,
@@ -448,8 +459,8 @@ class _Registration:
         )
 
 
-def joint_shifts(tree: PoseTree, found: JointCalibration) -> dict[str, list[float]]:
+def joint_shifts(tree: PoseTree, lengths: Sequence[KinematicParameter]) -> dict[str, list[float]]:
     """By how much joints stand elsewhere on their links (3,), by name [m]; empty: none does."""
-    longer = {one.name: one.value for one in found.lengths if one.significant}
+    longer = {one.name: one.value for one in lengths if one.value}
     offsets = lengthened_joints(tree, longer)
     return {one.joint: (longer[one.link] * one.p_L).tolist() for one in offsets}

@@ -330,8 +330,9 @@ def parameter_rows(parameters: Mapping[str, Mapping[str, Any]]) -> list[tuple[st
         unit = key.removeprefix("value_")
         value = f"{one[key]:.3f} {'%' if unit == 'percent' else unit}"
         interval = f"{one[f'low_{unit}']:.3f} to {one[f'high_{unit}']:.3f}"
-        word = "as good as 0" if one[f"low_{unit}"] <= 0.0 <= one[f"high_{unit}"] else "doubtful"
-        word = "significant" if one["significant"] else f"{word}: held at 0"
+        within = one[f"low_{unit}"] <= 0.0 <= one[f"high_{unit}"]
+        word = "as good as 0" if within else "not significant at 5 % over all asked for"
+        word = "significant" if one["significant"] else f"{word}: not written into the URDF"
         if one["significant"] and unit != "percent":
             word += f": {say_reading(one[key], one[f'sd_{unit}'], unit)}"
         rows.append((name, value, interval, word))

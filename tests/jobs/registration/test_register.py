@@ -167,12 +167,9 @@ def body_poses(path: Path, q: np.ndarray, names: tuple[str, ...]) -> dict[str, n
 
 
 def test_a_longer_link_carries_the_next_joint_farther_along_it(tmp_path: Path) -> None:
-    """A tenth more of the .35 m between two joints, by the URDF; what is not sure stays."""
-    lengths = [
-        SimpleNamespace(name=name, value=value, significant=sure)
-        for name, value, sure in (("shoulder", 0.1, True), ("elbow", 0.2, False))
-    ]
-    shifts = joint_shifts(arm_tree(tmp_path), SimpleNamespace(lengths=lengths))
+    """A tenth more of the .35 m between two joints, by the URDF; what is not determined stays."""
+    lengths = [SimpleNamespace(name="shoulder", value=0.1), SimpleNamespace(name="elbow", value=0)]
+    shifts = joint_shifts(arm_tree(tmp_path), lengths)
     assert shifts == {"roll_turn": pytest.approx([0.0, 0.0, 0.035])}
 
 

@@ -309,6 +309,10 @@ class TrackingSettings:
         lost_colour_distance: a part is lost whose contour is farther from a picture's [pixel]:
             search lines are so short that a wrong pose cannot put them much further off. Such a
             part teaches no colours.
+        patience: a track that no pose explains is predicted for this time before the best pose
+            that a search finds replaces it [s].
+        search_pause: meanwhile the search is asked once in this time [s].
+        retries: number of frames in which a search that a time limit has ended is asked again.
 
     Raises:
         SettingsError: a number that is not positive.
@@ -330,6 +334,9 @@ class TrackingSettings:
     lost_distance: float = 12.0
     lost_inlier_ratio: float = 0.6
     lost_colour_distance: float = 1.5
+    patience: float = 1.0
+    search_pause: float = 0.2
+    retries: int = 5
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():

@@ -19,6 +19,7 @@ from drake_pose.filtering.contour_tracker import (
 from drake_pose.search import (
     TRACKED,
     UNEXPLAINED,
+    MultiStartSearch,
     PoseEstimate,
     PoseSearch,
     View,
@@ -35,11 +36,17 @@ class Followed:
         track: of the body; None before the first match, and where none was found.
         reference: E_total after the last match; a track that explains much less is lost.
         matches: how often the search has been asked.
+        unexplained: number of frames, up to this one, that no pose explained: the track is
+            predicted through them.
+        retries: number of frames to come in which the search is asked again, since a time limit
+            ended it.
     """
 
     track: Track | None = None
     reference: float = 0.0
     matches: int = 0
+    unexplained: int = 0
+    retries: int = 0
 
 
 def make_tracker(
@@ -68,13 +75,25 @@ class _GivenFrame:
     pictures: list[Picture | None] | None
     begin: float
 
+    @property
+    def is_blind(self) -> bool:
+        """Whether nothing is seen in the frame."""
+        return all(one is None for one in (*self.masks, *(self.pictures or ())))
+
 
 class MatchAndTrack:
     """Follows a body from frame to frame, and asks a search where it cannot.
 
+    A frame that no pose explains, because the body is hidden or nothing is seen, does not move the
+    track: it is predicted, its deviations grow, and the pose of the frame is not found. A pose that
+    the search finds replaces the prediction only where it explains the masks about as well as poses
+    did before, or where nothing has done so for ``TrackingSettings.patience``.
+
     Args:
         search: asked in the first frame, and when the track is lost.
         period: time between two frames [s].
+        search_time: longest search [s]; None: as the search says. What a limit cuts short is
+            searched again in the next frames.
 
     Raises:
         SettingsError: no camera, a period that is not positive, or a tree without free values.
@@ -86,8 +105,11 @@ class MatchAndTrack:
         cameras: Sequence[Camera],
         period: float,
         settings: TrackingSettings | None = None,
+        search_time: float | None = None,
     ) -> None:
-        self.settings = settings or TrackingSettings()
+        self.settings, self._period = settings or TrackingSettings(), period
+        if search_time is not None and isinstance(search, MultiStartSearch):
+            search = search.with_time_limit(search_time)
         self._search = search
         self.tracker = make_tracker(search.tree, cameras, period, self.settings)
 
@@ -111,8 +133,10 @@ class MatchAndTrack:
 
         Returns:
             What is known now, and the pose. ``stopped_by`` is TRACKED where it was tracked. Where
-            the track is lost, and there is neither a mask nor a start, no pose is found; it is
-            followed all the same, and found again if the contour fits again.
+            no pose explains the masks, or nothing is seen, ``found`` is false and the pose is what
+            is predicted, or the start where there is one. Where the track is lost in pictures
+            without masks, no pose is found; it is followed all the same, and found again if the
+            contour fits again.
 
         Raises:
             SettingsError: masks or pictures that do not fit the cameras.
@@ -129,16 +153,17 @@ class MatchAndTrack:
         if last.track is not None:
             track = self._follow(last.track, frame, False)
             tracked = track, self._result(track, frame)
-            if not self._is_lost(*tracked, last.reference, bool(views)):
+            if not self._is_lost(*tracked, last.reference, frame):
+                if last.retries and views:
+                    return self._match(last, tracked, frame, None)
                 return Followed(track, last.reference, last.matches), tracked[1]
         if start is not None:
             begun = self._begin(start, last, frame)
-            # A start that the masks contradict is no better than none.
             if begun[1].found or not views:
                 return begun
         if not views:
             return self._go_on(last, tracked, frame)
-        return self._match(last, tracked, frame)
+        return self._match(last, tracked, frame, start)
 
     def with_intervals(self, followed: Followed, pose: PoseEstimate) -> PoseEstimate:
         """A frame's pose that was tracked, with what its contours alone say of each joint."""
@@ -151,40 +176,83 @@ class MatchAndTrack:
         return replace(pose, pose_set=covariance_pose_set(self._search.tree, pose, own, pictures))
 
     def _match(
-        self, last: Followed, tracked: tuple[Track, PoseEstimate] | None, frame: _GivenFrame
+        self,
+        last: Followed,
+        tracked: tuple[Track, PoseEstimate] | None,
+        frame: _GivenFrame,
+        start: Array | None,
     ) -> tuple[Followed, PoseEstimate]:
-        """The best of what was tracked, if anything, and of what the search finds."""
-        matched = self._search.match(frame.views, frame.root_position)
-        found = [] if tracked is None else [tracked]
-        if matched.found:
-            x = frame.observation.state(matched.q, matched.X_WB, matched.scale)
-            if last.track is not None:
-                # A search does not know how often an angle has turned round.
-                x = frame.observation.continued(x, last.track.state.best.mean)
-                matched = self._turned(matched, frame.observation.node_values(x))
-            first = self.tracker.start(x)
-            followed = self._follow(first, frame, True)
-            # The first look of a track is at what the search found, whose families are its own.
-            looked = replace(self._result(followed, frame), pose_set=matched.pose_set)
-            # The searched pose may fit better: the colours of this frame are learned all the same.
-            found += [(followed, looked), (replace(first, colours=followed.colours), matched)]
-        if not found:
-            return Followed(None, 0.0, last.matches + 1), matched
-        track, result = min(found, key=lambda pair: pair[1].E_total)
-        return Followed(track, result.E_total, last.matches + 1), result
+        """The best of what was tracked, if anything, and of what the search finds.
+
+        Where neither explains the masks: the start that was given, or what is predicted.
+        """
+        settings, followed = self.settings, last.track
+        unexplained = last.unexplained + 1
+        pause = max(1, round(settings.search_pause / self._period))
+        found, matches = [] if tracked is None else [tracked], last.matches
+        retries = max(0, last.retries - 1)
+        if followed is None or last.retries or unexplained % pause == 1 % pause:
+            matches += 1
+            matched = self._search.match(frame.views, frame.root_position)
+            found += self._looked(matched, followed, frame)
+            if matched.stopped_by != "time_limit":
+                retries = 0
+            elif not last.retries:
+                retries = settings.retries
+            if not found and followed is None and start is None:
+                return Followed(None, 0.0, matches, 0, retries), matched
+        limit = self._limit(last.reference)
+        explained = [one for one in found if followed is None or one[1].E_total <= limit]
+        if not explained and unexplained * self._period > settings.patience:
+            explained = found
+        if start is not None and (followed is None or not explained):
+            # Measured positions are no worse for masks that nothing explains.
+            explained = [one for one in found if one[1].E_total <= self._limit(0.0)]
+        if explained:
+            track, result = min(explained, key=lambda pair: pair[1].E_total)
+            return Followed(track, result.E_total, matches, 0, retries), result
+        if start is not None:
+            track = self.tracker.start(self._state(start, last, frame))
+        else:
+            assert followed is not None
+            track = self._follow(followed, frame, False, blind=True)
+        result = replace(self._result(track, frame), found=False)
+        return Followed(track, last.reference, matches, unexplained, retries), result
+
+    def _looked(
+        self, matched: PoseEstimate, last: Track | None, frame: _GivenFrame
+    ) -> list[tuple[Track, PoseEstimate]]:
+        """A pose that the search found, as it is and followed in its frame; none if none was."""
+        if not matched.found:
+            return []
+        x = frame.observation.state(matched.q, matched.X_WB, matched.scale)
+        if last is not None:
+            # A search does not know how often an angle has turned round.
+            x = frame.observation.continued(x, last.state.best.mean)
+            matched = self._turned(matched, frame.observation.node_values(x))
+        first = self.tracker.start(x)
+        followed = self._follow(first, frame, True)
+        # The first look of a track is at what the search found, whose families are its own.
+        looked = replace(self._result(followed, frame), pose_set=matched.pose_set)
+        # The searched pose may fit better: the colours of this frame are learned all the same.
+        return [(followed, looked), (replace(first, colours=followed.colours), matched)]
 
     def _begin(
         self, start: Array, last: Followed, frame: _GivenFrame
     ) -> tuple[Followed, PoseEstimate]:
         """A track that begins where the body is known to be."""
-        x = frame.observation.state(start)
-        if last.track is not None:
-            x = frame.observation.continued(x, last.track.state.best.mean)
-        track = self._follow(self.tracker.start(x), frame, True)
+        track = self._follow(self.tracker.start(self._state(start, last, frame)), frame, True)
         result = self._result(track, frame)
         reference = result.E_total if frame.views else UNEXPLAINED
-        found = not self._is_lost(track, result, reference, bool(frame.views))
+        found = not self._is_lost(track, result, reference, frame)
         return Followed(track, reference, last.matches), replace(result, found=found)
+
+    def _state(self, start: Array, last: Followed, frame: _GivenFrame) -> Array:
+        """The tracker's state (n,) at positions (nq,), angles in the turns of the last track."""
+        x = frame.observation.state(start)
+        if last.track is None:
+            return x
+        return frame.observation.continued(x, last.track.state.best.mean)
 
     def _go_on(
         self, last: Followed, tracked: tuple[Track, PoseEstimate] | None, frame: _GivenFrame
@@ -195,10 +263,14 @@ class MatchAndTrack:
             nowhere = self.tracker.observation.state(default)
             result = self._result(self.tracker.start(nowhere), frame)
             return last, replace(result, found=False)
-        return Followed(tracked[0], last.reference, last.matches), replace(tracked[1], found=False)
+        # The search is asked at once where something is seen again.
+        return replace(last, track=tracked[0], unexplained=0), replace(tracked[1], found=False)
 
-    def _follow(self, track: Track, frame: _GivenFrame, first: bool) -> Track:
-        """The tracker's next frame; first: it is the one that the track begins in."""
+    def _follow(self, track: Track, frame: _GivenFrame, first: bool, blind: bool = False) -> Track:
+        """The next frame; first: it is the one that the track begins in; blind: it is not seen."""
+        if blind:
+            masks = [None] * len(frame.masks)
+            return self.tracker.follow(track, masks, first, frame.root_position)
         return self.tracker.follow(track, frame.masks, first, frame.root_position, frame.pictures)
 
     def _turned(self, matched: PoseEstimate, node_values: Sequence[Array]) -> PoseEstimate:
@@ -210,11 +282,16 @@ class MatchAndTrack:
         return matched.turned(self._search.tree, turns)
 
     def _is_lost(
-        self, track: Track, result: PoseEstimate, reference: float, has_masks: bool
+        self, track: Track, result: PoseEstimate, reference: float, frame: _GivenFrame
     ) -> bool:
-        """Whether a track left the contour, or its E_total grew by half and .1 since its match."""
-        limit = 1.5 * reference + 0.1
-        return track.lost or (has_masks and result.E_total > min(limit, UNEXPLAINED))
+        """Whether nothing is seen, or a track left the contour, or explains too little."""
+        explains = not frame.views or result.E_total <= self._limit(reference)
+        return frame.is_blind or track.lost or not explains
+
+    @staticmethod
+    def _limit(reference: float) -> float:
+        """The largest E_total of a pose that explains the masks, by that after the last match."""
+        return min(1.5 * reference + 0.1, UNEXPLAINED)
 
     def _difference(self, track: Track, frame: _GivenFrame) -> tuple[float, float]:
         """The area where the body differs from what is seen, and the body's [pixel]."""

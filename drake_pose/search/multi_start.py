@@ -9,6 +9,7 @@ left unexplained, a beam search by areas gives other starts.
 """
 
 import copy
+import functools
 import itertools
 import math
 import time
@@ -19,8 +20,9 @@ from functools import cached_property
 import cv2
 import numpy as np
 
-from drake_pose.body import PoseTree
+from drake_pose.body import PoseTree, bundled_model, load_model
 from drake_pose.body.tree_kinematics import TreeKinematics
+from drake_pose.camera.models import ParallelCamera
 from drake_pose.errors import SettingsError
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.fit.surfaces import few_triangles, rough_outlines
@@ -84,6 +86,14 @@ class MultiStartSearch:
         other._alternatives = False
         return other
 
+    def with_time_limit(self, seconds: float) -> "MultiStartSearch":
+        """The same search with a limit on the time of a match [s], or with its own if shorter."""
+        other = copy.copy(self)
+        other._time_limit = min(
+            seconds, math.inf if other._time_limit is None else other._time_limit
+        )
+        return other
+
     def match(self, views: Sequence[View], root_position: np.ndarray | None = None) -> PoseEstimate:
         """Estimate the pose that the views show; see ``PoseSearch``.
 
@@ -95,6 +105,8 @@ class MultiStartSearch:
         """
         if not views:
             raise SettingsError("a match needs at least one view, but none was given")
+        if self._time_limit is not None:
+            warm_up()
         start = time.perf_counter()
         body, fit, clean = self._fit(views, root_position)
         deadline = np.inf if self._time_limit is None else start + self._time_limit
@@ -368,6 +380,15 @@ class _MultiStartRun:
     def _J(self, values: np.ndarray) -> float:
         """The objective (1) at values (m,), skin included [pixel]."""
         return float(self._problem.J(self._parameters(values)))
+
+
+@functools.cache
+def warm_up() -> None:
+    """Compile or load a search's kernels, by a match of a small body: not in a match's time."""
+    tree = load_model(bundled_model("two_finger_hand"), check=False).pose_tree()
+    camera = ParallelCamera("warm-up", 64, 64, 300.0, 32.0, 32.0, np.eye(4))
+    view = View(camera, cv2.circle(np.zeros((64, 64), np.uint8), (32, 32), 16, 1, -1) > 0)
+    MultiStartSearch(tree).match([view])
 
 
 def without_specks(mask: np.ndarray, largest: int = 6, least: float = 0.02) -> np.ndarray:

@@ -149,9 +149,13 @@ class SilhouetteMatcher(BeliefSystem[Matched]):
             if camera.name in masks and masks[camera.name].any()
         ]
         estimate, memory = self._find(context, last.memory, views)
-        if estimate is None or not estimate.found:
+        if estimate is None or not (estimate.found or self._is_predicted(memory)):
             return Matched(last.q, last.X_WB, estimate, memory)
         return Matched(estimate.q, estimate.X_WB, estimate, memory)
+
+    def _is_predicted(self, memory: Any) -> bool:
+        """Whether an estimate that was not found is a prediction."""
+        return False
 
     def _find(
         self, context: Context, memory: Any, views: Sequence[View]
@@ -222,17 +226,21 @@ class SilhouetteTracker(SilhouetteMatcher):
       where there is no label image, or one without any pixel of the body. So a label image of the
       first frame will do; or none, where measured positions say where the body is at first.
     - ``measured_positions`` (nq): about where the body is now, of encoders for example. The track
-      begins there, and again after a loss; the search is asked only where the masks contradict it.
-      NaN: it is not known now.
+      begins there, and again after a loss; the search is asked only where the masks contradict it,
+      and overrules it only by a pose that explains the masks. NaN: it is not known now.
     - ``first_positions`` (nq): about where the body is in the first image; ignored afterwards.
     - ``position_deviations`` (nq): the standard deviation of each position [rad or m]; NaN where a
-      position is no part of what is tracked (held, or solved from the root's pose).
+      position is no part of what is tracked (held, or solved from the root's pose). Where nothing
+      is seen, or no pose explains the masks because the body is hidden, the positions are predicted
+      and their deviations grow; see ``tracked``. At most a tenth of the silhouettes' area may be
+      hidden in a frame that is tracked.
     - ``estimated_state`` (nq + nv): the estimated positions, then the plant's velocities [rad/s or
       m/s]; these are NaN where there is no track, and where ``position_deviations`` are. They are
       what the filter believes: rates fade within ``tracking.memory``, so in steady motion they are
       too small (by a fifth at 30 frames a second with the default of 0.15 s), and right with 5 s.
     - ``track``: see ``TRACK``. ``tracked`` is 1 where the last pose was tracked and 0 where the
-      search found it; ``matches`` counts how often the search was asked; ``distance`` is between
+      search found it, or it was only predicted (``error`` is infinite then); ``matches`` counts
+      how often the search was asked; ``distance`` is between
       the body's contour and the masks' edge (root mean square, robust) [pixel].
 
     All that is known is state of the context. Arguments are those of ``SilhouetteMatcher``, and:
@@ -241,6 +249,8 @@ class SilhouetteTracker(SilhouetteMatcher):
         tracking: how the body may move, and when its track is lost: abstract parameter 1 of the
             context, but for ``root_moves`` and ``scale_unknown``, on which the state depends.
         color_cameras: names of the cameras that have a port for a colour image.
+        search_time: longest search by a ``MultiStartSearch`` [s]. A search that it cuts short is
+            asked again in the next updates; None: no limit.
 
     Raises:
         SettingsError: as for ``SilhouetteMatcher``; and in a simulation, when time runs backwards,
@@ -258,11 +268,12 @@ class SilhouetteTracker(SilhouetteMatcher):
         labels: Collection[int] | None = None,
         tracking: TrackingSettings | None = None,
         color_cameras: Collection[str] = (),
+        search_time: float | None = 5.0,
     ) -> None:
         super().__init__(search, cameras, period, labels)
-        cameras = self._cameras
+        cameras, self._search_time = self._cameras, search_time
         tracking = tracking or TrackingSettings()
-        follower = MatchAndTrack(search, cameras, period, tracking)
+        follower = MatchAndTrack(search, cameras, period, tracking, search_time)
         self._tracking, self._followers = self.add_parameter(tracking), {tracking: follower}
         self._period, self._layout = period, follower.tracker.filter.layout
         model = search.tree.model
@@ -285,10 +296,10 @@ class SilhouetteTracker(SilhouetteMatcher):
         self, context: Context, memory: _Memory, views: Sequence[View]
     ) -> tuple[PoseEstimate | None, _Memory]:
         pictures = self._colours.pictures(context)
-        if not views and not pictures:
+        last, root_position = memory.followed, self.given(context, "root_position")
+        if not views and not pictures and last.track is None:
             return None, memory
         require_time_forward(self, context, memory.time)
-        last, root_position = memory.followed, self.given(context, "root_position")
         ports = ["measured_positions", *(["first_positions"] if last.track is None else [])]
         starts = (self.given(context, port) for port in ports)
         start = next((q for q in starts if q is not None and np.isfinite(q).all()), None)
@@ -299,6 +310,9 @@ class SilhouetteTracker(SilhouetteMatcher):
         distance = np.nan if measurement is None else measurement.distance
         track = float(result.found and is_tracked), float(now.matches), distance
         return result, _Memory(now, track, context.get_time())
+
+    def _is_predicted(self, memory: _Memory) -> bool:
+        return memory.followed.track is not None
 
     def with_intervals(self, context: Context) -> PoseEstimate:
         """The pose of the last update, which was tracked, with intervals; see ``MatchAndTrack``.
@@ -313,7 +327,9 @@ class SilhouetteTracker(SilhouetteMatcher):
     def _follower(self, tracking: TrackingSettings) -> MatchAndTrack:
         """What follows as a context's settings say; made of them once."""
         if tracking not in self._followers:
-            made = MatchAndTrack(self._search, self._cameras, self._period, tracking)
+            made = MatchAndTrack(
+                self._search, self._cameras, self._period, tracking, self._search_time
+            )
             if made.tracker.filter.layout.names != self._layout.names:
                 raise SettingsError(
                     f"{self.get_name()}: root_moves and scale_unknown cannot be varied in a "

@@ -264,3 +264,86 @@ def test_the_first_frame_teaches_colours_also_where_the_searched_pose_fits_best(
         assert found.found
         assert found.stopped_by == ("end" if has_mask else TRACKED)
         np.testing.assert_allclose(found.q, q, atol=np.radians(3.0))
+
+
+def hidden(mask, share):
+    """A mask without its left pixels."""
+    columns = np.nonzero(mask)[1]
+    rest = mask.copy()
+    rest[:, : int(np.quantile(columns, share))] = False
+    return rest
+
+
+@pytest.mark.parametrize("share", [0.6, 1.0])
+def test_what_no_pose_explains_is_predicted_and_the_truth_stays_near(body, share):
+    """Hidden in part or whole for a quarter of a second; the search has nothing but bad poses."""
+    search = KnownPoses(body.pose_tree(), [])
+    wrong = np.array([1.0, -1.2, 1.0])
+    answers = {"q": None}
+
+    def match(views, root_position=None):
+        q = answers["q"]
+        J, area = follower.tracker.observation.difference(
+            follower.tracker.observation.state(q), [(CAMERA, view.mask) for view in views]
+        )
+        values = tuple(search.tree.values_from_positions(q, np.eye(4)))
+        return PoseEstimate(True, q, np.eye(4), values, float(J), float(area), "end")
+
+    search.match = match
+    follower, followed = MatchAndTrack(search, [CAMERA], PERIOD), Followed()
+    poses = swings(30, np.array([0.1, 0.4, -0.4]), 0.4, np.random.default_rng(3))
+    renderer, observation = LabelRenderer(body, CAMERA), follower.tracker.observation
+    moving = follower.tracker.filter.layout.indices(follower.tracker.filter.layout.moving)
+    before = np.zeros(len(moving))
+    for k, q in enumerate(poses):
+        is_hidden = 10 <= k < 20
+        answers["q"] = wrong if is_hidden else q
+        mask = hidden(renderer.mask(q), share if is_hidden else 0.0)
+        views = [View(CAMERA, mask)] if mask.any() else []
+        followed, pose = follower.next(followed, views)
+        if k < 20 or k > 25:
+            # Of what is seen in part the search is asked once in a while.
+            assert pose.found == (not is_hidden)
+        state = followed.track.state.best
+        off = np.abs(state.mean - observation.state(q))[moving]
+        assert np.all(off < 3.0 * state.deviations()[moving] + np.radians(3.0)), k
+        if is_hidden:
+            assert np.all(state.deviations()[moving] > before)
+        before = state.deviations()[moving]
+
+
+def test_measured_positions_are_overruled_by_a_pose_alone_that_explains_the_masks(body):
+    q = np.array([0.1, 0.4, -0.4])
+    mask = hidden(LabelRenderer(body, CAMERA).mask(q), 0.6)
+    wrong, right = (q + off for off in ([0.9, -1.0, 1.0], [0.0, 0.01, 0.01]))
+    search = KnownPoses(body.pose_tree(), [(wrong, np.eye(4), 1.0, None)])
+    follower = MatchAndTrack(search, [CAMERA], PERIOD)
+    followed, pose = follower.next(Followed(), [View(CAMERA, mask)], start=right)
+    assert search.calls == 1
+    # The search says J = 20 of 100 pixels: that is no explanation, and more than nothing.
+    np.testing.assert_allclose(pose.q, right, atol=0.005)
+    assert not pose.found
+    assert followed.track.state.best.deviations().min() > 0.0
+
+
+def test_a_search_that_a_time_limit_ended_is_asked_again(body):
+    """And the better pose is taken, although the first one's track is not lost."""
+    q = np.array([0.1, 0.4, -0.4])
+    views = [View(CAMERA, LabelRenderer(body, CAMERA).mask(q))]
+    tree, asked = body.pose_tree(), []
+    search = KnownPoses(tree, [])
+
+    def match(views, root_position=None):
+        asked.append(len(asked))
+        first = len(asked) == 1
+        at = q + (0.5 if first else 0.0)
+        values = tuple(tree.values_from_positions(at, np.eye(4)))
+        J, stopped_by = (40.0, "time_limit") if first else (0.0, "end")
+        return PoseEstimate(True, at, np.eye(4), values, J, 100.0, stopped_by)
+
+    search.match = match
+    follower, followed = MatchAndTrack(search, [CAMERA], PERIOD), Followed()
+    for _ in range(4):
+        followed, pose = follower.next(followed, views)
+    assert len(asked) == 2
+    np.testing.assert_allclose(pose.q, q, atol=np.radians(2.0))

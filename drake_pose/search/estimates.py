@@ -23,8 +23,10 @@ TRACKED = "tracked"
 class View:
     """What one calibrated camera sees of the body: the silhouette S, (height, width) bool.
 
+    A mask of numbers with two values is true where it has the larger one.
+
     Raises:
-        MaskError: the mask is not of the camera's size, or is empty.
+        MaskError: the mask is not of the camera's size, has more than two values, or is empty.
     """
 
     camera: Camera
@@ -32,12 +34,21 @@ class View:
 
     def __post_init__(self) -> None:
         expected = (self.camera.height, self.camera.width)
+        object.__setattr__(self, "mask", np.asarray(self.mask))
         if self.mask.shape != expected:
             raise MaskError(
                 f"mask of camera '{self.camera.name}' is {self.mask.shape[::-1]} pixels (width, "
                 f"height), but the camera's picture is {expected[::-1]}; give the mask at the "
                 "size the camera was calibrated for"
             )
+        if self.mask.dtype != np.bool_:
+            values = np.unique(self.mask)
+            if len(values) > 2 or not np.isfinite(values).all():
+                raise MaskError(
+                    f"mask of camera '{self.camera.name}' has {len(values)} values from "
+                    f"{values[0]} to {values[-1]}, but a mask has two; compare it with a threshold"
+                )
+            object.__setattr__(self, "mask", self.mask > (values[0] if len(values) > 1 else 0))
         if not self.mask.any():
             raise MaskError(
                 f"mask of camera '{self.camera.name}' is empty; leave this view out, or give a "

@@ -76,7 +76,8 @@ class CameraRegistration(BeliefSystem[OnlineState]):
 
     Args:
         period: time between two updates [s].
-        labels: the labels that belong to the body; None: all that are not reserved.
+        labels: the labels that belong to the body; None: those of its model where that was made of
+            a plant (``ArticulatedModel.from_plant``), else all that are not reserved.
 
     Raises:
         SettingsError: a period that is not positive.
@@ -92,6 +93,7 @@ class CameraRegistration(BeliefSystem[OnlineState]):
         require_period("registration", period)
         self._registration = registration
         self._tree, camera = registration.body.tree, registration.camera
+        labels = self._tree.model.labels if labels is None else labels
         self._labels = None if labels is None else frozenset(labels)
         self.add_input("label_image", ImageLabel16I(camera.width, camera.height))
         self.add_input("measured_positions", len(self._tree.model.position_names))

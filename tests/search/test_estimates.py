@@ -8,6 +8,8 @@ import pytest
 from scipy.stats import t as student
 
 from drake_pose.body.tree_kinematics import TreeKinematics
+from drake_pose.camera.models import ParallelCamera
+from drake_pose.errors import MaskError
 from drake_pose.search import (
     BeamSearch,
     ExaminationSettings,
@@ -16,11 +18,35 @@ from drake_pose.search import (
     PoseEstimate,
     PoseFamily,
     PoseSet,
+    View,
     covariance_pose_set,
 )
 from tests.search.turning import crane, views_of
 
 TURN = 2.0 * math.pi
+CAMERA = ParallelCamera("front", 6, 4, 10.0, 3.0, 2.0, np.eye(4))
+
+
+@pytest.mark.parametrize("largest", [1, 255, np.uint8(255), 0.5, True])
+def test_any_array_of_two_values_is_a_mask(largest):
+    inside = np.arange(24).reshape(4, 6) % 5 == 0
+    view = View(CAMERA, inside * largest)
+    assert view.mask.dtype == np.bool_
+    np.testing.assert_array_equal(view.mask, inside)
+
+
+@pytest.mark.parametrize(
+    ("mask", "reason"),
+    [
+        (np.arange(24).reshape(4, 6), "24 values from 0 to 23"),
+        (np.full((4, 6), np.nan), "values from nan"),
+        (np.zeros((4, 6), int), "empty"),
+        (np.ones((6, 4), int), "size the camera was calibrated for"),
+    ],
+)
+def test_what_is_no_mask_is_refused(mask, reason):
+    with pytest.raises(MaskError, match=f"'front'.*{reason}"):
+        View(CAMERA, mask)
 
 
 @pytest.fixture(scope="module")

@@ -36,11 +36,12 @@ def label_image_to_mask(
 ) -> np.ndarray:
     """The mask (H, W) of a label image or of its data (H, W) or (H, W, 1).
 
-    ``labels``: those that count as the object; None: all but EMPTY.
+    ``labels``: those that count as the object; None: all but Drake's reserved ones, kEmpty,
+    kDontCare, kDoNotRender and kUnspecified.
     """
     data = label_data(image)
     if labels is None:
-        return data != EMPTY
+        return data <= int(RenderLabel.kMaxUnreserved)
     return np.isin(data, list(labels))
 
 

@@ -143,6 +143,10 @@ def test_label_images_are_masks():
 def test_labels_can_be_chosen():
     labels = np.full((4, 5), int(RenderLabel.kEmpty), dtype=np.int16)
     labels[1, 2], labels[3, 3] = 7, 9
+    # Drake's reserved labels are no object's.
+    labels[0, :3] = [
+        int(getattr(RenderLabel, k)) for k in ("kDontCare", "kDoNotRender", "kUnspecified")
+    ]
     assert np.argwhere(label_image_to_mask(labels)).tolist() == [[1, 2], [3, 3]]
     assert np.argwhere(label_image_to_mask(labels, [9])).tolist() == [[3, 3]]
 

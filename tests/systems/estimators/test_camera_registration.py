@@ -1,5 +1,6 @@
 """A camera whose pose nobody told is found in a diagram, and found again after a bump."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -64,6 +65,21 @@ class TestCameraRegistration:
         # What is known is state of the context.
         run.context.SetStateAndParametersFrom(system.CreateDefaultContext())
         assert system.belief(run.context).keyframes == ()
+
+    def test_counts_the_labels_of_a_model_made_of_a_plant(self, online) -> None:
+        """A ground that fills the picture is not the robot's."""
+        labels = np.full((480, 640, 1), 9, np.int16)
+        labels[100:200, 100:200] = 5
+        for own, seen in ((frozenset({5}), labels == 5), (None, labels > 0)):
+            model = replace(online.body.tree.model, labels=own)
+            tree = replace(online.body.tree, model=model)
+            known = OnlineRegistration(RegistrationBody(tree), online.camera)
+            system = CameraRegistration(known, PERIOD)
+            image = mask_to_label_image(labels[..., 0] > 0)
+            image.mutable_data[:] = labels
+            run = Bench(system).update(measured_positions=np.zeros(5), label_image=image)
+            (kept,) = system.belief(run.context).keyframes
+            np.testing.assert_array_equal(kept.mask, seen[..., 0])
 
     def test_refuses_a_period_that_is_none(self, online: OnlineRegistration) -> None:
         with pytest.raises(SettingsError, match="period"):

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.special import stdtr, stdtrit
+from scipy.stats import multivariate_normal
 
 from drake_pose.arrays import Array, Mask
 from drake_pose.body import OBJECT_POSITIONS, PoseTree
@@ -122,7 +123,8 @@ def calibrate_joints(
     """The zeros of some joints and lengths of links, fitted together with the cameras' poses.
 
     All that are determined stay in the fit, significant or not: one that is held at 0 because
-    chance could explain it would move the cameras.
+    chance could explain it would move the cameras. In the end they are drawn towards 0 as far as
+    their own sizes say (``drawn_together``); the covariance stays that of the fit.
 
     Args:
         cameras: as they were registered with the model's zeros and lengths; no two of one name.
@@ -179,6 +181,9 @@ def calibrate_joints(
                 values = {k: replace(one, significant=k in beside) for k, one in values.items()}
         told |= values
         kept = [name for name in sought if values[name].determined]
+    found = found._replace(shared=drawn_together(fit, found, covariance, sought))
+    again = describe_constants(fit, found, freedom, least, covariance, sought)
+    told |= {k: replace(one, significant=told[k].significant) for k, one in again.items()}
     ratios = fit.inlier_ratios(found)
     if ratios.mean() < before - most_lost:
         raise RegistrationError(
@@ -200,6 +205,33 @@ def calibrate_joints(
         tuple(ratios[fit.rows == c] for c in range(len(seen))),
         tuple(fit.agreeing(ratios)[fit.rows == c] for c in range(len(seen))),
     )
+
+
+def drawn_together(fit: SharedFit, found: Shared, covariance: Array, names: Sequence[str]) -> Array:
+    """(u,) what is shared, if constants are as large as those of their kind seem to be.
+
+    Joint offsets of angles, those of slides, and link scales have a standard deviation each, the
+    most likely one by their estimates (empirical Bayes; Efron and Morris 1975): where most offsets
+    are small one that hardly shows is likely to be, and the cameras follow.
+    """
+    kinematics, told = fit.seen[0].kinematics, np.zeros(len(fit.names))
+    kinds = dict(zip(kinematics.names, kinematics.is_angle.tolist(), strict=True))
+    for kind in (True, False, None):
+        rows = [fit.names.index(name) for name in names if kinds.get(name) is kind]
+        if rows:
+            x, C = found.shared[rows], covariance[np.ix_(rows, rows)]
+            # From a hundredth of a degree or a fiftieth of a millimetre to what was assumed.
+            sizes = np.geomspace(1e-4, 1.0, 60) * SHARED.constant_deviation
+            likely = [
+                multivariate_normal(cov=C + size**2 * np.eye(len(x))).logpdf(x) for size in sizes
+            ]
+            told[rows] = sizes[int(np.argmax(likely))] ** -2 - SHARED.constant_deviation**-2
+    known = told > 0.0
+    # The posterior by what is known more of these constants.
+    gain = covariance[:, known] @ np.linalg.inv(
+        covariance[np.ix_(known, known)] + np.diag(1.0 / told[known])
+    )
+    return np.asarray(found.shared - gain @ found.shared[known])
 
 
 def significant_constants(

@@ -366,6 +366,22 @@ def doubted_covariance(
     return (follow * variances) @ follow.T + np.outer(off, off), without
 
 
+@_on_one_thread
+def scored_doubts(seen: Distances, sizes: ErrorSizes) -> tuple[Array, Array]:
+    """(k,) value and standard deviation of each doubt, one group after another [its unit].
+
+    Each is what explains the residuals best by itself, beside the values (score test, Rao 1948).
+    """
+    if not seen.doubts:
+        return np.zeros(0), np.zeros(0)
+    A = np.concatenate(seen.doubts, axis=1)
+    inverse = np.linalg.inv(distances_covariance(seen, sizes))
+    VX = inverse @ seen.X
+    P = inverse - VX @ np.linalg.pinv(seen.X.T @ VX) @ VX.T
+    weights = np.maximum(np.einsum("nk,nm,mk->k", A, P, A, optimize=True), 1e-12)
+    return A.T @ P @ seen.y / weights, weights**-0.5
+
+
 def _apriori(is_angle: Mask) -> Array:
     """(m, m) information of an even distribution over a full turn, or over ten metres."""
     return np.diag(12.0 / np.where(is_angle, 2.0 * np.pi, 10.0) ** 2)

@@ -1,5 +1,6 @@
 """Zeros of encoders are found where they are off, and none where they are right."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -8,6 +9,7 @@ import pytest
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import RegistrationError, UnknownNameError
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
+from drake_pose.jobs.registration.diagnosis import say_likely_offsets
 from drake_pose.registration.joint_zeros import calibrate_joints
 from drake_pose.registration.posed_frames import PosedFrame, PosedFrames
 from drake_pose.registration.register import CameraSearch, RegisteredCamera
@@ -109,3 +111,22 @@ def test_the_cost_bends_as_the_normal_equations_say(model, body, camera) -> None
     )
     known = (by[-1] / SHARED.constant_deviation) ** 2
     assert bends == pytest.approx(0.5 * (more + less) - here - known, rel=0.2)
+
+
+@pytest.mark.parametrize("degrees", [3.0, -3.0, 0.0, 0.4])
+def test_an_offset_that_was_not_asked_for_shows_in_what_frames_have_in_common(
+    model, body, camera, degrees: float
+) -> None:
+    """The camera has followed it, and its standard deviation alone would not say why."""
+    zeros = np.zeros(len(body.kinematics.names))
+    zeros[body.kinematics.names.index("elbow_turn")] = np.radians(degrees)
+    frames = misread(see(model, body, camera, 6, 4), zeros)
+    found = CameraSearch(body).refine(camera, frames)
+    texts = say_likely_offsets(body, found, frames)
+    if abs(degrees) < 1.0:
+        assert not texts
+        return
+    (text,) = texts
+    word = "low" if degrees > 0.0 else "high"
+    assert re.search(rf"'elbow_turn' reads [23]\.\d+ \+- \d\.\d+ degrees too {word};", text)
+    assert "--zeros all" in text

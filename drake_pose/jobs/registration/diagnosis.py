@@ -21,6 +21,7 @@ from drake_pose.registration.per_frame_fit import PerFrameFit
 from drake_pose.registration.picture_registration import PictureRegistration, Recording
 from drake_pose.registration.posed_frames import PosedFrame, PosedFrames, SeenFrame, placed_points
 from drake_pose.registration.register import (
+    LAST_SPACING,
     SEARCH,
     CameraSearch,
     E_total,
@@ -30,7 +31,7 @@ from drake_pose.registration.register import (
     areas,
     spread,
 )
-from drake_pose.registration.shared_fit import SharedFit
+from drake_pose.registration.shared_fit import SHARED, SharedFit
 from drake_pose.registration.standing_object import ObjectSearch
 from drake_pose.silhouette.pictures.scene_checks import frame_ranges
 from drake_pose.silhouette.scoring import require_visible
@@ -411,6 +412,30 @@ def say_reading(value: float, deviation: float, unit: str) -> str:
     word, digits = "low" if value > 0.0 else "high", 2 if unit == "deg" else 1
     size = f"{abs(value):.{digits}f} +- {deviation:.{digits}f}"
     return f"reads {size} {'degrees' if unit == 'deg' else unit} too {word}"
+
+
+def say_likely_offsets(
+    body: RegistrationBody, found: RegisteredCamera, frames: Sequence[PosedFrame]
+) -> list[str]:
+    """That joint offsets would explain what all frames of a camera have in common."""
+    agreeing = {one.frame for one in found.frames if one.agrees}
+    some = spread([one for one in frames if one.name in agreeing], 24)
+    if not some:
+        return []
+    seen = PosedFrames(body.kinematics, body.all, found.camera, some, LAST_SPACING)
+    fit = SharedFit([seen], [found.camera.X_CW])
+    agree = np.ones(len(some), bool)
+    likely = fit.likely_offsets(fit.fit(SHARED.rounds_with_constants[-1:], fit.start, agree), agree)
+    turns = dict(zip(body.kinematics.names, body.kinematics.is_angle, strict=True))
+    for name, one in likely.items():
+        unit, factor = ("deg", math.degrees(1.0)) if turns[name] else ("mm", 1e3)
+        reading = say_reading(factor * one[0], factor * one[1], unit)
+        return [
+            f"camera '{found.camera.name}': its frames are explained better if joint '{name}' "
+            f"{reading}; until the offsets of joints are known the camera may be off by more than "
+            "its standard deviation: find them with --zeros all"
+        ]
+    return []
 
 
 def say_drift(camera: str, drift: float, deviation: float) -> str:

@@ -25,6 +25,7 @@ from drake_pose.jobs.registration.diagnosis import (
     require_explained,
     say_common,
     say_held,
+    say_likely_offsets,
     say_lost,
     say_object,
     say_outliers,
@@ -326,12 +327,14 @@ class _Registration:
                 require_determined(found)
             picture = self.pictures.get(name)
             focal_found = picture is not None and picture.focal_deviation
+            fitted, own = found, inputs.of(name)
+            if picture is not None:
+                # By the pictures that it was fitted to.
+                fitted = replace(found, frames=picture.found.frames)
+                own = [replace(k, values=k.values + self._zeros) for k in picture.frames]
+            if not (inputs.positions.is_estimate or self._settings.zeros):
+                self.warnings += say_likely_offsets(body, fitted, own)
             if not (inputs.positions.is_estimate or self._settings.focal or focal_found):
-                fitted, own = found, inputs.of(name)
-                if picture is not None:
-                    # By the pictures that it was fitted to.
-                    fitted = replace(found, frames=picture.found.frames)
-                    own = [replace(k, values=k.values + self._zeros) for k in picture.frames]
                 covariance, texts = check_focal_length(body, fitted, own)
                 self.warnings += texts
                 found = self.registered[name] = replace(found, covariance=covariance)

@@ -457,8 +457,12 @@ def say_lost(camera: str, lost: Sequence[str], names: Sequence[str], what: str =
     )
 
 
-def say_outliers(found: RegisteredCamera) -> list[str]:
-    """What a user should know of a camera's frames that contradict, and of other poses."""
+def say_outliers(found: RegisteredCamera, of_pictures: bool = False) -> list[str]:
+    """What a user should know of a camera's frames that contradict, and of other poses.
+
+    Raises RegistrationError: half of the masks or more contradict the others. In pictures those of
+        the fit agree, and the others may be dark or blurred.
+    """
     name, frames = found.camera.name, [frame.frame for frame in found.frames]
     wrong, texts = found.contradictions, []
     if wrong:
@@ -468,8 +472,17 @@ def say_outliers(found: RegisteredCamera) -> list[str]:
             f"not count: {frame_ranges(wrong, frames)}; are their joint positions those of the "
             "pictures?"
         )
-        if 2 * right < len(frames):
+        if 2 * right <= len(frames):
             supporting = frame_ranges([one for one in frames if one not in wrong], frames)
+            if not of_pictures:
+                raise RegistrationError(
+                    f"camera '{name}': half of the frames or more contradict the others, "
+                    f"{len(wrong)} of {len(frames)}: {frame_ranges(wrong, frames)}. Either these "
+                    f"are wrong or those that agree, {supporting}, do by chance: is the model this "
+                    "robot's, with its covers and tools, and are joint positions those of the "
+                    "pictures and in the model's zeros (--zeros all)? To trust those that agree "
+                    "give a scene of them alone. Nothing was written"
+                )
             text += (
                 f" FEWER THAN HALF OF THE FRAMES AGREE, {right} of {len(frames)}: {supporting}; "
                 "the pose rests on these alone and may be wrong: mend the others, or add frames"

@@ -338,7 +338,7 @@ class _Registration:
                 covariance, texts = check_focal_length(body, fitted, own)
                 self.warnings += texts
                 found = self.registered[name] = replace(found, covariance=covariance)
-            self.warnings += say_outliers(found)
+            self.warnings += say_outliers(found, picture is not None or name in self.seen)
         self.warnings += say_common(self.registered.values(), of_pictures=bool(self.pictures))
 
     def describe(self, more: float) -> dict[str, dict[str, Any]]:

@@ -113,6 +113,10 @@ def audit(
     counted, and moves outlines by a pixel or more. Of causes that explain the masks equally well
     all are told: with one camera, a base that has moved looks like a camera that has.
 
+    Errors that are too large for that are searched: joints' offsets and signs over their whole
+    range, focal lengths, exchanged cameras, mirrored masks, conventions of X_WC, cameras that moved
+    half-way.
+
     An episode, as register takes it, needs no masks: each camera is found in its pictures without
     the given one, which is then compared with it; and by how much pictures and joints are out of
     step is told.
@@ -235,7 +239,8 @@ def _print_audit(result: SceneAudit) -> None:
     count, agree = result.summary["frame_count"], result.summary["agreeing_count"]
     console.print(f"{agree} of {count} frames agree")
     if not contradictions:
-        say("drake-pose: nothing contradicts the rest")
+        but = ", but see the warnings" if result.warnings else ""
+        say(f"drake-pose: nothing contradicts the rest{but}")
     if result.summary["noticed_from"]:
         noticed = result.summary["noticed_from"].items()
         told = ", ".join(f"{k} {'-' if one is None else f'{one:.2g}'}" for k, one in noticed)

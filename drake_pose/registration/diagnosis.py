@@ -6,8 +6,7 @@ of a joint's offset, a camera or the base. A frame is an outlier if it is signif
 others: r^T Q^-1 r, r = h - N x_common, follows Fisher's distribution where nothing is wrong.
 """
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import reduce
 from itertools import compress
 from typing import NamedTuple
@@ -25,6 +24,7 @@ from drake_pose.fit.covariance import (
     estimate_sizes,
 )
 from drake_pose.fit.parameters import POSE_NAMES
+from drake_pose.registration.findings import Diagnosis, Finding, FrameDiagnosis
 from drake_pose.registration.per_frame_fit import FrameFit, PerFrameFit
 from drake_pose.registration.shared_fit import SHARED
 
@@ -45,79 +45,6 @@ class DiagnosisSettings(NamedTuple):
 
 
 DIAGNOSIS = DiagnosisSettings()
-
-
-@dataclass(frozen=True)
-class Finding:
-    """By how much something is off.
-
-    Args:
-        kind: "joint", "camera", "base", "focal", "center", "clock", "rate" of a clock, "joints"
-            where several are off, or "unexplained" where nothing within reach explains a frame.
-        name: of the joint, or the camera: "" where it is all of them.
-        angle, shift: what must be added [rad, m]; of joints the largest; of focal lengths the shift
-            is relative, of principal points in pixels, of a camera's clock by how much later its
-            pictures' joints are in the log [s], of its rate how much faster the log's runs [s/s].
-        angle_sd, shift_sd: their standard deviations.
-        pixels: how far it moves the outlines of the parts that it moves, root mean square.
-        p_value: probability of a deviation this large where nothing is off.
-        rivals: names of alternative causes that explain it as well.
-        joints: by how much joints are off where several are [rad or m].
-    """
-
-    kind: str
-    name: str
-    angle: float
-    shift: float
-    angle_sd: float
-    shift_sd: float
-    pixels: float
-    p_value: float
-    rivals: tuple[str, ...] = ()
-    joints: Mapping[str, float] = field(default_factory=dict)
-
-
-@dataclass(frozen=True)
-class FrameDiagnosis:
-    """What was found of one frame.
-
-    Args:
-        given, fitted: by camera, the inlier ratio with everything as given, and once fitted.
-        pixels: how far the outlines are off from what all frames have in common.
-        finding: what contradicts the other frames; None: it agrees.
-    """
-
-    frame: str
-    given: Mapping[str, float]
-    fitted: Mapping[str, float]
-    pixels: float
-    finding: Finding | None
-
-
-@dataclass(frozen=True)
-class Diagnosis:
-    """What contradicts the rest.
-
-    Args:
-        frames: of each frame.
-        common: what is off in all frames that agree.
-        sizes: of contours' errors [pixel].
-        center: all principal points are off by half a pixel along x and y: by how much, and
-            standard deviations (2,) [pixel]; None: they are not.
-        noticed_from: smallest offset of each joint that is not named that would be, in all frames
-            [rad or m].
-    """
-
-    frames: tuple[FrameDiagnosis, ...]
-    common: tuple[Finding, ...]
-    sizes: ErrorSizes
-    center: tuple[list[float], list[float]] | None = None
-    noticed_from: Mapping[str, float] = field(default_factory=dict)
-
-    @property
-    def contradicting(self) -> tuple[str, ...]:
-        """The frames that contradict the others."""
-        return tuple(one.frame for one in self.frames if one.finding is not None)
 
 
 class _Information(NamedTuple):
@@ -232,16 +159,33 @@ class _Residual(NamedTuple):
         return _Residual(self.info, gain @ N @ gain.T, gain @ self.r, gain @ self.Q @ gain.T)
 
 
-def diagnose_frames(fit: PerFrameFit, frames: Sequence[FrameFit]) -> Diagnosis:
-    """Finds what contradicts the rest in frames that were fitted, in time linear in them."""
-    return _Diagnoser(fit, frames).diagnose()
+def diagnose_frames(
+    fit: PerFrameFit,
+    frames: Sequence[FrameFit],
+    asked: Collection[tuple[str, str]] = (),
+    moved: bool = False,
+) -> Diagnosis:
+    """Finds what contradicts the rest in frames that were fitted, in time linear in them.
+
+    Args:
+        asked: kinds and names of what is told of all frames that agree, however little it is off.
+        moved: whether cameras or the base may stand far from where they are said to, lenses being
+            right.
+    """
+    return _Diagnoser(fit, frames, asked, moved).diagnose()
 
 
 class _Diagnoser:
     """A diagnosis under way."""
 
-    def __init__(self, fit: PerFrameFit, frames: Sequence[FrameFit]) -> None:
-        self._fit, self._frames = fit, frames
+    def __init__(
+        self,
+        fit: PerFrameFit,
+        frames: Sequence[FrameFit],
+        asked: Collection[tuple[str, str]],
+        moved: bool,
+    ) -> None:
+        self._fit, self._frames, self._asked, self._moved = fit, frames, asked, moved
         # Errors of a single frame: standard deviations of angles [rad], and of places [m].
         tolerance = np.where(fit.is_angle, np.radians(0.1), 0.001)
         self._tolerance = np.diag((tolerance / fit.deviations) ** 2)
@@ -254,6 +198,7 @@ class _Diagnoser:
 
     def diagnose(self) -> Diagnosis:
         """Does it."""
+        usual = 4.0 if self._moved else 0.4
         explained = explained_frames([one.inlier_ratios[1] for one in self._frames])
 
         def judge(kept: Mask) -> tuple[Array, Array]:
@@ -268,7 +213,7 @@ class _Diagnoser:
             self._info = [self._info_of(one, sizes) for one in self._frames]
             self._surface = sizes.surface
             # Contradicting frames no longer make errors seem large.
-            agreeing, together = likeliest_frames(explained, judge), 4
+            agreeing, together = likeliest_frames(explained, judge, usual), 4
         total, frames = self._sum(agreeing), list[FrameDiagnosis]()
         for fitted, info, agrees, is_explained in zip(
             self._frames, self._info, agreeing, explained, strict=True
@@ -375,7 +320,7 @@ class _Diagnoser:
                 causes.append(_Cause("camera", name, eye[:, own], deviations[own], six))
         if len(names) > 1:
             causes.append(_Cause("base", "base", fit.base_moves(), np.ones(six), six))
-        if fitted is not None:
+        if fitted is not None or self._moved:
             return causes
         groups = [("", [*range(len(names))])] if len(names) > 1 else []
         groups += [(f" of camera '{name}'", [c]) for c, name in enumerate(names)]
@@ -406,8 +351,14 @@ class _Diagnoser:
         def size(part: Array) -> float:
             return float(part[0]) if len(part) == 1 else float(np.linalg.norm(part))
 
+        at_body = 0.0
+        if kind == "camera":
+            # A camera that turns where it stands shifts the body.
+            own, at_body = self._fit.camera_motion(name), size(x[3:])
+            covariance = best.covariance * np.outer(best.units, best.units)
+            x[3:], sd[3:] = own @ x, np.sqrt(np.diag(own @ covariance @ own.T))
         sizes = (size(x[:turns]), size(x[turns:]), size(sd[:turns]), size(sd[turns:]))
-        return Finding(kind, name, *sizes, pixels, best.p_value, tuple(rivals))
+        return Finding(kind, name, *sizes, pixels, best.p_value, tuple(rivals), at_body=at_body)
 
     def _joints_finding(self, kind: str, residual: _Residual) -> Finding:
         """What is off in a frame where no cause by itself explains it."""
@@ -430,6 +381,11 @@ class _Diagnoser:
         Q = self._covariance(info) + info.N @ self._tolerance @ info.N / count
         residual = _Residual(info, info.N, info.h, Q)
         causes = self._causes(None)
+        if self._moved:
+            # Cameras that moved by themselves are not told as the base and the rest.
+            tests = [residual.test(one) for one in causes if one.kind == "base"]
+            alone = residual.sufficient(tests, DIAGNOSIS.min_pixels, 0.1)
+            causes = [one for one in causes if one.kind != "base" or alone]
         every = range(len(self._fit.camera_names))
         shifted = residual.test(_Cause("center", "", self._fit.center_moves(every), np.ones(2), 2))
         others = [residual.test(one).gain for one in causes if one.kind != "center"]
@@ -449,12 +405,18 @@ class _Diagnoser:
                 joints.append(cause)
         residual, zeros = _name(residual, joints, DIAGNOSIS.min_joint_pixels)
         found += zeros
+        names = {(one[0].kind, one[0].name) for one in found}
+        for cause in causes:
+            if (key := (cause.kind, cause.name)) in self._asked and key not in names:
+                found.append([residual.test(cause)])
         findings = list[Finding]()
         if found:
             # By how much they are off together, and the others that are free beside.
             own = [best for best, *_ in found]
             names = {(one.kind, one.name) for one in own}
-            free = [one for one in freed if zeros and (one.kind, one.name) not in names]
+            free = [
+                one for one in freed if (zeros or self._asked) and (one.kind, one.name) not in names
+            ]
             moves = np.hstack([one.moves for one in (*own, *free)])
             whole_test, first = whole.test(_Cause("", "", moves, np.ones(0), 0)), 0
             for best, *rivals in found:
@@ -465,7 +427,7 @@ class _Diagnoser:
                 )
                 pixels = whole.info.pixels(best.moves @ better.amount)
                 findings.append(self._finding([better, *rivals], pixels))
-        named = [one[0].name for one in zeros]
+        named = [one[0].name for one in found]
         noticed = _noticed_from(residual, [one for one in joints if one.name not in named])
         return tuple(findings), center, noticed
 
@@ -516,9 +478,9 @@ def _noticed_from(residual: _Residual, causes: Sequence[_Cause]) -> dict[str, fl
 def likeliest_frames(
     explained: Mask,
     judge: Callable[[Mask], tuple[Array, Array]],
+    usual_deviation: float = 0.4,
     *,
     outlier_cost: float = 3.0,
-    usual_deviation: float = 0.4,
     max_iterations: int = 10,
 ) -> Mask:
     """(frames,) the frames that agree: the likeliest of the sets that some starts lead to.
@@ -527,8 +489,8 @@ def likeliest_frames(
         explained: (frames,) those that may agree.
         judge: of a set the p-values (frames,) of all frames' residuals, and x (p,) that the set has
             in common.
-        outlier_cost: negative log-likelihood of each outlier.
         usual_deviation: standard deviation of x.
+        outlier_cost: negative log-likelihood of each outlier.
         max_iterations: of each start; also the number of single frames that are starts.
     """
     best, least = explained & False, np.inf

@@ -34,12 +34,14 @@ class FrameFit:
             camera.
         inlier_ratios: before and after, by camera.
         weights: (nodes,) how much of the contours of each node was compared [pixel].
+        fitting: (nodes, 2) lengths of each node's contours that were compared and that fit.
     """
 
     name: str
     pictures: tuple[ComparedMask, ...]
     inlier_ratios: tuple[Mapping[str, float], Mapping[str, float]]
     weights: Array
+    fitting: Array
 
 
 class PerFrameFit:
@@ -138,6 +140,7 @@ class PerFrameFit:
             (self._inlier_ratios(before, frame), self._inlier_ratios(after, frame)),
             # Edges are shared out among the nodes.
             weights[:-1] * weights.sum() / max(float(weights[:-1].sum()), 1e-9),
+            told.sums[:, :-1, [Sum.COMPARED, Sum.FITTING]].sum(axis=0),
         )
 
     def _inlier_ratios(self, compared: Comparison, frame: SeenFrame) -> dict[str, float]:
@@ -200,6 +203,15 @@ class PerFrameFit:
             if self.cameras[c].kernel_parameters()[0] != 1.0:
                 moves[len(self.joints) + 6 * c + 5] = -self._depth(c)
         return np.asarray(moves / self.deviations[:, None])
+
+    def camera_motion(self, camera: str) -> Array:
+        """(3, 6) how a camera itself moves along its axes [m] by what its POSE_NAMES say it is off.
+
+        These turn and shift the body about its middle, as the camera sees it.
+        """
+        X_CW = self.cameras[self.camera_names.index(camera)].X_CW
+        middle = X_CW[:3, :3] @ self._middle + X_CW[:3, 3]
+        return np.hstack([np.cross(np.eye(3), middle).T, -np.eye(3)])
 
     def _depth(self, camera: int) -> float:
         """How far the body's middle is before a camera [m]."""

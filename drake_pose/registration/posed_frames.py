@@ -149,8 +149,14 @@ class PosedFrames:
 
     def sums(self, frame: int, camera: PinholeCamera) -> NDArray[np.int32]:
         """(H, W + 1) prefix sums of a frame's silhouette in a smaller camera's picture."""
-        mask, size = self.frames[frame].mask.astype(np.float32), (camera.width, camera.height)
-        return prefix_sums(cv2.resize(mask, size, interpolation=cv2.INTER_AREA) > 0.5)
+        return reduced_sums(self.frames[frame].mask, camera)
+
+
+def reduced_sums(mask: Mask, camera: Camera) -> NDArray[np.int32]:
+    """(H, W + 1) prefix sums of a silhouette in the smaller pictures of a camera like its own."""
+    size = (camera.width, camera.height)
+    small = cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA)
+    return prefix_sums(small > 0.5)
 
 
 @lru_cache(maxsize=512)

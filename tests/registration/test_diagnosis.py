@@ -14,13 +14,12 @@ from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import MaskError
 from drake_pose.jobs.registration.diagnosis import say_off
 from drake_pose.registration.diagnosis import (
-    Diagnosis,
-    Finding,
     diagnose_frames,
     explained_frames,
     is_half_pixel,
     likeliest_frames,
 )
+from drake_pose.registration.findings import Diagnosis, Finding
 from drake_pose.registration.per_frame_fit import FrameFit, PerFrameFit
 from drake_pose.registration.posed_frames import SeenFrame
 from drake_pose.registration.register import RegistrationBody

@@ -16,7 +16,7 @@ import numpy as np
 
 from drake_pose.camera.camera_files import describe_camera
 from drake_pose.camera.models import Camera
-from drake_pose.errors import MaskError, SceneError
+from drake_pose.errors import SceneError
 from drake_pose.files.folder import write_summary, writes_folder
 from drake_pose.files.records import mask_digests, user_units
 from drake_pose.files.settings import percent
@@ -24,14 +24,13 @@ from drake_pose.jobs.estimate.measurements import say_left_out
 from drake_pose.jobs.registration.diagnosis import (
     compare_camera,
     compare_clock,
-    find_misplaced,
-    require_seen_by,
+    say_common_finding,
     say_frame,
     say_lost,
-    say_off,
     shift_unit,
 )
 from drake_pose.jobs.registration.inputs import Inputs, read_inputs
+from drake_pose.jobs.registration.large_errors import SceneComparison
 from drake_pose.jobs.registration.result import (
     describe_pictures,
     describe_pose,
@@ -40,8 +39,8 @@ from drake_pose.jobs.registration.result import (
     write_overlays,
 )
 from drake_pose.jobs.registration.settings import AuditSettings
-from drake_pose.registration.diagnosis import DIAGNOSIS, Diagnosis, Finding, diagnose_frames
-from drake_pose.registration.per_frame_fit import PerFrameFit
+from drake_pose.registration.diagnosis import DIAGNOSIS
+from drake_pose.registration.findings import Diagnosis, Finding
 from drake_pose.registration.picture_registration import (
     Begun,
     PictureRegistration,
@@ -102,17 +101,18 @@ def audit_scene(
         pictures = _Pictures()
         if inputs.recordings:
             given, (inputs, pictures) = inputs, _look_at_episode(inputs)
-            found, unseen, misplaced = _audit(inputs, on_frame)
-            zeros = [one.name for one in found.common if one.kind == "joint"]
+            compared = SceneComparison(inputs, on_frame).run()
+            zeros = [one.name for one in compared.found.common if one.kind == "joint"]
             if zeros:
                 # Masks were found with these as they are, and lean on them.
                 inputs, pictures = _look_at_episode(given, pictures, zeros)
-                found, unseen, misplaced = _audit(inputs)
-            found = replace(found, common=(*pictures.findings, *found.common))
+                compared = SceneComparison(inputs).run()
         else:
-            found, unseen, misplaced = _audit(inputs, on_frame)
+            compared = SceneComparison(inputs, on_frame).run()
+    found, unseen = compared.found, compared.unseen
+    found = replace(found, common=(*pictures.findings, *found.common))
     seconds = time.perf_counter() - begin
-    warnings = [*inputs.warnings, *misplaced, *_doubts(inputs, found, unseen)]
+    warnings = [*inputs.warnings, *compared.warnings, *_doubts(inputs, found, unseen)]
     names = [camera.name for camera in inputs.held]
     units = zip(inputs.model.position_names, user_units(inputs.model), strict=True)
     noticed = {
@@ -148,7 +148,7 @@ def audit_scene(
             name: float(getattr(found.sizes, name)) for name in ("surface", "mask", "camera")
         },
         **describe_run(inputs, settings, warnings, seconds),
-        "unseen": unseen,
+        "unseen": list(unseen),
     }
     if folder is not None:
         _write_result(folder, inputs, found, pictures, overlay, summary)
@@ -228,36 +228,6 @@ def _look_at_episode(
     return looked, _Pictures(pictures, tuple(findings), names)
 
 
-def _audit(
-    inputs: Inputs, on_frame: OnFrame | None = None, sample_size: int = 20
-) -> tuple[Diagnosis, list[str], list[str]]:
-    """What contradicts the rest; frames of which no mask shows anything; cameras' mistakes.
-
-    sample_size: number of frames that tell how large silhouettes are, and where the body is.
-    """
-    body, frames = RegistrationBody(inputs.tree, inputs.seen), inputs.wanted
-    picks = np.linspace(0, len(frames) - 1, min(len(frames), sample_size)).round()
-    sample = [inputs.read(frames[int(k)]) for k in picks]
-    require_seen_by(body, inputs.held, sample)
-    fit = PerFrameFit(body.kinematics, (body.few, body.all), inputs.held, sample)
-    fitted, unseen = [], []
-    for done, frame in enumerate(frames, 1):
-        seen = inputs.read(frame)
-        if seen.masks:
-            fitted.append(fit.fit(seen))
-        else:
-            unseen.append(frame)
-        if on_frame is not None:
-            on_frame(done)
-    if not fitted:
-        raise MaskError(f"{inputs.scene.path}: no mask shows the body; it must be white in them")
-    found, misplaced = diagnose_frames(fit, fitted), list[str]()
-    if 2 * len(found.contradicting) > len(found.frames):
-        shown = [inputs.read(one) for one in found.contradicting[:3]]
-        misplaced = find_misplaced(body, inputs.held, shown)
-    return found, unseen, misplaced
-
-
 def _doubts(inputs: Inputs, found: Diagnosis, unseen: Sequence[str]) -> list[str]:
     """What a user should know of the frames, and of the file of cameras."""
     warnings = list[str]()
@@ -276,7 +246,8 @@ def _doubts(inputs: Inputs, found: Diagnosis, unseen: Sequence[str]) -> list[str
         named = frame_ranges(unseen, inputs.scene.frames)
         warnings.append(f"frame {named}: the masks show nothing: there is nothing to compare")
     count, agreeing = len(found.frames), len(found.frames) - len(found.contradicting)
-    if 2 * agreeing < count:
+    wrong_log = any(one.kind in ("sign", "log") for one in found.common)
+    if 2 * agreeing < count and not wrong_log:
         warnings.append(
             f"{agreeing} of {count} frames agree with each other: which of them are "
             "right is told by their being near to what is given, not by their number"
@@ -313,17 +284,11 @@ def _write_result(
 
 def _describe_contradictions(found: Diagnosis) -> list[dict[str, Any]]:
     """What contradicts the rest, worst first: joints, cameras and the base, then frames."""
-    told = [
-        (
-            one, one.kind, one.name,
-            f"{say_off(one)} in all frames that agree, outlines by {one.pixels:.1f} pixels",
-        )
-        for one in found.common
-    ]  # fmt: skip
+    told = [(one, one.kind, one.name, say_common_finding(one)) for one in found.common]
     told += [
         (one.finding, "frame", one.frame, f"frame '{one.frame}': {say_frame(one, one.finding)}")
         for one in sorted(found.frames, key=lambda one: -one.pixels)
-        if one.finding is not None
+        if one.finding is not None and one.finding not in found.common
     ]
     described = []
     for one, what, name, text in told:

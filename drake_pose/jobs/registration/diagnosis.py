@@ -3,7 +3,7 @@
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
-from itertools import combinations, pairwise
+from itertools import pairwise
 
 import numpy as np
 from scipy.special import chdtrc
@@ -14,10 +14,10 @@ from drake_pose.errors import CameraError, RegistrationError
 from drake_pose.files.records import BADLY_EXPLAINED
 from drake_pose.files.settings import percent
 from drake_pose.fit.parameters import POSE_NAMES
-from drake_pose.registration.diagnosis import DIAGNOSIS, Finding, FrameDiagnosis
+from drake_pose.registration.diagnosis import DIAGNOSIS
+from drake_pose.registration.findings import Finding, FrameDiagnosis
 from drake_pose.registration.joint_zeros import JointCalibration, calibrate_joints
 from drake_pose.registration.online_registration import pose_difference, squared_distance
-from drake_pose.registration.per_frame_fit import PerFrameFit
 from drake_pose.registration.picture_registration import PictureRegistration, Recording
 from drake_pose.registration.posed_frames import PosedFrame, PosedFrames, SeenFrame, placed_points
 from drake_pose.registration.register import (
@@ -128,43 +128,6 @@ def _alternatives(
             f"they fit with focal lengths near {focal_x:.0f}, {focal_y:.0f} pixels: calibrate it."
         )
         yield text, replace(camera, focal_x=focal_x, focal_y=focal_y), some
-
-
-def find_misplaced(
-    body: RegistrationBody,
-    held: Sequence[Camera],
-    frames: Sequence[SeenFrame],
-    *,
-    pairs: int = 10,
-    min_ratio: float = 0.7,
-    much_better: float = 0.5,
-) -> list[str]:
-    """What would put cameras right that explain few frames: exchanged ones, inverses.
-
-    Args:
-        held: the cameras as they are given.
-        pairs: number of pairs that are exchanged.
-        min_ratio, much_better: an alternative is named whose inlier ratio is this, and that leaves
-            less than this fraction of the contours that do not fit as given.
-    """
-
-    def fits(cameras: Sequence[Camera]) -> float:
-        fit = PerFrameFit(body.kinematics, (body.few, body.all), cameras, frames)
-        ratios = [fit.fit(one).inlier_ratios[1] for one in frames]
-        return float(np.mean([value for one in ratios for value in one.values()]))
-
-    given = fits(held)
-    trials = [("every X_WC seems to be the inverse of the camera's pose in the world",
-               [one.with_pose(np.linalg.inv(one.X_WC)) for one in held])]  # fmt: skip
-    for a, b in list(combinations(range(len(held)), 2))[:pairs]:
-        other = list(held)
-        other[a], other[b] = held[a].with_pose(held[b].X_WC), held[b].with_pose(held[a].X_WC)
-        text = f"cameras '{held[a].name}' and '{held[b].name}' seem to be exchanged"
-        trials.append((text, other))
-    best, text = max((fits(cameras), text) for text, cameras in trials)
-    if best < min_ratio or 1.0 - best > much_better * (1.0 - given):
-        return []
-    return [f"{text}; so {percent(best)} of the contours fit, as given {percent(given)}"]
 
 
 def require_seen_by(
@@ -381,8 +344,31 @@ def say_off(one: Finding, verb: str = "off") -> str:
     if one.angle_sd > 0.0:
         parts.append(f"{angle:.2f} +- {angle_sd:.2f} degrees")
     if one.shift_sd > 0.0:
-        parts.append(f"{shift:.1f} +- {shift_sd:.1f} {unit}")
+        at = f" ({1e3 * one.at_body:.1f} mm at the robot)" if one.at_body else ""
+        parts.append(f"{shift:.1f} +- {shift_sd:.1f} {unit}{at}")
     return f"{name}{':' if verb == 'off' else ''} {verb} by {' and '.join(parts)}"
+
+
+def say_common_finding(one: Finding) -> str:
+    """What is off in all frames that agree, or since some frame, in words."""
+    pixels = f", outlines by {one.pixels:.1f} pixels" if one.pixels else ""
+    link = f"link '{one.link}' is not where the log says"
+    if one.kind == "sign":
+        return (
+            f"joint '{one.name}' is logged with the other sign: {link}, {one.text}{pixels}: turn "
+            "the sign of its column round"
+        )
+    if one.kind == "log":
+        return f"{link}: joint '{one.name}' is another than in the log, {one.text}{pixels}"
+    if one.kind == "link":
+        return f"{link}: {one.text}"
+    if one.kind == "reading":
+        return f"{one.name}{pixels}"
+    if one.kind == "moved":
+        off = say_off(replace(one, kind=one.link), "is off")
+        what = "the base" if one.link == "base" else f"camera '{one.name}'"
+        return f"{what} was moved {one.text}, {off}{pixels}"
+    return f"{say_off(one)} in all frames that agree{pixels}"
 
 
 def say_frame(one: FrameDiagnosis, found: Finding) -> str:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from drake_pose.arrays import Array, Picture
+from drake_pose.arrays import Array, Mask, Picture
 from drake_pose.body import OBJECT, ArticulatedModel, PoseTree, RootRotation, load_model
 from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.camera.camera_files import CameraFile, load_camera_file, load_cameras
@@ -100,7 +100,7 @@ class Inputs:
         if frame in self._known:
             return self._known[frame]
         names = [one.name for one in self.held if (one.name, frame) in self.scene.masks]
-        masks = {name: self.scene.read(name, frame, may_be_empty=True) for name in names}
+        masks = {name: read_mask_of(self.scene, name, frame, may_be_empty=True) for name in names}
         seen = {name: mask for name, mask in masks.items() if mask.any()}
         return SeenFrame(frame, self.positions.of(frame, next(iter(masks), "")), seen)
 
@@ -116,6 +116,31 @@ class Inputs:
         """The frames at other values (m,) of the tree."""
         frames = zip(self.frames, values, strict=True)
         return tuple(replace(one, values=own) for one, own in frames)
+
+
+def read_mask_of(
+    scene: Scene,
+    camera: str,
+    frame: str,
+    *,
+    may_be_empty: bool,
+    most: float = 0.5,
+    most_of_edge: float = 0.75,
+) -> Mask:
+    """A camera's mask of a frame.
+
+    most, most_of_edge: shares of the picture and of its edge, both of which no body fills.
+
+    Raises MaskError: it cannot be read, shows nothing and must not, or is inverted.
+    """
+    mask = scene.read(camera, frame, may_be_empty=may_be_empty)
+    edge = np.concatenate([mask[0], mask[-1], mask[:, 0], mask[:, -1]])
+    if edge.mean() > most_of_edge and (share := float(mask.mean())) > most:
+        raise MaskError(
+            f"{scene.masks[camera, frame]}: white fills {100.0 * share:.0f} % of the picture and "
+            "its edge: the mask seems to be inverted; the body must be white in it, all else black"
+        )
+    return mask
 
 
 def looks_at_pictures(path: Path, settings: AuditSettings) -> bool:
@@ -463,7 +488,7 @@ def _read_frames(inputs: Inputs, wanted: Sequence[str], most: int = 12) -> tuple
         for camera in (name for name, frames in shown.items() if frame in frames):
             positions.of(frame, camera)
             try:
-                masks[camera] = scene.read(camera, frame, may_be_empty=estimated)
+                masks[camera] = read_mask_of(scene, camera, frame, may_be_empty=estimated)
             except MaskError as error:
                 raise MaskError(
                     f"{error} (camera '{camera}', frame '{frame}'); mend it, or leave the frame "

@@ -1,0 +1,447 @@
+"""What is wrong with a whole scene, and by much: looked for, put right, and told with the rest."""
+
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from drake_pose.arrays import Array
+from drake_pose.camera.models import Camera, PinholeCamera
+from drake_pose.errors import CameraError, MaskError, RegistrationError
+from drake_pose.files.settings import percent
+from drake_pose.jobs.registration.diagnosis import (
+    compare_camera,
+    find_misfit,
+    require_seen_by,
+)
+from drake_pose.jobs.registration.inputs import Inputs
+from drake_pose.jobs.registration.readings import scene_readings
+from drake_pose.registration.diagnosis import DIAGNOSIS, diagnose_frames
+from drake_pose.registration.findings import Diagnosis, Finding
+from drake_pose.registration.large_errors import (
+    LARGE,
+    LargeErrorSearch,
+    Reading,
+    doubted_joints,
+    links_not_seen,
+    mask_shares,
+)
+from drake_pose.registration.online_registration import pose_difference
+from drake_pose.registration.per_frame_fit import FrameFit, PerFrameFit
+from drake_pose.registration.posed_frames import SeenFrame, placed_points
+from drake_pose.registration.register import (
+    CameraSearch,
+    RegisteredCamera,
+    RegistrationBody,
+    spread,
+)
+from drake_pose.silhouette.pictures.scene_checks import frame_ranges
+
+
+@dataclass(frozen=True, eq=False)
+class Compared:
+    """All frames compared with what is given, or with what that may be meant to be.
+
+    Args:
+        cameras: as they are read.
+        readings: what was put right, in order.
+        fits: of the frames in which a mask shows something, and found: by these.
+        shares: by camera and frame, how much more than the robot a mask shows, and how much of it
+            that lacks.
+        unseen: frames of which no mask shows anything.
+        findings: what was put right, as findings.
+        warnings: what a user should know of them.
+    """
+
+    cameras: tuple[Camera, ...]
+    readings: tuple[Reading, ...]
+    fit: PerFrameFit
+    fits: tuple[FrameFit, ...]
+    shares: Mapping[tuple[str, str], tuple[float, float]]
+    unseen: tuple[str, ...]
+    found: Diagnosis
+    findings: tuple[Finding, ...] = ()
+    warnings: tuple[str, ...] = ()
+
+    def of(self, frame: SeenFrame) -> SeenFrame:
+        """A frame as it is read."""
+        for reading in self.readings:
+            frame = reading.of(frame)
+        return frame
+
+    @property
+    def is_doubtful(self) -> bool:
+        """Whether half of the frames or more contradict the others."""
+        return 2 * len(self.found.contradicting) >= len(self.found.frames)
+
+    @property
+    def inlier_ratio(self) -> float:
+        """Of all masks, once fitted."""
+        return float(np.mean([v for one in self.fits for v in one.inlier_ratios[1].values()]))
+
+
+class SceneComparison:
+    """Compares a scene with what is given, looks for large errors, and compares again.
+
+    Args:
+        sample_size: number of frames that tell how large silhouettes are, and where the body is.
+        on_frame: called with the number of frames that are done.
+    """
+
+    def __init__(
+        self,
+        inputs: Inputs,
+        on_frame: Callable[[int], None] | None = None,
+        sample_size: int = 20,
+    ) -> None:
+        self._inputs, self._on_frame = inputs, on_frame
+        self.body, frames = RegistrationBody(inputs.tree, inputs.seen), inputs.wanted
+        picks = np.linspace(0, len(frames) - 1, min(len(frames), sample_size)).round()
+        sample = [inputs.read(frames[int(k)]) for k in picks]
+        self._sample = [one for one in sample if one.masks]
+        self._names = frozenset(inputs.wanted)
+
+    def run(self, most: int = 3) -> Compared:
+        """Does it.
+
+        most: number of large errors that are put right, one after the other.
+
+        Raises:
+            CameraError: a camera cannot show the robot where it is said to stand.
+            MaskError: no mask shows the body.
+        """
+        inputs = self._inputs
+        try:
+            require_seen_by(self.body, inputs.held, self._sample)
+        except CameraError as error:
+            if not inputs.recordings and (one := self._search(inputs.held, [])) is not None:
+                raise CameraError(
+                    f"{error}; {one.name}: so the robot is where it is seen"
+                ) from None
+            raise
+        given = self._compare(inputs.held, ())
+        now = self._put_right(given, most)
+        if now.is_doubtful:
+            # What leaves most frames unexplained is no cause.
+            placed = self._look_for_cameras(given)
+            now = given if placed is None else self._put_right(placed, most)
+        return self._finish(given if now.is_doubtful else now)
+
+    def _put_right(self, now: Compared, most: int) -> Compared:
+        """With as many large errors put right as are found."""
+        for _ in range(most):
+            reading = self._look(now)
+            if reading is None:
+                break
+            again = self._compare(reading.cameras, (*now.readings, reading))
+            if again.inlier_ratio <= now.inlier_ratio:
+                break
+            now = self._tell(now, again, reading)
+        return now
+
+    def _finish(self, now: Compared) -> Compared:
+        """With links that are not seen, and cameras that moved; frames of a wrong log are wrong."""
+        found = now.found
+        rests = {(one.kind, one.name): one for one in found.common}
+        findings = [_with_rest(one, rests.pop((one.kind, one.name), None)) for one in now.findings]
+        found = replace(found, common=tuple(rests.values()))
+        known = {one.link for one in findings if one.link}
+        for k, share in () if now.is_doubtful else links_not_seen(now.fits):
+            node = self.body.tree.nodes[k].name
+            if node not in known:
+                text = (
+                    f"{percent(share)} of its outline fit in all frames, and no other positions of "
+                    "its joint do better: is its shape the model's?"
+                )
+                nothing = Finding("link", node, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, link=node, text=text)
+                findings.append(nothing)
+        moved, found = self._find_moved(now, found)
+        wrong = next((one for one in findings if one.kind in ("sign", "log")), None)
+        if wrong is not None:
+            # As it is given no frame is right.
+            frames = [one if one.finding else replace(one, finding=wrong) for one in found.frames]
+            found = replace(found, frames=tuple(frames))
+        common = (*findings, *moved, *found.common)
+        warnings = (*now.warnings, *self._say_masks(now))
+        return replace(now, found=replace(found, common=common), findings=(), warnings=warnings)
+
+    def _find_moved(
+        self, now: Compared, found: Diagnosis, least: int = 2
+    ) -> tuple[list[Finding], Diagnosis]:
+        """Whether cameras or the base moved between two frames, and what frames are left then.
+
+        They did where the frames that contradict are the last or the first ones of those that the
+        same cameras see, and agree with each other but for a camera or the base.
+
+        least: number of frames before and after.
+        """
+        moved, explained = list[Finding](), dict[str, Finding]()
+        for cameras in dict.fromkeys(tuple(one.given) for one in found.frames):
+            rows, last = changed_after(found, cameras, least)
+            if not rows:
+                continue
+            again = diagnose_frames(now.fit, [now.fits[k] for k in rows], moved=True)
+            places, agreeing = list(again.common), [*{one.frame for one in again.frames}]
+            if again.contradicting or any(one.kind not in ("camera", "base") for one in places):
+                frames = [now.of(self._inputs.read(found.frames[k].frame)) for k in rows]
+                own = [one for one in now.cameras if one.name in cameras]
+                placed = self._placed(frames, own)
+                places = [off for _, off in placed.values()]
+                base = base_motion(
+                    {one.name: one for one in own}, {k: one for k, (one, _) in placed.items()}
+                )
+                if base is not None and len(placed) == len(cameras):
+                    places = [replace(base, pixels=places[0].pixels)]
+            which = "since then" if found.frames[-1].finding is not None else "until then"
+            for one in places:
+                finding = replace(
+                    one, kind="moved", text=f"after frame '{last}'; {which}", link=one.kind
+                )
+                moved.append(finding)
+                explained.update(dict.fromkeys(agreeing, finding))
+        judged = [
+            replace(one, finding=explained[one.frame]) if one.frame in explained else one
+            for one in found.frames
+        ]
+        return moved, replace(found, frames=tuple(judged))
+
+    def _placed(
+        self, frames: Sequence[SeenFrame], cameras: Sequence[Camera], least: int = 3
+    ) -> dict[str, tuple[RegisteredCamera, Finding]]:
+        """Where cameras are found that explain frames, and by how much they are elsewhere.
+
+        least: number of frames of each camera.
+        """
+        search, placed = CameraSearch(self.body), dict[str, tuple[RegisteredCamera, Finding]]()
+        for camera in cameras:
+            own = [one.of(camera.name) for one in frames if camera.name in one.masks]
+            own = spread(own, LARGE.frames)
+            if not isinstance(camera, PinholeCamera) or len(own) < least:
+                continue
+            try:
+                found = search.register(camera, own)
+            except RegistrationError:
+                continue
+            agreeing = len(found.frames) - len(found.contradictions)
+            if find_misfit(found) is not None or 2 * agreeing <= len(own):
+                continue
+            values = np.array([one.values for one in own])
+            off = compare_camera(self.body, camera, found, values, len(cameras) == 1)
+            if off.p_value <= DIAGNOSIS.significance and off.pixels >= DIAGNOSIS.min_pixels:
+                placed[camera.name] = found, off
+        return placed
+
+    def _say_masks(self, now: Compared, more: float = 0.12, less: float = 0.25) -> list[str]:
+        """What masks show beside the robot, and lack of it, in frames that agree otherwise.
+
+        more, less: shares of the masks' areas that are said. Real masks of arms show .02 more, and
+            lack .15 at most; outlines that are a pixel too wide are .07 more.
+        """
+        texts, names, wrong = list[str](), self._inputs.scene.frames, now.found.contradicting
+        for camera in (one.name for one in now.cameras):
+            own = {frame: two for (name, frame), two in now.shares.items() if name == camera}
+            black = [frame for frame, two in own.items() if two[0] == 0.0 and two[1] > less]
+            shown = {k: two for k, two in own.items() if k not in black and k not in wrong}
+            # What is elsewhere is as much more as it is less.
+            wider = [k for k, (extra, lack) in shown.items() if extra >= more and 3 * lack < extra]
+            lacking = [k for k, (extra, lack) in shown.items() if lack >= less and 3 * extra < lack]
+            for frames, which, what in (
+                (wider, 0, "show {} more than the robot: is it a shadow, another robot, or a part "
+                 "that the model lacks?"),
+                (lacking, 1, "lack {} of the robot: is something before it, or a link missing?"),
+                (black, None, "are black, although the robot stands in view"),
+            ):  # fmt: skip
+                if frames:
+                    shares = [] if which is None else [own[k][which] for k in frames]
+                    share = percent(float(np.median(shares))) if shares else ""
+                    named = frame_ranges(frames, names)
+                    said = f"the masks of frames {named} {what.format(share)}"
+                    texts.append(f"camera '{camera}': {said}")
+        return texts
+
+    def _compare(self, cameras: Sequence[Camera], readings: tuple[Reading, ...]) -> Compared:
+        """Fits all frames as they are read."""
+        inputs, fitted, unseen = self._inputs, list[FrameFit](), list[str]()
+
+        def read(frame: SeenFrame) -> SeenFrame:
+            for one in readings:
+                frame = one.of(frame)
+            return frame
+
+        if not self._sample:
+            raise MaskError(
+                f"{inputs.scene.path}: no mask shows the body; it must be white in them"
+            )
+        body, sample = self.body, [read(one) for one in self._sample]
+        shares = dict[tuple[str, str], tuple[float, float]]()
+        fit = PerFrameFit(body.kinematics, (body.few, body.all), cameras, sample)
+        for done, name in enumerate(inputs.wanted, 1):
+            seen = inputs.read(name)
+            if seen.masks:
+                seen = read(seen)
+                fitted.append(fit.fit(seen))
+                for camera in cameras:
+                    mask = seen.masks.get(camera.name)
+                    if mask is None and (camera.name, name) in inputs.scene.masks:
+                        mask = np.zeros((camera.height, camera.width), bool)
+                    if mask is not None:
+                        own = mask_shares(body, camera, seen.values, mask, fit.size)
+                        shares[camera.name, name] = own
+            else:
+                unseen.append(name)
+            if self._on_frame is not None and not readings:
+                self._on_frame(done)
+        asked = [(_KINDS[one.kind], one.name) for one in readings if one.kind in _KINDS]
+        found = diagnose_frames(fit, fitted, asked)
+        return Compared(tuple(cameras), readings, fit, tuple(fitted), shares, tuple(unseen), found)
+
+    def _look(self, now: Compared) -> Reading | None:
+        """What is wrong by much; nothing is looked for where nothing is doubtful."""
+        joints = doubted_joints(now.fits, now.fit.joints)
+        if now.is_doubtful:
+            joints = list(now.fit.joints)
+        if not joints:
+            return None
+        sample = [now.of(one) for one in self._sample]
+        of_scene = now.is_doubtful and not now.readings
+        return self._search(now.cameras, joints, sample, scene=of_scene)
+
+    def _look_for_cameras(self, now: Compared) -> Compared | None:
+        """With cameras as they are found in the frames, where these explain what is seen."""
+        if self._inputs.recordings:
+            return None
+        placed = self._placed([now.of(one) for one in self._sample], now.cameras)
+        if not placed:
+            return None
+        cameras = [placed[one.name][0].camera if one.name in placed else one for one in now.cameras]
+        again = self._compare(cameras, now.readings)
+        return replace(again, findings=(*now.findings, *(one for _, one in placed.values())))
+
+    def _search(
+        self,
+        cameras: Sequence[Camera],
+        joints: Sequence[str],
+        sample: Sequence[SeenFrame] | None = None,
+        scene: bool = True,
+    ) -> Reading | None:
+        inputs = self._inputs
+        readings = list[Reading]()
+        if scene and not inputs.recordings:
+            values = [inputs.read(name).values for name in inputs.wanted]
+            readings = list(scene_readings(cameras, values, inputs.wanted))
+        return LargeErrorSearch(self.body, cameras, sample or self._sample).find(readings, joints)
+
+    def _tell(self, before: Compared, now: Compared, reading: Reading) -> Compared:
+        """With what was put right as a finding."""
+        kind, name, warnings = _KINDS.get(reading.kind, reading.kind), reading.name, before.warnings
+        off = Finding(kind, name, 0.0, 0.0, 0.0, 0.0, self._pixels(before, now), 0.0)
+        if reading.kind in _KINDS:
+            size, of_focal = reading.amount, reading.kind == "focal"
+            if not of_focal and self._turns(name):
+                off = replace(off, angle=size, angle_sd=float(np.radians(LARGE.fine_step)))
+            else:
+                step = LARGE.near_focal if of_focal else LARGE.near_place
+                off = replace(off, shift=size, shift_sd=step)
+        elif kind in ("sign", "log"):
+            off = self._differing(off, before, reading)
+        else:
+            now_fits, given = percent(now.inlier_ratio), percent(before.inlier_ratio)
+            warnings = (*warnings, f"{name}; so {now_fits} of the contours fit, as given {given}")
+        return replace(now, findings=(*before.findings, off), warnings=warnings)
+
+    def _turns(self, joint: str) -> bool:
+        kinematics = self.body.kinematics
+        return bool(kinematics.is_angle[kinematics.names.index(joint)])
+
+    def _differing(self, off: Finding, before: Compared, reading: Reading) -> Finding:
+        """How far a joint is from its log, in words and as the largest difference."""
+        j = self.body.kinematics.names.index(reading.name)
+        frames = [before.of(one) for one in self._sample]
+        logged = np.array([one.values[j] for one in frames])
+        by = np.array([reading.of(one).values[j] for one in frames]) - logged
+        turns = self._turns(reading.name)
+        unit, factor = ("degrees", 180.0 / np.pi) if turns else ("mm", 1e3)
+        sizes = np.abs((by + np.pi) % (2.0 * np.pi) - np.pi if turns else by)
+        text = f"it is {factor * sizes.min():.0f} to {factor * sizes.max():.0f} {unit} off"
+        if reading.kind == "log":
+            text += ", no constant and no sign explains it"
+            if np.ptp(logged) < 1e-6:
+                text += f"; the log has {logged[0]:.4g} in all frames"
+        elif abs(reading.amount) > 1e-9:
+            text += f"; then {factor * reading.amount:.0f} {unit} are to be added"
+        angle, shift = (float(sizes.max()), 0.0) if turns else (0.0, float(sizes.max()))
+        return replace(off, link=self._link(reading.name), text=text, angle=angle, shift=shift)
+
+    def _link(self, joint: str) -> str:
+        """The first link that a joint moves."""
+        tree, kinematics = self.body.tree, self.body.kinematics
+        values = kinematics.flatten(tree.default_values())
+        moved = values.copy()
+        moved[kinematics.names.index(joint)] += 0.1
+        off = np.abs(kinematics.poses(moved) - kinematics.poses(values)).max(axis=(1, 2))
+        return next((tree.nodes[k].name for k in np.flatnonzero(off > 1e-9)), "")
+
+    def _pixels(self, before: Compared, now: Compared) -> float:
+        """How far the parts that move are elsewhere in the pictures, root mean square [pixel]."""
+        squares, kinematics = list[Array](), self.body.kinematics
+        for frame in self._sample:
+            X = [kinematics.poses(one.of(frame).values) for one in (before, now)]
+            for one, other in zip(before.cameras, now.cameras, strict=True):
+                places = [
+                    camera.project(placed_points(self.body.very_few, X_WN))[0]
+                    for camera, X_WN in zip((one, other), X, strict=True)
+                ]
+                squares.append(((places[0] - places[1]) ** 2).sum(axis=1))
+        every = np.concatenate(squares)
+        every = every[np.isfinite(every) & (every > 0.01)]
+        return float(np.sqrt(every.mean())) if len(every) else 0.0
+
+
+def _with_rest(one: Finding, rest: Finding | None) -> Finding:
+    """What the search found and what fits add to it; they tell nothing where no frame agrees."""
+    if rest is None:
+        return one
+    shift = one.shift + rest.shift
+    if one.kind == "focal":
+        shift = (1.0 + one.shift) * (1.0 + rest.shift) - 1.0
+    angle = one.angle + rest.angle
+    return replace(rest, angle=angle, shift=shift, pixels=one.pixels, p_value=0.0, rivals=())
+
+
+def changed_after(found: Diagnosis, cameras: Collection[str], least: int) -> tuple[list[int], str]:
+    """Frames that contradict the others before or after a moment, and the last frame before it.
+
+    Args:
+        cameras: that see the frames that are looked at.
+        least: number of frames before and after; where they are fewer there is no such moment.
+    """
+    own = [k for k, one in enumerate(found.frames) if {*one.given} == {*cameras}]
+    wrong = np.array([found.frames[k].finding is not None for k in own], bool)
+    turns = np.flatnonzero(wrong[1:] != wrong[:-1])
+    if len(turns) != 1 or min(wrong.sum(), (~wrong).sum()) < least:
+        return [], ""
+    return [own[k] for k in np.flatnonzero(wrong)], found.frames[own[int(turns[0])]].frame
+
+
+def base_motion(
+    given: Mapping[str, Camera], placed: Mapping[str, RegisteredCamera], sds: float = 4.0
+) -> Finding | None:
+    """The motion of the base that several cameras tell alike; None: they tell several ones.
+
+    sds: by how many standard deviations motions may differ, and by a quarter of a degree and 3 mm.
+    """
+    motions = [given[name].X_WC @ one.camera.X_CW for name, one in placed.items()]
+    rotation_sd = max((one.rotation_sd for one in placed.values()), default=0.0)
+    shift_sd = max((one.translation_sd for one in placed.values()), default=0.0)
+    off = [pose_difference(one, motions[0]) for one in motions[1:]]
+    most = sds * rotation_sd + np.radians(0.25), sds * shift_sd + 0.003
+    if not off or any(
+        np.linalg.norm(one[:3]) > most[0] or np.linalg.norm(one[3:]) > most[1] for one in off
+    ):
+        return None
+    by = pose_difference(motions[0], np.eye(4))
+    size = float(np.linalg.norm(by[:3])), float(np.linalg.norm(by[3:]))
+    return Finding("base", "base", *size, rotation_sd, shift_sd, 0.0, 0.0)
+
+
+_KINDS = {"offset": "joint", "focal": "focal"}

@@ -1,0 +1,244 @@
+"""What is wrong by much in all frames is named with its size, in Drake's pictures of an arm."""
+
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from drake_pose.body import load_model
+from drake_pose.camera.camera_files import save_cameras
+from drake_pose.camera.models import Camera
+from drake_pose.errors import CameraError, MaskError
+from drake_pose.jobs.registration.audit import SceneAudit, audit_scene
+from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
+from drake_pose.silhouette.pictures.masks import read_mask, write_mask
+from tests.jobs.registration.arm_scenes import JOINTS, ArmScene, write_arm_scene
+
+COUNT = 8
+
+
+@pytest.fixture(scope="module")
+def right(tmp_path_factory: pytest.TempPathFactory) -> ArmScene:
+    """Eight frames of two cameras, in which everything is right."""
+    scene = write_arm_scene(tmp_path_factory.mktemp("right"), count=COUNT, seed=9)
+    save_cameras(scene.folder / "cameras.yaml", scene.cameras)
+    return scene
+
+
+@pytest.fixture
+def scene(right: ArmScene, tmp_path: Path) -> ArmScene:
+    """The same, to be spoilt."""
+    return right.copy(tmp_path)
+
+
+def audit(scene: ArmScene, cameras: Sequence[Camera] = ()) -> SceneAudit:
+    """An audit, of other cameras where they are given."""
+    if cameras:
+        save_cameras(scene.folder / "cameras.yaml", {one.name: one for one in cameras})
+    return audit_scene(scene.folder, scene.model, scene.joints)
+
+
+def change(scene: ArmScene, joint: str, changed: Callable[[float], float]) -> np.ndarray:
+    """Changes a column of the log; by how much, modulo a turn [deg]."""
+    header, *rows = scene.rows()
+    j, off = header.index(joint), []
+    for row in rows:
+        value = float(row[j])
+        row[j] = repr(float(changed(value)))
+        off.append(np.degrees(float(row[j]) - value))
+    scene.write_rows([header, *rows])
+    return np.abs((np.array(off) + 180.0) % 360.0 - 180.0)
+
+
+def masks(scene: ArmScene, spoilt: Callable[[np.ndarray], np.ndarray], frames: str = "*") -> None:
+    """Changes the masks of some frames."""
+    for path in scene.folder.rglob(f"masks/*/{frames}.png"):
+        write_mask(path, spoilt(read_mask(path)))
+
+
+def told(result: SceneAudit) -> list[tuple[str, str]]:
+    return [(one["cause"], one["cause_name"]) for one in result.summary["contradictions"]]
+
+
+def test_nothing_is_said_of_a_scene_that_is_right(right: ArmScene) -> None:
+    result = audit(right)
+    assert (told(result), result.warnings) == ([], ())
+
+
+@pytest.mark.parametrize(
+    ("joint", "degrees"), [("hand_turn", 25.0), ("hand_turn", -70.0), ("elbow_turn", 40.0)]
+)
+def test_an_offset_that_fits_do_not_reach_has_its_size(scene, joint, degrees) -> None:
+    change(scene, joint, lambda q: q + np.radians(degrees))
+    result = audit(scene)
+    assert told(result) == [("joint", joint)]
+    off = result.summary["contradictions"][0]
+    # What must be added to the log.
+    assert abs(off["angle_deg"] + degrees) < max(4.0 * off["angle_sd_deg"], 0.3)
+    assert off["angle_sd_deg"] < 1.0
+    assert result.summary["agreeing_count"] == COUNT
+
+
+@pytest.mark.parametrize("joint", ["hand_turn", "shoulder_turn"])
+def test_a_sign_that_is_turned_round_is_named(scene, joint) -> None:
+    change(scene, joint, lambda q: -q)
+    result = audit(scene)
+    assert told(result) == [("sign", joint)]
+    assert f"'{joint}' is logged with the other sign" in result.summary["contradictions"][0]["text"]
+    assert result.summary["agreeing_count"] == 0
+
+
+def test_a_column_that_is_always_0_is_no_constant(scene) -> None:
+    off = change(scene, "hand_turn", lambda _: 0.0)
+    result = audit(scene)
+    assert told(result) == [("log", "hand_turn")]
+    one = result.summary["contradictions"][0]
+    assert "link 'hand' is not where the log says" in one["text"]
+    assert one["angle_deg"] == pytest.approx(off.max(), abs=4.0)
+    assert result.summary["agreeing_count"] == 0
+
+
+def test_two_joints_that_are_off_by_much_are_told_one_by_one(scene) -> None:
+    change(scene, "hand_turn", lambda q: -q)
+    change(scene, "elbow_turn", lambda q: q + np.radians(30.0))
+    result = audit(scene)
+    assert {*told(result)} == {("sign", "hand_turn"), ("joint", "elbow_turn")}
+
+
+def _rotated(camera: Camera, by: np.ndarray, unit: float = 1.0) -> Camera:
+    X_WC = camera.X_WC.copy()
+    X_WC[:3, :3] = X_WC[:3, :3] @ by
+    X_WC[:3, 3] *= unit
+    return camera.with_pose(X_WC)
+
+
+# The axes of a camera's link, x forward, y left, z up, in those of its picture.
+LINK = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
+
+
+@pytest.mark.parametrize(
+    ("spoil", "text"),
+    [
+        (lambda one: one.with_pose(np.linalg.inv(one.X_WC)), "the inverse of the camera's pose"),
+        (lambda one: _rotated(one, LINK), "ROS' camera_link"),
+        (lambda one: _rotated(one, np.diag([1.0, -1.0, -1.0])), "the convention of OpenGL"),
+        (lambda one: _rotated(one, np.eye(3), 1e3), "in millimetres"),
+        (lambda one: _rotated(one, LINK, 1e3), r"camera_link .* and in millimetres"),
+        (lambda one: _rotated(one, (one.X_WC[:3, :3] @ one.X_WC[:3, :3]).T), "of its rotation"),
+    ],
+)
+def test_the_convention_of_a_camera_file_is_named(scene, spoil, text) -> None:
+    """Whether the robot is in the picture then, or not."""
+    cameras = [spoil(one) for one in scene.cameras.values()]
+    try:
+        result = audit(scene, cameras)
+    except CameraError as error:
+        found = str(error)
+    else:
+        (one,) = result.summary["contradictions"]
+        found = one["text"]
+        assert result.summary["agreeing_count"] == COUNT
+    assert re.search(text, found)
+
+
+def test_focal_lengths_that_are_far_too_long_are_told_as_such(scene) -> None:
+    cameras = [
+        replace(one, focal_x=1.15 * one.focal_x, focal_y=1.15 * one.focal_y)
+        for one in scene.cameras.values()
+    ]
+    result = audit(scene, cameras)
+    assert told(result) == [("focal", "focal lengths")]
+    assert result.summary["contradictions"][0]["shift_percent"] == pytest.approx(-13.0, abs=1.0)
+
+
+def test_mirrored_masks_are_named(scene) -> None:
+    masks(scene, lambda mask: mask[:, ::-1])
+    (one,) = audit(scene).summary["contradictions"]
+    assert "masks of all cameras seem to be mirrored" in one["text"]
+
+
+def test_cameras_that_moved_are_told_with_the_frame(scene) -> None:
+    """Each turned by two degrees where it stands, and moved 2 cm."""
+    poses = [list(map(float, row[1:])) for row in scene.rows()[1:]]
+    model, moved = load_model(scene.model), {}
+    for name, one in scene.cameras.items():
+        X_WC = one.X_WC.copy()
+        X_WC[:3, :3] = Rotation.from_euler("z", 2.0, degrees=True).as_matrix() @ X_WC[:3, :3]
+        X_WC[:3, 3] += [0.0, 0.0, 0.02]
+        moved[name] = one.with_pose(X_WC)
+        renderer = LabelRenderer(model, moved[name])
+        for k in range(4, COUNT):
+            mask = renderer.mask(np.array(poses[k]))
+            write_mask(scene.folder / "masks" / name / f"{k:04d}.png", mask)
+    result = audit(scene)
+    assert {*told(result)} == {("moved", "left"), ("moved", "right")}
+    for one in result.summary["contradictions"]:
+        assert "was moved after frame '0003'" in one["text"]
+        assert one["angle_deg"] == pytest.approx(2.0, abs=max(0.3, 3.0 * one["angle_sd_deg"]))
+        # The camera's own way, not that of the robot in the picture.
+        assert one["shift_mm"] == pytest.approx(20.0, abs=max(5.0, 3.0 * one["shift_sd_mm"]))
+    assert result.summary["agreeing_count"] == 4
+
+
+def test_a_camera_that_turned_where_it_stands_has_hardly_moved(scene) -> None:
+    left, right = scene.cameras.values()
+    X_WC = left.X_WC.copy()
+    X_WC[:3, :3] = Rotation.from_euler("z", 0.5, degrees=True).as_matrix() @ X_WC[:3, :3]
+    (one, *_) = audit(scene, [left.with_pose(X_WC), right]).summary["contradictions"]
+    assert one["cause_name"] == "left"
+    assert one["angle_deg"] == pytest.approx(0.5, abs=3.0 * one["angle_sd_deg"])
+    assert one["shift_mm"] < 3.0 * one["shift_sd_mm"]
+    assert "mm at the robot" in one["text"]
+
+
+def test_masks_that_show_more_less_or_nothing(scene) -> None:
+    def with_shadow(mask: np.ndarray) -> np.ndarray:
+        """Something else in a corner, a quarter as large."""
+        spoilt, side = mask.copy(), int(np.sqrt(0.25 * mask.sum()))
+        spoilt[:side, :side] = True
+        return spoilt
+
+    left = read_mask(scene.folder / "masks/left/0006.png")
+    masks(scene, with_shadow, "000[0-3]")
+    masks(scene, lambda mask: mask & False, "0006")
+    write_mask(scene.folder / "masks/left/0006.png", left)
+    result = audit(scene)
+    said = "\n".join(result.warnings)
+    assert "'right': the masks of frames 0006 are black" in said
+    for name in scene.cameras:
+        assert f"'{name}': the masks of frames 0000-0003 show" in said
+    assert "more than the robot" in said
+
+
+def test_inverted_masks_are_refused(scene) -> None:
+    masks(scene, np.logical_not)
+    with pytest.raises(MaskError, match=r"left/000\d.png.*inverted"):
+        audit(scene)
+    scene.edit_cameras("left", X_WC=None)
+    with pytest.raises(MaskError, match=r"000\d.png.*inverted"):
+        scene.read()
+
+
+def test_the_log_of_the_next_frame_is_named(scene) -> None:
+    header, *rows = scene.rows()
+    shifted = [[row[0], *other[1:]] for row, other in zip(rows, rows[-1:] + rows[:-1], strict=True)]
+    scene.write_rows([header, *shifted])
+    texts = [one["text"] for one in audit(scene).summary["contradictions"]]
+    assert any("those of the next frame" in text for text in texts)
+    assert JOINTS[0] in header
+
+
+def test_cameras_that_stand_far_from_where_they_are_said_to_are_found(scene) -> None:
+    """A metre and 30 degrees: no convention, and nothing that fits of single frames reach."""
+    left, right = scene.cameras.values()
+    X_WC = np.eye(4)
+    X_WC[:3, :3] = Rotation.from_euler("z", 30.0, degrees=True).as_matrix()
+    X_WC = X_WC @ left.X_WC
+    result = audit(scene, [left.with_pose(X_WC), right])
+    (one,) = result.summary["contradictions"]
+    assert (one["what"], one["name"]) == ("camera", "left")
+    assert one["angle_deg"] == pytest.approx(30.0, abs=1.0)

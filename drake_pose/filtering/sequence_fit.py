@@ -45,7 +45,10 @@ class SequenceSettings:
         worse_start: starts whose E_total in the first frame exceeds the best by more are dropped.
         followed_starts, fitted_starts: starts that are followed, and fitted, at most.
         prior_weight: E_total that a squared deviation of a joint from its usual angle counts as.
-        worse_fit: fits whose cost is more than this multiple of the best one's are dropped.
+        worse_fit: fits whose cost is more than this multiple of the best one's are dropped: with
+            flesh that is not the hand's the better of two fits may be the wrong one.
+        interval_factor: of the standard deviations of intervals. Errors of flesh are alike in all
+            frames: without it 80 to 99 % of the joints lay in 95 % intervals, 68 % in ``grasp``.
     """
 
     same: float = 0.1
@@ -66,8 +69,9 @@ class SequenceSettings:
     worse_start: float = 0.03
     followed_starts: int = 6
     prior_weight: float = 0.0003
-    fitted_starts: int = 3
-    worse_fit: float = 1.1
+    fitted_starts: int = 6
+    worse_fit: float = 1.3
+    interval_factor: float = 1.6
 
 
 SEQUENCE = SequenceSettings()
@@ -178,7 +182,7 @@ class FittedSequence:
         kinematics = self.body.kinematics
         count, around = len(kinematics.names), kinematics.turns_around
         values = self.fitted.parameters[frame, :count]
-        half = 1.96 * self.deviations[frame, :count]
+        half = 1.96 * SEQUENCE.interval_factor * self.deviations[frame, :count]
         half = np.where(around, np.minimum(half, np.pi), half)
         low = np.where(around, values - half, np.maximum(values - half, kinematics.lower))
         high = np.where(around, values + half, np.minimum(values + half, kinematics.upper))

@@ -31,7 +31,8 @@ from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from drake_pose.silhouette.pictures.masks import write_mask
 from tests.benchmarks.tables import print_table
 
-Damage = Callable[[Mask, np.random.Generator], Mask]
+Damage = Callable[[Mask, np.random.Generator, int], Mask]
+"""Of a mask, random numbers and the frame's number."""
 
 _FRAMES, _RATE_HZ, _FASTEST = 24, 30.0, 2.0
 _WRONG_DEGREES, _WRONG_METRES = 10.0, 0.05
@@ -88,9 +89,16 @@ def coverage_sets(data: Path | None) -> Iterator[CoverageSet]:
         yield CoverageSet(f"arm, sequence, cameras {_CAMERAS_OFF} px off", panda, make, ("panda_",))
         make = _draw_arm(panda, colours=True)
         yield CoverageSet("arm, sequence by colour", panda, make, _ARM_JOINTS[:1])
+        for name, share in (("half", 0.5), ("all", 1.0)):
+            make = _draw_arm(panda, _hidden(share))
+            yield CoverageSet(
+                f"arm, sequence, {name} hidden for 8 frames", panda, make, ("panda_",)
+            )
         stills = EstimateSettings(track=False, frames=("0000:0005",))
         make = _draw_arm(panda, _ragged)
         yield CoverageSet("arm, stills, edges 1.5 px off", panda, make, ("panda_",), stills)
+        make = _draw_arm(panda, views=1)
+        yield CoverageSet("arm, stills, one view, exact masks", panda, make, ("panda_",), stills)
     if (data / _LBR).is_dir():
         arm = data / _LBR
         model = arm / "med7" / "med7.urdf"
@@ -108,13 +116,13 @@ def _there(scene: Path) -> Callable[[Path, int], Path]:
 
 
 def _damages() -> Iterator[tuple[str, Damage]]:
-    yield "exact masks", lambda mask, rng: mask
+    yield "exact masks", lambda mask, rng, k: mask
     yield "edges 1.5 px off", _ragged
-    yield "masks a pixel too wide", lambda mask, rng: _grown(mask)
+    yield "masks a pixel too wide", lambda mask, rng, k: _grown(mask)
     yield "holes", _with_holes
 
 
-def _ragged(mask: Mask, rng: np.random.Generator) -> Mask:
+def _ragged(mask: Mask, rng: np.random.Generator, k: int) -> Mask:
     """A mask whose edge wanders by one and a half pixels, eight pixels of it alike."""
     noise = cv2.GaussianBlur(rng.normal(size=mask.shape), (0, 0), 8.0)
     inside = cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, 5)
@@ -126,7 +134,7 @@ def _grown(mask: Mask) -> Mask:
     return cv2.dilate(mask.astype(np.uint8), np.ones((3, 3), np.uint8)).astype(np.bool_)
 
 
-def _with_holes(mask: Mask, rng: np.random.Generator) -> Mask:
+def _with_holes(mask: Mask, rng: np.random.Generator, k: int) -> Mask:
     """A mask without 3 % of its area, in round holes."""
     drawn = mask.astype(np.uint8)
     rows, columns = np.nonzero(drawn)
@@ -152,10 +160,26 @@ def swinging(
     return np.asarray(centre + amplitude * np.sin(phase + rate * t))
 
 
+def _hidden(share: float) -> Damage:
+    """Hides a share of the silhouettes of eight frames, from the left."""
+
+    def damage(mask: Mask, rng: np.random.Generator, k: int) -> Mask:
+        rest = mask.copy()
+        if 8 <= k < 16:
+            rest[:, : int(np.quantile(np.nonzero(mask)[1], share)) + 1] = False
+        return rest
+
+    return damage
+
+
 def _draw_arm(
-    path: Path, damage: Damage | None = None, cameras_off: float = 0.0, colours: bool = False
+    path: Path,
+    damage: Damage | None = None,
+    cameras_off: float = 0.0,
+    colours: bool = False,
+    views: int = 2,
 ) -> Callable[[Path, int], Path]:
-    """Draws an arm that swings before two cameras 75 degrees apart."""
+    """Draws an arm that swings before one camera, or two 75 degrees apart."""
 
     def make(folder: Path, draw: int) -> Path:
         rng = np.random.default_rng([5, draw])
@@ -163,7 +187,7 @@ def _draw_arm(
         around = circle_of_cameras(
             5, radius=1.7, height=0.8, target=(0.0, 0.0, 0.4), face_camera=False
         )
-        cameras = dict(list(around.items())[:2])
+        cameras = dict(list(around.items())[:views])
         moving = np.array([name.startswith("panda_joint") for name in model.position_names])
         moving &= model.upper - model.lower > 0.1
         q = np.tile(model.default_positions, (_FRAMES, 1))
@@ -222,7 +246,7 @@ def _draw(
             segments = renderer.segments(positions)
             mask = segments >= 0
             if not colours or k == 0:
-                seen = mask if damage is None else damage(mask, rng)
+                seen = mask if damage is None else damage(mask, rng, k)
                 write_mask(folder / "masks" / name / f"{k:04d}.png", seen)
             if colours:
                 picture = np.where(mask[..., None], paint[segments], room)

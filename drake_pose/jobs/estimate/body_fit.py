@@ -128,7 +128,7 @@ class _BodyFit:
             # As measured (tutorials/figures.md): what the model's flesh lacks is not in them.
             text = (
                 "the body, its lengths and all poses were fitted to the sequence together: of four "
-                "hands that were measured, 49 to 100 % of the joints lay in these 95 % intervals, "
+                "hands that were measured, 90 to 100 % of the joints lay in these 95 % intervals, "
                 "and lengths were off by a fifth to a quarter"
             )
             body, warnings = fitted, (*warnings, text)

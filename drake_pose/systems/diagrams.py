@@ -318,8 +318,9 @@ def _matcher(
 ) -> SilhouetteMatcher:
     if tracking is None:
         return SilhouetteMatcher(search, cameras, period)
+    # What is recorded or simulated waits: its answer depends on no clock.
     return SilhouetteTracker(
-        search, cameras, period, tracking=tracking, color_cameras=color_cameras
+        search, cameras, period, tracking=tracking, color_cameras=color_cameras, search_time=None
     )
 
 

@@ -30,7 +30,8 @@ class LargeErrorSettings(NamedTuple):
         places: number of tried positions of a joint that slides.
         left: a reading of the scene is named that leaves less than this fraction of the area that
             is in body or silhouette alone.
-        left_by_any: the same of positions of a joint that are others in each frame.
+        left_of_one: the same where single links do not fit, the rest does.
+        mended: what single links lack of fitting outlines must be this many times as much before.
         improved: and that does so in at least this share of the frames.
         as_good: a simpler reading is preferred that gains this share of the most that one gains.
         constant: positions that differ from the log by another amount in each frame are named only
@@ -50,10 +51,11 @@ class LargeErrorSettings(NamedTuple):
     fine_step: float = 1.0
     places: int = 13
     left: float = 0.8
-    left_by_any: float = 0.7
+    left_of_one: float = 0.97
+    mended: float = 2.0
     improved: float = 0.7
     as_good: float = 0.85
-    constant: float = 0.6
+    constant: float = 0.8
     near_angle: float = 6.0
     near_place: float = 0.01
     near_focal: float = 0.04
@@ -112,22 +114,24 @@ class LargeErrorSearch:
         self._share = min(1.0, LARGE.side / common_size(cameras, self._frames))
         self._sums = dict[int, tuple[Mask, NDArray[np.int32]]]()
 
-    def find(self, readings: Sequence[Reading], joints: Sequence[str]) -> Reading | None:
+    def find(
+        self, readings: Sequence[Reading], joints: Sequence[str], left: float = LARGE.left
+    ) -> Reading | None:
         """What explains the silhouettes much better than what is given; None: nothing does.
 
         Args:
             readings: of the scene.
             joints: whose positions may be wrong as well.
+            left: largest share of what is not explained that is left.
         """
         given = self.misfits(Reading("", "", self._cameras, as_it_is))
         told = [(one, self.misfits(one)) for one in readings]
         for name in joints:
             told += self._of_joint(name)
-        left = {"log": LARGE.left_by_any}
         explained = [
             (one, own.sum())
             for one, own in told
-            if own.sum() <= left.get(one.kind, LARGE.left) * given.sum()
+            if own.sum() <= left * given.sum()
             and np.mean(own < given) >= LARGE.improved
             and not _is_near(self._body, one)
         ]
@@ -277,14 +281,15 @@ def _is_near(body: RegistrationBody, one: Reading) -> bool:
     return one.kind == "focal" and abs(one.amount) <= LARGE.near_focal
 
 
-def doubted_joints(fits: Sequence[FrameFit], joints: Sequence[str]) -> list[str]:
-    """Joints that move links of whose outlines too little fits, by frames that were fitted."""
+def shares_moved(fits: Sequence[FrameFit], joints: Sequence[str]) -> dict[str, float]:
+    """By joint, what share fits of the outlines of all links that it moves, in all frames."""
     moves = [picture.moves.any(axis=2) for one in fits for picture in one.pictures]
     if not moves:
-        return []
+        return {}
     moved = np.any(moves, axis=0)[:, : len(joints)].astype(float)
     lengths, fit = np.sum([one.fitting for one in fits], axis=0).T @ moved
-    return [name for k, name in enumerate(joints) if fit[k] < LARGE.seen * lengths[k]]
+    shares = fit / np.maximum(lengths, 1e-9)
+    return {name: float(shares[k]) for k, name in enumerate(joints) if lengths[k] > 0.0}
 
 
 def links_not_seen(fits: Sequence[FrameFit]) -> list[tuple[int, float]]:

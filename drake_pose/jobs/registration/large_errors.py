@@ -22,9 +22,9 @@ from drake_pose.registration.large_errors import (
     LARGE,
     LargeErrorSearch,
     Reading,
-    doubted_joints,
     links_not_seen,
     mask_shares,
+    shares_moved,
 )
 from drake_pose.registration.online_registration import pose_difference
 from drake_pose.registration.per_frame_fit import FrameFit, PerFrameFit
@@ -68,6 +68,11 @@ class Compared:
         for reading in self.readings:
             frame = reading.of(frame)
         return frame
+
+    @property
+    def shares_moved(self) -> dict[str, float]:
+        """By joint, what share fits of the outlines of all links that it moves."""
+        return shares_moved(self.fits, self.fit.joints)
 
     @property
     def is_doubtful(self) -> bool:
@@ -136,6 +141,10 @@ class SceneComparison:
             again = self._compare(reading.cameras, (*now.readings, reading))
             if again.inlier_ratio <= now.inlier_ratio:
                 break
+            if not now.is_doubtful:
+                before, after = now.shares_moved[reading.name], again.shares_moved[reading.name]
+                if LARGE.mended * (1.0 - after) > 1.0 - before:
+                    break
             now = self._tell(now, again, reading)
         return now
 
@@ -144,7 +153,10 @@ class SceneComparison:
         found = now.found
         rests = {(one.kind, one.name): one for one in found.common}
         findings = [_with_rest(one, rests.pop((one.kind, one.name), None)) for one in now.findings]
-        found = replace(found, common=tuple(rests.values()))
+        # Where a joint is in each frame is found to the search's step.
+        by_search = {("joint", one.name) for one in now.findings if one.kind == "log"}
+        common = tuple(one for key, one in rests.items() if key not in by_search)
+        found = replace(found, common=common)
         known = {one.link for one in findings if one.link}
         for k, share in () if now.is_doubtful else links_not_seen(now.fits):
             node = self.body.tree.nodes[k].name
@@ -231,11 +243,15 @@ class SceneComparison:
                 placed[camera.name] = found, off
         return placed
 
-    def _say_masks(self, now: Compared, more: float = 0.12, less: float = 0.25) -> list[str]:
+    def _say_masks(
+        self, now: Compared, more: float = 0.12, more_in_one: float = 0.18, less: float = 0.25
+    ) -> list[str]:
         """What masks show beside the robot, and lack of it, in frames that agree otherwise.
 
-        more, less: shares of the masks' areas that are said. Real masks of arms show .02 more, and
-            lack .15 at most; outlines that are a pixel too wide are .07 more.
+        Args:
+            more, more_in_one, less: shares of the masks' areas that are said: in half of the frames
+                and more, and in fewer. Real masks of arms show .02 more, and lack .15 at most;
+                outlines that are a pixel too wide are .07 more, damaged ones up to .13 in a frame.
         """
         texts, names, wrong = list[str](), self._inputs.scene.frames, now.found.contradicting
         for camera in (one.name for one in now.cameras):
@@ -244,6 +260,8 @@ class SceneComparison:
             shown = {k: two for k, two in own.items() if k not in black and k not in wrong}
             # What is elsewhere is as much more as it is less.
             wider = [k for k, (extra, lack) in shown.items() if extra >= more and 3 * lack < extra]
+            if 2 * len(wider) < len(shown):
+                wider = [k for k in wider if shown[k][0] >= more_in_one]
             lacking = [k for k, (extra, lack) in shown.items() if lack >= less and 3 * extra < lack]
             for frames, which, what in (
                 (wider, 0, "show {} more than the robot: is it a shadow, another robot, or a part "
@@ -297,14 +315,14 @@ class SceneComparison:
 
     def _look(self, now: Compared) -> Reading | None:
         """What is wrong by much; nothing is looked for where nothing is doubtful."""
-        joints = doubted_joints(now.fits, now.fit.joints)
-        if now.is_doubtful:
-            joints = list(now.fit.joints)
-        if not joints:
-            return None
         sample = [now.of(one) for one in self._sample]
-        of_scene = now.is_doubtful and not now.readings
-        return self._search(now.cameras, joints, sample, scene=of_scene)
+        if now.is_doubtful:
+            of_scene = not now.readings
+            return self._search(now.cameras, now.fit.joints, LARGE.left, sample, of_scene)
+        doubted = [name for name, share in now.shares_moved.items() if share < LARGE.seen]
+        if not doubted:
+            return None
+        return self._search(now.cameras, doubted, LARGE.left_of_one, sample, scene=False)
 
     def _look_for_cameras(self, now: Compared) -> Compared | None:
         """With cameras as they are found in the frames, where these explain what is seen."""
@@ -321,6 +339,7 @@ class SceneComparison:
         self,
         cameras: Sequence[Camera],
         joints: Sequence[str],
+        left: float = LARGE.left,
         sample: Sequence[SeenFrame] | None = None,
         scene: bool = True,
     ) -> Reading | None:
@@ -329,7 +348,8 @@ class SceneComparison:
         if scene and not inputs.recordings:
             values = [inputs.read(name).values for name in inputs.wanted]
             readings = list(scene_readings(cameras, values, inputs.wanted))
-        return LargeErrorSearch(self.body, cameras, sample or self._sample).find(readings, joints)
+        search = LargeErrorSearch(self.body, cameras, sample or self._sample)
+        return search.find(readings, joints, left)
 
     def _tell(self, before: Compared, now: Compared, reading: Reading) -> Compared:
         """With what was put right as a finding."""

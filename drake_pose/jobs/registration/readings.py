@@ -73,7 +73,7 @@ def scene_readings(
             yield Reading("focal", text, tuple(other), as_it_is, factor - 1.0)
     for which, by in (("next", 1), ("previous", -1)) if len(frames) > 2 else ():
         rows = dict(zip(frames, np.roll(np.array(values), -by, axis=0), strict=True))
-        text = f"the joint positions seem to be those of the {which} frame"
+        text = f"the masks fit with the joint positions of the {which} frame"
         yield Reading("reading", text, tuple(cameras), partial(_with_row, rows))
 
 

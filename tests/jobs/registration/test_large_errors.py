@@ -228,7 +228,7 @@ def test_the_log_of_the_next_frame_is_named(scene) -> None:
     shifted = [[row[0], *other[1:]] for row, other in zip(rows, rows[-1:] + rows[:-1], strict=True)]
     scene.write_rows([header, *shifted])
     texts = [one["text"] for one in audit(scene).summary["contradictions"]]
-    assert any("those of the next frame" in text for text in texts)
+    assert any("fit with the joint positions of the next frame" in text for text in texts)
     assert JOINTS[0] in header
 
 

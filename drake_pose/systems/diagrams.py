@@ -24,6 +24,7 @@ from pydrake.trajectories import PiecewisePolynomial, Trajectory
 from drake_pose.arrays import Array
 from drake_pose.body import ParsedModel, build_pose_tree
 from drake_pose.camera.models import Camera, PinholeCamera
+from drake_pose.errors import MaskError
 from drake_pose.filtering.contour_tracker import TrackingSettings
 from drake_pose.registration.online_registration import (
     CameraStatus,
@@ -78,9 +79,11 @@ class CameraRegistration(BeliefSystem[OnlineState]):
         period: time between two updates [s].
         labels: the labels that belong to the body; None: those of its model where that was made of
             a plant (``ArticulatedModel.from_plant``), else all that are not reserved.
+        most_covered: largest fraction of the picture that the body may cover.
 
     Raises:
         SettingsError: a period that is not positive.
+        MaskError: in a simulation, when the body's labels cover more of the picture.
     """
 
     def __init__(
@@ -88,10 +91,11 @@ class CameraRegistration(BeliefSystem[OnlineState]):
         registration: OnlineRegistration,
         period: float,
         labels: Collection[int] | None = None,
+        most_covered: float = 0.6,
     ) -> None:
         super().__init__()
         require_period("registration", period)
-        self._registration = registration
+        self._registration, self._most_covered = registration, most_covered
         self._tree, camera = registration.body.tree, registration.camera
         labels = self._tree.model.labels if labels is None else labels
         self._labels = None if labels is None else frozenset(labels)
@@ -118,6 +122,14 @@ class CameraRegistration(BeliefSystem[OnlineState]):
             return last
         values = np.concatenate(self._tree.values_from_positions(q))
         mask = label_image_to_mask(image, self._labels)
+        covered = float(mask.mean())
+        if covered > self._most_covered:
+            raise MaskError(
+                f"{self.get_name()}: labels of the body cover {covered:.0%} of the picture of "
+                f"camera '{self._registration.camera.name}' ({self._most_covered:.0%} at most): "
+                "does the ground count? Name the body's own labels (labels=), or use a model of "
+                "ArticulatedModel.from_plant"
+            )
         return self._registration.next(last, PosedFrame(f"{context.get_time():g} s", values, mask))
 
     def _believed(self, known: OnlineState) -> RegisteredCamera | None:

@@ -10,7 +10,7 @@ from pydrake.systems.analysis import Simulator
 from pydrake.trajectories import PiecewisePolynomial
 
 from drake_pose.body import ArticulatedModel, load_model
-from drake_pose.errors import SettingsError
+from drake_pose.errors import MaskError, SettingsError
 from drake_pose.registration.online_registration import OnlineRegistration, pose_difference
 from drake_pose.registration.register import RegistrationBody
 from drake_pose.silhouette.pictures.label_images import mask_to_label_image
@@ -70,16 +70,20 @@ class TestCameraRegistration:
         """A ground that fills the picture is not the robot's."""
         labels = np.full((480, 640, 1), 9, np.int16)
         labels[100:200, 100:200] = 5
-        for own, seen in ((frozenset({5}), labels == 5), (None, labels > 0)):
-            model = replace(online.body.tree.model, labels=own)
-            tree = replace(online.body.tree, model=model)
-            known = OnlineRegistration(RegistrationBody(tree), online.camera)
-            system = CameraRegistration(known, PERIOD)
-            image = mask_to_label_image(labels[..., 0] > 0)
-            image.mutable_data[:] = labels
-            run = Bench(system).update(measured_positions=np.zeros(5), label_image=image)
-            (kept,) = system.belief(run.context).keyframes
-            np.testing.assert_array_equal(kept.mask, seen[..., 0])
+        image = mask_to_label_image(labels[..., 0] > 0)
+        image.mutable_data[:] = labels
+        model = replace(online.body.tree.model, labels=frozenset({5}))
+        tree = replace(online.body.tree, model=model)
+        known = OnlineRegistration(RegistrationBody(tree), online.camera)
+        system = CameraRegistration(known, PERIOD)
+        run = Bench(system).update(measured_positions=np.zeros(5), label_image=image)
+        (kept,) = system.belief(run.context).keyframes
+        np.testing.assert_array_equal(kept.mask, labels[..., 0] == 5)
+        # A model of a file does not know them.
+        with pytest.raises(MaskError, match=r"cover 100% of the picture.*labels="):
+            Bench(CameraRegistration(online, PERIOD)).update(
+                measured_positions=np.zeros(5), label_image=image
+            )
 
     def test_refuses_a_period_that_is_none(self, online: OnlineRegistration) -> None:
         with pytest.raises(SettingsError, match="period"):

@@ -172,7 +172,7 @@ def _digest_of_others(function: Callable[..., Any]) -> str:
     digest = hashlib.sha256()
     for name, value in sorted(set(_taken(function, set()))):
         if value != own:
-            digest.update(f"{name}={_file_digest(value) if name == 'file' else value}\n".encode())
+            digest.update(f"{name}={file_digest(value) if name == 'file' else value}\n".encode())
     return digest.hexdigest()
 
 
@@ -193,7 +193,7 @@ def _taken(function: Callable[..., Any], seen: set[int]) -> Iterator[tuple[str, 
 
 
 @functools.cache
-def _file_digest(path: str) -> str:
+def file_digest(path: str) -> str:
     """SHA-256 of a source file, as it was when this process first asked."""
     return hashlib.sha256(Path(path).read_bytes()).hexdigest()
 
@@ -224,6 +224,12 @@ def multiply(X_AB: np.ndarray, X_BC: np.ndarray, X_AC: np.ndarray) -> None:
         for j in range(4):
             total = X_AB[i, 0] * X_BC[0, j] + X_AB[i, 1] * X_BC[1, j] + X_AB[i, 2] * X_BC[2, j]
             X_AC[i, j] = total + (X_AB[i, 3] if j == 3 else 0.0)
+
+
+def kernel_folder() -> Path | None:
+    """The folder where this package's kernels are stored; None where none can be written."""
+    cache = getattr(copy_into, "_cache", None)
+    return Path(cache.cache_path) if isinstance(cache, _SharedCache) else None
 
 
 def is_stored(kernel: Callable[..., Any]) -> bool:

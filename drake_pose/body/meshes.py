@@ -40,7 +40,7 @@ from drake_pose.arrays import Array
 from drake_pose.errors import ModelError
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class TriangleMesh:
     """A surface of triangles; not necessarily closed, not necessarily connected. Read-only.
 

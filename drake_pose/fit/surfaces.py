@@ -13,7 +13,10 @@ from scipy.spatial import cKDTree
 
 from drake_pose.arrays import Array
 from drake_pose.body import TriangleMesh
+from drake_pose.compiled import file_digest
+from drake_pose.fit.surface_store import stored
 from drake_pose.silhouette.outline import Outline, TreeSurfaces, outline_from_mesh
+from drake_pose.version import VERSION
 
 MANY, FEW, VERY_FEW = 2500, 400, 80
 """Triangles of a node: where a pixel counts, for a still, and for a person in real time."""
@@ -89,7 +92,8 @@ def _simplified(outline: Outline, count: int) -> Outline:
 def _simplify(vertices: bytes, triangles: bytes, count: int) -> Outline:
     """A surface of more triangles, by its vertices and triangles.
 
-    A process that estimates or audits many scenes of a body simplifies its surfaces once.
+    A process that estimates or audits many scenes of a body simplifies its surfaces once; the next
+    process finds what took long on disk.
     """
     # Nothing here needs the edges.
     outline = Outline(
@@ -97,7 +101,13 @@ def _simplify(vertices: bytes, triangles: bytes, count: int) -> Outline:
         np.frombuffer(triangles, np.int32).reshape(-1, 3).copy(),
         np.zeros((0, 5), np.int32),
     )
-    simplified = _collapsed(outline, count, 1.0)
+    way = f"{fast_simplification.__version__} {VERSION} {file_digest(__file__)} {count}".encode()
+    return stored((way, vertices, triangles), lambda: _make_simple(outline, count))
+
+
+def _make_simple(outline: Outline, count: int) -> Outline:
+    """A surface with about that number of triangles, in the way that is nearer to it."""
+    simplified = collapsed(outline, count)
     size = float(np.linalg.norm(np.ptp(outline.vertices, axis=0)))
     # The distance of a smooth surface falls with the triangles: it is 0.4 to 1.4 times size / count
     # on all parts of the bundled bodies, from 80 triangles to 400.
@@ -109,21 +119,24 @@ def _simplify(vertices: bytes, triangles: bytes, count: int) -> Outline:
     # A surface with slivers: the simplifier gets it in a unit in which its largest errors, a few
     # hundred units, are small. Vertices that are close together are merged before the next time.
     unit = size / (25.0 * count)
-    merged = _collapsed(outline, count, unit)
+    merged = collapsed(outline, count, unit)
     for grid in (10.0, 20.0, 40.0):
         if len(merged.triangles) <= 1.1 * count:
             break
         places = np.round(merged.vertices / (grid * unit)) * (grid * unit)
         merged = outline_from_mesh(TriangleMesh(places, merged.triangles))
-        merged = _collapsed(merged, count, unit)
+        merged = collapsed(merged, count, unit)
     merged_distance = surface_distance(outline, merged)
     if merged_distance < 0.75 * distance or (too_many and merged_distance <= too_far):
         return merged
     return simplified
 
 
-def _collapsed(outline: Outline, count: int, unit: float) -> Outline:
-    """A surface whose edges are collapsed till triangles are few, in a unit of length [m]."""
+def collapsed(outline: Outline, count: int, unit: float = 1.0) -> Outline:
+    """A surface whose edges are collapsed till triangles are few, in a unit of length [m].
+
+    By Garland and Heckbert's quadric error metric.
+    """
     if len(outline.triangles) <= count:
         return outline
     with _SIMPLIFIER:

@@ -5,15 +5,15 @@ from collections.abc import Sequence
 from functools import lru_cache
 from typing import Protocol
 
-import fast_simplification
 import numpy as np
 
-from drake_pose.body import PoseTree, TriangleMesh
+from drake_pose.body import PoseTree
 from drake_pose.camera.models import Camera, ParallelCamera
+from drake_pose.fit.surfaces import collapsed
 from drake_pose.search.estimates import PoseEstimate, View
 from drake_pose.search.settings import BeamSearchSettings, GridSettings
 from drake_pose.silhouette.contour_points import CelledOutline, divide_outline
-from drake_pose.silhouette.outline import Outline, TreeSurfaces, outline_from_mesh
+from drake_pose.silhouette.outline import Outline, TreeSurfaces
 from drake_pose.silhouette.scoring import (
     VisualHull,
     draw_mask,
@@ -295,13 +295,7 @@ class SampledBody:
         key = (node, spread, coarse)
         if key not in self._celled:
             if coarse:
-                # Fewer triangles by Garland and Heckbert's quadric error metric.
-                points, triangles = fast_simplification.simplify(
-                    outline.vertices, outline.triangles, target_count=300
-                )
-                outline = outline_from_mesh(
-                    TriangleMesh(np.asarray(points, dtype=np.float64), triangles)
-                )
+                outline = collapsed(outline, 300)
             skin, bands = self.sampled.tree.nodes[node].skin, self.sampled.bands[node]
             mesh = None if skin is None else skin.mesh
             self._celled[key] = divide_outline(outline, spread, mesh, bands)

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, NamedTuple
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from scipy.sparse import coo_array
@@ -393,6 +394,17 @@ class BendingOutline:
         return outline
 
 
+_node_outlines: WeakKeyDictionary[TriangleMesh, Outline] = WeakKeyDictionary()
+
+
+def _node_outline(mesh: TriangleMesh) -> Outline:
+    """The outline of a node's mesh; a search and a tracker of one tree share it."""
+    outline = _node_outlines.get(mesh)
+    if outline is None:
+        outline = _node_outlines[mesh] = outline_from_mesh(mesh)
+    return outline
+
+
 class TreeSurfaces:
     """The surfaces of a pose tree's nodes at any values, each in its node's frame.
 
@@ -404,7 +416,7 @@ class TreeSurfaces:
         self._nodes = tree.nodes
         self.value_counts = [len(node.value_names) for node in tree.nodes]
         self.skins = [node.skin for node in tree.nodes]
-        self.rigid = [outline_from_mesh(node.mesh) for node in tree.nodes]
+        self.rigid = [_node_outline(node.mesh) for node in tree.nodes]
         self.bending = [
             None if node.skin is None else BendingOutline(rigid, node.skin.mesh)
             for node, rigid in zip(tree.nodes, self.rigid, strict=True)

@@ -6,6 +6,8 @@ import pytest
 import trimesh
 
 from drake_pose.body import TriangleMesh, bundled_model, load_model
+from drake_pose.fit import surface_store
+from drake_pose.fit.surface_store import stored
 from drake_pose.fit.surfaces import (
     FEW,
     VERY_FEW,
@@ -111,7 +113,7 @@ def test_a_body_loaded_again_is_not_simplified_again_but_a_changed_one_is():
     assert len(coarser.triangles) < len(once.triangles)
 
 
-def test_threads_that_simplify_at_once_find_what_one_does():
+def test_threads_that_simplify_at_once_find_what_one_does(monkeypatch):
     balls = [
         outline_from_mesh(TriangleMesh(ball.vertices, ball.faces))
         for ball in (trimesh.creation.icosphere(5, radius=0.1 + 0.01 * k) for k in range(12))
@@ -120,7 +122,88 @@ def test_threads_that_simplify_at_once_find_what_one_does():
     def simplified(ball):
         return few_triangles(Rigid(ball), FEW)[0]
 
+    monkeypatch.setattr(surface_store, "kernel_folder", lambda: None)
     together = map_ordered(simplified, balls, 4)
     _simplify.cache_clear()
     for ball, one in zip(balls, together, strict=True):
         np.testing.assert_array_equal(simplified(ball).vertices, one.vertices)
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """Where surfaces are stored."""
+    monkeypatch.setattr(surface_store, "kernel_folder", lambda: tmp_path)
+    return tmp_path / "surfaces"
+
+
+class Maker:
+    """Makes a ball of few triangles, and counts how often."""
+
+    def __init__(self, radius=1.0):
+        mesh = trimesh.creation.icosphere(2, radius=radius)
+        self.outline = outline_from_mesh(TriangleMesh(mesh.vertices, mesh.faces))
+        self.count = 0
+
+    def __call__(self):
+        self.count += 1
+        return self.outline
+
+
+def same(one, other):
+    return all(
+        np.array_equal(getattr(one, name), getattr(other, name))
+        for name in ("vertices", "triangles", "edges")
+    )
+
+
+def test_a_process_loads_to_the_last_digit_what_another_simplified(folder, monkeypatch):
+    monkeypatch.setattr(surface_store.stored, "__defaults__", (0.0, 500))
+    given = ball_and_tube(40)
+    _simplify.cache_clear()
+    made = few_triangles(Rigid(given), FEW)[0]
+    (file,) = folder.iterdir()
+    _simplify.cache_clear()
+    before = file.stat().st_mtime_ns
+    assert same(few_triangles(Rigid(given), FEW)[0], made)
+    assert [file] == list(folder.iterdir())
+    assert file.stat().st_mtime_ns >= before
+
+
+@pytest.mark.parametrize(
+    "damage", [lambda b: b"", lambda b: b[:-9], lambda b: b[:99] + b"x" + b[100:]]
+)
+def test_a_damaged_file_is_made_again(folder, damage):
+    make = Maker()
+    stored((b"key",), make, 0.0)
+    (file,) = folder.iterdir()
+    whole = file.read_bytes()
+    file.write_bytes(damage(whole))
+    assert same(stored((b"key",), make, 0.0), make.outline)
+    assert make.count == 2
+    assert same(stored((b"key",), make, 0.0), make.outline)
+    assert make.count == 2
+    assert file.read_bytes() == whole
+
+
+def test_parts_of_a_key_are_told_apart_and_the_oldest_files_go(folder):
+    makers = [Maker(1.0 + k) for k in range(4)]
+    keys = [(b"ab", b"c"), (b"a", b"bc"), (b"abc",), (b"abc", b"")]
+    for key, make in zip(keys, makers, strict=True):
+        assert same(stored(key, make, 0.0, 3), make.outline)
+    assert len(list(folder.iterdir())) == 3
+    stored(keys[-1], makers[-1], 0.0)
+    assert makers[-1].count == 1
+    stored(keys[0], makers[0], 0.0)
+    assert makers[0].count == 2
+
+
+def test_where_nothing_can_be_written_surfaces_are_made(tmp_path, monkeypatch):
+    make = Maker()
+    (tmp_path / "file").touch()
+    for folder in (None, tmp_path / "file", tmp_path / "none"):
+        monkeypatch.setattr(surface_store, "kernel_folder", lambda folder=folder: folder)
+        assert stored((b"key",), make, 0.0) is make.outline
+    quick = Maker()
+    monkeypatch.setattr(surface_store, "kernel_folder", lambda: tmp_path)
+    assert stored((b"quick",), quick, 60.0) is quick.outline
+    assert not (tmp_path / "surfaces").exists()

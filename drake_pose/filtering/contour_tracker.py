@@ -511,8 +511,13 @@ class ContourTracker:
         measurement: ContourMeasurement,
         astray: Mask,
     ) -> FilterState:
-        """Where all lines lead to, as unsure as if those of parts that are astray were not seen."""
+        """Where all lines lead to, as unsure as if those of parts that are astray were not seen.
+
+        Where more than half of the parts are astray, what is predicted: lines lead anywhere.
+        """
         found, rest = state.best.mean, None
+        if 2 * np.count_nonzero(astray) > len(astray):
+            return prediction
         if not astray.all():
             rounds = self.settings.rounds
             rest = observation.measure(seen, found, measurement.distance, rounds, astray)

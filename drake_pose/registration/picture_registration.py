@@ -199,8 +199,7 @@ def _register(
     alternatives = level.distinct([start.X_CW, *alike])[1:]
     both, clock = [*chosen, *moving], NO_CLOCK
     if recording.times is not None:
-        offset, scores = scan_offsets(body, start, recording, both)
-        clock = TimeOffset(offset, np.inf, scores)
+        clock = scan_offsets(body, start, recording, both)
     return fit_pictures(body, Begun(start, both, clock, alternatives), recording, focal, zeros)
 
 
@@ -243,9 +242,15 @@ def fit_pictures(
 
     Raises RegistrationError: no pose explains the pictures.
     """
-    steady = best, as_now, begun, assumed = _settle(body, begun, recording, focal, zeros)
+    at_rate = begun.clock.drift
+    without = begun._replace(clock=replace(begun.clock, drift=0.0))
+    steady = best, as_now, begun, assumed = _settle(body, without, recording, focal, zeros)
     if recording.times is None:
         return _describe(*steady, focal)
+    if at_rate:
+        clock = replace(without.clock, drift=at_rate)
+        begun = without._replace(clock=clock)
+        best, as_now, begun, assumed = _settle(body, begun, recording, focal, zeros)
     since, span = _mean_time(recording, begun.rows), float(np.ptp(recording.times))
     for left in range(most_fits, -1, -1):
         rows = [recording.names.index(frame.name) for frame in best.fit.seen[0].frames]
@@ -363,32 +368,59 @@ def posed_pictures(recording: Recording, which: Sequence[int], offset: float) ->
 
 
 def scan_offsets(
-    body: RegistrationBody, camera: PinholeCamera, recording: Recording, which: Sequence[int]
-) -> tuple[float, Array]:
+    body: RegistrationBody,
+    camera: PinholeCamera,
+    recording: Recording,
+    which: Sequence[int],
+    *,
+    rates: Sequence[float] = (-0.2, -0.15, -0.1, -0.05, 0.05, 0.1, 0.15, 0.2, 0.25),
+    start_within: float = 0.3,
+    much_better: float = 1.01,
+) -> TimeOffset:
     """The offset at which a camera explains its pictures best, and what all that were tried do.
 
-    Tried are offsets from -1 to 1 s.
+    Tried are offsets from -1 to 1 s; then rates at which the joints' clock runs faster.
+
+    Args:
+        rates: [s/s].
+        start_within: at these both clocks start together but for this time [s].
+        much_better: a rate explains this many times as much as the best offset does.
     """
     offsets = np.linspace(-1.0, 1.0, 81)
     frames = posed_pictures(recording, which, 0.0)
     level = PictureSearch(body, camera, frames).compared
     names = [one.name for one in frames]
     rows = [recording.names.index(name) for name in names]
-    scores = np.full(len(offsets), np.nan)
-    for k, offset in enumerate(offsets):
-        values = recording.values_at(float(offset))[rows]
-        if np.isfinite(values).all():
-            X_WN = np.array([body.kinematics.poses(one) for one in values])
-            scores[k] = level.told(camera.X_CW, X_WN)[Explained.GAIN]
+
+    def told(clock: Recording, tried: Array) -> Array:
+        found = np.full(len(tried), np.nan)
+        for k, offset in enumerate(tried):
+            values = clock.values_at(float(offset))[rows]
+            if np.isfinite(values).all():
+                X_WN = np.array([body.kinematics.poses(one) for one in values])
+                found[k] = level.told(camera.X_CW, X_WN)[Explained.GAIN]
+        return found
+
+    scores = told(recording, offsets)
     k = int(np.nanargmax(scores))
-    offset = float(offsets[k])
+    offset, drift = float(offsets[k]), 0.0
     if 0 < k < len(scores) - 1 and np.isfinite(scores[k - 1 : k + 2]).all():
         low, middle, high = scores[k - 1 : k + 2]
         bend = low - 2.0 * middle + high
         if bend < 0.0:
             offset += 0.5 * float((low - high) / bend) * float(offsets[1] - offsets[0])
-    told = np.isfinite(scores)
-    return offset, np.column_stack([offsets[told], scores[told] / max(scores[k], 1e-9)])
+    best, most = scores[k], much_better * scores[k]
+    if recording.times is not None:
+        first, mean = float(recording.times[0]), _mean_time(recording, rows)
+        starts = np.linspace(-start_within, start_within, 13)
+        for rate in rates:
+            gains = told(recording.with_drift(rate, first), starts)
+            if np.isfinite(gains).any() and (gain := float(np.nanmax(gains))) > most:
+                most, drift = gain, rate
+                offset = float(starts[int(np.nanargmax(gains))]) + rate * (mean - first)
+    known = np.isfinite(scores)
+    tried = np.column_stack([offsets[known], scores[known] / max(best, 1e-9)])
+    return TimeOffset(offset, np.inf, tried, drift)
 
 
 def _describe(

@@ -195,19 +195,39 @@ def test_a_recording_s_clock_and_zeros(episode, recording) -> None:
 
 
 def test_a_clock_is_told_by_what_its_offsets_explain(episode, recording) -> None:
-    offset, scores = scan_offsets(episode.body, episode.camera, recording(), range(0, 16, 2))
-    assert offset == pytest.approx(LATE, abs=0.012)
+    clock = scan_offsets(episode.body, episode.camera, recording(), range(0, 16, 2))
+    offset, scores = clock.value, clock.scores
+    assert (offset, clock.drift) == (pytest.approx(LATE, abs=0.012), 0.0)
     assert scores[:, 1].max() == 1.0
     assert scores[scores[:, 1].argmax(), 0] == pytest.approx(LATE, abs=0.0126)
     # Those before the log begins are not tried.
     assert scores[0, 0] == -1.0
 
-    def logged(by: float) -> np.ndarray:
-        return episode.values_at(episode.times + by) if by > -0.31 else np.full((16, 5), np.nan)
+    def logged(by: float | np.ndarray) -> np.ndarray:
+        before = np.min(by) <= -0.31
+        return np.full((16, 5), np.nan) if before else episode.values_at(episode.times + by)
 
     told = scan_offsets(episode.body, episode.camera, recording(values_at=logged), range(0, 16, 2))
-    assert told[0] == offset
-    assert told[1][0, 0] == pytest.approx(-0.3)
+    assert told.value == offset
+    assert told.scores[0, 0] == pytest.approx(-0.3)
+
+
+@pytest.mark.parametrize("rate", [0.1, -0.15])
+def test_a_rate_that_is_far_off_is_told_with_the_offset_of_the_middle(
+    episode, recording, rate
+) -> None:
+    """A log whose clock runs that much faster than the pictures', both from the first picture."""
+    first = episode.times[0]
+
+    def logged(offset: float) -> np.ndarray:
+        since = episode.times + offset - first
+        return episode.values_at(first + since / (1.0 + rate) + LATE)
+
+    shown = range(0, 16, 2)
+    told = scan_offsets(episode.body, episode.camera, recording(values_at=logged), shown)
+    assert told.drift == pytest.approx(rate)
+    middle = float(np.mean(episode.times[list(shown)] - first))
+    assert told.value == pytest.approx(rate * middle, abs=0.051)
 
 
 def test_a_search_ends_about_where_the_camera_is(episode) -> None:

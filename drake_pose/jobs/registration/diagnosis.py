@@ -281,14 +281,20 @@ def compare_clock(
     pixels = _picture_shift(body, (camera, given[known]), (camera, found[known]))
     if pixels < DIAGNOSIS.min_joint_pixels:
         return []
+    value, deviation = clock.value, clock.deviation
+    if clock.drift and recording.times is not None:
+        # A clock that runs faster is later in the middle than when it starts.
+        since = float(recording.times[rows].mean() - recording.times[0])
+        value -= clock.drift * since
+        deviation = math.hypot(deviation, clock.drift_deviation * since)
     findings = []
-    for kind, value, sd, least in (
-        ("clock", clock.value, clock.deviation, clock_sd),
+    for kind, size, sd, least in (
+        ("clock", value, deviation, clock_sd),
         ("rate", clock.drift, clock.drift_deviation, 0.0),
     ):
-        p_value = float(chdtrc(1, value**2 / (sd**2 + least**2)))
+        p_value = float(chdtrc(1, size**2 / (sd**2 + least**2)))
         if p_value < DIAGNOSIS.significance:
-            findings.append(Finding(kind, camera.name, 0.0, value, 0.0, sd, pixels, p_value))
+            findings.append(Finding(kind, camera.name, 0.0, size, 0.0, sd, pixels, p_value))
     return findings
 
 
@@ -297,13 +303,17 @@ def _picture_shift(
 ) -> float:
     """How far points of a body are from each other in two pictures, root mean square [pixel].
 
+    What lies outside the pictures counts as a picture's diagonal at most.
+
     one, other: the cameras, and values (f, m) of the body.
     """
     places = []
     for camera, values in (one, other):
         points = [placed_points(body.very_few, body.kinematics.poses(row)) for row in values]
         places.append(camera.project(np.concatenate(points))[0])
-    return float(np.sqrt(np.nanmean(((places[0] - places[1]) ** 2).sum(axis=1))))
+    squares = ((places[0] - places[1]) ** 2).sum(axis=1)
+    most = math.hypot(one[0].width, one[0].height)
+    return float(np.sqrt(np.fmin(squares, most**2).mean()))
 
 
 def shift_unit(kind: str) -> tuple[str, float]:

@@ -411,9 +411,10 @@ class SceneComparison:
                     camera.project(placed_points(self.body.very_few, X_WN))[0]
                     for camera, X_WN in zip((one, other), X, strict=True)
                 ]
-                squares.append(((places[0] - places[1]) ** 2).sum(axis=1))
+                own = ((places[0] - places[1]) ** 2).sum(axis=1)
+                squares.append(np.minimum(own, one.width**2 + one.height**2))
         every = np.concatenate(squares)
-        every = every[np.isfinite(every) & (every > 0.01)]
+        every = every[every > 0.01]
         return float(np.sqrt(every.mean())) if len(every) else 0.0
 
 

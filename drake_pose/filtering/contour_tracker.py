@@ -10,6 +10,7 @@ import numpy as np
 from drake_pose.arrays import Array, Floats, Mask, Picture
 from drake_pose.errors import SettingsError
 from drake_pose.filtering.body_state import GROWTH, BodyState
+from drake_pose.filtering.motion import LinearMotion
 from drake_pose.filtering.state import Belief
 from drake_pose.filtering.truncated_filter import FilterSettings, FilterState, TruncatedFilter
 from drake_pose.filtering.update import LinearObservation
@@ -390,10 +391,13 @@ class ContourTracker:
             layout,
             nothing,
             observation.inequalities(),
-            layout.process_noise(scale),
+            LinearMotion(
+                layout.transition(math.exp(-period / self.settings.memory)),
+                layout.process_noise(scale),
+                None,
+            ),
             # A frame's numbers are not those of the frame before: there are no views to keep.
-            FilterSettings(hypothesis_cap=1, novelty=0.0),
-            layout.transition(math.exp(-period / self.settings.memory)),
+            FilterSettings(hypothesis_cap=1, linearisation="tangent", iterations=20),
         )
         self._period = period
 

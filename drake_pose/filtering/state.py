@@ -97,7 +97,10 @@ class StateLayout:
         return np.array([self.index(name) for name in names], dtype=np.intp)
 
     def transition(self, fading: float = 1.0) -> Array:
-        """(n, n) A of (8): a step at constant velocity; ``fading`` is left of a rate, 1 in (8)."""
+        """(n, n) A of (8): a step at constant velocity, rates per step; see ``constant_velocity``.
+
+        ``fading`` is left of a rate, 1 in (8).
+        """
         m = len(self.moving)
         A = np.eye(len(self))
         A[:m, m : 2 * m] = fading * np.eye(m)
@@ -123,7 +126,7 @@ class StateLayout:
             deviation = accelerations.get(name, -1.0)
             if not 0 <= deviation < np.inf:
                 raise SettingsError(
-                    f"'{name}' needs the standard deviation of its acceleration, 0 or more"
+                    f"'{name}' needs the standard deviation of what changes its rate, 0 or more"
                 )
             pair = [i, m + i]
             U[np.ix_(pair, pair)] = deviation**2 * np.array([[0.25, 0.5], [0.5, 1.0]])
@@ -145,11 +148,6 @@ class Belief:
     def deviations(self) -> Array:
         """(n,) standard deviations."""
         return np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
-
-    def moved(self, A: Array, U: Array) -> "Belief":
-        """The belief (6) after a step x -> A x (n, n) with noise of covariance U (n, n)."""
-        P = A @ self.covariance @ A.T + U
-        return Belief(A @ self.mean, 0.5 * (P + P.T))
 
 
 def make_belief(

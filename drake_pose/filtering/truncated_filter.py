@@ -9,6 +9,7 @@ curvature at its first frame, estimated beside the state and forgotten when the 
 
 import math
 from collections.abc import Iterator, Sequence
+from copy import copy
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from itertools import count
@@ -20,6 +21,8 @@ from scipy.special import chdtri
 from drake_pose.arrays import Array
 from drake_pose.errors import SettingsError
 from drake_pose.filtering.inequalities import Inequalities, inner_point
+from drake_pose.filtering.linearisation import Linear, difference, require_slope
+from drake_pose.filtering.motion import LinearMotion, MotionModel, require_models, step_from
 from drake_pose.filtering.state import Belief, StateLayout, factor_of, make_belief
 from drake_pose.filtering.truncated_normal import (
     Truncated,
@@ -35,7 +38,6 @@ from drake_pose.filtering.update import (
     ObservationModel,
     Truncate,
     Updated,
-    difference,
     make_measurement,
     update,
 )
@@ -93,6 +95,13 @@ def measure_curvature(model: ObservationModel, belief: Belief) -> Array:
     return total
 
 
+def moved(belief: Belief, step: Linear, U: Array) -> Belief:
+    """The belief (6) after a step with noise of covariance U (n, n)."""
+    noise = U if step.rest is None else U + step.rest
+    P = step.slope @ belief.covariance @ step.slope.T + noise
+    return Belief(step.value + step.slope @ (belief.mean - step.at), 0.5 * (P + P.T))
+
+
 @dataclass(frozen=True, eq=False)
 class RepeatedView:
     """What is believed within a view: the state, and beside it the tangent's offsets.
@@ -110,12 +119,13 @@ class RepeatedView:
         n = len(self.tangent)
         return Belief(self.belief.mean[:n].copy(), self.belief.covariance[:n, :n].copy())
 
-    def moved(self, A: Array, U: Array) -> "RepeatedView":
-        """One step at constant velocity; the offsets stay as they are."""
+    def moved(self, step: Linear, U: Array) -> "RepeatedView":
+        """A step with noise of covariance U (n, n); the offsets stay as they are."""
         n, P = len(self.tangent), self.belief.covariance.copy()
-        mean = np.r_[A @ self.belief.mean[:n], self.belief.mean[n:]]
-        P[:n, :n] = self.state().moved(A, U).covariance
-        P[:n, n:] = A @ P[:n, n:]
+        state = moved(self.state(), step, U)
+        mean = np.r_[state.mean, self.belief.mean[n:]]
+        P[:n, :n] = state.covariance
+        P[:n, n:] = step.slope @ P[:n, n:]
         P[n:, :n] = P[:n, n:].T
         return RepeatedView(self.tangent, Belief(mean, P))
 
@@ -245,23 +255,34 @@ def prune(
 
 
 Truncation = Literal["joint", "sequential", "clip", "none"]
+Linearisation = Literal["spread", "tangent"]
 Branch = tuple[Hypothesis, Updated]
 TRUNCATIONS: tuple[Truncation, ...] = get_args(Truncation)
+LINEARISATIONS: tuple[Linearisation, ...] = get_args(Linearisation)
 
 
 @dataclass(frozen=True)
 class FilterSettings:
     """How a ``TruncatedFilter`` works.
 
+    The defaults are for any system: they were chosen on a planar arm of three links of unknown
+    lengths (``tests/benchmarks/filters.py``), and are about as sure as they are right there, also
+    where elbow and tip alone are seen. What the hand of Shimada et al. needs is in
+    ``papers.shimada.experiment_settings``.
+
     Args:
         truncation: "joint" (all rows at once), "sequential" (the paper's), "clip" (only the mean
             is moved inside) or "none".
-        iterations: linearisations of an update at most; 1 for the paper's.
+        linearisation: "spread" (over all that is believed: what a tangent leaves out counts as
+            noise) or "tangent" (at one point, the paper's).
+        iterations: linearisations of an update at most; 1 for the paper's. More of them are nearer
+            to the most probable state where that is sharp, and too sure where it is not.
         hypothesis_cap: how many hypotheses are kept at most; 1 for none but the best.
         smallest_weight: lighter hypotheses are given up.
         novelty: a measurement shows nothing new if noise alone would make it differ as much
-            from the one that began the view with more than this probability, see ``views``. 0:
-            every frame is new, as in the paper; so it is always with "sequential" and "clip".
+            from the one that began the view with more than this probability, such as 1e-9, see
+            the module. 0: every frame is new, as in the paper; so it is always with "sequential"
+            and "clip".
         twin_distance: hypotheses that are closer in every element are one [deviations].
         tolerance: of the joint truncation [deviations].
         rough_iterations: linearisations of hypotheses that are compared before they are kept.
@@ -272,10 +293,11 @@ class FilterSettings:
     """
 
     truncation: Truncation = "joint"
-    iterations: int = 20
+    linearisation: Linearisation = "spread"
+    iterations: int = 1
     hypothesis_cap: int = 4
     smallest_weight: float = 1e-4
-    novelty: float = 1e-9
+    novelty: float = 0.0
     twin_distance: float = 0.3
     tolerance: float = 1e-3
     rough_iterations: int = 3
@@ -285,6 +307,11 @@ class FilterSettings:
         if self.truncation not in TRUNCATIONS:
             raise SettingsError(
                 f"truncation must be one of {', '.join(TRUNCATIONS)}, not '{self.truncation}'"
+            )
+        if self.linearisation not in LINEARISATIONS:
+            raise SettingsError(
+                f"linearisation must be one of {', '.join(LINEARISATIONS)}, not "
+                f"'{self.linearisation}'"
             )
         if self.iterations < 1 or self.hypothesis_cap < 1:
             raise SettingsError("iterations and hypothesis_cap must be 1 or more")
@@ -320,23 +347,23 @@ class FilterState:
 
 
 class TruncatedFilter:
-    """An extended Kalman filter whose belief stays inside linear inequalities.
+    """A Kalman filter of nonlinear measurements whose belief stays inside linear inequalities.
 
     Shimada, Shirai, Kuno and Miura, sections 4 and 5, with differences, each of which can be set
-    back: all rows are truncated at once; the update iterates, linearised where the truncated belief
-    lies; and with "joint" the next step is predicted from the belief without its limits, which
-    would else count again in every step and make it ever surer.
+    back: all rows are truncated at once; measurements are linearised over the truncated belief; and
+    with "joint" the next step is predicted from the belief without its limits, which would else
+    count again in every step and make it ever surer.
 
     Args:
         inequalities: the rows, over any elements of the state.
-        process_noise: (n, n) U of (6).
-        transition: (n, n) A of (6); constant velocity (8) if not given.
+        motion: how the state moves in a step, see ``constant_velocity``.
 
     Attributes:
         novelty: of the settings, or 0 where the truncation keeps no views.
 
     Raises:
-        SettingsError: contradictory rows, named; or a process noise that is indefinite.
+        SettingsError: contradictory rows, named; a noise that is indefinite; models or settings of
+            another kind or shape.
         UnknownNameError: a row is about an element that the state lacks.
     """
 
@@ -345,48 +372,80 @@ class TruncatedFilter:
         layout: StateLayout,
         observation: ObservationModel,
         inequalities: Inequalities,
-        process_noise: Array,
+        motion: MotionModel,
         settings: FilterSettings | None = None,
-        transition: Array | None = None,
     ) -> None:
         self.layout = layout
         self.observation = observation
-        self.settings = settings or FilterSettings()
+        self.motion = motion
+        require_models(layout, observation, motion)
         self.inequalities = inequalities.for_columns(layout.names)
         inner_point(self.inequalities)
-        noise = make_belief(np.zeros(len(layout)), process_noise, layout, "the process noise")
+        noise = make_belief(np.zeros(len(layout)), motion.noise, layout, "the motion's noise")
         self._U = noise.covariance
-        self._A = layout.transition() if transition is None else transition
         self._rows = join_rows(self.inequalities)
+        self._checked = False
+        self._set(FilterSettings() if settings is None else settings)
+
+    def _set(self, settings: FilterSettings) -> None:
+        if not isinstance(settings, FilterSettings):
+            raise SettingsError(
+                f"a filter's settings are FilterSettings, not {type(settings).__name__}"
+            )
+        self.settings = settings
         # What is truncated and fed back has no offsets to keep.
-        feeds_back = self.settings.truncation in ("sequential", "clip")
-        self.novelty = 0.0 if feeds_back else self.settings.novelty
-        is_free = self.settings.truncation == "none" or not self.inequalities
+        feeds_back = settings.truncation in ("sequential", "clip")
+        self.novelty = 0.0 if feeds_back else settings.novelty
+        is_free = settings.truncation == "none" or not self.inequalities
         self._limits: Truncate | None = None if is_free else self._truncate
+
+    def with_settings(self, settings: FilterSettings) -> "TruncatedFilter":
+        """The same filter with other settings; states of one are states of the other."""
+        if settings is self.settings:
+            return self
+        other = copy(self)
+        other._set(settings)
+        return other
 
     def start(self, belief: Belief) -> FilterState:
         """The state before the first measurement, truncated (but for "none").
 
+        The first call compares the models' Jacobians with differences, at the belief's mean.
+
         Raises:
-            SettingsError: a belief that does not fit, or is indefinite.
+            SettingsError: a belief that does not fit, or is indefinite; a Jacobian that is wrong.
         """
         checked = make_belief(belief.mean, belief.covariance, self.layout)
         truncated = self._cut(checked, np.zeros((0, 2)))
+        if not self._checked:
+            names, seen, motion = self.layout.names, self.observation, self.motion
+            require_slope(
+                seen.predict, truncated.mean, seen.names, names, seen.wraps, "the observation"
+            )
+            if not isinstance(motion, LinearMotion):
+                still = np.zeros(len(names), dtype=np.bool_)
+                require_slope(motion.predict, truncated.mean, names, names, still, "the motion")
+            self._checked = True
         return FilterState(0, (self._finish(Hypothesis(checked, checked), checked, truncated),))
 
     def predict(self, state: FilterState) -> FilterState:
-        """One step at constant velocity: (6), for every hypothesis."""
-        moved = []
+        """One step of the motion: (6), for every hypothesis."""
+        stepped = []
         for h in state.hypotheses:
-            repeated = h.repeated.moved(self._A, self._U) if h.repeated else None
-            free = repeated.state() if repeated else self.predicted(h.free)
-            belief = self.predicted(h.belief)
-            moved.append(replace(h, belief=belief, free=free, repeated=repeated))
-        return replace(state, hypotheses=tuple(moved), rejections=())
+            # Linear where the state can be, also for what is believed without limits.
+            step = self._step(h.belief)
+            repeated = h.repeated.moved(step, self._U) if h.repeated else None
+            free = repeated.state() if repeated else moved(h.free, step, self._U)
+            belief = moved(h.belief, step, self._U)
+            stepped.append(replace(h, belief=belief, free=free, repeated=repeated))
+        return replace(state, hypotheses=tuple(stepped), rejections=())
 
     def predicted(self, belief: Belief) -> Belief:
-        """A belief after one step at constant velocity: (6)."""
-        return belief.moved(self._A, self._U)
+        """A belief after one step of the motion: (6)."""
+        return moved(belief, self._step(belief), self._U)
+
+    def _step(self, belief: Belief) -> Linear:
+        return step_from(self.motion, belief, self.settings.linearisation == "spread")
 
     def corrected(self, prediction: Belief, y: Array, variances: Array, start: Array) -> Array:
         """(n,) the mean of a prediction after a measurement, without hypotheses: a rough state.
@@ -396,7 +455,9 @@ class TruncatedFilter:
         """
         seen = make_measurement(self.observation, y, variances)
         few = min(self.settings.iterations, self.settings.rough_iterations)
-        return update(prediction, seen, few, start, False, self._limits).truncated.mean
+        spread = self.settings.linearisation == "spread"
+        rough = update(prediction, seen, few, start, False, self._limits, spread=spread)
+        return rough.truncated.mean
 
     def update(
         self,
@@ -440,21 +501,27 @@ class TruncatedFilter:
     ) -> list[Branch]:
         """A hypothesis updated at its prediction, and at each mirrored one, which are counted."""
         own = replace(hypothesis, repeated=None)
+        spread, iterations = self.settings.linearisation == "spread", self.settings.iterations
         starts = [(own, own.belief.mean)]
         if self.settings.hypothesis_cap > 1:
             for start in seen.model.mirrors(own.belief):
                 starts.append((replace(own, born=step, place=next(places)), start))
+        # A belief that is as wide as its mirror is far would hold both: each begins at its place.
+        alone = spread and len(starts) == 1
+        if spread and not alone:
+            iterations = max(iterations, self.settings.rough_iterations)
         return [
             (
                 h,
                 update(
                     h.free,
                     seen,
-                    self.settings.iterations,
-                    start,
+                    iterations,
+                    None if alone else start,
                     tempered=h is own,
                     truncate=self._limits,
                     sites=h.sites,
+                    spread=spread,
                 ),
             )
             for h, start in starts

@@ -5,15 +5,24 @@ Joseph's form, (I - K H) P (I - K H)^T + K R K^T: positive also where rounding i
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple, Protocol
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.linalg.lapack import dpotrf, dpotrs
 
 from drake_pose.arrays import Array, Mask
-from drake_pose.errors import SettingsError
+from drake_pose.errors import SettingsError, UnknownNameError
+from drake_pose.filtering.linearisation import (
+    Function,
+    Linear,
+    difference,
+    differences,
+    linear_over,
+)
 from drake_pose.filtering.state import Belief
 from drake_pose.filtering.truncated_normal import Truncated, unlimited
 
@@ -59,6 +68,63 @@ class LinearObservation:
     def predict(self, x: Array) -> tuple[Array, Array]:
         """Its value (m,) and H."""
         return self.h + self.H @ (x - self.at), self.H
+
+    def mirrors(self, belief: Belief) -> list[Array]:
+        """None."""
+        return []
+
+
+@dataclass(frozen=True, eq=False)
+class FunctionObservation:
+    """The ``ObservationModel`` of any function of the state, without mirrors.
+
+    Args:
+        names: (m) what is measured.
+        deviations: standard deviation of the measurement noise, one for all or (m,).
+        function: x (n,) to what would be measured without noise (m,); NaN where nothing can be
+            seen at x.
+        jacobian: x (n,) to (m, n); None: by differences, at 2 n calls of the function.
+        angles: those of names that are angles [rad], equal after a full turn.
+
+    Raises:
+        SettingsError: deviations that are not positive, or not one or (m,).
+        UnknownNameError: an angle that is not measured.
+    """
+
+    names: tuple[str, ...]
+    deviations: ArrayLike
+    function: Function
+    jacobian: Function | None = None
+    angles: Sequence[str] = ()
+
+    def __post_init__(self) -> None:
+        size = np.shape(self.deviations)
+        if size not in ((), (len(self.names),)) or not (np.asarray(self.deviations) > 0).all():
+            raise SettingsError(
+                f"the deviations of {len(self.names)} measurements are one positive number, or "
+                f"as many, not {self.deviations!r}"
+            )
+        for name in self.angles:
+            if name not in self.names:
+                raise UnknownNameError("measurement", name, self.names, "the observation")
+
+    @cached_property
+    def variances(self) -> Array:
+        """(m,) of the measurement noise."""
+        return np.full(len(self.names), 1.0) * np.square(self.deviations)
+
+    @cached_property
+    def wraps(self) -> Mask:
+        """(m,) which measurements are angles."""
+        return np.array([name in self.angles for name in self.names], dtype=np.bool_)
+
+    def predict(self, x: Array) -> tuple[Array, Array]:
+        """Its value (m,) and Jacobian (m, n)."""
+        value = np.asarray(self.function(x), dtype=np.float64)
+        if self.jacobian is not None:
+            return value, np.asarray(self.jacobian(x), dtype=np.float64)
+        turning = self.wraps if value.shape == self.wraps.shape else np.zeros(0, dtype=np.bool_)
+        return value, differences(self.function, x, turning)
 
     def mirrors(self, belief: Belief) -> list[Array]:
         """None."""
@@ -138,6 +204,7 @@ def update(
     tempered: bool = True,
     truncate: Truncate | None = None,
     sites: Array | None = None,
+    spread: bool = False,
 ) -> Updated:
     """Fuse a belief with a measurement, and truncate it.
 
@@ -151,29 +218,40 @@ def update(
             draw a mirrored one back to the prediction.
         truncate: a belief, and sites (S, 2) to begin with, to a result; None: there are no limits.
         sites: of the last truncation.
+        spread: whether the measurement is linearised over the belief, see ``linear_over``, but
+            for a start that is given; else at a point.
 
     Raises:
         SettingsError: the belief has no density inside the limits, or a variance is not positive.
     """
-    x, temperature = prediction.mean if start is None else start, 1.0
-    sites = np.zeros((0, 2)) if sites is None else sites
+    sites, temperature = np.zeros((0, 2)) if sites is None else sites, 1.0
+    x, width = prediction.mean if start is None else start, None
+    if spread and start is None:
+        first = prediction if truncate is None else truncate(prediction, sites)
+        x, width = first.mean, first.covariance
     # A first guess far off is approached with more noise than there is, cooled from step to step:
     # narrow curved valleys, such as that of a known scale, would stop a descent. Steps below
     # ``settled`` deviations end it; later ones are halved, as tangents may point to and fro.
     good_fit, cooling, full_steps = 9.0, 6.0, 8
     settled = 0.01 if truncate is None else 0.3
     if not np.isfinite(seen.y).any():
-        iterations = 1
+        iterations, width = 1, None
     P = prediction.covariance
     for made in range(iterations):
         # Made linear at x: innovation = H (x - prediction) + noise, over what is measured there.
-        h, H = seen.model.predict(x)
+        _, h, H, left_out = (
+            linear_over(seen.model.predict, Belief(x, width), seen.model.wraps)
+            if width is not None
+            else Linear(x, *seen.model.predict(x))
+        )
         rows = np.isfinite(seen.y) & np.isfinite(h)
         count = int(np.count_nonzero(rows))
         residual = difference(seen.y[rows], h[rows], seen.model.wraps[rows])
         H, plain = H[rows], seen.covariance[np.ix_(rows, rows)]
+        if left_out is not None:
+            plain = plain + left_out[np.ix_(rows, rows)]
         innovation = residual + H @ (x - prediction.mean)
-        if made == 0 and iterations > 1 and tempered:
+        if made == 0 and iterations > 1 and tempered and not spread:
             misfit = float(residual @ np.linalg.solve(plain, residual)) / max(count, 1)
             temperature = max(1.0, misfit / good_fit)
         belief, log_likelihood, distance = prediction, 0.0, 0.0
@@ -196,17 +274,10 @@ def update(
             belief = Belief(mean, 0.5 * (covariance + covariance.T))
         truncated = unlimited(belief) if truncate is None else truncate(belief, sites)
         sites = truncated.sites
-        step = truncated.mean - x
+        step, width = truncated.mean - x, truncated.covariance if spread else None
         size = np.abs(step / np.maximum(belief.deviations(), 1e-12)).max()
         if temperature == 1.0 and size < settled:
             break
         x = x + (step if made < full_steps else 0.5 * step)
         temperature = max(1.0, temperature / cooling)
     return Updated(belief, truncated, log_likelihood, distance, count)
-
-
-def difference(values: Array, expected: Array, turning: Mask) -> Array:
-    """Measured minus expected, angles [rad] between -pi and pi."""
-    residual = values - expected
-    residual[..., turning] = np.remainder(residual[..., turning] + np.pi, 2 * np.pi) - np.pi
-    return residual

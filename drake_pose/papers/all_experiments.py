@@ -16,7 +16,6 @@ from rich.console import Console, RenderableType
 from drake_pose.errors import OutputError
 from drake_pose.files.folder import without_nan
 from drake_pose.files.report_page import page_template
-from drake_pose.filtering.truncated_filter import FilterSettings
 from drake_pose.papers import date, date_walk, kameda, kameda_pictures, shimada, shimada_pictures
 from drake_pose.papers.tables import Count, Figures
 from drake_pose.person.date.walking import COMMANDS, REGISTERED
@@ -84,7 +83,11 @@ def _kameda_pictures(experiment: str, short: bool, folder: Path, count: Count) -
 
 def _filters() -> tuple[tuple[str, str, int], ...]:
     """The paper's filter and ours: names of their figures, truncations, linearisations."""
-    return ("paper", "sequential", 1), ("ours", "joint", FilterSettings().iterations)
+    return ("paper", "sequential", 1), (
+        "ours",
+        "joint",
+        shimada.experiment_settings("joint").iterations,
+    )
 
 
 def _shimada(observed: str, runs: int, short: bool, folder: Path, count: Count) -> Outcome:

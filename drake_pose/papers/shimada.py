@@ -8,7 +8,7 @@ import time
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple, cast
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,12 +30,8 @@ from drake_pose.filtering.hand import (
 from drake_pose.filtering.hand_model import TWO_FINGERS
 from drake_pose.filtering.hand_silhouette import HandSilhouette
 from drake_pose.filtering.inequalities import Inequalities, model_inequalities
-from drake_pose.filtering.truncated_filter import (
-    FilterSettings,
-    FilterState,
-    TruncatedFilter,
-    Truncation,
-)
+from drake_pose.filtering.motion import LinearMotion
+from drake_pose.filtering.truncated_filter import FilterSettings, FilterState, TruncatedFilter
 from drake_pose.filtering.update import make_measurement, update
 from drake_pose.papers.shimada_sequences import (
     ACCELERATIONS,
@@ -43,6 +39,7 @@ from drake_pose.papers.shimada_sequences import (
     OBSERVED,
     HandTrack,
     SyntheticSequence,
+    experiment_settings,
     follow_pictures,
     make_sequence,
     track_of,
@@ -188,16 +185,12 @@ def run_experiment(
     return HandsResult(trials, seed, settings, observed, noise, acceleration)
 
 
-def experiment_settings(truncation: str, iterations: int | None = None) -> FilterSettings:
-    """The library's own settings, but for these; SettingsError where they are impossible."""
-    settings = FilterSettings(truncation=cast(Truncation, truncation))
-    return settings if iterations is None else replace(settings, iterations=iterations)
-
-
 def experiment_filter(
     settings: FilterSettings | None = None, noise: float = 1.0, acceleration: float = 1.0
 ) -> tuple[TruncatedFilter, HandObservation]:
     """The filter of the experiment: table 1's rows from the bundled hand, and its observation.
+
+    Without settings it has ``experiment_settings("joint")``.
 
     `noise` and `acceleration` are factors, as for ``run_experiment``.
     """
@@ -213,7 +206,9 @@ def experiment_filter(
         distance_deviation=noise * usual.distance_deviation,
     )
     U = acceleration**2 * HAND_STATE.process_noise(ACCELERATIONS)
-    return TruncatedFilter(HAND_STATE, observation, rows, U, settings), observation
+    motion = LinearMotion(HAND_STATE.transition(), U, None)
+    settings = settings or experiment_settings("joint")
+    return TruncatedFilter(HAND_STATE, observation, rows, motion, settings), observation
 
 
 def _hand() -> ArticulatedModel:

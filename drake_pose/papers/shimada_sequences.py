@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import numpy as np
 from pydrake.systems.analysis import Simulator
@@ -39,8 +39,14 @@ from drake_pose.filtering.hand_model import (
 )
 from drake_pose.filtering.hand_silhouette import HandSilhouette
 from drake_pose.filtering.inequalities import from_bounds, model_inequalities, stack
+from drake_pose.filtering.motion import LinearMotion
 from drake_pose.filtering.state import Belief
-from drake_pose.filtering.truncated_filter import FilterSettings, FilterState, TruncatedFilter
+from drake_pose.filtering.truncated_filter import (
+    FilterSettings,
+    FilterState,
+    TruncatedFilter,
+    Truncation,
+)
 from drake_pose.jobs.estimate.inputs import EstimateInputs, read_inputs
 from drake_pose.papers.tables import Advance, Count, figure_table, uncounted
 from drake_pose.search import View
@@ -328,6 +334,16 @@ def sequence_table(results: Sequence[SequenceResult]) -> Table:
     return figure_table("Shimada, figure 17: a recorded hand, camera unknown", rows, figures)
 
 
+def experiment_settings(truncation: str, iterations: int | None = None) -> FilterSettings:
+    """The hand's: tangents, iterated, kept within a view; SettingsError where impossible."""
+    return FilterSettings(
+        truncation=cast(Truncation, truncation),
+        linearisation="tangent",
+        iterations=20 if iterations is None else iterations,
+        novelty=1e-9,
+    )
+
+
 def run_sequence(
     folder: Path,
     settings: FilterSettings | None = None,
@@ -388,7 +404,8 @@ def run_sequence(
     A = layout.transition(math.exp(-period / 0.15))
     # How a hand is usually held is told once a second.
     observation = HandObservation(scale, rest=1.0 / period, hand=hand)
-    hand_filter = TruncatedFilter(layout, observation, rows, U, settings, A)
+    motion, settings = LinearMotion(A, U, None), settings or experiment_settings("joint")
+    hand_filter = TruncatedFilter(layout, observation, rows, motion, settings)
     center, frames = (camera.center_x, camera.center_y), len(inputs.frames)
     silhouette = HandSilhouette(
         hand_filter, camera.width, camera.height, center, _WELL_MATCHED, _UNMATCHED

@@ -6,10 +6,11 @@ And the hand's sensor of section 6, which measures a silhouette for it.
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from pydrake.geometry import SceneGraph
-from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPort
+from pydrake.systems.framework import BasicVector, Context, Diagram, DiagramBuilder, OutputPort
 from pydrake.systems.sensors import ImageLabel16I
 from pydrake.trajectories import Trajectory
 from scipy.special import chdtri
@@ -19,8 +20,9 @@ from drake_pose.body import ParsedModel
 from drake_pose.camera.models import Camera
 from drake_pose.errors import SettingsError
 from drake_pose.filtering.hand_silhouette import HandMeasurement, HandSilhouette
+from drake_pose.filtering.motion import MotionModel
 from drake_pose.filtering.state import Belief, make_belief
-from drake_pose.filtering.truncated_filter import FilterState, TruncatedFilter
+from drake_pose.filtering.truncated_filter import FilterState, Hypothesis, TruncatedFilter
 from drake_pose.silhouette.pictures.label_images import label_image_to_mask
 from drake_pose.silhouette.pictures.scenes import Scene
 from drake_pose.systems.diagrams import add_simulated_cameras
@@ -63,7 +65,7 @@ class TruncatedEkf(BeliefSystem[_Known]):
         input_ports: [measurement (optional), measurement_covariance (optional), reset_state
           (optional), restart (optional)]
         output_ports: [estimated_state, covariance, hypothesis_weights, hypothesis_states,
-          active_limits, statistics]
+          hypothesis_covariances, active_limits, statistics]
 
     A periodic update predicts and uses the measurement: NaN where something is occluded; all NaN,
     or an unconnected port, where a camera is late or missing, which leaves the prediction.
@@ -72,7 +74,7 @@ class TruncatedEkf(BeliefSystem[_Known]):
 
     - ``estimated_state`` (n), ``covariance`` (n x n, row by row): of the heaviest hypothesis.
     - ``hypothesis_weights`` (cap), ``hypothesis_states`` (cap x n, row by row): the heaviest first,
-      weights 0 and states NaN where there are fewer.
+      weights 0 and states NaN where there are fewer; ``hypothesis_covariances`` (cap x n x n).
     - ``active_limits`` (K): 1 where that row of ``filter.inequalities`` cut the best belief.
     - ``statistics``: see ``STATISTICS``. ``lost`` is 1 while measurements have been as unlikely as
       one in a million for several steps.
@@ -81,32 +83,41 @@ class TruncatedEkf(BeliefSystem[_Known]):
     starts again from ``reset_state`` (n), for example from a matcher, if all its elements are
     finite; with the covariance of the belief given here.
 
+    A context holds how the filter works: abstract parameter 0 is its ``FilterSettings``, numeric
+    parameter 0 is (patience, loss_probability).
+
     Args:
         start: the belief before the first measurement.
-        period: time between two updates, one step of the prediction [s].
+        period: time between two updates, one step of the prediction [s]; needed where the motion's
+            rates are per step. None: the motion's.
         patience: how many unlikely measurements in a row make a loss.
         loss_probability: p-value below which a measurement is unlikely.
 
     Raises:
-        SettingsError: a start that does not fit, a period or patience that is not positive; and, in
-            a simulation, time that runs backwards.
+        SettingsError: a filter of another class, a start that does not fit, a period that is not
+            the motion's, a patience below 1; and, in a simulation, time that runs backwards, or
+            parameters that do not fit.
     """
 
     def __init__(
         self,
         belief_filter: TruncatedFilter,
         start: Belief,
-        period: float,
+        period: float | None = None,
         patience: int = 3,
         loss_probability: float = 1e-6,
     ) -> None:
         super().__init__()
-        require_period("filter", period)
-        if patience < 1:
-            raise SettingsError(f"patience must be 1 or more, not {patience}")
-        self.filter, self._patience = belief_filter, patience
-        self._loss_probability = loss_probability
-        self._start = make_belief(start.mean, start.covariance)
+        if not isinstance(belief_filter, TruncatedFilter):
+            raise SettingsError(
+                f"TruncatedEkf takes a TruncatedFilter, not {type(belief_filter).__name__}"
+            )
+        period = _period_of(belief_filter.motion, period)
+        self.filter = belief_filter
+        self._start = make_belief(start.mean, start.covariance, belief_filter.layout, "the start")
+        self._settings = self.add_parameter(belief_filter.settings)
+        self._loss = self.DeclareNumericParameter(BasicVector([patience, loss_probability]))
+        _require_loss(patience, loss_probability)
         n, cap = len(belief_filter.layout), belief_filter.settings.hypothesis_cap
         self._measured = len(belief_filter.observation.names)
         self.add_input("measurement", self._measured)
@@ -116,11 +127,14 @@ class TruncatedEkf(BeliefSystem[_Known]):
         self.keep_belief(_Known(belief_filter.start(self._start)), period)
         rows = belief_filter.inequalities.rows
 
-        def hypotheses(known: _Known) -> tuple[Array, Array]:
-            weights, states = np.zeros(cap), np.full((cap, n), np.nan)
-            for k, one in enumerate(known.state.hypotheses):
-                weights[k], states[k] = one.weight, one.belief.mean
-            return weights, states.ravel()
+        def filled(size: int, read: Callable[[Hypothesis], Any], empty: float) -> Any:
+            def show(known: _Known) -> Array:
+                found = np.full((cap, size), empty)
+                for k, one in enumerate(known.state.hypotheses):
+                    found[k] = np.ravel(read(one))
+                return found.ravel()
+
+            return show
 
         def active(known: _Known) -> Array:
             cut = np.zeros(max(len(rows), 1))
@@ -130,8 +144,10 @@ class TruncatedEkf(BeliefSystem[_Known]):
 
         self.show("estimated_state", n, lambda known: known.state.best.mean)
         self.show("covariance", n * n, lambda known: known.state.best.covariance.ravel())
-        self.show("hypothesis_weights", cap, lambda known: hypotheses(known)[0])
-        self.show("hypothesis_states", cap * n, lambda known: hypotheses(known)[1])
+        self.show("hypothesis_weights", cap, filled(1, lambda one: one.weight, 0.0))
+        self.show("hypothesis_states", cap * n, filled(n, lambda one: one.belief.mean, math.nan))
+        covariances = filled(n * n, lambda one: one.belief.covariance, math.nan)
+        self.show("hypothesis_covariances", cap * n * n, covariances)
         self.show("active_limits", max(len(rows), 1), active)
         self.show("statistics", len(STATISTICS), _Known.statistics)
 
@@ -142,15 +158,24 @@ class TruncatedEkf(BeliefSystem[_Known]):
     def next_belief(self, context: Context, last: _Known) -> _Known:
         """A step of the filter."""
         require_time_forward(self, context, last.time)
+        settings = self._settings(context)
+        belief_filter = self.filter.with_settings(settings)
+        if settings.hypothesis_cap > self.filter.settings.hypothesis_cap:
+            raise SettingsError(
+                f"{self.get_name()}: its ports are of {self.filter.settings.hypothesis_cap} "
+                f"hypotheses at most; the context's hypothesis_cap is {settings.hypothesis_cap}"
+            )
+        patience, loss_probability = context.get_numeric_parameter(int(self._loss)).value()
+        _require_loss(patience, loss_probability)
         now, unlikely, is_fresh = last.state, last.unlikely, last.step == 0
         restart = self.given(context, "restart")
         if is_fresh or last.lost or (restart is not None and restart[0] != 0):
             mean = self.given(context, "reset_state")
             if mean is not None and np.isfinite(mean).all():
-                now = self.filter.start(Belief(mean, self._start.covariance))
+                now = belief_filter.start(Belief(mean, self._start.covariance))
                 is_fresh, unlikely = True, 0
         if not is_fresh:
-            now = self.filter.predict(now)
+            now = belief_filter.predict(now)
         y, noise = self.given(context, "measurement"), None
         if y is None:
             y = np.full(self._measured, np.nan)
@@ -158,12 +183,32 @@ class TruncatedEkf(BeliefSystem[_Known]):
             noise = self.given(context, "measurement_covariance")
         if noise is not None:
             noise = noise.reshape(self._measured, self._measured)
-        now = self.filter.update(now, y, variances=noise)
+        now = belief_filter.update(now, y, variances=noise)
         if now.count:
-            is_unlikely = now.distance > chdtri(now.count, self._loss_probability)
+            is_unlikely = now.distance > chdtri(now.count, loss_probability)
             unlikely = unlikely + 1 if is_unlikely else 0
-        lost = unlikely >= self._patience
+        lost = bool(unlikely >= patience)
         return _Known(now, last.step + 1, unlikely, lost, context.get_time())
+
+
+def _require_loss(patience: float, probability: float) -> None:
+    if not (patience >= 1 and 0.0 <= probability < 1.0):
+        raise SettingsError(
+            "patience must be 1 or more and loss_probability in [0, 1), not "
+            f"{patience:g} and {probability:g}"
+        )
+
+
+def _period_of(motion: MotionModel, period: float | None) -> float:
+    """The time between two updates [s]; SettingsError where it is not that of a step."""
+    if period is None and motion.period is None:
+        raise SettingsError("the motion's rates are per step: give TruncatedEkf a period")
+    given = period if motion.period is None else motion.period
+    assert given is not None
+    require_period("filter", given)
+    if period is not None and period != given:
+        raise SettingsError(f"a step of the motion takes {given:g} s: its period is not {period:g}")
+    return given
 
 
 class HandSensor(PortedSystem):

@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 
 from drake_pose.filtering.hand import HAND_STATE
+from drake_pose.filtering.linearisation import Linear
 from drake_pose.filtering.state import Belief
 from drake_pose.filtering.truncated_filter import (
     Hypothesis,
@@ -111,7 +112,8 @@ def test_offsets_stay_while_the_state_moves(hand):
     guess = f.start(sequence.guess).best
     repeated = begin_repeated_view(observation, guess, guess, guess.mean)
     A, U = HAND_STATE.transition(), f.predict(f.start(sequence.guess)).hypotheses[0].free.covariance
-    moved = repeated.moved(A, U)
+    n = len(HAND_STATE)
+    moved = repeated.moved(Linear(np.zeros(n), np.zeros(n), A), U)
     n = len(HAND_STATE)
     np.testing.assert_allclose(moved.state().mean, A @ guess.mean)
     np.testing.assert_allclose(moved.state().covariance, A @ guess.covariance @ A.T + U)

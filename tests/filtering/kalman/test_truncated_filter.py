@@ -4,6 +4,7 @@ from scipy.stats import multivariate_normal
 
 from drake_pose.errors import SettingsError, UnknownNameError
 from drake_pose.filtering.inequalities import from_bounds, stack, two_sided
+from drake_pose.filtering.motion import LinearMotion
 from drake_pose.filtering.state import Belief, StateLayout, covariance_from, factor_of, make_belief
 from drake_pose.filtering.truncated_filter import FilterSettings, TruncatedFilter
 from drake_pose.filtering.truncated_normal import truncate_joint
@@ -134,7 +135,8 @@ def test_covariances_stay_positive_definite_when_measurements_are_nearly_exact()
 def make_filter(model=None, rows=None, noise=None, **settings):
     rows = rows or from_bounds(["angle", "length"], [0.0, 0.5], [1.5, 1.5])
     noise = LAYOUT.process_noise({"angle": 0.02}) if noise is None else noise
-    return TruncatedFilter(LAYOUT, model or Segment(), rows, noise, FilterSettings(**settings))
+    motion = LinearMotion(LAYOUT.transition(), noise, None)
+    return TruncatedFilter(LAYOUT, model or Segment(), rows, motion, FilterSettings(**settings))
 
 
 @pytest.mark.parametrize("truncation", ["joint", "sequential", "clip"])
@@ -172,7 +174,7 @@ def test_weights_add_up_and_the_cap_holds():
 def test_a_mirrored_prediction_beyond_a_limit_dies_of_it():
     """Section 5: what looks the same at the negative angle lies far beyond the stop at zero."""
     rows = from_bounds(["angle", "length"], [0.0, 0.9], [1.5, 1.1])
-    paper = {"truncation": "sequential", "iterations": 1}
+    paper = {"truncation": "sequential", "linearisation": "tangent", "iterations": 1}
     f = make_filter(Segment(depth_only=True, deviation=0.002), rows, **paper)
     state = f.start(Belief(np.array([0.4, 0.0, 1.0]), np.diag([0.02, 1e-3, 1e-6])))
     state = f.update(f.predict(state), np.array([np.cos(0.4)]))
@@ -249,7 +251,7 @@ def test_transition_and_noise():
         (lambda: LAYOUT.process_noise({}), "'angle'"),
         (lambda: LAYOUT.process_noise({"length": 1.0}), "length"),
         (lambda: StateLayout(("a", "a"), ()), "'a'"),
-        (lambda: make_filter(noise=-np.eye(3)), "process noise: the covariance is indefinite"),
+        (lambda: make_filter(noise=-np.eye(3)), "motion's noise: the covariance is indefinite"),
         (lambda: make_filter(rows=stack([ONE_TURN, BEYOND_IT])), "stop"),
         (lambda: make_filter(rows=from_bounds(["elbow"], [0], [1])), "elbow"),
     ],

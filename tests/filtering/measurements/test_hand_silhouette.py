@@ -17,8 +17,8 @@ from drake_pose.filtering.hand import (
     plant_positions,
 )
 from drake_pose.filtering.hand_silhouette import MATCHING, HandSilhouette, match_axes
+from drake_pose.filtering.linearisation import difference
 from drake_pose.filtering.state import Belief
-from drake_pose.filtering.update import difference
 from drake_pose.fit.evidence import find_edge_points
 from drake_pose.papers.shimada import experiment_filter
 from drake_pose.papers.shimada_sequences import first_guess, true_states

@@ -1,29 +1,20 @@
-"""Several explanations of the same pictures, weighed against each other, each within a view.
-
-The same view for long teaches nothing new: what one view may tell in all, and no more. A filter
-linearised anew in every frame of a static view becomes ever surer: the flaw that Shimada et al.
-state in section 7. Here a view keeps the tangent of its first frame; what that leaves out is an
-offset of each measurement, unknown, the same in all frames of the view, of the size of the
-curvature at its first frame, estimated beside the state and forgotten when the view ends.
-"""
+"""Several explanations of the same measurements, weighed against each other."""
 
 import math
 from collections.abc import Iterator, Sequence
 from copy import copy
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
 from itertools import count
 from typing import Literal, get_args
 
 import numpy as np
-from scipy.special import chdtri
 
 from drake_pose.arrays import Array
 from drake_pose.errors import SettingsError
 from drake_pose.filtering.inequalities import Inequalities, inner_point
-from drake_pose.filtering.linearisation import Linear, difference, require_slope
+from drake_pose.filtering.linearisation import Linear, require_slope
 from drake_pose.filtering.motion import LinearMotion, MotionModel, require_models, step_from
-from drake_pose.filtering.state import Belief, StateLayout, factor_of, make_belief
+from drake_pose.filtering.state import Belief, StateLayout, make_belief
 from drake_pose.filtering.truncated_normal import (
     Truncated,
     clip,
@@ -33,7 +24,6 @@ from drake_pose.filtering.truncated_normal import (
     unlimited,
 )
 from drake_pose.filtering.update import (
-    LinearObservation,
     Measurement,
     ObservationModel,
     Truncate,
@@ -41,118 +31,14 @@ from drake_pose.filtering.update import (
     make_measurement,
     update,
 )
-
-
-@dataclass(frozen=True, eq=False)
-class StaticView:
-    """Frames that show the same: the measurement (m,) of the first, and how many."""
-
-    reference: Array
-    count: int
-
-
-def next_view(view: StaticView | None, seen: Measurement, significance: float) -> StaticView:
-    """The view a measurement belongs to: the one so far, or one that begins with it.
-
-    Args:
-        significance: a view is new when noise alone would make it differ so much from the reference
-            with no more than this probability; 0: every one is new.
-    """
-    y = seen.y
-    if view is None or significance == 0 or len(view.reference) != len(y):
-        return StaticView(y, 1)
-    change = difference(y, view.reference, seen.model.wraps)
-    both = np.isfinite(change)
-    new_rows = np.isfinite(y) & ~np.isfinite(view.reference)
-    if new_rows.any() or not both.any():
-        return StaticView(y, 1)
-    size = float(np.sum(change[both] ** 2 / (2.0 * np.diag(seen.covariance)[both])))
-    is_new = size > _largest_change(significance, int(np.count_nonzero(both)))
-    return StaticView(y, 1) if is_new else StaticView(view.reference, view.count + 1)
-
-
-@lru_cache(maxsize=1024)
-def _largest_change(significance: float, count: int) -> float:
-    return float(chdtri(count, significance))
-
-
-def measure_curvature(model: ObservationModel, belief: Belief) -> Array:
-    """(m,) mean square of what the tangent at a belief's mean leaves out of a measurement.
-
-    By second differences along the columns of the covariance's root.
-    """
-    h, H = model.predict(belief.mean)
-    used = np.flatnonzero(np.abs(H).sum(axis=0) > 0)
-    root = factor_of(belief.covariance[np.ix_(used, used)])
-    total = np.zeros(len(h))
-    for column in root.T:
-        step = np.zeros_like(belief.mean)
-        step[used] = column
-        ends = [model.predict(belief.mean + sign * step)[0] for sign in (1.0, -1.0)]
-        bend = 0.5 * sum(difference(end, h, model.wraps) for end in ends)
-        # E[(b z^2)^2] = 3 b^2 for a standard normal z.
-        total += 3.0 * np.nan_to_num(bend) ** 2
-    return total
-
-
-def moved(belief: Belief, step: Linear, U: Array) -> Belief:
-    """The belief (6) after a step with noise of covariance U (n, n)."""
-    noise = U if step.rest is None else U + step.rest
-    P = step.slope @ belief.covariance @ step.slope.T + noise
-    return Belief(step.value + step.slope @ (belief.mean - step.at), 0.5 * (P + P.T))
-
-
-@dataclass(frozen=True, eq=False)
-class RepeatedView:
-    """What is believed within a view: the state, and beside it the tangent's offsets.
-
-    Attributes:
-        tangent: (n,) where the view's first frame was linearised.
-        belief: over n + m numbers: the state, then what the tangent leaves out of each measurement.
-    """
-
-    tangent: Array
-    belief: Belief
-
-    def state(self) -> Belief:
-        """The belief about the state alone."""
-        n = len(self.tangent)
-        return Belief(self.belief.mean[:n].copy(), self.belief.covariance[:n, :n].copy())
-
-    def moved(self, step: Linear, U: Array) -> "RepeatedView":
-        """A step with noise of covariance U (n, n); the offsets stay as they are."""
-        n, P = len(self.tangent), self.belief.covariance.copy()
-        state = moved(self.state(), step, U)
-        mean = np.r_[state.mean, self.belief.mean[n:]]
-        P[:n, :n] = state.covariance
-        P[:n, n:] = step.slope @ P[:n, n:]
-        P[n:, :n] = P[:n, n:].T
-        return RepeatedView(self.tangent, Belief(mean, P))
-
-
-def begin_repeated_view(
-    model: ObservationModel, free: Belief, seen: Belief, tangent: Array
-) -> RepeatedView:
-    """A view's second frame: nothing is known yet of the offsets but how large they may be.
-
-    Args:
-        free: the prediction of the second frame, without its limits.
-        seen: how far the state may be from the tangent, where the curvature is measured.
-        tangent: (n,) where the first frame was linearised.
-    """
-    curvature = measure_curvature(model, Belief(tangent, seen.covariance))
-    n, m = len(tangent), len(curvature)
-    P = np.zeros((n + m, n + m))
-    P[:n, :n] = free.covariance
-    P[n:, n:] = np.diag(curvature)
-    return RepeatedView(tangent, Belief(np.r_[free.mean, np.zeros(m)], P))
-
-
-def anchored(model: ObservationModel, tangent: Array) -> LinearObservation:
-    """A model held at the tangent (n,) of one state, with offsets: linear in both, (n + m,)."""
-    h, H = model.predict(tangent)
-    at, slope = np.r_[tangent, np.zeros(len(h))], np.hstack([H, np.eye(len(h))])
-    return LinearObservation(model.names, model.variances, model.wraps, at, h, slope)
+from drake_pose.filtering.views import (
+    RepeatedView,
+    StaticView,
+    anchored,
+    begin_repeated_view,
+    moved,
+    next_view,
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -277,11 +163,13 @@ class FilterSettings:
             noise) or "tangent" (at one point, the paper's).
         iterations: linearisations of an update at most; 1 for the paper's. More of them are nearer
             to the most probable state where that is sharp, and too sure where it is not.
+        persistence: what a line leaves out of a measurement stays the same for about this time, so
+            that further frames do not average it away [s]; for "spread".
         hypothesis_cap: how many hypotheses are kept at most; 1 for none but the best.
         smallest_weight: lighter hypotheses are given up.
         novelty: a measurement shows nothing new if noise alone would make it differ as much
             from the one that began the view with more than this probability, such as 1e-9, see
-            the module. 0: every frame is new, as in the paper; so it is always with "sequential"
+            ``views``. 0: every frame is new, as in the paper; so it is always with "sequential"
             and "clip".
         twin_distance: hypotheses that are closer in every element are one [deviations].
         tolerance: of the joint truncation [deviations].
@@ -295,6 +183,7 @@ class FilterSettings:
     truncation: Truncation = "joint"
     linearisation: Linearisation = "spread"
     iterations: int = 1
+    persistence: float = 0.15
     hypothesis_cap: int = 4
     smallest_weight: float = 1e-4
     novelty: float = 0.0
@@ -313,6 +202,8 @@ class FilterSettings:
                 f"linearisation must be one of {', '.join(LINEARISATIONS)}, not "
                 f"'{self.linearisation}'"
             )
+        if not 0.0 <= self.persistence < math.inf:
+            raise SettingsError(f"persistence must be 0 or more, not {self.persistence}")
         if self.iterations < 1 or self.hypothesis_cap < 1:
             raise SettingsError("iterations and hypothesis_cap must be 1 or more")
         if not 0 <= self.novelty < 1:
@@ -396,6 +287,10 @@ class TruncatedFilter:
         # What is truncated and fed back has no offsets to keep.
         feeds_back = settings.truncation in ("sequential", "clip")
         self.novelty = 0.0 if feeds_back else settings.novelty
+        self._spread = 0.0
+        if settings.linearisation == "spread":
+            # A step of unknown time counts as one of 30 in a second.
+            self._spread = max(1.0, settings.persistence / (self.motion.period or 1 / 30))
         is_free = settings.truncation == "none" or not self.inequalities
         self._limits: Truncate | None = None if is_free else self._truncate
 
@@ -445,7 +340,7 @@ class TruncatedFilter:
         return moved(belief, self._step(belief), self._U)
 
     def _step(self, belief: Belief) -> Linear:
-        return step_from(self.motion, belief, self.settings.linearisation == "spread")
+        return step_from(self.motion, belief, self._spread > 0)
 
     def corrected(self, prediction: Belief, y: Array, variances: Array, start: Array) -> Array:
         """(n,) the mean of a prediction after a measurement, without hypotheses: a rough state.
@@ -455,8 +350,7 @@ class TruncatedFilter:
         """
         seen = make_measurement(self.observation, y, variances)
         few = min(self.settings.iterations, self.settings.rough_iterations)
-        spread = self.settings.linearisation == "spread"
-        rough = update(prediction, seen, few, start, False, self._limits, spread=spread)
+        rough = update(prediction, seen, few, start, False, self._limits, spread=self._spread)
         return rough.truncated.mean
 
     def update(
@@ -501,14 +395,14 @@ class TruncatedFilter:
     ) -> list[Branch]:
         """A hypothesis updated at its prediction, and at each mirrored one, which are counted."""
         own = replace(hypothesis, repeated=None)
-        spread, iterations = self.settings.linearisation == "spread", self.settings.iterations
+        iterations = self.settings.iterations
         starts = [(own, own.belief.mean)]
         if self.settings.hypothesis_cap > 1:
             for start in seen.model.mirrors(own.belief):
                 starts.append((replace(own, born=step, place=next(places)), start))
         # A belief that is as wide as its mirror is far would hold both: each begins at its place.
-        alone = spread and len(starts) == 1
-        if spread and not alone:
+        alone = self._spread > 0 and len(starts) == 1
+        if self._spread > 0 and not alone:
             iterations = max(iterations, self.settings.rough_iterations)
         return [
             (
@@ -521,7 +415,7 @@ class TruncatedFilter:
                     tempered=h is own,
                     truncate=self._limits,
                     sites=h.sites,
-                    spread=spread,
+                    spread=self._spread,
                 ),
             )
             for h, start in starts

@@ -204,7 +204,7 @@ def update(
     tempered: bool = True,
     truncate: Truncate | None = None,
     sites: Array | None = None,
-    spread: bool = False,
+    spread: float = 0.0,
 ) -> Updated:
     """Fuse a belief with a measurement, and truncate it.
 
@@ -218,8 +218,9 @@ def update(
             draw a mirrored one back to the prediction.
         truncate: a belief, and sites (S, 2) to begin with, to a result; None: there are no limits.
         sites: of the last truncation.
-        spread: whether the measurement is linearised over the belief, see ``linear_over``, but
-            for a start that is given; else at a point.
+        spread: 0: the measurement is linearised at a point. Else over the belief, but for a start
+            that is given, see ``linear_over``; what that leaves out counts as this many times its
+            covariance, as it repeats itself from frame to frame.
 
     Raises:
         SettingsError: the belief has no density inside the limits, or a variance is not positive.
@@ -249,7 +250,7 @@ def update(
         residual = difference(seen.y[rows], h[rows], seen.model.wraps[rows])
         H, plain = H[rows], seen.covariance[np.ix_(rows, rows)]
         if left_out is not None:
-            plain = plain + left_out[np.ix_(rows, rows)]
+            plain = plain + spread * left_out[np.ix_(rows, rows)]
         innovation = residual + H @ (x - prediction.mean)
         if made == 0 and iterations > 1 and tempered and not spread:
             misfit = float(residual @ np.linalg.solve(plain, residual)) / max(count, 1)

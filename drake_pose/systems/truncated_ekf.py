@@ -10,6 +10,8 @@ from typing import Any
 
 import numpy as np
 from pydrake.geometry import SceneGraph
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.systems.analysis import ResetIntegratorFromFlags, Simulator
 from pydrake.systems.framework import BasicVector, Context, Diagram, DiagramBuilder, OutputPort
 from pydrake.systems.sensors import ImageLabel16I
 from pydrake.trajectories import Trajectory
@@ -18,10 +20,10 @@ from scipy.special import chdtri
 from drake_pose.arrays import Array
 from drake_pose.body import ParsedModel
 from drake_pose.camera.models import Camera
-from drake_pose.errors import SettingsError
+from drake_pose.errors import SettingsError, listed
 from drake_pose.filtering.hand_silhouette import HandMeasurement, HandSilhouette
-from drake_pose.filtering.motion import MotionModel
-from drake_pose.filtering.state import Belief, make_belief
+from drake_pose.filtering.motion import FunctionMotion, MotionModel
+from drake_pose.filtering.state import Belief, StateLayout, make_belief
 from drake_pose.filtering.truncated_filter import FilterState, Hypothesis, TruncatedFilter
 from drake_pose.silhouette.pictures.label_images import label_image_to_mask
 from drake_pose.silhouette.pictures.scenes import Scene
@@ -189,6 +191,64 @@ class TruncatedEkf(BeliefSystem[_Known]):
             unlikely = unlikely + 1 if is_unlikely else 0
         lost = bool(unlikely >= patience)
         return _Known(now, last.step + 1, unlikely, lost, context.get_time())
+
+
+def plant_motion(
+    plant: MultibodyPlant,
+    layout: StateLayout,
+    noise: Array,
+    period: float,
+    context: Context | None = None,
+) -> FunctionMotion:
+    """A plant's own dynamics as a filter's motion, Jacobian by differences.
+
+    Args:
+        plant: finalized; each of its joints that moves has one position, and the joint's name is a
+            moving element of the state. Its constants stay as they are.
+        noise: (n, n) the covariance of what a step adds.
+        period: the time of a step [s], a multiple of a discrete plant's time step.
+        context: the plant's, with inputs and parameters that are fixed; None: the default.
+
+    Raises:
+        SettingsError: joints that are not the state's moving elements, or a period that does not
+            fit the plant's time step.
+    """
+    joints = {
+        joint.name(): joint
+        for joint in map(plant.get_joint, plant.GetJointIndices())
+        if joint.num_velocities()
+    }
+    single = all(one.num_positions() == one.num_velocities() == 1 for one in joints.values())
+    if not single or set(joints) != set(layout.moving):
+        raise SettingsError(
+            f"the plant's joints that move are {listed(list(joints))}; the state's moving elements "
+            f"are {listed(layout.moving)}: they must be the same, with one position each"
+        )
+    require_period("motion", period)
+    step = plant.time_step()
+    if step and abs(period / step - round(period / step)) > 1e-6:
+        raise SettingsError(f"a period of {period:g} s is no multiple of the plant's {step:g} s")
+    simulator = Simulator(plant, context.Clone() if context else plant.CreateDefaultContext())
+    if not step:
+        # Steps that a required accuracy chose would differ between neighbouring states.
+        ResetIntegratorFromFlags(simulator, "runge_kutta3", min(period / 4, 1e-2))
+        simulator.get_mutable_integrator().set_fixed_step_mode(True)
+    m, own = len(layout.moving), simulator.get_mutable_context()
+    order = [joints[name] for name in layout.moving]
+    places = np.array([one.position_start() for one in order])
+    rates = np.array([plant.num_positions() + one.velocity_start() for one in order])
+
+    def after(x: Array) -> Array:
+        state = plant.GetPositionsAndVelocities(own)
+        state[places], state[rates] = x[:m], x[m : 2 * m]
+        own.SetTime(0.0)
+        plant.SetPositionsAndVelocities(own, state)
+        simulator.Initialize()
+        simulator.AdvanceTo(period)
+        state = plant.GetPositionsAndVelocities(own)
+        return np.r_[state[places], state[rates], x[2 * m :]]
+
+    return FunctionMotion(after, noise, period)
 
 
 def _require_loss(patience: float, probability: float) -> None:

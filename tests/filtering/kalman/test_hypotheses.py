@@ -4,18 +4,15 @@ import pytest
 from drake_pose.filtering.hand import HAND_STATE
 from drake_pose.filtering.linearisation import Linear
 from drake_pose.filtering.state import Belief
-from drake_pose.filtering.truncated_filter import (
-    Hypothesis,
+from drake_pose.filtering.truncated_filter import Hypothesis, merge_twins, normalise, prune
+from drake_pose.filtering.update import make_measurement, update
+from drake_pose.filtering.views import (
     RepeatedView,
     anchored,
     begin_repeated_view,
     measure_curvature,
-    merge_twins,
     next_view,
-    normalise,
-    prune,
 )
-from drake_pose.filtering.update import make_measurement, update
 from drake_pose.papers.shimada import experiment_filter
 from drake_pose.papers.shimada_sequences import make_sequence
 

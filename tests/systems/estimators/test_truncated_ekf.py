@@ -1,12 +1,19 @@
 import numpy as np
 import pytest
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import RevoluteJoint, SpatialInertia, UnitInertia
+from scipy.integrate import solve_ivp
 
 from drake_pose.errors import SettingsError
 from drake_pose.filtering.hand import HAND_STATE
-from drake_pose.filtering.state import Belief
+from drake_pose.filtering.inequalities import from_bounds
+from drake_pose.filtering.motion import constant_velocity
+from drake_pose.filtering.state import Belief, StateLayout
+from drake_pose.filtering.truncated_filter import FilterSettings, TruncatedFilter
+from drake_pose.filtering.update import FunctionObservation
 from drake_pose.papers.shimada import experiment_filter
 from drake_pose.papers.shimada_sequences import make_sequence
-from drake_pose.systems.truncated_ekf import STATISTICS, TruncatedEkf
+from drake_pose.systems.truncated_ekf import STATISTICS, TruncatedEkf, plant_motion
 from tests.systems.bench import Bench
 
 PERIOD = 1 / 30
@@ -99,6 +106,92 @@ def test_a_frame_can_bring_its_own_noise(sequence):
         deviations.append(np.sqrt(np.diag(run["covariance"].reshape(len(HAND_STATE), -1))))
     np.testing.assert_array_equal(deviations[0], deviations[1])
     assert (deviations[2][:2] > 2 * deviations[1][:2]).all()
+
+
+LAYOUT = StateLayout(("swing",), ("length",))
+LIMITS = from_bounds(["swing", "length"], [-2.0, 0.2], [2.0, 2.0])
+ABOUT = Belief(np.array([0.5, 0.0, 1.0]), np.diag([0.2, 0.2, 0.1]) ** 2)
+
+
+def swinging(period=0.1, **settings):
+    """The end of a rod that swings, seen by one camera."""
+    end = FunctionObservation(
+        ("u", "v"), 0.02, lambda x: x[2] * np.array([np.sin(x[0]), -np.cos(x[0])])
+    )
+    motion = constant_velocity(LAYOUT, {"swing": 0.5}, period)
+    return TruncatedFilter(LAYOUT, end, LIMITS, motion, FilterSettings(**settings))
+
+
+def test_a_context_says_how_the_filter_works():
+    """What a parameter sets is what a filter made so does; more hypotheses than ports are none."""
+    run, rows = Bench(TruncatedEkf(swinging(), ABOUT)), np.array([[0.5, -0.8], [0.6, -0.7]])
+    settings = FilterSettings(linearisation="tangent", iterations=5)
+    run.context.get_mutable_abstract_parameter(0).set_value(settings)
+    other = Bench(TruncatedEkf(swinging(**vars(settings)), ABOUT))
+    plain = Bench(TruncatedEkf(swinging(), ABOUT))
+    for t, y in enumerate(rows):
+        for one in (run, other, plain):
+            one.update(0.1 * t, measurement=y)
+    for port in ("estimated_state", "covariance", "hypothesis_covariances"):
+        np.testing.assert_array_equal(run[port], other[port])
+    assert np.abs(run["covariance"] - plain["covariance"]).max() > 1e-6
+    np.testing.assert_array_equal(plain["hypothesis_covariances"][:9], plain["covariance"])
+    assert np.isnan(plain["hypothesis_covariances"][9:]).all()
+    # One that nothing but the context makes impatient.
+    run.context.get_mutable_numeric_parameter(0).SetFromVector([1.0, 0.5])
+    run.update(0.3, measurement=rows[0] + 1.0)
+    assert run["statistics"][STATISTICS.index("lost")] == 1
+    for index, value, word in (
+        (0, FilterSettings(hypothesis_cap=9), "4 hypotheses"),
+        (0, "joint", "not str"),
+    ):
+        run.context.get_mutable_abstract_parameter(index).set_value(value)
+        with pytest.raises(SettingsError, match=word):
+            run.update(0.4)
+
+
+def test_the_period_is_the_motions():
+    assert Bench(TruncatedEkf(swinging(0.02), ABOUT)).advance(0.1)["statistics"][0] == 5
+    with pytest.raises(SettingsError, match=r"takes 0\.1 s: its period is not 0\.5"):
+        TruncatedEkf(swinging(), ABOUT, 0.5)
+    with pytest.raises(SettingsError, match="per step"):
+        TruncatedEkf(experiment_filter()[0], ABOUT)
+    with pytest.raises(SettingsError, match="a TruncatedFilter, not StateLayout"):
+        TruncatedEkf(LAYOUT, ABOUT)
+    with pytest.raises(SettingsError, match="3 elements"):
+        TruncatedEkf(swinging(), Belief(np.zeros(2), np.eye(2)))
+
+
+def pendulum(time_step):
+    """A point of 1 kg at 0.8 m below a joint."""
+    plant = MultibodyPlant(time_step)
+    rod = plant.AddRigidBody(
+        "rod", SpatialInertia(1.0, [0.0, 0.0, -0.8], UnitInertia(0.64, 0.64, 0.0))
+    )
+    hinge = RevoluteJoint("swing", plant.world_frame(), rod.body_frame(), [0.0, 1.0, 0.0])
+    plant.AddJoint(hinge)
+    plant.Finalize()
+    return plant
+
+
+@pytest.mark.parametrize("time_step", [0.0, 1e-3])
+def test_a_plants_motion_is_its_differential_equation(time_step):
+    motion = plant_motion(pendulum(time_step), LAYOUT, 1e-6 * np.eye(3), 0.1)
+    for x in ([0.5, -1.0, 0.3], [2.5, 3.0, 0.3]):
+        expected = solve_ivp(
+            lambda t, z: [z[1], -9.81 / 0.8 * np.sin(z[0])], (0.0, 0.1), x[:2], rtol=1e-10
+        ).y[:, -1]
+        found, slope = motion.predict(np.array(x))
+        # A discrete plant steps by 1 ms, which errs by as much.
+        np.testing.assert_allclose(found[:2], expected, atol=0.01 if time_step else 1e-5)
+        assert found[2] == x[2]
+        assert np.isfinite(slope).all()
+    TruncatedFilter(LAYOUT, swinging().observation, LIMITS, motion).start(ABOUT)
+    with pytest.raises(SettingsError, match="swing; the state's moving elements are turn"):
+        plant_motion(pendulum(time_step), StateLayout(("turn",), ()), np.eye(2), 0.1)
+    if time_step:
+        with pytest.raises(SettingsError, match="multiple"):
+            plant_motion(pendulum(time_step), LAYOUT, np.eye(3), 0.1005)
 
 
 def test_bad_settings_are_refused(sequence):

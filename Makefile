@@ -45,6 +45,7 @@ bench: export OPENBLAS_NUM_THREADS = 1
 bench: $(VENV)/ready-cluster
 	$(PYTHON) -m tests.benchmarks.speed
 	$(PYTHON) -m tests.benchmarks.growth
+	$(PYTHON) -m tests.benchmarks.filters
 	$(PYTHON) -m tests.benchmarks.silhouette_camera
 	$(PYTHON) -m tests.benchmarks.estimates $(DATA)
 	$(PYTHON) -m tests.benchmarks.registration $(DATA) --cases 1

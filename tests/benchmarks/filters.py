@@ -1,8 +1,8 @@
-"""A filter for a system of one's own (``python -m tests.benchmarks.filters [FIRST_SEED]``).
+"""A filter for a system of one's own (``python -m tests.benchmarks.filters [FIRST [ARMS]]``).
 
 A planar arm of three links whose lengths nobody knows; its joints have limits. A camera sees elbow
-and tip, or elbow, wrist and tip, each with noise. 16 arms move for 120 frames as the filter's
-motion says, and stay within their limits.
+and tip, or elbow, wrist and tip, each with noise. 16 arms, of the seeds from FIRST on, move for 120
+frames as the filter's motion says, and stay within their limits.
 """
 
 import sys
@@ -172,18 +172,19 @@ def measure(follow: Filter, ends: tuple[int, ...], seeds: range) -> tuple[float,
     return float(squares[0] ** 0.5), float(squares[1] ** 0.5), float(squares[2]), cost
 
 
-def rows(first: int) -> Iterator[tuple[str, ...]]:
+def rows(seeds: range) -> Iterator[tuple[str, ...]]:
     """Each filter's figures, of both cases."""
     for name, follow in FILTERS.items():
         cells = [name]
         for ends in SEEN.values():
-            angle, length, nees, cost = measure(follow, ends, range(first, first + ARMS))
+            angle, length, nees, cost = measure(follow, ends, seeds)
             cells += [f"{angle:.1f}", f"{length:.1f}", f"{nees:.2f}", f"{cost:.2f}"]
         yield tuple(cells)
 
 
 if __name__ == "__main__":
-    seed = int(sys.argv[1]) if len(sys.argv) > 1 else 0
+    first, arms = (int(word) for word in [*sys.argv[1:], *["0", str(ARMS)][len(sys.argv) - 1 :]])
+    seeds = range(first, first + arms)
     figures = ("deg", "mm", "NEES", "ms") * len(SEEN)
     title = f"Angles, lengths at the end, NEES of a degree of freedom: {' | '.join(SEEN)} seen"
-    print_table(f"{title}; seeds {seed} to {seed + ARMS - 1}", ("filter", *figures), rows(seed))
+    print_table(f"{title}; seeds {first} to {seeds[-1]}", ("filter", *figures), rows(seeds))

@@ -190,6 +190,8 @@ class _Diagnoser:
         tolerance = np.where(fit.is_angle, np.radians(0.1), 0.001)
         self._tolerance = np.diag((tolerance / fit.deviations) ** 2)
         self._seen = dict[str, Distances]()
+        # Outlines are in the pictures, however far off a linear fit says they are.
+        self._most = max(float(np.hypot(one.width, one.height)) for one in fit.cameras)
         p, nodes = len(fit.names), len(fit.outlines)
         self._nothing = _Information(
             np.zeros((p, p)), np.zeros(p), np.zeros((p, 12 * nodes)), np.zeros((nodes, p, p)),
@@ -223,7 +225,7 @@ class _Diagnoser:
             tests = [residual.test(cause) for cause in self._causes(fitted)]
             # Each of the tests may find something by chance.
             least = min(residual.p_value, *(one.p_value for one in tests)) * (1 + len(tests))
-            finding, pixels = None, residual.pixels()
+            finding, pixels = None, min(residual.pixels(), self._most)
             if not is_explained:
                 finding = self._joints_finding("unexplained", residual)
             elif least <= DIAGNOSIS.significance and pixels >= DIAGNOSIS.min_pixels:
@@ -358,7 +360,8 @@ class _Diagnoser:
             covariance = best.covariance * np.outer(best.units, best.units)
             x[3:], sd[3:] = own @ x, np.sqrt(np.diag(own @ covariance @ own.T))
         sizes = (size(x[:turns]), size(x[turns:]), size(sd[:turns]), size(sd[turns:]))
-        return Finding(kind, name, *sizes, pixels, best.p_value, tuple(rivals), at_body=at_body)
+        off = (*sizes, min(pixels, self._most), best.p_value, tuple(rivals))
+        return Finding(kind, name, *off, at_body=at_body)
 
     def _joints_finding(self, kind: str, residual: _Residual) -> Finding:
         """What is off in a frame where no cause by itself explains it."""
@@ -370,8 +373,8 @@ class _Diagnoser:
         shift = float(np.abs(joints[~turns]).max(initial=0.0))
         sure = np.flatnonzero((np.abs(x) > 3.0 * sd)[: len(names)])
         named = {names[k]: float(joints[k]) for k in sure}
-        off = (angle, shift, 0.0, 0.0)
-        return Finding(kind, "", *off, residual.pixels(), residual.p_value, (), named)
+        off = (angle, shift, 0.0, 0.0, min(residual.pixels(), self._most))
+        return Finding(kind, "", *off, residual.p_value, (), named)
 
     def _common_findings(
         self, kept: Mask

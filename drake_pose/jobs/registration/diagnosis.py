@@ -3,7 +3,7 @@
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
-from itertools import pairwise
+from itertools import combinations, pairwise
 
 import numpy as np
 from scipy.special import chdtrc
@@ -390,6 +390,11 @@ def say_frame(one: FrameDiagnosis, found: Finding) -> str:
             f"no positions near those given explain it: in camera '{worst}' "
             f"{percent(one.fitted[worst])} of the contours fit at best"
         )
+    most = math.radians(10.0)
+    if found.kind == "joint" and abs(found.angle) > most:
+        # So far fits of single frames reach; what they say of more is no size.
+        word = "low" if found.angle > 0.0 else "high"
+        return f"joint '{found.name}' reads more than 10 degrees too {word}, {pixels}"
     if found.kind == "joints":
         named = sorted(found.joints.items(), key=lambda item: -abs(item[1]))
         joints = ", ".join(name for name, _ in named[:3])
@@ -453,6 +458,19 @@ def say_lost(camera: str, lost: Sequence[str], names: Sequence[str], what: str =
     )
 
 
+def last_before_change(wrong: Sequence[bool], least: int = 2) -> int | None:
+    """The last frame before a moment from or until which all frames contradict the others.
+
+    Args:
+        wrong: of each frame, whether it contradicts.
+        least: number of frames that do, and of those that do not; None where they are fewer.
+    """
+    turns = np.flatnonzero(np.diff(np.array(wrong, int)))
+    if len(turns) != 1 or min(sum(wrong), len(wrong) - sum(wrong)) < least:
+        return None
+    return int(turns[0])
+
+
 def say_outliers(found: RegisteredCamera, of_pictures: bool = False) -> list[str]:
     """What a user should know of a camera's frames that contradict, and of other poses.
 
@@ -460,22 +478,25 @@ def say_outliers(found: RegisteredCamera, of_pictures: bool = False) -> list[str
         the fit agree, and the others may be dark or blurred.
     """
     name, frames = found.camera.name, [frame.frame for frame in found.frames]
-    wrong, texts = found.contradictions, []
+    wrong, texts, moved = found.contradictions, [], ""
+    last = last_before_change([one in wrong for one in frames])
+    if last is not None:
+        moved = f" Were camera or base moved after frame '{frames[last]}'?"
     if wrong:
         right = len(frames) - len(wrong)
         text = (
             f"camera '{name}': {len(wrong)} of {len(frames)} frames contradict the others and did "
             f"not count: {frame_ranges(wrong, frames)}; are their joint positions those of the "
-            "pictures?"
+            f"pictures?{moved}"
         )
         if 2 * right <= len(frames):
             supporting = frame_ranges([one for one in frames if one not in wrong], frames)
             if not of_pictures:
                 raise RegistrationError(
                     f"camera '{name}': half of the frames or more contradict the others, "
-                    f"{len(wrong)} of {len(frames)}: {frame_ranges(wrong, frames)}. Either these "
-                    f"are wrong or those that agree, {supporting}, do by chance: is the model this "
-                    "robot's, with its covers and tools, and are joint positions those of the "
+                    f"{len(wrong)} of {len(frames)}: {frame_ranges(wrong, frames)}.{moved} Either "
+                    f"these are wrong or those that agree, {supporting}, do by chance: is the model "
+                    "this robot's, with its covers and tools, and are joint positions those of the "
                     "pictures and in the model's zeros (--zeros all)? To trust those that agree "
                     "give a scene of them alone. Nothing was written"
                 )
@@ -532,16 +553,25 @@ def say_object(seen: ObjectPose) -> list[str]:
 def say_common(registered: Iterable[RegisteredCamera], *, of_pictures: bool = False) -> list[str]:
     """Whose fault it is where several cameras see a frame that contradicts the others."""
     agrees: dict[str, dict[str, bool]] = {}
+    sets, looked_at = dict[str, list[str]](), dict[str, set[str]]()
     for found in registered:
         for one in found.frames:
             agrees.setdefault(one.frame, {})[found.camera.name] = one.agrees
+        sets[found.camera.name] = [one.frame for one in found.frames if one.agrees]
+        looked_at[found.camera.name] = {one.frame for one in found.frames}
     frames, masks = list(agrees), dict[str, list[str]]()
     positions = [k for k, own in agrees.items() if len(own) > 1 and not any(own.values())]
     for frame, own in agrees.items():
         for name in (name for name, right in own.items() if any(own.values()) and not right):
             masks.setdefault(name, []).append(frame)
     why = "something hides the robot there" if of_pictures else "their masks are not"
-    texts = []
+    texts = [
+        f"cameras '{a}' and '{b}' rest on no common frame: '{a}' on {frame_ranges(own, frames)}, "
+        f"'{b}' on {frame_ranges(other, frames)}: if cameras or base were moved between, their "
+        "poses are of two moments and do not belong together"
+        for (a, own), (b, other) in combinations(sets.items(), 2)
+        if looked_at[a] & looked_at[b] and not {*own} & {*other} and not of_pictures
+    ]
     if positions:
         texts.append(
             f"frames {frame_ranges(positions, frames)} contradict the others in all cameras that "

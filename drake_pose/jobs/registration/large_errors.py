@@ -12,6 +12,7 @@ from drake_pose.files.settings import percent
 from drake_pose.jobs.registration.diagnosis import (
     compare_camera,
     find_misfit,
+    last_before_change,
     require_seen_by,
 )
 from drake_pose.jobs.registration.inputs import Inputs
@@ -437,11 +438,11 @@ def changed_after(found: Diagnosis, cameras: Collection[str], least: int) -> tup
         least: number of frames before and after; where they are fewer there is no such moment.
     """
     own = [k for k, one in enumerate(found.frames) if {*one.given} == {*cameras}]
-    wrong = np.array([found.frames[k].finding is not None for k in own], bool)
-    turns = np.flatnonzero(wrong[1:] != wrong[:-1])
-    if len(turns) != 1 or min(wrong.sum(), (~wrong).sum()) < least:
+    wrong = [found.frames[k].finding is not None for k in own]
+    last = last_before_change(wrong, least)
+    if last is None:
         return [], ""
-    return [own[k] for k in np.flatnonzero(wrong)], found.frames[own[int(turns[0])]].frame
+    return [own[k] for k in np.flatnonzero(wrong)], found.frames[own[last]].frame
 
 
 def base_motion(

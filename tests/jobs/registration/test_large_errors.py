@@ -4,6 +4,7 @@ import re
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from drake_pose.camera.camera_files import save_cameras
 from drake_pose.camera.models import Camera
 from drake_pose.errors import CameraError, MaskError
 from drake_pose.jobs.registration.audit import SceneAudit, audit_scene
+from drake_pose.jobs.registration.diagnosis import last_before_change, say_common
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from drake_pose.silhouette.pictures.masks import read_mask, write_mask
 from tests.jobs.registration.arm_scenes import JOINTS, ArmScene, write_arm_scene
@@ -242,3 +244,24 @@ def test_cameras_that_stand_far_from_where_they_are_said_to_are_found(scene) -> 
     (one,) = result.summary["contradictions"]
     assert (one["what"], one["name"]) == ("camera", "left")
     assert one["angle_deg"] == pytest.approx(30.0, abs=1.0)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "last"),
+    [("00011", 2), ("11000", 1), ("00001", None), ("01100", None), ("00000", None), ("11", None)],
+)
+def test_a_change_is_where_all_frames_on_one_side_contradict(wrong, last) -> None:
+    assert last_before_change([one == "1" for one in wrong]) == last
+
+
+def test_cameras_that_rest_on_frames_of_two_moments_are_told_so() -> None:
+    def camera(name: str, agreeing: str) -> SimpleNamespace:
+        frames = [
+            SimpleNamespace(frame=f"{k}", agrees=one == "1") for k, one in enumerate(agreeing)
+        ]
+        return SimpleNamespace(camera=SimpleNamespace(name=name), frames=frames)
+
+    (said, *_) = say_common([camera("left", "11100"), camera("right", "00011")])
+    assert "'left' and 'right' rest on no common frame: 'left' on 0-2, 'right' on 3-4" in said
+    alike = say_common([camera("left", "11100"), camera("right", "00111")])
+    assert not any("no common frame" in text for text in alike)

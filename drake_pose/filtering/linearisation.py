@@ -41,7 +41,15 @@ def difference(values: Array, expected: Array, turning: Mask) -> Array:
     return residual
 
 
-def linear_over(function: WithSlope, belief: Belief, turning: Mask) -> Linear:
+def values_alone(model: object) -> Function | None:
+    """The function of a model whose Jacobian is by differences; None for any other."""
+    function: Function | None = getattr(model, "function", None)
+    return function if getattr(model, "jacobian", model) is None else None
+
+
+def linear_over(
+    function: WithSlope, belief: Belief, turning: Mask, values: Function | None = None
+) -> Linear:
     """A function made linear over a belief: 2 n + 1 calls.
 
     Exact in mean and covariance for a function of degree two. A value that is NaN at one of the
@@ -49,29 +57,38 @@ def linear_over(function: WithSlope, belief: Belief, turning: Mask) -> Linear:
 
     Args:
         turning: (m,) which values are angles [rad].
+        values: the function without its Jacobian, where that costs many calls: its values at
+            another n (n - 1) / 2 points are taken in the Jacobian's place.
     """
-    reach = np.sqrt(3.0)
+    reach, root, n = np.sqrt(3.0), belief.root, len(belief.mean)
     value, tangent = function(belief.mean)
-    root = belief.root
-    spread, bend, curvature = [], [], []
-    for column in root.T:
-        (far, far_slope), (near, near_slope) = (
-            function(belief.mean + sign * reach * column) for sign in (1.0, -1.0)
-        )
-        sides = [difference(np.array(end), value, turning) for end in (far, near)]
-        spread.append((sides[0] - sides[1]) / (2.0 * reach))
-        bend.append((sides[0] + sides[1]) / 6.0)
-        curvature.append((far_slope - near_slope) @ root / (2.0 * reach))
+
+    def end_of(step: Array) -> tuple[Array, Array]:
+        """How far the values at a step are from the mean's, and the Jacobian there."""
+        x = belief.mean + step
+        end, slope = function(x) if values is None else (values(x), tangent)
+        return difference(np.array(end, dtype=np.float64), value, turning), slope
+
+    ends = [[end_of(sign * reach * column) for column in root.T] for sign in (1.0, -1.0)]
+    far, near = (np.array([one for one, _ in side]) for side in ends)
     # (m, n) along the columns; (m,) how far the mean lies off; (m, n, n) second derivatives.
-    S, mean_bend, C = np.array(spread).T, np.sum(bend, axis=0), np.stack(curvature, axis=1)
+    S, mean_bend = (far - near).T / (2.0 * reach), (far + near).sum(axis=0) / 6.0
+    C = np.zeros((len(value), n, n))
+    for i, ((_, far_slope), (_, near_slope)) in enumerate(zip(*ends, strict=True)):
+        C[:, i] = (far_slope - near_slope) @ root / (2.0 * reach)
+        if values is not None:
+            C[:, i, i] = (far[i] + near[i]) / 3.0
+            for j in range(i):
+                both, _ = end_of(reach * (root[:, i] + root[:, j]))
+                C[:, i, j] = C[:, j, i] = (both - far[i] - far[j]) / 3.0
     whole = np.isfinite(S).all(axis=1) & np.isfinite(C).all(axis=(1, 2))
     S[~whole], mean_bend[~whole], C[~whole] = (tangent @ root)[~whole], 0.0, 0.0
     # Where the belief has no width the tangent stays.
     deviations = belief.deviations()
     scale = np.where(deviations > 0, deviations, 1.0)
-    off = np.linalg.lstsq((root / scale[:, None]).T, (S - tangent @ root).T, rcond=1e-12)[0]
+    turn = np.linalg.lstsq((root / scale[:, None]).T, (S - tangent @ root).T, rcond=1e-12)[0]
     flat = (0.5 * (C + C.transpose(0, 2, 1))).reshape(len(C), -1)
-    return Linear(belief.mean, value + mean_bend, tangent + off.T / scale, 0.5 * flat @ flat.T)
+    return Linear(belief.mean, value + mean_bend, tangent + turn.T / scale, 0.5 * flat @ flat.T)
 
 
 def differences(function: Function, x: Array, turning: Mask, size: float = 1.0) -> Array:

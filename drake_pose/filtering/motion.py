@@ -10,7 +10,13 @@ from scipy.linalg import expm
 
 from drake_pose.arrays import Array
 from drake_pose.errors import SettingsError
-from drake_pose.filtering.linearisation import Function, Linear, differences, linear_over
+from drake_pose.filtering.linearisation import (
+    Function,
+    Linear,
+    differences,
+    linear_over,
+    values_alone,
+)
 from drake_pose.filtering.state import Belief, StateLayout
 
 
@@ -136,5 +142,6 @@ def step_from(motion: MotionModel, belief: Belief, spread: bool) -> Linear:
         nothing = np.zeros(len(belief.mean))
         return Linear(nothing, nothing, motion.transition)
     if spread:
-        return linear_over(motion.predict, belief, np.zeros(len(belief.mean), dtype=np.bool_))
+        still = np.zeros(len(belief.mean), dtype=np.bool_)
+        return linear_over(motion.predict, belief, still, values_alone(motion))
     return Linear(belief.mean, *motion.predict(belief.mean))

@@ -237,6 +237,11 @@ class FilterState:
         return self.hypotheses[0].belief
 
 
+def _require_class(given: object, kind: type, said: str) -> None:
+    if not isinstance(given, kind):
+        raise SettingsError(f"{said} {kind.__name__}, not {type(given).__name__}")
+
+
 class TruncatedFilter:
     """A Kalman filter of nonlinear measurements whose belief stays inside linear inequalities.
 
@@ -266,6 +271,8 @@ class TruncatedFilter:
         motion: MotionModel,
         settings: FilterSettings | None = None,
     ) -> None:
+        for given, kind in ((layout, StateLayout), (inequalities, Inequalities)):
+            _require_class(given, kind, "a filter takes")
         self.layout = layout
         self.observation = observation
         self.motion = motion
@@ -279,10 +286,7 @@ class TruncatedFilter:
         self._set(FilterSettings() if settings is None else settings)
 
     def _set(self, settings: FilterSettings) -> None:
-        if not isinstance(settings, FilterSettings):
-            raise SettingsError(
-                f"a filter's settings are FilterSettings, not {type(settings).__name__}"
-            )
+        _require_class(settings, FilterSettings, "a filter's settings are")
         self.settings = settings
         # What is truncated and fed back has no offsets to keep.
         feeds_back = settings.truncation in ("sequential", "clip")
@@ -310,6 +314,7 @@ class TruncatedFilter:
         Raises:
             SettingsError: a belief that does not fit, or is indefinite; a Jacobian that is wrong.
         """
+        _require_class(belief, Belief, "a filter starts at a")
         checked = make_belief(belief.mean, belief.covariance, self.layout)
         truncated = self._cut(checked, np.zeros((0, 2)))
         if not self._checked:

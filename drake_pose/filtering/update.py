@@ -22,6 +22,7 @@ from drake_pose.filtering.linearisation import (
     difference,
     differences,
     linear_over,
+    values_alone,
 )
 from drake_pose.filtering.state import Belief
 from drake_pose.filtering.truncated_normal import Truncated, unlimited
@@ -87,7 +88,7 @@ class FunctionObservation:
         angles: those of names that are angles [rad], equal after a full turn.
 
     Raises:
-        SettingsError: deviations that are not positive, or not one or (m,).
+        SettingsError: deviations that are not positive, or not one or (m,); a name given twice.
         UnknownNameError: an angle that is not measured.
     """
 
@@ -98,6 +99,8 @@ class FunctionObservation:
     angles: Sequence[str] = ()
 
     def __post_init__(self) -> None:
+        if isinstance(self.names, str) or len(set(self.names)) != len(self.names):
+            raise SettingsError(f"what is measured has different names, not {self.names!r}")
         size = np.shape(self.deviations)
         if size not in ((), (len(self.names),)) or not (np.asarray(self.deviations) > 0).all():
             raise SettingsError(
@@ -237,11 +240,11 @@ def update(
     settled = 0.01 if truncate is None else 0.3
     if not np.isfinite(seen.y).any():
         iterations, width = 1, None
-    P = prediction.covariance
+    P, values = prediction.covariance, values_alone(seen.model)
     for made in range(iterations):
         # Made linear at x: innovation = H (x - prediction) + noise, over what is measured there.
         _, h, H, left_out = (
-            linear_over(seen.model.predict, Belief(x, width), seen.model.wraps)
+            linear_over(seen.model.predict, Belief(x, width), seen.model.wraps, values)
             if width is not None
             else Linear(x, *seen.model.predict(x))
         )

@@ -116,6 +116,8 @@ class TruncatedEkf(BeliefSystem[_Known]):
             )
         period = _period_of(belief_filter.motion, period)
         self.filter = belief_filter
+        if not isinstance(start, Belief):
+            raise SettingsError(f"TruncatedEkf starts at a Belief, not {type(start).__name__}")
         self._start = make_belief(start.mean, start.covariance, belief_filter.layout, "the start")
         self._settings = self.add_parameter(belief_filter.settings)
         self._loss = self.DeclareNumericParameter(BasicVector([patience, loss_probability]))

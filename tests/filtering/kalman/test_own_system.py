@@ -199,7 +199,12 @@ def test_a_line_over_a_belief_has_the_mean_and_covariance_of_a_quadratic():
     def function(x):
         return A @ x + 0.5 * np.einsum("kij,i,j->k", C, x, x), A + C @ x
 
-    line = linear_over(function, belief, np.zeros(2, dtype=bool))
+    line, called = (
+        linear_over(function, belief, np.zeros(2, dtype=bool), values)
+        for values in (None, lambda x: function(x)[0])
+    )
+    for one, other in zip(line, called, strict=True):
+        np.testing.assert_allclose(other, one, atol=1e-9)
     x = belief.mean + generator.normal(size=(400_000, 3)) @ root.T
     values = x @ A.T + 0.5 * np.einsum("kij,ni,nj->nk", C, x, x)
     spread = line.slope @ belief.covariance @ line.slope.T + line.rest
@@ -308,6 +313,12 @@ def wrong_slope(x):
             lambda: make(motion=LinearMotion(np.eye(3), np.eye(2), 0.1)),
             r"the motion's noise: \(3, 3\)",
         ),
+        (lambda: TruncatedFilter(("angle",), END, FREE, STEP), "StateLayout, not tuple"),
+        (lambda: TruncatedFilter(LAYOUT, END, [], STEP), "Inequalities, not list"),
+        (lambda: make().start((START.mean, START.covariance)), "a Belief, not tuple"),
+        (lambda: make().start(Belief(np.zeros(2), np.eye(2))), "3 elements"),
+        (lambda: make().update(make().start(START), np.zeros(3)), "measures 2"),
+        (lambda: FunctionObservation("uv", 0.05, end_of), "different names, not 'uv'"),
         (lambda: make(linearisation="straight"), "spread, tangent"),
         (lambda: make(persistence=-1.0), "persistence"),
         (lambda: constant_velocity(LAYOUT, {"angle": 1.0}, 0.0), "period 0"),

@@ -18,7 +18,7 @@ from drake_pose.body.model_files import bundled_model, package_folder
 from drake_pose.body.node_skin import ModelSkin
 from drake_pose.body.parsed_model import ParsedModel, link_names, nearest_turn
 from drake_pose.body.parsing import ModelSource, captured_warnings
-from drake_pose.body.pose_tree import PoseTree
+from drake_pose.body.pose_tree import PoseTree, require_tree
 from drake_pose.body.report import ModelReport, describe_model, model_warnings
 from drake_pose.body.root import RootRotation
 from drake_pose.body.tree_builder import build_pose_tree
@@ -55,5 +55,6 @@ __all__ = [
     "model_warnings",
     "nearest_turn",
     "package_folder",
+    "require_tree",
     "reshaped",
 ]

@@ -45,7 +45,7 @@ OBJECT_POSITIONS = tuple(f"{OBJECT}_{move}_{axis}" for move in ("shift", "turn")
 """The positions that move it: shifts along its axes [m], then turns about them [rad]."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class ArticulatedModel(ParsedModel):
     """An articulated object, from which pose trees are made (``ParsedModel``); never changes."""
 

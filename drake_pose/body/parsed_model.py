@@ -333,7 +333,7 @@ def _searched_limits(
     return float(start), float(end), True, remark
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class ParsedModel:
     """What a model file says, as Drake understands it. Never changes.
 
@@ -373,6 +373,13 @@ class ParsedModel:
     warnings: tuple[str, ...]
     _source: ModelSource | PlantSource = field(repr=False)
     labels: frozenset[int] | None = None
+
+    def __repr__(self) -> str:
+        """One line: what it is, and how large."""
+        return (
+            f"<{type(self).__name__} '{self.name}' of {self.path}: "
+            f"{len(self.position_names)} positions, {len(self.link_meshes)} links with a surface>"
+        )
 
     def add_to(
         self, plant: MultibodyPlant, scene_graph: SceneGraph | None = None, *, prefix: str = ""

@@ -121,7 +121,7 @@ def place_node(
     return NodePlacement(X_PA, None, steps, *told, follows)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class PoseTree:
     """All nodes of an object, parents before children. Never changes.
 
@@ -145,6 +145,11 @@ class PoseTree:
     placements: tuple[NodePlacement, ...] = field(repr=False)
     _base: BasePose = field(repr=False)
     _rebuild: "Callable[[Array], PoseTree] | None" = field(default=None, repr=False)
+
+    def __repr__(self) -> str:
+        """One line: whose it is, and how large."""
+        values = sum(len(node.value_names) for node in self.nodes)
+        return f"<PoseTree of {self.model!r}: {len(self.nodes)} nodes, {values} values>"
 
     def __post_init__(self) -> None:
         """Freeze the mapping."""
@@ -390,3 +395,10 @@ def product_grid(axes: Sequence[Sequence[float]], node: str, most: int = 5_000_0
             "use a larger sampling interval or hold some of its joints"
         )
     return np.array(list(itertools.product(*axes)), dtype=np.float64).reshape(size, len(axes))
+
+
+def require_tree(tree: object) -> None:
+    """Refuses, by a SettingsError, what is no pose tree: most often the model that has one."""
+    if not isinstance(tree, PoseTree):
+        what = f"a {type(tree).__name__}" + (f", '{tree.name}'" if hasattr(tree, "name") else "")
+        raise SettingsError(f"a pose tree is needed, as model.pose_tree() gives it, not {what}")

@@ -17,7 +17,7 @@ from drake_pose.arrays import Array
 from drake_pose.body.joint_kernel import PackedSteps, find_joint, pack_steps
 from drake_pose.body.link_graph import JointMap, PlantKinematics, chain_transforms
 from drake_pose.body.parsed_model import nearest_turn
-from drake_pose.body.pose_tree import PoseTree
+from drake_pose.body.pose_tree import PoseTree, require_tree
 from drake_pose.compiled import compiled, multiply
 from drake_pose.errors import SettingsError
 
@@ -67,6 +67,7 @@ class TreeKinematics:
     """
 
     def __init__(self, tree: PoseTree) -> None:
+        require_tree(tree)
         self.tree = tree
         self.names = tuple(name for node in tree.nodes for name in node.value_names)
         counts = [len(node.value_names) for node in tree.nodes]

@@ -242,8 +242,25 @@ Camera = PinholeCamera | ParallelCamera
 
 
 def camera_tuple(cameras: Mapping[str, Camera] | Iterable[Camera]) -> tuple[Camera, ...]:
-    """Cameras in their order, by name as ``load_cameras`` gives them or one after another."""
-    return tuple(cameras.values() if isinstance(cameras, Mapping) else cameras)
+    """Cameras in their order, by name as ``load_cameras`` gives them or one after another.
+
+    Raises:
+        CameraError: they are no cameras, or one camera alone.
+    """
+    if isinstance(cameras, Camera):
+        raise CameraError(
+            f"one camera, '{cameras.name}', where several are expected: give [camera], or "
+            "{name: camera}"
+        )
+    several = isinstance(cameras, Mapping | Iterable) and not isinstance(cameras, str | bytes)
+    found = tuple(cameras.values() if isinstance(cameras, Mapping) else cameras) if several else ()
+    for one in found if several else [cameras]:
+        if not isinstance(one, Camera):
+            raise CameraError(
+                f"{type(one).__name__} where a camera is expected: give a PinholeCamera or a "
+                "ParallelCamera, as load_cameras does"
+            )
+    return found
 
 
 def inverse_pose(X_AB: np.ndarray) -> np.ndarray:

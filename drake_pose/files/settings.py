@@ -4,17 +4,22 @@ A class's fields are all three; the text below a field is the option's help. Tex
 than an option's raise a SettingsError.
 """
 
+import ast
+import inspect
 import math
+import textwrap
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import MISSING, dataclass, field, fields
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin, get_type_hints
 
 from cyclopts import Parameter, Token
 
 from drake_pose.errors import SettingsError
 
+_Settings = TypeVar("_Settings", bound=type)
 Axis = Literal["x", "y", "z"]
 RootTurns = Literal["fixed", "free"] | Mapping[Axis, tuple[float, float]]
 Corner = tuple[float, float, float]
@@ -169,6 +174,65 @@ def percent(share: float | None) -> str:
     return "-" if share is None else f"{100.0 * share:.2f} %"
 
 
+class _Documentation:
+    """A settings class's docstring: its own words, and its fields' texts. Made when it is read."""
+
+    def __init__(self, own: str) -> None:
+        self._own = own
+
+    def __get__(self, settings: object, owner: type) -> str:
+        texts = {
+            name: next((one.help for one in hint.__metadata__ if one.help), "")
+            for name, hint in get_type_hints(owner, include_extras=True).items()
+            if get_origin(hint) is Annotated
+        }
+        for one in reversed(owner.__mro__[:-1]):
+            (tree,) = ast.parse(textwrap.dedent(inspect.getsource(one))).body
+            assert isinstance(tree, ast.ClassDef)
+            for entry, below in pairwise(tree.body):
+                if isinstance(entry, ast.AnnAssign) and isinstance(below, ast.Expr):
+                    texts[ast.unparse(entry.target)] = ast.literal_eval(below.value)
+        lines = [f"    {one.name}: {' '.join(texts[one.name].split())}" for one in fields(owner)]
+        begin, _, raises = inspect.cleandoc(self._own).partition("\n\n")
+        wrapped = "\n".join(textwrap.fill(one, 100, subsequent_indent=8 * " ") for one in lines)
+        return f"{begin}\n\nArgs:\n{wrapped}\n" + (f"\n{raises}\n" if raises else "")
+
+
+def readable(cls: _Settings) -> _Settings:
+    """Makes ``help()`` of a dataclass of settings show plain types, and what each field means."""
+    made: Any = cls
+    hints, own = get_type_hints(cls), {one.name: one for one in fields(made)}
+    signature = inspect.signature(made.__init__)
+    parameters = []
+    for one in signature.parameters.values():
+        factory = own[one.name].default_factory if one.name in own else MISSING
+        default = one.default if factory is MISSING else factory()
+        parameters.append(one.replace(annotation=hints.get(one.name, one.empty), default=default))
+    made.__init__.__signature__ = signature.replace(parameters=parameters)
+    made.__signature__ = signature.replace(parameters=parameters[1:])
+    made.__doc__ = _Documentation(cls.__doc__ or "")
+    return cls
+
+
+def take_single_names(settings: Any) -> None:
+    """Makes a tuple of a single name where names are expected: ``zeros="elbow"``, ``"all"``."""
+    hints = get_type_hints(type(settings))
+    for one in fields(settings):
+        value, (kind, *_) = getattr(settings, one.name), (*get_args(hints[one.name]), None)
+        if get_origin(hints[one.name]) is not tuple or get_args(hints[one.name])[1:] != (...,):
+            continue
+        if kind is not str and get_origin(kind) is not Literal:
+            continue
+        names = (value,) if isinstance(value, str) else tuple(value) if _is_many(value) else None
+        if names is None or not all(isinstance(name, str) for name in names):
+            raise SettingsError(f"{one.name} must be names, as ('a', 'b'), not {value!r}")
+        object.__setattr__(settings, one.name, names)
+
+
+def _is_many(value: object) -> bool:
+    return isinstance(value, Iterable) and not isinstance(value, Mapping)
+
+
 Names = Annotated[tuple[str, ...], Parameter(metavar="NAME")]
 Positions = Annotated[
     Mapping[str, float], from_text(parse_assignments, "NAME=VALUE", repeated=True)
@@ -196,11 +260,15 @@ class SceneSettings:
     times as long."""
     packages: Packages = field(default_factory=dict)
 
+    def __post_init__(self) -> None:
+        take_single_names(self)
+
     def as_json(self) -> dict[str, Any]:
         """Returns the settings as plain JSON values."""
         return {one.name: plain(getattr(self, one.name)) for one in fields(self)}
 
 
+@readable
 @dataclass(frozen=True, kw_only=True)
 class CaptureSettings(SceneSettings):
     """Options that the capture of a person has, too."""
@@ -227,6 +295,7 @@ class EpisodeSettings(SceneSettings):
     """Number of threads; the result is the same. Default: one for each core."""
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if self.workers is not None and self.workers < 1:
             raise SettingsError(f"workers must be 1 or more, not {self.workers}")
 
@@ -237,6 +306,7 @@ class EpisodeSettings(SceneSettings):
         return values
 
 
+@readable
 @dataclass(frozen=True, kw_only=True)
 class EstimateSettings(CaptureSettings, EpisodeSettings):
     """How a scene is estimated.
@@ -299,6 +369,7 @@ class EstimateSettings(CaptureSettings, EpisodeSettings):
         return values
 
 
+@readable
 @dataclass(frozen=True, kw_only=True)
 class MaskSettings:
     """How masks are found; where no way is given, the source holds masks of another tool.
@@ -334,6 +405,7 @@ class MaskSettings:
     """Keep only the largest patch of each mask."""
 
     def __post_init__(self) -> None:
+        take_single_names(self)
         if self.box is not None and not (len(self.box) == 4 and all(map(math.isfinite, self.box))):
             raise SettingsError(f"box must be 4 numbers, not {self.box}")
         ways = [one for one in ("background", "box", "model") if getattr(self, one) is not None]

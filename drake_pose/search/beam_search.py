@@ -16,9 +16,8 @@ from typing import Any
 import numpy as np
 
 from drake_pose.body import PoseTree
-from drake_pose.errors import SettingsError
 from drake_pose.search.branch_and_bound import PosesWithin, branch_and_bound
-from drake_pose.search.estimates import PoseEstimate, View
+from drake_pose.search.estimates import PoseEstimate, View, require_views
 from drake_pose.search.partial_poses import (
     PartialPoses,
     Pictures,
@@ -172,8 +171,7 @@ class _BeamRun:
         gathers: bool = False,
         all_within: bool = False,
     ) -> None:
-        if not views:
-            raise SettingsError("a match needs at least one view, but none was given")
+        require_views(views)
         limit = settings.time_limit
         self._deadline = np.inf if limit is None else time.perf_counter() + limit
         self._body = body if root_position is None else body.with_root_position(root_position)

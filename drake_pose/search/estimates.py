@@ -10,7 +10,7 @@ import numpy as np
 from drake_pose.body import PoseTree
 from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.camera.models import Camera
-from drake_pose.errors import MaskError
+from drake_pose.errors import MaskError, SettingsError
 
 UNEXPLAINED = 0.5
 """From this E_total on, the pose is no explanation of the silhouettes."""
@@ -54,6 +54,14 @@ class View:
                 f"mask of camera '{self.camera.name}' is empty; leave this view out, or give a "
                 "mask that shows the body"
             )
+
+
+def require_views(views: Sequence[View]) -> None:
+    """Refuses, by a SettingsError, a match with no view, or with one that is in no list."""
+    if isinstance(views, View):
+        raise SettingsError("a match needs a list of views, as [view], not one View")
+    if not views:
+        raise SettingsError("a match needs at least one view, but none was given")
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 
 from drake_pose.body import PoseTree
-from drake_pose.errors import SettingsError
-from drake_pose.search.estimates import PoseEstimate, View
+from drake_pose.search.estimates import PoseEstimate, View, require_views
 from drake_pose.search.sampled_body import Regions, SampledTree, Scoring
 from drake_pose.search.settings import PaperSearchSettings
 
@@ -48,8 +47,7 @@ class PaperSearch:
         Raises:
             SettingsError: there is no view.
         """
-        if not views:
-            raise SettingsError("a match needs at least one view, but none was given")
+        require_views(views)
         start = time.perf_counter()
         sampled, fixed = self.sampled, self.settings.outside_limit
         if root_position is not None:

@@ -23,12 +23,11 @@ import numpy as np
 from drake_pose.body import PoseTree, bundled_model, load_model
 from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.camera.models import ParallelCamera
-from drake_pose.errors import SettingsError
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.fit.surfaces import few_triangles, rough_outlines
 from drake_pose.search.beam_search import BeamSearch
 from drake_pose.search.coarse_search import CoarsePoses, CoarseSearch
-from drake_pose.search.estimates import PoseEstimate, View
+from drake_pose.search.estimates import PoseEstimate, View, require_views
 from drake_pose.search.exact_search import ExactPose, ExactSearch
 from drake_pose.search.partial_poses import coarsen
 from drake_pose.search.refinement import RefinementProblem
@@ -103,8 +102,7 @@ class MultiStartSearch:
         Raises:
             SettingsError: if there is no view.
         """
-        if not views:
-            raise SettingsError("a match needs at least one view, but none was given")
+        require_views(views)
         if self._time_limit is not None:
             warm_up()
         start = time.perf_counter()

@@ -12,7 +12,6 @@ import numpy as np
 
 from drake_pose.body import PoseTree
 from drake_pose.body.tree_kinematics import TreeKinematics
-from drake_pose.errors import SettingsError
 from drake_pose.fit.kernel import collect
 from drake_pose.fit.levenberg_marquardt import Equations, StepSettings, damped_step
 from drake_pose.fit.parameters import BodyParameters, Placement
@@ -22,7 +21,7 @@ from drake_pose.fit.raster_lines import (
     find_body_border,
     find_border,
 )
-from drake_pose.search.estimates import View
+from drake_pose.search.estimates import View, require_views
 from drake_pose.search.settings import Pass
 from drake_pose.silhouette.outline import PackedSurfaces, TreeSurfaces
 from drake_pose.silhouette.scoring import draw_packed
@@ -125,8 +124,7 @@ class RefinementProblem:
     """
 
     def __init__(self, body: RefinementBody, views: Sequence[View]) -> None:
-        if not views:
-            raise SettingsError("a match needs at least one view, but none was given")
+        require_views(views)
         self.body, self.views = body, tuple(views)
         self.area = float(sum(np.count_nonzero(view.mask) for view in views))
         self._silhouettes = [find_border(view.mask) for view in views]

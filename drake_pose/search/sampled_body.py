@@ -7,7 +7,7 @@ from typing import Protocol
 
 import numpy as np
 
-from drake_pose.body import PoseTree
+from drake_pose.body import PoseTree, require_tree
 from drake_pose.camera.models import Camera, ParallelCamera
 from drake_pose.fit.surfaces import collapsed
 from drake_pose.search.estimates import PoseEstimate, View
@@ -40,6 +40,7 @@ class SampledTree:
     """
 
     def __init__(self, tree: PoseTree, settings: GridSettings) -> None:
+        require_tree(tree)
         self.tree = tree
         self._settings = settings
         samples = [self._sample(i) for i in range(len(tree.nodes))]

@@ -58,9 +58,9 @@ class CameraRegistration(BeliefSystem[OnlineState]):
     No guess of the pose is needed. A periodic update keeps frames in which the body stands
     differently, and searches when there are enough of them; from then on the pose is fitted anew
     whenever another one is kept, the oldest are forgotten, and a camera that was moved is found
-    again. All pixels with a label other than Drake's reserved ones belong to the body, or those
-    with the given labels. An image that is not connected or shows nothing of the body says nothing,
-    nor do positions that are not finite. Image and positions must be of the same moment.
+    again. See ``labels`` for the pixels that belong to the body. An image that is not
+    connected or shows nothing of the body says nothing, nor do positions that are not finite. Image
+    and positions must be of the same moment.
 
     - ``X_WC``: a RigidTransform, the camera's pose in the world of the body's plant. Until it is
       found its translation is nan; later it is the last one found.
@@ -78,7 +78,7 @@ class CameraRegistration(BeliefSystem[OnlineState]):
     Args:
         period: time between two updates [s].
         labels: the labels that belong to the body; None: those of its model where that was made of
-            a plant (``ArticulatedModel.from_plant``), else all that are not reserved.
+            a plant (``ArticulatedModel.from_plant``), else all but Drake's reserved ones.
         most_covered: largest fraction of the picture that the body may cover.
 
     Raises:

@@ -59,8 +59,8 @@ class SilhouetteMatcher(BeliefSystem[Matched]):
           proved_optimal, determined, lower, upper, family_positions, pose_estimate]
 
     With several cameras the input ports are ``label_image_<camera>``; an unconnected one, or an
-    image without any pixel of the body, is left out of the match. All pixels with a label other
-    than Drake's reserved ones belong to the body, or those with the given labels.
+    image without any pixel of the body, is left out of the match. See ``labels``
+    for the pixels that belong to the body.
 
     The match is made in a periodic update. Until the first one, and where no pose is found, the
     estimated positions are the last ones (at first the model's default), and the error is infinite.
@@ -78,8 +78,8 @@ class SilhouetteMatcher(BeliefSystem[Matched]):
         cameras: the calibrated cameras, in the order of the input ports, or by name.
         period: time between two matches [s].
         labels: the labels that belong to the body; None: those of its model where that was made of
-            a plant (``ArticulatedModel.from_plant``), else all that are not reserved. A frozenset,
-            or None for all, is abstract parameter 0 of the context, where they can be varied.
+            a plant (``ArticulatedModel.from_plant``), else all but Drake's reserved ones. A
+            frozenset, or None, is abstract parameter 0 of the context, where it can be varied.
         family_limit: how many families are given out at most.
 
     Raises:

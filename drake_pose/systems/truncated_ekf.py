@@ -114,6 +114,11 @@ class TruncatedEkf(BeliefSystem[_Known]):
             raise SettingsError(
                 f"TruncatedEkf takes a TruncatedFilter, not {type(belief_filter).__name__}"
             )
+        if not isinstance(start, Belief):
+            raise SettingsError(
+                "start must be a Belief, as make_belief(mean, covariance) gives it, not a "
+                f"{type(start).__name__}"
+            )
         period = _period_of(belief_filter.motion, period)
         self.filter = belief_filter
         if not isinstance(start, Belief):

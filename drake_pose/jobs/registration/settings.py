@@ -14,6 +14,7 @@ from drake_pose.files.settings import (
     Positions,
     from_text,
     parse_boxes,
+    readable,
 )
 
 ALL = "all"
@@ -23,6 +24,7 @@ Export = Literal["ros", "mujoco", "drake", "rerun"]
 """Programs that cameras are written for."""
 
 
+@readable
 @dataclass(frozen=True, kw_only=True)
 class AuditSettings(EpisodeSettings):
     """How a scene is audited."""
@@ -33,6 +35,7 @@ class AuditSettings(EpisodeSettings):
     """Look at pictures and the joint log beside them, even where there are masks."""
 
 
+@readable
 @dataclass(frozen=True, kw_only=True)
 class RegistrationSettings(AuditSettings):
     """How cameras are registered."""

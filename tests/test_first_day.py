@@ -1,0 +1,104 @@
+"""What a stranger meets first: names, help, single things where several are expected."""
+
+import inspect
+import pydoc
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import drake_pose
+from drake_pose import (
+    AuditSettings,
+    EstimateSettings,
+    MaskSettings,
+    MultiStartSearch,
+    PersonTracker,
+    PinholeCamera,
+    RegistrationSettings,
+    SilhouetteMatcher,
+    TruncatedEkf,
+    TruncatedFilter,
+    View,
+    bundled_model,
+    load_model,
+    look_at,
+    save_cameras,
+)
+from drake_pose.errors import CameraError, SettingsError
+from drake_pose.registration.register import RegistrationBody
+
+ROOT = Path(__file__).resolve().parents[1]
+CAMERA = PinholeCamera("c", 64, 48, 60.0, 60.0, 32.0, 24.0, look_at([3, 0, 1], [0, 0, 1]))
+
+
+@pytest.fixture(scope="module")
+def model():
+    return load_model(bundled_model("two_finger_hand"), check=False)
+
+
+def test_every_public_name_is_there_and_pages_use_it():
+    for name in drake_pose.__all__:
+        assert getattr(drake_pose, name) is not None
+    pages = [ROOT / "README.md", *(ROOT / "tutorials").glob("*.md")]
+    pages += (ROOT / "tutorials").glob("*.ipynb")
+    for page in pages:
+        for room, names in re.findall(
+            r"from drake_pose\.([\w.]+) import ([\w, ]+)", page.read_text()
+        ):
+            long = {*names.replace(" ", "").split(",")} & {*drake_pose.__all__}
+            assert not long, f"{page.name}: {room}: {long} are names of drake_pose itself"
+
+
+@pytest.mark.parametrize(
+    "settings", [AuditSettings, EstimateSettings, MaskSettings, RegistrationSettings]
+)
+def test_help_of_settings_shows_plain_types_and_says_what_each_means(settings):
+    shown = pydoc.plain(pydoc.render_doc(settings)).partition("Data and other attributes")[0]
+    assert "Annotated" not in shown
+    for name in inspect.signature(settings).parameters:
+        assert re.search(rf"^ \|      {name}: \w+", shown, re.M), name
+
+
+def test_one_name_is_taken_where_several_are_expected_and_a_number_is_refused():
+    one = RegistrationSettings(zeros="elbow_flex", cameras="left", exports="ros")
+    assert (one.zeros, one.cameras, one.exports) == (("elbow_flex",), ("left",), ("ros",))
+    assert RegistrationSettings(lengths=["a", "b"]).lengths == ("a", "b")
+    for wrong in ({"zeros": 3}, {"frames": (1, 2)}):
+        with pytest.raises(SettingsError, match=f"{next(iter(wrong))} must be names"):
+            RegistrationSettings(**wrong)
+
+
+@pytest.mark.parametrize("make", [MultiStartSearch, drake_pose.BeamSearch, RegistrationBody])
+def test_a_model_in_place_of_its_tree_is_refused_by_name(make, model):
+    with pytest.raises(SettingsError, match=r"model\.pose_tree\(\).*ArticulatedModel, '"):
+        make(model)
+
+
+def test_one_camera_in_place_of_several_is_refused_by_name(model, tmp_path):
+    search = MultiStartSearch(model.pose_tree())
+    calls = [
+        lambda: SilhouetteMatcher(search, CAMERA, 1.0),
+        lambda: save_cameras(tmp_path / "cameras.yaml", CAMERA),
+        lambda: PersonTracker(None, CAMERA, 1.0),
+    ]
+    for call in calls:
+        with pytest.raises(CameraError, match="one camera, 'c'"):
+            call()
+    with pytest.raises(CameraError, match="str where a camera"):
+        SilhouetteMatcher(search, "c", 1.0)
+    with pytest.raises(SettingsError, match=r"\[view\]"):
+        search.match(View(CAMERA, np.ones((48, 64), bool)))
+
+
+def test_a_mean_and_covariance_in_place_of_a_belief_are_refused_by_name():
+    with pytest.raises(SettingsError, match="start must be a Belief.*not a tuple"):
+        TruncatedEkf(object.__new__(TruncatedFilter), (np.zeros(3), np.eye(3)), 0.1)
+
+
+def test_a_model_shows_itself_in_one_line(model):
+    for one in (model, model.pose_tree()):
+        assert "\n" not in repr(one)
+        assert len(repr(one)) < 300
+        assert "two_finger_hand" in repr(one)

@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -17,7 +18,7 @@ from drake_pose.camera.models import Camera, PinholeCamera
 from drake_pose.registration.per_frame_fit import FrameFit
 from drake_pose.registration.posed_frames import SeenFrame, common_size, reduced_sums
 from drake_pose.registration.register import RegistrationBody
-from drake_pose.silhouette.scoring import score_bodies
+from drake_pose.silhouette.scoring import draw_mask, score_bodies
 from drake_pose.workers import map_ordered
 
 
@@ -256,20 +257,30 @@ def smaller(camera: Camera, share: float) -> Camera:
 
 
 def mask_shares(
-    body: RegistrationBody, camera: Camera, values: Array, mask: Mask, size: float
+    body: RegistrationBody,
+    camera: Camera,
+    values: Array,
+    mask: Mask,
+    size: float,
+    band: float = 2.5,
 ) -> tuple[float, float]:
     """How much more than the body a silhouette shows, and how much of the body it lacks.
 
     Args:
         size: the root of the silhouettes' usual area [pixel]; both are shares of that of this one,
             of one that shows nothing of the usual one.
+        band: what is nearer to the outlines [pixel] is none of it.
     """
-    small = smaller(camera, share := min(1.0, LARGE.side / size))
-    sums, X_CN = reduced_sums(mask, small), camera.X_CW @ body.kinematics.poses(values)
-    own, both = score_bodies(body.few, X_CN[None], small, sums[None])[0].tolist()
-    area = float(sums[:, -1].sum())
-    usual = (share * size) ** 2 if isinstance(camera, PinholeCamera) else size**2
-    return (area - both) / (area or usual), (own - both) / (area or usual)
+    small = smaller(camera, min(1.0, LARGE.side / size))
+    share = small.width / camera.width
+    seen = np.diff(reduced_sums(mask, small), axis=1).astype(np.uint8)
+    drawn = draw_mask(body.few, camera.X_CW @ body.kinematics.poses(values), small)
+    side = 2 * max(1, round(band * share)) + 1
+    ball = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
+    wide, wide_seen = (cv2.dilate(one.astype(np.uint8), ball) for one in (drawn, seen))
+    area = float(seen.sum()) or (share * size) ** 2
+    more, less = (seen > wide).sum(), (drawn > wide_seen).sum()
+    return float(more) / area, float(less) / area
 
 
 def _is_near(body: RegistrationBody, one: Reading) -> bool:

@@ -495,10 +495,10 @@ def say_outliers(found: RegisteredCamera, of_pictures: bool = False) -> list[str
                 raise RegistrationError(
                     f"camera '{name}': half of the frames or more contradict the others, "
                     f"{len(wrong)} of {len(frames)}: {frame_ranges(wrong, frames)}.{moved} Either "
-                    f"these are wrong or those that agree, {supporting}, do by chance: is the model "
-                    "this robot's, with its covers and tools, and are joint positions those of the "
-                    "pictures and in the model's zeros (--zeros all)? To trust those that agree "
-                    "give a scene of them alone. Nothing was written"
+                    f"these are wrong or those that agree, {supporting}, do by chance: is the "
+                    "model this robot's, with its covers and tools, and are joint positions those "
+                    "of the pictures and in the model's zeros (--zeros all)? To trust those that "
+                    "agree give a scene of them alone. Nothing was written"
                 )
             text += (
                 f" FEWER THAN HALF OF THE FRAMES AGREE, {right} of {len(frames)}: {supporting}; "

@@ -245,14 +245,14 @@ class SceneComparison:
         return placed
 
     def _say_masks(
-        self, now: Compared, more: float = 0.12, more_in_one: float = 0.18, less: float = 0.25
+        self, now: Compared, more: float = 0.08, more_in_one: float = 0.15, less: float = 0.25
     ) -> list[str]:
         """What masks show beside the robot, and lack of it, in frames that agree otherwise.
 
         Args:
             more, more_in_one, less: shares of the masks' areas that are said: in half of the frames
-                and more, and in fewer. Real masks of arms show .02 more, and lack .15 at most;
-                outlines that are a pixel too wide are .07 more, damaged ones up to .13 in a frame.
+                and more, and in fewer. Real masks of arms show less than .02 more, and lack .15 at
+                most.
         """
         texts, names, wrong = list[str](), self._inputs.scene.frames, now.found.contradicting
         for camera in (one.name for one in now.cameras):

@@ -113,6 +113,7 @@ def model_warnings(
             "these joints move nothing that is seen and keep their default values: "
             + ", ".join(tree.unobserved_positions)
         )
+    warnings += _size_warnings(model, tree)
     slides = [
         model.position_names[position]
         for position, value in tree.held.items()
@@ -130,6 +131,39 @@ def model_warnings(
         if not node.mesh.is_empty and not is_watertight(node.mesh)
     ]
     return tuple(limit_kinds(warnings + _symmetry_warnings(model)))
+
+
+def _size_warnings(
+    model: ArticulatedModel, tree: PoseTree, smallest: float = 0.02, largest: float = 20.0
+) -> list[str]:
+    """What lengths and limits no robot or person has.
+
+    smallest, largest: of a body, from end to end in its default pose [m].
+    """
+    poses = tree.node_poses(tree.default_values())
+    corners = [
+        node.mesh.vertices @ X[:3, :3].T + X[:3, 3]
+        for node, X in zip(tree.nodes, poses, strict=True)
+        if not node.mesh.is_empty
+    ]
+    size = float(np.ptp(np.concatenate(corners), axis=0).max()) if corners else 1.0
+    warnings = []
+    if not smallest <= size <= largest:
+        warnings.append(
+            f"the body is {size:.3g} m long from end to end: are its lengths and the scale of its "
+            "meshes in metres?"
+        )
+    still = [
+        model.position_names[position]
+        for node in tree.nodes
+        for position in node.positions
+        if model.lower[position] == model.upper[position]
+    ]
+    if still:
+        warnings.append(
+            f"the limits of these joints leave one value, so they never move: {', '.join(still)}"
+        )
+    return warnings
 
 
 def _symmetry_warnings(model: ArticulatedModel) -> list[str]:

@@ -275,3 +275,23 @@ def test_given_packages_come_first_and_unknown_ones_name_the_option(tmp_path):
         message = refusal(tmp_path, package_urdf(f"package://{name}/a.stl"))
         assert f"link 'a': mesh 'package://{name}/a.stl': package '{name}' is not known" in message
         assert f"--package {name}=FOLDER" in message
+
+
+@pytest.mark.parametrize(
+    ("scale", "upper", "said"),
+    [
+        (1.0, 1.0, []),
+        (1000.0, 1.0, ["are its lengths and the scale of its meshes in metres"]),
+        (0.001, 1.0, ["are its lengths and the scale of its meshes in metres"]),
+        (1.0, 0.0, ["they never move: turn"]),
+    ],
+)
+def test_sizes_and_limits_that_nothing_has_are_said(tmp_path, scale, upper, said) -> None:
+    sides = f"{0.3 * scale} {scale} {0.1 * scale}"
+    box = f'<visual><geometry><box size="{sides}"/></geometry></visual>'
+    turn = joint("turn", "revolute", "a", "b", axis="0 0 1", limits=f'lower="0" upper="{upper}"')
+    path = tmp_path / "r.urdf"
+    path.write_text(f'<robot name="r">{link("a", box)}{link("b", box)}{turn}</robot>')
+    warnings = describe_model(path).warnings
+    assert len(warnings) == len(said)
+    assert all(text in one for text, one in zip(said, warnings, strict=True))

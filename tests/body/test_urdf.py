@@ -289,7 +289,8 @@ def test_given_packages_come_first_and_unknown_ones_name_the_option(tmp_path):
 def test_sizes_and_limits_that_nothing_has_are_said(tmp_path, scale, upper, said) -> None:
     sides = f"{0.3 * scale} {scale} {0.1 * scale}"
     box = f'<visual><geometry><box size="{sides}"/></geometry></visual>'
-    turn = joint("turn", "revolute", "a", "b", axis="0 0 1", limits=f'lower="0" upper="{upper}"')
+    at = {"axis": "0 0 1", "limits": f'lower="0" upper="{upper}"', "origin": 'xyz="0 0 0"'}
+    turn = joint("turn", "revolute", "a", "b", **at)
     path = tmp_path / "r.urdf"
     path.write_text(f'<robot name="r">{link("a", box)}{link("b", box)}{turn}</robot>')
     warnings = describe_model(path).warnings

@@ -93,7 +93,7 @@ def test_one_camera_in_place_of_several_is_refused_by_name(model, tmp_path):
 
 
 def test_a_mean_and_covariance_in_place_of_a_belief_are_refused_by_name():
-    with pytest.raises(SettingsError, match="start must be a Belief.*not a tuple"):
+    with pytest.raises(SettingsError, match=r"start must be a Belief.*not a tuple"):
         TruncatedEkf(object.__new__(TruncatedFilter), (np.zeros(3), np.eye(3)), 0.1)
 
 

@@ -8,16 +8,27 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.geometry import Meshcat, MeshcatParams, MeshcatVisualizer, Rgba, SceneGraph
+from pydrake.geometry import (
+    Mesh,
+    Meshcat,
+    MeshcatParams,
+    MeshcatVisualizer,
+    Rgba,
+    Role,
+    SceneGraph,
+    SourceId,
+)
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.framework import Diagram, DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource
 
 from drake_pose.body import ArticulatedModel, PoseTree, TriangleMesh
+from drake_pose.body.meshes import shape_mesh, write_obj
 from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.camera.models import HALF_PIXEL, Camera, ParallelCamera, PinholeCamera
 from drake_pose.errors import OutputError
 from drake_pose.files.overlay import EXCESS_RGB
+from drake_pose.fit.surfaces import light_meshes
 from drake_pose.registration.posed_frames import SeenFrame
 from drake_pose.systems.bodies import add_meshcat_skin, add_posed_plant, body_poses
 
@@ -31,6 +42,7 @@ def make_replay(
     cameras: Sequence[Camera],
     period: float,
     measured: np.ndarray | None = None,
+    most_triangles: int = 8_000,
 ) -> str:
     """The page that Meshcat records of poses of a body, and where the cameras are.
 
@@ -39,6 +51,8 @@ def make_replay(
         X_WB: (frames, 4, 4) poses of the plant's world in the scene's world.
         period: time between two frames [s]; those a second or more apart stand still.
         measured: (frames, nq) positions at which the body is shown as a ghost, too.
+        most_triangles: a body of more is shown with so many, a ghost with half as
+            many: a triangle takes about 100 bytes.
     """
     # Port 0: any free one. The server lives for a moment only, and listens on this machine alone.
     logger = logging.getLogger("drake")
@@ -51,26 +65,45 @@ def make_replay(
     builder = DiagramBuilder()
     scene_graph = builder.AddNamedSystem("scene_graph", SceneGraph())
     source = builder.AddNamedSystem("positions", ConstantVectorSource(positions[0]))
-    add_posed_plant(builder, scene_graph, model, source.get_output_port(), "geometry_pose")
+    plant = add_posed_plant(builder, scene_graph, model, source.get_output_port(), "geometry_pose")
+    _lighten(scene_graph, plant.get_source_id(), most_triangles)
     MeshcatVisualizer.AddToBuilder(builder, scene_graph, meshcat)
     add_meshcat_skin(
         builder, meshcat, model, source.get_output_port(), "body", prefix=_BODY_PATH, recorded=True
     )
-    for link, mesh in model.link_meshes.items() if measured is not None else ():
+    own = [*model.link_meshes.values()]
+    ghosts = [] if measured is None else light_meshes(own, most_triangles // 2)
+    for link, mesh in zip(model.link_meshes, ghosts, strict=False):
         surface = mesh.vertices.T, mesh.triangles.T
         meshcat.SetTriangleMesh(f"{_MEASURED_PATH}/{link}", *surface, Rgba(0.0, 0.62, 0.45, 0.4))
-    p_WO, radius = _extent(model, positions, X_WB)
+    shown = [positions] if measured is None else [positions, measured]
+    p_WO, radius = _extent(model, np.concatenate(shown), np.concatenate(len(shown) * [X_WB]))
     for camera in cameras:
         _draw_camera(meshcat, camera, p_WO, radius)
-    # The view shows the first camera behind the object, wherever up to infinity that stands. In
-    # Meshcat's window of 75 degrees a radius above and below the middle is seen from 1.3 radii.
+    # The body is seen from the first camera's side, past its frustum, wherever up to infinity that
+    # stands. In Meshcat's window of 75 degrees a ball is seen whole from 1.65 radii.
     p_OC_W = cameras[0].X_WC[:3, 3] - p_WO
     if isinstance(cameras[0], ParallelCamera):
         p_OC_W = -cameras[0].X_WC[:3, 2]
-    beside = RotationMatrix.MakeZRotation(np.radians(125.0)).multiply(p_OC_W)
-    meshcat.SetCameraPose(p_WO + 1.35 * radius * beside / np.linalg.norm(beside), p_WO)
+    beside = RotationMatrix.MakeZRotation(np.radians(20.0)).multiply(p_OC_W)
+    meshcat.SetCameraPose(p_WO + 1.7 * radius * beside / np.linalg.norm(beside), p_WO)
     _record(meshcat, builder.Build(), source, positions, X_WB, period, model, measured)
     return meshcat.StaticHtml()
+
+
+def _lighten(scene_graph: SceneGraph, source: SourceId, most: int) -> None:
+    """Gives the shown meshes of a source fewer triangles, if they have more than so many in all."""
+    inspector = scene_graph.model_inspector()
+    shown = {
+        one: shape
+        for one in inspector.GetAllGeometryIds(Role.kIllustration)
+        if inspector.BelongsToSource(one, source)
+        and isinstance(shape := inspector.GetShape(one), Mesh)
+    }
+    meshes = [shape_mesh(one) for one in shown.values()]
+    for one, mesh, light in zip(shown, meshes, light_meshes(meshes, most), strict=True):
+        if light is not mesh:
+            scene_graph.ChangeShape(source, one, Mesh(write_obj(light, "replay")))
 
 
 def _record(

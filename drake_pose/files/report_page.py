@@ -248,17 +248,18 @@ def plot_curves(
     limits: tuple[float, float] | None = None,
     intervals: tuple[Array, Array, Mask] | None = None,
     least: float | None = None,
-    limits_from: float = 0.2,
+    limits_within: float = 0.3,
 ) -> Figure:
     """Plots curves over frames; nan leaves a gap.
 
     Args:
         values: label and (frames,) values of each curve; what is labelled measured is wide.
         joined: whether neighbouring frames are joined by a line.
-        limits: lower and upper, in the picture where they are near.
+        limits: lower and upper, each in the picture where it is near.
         intervals: low and high (frames,), and where they are what is known.
         least: the lowest value that the axis shows, such as 0.
-        limits_from: limits are near where the curve takes up this fraction of them.
+        limits_within: a limit is near where it is at most this fraction of the span of curves and
+            intervals beyond them.
     """
     (figure, axes), places = new_plot(), np.arange(len(frames))
     shown = np.concatenate([value for _, value in values])
@@ -271,8 +272,11 @@ def plot_curves(
             axes.vlines(places[where], low[where], high[where], colour, linewidth=width)
     shown = shown[np.isfinite(shown)]
     bottom, top = (float(shown.min()), float(shown.max())) if len(shown) else (0.0, 1.0)
-    if limits is not None and top - bottom >= limits_from * (limits[1] - limits[0]):
-        bottom, top = min(bottom, limits[0]), max(top, limits[1])
+    near = limits_within * (top - bottom)
+    if limits is not None and bottom - near <= limits[0] < bottom:
+        bottom = limits[0]
+    if limits is not None and top < limits[1] <= top + near:
+        top = limits[1]
     bottom = bottom if least is None else min(bottom, least)
     margin = 0.08 * (top - bottom if top > bottom else max(1e-3, 0.02 * abs(top)))
     axes.set_ylim(bottom - (0.0 if bottom == least else margin), top + margin)

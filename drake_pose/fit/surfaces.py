@@ -44,6 +44,25 @@ def rough_outlines(outlines: Sequence[Outline], count: int = 160) -> tuple[Outli
     return tuple(_simplified(outline, count) for outline in outlines)
 
 
+def light_meshes(meshes: Sequence[TriangleMesh], total: int, rounds: int = 4) -> list[TriangleMesh]:
+    """Meshes with about so many triangles in all; each keeps its share, or 100 at least.
+
+    ``rounds``: how often they are simplified at most: what has holes and slivers keeps several
+    times as many at once.
+    """
+    light = list(meshes)
+    for _ in range(rounds):
+        given = sum(len(mesh.triangles) for mesh in light)
+        if given <= 1.2 * total:
+            break
+        for k, mesh in enumerate(light):
+            count = max(100, round(total * len(mesh.triangles) / given))
+            if len(mesh.triangles) > count:
+                few = _simplified(outline_from_mesh(mesh), count)
+                light[k] = TriangleMesh(few.vertices, few.triangles)
+    return light
+
+
 def hull_of_few(outlines: Sequence[Outline], count: int, limit: float = 3.0) -> tuple[Outline, ...]:
     """Surfaces with few triangles each.
 

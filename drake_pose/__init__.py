@@ -26,8 +26,11 @@ if TYPE_CHECKING:
     from drake_pose.files.records import SceneEstimate
     from drake_pose.files.settings import EstimateSettings, MaskSettings
     from drake_pose.filtering.contour_tracker import TrackingSettings
+    from drake_pose.filtering.inequalities import from_bounds
+    from drake_pose.filtering.motion import FunctionMotion, LinearMotion, constant_velocity
     from drake_pose.filtering.state import Belief, StateLayout, make_belief
     from drake_pose.filtering.truncated_filter import FilterSettings, TruncatedFilter
+    from drake_pose.filtering.update import FunctionObservation
     from drake_pose.jobs.estimate.scene import estimate_scene
     from drake_pose.jobs.masks import SceneMasks, make_masks
     from drake_pose.jobs.registration.audit import SceneAudit, audit_scene
@@ -42,7 +45,7 @@ if TYPE_CHECKING:
     from drake_pose.systems.images import MaskPlayer
     from drake_pose.systems.person import PersonTracker
     from drake_pose.systems.silhouette_matcher import SilhouetteMatcher, SilhouetteTracker
-    from drake_pose.systems.truncated_ekf import TruncatedEkf
+    from drake_pose.systems.truncated_ekf import TruncatedEkf, plant_motion
 
 __version__ = VERSION
 
@@ -55,7 +58,10 @@ _HOMES = {
     "DrakePoseError": "errors",
     "EstimateSettings": "files.settings",
     "FilterSettings": "filtering.truncated_filter",
+    "FunctionMotion": "filtering.motion",
+    "FunctionObservation": "filtering.update",
     "LabelRenderer": "silhouette.pictures.label_renderer",
+    "LinearMotion": "filtering.motion",
     "MaskPlayer": "systems.images",
     "MaskSettings": "files.settings",
     "MultiStartSearch": "search",
@@ -83,7 +89,9 @@ _HOMES = {
     "camera_from_drake": "camera.drake",
     "camera_to_drake": "camera.drake",
     "cameras_from_drake": "systems.cameras",
+    "constant_velocity": "filtering.motion",
     "estimate_scene": "jobs.estimate.scene",
+    "from_bounds": "filtering.inequalities",
     "label_image_to_mask": "silhouette.pictures.label_images",
     "load_cameras": "camera.camera_files",
     "load_model": "body.model",
@@ -91,6 +99,7 @@ _HOMES = {
     "look_at": "camera.models",
     "make_belief": "filtering.state",
     "make_masks": "jobs.masks",
+    "plant_motion": "systems.truncated_ekf",
     "register_scene": "jobs.registration.register",
     "save_cameras": "camera.camera_files",
 }

@@ -236,6 +236,16 @@ class FilterState:
         """The belief of the heaviest hypothesis."""
         return self.hypotheses[0].belief
 
+    @property
+    def overall(self) -> Belief:
+        """Mean and covariance of all hypotheses together: wide where they disagree."""
+        weights = np.array([one.weight for one in self.hypotheses])
+        means = np.array([one.belief.mean for one in self.hypotheses])
+        mean = weights @ means / weights.sum()
+        within = sum(one.weight * one.belief.covariance for one in self.hypotheses)
+        between = (weights[:, None] * (means - mean)).T @ (means - mean)
+        return Belief(mean, (within + between) / weights.sum())
+
 
 def _require_class(given: object, kind: type, said: str) -> None:
     if not isinstance(given, kind):

@@ -66,8 +66,8 @@ class TruncatedEkf(BeliefSystem[_Known]):
         name: TruncatedEkf
         input_ports: [measurement (optional), measurement_covariance (optional), reset_state
           (optional), restart (optional)]
-        output_ports: [estimated_state, covariance, hypothesis_weights, hypothesis_states,
-          hypothesis_covariances, active_limits, statistics]
+        output_ports: [estimated_state, covariance, overall_state, overall_covariance,
+          hypothesis_weights, hypothesis_states, hypothesis_covariances, active_limits, statistics]
 
     A periodic update predicts and uses the measurement: NaN where something is occluded; all NaN,
     or an unconnected port, where a camera is late or missing, which leaves the prediction.
@@ -75,6 +75,8 @@ class TruncatedEkf(BeliefSystem[_Known]):
     the observation model's own where the port is not connected.
 
     - ``estimated_state`` (n), ``covariance`` (n x n, row by row): of the heaviest hypothesis.
+    - ``overall_state`` (n), ``overall_covariance`` (n x n): of all hypotheses together, wide where
+      they disagree.
     - ``hypothesis_weights`` (cap), ``hypothesis_states`` (cap x n, row by row): the heaviest first,
       weights 0 and states NaN where there are fewer; ``hypothesis_covariances`` (cap x n x n).
     - ``active_limits`` (K): 1 where that row of ``filter.inequalities`` cut the best belief.
@@ -121,8 +123,6 @@ class TruncatedEkf(BeliefSystem[_Known]):
             )
         period = _period_of(belief_filter.motion, period)
         self.filter = belief_filter
-        if not isinstance(start, Belief):
-            raise SettingsError(f"TruncatedEkf starts at a Belief, not {type(start).__name__}")
         self._start = make_belief(start.mean, start.covariance, belief_filter.layout, "the start")
         self._settings = self.add_parameter(belief_filter.settings)
         self._loss = self.DeclareNumericParameter(BasicVector([patience, loss_probability]))
@@ -153,6 +153,8 @@ class TruncatedEkf(BeliefSystem[_Known]):
 
         self.show("estimated_state", n, lambda known: known.state.best.mean)
         self.show("covariance", n * n, lambda known: known.state.best.covariance.ravel())
+        self.show("overall_state", n, lambda known: known.state.overall.mean)
+        self.show("overall_covariance", n * n, lambda known: known.state.overall.covariance.ravel())
         self.show("hypothesis_weights", cap, filled(1, lambda one: one.weight, 0.0))
         self.show("hypothesis_states", cap * n, filled(n, lambda one: one.belief.mean, math.nan))
         covariances = filled(n * n, lambda one: one.belief.covariance, math.nan)

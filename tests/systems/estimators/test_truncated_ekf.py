@@ -59,6 +59,16 @@ def test_in_a_diagram_it_gives_what_the_filter_gives(sequence):
     assert weights.sum() == pytest.approx(1.0)
     states = run["hypothesis_states"].reshape(4, -1)
     np.testing.assert_array_equal(np.isnan(states).all(axis=1), weights == 0)
+    # Together they have the moments of what is drawn from them.
+    covariances = run["hypothesis_covariances"].reshape(4, len(HAND_STATE), -1)
+    second = sum(
+        weights[k] * (covariances[k] + np.outer(states[k], states[k]))
+        for k in np.flatnonzero(weights)
+    )
+    mean = run["overall_state"]
+    overall = run["overall_covariance"].reshape(len(HAND_STATE), -1)
+    np.testing.assert_allclose(mean, weights[weights > 0] @ states[weights > 0], rtol=1e-9)
+    np.testing.assert_allclose(overall + np.outer(mean, mean), second, rtol=1e-6, atol=1e-9)
     assert logs["active_limits"].any()
     statistics = dict(zip(STATISTICS, run["statistics"], strict=True))
     assert (statistics["step"], statistics["lost"]) == (len(rows), 0)

@@ -276,6 +276,37 @@ def record_deviations(model: ArticulatedModel, q: Array, deviations: Array) -> J
     }
 
 
+def record_families(
+    model: ArticulatedModel, answers: Sequence[tuple[Array, Array]]
+) -> dict[str, Any]:
+    """FrameRecord's fields of one pose, or of several that explain a frame as well, best first.
+
+    ``answers``: positions (nq,) and deviations (nq,) as of `record_deviations`.
+    """
+    told = [record_deviations(model, *one) for one in answers]
+    if len(told) < 2:
+        return {"joints": told[0]}
+    joints = {
+        name: {
+            "determined": all(one[name]["determined"] for one in told),
+            "low": min(one[name]["low"] for one in told),
+            "high": max(one[name]["high"] for one in told),
+            "value": None,
+        }
+        for name in told[0]
+        if all(name in one for one in told)
+    }
+    families = [
+        {
+            name: {**joint, "value": float(user_units(model)[k] * q[k])}
+            for name, joint in one.items()
+            for k in [model.position_index(name)]
+        }
+        for (q, _), one in zip(answers, told, strict=True)
+    ]
+    return {"joints": joints, "families": families, "family_count": len(told)}
+
+
 def joint_table(records: Iterable[FrameRecord]) -> str:
     """The text of joints.csv: a row for each frame and joint, over all families [deg or m]."""
     rows = [

@@ -7,7 +7,8 @@ all is captured once more.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +18,7 @@ from drake_pose.body import PoseTree
 from drake_pose.camera.models import Camera
 from drake_pose.errors import CameraError, MaskError, SettingsError
 from drake_pose.fit.colours import OwnColours
-from drake_pose.fit.contour_fit import ContourFit
+from drake_pose.fit.contour_fit import ContourFit, PoseFit
 from drake_pose.fit.evidence import EdgePoints, find_edge_points
 from drake_pose.person.camera_faults import (
     CameraFault,
@@ -55,6 +56,7 @@ class PersonCapture:
         shape: the person's; None where the model has no shape joints.
         outlines: the simplified surfaces of the tree's nodes, as wide as the person.
         deviations: (frames, nq) standard deviations of q [rad or m] by pictures and limits; nan.
+        rivals: by frame that was searched, unlike poses that explain it as well: q and deviations.
     """
 
     q: Array
@@ -63,6 +65,7 @@ class PersonCapture:
     outlines: tuple[Outline, ...]
     tree: PoseTree
     deviations: Array
+    rivals: dict[int, tuple[tuple[Array, Array], ...]] = field(default_factory=dict)
 
     @staticmethod
     def begun(count: int, shape: PersonShape | None, fit: ContourFit) -> "PersonCapture":
@@ -121,7 +124,15 @@ def capture_person(
             on_frame(frame)
 
     capture.follow_all(frames, states, finish)
+    captured.rivals.update(capture.rivals)
     return captured
+
+
+class _Explanation(NamedTuple):
+    """A pose, fitted with the shape that it gives the person, and the tracker that has this."""
+
+    fit: PoseFit
+    tracker: PersonPoseTracker
 
 
 class _Capture:
@@ -131,7 +142,11 @@ class _Capture:
         self, tree: PoseTree, cameras: Mapping[str, Camera], read: ReadFrame, is_sequence: bool
     ) -> None:
         self._cameras, self._read, self._is_sequence = cameras, read, is_sequence
-        self.tracker = PersonPoseTracker(ContourFit(tree, noise=NOISE), LENIENT, shape_values(tree))
+        self._bare, is_shape = ContourFit(tree, noise=NOISE), shape_values(tree)
+        self.tracker = PersonPoseTracker(self._bare, LENIENT, is_shape)
+        # Whether the shape is yet to be found.
+        self._is_measured = bool(is_shape.any())
+        self.rivals: dict[int, tuple[tuple[Array, Array], ...]] = {}
         # The frames that the shape is measured in are seen three times: by camera regions as bits
         # along the rows, and edges.
         self._kept: dict[int, dict[str, tuple[NDArray[np.uint8], EdgePoints]]] = {}
@@ -155,9 +170,7 @@ class _Capture:
 
         It is fitted to some among the first ones.
         """
-        fit = self.tracker.fit
-        is_shape = shape_values(fit.tree)
-        if not is_shape.any():
+        if not self._is_measured:
             return None, {}
         frames = frames[:first]
         for frame in frames:
@@ -165,15 +178,65 @@ class _Capture:
                 camera.name: (np.packbits(view.region, axis=1), view.edge)
                 for camera, view in self._see(frame).pairs
             }
-        rough = self.follow_all(frames, {})
-        poses = {k: one.values for k in spread_over(frames, fitted) if (one := rough[k])}
-        looks = [self._see(k) for k in poses]
-        views = [(one.cameras, [view.edge for view in one.views]) for one in looks]
-        shape = fit_shape(fit, views, np.array(list(poses.values())))
-        worn, plan = ContourFit(fit.kinematics, shape.outlines, NOISE), self.tracker.plan
-        self.tracker = PersonPoseTracker(worn, LENIENT, is_shape, shape.values, plan)
+        chosen = spread_over(frames, fitted)
+        if self._is_sequence:
+            rough = self.follow_all(frames, {})
+            poses = {k: one.values for k in chosen if (one := rough[k])}
+        else:
+            told = {k: self.explained(k) for k in chosen}
+            poses = {k: own[0].fit.values for k, own in told.items() if own}
+        shape, self.tracker = self._measured(list(poses), list(poses.values()))
+        self._is_measured = False
         states = zip(poses, shape.poses, strict=True)
         return shape, {k: self.tracker.start(pose) for k, pose in states}
+
+    def _measured(
+        self, frames: Sequence[int], poses: Sequence[Array]
+    ) -> tuple[PersonShape, PersonPoseTracker]:
+        """The shape that some frames with such poses (m,) give, and a tracker of whom has it."""
+        fit, looks = self._bare, [self._see(k) for k in frames]
+        views = [(one.cameras, [view.edge for view in one.views]) for one in looks]
+        shape = fit_shape(fit, views, np.array(poses))
+        worn, plan = ContourFit(fit.kinematics, shape.outlines, NOISE), self.tracker.plan
+        return shape, PersonPoseTracker(worn, LENIENT, shape_values(fit.tree), shape.values, plan)
+
+    def explained(self, frame: int, begun: PoseFit | None = None) -> list["_Explanation"]:
+        """All that the person may be in a frame, best first; none where nobody is seen.
+
+        Where the shape is not known, that of a first fit begins the search, and each explanation
+        has its own before they are compared: in a body that is not the person's, a wrong pose may
+        fit better than the right one.
+
+        Args:
+            begun: the first fit, where it is known.
+        """
+        seen, tracker = self._see(frame), self.tracker
+        if self._is_measured:
+            begun = begun or next(iter(tracker.search.started(seen)), None)
+            if begun is None:
+                return []
+            _, tracker = self._measured([frame], [begun.values])
+        fits = tracker.search.explanations(seen)
+        least = fits[0].closeness - tracker.settings.rival if fits else 0.0
+        found = [_Explanation(one, tracker) for one in fits if one.closeness > least]
+        if self._is_measured:
+            found = [self._with_shape(frame, one.fit.values) for one in found]
+        ranked = {id(one.fit): one for one in found}
+        unlike = tracker.search.unlike(one.fit for one in found)
+        found = [ranked[id(fit)] for fit in unlike]
+        self.rivals[frame] = tuple(
+            (own.positions(fit.values), own.deviations(fit.values, seen))
+            for fit, own in found[1:]
+            if fit.closeness > unlike[0].closeness - tracker.settings.alike
+        )
+        return found
+
+    def _with_shape(self, frame: int, values: Array) -> "_Explanation":
+        """A pose (m,) of a frame, fitted with the shape that it gives the person."""
+        seen = self._see(frame)
+        shape, own = self._measured([frame], [values])
+        shaped = own.search.refined(shape.poses[0], seen)
+        return _Explanation(own.search.mended(shaped, seen), own)
 
     def follow_all(
         self,
@@ -186,7 +249,14 @@ class _Capture:
 
         def follow(state: TrackState | None, frame: int, last: int) -> TrackState | None:
             seen = self._see(frame)
-            found[frame] = self.tracker.follow(state, seen)
+            if state is None and not self._is_sequence:
+                explained = self.explained(frame)
+                found[frame] = None
+                if explained:
+                    fit = explained[0].fit
+                    found[frame] = self.tracker.start(fit.values, fit.inlier_ratio)
+            else:
+                found[frame] = self.tracker.follow(state, seen)
             if state is not None and abs(frame - last) > 1:
                 anew = self.tracker.follow(None, seen)
                 found[frame] = max(found[frame], anew, key=lambda one: one.share if one else 0.0)
@@ -217,18 +287,19 @@ class _Capture:
 
         One of which enough of the contours fits needs no other to be compared with.
         """
-        best: tuple[int, TrackState] | None = None
+        best: tuple[int, PoseFit] | None = None
         for frame in spread_over(frames, tried):
-            state = self.tracker.follow(None, self._see(frame))
-            if state is not None and (best is None or state.share > best[1].share):
-                best = frame, state
-                if state.share > enough:
-                    break
+            for one in self.tracker.search.started(self._see(frame)):
+                if best is None or one.closeness > best[1].closeness:
+                    best = frame, one
+            if best is not None and best[1].inlier_ratio > enough:
+                break
         if best is None:
             raise SettingsError(
                 f"in none of {tried} frames two cameras saw a person: give masks that show one"
             )
-        return best
+        fit, self.tracker = self.explained(*best)[0]
+        return best[0], self.tracker.start(fit.values, fit.inlier_ratio)
 
 
 def spread_over(frames: Sequence[int], count: int) -> list[int]:

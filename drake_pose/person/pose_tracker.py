@@ -190,7 +190,7 @@ class PersonPoseTracker:
         self._order: Indices = np.array([model.position_index(n) for n in fit.kinematics.names])
         if rest is None:
             rest = fit.kinematics.flatten(fit.tree.default_values())
-        self._search = PersonSearch(fit, self.plan, settings, self._information, self._held, rest)
+        self.search = PersonSearch(fit, self.plan, settings, self._information, self._held, rest)
 
     def start(self, values: Array, share: float = 1.0) -> TrackState:
         """A state at rest at values (m,) of the pose tree, of which a share of contours fits."""
@@ -234,7 +234,7 @@ class PersonPoseTracker:
         """The next state; None where nothing is known yet and not two cameras see a person."""
         settings = self.settings
         if last is None:
-            found = self._search.found(frame, range(settings.headings))
+            found = self.search.found(frame, range(settings.headings))
             return None if found is None else self.start(found.values, found.inlier_ratio)
         fitted = self._fitted(last, frame)
         enough = last.usual - settings.retry_below
@@ -244,7 +244,7 @@ class PersonPoseTracker:
         due = fitted.inlier_ratio < enough and is_due
         if due and not lost:
             first, limbs = last.troubled * settings.limbs_a_frame, settings.limbs_a_frame
-            fitted = self._search.mended(fitted, frame, enough, first, limbs)
+            fitted = self.search.mended(fitted, frame, enough, first, limbs)
         share, doubted = fitted.inlier_ratio, last.troubled < 0
         state = TrackState(
             fitted.values,
@@ -258,7 +258,7 @@ class PersonPoseTracker:
             return state
         # The person found anew where that fits better, all headings in turn.
         headings = settings.headings_of(last.troubled)
-        found = self._search.found(frame, headings, last.values, last.usual)
+        found = self.search.found(frame, headings, last.values, last.usual)
         if found is None or found.inlier_ratio <= share:
             return state
         left = last.troubled + 1 if doubted else 1 - settings.cycle
@@ -285,7 +285,7 @@ class PersonPoseTracker:
             for limb in self.plan.limbs.values():
                 worst = float(np.nanmin([*shares[limb.nodes], 1.0]))
                 if worst < enough:
-                    placed = self._search.placed_by_colour(fitted.values, limb, colours, own.known)
+                    placed = self.search.placed_by_colour(fitted.values, limb, colours, own.known)
                     told = [(one, np.nan_to_num(shows(one.values))) for one in placed]
                     right = [one for one in told if one[1][limb.nodes].min() >= enough]
                     if right:

@@ -59,6 +59,10 @@ class PersonSettings:
         placements: in how many ways a limb is placed by its colours.
         unalike, near: limbs whose tips are farther apart are not alike; limbs that are nearer are
             about the same [m].
+        rival: another pose that fits worse by this much closeness at most is mended, too, before
+            both are compared.
+        alike: another pose that fits worse by this much closeness at most is as good; chosen on 36
+            drawn persons of other measures and clothes before four cameras.
         judged, rougher: how many of the steps of a fit tell which guess is promising, with points
             of the contour as much farther apart.
     """
@@ -85,6 +89,8 @@ class PersonSettings:
     placements: int = 3
     unalike: float = 0.25
     near: float = 0.15
+    rival: float = 0.15
+    alike: float = 0.02
     judged: int = 3
     rougher: float = 1.5
 
@@ -294,7 +300,7 @@ class PersonSearch:
             first: the doubtful limb to begin with; the worst is 0.
             limbs: how many limbs are searched; None: all that are doubtful.
         """
-        best = _better(fitted, self._refine(fitted.values, frame))
+        best = _better(fitted, self.refined(fitted.values, frame))
         if best.inlier_ratio >= enough:
             return best
         doubtful = self._doubtful(best, frame)
@@ -318,7 +324,7 @@ class PersonSearch:
                 guesses.append(best.values.copy())
                 guesses[-1][limb.values] = pose
             for values in guesses:
-                best = _better(best, self._refine(values, frame))
+                best = _better(best, self.refined(values, frame))
             if best.inlier_ratio >= enough:
                 break
         return best
@@ -337,24 +343,57 @@ class PersonSearch:
             known: (m,) where held values are taken from; None: the person at rest.
             enough: where this much of the contours fits, no more limbs are searched.
         """
-        middle, settings = frame.middle(), self._settings
+        if len(headings) == self._settings.headings:
+            return next(iter(self.explanations(frame, known)), None)
+        begun = self._begun(frame, headings, known)
+        limbs = self._settings.limbs_a_frame
+        return self.mended(begun[0], frame, enough, limbs=limbs) if begun else None
+
+    def explanations(self, frame: FrameViews, known: Array | None = None) -> list[PoseFit]:
+        """All that a person who is seen so may be: poses that are unlike each other, best first.
+
+        Before they are compared, the doubtful limbs of each are searched. None where not two
+        cameras see a person; `known` is as of `found`.
+        """
+        found, best = self.started(frame, known), None
+        while found and best is not (leading := max(found, key=lambda one: one.closeness)):
+            best = leading
+            others = [self.refined(values, frame) for values in self._exchanged(best.values)]
+            least = best.closeness - self._settings.rival
+            found += [self.mended(one, frame) for one in others if one.closeness > least]
+        if best is not None:
+            found.append(self._searched(best, self._plan.limbs.values(), frame, math.inf))
+        return self.unlike(found)
+
+    def started(self, frame: FrameViews, known: Array | None = None) -> list[PoseFit]:
+        """The most promising fresh starts of all headings, their doubtful limbs searched."""
+        begun = self._begun(frame, range(self._settings.headings), known)
+        return [self.mended(one, frame) for one in begun[: self._settings.mended]]
+
+    def unlike(self, fits: Iterable[PoseFit]) -> list[PoseFit]:
+        """Fits of which no two are alike in all joints' places, best first."""
+        found: list[PoseFit] = []
+        kept: list[Array] = []
+        for one in sorted(fits, key=lambda one: -one.closeness):
+            places = self._plan.landmarks.positions(self._fit.kinematics.poses(one.values))
+            off = [np.linalg.norm(places - other, axis=-1).max() for other in kept]
+            if all(far > self._settings.unalike for far in off):
+                found.append(one)
+                kept.append(places)
+        return found
+
+    def _begun(
+        self, frame: FrameViews, headings: Sequence[int], known: Array | None
+    ) -> list[PoseFit]:
+        """Fresh starts with some headings, the promising ones fitted, best first."""
+        middle = frame.middle()
         if middle is None:
-            return None
+            return []
         guesses = [self._guess(frame, heading, middle, known) for heading in headings]
         guesses.sort(key=lambda one: -one.closeness)
-        promising = guesses[: math.ceil(settings.fitted * len(guesses))]
-        found = [self._refine(one.values, frame) for one in promising]
-        found.sort(key=lambda one: -one.closeness)
-        if len(headings) < settings.headings:
-            return self.mended(found[0], frame, enough, limbs=settings.limbs_a_frame)
-        mended = [self.mended(one, frame) for one in found[: settings.mended]]
-        best = max(mended, key=lambda one: one.closeness)
-        while True:
-            others = [self._refine(values, frame) for values in self._exchanged(best.values)]
-            other = max(others, key=lambda one: one.closeness)
-            if other.closeness <= best.closeness:
-                return self._searched(best, self._plan.limbs.values(), frame, math.inf)
-            best = self.mended(other, frame)
+        promising = guesses[: math.ceil(self._settings.fitted * len(guesses))]
+        fitted = [self.refined(one.values, frame) for one in promising]
+        return sorted(fitted, key=lambda one: -one.closeness)
 
     def _guess(
         self, frame: FrameViews, heading: int, middle: Array, known: Array | None
@@ -382,7 +421,7 @@ class PersonSearch:
         ]
         return self._fit.fit(frame.coarse, values, rounds, prior, self._held)
 
-    def _refine(self, values: Array, frame: FrameViews | ColourViews) -> PoseFit:
+    def refined(self, values: Array, frame: FrameViews | ColourViews) -> PoseFit:
         """A fit from a coarse guess, which is trusted little."""
         prior, rounds = Prior(values, 0.1 * self._information), self._settings.search
         return self._fit.fit(partial(frame.compare, self._fit), values, rounds, prior, self._held)
@@ -453,7 +492,7 @@ class PersonSearch:
                 here = np.ascontiguousarray(places[points])
                 scores += sum_at_points(camera, worth, here, weights)[0]
         chosen = self._unalike(values, limb, scores, self._settings.placements)
-        return [self._refine(one, views) for one in chosen]
+        return [self.refined(one, views) for one in chosen]
 
     def _exchanged(self, values: Array) -> list[Array]:
         """Values (m,) that look much alike: both arms or legs exchanged; turned about."""

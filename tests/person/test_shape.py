@@ -22,7 +22,7 @@ def test_a_person_of_known_lengths_and_girths(shaped_person: ArticulatedModel) -
     known = tracker_of_person(tree, KnownShape({length: 0.07}, {parts[2]: 1.5}))
     rest = known.fit.kinematics.flatten(tree.default_values())
     rest[names == length] = 0.07
-    np.testing.assert_allclose(known._search._rest, rest)
+    np.testing.assert_allclose(known.search._rest, rest)
     for group, one, other in zip(groups, plain.fit.outlines, known.fit.outlines, strict=True):
         wide = 1.5 if group == 2 else 1.0
         times = np.array([wide, 1.0, wide])

@@ -8,8 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_pose.arrays import Array, Mask
+from drake_pose.body import landmark_positions, load_landmarks
 from drake_pose.errors import MaskError, SceneError
-from drake_pose.files.records import FrameRecord, record_deviations
+from drake_pose.files.records import FrameRecord, record_families
 from drake_pose.files.writer import Drawn, OnStage, ResultWriter
 from drake_pose.jobs.estimate.inputs import EstimateInputs, draw_parts
 from drake_pose.person.camera_faults import CameraFault
@@ -79,7 +80,8 @@ def follow_person(
             own = X_WN, read(index), reader, float(distances[index])
             yield _finish(inputs, captured, index, *own, seconds, overlay)
         unread = describe_unreadable(reader.refused, inputs.scene.frames)
-        result.warnings += (*unread, *faults)
+        doubts = describe_rivals(captured, inputs.frames)
+        result.warnings += (*unread, *faults, *doubts)
 
     return inputs, finished()
 
@@ -193,10 +195,11 @@ def _finish(
         area = float(sum(map(np.count_nonzero, bodies))) or 1.0
         wrong = sum(map(edge_area, bodies)) * distance
     pose = PoseEstimate(found, q, np.eye(4), (), wrong, area, stopped_by=FOLLOWED, seconds=seconds)
+    answers = ((q, captured.deviations[index]), *captured.rivals.get(index, ()))
+    known = record_families(inputs.model, answers if found else answers[:1])
     return inputs.finish(
-        frame, pose, masks, parts, shown, share=float(captured.shares[index]),
-        joints=record_deviations(inputs.model, q, captured.deviations[index]),
-    )  # fmt: skip
+        frame, pose, masks, parts, shown, share=float(captured.shares[index]), **known
+    )
 
 
 def describe_faults(checked: CheckedCapture, frames: Sequence[str]) -> tuple[str, ...]:
@@ -252,6 +255,25 @@ def describe_fit(shares: Sequence[float], usual_from: float = 0.6) -> tuple[str,
         "usual: do the masks show one person, and are cameras.yaml and the folders' names right?"
     )
     return (text,)
+
+
+def describe_rivals(captured: PersonCapture, frames: Sequence[str]) -> tuple[str, ...]:
+    """Warnings of frames that another pose explains as well, and where it differs."""
+    model, found = captured.tree.model, []
+    marks = load_landmarks(model.path)
+    for k, rivals in sorted(captured.rivals.items()):
+        for number, (q, _) in enumerate(rivals, start=2):
+            if not np.isfinite(captured.q[k]).all():
+                continue
+            here, there = (landmark_positions(model, marks, one) for one in (captured.q[k], q))
+            off = np.linalg.norm(np.subtract(here, there), axis=1)
+            far = [name for name, one in zip(marks, off, strict=True) if one > 0.5 * off.max()]
+            found.append(
+                f"frame {frames[k]}: another pose explains the silhouettes as well (family "
+                f"{number} in families.csv): {', '.join(far)} up to {1e3 * off.max():.0f} mm "
+                "elsewhere; look at the overlays, or add a camera"
+            )
+    return tuple(found)
 
 
 def describe_rig(rig: RigFault | None) -> tuple[str, ...]:

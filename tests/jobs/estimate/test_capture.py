@@ -8,6 +8,7 @@ from drake_pose.body import bundled_model
 from drake_pose.errors import ModelError, SceneError, SettingsError
 from drake_pose.files.settings import EstimateSettings
 from drake_pose.fit.contour_fit import ContourFit
+from drake_pose.jobs.estimate import person
 from drake_pose.jobs.estimate.scene import estimate_scene
 from drake_pose.person.capture import CheckedCapture, PersonCapture
 from drake_pose.person.figures import ViewFaults
@@ -92,6 +93,41 @@ def test_estimate_follows_a_person_and_says_so(
     assert float(row["high"]) == pytest.approx(40.0 + half, abs=1e-3)
     assert row["determined"] == "yes"
     assert float(joints["0001", "left_forearm_x"]["high"]) == 0.0
+
+
+def test_a_pose_that_explains_a_frame_as_well_is_given_and_named(
+    recording: PersonScene, known: list[int], out: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    follow = person.capture_checked
+
+    def doubtful(*given):
+        checked = follow(*given)
+        other = recording.truth[1].copy()
+        other[recording.person.position_index("left_upper_arm_z")] += np.radians(60.0)
+        checked.captured.rivals[1] = ((other, np.full(len(other), 0.01)),)
+        return checked
+
+    monkeypatch.setattr(person, "capture_checked", doubtful)
+    _, summary = run_estimate(recording, out)
+    (warning,) = [text for text in summary["warnings"] if "as well" in text]
+    assert "frame 0001" in warning
+    assert "left_wrist" in warning
+    assert "right" not in warning
+    rows = {
+        row["family"]: row
+        for row in read_rows(out / "families.csv")
+        if row["joint"] == "left_upper_arm_z"
+    }
+    assert {key: float(row["value"]) for key, row in rows.items()} == pytest.approx(
+        {"1": 40.0, "2": 100.0}, abs=1e-3
+    )
+    row = next(
+        row
+        for row in read_rows(out / "joints.csv")
+        if (row["frame"], row["joint"]) == ("0001", "left_upper_arm_z")
+    )
+    assert float(row["low"]) < 40.0 < 100.0 < float(row["high"])
+    assert row["families"] == "2"
 
 
 def test_stills_cameras_and_frames_are_chosen_like_an_estimates(

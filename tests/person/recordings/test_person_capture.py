@@ -69,6 +69,28 @@ class TestCapture:
         with pytest.raises(SettingsError, match=word):
             capture_person(shaped_person.pose_tree(), cameras, lambda _: nobody, frames)
 
+    @pytest.mark.parametrize("frame", ["0025", "0040"], ids=["leg", "turned about"])
+    def test_a_still_of_unknown_measures_is_not_taken_for_another_pose(
+        self, shaped_person, shared_data, frame
+    ):
+        """In a body of average measures a leg elsewhere, or a person turned about, fits better."""
+        scene = load_scene(shared_data / "human_four_views")
+        masks = {name: scene.read(name, frame) for name in scene.cameras}
+        captured = capture_person(
+            shaped_person.pose_tree(), scene.cameras, lambda _: masks, [0], is_sequence=False
+        )
+        marks = load_landmarks(shaped_person.path)
+        found = dict(
+            zip(marks, landmark_positions(shaped_person, marks, captured.q[0]), strict=True)
+        )
+        off = []
+        with (scene.path / "joint_centres.csv").open() as stream:
+            for row in csv.DictReader(stream):
+                if int(row["frame"]) == int(frame) and row["joint"] != "head_top":
+                    place = [float(row[axis]) for axis in "xyz"]
+                    off.append(np.linalg.norm(found[row["joint"]] - place))
+        assert np.nanmax(off) < 0.12
+
     @pytest.mark.slow
     def test_real_person_of_unknown_proportions(self, shaped_person, shared_data):
         scene = load_scene(shared_data / "human_four_views")

@@ -144,7 +144,7 @@ class _Capture:
         self._cameras, self._read, self._is_sequence = cameras, read, is_sequence
         self._bare, is_shape = ContourFit(tree, noise=NOISE), shape_values(tree)
         self.tracker = PersonPoseTracker(self._bare, LENIENT, is_shape)
-        # Whether the shape is yet to be found.
+        # Whether the model has a shape that is to be found.
         self._is_measured = bool(is_shape.any())
         self.rivals: dict[int, tuple[tuple[Array, Array], ...]] = {}
         # The frames that the shape is measured in are seen three times: by camera regions as bits
@@ -186,7 +186,6 @@ class _Capture:
             told = {k: self.explained(k) for k in chosen}
             poses = {k: own[0].fit.values for k, own in told.items() if own}
         shape, self.tracker = self._measured(list(poses), list(poses.values()))
-        self._is_measured = False
         states = zip(poses, shape.poses, strict=True)
         return shape, {k: self.tracker.start(pose) for k, pose in states}
 
@@ -250,11 +249,7 @@ class _Capture:
         def follow(state: TrackState | None, frame: int, last: int) -> TrackState | None:
             seen = self._see(frame)
             if state is None and not self._is_sequence:
-                explained = self.explained(frame)
-                found[frame] = None
-                if explained:
-                    fit = explained[0].fit
-                    found[frame] = self.tracker.start(fit.values, fit.inlier_ratio)
+                found[frame] = self._found_anew(frame, known.get(frame))
             else:
                 found[frame] = self.tracker.follow(state, seen)
             if state is not None and abs(frame - last) > 1:
@@ -279,6 +274,20 @@ class _Capture:
             for frame in way:
                 state, last = follow(state, frame, last), frame
         return found
+
+    def _found_anew(self, frame: int, known: TrackState | None) -> TrackState | None:
+        """The state in a frame on its own, in the body that the tracker has."""
+        if known is None:
+            explained = self.explained(frame)
+            if not explained:
+                return None
+            fit, own = explained[0]
+            if own is self.tracker:
+                return self.tracker.start(fit.values, fit.inlier_ratio)
+            known = self.tracker.start(self.tracker.worn(fit.values))
+        seen, search = self._see(frame), self.tracker.search
+        fit = search.mended(search.refined(known.values, seen), seen)
+        return self.tracker.start(fit.values, fit.inlier_ratio)
 
     def _best_start(
         self, frames: Sequence[int], tried: int = 4, enough: float = 0.97

@@ -190,12 +190,17 @@ class PersonPoseTracker:
         self._order: Indices = np.array([model.position_index(n) for n in fit.kinematics.names])
         if rest is None:
             rest = fit.kinematics.flatten(fit.tree.default_values())
+        self._rest = rest
         self.search = PersonSearch(fit, self.plan, settings, self._information, self._held, rest)
 
     def start(self, values: Array, share: float = 1.0) -> TrackState:
         """A state at rest at values (m,) of the pose tree, of which a share of contours fits."""
         still = np.zeros(len(values))
         return TrackState(np.array(values, dtype=np.float64), still, share, self.settings.usual)
+
+    def worn(self, values: Array) -> Array:
+        """Values (m,) with the tracker's own held ones."""
+        return np.where(self._held, self._rest, values)
 
     def positions(self, values: Array) -> Array:
         """The plant's q (nq,) of values (m,), free angles within half a turn."""

@@ -92,6 +92,19 @@ class TestCapture:
         assert np.nanmax(off) < 0.12
 
     @pytest.mark.slow
+    def test_stills_share_a_shape_and_none_spoils_the_others(self, shaped_person, shared_data):
+        """One still turned about in the common shape made others turn about, too."""
+        scene = load_scene(shared_data / "human_four_views")
+        frames = scene.frames[::5]
+        captured = capture_person(
+            shaped_person.pose_tree(), scene.cameras,
+            lambda k: {name: scene.read(name, frames[k]) for name in scene.cameras},
+            range(len(frames)), is_sequence=False,
+        )  # fmt: skip
+        assert captured.shares.min() > 0.88
+        assert np.ptp(np.unwrap(captured.q[:, shaped_person.position_index("head_y")])) < np.pi / 2
+
+    @pytest.mark.slow
     def test_real_person_of_unknown_proportions(self, shaped_person, shared_data):
         scene = load_scene(shared_data / "human_four_views")
         frames = scene.frames[::8]

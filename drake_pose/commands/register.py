@@ -121,7 +121,8 @@ def audit(
     the given one, which is then compared with it; and by how much pictures and joints are out of
     step is told.
 
-    Files in DIR: summary.json; overlay/ of the frames that contradict the others.
+    Files in DIR: report.html, a page with all of it; summary.json; overlay/ of the frames that
+    contradict the others; overlay_as_given/, the robot as given and as found.
 
     Whose positions are not those of the pictures:
 

@@ -95,7 +95,7 @@ def _describe_method(scene: Scene, estimate: SceneEstimate) -> str:
     return f"{how}, {others} {text}" if others else how
 
 
-def page_template(package: str) -> Template:
+def page_template(package: str, name: str = "report_template.html.j2") -> Template:
     """The template of a package's page, which may use the style of all pages."""
     environment = Environment(
         autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True,
@@ -104,7 +104,7 @@ def page_template(package: str) -> Template:
     environment.tests |= {"infinite": math.isinf, "nan": math.isnan}
     style = files("drake_pose.files").joinpath("report_style.css")
     environment.globals["style"] = Markup(style.read_text(encoding="utf-8").rstrip())
-    source = files(package).joinpath("report_template.html.j2")
+    source = files(package).joinpath(name)
     return environment.from_string(source.read_text(encoding="utf-8"))
 
 

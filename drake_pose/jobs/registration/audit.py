@@ -21,6 +21,7 @@ from drake_pose.files.folder import write_summary, writes_folder
 from drake_pose.files.records import mask_digests, user_units
 from drake_pose.files.settings import percent
 from drake_pose.jobs.estimate.measurements import say_left_out
+from drake_pose.jobs.registration.audit_page import write_audit_page
 from drake_pose.jobs.registration.diagnosis import (
     compare_camera,
     compare_clock,
@@ -263,7 +264,7 @@ def _write_result(
     overlay: bool,
     summary: Mapping[str, Any],
 ) -> None:
-    """The summary, and the robot at its encoders' positions over what is at fault."""
+    """Summary and page, and the robot at its encoders' positions over what is at fault."""
     named, shown = found.contradicting if overlay else (), {}
     for frame in named if pictures.names else ():
         camera_name, name = pictures.names[frame]
@@ -280,6 +281,7 @@ def _write_result(
         own = pictures.found[given.name]
         write_comparisons(path, inputs, own.frames, given, own.found, own.pictures)
     write_summary(path, summary)
+    write_audit_page(path, inputs, found, summary, overlay)
 
 
 def _describe_contradictions(found: Diagnosis) -> list[dict[str, Any]]:

@@ -257,7 +257,7 @@ def write_overlays(
 
     seen: the nodes that are drawn; None: all. pictures: by frame.
     """
-    draw = _drawer(tree, seen)
+    draw = body_drawer(tree, seen)
     for frame, title in titled:
         segments = draw(camera, frame)
         shown: NDArray[Any] = (pictures or {}).get(frame.name, frame.mask)
@@ -274,7 +274,7 @@ def write_comparisons(
     pictures: Mapping[str, Picture],
 ) -> None:
     """Draws the robot as a camera that was given would see it, and as the one that was found."""
-    draw = _drawer(inputs.tree, inputs.seen)
+    draw = body_drawer(inputs.tree, inputs.seen)
     errors = {one.frame: one.E_total for one in found.frames}
     for frame in (one for one in frames if one.name in compared_frames(errors)):
         shown: NDArray[Any] = pictures.get(frame.name, frame.mask)
@@ -284,7 +284,7 @@ def write_comparisons(
         write_file(folder, f"{AS_GIVEN}/{given.name}/{frame.name}.png", encode_png(picture))
 
 
-def _drawer(
+def body_drawer(
     tree: PoseTree, seen: Collection[str] | None
 ) -> Callable[[Camera, PosedFrame], NDArray[np.intp]]:
     """What draws a camera's view (H, W) of a frame: which of the nodes is seen, or -1."""

@@ -13,6 +13,8 @@ from drake_pose.camera.camera_files import save_cameras
 from drake_pose.camera.models import Camera
 from drake_pose.errors import CameraError, MaskError, SceneError, SettingsError
 from drake_pose.jobs.registration.audit import SceneAudit, audit_scene
+from drake_pose.jobs.registration.audit_page import corrected
+from drake_pose.registration.findings import Finding
 from drake_pose.silhouette.pictures.masks import write_mask
 from tests.cli import Result, run_to_end
 from tests.jobs.registration.arm_scenes import JOINTS, ArmScene, write_arm_scene
@@ -76,8 +78,31 @@ class TestAudit:
                 audit_scene(own.folder, own.model)
 
     def test_only_what_contradicts_is_drawn(self, found) -> None:
-        drawn = sorted(path.relative_to(found[0]) for path in found[0].rglob("*.png"))
-        assert drawn == [Path("overlay/left/0002.png"), Path("overlay/right/0002.png")]
+        drawn = {str(path.relative_to(found[0])) for path in found[0].rglob("*.png")}
+        overlays = {f"{one}/0002.png" for one in ("overlay/left", "overlay/right")}
+        as_given = {f"overlay_as_given/{one}/0002.png" for one in ("left", "right")}
+        assert drawn - as_given == overlays
+
+    def test_the_page_says_what_is_off_with_its_interval_and_what_goes_unnoticed(
+        self, audited, tmp_path: Path
+    ) -> None:
+        """The encoder of the elbow reads two degrees too much: two are to be taken off."""
+        own, out = audited.copy(tmp_path / "scene"), tmp_path / "out"
+        own.add_to("elbow_turn", np.radians(2.0))
+        summary = audit_scene(own.folder, own.model, own.joints, out).summary
+        text = (out / "report.html").read_text()
+        rows = re.findall(r"<tr>(.*?)</tr>", text, re.S)
+        (elbow,) = (row for row in rows if row.startswith("<td>elbow_turn</td>"))
+        low, high = map(float, re.search(r"\(([-+.\d]+) to ([-+.\d]+) deg\)", elbow).groups())
+        assert low < -2.0 < high
+        assert high - low < 1.0
+        for name, least in summary["noticed_from"].items():
+            (row,) = (row for row in rows if row.startswith(f"<td>{name}</td>"))
+            assert ("any size" if least is None else f"{least:.3g}") in row
+        for camera in ("left", "right"):
+            assert f"<td>{camera}</td>" in text
+            places = out.glob(f"overlay_as_given/{camera}/*.png")
+            assert {path.stem for path in places} >= {"0003", "0004"}
 
     def test_without_out_the_table_is_printed(self, audited) -> None:
         result = run(audited, "--frame", "0:4")
@@ -174,3 +199,25 @@ class TestAudit:
             write_mask(path, nothing)
         with pytest.raises(MaskError, match="no mask shows the body"):
             audit_scene(own.folder, own.model, own.joints)
+
+
+def test_what_the_page_draws_as_found_is_the_truth() -> None:
+    """A value that was logged with an error, and the finding that says what must be added."""
+    names, truth = ("a", "b", "slide"), np.array([0.3, -0.7, 0.05])
+    nothing = Finding("joint", "", 0.0, 0.0, 0.0, 0.0, 1.0, 0.0)
+    logged = {
+        "joint": (
+            np.add(truth, [0.0, 0.2, 0.0]),
+            replace(nothing, name="b", angle=-0.2, angle_sd=0.01),
+        ),
+        "slide": (
+            np.add(truth, [0.0, 0.0, 0.01]),
+            replace(nothing, name="slide", shift=-0.01, shift_sd=0.1),
+        ),
+        "sign": (truth * [1, -1, 1], replace(nothing, kind="sign", name="b")),
+        "joints": (truth - 0.1, replace(nothing, kind="joints", joints=dict.fromkeys(names, 0.1))),
+    }
+    for values, finding in logged.values():
+        np.testing.assert_allclose(corrected(values, names, finding)[0], truth)
+    for kind in ("camera", "base", "unexplained", "clock"):
+        assert corrected(truth, names, replace(nothing, kind=kind)) == ()

@@ -411,7 +411,7 @@ class _Diagnoser:
         names = {(one[0].kind, one[0].name) for one in found}
         for cause in causes:
             if (key := (cause.kind, cause.name)) in self._asked and key not in names:
-                found.append([residual.test(cause)])
+                found.append([whole.test(cause)])
         findings = list[Finding]()
         if found:
             # By how much they are off together, and the others that are free beside.

@@ -5,7 +5,7 @@ alike. Here the areas of body and silhouettes are compared over each joint's who
 the scene read otherwise: other signs, conventions, focal lengths, cameras exchanged.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -37,6 +37,7 @@ class LargeErrorSettings(NamedTuple):
         as_good: a simpler reading is preferred that gains this share of the most that one gains.
         constant: positions that differ from the log by another amount in each frame are named only
             where no constant gains this share of what they gain.
+        again: fits are begun anew from where they found a joint that is off by more [deg].
         near_angle, near_place, near_focal: what is off by less is left to fits [deg, m, share].
         frames: number of frames that are compared, spread over all.
         seen: a joint is looked at where less of the outlines of all links that it moves fits.
@@ -57,6 +58,7 @@ class LargeErrorSettings(NamedTuple):
     improved: float = 0.7
     as_good: float = 0.85
     constant: float = 0.8
+    again: float = 2.0
     near_angle: float = 6.0
     near_place: float = 0.01
     near_focal: float = 0.04
@@ -116,7 +118,11 @@ class LargeErrorSearch:
         self._sums = dict[int, tuple[Mask, NDArray[np.int32]]]()
 
     def find(
-        self, readings: Sequence[Reading], joints: Sequence[str], left: float = LARGE.left
+        self,
+        readings: Sequence[Reading],
+        joints: Sequence[str],
+        left: float = LARGE.left,
+        likely: Collection[str] = (),
     ) -> Reading | None:
         """What explains the silhouettes much better than what is given; None: nothing does.
 
@@ -124,6 +130,7 @@ class LargeErrorSearch:
             readings: of the scene.
             joints: whose positions may be wrong as well.
             left: largest share of what is not explained that is left.
+            likely: joints that fits say are off: of these it may be all of it.
         """
         given = self.misfits(Reading("", "", self._cameras, as_it_is))
         told = [(one, self.misfits(one)) for one in readings]
@@ -132,7 +139,7 @@ class LargeErrorSearch:
         explained = [
             (one, own.sum())
             for one, own in told
-            if own.sum() <= left * given.sum()
+            if own.sum() <= (1.0 if one.name in likely else left) * given.sum()
             and np.mean(own < given) >= LARGE.improved
             and not _is_near(self._body, one)
         ]
@@ -181,6 +188,7 @@ class LargeErrorSearch:
             fine = step / LARGE.step * LARGE.fine_step
         grid = np.arange(-np.pi, np.pi, step) if angle else np.linspace(low, high, LARGE.places)
         beside = np.arange(-4, 5) * fine
+        near = np.radians(LARGE.near_angle) if angle else LARGE.near_place
 
         def compare(k: int, places: Array) -> Array:
             values = np.tile(frames[k].values, (len(places), 1))
@@ -207,9 +215,9 @@ class LargeErrorSearch:
             by = float(about + beside[best])
             if sign < 0.0:
                 plain = np.array([compare(k, -q[[k]])[0] for k in range(len(frames))])
-                told.append((self._joint_reading("sign", name, -1.0, 0.0, 0.0), plain))
+                told.append((self.joint_reading("sign", name, -1.0, 0.0, 0.0), plain))
             rank = 1.0 if sign > 0.0 else 2.0
-            reading = self._joint_reading(kind, name, sign, by, rank)
+            reading = self.joint_reading(kind, name, sign, by, rank)
             told.append((reading, exact[:, best]))
         inside = np.ones(len(grid), bool)
         if angle and high - low < 2.0 * np.pi:
@@ -218,12 +226,21 @@ class LargeErrorSearch:
             inside = off <= 0.5 * (high - low) + step
         seen = grid[np.argmin(np.where(inside, profile, np.inf), axis=1)]
         exact = np.array(map_ordered(lambda k: compare(k, seen[k] + beside), range(len(frames))))
+        off = seen + beside[np.argmin(exact, axis=1)] - q
+        if angle:
+            # About the middle of the smaller side, as a turn may be counted more or less.
+            middle = np.angle(np.exp(1j * off).mean())
+            off = (off - middle + np.pi) % (2.0 * np.pi) - np.pi
+        if np.median(np.abs(off - np.median(off))) <= near:
+            # A constant, as well as single frames tell.
+            return told
         free = Reading(
             "log", name, self._cameras, self._seen_anew(j, grid[inside], beside), 0.0, 3.0
         )  # fmt: skip
         return [*told, (free, exact.min(axis=1))]
 
-    def _joint_reading(self, kind: str, name: str, sign: float, by: float, rank: float) -> Reading:
+    def joint_reading(self, kind: str, name: str, sign: float, by: float, rank: float) -> Reading:
+        """Another sign of a joint's positions (sign -1), and what is added then [rad or m]."""
         j = self._body.kinematics.names.index(name)
 
         def changed(frame: SeenFrame) -> SeenFrame:

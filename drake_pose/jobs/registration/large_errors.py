@@ -70,6 +70,11 @@ class Compared:
             frame = reading.of(frame)
         return frame
 
+    def joint_off(self, name: str) -> Finding | None:
+        """What fits say of a joint that is so far off that they should begin anew from there."""
+        off = [one for one in self.found.common if (one.kind, one.name) == ("joint", name)]
+        return next((one for one in off if abs(one.angle) > np.radians(LARGE.again)), None)
+
     @property
     def shares_moved(self) -> dict[str, float]:
         """By joint, what share fits of the outlines of all links that it moves."""
@@ -140,6 +145,10 @@ class SceneComparison:
             if reading is None:
                 break
             again = self._compare(reading.cameras, (*now.readings, reading))
+            told = now.joint_off(reading.name) if reading.kind == "offset" else None
+            if told is not None and told.angle * reading.amount > 0.0:
+                now = self._tell(now, again, reading, told)
+                continue
             if again.inlier_ratio <= now.inlier_ratio:
                 break
             if not now.is_doubtful:
@@ -176,7 +185,14 @@ class SceneComparison:
             found = replace(found, frames=tuple(frames))
         common = (*findings, *moved, *found.common)
         warnings = (*now.warnings, *self._say_masks(now))
-        return replace(now, found=replace(found, common=common), findings=(), warnings=warnings)
+        # Where outlines do not fit, what would be noticed is not told by how they would move.
+        shares = now.shares_moved
+        noticed = {
+            name: least if shares.get(name, 0.0) >= LARGE.seen else np.inf
+            for name, least in found.noticed_from.items()
+        }
+        found = replace(found, common=common, noticed_from=noticed)
+        return replace(now, found=found, findings=(), warnings=warnings)
 
     def _find_moved(
         self, now: Compared, found: Diagnosis, least: int = 2
@@ -320,10 +336,18 @@ class SceneComparison:
         if now.is_doubtful:
             of_scene = not now.readings
             return self._search(now.cameras, now.fit.joints, LARGE.left, sample, of_scene)
-        doubted = [name for name, share in now.shares_moved.items() if share < LARGE.seen]
+        off = [name for name in now.fit.joints if now.joint_off(name) is not None]
+        shares = now.shares_moved.items()
+        doubted = [name for name, share in shares if share < LARGE.seen or name in off]
         if not doubted:
             return None
-        return self._search(now.cameras, doubted, LARGE.left_of_one, sample, scene=False)
+        reading = self._search(now.cameras, doubted, LARGE.left_of_one, sample, False, off)
+        if reading is not None or not off:
+            return reading
+        # Fits are linear about where they begin.
+        by = next(one.angle for one in now.found.common if one.name == off[0])
+        search = LargeErrorSearch(self.body, now.cameras, sample)
+        return search.joint_reading("offset", off[0], 1.0, by, 0.0)
 
     def _look_for_cameras(self, now: Compared) -> Compared | None:
         """With cameras as they are found in the frames, where these explain what is seen."""
@@ -343,6 +367,7 @@ class SceneComparison:
         left: float = LARGE.left,
         sample: Sequence[SeenFrame] | None = None,
         scene: bool = True,
+        likely: Collection[str] = (),
     ) -> Reading | None:
         inputs = self._inputs
         readings = list[Reading]()
@@ -350,16 +375,20 @@ class SceneComparison:
             values = [inputs.read(name).values for name in inputs.wanted]
             readings = list(scene_readings(cameras, values, inputs.wanted))
         search = LargeErrorSearch(self.body, cameras, sample or self._sample)
-        return search.find(readings, joints, left)
+        return search.find(readings, joints, left, likely)
 
-    def _tell(self, before: Compared, now: Compared, reading: Reading) -> Compared:
-        """With what was put right as a finding."""
+    def _tell(
+        self, before: Compared, now: Compared, reading: Reading, told: Finding | None = None
+    ) -> Compared:
+        """With what was put right as a finding; told: of a joint, what fits have said of it."""
         kind, name, warnings = _KINDS.get(reading.kind, reading.kind), reading.name, before.warnings
         off = Finding(kind, name, 0.0, 0.0, 0.0, 0.0, self._pixels(before, now), 0.0)
         if reading.kind in _KINDS:
             size, of_focal = reading.amount, reading.kind == "focal"
             if not of_focal and self._turns(name):
                 off = replace(off, angle=size, angle_sd=float(np.radians(LARGE.fine_step)))
+                if told is not None and abs(size - told.angle) < 1e-9:
+                    off = told
             else:
                 step = LARGE.near_focal if of_focal else LARGE.near_place
                 off = replace(off, shift=size, shift_sd=step)
@@ -368,7 +397,14 @@ class SceneComparison:
         else:
             now_fits, given = percent(now.inlier_ratio), percent(before.inlier_ratio)
             warnings = (*warnings, f"{name}; so {now_fits} of the contours fit, as given {given}")
-        return replace(now, findings=(*before.findings, off), warnings=warnings)
+        findings = list(before.findings)
+        earlier = [
+            one for one in findings if (one.kind, one.name) == (kind, name) == ("joint", name)
+        ]
+        if earlier:
+            findings.remove(earlier[0])
+            off = replace(off, angle=off.angle + earlier[0].angle, rivals=earlier[0].rivals)
+        return replace(now, findings=(*findings, off), warnings=warnings)
 
     def _turns(self, joint: str) -> bool:
         kinematics = self.body.kinematics
@@ -427,7 +463,8 @@ def _with_rest(one: Finding, rest: Finding | None) -> Finding:
     if one.kind == "focal":
         shift = (1.0 + one.shift) * (1.0 + rest.shift) - 1.0
     angle = one.angle + rest.angle
-    return replace(rest, angle=angle, shift=shift, pixels=one.pixels, p_value=0.0, rivals=())
+    told = replace(rest, angle=angle, shift=shift, pixels=one.pixels)
+    return replace(told, p_value=one.p_value, rivals=one.rivals)
 
 
 def changed_after(found: Diagnosis, cameras: Collection[str], least: int) -> tuple[list[int], str]:

@@ -130,7 +130,8 @@ class LargeErrorSearch:
             readings: of the scene.
             joints: whose positions may be wrong as well.
             left: largest share of what is not explained that is left.
-            likely: joints that fits say are off: of these it may be all of it.
+            likely: joints that fits say are off: of these it may be all of it, and half of the
+                frames need not gain.
         """
         given = self.misfits(Reading("", "", self._cameras, as_it_is))
         told = [(one, self.misfits(one)) for one in readings]
@@ -140,7 +141,7 @@ class LargeErrorSearch:
             (one, own.sum())
             for one, own in told
             if own.sum() <= (1.0 if one.name in likely else left) * given.sum()
-            and np.mean(own < given) >= LARGE.improved
+            and np.mean(own < given) >= (0.5 if one.name in likely else LARGE.improved)
             and not _is_near(self._body, one)
         ]
         alike = [one for one in explained if one[0].kind != "log"]

@@ -290,7 +290,7 @@ class _Capture:
         return self.tracker.start(fit.values, fit.inlier_ratio)
 
     def _best_start(
-        self, frames: Sequence[int], tried: int = 4, enough: float = 0.97
+        self, frames: Sequence[int], tried: int = 3, enough: float = 0.97
     ) -> tuple[int, TrackState]:
         """The frame of those tried in which a fresh start fits best, and the state there.
 

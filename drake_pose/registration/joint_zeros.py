@@ -34,7 +34,7 @@ class KinematicParameter:
         low, high: the ends of its 95 % interval.
         significant: whether it is not 0, at 5 % over all that were asked for (Bonferroni). So it
             may be insignificant although its 95 % interval does not hold 0.
-        gauge: what it cannot be told from; empty where it is determined.
+        gauge: what it cannot be told from, or, where it is determined, by still parts alone.
     """
 
     name: str
@@ -119,6 +119,7 @@ def calibrate_joints(
     level: float = 0.05,
     start: Mapping[str, float] | None = None,
     most_lost: float = 0.05,
+    still_factor: float = 1.0,
 ) -> JointCalibration:
     """The zeros of some joints and lengths of links, fitted together with the cameras' poses.
 
@@ -136,6 +137,10 @@ def calibrate_joints(
         start: zeros that the cameras were found with, by name, where the fit begins [rad or m].
         most_lost: an end is refused whose mean inlier ratio is smaller than the beginning's by
             more: 0.3 and more where the fit went to another optimum.
+        still_factor: of the standard deviation of what goes with a camera, such as the offset of a
+            first joint. Parts that stand still alone tell the two apart, and pictures show those
+            parts badly: 2.5 there (six rooms with an SO-101, whose first offset was off by .1 to 3
+            standard deviations).
 
     Raises:
         UnknownNameError: a name that is no position of the body's, or no link with a length.
@@ -182,8 +187,14 @@ def calibrate_joints(
         told |= values
         kept = [name for name in sought if values[name].determined]
     found = found._replace(shared=drawn_together(fit, found, covariance, sought))
-    again = describe_constants(fit, found, freedom, least, covariance, sought)
-    told |= {k: replace(one, significant=told[k].significant) for k, one in again.items()}
+    covariance, gauges = wider_with_cameras(fit, covariance, still_factor)
+    again = describe_constants(
+        fit, found, freedom, least, covariance, sought, determined=0.2 * still_factor
+    )
+    told |= {
+        k: replace(one, significant=told[k].significant, gauge=gauges.get(k, one.gauge))
+        for k, one in again.items()
+    }
     ratios = fit.inlier_ratios(found)
     if ratios.mean() < before - most_lost:
         raise RegistrationError(
@@ -269,6 +280,28 @@ def as_the_cost_bends(fit: SharedFit, found: Shared, which: Mask, covariance: Ar
         share = min(1.0, max(1e-3, bends / said))
         found_covariance += (1.0 / share - 1.0) * np.outer(along, along)
     return found_covariance
+
+
+def wider_with_cameras(
+    fit: SharedFit, covariance: Array, factor: float, goes_with: float = 0.9
+) -> tuple[Array, dict[str, tuple[str, ...]]]:
+    """(u, u) the covariance, wider by a factor along constants that go with a camera.
+
+    Which these are, each with the camera's unknowns that it goes with; none if the factor is 1.
+
+    Args:
+        goes_with: least correlation.
+    """
+    deviations, cameras = np.sqrt(np.diag(covariance)), len(fit.names) - len(fit.constants)
+    wider, gauges = covariance.copy(), dict[str, tuple[str, ...]]()
+    for k in range(cameras, len(fit.names)) if factor > 1.0 else ():
+        correlations = covariance[k, :cameras] / (deviations[k] * deviations[:cameras])
+        with_it = np.flatnonzero(np.abs(correlations) > goes_with)
+        if len(with_it):
+            along = covariance[:, k] / deviations[k]
+            wider += (factor**2 - 1.0) * np.outer(along, along)
+            gauges[fit.names[k]] = tuple(fit.names[j] for j in with_it)
+    return wider, gauges
 
 
 def describe_constants(

@@ -25,6 +25,7 @@ from drake_pose.registration.joint_zeros import (
     describe_constants,
     drawn_together,
     significant_constants,
+    wider_with_cameras,
 )
 from drake_pose.registration.online_registration import pose_difference
 from drake_pose.registration.per_frame_fit import PerFrameFit
@@ -580,3 +581,17 @@ def test_offsets_and_the_camera_that_goes_with_them_come_nearer_by_their_size(
     after, before = np.mean(errors, axis=0)
     for ratio in (after[0] / before[0], after[1:].sum() / before[1:].sum()):
         assert least <= ratio < most
+
+
+def test_a_first_joint_is_as_unsure_as_pictures_of_still_parts() -> None:
+    """The variance of it and of the camera that goes with it grows by the factor's square."""
+    fit = SimpleNamespace(names=("eye.turn_y", "base", "elbow"), constants=("base", "elbow"))
+    A = np.array([[1.0, 0.1, 0.0], [1.0, 0.0, 0.0], [0.2, 0.0, 1.0]])
+    covariance = A @ A.T
+    same, none = wider_with_cameras(fit, covariance, 1.0)
+    np.testing.assert_array_equal(same, covariance)
+    wider, gauges = wider_with_cameras(fit, covariance, 2.5)
+    assert (none, gauges) == ({}, {"base": ("eye.turn_y",)})
+    np.testing.assert_allclose(wider[1, 1], 2.5**2 * covariance[1, 1])
+    np.testing.assert_allclose(wider[0, 0] - covariance[0, 0], 2.5**2 - 1.0)
+    np.linalg.cholesky(wider)

@@ -523,7 +523,14 @@ def say_zeros(found: JointCalibration) -> list[str]:
             "none of the zeros and lengths that were asked for is significant beside what else may "
             "be off (the others, focal length, principal point, masks): no corrected URDF is made"
         ]
-    return [
+    with_cameras = [
+        f"{what} goes with {', '.join(one.gauge)}; parts that stand still alone tell them apart, "
+        "and pictures show those badly: the camera may be turned with it about the robot. Look "
+        "whether the robot's base fits in the overlays, or give masks or a second camera"
+        for what, one in asked
+        if one.determined and one.gauge
+    ]
+    return with_cameras + [
         f"{what} is not determined by these silhouettes and was left as it is;"
         + (f" it goes with {', '.join(one.gauge)};" if one.gauge else "")
         + " frames in which the robot stands otherwise, or a part of it that does not move with "

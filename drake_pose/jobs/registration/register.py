@@ -394,7 +394,7 @@ class _Registration:
         found = calibrate_joints(
             self.body, list(cameras.values()), [inputs.of(name) for name in cameras],
             inputs.zeros, self._settings.focal, lengths=inputs.lengths,
-            start=self._zeros_in_pictures(),
+            start=self._zeros_in_pictures(), still_factor=2.5 if self.pictures else 1.0,
         )  # fmt: skip
         self.parameters = describe_parameters(found, self.body.kinematics)
         self.warnings += say_zeros(found)

@@ -4,7 +4,10 @@ Every message names the file, link, joint, camera or frame at fault, says what w
 what to do about it.
 """
 
-from collections.abc import Iterable, Sequence
+import re
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
 
 
 class DrakePoseError(Exception):
@@ -65,3 +68,45 @@ def listed(names: Sequence[str], most: int = 5) -> str:
     """Names as a message has them: of many the first, and how many more there are."""
     more = f" and {len(names) - most} more" if len(names) > most else ""
     return ", ".join(names[:most]) + more
+
+
+_typed: ContextVar[bool] = ContextVar("typed", default=False)
+
+
+@contextmanager
+def options_are_typed() -> Iterator[None]:
+    """While the command line runs: messages name its options."""
+    token = _typed.set(True)
+    try:
+        yield
+    finally:
+        _typed.reset(token)
+
+
+def in_callers_words(text: str) -> str:
+    """A message that names options as they are typed, or for a Python call its arguments.
+
+    ``--joints FILE`` becomes ``joints=FILE``, ``--camera`` ``cameras``; commands stay as they are.
+    """
+    if _typed.get():
+        return text
+    names = {"camera": "cameras", "frame": "frames", "class": "classes", "export": "exports"}
+    names |= {"package": "packages", "no-track": "track=False"}
+
+    def argument(found: re.Match[str]) -> str:
+        if found["command"]:
+            return found[0]
+        name = names.get(found["name"], found["name"].replace("-", "_"))
+        value = found["value"]
+        if value is None:
+            return name
+        key, equals, what = value.partition("=")
+        if equals:
+            return f"{name}={{'{key}': {what}}}"
+        return f"{name}='{value}'" if value == value.lower() else f"{name}={value}"
+
+    command = r"(?P<command>drake-pose [a-z]+[^;,()]*)"
+    # A value is in capitals, such as FILE or NAME=VALUE, or the word all.
+    value = r"[\w.-]+=[A-Z]+\b|[A-Z]{2,}\b|N\b|all\b"
+    option = rf"--(?P<name>[a-z][a-z-]*)(?: (?P<value>{value}))?"
+    return re.sub(f"{command}|{option}", argument, text)

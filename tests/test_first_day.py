@@ -11,6 +11,7 @@ import pytest
 import drake_pose
 from drake_pose import (
     AuditSettings,
+    DrakePoseError,
     EstimateSettings,
     MaskSettings,
     MultiStartSearch,
@@ -21,12 +22,13 @@ from drake_pose import (
     TruncatedEkf,
     TruncatedFilter,
     View,
+    audit_scene,
     bundled_model,
     load_model,
     look_at,
     save_cameras,
 )
-from drake_pose.errors import CameraError, SettingsError
+from drake_pose.errors import CameraError, SettingsError, in_callers_words, options_are_typed
 from drake_pose.registration.register import RegistrationBody
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -102,3 +104,29 @@ def test_a_model_shows_itself_in_one_line(model):
         assert "\n" not in repr(one)
         assert len(repr(one)) < 300
         assert "two_finger_hand" in repr(one)
+
+
+@pytest.mark.parametrize(
+    ("typed", "called"),
+    [
+        ("name those: --camera NAME", "name those: cameras=NAME"),
+        ("(--joints FILE): --hold elbow=VALUE", "(joints=FILE): hold={'elbow': VALUE}"),
+        ("in the zeros (--zeros all)?", "in the zeros (zeros='all')?"),
+        ("leave --no-track out (--keep-out)", "leave track=False out (keep_out)"),
+        ("(drake-pose masks --box 1) or --out", "(drake-pose masks --box 1) or out"),
+    ],
+)
+def test_errors_of_python_calls_name_arguments_and_those_of_the_program_options(typed, called):
+    assert in_callers_words(typed) == called
+    with options_are_typed():
+        assert in_callers_words(typed) == typed
+    assert in_callers_words(typed) == called
+
+
+def test_a_python_call_is_answered_in_its_words():
+    scene = ROOT / "tutorials" / "data" / "human"
+    with pytest.raises(DrakePoseError, match=r"joints") as refused:
+        audit_scene(scene, bundled_model("man"))
+    assert "--" not in str(refused.value)
+    with pytest.raises(SettingsError, match="keep_out is for suggest"):
+        RegistrationSettings(keep_out=(((0.0,) * 3, (1.0,) * 3),))

@@ -20,7 +20,7 @@ from drake_pose.commands.papers import date, kameda, reproduce_all, shimada
 from drake_pose.commands.prepare import check, masks, undistort
 from drake_pose.commands.register import audit, register
 from drake_pose.commands.walk import walk
-from drake_pose.errors import DrakePoseError, SettingsError
+from drake_pose.errors import DrakePoseError, SettingsError, options_are_typed
 from drake_pose.version import VERSION
 
 
@@ -106,6 +106,12 @@ def main(words: Sequence[str] | None = None) -> None:
     for ending in (signal.SIGTERM, signal.SIGHUP):
         if signal.getsignal(ending) is signal.SIG_DFL:
             signal.signal(ending, signal.default_int_handler)
+    with options_are_typed():
+        _run(words)
+
+
+def _run(words: Sequence[str] | None) -> None:
+    """Reads the command line and does what it says."""
     try:
         command, bound, _ = app.parse_args(words, exit_on_error=False, print_error=False)
     except (CycloptsError, SettingsError) as error:

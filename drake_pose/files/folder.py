@@ -16,7 +16,7 @@ from typing import Any, TypeVar, cast
 
 import numpy as np
 
-from drake_pose.errors import OutputError
+from drake_pose.errors import DrakePoseError, OutputError, in_callers_words
 
 POSES = "poses.csv"
 JOINTS = "joints.csv"
@@ -100,15 +100,22 @@ def claimed(path: Path, resume: bool = False) -> Iterator[None]:
 
 
 def writes_folder(job: _Job) -> _Job:
-    """A job whose argument ``out`` names a folder, if any, that is claimed while it runs."""
+    """A job whose argument ``out`` names a folder, if any, that is claimed while it runs.
+
+    Where it is called from Python its errors name arguments, not options.
+    """
 
     @wraps(job)
     def run(*args: Any, **kwargs: Any) -> Any:
         given = signature(job).bind(*args, **kwargs).arguments
-        if given.get("out") is None:
-            return job(*args, **kwargs)
-        with claimed(Path(given["out"]), given.get("resume", False)):
-            return job(*args, **kwargs)
+        try:
+            if given.get("out") is None:
+                return job(*args, **kwargs)
+            with claimed(Path(given["out"]), given.get("resume", False)):
+                return job(*args, **kwargs)
+        except DrakePoseError as error:
+            error.args = (in_callers_words(str(error)),)
+            raise
 
     return cast(_Job, run)
 

@@ -17,7 +17,7 @@ from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin, get_t
 
 from cyclopts import Parameter, Token
 
-from drake_pose.errors import SettingsError
+from drake_pose.errors import SettingsError, in_callers_words
 
 _Settings = TypeVar("_Settings", bound=type)
 Axis = Literal["x", "y", "z"]
@@ -410,13 +410,17 @@ class MaskSettings:
             raise SettingsError(f"box must be 4 numbers, not {self.box}")
         ways = [one for one in ("background", "box", "model") if getattr(self, one) is not None]
         if len(ways) > 1:
-            raise SettingsError(f"--{ways[0]} and --{ways[1]} are two ways to find masks: give one")
+            text = f"--{ways[0]} and --{ways[1]} are two ways to find masks: give one"
+            raise SettingsError(in_callers_words(text))
         if self.classes and ways:
-            raise SettingsError(f"--class is for COCO files, not for --{ways[0]}")
+            text = f"--class is for COCO files, not for --{ways[0]}"
+            raise SettingsError(in_callers_words(text))
         if (self.model is None) != (self.start is None):
-            raise SettingsError("--model and --start need each other: rough joint positions")
+            text = "--model and --start need each other: rough joint positions"
+            raise SettingsError(in_callers_words(text))
         if not (math.isfinite(self.start_error) and self.start_error > 0.0):
-            raise SettingsError("--start-error must be a positive number of degrees")
+            text = "--start-error must be a positive number of degrees"
+            raise SettingsError(in_callers_words(text))
 
     def as_json(self) -> Mapping[str, Any]:
         """The settings that are not the default's, as plain JSON values."""

@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal, get_args
 
 from cyclopts import Parameter
 
-from drake_pose.errors import SettingsError
+from drake_pose.errors import SettingsError, in_callers_words
 from drake_pose.files.settings import (
     Corner,
     EpisodeSettings,
@@ -79,7 +79,9 @@ class RegistrationSettings(AuditSettings):
             if name not in (known := get_args(Export)):
                 raise SettingsError(f"there is no export '{name}'; there is: {', '.join(known)}")
         if self.keep_out and not self.suggest:
-            raise SettingsError("--keep-out is for --suggest; give both, or leave it out")
+            raise SettingsError(
+                in_callers_words("--keep-out is for --suggest; give both, or leave it out")
+            )
 
     def as_json(self) -> dict[str, Any]:
         """Returns the settings as plain JSON values."""

@@ -88,7 +88,7 @@ def test_one_mask_does_not_say_where_a_person_is(recording, tmp_path):
     copy = shutil.copytree(scene, tmp_path / "scene")
     (copy / "masks" / "camera_0").mkdir(parents=True)
     shutil.copy(masks / "camera_0" / "0000.png", copy / "masks" / "camera_0" / "0000.png")
-    with pytest.raises(SceneError, match=r"two cameras.*'0000'.*--start"):
+    with pytest.raises(SceneError, match=r"two cameras.*'0000'.*start"):
         estimate_scene(copy, bundled_model("person"))
 
 

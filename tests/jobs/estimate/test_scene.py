@@ -288,7 +288,7 @@ def test_a_root_position_that_is_not_known(tiny_scene: TinyScene, out: Path) -> 
 def test_what_needs_a_known_root_is_refused(tiny_scene: TinyScene, bare_scene: TinyScene) -> None:
     settings = EstimateSettings(method="paper")
     for scene, more in ((bare_scene, None), (tiny_scene, "unknown")):
-        with pytest.raises(SettingsError, match="--method beam"):
+        with pytest.raises(SettingsError, match="method beam"):
             estimate_scene(scene.folder, scene.model, None, replace(settings, root_position=more))
 
 

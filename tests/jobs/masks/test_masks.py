@@ -110,7 +110,7 @@ def test_light_that_changed_and_pictures_of_another_size_are_named(pictures, tmp
     ("settings", "words"),
     [
         ({"background": "median", "box": (1, 2, 3, 4)}, "two ways"),
-        ({"background": "median", "classes": ("1",)}, "--class"),
+        ({"background": "median", "classes": ("1",)}, "classes is for COCO"),
         ({"box": (1, 2, 3)}, "4 numbers"),
     ],
 )
@@ -213,7 +213,7 @@ def test_coco_run_lengths_become_the_same_masks(tmp_path, out, two_views, packed
     found = load_scene(out)
     assert set(found.masks) == set(scene.masks)
     assert all((found.read(*key) == scene.read(*key)).all() for key in scene.masks)
-    with pytest.raises(MaskError, match=r"classes arm, tool.*--class 'arm'"):
+    with pytest.raises(MaskError, match=r"classes arm, tool.*classes 'arm'"):
         make_masks(file, tmp_path / "none", MaskSettings(cameras=cameras))
     with pytest.raises(DrakePoseError, match=r"no class 'robot'; it has: arm, tool"):
         make_masks(file, tmp_path / "none", MaskSettings(classes=("robot",), cameras=cameras))

@@ -76,7 +76,7 @@ def test_starts_far_off_are_refused_or_named(filmed, tmp_path, out):
 
 def test_what_is_missing_is_named(filmed, tmp_path):
     start = write_start(tmp_path / "start.csv", NAMES, filmed.truth)
-    with pytest.raises(SettingsError, match="--model and --start"):
+    with pytest.raises(SettingsError, match="model and start"):
         MaskSettings(model=filmed.model)
     settings = MaskSettings(model=filmed.model, start=start)
     with pytest.raises(CameraError, match="needs to know the cameras"):

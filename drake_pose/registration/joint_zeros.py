@@ -109,6 +109,21 @@ def require_enough(count: int, zeros: int, lengths: int) -> None:
         )
 
 
+def require_explained_still(ratio: float, before: float, most_lost: float = 0.05) -> None:
+    """Refuses a fit whose mean inlier ratio is smaller than where it began.
+
+    most_lost: by more: 0.3 and more where the fit went to another optimum.
+
+    Raises RegistrationError: says both ratios.
+    """
+    if ratio < before - most_lost:
+        raise RegistrationError(
+            f"the fit of cameras and joint offsets ends where {ratio:.0%} of the contours fit, and "
+            f"began where {before:.0%} did: it has lost the robot; ask for fewer offsets, or give "
+            "more frames. Nothing was written"
+        )
+
+
 def calibrate_joints(
     body: RegistrationBody,
     cameras: Sequence[RegisteredCamera],
@@ -118,7 +133,6 @@ def calibrate_joints(
     lengths: Sequence[str] = (),
     level: float = 0.05,
     start: Mapping[str, float] | None = None,
-    most_lost: float = 0.05,
     still_factor: float = 1.0,
 ) -> JointCalibration:
     """The zeros of some joints and lengths of links, fitted together with the cameras' poses.
@@ -135,8 +149,6 @@ def calibrate_joints(
         lengths: the links whose lengths are asked for.
         level: probability that a calibration finds anything significant by chance.
         start: zeros that the cameras were found with, by name, where the fit begins [rad or m].
-        most_lost: an end is refused whose mean inlier ratio is smaller than the beginning's by
-            more: 0.3 and more where the fit went to another optimum.
         still_factor: of the standard deviation of what goes with a camera, such as the offset of a
             first joint. Parts that stand still alone tell the two apart, and pictures show those
             parts badly: 2.5 there (six rooms with an SO-101, whose first offset was off by .1 to 3
@@ -196,12 +208,7 @@ def calibrate_joints(
         for k, one in again.items()
     }
     ratios = fit.inlier_ratios(found)
-    if ratios.mean() < before - most_lost:
-        raise RegistrationError(
-            f"the fit of cameras and joint offsets ends where {ratios.mean():.0%} of the contours "
-            f"fit, and began where {before:.0%} did: it has lost the robot; ask for fewer offsets, "
-            "or give more frames. Nothing was written"
-        )
+    require_explained_still(float(ratios.mean()), before)
     deviations = np.sqrt(np.diag(covariance))[: len(seen) * fit.per_camera]
     first = len(fit.names) - len(fit.constants)
     stands = slice(first, first + len(standing))

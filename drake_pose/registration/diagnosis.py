@@ -34,13 +34,15 @@ class DiagnosisSettings(NamedTuple):
 
     significance: a right scene, or a right frame, is named with at most this probability.
     min_pixels, min_joint_pixels: what moves outlines by less [pixel] is not named; the latter is
-    for joint offsets in all frames that agree, whatever cameras are off by. min_information:
-    directions with less information, in units of the priors, are left out.
+    for joint offsets in all frames that agree, whatever cameras are off by. least_focal: focal
+    lengths are known no better [share]. min_information: directions with less information, in units
+    of the priors, are left out.
     """
 
     significance: float = 1e-4
     min_pixels: float = 1.0
     min_joint_pixels: float = 0.3
+    least_focal: float = 0.001
     min_information: float = 1.0
 
 
@@ -344,7 +346,11 @@ class _Diagnoser:
         if seen_by_one and any(one.kind == "camera" for one in sufficient):
             rivals.append("base")
         kind, name = best.kind, best.name
-        x, sd = best.amount * best.units, np.sqrt(np.diag(best.covariance)) * best.units
+        variances = np.maximum(np.diag(best.covariance), 0.0)
+        if kind == "focal":
+            # A body is seen larger as if it were nearer to a thousandth of its depth at best.
+            variances = variances + DIAGNOSIS.least_focal**2
+        x, sd = best.amount * best.units, np.sqrt(variances) * best.units
         # Poses turn and shift; a joint does one of them; the rest is shifts.
         turns = len(x) // 2 if kind in ("camera", "base") else 0
         if kind == "joint":

@@ -37,7 +37,8 @@ class LargeErrorSettings(NamedTuple):
         as_good: a simpler reading is preferred that gains this share of the most that one gains.
         constant: positions that differ from the log by another amount in each frame are named only
             where no constant gains this share of what they gain.
-        again: fits are begun anew from where they found a joint that is off by more [deg].
+        again, again_focal: fits are begun anew from where they found a joint, or focal lengths,
+            that are off by more [deg, share].
         near_angle, near_place, near_focal: what is off by less is left to fits [deg, m, share].
         frames: number of frames that are compared, spread over all.
         seen: a joint is looked at where less of the outlines of all links that it moves fits.
@@ -59,6 +60,7 @@ class LargeErrorSettings(NamedTuple):
     as_good: float = 0.85
     constant: float = 0.8
     again: float = 2.0
+    again_focal: float = 0.02
     near_angle: float = 6.0
     near_place: float = 0.01
     near_focal: float = 0.04

@@ -16,7 +16,7 @@ from drake_pose.jobs.registration.diagnosis import (
     require_seen_by,
 )
 from drake_pose.jobs.registration.inputs import Inputs
-from drake_pose.jobs.registration.readings import scene_readings
+from drake_pose.jobs.registration.readings import focal_reading, scene_readings
 from drake_pose.registration.diagnosis import DIAGNOSIS, diagnose_frames
 from drake_pose.registration.findings import Diagnosis, Finding
 from drake_pose.registration.large_errors import (
@@ -74,6 +74,12 @@ class Compared:
         """What fits say of a joint that is so far off that they should begin anew from there."""
         off = [one for one in self.found.common if (one.kind, one.name) == ("joint", name)]
         return next((one for one in off if abs(one.angle) > np.radians(LARGE.again)), None)
+
+    @property
+    def focal_off(self) -> Finding | None:
+        """The same of focal lengths."""
+        off = [one for one in self.found.common if one.kind == "focal"]
+        return next((one for one in off if abs(one.shift) > LARGE.again_focal), None)
 
     @property
     def shares_moved(self) -> dict[str, float]:
@@ -146,7 +152,9 @@ class SceneComparison:
                 break
             again = self._compare(reading.cameras, (*now.readings, reading))
             told = now.joint_off(reading.name) if reading.kind == "offset" else None
-            if told is not None and told.angle * reading.amount > 0.0:
+            if reading.kind == "focal":
+                told = now.focal_off
+            if told is not None and (told.angle + told.shift) * reading.amount > 0.0:
                 now = self._tell(now, again, reading, told)
                 continue
             if again.inlier_ratio <= now.inlier_ratio:
@@ -339,15 +347,20 @@ class SceneComparison:
         off = [name for name in now.fit.joints if now.joint_off(name) is not None]
         shares = now.shares_moved.items()
         doubted = [name for name, share in shares if share < LARGE.seen or name in off]
-        if not doubted:
-            return None
-        reading = self._search(now.cameras, doubted, LARGE.left_of_one, sample, False, off)
-        if reading is not None or not off:
-            return reading
+        if doubted:
+            reading = self._search(now.cameras, doubted, LARGE.left_of_one, sample, False, off)
+            if reading is not None:
+                return reading
         # Fits are linear about where they begin.
-        by = next(one.angle for one in now.found.common if one.name == off[0])
-        search = LargeErrorSearch(self.body, now.cameras, sample)
-        return search.joint_reading("offset", off[0], 1.0, by, 0.0)
+        if off:
+            by = next(one.angle for one in now.found.common if one.name == off[0])
+            search = LargeErrorSearch(self.body, now.cameras, sample)
+            return search.joint_reading("offset", off[0], 1.0, by, 0.0)
+        lens = now.focal_off
+        if lens is None or any(one.kind == "focal" for one in now.readings):
+            return None
+        group = [one.name for one in now.cameras if f"'{one.name}'" in lens.name]
+        return focal_reading(now.cameras, group, lens.name, 1.0 + lens.shift)
 
     def _look_for_cameras(self, now: Compared) -> Compared | None:
         """With cameras as they are found in the frames, where these explain what is seen."""
@@ -392,6 +405,8 @@ class SceneComparison:
             else:
                 step = LARGE.near_focal if of_focal else LARGE.near_place
                 off = replace(off, shift=size, shift_sd=step)
+                if told is not None and abs(size - told.shift) < 1e-9:
+                    off = told
         elif kind in ("sign", "log"):
             off = self._differing(off, before, reading)
         else:

@@ -65,16 +65,24 @@ def scene_readings(
         text = "focal lengths" if len(cameras) > 1 and len(group) > 1 else "focal length of camera"
         text += "" if len(group) > 1 else f" '{group[0]}'"
         for factor in factors:
-            other = [
-                replace(one, focal_x=factor * one.focal_x, focal_y=factor * one.focal_y)
-                if one.name in group and isinstance(one, PinholeCamera) else one
-                for one in cameras
-            ]  # fmt: skip
-            yield Reading("focal", text, tuple(other), as_it_is, factor - 1.0)
+            yield focal_reading(cameras, group, text, factor)
     for which, by in (("next", 1), ("previous", -1)) if len(frames) > 2 else ():
         rows = dict(zip(frames, np.roll(np.array(values), -by, axis=0), strict=True))
         text = f"the masks fit with the joint positions of the {which} frame"
         yield Reading("reading", text, tuple(cameras), partial(_with_row, rows))
+
+
+def focal_reading(
+    cameras: Sequence[Camera], group: Collection[str], text: str, factor: float
+) -> Reading:
+    """Cameras of a group, or all where it is empty, with focal lengths that are a factor longer."""
+    changed = [
+        replace(one, focal_x=factor * one.focal_x, focal_y=factor * one.focal_y)
+        if isinstance(one, PinholeCamera) and (not group or one.name in group)
+        else one
+        for one in cameras
+    ]
+    return Reading("focal", text, tuple(changed), as_it_is, factor - 1.0)
 
 
 def _groups(cameras: Sequence[Camera]) -> list[tuple[str, ...]]:

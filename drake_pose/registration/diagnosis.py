@@ -435,7 +435,10 @@ class _Diagnoser:
                     amount=whole_test.amount[k], covariance=whole_test.covariance[k, k]
                 )
                 pixels = whole.info.pixels(best.moves @ better.amount)
-                findings.append(self._finding([better, *rivals], pixels))
+                least = DIAGNOSIS.min_joint_pixels if best.kind == "joint" else DIAGNOSIS.min_pixels
+                # Beside the others there may be nothing left of it.
+                if pixels >= least or (best.kind, best.name) in self._asked:
+                    findings.append(self._finding([better, *rivals], pixels))
         named = [one[0].name for one in found]
         noticed = _noticed_from(residual, [one for one in joints if one.name not in named])
         return tuple(findings), center, noticed

@@ -111,10 +111,10 @@ def test_frames_of_a_video_are_named_as_its_masks_are(recording, filmed, tmp_pat
 @pytest.mark.parametrize(
     ("with_start", "more", "words"),
     [
-        (False, {}, r"'0000'.*masks/front/0000\.png.*--start"),
+        (False, {}, r"'0000'.*masks/front/0000\.png.*start="),
         (True, {"frames": ("0003:0005",)}, r"start\.csv.*'0003'"),
         (True, {"track": False}, "sequence: true"),
-        (False, {"track": False}, "--no-track"),
+        (False, {"track": False}, "leave track=False out"),
     ],
 )
 def test_what_does_not_say_where_the_body_is_is_refused(recording, with_start, more, words):

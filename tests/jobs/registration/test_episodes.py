@@ -169,9 +169,9 @@ def test_what_cannot_be_used_is_named(episode, tmp_path, spoil, words):
 
 def test_what_needs_masks_or_pictures_is_refused(episode, tmp_path):
     scene, painted = episode
-    for name, value, advice in (("on", "box4", "; with --target FILE"), ("suggest", True, "$")):
+    for name, value, advice in (("on", "box4", "; with target=FILE"), ("suggest", True, "$")):
         settings = RegistrationSettings(**{name: value})
-        with pytest.raises(DrakePoseError, match=f"--{name} needs masks.*leave it out{advice}"):
+        with pytest.raises(DrakePoseError, match=f"^{name} needs masks.*leave it out{advice}"):
             register_scene(scene, painted.path, settings=settings)
     with pytest.raises(DrakePoseError, match=r"has no folder masks.* no pictures"):
         register_scene(tmp_path, painted.path, tmp_path / "joints.csv")

@@ -195,8 +195,9 @@ class SceneComparison:
         warnings = (*now.warnings, *self._say_masks(now))
         # Where outlines do not fit, what would be noticed is not told by how they would move.
         shares = now.shares_moved
+        enough = LARGE.seen * max(shares.values(), default=0.0)
         noticed = {
-            name: least if shares.get(name, 0.0) >= LARGE.seen else np.inf
+            name: least if shares.get(name, 0.0) >= enough else np.inf
             for name, least in found.noticed_from.items()
         }
         found = replace(found, common=common, noticed_from=noticed)

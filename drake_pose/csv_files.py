@@ -16,6 +16,16 @@ def csv_text(rows: Iterable[Sequence[object]]) -> str:
     return text.getvalue()
 
 
+def read_number(cell: str) -> float:
+    """The number that a cell holds; nan where it is empty.
+
+    Raises ValueError: it holds none. Python reads 1_8 as 18; tables mean no such thing.
+    """
+    if "_" in cell:
+        raise ValueError(f"'{cell[:40]}' is no number")
+    return float(cell or "nan")
+
+
 def read_csv(
     path: Path, error_type: type[DrakePoseError], *, whole_lines: bool = False
 ) -> tuple[list[str], list[tuple[int, list[str]]]]:

@@ -25,7 +25,7 @@ from drake_pose.camera.picture_files import (
     recorded_files,
 )
 from drake_pose.camera.sources import CAMERAS, TIME_STAMPS, read_time_stamps
-from drake_pose.csv_files import read_csv
+from drake_pose.csv_files import read_csv, read_number
 from drake_pose.errors import CameraError, SceneError, SettingsError, listed
 from drake_pose.yaml_files import read_yaml
 
@@ -53,7 +53,7 @@ def read_joint_table(path: Path) -> tuple[JointLog, list[str]]:
     for name, cells in columns.items():
         for k, cell in enumerate(cells):
             try:
-                values[name][k] = float(cell or "nan")
+                values[name][k] = read_number(cell)
             except ValueError:
                 raise SceneError(
                     f"{path}: line {rows[k][0]}, column '{name}': '{cell[:40]}' is no number"

@@ -116,6 +116,9 @@ def _run(words: Sequence[str] | None) -> None:
         command, bound, _ = app.parse_args(words, exit_on_error=False, print_error=False)
     except (CycloptsError, SettingsError) as error:
         _stop(str(error), 2)
+    except KeyboardInterrupt:
+        # What a command needs is imported, and compiled, while its words are read.
+        _stop("interrupted before anything was written")
     try:
         command(*bound.args, **bound.kwargs)
     except UsageError as error:

@@ -21,7 +21,7 @@ from pydrake.math import RigidTransform, RotationMatrix
 
 from drake_pose.arrays import Array
 from drake_pose.body import ArticulatedModel, PoseTree, nearest_turn
-from drake_pose.csv_files import csv_text, read_csv
+from drake_pose.csv_files import csv_text, read_csv, read_number
 from drake_pose.errors import OutputError, SettingsError
 from drake_pose.files.folder import POSES, cannot_write, read_summary, write_file
 from drake_pose.files.settings import SceneSettings, percent
@@ -182,7 +182,7 @@ class PoseTable:
         records = []
         for line, (frame, *cells) in lines:
             try:
-                numbers = np.array([float(cell or "nan") for cell in cells])
+                numbers = np.array([read_number(cell) for cell in cells])
             except ValueError:
                 raise OutputError(
                     f"{path}: line {line} is damaged, so it cannot be resumed"

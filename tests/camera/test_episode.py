@@ -121,6 +121,7 @@ def test_distortion_is_taken_out_as_the_formula_says(tmp_path):
         ("time,q,q\n1,2,3\n", "expected one column 'time'"),
         ("time,q\n", "has 0 rows of: time, q"),
         ("time,q\n0,1\n1,two\n", "line 3, column 'q': 'two' is no number"),
+        ("time,q\n0,1\n1,1_8\n", "line 3, column 'q': '1_8' is no number"),
         ("frame,q\n1,0\n01,0\n", "has frame 1 more than once"),
         ("time,q\n3,1\n2,1\n1,1\n", "rows: number 1 .* runs backwards"),
         ("frame,q\n5,1\n", "camera 'a': 1 of 1 pictures have no row .* called alike in both"),

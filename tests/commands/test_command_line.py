@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -79,6 +80,17 @@ def test_whatever_ends_a_command_is_said_in_a_line(
     assert result.exit_code == 1
     assert result.output.startswith(f"drake-pose: error: {message}")
     assert result.output.count("\n") == 1
+
+
+def test_a_signal_while_words_are_read_is_said_in_a_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    def parse_args(*_: object, **__: object) -> None:
+        os.kill(os.getpid(), signal.SIGTERM)
+        time.sleep(10.0)
+
+    monkeypatch.setattr("drake_pose.commands.main.app", SimpleNamespace(parse_args=parse_args))
+    result = run_command(["check", "arm.urdf"])
+    assert result.exit_code == 1
+    assert result.output == "drake-pose: error: interrupted before anything was written\n"
 
 
 def test_version() -> None:

@@ -17,7 +17,7 @@ from drake_pose.camera.episode import Episode, EpisodeCamera, JointLog
 from drake_pose.camera.episode_files import format_of, open_episode, with_intrinsics
 from drake_pose.camera.joint_map import map_joints, read_joint_map
 from drake_pose.camera.picture_files import frame_key
-from drake_pose.csv_files import read_csv
+from drake_pose.csv_files import read_csv, read_number
 from drake_pose.errors import SceneError, SettingsError, UnknownNameError
 from drake_pose.files.records import BASE_COLUMNS, FIT_COLUMNS
 from drake_pose.files.settings import EpisodeSettings
@@ -187,7 +187,7 @@ def check_units(
 
 def _numbers(cells: Sequence[str], path: Path, line: int) -> np.ndarray:
     try:
-        numbers = np.array([float(cell) for cell in cells])
+        numbers = np.array([read_number(cell) for cell in cells])
     except ValueError:
         raise SceneError(f"{path}: line {line} holds something that is not a number") from None
     if not np.isfinite(numbers).all():

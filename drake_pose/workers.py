@@ -3,6 +3,7 @@
 Kernels and OpenCV hold no interpreter lock, so threads will do.
 """
 
+import gc
 import multiprocessing
 import os
 from collections.abc import Callable, Iterable, Iterator
@@ -40,8 +41,15 @@ def map_ordered(
     count = min(len(things), workers or _CHOSEN.get() or _cores())
     if count < 2:
         return [function(one) for one in things]
-    with ThreadPoolExecutor(count, initializer=_CHOSEN.set, initargs=(1,)) as pool:
-        return list(pool.map(function, things))
+    # A renderer of Drake's aborts the process where another thread than its own collects it.
+    collects = gc.isenabled()
+    gc.disable()
+    try:
+        with ThreadPoolExecutor(count, initializer=_CHOSEN.set, initargs=(1,)) as pool:
+            return list(pool.map(function, things))
+    finally:
+        if collects:
+            gc.enable()
 
 
 def _cores() -> int:

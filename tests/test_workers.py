@@ -1,3 +1,4 @@
+import gc
 import threading
 
 import pytest
@@ -32,3 +33,12 @@ def test_who_names_no_number_keeps_the_one_before() -> None:
     with working(1), working(None):
         names = set(map_ordered(lambda _: threading.current_thread().name, range(4)))
     assert names == {threading.current_thread().name}
+
+
+def test_threads_collect_no_cycles_and_their_caller_does_again() -> None:
+    """What hangs in a cycle, as Drake's renderers may, is freed by the thread that made it."""
+    assert map_ordered(lambda _: gc.isenabled(), range(3), 2) == [False] * 3
+    assert gc.isenabled()
+    with pytest.raises(ZeroDivisionError):
+        map_ordered(lambda k: 1 // k, range(3), 2)
+    assert gc.isenabled()

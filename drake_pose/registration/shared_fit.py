@@ -294,17 +294,20 @@ class SharedFit:
             value and standard deviation by joint [rad or m], the likeliest one first.
         """
         seen = self._doubted_distances(found, SHARED.told_apart, which)
-        kinematics, angles = self.seen[0].kinematics, np.zeros(seen.X.shape[1], bool)
+        angles = np.zeros(seen.X.shape[1], bool)
         sizes = estimate_sizes(seen, angles, 0.0, SHARED.prior_deviation)
         values, deviations = scored_doubts(seen, sizes)
-        halves = np.where(kinematics.is_angle, np.radians(0.5), 0.002)
-        units = dict(zip(kinematics.names, halves.tolist(), strict=True))
-        names = [one for one in self._doubting.names if one in units and one not in self.names]
+        units = self._offset_units
+        # As they stand among the doubts: what is fitted and an object's place are none.
+        known = {*self.names, *OBJECT_POSITIONS}
+        names = [one for one in self._doubting.names if one in units and one not in known]
+        if not seen.doubts or seen.doubts[0].shape[1] != len(names):
+            return {}
         scored = zip(names, values, deviations, strict=False)
         told = {
             name: (float(value * units[name]), float(deviation * units[name]))
             for name, value, deviation in scored
-            if name not in OBJECT_POSITIONS and abs(value) > max(smallest, min_score * deviation)
+            if abs(value) > max(smallest, min_score * deviation)
         }
         return dict(sorted(told.items(), key=lambda one: -abs(one[1][0]) / one[1][1]))
 
@@ -381,11 +384,9 @@ class SharedFit:
         focal length; half a percent of it where the principal point lies].
         """
         whole = self._doubting
-        names, kinematics, units = whole.names, self.seen[0].kinematics, dict[str, float]()
+        names, kinematics, units = whole.names, self.seen[0].kinematics, dict(self._offset_units)
         groups: dict[str, list[str]] = {"offsets": [], "scales": [], "lenses": []}
-        for name, is_angle in zip(kinematics.names, kinematics.is_angle, strict=True):
-            units[name] = np.radians(0.5) if is_angle else 0.002
-            groups["offsets"] += [] if name in OBJECT_POSITIONS else [name]
+        groups["offsets"] = [name for name in kinematics.names if name not in OBJECT_POSITIONS]
         for camera in (one.camera for one in self.seen):
             lens = [f"{camera.name}.{name}" for name in CAMERA_NAMES[len(POSE_NAMES) :]]
             units |= zip(lens, (0.01, *[0.005 * camera.focal_x] * 2), strict=True)
@@ -407,6 +408,13 @@ class SharedFit:
             information=distances.information[np.ix_(values, values)],
             doubts=tuple(Z for Z in doubts if Z.any()),
         )
+
+    @property
+    def _offset_units(self) -> dict[str, float]:
+        """By what joints' offsets are doubted: half a degree or two millimetres [rad or m]."""
+        kinematics = self.seen[0].kinematics
+        units = np.where(kinematics.is_angle, np.radians(0.5), 0.002)
+        return dict(zip(kinematics.names, units.tolist(), strict=True))
 
     @cached_property
     def _doubting(self) -> "SharedFit":

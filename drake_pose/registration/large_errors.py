@@ -17,7 +17,7 @@ from drake_pose.arrays import Array, Mask
 from drake_pose.camera.models import Camera, PinholeCamera
 from drake_pose.registration.per_frame_fit import FrameFit
 from drake_pose.registration.posed_frames import SeenFrame, common_size, reduced_sums
-from drake_pose.registration.register import RegistrationBody
+from drake_pose.registration.register import RegistrationBody, spread
 from drake_pose.silhouette.scoring import draw_mask, score_bodies
 from drake_pose.workers import map_ordered
 
@@ -100,6 +100,13 @@ def as_it_is(frame: SeenFrame) -> SeenFrame:
     return frame
 
 
+def as_read(readings: Sequence[Reading], frame: SeenFrame) -> SeenFrame:
+    """A frame with what some readings put right, one after the other."""
+    for one in readings:
+        frame = one.of(frame)
+    return frame
+
+
 class LargeErrorSearch:
     """Compares body and silhouettes in some frames, as they are given and otherwise.
 
@@ -113,9 +120,8 @@ class LargeErrorSearch:
     def __init__(
         self, body: RegistrationBody, cameras: Sequence[Camera], frames: Sequence[SeenFrame]
     ) -> None:
-        picks = np.linspace(0, len(frames) - 1, min(len(frames), LARGE.frames)).round()
         self._body, self._cameras = body, tuple(cameras)
-        self._frames = [frames[int(k)] for k in picks]
+        self._frames = spread(frames, LARGE.frames)
         self._share = min(1.0, LARGE.side / common_size(cameras, self._frames))
         self._sums = dict[int, tuple[Mask, NDArray[np.int32]]]()
 

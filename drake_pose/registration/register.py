@@ -315,7 +315,7 @@ def frame_misfits(
     return tuple(FrameMisfit(frame.name, *row) for frame, *row in rows)
 
 
-def spread(frames: Sequence[PosedFrame], most: int = 8) -> list[PosedFrame]:
+def spread(frames: Sequence[T], most: int = 8) -> list[T]:
     """Some of many frames, from the first to the last."""
     count = min(len(frames), most)
     return [frames[k] for k in np.linspace(0, len(frames) - 1, count).round().astype(int)]

@@ -380,12 +380,17 @@ class _MultiStartRun:
         return float(self._problem.J(self._parameters(values)))
 
 
+def small_match() -> tuple[PoseTree, View]:
+    """A small body and picture, by which kernels are compiled."""
+    tree = load_model(bundled_model("two_finger_hand"), check=False).pose_tree()
+    camera = ParallelCamera("warm-up", 64, 64, 300.0, 32.0, 32.0, np.eye(4))
+    return tree, View(camera, cv2.circle(np.zeros((64, 64), np.uint8), (32, 32), 16, 1, -1) > 0)
+
+
 @functools.cache
 def warm_up() -> None:
     """Compile or load a search's kernels, by a match of a small body: not in a match's time."""
-    tree = load_model(bundled_model("two_finger_hand"), check=False).pose_tree()
-    camera = ParallelCamera("warm-up", 64, 64, 300.0, 32.0, 32.0, np.eye(4))
-    view = View(camera, cv2.circle(np.zeros((64, 64), np.uint8), (32, 32), 16, 1, -1) > 0)
+    tree, view = small_match()
     MultiStartSearch(tree).match([view])
 
 

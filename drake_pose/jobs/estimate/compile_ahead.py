@@ -8,18 +8,16 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-import cv2
 import numpy as np
 
-from drake_pose.body import bundled_model, load_model
 from drake_pose.body.tree_kinematics import TreeKinematics
-from drake_pose.camera.models import ParallelCamera
 from drake_pose.compiled import is_stored
 from drake_pose.fit.contour_fit import pack_views
 from drake_pose.fit.evidence import find_edge_points
 from drake_pose.fit.kernel import collect, compare_contours
 from drake_pose.fit.surfaces import few_triangles
-from drake_pose.search import MultiStartSearch, View, ViewsFit
+from drake_pose.search import MultiStartSearch, ViewsFit
+from drake_pose.search.multi_start import small_match
 from drake_pose.silhouette.outline import TreeSurfaces, pack
 
 
@@ -41,12 +39,10 @@ def compiling_ahead() -> Iterator[None]:
 
 def main() -> None:
     """Goes through a search from its end to its beginning, with a small body and picture."""
-    tree = load_model(bundled_model("two_finger_hand"), check=False).pose_tree()
-    camera = ParallelCamera("ahead", 64, 64, 300.0, 32.0, 32.0, np.eye(4))
-    view = View(camera, cv2.circle(np.zeros((64, 64), np.uint8), (32, 32), 16, 1, -1) > 0)
+    tree, view = small_match()
     surfaces = few_triangles(TreeSurfaces(tree))
     # The kernel that takes longest, by itself: the first process compiles what comes before it.
-    views = pack_views([camera], [find_edge_points(view.mask, 1.0)])
+    views = pack_views([view.camera], [find_edge_points(view.mask, 1.0)])
     X_WN = tree.node_poses(tree.default_values())
     compare_contours(pack(surfaces), X_WN, *views, np.ones((1, 4)), 0, 1.0, False)
     fit, search = ViewsFit(TreeKinematics(tree), surfaces, [view]), MultiStartSearch(tree)

@@ -23,6 +23,7 @@ from drake_pose.registration.large_errors import (
     LARGE,
     LargeErrorSearch,
     Reading,
+    as_read,
     links_not_seen,
     mask_shares,
     shares_moved,
@@ -66,9 +67,7 @@ class Compared:
 
     def of(self, frame: SeenFrame) -> SeenFrame:
         """A frame as it is read."""
-        for reading in self.readings:
-            frame = reading.of(frame)
-        return frame
+        return as_read(self.readings, frame)
 
     def joint_off(self, name: str) -> Finding | None:
         """What fits say of a joint that is so far off that they should begin anew from there."""
@@ -113,8 +112,7 @@ class SceneComparison:
     ) -> None:
         self._inputs, self._on_frame = inputs, on_frame
         self.body, frames = RegistrationBody(inputs.tree, inputs.seen), inputs.wanted
-        picks = np.linspace(0, len(frames) - 1, min(len(frames), sample_size)).round()
-        sample = [inputs.read(frames[int(k)]) for k in picks]
+        sample = [inputs.read(frame) for frame in spread(frames, sample_size)]
         self._sample = [one for one in sample if one.masks]
         self._names = frozenset(inputs.wanted)
 
@@ -307,22 +305,17 @@ class SceneComparison:
         """Fits all frames as they are read."""
         inputs, fitted, unseen = self._inputs, list[FrameFit](), list[str]()
 
-        def read(frame: SeenFrame) -> SeenFrame:
-            for one in readings:
-                frame = one.of(frame)
-            return frame
-
         if not self._sample:
             raise MaskError(
                 f"{inputs.scene.path}: no mask shows the body; it must be white in them"
             )
-        body, sample = self.body, [read(one) for one in self._sample]
+        body, sample = self.body, [as_read(readings, one) for one in self._sample]
         shares = dict[tuple[str, str], tuple[float, float]]()
         fit = PerFrameFit(body.kinematics, (body.few, body.all), cameras, sample)
         for done, name in enumerate(inputs.wanted, 1):
             seen = inputs.read(name)
             if seen.masks:
-                seen = read(seen)
+                seen = as_read(readings, seen)
                 fitted.append(fit.fit(seen))
                 for camera in cameras:
                     mask = seen.masks.get(camera.name)

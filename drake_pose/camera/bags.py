@@ -112,7 +112,7 @@ def _scan(path: Path) -> tuple[Any, Any, Any, Any, Any]:
                 infos[topic] = message
             elif kind != "JointState":
                 coding = (message.encoding if kind == "Image" else message.format).lower()
-                if any(one in coding for one in ("16uc1", "32fc1", "mono16", "compresseddepth")):
+                if any(one in coding for one in ("16uc1", "32fc1", "compresseddepth")):
                     left_out[topic] = "depths"
                 elif kind == "Image" and coding not in _ENCODINGS:
                     left_out[topic] = f"{coding} is not one of {', '.join(_ENCODINGS)}"

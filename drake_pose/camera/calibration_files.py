@@ -153,8 +153,19 @@ def _kalibr(
         yield name, (lens, None if X_CW is None else inverse_pose(X_CW))
 
 
-def _lens(size: Any, matrix: Any, distortion: Any, fisheye: bool, where: str) -> Lens:
-    """A lens from a size [pixel], a camera matrix (3, 3) and OpenCV's coefficients."""
+def _lens(
+    size: Any,
+    matrix: Any,
+    distortion: Any,
+    fisheye: bool,
+    where: str,
+    largest_skew: float = 1e-3,
+) -> Lens:
+    """A lens from a size [pixel], a camera matrix (3, 3) and OpenCV's coefficients.
+
+    largest_skew: of the camera matrix, as a fraction of f_x, which is dropped: half a pixel at the
+    edge of a picture.
+    """
     sides, K, D = (_numbers(one) for one in (size, matrix, distortion))
     if sides is None or sides.size != 2:
         raise CameraError(f"{where}: needs the pictures' width and height [pixel]")
@@ -164,6 +175,11 @@ def _lens(size: Any, matrix: Any, distortion: Any, fisheye: bool, where: str) ->
     if K is None or K.size != 9 or not (K[0] > 0.0 and K[4] > 0.0 and K[8] == 1.0):
         raise CameraError(
             f"{where}: its camera matrix must be [[f_x, 0, c_x], [0, f_y, c_y], [0, 0, 1]] [pixel]"
+        )
+    if abs(K[1]) > largest_skew * K[0]:
+        raise CameraError(
+            f"{where}: its camera matrix has a skew of {K[1]:g} pixels, which is not modelled: "
+            "calibrate without skew, or set it to 0 if it is none"
         )
     if D is None:
         raise CameraError(f"{where}: its distortion coefficients are no list of finite numbers")

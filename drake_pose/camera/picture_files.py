@@ -211,6 +211,15 @@ def _decode(
         decoded = None
     if decoded is None:
         raise error_type(f"{path}: not a whole PNG or JPEG picture")
+    # Of 16 bits OpenCV keeps the upper eight: 12-bit values would turn black.
+    if how == cv2.IMREAD_COLOR and data[24:25] == b"\x10" and not is_jpeg:
+        deep = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+        brightest = 0 if deep is None else int(deep.max())
+        if 0 < brightest < 1 << 12:
+            raise error_type(
+                f"{path}: 16 bits a pixel, but no value above {brightest} of 65535: its values "
+                "have fewer bits; scale them to the whole range, or save the picture in 8 bits"
+            )
     return np.asarray(decoded)
 
 

@@ -158,6 +158,7 @@ def test_encodings(tmp_path):
             mosaic = np.take_along_axis(red, place[:, :, None], axis=2)[:, :, 0]
             bag.image(f"/{pattern}", 0.0, mosaic, f"bayer_{pattern}8")
         bag.image("/strange", 0.0, grey, "bayer_rggb16")
+        bag.image("/deep", 0.0, np.dstack([grey, grey]), "mono16")
         bag.image("/depth", 0.0, np.dstack([grey, grey]), "16UC1")
     episode = open_episode(bag.path)
     for name in ("rgb", "bgr", "bgra"):
@@ -166,8 +167,11 @@ def test_encodings(tmp_path):
     for pattern in ("rggb", "bggr", "gbrg", "grbg"):
         found = episode.camera(pattern).read(0).astype(int)
         assert np.abs(found - red)[2 : SIDE // 4 - 2, 2:-2].max() < 3, pattern
-    assert not {"depth", "strange"} & set(episode.cameras)
-    assert "/strange is left out: bayer_rggb16 is not one of rgb8, bgr8" in episode.warnings[0]
+    assert not {"depth", "strange", "deep"} & set(episode.cameras)
+    said = "\n".join(episode.warnings)
+    assert "/strange is left out: bayer_rggb16 is not one of rgb8, bgr8" in said
+    assert "/deep is left out: mono16 is not one of rgb8, bgr8" in said
+    assert "/depth" not in said
 
 
 def test_lenses_are_undone_as_their_formulas_say(tmp_path):

@@ -138,6 +138,7 @@ def test_a_chain_begins_in_its_first_camera(tmp_path):
         (camera_info("plumb_bob", RADIAL[:3]), ["'left'", "3 distortion coefficients"]),
         (camera_info().replace("image_width", "width_"), ["image_width and image_height"]),
         (camera_info().replace("500", "-500"), ["camera matrix"]),
+        (camera_info().replace("[500, 0,", "[500, 3,"), ["'left'", "skew of 3 pixels"]),
         (opencv().replace("image_height: 480\n", ""), ["image_height"]),
         (opencv()[:60], ["any"]),
         (opencv()[:200], ["distortion coefficients"]),

@@ -9,8 +9,8 @@ import pytest
 from matplotlib.path import Path as MplPath
 from pycocotools import mask as coco
 
-from drake_pose.camera.picture_files import mask_of_picture, read_two_colours
-from drake_pose.errors import MaskError
+from drake_pose.camera.picture_files import mask_of_picture, read_picture, read_two_colours
+from drake_pose.errors import MaskError, SceneError
 from drake_pose.silhouette.mask_pictures import (
     decode_run_lengths,
     fill_polygon,
@@ -26,6 +26,17 @@ def classes():
     layer = np.zeros((HEIGHT, WIDTH), np.uint8)
     layer[5:20, 10:30], layer[25:35, 40:55] = 1, 7
     return layer
+
+
+def test_values_of_few_bits_in_files_of_sixteen_are_refused(tmp_path):
+    """OpenCV keeps the upper eight of 16 bits, so that 12-bit values would read as black."""
+    ramp = np.linspace(0, 4095, HEIGHT * WIDTH).reshape(HEIGHT, WIDTH).astype(np.uint16)
+    for name, values in (("twelve", ramp), ("sixteen", ramp * 16), ("black", ramp * 0)):
+        cv2.imwrite(str(tmp_path / f"{name}.png"), values)
+    with pytest.raises(SceneError, match=r"twelve\.png: 16 bits a pixel.*above 4095 of 65535"):
+        read_picture(tmp_path / "twelve.png", SceneError)
+    assert read_picture(tmp_path / "sixteen.png", SceneError).max() == 255
+    assert read_picture(tmp_path / "black.png", SceneError).max() == 0
 
 
 def test_a_photograph_is_no_mask_that_compression_blurred(classes, tmp_path):

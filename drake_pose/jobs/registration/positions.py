@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from drake_pose.arrays import Array
 from drake_pose.body import BASE_JOINTS, ArticulatedModel
 from drake_pose.body.tree_kinematics import TreeKinematics
+from drake_pose.camera.episode_files import JOINT_TABLE
 from drake_pose.camera.models import Camera
 from drake_pose.camera.picture_files import frame_key
 from drake_pose.errors import SceneError
@@ -150,9 +151,11 @@ def estimate_positions(
     """
     names = tuple(camera.name for camera in known)
     if not names:
+        table = scene_path / JOINT_TABLE
+        given = f"--joints {table}" if table.is_file() else "--joints"
         raise SceneError(
             f"{scene_path}: neither a camera's place nor the body's joint positions are known: "
-            "give X_WC of one camera or more (of two for a person), or joint positions (--joints)"
+            f"give X_WC of one camera or more (of two for a person), or joint positions ({given})"
         )
     if len(names) < 2 and not missing_for_person(model):
         raise SceneError(

@@ -69,7 +69,7 @@ _KNOWN = (
 Limits = dict[str, tuple[float, float]]
 
 
-def cure_urdf(path: Path, finder: FileFinder, warn: Warn) -> str:
+def sanitise_urdf(path: Path, finder: FileFinder, warn: Warn) -> str:
     """The text of a URDF file that Drake reads as URDF means it; it may be parsed from anywhere.
 
     Raises ModelError, which names the link, joint or mesh at fault.
@@ -235,12 +235,12 @@ def _kind_of_shape(shape: ElementTree.Element, where: str, *, is_urdf: bool) -> 
     return kind
 
 
-def cure_sdf(
-    path: Path, finder: FileFinder, warn: Warn, cure_file: Callable[[Path], Path]
+def sanitise_sdf(
+    path: Path, finder: FileFinder, warn: Warn, sanitise_file: Callable[[Path], Path]
 ) -> tuple[str, Limits]:
     """The text of an SDFormat file that Drake reads; it may be parsed from anywhere.
 
-    ``cure_file`` makes a file that stands in for an included model.
+    ``sanitise_file`` makes a file that stands in for an included model.
 
     Returns:
         The text, and the limits (lower, upper) [rad] by position name of universal and screw
@@ -260,7 +260,7 @@ def cure_sdf(
         found = finder.resolve(name, path, "included model")
         if found.is_dir():
             found = _model_of_folder(found, name)
-        uri.text = f"file://{cure_file(found)}"
+        uri.text = f"file://{sanitise_file(found)}"
     for link in root.iter("link"):
         where = f"link '{link.get('name', '(unnamed)')}'"
         _check_poses(link, where)

@@ -30,7 +30,7 @@ Couple = tuple[str, str, float, float]
 """A joint, the one that it follows, multiplier and offset [rad or m]."""
 
 
-def cure_mjcf(path: Path, warn: Warn) -> tuple[str, list[Couple]]:
+def sanitise_mjcf(path: Path, warn: Warn) -> tuple[str, list[Couple]]:
     """The text of an MJCF file, paths absolute, that Drake reads as MuJoCo does.
 
     Returns:

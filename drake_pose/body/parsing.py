@@ -25,9 +25,9 @@ from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import ModelInstanceIndex
 
-from drake_pose.body.link_files import Limits, cure_sdf, cure_urdf
+from drake_pose.body.link_files import Limits, sanitise_sdf, sanitise_urdf
 from drake_pose.body.meshes import TriangleMesh, draws_given_files, read_meshes, workspace
-from drake_pose.body.mjcf import Couple, cure_mjcf
+from drake_pose.body.mjcf import Couple, sanitise_mjcf
 from drake_pose.body.model_files import FileFinder
 from drake_pose.body.plant_source import add_coupler
 from drake_pose.errors import DrakePoseError, ModelError
@@ -57,7 +57,7 @@ class ModelSource:
         self._finder = FileFinder(package_paths)
         self._stand_ins: dict[Path, Path] = {}
         self._under_way: list[Path] = []
-        self.text, self.kind = self._cure(path)
+        self.text, self.kind = self._sanitise(path)
 
     def with_text(self, text: str) -> "ModelSource":
         """The same file with another text."""
@@ -108,7 +108,7 @@ class ModelSource:
         ]
         return list(instances), [*self.warnings, *remarks]
 
-    def _cure(self, path: Path) -> tuple[str, str]:
+    def _sanitise(self, path: Path) -> tuple[str, str]:
         """The text that is parsed in place of a file, and the kind of it."""
         # What Drake's parser calls each kind of file.
         kinds = {".urdf": "urdf", ".sdf": "sdf", ".xml": "xml", ".mjcf": "xml"}
@@ -127,19 +127,19 @@ class ModelSource:
         self._under_way.append(path)
         try:
             if kind == "urdf":
-                text = cure_urdf(path, self._finder, self._warn)
+                text = sanitise_urdf(path, self._finder, self._warn)
             elif kind == "xml":
-                text, couples = cure_mjcf(path, self._warn)
+                text, couples = sanitise_mjcf(path, self._warn)
                 if len(self._under_way) == 1:
                     self._couples = couples
                 elif couples:
                     self._warn(f"{path}: joints of an included MJCF follow no others")
             elif kind == "sdf":
-                text, limits = cure_sdf(path, self._finder, self._warn, self._stand_in)
+                text, limits = sanitise_sdf(path, self._finder, self._warn, self._stand_in)
                 if len(self._under_way) == 1:
                     self.limits = limits
             else:
-                text = _cure_directives(path, self._finder, self._stand_in)
+                text = _sanitise_directives(path, self._finder, self._stand_in)
             return text, kind
         except ModelError as error:
             reason = str(error)
@@ -151,7 +151,7 @@ class ModelSource:
         """A file with the cured text of another one."""
         path = path.resolve()
         if path not in self._stand_ins:
-            text, kind = self._cure(path)
+            text, kind = self._sanitise(path)
             folder = Path(tempfile.mkdtemp(prefix="model_", dir=workspace()))
             stand_in = folder / f"{path.name.partition('.')[0]}.{kind}"
             stand_in.write_text(text, encoding="utf-8")
@@ -205,7 +205,9 @@ def captured_warnings() -> Iterator[list[str]]:
         logger.removeFilter(collect)
 
 
-def _cure_directives(path: Path, finder: FileFinder, cure_file: Callable[[Path], Path]) -> str:
+def _sanitise_directives(
+    path: Path, finder: FileFinder, sanitise_file: Callable[[Path], Path]
+) -> str:
     """The text of model directives, tags and aliases kept, that name the files' stand-ins."""
     try:
         node = top = yaml.compose(path.read_bytes(), Loader=yaml.SafeLoader)
@@ -233,7 +235,7 @@ def _cure_directives(path: Path, finder: FileFinder, cure_file: Callable[[Path],
             elif id(value) not in seen:
                 seen.add(id(value))
                 found = finder.resolve(value.value, path, directive)
-                value.value = f"file://{cure_file(found)}"
+                value.value = f"file://{sanitise_file(found)}"
     return yaml.serialize(top, Dumper=yaml.SafeDumper, allow_unicode=True)
 
 

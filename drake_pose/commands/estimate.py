@@ -60,12 +60,12 @@ def estimate(
     to continuous angles by fitting the body's contour to the silhouettes' edges. All cameras are
     used together. If scene.yaml has sequence: true, the pose is searched in the first frame and
     tracked from there on. A person before two or more calibrated cameras is followed by all
-    silhouettes at once, lengths and girths too, where the model has a person's landmarks and no
-    option of the search is given.
+    silhouettes at once, lengths and radius scales too, where the model has a person's landmarks
+    and no option of the search is given.
 
     Files in DIR: report.html, which shows all of it; poses.csv (a row a frame: every joint's
     position in rad or m, E_total, seconds); joints.csv (which joints the silhouettes determine,
-    and their 95 % intervals); families.csv (poses that look the same); summary.json; overlay/;
+    and their 95 % intervals); modes.csv (poses that look the same); summary.json; overlay/;
     replay.html; of a sequence also a MOT file, and of a person or hand TRC and BVH files. E_total
     is the area where body and silhouettes differ, over the silhouettes' area. Ctrl-C keeps the
     finished frames.
@@ -219,8 +219,9 @@ def capture(
 ) -> None:
     """Capture the motion of one person before several calibrated cameras, from masks or live.
 
-    Nothing need be known of the person: lengths and girths are fitted to the first frames. This is
-    estimate with the bundled person as the model, of a sequence of frames unless scene.yaml has
+    Nothing need be known of the person: lengths and radius scales are fitted to the first frames.
+    This is estimate with the bundled person as the model, of a sequence of frames unless
+    scene.yaml has
     sequence: false. Pictures or videos need masks of the first frame alone, in two cameras or more;
     with --start no mask. If the folder has sources.yaml beside cameras.yaml, frames are captured as
     they come, from live cameras in real time, until Ctrl-C.

@@ -175,7 +175,7 @@ def _print_registration(result: SceneRegistration) -> None:
             ", ".join(f"{p:.4f}" for p in found.camera.X_WC[:3, 3]),
             f"{one['translation_sd_mm']:.2f}",
             f"{one['rotation_sd_deg']:.3f}",
-            str(len(one["families"])),
+            str(len(one["modes"])),
             f"{agreeing} of {len(found.frames)}",
             percent(one["mean_iou"]),
             f"{one['seconds']:.1f}",
@@ -224,7 +224,7 @@ def _say_target(target: Mapping[str, Any]) -> str:
     place = ", ".join(f"{row[3]:.4f}" for row in target["X_WT"][:3])
     return (
         f"target at {place} m in the robot's world, sd {target['translation_sd_mm']:.2f} mm, "
-        f"{target['rotation_sd_deg']:.3f} deg; poses that look alike: {len(target['families'])}"
+        f"{target['rotation_sd_deg']:.3f} deg; poses that look alike: {len(target['modes'])}"
     )
 
 
@@ -242,8 +242,8 @@ def _print_audit(result: SceneAudit) -> None:
     if not contradictions:
         but = ", but see the warnings" if result.warnings else ""
         say(f"drake-pose: nothing contradicts the rest{but}")
-    if result.summary["noticed_from"]:
-        noticed = result.summary["noticed_from"].items()
+    if result.summary["minimum_detectable"]:
+        noticed = result.summary["minimum_detectable"].items()
         told = ", ".join(f"{k} {'-' if one is None else f'{one:.2g}'}" for k, one in noticed)
         console.print(f"not noticed    joints off by less than {told} (deg or m)", soft_wrap=True)
     if result.folder is not None:

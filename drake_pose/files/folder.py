@@ -20,7 +20,7 @@ from drake_pose.errors import DrakePoseError, OutputError, in_callers_words
 
 POSES = "poses.csv"
 JOINTS = "joints.csv"
-FAMILIES = "families.csv"
+MODES = "modes.csv"
 SUMMARY = "summary.json"
 REPLAY, REPORT = "replay.html", "report.html"
 JOINT_CENTRES = "joint_centres.csv"
@@ -30,7 +30,7 @@ OVERLAY, SHAPES = "overlay", "shapes.png"
 _Job = TypeVar("_Job", bound=Callable[..., Any])
 
 RESULT_FILES = (
-    POSES, JOINTS, FAMILIES, SUMMARY, REPLAY, REPORT, JOINT_CENTRES, TRC, MOT, BVH, SHAPES
+    POSES, JOINTS, MODES, SUMMARY, REPLAY, REPORT, JOINT_CENTRES, TRC, MOT, BVH, SHAPES
 )  # fmt: skip
 """Every file that a result may have beside its overlays."""
 

@@ -1,4 +1,4 @@
-"""What is known of each frame, and of all: poses.csv, joints.csv, families.csv, summary.json.
+"""What is known of each frame, and of all: poses.csv, joints.csv, modes.csv, summary.json.
 
 Frames that have a row in poses.csv are finished: they survive whatever ends the job.
 """
@@ -42,7 +42,7 @@ BADLY_EXPLAINED = 0.25
 
 Joints = Mapping[str, Mapping[str, Any]]
 """By the name of a value of the pose tree: determined, low and high, as JointEstimate [deg or m];
-and value, that of a family, None over all families."""
+and value, that of a mode, None over all modes."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,8 +63,8 @@ class FrameRecord:
         camera_scale: pixels a metre of a parallel camera whose scale was found.
         explained: whether the pose explains the silhouettes at least roughly.
         joints: what is known of each value of the pose tree.
-        families: the same in the first families of poses that look the same.
-        family_count: how many families there are; None where the search does not say.
+        modes: the same in the first modes of poses that look the same.
+        mode_count: how many modes there are; None where the search does not say.
         ious: by camera that was used, intersection over union of silhouette and body.
         share: of the contours' lengths, what fits; by the method person alone.
         masks: by camera, what tells the mask's file from another (``mask_digests``).
@@ -83,8 +83,8 @@ class FrameRecord:
     camera_scale: float | None = None
     explained: bool = True
     joints: Joints = field(default_factory=dict)
-    families: Sequence[Joints] = ()
-    family_count: int | None = None
+    modes: Sequence[Joints] = ()
+    mode_count: int | None = None
     ious: Mapping[str, float] = field(default_factory=dict)
     share: float | None = None
     masks: Mapping[str, str] = field(default_factory=dict)
@@ -220,7 +220,7 @@ def measured_positions(model: ArticulatedModel, records: Sequence[FrameRecord]) 
 
 
 def record_pose_set(pose_set: PoseSet | None, tree: PoseTree) -> dict[str, Any]:
-    """FrameRecord's fields of what is known of each joint, over all families and in each."""
+    """FrameRecord's fields of what is known of each joint, over all modes and in each."""
     if pose_set is None:
         return {}
     kinds = dict(zip(tree.model.position_names, tree.model.position_kinds, strict=True))
@@ -238,15 +238,15 @@ def record_pose_set(pose_set: PoseSet | None, tree: PoseTree) -> dict[str, Any]:
             }
         return told
 
-    families = [
+    modes = [
         record(one.joints, [*np.concatenate(one.node_values).tolist(), *one.q[followers].tolist()])
-        for one in pose_set.families
+        for one in pose_set.modes
     ]
     unknown = [None] * (len(pose_set.joints) + len(followers))
     return {
         "joints": record(pose_set.joints, unknown),
-        "families": families,
-        "family_count": pose_set.family_count,
+        "modes": modes,
+        "mode_count": pose_set.mode_count,
     }
 
 
@@ -276,9 +276,7 @@ def record_deviations(model: ArticulatedModel, q: Array, deviations: Array) -> J
     }
 
 
-def record_families(
-    model: ArticulatedModel, answers: Sequence[tuple[Array, Array]]
-) -> dict[str, Any]:
+def record_modes(model: ArticulatedModel, answers: Sequence[tuple[Array, Array]]) -> dict[str, Any]:
     """FrameRecord's fields of one pose, or of several that explain a frame as well, best first.
 
     ``answers``: positions (nq,) and deviations (nq,) as of `record_deviations`.
@@ -296,7 +294,7 @@ def record_families(
         for name in told[0]
         if all(name in one for one in told)
     }
-    families = [
+    modes = [
         {
             name: {**joint, "value": float(user_units(model)[k] * q[k])}
             for name, joint in one.items()
@@ -304,28 +302,28 @@ def record_families(
         }
         for (q, _), one in zip(answers, told, strict=True)
     ]
-    return {"joints": joints, "families": families, "family_count": len(told)}
+    return {"joints": joints, "modes": modes, "mode_count": len(told)}
 
 
 def joint_table(records: Iterable[FrameRecord]) -> str:
-    """The text of joints.csv: a row for each frame and joint, over all families [deg or m]."""
+    """The text of joints.csv: a row for each frame and joint, over all modes [deg or m]."""
     rows = [
-        (record.frame, name, *_ends(joint), record.family_count)
+        (record.frame, name, *_ends(joint), record.mode_count)
         for record in records
         for name, joint in record.joints.items()
     ]
-    return csv_text([("frame", "joint", "determined", "low", "high", "families"), *rows])
+    return csv_text([("frame", "joint", "determined", "low", "high", "modes"), *rows])
 
 
-def family_table(records: Iterable[FrameRecord]) -> str:
-    """The text of families.csv: a row for each frame, family and joint; family 1 is the answer."""
+def mode_table(records: Iterable[FrameRecord]) -> str:
+    """The text of modes.csv: a row for each frame, mode and joint; mode 1 is the answer."""
     rows = [
         (record.frame, number, name, f"{one['value']:.6g}", *_ends(one))
         for record in records
-        for number, family in enumerate(record.families, start=1)
-        for name, one in family.items()
+        for number, mode in enumerate(record.modes, start=1)
+        for name, one in mode.items()
     ]
-    return csv_text([("frame", "family", "joint", "value", "determined", "low", "high"), *rows])
+    return csv_text([("frame", "mode", "joint", "value", "determined", "low", "high"), *rows])
 
 
 def _ends(joint: Mapping[str, Any]) -> tuple[str, str, str]:

@@ -47,7 +47,7 @@ def make_report(
     about = {
         "poses.csv": "every position of every frame [rad or m]",
         "joints.csv": "what is known of each joint, and in what interval [deg or m]",
-        "families.csv": "poses that look the same",
+        "modes.csv": "poses that look the same",
         "joint_centres.csv": "anatomical joint centres in the world [m]",
         "joint_centres.trc": "the same as markers [mm], for motion analysis",
         "positions.mot": "every position over time [deg or m], for motion analysis",

@@ -12,8 +12,8 @@ from drake_pose.body import ArticulatedModel
 from drake_pose.camera.models import ParallelCamera
 from drake_pose.errors import OutputError
 from drake_pose.files.folder import (
-    FAMILIES,
     JOINTS,
+    MODES,
     OVERLAY,
     REPLAY,
     REPORT,
@@ -29,11 +29,11 @@ from drake_pose.files.records import (
     SceneEstimate,
     base_pose,
     camera_warnings,
-    family_table,
     frame_warnings,
     joint_table,
     mask_digests,
     measured_positions,
+    mode_table,
     next_summary,
     poor_fit_warnings,
     summarize,
@@ -96,7 +96,7 @@ class ResultWriter:
             self._table = PoseTable(folder, model.position_names, with_base)
         earlier = earlier or {}
         # What a method says of a whole recording.
-        kept = ("lengths_m", "girths", "unseen", "proportions", "body_fit_seconds")
+        kept = ("lengths_m", "radius_scales", "unseen", "proportions", "body_fit_seconds")
         self.more = {name: earlier[name] for name in kept if name in earlier}
         if not earlier or self._table is None:
             return
@@ -223,6 +223,6 @@ class ResultWriter:
         write_summary(self.folder, done.summary)
         if any(record.joints for record in records):
             write_file(self.folder, JOINTS, joint_table(records))
-        if any(record.family_count is not None for record in records):
-            write_file(self.folder, FAMILIES, family_table(records))
+        if any(record.mode_count is not None for record in records):
+            write_file(self.folder, MODES, mode_table(records))
         self._next_summary = next_summary(begin)

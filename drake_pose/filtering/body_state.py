@@ -34,10 +34,10 @@ Self = TypeVar("Self", bound="BodyState")
 ROOT_SHIFT = ("root_shift_x", "root_shift_y", "root_shift_z")
 """Where the root is in the world, beside where its tree holds it [m]."""
 
-GROWTH = "log_growth"
+LOG_SCALE = "log_scale"
 """The logarithm of how much larger the body is seen than a parallel camera's scale says."""
 
-_ROOT = (*ROOT_SHIFT, GROWTH)
+_ROOT = (*ROOT_SHIFT, LOG_SCALE)
 
 
 class BodyState:
@@ -49,7 +49,7 @@ class BodyState:
         rest: with so much weight each measurement also says that joints are held as usual.
 
     Attributes:
-        layout: the state: the tree's values that are free to move, then ROOT_SHIFT and GROWTH,
+        layout: the state: the tree's values that are free to move, then ROOT_SHIFT and LOG_SCALE,
             and their rates.
         usual: how joints are usually held, about the state's moving elements: what the model's
             couplings file says, and about the middle of their limits, as evenly spread as these are
@@ -82,7 +82,7 @@ class BodyState:
         self._body = BodyParameters(self._kinematics, compared.rigid, surfaces=compared)
         free = self._kinematics.lower < self._kinematics.upper
         names = [n for n, is_free in zip(self._kinematics.names, free, strict=True) if is_free]
-        root = (*(ROOT_SHIFT if moves else ()), *((GROWTH,) if grows else ()))
+        root = (*(ROOT_SHIFT if moves else ()), *((LOG_SCALE,) if grows else ()))
         self.layout = StateLayout((*names, *root), ())
         if not len(self.layout):
             raise SettingsError(f"{tree.model.path}: all values of its tree are held")

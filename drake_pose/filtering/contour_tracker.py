@@ -9,7 +9,7 @@ import numpy as np
 
 from drake_pose.arrays import Array, Floats, Mask, Picture
 from drake_pose.errors import SettingsError
-from drake_pose.filtering.body_state import GROWTH, BodyState
+from drake_pose.filtering.body_state import LOG_SCALE, BodyState
 from drake_pose.filtering.motion import LinearMotion
 from drake_pose.filtering.state import Belief
 from drake_pose.filtering.truncated_filter import FilterSettings, FilterState, TruncatedFilter
@@ -410,7 +410,7 @@ class ContourTracker:
 
     def _of_kind(self, name: str, growth: float, angle: float, length: float) -> float:
         """One of three numbers: that of what a moving element is."""
-        if name == GROWTH:
+        if name == LOG_SCALE:
             return growth
         return angle if self.observation.is_angle(name) else length
 

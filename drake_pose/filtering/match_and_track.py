@@ -29,7 +29,7 @@ from drake_pose.silhouette.pictures.masks import edge_area
 
 
 @dataclass(frozen=True, eq=False)
-class Followed:
+class TrackerState:
     """What is known after a frame.
 
     Attributes:
@@ -115,12 +115,12 @@ class MatchAndTrack:
 
     def next(
         self,
-        last: Followed,
+        last: TrackerState,
         views: Sequence[View],
         root_position: Array | None = None,
         pictures: Mapping[str, Picture] | None = None,
         start: Array | None = None,
-    ) -> tuple[Followed, PoseEstimate]:
+    ) -> tuple[TrackerState, PoseEstimate]:
         """The next frame.
 
         Args:
@@ -156,7 +156,7 @@ class MatchAndTrack:
             if not self._is_lost(*tracked, last.reference, frame):
                 if last.retries and views:
                     return self._match(last, tracked, frame, None)
-                return Followed(track, last.reference, last.matches), tracked[1]
+                return TrackerState(track, last.reference, last.matches), tracked[1]
         if start is not None:
             begun = self._begin(start, last, frame)
             if begun[1].found or not views:
@@ -165,7 +165,7 @@ class MatchAndTrack:
             return self._go_on(last, tracked, frame)
         return self._match(last, tracked, frame, start)
 
-    def with_intervals(self, followed: Followed, pose: PoseEstimate) -> PoseEstimate:
+    def with_intervals(self, followed: TrackerState, pose: PoseEstimate) -> PoseEstimate:
         """A frame's pose that was tracked, with what its contours alone say of each joint."""
         track = followed.track
         if track is None or track.measurement is None:
@@ -177,11 +177,11 @@ class MatchAndTrack:
 
     def _match(
         self,
-        last: Followed,
+        last: TrackerState,
         tracked: tuple[Track, PoseEstimate] | None,
         frame: _GivenFrame,
         start: Array | None,
-    ) -> tuple[Followed, PoseEstimate]:
+    ) -> tuple[TrackerState, PoseEstimate]:
         """The best of what was tracked, if anything, and of what the search finds.
 
         Where neither explains the masks: the start that was given, or what is predicted.
@@ -200,7 +200,7 @@ class MatchAndTrack:
             elif not last.retries:
                 retries = settings.retries
             if not found and followed is None and start is None:
-                return Followed(None, 0.0, matches, 0, retries), matched
+                return TrackerState(None, 0.0, matches, 0, retries), matched
         limit = self._limit(last.reference)
         explained = [one for one in found if followed is None or one[1].E_total <= limit]
         if not explained and unexplained * self._period > settings.patience:
@@ -210,14 +210,14 @@ class MatchAndTrack:
             explained = [one for one in found if one[1].E_total <= self._limit(0.0)]
         if explained:
             track, result = min(explained, key=lambda pair: pair[1].E_total)
-            return Followed(track, result.E_total, matches, 0, retries), result
+            return TrackerState(track, result.E_total, matches, 0, retries), result
         if start is not None:
             track = self.tracker.start(self._state(start, last, frame))
         else:
             assert followed is not None
             track = self._follow(followed, frame, False, blind=True)
         result = replace(self._result(track, frame), found=False)
-        return Followed(track, last.reference, matches, unexplained, retries), result
+        return TrackerState(track, last.reference, matches, unexplained, retries), result
 
     def _looked(
         self, matched: PoseEstimate, last: Track | None, frame: _GivenFrame
@@ -232,22 +232,22 @@ class MatchAndTrack:
             matched = self._turned(matched, frame.observation.node_values(x))
         first = self.tracker.start(x)
         followed = self._follow(first, frame, True)
-        # The first look of a track is at what the search found, whose families are its own.
+        # The first look of a track is at what the search found, whose modes are its own.
         looked = replace(self._result(followed, frame), pose_set=matched.pose_set)
         # The searched pose may fit better: the colours of this frame are learned all the same.
         return [(followed, looked), (replace(first, colours=followed.colours), matched)]
 
     def _begin(
-        self, start: Array, last: Followed, frame: _GivenFrame
-    ) -> tuple[Followed, PoseEstimate]:
+        self, start: Array, last: TrackerState, frame: _GivenFrame
+    ) -> tuple[TrackerState, PoseEstimate]:
         """A track that begins where the body is known to be."""
         track = self._follow(self.tracker.start(self._state(start, last, frame)), frame, True)
         result = self._result(track, frame)
         reference = result.E_total if frame.views else UNEXPLAINED
         found = not self._is_lost(track, result, reference, frame)
-        return Followed(track, reference, last.matches), replace(result, found=found)
+        return TrackerState(track, reference, last.matches), replace(result, found=found)
 
-    def _state(self, start: Array, last: Followed, frame: _GivenFrame) -> Array:
+    def _state(self, start: Array, last: TrackerState, frame: _GivenFrame) -> Array:
         """The tracker's state (n,) at positions (nq,), angles in the turns of the last track."""
         x = frame.observation.state(start)
         if last.track is None:
@@ -255,8 +255,8 @@ class MatchAndTrack:
         return frame.observation.continued(x, last.track.state.best.mean)
 
     def _go_on(
-        self, last: Followed, tracked: tuple[Track, PoseEstimate] | None, frame: _GivenFrame
-    ) -> tuple[Followed, PoseEstimate]:
+        self, last: TrackerState, tracked: tuple[Track, PoseEstimate] | None, frame: _GivenFrame
+    ) -> tuple[TrackerState, PoseEstimate]:
         """What is known where neither a track nor a mask nor a start says where the body is."""
         if tracked is None:
             default = self._search.tree.model.default_positions

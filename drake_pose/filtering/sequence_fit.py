@@ -21,7 +21,7 @@ from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.fit.problem import Solution
 from drake_pose.fit.proportions import ProportionedBody, fit_proportions, sequence_prior
 from drake_pose.fit.surfaces import few_rigid_triangles
-from drake_pose.search import JointEstimate, PoseFamily, PoseSet, joint_estimates
+from drake_pose.search import JointEstimate, PoseMode, PoseSet, joint_estimates
 from drake_pose.silhouette.outline import TreeSurfaces
 
 
@@ -78,7 +78,7 @@ SEQUENCE = SequenceSettings()
 
 
 @dataclass(frozen=True, eq=False)
-class FollowedStart:
+class TrackedStart:
     """A start and how well the frames after it are explained.
 
     Args:
@@ -121,7 +121,7 @@ def find_start(
     tracker: ContourTracker,
     x: Array,
     masks: Sequence[Sequence[Mask | None]],
-) -> list[FollowedStart]:
+) -> list[TrackedStart]:
     """The poses to be followed in frames of all cameras' masks, best first, from a state (n,)."""
     observation = tracker.observation
     steps = (0.0, SEQUENCE.tilt, -SEQUENCE.tilt)
@@ -132,7 +132,7 @@ def find_start(
             track = tracker.follow(tracker.start(track.state.best.mean), masks[0], first=True)
         candidates.append(_judged(observation, track, masks[0]))
     candidates.sort(key=lambda one: one.cost)
-    kept: list[FollowedStart] = []
+    kept: list[TrackedStart] = []
     for one in candidates:
         if (
             one.errors[0] > candidates[0].errors[0] + SEQUENCE.worse_start
@@ -151,8 +151,8 @@ def _judged(
     observation: ContourObservation,
     track: Track,
     masks: Sequence[Mask | None],
-    before: FollowedStart | None = None,
-) -> FollowedStart:
+    before: TrackedStart | None = None,
+) -> TrackedStart:
     """A start and what it has explained, one frame more."""
     x = track.state.best.mean
     pairs = zip(observation.cameras, masks, strict=True)
@@ -160,8 +160,8 @@ def _judged(
     wrong, area = observation.difference(x, seen)
     error, prior = wrong / max(area, 1), observation.prior_distance(x)
     if before is None:
-        return FollowedStart((x,), track, (error,), (prior,))
-    return FollowedStart(
+        return TrackedStart((x,), track, (error,), (prior,))
+    return TrackedStart(
         (*before.states, x), track, (*before.errors, error), (*before.prior_distances, prior)
     )
 
@@ -255,18 +255,18 @@ def pose_set(
         explanations: best first.
         poses: q (nq,), X_WB (4, 4) and the objective (1) J [pixel] of each in the frame.
     """
-    families = []
+    modes = []
     for one, (q, X_WB, J) in zip(explanations, poses, strict=True):
         kinematics = one.body.kinematics
         values = kinematics.split(one.fitted.parameters[frame, : len(kinematics.names)])
-        families.append(PoseFamily(q, X_WB, values, J, one.estimates(frame), 1.0))
+        modes.append(PoseMode(q, X_WB, values, J, one.estimates(frame), 1.0))
     kinematics = explanations[0].body.kinematics
     low, high = (
-        extreme([[getattr(joint, end) for joint in one.joints] for one in families], axis=0)
+        extreme([[getattr(joint, end) for joint in one.joints] for one in modes], axis=0)
         for end, extreme in (("low", np.min), ("high", np.max))
     )
     joints = joint_estimates(kinematics, low, high, _are_determined(kinematics, low, high))
-    return PoseSet(tuple(families), joints, 0.0, False, len(families))
+    return PoseSet(tuple(modes), joints, 0.0, False, len(modes))
 
 
 def _are_same(one: FittedSequence, other: FittedSequence) -> bool:

@@ -10,7 +10,8 @@ as backgrounds change now and then, and a body may look like what is behind it. 
 logarithms over the frames, of the best background, scores a set of frames in which the body covers
 the pixel (``PixelSums``, ``explain``).
 
-Once a pose is about known, so are the background of each pixel and the odds that a pixel shows the
+Once a pose is about known, so are the background of each pixel and the probability that a pixel
+shows the
 body: lines across the contour then measure where its edge is (``fit.colours``).
 """
 
@@ -46,7 +47,7 @@ class BackgroundModel:
         shaken: standard deviation of a colour per gradient there [pixel], as cameras shake.
         min_noise: the least standard deviation of a colour [of 255].
         near: half the width of the strip along a contour where either side may show [pixel].
-        max_log_odds: log odds are clipped to this.
+        max_log_odds: log-odds are clipped to this.
         unseen, max_frequent: colours are at least and at most this many times as frequent as any.
     """
 
@@ -243,8 +244,8 @@ class KnownBackground:
             colours, deviations, count == 0, _log_frequencies(on), _log_frequencies(beside)
         )
 
-    def odds(self, picture: Picture, light: Floats) -> Floats:
-        """(H, W) logarithms of the odds that each pixel of a picture shows the body."""
+    def foreground(self, picture: Picture, light: Floats) -> Floats:
+        """(H, W) log-odds that each pixel of a picture shows the body."""
         even = in_light(picture, light)
         numbers = colour_numbers(np.clip(even, 0.0, 255.0).astype(np.uint8))
         likeness = _likeness(even, self.colours, self.deviations) * np.float32(MODEL.known_times)
@@ -252,34 +253,38 @@ class KnownBackground:
         return np.asarray(self.on[numbers] - np.where(self.unseen, self.beside[numbers], shown))
 
 
-def odds_picture(odds: Floats) -> Picture:
-    """A picture (H, W, 3) whose colours stand for log odds (H, W), see ``odds_of_colours``."""
+def foreground_picture(foreground: Floats) -> Picture:
+    """Encode log-odds (H, W) as a picture (H, W, 3); ``foreground_of_colours`` decodes it."""
     most = MODEL.max_log_odds
-    share = (np.clip(odds, -most, most) + most) / (2.0 * most)
+    share = (np.clip(foreground, -most, most) + most) / (2.0 * most)
     number = np.rint(share * (COLOURS - 1)).astype(np.uint16)
     channels = (number >> 8, (number >> 4) & 15, number & 15)
     return np.stack([(one << 4).astype(np.uint8) for one in channels], axis=-1)
 
 
-def odds_of_colours(nodes: int) -> Floats:
-    """(nodes, 3, COLOURS) what the colours of an ``odds_picture`` say, as of `compare_lines`."""
+def foreground_of_colours(nodes: int) -> Floats:
+    """Tables (nodes, 3, COLOURS) that decode a ``foreground_picture`` for `compare_lines`."""
     known = np.zeros((nodes, len(Colour), COLOURS), np.float32)
-    known[:, Colour.ODDS] = np.exp(np.linspace(-MODEL.max_log_odds, MODEL.max_log_odds, COLOURS))
+    known[:, Colour.FOREGROUND] = np.exp(
+        np.linspace(-MODEL.max_log_odds, MODEL.max_log_odds, COLOURS)
+    )
     return known
 
 
-def mask_of_odds(odds: Floats, covered: Mask, smooth: float = 0.7, reach: float = 0.1) -> Mask:
-    """Where odds (H, W) are for the body.
+def mask_of_foreground(
+    foreground: Floats, covered: Mask, smooth: float = 0.7, reach: float = 0.1
+) -> Mask:
+    """Where log-odds (H, W) are for the body.
 
     Args:
-        odds: (H, W) log odds.
+        foreground: (H, W) log-odds.
         covered: (H, W) where the body is about.
-        smooth: standard deviation of the Gaussian that smooths the odds [pixel].
+        smooth: standard deviation of the Gaussian that smooths the log-odds [pixel].
         reach: a mask ends within this distance of where the body is about [root of its area].
     """
     limit = max(MODEL.near, round(reach * float(np.sqrt(np.count_nonzero(covered)))))
     near = _grown(covered[None], limit)[0]
-    found = ((cv2.GaussianBlur(odds, (0, 0), smooth) > 0.0) & near).astype(np.uint8)
+    found = ((cv2.GaussianBlur(foreground, (0, 0), smooth) > 0.0) & near).astype(np.uint8)
     found = cv2.morphologyEx(found, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
     return np.asarray(cv2.morphologyEx(found, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8)), bool)
 

@@ -46,7 +46,7 @@ class Colour(IntEnum):
 
     ON = 0
     BESIDE = 1
-    ODDS = 2
+    FOREGROUND = 2
 
 
 class LineSettings(NamedTuple):
@@ -148,7 +148,7 @@ def step_of_lines(number: int) -> int:
 def no_colours(cameras: int, nodes: int) -> Floats:
     """What is known of a body that was never seen: nothing."""
     known = np.zeros((cameras, nodes, len(Colour), COLOURS), dtype=np.float32)
-    known[:, :, Colour.ODDS] = 1.0
+    known[:, :, Colour.FOREGROUND] = 1.0
     return known
 
 
@@ -359,13 +359,13 @@ def _find_edge(
     pixels = min(step, LINES.pixels)
     apart = step / pixels
     for k in range(-LINES.blocks, LINES.blocks + 1):
-        odds = 1.0
+        foreground = 1.0
         for pixel in range(pixels):
             r = k * step + apart * (pixel + 0.5) - 0.5 * step
             colour = _colour(picture, uv[0] + r * normal[0], uv[1] + r * normal[1])
             if colour >= 0:
-                odds *= histograms[Colour.ODDS, colour]
-        share = odds / (1.0 + odds)
+                foreground *= histograms[Colour.FOREGROUND, colour]
+        share = foreground / (1.0 + foreground)
         # How much more likely than not the block is on the body; 0: its colours do not say.
         blocks[k + LINES.blocks] = 4.0 * LINES.trust * (share - 0.5)
     inner, outer = clearance[0] / step, clearance[1] / step
@@ -482,4 +482,4 @@ def learn_colours(
                 histograms[node, Colour.ON, colour],
                 histograms[node, Colour.BESIDE, colour],
             )
-            histograms[node, Colour.ODDS, colour] = (on_it + rare) / (beside_it + rare)
+            histograms[node, Colour.FOREGROUND, colour] = (on_it + rare) / (beside_it + rare)

@@ -54,14 +54,14 @@ class Observation(NamedTuple):
         edges: of its silhouettes, camera after camera.
         values: (k,) known values of the first k parameters of a ``Problem``, such as encoders'
             readings [rad or m]; the others are 0.
-        odds: of each camera a picture (H, W, 3) whose colours are odds (``fit.background``), or
-            None; empty: of none.
+        foreground: of each camera a picture (H, W, 3) whose colours are log-odds
+            (``fit.background``), or None; empty: of none.
         rates: (m,) velocities of the pose tree's values [rad/s or m/s]; None: not known.
     """
 
     edges: Evidence
     values: Array = np.zeros(0)
-    odds: tuple[Picture | None, ...] = ()
+    foreground: tuple[Picture | None, ...] = ()
     rates: Array | None = None
 
 

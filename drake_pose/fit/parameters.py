@@ -24,12 +24,12 @@ from drake_pose.silhouette.outline import (
     pack,
 )
 
-ROOT_NAMES = ("root_shift_x", "root_shift_y", "root_shift_z", "log_growth")
+ROOT_NAMES = ("root_shift_x", "root_shift_y", "root_shift_z", "log_scale")
 """The shift of the first root along the world's axes [m], and the logarithm of the growth of it and
 all behind it about its origin."""
 
-GIRTH_PREFIX = "log_girth_"
-"""Begins the names of girths: the logarithm of how wide a part is across its y axis."""
+RADIUS_SCALE_PREFIX = "log_girth_"
+"""Begins the names of radius_scales: the logarithm of how wide a part is across its y axis."""
 
 POSE_NAMES = ("turn_x", "turn_y", "turn_z", "shift_x", "shift_y", "shift_z")
 """The rotation vector [rad] by which, and the shift [m] along its axes by which a camera sees
@@ -70,25 +70,25 @@ class Placement(NamedTuple):
 class BodyParameters:
     """A body's parameters.
 
-    They are its tree's values, ROOT_NAMES, the logarithms of its girths, and the logarithms of its
-    links' scales. A scaled link carries its joints farther from its own joint, along their offsets;
-    its surface stays as it is, and all behind such a joint is shifted.
+    They are its tree's values, ROOT_NAMES, the logarithms of its radius scales, and the logarithms
+    of its links' scales. A scaled link carries its joints farther from its own joint, along their
+    offsets; its surface stays as it is, and all behind such a joint is shifted.
 
     Attributes:
         kinematics: the pose tree's.
         outlines: a surface for each node.
-        groups: (nodes,) which girth each node has, or -1.
+        groups: (nodes,) which radius scale each node has, or -1.
         links: the links with a scale, in the order of their parameters.
         names: of the n parameters.
 
     Args:
         kinematics: the pose tree's.
         outlines: a surface for each node.
-        groups: (nodes,) which girth each node has, or -1: how wide it is across its y axis. None:
-            there are no girths.
-        girth_names: of the girths.
+        groups: (nodes,) which radius scale each node has, or -1: how wide it is across its y axis.
+            None: there are no radius_scales.
+        radius_scale_names: of the radius_scales.
         surfaces: the pose tree's, where bands of skin shall bend with the values; the outlines are
-            these at rest then, and there are no girths.
+            these at rest then, and there are no radius_scales.
         offsets: joints whose origins move as their links are scaled.
     """
 
@@ -97,7 +97,7 @@ class BodyParameters:
         kinematics: TreeKinematics,
         outlines: Sequence[Outline],
         groups: Sequence[int] | None = None,
-        girth_names: Sequence[str] = (),
+        radius_scale_names: Sequence[str] = (),
         surfaces: TreeSurfaces | None = None,
         offsets: Sequence[JointOffset] = (),
     ) -> None:
@@ -108,16 +108,16 @@ class BodyParameters:
         nodes, count = len(self.outlines), len(kinematics.names) + len(ROOT_NAMES)
         made_by = kinematics.parameters
         self.groups = np.full(nodes, -1) if groups is None else np.array(groups)
-        girths = tuple(f"{GIRTH_PREFIX}{name}" for name in girth_names)
+        radius_scales = tuple(f"{RADIUS_SCALE_PREFIX}{name}" for name in radius_scale_names)
         lengths = tuple(length_name(link) for link in self.links)
-        self.names = (*kinematics.names, *ROOT_NAMES, *girths, *lengths)
+        self.names = (*kinematics.names, *ROOT_NAMES, *radius_scales, *lengths)
         self._packed = pack(self.outlines)
         values = kinematics.flatten(kinematics.tree.default_values())
         moves = kinematics.motions(values, translation=True, scale=True).moves
         self._rooted = moves[:, -1]
         self._values_only = owners_of(moves[:, :-4], made_by)
         self._wide = np.flatnonzero(self.groups >= 0)
-        self._offsets, self._first_length = tuple(offsets), count + len(girths)
+        self._offsets, self._first_length = tuple(offsets), count + len(radius_scales)
         self._scaled = np.array([self.links.index(one.link) for one in offsets], dtype=np.intp)
         # Which nodes are behind each joint whose origin moves, and which joints' axes move.
         self._behind = np.zeros((nodes, len(offsets)), dtype=np.bool_)
@@ -184,8 +184,8 @@ class BodyParameters:
         packed = self._at(theta[:count])
         if len(self._wide):
             scale = np.ones((len(X_WN), 3))
-            girths = np.exp(theta[count + 4 : self._first_length])[self.groups[self._wide]]
-            scale[self._wide, 0] = scale[self._wide, 2] = girths
+            radius_scales = np.exp(theta[count + 4 : self._first_length])[self.groups[self._wide]]
+            scale[self._wide, 0] = scale[self._wide, 2] = radius_scales
             packed = stretched(packed, scale)
             widening = np.zeros((len(self._wide), 3, 4))
             for own, X in zip(widening, X_WN[self._wide], strict=True):

@@ -16,7 +16,7 @@ from scipy.linalg import block_diag
 from drake_pose.arrays import Array
 from drake_pose.camera.models import Camera
 from drake_pose.errors import SettingsError, UnknownNameError
-from drake_pose.fit.background import odds_of_colours
+from drake_pose.fit.background import foreground_of_colours
 from drake_pose.fit.colours import compare_lines
 from drake_pose.fit.contour_fit import (
     Comparison,
@@ -185,7 +185,7 @@ class Problem:
         self._count, self._first_look = len(every), len(body.names) + 1
         self._first_width = len(every) - len(cameras)
         self._widths = np.flatnonzero(self.entries >= self._first_width)
-        self._of_odds = odds_of_colours(len(body.outlines))
+        self._of_foreground = foreground_of_colours(len(body.outlines))
         self._fixed = not np.any(self.entries >= self._first_look)
         # A body is placed faster that neither grows nor is shifted.
         self._values = len(kinematics.names)
@@ -351,7 +351,7 @@ class Problem:
             self._placed[key] = placed
         weights = self._contours.weights(views.cameras, placed, step)
         compared = compare_views(views, placed, weights, len(self._widths) > 0)
-        for c, picture in enumerate(seen.odds):
+        for c, picture in enumerate(seen.foreground):
             if picture is not None:
                 # Lines nearer than three pixels say the same; offsets are 0.4 scales apart.
                 own = weights[c].copy()
@@ -359,7 +359,7 @@ class Problem:
                 offset, width = max(1, round(own[1] * 0.4)), theta[self._first_width + c]
                 compare_lines(
                     placed.packed, placed.X_WN, (places[0][c], places[1][c]), picture,
-                    self._of_odds, own, offset, compared.A[c], compared.b[c],
+                    self._of_foreground, own, offset, compared.A[c], compared.b[c],
                     compared.sums[c], compared.wide[c], width,
                 )  # fmt: skip
         return compared, places

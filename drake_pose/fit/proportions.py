@@ -1,10 +1,10 @@
 """A body whose parts may be longer and wider than its model's: unknowns of its proportions.
 
 Each part is stretched along one axis of its frame, that along which it carries what hangs on it,
-and widened across it. So bones get their own lengths and flesh its own girth, which silhouettes of
-somebody else than the model's measures show. Where a limb begins, its joint may lie further out in
-the flesh than the model's: at rest nothing changes, but the limb bends elsewhere. The model's
-joints keep their meaning.
+and widened across it. So bones get their own lengths and flesh its own radius scale, which
+silhouettes of somebody else than the model's measures show. Where a limb begins, its joint may lie
+further out in the flesh than the model's: at rest nothing changes, but the limb bends elsewhere.
+The model's joints keep their meaning.
 """
 
 from collections.abc import Sequence

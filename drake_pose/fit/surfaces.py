@@ -79,11 +79,11 @@ def hull_of_few(outlines: Sequence[Outline], count: int, limit: float = 3.0) -> 
     return tuple(found)
 
 
-def with_girths(outlines: Sequence[Outline], girths: Array) -> tuple[Outline, ...]:
-    """Surfaces, each as many times as wide across its y axis as girths (nodes,) say."""
+def with_radius_scales(outlines: Sequence[Outline], radius_scales: Array) -> tuple[Outline, ...]:
+    """Surfaces, each as many times as wide across its y axis as radius scales (nodes,) say."""
     wider = []
-    for outline, girth in zip(outlines, girths, strict=True):
-        vertices = outline.vertices * [girth, 1.0, girth]
+    for outline, radius_scale in zip(outlines, radius_scales, strict=True):
+        vertices = outline.vertices * [radius_scale, 1.0, radius_scale]
         wider.append(outline_from_mesh(TriangleMesh(vertices, outline.triangles)))
     return tuple(wider)
 

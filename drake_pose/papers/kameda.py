@@ -89,7 +89,7 @@ class RandomPose:
         true_values: the values drawn, one array for each node [rad or m].
         inside: whether the whole body is inside the picture.
         seconds: processor time of the search.
-        more_seconds: processor time of proof and families, or of intervals.
+        more_seconds: processor time of proof and modes, or of intervals.
         tolerance: a silhouette is matched exactly that differs by no more [pixel].
         causes: on the grid, why angles are wrong though the silhouette is matched exactly.
     """
@@ -249,9 +249,9 @@ def run_experiment(
             # Tighter limits on time would make the figures those of one machine.
             limits = ExaminationSettings(
                 proof_time_limit=60.0,
-                family_time_limit=60.0,
+                mode_time_limit=60.0,
                 proof_poses=1_000_000,
-                family_poses=100_000,
+                mode_poses=100_000,
             )
             start = time.process_time()
             result = examine(search.body, seen, result, limits)
@@ -351,7 +351,7 @@ def _grid_figures(result: RandomPoses) -> dict[str, Any]:
         "truth_in_set": sum(named),
         "budget_spent": sum(one.budget_spent for one in found),
         "complete_sets": sum(one.complete for one in known),
-        "several_families": sum(one.family_count > 1 for one in known),
+        "several_modes": sum(one.mode_count > 1 for one in known),
         "free_joints": sum(not all(one.determined) for one in known),
         "examination_median_seconds": float(np.median([trial.more_seconds for trial in trials])),
     }
@@ -381,7 +381,7 @@ def grid_table(columns: Sequence[Sequence[RandomPoses]]) -> Table:
         "budget_spent": ("proof or set ended by its time or memory", "{}"),
         "truth_in_set": ("true pose in the set of poses as good", "{}"),
         "complete_sets": ("sets that are complete", "{}"),
-        "several_families": ("silhouettes with several families of poses", "{}"),
+        "several_modes": ("silhouettes with several modes of poses", "{}"),
         "free_joints": ("silhouettes that leave a joint free", "{}"),
         "examination_median_seconds": ("seconds for proof and set, median", "{:.3f}"),
     }

@@ -1,4 +1,4 @@
-"""Pictures of experiment A in the manner of the paper's figures 7 to 12, and of pose families."""
+"""Pictures of experiment A in the manner of the paper's figures 7 to 12, and of pose modes."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -68,11 +68,11 @@ def save_pictures(
     several = [
         (trial, answer)
         for trial in result.trials
-        if (answer := trial.result.pose_set) is not None and answer.family_count > 1
+        if (answer := trial.result.pose_set) is not None and answer.mode_count > 1
     ]
     for k, (trial, answer) in enumerate(several[:most_sets], start=1):
-        path, model = folder / f"families_{k}.png", result.search.tree.model
-        files.append(save_families(path, model, answer, [result.view(trial)]))
+        path, model = folder / f"modes_{k}.png", result.search.tree.model
+        files.append(save_modes(path, model, answer, [result.view(trial)]))
     return files
 
 
@@ -188,7 +188,7 @@ def ratio_within(ranks: NDArray[np.int64], limit: int) -> float:
     return float(((ranks > 0) & (ranks <= limit)).mean())
 
 
-def save_families(
+def save_modes(
     path: Path,
     model: ParsedModel,
     answer: PoseSet,
@@ -197,23 +197,23 @@ def save_families(
     margin: int = 20,
     most_names: int = 5,
 ) -> Path:
-    """Draw the best families as columns of a PNG file: what the silhouettes leave open.
+    """Draw the best modes as columns of a PNG file: what the silhouettes leave open.
 
     Rows for every camera: the representative's segments, and where body and silhouette agree;
-    below, the joints that are free in the family.
+    below, the joints that are free in the mode.
 
     Args:
-        most: of families.
+        most: of modes.
         margin: about the body [pixel].
-        most_names: of joints that are named below a family.
+        most_names: of joints that are named below a mode.
     """
-    families = answer.families[:most]
+    modes = answer.modes[:most]
     renderers = [LabelRenderer(model, view.camera) for view in views]
     columns, titles = [], []
-    for family in families:
+    for mode in modes:
         column = []
         for view, renderer in zip(views, renderers, strict=True):
-            segments = renderer.segments(family.q, family.X_WB)
+            segments = renderer.segments(mode.q, mode.X_WB)
             places = np.nonzero(view.mask | (segments >= 0))
             window = tuple(
                 slice(max(0, one.min() - margin), one.max() + 1 + margin) for one in places
@@ -222,16 +222,16 @@ def save_families(
             column.append(_coloured(segments, range(segments.max() + 2)))
             column.append(paint_agreement(mask, segments >= 0, segments))
         columns.append(column)
-        poses = "1 pose" if family.size == 1 else f"{family.size:,.0f} poses"
-        titles.append(f"J = {family.J:.0f} pixels, {poses}")
+        poses = "1 pose" if mode.size == 1 else f"{mode.size:,.0f} poses"
+        titles.append(f"J = {mode.J:.0f} pixels, {poses}")
     found = "all found" if answer.complete else "the search left some out"
     title = (
-        f"{len(families)} of {answer.family_count} families within {answer.tolerance:.0f} pixels "
+        f"{len(modes)} of {answer.mode_count} modes within {answer.tolerance:.0f} pixels "
         f"of the best ({found})\n{_COLOURS}"
     )
     below = []
-    for family in families:
-        names = [joint.name for joint in family.joints if not joint.determined]
+    for mode in modes:
+        names = [joint.name for joint in mode.joints if not joint.determined]
         more = len(names) - most_names
         lines = ["free:", *names[:most_names], *([f"and {more} more"] if more > 0 else [])]
         below.append("\n".join(lines) if names else "every joint determined")

@@ -1,4 +1,4 @@
-"""A person's lengths (shape joints) and girths (how wide parts are across their y axis).
+"""A person's lengths (shape joints) and radius scales (how wide parts are across their y axis).
 
 All frames share them, each has its own pose; silhouettes of several frames tell.
 """
@@ -15,9 +15,9 @@ from drake_pose.errors import ModelError, UnknownNameError
 from drake_pose.fit.contour_fit import ContourFit, Noise, pack_views
 from drake_pose.fit.evidence import NO_EDGE, EdgePoints, Observation, pack_evidence
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
-from drake_pose.fit.parameters import GIRTH_PREFIX, BodyParameters
+from drake_pose.fit.parameters import RADIUS_SCALE_PREFIX, BodyParameters
 from drake_pose.fit.problem import Problem, Unknowns
-from drake_pose.fit.surfaces import with_girths
+from drake_pose.fit.surfaces import with_radius_scales
 from drake_pose.person.pose_tracker import PersonPoseTracker, pose_uncertainty
 from drake_pose.person.search import LENIENT
 from drake_pose.silhouette.outline import Outline
@@ -25,9 +25,9 @@ from drake_pose.silhouette.outline import Outline
 Frames = Sequence[tuple[Sequence[Camera], Sequence[EdgePoints]]]
 """The cameras of each frame and their regions' edges."""
 
-# How far off the model lengths are, left and right differ [m], girths' logarithms are, and angles
-# are off where they were [rad]; and the farthest that a girth's logarithm is off.
-_LENGTH, _SIDE, _GIRTH, _POSE, _WIDEST = 0.03, 0.005, 0.15, 0.5, 0.5
+# How far off the model lengths are, left and right differ [m], radius_scales' logarithms are, and
+# angles are off where they were [rad]; and the farthest that a radius_scale's logarithm is off.
+_LENGTH, _SIDE, _RADIUS_SCALE, _POSE, _WIDEST = 0.03, 0.005, 0.15, 0.5, 0.5
 _ROUNDS = tuple(
     AnnealingStage(scale, 0.04) for scale in (0.10, 0.08, 0.06, 0.05, 0.04, 0.04, 0.03, 0.03)
 )
@@ -37,10 +37,10 @@ NOISE = Noise(deviation=0.02, correlation=0.15)
 
 @dataclass(frozen=True, eq=False)
 class KnownShape:
-    """A person's lengths by shape joint [m], else the model's, and girths by part, else 1."""
+    """A person's lengths [m] by shape joint, and radius scales by part; else the model's, and 1."""
 
     lengths: Mapping[str, float]
-    girths: Mapping[str, float]
+    radius_scales: Mapping[str, float]
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +51,7 @@ class PersonShape:
         values: (m,) of the pose tree; the shape joints' are the person's, others 0.
         covariance: (h, h) of the shape joints' [m].
         poses: (frames, m) values in the frames that it was fitted to.
-        outlines: the model's simplified surfaces with these girths.
+        outlines: the model's simplified surfaces with these radius_scales.
     """
 
     known: KnownShape
@@ -76,7 +76,7 @@ def shape_values(tree: PoseTree) -> Mask:
 
 
 def shape_parts(tree: PoseTree) -> tuple[list[str], list[int]]:
-    """The parts that have a girth, and which of them each node belongs to."""
+    """The parts that have a radius scale, and which of them each node belongs to."""
     names = [
         node.name.removeprefix("left_").removeprefix("right_").removesuffix("_end")
         for node in tree.nodes
@@ -102,17 +102,17 @@ def tracker_of_person(tree: PoseTree, shape: KnownShape | None) -> PersonPoseTra
             raise UnknownNameError("length", name, lengths, str(tree.model.path))
         rest[names.index(name)] = length
     parts, groups = shape_parts(tree)
-    for part in shape.girths:
+    for part in shape.radius_scales:
         if part not in parts:
             raise UnknownNameError("part", part, parts, str(tree.model.path))
-    if shape.girths:
-        widths = np.array([shape.girths.get(part, 1.0) for part in parts])
-        fit = ContourFit(fit.kinematics, with_girths(fit.outlines, widths[groups]), NOISE)
+    if shape.radius_scales:
+        widths = np.array([shape.radius_scales.get(part, 1.0) for part in parts])
+        fit = ContourFit(fit.kinematics, with_radius_scales(fit.outlines, widths[groups]), NOISE)
     return PersonPoseTracker(fit, LENIENT, held, rest)
 
 
 def fit_shape(fit: ContourFit, frames: Frames, poses: Array) -> PersonShape:
-    """Fits lengths, girths and all frames' poses, from values poses (frames, m).
+    """Fits lengths, radius scales and all frames' poses, from values poses (frames, m).
 
     Raises ModelError where the model has no shape joints, as urdf/person/person_shape.urdf has.
     """
@@ -137,9 +137,9 @@ def fit_shape(fit: ContourFit, frames: Frames, poses: Array) -> PersonShape:
         )
         for chosen, shared, deviation in ((~is_shape, False, _POSE), (is_shape, True, _LENGTH))
     )  # fmt: skip
-    girths = [name for name in body.names if name.startswith(GIRTH_PREFIX)]
-    girth = Unknowns(girths, True, -_WIDEST, _WIDEST, _GIRTH)
-    problem = Problem(body, list(cameras.values()), [pose, shape, girth], noise=fit.noise)
+    radius_scales = [name for name in body.names if name.startswith(RADIUS_SCALE_PREFIX)]
+    radius_scale = Unknowns(radius_scales, True, -_WIDEST, _WIDEST, _RADIUS_SCALE)
+    problem = Problem(body, list(cameras.values()), [pose, shape, radius_scale], noise=fit.noise)
     found = problem.solve(
         observations,
         _ROUNDS,
@@ -147,7 +147,7 @@ def fit_shape(fit: ContourFit, frames: Frames, poses: Array) -> PersonShape:
         shared_information=_sides_information(names, len(parts)),
     )
     lengths, widths = found.shared[:count], np.exp(found.shared[count:])
-    worn = ContourFit(fit.kinematics, with_girths(fit.outlines, widths[groups]), fit.noise)
+    worn = ContourFit(fit.kinematics, with_radius_scales(fit.outlines, widths[groups]), fit.noise)
     values = np.zeros(len(is_shape))
     values[is_shape] = poses[:, is_shape] = lengths
     poses[:, ~is_shape] = found.own
@@ -168,9 +168,9 @@ def fit_shape(fit: ContourFit, frames: Frames, poses: Array) -> PersonShape:
     return PersonShape(known, values, np.asarray(covariance), poses, worn.outlines)
 
 
-def _sides_information(names: Sequence[str], girths: int) -> Array:
-    """The information about lengths, and after them girths: left and right are alike."""
-    information = np.zeros((len(names) + girths, len(names) + girths))
+def _sides_information(names: Sequence[str], radius_scales: int) -> Array:
+    """The information about lengths, and after them radius_scales: left and right are alike."""
+    information = np.zeros((len(names) + radius_scales, len(names) + radius_scales))
     for k, name in enumerate(names):
         other = name.replace("left_", "right_", 1)
         if name.startswith("left_") and other in names:

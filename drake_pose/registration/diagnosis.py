@@ -440,7 +440,7 @@ class _Diagnoser:
                 if pixels >= least or (best.kind, best.name) in self._asked:
                     findings.append(self._finding([better, *rivals], pixels))
         named = [one[0].name for one in found]
-        noticed = _noticed_from(residual, [one for one in joints if one.name not in named])
+        noticed = _minimum_detectable(residual, [one for one in joints if one.name not in named])
         return tuple(findings), center, noticed
 
 
@@ -471,7 +471,7 @@ def _name(
     return residual, named
 
 
-def _noticed_from(residual: _Residual, causes: Sequence[_Cause]) -> dict[str, float]:
+def _minimum_detectable(residual: _Residual, causes: Sequence[_Cause]) -> dict[str, float]:
     """How far joints must be off to be named 19 times of 20 [rad or m]; inf: never."""
     level = DIAGNOSIS.significance / max(1, len(causes))
     critical, found = fdtri(1, residual.info.freedom, 1.0 - level), {}

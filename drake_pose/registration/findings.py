@@ -72,15 +72,15 @@ class Diagnosis:
         sizes: of contours' errors [pixel].
         center: all principal points are off by half a pixel along x and y: by how much, and
             standard deviations (2,) [pixel]; None: they are not.
-        noticed_from: smallest offset of each joint that is not named that would be, in all frames
-            [rad or m].
+        minimum_detectable: smallest offset of each joint that is not named that would be, in all
+            frames [rad or m].
     """
 
     frames: tuple[FrameDiagnosis, ...]
     common: tuple[Finding, ...]
     sizes: ErrorSizes
     center: tuple[list[float], list[float]] | None = None
-    noticed_from: Mapping[str, float] = field(default_factory=dict)
+    minimum_detectable: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def contradicting(self) -> tuple[str, ...]:

@@ -119,13 +119,13 @@ class PictureRegistration:
 
     Args:
         found: the camera.
-        frames: its frames, with masks and odds, at the joints' values of their moments.
+        frames: its frames, with masks and log-odds, at the joints' values of their moments.
         pictures: of these frames, by name.
         fit: that found it.
         offset: of its clock; None: the joints have no times.
         focal_deviation: over the focal length; 0: it was held.
         recording: it was found in, the joints' clock drifting no more.
-        zeros: (m,) that were added to the frames' values where masks and odds were found.
+        zeros: (m,) that were added to the frames' values where masks and log-odds were found.
     """
 
     found: RegisteredCamera
@@ -567,7 +567,7 @@ def judge_pictures(
             ]
             # Odds fill the memory.
             frames += [
-                replace(frame, values=frame.values - one.zeros, odds=None, rates=None)
+                replace(frame, values=frame.values - one.zeros, foreground=None, rates=None)
                 for frame in seen
             ]
     return tuple(frames), tuple(misfits), tuple(lost)

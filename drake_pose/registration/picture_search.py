@@ -4,7 +4,7 @@ The body's positions are known in each picture, and the camera stands still: so 
 says in which frames the body covers each pixel, and the pixels' colours say how well that fits
 (``fit.background``). Rotations spread over all, and more of them near upright, are tried with the
 bodies where pictures change; the best are improved step by step, in larger and larger pictures, and
-in the end by the one fit, on lines across the contour in the odds of pixels to show the body.
+in the end by the one fit, on lines across the contour in the log-odds of pixels to show the body.
 """
 
 import math
@@ -24,8 +24,8 @@ from drake_pose.fit.background import (
     Explained,
     KnownBackground,
     explain,
-    mask_of_odds,
-    odds_picture,
+    foreground_picture,
+    mask_of_foreground,
 )
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.fit.parameters import POSE_NAMES
@@ -80,7 +80,7 @@ class PictureFit:
     """A camera that was fitted to pictures.
 
     Args:
-        fit: the fit of its frames, which have the odds of their pixels, and masks of these.
+        fit: the fit of its frames, which have foreground probabilities, and masks of these.
         found: by it.
         background: what is behind the body; it gives foreground probabilities of other pictures.
         explained: share of what could be explained at most, that the pose explains.
@@ -287,7 +287,7 @@ class PictureSearch:
         covered: Mask,
         outlines: Sequence[Outline],
     ) -> PosedFrames | None:
-        """Frames with the odds of their pixels and masks of these; None: fewer than two show it.
+        """Frames with foreground probabilities and masks of these; None: fewer than two show it.
 
         Args:
             covered: (f, H, W) where the body is about; frames that do not show it tell nothing.
@@ -326,17 +326,17 @@ def _stages(scales: Sequence[float], seen: PosedFrames) -> list[AnnealingStage]:
 def see_picture(
     one: PosedPicture, known: KnownBackground, light: Floats, covered: Mask
 ) -> PosedFrame | None:
-    """A picture with the odds of its pixels and a mask of these; None where no body shows.
+    """A picture with its log-odds and a mask of these; None where no body shows.
 
     covered: (H, W) where the body is about.
     """
     if not covered.any():
         return None
-    odds = known.odds(one.picture, light)
-    mask = mask_of_odds(odds, covered)
+    foreground = known.foreground(one.picture, light)
+    mask = mask_of_foreground(foreground, covered)
     if not mask.any():
         return None
-    return PosedFrame(one.name, one.values, mask, odds_picture(odds), one.rates)
+    return PosedFrame(one.name, one.values, mask, foreground_picture(foreground), one.rates)
 
 
 def evidence(explained: float, contour: float) -> float:

@@ -37,15 +37,15 @@ class PosedFrame:
     Args:
         values: (m,) of the body's pose tree [rad or m].
         mask: (H, W) the silhouette.
-        odds: (H, W, 3) of each pixel to show the body (``fit.background``): a fit looks at these
-            and not at the mask, where they are given.
+        foreground: (H, W, 3) log-odds of each pixel to show the body (``fit.background``): a fit
+            looks at these and not at the mask, where they are given.
         rates: (m,) velocities of the values [rad/s or m/s], where they are known.
     """
 
     name: str
     values: Array
     mask: Mask
-    odds: NDArray[np.uint8] | None = None
+    foreground: NDArray[np.uint8] | None = None
     rates: Array | None = None
 
 
@@ -123,8 +123,8 @@ class PosedFrames:
         found = []
         for frame, edge in zip(self.frames, self._edges, strict=True):
             edges = pack_evidence([edge if c == camera else NO_EDGE for c in range(count)])
-            odds = tuple(frame.odds if c == camera else None for c in range(count))
-            found.append(Observation(edges, frame.values, odds, frame.rates))
+            foreground = tuple(frame.foreground if c == camera else None for c in range(count))
+            found.append(Observation(edges, frame.values, foreground, frame.rates))
         return found
 
     @cached_property
@@ -137,7 +137,7 @@ class PosedFrames:
         """Of the silhouettes that fits look at."""
         spacing = max(1.0, round(self.spacing * self.size))
         return [
-            NO_EDGE if frame.odds is not None else find_edge_points(frame.mask, spacing)
+            NO_EDGE if frame.foreground is not None else find_edge_points(frame.mask, spacing)
             for frame in self.frames
         ]
 
@@ -179,18 +179,18 @@ def placed_points(outlines: Sequence[Outline], X_WN: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class SeenFrame:
-    """A frame of several cameras: as ``PosedFrame``, masks and odds by the cameras' names."""
+    """A frame of several cameras: as ``PosedFrame``, masks and log-odds by the cameras' names."""
 
     name: str
     values: Array
     masks: Mapping[str, Mask]
-    odds: Mapping[str, NDArray[np.uint8]] = field(default_factory=dict)
+    foreground: Mapping[str, NDArray[np.uint8]] = field(default_factory=dict)
     rates: Array | None = None
 
     def of(self, camera: str) -> PosedFrame:
         """What a camera sees that has a mask."""
-        odds = self.odds.get(camera)
-        return PosedFrame(self.name, self.values, self.masks[camera], odds, self.rates)
+        foreground = self.foreground.get(camera)
+        return PosedFrame(self.name, self.values, self.masks[camera], foreground, self.rates)
 
     def edges(self, cameras: Sequence[Camera], spacing: float) -> Evidence:
         """The silhouettes' edges, by points at a spacing [pixel].

@@ -24,7 +24,7 @@ from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import RegistrationError
 from drake_pose.fit.covariance import excess
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
-from drake_pose.fit.surfaces import FEW, VERY_FEW, few_triangles, with_girths
+from drake_pose.fit.surfaces import FEW, VERY_FEW, few_triangles, with_radius_scales
 from drake_pose.registration.posed_frames import (
     LAST_SPACING,
     PosedFrame,
@@ -87,8 +87,8 @@ class RegistrationBody:
     Args:
         seen: the nodes that silhouettes show; all where None.
         fewest: number of triangles of a node where it has very few.
-        girths: (nodes,) how many times as wide nodes are across their y axes as the model's; 1
-            where None.
+        radius_scales: (nodes,) how many times as wide nodes are across their y axes as the
+            model's; 1 where None.
     """
 
     def __init__(
@@ -96,12 +96,12 @@ class RegistrationBody:
         tree: PoseTree,
         seen: Collection[str] | None = None,
         fewest: int = VERY_FEW,
-        girths: Array | None = None,
+        radius_scales: Array | None = None,
     ) -> None:
         self.tree, self.kinematics = tree, TreeKinematics(tree)
         surfaces = TreeSurfaces(tree)
-        if girths is not None:
-            surfaces = surfaces.with_rigid(with_girths(surfaces.rigid, girths))
+        if radius_scales is not None:
+            surfaces = surfaces.with_rigid(with_radius_scales(surfaces.rigid, radius_scales))
         if seen is not None:
             own = zip(tree.nodes, surfaces.rigid, strict=True)
             surfaces = surfaces.with_rigid(

@@ -35,8 +35,8 @@ from drake_pose.fit.evidence import Observation
 from drake_pose.fit.levenberg_marquardt import AnnealingStage, Equations, StepSettings
 from drake_pose.fit.parameters import (
     CAMERA_NAMES,
-    GIRTH_PREFIX,
     POSE_NAMES,
+    RADIUS_SCALE_PREFIX,
     BodyParameters,
     length_name,
     lengthened_joints,
@@ -494,22 +494,22 @@ def adjust_bundle(
     """Fits poses and cameras together, in the end as finely as the model is like the body.
 
     Cameras that are found from estimated joint positions are off with them. So all are fitted to
-    all silhouettes at once (bundle adjustment), with lengths and girths that all frames share;
-    cameras whose places are known hold the whole.
+    all silhouettes at once (bundle adjustment), with lengths and radius scales that all frames
+    share; cameras whose places are known hold the whole.
 
     Args:
         cameras: all cameras, those that are unknown near where they stand.
         unknown: names of the cameras whose poses are unknown.
         frames: what they see, with approximate values of the body.
         is_length: (m,) which of the pose tree's values are lengths, the same in all frames.
-        parts: names of the parts that have a girth: how wide they are across their y axes.
+        parts: names of the parts that have a radius_scale: how wide they are across their y axes.
         groups: (nodes,) which of these each node belongs to, or -1; None: none.
         telling_frames: number of frames from which covariances are estimated.
 
     Returns:
         the c unknown cameras with their poses; (c, 6, 6) covariances of these, as of
-        ``RegisteredCamera``; (frames, m) values, lengths among them [rad or m]; and (nodes,) girths
-        over the model's.
+        ``RegisteredCamera``; (frames, m) values, lengths among them [rad or m]; and (nodes,)
+        radius scales over the model's.
 
     Raises:
         MaskError: a mask of another size than its camera's picture, or no mask shows the body.
@@ -518,7 +518,7 @@ def adjust_bundle(
     body = BodyParameters(kinematics, outlines, groups, parts)
     free = (kinematics.lower < kinematics.upper) & ~is_length
     looks = [k for k, camera in enumerate(cameras) if camera.name in unknown]
-    # Known beforehand: estimated angles [rad], places and lengths [m], logarithms of girths.
+    # Known beforehand: estimated angles [rad], places and lengths [m], logarithms of radius scales.
     worth = SHARED.point_error * np.sqrt(SHARED.error_length)
     deviations = np.where(is_length, 0.03, 0.5) / worth
     pose, lengths = (
@@ -528,12 +528,12 @@ def adjust_bundle(
         )
         for which, shared in ((free, False), (is_length, True))
     )  # fmt: skip
-    girths = [name for name in body.names if name.startswith(GIRTH_PREFIX)]
+    radius_scales = [name for name in body.names if name.startswith(RADIUS_SCALE_PREFIX)]
     poses = [f"{cameras[k].name}.{name}" for k in looks for name in POSE_NAMES]
     unknowns = [
         pose,
         lengths,
-        Unknowns(girths, True, deviation=0.15 / worth),
+        Unknowns(radius_scales, True, deviation=0.15 / worth),
         Unknowns(poses, True),
     ]
     fit = Problem(

@@ -576,7 +576,7 @@ def find_in_pictures(
         known = KnownBackground.of([one.picture], [light], shows[None], covered[None])
         frame = see_picture(one, known, light, covered)
         if frame is not None and intersection_over_union(frame.mask, covered) > min_iou:
-            shown.append(replace(frame, odds=None))
+            shown.append(replace(frame, foreground=None))
     return shown
 
 

@@ -6,7 +6,7 @@ from drake_pose.search.estimates import (
     UNEXPLAINED,
     JointEstimate,
     PoseEstimate,
-    PoseFamily,
+    PoseMode,
     PoseSet,
     View,
     following_joints,
@@ -15,7 +15,7 @@ from drake_pose.search.estimates import (
 from drake_pose.search.kameda import PaperSearch
 from drake_pose.search.multi_start import MultiStartSearch
 from drake_pose.search.pose_and_mask import FoundPose, PoseAndMask, PoseAndMaskSettings
-from drake_pose.search.pose_families import (
+from drake_pose.search.pose_modes import (
     ExaminationSettings,
     GridPoseSet,
     examine,
@@ -49,7 +49,7 @@ __all__ = [
     "PoseAndMask",
     "PoseAndMaskSettings",
     "PoseEstimate",
-    "PoseFamily",
+    "PoseMode",
     "PoseSearch",
     "PoseSet",
     "RootPlacementSearch",

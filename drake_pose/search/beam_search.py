@@ -24,7 +24,7 @@ from drake_pose.search.partial_poses import (
     PoseStore,
     coarsen,
 )
-from drake_pose.search.pose_families import ExaminationSettings, examine, renderer_tolerance
+from drake_pose.search.pose_modes import ExaminationSettings, examine, renderer_tolerance
 from drake_pose.search.sampled_body import SampledBody, Scoring
 from drake_pose.search.settings import BeamSearchSettings, BoundLimits, Stage
 

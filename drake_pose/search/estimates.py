@@ -1,4 +1,4 @@
-"""What a search is given, and the poses in families that searches and trackers answer."""
+"""What a search is given, and the poses in modes that searches and trackers answer."""
 
 import math
 from collections.abc import Sequence
@@ -125,14 +125,14 @@ def following_joints(tree: PoseTree, joints: Sequence[JointEstimate]) -> tuple[J
 
 
 @dataclass(frozen=True)
-class PoseFamily:
+class PoseMode:
     """Poses that differ by small steps, with one that stands for all.
 
     Args:
         q: (nq,) the representative's positions in the plant's order [rad, m].
         X_WB: (4, 4) pose of the plant's world frame B in the world W.
         J: its objective (1) [pixel].
-        joints: each value of the pose tree, node after node, as far as this family goes.
+        joints: each value of the pose tree, node after node, as far as this mode goes.
         size: how many poses were found in it.
     """
 
@@ -151,8 +151,8 @@ class PoseFamily:
         J: float,
         joints: tuple[JointEstimate, ...],
         size: float = 1.0,
-    ) -> "PoseFamily":
-        """The family of a pose tree's values, (k_i,) of each node."""
+    ) -> "PoseMode":
+        """The mode of a pose tree's values, (k_i,) of each node."""
         return cls(*tree.positions_from(node_values), tuple(node_values), J, joints, size)
 
 
@@ -161,19 +161,19 @@ class PoseSet:
     """All poses found that are as good as the best within the noise.
 
     Args:
-        families: best first; of equals the larger one first.
-        joints: each value of the pose tree, node after node, over all families.
+        modes: best first; of equals the larger one first.
+        joints: each value of the pose tree, node after node, over all modes.
         tolerance: the greatest excess over the best pose's J, or cost of the edges [pixel].
         complete: whether no pose within the tolerance was left out (on the grid, for a search on
             a grid).
-        family_count: how many families there are; ``families`` may hold only the first of them.
+        mode_count: how many modes there are; ``modes`` may hold only the first of them.
     """
 
-    families: tuple[PoseFamily, ...]
+    modes: tuple[PoseMode, ...]
     joints: tuple[JointEstimate, ...]
     tolerance: float
     complete: bool
-    family_count: int
+    mode_count: int
 
     @property
     def determined(self) -> tuple[bool, ...]:
@@ -270,22 +270,22 @@ class PoseEstimate:
         return bool(self.found and self.lower_bound >= self.J)
 
     def widened(self, begun: "PoseEstimate | None") -> "PoseEstimate":
-        """A tracked pose whose joints are as open as the families that its track began with."""
+        """A tracked pose whose joints are as open as the modes that its track began with."""
         before = None if begun is None else begun.pose_set
-        if begun is None or before is None or self.pose_set is None or before.family_count < 2:
+        if begun is None or before is None or self.pose_set is None or before.mode_count < 2:
             return self
         values = np.concatenate(self.node_values) - np.concatenate(begun.node_values)
         joints = tuple(
             now.widened(then, float(moved))
             for now, then, moved in zip(self.pose_set.joints, before.joints, values, strict=True)
         )
-        known = replace(self.pose_set, joints=joints, family_count=before.family_count)
+        known = replace(self.pose_set, joints=joints, mode_count=before.mode_count)
         return replace(self, pose_set=known)
 
     def turned(self, tree: PoseTree, turns: Sequence[np.ndarray]) -> "PoseEstimate":
         """The same pose with full turns (k_i,) [rad] added to each node's values."""
 
-        def pose(one: PoseFamily | PoseEstimate) -> dict[str, Any]:
+        def pose(one: PoseMode | PoseEstimate) -> dict[str, Any]:
             q = np.array(one.q)
             for node, added in zip(tree.nodes, turns, strict=True):
                 # The values of a root that is turned by a RootRotation are no positions.
@@ -294,7 +294,7 @@ class PoseEstimate:
             values = tuple(np.add(*both) for both in zip(one.node_values, turns, strict=True))
             return {"q": q, "node_values": values}
 
-        def joints(one: PoseFamily | PoseSet) -> tuple[JointEstimate, ...]:
+        def joints(one: PoseMode | PoseSet) -> tuple[JointEstimate, ...]:
             return tuple(
                 replace(joint, low=joint.low + turn, high=joint.high + turn)
                 for joint, turn in zip(one.joints, np.concatenate(turns).tolist(), strict=True)
@@ -302,6 +302,6 @@ class PoseEstimate:
 
         known = self.pose_set
         if known is not None:
-            families = [replace(one, joints=joints(one), **pose(one)) for one in known.families]
-            known = replace(known, families=tuple(families), joints=joints(known))
+            modes = [replace(one, joints=joints(one), **pose(one)) for one in known.modes]
+            known = replace(known, modes=tuple(modes), joints=joints(known))
         return replace(self, pose_set=known, **pose(self))

@@ -21,7 +21,7 @@ from drake_pose.search.refinement import (
     descend,
 )
 from drake_pose.search.settings import PASSES, ExactSearchSettings
-from drake_pose.search.views_fit import FittedPose, describe_families
+from drake_pose.search.views_fit import FittedPose, describe_modes
 
 
 class ExactPose(NamedTuple):
@@ -107,7 +107,7 @@ class ExactSearch:
             steps=steps + reached.steps,
         )
 
-    def families(
+    def modes(
         self, problem: RefinementProblem, reached: ExactPose, tree: PoseTree
     ) -> tuple[ExactPose, PoseSet]:
         """The best pose, and all that are as good, of a tree with its root where it is."""
@@ -141,7 +141,7 @@ def find_intervals(
         tree: the pose tree, with its root where the body is; None: the body's.
 
     Returns:
-        The poses that are as good, the best leading the first family.
+        The poses that are as good, the best leading the first mode.
     """
     own = settings or ExactSearchSettings()
     body, kinematics = problem.body, problem.body.kinematics
@@ -172,14 +172,14 @@ def find_intervals(
             groups.append([pose])
         else:
             group.append(pose)
-    families, Js = [], []
+    modes, Js = [], []
     for group in groups:
         first = body.nearest_turns(group[0])
         poses = [body.nearest_turns(member, first)[:count] for member in group]
         ends = np.min(poses, axis=0) - margins, np.max(poses, axis=0) + margins
         if not fits:
             ends = np.full(count, -np.inf), np.full(count, np.inf)
-        families.append(FittedPose(poses[0], 0.0, *ends, len(poses)))
+        modes.append(FittedPose(poses[0], 0.0, *ends, len(poses)))
         Js.append(float(problem.J(first)))
     tolerance = own.tolerance * problem.border_length
-    return describe_families(kinematics, tree or body.tree, families, Js, tolerance, fits)
+    return describe_modes(kinematics, tree or body.tree, modes, Js, tolerance, fits)

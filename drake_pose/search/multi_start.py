@@ -39,7 +39,7 @@ from drake_pose.search.settings import (
     ExactSearchSettings,
     MultiStartSettings,
 )
-from drake_pose.search.views_fit import FittedPose, RobustFamilies, ViewsFit, distinct, refine_best
+from drake_pose.search.views_fit import FittedPose, RobustModes, ViewsFit, distinct, refine_best
 from drake_pose.silhouette.outline import Outline
 from drake_pose.workers import map_ordered
 
@@ -125,12 +125,12 @@ class MultiStartSearch:
         next, so that many of them tell little more.
 
         Args:
-            begun: the answer that the track began with. Where it had several families, they move
+            begun: the answer that the track began with. Where it had several modes, they move
                 along: a joint that it left open stays open.
         """
         _, fit, _ = self._fit(views, root_position)
         values = self._kinematics.flatten(tracked.node_values)
-        found = RobustFamilies(fit, lambda: True).around(values, tracked.J)
+        found = RobustModes(fit, lambda: True).around(values, tracked.J)
         return replace(tracked, pose_set=found).widened(begun)
 
     def _fit(
@@ -192,11 +192,11 @@ class _MultiStartRun:
             if looks_exact and (found is None or found.J > exactly):
                 found = self._refine_by_pixels(found, poses[0].values)
         begin, pose_set = time.perf_counter(), None
-        # Before the families, whose evaluations are not the search's.
+        # Before the modes, whose evaluations are not the search's.
         steps = self._fit.evaluations
         if found is not None and found.J <= exactly:
             if as_set:
-                found, pose_set = exact.families(problem, found, tree)
+                found, pose_set = exact.modes(problem, found, tree)
             values = found.parameters[:-4]
             steps += found.steps
         else:
@@ -205,7 +205,7 @@ class _MultiStartRun:
                 poses = distinct([FittedPose(by_pixels, -math.inf), *poses], len(poses))
             values = poses[0].values
             if as_set:
-                pose_set = RobustFamilies(self._fit, self._proceed).find(poses, self._J)
+                pose_set = RobustModes(self._fit, self._proceed).find(poses, self._J)
         seconds = time.perf_counter() - begin
         return PoseEstimate.of_values(
             tree,

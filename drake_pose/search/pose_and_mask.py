@@ -221,7 +221,7 @@ class PoseAndMask:
                 frame.share = min(frame.share, own.searched_share)
                 frame.chances = self._chances(level, frame)
             frame.cuts = [
-                None if picture is None else cut_by_odds(picture, chance, told)
+                None if picture is None else cut_by_foreground(picture, chance, told)
                 for picture, chance, told in zip(
                     level.pictures[k], frame.chances, ratios[k], strict=True
                 )
@@ -332,7 +332,7 @@ class PoseAndMask:
         return self._fit.fit(views, frame.values, rounds, prior, held).values
 
 
-def cut_by_odds(
+def cut_by_foreground(
     picture: Picture,
     chance: Likelihood,
     ratio: Likelihood,
@@ -343,16 +343,16 @@ def cut_by_odds(
 
     Args:
         chance: (H, W) of the object, by its pose; ``least``: where it is surely not.
-        ratio: (H, W) logarithm of the odds by its colour.
+        ratio: (H, W) log-odds by its colour.
         sure: by such log-odds a pixel is surely the object, or surely not.
     """
-    odds = np.log(chance / (1.0 - chance)) + ratio
-    labels = np.where(odds > 0.0, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
-    labels[odds > sure] = cv2.GC_FGD
-    labels[(odds < -sure) | (chance <= least)] = cv2.GC_BGD
+    foreground = np.log(chance / (1.0 - chance)) + ratio
+    labels = np.where(foreground > 0.0, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
+    labels[foreground > sure] = cv2.GC_FGD
+    labels[(foreground < -sure) | (chance <= least)] = cv2.GC_BGD
     # GrabCut's two rounds learn colours of bodies 30 pixels large; a median filter takes specks
     # away.
-    every = max(1, int(math.sqrt(np.count_nonzero(odds > 0.0)) / 30.0))
+    every = max(1, int(math.sqrt(np.count_nonzero(foreground > 0.0)) / 30.0))
     found = cut(picture, labels, 2, every)
     return np.asarray(cv2.medianBlur(found.astype(np.uint8), 5) > 0)
 

@@ -282,7 +282,7 @@ class MultiStartSettings:
 
 
 class RobustSettings(NamedTuple):
-    """Numbers of the intervals and families of damaged masks."""
+    """Numbers of the intervals and modes of damaged masks."""
 
     look: AnnealingStage = AnnealingStage(0.0125, 0.026, 2)  # Compares poses.
     follow: tuple[AnnealingStage, ...] = (  # The others follow a value that is moved.
@@ -291,7 +291,7 @@ class RobustSettings(NamedTuple):
     )
     fine: AnnealingStage = AnnealingStage(0.025, 0.0125)  # Measures errors, large ones too.
     significance: float = 1.96  # Standard deviations of the costs' difference that matter.
-    families: int = 8  # The greatest number.
+    modes: int = 8  # The greatest number.
     moved: tuple[float, float] = (math.radians(3.0), 0.01)  # Wider intervals are searched [rad, m].
     longest_steps: tuple[float, float] = (0.5, 0.1)  # Of this search [rad, m],
     growth: float = 1.6  # each step longer by this factor.

@@ -4,8 +4,8 @@ Where neither scale nor distance of a body is known, lengths in a picture are on
 silhouettes themselves: the unit of length is the root of their mean area.
 
 A covariance says how far a right pose may be off. Other optima show whether another pose fits as
-well: those as good are families of their own. Exact masks, drawn by pixels, and damaged
-masks or bodies that fit badly are treated apart (``find_intervals``, ``RobustFamilies``).
+well: those as good are modes of their own. Exact masks, drawn by pixels, and damaged
+masks or bodies that fit badly are treated apart (``find_intervals``, ``RobustModes``).
 """
 
 import itertools
@@ -42,7 +42,7 @@ from drake_pose.fit.levenberg_marquardt import AnnealingStage, StepSettings
 from drake_pose.search.estimates import (
     JointEstimate,
     PoseEstimate,
-    PoseFamily,
+    PoseMode,
     PoseSet,
     View,
     joint_estimates,
@@ -206,15 +206,15 @@ def distinct(
     return chosen
 
 
-def describe_families(
+def describe_modes(
     kinematics: TreeKinematics,
     tree: PoseTree,
-    families: Sequence[FittedPose],
+    modes: Sequence[FittedPose],
     Js: Sequence[float],
     tolerance: float,
     is_known: bool,
 ) -> PoseSet:
-    """The set of families, the best first; where it is not known, no value is determined."""
+    """The set of modes, the best first; where it is not known, no value is determined."""
 
     def joints(some: Sequence[FittedPose]) -> tuple[JointEstimate, ...]:
         # All in the turns nearest to the first one.
@@ -227,10 +227,10 @@ def describe_families(
         return joint_estimates(kinematics, low, high, (high - low <= widest) & is_known)
 
     described = tuple(
-        PoseFamily.of_values(tree, kinematics.split(one.values), J, joints([one]), one.size)
-        for one, J in zip(families, Js, strict=True)
+        PoseMode.of_values(tree, kinematics.split(one.values), J, joints([one]), one.size)
+        for one, J in zip(modes, Js, strict=True)
     )
-    return PoseSet(described, joints(families), tolerance, False, len(described))
+    return PoseSet(described, joints(modes), tolerance, False, len(described))
 
 
 def covariance_pose_set(
@@ -246,19 +246,19 @@ def covariance_pose_set(
         np.diag(covariance)
     )
     lower, upper = kinematics.reach(values)
-    family = FittedPose(
+    mode = FittedPose(
         values,
         low=np.maximum(values - widths, lower),
         high=np.minimum(values + widths, upper),
     )
-    described = describe_families(kinematics, tree, [family], [pose.J], 0.0, True)
+    described = describe_modes(kinematics, tree, [mode], [pose.J], 0.0, True)
     # The tree may hold its root elsewhere.
-    own = replace(described.families[0], q=pose.q, X_WB=pose.X_WB)
-    return replace(described, families=(own,))
+    own = replace(described.modes[0], q=pose.q, X_WB=pose.X_WB)
+    return replace(described, modes=(own,))
 
 
-class RobustFamilies:
-    """The families of one match, where parts, masks and cameras err together.
+class RobustModes:
+    """The modes of one match, where parts, masks and cameras err together.
 
     What no pose explains, such as a part that is missing in a mask, costs all poses alike and says
     nothing. A value that may go far is moved step by step, the others following, until what does
@@ -278,25 +278,25 @@ class RobustFamilies:
         look = self._settings.look
         pieces = map_ordered(lambda pose: self._fit.piece_costs(pose.values, look), poses)
         self._pieces = min(pieces, key=lambda one: float(one.sum()))
-        families: list[FittedPose] = []
+        modes: list[FittedPose] = []
         for k, (pose, one) in enumerate(zip(poses, pieces, strict=True)):
             as_good = self._is_as_good(one)
-            is_new = (as_good or k == 0) and not self._is_in(families, pose.values)
-            if is_new and self._has_room(families):
-                families.append(self._spread(pose.values))
-                self._add_flipped(families, families[-1])
-        return self._described(families, [J(one.values) for one in families])
+            is_new = (as_good or k == 0) and not self._is_in(modes, pose.values)
+            if is_new and self._has_room(modes):
+                modes.append(self._spread(pose.values))
+                self._add_flipped(modes, modes[-1])
+        return self._described(modes, [J(one.values) for one in modes])
 
     def around(self, values: np.ndarray, J: float) -> PoseSet:
         """What the silhouettes say about one pose (m,), where no other is looked for."""
         self._pieces = self._fit.piece_costs(values, self._settings.look)
         return self._described([self._spread(values, moves=False)], [J])
 
-    def _described(self, families: Sequence[FittedPose], Js: Sequence[float]) -> PoseSet:
+    def _described(self, modes: Sequence[FittedPose], Js: Sequence[float]) -> PoseSet:
         # A fit of which most does not fit can be wrong altogether: no robust estimate outlives it.
         known = float(self._pieces.sum()) <= self._fit.edge_length
         tree = self._kinematics.tree
-        return describe_families(self._kinematics, tree, families, Js, self._tolerance, known)
+        return describe_modes(self._kinematics, tree, modes, Js, self._tolerance, known)
 
     def _is_as_good(self, pieces: np.ndarray) -> bool:
         """Whether costs by pieces are not significantly above the best pose's."""
@@ -305,51 +305,51 @@ class RobustFamilies:
             self._tolerance = max(self._tolerance, float((pieces - self._pieces).sum()))
         return as_good
 
-    def _has_room(self, families: Sequence[FittedPose]) -> bool:
-        return not families or (len(families) < self._settings.families and self._proceed())
+    def _has_room(self, modes: Sequence[FittedPose]) -> bool:
+        return not modes or (len(modes) < self._settings.modes and self._proceed())
 
-    def _is_in(self, families: list[FittedPose], values: np.ndarray) -> bool:
-        """Whether some family holds a pose; it is counted there.
+    def _is_in(self, modes: list[FittedPose], values: np.ndarray) -> bool:
+        """Whether some mode holds a pose; it is counted there.
 
-        What is free in a family may be anything: that widens it.
+        What is free in a mode may be anything: that widens it.
         """
         widest = self._settings.widest(self._kinematics.is_angle)
-        for i, family in enumerate(families):
-            near = self._kinematics.nearest_turns(values, family.values)
-            outside = (near < family.low - 1e-9) | (near > family.high + 1e-9)
-            if not np.any(outside & (family.high - family.low <= widest)):
-                low, high = np.minimum(family.low, near), np.maximum(family.high, near)
-                families[i] = family._replace(low=low, high=high, size=family.size + 1)
+        for i, mode in enumerate(modes):
+            near = self._kinematics.nearest_turns(values, mode.values)
+            outside = (near < mode.low - 1e-9) | (near > mode.high + 1e-9)
+            if not np.any(outside & (mode.high - mode.low <= widest)):
+                low, high = np.minimum(mode.low, near), np.maximum(mode.high, near)
+                modes[i] = mode._replace(low=low, high=high, size=mode.size + 1)
                 return True
         return False
 
-    def _add_flipped(self, families: list[FittedPose], family: FittedPose) -> None:
-        """Add what flips make of a family, as far as it fits: intervals flip as middles do."""
+    def _add_flipped(self, modes: list[FittedPose], mode: FittedPose) -> None:
+        """Add what flips make of a mode, as far as it fits: intervals flip as middles do."""
         kinematics, look = self._kinematics, self._settings.look
 
         def settle(flip: Flip) -> tuple[np.ndarray, np.ndarray]:
             seen = self._fit.refine(flip.values, (look,)).values
             return seen, self._fit.piece_costs(seen, look)
 
-        others = flips(kinematics, family.values) if self._has_room(families) else []
+        others = flips(kinematics, mode.values) if self._has_room(modes) else []
         for flip, (seen, pieces) in zip(others, map_ordered(settle, others), strict=True):
-            if not self._has_room(families):
+            if not self._has_room(modes):
                 return
-            if not self._is_as_good(pieces) or self._is_in(families, seen):
+            if not self._is_as_good(pieces) or self._is_in(modes, seen):
                 continue
             values = kinematics.nearest_turns(seen)
-            below, above = family.values - family.low, family.high - family.values
-            lower, upper = kinematics.reach(family.values)
+            below, above = mode.values - mode.low, mode.high - mode.values
+            lower, upper = kinematics.reach(mode.values)
             # Where a limit ended the interval, the flipped one may go further.
-            below = np.where(flip.changed & (family.low <= lower + 1e-9), math.inf, below)
-            above = np.where(flip.changed & (family.high >= upper - 1e-9), math.inf, above)
+            below = np.where(flip.changed & (mode.low <= lower + 1e-9), math.inf, below)
+            above = np.where(flip.changed & (mode.high >= upper - 1e-9), math.inf, above)
             swapped = np.where(flip.mirrored, [above, below], [below, above])
             lower, upper = kinematics.reach(values)
             low, high = (
                 np.maximum(values - swapped[0], lower),
                 np.minimum(values + swapped[1], upper),
             )
-            families.append(FittedPose(values, low=low, high=high))
+            modes.append(FittedPose(values, low=low, high=high))
 
     def _spread(self, values: np.ndarray, moves: bool = True) -> FittedPose:
         """What the values (m,) may be about a pose; unless it moves them, by covariance alone."""

@@ -14,7 +14,7 @@ from drake_pose.arrays import Array
 from drake_pose.camera.models import Camera, camera_tuple
 from drake_pose.errors import SettingsError
 from drake_pose.filtering.contour_tracker import TrackingSettings
-from drake_pose.filtering.match_and_track import Followed, MatchAndTrack
+from drake_pose.filtering.match_and_track import MatchAndTrack, TrackerState
 from drake_pose.search import TRACKED, PoseEstimate, PoseSearch, View
 from drake_pose.silhouette.pictures.label_images import label_image_to_mask
 from drake_pose.systems.bodies import body_poses
@@ -56,7 +56,7 @@ class SilhouetteMatcher(BeliefSystem[Matched]):
         name: SilhouetteMatcher
         input_ports: [label_image, root_position (optional)]
         output_ports: [estimated_positions, error, base_pose, body_poses, statistics,
-          proved_optimal, determined, lower, upper, family_positions, pose_estimate]
+          proved_optimal, determined, lower, upper, mode_positions, pose_estimate]
 
     With several cameras the input ports are ``label_image_<camera>``; an unconnected one, or an
     image without any pixel of the body, is left out of the match. See ``labels``
@@ -71,7 +71,7 @@ class SilhouetteMatcher(BeliefSystem[Matched]):
     What the answer is worth: ``proved_optimal`` is 1 where it is proved that no pose of the grid
     that was searched fits better. ``determined`` is 1 for each position that the silhouettes
     determine, 0 for one that is free; ``lower`` and ``upper`` are the ends of its interval, or of
-    the range seen. ``family_positions`` are the positions of the families that look the same, best
+    the range seen. ``mode_positions`` are the positions of the modes that look the same, best
     first, one after another. All are NaN where the search does not say, as one without examination.
 
     Args:
@@ -80,11 +80,11 @@ class SilhouetteMatcher(BeliefSystem[Matched]):
         labels: the labels that belong to the body; None: those of its model where that was made of
             a plant (``ArticulatedModel.from_plant``), else all but Drake's reserved ones. A
             frozenset, or None, is abstract parameter 0 of the context, where it can be varied.
-        family_limit: how many families are given out at most.
+        mode_limit: how many modes are given out at most.
 
     Raises:
         SettingsError: if there is no search or no camera, two cameras share a name, the period is
-            not positive, or the family limit is below 1.
+            not positive, or the mode limit is below 1.
     """
 
     _first_memory: Any = None
@@ -96,7 +96,7 @@ class SilhouetteMatcher(BeliefSystem[Matched]):
         cameras: Sequence[Camera] | Mapping[str, Camera],
         period: float,
         labels: Collection[int] | None = None,
-        family_limit: int = 4,
+        mode_limit: int = 4,
     ) -> None:
         super().__init__()
         if not hasattr(search, "match"):
@@ -106,9 +106,9 @@ class SilhouetteMatcher(BeliefSystem[Matched]):
         cameras = camera_tuple(cameras)
         require_different(cameras, 1, "a matcher needs one or more cameras of different names")
         require_period("matcher", period)
-        if family_limit < 1:
-            raise SettingsError(f"the family limit must be 1 or more, not {family_limit}")
-        self._search, self._cameras, self._family_limit = search, cameras, family_limit
+        if mode_limit < 1:
+            raise SettingsError(f"the mode limit must be 1 or more, not {mode_limit}")
+        self._search, self._cameras, self._mode_limit = search, cameras, mode_limit
         labels = search.tree.model.labels if labels is None else labels
         self._labels = self.add_parameter(None if labels is None else frozenset(labels))
         known = {camera.name: camera for camera in cameras}
@@ -132,7 +132,7 @@ class SilhouetteMatcher(BeliefSystem[Matched]):
         )
         self.show("pose_estimate", None, lambda known: known.estimate)
         sizes = {"proved_optimal": 1, "determined": nq, "lower": nq, "upper": nq}
-        for name, size in (sizes | {"family_positions": self._family_limit * nq}).items():
+        for name, size in (sizes | {"mode_positions": self._mode_limit * nq}).items():
 
             def worth(known: Matched, name: str = name, size: int = size) -> Array:
                 return self._worth(known.estimate).get(name, np.full(size, np.nan))
@@ -170,16 +170,16 @@ class SilhouetteMatcher(BeliefSystem[Matched]):
         if estimate is None or not estimate.found or estimate.pose_set is None:
             return {}
         names = self._search.tree.model.position_names
-        families = np.full((self._family_limit, len(names)), np.nan)
-        found = [family.q for family in estimate.pose_set.families[: self._family_limit]]
-        families[: len(found)] = found
+        modes = np.full((self._mode_limit, len(names)), np.nan)
+        found = [mode.q for mode in estimate.pose_set.modes[: self._mode_limit]]
+        modes[: len(found)] = found
         determined, lower, upper = estimate.pose_set.position_intervals(self._search.tree)
         return {
             "proved_optimal": np.array([float(estimate.proved_optimal)]),
             "determined": determined,
             "lower": lower,
             "upper": upper,
-            "family_positions": families.ravel(),
+            "mode_positions": modes.ravel(),
         }
 
 
@@ -202,7 +202,7 @@ TRACK = ("tracked", "matches", "distance")
 class _Memory(NamedTuple):
     """What the next update begins with: what is followed, TRACK, and the last update's time [s]."""
 
-    followed: Followed
+    followed: TrackerState
     track: tuple[float, float, float]
     time: float
 
@@ -216,7 +216,7 @@ class SilhouetteTracker(SilhouetteMatcher):
         input_ports: [label_image, root_position (optional), measured_positions (optional),
           first_positions (optional), color_image (where asked for)]
         output_ports: [estimated_positions, error, base_pose, body_poses, statistics,
-          proved_optimal, determined, lower, upper, family_positions, pose_estimate,
+          proved_optimal, determined, lower, upper, mode_positions, pose_estimate,
           position_deviations, estimated_state, track]
 
     The ports are those of ``SilhouetteMatcher``, which it can replace in any diagram, and:
@@ -258,7 +258,7 @@ class SilhouetteTracker(SilhouetteMatcher):
         UnknownNameError: a name of ``color_cameras`` is no camera's.
     """
 
-    _first_memory = _Memory(Followed(), (0.0, 0.0, 0.0), -np.inf)
+    _first_memory = _Memory(TrackerState(), (0.0, 0.0, 0.0), -np.inf)
 
     def __init__(
         self,

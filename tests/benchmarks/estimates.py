@@ -167,7 +167,7 @@ def _hand_rows(data: Path) -> Iterator[tuple[str, ...]]:
                 low, high = (known.get(name, {}).get(end, np.nan) for end in ("low", "high"))
                 inside.append(low <= true[name] <= high)
                 widths.append(high - low)
-        counts = [one.family_count or 1 for one in found.records.values()]
+        counts = [one.mode_count or 1 for one in found.records.values()]
         yield (
             scene.name,
             f"{np.median(off):.1f} ({np.mean(off):.1f})",

@@ -29,7 +29,7 @@ from drake_pose.fit.parameters import lengthened_joints
 from drake_pose.jobs.estimate.inputs import make_tree
 from drake_pose.jobs.registration.inputs import read_inputs
 from drake_pose.jobs.registration.settings import RegistrationSettings
-from drake_pose.registration.joint_zeros import links_with_length
+from drake_pose.registration.joint_offsets import links_with_length
 from drake_pose.registration.posed_frames import PosedFrame, PosedFrames
 from drake_pose.registration.register import CameraSearch, RegistrationBody, areas
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer

@@ -8,11 +8,11 @@ from drake_pose.fit.background import (
     Explained,
     KnownBackground,
     explain,
+    foreground_of_colours,
+    foreground_picture,
     in_light,
     light_between,
-    mask_of_odds,
-    odds_of_colours,
-    odds_picture,
+    mask_of_foreground,
 )
 from drake_pose.fit.colours import COLOURS, Colour
 from drake_pose.silhouette.outline import pack
@@ -85,7 +85,7 @@ def test_light_is_told_whatever_else_changes():
 
 
 def test_odds_show_the_body_and_the_background_behind_it(episode):
-    """The background is told where a frame shows it; and odds are for the body where it is."""
+    """The background is told where a frame shows it; and log-odds are for the body where it is."""
     covered, _ = drawn(episode, episode.camera.X_CW)
     backgrounds = Backgrounds.of(episode.pictures)
     showing = backgrounds.showing(covered)
@@ -95,17 +95,17 @@ def test_odds_show_the_body_and_the_background_behind_it(episode):
     seen = ~known.unseen
     assert np.median(np.abs(known.colours - episode.background).max(axis=-1)[seen]) < 6.0
     for picture, light, mask in zip(episode.pictures, backgrounds.lights, covered, strict=True):
-        odds = known.odds(picture, light)
-        assert ((odds > 0.0) == mask)[seen].mean() > 0.97
-        found = mask_of_odds(odds, mask)
+        foreground = known.foreground(picture, light)
+        assert ((foreground > 0.0) == mask)[seen].mean() > 0.97
+        found = mask_of_foreground(foreground, mask)
         assert (found & mask).sum() / (found | mask).sum() > 0.85
 
 
 def test_odds_pictures_are_read_as_they_were_written():
-    odds = np.linspace(-9.0, 9.0, 120, dtype=np.float32).reshape(10, 12)
-    picture = odds_picture(odds)
+    foreground = np.linspace(-9.0, 9.0, 120, dtype=np.float32).reshape(10, 12)
+    picture = foreground_picture(foreground)
     red, green, blue = np.moveaxis(picture.astype(np.intp) >> 4, -1, 0)
-    table = odds_of_colours(2)
+    table = foreground_of_colours(2)
     assert table.shape == (2, 3, COLOURS)
-    read = np.log(table[1, Colour.ODDS][(red * 16 + green) * 16 + blue])
-    np.testing.assert_allclose(read, np.clip(odds, -8.0, 8.0), atol=0.01)
+    read = np.log(table[1, Colour.FOREGROUND][(red * 16 + green) * 16 + blue])
+    np.testing.assert_allclose(read, np.clip(foreground, -8.0, 8.0), atol=0.01)

@@ -11,7 +11,7 @@ from drake_pose.body import TriangleMesh
 from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.camera.models import ParallelCamera, PinholeCamera, circle_of_cameras
 from drake_pose.errors import SettingsError, UnknownNameError
-from drake_pose.fit.background import odds_picture
+from drake_pose.fit.background import foreground_picture
 from drake_pose.fit.evidence import NO_EDGE, Observation, find_edge_points, pack_evidence
 from drake_pose.fit.levenberg_marquardt import AnnealingStage, Equations, LinearPrior
 from drake_pose.fit.parameters import BodyParameters, CameraParameters
@@ -109,8 +109,8 @@ def test_odds_of_pixels_draw_contours_as_masks_do(body, rig):
     stages = [AnnealingStage(scale, 0.02, 4) for scale in (0.03, 0.01, 0.005)]
     for grown in (0, 2):
         wide = cv2.dilate(mask.view(np.uint8), np.ones((2 * grown + 1,) * 2, np.uint8))
-        odds = odds_picture(np.where(wide > 0, 5.0, -5.0).astype(np.float32))
-        seen = [Observation(pack_evidence([NO_EDGE]), truth, (odds,))]
+        foreground = foreground_picture(np.where(wide > 0, 5.0, -5.0).astype(np.float32))
+        seen = [Observation(pack_evidence([NO_EDGE]), truth, (foreground,))]
         problem = Problem(body, [camera], [Unknowns(names, shared=True)])
         found = problem.solve(seen, stages, (nothing, off)).shared
         np.testing.assert_allclose(found[:2], 0.0, atol=0.004)
@@ -201,9 +201,11 @@ def test_cameras_stand_where_the_last_parameters_asked_for_say(body, rig):
 
 def test_what_is_known_without_pictures_counts_once(body, rig):
     """Of each frame's own unknowns in each, of the shared ones in all together."""
-    names, girths = BENT[:2], body.names[-2:]
+    names, radius_scales = BENT[:2], body.names[-2:]
     known, free = (
-        Problem(body, rig, [Unknowns(names, deviation=a), Unknowns(girths, True, deviation=b)])
+        Problem(
+            body, rig, [Unknowns(names, deviation=a), Unknowns(radius_scales, True, deviation=b)]
+        )
         for a, b in ((0.5, 0.25), (np.inf, np.inf))
     )
     held = poses(body, 3, 8)

@@ -82,7 +82,7 @@ def test_chunks_put_together_are_the_result_of_the_whole_scene(jobs, alone, scen
         scenes / "stills", scenes / "crane.urdf", plain, jobs[0].settings, replay=False,
         overlay=False,
     )  # fmt: skip
-    for file in ("joints.csv", "families.csv"):
+    for file in ("joints.csv", "modes.csv"):
         assert (plain / file).exists() == (alone / "stills" / file).exists()
     assert rows(plain) == rows(alone / "stills")
     summary = json.loads((alone / "motion" / "summary.json").read_text())

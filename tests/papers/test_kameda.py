@@ -117,11 +117,11 @@ def test_pictures_are_written(result, beam_result, tmp_path):
     names = {file.name for file in files}
     assert {"figure_11_runs_of_step_3.png", "figure_12_chest_candidates.png"} < names
     assert ("figure_12_not_matched.png" in names) == (not result.trials[0].exact)
-    several = [one for one in beam_result.trials if one.result.pose_set.family_count > 1][:1]
+    several = [one for one in beam_result.trials if one.result.pose_set.mode_count > 1][:1]
     few = replace(beam_result, trials=(*beam_result.trials[:1], *several))
     names = {file.name for file in save_pictures(few, tmp_path / "beam")}
     assert "figure_11_milliseconds.png" in names
-    assert ("families_1.png" in names) == bool(several)
+    assert ("modes_1.png" in names) == bool(several)
 
 
 def at(search, **degrees):

@@ -8,7 +8,7 @@ from drake_pose.errors import UnknownNameError
 from drake_pose.person.shape import KnownShape, shape_parts, shape_values, tracker_of_person
 
 
-def test_a_person_of_known_lengths_and_girths(shaped_person: ArticulatedModel) -> None:
+def test_a_person_of_known_lengths_and_radius_scales(shaped_person: ArticulatedModel) -> None:
     tree = shaped_person.pose_tree()
     names = np.array([name for node in tree.nodes for name in node.value_names])
     held = shape_values(tree)

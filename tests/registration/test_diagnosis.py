@@ -164,7 +164,7 @@ class TestAuditFrames:
     ) -> None:
         found = diagnose_frames(*right(1))
         assert (found.contradicting, found.common) == ((), ())
-        least = found.noticed_from
+        least = found.minimum_detectable
         assert least.keys() == {*TreeKinematics(body.tree).names}
         assert 0.0 < least["elbow_turn"] < np.radians(1.0)
         by = 1.2 * np.degrees(least["elbow_turn"])

@@ -20,7 +20,7 @@ from drake_pose.fit.evidence import Observation
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.fit.parameters import BodyParameters
 from drake_pose.fit.problem import parameter_names
-from drake_pose.registration.joint_zeros import (
+from drake_pose.registration.joint_offsets import (
     as_the_cost_bends,
     describe_constants,
     drawn_together,
@@ -488,14 +488,14 @@ def test_a_bundle_finds_poses_and_a_camera_together(body: RegistrationBody) -> N
     X_WC[:3, 3] += [0.02, -0.02, 0.02]
     given = [cameras[0], cameras[1].with_pose(X_WC)]
     nothing = np.zeros(len(kinematics.names), bool)
-    (camera,), (covariance,), values, girths = adjust_bundle(
+    (camera,), (covariance,), values, radius_scales = adjust_bundle(
         kinematics, body.few, given, ("b",), frames, nothing, telling_frames=1
     )
     shift, turn = errors(camera.X_WC, cameras[1].X_WC)
     assert shift < 0.012
     assert turn < np.radians(0.4)
     assert np.abs(values - true).max() < 0.03
-    np.testing.assert_array_equal(girths, 1.0)
+    np.testing.assert_array_equal(radius_scales, 1.0)
     off = pose_difference(camera.X_WC, cameras[1].X_WC)
     assert off @ np.linalg.solve(covariance, off) < 22.5
 

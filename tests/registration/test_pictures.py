@@ -300,7 +300,7 @@ def test_a_clock_is_fitted_with_a_camera_and_told_as_surely_as_it_is(registered,
     assert clock.deviation < 0.003
     assert clock.drift == 0.0
     assert all(one.agrees for one in registered.found.frames)
-    # Masks and odds are those of the joints' values before the last step.
+    # Masks and log-odds are those of the joints' values before the last step.
     values = episode.values_at(episode.times[::3] + LATE - 0.01)
     np.testing.assert_allclose([one.values for one in registered.frames], values)
     np.testing.assert_array_equal(registered.pictures["0003"], episode.pictures[3])
@@ -328,7 +328,7 @@ def test_pictures_are_judged_by_where_the_others_show_a_body(registered, episode
     expected = {f"{k:04d}": row - zeros for k, row in enumerate(episode.values)}
     for frame in frames:
         np.testing.assert_allclose(frame.values, expected[frame.name], atol=0.01)
-        assert frame.odds is None
+        assert frame.foreground is None
     # Nothing is asked of pictures that should not show it.
     away = np.eye(4)
     away[:3, :3] = np.diag([-1.0, 1.0, -1.0])

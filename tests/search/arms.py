@@ -76,10 +76,10 @@ def draw_view(
 
 
 def is_held(answer: PoseSet, values: np.ndarray) -> bool:
-    """Whether some one family's intervals hold all of a pose's values (m,)."""
+    """Whether some one mode's intervals hold all of a pose's values (m,)."""
     return any(
-        all(joint.holds(float(v)) for joint, v in zip(family.joints, values, strict=True))
-        for family in answer.families
+        all(joint.holds(float(v)) for joint, v in zip(mode.joints, values, strict=True))
+        for mode in answer.modes
     )
 
 

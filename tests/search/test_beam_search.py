@@ -119,11 +119,11 @@ def test_a_limit_still_answers_and_says_so(maker):
         (Stage, {"hypotheses": 1, "outside_share": -0.1}),
         (Stage, {"hypotheses": 1, "outside_weight": 0}),
         (ExaminationSettings, {"tolerance": -1.0}),
-        (ExaminationSettings, {"families": 0}),
+        (ExaminationSettings, {"modes": 0}),
         (ExaminationSettings, {"proof_poses": 0}),
         (ExaminationSettings, {"memory": 0}),
         (ExaminationSettings, {"proof_time_limit": -1.0}),
-        (ExaminationSettings, {"family_time_limit": float("nan")}),
+        (ExaminationSettings, {"mode_time_limit": float("nan")}),
         (ExaminationSettings, {"proof_time_limit": float("inf")}),
     ],
 )
@@ -178,7 +178,7 @@ def search_of(maker, examination):
 
 
 def test_what_is_proved_is_the_best_of_the_grid(maker):
-    examined = search_of(maker, ExaminationSettings(proof_poses=10**6, family_poses=10**6))
+    examined = search_of(maker, ExaminationSettings(proof_poses=10**6, mode_poses=10**6))
     generator = np.random.default_rng(5)
     for noise, views in itertools.product((0.0, 0.003, 0.01, 0.03), (1, 2)):
         problem = maker.make(generator, views=views, noise=noise, on_grid=noise == 0.0)
@@ -242,7 +242,7 @@ def test_a_limit_leaves_a_true_bound_and_no_false_proof(maker, limit):
         start = int(np.argsort(problem.Js)[number])
         values = search.sampled.values_at(problem.choices[start])
         found = replace(search.match(problem.views), node_values=values, J=float(problem.Js[start]))
-        settings = ExaminationSettings(family_poses=1, **limit)
+        settings = ExaminationSettings(mode_poses=1, **limit)
         proof = examine(search.body, problem.views, found, settings)
         assert proof.lower_bound <= problem.best[1] <= proof.J <= found.J
         assert proof.J in problem.Js

@@ -16,7 +16,7 @@ from drake_pose.search import (
     JointEstimate,
     MultiStartSearch,
     PoseEstimate,
-    PoseFamily,
+    PoseMode,
     PoseSet,
     View,
     covariance_pose_set,
@@ -69,25 +69,25 @@ def test_a_widened_interval_holds_what_either_held(around):
     )
 
 
-def estimate(tree, values, families):
-    """A pose with intervals of 0.1 about its values, one of so many families."""
+def estimate(tree, values, modes):
+    """A pose with intervals of 0.1 about its values, one of so many modes."""
     kinematics = TreeKinematics(tree)
     own = kinematics.split(np.array(values))
     joints = tuple(
         JointEstimate(name, True, value - 0.1, value + 0.1)
         for name, value in zip(kinematics.names, values, strict=True)
     )
-    family = PoseFamily.of_values(tree, own, 7.0, joints, 1.0)
-    known = PoseSet((family,), joints, 0.0, False, families)
+    mode = PoseMode.of_values(tree, own, 7.0, joints, 1.0)
+    known = PoseSet((mode,), joints, 0.0, False, modes)
     return PoseEstimate.of_values(tree, own, 7.0, 100.0, stopped_by="end", pose_set=known)
 
 
-def test_a_track_is_as_open_as_the_families_that_it_began_with(tree):
+def test_a_track_is_as_open_as_the_modes_that_it_began_with(tree):
     now, begun = estimate(tree, [0.5, 0.2], 1), estimate(tree, [0.3, 0.3], 2)
     wide = [replace(one, low=one.low - 1.0) for one in begun.pose_set.joints]
     begun = replace(begun, pose_set=replace(begun.pose_set, joints=tuple(wide)))
     widened = now.widened(begun).pose_set
-    assert widened.family_count == 2
+    assert widened.mode_count == 2
     ends = [(one.low, one.high) for one in widened.joints]
     # By 0.2 and -0.1 both have moved since.
     np.testing.assert_allclose(ends, [(-0.6, 0.6), (-0.9, 0.3)])
@@ -104,15 +104,15 @@ def test_full_turns_leave_a_pose_where_it_is(tree):
     ]
     by = np.concatenate(turns)
     turned = pose.turned(tree, turns)
-    (family,) = turned.pose_set.families
-    for one in (turned, family):
+    (mode,) = turned.pose_set.modes
+    for one in (turned, mode):
         np.testing.assert_allclose(np.concatenate(one.node_values), by + np.array([0.5, 0.2]))
         q, X_WB = tree.positions_from(one.node_values)
         np.testing.assert_allclose(one.q, q)
         np.testing.assert_allclose(one.X_WB, X_WB)
     before, after = (tree.node_poses(list(one.node_values)) for one in (pose, turned))
     np.testing.assert_allclose(after, before, atol=1e-12)
-    for joints in (turned.pose_set.joints, family.joints):
+    for joints in (turned.pose_set.joints, mode.joints):
         np.testing.assert_allclose([one.low for one in joints], by + np.array([0.4, 0.1]))
         np.testing.assert_allclose([one.high for one in joints], by + np.array([0.6, 0.3]))
 
@@ -129,8 +129,8 @@ def test_a_covariance_is_told_as_intervals_inside_the_limits(tree):
         widths = student.ppf(0.975, 6 * count) * deviations
         ends = [(joint.low, joint.high) for joint in told.joints]
         np.testing.assert_allclose(ends, np.array([[0.5], [0.2]]) + widths[:, None] * [-1, 1])
-        np.testing.assert_array_equal(told.families[0].q, [7.0, 8.0])
-        assert told.families[0].J == 7.0
+        np.testing.assert_array_equal(told.modes[0].q, [7.0, 8.0])
+        assert told.modes[0].J == 7.0
     wide = covariance_pose_set(tree, pose, 100.0 * np.eye(2), 1)
     lower, upper = kinematics.reach(np.array([0.5, 0.2]))
     np.testing.assert_allclose([joint.low for joint in wide.joints], lower)
@@ -152,10 +152,10 @@ def test_drakes_pictures_are_answered_in_the_turn_about_the_default(model, truth
     # A pixel is about a degree of the jib.
     assert np.abs(errors).max() < 2.0
     answer = result.pose_set
-    keys = [tuple(np.round(np.degrees(one.q) % 360.0, 1)) for one in answer.families]
+    keys = [tuple(np.round(np.degrees(one.q) % 360.0, 1)) for one in answer.modes]
     assert len(set(keys)) == len(keys)
-    for family in answer.families:
-        for joint, value in zip(family.joints, np.concatenate(family.node_values), strict=True):
+    for mode in answer.modes:
+        for joint, value in zip(mode.joints, np.concatenate(mode.node_values), strict=True):
             assert joint.low <= value <= joint.high
             assert joint.high - joint.low <= 2 * math.pi + 1e-9
     swing = answer.joints[0]
@@ -165,13 +165,13 @@ def test_drakes_pictures_are_answered_in_the_turn_about_the_default(model, truth
     assert not swing.holds(math.radians(truth[0] + 90.0))
 
 
-def test_directions_on_both_sides_of_half_a_turn_are_one_family(model):
+def test_directions_on_both_sides_of_half_a_turn_are_one_mode(model):
     """A pose on the grid at 180 degrees, with room for its neighbours at 160 and -160."""
     search = BeamSearch(model.pose_tree(), None, ExaminationSettings(tolerance=400.0))
     result = search.match(views_of(model, np.radians([180.0, 0.0])))
     np.testing.assert_allclose(np.degrees(np.abs(result.q)), [180.0, 0.0], atol=1e-6)
-    first = result.pose_set.families[0].joints[0]
+    first = result.pose_set.modes[0].joints[0]
     # Values rise without a gap through half a turn, and the answer is amidst.
     ends = np.degrees(np.array([first.low, first.high]) - result.q[0])
     np.testing.assert_allclose(ends, [-20.0, 20.0], atol=1e-6)
-    assert result.pose_set.family_count == 1
+    assert result.pose_set.mode_count == 1

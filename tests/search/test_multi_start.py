@@ -85,8 +85,8 @@ def test_an_exact_pose_is_found_by_pixels_and_said_to_be_known(tree, search, pos
     assert worst_place(tree, result, pose) < 0.005
     answer = result.pose_set
     assert is_held(answer, pose)
-    np.testing.assert_array_equal(answer.families[0].q, result.q)
-    assert answer.families[0].J == result.J
+    np.testing.assert_array_equal(answer.modes[0].q, result.q)
+    assert answer.modes[0].J == result.J
     assert sum(answer.determined) >= 4
     plain = search.without_alternatives().match(views)
     assert plain.pose_set is None
@@ -111,17 +111,17 @@ def test_poses_between_the_samples_are_found(chain):
     assert np.mean(inside) > 0.85
 
 
-def test_families_are_as_good_as_the_best(chain):
+def test_modes_are_as_good_as_the_best(chain):
     found = chain.match(
         [chain_view(chain.tree, chain_values(chain.tree, np.random.default_rng(10)))]
     )
-    families = found.pose_set.families
-    assert families[0].J == found.J
-    assert found.pose_set.family_count == len(families)
-    for family in families:
-        assert family.J <= found.J + found.pose_set.tolerance
-        np.testing.assert_allclose(family.q, chain.tree.positions_from(family.node_values)[0])
-        assert family.joints[0].holds(family.node_values[0][0])
+    modes = found.pose_set.modes
+    assert modes[0].J == found.J
+    assert found.pose_set.mode_count == len(modes)
+    for mode in modes:
+        assert mode.J <= found.J + found.pose_set.tolerance
+        np.testing.assert_allclose(mode.q, chain.tree.positions_from(mode.node_values)[0])
+        assert mode.joints[0].holds(mode.node_values[0][0])
 
 
 def test_nothing_is_determined_where_the_body_does_not_fit(chain):
@@ -153,8 +153,8 @@ def test_damaged_and_ill_fitting_arms(tree, search):
         result = search.match(damaged_views(tree, values, seed))
         places.append(worst_place(tree, result, values))
         shares = [
-            np.mean([one.holds(v) for one, v in zip(family.joints, values, strict=True)])
-            for family in result.pose_set.families
+            np.mean([one.holds(v) for one, v in zip(mode.joints, values, strict=True)])
+            for mode in result.pose_set.modes
         ]
         held.append(max(shares))
     # Flips leave the hand where it is, but not what is between.

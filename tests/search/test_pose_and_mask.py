@@ -7,7 +7,12 @@ import numpy as np
 import pytest
 
 from drake_pose.search import PoseAndMask, PoseAndMaskSettings
-from drake_pose.search.pose_and_mask import PictureLevel, cut_by_odds, follow_colours, narrowed
+from drake_pose.search.pose_and_mask import (
+    PictureLevel,
+    cut_by_foreground,
+    follow_colours,
+    narrowed,
+)
 from drake_pose.silhouette.pictures.masks import intersection_over_union
 from drake_pose.silhouette.scoring import draw_mask
 from tests.registration.episodes import painted_episode
@@ -69,14 +74,14 @@ def test_a_cut_is_sure_where_odds_are_and_follows_colours_elsewhere():
     object_ = picture[..., 0] > 100
     blurred = cv2.GaussianBlur(object_.astype(np.float32), (0, 0), 4.0)
     chance = np.clip(blurred, 0.02, 0.98)
-    found = cut_by_odds(picture, chance, np.zeros_like(chance))
+    found = cut_by_foreground(picture, chance, np.zeros_like(chance))
     assert intersection_over_union(found, object_) > 0.97
     ratio = np.where(np.arange(80) < 40, 9.0, -9.0) * np.ones((60, 1))
     np.testing.assert_array_equal(
-        cut_by_odds(picture, np.full_like(chance, 0.5), ratio)[5:-5], ratio[5:-5] > 0.0
+        cut_by_foreground(picture, np.full_like(chance, 0.5), ratio)[5:-5], ratio[5:-5] > 0.0
     )
     # What a pose rules out is nowhere.
-    assert not cut_by_odds(picture, np.full_like(chance, 0.01), ratio).any()
+    assert not cut_by_foreground(picture, np.full_like(chance, 0.01), ratio).any()
 
 
 @pytest.mark.parametrize(

@@ -262,10 +262,10 @@ def test_intervals_hold_the_truth_and_say_what_is_free(body, search):
         others = [pose for pose in others if problem.J(pose) <= problem.J(refined) + 20.0]
         intervals = find_intervals(problem, others, refined)
         assert len(intervals.joints) == len(true) - 4
-        first = np.concatenate(intervals.families[0].node_values)
+        first = np.concatenate(intervals.modes[0].node_values)
         np.testing.assert_allclose(first, refined[:-4], atol=1e-12)
-        for family in intervals.families:
-            assert family.J <= problem.J(refined) + intervals.tolerance
+        for mode in intervals.modes:
+            assert mode.J <= problem.J(refined) + intervals.tolerance
         for j, joint in enumerate(intervals.joints):
             if joint.determined and body.upper[j] > body.lower[j]:
                 claimed += 1

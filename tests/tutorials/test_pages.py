@@ -96,7 +96,7 @@ def test_the_readme_s_command_runs_as_pasted(
     result = run_command(words[1:])
     assert result.exit_code == 0, result.output
     out = tmp_path / words[words.index("--out") + 1]
-    for file in ("report.html", "poses.csv", "joints.csv", "families.csv"):
+    for file in ("report.html", "poses.csv", "joints.csv", "modes.csv"):
         assert file in TEXTS["README.md"]
         assert (out / file).is_file()
 

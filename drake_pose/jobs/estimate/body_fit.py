@@ -25,7 +25,7 @@ from drake_pose.filtering.contour_tracker import (
 from drake_pose.filtering.match_and_track import make_tracker
 from drake_pose.filtering.sequence_fit import (
     SEQUENCE,
-    FollowedStart,
+    TrackedStart,
     find_start,
     fit_sequence,
     pose_set,
@@ -144,7 +144,7 @@ class _BodyFit:
         )  # fmt: skip
         return inputs, self._more, shapes
 
-    def _fit(self, tracker: ContourTracker, starts: Sequence[FollowedStart]) -> _Fitted | None:
+    def _fit(self, tracker: ContourTracker, starts: Sequence[TrackedStart]) -> _Fitted | None:
         """The sequence fitted as a whole; None where that explains it no better."""
         explanations = fit_sequence(
             tracker, self._masks, [start.states for start in starts], self._period

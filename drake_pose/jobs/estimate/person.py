@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from drake_pose.arrays import Array, Mask
 from drake_pose.body import landmark_positions, load_landmarks
 from drake_pose.errors import MaskError, SceneError
-from drake_pose.files.records import FrameRecord, record_families
+from drake_pose.files.records import FrameRecord, record_modes
 from drake_pose.files.writer import Drawn, OnStage, ResultWriter
 from drake_pose.jobs.estimate.inputs import EstimateInputs, draw_parts
 from drake_pose.person.camera_faults import CameraFault
@@ -71,7 +71,7 @@ def follow_person(
     result.begin()
     if captured.shape is not None:
         known = captured.shape.known
-        result.more |= {"lengths_m": known.lengths, "girths": known.girths}
+        result.more |= {"lengths_m": known.lengths, "radius_scales": known.radius_scales}
 
     def finished() -> Iterator[tuple[FrameRecord, Drawn]]:
         values = [captured.tree.values_from_positions(q) for q in captured.q]
@@ -172,7 +172,7 @@ def _finish(
     seconds: float,
     overlay: bool,
 ) -> tuple[FrameRecord, Drawn]:
-    """A frame with the captured person, of the girth that was found, the nodes at X_WN.
+    """A frame with the captured person, of the radius scale that was found, the nodes at X_WN.
 
     Args:
         X_WN: (nodes, 4, 4).
@@ -196,7 +196,7 @@ def _finish(
         wrong = sum(map(edge_area, bodies)) * distance
     pose = PoseEstimate(found, q, np.eye(4), (), wrong, area, stopped_by=FOLLOWED, seconds=seconds)
     answers = ((q, captured.deviations[index]), *captured.rivals.get(index, ()))
-    known = record_families(inputs.model, answers if found else answers[:1])
+    known = record_modes(inputs.model, answers if found else answers[:1])
     return inputs.finish(
         frame, pose, masks, parts, shown, share=float(captured.shares[index]), **known
     )
@@ -269,8 +269,8 @@ def describe_rivals(captured: PersonCapture, frames: Sequence[str]) -> tuple[str
             off = np.linalg.norm(np.subtract(here, there), axis=1)
             far = [name for name, one in zip(marks, off, strict=True) if one > 0.5 * off.max()]
             found.append(
-                f"frame {frames[k]}: another pose explains the silhouettes as well (family "
-                f"{number} in families.csv): {', '.join(far)} up to {1e3 * off.max():.0f} mm "
+                f"frame {frames[k]}: another pose explains the silhouettes as well (mode "
+                f"{number} in modes.csv): {', '.join(far)} up to {1e3 * off.max():.0f} mm "
                 "elsewhere; look at the overlays, or add a camera"
             )
     return tuple(found)

@@ -121,7 +121,7 @@ def capture_live(
         writer = ResultWriter(recorded, model, job, out)
         writer.more["method"] = "person" if setup is None else f"{method}_capture"
         if shape is not None:
-            writer.more |= {"lengths_m": shape.lengths, "girths": shape.girths}
+            writer.more |= {"lengths_m": shape.lengths, "radius_scales": shape.radius_scales}
         views = {name: diagram.GetOutputPort(f"{kind}_{name}") for name in cameras}
         frames = _FrameWriter(writer, scene, tracker, diagram, views, sensors.period, on_frame)
         told: list[str] = []
@@ -143,14 +143,14 @@ def capture_live(
 
 
 def shape_of_result(result: Path) -> KnownShape:
-    """The lengths and girths that an earlier capture found.
+    """The lengths and radius scales that an earlier capture found.
 
     Raises:
         OutputError: there is no such result, or it has none.
     """
     summary = read_summary(result)
     found = []
-    for name in ("lengths_m", "girths"):
+    for name in ("lengths_m", "radius_scales"):
         numbers = summary.get(name)
         if not isinstance(numbers, dict) or not all(
             isinstance(number, int | float) for number in numbers.values()
@@ -167,7 +167,7 @@ def _fit_first_frames(
     on_report: Callable[[str], None],
     count: int = 40,
 ) -> KnownShape | None:
-    """Lengths and girths by the first frames that two cameras see; None without shape joints."""
+    """Fit lengths and radius scales to the first frames; None without shape joints."""
     if not shape_values(tree).any():
         return None
     sensors = scene.open_sensors(tolerance=settings.tolerance)

@@ -19,8 +19,8 @@ Shape = Annotated[
     Path | None,
     Parameter(
         metavar="RESULT",
-        help="Take lengths and girths from this result of capture with the same person. Live "
-        "capture (sources.yaml) only.",
+        help="Take lengths and radius scales from this result of capture with the same person. "
+        "Live capture (sources.yaml) only.",
     ),
 ]
 _OF_PYTHON = Parameter(parse=False)
@@ -42,7 +42,7 @@ class LiveSettings:
     """Stop after this time [s]. Live capture (sources.yaml) only."""
     shape: Shape = None
     fit_shape: Annotated[bool, Parameter(negative="--no-fit-shape")] = True
-    """Fit lengths and girths to the first frames; or keep the model's. Live capture only."""
+    """Fit lengths and radius scales to the first frames; or keep the model's. Live capture only."""
     tolerance: Annotated[float | None, within(0.0), Parameter(metavar="SECONDS")] = None
     """Largest difference of time stamps of simultaneous pictures. Default: half the time between
     two pictures of a camera, or 0.9 of it if cameras are live."""

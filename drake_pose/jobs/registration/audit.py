@@ -117,7 +117,9 @@ def audit_scene(
     names = [camera.name for camera in inputs.held]
     units = zip(inputs.model.position_names, user_units(inputs.model), strict=True)
     noticed = {
-        name: unit * found.noticed_from[name] for name, unit in units if name in found.noticed_from
+        name: unit * found.minimum_detectable[name]
+        for name, unit in units
+        if name in found.minimum_detectable
     }
     center = found.center
     summary = {
@@ -143,7 +145,9 @@ def audit_scene(
             }
             for name, one in pictures.found.items()
         },
-        "noticed_from": {k: one if math.isfinite(one) else None for k, one in noticed.items()},
+        "minimum_detectable": {
+            k: one if math.isfinite(one) else None for k, one in noticed.items()
+        },
         "principal_point_px": center and dict(zip(("offset", "sd"), center, strict=True)),
         "error_sizes_px": {
             name: float(getattr(found.sizes, name)) for name in ("surface", "mask", "camera")
@@ -307,7 +311,7 @@ def _describe_contradictions(found: Diagnosis) -> list[dict[str, Any]]:
                 f"shift_{unit}": factor * one.shift,
                 f"shift_sd_{unit}": factor * one.shift_sd,
                 "pixels": one.pixels,
-                "chance": one.p_value,
+                "p_value": one.p_value,
                 "rivals": list(one.rivals),
                 "joints": dict(one.joints),
             }

@@ -106,8 +106,8 @@ def _joint_rows(inputs: Inputs, summary: Mapping[str, Any]) -> list[dict[str, An
             "name": name,
             "unit": "deg" if kinds[name] == "angle" else "m",
             "off": _off(("joint", "sign", "log", "link"), name, summary),
-            "asked": name in summary["noticed_from"],
-            "noticed_from": summary["noticed_from"].get(name),
+            "asked": name in summary["minimum_detectable"],
+            "minimum_detectable": summary["minimum_detectable"].get(name),
         }
         for name in names
     ]

@@ -16,7 +16,7 @@ from drake_pose.files.settings import percent
 from drake_pose.fit.parameters import POSE_NAMES
 from drake_pose.registration.diagnosis import DIAGNOSIS
 from drake_pose.registration.findings import Finding, FrameDiagnosis
-from drake_pose.registration.joint_zeros import JointCalibration, calibrate_joints
+from drake_pose.registration.joint_offsets import JointCalibration, calibrate_joints
 from drake_pose.registration.online_registration import pose_difference, squared_distance
 from drake_pose.registration.picture_registration import PictureRegistration, Recording
 from drake_pose.registration.posed_frames import PosedFrame, PosedFrames, SeenFrame, placed_points
@@ -551,7 +551,7 @@ def say_object(seen: ObjectPose) -> list[str]:
         )
     if len(seen.alternatives):
         texts.append(
-            f"the target looks alike in {len(seen.alternatives)} other poses, see families of the "
+            f"the target looks alike in {len(seen.alternatives)} other poses, see modes of the "
             "target in summary.json; where the camera is does not depend on it"
         )
     return texts

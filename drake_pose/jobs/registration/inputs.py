@@ -36,7 +36,7 @@ from drake_pose.jobs.registration.positions import (
     read_known_positions,
 )
 from drake_pose.jobs.registration.settings import ALL, AuditSettings, RegistrationSettings
-from drake_pose.registration.joint_zeros import links_with_length, require_enough, require_known
+from drake_pose.registration.joint_offsets import links_with_length, require_enough, require_known
 from drake_pose.registration.picture_registration import Recording
 from drake_pose.registration.posed_frames import PosedFrame, SeenFrame
 from drake_pose.registration.standing_object import StandingObject, require_turns, stands_still

@@ -196,9 +196,9 @@ class SceneComparison:
         enough = LARGE.seen * max(shares.values(), default=0.0)
         noticed = {
             name: least if shares.get(name, 0.0) >= enough else np.inf
-            for name, least in found.noticed_from.items()
+            for name, least in found.minimum_detectable.items()
         }
-        found = replace(found, common=common, noticed_from=noticed)
+        found = replace(found, common=common, minimum_detectable=noticed)
         return replace(now, found=found, findings=(), warnings=warnings)
 
     def _find_moved(

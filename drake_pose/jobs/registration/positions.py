@@ -32,7 +32,7 @@ class KnownPositions:
         values: (m,) of the pose tree by ``frame_key`` [rad or m].
         is_estimate: whether they were estimated, so that they are off.
         warnings: what the user should know of it.
-        girths: (nodes,) how many times as wide as the model's the nodes were found to be.
+        radius_scales: (nodes,) how many times as wide as the model's the nodes were found to be.
     """
 
     path: Path
@@ -40,7 +40,7 @@ class KnownPositions:
     values: Mapping[int | str, Array]
     is_estimate: bool = False
     warnings: tuple[str, ...] = ()
-    girths: Array | None = None
+    radius_scales: Array | None = None
 
     def has(self, frame: str) -> bool:
         """Whether there is a row of a frame."""
@@ -172,8 +172,8 @@ def estimate_positions(
             "frame well enough to tell its pose, so nothing tells where the others are: give its "
             "joint positions (--joints), or cameras with X_WC that see it"
         )
-    girths = None
-    if of_parts := found.summary.get("girths"):
+    radius_scales = None
+    if of_parts := found.summary.get("radius_scales"):
         parts, groups = shape_parts(kinematics.tree)
-        girths = np.array([of_parts.get(parts[group], 1.0) for group in groups])
-    return KnownPositions(scene_path, kinematics, values, True, found.warnings, girths)
+        radius_scales = np.array([of_parts.get(parts[group], 1.0) for group in groups])
+    return KnownPositions(scene_path, kinematics, values, True, found.warnings, radius_scales)

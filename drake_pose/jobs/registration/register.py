@@ -44,7 +44,7 @@ from drake_pose.jobs.registration.result import (
 )
 from drake_pose.jobs.registration.settings import RegistrationSettings
 from drake_pose.person.shape import shape_parts, shape_values
-from drake_pose.registration.joint_zeros import KinematicParameter, calibrate_joints
+from drake_pose.registration.joint_offsets import KinematicParameter, calibrate_joints
 from drake_pose.registration.picture_registration import (
     PictureRegistration,
     choose_pictures,
@@ -169,7 +169,9 @@ class _Registration:
         self, inputs: Inputs, settings: RegistrationSettings, on_camera: OnCamera | None
     ) -> None:
         self.inputs, self._settings, self._on_camera = inputs, settings, on_camera
-        self.body = RegistrationBody(inputs.tree, inputs.seen, girths=inputs.positions.girths)
+        self.body = RegistrationBody(
+            inputs.tree, inputs.seen, radius_scales=inputs.positions.radius_scales
+        )
         self._held = [one for one in inputs.held if isinstance(one, PinholeCamera)]
         self.warnings = list(inputs.warnings)
         self.registered = dict[str, RegisteredCamera]()
@@ -219,7 +221,7 @@ class _Registration:
                 frames += [
                     SeenFrame(
                         frame.name, frame.values, {name: frame.mask},
-                        {} if frame.odds is None else {name: frame.odds}, frame.rates,
+                        {} if frame.foreground is None else {name: frame.foreground}, frame.rates,
                     )
                     for frame in one.frames
                 ]  # fmt: skip
@@ -368,13 +370,13 @@ class _Registration:
         shape: tuple[Any, ...] = (np.zeros(len(self.body.kinematics.names), np.bool_),)
         if not missing_for_person(inputs.model):
             shape = (shape_values(inputs.tree), *shape_parts(inputs.tree))
-        adjusted, covariances, values, girths = adjust_bundle(
+        adjusted, covariances, values, radius_scales = adjust_bundle(
             self.body.kinematics, self.body.few, cameras, registered, frames, *shape
         )
         self.inputs = replace(inputs, frames=inputs.moved(values))
-        known = inputs.positions.girths
-        girths = girths * (1.0 if known is None else known)
-        self.body = RegistrationBody(inputs.tree, inputs.seen, girths=girths)
+        known = inputs.positions.radius_scales
+        radius_scales = radius_scales * (1.0 if known is None else known)
+        self.body = RegistrationBody(inputs.tree, inputs.seen, radius_scales=radius_scales)
         for camera, covariance in zip(adjusted, covariances, strict=True):
             self._found_again(self.body.kinematics, camera, covariance)
             found = self.registered[camera.name]

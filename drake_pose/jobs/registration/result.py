@@ -27,7 +27,7 @@ from drake_pose.files.settings import percent
 from drake_pose.jobs.registration.diagnosis import say_drift, say_reading
 from drake_pose.jobs.registration.inputs import Inputs
 from drake_pose.jobs.registration.settings import AuditSettings
-from drake_pose.registration.joint_zeros import JointCalibration, KinematicParameter
+from drake_pose.registration.joint_offsets import JointCalibration, KinematicParameter
 from drake_pose.registration.picture_registration import PictureRegistration
 from drake_pose.registration.posed_frames import PosedFrame
 from drake_pose.registration.register import ObjectPose, RegisteredCamera
@@ -56,7 +56,7 @@ def describe_camera(
     if seen is not None:
         target = {
             **describe_pose("X_WT", seen.X_WT, seen),
-            "families": [{"X_WT": one.tolist()} for one in (seen.X_WT, *seen.alternatives)],
+            "modes": [{"X_WT": one.tolist()} for one in (seen.X_WT, *seen.alternatives)],
             "determined": not len(seen.round_about),
             "covariance": seen.covariance.tolist(),
             "round_about": seen.round_about.tolist(),
@@ -64,7 +64,7 @@ def describe_camera(
     return {
         **({} if link is None else {"link": link}),
         **describe_pose(pose, X, found),
-        "families": [{pose: one.tolist()} for one in (X, *found.alternatives)],
+        "modes": [{pose: one.tolist()} for one in (X, *found.alternatives)],
         "mean_iou": float(np.mean([frame.iou for frame in found.frames])),
         "suggestion": suggestion,
         **({"target": target} if target else {}),

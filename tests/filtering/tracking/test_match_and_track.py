@@ -10,7 +10,7 @@ from drake_pose.filtering.contour_tracker import (
     ContourTracker,
     TrackingSettings,
 )
-from drake_pose.filtering.match_and_track import Followed, MatchAndTrack, make_tracker
+from drake_pose.filtering.match_and_track import MatchAndTrack, TrackerState, make_tracker
 from drake_pose.filtering.state import Belief
 from drake_pose.search import TRACKED, PaperSearch, PaperSearchSettings, PoseEstimate, View
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
@@ -68,7 +68,7 @@ def test_tracked_after_one_match_and_matched_again_after_a_jump(body):
     # Cut: the body stands otherwise in the next frame.
     second = swings(12, np.array([-0.3, 1.7, -1.7]), 0.25, generator)
     renderer = LabelRenderer(body, CAMERA)
-    followed, errors, asked, held, widths = Followed(), [], [], [], []
+    followed, errors, asked, held, widths = TrackerState(), [], [], [], []
     for q in np.vstack([first, second]):
         followed, result = follower.next(followed, [View(CAMERA, renderer.mask(q))])
         told = follower.with_intervals(followed, result)
@@ -97,11 +97,11 @@ def test_the_first_look_of_a_track_is_at_what_the_search_found(body):
     follower = MatchAndTrack(search, [CAMERA], PERIOD)
     mask = LabelRenderer(body, CAMERA).mask(np.array([0.1, 0.4, -0.4]))
     views, tracker = [View(CAMERA, mask)], follower.tracker
-    begun, _ = follower.next(Followed(), views)
+    begun, _ = follower.next(TrackerState(), views)
     told = search.search.match(views)
     for followed, q in (
         (begun, told.q),
-        (follower.next(Followed(), views, start=told.q + 0.02)[0], told.q + 0.02),
+        (follower.next(TrackerState(), views, start=told.q + 0.02)[0], told.q + 0.02),
     ):
         start = tracker.start(tracker.observation.state(q))
         expected = [tracker.follow(start, [mask], first).state.best for first in (True, False)]
@@ -117,7 +117,7 @@ def test_no_pose_found_is_said_and_asked_again(body):
     follower = MatchAndTrack(search, [CAMERA], PERIOD)
     speck = np.zeros((200, 200), dtype=bool)
     speck[3:5, 3:5] = True
-    followed, result = follower.next(Followed(), [View(CAMERA, speck)])
+    followed, result = follower.next(TrackerState(), [View(CAMERA, speck)])
     assert not result.found
     assert followed.track is None
     followed, _ = follower.next(followed, [View(CAMERA, speck)])
@@ -140,7 +140,7 @@ def test_lost_when_the_body_is_elsewhere(body):
     # Where nothing was measured contours say nothing of joints.
     follower, pose = MatchAndTrack(paper_search(body), [CAMERA], PERIOD), object()
     for unmeasured in (None, waited):
-        assert follower.with_intervals(Followed(unmeasured), pose) is pose
+        assert follower.with_intervals(TrackerState(unmeasured), pose) is pose
 
 
 def test_bad_settings_and_a_bad_period_are_named(body):
@@ -194,7 +194,7 @@ def test_a_search_is_asked_where_much_of_the_silhouette_is_not_explained(body, s
     mask = LabelRenderer(body, CAMERA).mask(q)
     search = KnownPoses(tree, [(q, np.eye(4), 1.0, None)])
     follower = MatchAndTrack(search, [CAMERA], PERIOD)
-    followed, _ = follower.next(Followed(), [View(CAMERA, mask)])
+    followed, _ = follower.next(TrackerState(), [View(CAMERA, mask)])
     with_other = mask.copy()
     with_other[150:, : round(share * mask.sum() / 50)] = True
     assert not (mask[150:] | mask[:, :60].any()).any()
@@ -226,7 +226,7 @@ def test_colours_alone_are_followed_from_where_the_body_is_said_to_be(body):
     q, search = np.array([0.2, 0.9, -0.6]), KnownPoses(body.pose_tree(), [])
     mask = LabelRenderer(body, CAMERA).mask(q)
     lit = np.where(mask[..., None], (230, 130, 40), (60, 140, 60)).astype(np.uint8)
-    follower, followed = MatchAndTrack(search, [CAMERA], PERIOD), Followed()
+    follower, followed = MatchAndTrack(search, [CAMERA], PERIOD), TrackerState()
     found = []
     for picture, start in ((lit, None), (lit, q), (lit, None), (0 * lit, None), (lit, q)):
         followed, pose = follower.next(followed, [], None, {"front": picture}, start)
@@ -254,7 +254,7 @@ def test_the_first_frame_teaches_colours_also_where_the_searched_pose_fits_best(
     )
     search = KnownPoses(body.pose_tree(), [])
     search.match = lambda views, root_position=None: pose
-    follower, followed = MatchAndTrack(search, [CAMERA], PERIOD), Followed()
+    follower, followed = MatchAndTrack(search, [CAMERA], PERIOD), TrackerState()
     renderer = LabelRenderer(body, CAMERA)
     for q, has_mask in zip(moved, (True, False), strict=True):
         mask = renderer.mask(q)
@@ -290,7 +290,7 @@ def test_what_no_pose_explains_is_predicted_and_the_truth_stays_near(body, share
         return PoseEstimate(True, q, np.eye(4), values, float(J), float(area), "end")
 
     search.match = match
-    follower, followed = MatchAndTrack(search, [CAMERA], PERIOD), Followed()
+    follower, followed = MatchAndTrack(search, [CAMERA], PERIOD), TrackerState()
     poses = swings(30, np.array([0.1, 0.4, -0.4]), 0.4, np.random.default_rng(3))
     renderer, observation = LabelRenderer(body, CAMERA), follower.tracker.observation
     moving = follower.tracker.filter.layout.indices(follower.tracker.filter.layout.moving)
@@ -318,7 +318,7 @@ def test_measured_positions_are_overruled_by_a_pose_alone_that_explains_the_mask
     wrong, right = (q + off for off in ([0.9, -1.0, 1.0], [0.0, 0.01, 0.01]))
     search = KnownPoses(body.pose_tree(), [(wrong, np.eye(4), 1.0, None)])
     follower = MatchAndTrack(search, [CAMERA], PERIOD)
-    followed, pose = follower.next(Followed(), [View(CAMERA, mask)], start=right)
+    followed, pose = follower.next(TrackerState(), [View(CAMERA, mask)], start=right)
     assert search.calls == 1
     # The search says J = 20 of 100 pixels: that is no explanation, and more than nothing.
     np.testing.assert_allclose(pose.q, right, atol=0.005)
@@ -342,7 +342,7 @@ def test_a_search_that_a_time_limit_ended_is_asked_again(body):
         return PoseEstimate(True, at, np.eye(4), values, J, 100.0, stopped_by)
 
     search.match = match
-    follower, followed = MatchAndTrack(search, [CAMERA], PERIOD), Followed()
+    follower, followed = MatchAndTrack(search, [CAMERA], PERIOD), TrackerState()
     for _ in range(4):
         followed, pose = follower.next(followed, views)
     assert len(asked) == 2

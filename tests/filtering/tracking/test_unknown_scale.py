@@ -13,7 +13,7 @@ from drake_pose.filtering.contour_tracker import (
     ContourTracker,
     TrackingSettings,
 )
-from drake_pose.filtering.match_and_track import Followed, MatchAndTrack
+from drake_pose.filtering.match_and_track import MatchAndTrack, TrackerState
 from drake_pose.filtering.sequence_fit import (
     find_start,
     fit_sequence,
@@ -50,7 +50,7 @@ def moving_states(tree, camera, frames, generator):
     states = np.zeros((frames, len(layout)))
     states[:, :3] = swings(frames, np.array([0.1, 0.5, -0.5]), 0.3, generator)
     states[:, layout.index("root_shift_y")] = 0.1 * t
-    states[:, layout.index("log_growth")] = 0.3 + 0.06 * np.sin(2.0 * t)
+    states[:, layout.index("log_scale")] = 0.3 + 0.06 * np.sin(2.0 * t)
     return states
 
 
@@ -71,11 +71,11 @@ def test_the_scale_is_tracked_while_it_drifts_and_found_again_after_a_cut(tree):
     second = moving_states(tree, camera, 10, generator)
     second[:, :3] += np.array([-0.3, 0.5, 0.3])
     layout = ContourObservation(tree, [camera], True, True).layout
-    second[:, layout.index("log_growth")] += 0.15
+    second[:, layout.index("log_scale")] += 0.15
     second[:, layout.index("root_shift_y")] += 0.5
     masks, answers = drawn(tree, camera, [*first, *second])
     search = KnownPoses(tree, answers)
-    follower, followed = MatchAndTrack(search, [camera], PERIOD, SETTINGS), Followed()
+    follower, followed = MatchAndTrack(search, [camera], PERIOD, SETTINGS), TrackerState()
     scales, errors, kinds = [], [], []
     for frame, mask in enumerate(masks):
         search.frame = frame
@@ -160,10 +160,10 @@ def test_what_an_explanation_says_of_a_frame_is_its_pose_and_its_intervals(fitte
         )
         q, X_WB = observation.positions(x)
         told = pose_set(explanations, [(q, X_WB, 7.0)], frame)
-        (family,) = told.families
-        assert family.J == 7.0
+        (mode,) = told.modes
+        assert mode.J == 7.0
         values = np.concatenate(tree.values_from_positions(q, X_WB))
-        np.testing.assert_allclose(np.concatenate(family.node_values), values, atol=1e-9)
+        np.testing.assert_allclose(np.concatenate(mode.node_values), values, atol=1e-9)
         kinematics = explanations[0].body.kinematics
         ranges = np.minimum(kinematics.upper - kinematics.lower, 2.0 * np.pi)
         for joint, value, whole in zip(told.joints, values, ranges, strict=True):

@@ -68,8 +68,8 @@ def test_the_recorded_arm(shared_data: Path) -> None:
         assert answer is not None
         held = max(
             (
-                [joint.holds(float(one)) for joint, one in zip(family.joints, truth, strict=True)]
-                for family in answer.families
+                [joint.holds(float(one)) for joint, one in zip(mode.joints, truth, strict=True)]
+                for mode in answer.modes
             ),
             key=sum,
         )

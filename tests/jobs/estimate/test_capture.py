@@ -114,8 +114,8 @@ def test_a_pose_that_explains_a_frame_as_well_is_given_and_named(
     assert "left_wrist" in warning
     assert "right" not in warning
     rows = {
-        row["family"]: row
-        for row in read_rows(out / "families.csv")
+        row["mode"]: row
+        for row in read_rows(out / "modes.csv")
         if row["joint"] == "left_upper_arm_z"
     }
     assert {key: float(row["value"]) for key, row in rows.items()} == pytest.approx(
@@ -127,7 +127,7 @@ def test_a_pose_that_explains_a_frame_as_well_is_given_and_named(
         if (row["frame"], row["joint"]) == ("0001", "left_upper_arm_z")
     )
     assert float(row["low"]) < 40.0 < 100.0 < float(row["high"])
-    assert row["families"] == "2"
+    assert row["modes"] == "2"
 
 
 def test_stills_cameras_and_frames_are_chosen_like_an_estimates(

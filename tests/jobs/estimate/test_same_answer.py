@@ -13,7 +13,7 @@ from tests.jobs.scenes import TinyScene, read_rows
 
 NUMBERS = {
     "poses.csv": ("lift", "luff", "error"), "joints.csv": ("low", "high"),
-    "families.csv": ("value", "low", "high"),
+    "modes.csv": ("value", "low", "high"),
 }  # fmt: skip
 
 

@@ -46,7 +46,7 @@ def positions(out: Path) -> dict[str, np.ndarray]:
 def test_result_folder(tiny_scene: TinyScene, out: Path) -> None:
     run_estimate(tiny_scene, out)
     assert sorted(path.name for path in out.iterdir()) == [
-        "families.csv", "joints.csv", "overlay", "poses.csv", "replay.html", "report.html",
+        "modes.csv", "joints.csv", "overlay", "poses.csv", "replay.html", "report.html",
         "summary.json",
     ]  # fmt: skip
     rows = read_rows(out / "poses.csv")
@@ -195,7 +195,7 @@ def test_a_frame_without_a_pose(own_scene: TinyScene, monkeypatch: pytest.Monkey
 
 
 def test_what_is_known_of_each_joint_and_of_frames_before(own_scene: TinyScene) -> None:
-    """One camera, angles between the samples: the truth lies in the intervals of some family."""
+    """One camera, angles between the samples: the truth lies in the intervals of some mode."""
     scene = write_scene(own_scene.folder.parent / "between", [(13.0, -47.0), (-31.0, -22.0)])
     out = own_scene.folder.parent / "out"
     run_estimate(scene, out, "--frame", "1", "--no-replay")
@@ -204,7 +204,7 @@ def test_what_is_known_of_each_joint_and_of_frames_before(own_scene: TinyScene) 
     assert list(summary["frames"]) == ["0000", "0001"]
     assert all(frame["runs"] for frame in summary["frames"].values())
     assert (out / "poses.csv").read_text().splitlines()[2] == before
-    joints, families = read_rows(out / "joints.csv"), read_rows(out / "families.csv")
+    joints, modes = read_rows(out / "joints.csv"), read_rows(out / "modes.csv")
     cells = [(frame, name) for frame in scene.truth for name in NAMES]
     assert [(row["frame"], row["joint"]) for row in joints] == cells
     found = positions(out)
@@ -217,8 +217,8 @@ def test_what_is_known_of_each_joint_and_of_frames_before(own_scene: TinyScene) 
         assert float(row["low"]) <= truth <= float(row["high"]) < float(row["low"]) + 30.0
         (answer,) = (
             float(one["value"])
-            for one in families
-            if (one["frame"], one["joint"], one["family"]) == (frame, name, "1")
+            for one in modes
+            if (one["frame"], one["joint"], one["mode"]) == (frame, name, "1")
         )
         assert answer == pytest.approx(value, abs=1e-3)
 

@@ -51,7 +51,7 @@ def test_every_frame_of_a_sequence_has_intervals_that_hold_the_truth(tmp_path: P
     result = estimate_scene(scene.folder, scene.model, replay=False)
     names, inside = result.position_names, []
     for frame, record in result.records.items():
-        assert record.family_count is not None, frame
+        assert record.mode_count is not None, frame
         truth = dict(zip(names, np.degrees(scene.truth[frame]), strict=True))
         assert truth.keys() <= record.joints.keys()
         known = [

@@ -142,7 +142,7 @@ def test_persons_own_shape_is_found_in_a_video_and_taken_from_its_result(person,
     assert found["mean_iou"] > 0.85
     assert len(found["lengths_m"]) > 5
     again = capture_live(scene, second, None, LiveSettings(shape=first, replay=False))
-    assert again.estimate.summary["girths"] == pytest.approx(found["girths"])
+    assert again.estimate.summary["radius_scales"] == pytest.approx(found["radius_scales"])
     assert again.estimate.summary["mean_iou"] > 0.85
 
 

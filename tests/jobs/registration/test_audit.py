@@ -96,7 +96,7 @@ class TestAudit:
         low, high = map(float, re.search(r"\(([-+.\d]+) to ([-+.\d]+) deg\)", elbow).groups())
         assert low < -2.0 < high
         assert high - low < 1.0
-        for name, least in summary["noticed_from"].items():
+        for name, least in summary["minimum_detectable"].items():
             (row,) = (row for row in rows if row.startswith(f"<td>{name}</td>"))
             assert ("any size" if least is None else f"{least:.3g}") in row
         for camera in ("left", "right"):

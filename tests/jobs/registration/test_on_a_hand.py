@@ -76,8 +76,8 @@ def test_camera_and_target_are_found(
     require_near(found, 1.0, 0.1)
     target = found["target"]
     assert target["determined"]
-    assert (len(found["families"]), len(target["families"])) == (1, alike)
-    errors = [pose_errors(np.array(one["X_WT"]), scene.X_WT) for one in target["families"]]
+    assert (len(found["modes"]), len(target["modes"])) == (1, alike)
+    errors = [pose_errors(np.array(one["X_WT"]), scene.X_WT) for one in target["modes"]]
     millimetres, degrees = min(errors, key=lambda error: error[1])
     assert millimetres < min(1.0, 4.0 * np.sqrt(3.0) * target["translation_sd_mm"])
     assert degrees < 0.2
@@ -104,7 +104,7 @@ def test_pictures_are_enough_of_a_target(tmp_path: Path, out: Path) -> None:
     paint_pictures(scene.arm.folder)
     found = run_json(*scene.register(out))
     require_near(found, 2.0, 0.2)
-    poses = [np.array(one["X_WT"]) for one in found["target"]["families"]]
+    poses = [np.array(one["X_WT"]) for one in found["target"]["modes"]]
     assert min(pose_errors(X, scene.X_WT)[0] for X in poses) < 2.0
     assert (found["masks"], found["contradictions"]) == ("found", [])
     # The result is a scene of the masks, as Drake has drawn them but for the noise of the pictures.

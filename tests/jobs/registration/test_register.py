@@ -55,9 +55,9 @@ class TestRegister:
         out, found, _ = registered
         assert found == json.loads((out / "summary.json").read_text())
         assert list(found["cameras"]) == ["left"]
-        for name in ("X_WC", "translation_sd_mm", "rotation_sd_deg", "families", "mean_iou"):
+        for name in ("X_WC", "translation_sd_mm", "rotation_sd_deg", "modes", "mean_iou"):
             assert found[name] == found["cameras"]["left"][name]
-        assert found["families"] == [{"X_WC": found["X_WC"]}]
+        assert found["modes"] == [{"X_WC": found["X_WC"]}]
         assert found["mean_iou"] > 0.98
         assert (found["zeros"], found["lengths"], found["contradictions"]) == ({}, {}, [])
         assert 0.0 < found["seconds"]
@@ -227,5 +227,5 @@ def test_that_no_picture_can_be_suggested_is_said(
     words += ["--keep-out", "-9,-9,-9:9,9,9"]
     assert_refused(run_command(words), "--keep-out is for --suggest", status=2)
     found = run_to_end(*words, "--suggest", "--json")
-    assert len(json.loads(found.stdout)["families"]) > 1
+    assert len(json.loads(found.stdout)["modes"]) > 1
     assert "no picture is suggested; is --keep-out too large?" in found.stderr

@@ -17,7 +17,7 @@ from tests.search.arms import arm_cameras
 def summary(**camera):
     one = {
         "X_WC": np.eye(4).tolist(), "translation_sd_mm": 1.0, "rotation_sd_deg": 0.1,
-        "families": [{}], "mean_iou": 0.9, "seconds": 1.0, "contradictions": [], "zeros": {},
+        "modes": [{}], "mean_iou": 0.9, "seconds": 1.0, "contradictions": [], "zeros": {},
         "lengths": {}, "masks": "found", "focal_px": 500.0, "focal_sd_px": None,
         "time_offset_s": None, "time_offset_sd_s": None, "time_offset_scores": [],
         "frames": {"0000": {"agrees": True, "E_total": 0.1, "iou": 0.9, "share": 0.8}},

@@ -8,7 +8,7 @@ from drake_pose.camera.models import circle_of_cameras
 from drake_pose.errors import ModelError, SettingsError
 from drake_pose.fit.contour_fit import ContourFit
 from drake_pose.fit.evidence import find_edge_points
-from drake_pose.fit.surfaces import with_girths
+from drake_pose.fit.surfaces import with_radius_scales
 from drake_pose.person.capture import capture_person
 from drake_pose.person.shape import NOISE, fit_shape, shape_values
 from drake_pose.silhouette.pictures.scenes import load_scene
@@ -30,12 +30,12 @@ class TestShape:
         fit = ContourFit(shaped_person.pose_tree(), noise=NOISE)
         order = [shaped_person.position_index(name) for name in fit.kinematics.names]
         factors = {"trunk": 1.1, "thigh": 1.2, "shin": 0.9}
-        girths = np.ones(len(fit.outlines))
+        radius_scales = np.ones(len(fit.outlines))
         for k, node in enumerate(fit.tree.nodes):
             for part, factor in factors.items():
                 if part in node.name:
-                    girths[k] = factor
-        outlines = with_girths(fit.outlines, girths)
+                    radius_scales[k] = factor
+        outlines = with_radius_scales(fit.outlines, radius_scales)
         frames, starts = [], []
         for phase in np.linspace(0.0, 2 * np.pi, 6, endpoint=False):
             q = stepping(shaped_person, phase, knees=45.0)
@@ -52,7 +52,7 @@ class TestShape:
         assert np.abs(off).max() < 0.02
         assert np.abs(off).mean() < 0.5 * np.mean(np.abs(list(LENGTHS.values())))
         for part, factor in factors.items():
-            assert shape.known.girths[part] == pytest.approx(factor, abs=0.05), part
+            assert shape.known.radius_scales[part] == pytest.approx(factor, abs=0.05), part
         off = np.array([x - LENGTHS.get(name, 0.0) for name, x in shape.known.lengths.items()])
         assert 0.05 < off @ np.linalg.solve(shape.covariance, off) / len(off) < 2.0
 

@@ -192,17 +192,17 @@ def test_what_the_answer_is_worth_comes_out(tmp_path):
     )
     camera = front_camera(160, shift=0.1234)
     search = BeamSearch(model.pose_tree(), BeamSearchSettings(interval=0.25), ExaminationSettings())
-    run = Bench(SilhouetteMatcher(search, [camera], PERIOD, family_limit=3))
+    run = Bench(SilhouetteMatcher(search, [camera], PERIOD, mode_limit=3))
     assert np.isnan(run["proved_optimal"]).all()
     mask = LabelRenderer(model, camera).mask(np.array([0.5]))
     run.update(label_image=mask_to_label_image(mask))
     assert run["proved_optimal"] == 1.0
-    np.testing.assert_allclose(np.sort(run["family_positions"][:2]), [-0.5, 0.5], atol=1e-9)
-    assert np.isnan(run["family_positions"][2])
+    np.testing.assert_allclose(np.sort(run["mode_positions"][:2]), [-0.5, 0.5], atol=1e-9)
+    assert np.isnan(run["mode_positions"][2])
     assert run["determined"] == 0.0
     np.testing.assert_allclose([run["lower"][0], run["upper"][0]], [-0.5, 0.5], atol=1e-9)
     # An empty image says nothing, and a search that does not examine leaves it open.
     run.update(label_image=mask_to_label_image(0 * mask > 0))
-    assert np.isnan(run["family_positions"]).all()
-    with pytest.raises(SettingsError, match="family limit"):
-        SilhouetteMatcher(search, [camera], PERIOD, family_limit=0)
+    assert np.isnan(run["mode_positions"]).all()
+    with pytest.raises(SettingsError, match="mode limit"):
+        SilhouetteMatcher(search, [camera], PERIOD, mode_limit=0)

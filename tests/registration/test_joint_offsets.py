@@ -10,7 +10,7 @@ from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import RegistrationError, UnknownNameError
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.jobs.registration.diagnosis import say_likely_offsets
-from drake_pose.registration.joint_zeros import calibrate_joints
+from drake_pose.registration.joint_offsets import calibrate_joints
 from drake_pose.registration.posed_frames import PosedFrame, PosedFrames
 from drake_pose.registration.register import CameraSearch, RegisteredCamera
 from drake_pose.registration.shared_fit import SHARED, SharedFit

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from drake_pose.search import View, renderer_tolerance, samples_at
-from drake_pose.search.pose_families import (
+from drake_pose.search.pose_modes import (
     cluster_samples,
     contour_length,
     estimate_joints,
-    find_families,
+    find_modes,
     grid_steps,
 )
 from drake_pose.search.settings import BoundLimits
@@ -34,9 +34,9 @@ def flipping_body(tmp_path_factory):
     return ProblemMaker(model.pose_tree(), 0.4)
 
 
-def found_families(problem, tolerance=None):
+def found_modes(problem, tolerance=None):
     samples, J = problem.best
-    return find_families(problem.body, problem.views, samples, J, tolerance)
+    return find_modes(problem.body, problem.views, samples, J, tolerance)
 
 
 def seen_values(problem, J, node):
@@ -44,16 +44,16 @@ def seen_values(problem, J, node):
     return np.unique(problem.body.sampled.values[node][rows[:, node], 0])
 
 
-def test_towards_and_away_from_the_camera_are_two_families(flipping_body):
+def test_towards_and_away_from_the_camera_are_two_modes(flipping_body):
     values = [np.array([0.4]), np.array([0.8]), np.array([-1.2])]
     problem = flipping_body.show(values)
-    answer = found_families(problem)
+    answer = found_modes(problem)
     assert answer.complete
     assert answer.tolerance == renderer_tolerance(problem.views)
     assert answer.contains(values)
-    assert answer.family_count == 2
-    assert [family.size for family in answer.families] == [7.0, 7.0]
-    flips = sorted(float(family.node_values[1][0]) for family in answer.families)
+    assert answer.mode_count == 2
+    assert [mode.size for mode in answer.modes] == [7.0, 7.0]
+    flips = sorted(float(mode.node_values[1][0]) for mode in answer.modes)
     assert flips == pytest.approx([-0.8, 0.8])
     turn, flip, spin = answer.joints
     assert turn.determined
@@ -61,9 +61,9 @@ def test_towards_and_away_from_the_camera_are_two_families(flipping_body):
     assert not flip.determined
     assert not spin.determined
     assert (spin.low, spin.high) == pytest.approx((-1.2, 1.2))
-    for family in answer.families:
-        assert [report.determined for report in family.joints] == [True, True, False]
-        assert family.joints[1].holds(float(family.node_values[1][0]))
+    for mode in answer.modes:
+        assert [report.determined for report in mode.joints] == [True, True, False]
+        assert mode.joints[1].holds(float(mode.node_values[1][0]))
     assert is_held(answer, np.concatenate(values))
     assert not is_held(answer, np.array([0.4, 0.0, 0.0]))
 
@@ -74,11 +74,11 @@ def test_the_set_is_that_of_the_definition(tmp_path):
         maker = ProblemMaker(model.pose_tree(), 0.4)
         for tolerance in (0.0, 25.0, 150.0):
             problem = maker.make(generator, views=1, noise=0.005, on_grid=False)
-            answer = found_families(problem, tolerance)
+            answer = found_modes(problem, tolerance)
             J = problem.best[1] + tolerance
             expected = problem.within(J)
             assert answer.complete
-            assert answer.size == len(expected) == sum(family.size for family in answer.families)
+            assert answer.size == len(expected) == sum(mode.size for mode in answer.modes)
             for row in problem.choices:
                 values = [grid[t] for grid, t in zip(maker.body.sampled.values, row, strict=True)]
                 assert answer.contains(values) == (tuple(row.tolist()) in expected)
@@ -90,9 +90,9 @@ def test_the_set_is_that_of_the_definition(tmp_path):
                 assert report.determined or ends == pytest.approx((seen[0], seen[-1]))
 
 
-def test_families_are_the_connected_groups_of_clusters(flipping_body):
+def test_modes_are_the_connected_groups_of_clusters(flipping_body):
     problem = flipping_body.make(np.random.default_rng(22), views=1, noise=0.01, on_grid=False)
-    answer = found_families(problem, 120.0)
+    answer = found_modes(problem, 120.0)
     J, groups = problem.best[1] + 120.0, []
     rows = np.array([*problem.within(J)])
     for node, grid in enumerate(flipping_body.body.sampled.values):
@@ -100,8 +100,8 @@ def test_families_are_the_connected_groups_of_clusters(flipping_body):
         # A gap is more than a step of the grid.
         breaks = seen[1:][np.diff(seen) > 0.4 * 1.01]
         groups.append((grid[rows[:, node]] >= breaks - 1e-9).sum(axis=1))
-    assert answer.family_count == len(np.unique(groups, axis=1).T)
-    assert [f.J for f in answer.families] == sorted(f.J for f in answer.families)
+    assert answer.mode_count == len(np.unique(groups, axis=1).T)
+    assert [f.J for f in answer.modes] == sorted(f.J for f in answer.modes)
 
 
 def test_a_better_pose_that_turns_up_takes_the_place_of_the_known_one(flipping_body):
@@ -109,8 +109,8 @@ def test_a_better_pose_that_turns_up_takes_the_place_of_the_known_one(flipping_b
     worse = int(np.argsort(problem.Js)[40])
     J = float(problem.Js[worse])
     assert J > 0.0
-    answer = find_families(problem.body, problem.views, problem.choices[worse], J, tolerance=0.0)
-    assert answer.families[0].J == problem.best[1]
+    answer = find_modes(problem.body, problem.views, problem.choices[worse], J, tolerance=0.0)
+    assert answer.modes[0].J == problem.best[1]
     assert answer.size == len(problem.within(problem.best[1]))
 
 
@@ -118,17 +118,15 @@ def test_a_better_pose_that_turns_up_takes_the_place_of_the_known_one(flipping_b
 def test_a_limit_still_leaves_the_best_pose_and_is_reported(flipping_body, limits):
     problem = flipping_body.make(np.random.default_rng(24), views=1, noise=0.0, on_grid=False)
     samples, J = problem.best
-    answer = find_families(
-        problem.body, problem.views, samples, J, 60.0, limits=BoundLimits(**limits)
-    )
+    answer = find_modes(problem.body, problem.views, samples, J, 60.0, limits=BoundLimits(**limits))
     assert not answer.complete
     assert answer.graph.contains(samples)
-    assert answer.families[0].J == J
+    assert answer.modes[0].J == J
 
 
 def test_by_default_the_noise_is_a_share_of_the_contour(flipping_body):
     problem = flipping_body.make(np.random.default_rng(25), views=1, noise=0.01, on_grid=True)
-    assert found_families(problem).tolerance == pytest.approx(0.05 * contour_length(problem.views))
+    assert found_modes(problem).tolerance == pytest.approx(0.05 * contour_length(problem.views))
     mask = np.zeros((70, 70), dtype=np.bool_)
     mask[10:20, 30:50] = True
     # Along the picture's edge there is no contour: what lies beyond is not known.

@@ -1,8 +1,8 @@
-"""All poses of the grid as good as the best within the noise, in families; is the best proved?
+"""All poses of the grid as good as the best within the noise, in modes; is the best proved?
 
 Two samples of a node are neighbours if no value differs by more than a step of the grid, or if they
 place the node alike. The samples of a node that occur fall into clusters of neighbours of
-neighbours; a family is a choice of one cluster for each node.
+neighbours; a mode is a choice of one cluster for each node.
 
 A complete branch and bound without a find proves that J is greater than its limit everywhere: just
 below the best J known. An incomplete one gives a smaller bound.
@@ -24,7 +24,7 @@ from drake_pose.search.branch_and_bound import (
     PosesWithin,
     branch_and_bound,
 )
-from drake_pose.search.estimates import JointEstimate, PoseEstimate, PoseFamily, PoseSet, View
+from drake_pose.search.estimates import JointEstimate, PoseEstimate, PoseMode, PoseSet, View
 from drake_pose.search.partial_poses import expand_groups
 from drake_pose.search.sampled_body import SampledBody, SampledTree
 from drake_pose.search.settings import BoundLimits
@@ -112,15 +112,15 @@ def cluster_samples(sampled: SampledTree, node: int, samples: np.ndarray) -> np.
     return labels
 
 
-def split_into_families(
+def split_into_modes(
     graph: PartialPoseGraph, labels: list[np.ndarray], most_pairs: int = 200_000
 ) -> list[tuple[float, float, np.ndarray]]:
-    """The families of a graph by clusters of samples: J [pixel], poses, clusters (nodes,).
+    """The modes of a graph by clusters of samples: J [pixel], poses, clusters (nodes,).
 
     Best first, of equals the larger first. ``most_pairs``: beyond this number of pairs of a state
-    and a family, later nodes are not told apart any more.
+    and a mode, later nodes are not told apart any more.
     """
-    states, families = np.zeros(1, dtype=np.int64), np.zeros(1, dtype=np.int64)
+    states, modes = np.zeros(1, dtype=np.int64), np.zeros(1, dtype=np.int64)
     sizes: np.ndarray = np.ones(1)
     clusters = np.zeros((1, len(labels)), dtype=np.int64)
     for layer in graph.layers:
@@ -132,19 +132,19 @@ def split_into_families(
         begins = np.searchsorted(bundles[:, 0], states)
         after = np.searchsorted(bundles[:, 0], states, side="right")
         source, edge = expand_groups(begins, after)
-        pairs = np.column_stack([families[source], bundles[edge, 1]])
-        known, families = np.unique(pairs, axis=0, return_inverse=True)
+        pairs = np.column_stack([modes[source], bundles[edge, 1]])
+        known, modes = np.unique(pairs, axis=0, return_inverse=True)
         clusters = clusters[known[:, 0]]
         clusters[:, layer.node] = known[:, 1]
-        keys = np.column_stack([bundles[edge, 2], families.ravel()])
+        keys = np.column_stack([bundles[edge, 2], modes.ravel()])
         merged, places = np.unique(keys, axis=0, return_inverse=True)
         sizes = np.bincount(places.ravel(), sizes[source] * weights[edge], minlength=len(merged))
-        states, families = merged[:, 0], merged[:, 1]
+        states, modes = merged[:, 0], merged[:, 1]
     split = []
-    for family in np.unique(families):
-        own = families == family
+    for mode in np.unique(modes):
+        own = modes == mode
         J = float(graph.Js[states[own]].min())
-        split.append((J, float(sizes[own].sum()), clusters[family]))
+        split.append((J, float(sizes[own].sum()), clusters[mode]))
     return sorted(split, key=lambda one: (one[0], -one[1]))
 
 
@@ -167,7 +167,7 @@ class GridPoseSet(PoseSet):
         return samples is not None and self.graph.contains(samples)
 
 
-def find_families(
+def find_modes(
     body: SampledBody,
     views: Sequence[View],
     samples: np.ndarray,
@@ -183,7 +183,7 @@ def find_families(
         tolerance: a pose counts as good as the best if its objective is greater by no more than
             this [pixel]; None: up to what two renderers differ by where the best is within that
             (``renderer_tolerance``), else 5 % of the contours' length.
-        most: how many families are described at most.
+        most: how many modes are described at most.
         within: all poses within a tolerance of exactness, where they are known: the tolerance is
             that then.
 
@@ -206,22 +206,22 @@ def find_families(
     sampled, described = body.sampled, []
     seen = graph.samples_seen()
     labels = [cluster_samples(sampled, node, own) for node, own in enumerate(seen)]
-    families = split_into_families(graph, labels)
-    for family_J, size, clusters in families[:most]:
+    modes = split_into_modes(graph, labels)
+    for mode_J, size, clusters in modes[:most]:
         own = graph.restricted(
             [label == cluster for label, cluster in zip(labels, clusters, strict=True)]
         )
-        # The pose given stands for its own family if it is a best one.
-        first = samples if own.objective(samples) == family_J else own.central()
+        # The pose given stands for its own mode if it is a best one.
+        first = samples if own.objective(samples) == mode_J else own.central()
         values = sampled.values_at(first)
         joints = estimate_joints(sampled, own.samples_seen(), values, complete=complete)
-        described.append(PoseFamily.of_values(sampled.tree, values, family_J, joints, size))
+        described.append(PoseMode.of_values(sampled.tree, values, mode_J, joints, size))
     return GridPoseSet(
-        families=tuple(described),
+        modes=tuple(described),
         joints=estimate_joints(sampled, seen, described[0].node_values, complete=complete),
         tolerance=tolerance,
         complete=complete,
-        family_count=len(families),
+        mode_count=len(modes),
         graph=graph,
         sampled=sampled,
         budget_spent=found.limited,
@@ -268,36 +268,36 @@ class ExaminationSettings:
     Args:
         proof_time_limit: the proof ends after this time [s], proved or not; None: no limit, 0: it
             is not tried. An answer with J = 0 needs none.
-        family_time_limit: the same of the search for all poses as good; it then answers with those
+        mode_time_limit: the same of the search for all poses as good; it then answers with those
             it has, and no joint is called determined.
         proof_poses: the proof ends after this number of poses of nodes is drawn: unlike a
             limit on time, with the same result on every machine.
-        family_poses: the same of the search for all poses as good: about two seconds.
+        mode_poses: the same of the search for all poses as good: about two seconds.
         memory: of each of the two, for what it keeps; it ends as if its time were over [byte].
-        families: how many families are described at most.
-        tolerance: as in ``find_families`` [pixel].
+        modes: how many modes are described at most.
+        tolerance: as in ``find_modes`` [pixel].
 
     Raises:
         SettingsError: if a value is out of its range.
     """
 
     proof_time_limit: float | None = None
-    family_time_limit: float | None = None
+    mode_time_limit: float | None = None
     proof_poses: int = 25_000
-    family_poses: int = 50_000
+    mode_poses: int = 50_000
     memory: int = BoundLimits.memory
-    families: int = 32
+    modes: int = 32
     tolerance: float | None = None
 
     def __post_init__(self) -> None:
         if self.tolerance is not None and not self.tolerance >= 0.0:
             raise SettingsError(f"tolerance must be 0 pixels or more, not {self.tolerance}")
-        if self.families < 1:
-            raise SettingsError(f"families must be 1 or more, not {self.families}")
-        self.limits("family"), self.limits("proof")
+        if self.modes < 1:
+            raise SettingsError(f"modes must be 1 or more, not {self.modes}")
+        self.limits("mode"), self.limits("proof")
 
     def limits(self, step: str) -> BoundLimits:
-        """Those of the "proof", or of the search for all poses as good, of a "family"."""
+        """Those of the "proof", or of the search for all poses as good, of a "mode"."""
         poses, seconds = getattr(self, f"{step}_poses"), getattr(self, f"{step}_time_limit")
         return BoundLimits(poses=poses, memory=self.memory, time_limit=seconds)
 
@@ -330,11 +330,11 @@ def examine(
         if better.graph.best_J < J:
             J, samples = better.graph.best_J, better.graph.central()
         lower_bound, spent = J if better.complete else better.lower_bound, better.limited
-    answer = find_families(
-        body, views, samples, J, settings.tolerance, settings.families, settings.limits("family"),
+    answer = find_modes(
+        body, views, samples, J, settings.tolerance, settings.modes, settings.limits("mode"),
         within if settings.tolerance is None else None,
     )  # fmt: skip
-    best = answer.families[0]
+    best = answer.modes[0]
     J = min(J, best.J)
     if J < result.J:
         q, X_WB, values = best.q, best.X_WB, best.node_values

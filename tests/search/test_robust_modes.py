@@ -10,7 +10,7 @@ from drake_pose.fit.surfaces import few_triangles
 from drake_pose.search import ViewsFit
 from drake_pose.search.self_motions import flips
 from drake_pose.search.settings import RobustSettings
-from drake_pose.search.views_fit import FittedPose, RobustFamilies, distinct
+from drake_pose.search.views_fit import FittedPose, RobustModes, distinct
 from drake_pose.silhouette.outline import TreeSurfaces
 from tests.body.models import joint, link, urdf, write
 from tests.search.arms import arm_cameras, arm_tree, damaged_views, draw_view, is_held
@@ -21,8 +21,8 @@ FINE = tuple(AnnealingStage(scale, 0.0125, 8) for scale in (0.025, 0.0125))
 
 def find(kinematics, views, values, settings=None):
     fit = ViewsFit(kinematics, few_triangles(TreeSurfaces(kinematics.tree)), views)
-    families = RobustFamilies(fit, lambda: True, settings)
-    return families.find([fit.refine(values, FINE)], lambda values: float(values[0]))
+    modes = RobustModes(fit, lambda: True, settings)
+    return modes.find([fit.refine(values, FINE)], lambda values: float(values[0]))
 
 
 @pytest.fixture(scope="module")
@@ -37,26 +37,26 @@ def test_intervals_hold_the_truth_and_widen_with_the_damage(kinematics):
     for views in (clean, damaged_views(tree, TRUTH, 1)):
         answer = find(kinematics, views, TRUTH)
         assert is_held(answer, TRUTH)
-        family = answer.families[0]
-        assert family.J == family.q[0]
-        widths.append([one.high - one.low for one in family.joints])
-        for one, value in zip(family.joints, family.q, strict=True):
+        mode = answer.modes[0]
+        assert mode.J == mode.q[0]
+        widths.append([one.high - one.low for one in mode.joints])
+        for one, value in zip(mode.joints, mode.q, strict=True):
             assert one.holds(value)
     assert np.all(np.array(widths[0]) < np.radians(10.0))
     # A pixel of error in every camera is assumed where nothing is damaged, too.
     assert np.median(np.array(widths[1]) / widths[0]) > 1.03
 
 
-def test_flips_are_families_of_their_own(kinematics):
+def test_flips_are_modes_of_their_own(kinematics):
     """Where nothing is significant, all that flips make is as good; nothing is determined."""
     tree = kinematics.tree
     views = [draw_view(tree, TRUTH, camera) for camera in arm_cameras()]
-    nothing = RobustSettings(significance=1e6, families=5)
+    nothing = RobustSettings(significance=1e6, modes=5)
     assert not any(find(kinematics, views, TRUTH, nothing).determined)
     answer = find(kinematics, damaged_views(tree, TRUTH, 1), TRUTH)
-    flipped = [flip.values for flip in flips(kinematics, answer.families[0].q)]
-    for family in answer.families[1:]:
-        gaps = [np.abs(family.q - values).max() for values in flipped]
+    flipped = [flip.values for flip in flips(kinematics, answer.modes[0].q)]
+    for mode in answer.modes[1:]:
+        gaps = [np.abs(mode.q - values).max() for values in flipped]
         assert min(gaps) < np.radians(15.0)
 
 
@@ -86,8 +86,8 @@ def test_time_that_is_up_leaves_the_intervals_of_the_curvature(kinematics):
     fit = ViewsFit(kinematics, few_triangles(TreeSurfaces(kinematics.tree)), views)
     pose = fit.refine(TRUTH, FINE)
     before = fit.evaluations
-    answer = RobustFamilies(fit, lambda: False).find([pose], lambda _: 0.0)
-    assert answer.family_count == 1
+    answer = RobustModes(fit, lambda: False).find([pose], lambda _: 0.0)
+    assert answer.mode_count == 1
     assert fit.evaluations - before < 5
     assert all(one.low < one.high for one in answer.joints)
 

@@ -46,7 +46,7 @@ def positions(out: Path) -> dict[str, np.ndarray]:
 def test_result_folder(tiny_scene: TinyScene, out: Path) -> None:
     run_estimate(tiny_scene, out)
     assert sorted(path.name for path in out.iterdir()) == [
-        "modes.csv", "joints.csv", "overlay", "poses.csv", "replay.html", "report.html",
+        "joints.csv", "modes.csv", "overlay", "poses.csv", "replay.html", "report.html",
         "summary.json",
     ]  # fmt: skip
     rows = read_rows(out / "poses.csv")

@@ -210,7 +210,7 @@ def copy_into(target: np.ndarray, source: np.ndarray) -> None:
 
 
 @compiled
-def with_room(array: np.ndarray, used: int, rows: int) -> np.ndarray:
+def grow_rows(array: np.ndarray, used: int, rows: int) -> np.ndarray:
     """Returns an array of this many rows that begins with the first rows in use of another."""
     wider = np.empty((rows, *array.shape[1:]), dtype=array.dtype)
     copy_into(wider, array[:used])

@@ -74,7 +74,7 @@ _typed: ContextVar[bool] = ContextVar("typed", default=False)
 
 
 @contextmanager
-def options_are_typed() -> Iterator[None]:
+def options_in_messages() -> Iterator[None]:
     """While the command line runs: messages name its options."""
     token = _typed.set(True)
     try:
@@ -83,7 +83,7 @@ def options_are_typed() -> Iterator[None]:
         _typed.reset(token)
 
 
-def in_callers_words(text: str) -> str:
+def for_caller(text: str) -> str:
     """A message that names options as they are typed, or for a Python call its arguments.
 
     ``--joints FILE`` becomes ``joints=FILE``, ``--camera`` ``cameras``; commands stay as they are.

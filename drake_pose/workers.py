@@ -19,7 +19,7 @@ _CHOSEN: ContextVar[int | None] = ContextVar("workers", default=None)
 
 
 @contextmanager
-def working(workers: int | None) -> Iterator[None]:
+def use_workers(workers: int | None) -> Iterator[None]:
     """Has so many threads work meanwhile; None: as many as before, at first one for each core."""
     token = _CHOSEN.set(workers or _CHOSEN.get())
     try:
@@ -34,7 +34,7 @@ def map_ordered(
     """What a function makes of each item, in the items' order.
 
     Args:
-        workers: so many threads; None: as ``working`` says. What a thread maps itself it does
+        workers: so many threads; None: as ``use_workers`` says. What a thread maps itself it does
             alone, as does a process that another one started beside others.
     """
     things = list(items)

@@ -28,7 +28,7 @@ from drake_pose import (
     look_at,
     save_cameras,
 )
-from drake_pose.errors import CameraError, SettingsError, in_callers_words, options_are_typed
+from drake_pose.errors import CameraError, SettingsError, for_caller, options_in_messages
 from drake_pose.registration.register import RegistrationBody
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -117,10 +117,10 @@ def test_a_model_shows_itself_in_one_line(model):
     ],
 )
 def test_errors_of_python_calls_name_arguments_and_those_of_the_program_options(typed, called):
-    assert in_callers_words(typed) == called
-    with options_are_typed():
-        assert in_callers_words(typed) == typed
-    assert in_callers_words(typed) == called
+    assert for_caller(typed) == called
+    with options_in_messages():
+        assert for_caller(typed) == typed
+    assert for_caller(typed) == called
 
 
 def test_a_python_call_is_answered_in_its_words():

@@ -3,7 +3,7 @@ import threading
 
 import pytest
 
-from drake_pose.workers import map_ordered, working
+from drake_pose.workers import map_ordered, use_workers
 
 
 @pytest.mark.parametrize("workers", [1, 2, 5])
@@ -18,7 +18,7 @@ def test_so_many_threads_work_and_each_maps_alone() -> None:
         together.wait()
         return set(map_ordered(lambda _: threading.current_thread().name, range(4)))
 
-    with working(3):
+    with use_workers(3):
         found = map_ordered(names, range(3))
     assert [len(one) for one in found] == [1, 1, 1]
     assert len(set.union(*found)) == 3
@@ -30,7 +30,7 @@ def test_an_error_comes_out() -> None:
 
 
 def test_who_names_no_number_keeps_the_one_before() -> None:
-    with working(1), working(None):
+    with use_workers(1), use_workers(None):
         names = set(map_ordered(lambda _: threading.current_thread().name, range(4)))
     assert names == {threading.current_thread().name}
 

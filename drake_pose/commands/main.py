@@ -20,7 +20,7 @@ from drake_pose.commands.papers import date, kameda, reproduce_all, shimada
 from drake_pose.commands.prepare import check, masks, undistort
 from drake_pose.commands.register import audit, register
 from drake_pose.commands.walk import walk
-from drake_pose.errors import DrakePoseError, SettingsError, options_are_typed
+from drake_pose.errors import DrakePoseError, SettingsError, options_in_messages
 from drake_pose.version import VERSION
 
 
@@ -106,7 +106,7 @@ def main(words: Sequence[str] | None = None) -> None:
     for ending in (signal.SIGTERM, signal.SIGHUP):
         if signal.getsignal(ending) is signal.SIG_DFL:
             signal.signal(ending, signal.default_int_handler)
-    with options_are_typed():
+    with options_in_messages():
         _run(words)
 
 

@@ -16,7 +16,7 @@ from typing import Any, TypeVar, cast
 
 import numpy as np
 
-from drake_pose.errors import DrakePoseError, OutputError, in_callers_words
+from drake_pose.errors import DrakePoseError, OutputError, for_caller
 
 POSES = "poses.csv"
 JOINTS = "joints.csv"
@@ -114,7 +114,7 @@ def writes_folder(job: _Job) -> _Job:
             with claimed(Path(given["out"]), given.get("resume", False)):
                 return job(*args, **kwargs)
         except DrakePoseError as error:
-            error.args = (in_callers_words(str(error)),)
+            error.args = (for_caller(str(error)),)
             raise
 
     return cast(_Job, run)

@@ -28,7 +28,7 @@ from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.camera.models import HALF_PIXEL, Camera, ParallelCamera, PinholeCamera
 from drake_pose.errors import OutputError
 from drake_pose.files.overlay import EXCESS_RGB
-from drake_pose.fit.surfaces import light_meshes
+from drake_pose.fit.surfaces import reduce_meshes
 from drake_pose.registration.posed_frames import SeenFrame
 from drake_pose.systems.bodies import add_meshcat_skin, add_posed_plant, body_poses
 
@@ -72,7 +72,7 @@ def make_replay(
         builder, meshcat, model, source.get_output_port(), "body", prefix=_BODY_PATH, recorded=True
     )
     own = [*model.link_meshes.values()]
-    ghosts = [] if measured is None else light_meshes(own, most_triangles // 2)
+    ghosts = [] if measured is None else reduce_meshes(own, most_triangles // 2)
     for link, mesh in zip(model.link_meshes, ghosts, strict=False):
         surface = mesh.vertices.T, mesh.triangles.T
         meshcat.SetTriangleMesh(f"{_MEASURED_PATH}/{link}", *surface, Rgba(0.0, 0.62, 0.45, 0.4))
@@ -101,7 +101,7 @@ def _lighten(scene_graph: SceneGraph, source: SourceId, most: int) -> None:
         and isinstance(shape := inspector.GetShape(one), Mesh)
     }
     meshes = [shape_mesh(one) for one in shown.values()]
-    for one, mesh, light in zip(shown, meshes, light_meshes(meshes, most), strict=True):
+    for one, mesh, light in zip(shown, meshes, reduce_meshes(meshes, most), strict=True):
         if light is not mesh:
             scene_graph.ChangeShape(source, one, Mesh(write_obj(light, "replay")))
 

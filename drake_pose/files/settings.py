@@ -17,7 +17,7 @@ from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin, get_t
 
 from cyclopts import Parameter, Token
 
-from drake_pose.errors import SettingsError, in_callers_words
+from drake_pose.errors import SettingsError, for_caller
 
 _Settings = TypeVar("_Settings", bound=type)
 Axis = Literal["x", "y", "z"]
@@ -411,16 +411,16 @@ class MaskSettings:
         ways = [one for one in ("background", "box", "model") if getattr(self, one) is not None]
         if len(ways) > 1:
             text = f"--{ways[0]} and --{ways[1]} are two ways to find masks: give one"
-            raise SettingsError(in_callers_words(text))
+            raise SettingsError(for_caller(text))
         if self.classes and ways:
             text = f"--class is for COCO files, not for --{ways[0]}"
-            raise SettingsError(in_callers_words(text))
+            raise SettingsError(for_caller(text))
         if (self.model is None) != (self.start is None):
             text = "--model and --start need each other: rough joint positions"
-            raise SettingsError(in_callers_words(text))
+            raise SettingsError(for_caller(text))
         if not (math.isfinite(self.start_error) and self.start_error > 0.0):
             text = "--start-error must be a positive number of degrees"
-            raise SettingsError(in_callers_words(text))
+            raise SettingsError(for_caller(text))
 
     def as_json(self) -> Mapping[str, Any]:
         """The settings that are not the default's, as plain JSON values."""

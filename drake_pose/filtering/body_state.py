@@ -24,7 +24,7 @@ from drake_pose.filtering.inequalities import (
 )
 from drake_pose.filtering.state import StateLayout
 from drake_pose.fit.parameters import BodyParameters
-from drake_pose.fit.surfaces import MANY, few_rigid_triangles
+from drake_pose.fit.surfaces import MANY, simplify_rigid_parts
 from drake_pose.search import slide_root
 from drake_pose.silhouette.outline import PackedSurfaces, TreeSurfaces
 from drake_pose.silhouette.scoring import draw_packed
@@ -78,7 +78,7 @@ class BodyState:
         self._whole = PackedSurfaces(surfaces)
         # Few triangles are compared; what is drawn has all of them. Beside bands of skin 160 show
         # a rigid part to a fraction of a pixel.
-        compared = few_rigid_triangles(surfaces, 160 if surfaces.bends else MANY)
+        compared = simplify_rigid_parts(surfaces, 160 if surfaces.bends else MANY)
         self._body = BodyParameters(self._kinematics, compared.rigid, surfaces=compared)
         free = self._kinematics.lower < self._kinematics.upper
         names = [n for n, is_free in zip(self._kinematics.names, free, strict=True) if is_free]

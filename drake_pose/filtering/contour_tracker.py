@@ -18,10 +18,10 @@ from drake_pose.fit.colours import (
     LINES,
     add_pictures,
     check_picture,
-    learned,
-    no_colours,
     part_distances,
-    step_of_lines,
+    search_line_step,
+    uninformed_histograms,
+    update_histograms,
     weigh_parts,
 )
 from drake_pose.fit.contour_fit import (
@@ -147,11 +147,11 @@ class ContourObservation(BodyState):
 
     def is_finest(self, number: int) -> bool:
         """Whether no later measurement of a frame looks at pictures more closely than this one."""
-        return step_of_lines(number) == step_of_lines(number + 9)
+        return search_line_step(number) == search_line_step(number + 9)
 
     def no_colours(self) -> Floats:
         """What is known of a body's colours that was never seen."""
-        return no_colours(len(self.cameras), len(self._body.outlines))
+        return uninformed_histograms(len(self.cameras), len(self._body.outlines))
 
     def learn(
         self,
@@ -177,7 +177,7 @@ class ContourObservation(BodyState):
             for camera, picture in zip(self.cameras, pictures, strict=True)
         ]
         placed = self._body.place(self.parameters(x))
-        known = learned(placed, self.cameras, checked, colours, surely)
+        known = update_histograms(placed, self.cameras, checked, colours, surely)
         if without is not None:
             known[:, without] = colours[:, without]
         return known
@@ -223,7 +223,7 @@ class ContourObservation(BodyState):
         weights = camera_weights(seen.views.cameras, placed, step, _PLAIN, 1.0)
         compared = compare_views(seen.views, placed, weights)
         if seen.colours is not None and seen.has_pictures:
-            pixels = step_of_lines(number)
+            pixels = search_line_step(number)
             # Coarse lines are so wide that they would say the same.
             lines = AnnealingStage(width, LINES.spacing * min(pixels, 2))
             correlation = _PLAIN.correlation * LINES.correlation / CONTOUR.correlation

@@ -20,7 +20,7 @@ from drake_pose.fit.evidence import find_edge_points
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.fit.problem import Solution
 from drake_pose.fit.proportions import ProportionedBody, fit_proportions, sequence_prior
-from drake_pose.fit.surfaces import few_rigid_triangles
+from drake_pose.fit.surfaces import simplify_rigid_parts
 from drake_pose.search import JointEstimate, PoseMode, PoseSet, joint_estimates
 from drake_pose.silhouette.outline import TreeSurfaces
 
@@ -203,7 +203,7 @@ def fit_sequence(
         period: time between two frames [s].
     """
     observation = tracker.observation
-    surfaces = few_rigid_triangles(TreeSurfaces(observation.tree), SEQUENCE.triangles)
+    surfaces = simplify_rigid_parts(TreeSurfaces(observation.tree), SEQUENCE.triangles)
     body = ProportionedBody(TreeKinematics(observation.tree), surfaces)
     edges = [find_edge_points(mask, SEQUENCE.spacing) for mask in masks]
     step = max(1, min(int(SEQUENCE.memory / period + 1e-9), (len(masks) - 1) // 2))

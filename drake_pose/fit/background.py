@@ -68,7 +68,7 @@ class BackgroundModel:
 MODEL = BackgroundModel()
 
 
-def light_between(picture: Picture | Floats, reference: Floats, rounds: int = 4) -> Floats:
+def estimate_gain(picture: Picture | Floats, reference: Floats, rounds: int = 4) -> Floats:
     """(3, 4) gains and offsets of a picture's channels (H, W, 3) that make a reference's light.
 
     A line is fitted to each channel, without outliers. Gains are between a half and two. Pictures
@@ -91,7 +91,7 @@ def light_between(picture: Picture | Floats, reference: Floats, rounds: int = 4)
     return light
 
 
-def in_light(picture: Picture | Floats, light: Floats) -> Floats:
+def apply_gain(picture: Picture | Floats, light: Floats) -> Floats:
     """A picture (H, W, 3) in the reference's light."""
     return np.asarray(cv2.transform(picture.astype(np.float32), light))
 
@@ -116,13 +116,13 @@ class Backgrounds:
 
     Args:
         pictures: (f, H, W, 3) in even light.
-        lights: (3, 4) of each picture, see ``light_between``.
+        gains: (3, 4) of each picture, see ``estimate_gain``.
         colours: (3, H, W, 3) backgrounds, the most frequent first; they may be alike.
         deviations: (H, W) of a background's colours.
     """
 
     pictures: Floats
-    lights: tuple[Floats, ...]
+    gains: tuple[Floats, ...]
     colours: Floats
     deviations: Floats
 
@@ -131,11 +131,11 @@ class Backgrounds:
         """The backgrounds of pictures (f, H, W, 3) red, green, blue."""
         floats = pictures.astype(np.float32)
         reference = np.median(floats, axis=0)
-        lights = tuple(light_between(one, reference) for one in floats)
-        even = np.array([in_light(*one) for one in zip(floats, lights, strict=True)])
+        gains = tuple(estimate_gain(one, reference) for one in floats)
+        even = np.array([apply_gain(*one) for one in zip(floats, gains, strict=True)])
         off = np.median(_largest(np.abs(even - reference)), axis=0)
         deviations = _deviations(reference, 1.4826 * float(np.median(off)))
-        return Backgrounds(even, lights, _find_colours(even, deviations), deviations)
+        return Backgrounds(even, gains, _find_colours(even, deviations), deviations)
 
     @cached_property
     def sums(self) -> PixelSums:
@@ -210,12 +210,12 @@ class KnownBackground:
 
     @staticmethod
     def of(
-        pictures: Sequence[Picture], lights: Sequence[Floats], showing: Mask, covered: Mask
+        pictures: Sequence[Picture], gains: Sequence[Floats], showing: Mask, covered: Mask
     ) -> "KnownBackground":
         """That of pictures (H, W, 3) of any size.
 
         Args:
-            lights: of each.
+            gains: of each.
             showing: (f, h, w) which of them show the background, in smaller pictures.
             covered: (f, H, W) where the body is about.
         """
@@ -224,8 +224,8 @@ class KnownBackground:
         on, beside = (np.zeros(COLOURS) for _ in range(2))
         inside, near = ~_grown(~covered, MODEL.near), _grown(covered, MODEL.near)
         small, means = [], []
-        for f, (picture, light) in enumerate(zip(pictures, lights, strict=True)):
-            even = in_light(picture, light)
+        for f, (picture, light) in enumerate(zip(pictures, gains, strict=True)):
+            even = apply_gain(picture, light)
             shown = showing[f].astype(np.uint8)
             shown = cv2.resize(shown, (width, height), interpolation=cv2.INTER_NEAREST)
             shows = shown.astype(np.bool_) & ~near[f]
@@ -246,7 +246,7 @@ class KnownBackground:
 
     def foreground(self, picture: Picture, light: Floats) -> Floats:
         """(H, W) log-odds that each pixel of a picture shows the body."""
-        even = in_light(picture, light)
+        even = apply_gain(picture, light)
         numbers = colour_numbers(np.clip(even, 0.0, 255.0).astype(np.uint8))
         likeness = _likeness(even, self.colours, self.deviations) * np.float32(MODEL.known_times)
         shown = np.log(MODEL.shown * likeness + (1.0 - MODEL.shown))

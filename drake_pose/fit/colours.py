@@ -95,7 +95,7 @@ def colour_numbers(pixels: Picture) -> NDArray[np.intp]:
 
 
 @dataclass(frozen=True, eq=False)
-class OwnColours:
+class PartColours:
     """What parts look like to whichever camera, learned where the body is known to be.
 
     Args:
@@ -112,12 +112,12 @@ class OwnColours:
         outlines: Sequence[Outline],
         X_WN: Array,
         views: Iterable[tuple[Camera, Picture]],
-    ) -> "OwnColours":
+    ) -> "PartColours":
         """Those of cameras' histograms, of a body of these surfaces at X_WN (nodes, 4, 4)."""
         # Rarer colours than this fraction of the pixels are not a part's own.
         known = np.any([one[:, Colour.ON] > 4e-4 for one in histograms], axis=0)
-        own = OwnColours(known, np.ones(len(known)))
-        return OwnColours(known, own._shares(outlines, X_WN, views))
+        own = PartColours(known, np.ones(len(known)))
+        return PartColours(known, own._shares(outlines, X_WN, views))
 
     def shown(
         self, outlines: Sequence[Outline], X_WN: Array, views: Iterable[tuple[Camera, Picture]]
@@ -140,12 +140,12 @@ class OwnColours:
         return np.where(counts[1] < 100, np.nan, counts[0] / np.maximum(counts[1], 1.0))
 
 
-def step_of_lines(number: int) -> int:
+def search_line_step(number: int) -> int:
     """From offset to offset of lines in a round, counted from 0 [pixel]."""
     return LINES.steps[min(number, len(LINES.steps) - 1)]
 
 
-def no_colours(cameras: int, nodes: int) -> Floats:
+def uninformed_histograms(cameras: int, nodes: int) -> Floats:
     """What is known of a body that was never seen: nothing."""
     known = np.zeros((cameras, nodes, len(Colour), COLOURS), dtype=np.float32)
     known[:, :, Colour.FOREGROUND] = 1.0
@@ -249,7 +249,7 @@ def part_distances(sums: Array, closest: float = 0.7, shortest: float = 20.0) ->
     return np.where(told >= shortest, distances, 0.0)
 
 
-def learned(
+def update_histograms(
     placed: Placement,
     cameras: Sequence[Camera],
     pictures: Sequence[Picture | None],

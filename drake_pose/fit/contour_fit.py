@@ -19,7 +19,7 @@ from drake_pose.fit.evidence import EdgePoints, Evidence, pack_evidence
 from drake_pose.fit.kernel import Sum, collect, compare_contours
 from drake_pose.fit.levenberg_marquardt import AnnealingStage, Equations, StepSettings, minimise
 from drake_pose.fit.parameters import BodyParameters, Placement
-from drake_pose.fit.surfaces import VERY_FEW, few_triangles
+from drake_pose.fit.surfaces import VERY_FEW, simplify_surfaces
 from drake_pose.silhouette.outline import Outline, TreeSurfaces
 
 FINEST_SCALE = 1.5
@@ -157,7 +157,7 @@ class ContourFit:
         self.kinematics = tree if isinstance(tree, TreeKinematics) else TreeKinematics(tree)
         self.tree = self.kinematics.tree
         self.outlines = tuple(
-            few_triangles(TreeSurfaces(self.tree), VERY_FEW) if outlines is None else outlines
+            simplify_surfaces(TreeSurfaces(self.tree), VERY_FEW) if outlines is None else outlines
         )
         self.noise, self.steps = noise or Noise(), steps or StepSettings()
         self.body = body or BodyParameters(self.kinematics, self.outlines)
@@ -215,7 +215,7 @@ class ContourFit:
         placement = self.body.place(theta)
         return compare_views(views, placement, self.weights(views.cameras, placement, step))
 
-    def piece_costs(self, views: Views, theta: Array, step: AnnealingStage, side: float) -> Array:
+    def tile_costs(self, views: Views, theta: Array, step: AnnealingStage, side: float) -> Array:
         """(cameras, k, k) the cost at values (m,) by squares of the pictures of a side [pixel]."""
         placement = self.body.place(theta)
         weights = self.weights(views.cameras, placement, step)

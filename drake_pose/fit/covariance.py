@@ -37,7 +37,7 @@ class ErrorSizes(NamedTuple):
         repeated: the same of what noise repeats in all pictures of a part that stands still before
             a camera; 0 where no part does.
         surface, mask, camera: how far they move contours [the unit of the distances].
-        doubts: of each group of what is doubted [its own unit].
+        nuisances: of each group of what is doubted [its own unit].
     """
 
     noise: float
@@ -45,7 +45,7 @@ class ErrorSizes(NamedTuple):
     surface: float
     mask: float
     camera: float
-    doubts: tuple[float, ...] = ()
+    nuisances: tuple[float, ...] = ()
 
 
 class Distances(NamedTuple):
@@ -58,7 +58,7 @@ class Distances(NamedTuple):
         information: (m, m) about the values, were all errors independent.
         bends: (n, 12 nodes) derivatives by the parts' surfaces, which all pictures see alike.
         pictures: (n,) the picture of each.
-        doubts: (n, k) derivatives, by groups, by what may be off alike in all pictures and is not
+        nuisances: (n, k) derivatives, by groups, by what may be off in all pictures and is not
             among the values, such as joints' offsets; each by a unit of its group.
     """
 
@@ -68,7 +68,7 @@ class Distances(NamedTuple):
     information: Array
     bends: Array
     pictures: Indices
-    doubts: tuple[Array, ...] = ()
+    nuisances: tuple[Array, ...] = ()
 
 
 class ComparedMask(NamedTuple):
@@ -271,7 +271,7 @@ def estimate_sizes(
     stands_still = np.abs(seen.effects[1] - seen.effects[0]).max(initial=0.0) > settled
     # Of parts that move, noise is not repeated.
     told = [0, 1, 2, 3, 4] if stands_still else [0, 2, 3, 4]
-    effects = [*seen.effects[told], *(Z @ Z.T for Z in seen.doubts)]
+    effects = [*seen.effects[told], *(Z @ Z.T for Z in seen.nuisances)]
     stacked = np.reshape(effects, (len(effects), -1))
 
     apriori = _apriori(is_angle)
@@ -316,8 +316,8 @@ def estimate_sizes(
     sizes = np.zeros(5)
     sizes[told] = np.exp(t[: len(told)])
     noise, repeated, surface, mask, camera = sizes.tolist()
-    doubts = tuple(np.exp(t[len(told) :]).tolist())
-    return ErrorSizes(noise, repeated, surface, mask, max(camera, least_camera), doubts)
+    nuisances = tuple(np.exp(t[len(told) :]).tolist())
+    return ErrorSizes(noise, repeated, surface, mask, max(camera, least_camera), nuisances)
 
 
 @_on_one_thread
@@ -339,42 +339,42 @@ def values_covariance(
 
 
 def distances_covariance(seen: Distances, sizes: ErrorSizes) -> Array:
-    """(n, n) of the distances, doubts left out."""
+    """(n, n) of the distances, nuisances left out."""
     parts = zip(sizes[:5], seen.effects, strict=True)
     return sum((size**2 * W for size, W in parts), np.zeros((len(seen.y), len(seen.y))))
 
 
 @_on_one_thread
-def doubted_covariance(
+def nuisance_covariance(
     seen: Distances, sizes: ErrorSizes, is_angle: Mask
 ) -> tuple[Array, Distances]:
-    """What the doubts add to the covariance (m, m) of the values, and the distances without them.
+    """Covariance (m, m) of the values due to nuisances, and the distances without them.
 
-    Doubts were not fitted, so the values follow them: by the doubts' variance, and the square of
+    Doubts were not fitted, so the values follow them: by the nuisances' variance, and the square of
     their likeliest values by the residuals (best linear unbiased prediction, Henderson 1975).
     """
     white = sizes.noise**2 + sizes.repeated**2
-    A = np.concatenate(seen.doubts, axis=1)
-    variances = np.repeat(np.square(sizes.doubts), [Z.shape[1] for Z in seen.doubts])
+    A = np.concatenate(seen.nuisances, axis=1)
+    variances = np.repeat(np.square(sizes.nuisances), [Z.shape[1] for Z in seen.nuisances])
     inverse = np.linalg.inv(distances_covariance(seen, sizes) + (A * variances) @ A.T)
     VX, apriori = inverse @ seen.X, _apriori(is_angle)
     left = inverse @ seen.y - VX @ np.linalg.solve(seen.X.T @ VX + apriori, VX.T @ seen.y)
     likeliest = variances * (A.T @ left)
     follow = np.linalg.solve(seen.information + white * apriori, seen.X.T @ A)
     off = follow @ likeliest
-    without = seen._replace(y=seen.y - A @ likeliest, doubts=())
+    without = seen._replace(y=seen.y - A @ likeliest, nuisances=())
     return (follow * variances) @ follow.T + np.outer(off, off), without
 
 
 @_on_one_thread
-def scored_doubts(seen: Distances, sizes: ErrorSizes) -> tuple[Array, Array]:
+def score_nuisances(seen: Distances, sizes: ErrorSizes) -> tuple[Array, Array]:
     """(k,) value and standard deviation of each doubt, one group after another [its unit].
 
     Each is what explains the residuals best by itself, beside the values (score test, Rao 1948).
     """
-    if not seen.doubts:
+    if not seen.nuisances:
         return np.zeros(0), np.zeros(0)
-    A = np.concatenate(seen.doubts, axis=1)
+    A = np.concatenate(seen.nuisances, axis=1)
     inverse = np.linalg.inv(distances_covariance(seen, sizes))
     VX = inverse @ seen.X
     P = inverse - VX @ np.linalg.pinv(seen.X.T @ VX) @ VX.T
@@ -387,7 +387,7 @@ def _apriori(is_angle: Mask) -> Array:
     return np.diag(12.0 / np.where(is_angle, 2.0 * np.pi, 10.0) ** 2)
 
 
-def excess(pieces: Array, others: Array) -> float:
+def vuong_statistic(pieces: Array, others: Array) -> float:
     """By how many standard deviations costs by pieces of pictures are above others (same shape).
 
     Vuong's test (1989): differences of pieces scatter as that of the whole does by chance. What no

@@ -109,7 +109,7 @@ class BodyParameters:
         made_by = kinematics.parameters
         self.groups = np.full(nodes, -1) if groups is None else np.array(groups)
         radius_scales = tuple(f"{RADIUS_SCALE_PREFIX}{name}" for name in radius_scale_names)
-        lengths = tuple(length_name(link) for link in self.links)
+        lengths = tuple(link_scale_name(link) for link in self.links)
         self.names = (*kinematics.names, *ROOT_NAMES, *radius_scales, *lengths)
         self._packed = pack(self.outlines)
         values = kinematics.flatten(kinematics.tree.default_values())
@@ -214,12 +214,12 @@ class BodyParameters:
         return found
 
 
-def length_name(link: str) -> str:
+def link_scale_name(link: str) -> str:
     """The name of the logarithm of a link's scale among the parameters."""
     return f"length of {link}"
 
 
-def lengthened_joints(tree: PoseTree, links: Collection[str] | None = None) -> list[JointOffset]:
+def carried_joints(tree: PoseTree, links: Collection[str] | None = None) -> list[JointOffset]:
     """The robot's joints that links, all where None, carry at a distance from their own."""
     return [
         one

@@ -40,7 +40,7 @@ from drake_pose.fit.levenberg_marquardt import (
 from drake_pose.fit.parameters import CAMERA_NAMES, BodyParameters, CameraParameters, Placement
 from drake_pose.workers import map_ordered
 
-WIDTH = "width"
+BOUNDARY_BIAS = "width"
 """Parameter of each camera: by how much its silhouettes are too wide on all sides [pixel]."""
 
 TIME_OFFSET = "time_offset"
@@ -116,7 +116,7 @@ class Solution:
 def parameter_names(body: BodyParameters, cameras: Sequence[Camera]) -> tuple[str, ...]:
     """All parameters of a frame: the body's, TIME_OFFSET, CAMERA_NAMES of each camera, WIDTHs."""
     looks = [f"{camera.name}.{name}" for camera in cameras for name in CAMERA_NAMES]
-    widths = [f"{camera.name}.{WIDTH}" for camera in cameras]
+    widths = [f"{camera.name}.{BOUNDARY_BIAS}" for camera in cameras]
     return (*body.names, TIME_OFFSET, *looks, *widths)
 
 
@@ -342,7 +342,7 @@ class Problem:
         Returns:
             the comparison, and the cameras as of ``CameraParameters.place``.
         """
-        places = self.places(theta)
+        places = self.place_cameras(theta)
         views = self._views(seen, theta)
         own = self._of_body(theta, seen.rates)
         # Where the body stands still in each frame it is placed once.
@@ -364,12 +364,12 @@ class Problem:
                 )  # fmt: skip
         return compared, places
 
-    def piece_costs(
+    def tile_costs(
         self, seen: Observation, theta: Array, step: AnnealingStage, side: float
     ) -> Array:
         """(cameras, k, k) the costs at all parameters (n,) by squares of a side [pixel]."""
         views = self._views(seen, theta)
-        return self._contours.piece_costs(views, self._of_body(theta, seen.rates), step, side)
+        return self._contours.tile_costs(views, self._of_body(theta, seen.rates), step, side)
 
     def _of_body(self, theta: Array, rates: Array | None) -> Array:
         """The body's parameters, the tree's values alone where all others are 0."""
@@ -383,9 +383,9 @@ class Problem:
         """The cameras, and their silhouettes as wide as they are."""
         widths = theta[self._first_width :]
         edges = widened(seen.edges, -widths) if widths.any() else seen.edges
-        return Views(self.places(theta)[:2], edges)
+        return Views(self.place_cameras(theta)[:2], edges)
 
-    def places(self, theta: Array) -> tuple[Array, Array, Array]:
+    def place_cameras(self, theta: Array) -> tuple[Array, Array, Array]:
         """The cameras at all parameters (n,), as of ``CameraParameters.place``."""
         look = theta[self._first_look : self._first_width]
         # One frame after another mostly asks for the same.
@@ -393,7 +393,7 @@ class Problem:
             self._last_look = look.tobytes(), self._cameras.place(look)
         return self._last_look[1]
 
-    def pictures(
+    def compared_masks(
         self, observations: Sequence[Observation], parameters: Array, step: AnnealingStage
     ) -> list[ComparedMask]:
         """What each silhouette says at all parameters (frames, n).

@@ -25,12 +25,12 @@ MANY, FEW, VERY_FEW = 2500, 400, 80
 _SIMPLIFIER = Lock()
 
 
-def few_rigid_triangles(surfaces: TreeSurfaces, count: int) -> TreeSurfaces:
+def simplify_rigid_parts(surfaces: TreeSurfaces, count: int) -> TreeSurfaces:
     """The surfaces with few triangles in each rigid part; bands of skin stay and bend."""
     return surfaces.with_rigid([_simplified(rigid, count) for rigid in surfaces.rigid])
 
 
-def few_triangles(surfaces: TreeSurfaces, count: int = FEW) -> tuple[Outline, ...]:
+def simplify_surfaces(surfaces: TreeSurfaces, count: int = FEW) -> tuple[Outline, ...]:
     """The nodes' surfaces, skin at rest, with few triangles (Garland and Heckbert's metric)."""
     outlines = []
     for node, rigid in enumerate(surfaces.rigid):
@@ -39,12 +39,14 @@ def few_triangles(surfaces: TreeSurfaces, count: int = FEW) -> tuple[Outline, ..
     return tuple(outlines)
 
 
-def rough_outlines(outlines: Sequence[Outline], count: int = 160) -> tuple[Outline, ...]:
+def simplify_outlines(outlines: Sequence[Outline], count: int = 160) -> tuple[Outline, ...]:
     """Surfaces of few triangles with fewer still, which takes a fraction of what the first took."""
     return tuple(_simplified(outline, count) for outline in outlines)
 
 
-def light_meshes(meshes: Sequence[TriangleMesh], total: int, rounds: int = 4) -> list[TriangleMesh]:
+def reduce_meshes(
+    meshes: Sequence[TriangleMesh], total: int, rounds: int = 4
+) -> list[TriangleMesh]:
     """Meshes with about so many triangles in all; each keeps its share, or 100 at least.
 
     ``rounds``: how often they are simplified at most: what has holes and slivers keeps several
@@ -63,7 +65,9 @@ def light_meshes(meshes: Sequence[TriangleMesh], total: int, rounds: int = 4) ->
     return light
 
 
-def hull_of_few(outlines: Sequence[Outline], count: int, limit: float = 3.0) -> tuple[Outline, ...]:
+def simplify_or_hull(
+    outlines: Sequence[Outline], count: int, limit: float = 3.0
+) -> tuple[Outline, ...]:
     """Surfaces with few triangles each.
 
     A surface that will not simplify below `limit` times as many becomes its convex hull.
@@ -126,7 +130,7 @@ def _simplify(vertices: bytes, triangles: bytes, count: int) -> Outline:
 
 def _make_simple(outline: Outline, count: int) -> Outline:
     """A surface with about that number of triangles, in the way that is nearer to it."""
-    simplified = collapsed(outline, count)
+    simplified = collapse_edges(outline, count)
     size = float(np.linalg.norm(np.ptp(outline.vertices, axis=0)))
     # The distance of a smooth surface falls with the triangles: it is 0.4 to 1.4 times size / count
     # on all parts of the bundled bodies, from 80 triangles to 400.
@@ -138,20 +142,20 @@ def _make_simple(outline: Outline, count: int) -> Outline:
     # A surface with slivers: the simplifier gets it in a unit in which its largest errors, a few
     # hundred units, are small. Vertices that are close together are merged before the next time.
     unit = size / (25.0 * count)
-    merged = collapsed(outline, count, unit)
+    merged = collapse_edges(outline, count, unit)
     for grid in (10.0, 20.0, 40.0):
         if len(merged.triangles) <= 1.1 * count:
             break
         places = np.round(merged.vertices / (grid * unit)) * (grid * unit)
         merged = outline_from_mesh(TriangleMesh(places, merged.triangles))
-        merged = collapsed(merged, count, unit)
+        merged = collapse_edges(merged, count, unit)
     merged_distance = surface_distance(outline, merged)
     if merged_distance < 0.75 * distance or (too_many and merged_distance <= too_far):
         return merged
     return simplified
 
 
-def collapsed(outline: Outline, count: int, unit: float = 1.0) -> Outline:
+def collapse_edges(outline: Outline, count: int, unit: float = 1.0) -> Outline:
     """A surface whose edges are collapsed till triangles are few, in a unit of length [m].
 
     By Garland and Heckbert's quadric error metric.

@@ -158,7 +158,7 @@ class CameraJudge:
         for start in (np.zeros(3), _way_to_regions(camera, edges, places)):
             shift = np.concatenate([np.zeros(3), camera.X_CW[:3, :3] @ start])
             solved = problem.solve(seen, rounds, (nothing, shift), expected=(nothing, np.zeros(6)))
-            X_CW = problem.places(solved.parameters[0])[0][0]
+            X_CW = problem.place_cameras(solved.parameters[0])[0][0]
             moved = camera.with_pose(np.linalg.inv(X_CW))
             found.append(self._describe(camera, moved, pairs, points))
             # What is far off may be drawn to the wrong side of the body; else one start is enough.

@@ -17,7 +17,7 @@ from drake_pose.arrays import Array, Mask, Picture
 from drake_pose.body import PoseTree
 from drake_pose.camera.models import Camera
 from drake_pose.errors import CameraError, MaskError, SettingsError
-from drake_pose.fit.colours import OwnColours
+from drake_pose.fit.colours import PartColours
 from drake_pose.fit.contour_fit import ContourFit, PoseFit
 from drake_pose.fit.evidence import EdgePoints, find_edge_points
 from drake_pose.person.camera_faults import (
@@ -349,7 +349,7 @@ def capture_by_colour(
     captured, distances = PersonCapture.begun(count, shape, fit), np.full(count, np.nan)
     state: TrackState | None = None
     colours: KnownColours = {}
-    own: OwnColours | None = None
+    own: PartColours | None = None
     for frame in range(count):
         seen = pictures(frame)
         views = ColourViews([cameras[name] for name in seen], list(seen.values()), colours)
@@ -364,7 +364,7 @@ def capture_by_colour(
             colours = views.learned(fit, values, masked[frame])
             shown = zip(views.cameras, views.pictures, strict=True)
             X_WN = fit.kinematics.poses(values)
-            own = OwnColours.learned(colours.values(), fit.outlines, X_WN, shown)
+            own = PartColours.learned(colours.values(), fit.outlines, X_WN, shown)
         else:
             if state is not None:
                 state = tracker.follow_by_colour(state, views, own)

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from drake_pose.arrays import Array, Indices, Mask
-from drake_pose.fit.colours import OwnColours
+from drake_pose.fit.colours import PartColours
 from drake_pose.fit.contour_fit import Comparison, ContourFit, PoseFit, Prior, symmetric
 from drake_pose.fit.covariance import surface_deformations
 from drake_pose.fit.kernel import Sum
@@ -272,7 +272,7 @@ class PersonPoseTracker:
         )
 
     def follow_by_colour(
-        self, last: TrackState, colours: ColourViews, own: OwnColours | None = None
+        self, last: TrackState, colours: ColourViews, own: PartColours | None = None
     ) -> TrackState:
         """The next frame, where pictures say where the person's edge is.
 

@@ -16,7 +16,12 @@ from numpy.typing import NDArray
 from drake_pose.arrays import Array, Mask, Picture
 from drake_pose.camera.models import Camera, ParallelCamera
 from drake_pose.compiled import compiled
-from drake_pose.fit.colours import check_picture, compare_lines, learn_colours, no_colours
+from drake_pose.fit.colours import (
+    check_picture,
+    compare_lines,
+    learn_colours,
+    uninformed_histograms,
+)
 from drake_pose.fit.contour_fit import (
     Comparison,
     ContourFit,
@@ -116,7 +121,7 @@ class ColourViews:
             size = float(scales[c])
             surely = known is None or region is not None
             nodes = len(placement.X_WN)
-            histograms = no_colours(1, nodes)[0] if known is None else known.copy()
+            histograms = uninformed_histograms(1, nodes)[0] if known is None else known.copy()
             learn_colours(
                 placement.packed, placement.X_WN, self._camera(c), self.pictures[c], histograms,
                 max(2.0, self._spacing * size),

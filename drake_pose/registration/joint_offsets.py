@@ -18,7 +18,7 @@ from drake_pose.arrays import Array, Mask
 from drake_pose.body import OBJECT_POSITIONS, PoseTree
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import RegistrationError, UnknownNameError
-from drake_pose.fit.parameters import POSE_NAMES, length_name, lengthened_joints
+from drake_pose.fit.parameters import POSE_NAMES, carried_joints, link_scale_name
 from drake_pose.registration.posed_frames import PosedFrame, PosedFrames
 from drake_pose.registration.register import RegisteredCamera, RegistrationBody
 from drake_pose.registration.shared_fit import SHARED, Shared, SharedFit
@@ -78,7 +78,7 @@ class JointCalibration:
 
 def links_with_length(tree: PoseTree) -> tuple[str, ...]:
     """The links that carry a joint at a distance from their own."""
-    return tuple(dict.fromkeys(one.link for one in lengthened_joints(tree)))
+    return tuple(dict.fromkeys(one.link for one in carried_joints(tree)))
 
 
 def require_known(tree: PoseTree, names: Sequence[str], lengths: Sequence[str]) -> None:
@@ -166,8 +166,8 @@ def calibrate_joints(
         for one, each in zip(cameras, frames, strict=True)
     ]
     X_CW = [one.camera.X_CW for one in cameras]
-    offsets = lengthened_joints(body.tree, lengths)
-    asked, looks = [*names, *map(length_name, lengths)], len(POSE_NAMES) + focal
+    offsets = carried_joints(body.tree, lengths)
+    asked, looks = [*names, *map(link_scale_name, lengths)], len(POSE_NAMES) + focal
     standing = [name for name in body.kinematics.names if name in OBJECT_POSITIONS]
     told: dict[str, KinematicParameter] = {}
     sought: list[str] | None = None
@@ -214,7 +214,7 @@ def calibrate_joints(
     stands = slice(first, first + len(standing))
     return JointCalibration(
         tuple(told[name] for name in names),
-        tuple(replace(told[length_name(link)], name=link) for link in lengths),
+        tuple(replace(told[link_scale_name(link)], name=link) for link in lengths),
         tuple(fit.cameras(found)),
         fit.camera_covariances(found, covariance),
         deviations[fit.per_camera - 1 :: fit.per_camera] if focal else np.zeros(len(seen)),

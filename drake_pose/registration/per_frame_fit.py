@@ -135,7 +135,7 @@ class PerFrameFit:
             frame.name,
             tuple(
                 one._replace(b=one.b + np.einsum("nkl,npl,p->nk", one.A, one.moves, change[0][0]))
-                for one in self._all.pictures([given], theta[None], SHARED.told_apart)
+                for one in self._all.compared_masks([given], theta[None], SHARED.told_apart)
             ),
             (self._inlier_ratios(before, frame), self._inlier_ratios(after, frame)),
             # Edges are shared out among the nodes.

@@ -14,10 +14,10 @@ import numpy as np
 from drake_pose.arrays import Array, Picture
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import RegistrationError
-from drake_pose.fit.background import Explained, light_between
-from drake_pose.fit.covariance import excess
+from drake_pose.fit.background import Explained, estimate_gain
+from drake_pose.fit.covariance import vuong_statistic
 from drake_pose.fit.problem import TIME_OFFSET
-from drake_pose.fit.surfaces import hull_of_few
+from drake_pose.fit.surfaces import simplify_or_hull
 from drake_pose.registration.picture_search import (
     PICTURES,
     PictureFit,
@@ -193,7 +193,9 @@ def _register(
     level, start = search.compared, near[0][0]
     pieces = level.pieces(start.X_CW)
     # Once more, for those that are as good, but for chance, and on their way to the best.
-    close = [one.X_CW for one, _ in near[1:] if excess(pieces, level.pieces(one.X_CW)) <= 1.96]
+    close = [
+        one.X_CW for one, _ in near[1:] if vuong_statistic(pieces, level.pieces(one.X_CW)) <= 1.96
+    ]
     again = map_ordered(search.approach, close)
     alike = [one[0].X_CW for one in again if one is not None]
     alternatives = level.distinct([start.X_CW, *alike])[1:]
@@ -539,14 +541,14 @@ def judge_pictures(
     min_iou = min_overlap * float(np.median(overlaps))
     least = agreeing_share(one.fit.ratios)
     known, camera = one.fit.background, found.camera
-    outlines = hull_of_few(body.very_few, PICTURES.triangles[-1])
+    outlines = simplify_or_hull(body.very_few, PICTURES.triangles[-1])
     offset = 0.0 if one.offset is None else one.offset.value
 
     def see(posed: PosedPicture) -> tuple[str, PosedFrame | None] | None:
         covered = draw_mask(outlines, camera.X_CW @ body.kinematics.poses(posed.values), camera)
         if covered.mean() < shown:
             return None
-        light = light_between(posed.picture, known.colours)
+        light = estimate_gain(posed.picture, known.colours)
         return posed.name, see_picture(posed, known, light, covered)
 
     frames, misfits, lost = list[PosedFrame](), list[FrameMisfit](), list[str]()

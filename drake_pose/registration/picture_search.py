@@ -29,7 +29,7 @@ from drake_pose.fit.background import (
 )
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.fit.parameters import POSE_NAMES
-from drake_pose.fit.surfaces import hull_of_few
+from drake_pose.fit.surfaces import simplify_or_hull
 from drake_pose.registration.posed_frames import PosedFrame, PosedFrames, placed_points
 from drake_pose.registration.register import RegistrationBody, spread_rotations
 from drake_pose.registration.shared_fit import Shared, SharedFit
@@ -152,7 +152,7 @@ class PictureSearch:
         self, body: RegistrationBody, camera: PinholeCamera, frames: Sequence[PosedPicture]
     ) -> None:
         self._body, self._camera, self.frames = body, camera, tuple(frames)
-        coarse, *finer = (hull_of_few(body.very_few, count) for count in PICTURES.triangles)
+        coarse, *finer = (simplify_or_hull(body.very_few, count) for count in PICTURES.triangles)
         # Smaller parts do not show in the smallest pictures.
         least = 0.25 * max(one.ball[3] for one in coarse)
         coarse = tuple(one if one.ball[3] >= least else NOTHING for one in coarse)
@@ -275,9 +275,9 @@ class PictureSearch:
             np.array([draw_mask(self._outlines[-1], X_CN, one) for X_CN in poses])
             for one in (small, camera)
         ]
-        pictures, lights = [one.picture for one in frames], level.backgrounds.lights
+        pictures, gains = [one.picture for one in frames], level.backgrounds.gains
         showing = level.backgrounds.showing(both[0])
-        return KnownBackground.of(pictures, lights, showing, both[1]), both[1]
+        return KnownBackground.of(pictures, gains, showing, both[1]), both[1]
 
     def _see(
         self,
@@ -293,10 +293,10 @@ class PictureSearch:
             covered: (f, H, W) where the body is about; frames that do not show it tell nothing.
             outlines: the surfaces that are compared.
         """
-        lights = self._level(PICTURES.learned).backgrounds.lights
+        gains = self._level(PICTURES.learned).backgrounds.gains
 
         def see(k: int) -> PosedFrame | None:
-            return see_picture(frames[k], known, lights[k], covered[k])
+            return see_picture(frames[k], known, gains[k], covered[k])
 
         posed = [one for one in map_ordered(see, range(len(frames))) if one is not None]
         if len(posed) < 2:

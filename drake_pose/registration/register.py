@@ -22,9 +22,9 @@ from drake_pose.body import PoseTree
 from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import RegistrationError
-from drake_pose.fit.covariance import excess
+from drake_pose.fit.covariance import vuong_statistic
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
-from drake_pose.fit.surfaces import FEW, VERY_FEW, few_triangles, with_radius_scales
+from drake_pose.fit.surfaces import FEW, VERY_FEW, simplify_surfaces, with_radius_scales
 from drake_pose.registration.posed_frames import (
     LAST_SPACING,
     PosedFrame,
@@ -108,13 +108,13 @@ class RegistrationBody:
                 [surface if node.name in seen else NOTHING for node, surface in own]
             )
         self._surfaces, self._fewest = surfaces, fewest
-        self.few = few_triangles(surfaces, FEW)
-        self.all = few_triangles(surfaces, np.iinfo(np.int64).max)
+        self.few = simplify_surfaces(surfaces, FEW)
+        self.all = simplify_surfaces(surfaces, np.iinfo(np.int64).max)
 
     @cached_property
     def very_few(self) -> tuple[Outline, ...]:
         """Surfaces for searches: what only fits does without them."""
-        return few_triangles(self._surfaces, self._fewest)
+        return simplify_surfaces(self._surfaces, self._fewest)
 
     def with_tree(self, tree: PoseTree) -> "RegistrationBody":
         """The same surfaces on another tree with the same nodes."""
@@ -238,10 +238,10 @@ class CameraSearch:
         halfway = map_ordered(partial(fit_pose, fine, rounds=SEARCH.fine), looks)
         begun = [SharedFit([fine], [X], widths=False) for X in halfway]
         side = max(1.0, SEARCH.piece * fine.size)
-        pieces = [fit.piece_costs(fit.start, side) for fit in begun]
+        pieces = [fit.tile_costs(fit.start, side) for fit in begun]
         order = np.argsort([one.sum() for one in pieces], kind="stable")
         # Those that are far worse than the best now are not fitted to the end.
-        likely = [halfway[k] for k in order if excess(pieces[k], pieces[order[0]]) <= 6.0]
+        likely = [halfway[k] for k in order if vuong_statistic(pieces[k], pieces[order[0]]) <= 6.0]
         likely = distinct(fine, likely)
         fitted = distinct(last, map_ordered(partial(fit_pose, last, rounds=SEARCH.last), likely))
         if len(some) < len(frames):
@@ -281,7 +281,7 @@ def describe_fitted(
     Between these, the covariance (u, u) of what is shared in the best one.
     """
     side = max(1.0, SEARCH.piece * fitted[0][0].seen[0].size)
-    pieces = [fit.piece_costs(found, side) for fit, found in fitted]
+    pieces = [fit.tile_costs(found, side) for fit, found in fitted]
     order = np.argsort([one.sum() for one in pieces], kind="stable")
     fit, best = fitted[order[0]]
     (seen,), (camera,) = fit.seen, fit.cameras(best)
@@ -290,7 +290,7 @@ def describe_fitted(
     misfits = frame_misfits(seen, camera.X_CW, ratios, agree)
     # A frame that contradicts fits no pose, so it tells none from another.
     counted = [one[agree] for one in pieces]
-    worse = [excess(one, counted[order[0]]) for one in counted]
+    worse = [vuong_statistic(one, counted[order[0]]) for one in counted]
     as_good = [int(k) for k in order if worse[k] <= SEARCH.significance]
     # Fits that began apart may have ended in one pose.
     looks = [fitted[k][0].cameras(fitted[k][1])[0].X_CW for k in as_good]

@@ -26,9 +26,9 @@ from drake_pose.fit.covariance import (
     ErrorSizes,
     distances_covariance,
     distances_in_masks,
-    doubted_covariance,
     estimate_sizes,
-    scored_doubts,
+    nuisance_covariance,
+    score_nuisances,
     values_covariance,
 )
 from drake_pose.fit.evidence import Observation
@@ -38,8 +38,8 @@ from drake_pose.fit.parameters import (
     POSE_NAMES,
     RADIUS_SCALE_PREFIX,
     BodyParameters,
-    length_name,
-    lengthened_joints,
+    carried_joints,
+    link_scale_name,
 )
 from drake_pose.fit.problem import TIME_OFFSET, Problem, Unknowns, parameter_names
 from drake_pose.registration.posed_frames import PosedFrames, SeenFrame, common_size, middle_of
@@ -233,18 +233,18 @@ class SharedFit:
         own = [ratios[self.rows == c] for c in range(len(self.seen))]
         return np.concatenate([one >= agreeing_share(one) for one in own])
 
-    def piece_costs(self, found: Shared, side: float) -> Array:
+    def tile_costs(self, found: Shared, side: float) -> Array:
         """(rows, k, k) costs by squares of the pictures of a side [pixel]."""
 
         def costs(mask: tuple[Observation, Array, int]) -> Array:
-            return self.problem.piece_costs(*mask[:2], SHARED.told_apart, side)[mask[2]]
+            return self.problem.tile_costs(*mask[:2], SHARED.told_apart, side)[mask[2]]
 
         masks = zip(self._observations, self._parameters(found), self.rows.tolist(), strict=True)
         return np.array(map_ordered(costs, masks))
 
     def cameras(self, found: Shared) -> list[PinholeCamera]:
         """The cameras as they were found."""
-        X_CW, kernel, _ = self.problem.places(self._parameters(found)[0])
+        X_CW, kernel, _ = self.problem.place_cameras(self._parameters(found)[0])
         return [
             replace(one.camera, X_WC=np.linalg.inv(X), focal_x=float(k[1]), focal_y=float(k[2]))
             for one, X, k in zip(self.seen, X_CW, kernel, strict=True)
@@ -258,7 +258,7 @@ class SharedFit:
         seen = self._doubted_distances(found, SHARED.fitted, which)
         is_angle = np.zeros(seen.X.shape[1], bool)
         sizes = estimate_sizes(seen, is_angle, 0.0, SHARED.prior_deviation)
-        doubted, seen = doubted_covariance(seen, sizes, is_angle)
+        doubted, seen = nuisance_covariance(seen, sizes, is_angle)
         covariance = values_covariance(seen, sizes, np.arange(len(is_angle)), is_angle)
         covariance *= scatter_factor(seen, sizes, len(self.names))
         # Wrong intrinsics err alike in all frames: the pose follows, and nothing is left of it. So
@@ -296,12 +296,12 @@ class SharedFit:
         seen = self._doubted_distances(found, SHARED.told_apart, which)
         angles = np.zeros(seen.X.shape[1], bool)
         sizes = estimate_sizes(seen, angles, 0.0, SHARED.prior_deviation)
-        values, deviations = scored_doubts(seen, sizes)
+        values, deviations = score_nuisances(seen, sizes)
         units = self._offset_units
-        # As they stand among the doubts: what is fitted and an object's place are none.
+        # As they stand among the nuisances: what is fitted and an object's place are none.
         known = {*self.names, *OBJECT_POSITIONS}
         names = [one for one in self._doubting.names if one in units and one not in known]
-        if not seen.doubts or seen.doubts[0].shape[1] != len(names):
+        if not seen.nuisances or seen.nuisances[0].shape[1] != len(names):
             return {}
         scored = zip(names, values, deviations, strict=False)
         told = {
@@ -341,7 +341,7 @@ class SharedFit:
 
     def camera_covariances(self, found: Shared, covariance: Array) -> Array:
         """(cameras, 6, 6) of the poses' errors in the world, covariance being of what is shared."""
-        X_CW, _, motions = self.problem.places(self._parameters(found)[0])
+        X_CW, _, motions = self.problem.place_cameras(self._parameters(found)[0])
         own = [slice(k, k + 6) for k in self.per_camera * np.arange(len(X_CW))]
         several = zip(X_CW, motions, own, strict=True)
         return np.array([pose_covariance(X, J[:6], covariance[k, k]) for X, J, k in several])
@@ -371,7 +371,7 @@ class SharedFit:
     def distances(self, at: Shared, step: AnnealingStage, which: Mask | None = None) -> Distances:
         """The distances in all masks that count; values are what is shared, then the widths."""
         seen, _, _, which = self._at(at, which)
-        pictures = self.problem.pictures(seen, self._parameters(at)[which], step)
+        pictures = self.problem.compared_masks(seen, self._parameters(at)[which], step)
         return distances_in_masks(self.problem.body.outlines, pictures, widths=True)
 
     def _doubted_distances(
@@ -397,16 +397,16 @@ class SharedFit:
         own = [names.index(name) for name in self.names]
         shared[own] = found.shared
         distances = whole.distances(Shared(shared, found.widths), step, which)
-        doubts = []
+        nuisances = []
         for kind, members in groups.items():
             doubted = [k for k, name in enumerate(names) if k not in own and name in members]
             Z = distances.X[:, doubted] * [units.get(names[k], 0.01) for k in doubted]
-            doubts.append(np.column_stack([Z, Z.sum(axis=1)]) if kind == "scales" else Z)
+            nuisances.append(np.column_stack([Z, Z.sum(axis=1)]) if kind == "scales" else Z)
         values = np.array([*own, *range(len(names), distances.X.shape[1])])
         return distances._replace(
             X=distances.X[:, values],
             information=distances.information[np.ix_(values, values)],
-            doubts=tuple(Z for Z in doubts if Z.any()),
+            nuisances=tuple(Z for Z in nuisances if Z.any()),
         )
 
     @property
@@ -420,10 +420,10 @@ class SharedFit:
     def _doubting(self) -> "SharedFit":
         """The same fit, all unknown that is doubted."""
         kinematics = self.seen[0].kinematics
-        offsets = lengthened_joints(kinematics.tree)
+        offsets = carried_joints(kinematics.tree)
         free = np.flatnonzero(kinematics.lower < kinematics.upper)
         zeros = [name for name in (kinematics.names[k] for k in free) if name not in self.constants]
-        lengths = dict.fromkeys(length_name(one.link) for one in offsets)
+        lengths = dict.fromkeys(link_scale_name(one.link) for one in offsets)
         names = [*self.constants, *zeros, *(one for one in lengths if one not in self.constants)]
         options = self._options | {"offsets": offsets, "looks": len(CAMERA_NAMES)}
         return SharedFit(self.seen, self._X_CW, names, **options)
@@ -563,13 +563,13 @@ def adjust_bundle(
     # which nothing is left out because it is off.
     some = np.unique(np.linspace(0, len(seen) - 1, telling_frames).round().astype(int))
     uncut = AnnealingStage(0.08, 0.015)
-    pictures = fit.pictures([seen[k] for k in some], found.parameters[some], uncut)
+    pictures = fit.compared_masks([seen[k] for k in some], found.parameters[some], uncut)
     distances = distances_in_masks(body.outlines, pictures, 1000)
     turns = [name.split(".")[-1] in CAMERA_NAMES[:3] for name in fit.names[fit.own_count :]]
     is_angle = np.concatenate([np.tile(kinematics.is_angle[free], len(some)), turns])
     sizes = estimate_sizes(distances, is_angle, prior_deviation=SHARED.prior_deviation)
     whole = values_covariance(distances, sizes, np.arange(len(is_angle)), is_angle)
-    X_CW, _, motions = fit.places(found.parameters[0])
+    X_CW, _, motions = fit.place_cameras(found.parameters[0])
     own = np.arange(len(whole) - len(poses), len(whole)).reshape(len(looks), 6)
     found_cameras = [replace(cameras[k], X_WC=np.linalg.inv(X_CW[k])) for k in looks]
     covariances = [

@@ -24,7 +24,7 @@ from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import RegistrationError, SettingsError
 from drake_pose.fit.background import KnownBackground
-from drake_pose.fit.surfaces import FEW, few_triangles, surface_distance
+from drake_pose.fit.surfaces import FEW, simplify_surfaces, surface_distance
 from drake_pose.registration.picture_search import PICTURES, PosedPicture, see_picture
 from drake_pose.registration.posed_frames import LAST_SPACING, PosedFrame, PosedFrames
 from drake_pose.registration.register import (
@@ -162,7 +162,7 @@ class StandingObject:
             (n, 4, 4) the motions, the identity first; about an axis of a round object every 15
             degrees. (k, 3) the axes.
         """
-        few = few_triangles(TreeSurfaces(self._bodies.tree), FEW)
+        few = simplify_surfaces(TreeSurfaces(self._bodies.tree), FEW)
         outline = few[self._bodies.tree.node_index(OBJECT)]
         corners = outline.vertices[outline.triangles]
         weights = np.linalg.norm(outline.planes[:, :3], axis=1)

@@ -24,7 +24,7 @@ from drake_pose.body import PoseTree, bundled_model, load_model
 from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.camera.models import ParallelCamera
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
-from drake_pose.fit.surfaces import few_triangles, rough_outlines
+from drake_pose.fit.surfaces import simplify_outlines, simplify_surfaces
 from drake_pose.search.beam_search import BeamSearch
 from drake_pose.search.coarse_search import CoarsePoses, CoarseSearch
 from drake_pose.search.estimates import PoseEstimate, View, require_views
@@ -62,12 +62,12 @@ class MultiStartSearch:
         self._grid = BeamSearch(tree, BeamSearchSettings(interval=self.settings.interval))
         self._body = self._grid.body
         self.sampled = self._body.sampled
-        self._outlines = few_triangles(self.sampled.surfaces)
+        self._outlines = simplify_surfaces(self.sampled.surfaces)
         self._kinematics = TreeKinematics(tree)
 
     @cached_property
     def _rough(self) -> tuple[Outline, ...]:
-        return rough_outlines(self._outlines)
+        return simplify_outlines(self._outlines)
 
     @cached_property
     def beam(self) -> BeamSearch:

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from drake_pose.body import PoseTree
-from drake_pose.fit.surfaces import few_rigid_triangles
+from drake_pose.fit.surfaces import simplify_rigid_parts
 from drake_pose.search.estimates import View
 from drake_pose.search.refinement import Freedom, RefinementBody, RefinementProblem, descend
 from drake_pose.search.settings import NeighbourhoodSettings
@@ -109,7 +109,7 @@ class PartSearch:
         sources = [grids[body.tree.source(i)] for i in range(len(grids))]
         self._X_PN = [body.tree.relative_transforms(i, grid) for i, grid in enumerate(sources)]
         # Bands of skin are small, and where they are depends on the sample.
-        self._outlines = few_rigid_triangles(body.surfaces, 200).rigid
+        self._outlines = simplify_rigid_parts(body.surfaces, 200).rigid
         nodes = body.kinematics.value_nodes
         self._columns = [np.flatnonzero(nodes == i) for i in range(len(grids))]
         self._balls = np.array([outline.ball for outline in body.surfaces.rigid])

@@ -23,7 +23,7 @@ from drake_pose.camera.models import Camera, PinholeCamera
 from drake_pose.fit.contour_fit import ContourFit, Prior, pack_views
 from drake_pose.fit.evidence import NO_EDGE, find_edge_points
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
-from drake_pose.fit.surfaces import VERY_FEW, few_triangles
+from drake_pose.fit.surfaces import VERY_FEW, simplify_surfaces
 from drake_pose.silhouette.outline import TreeSurfaces
 from drake_pose.silhouette.pictures.masks import intersection_over_union
 from drake_pose.silhouette.scoring import (
@@ -146,8 +146,8 @@ class PoseAndMask:
         self._settings = settings or PoseAndMaskSettings()
         self._seed = seed
         self._surfaces = TreeSurfaces(kinematics.tree)
-        fitted = few_triangles(self._surfaces, self._settings.triangles)
-        self._few = few_triangles(self._surfaces, VERY_FEW)
+        fitted = simplify_surfaces(self._surfaces, self._settings.triangles)
+        self._few = simplify_surfaces(self._surfaces, VERY_FEW)
         self._fit = ContourFit(kinematics, fitted, pixels=100.0)
         ranges = kinematics.upper - kinematics.lower
         lengths = np.where(

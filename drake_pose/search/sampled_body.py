@@ -9,7 +9,7 @@ import numpy as np
 
 from drake_pose.body import PoseTree, require_tree
 from drake_pose.camera.models import Camera, ParallelCamera
-from drake_pose.fit.surfaces import collapsed
+from drake_pose.fit.surfaces import collapse_edges
 from drake_pose.search.estimates import PoseEstimate, View
 from drake_pose.search.settings import BeamSearchSettings, GridSettings
 from drake_pose.silhouette.contour_points import CelledOutline, divide_outline
@@ -296,7 +296,7 @@ class SampledBody:
         key = (node, spread, coarse)
         if key not in self._celled:
             if coarse:
-                outline = collapsed(outline, 300)
+                outline = collapse_edges(outline, 300)
             skin, bands = self.sampled.tree.nodes[node].skin, self.sampled.bands[node]
             mesh = None if skin is None else skin.mesh
             self._celled[key] = divide_outline(outline, spread, mesh, bands)

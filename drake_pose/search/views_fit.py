@@ -33,8 +33,8 @@ from drake_pose.fit.covariance import (
     distances,
     error_unit,
     estimate_sizes,
-    excess,
     values_covariance,
+    vuong_statistic,
 )
 from drake_pose.fit.evidence import find_edge_points
 from drake_pose.fit.kernel import Sum
@@ -76,7 +76,7 @@ class ViewsFit:
         evaluations: how often contours were compared.
 
     Args:
-        outlines: a surface for each node; few triangles will do, see ``few_triangles``.
+        outlines: a surface for each node; few triangles will do, see ``simplify_surfaces``.
         rough: those of rough rounds, of fewer triangles; None: the same.
     """
 
@@ -121,7 +121,7 @@ class ViewsFit:
         moves, unit = compared.placement.dense(len(values)), error_unit(self.size)
         return distances(fit.outlines, views.cameras, compared, moves, unit)
 
-    def piece_costs(self, values: np.ndarray, step: AnnealingStage) -> np.ndarray:
+    def tile_costs(self, values: np.ndarray, step: AnnealingStage) -> np.ndarray:
         """What does not fit at values (m,), by pieces of the pictures that err on their own.
 
         What is missing or too much is about as large as a piece, a fifth of the silhouettes' size.
@@ -129,7 +129,7 @@ class ViewsFit:
         self._count(1)
         side = max(1.0, 0.2 * self.size)
         fit, views = self._level(step)
-        costs = fit.piece_costs(views, values, step, side)
+        costs = fit.tile_costs(views, values, step, side)
         return costs / self._scale(step) ** 2
 
     def refine(
@@ -276,7 +276,7 @@ class RobustModes:
     def find(self, poses: Sequence[FittedPose], J: Callable[[np.ndarray], float]) -> PoseSet:
         """The poses that fit as well as the best of some, the answer first; J (1) of values."""
         look = self._settings.look
-        pieces = map_ordered(lambda pose: self._fit.piece_costs(pose.values, look), poses)
+        pieces = map_ordered(lambda pose: self._fit.tile_costs(pose.values, look), poses)
         self._pieces = min(pieces, key=lambda one: float(one.sum()))
         modes: list[FittedPose] = []
         for k, (pose, one) in enumerate(zip(poses, pieces, strict=True)):
@@ -289,7 +289,7 @@ class RobustModes:
 
     def around(self, values: np.ndarray, J: float) -> PoseSet:
         """What the silhouettes say about one pose (m,), where no other is looked for."""
-        self._pieces = self._fit.piece_costs(values, self._settings.look)
+        self._pieces = self._fit.tile_costs(values, self._settings.look)
         return self._described([self._spread(values, moves=False)], [J])
 
     def _described(self, modes: Sequence[FittedPose], Js: Sequence[float]) -> PoseSet:
@@ -300,7 +300,7 @@ class RobustModes:
 
     def _is_as_good(self, pieces: np.ndarray) -> bool:
         """Whether costs by pieces are not significantly above the best pose's."""
-        as_good = excess(pieces, self._pieces) <= self._settings.significance
+        as_good = vuong_statistic(pieces, self._pieces) <= self._settings.significance
         if as_good:
             self._tolerance = max(self._tolerance, float((pieces - self._pieces).sum()))
         return as_good
@@ -329,7 +329,7 @@ class RobustModes:
 
         def settle(flip: Flip) -> tuple[np.ndarray, np.ndarray]:
             seen = self._fit.refine(flip.values, (look,)).values
-            return seen, self._fit.piece_costs(seen, look)
+            return seen, self._fit.tile_costs(seen, look)
 
         others = flips(kinematics, mode.values) if self._has_room(modes) else []
         for flip, (seen, pieces) in zip(others, map_ordered(settle, others), strict=True):
@@ -402,8 +402,8 @@ class RobustModes:
         while lower[index] < found[-1][index] < upper[index] and self._proceed():
             trial = np.clip(found[-1] + min(step, longest) * along, lower, upper)
             looked = self._fit.refine(trial, own.follow, held=(index,)).values
-            costs = self._fit.piece_costs(looked, own.look)
-            before, worse = worse, excess(costs, self._pieces)
+            costs = self._fit.tile_costs(looked, own.look)
+            before, worse = worse, vuong_statistic(costs, self._pieces)
             if worse > own.significance:
                 # Costs are parabolas in the rough, and their differences scatter as values differ.
                 share = (own.significance - before) / (worse - before)

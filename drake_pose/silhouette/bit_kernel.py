@@ -11,7 +11,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from drake_pose.compiled import compiled, multiply, with_room
+from drake_pose.compiled import compiled, grow_rows, multiply
 from drake_pose.silhouette.contour_points import CelledOutline, find_cell
 from drake_pose.silhouette.outline import bend, viewpoint_in_node
 from drake_pose.silhouette.span_kernel import (
@@ -156,7 +156,7 @@ def draw_bits(
         if count < 0:
             continue
         if words.shape[0] < used + inside_size + band_size:
-            words = with_room(words, used, 2 * words.shape[0] + inside_size + band_size)
+            words = grow_rows(words, used, 2 * words.shape[0] + inside_size + band_size)
         used = write_runs(view.inside, spans, count, words, used, runs[found, 0])
         if band_size:
             used = write_runs(view.band, spans, count, words, used, runs[found, 1])
@@ -271,7 +271,7 @@ def _gather_spans(
     for row in range(rows.reach[0], rows.reach[1]):
         number = find_spans(row, crossings, rows.counts, rows.changes, rows.spans)
         if count + number > spans.shape[0]:
-            spans = with_room(spans, count, 2 * spans.shape[0] + number)
+            spans = grow_rows(spans, count, 2 * spans.shape[0] + number)
         for k in range(number):
             a, b = rows.spans[k, 0], rows.spans[k, 1]
             total += b - a

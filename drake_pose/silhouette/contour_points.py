@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from drake_pose.body import TriangleMesh
-from drake_pose.compiled import compiled, with_room
+from drake_pose.compiled import compiled, grow_rows
 from drake_pose.silhouette.outline import (
     Outline,
     PackedOutlines,
@@ -85,8 +85,8 @@ def find_segments(
             found += facings[before[e]] + sides[e] * facings[behind[e]] != 0
         if count + found > capacity:
             capacity = 2 * (count + found)
-            ends, depths = with_room(ends, count, capacity), with_room(depths, count, capacity)
-            labels = with_room(labels, count, capacity)
+            ends, depths = grow_rows(ends, count, capacity), grow_rows(depths, count, capacity)
+            labels = grow_rows(labels, count, capacity)
         for e in chosen[:found]:
             weight = int(facings[before[e]]) + int(sides[e]) * int(facings[behind[e]])
             labels[count, 0], labels[count, 1] = weight, node

@@ -25,7 +25,7 @@ from drake_pose.body import load_model
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import RegistrationError
 from drake_pose.files.settings import EstimateSettings
-from drake_pose.fit.parameters import lengthened_joints
+from drake_pose.fit.parameters import carried_joints
 from drake_pose.jobs.estimate.inputs import make_tree
 from drake_pose.jobs.registration.inputs import read_inputs
 from drake_pose.jobs.registration.settings import RegistrationSettings
@@ -204,7 +204,7 @@ def _with_other_lengths(body: RegistrationBody, rng: np.random.Generator) -> Reg
     """The arm whose links are a little longer or shorter."""
     tree, settings = body.tree, EstimateSettings()
     by = {link: rng.normal(0.0, _LENGTH_SD) for link in links_with_length(tree)}
-    shifts = {one.joint: (by[one.link] * one.p_L).tolist() for one in lengthened_joints(tree)}
+    shifts = {one.joint: (by[one.link] * one.p_L).tolist() for one in carried_joints(tree)}
     return body.with_tree(make_tree(tree.model.reshaped(shifts=shifts), settings, None))
 
 

@@ -15,7 +15,7 @@ from drake_pose.body import ArticulatedModel, describe_model, load_model, model_
 from drake_pose.body.tree_kinematics import TreeKinematics, joint_offsets
 from drake_pose.errors import ModelError, SettingsError
 from drake_pose.fit.parameters import BodyParameters
-from drake_pose.fit.surfaces import VERY_FEW, few_triangles
+from drake_pose.fit.surfaces import VERY_FEW, simplify_surfaces
 from drake_pose.silhouette.outline import TreeSurfaces
 from tests.body import test_sdf as sdf
 from tests.body.models import joint, link, link_poses, urdf, write
@@ -85,7 +85,7 @@ def test_what_is_not_enforced_is_told_and_what_is_stands_in_the_report(tmp_path)
 @pytest.mark.parametrize("lengths", [False, True])
 def test_motions_against_finite_differences(tmp_path, lengths):
     kinematics, values = drawn(tree_of(tmp_path), np.random.default_rng(1))
-    surfaces = few_triangles(TreeSurfaces(kinematics.tree), VERY_FEW)
+    surfaces = simplify_surfaces(TreeSurfaces(kinematics.tree), VERY_FEW)
     body = BodyParameters(kinematics, surfaces, offsets=joint_offsets(kinematics.tree))
     logs = [0.0] * 4 + np.linspace(0.1, 0.2, len(body.links)).tolist() if lengths else []
     assert_motions_are_derivatives(body, np.append(values, logs))

@@ -7,11 +7,11 @@ from drake_pose.fit.background import (
     Backgrounds,
     Explained,
     KnownBackground,
+    apply_gain,
+    estimate_gain,
     explain,
     foreground_of_colours,
     foreground_picture,
-    in_light,
-    light_between,
     mask_of_foreground,
 )
 from drake_pose.fit.colours import COLOURS, Colour
@@ -78,10 +78,10 @@ def test_light_is_told_whatever_else_changes():
     gain, offset = np.array([0.8, 1.1, 1.2]), np.array([10.0, -5.0, 3.0])
     picture = ((reference - offset) / gain).astype(np.float32)
     picture[:15, :20] = 0.0
-    light = light_between(picture, reference)
+    light = estimate_gain(picture, reference)
     np.testing.assert_allclose(light[:, :3], np.diag(gain), rtol=0.01)
     np.testing.assert_allclose(light[:, 3], offset, atol=1.0)
-    np.testing.assert_allclose(in_light(picture, light)[20:], reference[20:], atol=0.5)
+    np.testing.assert_allclose(apply_gain(picture, light)[20:], reference[20:], atol=0.5)
 
 
 def test_odds_show_the_body_and_the_background_behind_it(episode):
@@ -90,11 +90,11 @@ def test_odds_show_the_body_and_the_background_behind_it(episode):
     backgrounds = Backgrounds.of(episode.pictures)
     showing = backgrounds.showing(covered)
     assert not (showing & covered).any()
-    known = KnownBackground.of(list(episode.pictures), backgrounds.lights, showing, covered)
+    known = KnownBackground.of(list(episode.pictures), backgrounds.gains, showing, covered)
     assert (known.unseen == ~showing.any(axis=0)).mean() > 0.99
     seen = ~known.unseen
     assert np.median(np.abs(known.colours - episode.background).max(axis=-1)[seen]) < 6.0
-    for picture, light, mask in zip(episode.pictures, backgrounds.lights, covered, strict=True):
+    for picture, light, mask in zip(episode.pictures, backgrounds.gains, covered, strict=True):
         foreground = known.foreground(picture, light)
         assert ((foreground > 0.0) == mask)[seen].mean() > 0.97
         found = mask_of_foreground(foreground, mask)

@@ -11,7 +11,7 @@ from drake_pose.fit.evidence import NO_EDGE
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.fit.parameters import CAMERA_NAMES, BodyParameters, CameraParameters
 from drake_pose.fit.proportions import ProportionedBody, fit_proportions, sequence_prior
-from drake_pose.fit.surfaces import VERY_FEW, few_triangles
+from drake_pose.fit.surfaces import VERY_FEW, simplify_surfaces
 from drake_pose.silhouette.outline import Outline, TreeSurfaces, outline_from_mesh
 from tests.body.models import joint, link, urdf
 from tests.fit.motions import STEP, assert_motions_are_derivatives
@@ -20,7 +20,7 @@ from tests.fit.motions import STEP, assert_motions_are_derivatives
 @pytest.fixture(scope="module")
 def body(person):
     tree = person.pose_tree()
-    outlines = few_triangles(TreeSurfaces(tree), VERY_FEW)
+    outlines = simplify_surfaces(TreeSurfaces(tree), VERY_FEW)
     groups = np.arange(len(tree.nodes)) % 3 - 1
     return BodyParameters(TreeKinematics(tree), outlines, groups, ("one", "two"))
 

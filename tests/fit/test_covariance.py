@@ -11,15 +11,15 @@ from drake_pose.fit.covariance import (
     ErrorSizes,
     _apriori,
     distances_covariance,
-    doubted_covariance,
     error_unit,
     estimate_sizes,
-    excess,
+    nuisance_covariance,
     surface_deformations,
     values_covariance,
+    vuong_statistic,
 )
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
-from drake_pose.fit.surfaces import few_triangles
+from drake_pose.fit.surfaces import simplify_surfaces
 from drake_pose.search import ViewsFit
 from drake_pose.silhouette.outline import TreeSurfaces
 from tests.search.arms import arm_tree, damaged_views, draw_pose
@@ -38,12 +38,12 @@ def drawn_distances(generator, sizes, count=150):
     # The second half repeats some noise of the first.
     again = np.tile(np.eye(count // 2), (2, 1))
     kinds = [again, *kinds]
-    doubts = tuple(generator.normal(0.0, 2.0, (count, 4)) for _ in sizes.doubts)
-    for size, kind in zip((*sizes[1:5], *sizes.doubts), (*kinds, *doubts), strict=True):
+    nuisances = tuple(generator.normal(0.0, 2.0, (count, 4)) for _ in sizes.nuisances)
+    for size, kind in zip((*sizes[1:5], *sizes.nuisances), (*kinds, *nuisances), strict=True):
         y += size * kind @ generator.standard_normal(kind.shape[1])
     effects = np.array([np.eye(count), *(kind @ kind.T for kind in kinds)])
     which = np.arange(count) // (count // 2)
-    seen = Distances(y, X, effects, X.T @ X, kinds[1], which, doubts)
+    seen = Distances(y, X, effects, X.T @ X, kinds[1], which, nuisances)
     return seen, np.linalg.solve(X.T @ X, X.T @ y)
 
 
@@ -98,7 +98,7 @@ def test_what_is_doubted_widens_what_leans_on_it(size):
         sizes = ErrorSizes(1.0, 0.0, 0.1, 0.1, 0.1, (size,))
         seen, errors = drawn_distances(generator, sizes, 60)
         found = estimate_sizes(seen, ANGLES, 0.0, 3.0)
-        doubted, without = doubted_covariance(seen, found, ANGLES)
+        doubted, without = nuisance_covariance(seen, found, ANGLES)
         own = values_covariance(without, found, ALL, ANGLES)
         deviations = np.sqrt(np.diag(own + doubted))
         inside += (np.abs(errors) < 1.96 * deviations).tolist()
@@ -134,14 +134,14 @@ def test_noise_is_not_repeated_where_no_part_stands_still():
 
 def test_costs_differ_by_how_their_pieces_scatter():
     pieces, others = np.array([[3.0, 1.0], [2.0, 5.0]]), np.array([[1.0, 1.0], [3.0, 3.0]])
-    assert excess(pieces, others) == pytest.approx(3.0 / np.sqrt(4.0 + 1.0 + 4.0))
-    assert excess(others, pieces) == -excess(pieces, others)
+    assert vuong_statistic(pieces, others) == pytest.approx(3.0 / np.sqrt(4.0 + 1.0 + 4.0))
+    assert vuong_statistic(others, pieces) == -vuong_statistic(pieces, others)
     assert [error_unit(size) for size in (10.0, 200.0, 500.0)] == [1.0, 1.0, 2.5]
 
 
 def test_deformations_move_surfaces_by_a_metre(kinematics):
     """Each of twelve: shifts along the part's axes, stretches along them of its vertices."""
-    outlines = few_triangles(TreeSurfaces(kinematics.tree))
+    outlines = simplify_surfaces(TreeSurfaces(kinematics.tree))
     X_WN = kinematics.poses(np.array([0.6, 0.7, -0.7, 0.9, 0.3]))
     for outline, X, K in zip(outlines, X_WN, surface_deformations(outlines, X_WN), strict=True):
         p_W = outline.vertices @ X[:3, :3].T + X[:3, 3]
@@ -159,7 +159,7 @@ def test_distances_err_together_in_a_picture_a_part_and_a_view(kinematics):
         replace(view, camera=replace(view.camera, name=f"{k}"))
         for k, view in enumerate((one, one, other))
     ]
-    fit = ViewsFit(kinematics, few_triangles(TreeSurfaces(kinematics.tree)), views)
+    fit = ViewsFit(kinematics, simplify_surfaces(TreeSurfaces(kinematics.tree)), views)
     seen = fit.distances(truth, STEP)
     _, repeated, surface, mask, camera = seen.effects
     apart = seen.pictures[:, None] != seen.pictures
@@ -187,7 +187,7 @@ def kinematics(tmp_path_factory):
 
 def fitted(kinematics, views, truth):
     """How far a pose fitted from the truth is from it, its standard deviations, and the sizes."""
-    fit = ViewsFit(kinematics, few_triangles(TreeSurfaces(kinematics.tree)), views)
+    fit = ViewsFit(kinematics, simplify_surfaces(TreeSurfaces(kinematics.tree)), views)
     values = fit.refine(truth, FINE).values
     seen = fit.distances(values, STEP)
     sizes = estimate_sizes(seen, kinematics.is_angle)
@@ -213,8 +213,8 @@ def test_truths_lie_in_their_intervals_where_cameras_masks_and_links_are_off(kin
 def test_costs_by_pieces_add_up(kinematics):
     truth = np.array([0.6, 0.7, -0.7, 0.9, 0.3])
     views = damaged_views(kinematics.tree, truth, 2)
-    fit = ViewsFit(kinematics, few_triangles(TreeSurfaces(kinematics.tree)), views)
-    pieces = fit.piece_costs(truth, STEP)
+    fit = ViewsFit(kinematics, simplify_surfaces(TreeSurfaces(kinematics.tree)), views)
+    pieces = fit.tile_costs(truth, STEP)
     assert pieces.sum() == pytest.approx(fit.cost(truth, STEP))
     # Only where a silhouette or the body has an edge.
     assert 5 < np.count_nonzero(pieces[0]) < 80
@@ -224,8 +224,8 @@ def test_costs_by_pieces_add_up(kinematics):
 def test_what_is_doubted_is_taken_out_as_likely_as_one_normal_distribution_says():
     sizes = ErrorSizes(1.0, 0.5, 0.2, 0.1, 0.3, (2.0,))
     seen, _ = drawn_distances(np.random.default_rng(5), sizes, 40)
-    _, without = doubted_covariance(seen, sizes, ANGLES)
-    (A,) = seen.doubts
+    _, without = nuisance_covariance(seen, sizes, ANGLES)
+    (A,) = seen.nuisances
     values = seen.X @ np.linalg.inv(_apriori(ANGLES)) @ seen.X.T
     whole = distances_covariance(seen, sizes) + 4.0 * A @ A.T + values
     likeliest = 4.0 * A.T @ np.linalg.solve(whole, seen.y)

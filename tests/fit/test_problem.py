@@ -15,8 +15,8 @@ from drake_pose.fit.background import foreground_picture
 from drake_pose.fit.evidence import NO_EDGE, Observation, find_edge_points, pack_evidence
 from drake_pose.fit.levenberg_marquardt import AnnealingStage, Equations, LinearPrior
 from drake_pose.fit.parameters import BodyParameters, CameraParameters
-from drake_pose.fit.problem import WIDTH, Problem, Solution, Unknowns, parameter_names
-from drake_pose.fit.surfaces import VERY_FEW, few_triangles
+from drake_pose.fit.problem import BOUNDARY_BIAS, Problem, Solution, Unknowns, parameter_names
+from drake_pose.fit.surfaces import VERY_FEW, simplify_surfaces
 from drake_pose.silhouette.outline import TreeSurfaces, outline_from_mesh
 from drake_pose.silhouette.scoring import draw_mask
 
@@ -32,7 +32,7 @@ BENT = ("left_forearm_x", "right_forearm_x", "left_shin_x", "right_shin_x")
 def body(person):
     tree = person.pose_tree()
     groups = np.arange(len(tree.nodes)) % 2
-    outlines = few_triangles(TreeSurfaces(tree), VERY_FEW)
+    outlines = simplify_surfaces(TreeSurfaces(tree), VERY_FEW)
     return BodyParameters(TreeKinematics(tree), outlines, groups, ("even", "odd"))
 
 
@@ -104,7 +104,7 @@ def test_odds_of_pixels_draw_contours_as_masks_do(body, rig):
     truth = poses(body, 1, 4)[0]
     camera, outlines = rig[0], few_outlines(body, truth)
     mask = draw_mask(outlines, camera.X_CW @ body.place(truth).X_WN, camera)
-    names = [f"{camera.name}.{name}" for name in ("shift_x", "shift_y", WIDTH)]
+    names = [f"{camera.name}.{name}" for name in ("shift_x", "shift_y", BOUNDARY_BIAS)]
     off, nothing = np.array([0.02, -0.015, 0.0]), np.zeros((1, 0))
     stages = [AnnealingStage(scale, 0.02, 4) for scale in (0.03, 0.01, 0.005)]
     for grown in (0, 2):
@@ -194,7 +194,7 @@ def test_cameras_stand_where_the_last_parameters_asked_for_say(body, rig):
     problem = Problem(body, rig, [Unknowns(BENT)])
     theta = np.zeros((2, len(parameter_names(body, rig))))
     theta[1, len(body.names) + 4] = 0.5
-    first, moved, again = (problem.places(one)[0] for one in (*theta, theta[0]))
+    first, moved, again = (problem.place_cameras(one)[0] for one in (*theta, theta[0]))
     np.testing.assert_array_equal(first, again)
     np.testing.assert_allclose((moved - first)[0, :3, 3], [0.5, 0.0, 0.0], atol=1e-12)
 

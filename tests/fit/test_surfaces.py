@@ -12,7 +12,7 @@ from drake_pose.fit.surfaces import (
     FEW,
     VERY_FEW,
     _simplify,
-    few_triangles,
+    simplify_surfaces,
     surface_distance,
 )
 from drake_pose.silhouette.outline import TreeSurfaces, outline_from_mesh
@@ -22,7 +22,7 @@ RADIUS, TUBE, ENDS = 0.08, 0.06, (0.1, 0.3)
 
 
 class Rigid:
-    """What ``few_triangles`` asks of surfaces."""
+    """What ``simplify_surfaces`` asks of surfaces."""
 
     def __init__(self, *outlines):
         self.rigid, self.bending = outlines, [None] * len(outlines)
@@ -60,7 +60,7 @@ def nearest_sample(points, outline):
 @pytest.mark.parametrize("slivers", [40, 100])
 def test_slivers_leave_the_shape_as_it_is(slivers):
     given = ball_and_tube(slivers)
-    (simple,) = few_triangles(Rigid(given))
+    (simple,) = simplify_surfaces(Rigid(given))
     assert 0.5 * FEW < len(simple.triangles) < 1.2 * FEW
     # Nothing has been lost, and nothing sticks out.
     assert nearest_sample(on_surface(given, 400), simple).max() < 0.012
@@ -70,7 +70,7 @@ def test_slivers_leave_the_shape_as_it_is(slivers):
 def test_without_slivers_surfaces_are_what_the_simplifier_makes():
     surfaces = TreeSurfaces(load_model(bundled_model("person"), check=False).pose_tree())
     for count in (FEW, VERY_FEW):
-        for given, simple in zip(surfaces.rigid, few_triangles(surfaces, count), strict=True):
+        for given, simple in zip(surfaces.rigid, simplify_surfaces(surfaces, count), strict=True):
             if len(given.triangles) > count:
                 points, _ = fast_simplification.simplify(
                     given.vertices, given.triangles, target_count=count
@@ -80,7 +80,7 @@ def test_without_slivers_surfaces_are_what_the_simplifier_makes():
 
 def test_thin_rod_of_many_triangles_is_not_lost():
     rod = trimesh.creation.cylinder(0.0005, height=1.0, sections=600)
-    (simple,) = few_triangles(Rigid(outline_from_mesh(TriangleMesh(rod.vertices, rod.faces))))
+    (simple,) = simplify_surfaces(Rigid(outline_from_mesh(TriangleMesh(rod.vertices, rod.faces))))
     assert len(simple.triangles) > 0
     np.testing.assert_allclose(np.ptp(simple.vertices, axis=0)[2], 1.0, atol=0.01)
 
@@ -103,11 +103,11 @@ def test_distance_of_surfaces():
 
 
 def test_a_body_loaded_again_is_not_simplified_again_but_a_changed_one_is():
-    once, again = (few_triangles(Rigid(ball_and_tube(40)))[0] for _ in range(2))
+    once, again = (simplify_surfaces(Rigid(ball_and_tube(40)))[0] for _ in range(2))
     given = ball_and_tube(40)
     wider = outline_from_mesh(TriangleMesh(1.1 * given.vertices, given.triangles))
-    (other,) = few_triangles(Rigid(wider))
-    (coarser,) = few_triangles(Rigid(given), VERY_FEW)
+    (other,) = simplify_surfaces(Rigid(wider))
+    (coarser,) = simplify_surfaces(Rigid(given), VERY_FEW)
     assert again is once
     np.testing.assert_allclose(np.ptp(other.vertices, axis=0), np.ptp(wider.vertices, axis=0), 0.02)
     assert len(coarser.triangles) < len(once.triangles)
@@ -120,7 +120,7 @@ def test_threads_that_simplify_at_once_find_what_one_does(monkeypatch):
     ]
 
     def simplified(ball):
-        return few_triangles(Rigid(ball), FEW)[0]
+        return simplify_surfaces(Rigid(ball), FEW)[0]
 
     monkeypatch.setattr(surface_store, "kernel_folder", lambda: None)
     together = map_ordered(simplified, balls, 4)
@@ -160,11 +160,11 @@ def test_a_process_loads_to_the_last_digit_what_another_simplified(folder, monke
     monkeypatch.setattr(surface_store.stored, "__defaults__", (0.0, 500))
     given = ball_and_tube(40)
     _simplify.cache_clear()
-    made = few_triangles(Rigid(given), FEW)[0]
+    made = simplify_surfaces(Rigid(given), FEW)[0]
     (file,) = folder.iterdir()
     _simplify.cache_clear()
     before = file.stat().st_mtime_ns
-    assert same(few_triangles(Rigid(given), FEW)[0], made)
+    assert same(simplify_surfaces(Rigid(given), FEW)[0], made)
     assert [file] == list(folder.iterdir())
     assert file.stat().st_mtime_ns >= before
 

@@ -9,7 +9,7 @@ from drake_pose.search.multi_start import without_specks
 from drake_pose.search.refinement import RefinementProblem
 from drake_pose.silhouette.outline import TreeSurfaces
 from drake_pose.silhouette.scoring import draw_mask
-from drake_pose.workers import working
+from drake_pose.workers import use_workers
 from tests.search.arms import (
     arm_cameras,
     arm_tree,
@@ -166,7 +166,7 @@ def test_damaged_and_ill_fitting_arms(tree, search):
 def test_the_same_every_time(tree, search, pose, make):
     views, found = make(tree, pose, 3), []
     for workers in (1, 3):
-        with working(workers):
+        with use_workers(workers):
             found.append(search.match(views))
     np.testing.assert_array_equal(found[0].q, found[1].q)
     assert (found[0].runs, found[0].first_J) == (found[1].runs, found[1].first_J)

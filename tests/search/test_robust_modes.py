@@ -6,7 +6,7 @@ import pytest
 from drake_pose.body import load_model
 from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
-from drake_pose.fit.surfaces import few_triangles
+from drake_pose.fit.surfaces import simplify_surfaces
 from drake_pose.search import ViewsFit
 from drake_pose.search.self_motions import flips
 from drake_pose.search.settings import RobustSettings
@@ -20,7 +20,7 @@ FINE = tuple(AnnealingStage(scale, 0.0125, 8) for scale in (0.025, 0.0125))
 
 
 def find(kinematics, views, values, settings=None):
-    fit = ViewsFit(kinematics, few_triangles(TreeSurfaces(kinematics.tree)), views)
+    fit = ViewsFit(kinematics, simplify_surfaces(TreeSurfaces(kinematics.tree)), views)
     modes = RobustModes(fit, lambda: True, settings)
     return modes.find([fit.refine(values, FINE)], lambda values: float(values[0]))
 
@@ -83,7 +83,7 @@ def test_a_round_hand_may_turn_as_it_likes(tmp_path):
 
 def test_time_that_is_up_leaves_the_intervals_of_the_curvature(kinematics):
     views = damaged_views(kinematics.tree, TRUTH, 1)
-    fit = ViewsFit(kinematics, few_triangles(TreeSurfaces(kinematics.tree)), views)
+    fit = ViewsFit(kinematics, simplify_surfaces(TreeSurfaces(kinematics.tree)), views)
     pose = fit.refine(TRUTH, FINE)
     before = fit.evaluations
     answer = RobustModes(fit, lambda: False).find([pose], lambda _: 0.0)
@@ -94,7 +94,7 @@ def test_time_that_is_up_leaves_the_intervals_of_the_curvature(kinematics):
 
 def test_refinement_keeps_limits_and_what_is_held(kinematics):
     views = [draw_view(kinematics.tree, TRUTH, camera) for camera in arm_cameras()]
-    fit = ViewsFit(kinematics, few_triangles(TreeSurfaces(kinematics.tree)), views)
+    fit = ViewsFit(kinematics, simplify_surfaces(TreeSurfaces(kinematics.tree)), views)
     outside = kinematics.upper + 0.5
     found = fit.refine(outside, FINE, held=(1,))
     assert found.values[1] == outside[1]

@@ -11,7 +11,7 @@ from drake_pose.search import BeamSearchSettings, RootPlacementSearch, View, hub
 from drake_pose.search.root_placement import choose_root_samples, find_root_places, whereabouts
 from drake_pose.search.sampled_body import SampledBody
 from drake_pose.silhouette.scoring import draw_mask
-from drake_pose.workers import working
+from drake_pose.workers import use_workers
 from tests.search.bodies import box_link, front_camera, joint, load_body
 
 SETTINGS = BeamSearchSettings(interval=math.radians(30.0))
@@ -101,7 +101,7 @@ def placed(tree, views, *position, **settings):
 def test_position_and_scale_of_a_parallel_camera_are_found(body, seen):
     views, found = [View(replace(seen.camera, pixels_per_metre=7.0), seen.mask)], []
     for workers in (1, 3):
-        with working(workers):
+        with use_workers(workers):
             found.append(placed(body.pose_tree(), views, scale_unknown=True))
     result, again = found
     np.testing.assert_array_equal(result.q, again.q)

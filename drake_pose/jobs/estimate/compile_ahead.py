@@ -15,7 +15,7 @@ from drake_pose.compiled import is_stored
 from drake_pose.fit.contour_fit import pack_views
 from drake_pose.fit.evidence import find_edge_points
 from drake_pose.fit.kernel import collect, compare_contours
-from drake_pose.fit.surfaces import few_triangles
+from drake_pose.fit.surfaces import simplify_surfaces
 from drake_pose.search import MultiStartSearch, ViewsFit
 from drake_pose.search.multi_start import small_match
 from drake_pose.silhouette.outline import TreeSurfaces, pack
@@ -40,7 +40,7 @@ def compiling_ahead() -> Iterator[None]:
 def main() -> None:
     """Goes through a search from its end to its beginning, with a small body and picture."""
     tree, view = small_match()
-    surfaces = few_triangles(TreeSurfaces(tree))
+    surfaces = simplify_surfaces(TreeSurfaces(tree))
     # The kernel that takes longest, by itself: the first process compiles what comes before it.
     views = pack_views([view.camera], [find_edge_points(view.mask, 1.0)])
     X_WN = tree.node_poses(tree.default_values())

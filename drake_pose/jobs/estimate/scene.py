@@ -41,7 +41,7 @@ from drake_pose.search import (
 from drake_pose.silhouette.outline import TreeSurfaces
 from drake_pose.silhouette.pictures.scenes import USUAL_RATE_HZ, Scene
 from drake_pose.systems.diagrams import build_recorded_matching
-from drake_pose.workers import working
+from drake_pose.workers import use_workers
 
 
 @writes_folder
@@ -96,7 +96,7 @@ def estimate_scene(
         else:
             missing = [frame for frame in inputs.frames if frame not in result.records]
             frames = match_frames(inputs, search, overlay, missing)
-        with working(settings.workers):
+        with use_workers(settings.workers):
             result.add_all(frames, inputs.frames, on_frame)
             if search is not None:
                 result.warnings += check_track(inputs, search, result.records)

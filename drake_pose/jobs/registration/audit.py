@@ -52,7 +52,7 @@ from drake_pose.registration.picture_registration import (
 from drake_pose.registration.posed_frames import PosedFrame, SeenFrame
 from drake_pose.registration.register import RegistrationBody
 from drake_pose.silhouette.pictures.scene_checks import frame_ranges
-from drake_pose.workers import working
+from drake_pose.workers import use_workers
 
 OnFrame = Callable[[int], None]
 """Called with the number of frames that are done."""
@@ -97,7 +97,7 @@ def audit_scene(
     """
     settings, begin = settings or AuditSettings(), time.perf_counter()
     table, own, folder = (None if one is None else Path(one) for one in (joints, cameras, out))
-    with working(settings.workers):
+    with use_workers(settings.workers):
         inputs = read_inputs(Path(scene), Path(model), table, own, settings)
         pictures = _Pictures()
         if inputs.recordings:

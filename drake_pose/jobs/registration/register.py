@@ -16,7 +16,7 @@ from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.camera.models import Camera, PinholeCamera
 from drake_pose.errors import CameraError
 from drake_pose.files.folder import writes_folder
-from drake_pose.fit.parameters import lengthened_joints
+from drake_pose.fit.parameters import carried_joints
 from drake_pose.jobs.estimate.inputs import missing_for_person
 from drake_pose.jobs.registration.diagnosis import (
     Search,
@@ -70,7 +70,7 @@ from drake_pose.registration.standing_object import (
     find_in_pictures,
     require_seen,
 )
-from drake_pose.workers import working
+from drake_pose.workers import use_workers
 
 OnCamera = Callable[[int], None]
 """Called with the number of cameras that are done."""
@@ -124,7 +124,7 @@ def register_scene(
     """
     settings = settings or RegistrationSettings()
     table, own, folder = (None if one is None else Path(one) for one in (joints, cameras, out))
-    with working(settings.workers):
+    with use_workers(settings.workers):
         inputs = read_inputs(Path(scene), Path(model), table, own, settings)
         work = _Registration(inputs, settings, on_camera)
         check_exports(settings.exports, [*inputs.held, *inputs.searched])
@@ -467,5 +467,5 @@ class _Registration:
 def joint_shifts(tree: PoseTree, lengths: Sequence[KinematicParameter]) -> dict[str, list[float]]:
     """By how much joints stand elsewhere on their links (3,), by name [m]; empty: none does."""
     longer = {one.name: one.value for one in lengths if one.value}
-    offsets = lengthened_joints(tree, longer)
+    offsets = carried_joints(tree, longer)
     return {one.joint: (longer[one.link] * one.p_L).tolist() for one in offsets}

@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal, get_args
 
 from cyclopts import Parameter
 
-from drake_pose.errors import SettingsError, in_callers_words
+from drake_pose.errors import SettingsError, for_caller
 from drake_pose.files.settings import (
     Corner,
     EpisodeSettings,
@@ -80,7 +80,7 @@ class RegistrationSettings(AuditSettings):
                 raise SettingsError(f"there is no export '{name}'; there is: {', '.join(known)}")
         if self.keep_out and not self.suggest:
             raise SettingsError(
-                in_callers_words("--keep-out is for --suggest; give both, or leave it out")
+                for_caller("--keep-out is for --suggest; give both, or leave it out")
             )
 
     def as_json(self) -> dict[str, Any]:

@@ -7,7 +7,7 @@ import pytest
 
 from drake_pose.body import landmark_positions, load_landmarks
 from drake_pose.camera.models import circle_of_cameras
-from drake_pose.fit.colours import Colour, OwnColours
+from drake_pose.fit.colours import Colour, PartColours
 from drake_pose.fit.contour_fit import ContourFit
 from drake_pose.person.capture import capture_by_colour
 from drake_pose.person.pose_tracker import PersonPoseTracker
@@ -100,7 +100,7 @@ def test_a_limb_without_its_own_colours_is_searched_again_or_said_to_be_lost(
     views = ColourViews(list(cameras.values()), seen, known)
     pairs = list(zip(views.cameras, seen, strict=True))
     X_WN = fit.kinematics.poses(values)
-    own = OwnColours.learned(known.values(), fit.outlines, X_WN, pairs)
+    own = PartColours.learned(known.values(), fit.outlines, X_WN, pairs)
     np.testing.assert_allclose(own.shown(fit.outlines, X_WN, pairs), 1.0)
     wrong, limb = values.copy(), tracker.plan.limbs["left_arm"]
     wrong[limb.values] = limb.poses[7]

@@ -1,4 +1,4 @@
-.PHONY: demo test test-slow robots docs bench clean
+.PHONY: demo test test-slow robots docs bench figures clean
 
 VENV := .venv
 PYTHON := $(VENV)/bin/python
@@ -51,6 +51,11 @@ bench: $(VENV)/ready-cluster
 	$(PYTHON) -m tests.benchmarks.registration $(DATA) --cases 1
 	$(PYTHON) -m tests.benchmarks.memory
 	$(PYTHON) -m tests.benchmarks.cluster
+
+# The tables of tutorials/figures.md, about an hour of two cores; NAMES="hands date": these sections.
+figures: export OPENBLAS_NUM_THREADS = 1
+figures: $(VENV)/ready-cluster
+	$(PYTHON) -m tests.benchmarks.figures $(or $(DATA),../shared/data) $(NAMES)
 
 clean:
 	rm -rf $(VENV) results build

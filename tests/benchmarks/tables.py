@@ -1,5 +1,6 @@
 """How benchmarks show their figures."""
 
+import os
 from collections.abc import Iterable, Sequence
 
 from rich.console import Console
@@ -13,4 +14,4 @@ def print_table(title: str, headings: Sequence[str], rows: Iterable[Sequence[str
         table.add_column(heading, justify="right" if k else "left")
     for row in rows:
         table.add_row(*row)
-    Console(width=150).print(table)
+    Console(width=int(os.environ.get("COLUMNS", "150")), markup=False).print(table)

@@ -9,7 +9,8 @@ from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
 from drake_pose.commands.main import app
-from tests.benchmarks import memory, registration
+from tests.benchmarks import figures, memory, registration
+from tests.benchmarks.tables import print_table
 
 MIB = 2**20
 
@@ -63,3 +64,34 @@ def test_every_command_of_the_benchmark_is_one():
     for line in memory.COMMANDS:
         # Parses without running it; an option that is none raises.
         app.parse_args(line.split(), exit_on_error=False, print_error=False)
+
+
+def test_printed_tables_become_markdown(capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "60")
+    long = "long enough for two lines"
+    for title in ("first", long):
+        print_table(title, ("name", "value"), [("a", "1"), ("b [m]", "2.5 %")])
+    rows = "| name | value |\n| --- | --- |\n| a | 1 |\n| b [m] | 2.5 % |"
+    printed = capsys.readouterr().out
+    assert long not in printed
+    found = figures.to_markdown(f"of\nsomething\nelse\n{printed}")
+    assert found.startswith("**first**")
+    assert found.endswith(f"**{long}**\n\n{rows}")
+    assert found.count(rows) == 2
+
+
+def test_only_the_section_that_was_measured_changes():
+    page = "".join(f"# {n}\n{a}\nold\n{b}\n" for n in "xy" for a, b in [figures.markers(n)])
+    found = figures.replaced(page, "y", "new")
+    assert found.startswith(page.split("# y")[0])
+    assert "old" not in found.split("# y")[1]
+    assert figures.replaced(found, "y", "new") == found
+    with pytest.raises(ValueError, match="section 'z'"):
+        figures.replaced(page, "z", "new")
+
+
+def test_no_table_of_figures_is_typed_by_hand():
+    page = figures.PAGE.read_text(encoding="utf-8")
+    for name in figures.SECTIONS:
+        page = figures.replaced(page, name, "")
+    assert "\n|" not in page

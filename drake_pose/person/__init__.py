@@ -1,1 +1,1 @@
-"""One person before many cameras: by all silhouettes at once, and (`date`) as Date et al. did."""
+"""Pose and shape of one person seen by several cameras; `date` is the method of Date et al."""

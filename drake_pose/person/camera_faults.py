@@ -1,7 +1,7 @@
-"""Cameras that have moved since they were calibrated, found by their residual.
+"""Detection of cameras that have moved since they were calibrated.
 
-Each camera in turn is predicted by the others' pose. It has moved where one rigid motion of it
-explains many frames; poor masks are off in another way each time.
+Each camera's silhouettes are compared with the pose that all other cameras determine. A camera has
+moved where one rigid motion of it explains many frames; errors of poor masks vary between frames.
 """
 
 from collections.abc import Mapping, Sequence
@@ -22,13 +22,16 @@ from drake_pose.person.views import viewing_rays
 
 
 class FaultSettings(NamedTuple):
-    """From when on a camera is at fault.
+    """Thresholds for a camera to be at fault.
 
-    rounds: scales at which a camera's motion is fitted. lowered: a camera is at fault where leaving
-    it out lowers the others' misfit to this fraction; alike: those that lower it to no more than so
-    many times the least are rivals. min_metres, min_pixels: a surface is known to 2 cm, and an edge
-    to a pixel: what is off by more is off. explained: one motion explains a camera's silhouettes
-    where they fit this fraction of what the others' do.
+    Args:
+        rounds: scales at which a camera's motion is fitted [m].
+        lowered: leaving the camera out must lower the others' misfit to this fraction.
+        alike: other cameras whose misfit is at most this factor above the lowest are suspected too.
+        min_metres, min_pixels: least displacement at the person [m] and in the picture [pixel]: a
+            surface is known to 2 cm, and an edge to a pixel.
+        explained: a motion explains a camera's silhouettes if their inlier ratio is at least this
+            fraction of the others'.
     """
 
     rounds: tuple[float, ...] = (0.4, 0.3, 0.2, 0.15, 0.1, 0.07, 0.05, 0.05)
@@ -44,7 +47,7 @@ FAULT = FaultSettings()
 
 @dataclass(frozen=True, eq=False)
 class FrameView:
-    """A frame: edges of the regions by camera that sees the person, and about the pose (m,)."""
+    """A frame: edge points of the regions by camera, and an approximate pose (m,) [rad, m]."""
 
     edges: Mapping[str, EdgePoints]
     values: Array
@@ -52,15 +55,16 @@ class FrameView:
 
 @dataclass(frozen=True, eq=False)
 class CameraMotion:
-    """How a camera seems to have moved.
+    """Estimated motion of a camera since its calibration.
 
     Args:
-        X_WC: (4, 4) where it would have to be.
-        shift: (2,) by how much the person is off in its pictures [pixel], right and down.
-        pixels: how far the person's joints are off in its pictures, root mean square [pixel].
-        metres: the same at the person's place [m].
-        turn: by how much the pictures are turned, clockwise [rad].
-        share_before, share_after: of the contours, what fits as calibrated and as moved.
+        X_WC: (4, 4) pose of the camera that fits its silhouettes.
+        shift: (2,) displacement of the person in its pictures, right and down [pixel].
+        pixels: RMS displacement of the person's joints in its pictures [pixel].
+        metres: the same at the person's distance [m].
+        turn: rotation of the person in its pictures, clockwise [rad].
+        share_before, share_after: inlier ratio of the contours with the calibration, and after the
+            motion.
     """
 
     X_WC: Array
@@ -74,15 +78,17 @@ class CameraMotion:
 
 @dataclass(frozen=True, eq=False)
 class CameraFault:
-    """A camera that contradicts the others.
+    """A camera whose silhouettes disagree with the others'.
 
     Args:
-        motion: how it has moved; it may also have turned further than can be told.
-        is_explained: whether its having moved explains all: else its masks may be poor, mirrored,
-            or another camera's.
-        rivals: cameras that may be at fault in its stead: who it is, cannot be told.
-        others_share: of the other cameras' contours, what fits without it.
-        first, is_left_out: since which frame (from 0) it is at fault; whether it was left out.
+        name: of the camera.
+        motion: how it has moved; turns about the camera itself may be undetermined.
+        is_explained: whether the motion explains the silhouettes. If not, the masks may be poor,
+            mirrored, or another camera's.
+        rivals: cameras that may be at fault instead.
+        others_share: inlier ratio of the other cameras' contours without this one.
+        first: index of the first frame in which it is at fault.
+        is_left_out: whether it was left out.
     """
 
     name: str
@@ -95,11 +101,12 @@ class CameraFault:
 
 
 class CameraJudge:
-    """Compares cameras with each other by a person whom they see.
+    """Compares cameras with each other by a person that they see.
 
     Args:
-        fit: of the person.
-        held: (m,) values that stay.
+        fit: for the person's pose tree.
+        cameras: by name.
+        held: (m,) values that stay fixed.
     """
 
     def __init__(
@@ -109,14 +116,14 @@ class CameraJudge:
         self._without: dict[tuple[FrameView, str], tuple[Array, float]] = {}
 
     def pose_without(self, frame: FrameView, left_out: str) -> tuple[Array, float]:
-        """A frame's pose (m,) by all cameras but one, and what share of their contours fits."""
+        """Return a frame's pose (m,) by all cameras but one, and these cameras' inlier ratio."""
         if (frame, left_out) in self._without:
             return self._without[frame, left_out]
         names = [name for name in frame.edges if name != left_out]
         views = pack_views(
             [self._cameras[name] for name in names], [frame.edges[name] for name in names]
         )
-        # Angles are known to half a radian, lengths twice as well.
+        # The start is known to half a radian and a quarter of a metre.
         is_angle = self._fit.kinematics.is_angle
         prior = Prior(frame.values, np.where(is_angle, 1.0, 4.0) / 0.5**2)
         scales = (0.15, 0.12, 0.10, 0.08, 0.06, 0.05, 0.04)
@@ -126,7 +133,7 @@ class CameraJudge:
         return found.values, found.inlier_ratio
 
     def share(self, camera: Camera, edge: EdgePoints, values: Array) -> float:
-        """What share of the contours' lengths fits in one picture."""
+        """Return the inlier ratio of the contours in one picture, for values (m,)."""
         return self._fit.compare(
             pack_views([camera], [edge]), values, AnnealingStage(0.05, 0.05)
         ).inlier_ratio
@@ -138,13 +145,19 @@ class CameraJudge:
         poses: Sequence[Array],
         scales: Sequence[float] = FAULT.rounds,
     ) -> CameraMotion:
-        """The motion of a camera that explains its edges best, by poses (m,) found without it."""
+        """Fit the motion of a camera to its edges, for poses (m,) found without this camera.
+
+        Args:
+            edges: edge points in each frame.
+            poses: (m,) pose in each frame [rad, m].
+            scales: of the fit, coarse to fine [m].
+        """
         camera, pairs = self._cameras[name], list(zip(edges, poses, strict=True))
         fit, places = self._fit, np.array([self._fit.kinematics.poses(q)[:, :3, 3] for q in poses])
         points = places.reshape(-1, 3)
         middle = points.mean(axis=0)
-        # A camera that was pushed has turned and shifted by about 0.15 rad and 0.3 m. What the
-        # pictures see of a turn about the camera is the person's way about it.
+        # A pushed camera has turned by about 0.15 rad and moved by about 0.3 m. Motions are about
+        # the person's place, so a turn of the camera displaces the person by 0.15 rad x distance.
         reach = float(np.linalg.norm(camera.X_WC[:3, 3] - middle))
         deviations = np.array([0.15] * 3 + [0.3 + 0.15 * reach] * 3)
         names = [f"{camera.name}.{one}" for one in POSE_NAMES]
@@ -154,17 +167,17 @@ class CameraJudge:
         )  # fmt: skip
         seen = [Observation(pack_evidence([edge]), values) for edge, values in pairs]
         rounds = [AnnealingStage(scale, 0.05) for scale in scales]
-        nothing, found = np.zeros((len(pairs), 0)), []
+        nothing, solutions = np.zeros((len(pairs), 0)), []
         for start in (np.zeros(3), _way_to_regions(camera, edges, places)):
             shift = np.concatenate([np.zeros(3), camera.X_CW[:3, :3] @ start])
             solved = problem.solve(seen, rounds, (nothing, shift), expected=(nothing, np.zeros(6)))
             X_CW = problem.place_cameras(solved.parameters[0])[0][0]
             moved = camera.with_pose(np.linalg.inv(X_CW))
-            found.append(self._describe(camera, moved, pairs, points))
-            # What is far off may be drawn to the wrong side of the body; else one start is enough.
-            if found[0].share_after > FAULT.explained:
+            solutions.append(self._describe(camera, moved, pairs, points))
+            # A large motion may end on the wrong side of the body: try the regions' middles, too.
+            if solutions[0].share_after > FAULT.explained:
                 break
-        return max(found, key=lambda one: one.share_after)
+        return max(solutions, key=lambda one: one.share_after)
 
     def _describe(
         self,
@@ -173,65 +186,69 @@ class CameraJudge:
         pairs: Sequence[tuple[EdgePoints, Array]],
         points: Array,
     ) -> CameraMotion:
-        """What a camera's motion does to its pictures, and to points (n, 3) in them [m]."""
+        """Describe a camera's motion by what it does to points (n, 3) in its pictures [m]."""
         before, after = camera.project(points)[0], moved.project(points)[0]
         pixels = float(np.sqrt(((after - before) ** 2).sum(axis=1).mean()))
-        arms, ends = before - before.mean(axis=0), after - after.mean(axis=0)
-        sine = (arms[:, 0] * ends[:, 1] - arms[:, 1] * ends[:, 0]).sum()
-        shares = [np.mean([self.share(one, *pair) for pair in pairs]) for one in (camera, moved)]
+        offsets_before, offsets_after = before - before.mean(axis=0), after - after.mean(axis=0)
+        sine = (
+            offsets_before[:, 0] * offsets_after[:, 1] - offsets_before[:, 1] * offsets_after[:, 0]
+        ).sum()
+        ratios = [np.mean([self.share(one, *pair) for pair in pairs]) for one in (camera, moved)]
         return CameraMotion(
             moved.X_WC,
             (after - before).mean(axis=0),
             pixels,
             pixels / pixels_per_metre(camera, points.mean(axis=0)),
-            float(np.arctan2(sine, (arms * ends).sum())),
-            float(shares[0]),
-            float(shares[1]),
+            float(np.arctan2(sine, (offsets_before * offsets_after).sum())),
+            float(ratios[0]),
+            float(ratios[1]),
         )
 
     def find_fault(self, frames: Sequence[FrameView]) -> CameraFault | None:
-        """The camera that contradicts the others most, if one does.
+        """Return the camera that disagrees most with the others, or None.
 
-        Of the frames those count that three cameras see or more.
+        Only frames that three or more cameras see are used.
         """
         frames = [frame for frame in frames if len(frame.edges) >= 3]
         names = [name for name in self._cameras if any(name in frame.edges for frame in frames)]
 
         def is_off(name: str) -> bool:
-            # Of a camera that has moved a fifth at least shows beside the pose that it helped to
-            # find: that pose goes along by 0.3 of the way with nine cameras, by half with four.
+            # The pose follows a moved camera by 0.3 of the way with nine cameras, by half with
+            # four. So at least a fifth of the motion shows beside the pose found with all cameras.
             own = [frame for frame in frames if name in frame.edges]
-            poses, shares = zip(*(self.pose_without(frame, "") for frame in own), strict=True)
+            poses, ratios = zip(*(self.pose_without(frame, "") for frame in own), strict=True)
             edges = [frame.edges[name] for frame in own]
             motion = self.motion(name, edges, poses, (0.1, 0.07, 0.05))
-            fits = motion.share_before > FAULT.explained * float(np.mean(shares))
+            fits = motion.share_before > FAULT.explained * float(np.mean(ratios))
             return not fits or motion.metres > 0.2 * FAULT.min_metres
 
-        # What few cameras say, their pose follows.
+        # With few cameras the pose follows each of them, and this quick test would miss faults.
         if len(names) > 3 and not any(is_off(name) for name in names):
             return None
         with_all = [self.pose_without(frame, "")[1] for frame in frames]
         misfits, found = {}, {}
         for name in names:
             own = [frame for frame in frames if name in frame.edges]
-            shares = [s for s, f in zip(with_all, frames, strict=True) if name in f.edges]
+            ratios = [s for s, f in zip(with_all, frames, strict=True) if name in f.edges]
             without = [self.pose_without(frame, name) for frame in own]
             motion = self.motion(
                 name, [frame.edges[name] for frame in own], [values for values, _ in without]
             )
-            share = float(np.mean([others for _, others in without]))
+            others_ratio = float(np.mean([others for _, others in without]))
             count = float(np.mean([len(frame.edges) for frame in own]))
-            best = ((count - 1.0) * share + max(motion.share_after, motion.share_before)) / count
-            misfits[name] = (1.0 - best) / max(1.0 - float(np.mean(shares)), 1e-3)
-            found[name] = motion, share
+            best = (
+                (count - 1.0) * others_ratio + max(motion.share_after, motion.share_before)
+            ) / count
+            misfits[name] = (1.0 - best) / max(1.0 - float(np.mean(ratios)), 1e-3)
+            found[name] = motion, others_ratio
         suspects = sorted(misfits, key=lambda one: misfits[one])
         if not suspects or misfits[suspects[0]] > FAULT.lowered:
             return None
-        # Any two cameras agree more or less: two alone predict a third one's picture half as well,
-        # and of three it is unknown which one contradicts the others.
-        few = len(names) <= 3
-        metres = (2.0 if few else 1.0) * FAULT.min_metres
-        # Of those that lower the misfit alike, one that has not moved is not at fault.
+        # With three cameras it is unknown which one disagrees with the others, and two of them
+        # predict the third one's picture only half as well.
+        has_few = len(names) <= 3
+        metres = (2.0 if has_few else 1.0) * FAULT.min_metres
+        # Of the cameras with about the lowest misfit, those that have not moved are not at fault.
         moved = [
             one
             for one in suspects
@@ -241,19 +258,19 @@ class CameraJudge:
         ]
         if not moved:
             return None
-        first, alike = moved[0], np.inf if few else FAULT.alike * misfits[moved[0]]
-        motion, share = found[first]
+        first, alike = moved[0], np.inf if has_few else FAULT.alike * misfits[moved[0]]
+        motion, others_ratio = found[first]
         rivals = [
             one
             for one in suspects
             if one != first and misfits[one] < alike and found[one][0].metres > FAULT.min_metres
         ]
-        explained = not few and is_explained(motion, share)
-        return CameraFault(first, motion, explained, tuple(rivals), share)
+        explained = not has_few and is_explained(motion, others_ratio)
+        return CameraFault(first, motion, explained, tuple(rivals), others_ratio)
 
 
 def _way_to_regions(camera: Camera, edges: Sequence[EdgePoints], places: Array) -> Array:
-    """The mean way (3,) from the bodies' middles to the rays of their regions' middles [m]."""
+    """Return the mean shift (3,) from bodies' middles to the rays of regions' middles [m]."""
     ways = [np.zeros(3)]
     for edge, own in zip(edges, places, strict=True):
         if len(edge.uv):
@@ -264,13 +281,20 @@ def _way_to_regions(camera: Camera, edges: Sequence[EdgePoints], places: Array) 
 
 
 def is_explained(motion: CameraMotion, others_share: float) -> bool:
-    """Whether a camera's motion explains its silhouettes nearly as well as the others' fit."""
+    """Return whether a camera's motion makes its silhouettes fit nearly as well as the others'."""
     return motion.share_after > FAULT.explained * others_share
 
 
 def moved_since(before: Sequence[float], after: Sequence[float]) -> int:
-    """The frame of a camera's motion, by shares that fit before and after it; or their count."""
+    """Estimate when a camera moved, from the inlier ratios before and after its motion.
+
+    Args:
+        before, after: (n,) ratios in n frames with the camera as calibrated, and as moved.
+
+    Returns:
+        The index of the first frame after the motion; n if there is none.
+    """
     gain = np.asarray(after) - np.asarray(before)
-    # What speaks for the motion from each frame on, less what speaks for it before that.
+    # Sum of the gains from each frame on; the best frame also excludes the gains before it.
     later = np.concatenate([np.cumsum(gain[::-1])[::-1], [0.0]])
     return int(np.argmax(2.0 * later - later[0]))

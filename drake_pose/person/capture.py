@@ -1,9 +1,9 @@
-"""A whole recording of one person, whose proportions need not be known, in spite of its faults.
+"""Capture of a recording of one person of unknown proportions, robust to faults of the recording.
 
-By masks: found in a few frames, followed both ways from the best; shape joints are fitted, then all
-again. Where only a few frames have masks the person's colours in pictures say the rest. Others are
-cut out of the masks first. After the capture a camera that contradicts the rest is left out, and
-all is captured once more.
+With masks (`capture_person`): find the person in a few frames, track forwards and backwards from
+the best one, fit the shape joints, and track all frames again. With few masks (`capture_by_colour`)
+the person's colours replace them. `capture_checked` cuts other persons out of the masks first,
+leaves out a camera that disagrees with the others, and then captures the recording once more.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -43,7 +43,7 @@ from drake_pose.person.views import (
 from drake_pose.silhouette.outline import Outline
 
 ReadPictures = Callable[[int], Mapping[str, Picture]]
-"""Gives the pictures (H, W, 3) of a frame, counted from 0, by camera."""
+"""Returns the pictures (H, W, 3) of a frame by camera; frames count from 0."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,12 +51,14 @@ class PersonCapture:
     """A captured recording.
 
     Args:
-        q: (frames, nq) the plant's positions; nan where no person was seen in time.
-        shares: (frames,) of the contours' lengths, inlier ratio; 0 where no person was seen.
+        q: (frames, nq) the plant's positions [rad, m]; nan where no person was found.
+        shares: (frames,) inlier ratio of the contours; 0 where no person was seen.
         shape: the person's; None where the model has no shape joints.
-        outlines: the simplified surfaces of the tree's nodes, as wide as the person.
-        deviations: (frames, nq) standard deviations of q [rad or m] by pictures and limits; nan.
-        rivals: by frame that was searched, unlike poses that explain it as well: q and deviations.
+        outlines: simplified surfaces of the tree's nodes with the person's radius scales.
+        tree: the model's pose tree.
+        deviations: (frames, nq) standard deviations of q [rad, m] by pictures and limits, or nan.
+        rivals: (q, deviations) of distinct alternative poses that fit as well, by frame. Only
+            frames in which the person was searched have any.
     """
 
     q: Array
@@ -69,7 +71,7 @@ class PersonCapture:
 
     @staticmethod
     def begun(count: int, shape: PersonShape | None, fit: ContourFit) -> "PersonCapture":
-        """A capture of `count` frames in which nothing is known yet."""
+        """Return a capture of `count` frames without poses."""
         q = np.full((count, len(fit.tree.model.position_names)), np.nan)
         return PersonCapture(q, np.zeros(count), shape, fit.outlines, fit.tree, q.copy())
 
@@ -80,7 +82,7 @@ class PersonCapture:
         state: TrackState,
         seen: FrameViews | ColourViews,
     ) -> None:
-        """Notes where the person is in a frame, and how sure that is by what was seen."""
+        """Store the pose of a frame and its standard deviations, given what was seen."""
         lengths = None if self.shape is None else self.shape.covariance
         self.q[frame], self.shares[frame] = tracker.positions(state.values), state.share
         self.deviations[frame] = tracker.deviations(state.values, seen, lengths)
@@ -95,20 +97,22 @@ def capture_person(
     is_sequence: bool = True,
     on_frame: Callable[[int], None] | None = None,
 ) -> PersonCapture:
-    """Captures a recording.
+    """Capture a recording.
 
     Args:
-        tree: of a model with the landmarks of a person, best with shape joints:
-            urdf/person/person_shape.urdf.
-        read: gives the masks of a frame.
-        frames: those in which the person is seen, of `count`; before one that does not follow the
-            last he may have gone anywhere.
-        is_sequence: whether frames follow each other; else each is found afresh.
-        on_frame: called after each frame.
+        tree: of a model with a person's landmarks, best with shape joints, as
+            urdf/person/person_shape.urdf has.
+        cameras: by name.
+        read: returns the masks of a frame.
+        frames: indices, in order, of the frames in which the person is seen. After a gap the
+            person is also searched anew.
+        count: number of frames of the whole recording.
+        is_sequence: whether frames follow each other; if not, each is searched by itself.
+        on_frame: called after each frame with its index.
 
     Raises:
         ModelError: the model has no landmarks of trunk, arms and legs.
-        SettingsError: there is no frame, or in none of those looked at two cameras see a person.
+        SettingsError: there are no frames, or two cameras see a person in none of those tried.
     """
     if not len(frames):
         raise SettingsError("a recording needs one frame or more")
@@ -129,14 +133,14 @@ def capture_person(
 
 
 class _Explanation(NamedTuple):
-    """A pose, fitted with the shape that it gives the person, and the tracker that has this."""
+    """A pose fit together with the person's shape in it, and the tracker with this shape."""
 
     fit: PoseFit
     tracker: PersonPoseTracker
 
 
 class _Capture:
-    """A recording, and what follows the person in it."""
+    """A recording with the tracker that follows the person in it."""
 
     def __init__(
         self, tree: PoseTree, cameras: Mapping[str, Camera], read: ReadFrame, is_sequence: bool
@@ -144,11 +148,11 @@ class _Capture:
         self._cameras, self._read, self._is_sequence = cameras, read, is_sequence
         self._bare, is_shape = ContourFit(tree, noise=NOISE), shape_values(tree)
         self.tracker = PersonPoseTracker(self._bare, LENIENT, is_shape)
-        # Whether the model has a shape that is to be found.
+        # Whether the model has shape joints to be fitted.
         self._is_measured = bool(is_shape.any())
         self.rivals: dict[int, tuple[tuple[Array, Array], ...]] = {}
-        # The frames that the shape is measured in are seen three times: by camera regions as bits
-        # along the rows, and edges.
+        # Frames used for the shape are needed three times. By frame and camera: the region, packed
+        # to bits along the rows, and its edge.
         self._kept: dict[int, dict[str, tuple[NDArray[np.uint8], EdgePoints]]] = {}
 
     def _see(self, frame: int) -> FrameViews:
@@ -166,9 +170,10 @@ class _Capture:
     def measure(
         self, frames: Sequence[int], first: int = 40, fitted: int = 10
     ) -> tuple[PersonShape | None, dict[int, TrackState]]:
-        """The shape that the first frames give, which the tracker has from now on; and states.
+        """Fit the shape to `fitted` of the `first` frames, and give it to the tracker.
 
-        It is fitted to some among the first ones.
+        Returns:
+            The shape, None where the model has no shape joints; and the states in these frames.
         """
         if not self._is_measured:
             return None, {}
@@ -183,8 +188,8 @@ class _Capture:
             rough = self.follow_all(frames, {})
             poses = {k: one.values for k in chosen if (one := rough[k])}
         else:
-            told = {k: self.explained(k) for k in chosen}
-            poses = {k: own[0].fit.values for k, own in told.items() if own}
+            explained = {k: self.explained(k) for k in chosen}
+            poses = {k: own[0].fit.values for k, own in explained.items() if own}
         shape, self.tracker = self._measured(list(poses), list(poses.values()))
         states = zip(poses, shape.poses, strict=True)
         return shape, {k: self.tracker.start(pose) for k, pose in states}
@@ -192,22 +197,22 @@ class _Capture:
     def _measured(
         self, frames: Sequence[int], poses: Sequence[Array]
     ) -> tuple[PersonShape, PersonPoseTracker]:
-        """The shape that some frames with such poses (m,) give, and a tracker of whom has it."""
-        fit, looks = self._bare, [self._see(k) for k in frames]
-        views = [(one.cameras, [view.edge for view in one.views]) for one in looks]
+        """Fit the shape to frames with these poses (m,); return it with a tracker that has it."""
+        fit, observed = self._bare, [self._see(k) for k in frames]
+        views = [(one.cameras, [view.edge for view in one.views]) for one in observed]
         shape = fit_shape(fit, views, np.array(poses))
-        worn, plan = ContourFit(fit.kinematics, shape.outlines, NOISE), self.tracker.plan
-        return shape, PersonPoseTracker(worn, LENIENT, shape_values(fit.tree), shape.values, plan)
+        shaped, plan = ContourFit(fit.kinematics, shape.outlines, NOISE), self.tracker.plan
+        return shape, PersonPoseTracker(shaped, LENIENT, shape_values(fit.tree), shape.values, plan)
 
     def explained(self, frame: int, begun: PoseFit | None = None) -> list["_Explanation"]:
-        """All that the person may be in a frame, best first; none where nobody is seen.
+        """Return the distinct poses that explain a frame, best first; empty where nobody is seen.
 
-        Where the shape is not known, that of a first fit begins the search, and each explanation
-        has its own before they are compared: in a body that is not the person's, a wrong pose may
-        fit better than the right one.
+        Where the shape is unknown, the shape of a first fit is used in the search, and each
+        explanation gets its own shape before they are compared: in a body of other proportions a
+        wrong pose may fit better than the right one.
 
         Args:
-            begun: the first fit, where it is known.
+            begun: the first fit, if it exists already.
         """
         seen, tracker = self._see(frame), self.tracker
         if self._is_measured:
@@ -231,7 +236,7 @@ class _Capture:
         return found
 
     def _with_shape(self, frame: int, values: Array) -> "_Explanation":
-        """A pose (m,) of a frame, fitted with the shape that it gives the person."""
+        """Refine a pose (m,) of a frame together with the person's shape."""
         seen = self._see(frame)
         shape, own = self._measured([frame], [values])
         shaped = own.search.refined(shape.poses[0], seen)
@@ -243,7 +248,7 @@ class _Capture:
         known: Mapping[int, TrackState],
         finish: Callable[[int, TrackState | None, FrameViews], None] | None = None,
     ) -> dict[int, TrackState | None]:
-        """The states of all frames, begun where the person is known or fits best."""
+        """Return the states of all frames; tracking starts at a known or the best-fitting frame."""
         found: dict[int, TrackState | None] = {}
 
         def follow(state: TrackState | None, frame: int, last: int) -> TrackState | None:
@@ -276,7 +281,7 @@ class _Capture:
         return found
 
     def _found_anew(self, frame: int, known: TrackState | None) -> TrackState | None:
-        """The state in a frame on its own, in the body that the tracker has."""
+        """Return the state in a frame by itself, with the tracker's shape."""
         if known is None:
             explained = self.explained(frame)
             if not explained:
@@ -292,9 +297,9 @@ class _Capture:
     def _best_start(
         self, frames: Sequence[int], tried: int = 3, enough: float = 0.97
     ) -> tuple[int, TrackState]:
-        """The frame of those tried in which a fresh start fits best, and the state there.
+        """Return which of the tried frames has the best-fitting fresh start, and its state.
 
-        One of which enough of the contours fits needs no other to be compared with.
+        A frame whose inlier ratio exceeds `enough` ends the trials.
         """
         best: tuple[int, PoseFit] | None = None
         for frame in spread_over(frames, tried):
@@ -305,14 +310,14 @@ class _Capture:
                 break
         if best is None:
             raise SettingsError(
-                f"in none of {tried} frames two cameras saw a person: give masks that show one"
+                f"two cameras see no person in any of {tried} frames: give masks that show one"
             )
         fit, self.tracker = self.explained(*best)[0]
         return best[0], self.tracker.start(fit.values, fit.inlier_ratio)
 
 
 def spread_over(frames: Sequence[int], count: int) -> list[int]:
-    """This many frames of all, evenly."""
+    """Return `count` of the frames, evenly spread; all if there are fewer."""
     picked = np.linspace(0, len(frames) - 1, min(count, len(frames)))
     return [frames[int(k)] for k in picked]
 
@@ -327,18 +332,22 @@ def capture_by_colour(
     known: PersonCapture | None,
     on_frame: Callable[[int], None] | None = None,
 ) -> tuple[PersonCapture, Array]:
-    """Captures a recording of few masks: these or given positions start it, also after a loss.
+    """Capture a recording of which few frames have masks, by the person's colours.
+
+    Masks or given positions start the track, and start it again after a loss.
 
     Args:
-        pictures: gives a frame's (H, W, 3), by camera, of `count` frames.
-        starts: the plant's positions (nq,) by frame, where they are about known.
-        masked: the masks by camera of the frames that have some.
-        known: what these say, which also gives shape joints; None: there are none, and shape
-            joints stay where the first start has them.
+        count: number of frames.
+        pictures: returns a frame's pictures (H, W, 3) by camera.
+        starts: approximate positions (nq,) of the plant by frame [rad, m].
+        masked: masks by camera of each frame that has some.
+        known: the capture of the masked frames, which also gives the shape; None: there are no
+            masks, and shape joints stay as in the first start.
+        on_frame: called after each frame with its index.
 
     Returns:
-        The capture, nan where the person is lost; and (frames,) the distance of the contours, root
-        mean square over cameras [pixel], nan in frames that were not followed by colour.
+        The capture, nan where the person is lost; and (frames,) RMS distances of the contours over
+        all cameras [pixel], nan in frames that were not tracked by colour.
     """
     shape = None if known is None else known.shape
     fit = ContourFit(tree, None if known is None else known.outlines, NOISE)
@@ -388,14 +397,14 @@ def capture_by_colour(
 
 @dataclass(frozen=True, eq=False)
 class CheckedCapture:
-    """A captured recording.
+    """A captured recording and its faults.
 
     Args:
-        captured: the capture of all frames; nan where fewer than two cameras see the person.
-        cameras: those that contradict the others, measured at the end once more.
-        rig: what the silhouettes say against the calibration as a whole, if no single camera
-            explains it; undone where it can be.
-        read: gives the masks that were used.
+        captured: all frames; nan where fewer than two cameras see the person.
+        views: what else was in view, or was not.
+        cameras: cameras that disagree with the others, evaluated once more at the end.
+        rig: the fault of the rig as a whole, if no single camera explains it; undone if identified.
+        read: returns the masks that were used.
     """
 
     captured: PersonCapture
@@ -415,17 +424,17 @@ def capture_checked(
     carved: int = 3,
     least_left: int = 3,
 ) -> CheckedCapture:
-    """Captures a recording like `capture_person`, whose arguments it has, and finds its faults.
+    """Capture a recording as `capture_person` does, and find its faults.
 
     Args:
-        carved: in how many frames visual hulls are carved out of the silhouettes.
-        least_left: a camera is left out only where as many others follow the person.
+        carved: number of frames whose visual hull is compared with the silhouettes.
+        least_left: a camera is left out only if at least this number of others remains.
 
     Raises:
         CameraError: the person is smaller or taller than people are.
         MaskError: the masks show the background.
         ModelError: the model has no landmarks of trunk, arms and legs.
-        SettingsError: there is no frame in which two cameras see a person.
+        SettingsError: two cameras see a person in no frame.
     """
     recording = require_person(PersonRecording(cameras, read, count, is_sequence), count)
     rig = find_rig_fault(cameras, [recording.read(k) for k in spread_over(recording.seen, carved)])
@@ -435,18 +444,18 @@ def capture_checked(
         recording = require_person(undone, count)
     found: list[CameraFault] = []
     while True:
-        # Frames are reported in the first capture only: callers count them.
-        tell = None if found else on_frame
+        # Only the first capture reports frames, because callers count them.
+        report = None if found else on_frame
         captured = capture_person(
-            tree, cameras, recording.read, recording.seen, count, is_sequence, tell
+            tree, cameras, recording.read, recording.seen, count, is_sequence, report
         )
         judge = _Judge(tree, cameras, recording, captured)
         found = [judge.dated(one) for one in found]
         fault = judge.find()
         if fault is None:
             break
-        left = len(recording.cameras_at(fault.first)) - 1
-        fault = replace(fault, is_left_out=left >= least_left and not fault.rivals)
+        others = len(recording.cameras_at(fault.first)) - 1
+        fault = replace(fault, is_left_out=others >= least_left and not fault.rivals)
         found.append(fault)
         if not fault.is_left_out:
             break
@@ -457,14 +466,17 @@ def capture_checked(
 
 
 def require_person(recording: PersonRecording, count: int) -> PersonRecording:
-    """A recording of `count` frames in which somebody is seen who may be a person.
+    """Return a recording of `count` frames if it shows a person.
 
-    Raises the errors of `capture_checked`. A visible part of a person is 0.1 to 3 m tall, and does
-    not fill the whole picture in more than half of the masks.
+    A visible part of a person is 0.1 to 3 m tall, and fills the whole picture in at most half of
+    the masks.
+
+    Raises:
+        As `capture_checked`.
     """
     if not recording.seen:
         raise SettingsError(
-            f"in none of {count} frames two cameras see a person: give masks that show one"
+            f"two cameras see no person in any of {count} frames: give masks that show one"
         )
     if recording.covering > 0.5:
         raise MaskError(
@@ -480,7 +492,7 @@ def require_person(recording: PersonRecording, count: int) -> PersonRecording:
 
 
 class _Judge(CameraJudge):
-    """Compares the cameras with each other by what was captured."""
+    """Compares the cameras of a captured recording with each other."""
 
     def __init__(
         self,
@@ -497,9 +509,9 @@ class _Judge(CameraJudge):
         self._values = {k: flatten(tree.values_from_positions(captured.q[k])) for k in found}
 
     def find(self, compared: int = 10) -> CameraFault | None:
-        """The camera that contradicts the others in all frames or in the last, and since when.
+        """Return the camera that disagrees most with the others, and since when; None: none does.
 
-        Cameras are compared in this many frames.
+        Cameras are compared in `compared` frames: in all of them, and in the last third.
         """
         picked = spread_over(list(self._values), compared)
         views = []
@@ -509,24 +521,24 @@ class _Judge(CameraJudge):
             views.append(FrameView(edges, self._values[frame]))
         fault = self.find_fault(views)
         if fault is None or not fault.is_explained:
-            # A camera that moved in the middle is another one before and after that.
+            # A camera that moved in the middle of the recording disagrees in the last part only.
             fault = self.find_fault(views[-(len(views) + 2) // 3 :]) or fault
         if fault is None:
             return None
         own = [k for k, view in enumerate(views) if fault.name in view.edges]
         poses = [self.pose_without(views[k], fault.name)[0] for k in own]
         since = self._since(fault, [views[k].edges[fault.name] for k in own], poses)
-        # Between two compared frames it may have moved at any time.
+        # It may have moved at any time between two compared frames.
         first = 0 if since == 0 else picked[own[min(since, len(own)) - 1]] + 1
         return replace(fault, first=first)
 
     def dated(self, fault: CameraFault) -> CameraFault:
-        """A camera that was left out, measured once more by what the others captured without it."""
+        """Evaluate a left-out camera again, by the poses captured without it."""
         seen = {k: self._recording.read(k, with_all=True).get(fault.name) for k in self._values}
         frames = [k for k, mask in seen.items() if mask is not None]
         edges = [self._edge(fault.name, mask) for mask in seen.values() if mask is not None]
         poses = [self._values[frame] for frame in frames]
-        # The first guess may be some frames too early, which blurs the motion.
+        # The first estimate may be some frames too early, which blurs the motion.
         for _ in range(2):
             late = [k for k, frame in enumerate(frames) if frame >= fault.first]
             if not late:
@@ -541,9 +553,9 @@ class _Judge(CameraJudge):
     def _since(
         self, fault: CameraFault, edges: Sequence[EdgePoints], poses: Sequence[Array]
     ) -> int:
-        """Since which of some pictures a camera is at fault.
+        """Return the index of the first picture in which a camera is at fault.
 
-        Pictures of which less than 0.7 of the others' share fits do not agree.
+        Its inlier ratio after the motion counts as at least 0.7 of the others' ratio.
         """
         camera = self._cameras[fault.name]
         before, after = (

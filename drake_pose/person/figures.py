@@ -1,6 +1,6 @@
-"""Figures of masks, the persons whom they show, and which of these is followed.
+"""Connected components ("figures") of masks, the persons that they show, and which one to follow.
 
-Persons are where figures of several views meet. The figures of others are cut out of the masks.
+A person is where figures of several views meet in space. Figures of other persons are cut out.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -23,14 +23,22 @@ from drake_pose.person.views import (
 )
 
 ReadFrame = Callable[[int], Mapping[str, Mask]]
-"""Gives the masks (H, W) of a frame, counted from 0, by camera; one may be missing."""
+"""Returns the masks (H, W) of a frame by camera; frames count from 0. A camera may lack a mask."""
+
+# Largest distance of a person's middle from the ray of one of the person's figures [m].
 
 # Middles of one person's silhouettes lie no farther apart [m].
 _WITHIN = 0.35
 
 
 class Figure(NamedTuple):
-    """A connected part of a mask: middle (2,) [pixel], area, box (4,) left, top, right, bottom."""
+    """A connected component of a mask.
+
+    Args:
+        middle: (2,) centroid [pixel].
+        area: [pixel^2].
+        box: (4,) left, top, right, bottom [pixel].
+    """
 
     middle: Array
     area: float
@@ -39,12 +47,12 @@ class Figure(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Person:
-    """Somebody whom two cameras see or more.
+    """A person seen by two or more cameras.
 
     Args:
-        place: (3,) the middle of the body [m].
-        figures: by the camera's index, the index of the figure that is this person's alone.
-        area: of the middle one of these figures, of two the smaller one [pixel^2].
+        place: (3,) middle of the body [m].
+        figures: index of the person's figure, by index of the camera.
+        area: median area of these figures, the smaller one of two [pixel^2].
     """
 
     place: Array
@@ -59,18 +67,17 @@ def find_figures(
     least_pixels: float = 16.0,
     least_fraction: float = 2e-4,
 ) -> tuple[Figure, ...]:
-    """The figures of a mask (H, W), the largest first; specks are left out.
+    """Return the figures of a mask (H, W), the largest first, without specks.
 
     Args:
-        speck: a figure of less than this fraction of the largest is a speck, or a part of another.
-        least_pixels, least_fraction: a person is larger than this many pixels, and than this
-            fraction of the picture.
+        speck: figures below this fraction of the largest one's area are specks.
+        least_pixels, least_fraction: least area of a figure [pixel^2], and over the picture's.
     """
     small, step = _coarse(mask)
     left, top, width, height = cv2.boundingRect(small)
     if not width:
         return ()
-    # Most of a picture is empty, and to label that takes as long.
+    # Most of a picture is empty, and labelling takes as long there.
     inner = np.ascontiguousarray(small[top : top + height, left : left + width])
     _, _, boxes, middles = cv2.connectedComponentsWithStats(inner)
     corner = np.array([left, top], dtype=np.float64)
@@ -88,7 +95,7 @@ def find_figures(
 
 
 def cut_figures(mask: Mask, unwanted: Sequence[Figure]) -> Mask:
-    """A mask (H, W) without some of its figures."""
+    """Return a mask (H, W) without some of its figures."""
     if not unwanted:
         return mask
     small, step = _coarse(mask)
@@ -97,7 +104,7 @@ def cut_figures(mask: Mask, unwanted: Sequence[Figure]) -> Mask:
     gone = np.zeros(count, dtype=np.uint8)
     for figure in unwanted:
         gone[1 + int(np.argmin(np.linalg.norm(middles[1:] - figure.middle, axis=1)))] = 1
-    # What the raster left out of a figure lies within one step of it.
+    # Pixels of a figure that the subsampling skipped lie within one step.
     cut = gone[labels] if step == 1 else cv2.dilate(gone[labels], np.ones((3, 3), np.uint8))
     height, width = mask.shape
     large = np.repeat(np.repeat(cut, step, axis=0), step, axis=1)[:height, :width]
@@ -105,7 +112,7 @@ def cut_figures(mask: Mask, unwanted: Sequence[Figure]) -> Mask:
 
 
 def _coarse(mask: Mask) -> tuple[Picture, int]:
-    """Every step-th pixel of a mask, 240 of its shorter side, and the step."""
+    """Return every step-th pixel of a mask, at least 240 on its shorter side, and the step."""
     step = max(1, min(mask.shape) // 240)
     return np.ascontiguousarray(mask[::step, ::step]).view(np.uint8), step
 
@@ -113,7 +120,12 @@ def _coarse(mask: Mask) -> tuple[Picture, int]:
 def find_persons(
     cameras: Sequence[Camera], figures: Sequence[Sequence[Figure]], looked_at: int = 8
 ) -> tuple[Person, ...]:
-    """The persons whom two cameras or more see by masks' figures, the best supported first."""
+    """Return the persons that two or more cameras see, the best supported first.
+
+    Args:
+        figures: of each camera's mask.
+        looked_at: number of places with the best support that are examined in each round.
+    """
     if all(len(own) <= 1 for own in figures):
         taken = {k: 0 for k, own in enumerate(figures) if own}
         if len(taken) < 2:
@@ -126,21 +138,21 @@ def find_persons(
     middles = [np.array([figure.middle for figure in own]).reshape(-1, 2) for own in figures]
     persons: list[Person] = []
     while True:
-        is_free = [
-            np.isin(np.arange(len(own)), list(left))
-            for own, left in zip(figures, free, strict=True)
+        is_candidate = [
+            np.isin(np.arange(len(own)), list(rest))
+            for own, rest in zip(figures, free, strict=True)
         ]
-        places = meeting_points(cameras, middles, 2.0 * _WITHIN, is_free)
+        places = meeting_points(cameras, middles, 2.0 * _WITHIN, is_candidate)
         best: tuple[float, float, Person] | None = None
         scores, nearest = _support(cameras, figures, free, places)
-        # The best places are looked at more closely; those of the same figures are one person's.
-        for own in dict.fromkeys(map(tuple, nearest[np.argsort(-scores)[:looked_at]].tolist())):
-            taken = {k: i for k, i in enumerate(own) if i >= 0}
+        # Places with the same nearest figures belong to one person.
+        for chosen in dict.fromkeys(map(tuple, nearest[np.argsort(-scores)[:looked_at]].tolist())):
+            taken = {k: i for k, i in enumerate(chosen) if i >= 0}
             if len(taken) < 2:
                 continue
             place = _person(cameras, figures, taken).place
-            score, again = _support(cameras, figures, free, place[None])
-            taken = {k: i for k, i in enumerate(again[0].tolist()) if i >= 0}
+            score, confirmed = _support(cameras, figures, free, place[None])
+            taken = {k: i for k, i in enumerate(confirmed[0].tolist()) if i >= 0}
             if len(taken) < 2:
                 continue
             person = _person(cameras, figures, taken)
@@ -156,7 +168,7 @@ def find_persons(
 def _person(
     cameras: Sequence[Camera], figures: Sequence[Sequence[Figure]], taken: dict[int, int]
 ) -> Person:
-    """Who has the figures that are taken, by the camera's index."""
+    """Return the person with these figures, by index of the camera."""
     chosen = [figures[k][i] for k, i in taken.items()]
     areas = sorted(figure.area for figure in chosen)
     place = triangulate([cameras[k] for k in taken], [figure.middle for figure in chosen])
@@ -172,44 +184,52 @@ def _support(
     covers: float = 0.4,
     misses: float = -1.0,
 ) -> tuple[Array, Indices]:
-    """What speaks (n,) for somebody at places (n, 3), and by camera (n, m) the figure, or -1.
+    """Score places (n, 3) by the figures that support a person there.
+
+    A figure adds 0.5 to 1 if its ray passes within 0.35 m.
 
     Args:
-        covers, misses: a figure whose middle the place is counts up to 1; one that only covers it,
-            or none at all, counts as much.
+        free: indices of the figures of each camera that belong to nobody yet.
+        covers: score of a figure whose box only covers the place.
+        misses: score of a camera that sees the place, but no figure there.
+
+    Returns:
+        (n,) sums of the scores over cameras, and (n, cameras) index of the figure, or -1.
     """
     scores = np.zeros(len(places))
     taken = np.full((len(places), len(cameras)), -1)
     for k, (camera, own) in enumerate(zip(cameras, figures, strict=True)):
         uv, depth = camera.project(places)
         with np.errstate(invalid="ignore"):
-            seen = (depth > 0.0) & (uv >= 0.0).all(axis=1)
-            seen &= (uv < [camera.width, camera.height]).all(axis=1)
+            is_visible = (depth > 0.0) & (uv >= 0.0).all(axis=1)
+            is_visible &= (uv < [camera.width, camera.height]).all(axis=1)
         if not own:
-            scores += misses * seen
+            scores += misses * is_visible
             continue
-        offs = np.array([metres_off(camera, figure.middle, places) for figure in own])
-        offs[[i for i in range(len(own)) if i not in free[k]]] = np.inf
-        nearest = offs.argmin(axis=0)
-        off = offs.min(axis=0)
+        distances = np.array([metres_off(camera, figure.middle, places) for figure in own])
+        distances[[i for i in range(len(own)) if i not in free[k]]] = np.inf
+        nearest = distances.argmin(axis=0)
+        distance = distances.min(axis=0)
         boxes = np.array([figure.box for figure in own])
         with np.errstate(invalid="ignore"):
             within = (uv[:, None] >= boxes[:, :2]) & (uv[:, None] <= boxes[:, 2:])
         covered = np.any(np.all(within, axis=2), axis=1)
-        fits = seen & (off < _WITHIN)
+        fits = is_visible & (distance < _WITHIN)
         taken[:, k] = np.where(fits, nearest, -1)
         points = np.where(covered, covers, misses)
-        points[fits] = 1.0 - 0.5 * off[fits] / _WITHIN
-        scores += points * seen
+        points[fits] = 1.0 - 0.5 * distance[fits] / _WITHIN
+        scores += points * is_visible
     return scores, taken
 
 
 def is_another(
     person: Person, persons: Sequence[Person], least_area: float = 0.25, apart: float = 0.5
 ) -> bool:
-    """Whether somebody stands apart from all others [m], and is no part of them.
+    """Return whether a person is separate from all others, and no part of their silhouettes.
 
-    Another person's silhouettes are no smaller than the fraction `least_area` of the largest.
+    Args:
+        least_area: least area of the figures, as a fraction of the largest person's.
+        apart: least horizontal distance from all others [m].
     """
     if person.area < least_area * max(one.area for one in persons):
         return False
@@ -217,12 +237,12 @@ def is_another(
 
 
 def pixels_per_metre(camera: Camera, place: Array) -> float:
-    """How large a metre is in a picture at a place (3,), however far to the side [pixel/m]."""
+    """Return the size of a metre at the depth of a place (3,) in a picture [pixel/m]."""
     return float(contour_fit.pixels_per_metre(contour_fit.pack_cameras([camera]), place)[0])
 
 
 def metres_off(camera: Camera, uv: Array, places: Array) -> Array:
-    """How far (n,) the ray of a pixel (2,) passes by places (n, 3) [m]."""
+    """Return the distances (n,) of places (n, 3) from the ray of a pixel (2,) [m]."""
     origin, direction = viewing_rays(camera, uv[None])
     across = places - origin
     along = across @ direction[0]
@@ -230,7 +250,7 @@ def metres_off(camera: Camera, uv: Array, places: Array) -> Array:
 
 
 def middle_of_view(cameras: Sequence[Camera]) -> Array:
-    """(3,) the point nearest to where all cameras look [m]."""
+    """Return the point (3,) nearest to the rays of all pictures' middles [m]."""
     middles = [np.array([0.5 * (c.width - 1), 0.5 * (c.height - 1)]) for c in cameras]
     return triangulate(cameras, middles)
 
@@ -244,13 +264,17 @@ def sort_figures(
     far: float = 0.7,
     large: float = 0.25,
 ) -> dict[str, tuple[tuple[Figure, ...], bool]]:
-    """By camera the figures of others, and whether the person and another are one figure.
+    """Find the figures of other persons, and where they merge with the followed person.
 
     Args:
         figures: of each mask, in the order of the persons' camera indices.
-        person: who is followed; None: he is away.
-        far, large: a figure of no known person is a stranger's if it is farther off [m], and
+        persons: all persons of the frame.
+        person: the followed one; None: absent.
+        far, large: a figure of no known person is a stranger's if it is farther away [m] and
             larger than this fraction of the followed person's figure.
+
+    Returns:
+        By camera: the figures of others; whether the person and another are one figure.
     """
 
     def covers(camera: Camera, figure: Figure, one: Person) -> bool:
@@ -292,14 +316,16 @@ def sort_figures(
 def keep_person(
     cameras: Mapping[str, Camera], masks: Mapping[str, Mask], place: Array | None = None
 ) -> tuple[dict[str, Mask], Person | None, tuple[str, ...], tuple[str, ...]]:
-    """A frame's masks of one person only, who was at a place (3,) [m] in the last frame.
+    """Keep one person in the masks of a frame, and cut out all others.
 
-    None: the one whose figures are the largest, of two alike nearer to where the cameras look.
+    Args:
+        place: (3,) where the person was in the last frame [m]. None: the person with the largest
+            figures is kept, of equal ones the nearer one to the middle of the cameras' view.
 
     Returns:
         The masks without other persons, by camera; the person, None where fewer than two cameras
-        see anybody; the cameras whose masks had others in them, who were cut out; and those in
-        which the person and another are one figure, which is left whole.
+        see anybody; the cameras whose masks others were cut out of; and the cameras in which the
+        person and another are one figure, which is left whole.
     """
     used = {name: cameras[name] for name in masks}
     figures = {name: find_figures(mask) for name, mask in masks.items()}
@@ -323,7 +349,7 @@ def keep_person(
 def keep_views(
     frame: FrameViews, place: Array | None = None
 ) -> tuple[FrameViews, tuple[str, ...], tuple[str, ...]]:
-    """What cameras see of one person only, and the cameras cut and merged, as of keep_person."""
+    """Keep one person in a frame's views; return them, and the cut and merged cameras' names."""
     cameras = {camera.name: camera for camera in frame.cameras}
     regions = {one.name: view.region for one, view in frame.pairs}
     masks, _, cut, merged = keep_person(cameras, regions, place)
@@ -337,15 +363,15 @@ def keep_views(
 def follow_one(
     frames: Sequence[Sequence[Person]], middle: Array, is_sequence: bool
 ) -> list[Person | None]:
-    """Who is followed in each frame: the one who is seen longest and largest.
+    """Choose the person to follow: the one seen longest and largest.
 
     Args:
         frames: the persons in each frame.
-        middle: (3,) of the cameras' view [m].
-        is_sequence: whether the frames follow each other; else the largest is taken in each.
+        middle: (3,) middle of the cameras' view [m].
+        is_sequence: whether the frames follow each other; if not, the largest in each is chosen.
 
     Returns:
-        Where he is hidden for a while, somebody without figures in between; None where he is away.
+        The person in each frame: without figures where hidden for a while, None where absent.
     """
     if not is_sequence:
         return [max(own, key=lambda one: _standing(one, middle), default=None) for own in frames]
@@ -353,7 +379,7 @@ def follow_one(
     if not tracks:
         return [None] * len(frames)
     main = max(tracks, key=lambda track: sum(_standing(one, middle)[0] for one in track.values()))
-    # Who is there only while he is not is himself, come back.
+    # A person who is present only while the main one is absent is taken for the same person.
     for track in sorted(tracks, key=len, reverse=True):
         if not set(range(min(track), max(track) + 1)) & set(main):
             main = main | track
@@ -361,18 +387,18 @@ def follow_one(
     places = np.array([main[k].place for k in known])
     found: list[Person | None] = [None] * len(frames)
     for k in range(known[0], known[-1] + 1):
-        way = np.array([np.interp(k, known, places[:, axis]) for axis in range(3)])
-        found[k] = main.get(k, Person(way))
+        place = np.array([np.interp(k, known, places[:, axis]) for axis in range(3)])
+        found[k] = main.get(k, Person(place))
     return found
 
 
 def find_tracks(
     frames: Sequence[Sequence[Person]], step: float = 0.4, more: float = 0.1
 ) -> list[dict[int, Person]]:
-    """Who is who from frame to frame: the nearest go together.
+    """Link persons from frame to frame, nearest ones first; return each one's track by frame.
 
-    A person's middle moves by no more than `step` from one frame to the next, and by `more` in each
-    frame in which he is hidden [m].
+    A person's middle moves by at most `step` from one frame to the next, and by `more` in each
+    frame in which the person is hidden [m].
     """
     tracks: list[dict[int, Person]] = []
     for k, persons in enumerate(frames):
@@ -394,19 +420,19 @@ def find_tracks(
 
 
 def _standing(person: Person, middle: Array) -> tuple[float, float]:
-    """What one is chosen by: first how large one is seen, then how near to the middle."""
+    """Return the sort key of the most prominent person: area first, then nearness to the middle."""
     return person.area, -float(np.linalg.norm(person.place - middle))
 
 
 @dataclass(frozen=True, eq=False)
 class ViewFaults:
-    """What was in view or was not; frames are counted from 0.
+    """What was in view and what was not; frames count from 0.
 
     Args:
-        nobody: the frames in which fewer than two cameras see the person.
-        blind: by camera, the frames in which it sees no person, but two others do.
-        others: by camera, the frames in which it sees others, too.
-        merged: by camera, those of them in which person and others are one figure.
+        nobody: frames in which fewer than two cameras see the person.
+        blind: by camera, frames in which it sees no person, but two others do.
+        others: by camera, frames in which it sees other persons.
+        merged: by camera, frames in which the person and others are one figure.
     """
 
     nobody: tuple[int, ...] = ()
@@ -416,17 +442,20 @@ class ViewFaults:
 
 
 class PersonRecording:
-    """The masks of one person, without those of cameras that do not see it or are left out.
+    """The masks of one person, without other persons and without cameras that were left out.
 
     Attributes:
-        height: of what is seen, by the calibration [m]; nan where no two cameras see a person.
-        covering: in what fraction of the masks the largest figure reaches all four sides, as
+        height: median height of what is seen, by the calibration [m]; nan where no two cameras see
+            a person.
+        covering: fraction of the masks whose largest figure reaches all four sides, as
             backgrounds do.
 
     Args:
-        read: gives the masks of a frame; all `count` are read once.
-        is_sequence: whether they follow each other.
-        measured: in this many frames, or somewhat more, the person is measured.
+        cameras: by name.
+        read: returns the masks of a frame; each of `count` frames is read once here.
+        count: number of frames.
+        is_sequence: whether frames follow each other.
+        measured: least number of frames in which the height is measured.
     """
 
     def __init__(
@@ -461,7 +490,7 @@ class PersonRecording:
         self.covering = float(np.mean(covering)) if covering else 0.0
         middle = middle_of_view(list(cameras.values()))
         followed = follow_one(persons, middle, is_sequence)
-        # By frame and camera: the figures of others, and whether the person is one with them.
+        # By frame and camera: figures of others, and whether the person is one figure with them.
         self._others = [
             sort_figures(cameras, own, found, person) if found else dict.fromkeys(own, ((), False))
             for own, found, person in zip(figures, persons, followed, strict=True)
@@ -473,21 +502,21 @@ class PersonRecording:
 
     @property
     def seen(self) -> list[int]:
-        """The frames in which two cameras see the person that are not left out."""
+        """Frames in which two cameras that are not left out see the person."""
         return [k for k in range(self._count) if len(self.cameras_at(k)) >= 2]
 
     def cameras_at(self, frame: int) -> set[str]:
-        """The cameras that see the person and are not left out."""
+        """Return the cameras that see the person in a frame and are not left out."""
         return {
             name for name in self._seeing[frame] if frame < self._left_out.get(name, self._count)
         }
 
     def leave_out(self, name: str, first: int) -> None:
-        """Leaves a camera out from a frame on."""
+        """Leave a camera out from frame `first` on."""
         self._left_out[name] = first
 
     def read(self, frame: int, with_all: bool = False) -> dict[str, Mask]:
-        """The masks of a frame by camera, those of cameras that were left out if wanted."""
+        """Return the masks of a frame by camera; `with_all`: left-out cameras' masks, too."""
         wanted = self._seeing[frame] if with_all else self.cameras_at(frame)
         return {
             name: cut_figures(mask, self._others[frame][name][0])
@@ -496,16 +525,16 @@ class PersonRecording:
         }
 
     def faults(self) -> ViewFaults:
-        """What was in view or was not."""
+        """Return what was in view and what was not."""
         seen = set(self.seen)
         found: list[dict[str, list[int]]] = [{}, {}, {}]
         for frame, own in enumerate(self._others):
             for name, (strangers, is_merged) in own.items():
                 is_blind = name not in self._seeing[frame] and frame in seen
-                for told, kind in zip(
+                for applies, kind in zip(
                     (is_blind, bool(strangers) or is_merged, is_merged), found, strict=True
                 ):
-                    if told:
+                    if applies:
                         kind.setdefault(name, []).append(frame)
         nobody = sorted(set(range(self._count)) - seen)
         return ViewFaults(tuple(nobody), *({k: tuple(v) for k, v in one.items()} for one in found))

@@ -1,7 +1,7 @@
-"""A rig that masks contradict as a whole, before anybody is fitted.
+"""Detection of faults that concern all cameras: mirrored or exchanged pictures.
 
-Silhouettes of a consistent rig are filled by their visual hull (silhouette coherence, Hernandez,
-Schmitt and Cipolla 2007); a rig that only a mirrored or exchanged picture mends is faulty.
+The visual hull of a consistent rig fills all silhouettes (silhouette coherence, Hernandez, Schmitt
+and Cipolla 2007). A rig is at fault if mirroring or exchanging pictures makes the hull fill them.
 """
 
 from collections.abc import Mapping, Sequence
@@ -19,14 +19,15 @@ from drake_pose.person.views import triangulate
 
 @dataclass(frozen=True)
 class RigFault:
-    """What the silhouettes of all cameras together say against their calibration.
+    """A disagreement of all silhouettes with the calibration.
 
-    In a ring of four, opposite cameras exchanged are all cameras mirrored: then that is said.
+    In a ring of four cameras, exchanging opposite ones is the same as mirroring all; the latter is
+    reported.
 
     Args:
-        mirrored: the cameras whose pictures are mirrored, left for right.
-        exchanged: the two cameras whose pictures are each other's.
-        filled: what share of the silhouettes a body can fill, by camera.
+        mirrored: cameras whose pictures are mirrored, left for right.
+        exchanged: two cameras whose pictures are exchanged.
+        filled: fraction of the silhouettes that a visual hull fills, by camera, before the change.
     """
 
     mirrored: tuple[str, ...]
@@ -35,11 +36,11 @@ class RigFault:
 
     @property
     def is_undone(self) -> bool:
-        """Whether it is known what happened."""
+        """Whether the fault was identified, so that `undo` mends it."""
         return bool(self.mirrored or self.exchanged)
 
     def undo(self, masks: Mapping[str, Mask]) -> dict[str, Mask]:
-        """The masks (H, W) of a frame by camera, mirrored and exchanged back."""
+        """Return a frame's masks (H, W) by camera, mirrored and exchanged back."""
         partner = dict(zip(self.exchanged, reversed(self.exchanged), strict=True))
         found = {}
         for name, mask in masks.items():
@@ -57,13 +58,16 @@ def find_rig_fault(
     explained: float = 0.35,
     contradicting: float = 0.3,
 ) -> RigFault | None:
-    """What is wrong with a rig as a whole, by one person's masks in some frames; None: nothing.
+    """Find what is wrong with a rig as a whole, from one person's masks in some frames.
 
     Args:
-        sound: silhouettes of a sound rig are filled but for this much.
-        left, explained: what happened leaves no more than this much, and this share of what was
-            unfilled.
-        contradicting: where more is unfilled and nothing explains it, the rig is not sound.
+        sound: the rig is sound if less than this fraction of the silhouettes is unfilled.
+        left, explained: a change is accepted if less than this fraction remains unfilled, and less
+            than this part of what was unfilled.
+        contradicting: above this unfilled fraction a rig is at fault, even if no change helps.
+
+    Returns:
+        The fault; None if there is none, or too little is unfilled.
     """
     frames = [masks for masks in frames if len(masks) >= 2]
     if not frames:
@@ -101,13 +105,14 @@ def _filled(
     height: float = 1.3,
     lattice: float = 0.25,
 ) -> dict[str, float]:
-    """What share of the silhouettes a visual hull can fill, by camera, if a guess is undone.
+    """Return the fraction of the silhouettes that a visual hull fills, by camera.
 
     Args:
-        first: where cameras see the points of grids, by camera and grid; added to.
-        spacing, side, height: from point to point of the hull's grid, and how far they are from its
-            middle to the side and up [m].
-        lattice: grids whose middles differ by less are the same [m].
+        guess: change that is undone first.
+        first: cache of the cells in which cameras see grids, by camera and grid; changed.
+        spacing: of the hull's grid of points [m].
+        side, height: half the grid's horizontal and vertical extent [m].
+        lattice: spacing of the places where grids are put, so that frames can share them [m].
     """
     shares: dict[str, list[float]] = {}
     for frame in frames:
@@ -118,7 +123,7 @@ def _filled(
         ends = (np.arange(-end, end, spacing) for end in (side, side, height))
         grid = np.stack(np.meshgrid(*ends, indexing="ij"), axis=-1).reshape(-1, 3)
         points = grid + lattice * np.array(cell, dtype=np.float64)
-        # Pixels of a cell that is as large as the grid is fine there.
+        # Masks are reduced to cells as large as the grid's spacing at the person.
         middle = points.mean(axis=0)
         sizes = [max(1.0, spacing * pixels_per_metre(camera, middle)) for camera in used]
         touched: list[Mask] = []
@@ -127,8 +132,8 @@ def _filled(
             padded = np.zeros((int(np.ceil(h * size)), int(np.ceil(w * size))), np.float32)
             padded[: mask.shape[0], : mask.shape[1]] = mask
             touched.append(cv2.resize(padded, (w, h), interpolation=cv2.INTER_AREA) > 0.25)
-        # What touched cells and those beside them allow, and all that is not seen. Each camera
-        # looks at what the ones before it left, which soon is little.
+        # A grid point stays if it is seen in or beside a touched cell, or outside the picture. Each
+        # camera examines only the points that the cameras before it left.
         cells: list[Indices] = []
         for camera, size, own in zip(used, sizes, touched, strict=True):
             key = camera.name, cell
@@ -147,7 +152,7 @@ def _filled(
 
 
 def _cells(camera: Camera, points: Array, size: float, shape: tuple[int, ...]) -> Indices:
-    """(n,) index of the cell, `size` pixels wide, in which each point is seen; -1: in none."""
+    """Return the index (n,) of the cell, `size` pixels wide, that shows each point; -1: none."""
     uv, depth = camera.project(points)
     with np.errstate(invalid="ignore"):
         column, row = np.floor((uv.T + 0.5) / size)
@@ -157,4 +162,5 @@ def _cells(camera: Camera, points: Array, size: float, shape: tuple[int, ...]) -
 
 
 def _grown(cells: Mask) -> Mask:
+    """Return cells grown by one to all eight sides."""
     return np.asarray(cv2.dilate(cells.view(np.uint8), np.ones((3, 3), np.uint8)) > 0)

@@ -1,6 +1,7 @@
-"""Where a lost limb or a lost person is: coarse guesses all over, the best of them fitted.
+"""Search for a lost limb or a lost person: coarse guesses, of which the best are fitted.
 
-Guesses are judged in small pictures of a few cameras; only what is promising is fitted to all.
+Guesses are ranked in subsampled silhouettes of at most five cameras; only the most promising ones
+are fitted to all cameras.
 """
 
 import math
@@ -30,41 +31,42 @@ PERSON_LANDMARKS = (
         for joint in ("shoulder", "elbow", "wrist", "hip", "knee", "ankle")
     ),
 )
-"""The anatomical joint centres that a model of a person has in its landmarks.yaml."""
+"""The anatomical joint centres that landmarks.yaml of a person's model must have."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class PersonSettings:
-    """How a person is followed, and searched where he is lost.
+    """How a person is tracked, and searched where lost.
 
     Args:
-        follow, search: the steps of a frame's fit from where the last ones point to, and from a
-            coarse guess.
-        carry: the fraction of the last frame's step that is expected again.
-        angle_deviation, length_deviation: how far that is off [rad, m].
-        retry_below, lost_below: limbs are searched again where this much less of the contours fits
-            than usual; the whole person where less than this fraction of the usual does.
-        part_lost_below: a person followed by colour is lost where less of a part fits.
-        memory, usual: for how many frames the usual fraction is remembered, and what it is at
-            first.
-        telling: parts with less contour in all cameras together do not say that they are off [m].
-        headings, headings_a_frame: into how many directions a lost person is turned, and how many
-            of them in each frame of a sequence.
-        limbs_a_frame: how many doubtful limbs are searched again in each frame of a sequence.
-        limb_fits, limb_gain, limb_shows: a limb is doubtful where less of its own contour fits;
-            where elsewhere this much more of it would lie in unexplained pixels; or where it shows
-            less contour than this fraction of its length.
-        fitted, mended: the fraction of the fresh starts, the most promising ones, that is fitted;
-            and where nothing is known yet, for how many of these all doubtful limbs are searched.
-        placements: in how many ways a limb is placed by its colours.
-        unalike, near: limbs whose tips are farther apart are not alike; limbs that are nearer are
-            about the same [m].
-        rival: another pose that fits worse by this much closeness at most is mended, too, before
-            both are compared.
-        alike: another pose that fits worse by this much closeness at most is as good; chosen on 36
-            drawn persons of other measures and clothes before four cameras.
-        judged, rougher: how many of the steps of a fit tell which guess is promising, with points
-            of the contour as much farther apart.
+        follow, search: stages of a frame's fit from the predicted pose, and from a coarse guess.
+        carry: fraction of the last frame's step that is predicted for the next.
+        angle_deviation, length_deviation: standard deviations of the prediction [rad, m].
+        retry_below: limbs are searched again where the inlier ratio is below the usual one by this.
+        lost_below: the person is lost below this fraction of the usual inlier ratio.
+        part_lost_below: a person tracked by colour is lost where a part's ratio is below this.
+        memory: number of frames over which the usual inlier ratio is averaged.
+        usual: usual inlier ratio at the start.
+        telling: least contour of a part in all cameras for the part's ratio to count [m].
+        headings: number of headings, evenly spread, in which a lost person is searched.
+        headings_a_frame: number of them in each frame of a sequence.
+        limbs_a_frame: number of doubtful limbs searched in each frame of a sequence.
+        limb_fits: a limb is doubtful below this inlier ratio of its contour.
+        limb_gain: a limb is doubtful if another of its poses covers unexplained silhouette better,
+            by this part of the limb.
+        limb_shows: a limb is doubtful if its visible contour is shorter than this fraction of its
+            length, in the mean of the cameras.
+        fitted: fraction of the fresh starts that is fitted, the most promising first.
+        mended: number of fresh starts whose doubtful limbs are searched.
+        placements: number of placements of a limb by its colours that are fitted.
+        unalike: poses of a limb are distinct if their tips are farther apart than this [m].
+        near: poses of a limb are about the same if no point is farther apart than this [m].
+        rival: an alternative pose's limbs are searched, too, if its closeness is lower by at most
+            this, before both are compared.
+        alike: an alternative pose is as good if its closeness is lower by at most this; chosen on
+            36 drawn persons of other measures and clothes before four cameras.
+        judged: number of fit stages after which guesses are ranked.
+        rougher: factor on the spacing of contour points in these stages.
     """
 
     follow: tuple[AnnealingStage, ...]
@@ -96,22 +98,22 @@ class PersonSettings:
 
     def __post_init__(self) -> None:
         if not self.follow or not self.search:
-            raise SettingsError("a tracker and its search need one round or more")
+            raise SettingsError("a tracker needs one or more stages in `follow` and in `search`")
 
     @property
     def cycle(self) -> int:
-        """In how many frames all headings are tried."""
+        """Number of frames in which all headings are tried."""
         return self.headings // self.headings_a_frame
 
     def headings_of(self, frame: int) -> list[int]:
-        """The headings tried in a frame of trouble, all around first."""
-        # Bits in reverse order make neighbours late.
+        """Return the indices of the headings tried in a troubled frame, spread all around."""
+        # The bit-reversed order puts neighbouring headings late.
         order = sorted(range(self.cycle), key=lambda k: f"{k:032b}"[::-1])
         return list(range(order[frame % self.cycle], self.headings, self.cycle))
 
 
 def _stages(*pairs: tuple[float, float]) -> tuple[AnnealingStage, ...]:
-    """Stages of a scale [m] and a spacing of points [m]."""
+    """Return stages of (scale, spacing of contour points) [m]."""
     return tuple(AnnealingStage(scale, spacing) for scale, spacing in pairs)
 
 
@@ -121,7 +123,7 @@ EXACT = PersonSettings(
         (0.15, 0.06), (0.1, 0.06), (0.07, 0.06), (0.05, 0.06), (0.03, 0.05), (0.02, 0.05)
     ),
 )
-"""For a model that is the person."""
+"""For a model that is exactly the person's."""
 
 LENIENT = PersonSettings(
     follow=_stages((0.1, 0.06), (0.07, 0.05), (0.05, 0.05), (0.04, 0.04)),
@@ -129,18 +131,20 @@ LENIENT = PersonSettings(
         (0.2, 0.06), (0.15, 0.06), (0.1, 0.06), (0.07, 0.05), (0.05, 0.05), (0.04, 0.04)
     ),
 )
-"""For a model that is only like the person: it fits to within centimetres."""
+"""For a model that only resembles the person, to within centimetres."""
 
 
 class PlannedLimb(NamedTuple):
     """An arm or leg of a pose tree.
 
     Args:
-        nodes, values: those that move it alone; k values.
-        joints: (3,) its root, middle joint and end among the landmarks.
-        poses: (n, k) values all over its limits; the first is at rest.
-        samples_T, weights: (n, m, 3) points along it in the trunk's frame [m], and theirs (n, m).
-        length: from its root to its end, stretched out [m].
+        nodes: (j,) nodes that only this limb has.
+        values: (k,) values that move these nodes alone.
+        joints: (3,) indices of root, middle joint and end among the landmarks.
+        poses: (n, k) values that cover the limits; the first is at rest [rad].
+        samples_T: (n, m, 3) points along the limb in the trunk's frame in each pose [m].
+        weights: (n, m) weights of the points.
+        length: from root to end, stretched out [m].
     """
 
     nodes: Indices
@@ -152,23 +156,23 @@ class PlannedLimb(NamedTuple):
     length: float
 
     def places(self, X_WT: Array) -> Array:
-        """(n, m, 3) its points in the world [m] where the trunk is at X_WT (4, 4)."""
+        """Return the points (n, m, 3) in the world [m] where the trunk is at X_WT (4, 4)."""
         placed = self.samples_T.reshape(-1, 3) @ X_WT[:3, :3].T + X_WT[:3, 3]
         return np.asarray(placed.reshape(self.samples_T.shape))
 
 
 class BodyPlan:
-    """A person's limbs and trunk in a pose tree.
+    """Limbs and trunk of a person's pose tree.
 
     Attributes:
-        along: where points are put on a limb: so far from root to middle joint, and on to the end;
-            a hand's or foot's middle lies farther.
-        upper_samples: how many of a limb's points are on its first half; the others follow.
-        trunk: the node that the limbs hang on.
-        heading: the value that turns all of the body freely, about the vertical; None: no such.
+        along: places of the points on a limb: 0 at the root, 1 at the middle joint, 2 at the end;
+            the middle of a hand or foot lies beyond 2.
+        upper_samples: number of points on a limb's first half; the others follow.
+        trunk: index of the node that the limbs hang on.
+        heading: index of the value that turns the whole body about the vertical; None: none does.
 
     Raises:
-        ModelError: the model has no landmarks, or not those of trunk, arms and legs.
+        ModelError: the model lacks landmarks of trunk, arms or legs.
     """
 
     along = np.array([0.4, 0.6, 0.8, 1.0, 1.2, 1.4, 1.6, 1.8, 2.0, 2.25])
@@ -177,27 +181,27 @@ class BodyPlan:
     def __init__(self, kinematics: TreeKinematics) -> None:
         self.kinematics = kinematics
         tree = kinematics.tree
-        known = load_landmarks(tree.model.path)
-        missing = sorted(set(PERSON_LANDMARKS) - set(known))
+        landmarks = load_landmarks(tree.model.path)
+        missing = sorted(set(PERSON_LANDMARKS) - set(landmarks))
         if missing:
             raise ModelError(
                 f"{tree.model.path}: landmarks.yaml lacks {', '.join(missing)}, which the capture "
                 "of a person by its silhouettes needs"
             )
-        self.landmarks = landmarks_of_nodes(tree, known)
+        self.landmarks = landmarks_of_nodes(tree, landmarks)
         self.trunk = self._node("neck")
         free = np.flatnonzero(kinematics.turns_around)
         self.heading = int(free[0]) if len(free) else None
 
     def trunk_middle(self, X_WN: Array) -> Array:
-        """(3,) the trunk's middle [m], half-way between neck and hips."""
+        """Return the point (3,) half-way between neck and hips in the world [m]."""
         places = dict(zip(self.landmarks.names, self.landmarks.positions(X_WN), strict=True))
         hips = 0.5 * (places["left_hip"] + places["right_hip"])
         return np.asarray(0.5 * (places["neck"] + hips))
 
     @cached_property
     def limbs(self) -> dict[str, PlannedLimb]:
-        """The limbs, by name."""
+        """The four limbs by name: left_arm, right_arm, left_leg, right_leg."""
         kinds = {"arm": ("shoulder", "elbow", "wrist"), "leg": ("hip", "knee", "ankle")}
         return {
             f"{side}_{kind}": self._plan([f"{side}_{joint}" for joint in joints])
@@ -209,7 +213,7 @@ class BodyPlan:
         return int(self.landmarks.nodes[self.landmarks.names.index(landmark)])
 
     def _plan(self, names: Sequence[str], count: int = 2048) -> PlannedLimb:
-        """A limb by its three landmarks, in this many poses; one in eight is stretched."""
+        """Plan a limb from its three landmarks, in `count` poses, one of eight stretched."""
         from scipy.stats import qmc  # Slow to import, and needed for persons alone.
 
         kinematics, tree = self.kinematics, self.kinematics.tree
@@ -220,11 +224,11 @@ class BodyPlan:
         free = kinematics.is_angle & (kinematics.upper > kinematics.lower)
         values = np.flatnonzero(own & free)
         nodes = np.flatnonzero((moves & own).any(axis=1))
-        share = qmc.Halton(len(values), scramble=False).random(count)
+        fractions = qmc.Halton(len(values), scramble=False).random(count)
         lower, upper = (ends[values] for ends in kinematics.reach(rest))
         poses = np.clip(rest[values], lower, upper) * np.ones((count, 1))
-        poses[1:] = lower + share[1:] * (upper - lower)
-        # People stretch their limbs more often than chance would.
+        poses[1:] = lower + fractions[1:] * (upper - lower)
+        # People stretch their limbs more often than uniformly drawn angles do.
         stretched = np.flatnonzero(kinematics.value_nodes[values] == end)
         poses[np.ix_(np.arange(count // 8), stretched)] = poses[0, stretched]
         joints = np.array([self.landmarks.names.index(name) for name in names])
@@ -244,11 +248,11 @@ class BodyPlan:
         return PlannedLimb(nodes, values, joints, poses, samples_T, weights, length)
 
     def samples(self, limb: PlannedLimb, X_WN: Array) -> Array:
-        """(m, 3) points along a limb in the world [m] where the nodes are at X_WN."""
+        """Return points (m, 3) along a limb in the world [m] where the nodes are at X_WN."""
         return self._samples(limb.joints, X_WN[None])[0]
 
     def _samples(self, joints: Indices, X_WN: Array) -> Array:
-        """(n, m, 3) points along a limb, given its three landmarks and X_WN (n, nodes, 4, 4)."""
+        """Return points (n, m, 3) along a limb by its landmarks, nodes at X_WN (n, nodes, 4, 4)."""
         a, b, c = np.moveaxis(self.landmarks.positions(X_WN)[:, joints], 1, 0)
         upper = np.minimum(self.along, 1.0)[:, None]
         lower = np.maximum(self.along - 1.0, 0.0)[:, None]
@@ -257,7 +261,7 @@ class BodyPlan:
 
 
 def crowding(samples: Array, apart: float = 0.08) -> Array:
-    """(n, m) weights of points (n, m, 3): one over the points about each, over m.
+    """Return weights (n, m) of points (n, m, 3): 1 / (m times the number of points nearby).
 
     Points of a limb that are nearer to each other than `apart` [m] fill the same space.
     """
@@ -267,10 +271,15 @@ def crowding(samples: Array, apart: float = 0.08) -> Array:
 
 
 class PersonSearch:
-    """Searches limbs and persons by fits of some rounds from coarse guesses.
+    """Searches limbs and persons by fits from coarse guesses.
 
-    `information`, `held` and `rest` (m,) are what is known of values near a guess, which of them
-    stay, and those of a person at rest.
+    Args:
+        fit: of the person.
+        plan: the person's limbs.
+        settings: of the search.
+        information: (m,) inverse variances of the values about a guess.
+        held: (m,) values that stay fixed.
+        rest: (m,) values of the person at rest.
     """
 
     def __init__(
@@ -293,12 +302,12 @@ class PersonSearch:
         first: int = 0,
         limbs: int | None = None,
     ) -> PoseFit:
-        """A fit whose doubtful limbs were searched again, where that is better.
+        """Refine a fit and search its doubtful limbs again; keep what is better.
 
         Args:
-            enough: where this much of the contours fits, the search ends.
-            first: the doubtful limb to begin with; the worst is 0.
-            limbs: how many limbs are searched; None: all that are doubtful.
+            enough: the search ends at this inlier ratio.
+            first: index of the doubtful limb to begin with; 0 is the worst.
+            limbs: number of limbs searched; None: all doubtful ones.
         """
         best = _better(fitted, self.refined(fitted.values, frame))
         if best.inlier_ratio >= enough:
@@ -311,11 +320,11 @@ class PersonSearch:
     def _searched(
         self, best: PoseFit, limbs: Iterable[PlannedLimb], frame: FrameViews, enough: float
     ) -> PoseFit:
-        """A fit whose limbs were searched again, until enough of the contours fits."""
+        """Search limbs again, one after another, until the inlier ratio is enough."""
         for limb in limbs:
             scores, _ = self._scores(best.values, limb, frame)
             guesses = self._unalike(best.values, limb, scores, 2)
-            # It may be bent the wrong way: at rest, or the most relaxed about where it is.
+            # It may be bent the wrong way: try it at rest, and the most relaxed pose nearby.
             X_WN = self._fit.kinematics.poses(best.values)
             off = self._off(best.values, limb, self._plan.samples(limb, X_WN))
             near = limb.poses[off < self._settings.near]
@@ -336,12 +345,12 @@ class PersonSearch:
         known: Array | None = None,
         enough: float = math.inf,
     ) -> PoseFit | None:
-        """The best of fresh starts with some headings; None where not two cameras see a person.
+        """Return the best fit from fresh starts; None where fewer than two cameras see a person.
 
         Args:
-            headings: where not all, only the best start's limbs are searched.
-            known: (m,) where held values are taken from; None: the person at rest.
-            enough: where this much of the contours fits, no more limbs are searched.
+            headings: indices of headings; if not all, only the best start's limbs are searched.
+            known: (m,) values from which held ones are taken; None: the person's at rest.
+            enough: inlier ratio at which no more limbs are searched.
         """
         if len(headings) == self._settings.headings:
             return next(iter(self.explanations(frame, known)), None)
@@ -350,10 +359,10 @@ class PersonSearch:
         return self.mended(begun[0], frame, enough, limbs=limbs) if begun else None
 
     def explanations(self, frame: FrameViews, known: Array | None = None) -> list[PoseFit]:
-        """All that a person who is seen so may be: poses that are unlike each other, best first.
+        """Return distinct poses that explain a frame, best first.
 
-        Before they are compared, the doubtful limbs of each are searched. None where not two
-        cameras see a person; `known` is as of `found`.
+        The doubtful limbs of each are searched before they are compared. Empty where fewer than
+        two cameras see a person; `known` as in `found`.
         """
         found, best = self.started(frame, known), None
         while found and best is not (leading := max(found, key=lambda one: one.closeness)):
@@ -366,12 +375,12 @@ class PersonSearch:
         return self.unlike(found)
 
     def started(self, frame: FrameViews, known: Array | None = None) -> list[PoseFit]:
-        """The most promising fresh starts of all headings, their doubtful limbs searched."""
+        """Return the most promising fresh starts of all headings, doubtful limbs searched."""
         begun = self._begun(frame, range(self._settings.headings), known)
         return [self.mended(one, frame) for one in begun[: self._settings.mended]]
 
     def unlike(self, fits: Iterable[PoseFit]) -> list[PoseFit]:
-        """Fits of which no two are alike in all joints' places, best first."""
+        """Return the fits that differ in some joint's place from all better ones, best first."""
         found: list[PoseFit] = []
         kept: list[Array] = []
         for one in sorted(fits, key=lambda one: -one.closeness):
@@ -385,7 +394,7 @@ class PersonSearch:
     def _begun(
         self, frame: FrameViews, headings: Sequence[int], known: Array | None
     ) -> list[PoseFit]:
-        """Fresh starts with some headings, the promising ones fitted, best first."""
+        """Fit the most promising fresh starts with some headings; best first."""
         middle = frame.middle()
         if middle is None:
             return []
@@ -398,7 +407,7 @@ class PersonSearch:
     def _guess(
         self, frame: FrameViews, heading: int, middle: Array, known: Array | None
     ) -> PoseFit:
-        """A person turned somewhere, the trunk fitted roughly, then each limb placed."""
+        """Guess a pose in a heading: fit the trunk roughly, then place each limb."""
         values = self._rest.copy() if known is None else np.where(self._held, known, self._rest)
         if self._plan.heading is not None:
             values[self._plan.heading] = 2.0 * np.pi * heading / self._settings.headings
@@ -413,7 +422,7 @@ class PersonSearch:
         return self._judged(values, frame)
 
     def _judged(self, values: Array, frame: FrameViews) -> PoseFit:
-        """A few steps of a fit to a few cameras."""
+        """Fit by a few stages to the scoring cameras."""
         prior, rougher = Prior(values, 0.1 * self._information), self._settings.rougher
         rounds = [
             replace(one, spacing=rougher * one.spacing)
@@ -422,30 +431,40 @@ class PersonSearch:
         return self._fit.fit(frame.coarse, values, rounds, prior, self._held)
 
     def refined(self, values: Array, frame: FrameViews | ColourViews) -> PoseFit:
-        """A fit from a coarse guess, which is trusted little."""
+        """Fit from a coarse guess, with a weak prior."""
         prior, rounds = Prior(values, 0.1 * self._information), self._settings.search
         return self._fit.fit(partial(frame.compare, self._fit), values, rounds, prior, self._held)
 
     def _doubtful(self, fitted: PoseFit, frame: FrameViews) -> list[PlannedLimb]:
-        """The limbs that fit badly, hardly show, or would fill more elsewhere; always the worst."""
+        """Return the limbs that fit badly, hardly show or would cover more elsewhere, worst first.
+
+        The worst limb is always among them.
+        """
         settings = self._settings
         lengths, fitting = fitted.sums[:, [Sum.COMPARED, Sum.FITTING]].T
-        shares = np.where(lengths > 0.0, fitting / np.maximum(lengths, 1e-9), 1.0)
+        ratios = np.where(lengths > 0.0, fitting / np.maximum(lengths, 1e-9), 1.0)
         found = []
         for limb in self._plan.limbs.values():
-            share = shares[limb.nodes].min()
+            ratio = ratios[limb.nodes].min()
             shown = lengths[limb.nodes].sum() / (limb.length * len(frame.cameras))
             scores, now = self._scores(fitted.values, limb, frame)
             gain = float(scores.max() - now)
-            doubtful = share < settings.limb_fits or shown < settings.limb_shows
-            found.append((not (doubtful or gain > settings.limb_gain), share - gain, limb))
+            doubtful = ratio < settings.limb_fits or shown < settings.limb_shows
+            found.append((not (doubtful or gain > settings.limb_gain), ratio - gain, limb))
         found.sort(key=lambda one: one[:2])
         return [limb for k, (good, _, limb) in enumerate(found) if k == 0 or not good]
 
     def _scores(
         self, values: Array, limb: PlannedLimb, frame: FrameViews, placed: Mask | None = None
     ) -> tuple[Array, float]:
-        """How much each pose of a limb would fill that nothing else explains, and it fills now."""
+        """Score a limb's poses by the unexplained silhouette that they cover, -1 to 1.
+
+        Args:
+            placed: (nodes,) nodes that explain silhouettes; None: all but the limb's.
+
+        Returns:
+            (n,) scores of the limb's poses, and that of the pose in `values`.
+        """
         X_WN = self._fit.kinematics.poses(values)
         others = np.ones(len(X_WN), dtype=np.bool_) if placed is None else placed.copy()
         others[limb.nodes] = False
@@ -454,15 +473,15 @@ class PersonSearch:
         here = self._plan.samples(limb, X_WN)[None]
         scores, now, weights = np.zeros(len(places)), 0.0, crowding(here)
         for camera, region in zip(*frame.small, strict=True):
-            # 1 in the region where the others do not show, 0 where they do, -1 outside of it.
-            worth = np.where(region, 1, -1).astype(np.int8)
-            worth[region & draw_mask(outlines, camera.X_CW @ X_WN[others], camera)] = 0
-            scores += sum_at_points(camera, worth, places, limb.weights)[0]
-            now += float(sum_at_points(camera, worth, here, weights)[0][0])
+            # 1 in the silhouette where no other node shows, 0 where one does, -1 outside.
+            pixel_scores = np.where(region, 1, -1).astype(np.int8)
+            pixel_scores[region & draw_mask(outlines, camera.X_CW @ X_WN[others], camera)] = 0
+            scores += sum_at_points(camera, pixel_scores, places, limb.weights)[0]
+            now += float(sum_at_points(camera, pixel_scores, here, weights)[0][0])
         return scores / len(frame.judges), now / len(frame.judges)
 
     def _unalike(self, values: Array, limb: PlannedLimb, scores: Array, count: int) -> list[Array]:
-        """Values (m,) with the limb's best poses by scores (n,) that are not alike."""
+        """Return values (m,) for the `count` distinct poses of a limb with the best scores (n,)."""
         found: list[Array] = []
         tips: list[Array] = []
         for index in np.argsort(-scores):
@@ -478,7 +497,7 @@ class PersonSearch:
     def placed_by_colour(
         self, values: Array, limb: PlannedLimb, views: ColourViews, own: Mask
     ) -> list[PoseFit]:
-        """Fits whose limb was placed where its own colours (nodes, COLOURS) are seen most."""
+        """Fit after placing a limb where its own colours (nodes, COLOURS) show most."""
         places = limb.places(self._fit.kinematics.poses(values)[self._plan.trunk])
         half, first, scores = len(limb.nodes) // 2, self._plan.upper_samples, np.zeros(len(places))
         for camera, picture in zip(views.cameras, views.pictures, strict=True):
@@ -487,15 +506,15 @@ class PersonSearch:
                 (limb.nodes[:half], np.s_[:, :first]),
                 (limb.nodes[half:], np.s_[:, first:]),
             ):
-                worth = np.where(own[nodes].any(axis=0), 1, -1).astype(np.int8)[colours]
+                own_colours = np.where(own[nodes].any(axis=0), 1, -1).astype(np.int8)[colours]
                 weights = np.ascontiguousarray(limb.weights[points])
                 here = np.ascontiguousarray(places[points])
-                scores += sum_at_points(camera, worth, here, weights)[0]
+                scores += sum_at_points(camera, own_colours, here, weights)[0]
         chosen = self._unalike(values, limb, scores, self._settings.placements)
         return [self.refined(one, views) for one in chosen]
 
     def _exchanged(self, values: Array) -> list[Array]:
-        """Values (m,) that look much alike: both arms or legs exchanged; turned about."""
+        """Return values (m,) of similar silhouettes: arms or legs exchanged, or turned about."""
         plan, found = self._plan, []
         X_WN = self._fit.kinematics.poses(values)
         for turn, parts in ((0.0, ("arm",)), (0.0, ("leg",)), (math.pi, ("arm", "leg"))):
@@ -504,25 +523,25 @@ class PersonSearch:
                 other[plan.heading] += turn
                 other = self._stand_at(other, plan.trunk_middle(X_WN))
             for part in parts:
-                for side, its in (("left", "right"), ("right", "left")):
-                    limb, there = plan.limbs[f"{side}_{part}"], plan.limbs[f"{its}_{part}"]
+                for side, other_side in (("left", "right"), ("right", "left")):
+                    limb, there = plan.limbs[f"{side}_{part}"], plan.limbs[f"{other_side}_{part}"]
                     off = self._off(other, limb, plan.samples(there, X_WN))
                     other[limb.values] = limb.poses[np.argmin(off)]
             found.append(other)
         return found
 
     def _off(self, values: Array, limb: PlannedLimb, samples_W: Array) -> Array:
-        """(n,) how far each pose of a limb is from points (m, 3) along one, at most [m]."""
+        """Return each limb pose's largest distance (n,) from points along a limb (m, 3) [m]."""
         X_WT = self._fit.kinematics.poses(values)[self._plan.trunk]
         samples_T = (samples_W - X_WT[:3, 3]) @ X_WT[:3, :3]
         return np.asarray(np.linalg.norm(limb.samples_T - samples_T, axis=2).max(axis=1))
 
     def _stand_at(self, values: Array, middle: Array) -> Array:
-        """Values (m,) with the trunk's middle at a place (3,) [m]."""
+        """Return values (m,) shifted so that the trunk's middle is at a place (3,) [m]."""
         kinematics = self._fit.kinematics
         off = middle - self._plan.trunk_middle(kinematics.poses(values))
         motions = kinematics.motions(values)
-        # The root's place is three lengths along the world's axes.
+        # The root's position is three translations along the world's axes.
         for index in np.flatnonzero(~kinematics.is_angle & motions.moves[0] & ~self._held):
             values[index] += float(motions.twists[index, 3:6] @ off)
         return values

@@ -1,6 +1,6 @@
-"""A person's lengths (shape joints) and radius scales (how wide parts are across their y axis).
+"""A person's shape: lengths (shape joints) and radius scales (of parts, across their y axis).
 
-All frames share them, each has its own pose; silhouettes of several frames tell.
+`fit_shape` fits one shape to the silhouettes of several frames, together with each frame's pose.
 """
 
 from collections.abc import Mapping, Sequence
@@ -23,21 +23,25 @@ from drake_pose.person.search import LENIENT
 from drake_pose.silhouette.outline import Outline
 
 Frames = Sequence[tuple[Sequence[Camera], Sequence[EdgePoints]]]
-"""The cameras of each frame and their regions' edges."""
+"""Of each frame: the cameras, and the edge points of their regions."""
 
-# How far off the model lengths are, left and right differ [m], radius_scales' logarithms are, and
-# angles are off where they were [rad]; and the farthest that a radius_scale's logarithm is off.
-_LENGTH, _SIDE, _RADIUS_SCALE, _POSE, _WIDEST = 0.03, 0.005, 0.15, 0.5, 0.5
+# Prior standard deviations: of lengths from the model's [m], of left from right lengths [m], of
+# log radius scales, and of angles from the start [rad]; and the largest log radius scale.
+_LENGTH_DEVIATION, _SIDE_DEVIATION, _SCALE_DEVIATION = 0.03, 0.005, 0.15
+_ANGLE_DEVIATION, _MAX_LOG_SCALE = 0.5, 0.5
 _ROUNDS = tuple(
     AnnealingStage(scale, 0.04) for scale in (0.10, 0.08, 0.06, 0.05, 0.04, 0.04, 0.03, 0.03)
 )
 NOISE = Noise(deviation=0.02, correlation=0.15)
-"""Noise of a point of contour where the model is only like the person."""
+"""Noise of contour points where the model only resembles the person."""
 
 
 @dataclass(frozen=True, eq=False)
 class KnownShape:
-    """A person's lengths [m] by shape joint, and radius scales by part; else the model's, and 1."""
+    """A person's lengths by shape joint [m] and radius scales by part.
+
+    Shape joints that are not named have the model's length, parts that are not named scale 1.
+    """
 
     lengths: Mapping[str, float]
     radius_scales: Mapping[str, float]
@@ -48,10 +52,11 @@ class PersonShape:
     """A person's fitted shape.
 
     Args:
-        values: (m,) of the pose tree; the shape joints' are the person's, others 0.
-        covariance: (h, h) of the shape joints' [m].
-        poses: (frames, m) values in the frames that it was fitted to.
-        outlines: the model's simplified surfaces with these radius_scales.
+        known: lengths and radius scales.
+        values: (m,) values of the pose tree: fitted shape joints [m], others 0.
+        covariance: (h, h) covariance of the shape joints [m^2].
+        poses: (frames, m) values in the fitted frames [rad, m].
+        outlines: the model's simplified surfaces with these radius scales.
     """
 
     known: KnownShape
@@ -62,7 +67,7 @@ class PersonShape:
 
 
 def shape_values(tree: PoseTree) -> Mask:
-    """(m,) which of a tree's values are shape joints: lengths that do not move the whole body."""
+    """Return which of a tree's values are shape joints (m,): lengths not of the root."""
     root = set(tree.nodes[0].value_names)
     kinds = tree.model.position_kinds
     return np.array(
@@ -76,7 +81,7 @@ def shape_values(tree: PoseTree) -> Mask:
 
 
 def shape_parts(tree: PoseTree) -> tuple[list[str], list[int]]:
-    """The parts that have a radius scale, and which of them each node belongs to."""
+    """Return the names of parts with a radius scale, and the index of each node's part."""
     names = [
         node.name.removeprefix("left_").removeprefix("right_").removesuffix("_end")
         for node in tree.nodes
@@ -86,11 +91,11 @@ def shape_parts(tree: PoseTree) -> tuple[list[str], list[int]]:
 
 
 def tracker_of_person(tree: PoseTree, shape: KnownShape | None) -> PersonPoseTracker:
-    """What follows a person of a known shape, or of the model's own; lengths stay as they are.
+    """Return a tracker of a person of known shape, or of the model's own; lengths are held.
 
     Raises:
         ModelError: the model has no landmarks of trunk, arms and legs.
-        UnknownNameError: the shape has a length or a part that the model has not.
+        UnknownNameError: the shape names a length or a part that the model lacks.
     """
     shape = shape or KnownShape({}, {})
     fit, held = ContourFit(tree, noise=NOISE), shape_values(tree)
@@ -106,15 +111,21 @@ def tracker_of_person(tree: PoseTree, shape: KnownShape | None) -> PersonPoseTra
         if part not in parts:
             raise UnknownNameError("part", part, parts, str(tree.model.path))
     if shape.radius_scales:
-        widths = np.array([shape.radius_scales.get(part, 1.0) for part in parts])
-        fit = ContourFit(fit.kinematics, with_radius_scales(fit.outlines, widths[groups]), NOISE)
+        scales = np.array([shape.radius_scales.get(part, 1.0) for part in parts])
+        fit = ContourFit(fit.kinematics, with_radius_scales(fit.outlines, scales[groups]), NOISE)
     return PersonPoseTracker(fit, LENIENT, held, rest)
 
 
 def fit_shape(fit: ContourFit, frames: Frames, poses: Array) -> PersonShape:
-    """Fits lengths, radius scales and all frames' poses, from values poses (frames, m).
+    """Fit lengths, radius scales and the poses of all frames.
 
-    Raises ModelError where the model has no shape joints, as urdf/person/person_shape.urdf has.
+    Args:
+        fit: for the model's pose tree.
+        frames: cameras and edge points of each frame.
+        poses: (frames, m) initial values [rad, m].
+
+    Raises:
+        ModelError: the model has no shape joints, unlike urdf/person/person_shape.urdf.
     """
     is_shape = shape_values(fit.tree)
     if not is_shape.any():
@@ -135,10 +146,12 @@ def fit_shape(fit: ContourFit, frames: Frames, poses: Array) -> PersonShape:
             np.array(body.names[: len(chosen)])[chosen].tolist(), shared, fit.lower[chosen],
             fit.upper[chosen], deviation,
         )
-        for chosen, shared, deviation in ((~is_shape, False, _POSE), (is_shape, True, _LENGTH))
+        for chosen, shared, deviation in (
+            (~is_shape, False, _ANGLE_DEVIATION), (is_shape, True, _LENGTH_DEVIATION)
+        )
     )  # fmt: skip
     radius_scales = [name for name in body.names if name.startswith(RADIUS_SCALE_PREFIX)]
-    radius_scale = Unknowns(radius_scales, True, -_WIDEST, _WIDEST, _RADIUS_SCALE)
+    radius_scale = Unknowns(radius_scales, True, -_MAX_LOG_SCALE, _MAX_LOG_SCALE, _SCALE_DEVIATION)
     problem = Problem(body, list(cameras.values()), [pose, shape, radius_scale], noise=fit.noise)
     found = problem.solve(
         observations,
@@ -146,35 +159,37 @@ def fit_shape(fit: ContourFit, frames: Frames, poses: Array) -> PersonShape:
         (poses[:, ~is_shape], np.zeros(count + len(parts))),
         shared_information=_sides_information(names, len(parts)),
     )
-    lengths, widths = found.shared[:count], np.exp(found.shared[count:])
-    worn = ContourFit(fit.kinematics, with_radius_scales(fit.outlines, widths[groups]), fit.noise)
+    lengths, scales = found.shared[:count], np.exp(found.shared[count:])
+    shaped = ContourFit(fit.kinematics, with_radius_scales(fit.outlines, scales[groups]), fit.noise)
     values = np.zeros(len(is_shape))
     values[is_shape] = poses[:, is_shape] = lengths
     poses[:, ~is_shape] = found.own
-    prior = np.eye(count) / _LENGTH**2 + _sides_information(names, 0)
-    # Mean information of a frame: a surface's error is the same in all.
+    prior = np.eye(count) / _LENGTH_DEVIATION**2 + _sides_information(names, 0)
+    # The information of all frames is averaged, not added: a surface's error is the same in all.
     own, total = np.flatnonzero(~is_shape), np.zeros((count, count))
     for (seers, edges), values_then in zip(frames, poses, strict=True):
-        compared = worn.compare(pack_views(seers, edges), values_then, _ROUNDS[-1])
-        H = pose_uncertainty(worn, compared).information
+        compared = shaped.compare(pack_views(seers, edges), values_then, _ROUNDS[-1])
+        H = pose_uncertainty(shaped, compared).information
         cross = H[np.ix_(own, is_shape)]
-        follow = np.linalg.solve(H[np.ix_(own, own)] + np.eye(len(own)) / _POSE**2, cross)
+        follow = np.linalg.solve(
+            H[np.ix_(own, own)] + np.eye(len(own)) / _ANGLE_DEVIATION**2, cross
+        )
         total += (H[np.ix_(is_shape, is_shape)] - cross.T @ follow) / len(frames)
     covariance = np.linalg.inv(prior + total)
     known = KnownShape(
         dict(zip(names, lengths.tolist(), strict=True)),
-        dict(zip(parts, widths.tolist(), strict=True)),
+        dict(zip(parts, scales.tolist(), strict=True)),
     )
-    return PersonShape(known, values, np.asarray(covariance), poses, worn.outlines)
+    return PersonShape(known, values, np.asarray(covariance), poses, shaped.outlines)
 
 
-def _sides_information(names: Sequence[str], radius_scales: int) -> Array:
-    """The information about lengths, and after them radius_scales: left and right are alike."""
-    information = np.zeros((len(names) + radius_scales, len(names) + radius_scales))
+def _sides_information(names: Sequence[str], scale_count: int) -> Array:
+    """Return the prior information that left and right lengths are alike; radius scales last."""
+    information = np.zeros((len(names) + scale_count, len(names) + scale_count))
     for k, name in enumerate(names):
         other = name.replace("left_", "right_", 1)
         if name.startswith("left_") and other in names:
             row = np.zeros(len(information))
             row[k], row[list(names).index(other)] = 1.0, -1.0
-            information += np.outer(row, row) / _SIDE**2
+            information += np.outer(row, row) / _SIDE_DEVIATION**2
     return information

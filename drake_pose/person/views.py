@@ -1,7 +1,8 @@
-"""What cameras see of a person at a moment: silhouettes, or else colours; and viewing rays.
+"""Several cameras' observations of a person in one frame, and the rays of their pixels.
 
-Where there is no silhouette, colours along lines say where the edge is; lines are as wide as the
-fit's scale, and colours count on both sides.
+`FrameViews` compares a body's contours with the edges of silhouettes. `ColourViews` needs no
+silhouettes: colour histograms of the body and of the background beside it locate the edge on search
+lines across the body's contour. Search lines are as long as the fit's scale.
 """
 
 import math
@@ -35,20 +36,21 @@ from drake_pose.fit.evidence import EdgePoints, find_edge_points
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.fit.parameters import Placement
 
-# By camera (nodes, 3, COLOURS): what is known of the colours on a body's parts and beside them.
+# (nodes, 3, COLOURS) colour histograms by camera: on each part, beside it, and their ratio.
 KnownColours = Mapping[str, NDArray[np.float32]]
 
 
 class ColourViews:
-    """Pictures (H, W, 3 or 4) of a moment, to be compared with a person of whom colours are known.
+    """Colour pictures of one frame, compared with a body whose colours are known.
 
     Args:
-        cameras, pictures: the cameras that have a picture, and these.
-        known: a camera that is not in it says nothing.
-        spacing: from line to line along the contour, as seen at the body's root [m].
+        cameras: cameras that have a picture.
+        pictures: (H, W, 3 or 4) picture of each camera, red, green, blue (and alpha).
+        known: colour histograms by camera; a camera without them is not compared.
+        spacing: distance between search lines along the contour, at the body's root [m].
 
     Raises:
-        SettingsError: pictures that do not fit the cameras.
+        SettingsError: a picture has another size than its camera, or is not of bytes.
     """
 
     def __init__(
@@ -69,10 +71,13 @@ class ColourViews:
     def compare(
         self, fit: ContourFit, placement: Placement, step: AnnealingStage, offset: float = 0.2
     ) -> Comparison:
-        """What each camera says of a body where it stands.
+        """Compare a body's contour with the edges that the colours show.
 
-        From offset to offset of a line it is as far as this fraction of the fit's scale: the window
-        is as wide as that.
+        Args:
+            fit: gives the weights.
+            placement: pose of the body.
+            step: scale of the fit [m].
+            offset: distance between candidate edges on a search line, over the fit's scale.
         """
         count, nodes = len(self.cameras), len(placement.X_WN)
         weights = fit.weights(self._packed, placement, replace(step, spacing=self._spacing))
@@ -100,17 +105,20 @@ class ColourViews:
         least_widths: tuple[float, float] = (6.0, 12.0),
         least_agreeing: float = 2.5,
     ) -> KnownColours:
-        """What is known of the colours after this moment, of the pose tree's values (m,).
+        """Return the colour histograms, updated by this frame's pictures.
 
         Args:
-            regions: (H, W) the person by camera, where known; other cameras of which nothing is
-                known yet learn on both sides of the contour.
-            rate: weight of this moment's colours in what is known after it.
-            widths: how far inside of the edge, and outside of it, colours are counted [m].
-            counted: from one counted offset to the next [m].
-            agreeing: a line on which the edge seems to be farther from the contour teaches nothing
-                [m].
-            least_widths, least_agreeing: the same in small pictures, at least [pixel].
+            fit: of the body.
+            values: (m,) values of the pose tree in this frame [rad or m].
+            regions: (H, W) region of the person by camera, where known. A camera without a region
+                and without histograms learns from both sides of the body's contour.
+            rate: weight of this frame's colours in the histograms; 1 for a camera with a region or
+                without histograms.
+            widths: widths of the counted strips inside and outside of the edge [m].
+            counted: distance between candidate edges on a search line [m].
+            agreeing: search lines whose edge is farther from the body's contour are ignored [m].
+            least_widths: lower bounds of `widths` [pixel].
+            least_agreeing: lower bound of `agreeing` [pixel].
         """
         placement = fit.body.place(values)
         scales = pixels_per_metre(self._packed, placement.X_WN[0, :3, 3])
@@ -139,59 +147,59 @@ class ColourViews:
 
 
 EDGE_POINTS = 120.0
-"""A picture's height over the usual spacing of its region's edge points."""
+"""Number of edge points per picture height by default."""
 
 
 @dataclass(frozen=True, eq=False)
 class SilhouetteView:
-    """A camera's region (H, W) and points of its edge."""
+    """A camera's region of the person (H, W), and points of the region's edge."""
 
     region: Mask
     edge: EdgePoints
 
 
 def see_silhouette(region: Mask, spacing: float) -> SilhouetteView:
-    """The view of a person's region (H, W), its edge points this many pixels apart."""
+    """Return the view of a person's region (H, W), its edge points `spacing` pixels apart."""
     return SilhouetteView(region, find_edge_points(region, spacing))
 
 
 def edge_spacing(camera: Camera, edge_points: float = EDGE_POINTS) -> float:
-    """From edge point to edge point in a camera's pictures [pixel]."""
+    """Return the distance between edge points for a camera [pixel]; `edge_points` a height."""
     return max(2.0, camera.height / edge_points)
 
 
 def shows_somebody(view: SilhouetteView | None, least: float = 0.15) -> bool:
-    """Whether a view shows more than a speck: to search a person in specks takes seconds.
+    """Return whether a view shows more than a speck: searching a person in specks takes seconds.
 
-    A person's edge is longer than the fraction `least` of the picture's height.
+    The silhouette's edge must be longer than the fraction `least` of the picture's height.
     """
     return view is not None and float(view.edge.lengths.sum()) >= least * len(view.region)
 
 
 @dataclass(frozen=True, eq=False)
 class FrameViews:
-    """The cameras that have a picture in a frame, and what each of them sees."""
+    """The cameras that have a picture in a frame, and the silhouette seen by each of them."""
 
     cameras: Sequence[Camera]
     views: Sequence[SilhouetteView]
 
     @property
     def pairs(self) -> list[tuple[Camera, SilhouetteView]]:
-        """Cameras and their views."""
+        """(camera, view) of all cameras."""
         return list(zip(self.cameras, self.views, strict=True))
 
     @property
     def showing(self) -> list[str]:
-        """The names of the cameras that see somebody."""
+        """Names of the cameras whose silhouette is more than a speck."""
         return [camera.name for camera, view in self.pairs if shows_somebody(view)]
 
     def without(self, names: Collection[str]) -> "FrameViews":
-        """What the cameras see that are not named."""
+        """Return the views of all cameras but those named."""
         pairs = [pair for pair in self.pairs if pair[0].name not in names]
         return FrameViews([camera for camera, _ in pairs], [view for _, view in pairs])
 
     def compare(self, fit: ContourFit, placement: Placement, step: AnnealingStage) -> Comparison:
-        """A body's contours compared with all cameras' edges, as `fit` weighs them."""
+        """Compare a body's contours with the silhouettes' edges in all cameras."""
         weights = fit.weights(self._packed.cameras, placement, step)
         return compare_views(self._packed, placement, weights)
 
@@ -201,19 +209,19 @@ class FrameViews:
 
     @cached_property
     def seers(self) -> list[int]:
-        """Which cameras see somebody."""
+        """Indices of the cameras whose silhouette is not empty."""
         return [k for k, view in enumerate(self.views) if len(view.edge.uv)]
 
     @cached_property
     def judges(self) -> list[int]:
-        """Which of them judge guesses; five at most, as far as possible all around."""
+        """Indices of at most five cameras, spread over `seers`, that score coarse guesses."""
         count = min(5, len(self.seers))
         chosen = np.linspace(0, len(self.seers), count, endpoint=False).astype(int)
         return [self.seers[k] for k in chosen]
 
     @cached_property
     def small(self) -> tuple[list[Camera], list[Mask]]:
-        """The judges' cameras and regions in about 120 rows of pixels."""
+        """The scoring cameras and their regions, subsampled to about 120 rows of pixels."""
         strides = {k: max(1, len(self.views[k].region) // 120) for k in self.judges}
         return (
             [_coarser(self.cameras[k], n) for k, n in strides.items()],
@@ -222,7 +230,7 @@ class FrameViews:
 
     @cached_property
     def coarse(self) -> Views:
-        """The judges' cameras and every other point of their edges."""
+        """The scoring cameras and every other point of their edges."""
         edges = [self.views[k].edge for k in self.judges]
         return pack_views(
             [self.cameras[k] for k in self.judges],
@@ -233,7 +241,10 @@ class FrameViews:
         )
 
     def middle(self) -> Array | None:
-        """(3,) where somebody is [m]; None where fewer than two cameras see one."""
+        """Return where the person is (3,) [m], from the silhouettes' middles.
+
+        None where fewer than two silhouettes are not empty.
+        """
         if len(self.seers) < 2:
             return None
         return triangulate(
@@ -242,7 +253,7 @@ class FrameViews:
 
 
 def _coarser(camera: Camera, stride: int) -> Camera:
-    """The camera of every stride-th pixel of every stride-th row."""
+    """Return the camera of a picture of which every stride-th row and column is kept."""
     smaller = replace(
         camera,
         width=-(-camera.width // stride),
@@ -256,7 +267,7 @@ def _coarser(camera: Camera, stride: int) -> Camera:
 
 
 def viewing_rays(camera: Camera, uv: Array) -> tuple[Array, Array]:
-    """Origins (n, 3) [m] and unit directions (n, 3) in the world of the rays of pixels (n, 2)."""
+    """Return origins (n, 3) [m] and unit directions (n, 3) of pixels' rays (n, 2) in the world."""
     pixels = np.asarray(uv, dtype=np.float64).reshape(-1, 2)
     R, p = camera.X_WC[:3, :3], camera.X_WC[:3, 3]
     off = pixels - [camera.center_x, camera.center_y]
@@ -275,11 +286,14 @@ def meeting_points(
     threshold: float,
     free: Sequence[Mask] | None = None,
 ) -> Array:
-    """The points (m, 3) [m] where rays of two views pass each other by less than a threshold [m].
+    """Return the points (m, 3) [m] half-way between rays of two views that nearly meet.
+
+    All pairs of pixels of all pairs of views are tried.
 
     Args:
-        pixels: (n_k, 2) in each camera's view; all pairs of pixels of all pairs are tried.
-        free: (n_k,) pairs of which neither pixel is free are left out; None: all are.
+        pixels: (n_k, 2) pixels in each camera's picture.
+        threshold: largest distance of two rays [m].
+        free: (n_k,) which pixels are free; pairs without a free pixel are left out. None: all are.
     """
     rays = [viewing_rays(camera, uv) for camera, uv in zip(cameras, pixels, strict=True)]
     sides: list[list[Array]] = [[], [], [], []]
@@ -304,26 +318,35 @@ def meeting_points(
     t_a = (along_a - cosine * along_b) / divisor
     t_b = (cosine * along_a - along_b) / divisor
     p_a, p_b = p_a + t_a[:, None] * u_a, p_b + t_b[:, None] * u_b
-    # Both points lie in front of their origins, and rays are not parallel.
+    # Both points must lie in front of their cameras, and the rays must not be parallel.
     usable &= (t_a > 0.0) & (t_b > 0.0) & (np.linalg.norm(p_a - p_b, axis=1) <= threshold)
     return np.asarray(0.5 * (p_a + p_b))[usable]
 
 
 def triangulate(cameras: Sequence[Camera], pixels: Sequence[Array]) -> Array:
-    """(3,) the point nearest to the rays of one pixel (2,) in each camera [m]; nan has no say."""
+    """Return the point nearest to the rays of one pixel (2,) in each camera (3,) [m]; skip nan."""
     seen = [k for k, uv in enumerate(pixels) if not np.isnan(uv).any()]
     rays = [viewing_rays(cameras[k], pixels[k]) for k in seen]
     origins, directions = np.array(rays).reshape(-1, 2, 3).transpose(1, 0, 2)
-    # Each ray tells where the point is across it.
+    # A ray determines the point across its direction only.
     across = np.eye(3) - directions[:, :, None] * directions[:, None]
-    told = (across @ origins[..., None])[..., 0]
-    return np.asarray(np.linalg.lstsq(across.sum(axis=0), told.sum(axis=0), rcond=None)[0])
+    p = (across @ origins[..., None])[..., 0]
+    return np.asarray(np.linalg.lstsq(across.sum(axis=0), p.sum(axis=0), rcond=None)[0])
 
 
 def sum_at_points(
     camera: Camera, picture: NDArray[np.int8], points: Array, weights: Array
 ) -> tuple[Array, Array]:
-    """(n,) sums of a picture (H, W) at points (n, m, 3) [m], weighted (n, m), and weights in it."""
+    """Sum a picture (H, W) at projected points.
+
+    Args:
+        points: (n, m, 3) n sets of m points in the world [m].
+        weights: (n, m) weights of the points.
+
+    Returns:
+        (n,) weighted sums of the picture's values, and (n,) summed weights of the points inside
+        the picture.
+    """
     X_CW = np.ascontiguousarray(camera.X_CW)
     total: tuple[Array, Array] = _sum_at_points(
         camera.kernel_parameters(), X_CW, picture, points, weights
@@ -337,7 +360,7 @@ def _sum_at_points(
 ) -> tuple[Array, Array]:
     height, width = picture.shape
     sums, seen, P = np.zeros(points.shape[0]), np.zeros(points.shape[0]), np.empty((3, 4))
-    # Row and column of a point, times its depth: lens and pose in one matrix.
+    # P maps a point to (column, row, 1) times its depth: lens and camera pose in one matrix.
     parallel = camera[0] != 0.0
     for c in range(4):
         P[2, c] = X_CW[2, c] if not parallel else 1.0 * (c == 3)

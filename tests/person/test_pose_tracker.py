@@ -125,7 +125,7 @@ class TestTracker:
 
     @pytest.mark.parametrize("rounds", ["follow", "search"])
     def test_settings_are_checked(self, rounds):
-        with pytest.raises(SettingsError, match="round"):
+        with pytest.raises(SettingsError, match="stage"):
             replace(EXACT, **{rounds: ()})
 
 

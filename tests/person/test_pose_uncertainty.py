@@ -9,7 +9,7 @@ from drake_pose.fit.contour_fit import ContourFit, pack_views
 from drake_pose.fit.evidence import NO_EDGE, find_edge_points
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.person.pose_tracker import pose_uncertainty
-from drake_pose.person.shape import _SIDE, _sides_information
+from drake_pose.person.shape import _SIDE_DEVIATION, _sides_information
 from drake_pose.silhouette.outline import outline_from_mesh
 from drake_pose.silhouette.scoring import draw_mask
 from tests.person.persons_in_view import posed
@@ -129,4 +129,4 @@ def test_left_and_right_lengths_are_told_to_be_alike():
     H = _sides_information(names, 2)
     assert alike @ H @ alike == pytest.approx(0.0)
     other = np.array([0.3, 0.5, 0.1, -0.2, 0.7, 0.9])
-    assert other @ H @ other == pytest.approx((0.2 / _SIDE) ** 2)
+    assert other @ H @ other == pytest.approx((0.2 / _SIDE_DEVIATION) ** 2)

@@ -1,1 +1,1 @@
-"""Date, Yoshimatsu, Arita and Taniguchi's way from the pictures of many cameras to a pose."""
+"""The method of Date, Yoshimatsu, Arita and Taniguchi (2004): a person's pose by many cameras."""

@@ -1,7 +1,8 @@
-"""What the paper's stages see of a person in a moment's pictures (Date et al., 3 and 5).
+"""Features of a person in one frame's pictures (Date et al., sections 3 and 5).
 
-Skin-coloured blobs give head, hands and feet in space (3.1), eigenspace templates the direction of
-the face (3.2; Murase and Nayar 1995), contours the registered pose, which mends a lost track (5).
+Skin-coloured blobs give the positions of head, hands and feet (3.1); eigenspace templates give the
+direction of the face (3.2; Murase and Nayar 1995); contours are compared with the registered pose,
+whose recognition corrects a lost track (5).
 """
 
 import math
@@ -23,29 +24,28 @@ from drake_pose.person.views import meeting_points, triangulate
 from drake_pose.silhouette.segmentation import learn_background, person_region
 
 FACE_SIZE = (80, 130)
-"""Width and height that a face is scaled to [pixel]."""
+"""Width and height to which a face is scaled, 80 x 130 in section 3.2.2 [pixel]."""
 
 DIRECTIONS = 72
-"""In how many directions a contour is measured."""
+"""Number of directions in which a contour is measured."""
 
 Contour = tuple[Array, Array]
-"""The outer contour of a person seen whole, of one picture.
+"""Outer contour of a person who is whole in one picture.
 
-(DIRECTIONS,) distance of the farthest contour point in each direction from the region's middle,
-counterclockwise from the right, over the square root of the area; and (2,) the middle of the
-bounding box [pixel].
+(DIRECTIONS,) distances of the farthest contour points from the region's centroid, counterclockwise
+from the right, over the square root of the area; and (2,) middle of the bounding box [pixel].
 """
 
 
 @dataclass(frozen=True)
 class SkinColour:
-    """Which colours are skin: a box in the chroma plane, so that shade matters little.
+    """Range of skin colours: a box in the chroma plane, so that shading matters little.
 
     The defaults are those of Chai and Ngan (1999), found on faces of many origins.
 
     Args:
-        red, blue: lowest and highest chroma Cr and Cb (0 to 255, 128 is grey).
-        darkest: lowest brightness Y: chroma means nothing in the dark.
+        red, blue: lowest and highest chroma Cr and Cb, 0 to 255; 128 is grey.
+        darkest: lowest brightness Y, 0 to 255: chroma is unreliable in the dark.
     """
 
     red: tuple[float, float] = (133.0, 173.0)
@@ -55,9 +55,13 @@ class SkinColour:
 
 @dataclass(frozen=True, eq=False)
 class Blobs:
-    """Patches of skin in one picture, the largest first.
+    """Skin-coloured blobs of one picture, the largest first.
 
-    Centroids (n, 2), areas (n,), boxes (n, 4) of left, top, width, height [pixel]; mask (H, W).
+    Args:
+        centroids: (n, 2) [pixel].
+        areas: (n,) [pixel^2].
+        boxes: (n, 4) left, top, width, height [pixel].
+        mask: (H, W) pixels of the blobs.
     """
 
     centroids: Array
@@ -69,11 +73,13 @@ class Blobs:
 def skin_blobs(
     picture: Picture, region: Mask, colour: SkinColour, smallest: int = 12, most: int = 12
 ) -> Blobs:
-    """The largest `most` skin blobs of a picture (H, W, 3) in the person's region (H, W).
+    """Find skin-coloured blobs of a picture (H, W, 3) in the person's region (H, W) (3.1.1).
 
-    None has an area of less than `smallest` pixels.
+    Args:
+        smallest: least area [pixel^2].
+        most: largest number of blobs; the largest blobs are kept.
     """
-    # Of an empty region one pixel is looked at.
+    # The bounding box of an empty region is empty; one pixel keeps OpenCV's functions working.
     left, top, width, height = cv2.boundingRect(np.ascontiguousarray(region).view(np.uint8))
     part = slice(top, top + max(height, 1)), slice(left, left + max(width, 1))
     chroma = cv2.cvtColor(np.ascontiguousarray(picture[part]), cv2.COLOR_RGB2YCrCb)
@@ -99,7 +105,7 @@ def skin_blobs(
 
 @dataclass(frozen=True, eq=False)
 class PersonView:
-    """What one camera sees: region (H, W), skin in it, and the contour of a person seen whole."""
+    """One camera's region of the person (H, W), skin in it, and contour of a whole person."""
 
     region: Mask
     blobs: Blobs
@@ -107,9 +113,10 @@ class PersonView:
 
 
 def see_person(picture: Picture, region: Mask, skin: SkinColour) -> PersonView:
-    """One camera's share: skin in the person's region (H, W) of a picture (H, W, 3), and contour.
+    """Find skin and contour of the person's region (H, W) in one camera's picture (H, W, 3).
 
-    Raises SettingsError for a region of another size than the picture's.
+    Raises:
+        SettingsError: the region has another size than the picture.
     """
     if region.shape != picture.shape[:2]:
         raise SettingsError(f"the region is {region.shape}, but the picture {picture.shape}")
@@ -117,7 +124,7 @@ def see_person(picture: Picture, region: Mask, skin: SkinColour) -> PersonView:
 
 
 def measure_contour(region: Mask) -> Contour | None:
-    """The contour of a region (H, W); None where it is empty, or touches the edge."""
+    """Return the contour of a region (H, W); None if it is empty or touches the picture's edge."""
     edges = (region[0], region[-1], region[:, 0], region[:, -1])
     if not region.any() or any(edge.any() for edge in edges):
         return None
@@ -128,31 +135,32 @@ def measure_contour(region: Mask) -> Contour | None:
     area = moments["m00"]
     contours, _ = cv2.findContours(picture, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     points = np.concatenate([contour.reshape(-1, 2) for contour in contours]).astype(np.float64)
-    off = points - [moments["m10"] / area, moments["m01"] / area]
-    angle = np.arctan2(-off[:, 1], off[:, 0])
-    place = np.floor(angle / (2.0 * np.pi) * DIRECTIONS).astype(np.int64) % DIRECTIONS
-    reach = np.zeros(DIRECTIONS)
-    np.maximum.at(reach, place, np.linalg.norm(off, axis=1))
+    offsets = points - [moments["m10"] / area, moments["m01"] / area]
+    angle = np.arctan2(-offsets[:, 1], offsets[:, 0])
+    sector = np.floor(angle / (2.0 * np.pi) * DIRECTIONS).astype(np.int64) % DIRECTIONS
+    radii = np.zeros(DIRECTIONS)
+    np.maximum.at(radii, sector, np.linalg.norm(offsets, axis=1))
     middle = corner + 0.5 * (points.min(axis=0) + points.max(axis=0))
-    # A contour thinner than a direction leaves gaps.
-    known = np.flatnonzero(reach)
-    filled = np.interp(np.arange(DIRECTIONS), known, reach[known], period=DIRECTIONS)
+    # Directions without a contour point are interpolated.
+    known = np.flatnonzero(radii)
+    filled = np.interp(np.arange(DIRECTIONS), known, radii[known], period=DIRECTIONS)
     return filled / np.sqrt(area), middle
 
 
 def similarity(first: Array, second: Array) -> float:
-    """How alike two contour shapes (DIRECTIONS,) are: 1 for equal ones, 0 for nothing in common."""
+    """Return the similarity of two contour shapes (DIRECTIONS,), 0 to 1 for equal ones."""
     return float(1.0 - np.abs(first - second).sum() / np.maximum(first, second).sum())
 
 
 @dataclass(frozen=True, eq=False)
 class Features:
-    """The features of a frame.
+    """Positions of the features in a frame.
 
     Args:
-        places: (k, 3) [m]; the last frame's where nothing was measured.
-        support: (k,) how many 3-D points the place was taken from; 0: not measured.
-        points, owners: (m, 3) all inside every silhouette [m], and each's feature (m,).
+        places: (k, 3) positions [m]; the last frame's where nothing was measured.
+        support: (k,) number of 3-D points that each is the mean of; 0: not measured.
+        points: (m, 3) all 3-D points inside every silhouette [m].
+        owners: (m,) index of the feature that each point belongs to.
     """
 
     places: Array
@@ -170,21 +178,23 @@ def find_features(
     dense: float = 0.08,
     margin: int = 2,
 ) -> Features:
-    """The features' places in a frame: of the points nearest to a last place, the dense part.
+    """Measure the features' positions in a frame (3.1.2).
 
-    Points are where two rays meet that every camera sees in its silhouette. A camera has no say
-    about points outside its picture, nor where its region is empty.
+    The rays of two blobs that nearly meet give a 3-D point. Points outside a silhouette are
+    dropped, except in cameras whose region is empty or whose picture does not contain the point.
+    Each point belongs to the nearest of the last frame's features; a feature's position is the mean
+    of its densest points.
 
     Args:
-        views: what each camera sees.
+        views: of each camera.
         last: (k, 3) the last frame's features [m].
-        threshold: two rays show the same skin where they pass each other by less [m].
-        dense: the radius of the dense part of a feature's points [m].
-        margin: how far outside a silhouette a point may be seen [pixel].
+        threshold: largest distance of two rays of the same skin [m].
+        dense: radius of the densest part of a feature's points [m].
+        margin: largest distance of a point from a silhouette, along rows or columns [pixel].
     """
     points = meeting_points(cameras, [view.blobs.centroids for view in views], threshold)
     kept = np.ones(len(points), dtype=bool)
-    # To all sides along or across, and not at all.
+    # Shifts of up to `margin` pixels to either side, and none.
     aside = np.arange(1, margin + 1)
     beside = np.concatenate([[0], aside, -aside])[:, None]
     for camera, region in zip(cameras, (view.region for view in views), strict=True):
@@ -196,34 +206,34 @@ def find_features(
             visible = (depth > 0.0) & (pixels >= 0).all(axis=1)
             visible &= (pixels < [camera.width, camera.height]).all(axis=1)
         column, row = pixels[visible].astype(np.int64).T
-        near = region[np.clip(row + beside, 0, len(region) - 1), column].any(axis=0)
-        near |= region[row, np.clip(column + beside, 0, region.shape[1] - 1)].any(axis=0)
-        kept[visible] &= near
+        is_near = region[np.clip(row + beside, 0, len(region) - 1), column].any(axis=0)
+        is_near |= region[row, np.clip(column + beside, 0, region.shape[1] - 1)].any(axis=0)
+        kept[visible] &= is_near
     points = points[kept]
     owners = np.linalg.norm(points[:, None] - last[None], axis=2).argmin(axis=1)
     places, support = np.array(last, dtype=np.float64), np.zeros(len(last), dtype=np.int64)
     for k in range(len(last)):
-        mine = points[owners == k]
-        if len(mine):
-            # Those about the one with most others, of several the one to which they are nearest.
-            distances = np.linalg.norm(mine[:, None] - mine[None], axis=2)
+        owned = points[owners == k]
+        if len(owned):
+            # The densest part is around the point with most neighbours; ties go to the densest.
+            distances = np.linalg.norm(owned[:, None] - owned[None], axis=2)
             around = distances <= dense
             spread = np.where(around, distances, 0.0).sum(axis=1)
-            part = mine[around[np.lexsort((spread, -around.sum(axis=1)))[0]]]
+            part = owned[around[np.lexsort((spread, -around.sum(axis=1)))[0]]]
             places[k], support[k] = part.mean(axis=0), len(part)
     return Features(places, support, points, owners)
 
 
 @dataclass(frozen=True, eq=False)
 class RegisteredPose:
-    """The pose that is recognised, as every camera sees it.
+    """Contour templates of the registered pose, for all cameras and headings (5).
 
     Args:
-        q: (nq,) positions of the registered pose where the person was for the templates.
-        heading_position: where the head's turn about the vertical stands in q.
-        headings: (n,) the headings of the templates [rad].
-        shapes, middles: by camera: (n, DIRECTIONS) contour shapes, and (n, 2) middles of the
-            bounding box [pixel]; nan where the camera saw none whole.
+        q: (nq,) positions of the registered pose where the templates were made [rad, m].
+        heading_position: index in q of the head's angle about the vertical.
+        headings: (n,) headings of the templates [rad].
+        shapes: (n, DIRECTIONS) contour shapes by camera; nan where the person is not whole.
+        middles: (n, 2) middles of the bounding boxes by camera [pixel], or nan.
     """
 
     q: Array
@@ -236,7 +246,7 @@ class RegisteredPose:
 def stand_registered(
     skeleton: Skeleton, cameras: Sequence[Camera], middles: Sequence[Array]
 ) -> Array:
-    """Positions (nq,) of the registered pose, below boxes' middles (2,) [pixel] in cameras."""
+    """Return the registered pose (nq,) in the place of boxes' middles (2,) in cameras [pixel]."""
     q = registered_positions(skeleton)
     head, _, _, left_foot, right_foot = skeleton.features(q)
     middle = 0.5 * head + 0.25 * (left_foot + right_foot)
@@ -251,7 +261,7 @@ def register_pose(
     draw: Callable[[Camera, Array], Mask],
     heading_count: int = 36,
 ) -> RegisteredPose:
-    """Makes the templates of a pose q (nq,), about where it is shown; `draw` gives masks."""
+    """Make the templates of a pose q (nq,) at its place; `draw` renders a camera's mask of a q."""
     index = int(skeleton.head_angles[0])
     turns = np.arange(heading_count) * 2.0 * np.pi / heading_count
     headings = np.array([math.remainder(turn, 2.0 * math.pi) for turn in turns])
@@ -274,15 +284,15 @@ def recognise(
     contours: Sequence[Contour | None],
     threshold: float = 0.9,
 ) -> tuple[Array, float] | None:
-    """Whether the person stands in the registered pose now; None: not so.
+    """Recognise the registered pose in all cameras' contours (5).
 
     Args:
-        registered: from register_pose, for these cameras.
-        contours: in each camera's picture; None where it is not seen whole; two are needed.
-        threshold: mean similarity that is needed.
+        registered: templates for these cameras.
+        contours: of each camera; None where the person is not whole. Two are needed.
+        threshold: least mean similarity.
 
     Returns:
-        (nq,) positions, and the cameras' mean similarity, 0 to 1.
+        (nq,) positions and the mean similarity, 0 to 1; None if the pose is not recognised.
     """
     scores, seers, middles = [], [], []
     for camera, contour in zip(cameras, contours, strict=True):
@@ -298,10 +308,10 @@ def recognise(
     if means[best] < threshold:
         return None
     q = np.array(registered.q)
-    # The heading at the top of the parabola through the best template and its neighbours.
+    # The heading at the vertex of the parabola through the best template and its neighbours.
     before, here, after = means[best - 1], means[best], means[(best + 1) % len(means)]
-    bend = before - 2.0 * here + after
-    shift = 0.5 * (before - after) / bend if bend < 0.0 else 0.0
+    curvature = before - 2.0 * here + after
+    shift = 0.5 * (before - after) / curvature if curvature < 0.0 else 0.0
     heading = registered.headings[best] + shift * (2.0 * np.pi / len(means))
     q[registered.heading_position] = math.remainder(heading, 2.0 * math.pi)
     templates_middles = [registered.middles[camera.name][best] for camera in seers]
@@ -313,13 +323,13 @@ def recognise(
 
 @dataclass(frozen=True, eq=False)
 class FaceTemplates:
-    """Faces of known directions in their eigenspace.
+    """Faces of known directions in their eigenspace (3.2.2).
 
     Args:
-        mean: (d,) the mean face, d = 80 x 130 x 3.
-        basis: (k, d) the leading eigenvectors, orthonormal.
+        mean: (d,) mean face, d = 80 x 130 x 3.
+        basis: (k, d) leading eigenvectors, orthonormal.
         coordinates: (n, k) the templates in the eigenspace.
-        directions: (n, 2) turn to the person's left and nod down from facing the camera [rad].
+        directions: (n, 2) turn to the person's left and nod down, from facing the camera [rad].
     """
 
     mean: NDArray[np.float32]
@@ -329,7 +339,7 @@ class FaceTemplates:
 
 
 def cut_face(picture: Picture, blobs: Blobs) -> Picture | None:
-    """The largest skin blob of a picture (H, W, 3), scaled to (130, 80, 3); None: none is whole."""
+    """Return a picture's largest skin blob, scaled to (130, 80, 3); None if none or not whole."""
     if not len(blobs.areas):
         return None
     left, top, width, height = (int(side) for side in blobs.boxes[0])
@@ -337,19 +347,22 @@ def cut_face(picture: Picture, blobs: Blobs) -> Picture | None:
     if left == 0 or top == 0 or left + width == full_width or top + height == full_height:
         return None
     cut = picture[top : top + height, left : left + width].copy()
-    # What is behind the head must not matter.
+    # Pixels behind the head are blackened.
     cut[~blobs.mask[top : top + height, left : left + width]] = 0
-    # Averaged where the picture is larger: so the noise does not depend on the distance.
-    how = cv2.INTER_AREA if height >= FACE_SIZE[1] else cv2.INTER_LINEAR
-    return np.asarray(cv2.resize(cut, FACE_SIZE, interpolation=how))
+    # Larger pictures are averaged, so that noise does not depend on the distance.
+    interpolation = cv2.INTER_AREA if height >= FACE_SIZE[1] else cv2.INTER_LINEAR
+    return np.asarray(cv2.resize(cut, FACE_SIZE, interpolation=interpolation))
 
 
 def learn_faces(faces: Sequence[Picture], directions: Array, dimensions: int = 60) -> FaceTemplates:
-    """The eigenspace of faces (130, 80, 3) of known directions (n, 2) [rad], see FaceTemplates.
+    """Return the eigenspace of faces (130, 80, 3) of known directions (n, 2) [rad].
 
-    `dimensions` eigenvectors span it at most.
+    Args:
+        directions: see FaceTemplates.
+        dimensions: largest number of eigenvectors; 60 in section 3.2.2.
 
-    Raises SettingsError for fewer than three faces, or not one direction for each.
+    Raises:
+        SettingsError: fewer than three faces, or not one direction for each.
     """
     known = np.asarray(directions, dtype=np.float64).reshape(-1, 2)
     if len(faces) < 3 or len(known) != len(faces):
@@ -360,7 +373,7 @@ def learn_faces(faces: Sequence[Picture], directions: Array, dimensions: int = 6
     data = np.stack([face.reshape(-1) for face in faces]).astype(np.float32)
     mean = data.mean(axis=0)
     data -= mean
-    # The eigenvectors of d x d pixels from those of n x n faces (Murakami and Kumar's trick).
+    # The eigenvectors of d x d pixels follow from those of n x n faces (Murakami and Kumar).
     values, vectors = np.linalg.eigh((data @ data.T).astype(np.float64))
     order = np.argsort(-values)[: min(dimensions, len(faces) - 1)]
     order = order[values[order] > 1e-6 * values.max()]
@@ -369,9 +382,14 @@ def learn_faces(faces: Sequence[Picture], directions: Array, dimensions: int = 6
 
 
 def head_angles(direction: Array, head: Array, camera: Camera) -> Array:
-    """The head's turn and nod in the world (2,) [rad] of a face's direction (2,) seen by a camera.
+    """Return the head's turn and nod in the world (2,) [rad] from a face's direction (2,) [rad].
 
-    Turn is 0 where the face of a head at (3,) [m] looks along the world's x; nod is downwards.
+    Args:
+        direction: turn and nod from facing the camera.
+        head: (3,) position of the head [m].
+
+    Returns:
+        Turn, 0 along the world's x axis, and nod, positive downwards.
     """
     towards = camera.X_WC[:3, 3] - head
     level = math.hypot(towards[0], towards[1])
@@ -387,21 +405,22 @@ def head_angles(direction: Array, head: Array, camera: Camera) -> Array:
 
 
 def nearest_template(face: Picture, templates: FaceTemplates) -> tuple[int, float]:
-    """The template nearest to a face (130, 80, 3), and how far this is from the eigenspace.
+    """Return the index of the template nearest to a face (130, 80, 3), and the face's residual.
 
-    The distance is in grey levels; where it is large the picture is no face.
+    The residual is the RMS distance of the face from the eigenspace [grey levels]; a picture with
+    a large one shows no face.
     """
-    off = face.reshape(-1).astype(np.float32) - templates.mean
-    place = templates.basis @ off
-    nearest = int(np.argmin(np.linalg.norm(templates.coordinates - place, axis=1)))
-    left = max(0.0, float(off @ off) - float(place @ place))
-    return nearest, math.sqrt(left / len(off))
+    distances = face.reshape(-1).astype(np.float32) - templates.mean
+    coordinates = templates.basis @ distances
+    nearest = int(np.argmin(np.linalg.norm(templates.coordinates - coordinates, axis=1)))
+    residual = max(0.0, float(distances @ distances) - float(coordinates @ coordinates))
+    return nearest, math.sqrt(residual / len(distances))
 
 
 def find_face(picture: Picture, blobs: Blobs, templates: FaceTemplates, farthest: float) -> Array:
-    """The direction (2,) of the face in a picture (H, W, 3) [rad]; nan where no face is seen.
+    """Return the direction (2,) of the face in a picture (H, W, 3) [rad]; nan where there is none.
 
-    No face is farther from the eigenspace than `farthest` [grey levels].
+    A face's residual must be at most `farthest` [grey levels].
     """
     face = cut_face(picture, blobs)
     if face is not None:
@@ -412,17 +431,16 @@ def find_face(picture: Picture, blobs: Blobs, templates: FaceTemplates, farthest
 
 
 def learn_recorded_faces(folder: Path, skin: SkinColour | None = None) -> FaceTemplates:
-    """The eigenspace of faces that a camera recorded.
+    """Return the eigenspace of faces that a camera recorded.
 
-    The folder holds `directions.csv`, whose first line is `picture,turn,nod`: a picture's file
-    beside it (.png or .jpg), and where the face looks in it, away from facing the camera [deg]:
-    the turn to the person's left and the nod downwards. Of each whole picture the largest
-    skin-coloured patch is the face. A folder `empty` of pictures without the person is needed where
-    other things have skin's colour.
+    `directions.csv` in the folder has the header `picture,turn,nod`: the name of a picture beside
+    it (.png or .jpg), and where the face looks relative to the camera [deg]: turn to the person's
+    left, nod downwards. The largest skin-coloured blob of a whole picture is the face. Where other
+    things have the colour of skin, a subfolder `empty` must hold pictures without the person.
 
     Raises:
-        SceneError: names the file, line or picture at fault.
-        SettingsError: fewer than three pictures.
+        SceneError: a file, line or picture is wrong; the message names it.
+        SettingsError: there are fewer than three pictures.
     """
     path, background, empty = folder / "directions.csv", None, folder / "empty"
     header, rows = read_csv(path, SceneError)

@@ -1,7 +1,9 @@
-"""A frame's pose the paper's way, from features, face and silhouettes (Date et al., section 4).
+"""Pose of a person in one frame, from features, face and silhouettes (Date et al., section 4).
 
-Inverse kinematics goes in small steps from the last frame's angles (4.1.1 and 4.2). Elbows and
-knees are searched on circles by back-projection into the silhouettes (4.1.2 and 4.2).
+Inverse kinematics moves the last frame's angles in small steps until hands and feet are in place
+(4.1.1, 4.2). Elbows and knees are then searched on circles: P = r sin(theta) i + r cos(theta) j,
+with r the circle's radius and i, j its axes; theta has the highest correlation C(theta) of the
+limb's back-projection with the silhouettes (4.1.2, 4.2).
 """
 
 import math
@@ -22,23 +24,26 @@ from drake_pose.person.views import sum_at_points
 
 @dataclass(frozen=True)
 class PoseSettings:
-    """Step sizes and tolerances of the inverse kinematics and of the search on circles.
+    """Step sizes and tolerances of the inverse kinematics and of the circle search.
 
     Args:
-        largest_step: of any angle in a step [rad].
-        damping: of a step's normal equations [m^2].
-        reached, stalled: a point is at its target below the first distance [m]; a search ends
-            where no angle moves by more than the second [rad].
-        steps, steps_per_turn: at most in all; and before the other arm has its turn.
-        least_bend: a middle joint is bent by this much first, else no small step can help [rad].
-        elbow_range, knee_range: angles on the circle [deg]. An elbow's go from behind over outwards
-            to a little in front. A knee's are 0 in front and positive outwards, as far as the hip
-            can turn; a straight leg's knee lies behind, as the leg ends at the foot's middle.
-        circle_step: between two places that are compared [deg].
-        bend_tolerance, hip_tolerance: how far beyond its limits a straight limb's middle joint, or
-            a hip, may seem to be: the trunk's direction is measured, too [rad].
-        along, across: points of a rectangle in either direction.
-        head_fraction: the head's share in the waist's height (4.2), the feet have the rest.
+        largest_step: largest change of any angle in a step [rad].
+        damping: added to the diagonal of a step's normal equations [m^2].
+        reached: a point at this distance from its target has reached it [m].
+        stalled: the search ends if no angle changes by more than this in a step [rad].
+        steps: largest number of steps.
+        steps_per_turn: number of steps of one arm before the other arm's turn.
+        least_bend: least initial bend of a middle joint; small steps cannot bend a straight limb
+            [rad].
+        elbow_range: angles on the circle [deg]: from behind over outwards to a little in front.
+        knee_range: angles on the circle [deg]: 0 in front, positive outwards, as far as the hip can
+            turn. A straight leg's knee lies behind, as the leg ends at the middle of the foot.
+        circle_step: spacing of the candidates on a circle [deg].
+        bend_tolerance, hip_tolerance: how far a straight limb's middle joint, or a hip, may exceed
+            its limits, because the trunk's direction is measured with errors [rad].
+        along, across: number of points along and across a limb's rectangle.
+        head_fraction: weight of the head's height in the waist's height (4.2); the feet's is the
+            rest.
     """
 
     largest_step: float = math.radians(2.0)
@@ -60,15 +65,18 @@ class PoseSettings:
 
 SETTINGS = PoseSettings()
 
-# Below this a length [m], or a direction's component, counts as 0.
+# Lengths [m] and components of directions below this count as 0.
 _TINY = 1e-9
 
 
 def upper_body(skeleton: Skeleton, q: Array, features: Array, *, face_known: bool) -> Array:
-    """Moves neck base and arms from q (nq,), in place at the head, to hands of features (5, 3) [m].
+    """Move neck base and arms of q (nq,) until the hands are at those of features (5, 3) [m].
 
-    Each side's chain is head 2, neck base 2, shoulder 3, elbow 1. Both sides share head and neck
-    base, so they take turns, a few small steps each. A known face's head angles stay; legs, too.
+    The head must be in place already. Each side's chain is head 2, neck base 2, shoulder 3, elbow 1
+    (4.1.1). Both chains share head and neck base, so they take turns of a few steps each.
+
+    Args:
+        face_known: whether the head's angles were measured and stay.
     """
     shared = () if face_known else skeleton.head_angles
     for name in LIMBS[:2]:
@@ -82,21 +90,21 @@ def upper_body(skeleton: Skeleton, q: Array, features: Array, *, face_known: boo
             q, distance = reach(skeleton, q, index, part, hand, SETTINGS.steps_per_turn)
             farthest = max(farthest, distance)
             moved = max(moved, float(np.abs(q - before).max()))
-        # One side's turn may have moved the other's hand: only a round without steps is the end.
+        # One side's turn may have moved the other's hand, so only a round without steps is the end.
         if moved < SETTINGS.stalled or max(farthest, moved) < SETTINGS.reached:
             break
     return q
 
 
 def move_limb(skeleton: Skeleton, q: Array, name: str, target: Array) -> Array:
-    """Moves a limb of q (nq,) until its end is at a target (3,) [m]; all else stays."""
+    """Move a limb of q (nq,) until its end is at a target (3,) [m]; other positions stay."""
     limb = skeleton.limbs[name]
     part = limb.lower_node, limb.end_L
     return reach(skeleton, _bent(q, limb), limb.positions, part, target)[0]
 
 
 def _bent(q: Array, limb: Limb) -> Array:
-    """Positions with a limb's middle joint bent at least a little."""
+    """Return q with a limb's middle joint bent by `least_bend` or more."""
     q, least = np.array(q), SETTINGS.least_bend
     if abs(q[limb.positions[3]]) < least:
         q[limb.positions[3]] = least if limb.upper[3] > -limb.lower[3] else -least
@@ -111,18 +119,19 @@ def reach(
     target: Array,
     steps: int = SETTINGS.steps,
 ) -> tuple[Array, float]:
-    """Moves some positions of q (nq,) in small steps until a point is at the target (3,) [m].
+    """Move positions of q (nq,) in small steps until a point is at the target (3,) [m].
 
-    A step is Levenberg and Marquardt's, J (J^T J + damping)^-1 gap, damped so that all joints take
-    part, none by more than two degrees; then limits hold.
+    The step is J (J^T J + damping I)^-1 gap, with J (n, 3) the point's derivatives by the n angles
+    and gap (3,) the vector to the target. It is scaled so that no angle changes by more than
+    `largest_step`, then clipped to the limits. Damping makes all joints take part.
 
     Args:
-        index: (n,) which positions may change: angles that move the point.
-        part: a node, and the point (3,) in its frame [m].
-        steps: how many at most.
+        index: (n,) indices in q of the angles that may change; they must move the point.
+        part: index of a node, and the point (3,) in the node's frame [m].
+        steps: largest number of steps.
 
     Returns:
-        (nq,) positions, and the distance that is left [m].
+        (nq,) positions, and the remaining distance [m].
     """
     node, point = part
     packed, order = skeleton.chains[node]
@@ -147,7 +156,7 @@ def _reach(
     steps: int,
     numbers: tuple[float, float, float, float],
 ) -> tuple[Array, float]:
-    """As reach, of the values (m,) of a chain whose last node moves the point."""
+    """`reach` for the values (m,) of a chain of nodes whose last one carries the point."""
     damping, largest_step, reached, stalled = numbers
     n, distance = len(index), np.inf
     tip, J, M = np.empty(3), np.empty((n, 3)), np.empty((3, 4))
@@ -172,11 +181,11 @@ def _reach(
                     M[r, c] += J[k, r] * J[k, c]
         eliminate(M)
         changes = J[:, 0] * M[0, 3] + J[:, 1] * M[1, 3] + J[:, 2] * M[2, 3]
-        share = min(1.0, largest_step / max(1e-12, np.abs(changes).max()))
+        scale = min(1.0, largest_step / max(1e-12, np.abs(changes).max()))
         moved = 0.0
         for k in range(n):
             old = values[index[k]]
-            new = min(max(old + share * changes[k], limits[0][k]), limits[1][k])
+            new = min(max(old + scale * changes[k], limits[0][k]), limits[1][k])
             moved, values[index[k]] = max(moved, abs(new - old)), new
         if moved < stalled:
             break
@@ -194,20 +203,21 @@ def estimate_pose(
     search: bool = True,
     waist: Array | None = None,
 ) -> tuple[Array, dict[str, Array]]:
-    """Estimates a frame's pose the paper's way.
+    """Estimate a frame's pose by the paper's method.
 
     Args:
-        last: (nq,) the last frame's positions.
-        features: (5, 3) head, hands and feet in the order of FEATURES [m].
-        head_angles: (2,) [rad] where the face was seen; None: the last frame's, free to move.
-        cameras, regions: those on the circle, and (H, W) the person in each of their pictures.
-        search: whether elbows and knees are searched on their circles, or stay where inverse
-            kinematics puts them.
-        waist: (3,) half-way between the hips [m]; None: by the paper's formula, below the head.
+        last: (nq,) positions in the last frame.
+        features: (5, 3) positions of FEATURES: head, hands and feet [m].
+        head_angles: (2,) turn and nod of the head [rad]; None: unknown, start at the last frame's.
+        cameras: on the circle.
+        regions: (H, W) region of the person in each camera's picture.
+        search: whether elbows and knees are searched on their circles; if not, they stay where
+            inverse kinematics puts them.
+        waist: (3,) half-way between the hips [m]; None: by the formula of section 4.2.
 
     Returns:
-        (nq,) positions inside their limits; and by limb (3, 3) shoulder, elbow and hand, or hip,
-        knee and foot, as found [m].
+        (nq,) positions inside their limits; and by limb (3, 3) positions of shoulder, elbow and
+        hand, or hip, knee and foot, before the model is fitted to them [m].
     """
     q = np.array(last, dtype=np.float64)
     if head_angles is not None:
@@ -215,14 +225,14 @@ def estimate_pose(
         q[index] = np.clip(head_angles, skeleton.lower[index], skeleton.upper[index])
     q[skeleton.head_positions] = features[0] - skeleton.head_rotation(q) @ skeleton.face_H
     q = upper_body(skeleton, q, features, face_known=head_angles is not None)
-    # Where the head's angles moved, its middle must still be where it was measured.
+    # The head's angles may have changed: put its middle back to where it was measured.
     q[skeleton.head_positions] = features[0] - skeleton.head_rotation(q) @ skeleton.face_H
     if waist is None:
         feet = 0.5 * (features[4, 2] + features[3, 2])
         share = SETTINGS.head_fraction
         waist = np.array([*features[0, :2], share * features[0, 2] + (1.0 - share) * feet])
-    # The model's trunk is one piece: it cannot hold shoulders and waist found apart. For its
-    # positions the waist counts; so the neck's base cannot wander off from frame to frame either.
+    # The model's trunk is rigid: it cannot fit shoulders and waist that were found separately. The
+    # waist decides its pose, which also keeps the neck base from drifting from frame to frame.
     _, neck = skeleton.trunk_pose(q)
     across, length = waist - neck, float(np.linalg.norm(skeleton.waist_T))
     target = neck + across * (length / max(float(np.linalg.norm(across)), SETTINGS.reached))
@@ -231,45 +241,48 @@ def estimate_pose(
     R_aimed, _ = skeleton.trunk_pose(aimed)
     limbs = {}
     for name, end in zip(LIMBS, features[1:], strict=True):
-        limb, posed, off = skeleton.limbs[name], q, np.zeros(3)
+        limb, model_q, off = skeleton.limbs[name], q, np.zeros(3)
         R_WT, own_root = skeleton.trunk_pose(q)[0], skeleton.limb_points(aimed, name)[0]
         outward, last_angles = R_WT @ limb.root_T, q[limb.positions]
         if limb.is_leg:
-            # It hangs on the waist that was found, not on the model's.
+            # Hang the leg on the waist that was found, not on the model's.
             R_WT, outward = R_aimed, R_aimed @ (limb.root_T - skeleton.waist_T)
             off = waist + outward - own_root
-            posed = move_limb(skeleton, aimed, name, end - off)
-        found = skeleton.limb_points(posed, name) + off
-        found[2] = end
+            model_q = move_limb(skeleton, aimed, name, end - off)
+        joints = skeleton.limb_points(model_q, name) + off
+        joints[2] = end
         if search:
-            # Where elbow or knee agree best with the silhouettes; a knee is only where the hip can
-            # turn it. Of equally good places the one nearest to inverse kinematics's is taken.
-            low, high = SETTINGS.knee_range if limb.is_leg else SETTINGS.elbow_range
-            degrees = np.arange(low, high + 0.5 * SETTINGS.circle_step, SETTINGS.circle_step)
-            middles = joint_circle(limb, found[0], end, outward, degrees)
+            # Search the circle for the highest correlation. A knee must be where the hip can turn
+            # it. Of equally good places the one nearest to inverse kinematics' is taken.
+            start, stop = SETTINGS.knee_range if limb.is_leg else SETTINGS.elbow_range
+            degrees = np.arange(start, stop + 0.5 * SETTINGS.circle_step, SETTINGS.circle_step)
+            middles = joint_circle(limb, joints[0], end, outward, degrees)
             if limb.is_leg:
-                _, beyond = place_limb(limb, R_WT, found[0], middles, end, last_angles)
+                _, beyond = place_limb(limb, R_WT, joints[0], middles, end, last_angles)
                 middles = middles[beyond <= np.maximum(SETTINGS.hip_tolerance, beyond.min())]
-            samples = rectangles(found[0], middles, end, limb.half_widths)
+            samples = rectangles(joints[0], middles, end, limb.half_widths)
             scores = correlation(samples, cameras, regions)
             best = middles[scores >= scores.max() - _TINY]
-            found[1] = best[np.argmin(np.linalg.norm(best - found[1], axis=1))]
-        angles, _ = place_limb(limb, R_aimed, own_root, found[1:2], found[2], last_angles)
+            joints[1] = best[np.argmin(np.linalg.norm(best - joints[1], axis=1))]
+        angles, _ = place_limb(limb, R_aimed, own_root, joints[1:2], joints[2], last_angles)
         aimed[limb.positions] = np.clip(angles[0], limb.lower, limb.upper)
-        # Where limits forbid that, the hand or foot counts more than the elbow or knee.
-        aimed = move_limb(skeleton, aimed, name, found[2])
-        limbs[name] = found
+        # Where limits do not allow both, the end's position matters more than the middle joint's.
+        aimed = move_limb(skeleton, aimed, name, joints[2])
+        limbs[name] = joints
     return skeleton.clip(aimed), limbs
 
 
 def joint_circle(limb: Limb, root: Array, end: Array, outward: Array, degrees: Array) -> Array:
-    """Places (n, 3) of an elbow or knee between root and end (3,), at angles (n,) on its circle.
+    """Return places (n, 3) of an elbow or knee on its circle, at angles (n,) [deg] (4.1.2).
 
-    A place is center + radius (sin(theta) i + cos(theta) j) [m]. i is the direction in the circle's
-    plane that agrees best with the horizontal part of `outward` (3,), from neck base to shoulder or
-    waist to hip; j = i x z for the left arm, z from shoulder to hand (for the right arm and for
-    legs mirrored, to point behind the arm and in front of the leg). Beyond its reach the limb is
-    stretched out, or folded, in proportion.
+    Place = center + radius (sin(theta) i + cos(theta) j) [m]. i is the direction in the circle's
+    plane nearest to the horizontal part of `outward`; j = i x z for the left arm, with z from
+    shoulder to hand. The right arm and the legs are mirrored, so that j points behind an arm and in
+    front of a leg. A limb whose end is out of reach is stretched or folded in proportion.
+
+    Args:
+        root, end: (3,) shoulder and hand, or hip and foot [m].
+        outward: (3,) from neck base to shoulder, or from waist to hip [m].
     """
     z, distance = _along(root, end)
     a, b = limb.lengths
@@ -288,9 +301,13 @@ def joint_circle(limb: Limb, root: Array, end: Array, outward: Array, degrees: A
 
 
 def rectangles(root: Array, middles: Array, end: Array, half_widths: Array) -> Array:
-    """Points (n, m, 3) [m] of a limb's rectangles, from root (3,) over n middles (n, 3) to end.
+    """Return points (n, m, 3) of a limb's two rectangles, for n places of its middle joint [m].
 
-    They lie in the plane of the three joints and are so wide as half_widths (2,) says [m].
+    They lie in the plane of the three joints (figure 6).
+
+    Args:
+        root, middles, end: (3,), (n, 3) and (3,) the limb's joints [m].
+        half_widths: (2,) of the rectangles [m].
     """
     normal = np.cross(middles - root, end - root)
     along = ((np.arange(SETTINGS.along) + 0.5) / SETTINGS.along)[:, None, None]
@@ -308,7 +325,7 @@ def rectangles(root: Array, middles: Array, end: Array, half_widths: Array) -> A
 
 
 def correlation(samples: Array, cameras: Sequence[Camera], regions: Sequence[Mask]) -> Array:
-    """C (n,): the share of samples (n, m, 3) inside silhouettes, where cameras see somebody."""
+    """Return C (n,): mean fraction of samples (n, m, 3) inside silhouettes; skip empty ones."""
     total, seers, weights = np.zeros(len(samples)), 0, np.ones(samples.shape[:2])
     for camera, region in zip(cameras, regions, strict=True):
         if region.any():
@@ -321,26 +338,26 @@ def correlation(samples: Array, cameras: Sequence[Camera], regions: Sequence[Mas
 def place_limb(
     limb: Limb, R_WT: Array, root: Array, middles: Array, end: Array, last: Array
 ) -> tuple[Array, Array]:
-    """The joint angles that put a limb's joints where they are, for several places of the middle.
+    """Return the joint angles that put a limb's joints in given places, for n middle joints.
 
-    A nearly straight limb may be as long when bent a little: limits decide.
+    A nearly straight limb has the same length for two bends: limits decide.
 
     Args:
-        R_WT: (3, 3) the trunk's axes in the world.
+        R_WT: (3, 3) axes of the trunk in the world.
         root, middles, end: (3,), (n, 3) and (3,) [m].
-        last: (4,) angles to stay near where several sets do the same [rad].
+        last: (4,) angles to stay near where several solutions exist [rad].
 
     Returns:
-        (n, 4) angles, and (n,) by how much the worst of its root's lies beyond its limits [rad].
+        (n, 4) angles, and (n,) how far the worst of the root's angles exceeds its limits [rad].
     """
     letters = "".join("XYZ"[axis] for axis in limb.axes)
     towards, distances = _along(root, np.broadcast_to(end, middles.shape))
     frames, off_line = _triads(towards, middles - root)
-    # Stretched it does not tell how it is turned about itself: as in the last frame.
+    # A straight limb does not determine its turn about itself, which stays as in the last frame.
     stretched = off_line * distances < SETTINGS.reached * ((middles - root) ** 2).sum(axis=1)
     R_last = R_WT @ Rotation.from_euler(letters[:3], last[:3]).as_matrix()
-    # The squared distance of root and end is base + swing cos(bend - start), so there are two
-    # bends (n, 2): those inside limits, or about as near as the other one.
+    # The squared distance of root and end is base + swing cos(bend - start). Of its two solutions
+    # (n, 2) those are kept that exceed the limits by about the least.
     axis = np.eye(3)[limb.axes[3]]
     aside = (limb.middle_U @ axis) * (limb.end_L @ axis)
     cosine = limb.middle_U @ limb.end_L - aside
@@ -351,26 +368,28 @@ def place_limb(
     options = math.atan2(sine, cosine) + np.array([-1.0, 1.0]) * turns[:, None]
     options = np.remainder(options + math.pi, 2.0 * math.pi) - math.pi
     bends = np.clip(options, limb.lower[3], limb.upper[3])
-    off = np.abs(options - bends)
-    row, option = np.nonzero(off <= off.min(axis=1, keepdims=True) + SETTINGS.bend_tolerance)
+    excess = np.abs(options - bends)
+    row, option = np.nonzero(excess <= excess.min(axis=1, keepdims=True) + SETTINGS.bend_tolerance)
     bend = bends[row, option]
     end_U = limb.middle_U + Rotation.from_euler(letters[3], bend[:, None]).apply(limb.end_L)
     towards_U = _along(np.zeros(3), end_U)[0]
-    own = _triads(towards_U, np.broadcast_to(limb.middle_U, end_U.shape))[0]
-    R_WU = frames[row] @ own.transpose(0, 2, 1)
+    triads_U = _triads(towards_U, np.broadcast_to(limb.middle_U, end_U.shape))[0]
+    R_WU = frames[row] @ triads_U.transpose(0, 2, 1)
     if stretched.any():
-        still = stretched[row]
-        R_WU[still] = _least_turns(towards_U[still] @ R_last.T, towards[row[still]]) @ R_last
-    # The root's two sets of angles for a rotation: the one that is less beyond the limits.
+        is_straight = stretched[row]
+        R_WU[is_straight] = (
+            _least_turns(towards_U[is_straight] @ R_last.T, towards[row[is_straight]]) @ R_last
+        )
+    # Two sets of the root's angles give the same rotation: take the one nearer to the limits.
     first, second, third = Rotation.from_matrix(R_WT.T @ R_WU).as_euler(letters[:3]).T
     options = np.array(
         [[first, second, third], [first + math.pi, math.pi - second, third + math.pi]]
     ).transpose(0, 2, 1)
     options = np.remainder(options + math.pi, 2.0 * math.pi) - math.pi
-    off = np.abs(options - np.clip(options, limb.lower[:3], limb.upper[:3]))
-    cost = off.sum(axis=2) + 1e-3 * np.abs(options - last[:3]).sum(axis=2)
+    excess = np.abs(options - np.clip(options, limb.lower[:3], limb.upper[:3]))
+    cost = excess.sum(axis=2) + 1e-3 * np.abs(options - last[:3]).sum(axis=2)
     better, each = np.argmin(cost, axis=0), np.arange(len(row))
-    beyond = off[better, each].max(axis=1)
+    beyond = excess[better, each].max(axis=1)
     costs, beyonds = np.full(bends.shape, np.inf), np.zeros(bends.shape)
     roots = np.zeros((*bends.shape, 3))
     costs[row, option] = beyond + 1e-3 * np.abs(bend - last[3])
@@ -380,19 +399,24 @@ def place_limb(
 
 
 def _along(root: Array, ends: Array) -> tuple[Array, Array]:
-    """Directions (..., 3) from root to ends (..., 3), downwards where they are one, and distances.
+    """Return directions (..., 3) and distances (...) [m] from root to ends (..., 3).
 
-    Distances (...) are in m.
+    The direction is downwards where both points coincide.
     """
     across = ends - root
     distances = np.sqrt((across**2).sum(axis=-1))
     is_far = distances[..., None] > _TINY
-    ways = across / np.where(is_far, distances[..., None], 1.0)
-    return np.where(is_far, ways, [0.0, 0.0, -1.0]), distances
+    directions = across / np.where(is_far, distances[..., None], 1.0)
+    return np.where(is_far, directions, [0.0, 0.0, -1.0]), distances
 
 
 def _triads(x: Array, others: Array) -> tuple[Array, Array]:
-    """(n, 3, 3) axes: x (n, 3) of length 1, then what of the others (n, 3) is across; how much."""
+    """Return axes (n, 3, 3) with first axis x and second towards others; distances of others to x.
+
+    Args:
+        x: (n, 3) unit vectors.
+        others: (n, 3) vectors [m].
+    """
     across = others - (others * x).sum(axis=1, keepdims=True) * x
     length = np.sqrt((across**2).sum(axis=1))
     straight = length < _TINY
@@ -401,14 +425,14 @@ def _triads(x: Array, others: Array) -> tuple[Array, Array]:
     return np.stack([x, y, np.cross(x, y)], axis=2), length
 
 
-def _least_turns(ones: Array, others: Array) -> Array:
-    """The least rotations (n, 3, 3) from directions (n, 3) to others (n, 3)."""
-    quaternions = np.column_stack([np.cross(ones, others), 1.0 + (ones * others).sum(axis=1)])
+def _least_turns(starts: Array, ends: Array) -> Array:
+    """Return the smallest rotations (n, 3, 3) that turn directions (n, 3) to others (n, 3)."""
+    quaternions = np.column_stack([np.cross(starts, ends), 1.0 + (starts * ends).sum(axis=1)])
     turned_about = np.sqrt((quaternions**2).sum(axis=1)) < _TINY
-    quaternions[turned_about, :3] = _any_across(ones[turned_about])
+    quaternions[turned_about, :3] = _any_across(starts[turned_about])
     return np.asarray(Rotation.from_quat(quaternions).as_matrix())
 
 
 def _any_across(axes: Array) -> Array:
-    """Any vectors (n, 3) across axes (n, 3), not 0."""
+    """Return vectors (n, 3) perpendicular to axes (n, 3), not 0."""
     return np.cross(axes, np.eye(3)[np.argmin(np.abs(axes), axis=1)])

@@ -1,6 +1,6 @@
-"""The person of figure 5 in the paper's terms: limbs, ends and limits, read from a model once.
+"""Skeleton of the paper's body model (Date et al., figure 5), read from an articulated model.
 
-Head - neck base - trunk, and two arms and legs of 3 + 1 rotations: 23 degrees of freedom.
+Head, neck base and trunk, with two arms and two legs of 3 + 1 rotations: 23 degrees of freedom.
 """
 
 import math
@@ -16,24 +16,27 @@ from drake_pose.body.tree_kinematics import PackedTree, TreeKinematics
 from drake_pose.errors import ModelError
 
 LIMBS = ("left_arm", "right_arm", "left_leg", "right_leg")
-"""The limbs' names."""
+"""Names of the limbs."""
 
 FEATURES = ("head", "left_hand", "right_hand", "left_foot", "right_foot")
-"""The skin-coloured parts that are measured, head and the limbs' ends, in the limbs' order."""
+"""Skin-coloured parts that are measured: the head, then the limbs' ends in the order of LIMBS."""
 
 
 @dataclass(frozen=True, eq=False)
 class Limb:
-    """An arm or a leg, named as one of LIMBS.
+    """An arm or a leg.
 
     Args:
-        upper_node, lower_node: of the pose tree, its segments.
+        name: one of LIMBS.
+        upper_node, lower_node: indices of its segments' nodes in the pose tree.
         root_T: (3,) shoulder or hip in the trunk's frame [m].
         middle_U: (3,) elbow or knee in the upper segment's frame [m].
-        end_L: (3,) the hand's or foot's middle in the lower segment's frame [m].
-        axes: (4,) 0, 1, 2 for x, y, z: three at the root in the order of rotation, then the middle.
-        positions, lower, upper: (4,) where their angles stand in q, and their limits [rad].
-        half_widths: (2,) mean distance of either segment's surface from its joints' line [m].
+        end_L: (3,) middle of the hand or foot in the lower segment's frame [m].
+        axes: (4,) axes of rotation, 0, 1, 2 for x, y, z: three at the root in order, one at the
+            middle joint.
+        positions: (4,) indices of their angles in q.
+        lower, upper: (4,) limits of the angles [rad].
+        half_widths: (2,) mean distance of each segment's surface from the line of its joints [m].
     """
 
     name: str
@@ -50,7 +53,7 @@ class Limb:
 
     @property
     def lengths(self) -> tuple[float, float]:
-        """From root to middle joint, and from there to the end [m]."""
+        """Distances from root to middle joint, and from middle joint to end [m]."""
         return float(np.linalg.norm(self.middle_U)), float(np.linalg.norm(self.end_L))
 
     @property
@@ -66,15 +69,18 @@ class Limb:
 
 @dataclass(frozen=True, eq=False)
 class Skeleton:
-    """The person's pose tree, its nodes by name, and what the paper's method needs beside it.
+    """A person's pose tree, with the quantities that the paper's method needs.
 
     Args:
-        face_H: (3,) middle of the head's skin in the head's frame [m].
-        head_positions: (3,) where the head's place stands in q.
-        head_angles, neck_angles: (2,) where they stand in q.
-        order: (m,) where the pose tree's values stand in q.
-        chains: of each node, what it hangs on packed by itself, and where its values stand in q.
-        lower, upper: (nq,) limits [rad or m].
+        nodes: indices of the pose tree's nodes by name.
+        face_H: (3,) middle of the head's surface in the head's frame [m].
+        head_positions: (3,) indices in q of the head's position.
+        head_angles, neck_angles: (2,) indices in q of the head's and of the neck base's angles.
+        order: (m,) indices in q of the pose tree's values.
+        chains: for each node: the chain of nodes from the root to it, packed, and the indices in q
+            of the chain's values.
+        limbs: by name.
+        lower, upper: (nq,) limits of q [rad, m].
     """
 
     model: ArticulatedModel
@@ -91,39 +97,39 @@ class Skeleton:
     upper: Array
 
     def poses(self, q: Array) -> Array:
-        """X_WN (nodes, 4, 4) at q (nq,)."""
+        """Return the nodes' poses X_WN (nodes, 4, 4) at q (nq,)."""
         return self.kinematics.poses(q[self.order])
 
     def head_rotation(self, q: Array) -> Array:
-        """(3, 3) the head's axes in the world at q (nq,)."""
+        """Return the head's axes R_WH (3, 3) at q (nq,)."""
         return self.poses(q)[self.nodes["head"], :3, :3]
 
     def trunk_pose(self, q: Array) -> tuple[Array, Array]:
-        """The trunk's axes (3, 3) and origin, the neck's base (3,), in the world at q (nq,)."""
+        """Return the trunk's axes R_WT (3, 3) and origin, the neck base (3,) [m], at q (nq,)."""
         X_WT = self.poses(q)[self.nodes["trunk"]]
         return np.ascontiguousarray(X_WT[:3, :3]), X_WT[:3, 3]
 
     def limb_points(self, q: Array, name: str) -> Array:
-        """(3, 3) root, middle joint and end of a limb in the world at q (nq,) [m]."""
+        """Return a limb's root, middle joint and end (3, 3) in the world at q (nq,) [m]."""
         limb, X_WN = self.limbs[name], self.poses(q)
         X_WL = X_WN[limb.lower_node]
         return np.array([X_WN[limb.upper_node, :3, 3], X_WL[:3, 3], _moved(X_WL, limb.end_L)])
 
     def features(self, q: Array) -> Array:
-        """(5, 3) where FEATURES are in the world at q (nq,) [m]."""
+        """Return the positions (5, 3) of FEATURES in the world at q (nq,) [m]."""
         X_WN = self.poses(q)
         ends = [_moved(X_WN[limb.lower_node], limb.end_L) for limb in self.limbs.values()]
         return np.array([_moved(X_WN[self.nodes["head"]], self.face_H), *ends])
 
     @property
     def waist_T(self) -> Array:
-        """(3,) half-way between the hips, in the trunk's frame [m]."""
+        """Point half-way between the hips in the trunk's frame (3,) [m]."""
         return 0.5 * (self.limbs["left_leg"].root_T + self.limbs["right_leg"].root_T)
 
     def with_features(self, q: Array, places: Array, farthest: float = 0.05) -> "Skeleton":
-        """The same person whose features are at places (5, 3) measured in a known pose q (nq,) [m].
+        """Return the skeleton whose features are at places (5, 3), measured at q (nq,) [m].
 
-        A feature moves by `farthest` [m] at most; nan: not measured.
+        A feature moves by at most `farthest` [m]; nan: not measured, not moved.
         """
         off = np.nan_to_num(np.asarray(places) - self.features(q))
         length = np.linalg.norm(off, axis=1, keepdims=True)
@@ -137,14 +143,15 @@ class Skeleton:
         return replace(self, face_H=face_H, limbs=limbs)
 
     def clip(self, q: Array) -> Array:
-        """The positions q (nq,) moved inside their limits."""
+        """Return q (nq,) clipped to the limits."""
         return np.clip(q, self.lower, self.upper)
 
 
 def load_skeleton(model: ArticulatedModel) -> Skeleton:
-    """Reads the skeleton of a model made like the bundled person.
+    """Read the skeleton of a model that has the segments of the bundled person.
 
-    Raises ModelError where its segments do not hang together so, naming the segment.
+    Raises:
+        ModelError: a segment is missing or hangs on another one; the message names it.
     """
     kinematics = TreeKinematics(model.pose_tree())
     tree = kinematics.tree
@@ -183,7 +190,7 @@ def load_skeleton(model: ArticulatedModel) -> Skeleton:
 
 
 def registered_positions(skeleton: Skeleton, spread_deg: float = 80.0) -> Array:
-    """Positions (nq,) of the paper's registered pose: upright, both arms spread by degrees."""
+    """Return q (nq,) of the registered pose (3.1.1): upright, both arms spread by `spread_deg`."""
     q = np.zeros(len(skeleton.lower))
     for name in LIMBS[:2]:
         limb = skeleton.limbs[name]
@@ -192,7 +199,7 @@ def registered_positions(skeleton: Skeleton, spread_deg: float = 80.0) -> Array:
 
 
 def _chain(packed: PackedTree, node: int) -> tuple[PackedTree, Indices]:
-    """A node and those that it hangs on by themselves, and which values are theirs."""
+    """Pack the chain of nodes from the root to a node; return it with its values' indices."""
     path: list[int] = []
     while node >= 0:
         path, node = [node, *path], int(packed.parents[node])
@@ -219,7 +226,7 @@ def _limb(
     lower: str,
     end: str,
 ) -> Limb:
-    """The limb of two segments and an end, which is fixed to the lower one or hangs on it."""
+    """Read a limb from its two segments and its end, which the lower segment carries."""
     tree = kinematics.tree
     model = tree.model
     positions = [*tree.nodes[nodes[upper]].positions, *tree.nodes[nodes[lower]].positions]
@@ -260,17 +267,17 @@ def _limb(
 
 
 def _moved(X_AB: Array, p_B: Array) -> Array:
-    """(3,) a point of B in A."""
+    """Return a point of frame B in frame A (3,)."""
     return np.asarray(X_AB[:3, :3] @ p_B + X_AB[:3, 3])
 
 
 def _offset(X_WA: Array, X_WB: Array) -> Array:
-    """(3,) the origin of B in A."""
+    """Return the origin of frame B in frame A (3,)."""
     return np.asarray(X_WA[:3, :3].T @ (X_WB[:3, 3] - X_WA[:3, 3]))
 
 
 def _middle(mesh: TriangleMesh) -> Array:
-    """(3,) the middle of a surface, weighed by area."""
+    """Return the centroid (3,) of a surface."""
     a, b, c = (mesh.vertices[mesh.triangles[:, k]] for k in range(3))
     middles, area = (a + b + c) / 3.0, np.linalg.norm(np.cross(b - a, c - a), axis=1)
     return np.asarray((area[:, None] * middles).sum(axis=0) / area.sum())

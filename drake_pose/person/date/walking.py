@@ -1,6 +1,6 @@
-"""Walking through a place by gestures (Date, table 1), and a simulated person's known motions.
+"""Walking through a virtual place by gestures (Date et al., table 1), and motions for simulation.
 
-Facing right or left turns the view, standing ahead of or behind the rest place walks.
+Facing right or left turns the view; standing ahead of or behind the rest place walks.
 """
 
 import math
@@ -15,19 +15,21 @@ from drake_pose.person.date.skeleton import Skeleton, registered_positions
 
 @dataclass(frozen=True)
 class WalkSettings:
-    """How gestures walk.
+    """Thresholds of the gestures, and what their commands do.
 
-    A command begins at one threshold and ends at a lower one, so that noise does not toggle it.
+    A command begins at the first threshold of a pair and ends below the second, lower one, so that
+    noise does not toggle it.
 
     Args:
-        turn_rate, speed: how fast the view turns [rad/s] and one walks [m/s].
-        body_radius: how near one comes to walls [m].
-        turn: how far the face is turned away from the rest direction [rad].
-        step: how far one stands from the rest place [m].
-        lift: how much higher than the other a lifted foot is [m].
-        pause: walking on the spot ends this long after the last step [s].
-        start: where a walk begins: x, y [m] and heading [rad].
-        half_size: half the side of the square place, the origin is its middle [m].
+        turn_rate: of the view [rad/s].
+        speed: of walking [m/s].
+        body_radius: least distance from walls and obstacles [m].
+        turn: thresholds of the face's turn from the rest direction [rad].
+        step: thresholds of the distance from the rest place [m].
+        lift: least height of a lifted foot above the other one [m].
+        pause: walking on the spot ends at this time after the last step [s].
+        start: pose in which a walk begins: x, y [m] and heading [rad].
+        half_size: half the side of the square place, whose middle is the origin [m].
     """
 
     turn_rate: float = math.radians(40.0)
@@ -45,20 +47,22 @@ WALK = WalkSettings()
 
 
 def stance_of(left_W: Array, head_W: Array, feet_W: Array) -> Array:
-    """How a person stands: (5,) the face's heading [rad], head's and feet's x and y [m].
+    """Return how a person stands (5,): heading of the face [rad], x, y of the head and feet [m].
 
     Args:
-        left_W: (3,) the direction to the face's left, level also where the person looks down.
-        head_W, feet_W: (3,) and (2, 3) where they are [m]; midway between the feet counts.
+        left_W: (3,) direction to the left of the face; its horizontal part gives the heading.
+        head_W: (3,) position of the head [m].
+        feet_W: (2, 3) positions of the feet [m]; their mean counts.
     """
     heading = math.atan2(-left_W[0], left_W[1])
     return np.array([heading, *head_W[:2], *np.asarray(feet_W)[:, :2].mean(axis=0)])
 
 
 def offsets_from_rest(stance: Array, rest: Array) -> tuple[float, float]:
-    """How far a stance (5,) is from the one at rest: turned to the left [rad], and ahead [m].
+    """Return the turn to the left [rad] and the way ahead [m] of a stance (5,) from that at rest.
 
-    Ahead is the lesser of the head's and the feet's way, 0 if they differ: leaning is no step.
+    The way ahead is the smaller of the head's and the feet's; 0 if their signs differ, as when a
+    person leans.
     """
     turned = stance[0] - rest[0]
     turned = math.atan2(math.sin(turned), math.cos(turned))
@@ -69,14 +73,14 @@ def offsets_from_rest(stance: Array, rest: Array) -> tuple[float, float]:
 
 
 def recognise_command(stance: Array, rest: Array, last: tuple[int, int]) -> tuple[int, int]:
-    """Table 1: the command that a stance gives; whoever is lost from sight stops.
+    """Return the command of a stance (table 1); a person who is not seen stops.
 
     Args:
-        stance, rest: (5,) from stance_of.
-        last: the command before.
+        stance, rest: (5,) from stance_of, now and at rest.
+        last: the previous command.
 
     Returns:
-        Turning: 1 left, -1 right, 0 not; walking: 1 forward, -1 backward, 0 not.
+        Turning: 1 left, -1 right, 0 none; walking: 1 forward, -1 backward, 0 none.
     """
     if not np.isfinite(stance).all():
         return 0, 0
@@ -85,14 +89,17 @@ def recognise_command(stance: Array, rest: Array, last: tuple[int, int]) -> tupl
 
 
 def follow_steps(lift: float, steps: Array, seconds: float) -> Array:
-    """Counts the steps of somebody who may be walking on the spot; one foot held up is one step.
+    """Count the steps of walking on the spot; a foot that stays lifted is one step.
 
     Args:
-        lift: how much higher the left foot is than the right one [m]; nan: not seen.
-        steps: (3,) the foot lifted last (1 left, -1 right, 0 none), since when it was [s], and how
-            many steps, each with the other foot, were taken without a pause; 0 at first. Two are
-            walking on the spot.
+        lift: height of the left foot above the right one [m]; nan: not seen.
+        steps: (3,) foot lifted last (1 left, -1 right, 0 none), time since then [s], and number of
+            steps with alternating feet since the last pause; zeros at first. Two steps are walking
+            on the spot.
         seconds: since the last frame.
+
+    Returns:
+        (3,) the new steps.
     """
     foot, since, count = steps[0], steps[1] + seconds, steps[2]
     if since > WALK.pause:
@@ -109,13 +116,14 @@ def follow_command(
     obstacles: Array,
     half_size: float = WALK.half_size,
 ) -> Array:
-    """The walker's pose (3,), its heading in -pi..pi, after a command was followed for a while.
+    """Return the walker's pose (3,) after a command was followed for a time; heading in -pi..pi.
 
-    Turning and walking at once is an exact arc; the walker slides along walls and obstacles.
+    Turning and walking together give an exact arc. The walker slides along walls and obstacles.
 
     Args:
         pose: (3,) x, y [m] and heading [rad].
         command: from recognise_command.
+        seconds: for which the command is followed.
         obstacles: (n, 3) x, y and radius of round obstacles [m].
         half_size: half the side of the place [m].
     """
@@ -134,32 +142,32 @@ def follow_command(
 
 
 def _switch(value: float, last: int, begin: float, end: float) -> int:
-    """1, -1 or 0: a value beyond a threshold, the lower one where it was so before."""
+    """Return the sign of a value beyond the threshold `begin`, or `end` if it is the last sign."""
     if last and value * last > end:
         return last
     return int(math.copysign(1, value)) if abs(value) >= begin else 0
 
 
 MOTIONS = ("walk", "reach", "lean", "crouch", "turn", "cross")
-"""The motions, in their order; before the first and after the last the registered pose is shown."""
+"""Motions in their order; the registered pose is shown before the first and after the last."""
 
 UPRIGHT = ("walk", "reach", "turn", "cross")
-"""Those with an upright trunk, which the paper asks for."""
+"""Motions with an upright trunk, which the paper asks for (4.2)."""
 
 REGISTERED = "registered"
 FEWEST_FRAMES = 40
 
 
 def _sides(left: float = 1.0, right: float = 1.0, **degrees: float) -> dict[str, float]:
-    """Angles [deg] of joints on both sides, times what is theirs."""
+    """Return angles [deg] of joints on both sides, multiplied by each side's factor."""
     sides = {"left": left, "right": right}
     return {f"{side}_{joint}": k * a for joint, a in degrees.items() for side, k in sides.items()}
 
 
 def _key_poses(motion: str) -> list[dict[str, float]]:
-    """Angles [deg] that differ from the relaxed pose; a motion goes from one to the next, and back.
+    """Return the key poses of a motion of MOTIONS: angles [deg] that differ from the relaxed pose.
 
-    See MOTIONS.
+    The motion goes from one key pose to the next.
     """
     if motion == "walk":
         return [
@@ -189,29 +197,33 @@ def _key_poses(motion: str) -> list[dict[str, float]]:
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """Positions q (n, nq) [rad or m], and each frame's motion: of MOTIONS, or REGISTERED."""
+    """Positions q (n, nq) [rad, m], and the motion of each frame: one of MOTIONS, or REGISTERED."""
 
     q: Array
     names: tuple[str, ...]
 
 
 def make_motion(skeleton: Skeleton, frames: int, seed: int) -> Motion:
-    """The registered pose, then all motions of a person whose lower foot stands, then it again.
+    """Make the registered pose, all motions in turn, and the registered pose again.
 
-    All takes 120 frames or more; of fewer the first are given. The seed draws how far motions go
-    (85 to 115 per cent) and where the person stands.
+    The lower foot stands on the floor in every frame. The whole takes 120 frames or more; if fewer
+    are asked for, the first ones are returned.
 
-    Raises SettingsError below FEWEST_FRAMES frames.
+    Args:
+        seed: draws the size of each motion, 0.85 to 1.15, and where the person stands.
+
+    Raises:
+        SettingsError: there are fewer than FEWEST_FRAMES frames.
     """
     if frames < FEWEST_FRAMES:
         raise SettingsError(f"Date's experiment needs {FEWEST_FRAMES} frames or more, not {frames}")
     generator = np.random.default_rng(seed)
     registered = registered_positions(skeleton)
     relaxed = _positions(skeleton, {}, 1.0)
-    # In fewer frames the motions would be faster than people are; so they are not all shown.
+    # In fewer frames the motions would be faster than people's, so not all of them are shown.
     whole = max(frames, 120)
     still = whole // 20
-    # From key pose to key pose it always takes about as long.
+    # The time from key pose to key pose is the same in all motions.
     steps = np.cumsum([0, *(len(_key_poses(motion)) + 1 for motion in MOTIONS)])
     lengths = np.diff(np.rint((whole - 2 * still) * steps / steps[-1]).astype(int))
     rows, names = [registered] * still, [REGISTERED] * still
@@ -226,7 +238,7 @@ def make_motion(skeleton: Skeleton, frames: int, seed: int) -> Motion:
     rows += [registered] * still
     names += [REGISTERED] * still
     q = np.array(rows)
-    # Where the person stands on the floor: a slow loop of 20 cm.
+    # The person moves over the floor on a slow loop with a radius of 20 cm.
     phase, along = generator.uniform(0, 2 * np.pi), np.linspace(0, 2 * np.pi, whole)
     loop = np.column_stack([np.cos(along + phase), np.sin(2 * along + phase)])
     q[:, skeleton.head_positions[:2]] = 0.2 * loop + generator.uniform(-0.1, 0.1, 2)
@@ -236,13 +248,14 @@ def make_motion(skeleton: Skeleton, frames: int, seed: int) -> Motion:
 
 
 COMMANDS = ("turn left", "turn right", "walk ahead", "walk behind")
-"""What table 1 has gestures for."""
+"""Commands of table 1."""
 
 
 def make_gestures(skeleton: Skeleton, frames: int = 84) -> Motion:
-    """The registered pose, rest, then each of COMMANDS by its gesture for some frames, and rest.
+    """Make the registered pose, rest, and each of COMMANDS by its gesture, with rest in between.
 
-    Who walks stands 30 cm ahead or behind, and walks on the spot. A frame's name is the gesture.
+    To walk, the person stands 30 cm ahead or behind, and walks on the spot. The frames' names are
+    the gestures. Each takes `frames` frames.
     """
     registered, rest = registered_positions(skeleton), _positions(skeleton, {}, 1.0)
     rows, names = list(_through([registered, registered, rest], 24)), [REGISTERED] * 24
@@ -262,7 +275,7 @@ def make_gestures(skeleton: Skeleton, frames: int = 84) -> Motion:
 
 
 def _positions(skeleton: Skeleton, key: dict[str, float], size: float) -> Array:
-    """Positions of a key pose, its angles times a size."""
+    """Return q (nq,) of a key pose whose angles are multiplied by a size."""
     q = np.zeros(len(skeleton.lower))
     relaxed = _sides(forearm_x=-10.0) | _sides(right=-1.0, upper_arm_z=8.0)
     for name, degrees in {**relaxed, **{n: size * d for n, d in key.items()}}.items():
@@ -271,12 +284,12 @@ def _positions(skeleton: Skeleton, key: dict[str, float], size: float) -> Array:
 
 
 def _through(keys: list[Array], count: int) -> Array:
-    """(count, nq) positions from key to key, resting at each for a moment."""
+    """Return positions (count, nq) from key pose to key pose, slowing down at each."""
     place = np.linspace(0.0, len(keys) - 1.0, count + 1)[1:]
     index = np.minimum(place.astype(int), len(keys) - 2)
-    share = 0.5 - 0.5 * np.cos(np.pi * (place - index))
+    weight = 0.5 - 0.5 * np.cos(np.pi * (place - index))
     poses = np.array(keys)
-    return np.asarray(poses[index] + share[:, None] * (poses[index + 1] - poses[index]))
+    return np.asarray(poses[index] + weight[:, None] * (poses[index + 1] - poses[index]))
 
 
 def _stand_on_floor(skeleton: Skeleton, q: Array) -> None:

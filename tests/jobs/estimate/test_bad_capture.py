@@ -156,7 +156,7 @@ COLOURS = np.dstack([np.tile(np.arange(160, dtype=np.uint8), (120, 1)), *np.zero
         (halved, ("a person 3.", "m tall", "focal lengths")),
         (swapped, ("none of", "160 x 120", "120 x 160")),
         (alone, ("masks are there of camera_1 alone", LACKS)),
-        (lambda mask: 0 * mask, ("in none of 2 frames two cameras see a person",)),
+        (lambda mask: 0 * mask, ("two cameras see no person in any of 2 frames",)),
         (lambda mask: 255 - mask, ("white before a black background",)),
         (lambda _: COLOURS, ("none of 8 masks", "two")),
     ],

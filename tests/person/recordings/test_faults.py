@@ -369,7 +369,7 @@ class TestRecord:
             for name, camera in four.cameras.items()
         }
         for cameras, masks, error, words in (
-            (four.cameras, nothing, SettingsError, "none of 1 frames two cameras see"),
+            (four.cameras, nothing, SettingsError, "two cameras see no person in any of 1 frames"),
             (four.cameras, inverted, MaskError, "in 100 % of the masks"),
             (small, four.masks[0], CameraError, "m tall by the cameras' calibration"),
         ):

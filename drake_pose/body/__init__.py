@@ -1,7 +1,7 @@
-"""What is looked at: links, joints, limits and surfaces of an articulated object.
+"""Articulated models and pose trees: links, joints, limits, surfaces and kinematics.
 
-Kernels (``joint_kernel``, ``tree_kinematics``) are imported from their modules: numba is slow to
-import, and reading a model needs none.
+The compiled modules ``joint_kernel`` and ``tree_kinematics`` are not imported here: importing numba
+is slow, and reading a model does not need it.
 """
 
 from drake_pose.body.landmarks import (
@@ -13,7 +13,7 @@ from drake_pose.body.landmarks import (
 )
 from drake_pose.body.link_graph import PlantKinematics, chain_transforms, inverse_transforms
 from drake_pose.body.meshes import TriangleMesh, join_meshes, labelled_meshes
-from drake_pose.body.model import OBJECT, OBJECT_POSITIONS, ArticulatedModel, load_model
+from drake_pose.body.model import TARGET, TARGET_POSITIONS, ArticulatedModel, load_model
 from drake_pose.body.model_files import bundled_model, package_folder
 from drake_pose.body.node_skin import ModelSkin
 from drake_pose.body.parsed_model import ParsedModel, link_names, nearest_turn
@@ -26,8 +26,8 @@ from drake_pose.body.urdf_shape import BASE_JOINTS, reshaped
 
 __all__ = [
     "BASE_JOINTS",
-    "OBJECT",
-    "OBJECT_POSITIONS",
+    "TARGET",
+    "TARGET_POSITIONS",
     "ArticulatedModel",
     "Landmark",
     "ModelReport",

@@ -1,4 +1,4 @@
-"""Joints' transforms at their values, and the bands of skin that follow them, compiled."""
+"""Compiled transforms of joints at their values, and of the skin bands that deform with them."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -10,10 +10,13 @@ from drake_pose.compiled import compiled, multiply
 
 
 class PackedSteps(NamedTuple):
-    """Joints in the arrays that kernels walk.
+    """A chain of joints in the arrays that kernels take.
 
-    sizes: (s,) int64 how many positions each has; inverted: (s,) bool; starts: (s,) int64 the first
-    of its coefficients; coefficients: (r, 16) those of JointMap.
+    Attributes:
+        sizes: (s,) int64 number of positions of each joint.
+        inverted: (s,) bool, whether the joint is traversed inwards.
+        starts: (s,) int64 index of each joint's first row in ``coefficients``.
+        coefficients: (r, 16) coefficients of ``JointMap``.
     """
 
     sizes: np.ndarray
@@ -23,24 +26,27 @@ class PackedSteps(NamedTuple):
 
 
 class PackedBands(NamedTuple):
-    """Bands of skin in the arrays that the kernels walk, one band after another.
+    """Skin bands in the arrays that kernels take, one band after another.
 
-    starts: (b + 1, 3) int64 the first step, level and vertex of each; steps: the joints from the
-    node's parent to the node; levels: (l,) the different weights; which: (v,) int64 the level of
-    each vertex, counted in its band; points: (v, 3) the band at rest, in the node's frame or, where
-    turned over, in the parent's; turned: (b,) bool.
+    Attributes:
+        starts: (b + 1, 3) int64 index of each band's first step, weight and vertex.
+        steps: the joints from each node's parent to the node.
+        weights: (l,) the distinct vertex weights of each band.
+        weight_index: (v,) int64 index of each vertex's weight, counted in its band.
+        points: (v, 3) vertices at rest [m], in the node's frame, or in its parent's if inverted.
+        inverted: (b,) bool, whether the node is nearer to the plant's world than its parent.
     """
 
     starts: np.ndarray
     steps: PackedSteps
-    levels: np.ndarray
-    which: np.ndarray
+    weights: np.ndarray
+    weight_index: np.ndarray
     points: np.ndarray
-    turned: np.ndarray
+    inverted: np.ndarray
 
 
 def join_bands(bands: Sequence[PackedBands]) -> PackedBands:
-    """All bands together."""
+    """Return several packed bands as one."""
     steps = [band.steps for band in bands]
     rows = np.cumsum([0, *(len(one.coefficients) for one in steps)])
     counts = [np.diff(band.starts, axis=0) for band in bands]
@@ -54,15 +60,15 @@ def join_bands(bands: Sequence[PackedBands]) -> PackedBands:
             ),
             coefficients=np.vstack([one.coefficients for one in steps]),
         ),
-        levels=np.concatenate([band.levels for band in bands]),
-        which=np.concatenate([band.which for band in bands]),
+        weights=np.concatenate([band.weights for band in bands]),
+        weight_index=np.concatenate([band.weight_index for band in bands]),
         points=np.vstack([band.points for band in bands]),
-        turned=np.concatenate([band.turned for band in bands]),
+        inverted=np.concatenate([band.inverted for band in bands]),
     )
 
 
 def pack_steps(steps: Sequence[JointMap]) -> PackedSteps:
-    """Joints in arrays."""
+    """Return joints in the kernel's arrays."""
     rows = [len(step.coefficients) for step in steps]
     return PackedSteps(
         sizes=np.array([step.position_count for step in steps], dtype=np.int64),
@@ -73,30 +79,32 @@ def pack_steps(steps: Sequence[JointMap]) -> PackedSteps:
 
 
 @compiled
-def find_joint(
+def evaluate_joint(
     steps: PackedSteps,
     step: int,
     values: np.ndarray,
-    share: float,
-    changed: int,
+    fraction: float,
+    derived: int,
     basis: np.ndarray,
     X: np.ndarray,
 ) -> None:
-    """Writes the upper rows of a joint's transform as it is walked, or a derivative.
+    """Write the upper rows of a joint's transform in traversal order, or of a derivative.
 
     Args:
-        step: which of them.
-        values: its values and any after them [rad or m].
-        share: how far it goes of its way to them.
-        changed: -1, or the position by which the transform, walked outwards, is derived.
+        steps: the packed joints.
+        step: index of the joint.
+        values: the joint's values [rad or m], and any further ones.
+        fraction: factor by which the values are multiplied.
+        derived: index of the position by which to differentiate; -1: none. A derivative is that of
+            the transform outwards, whether or not the joint is inverted.
         basis: (3, 4) scratch.
-        X: (3 or 4, 4) written.
+        X: (3 or 4, 4) output.
     """
     size, begin, coefficients = steps.sizes[step], steps.starts[step], steps.coefficients
     for k in range(size):
-        q = share * values[k]
+        q = fraction * values[k]
         cosine, sine = np.cos(q), np.sin(q)
-        if k == changed:
+        if k == derived:
             basis[k, 0], basis[k, 1], basis[k, 2], basis[k, 3] = 0.0, -sine, cosine, 1.0
         else:
             basis[k, 0], basis[k, 1], basis[k, 2], basis[k, 3] = 1.0, cosine, sine, q
@@ -112,7 +120,7 @@ def find_joint(
             for i in range(3):
                 for j in range(4):
                     X[i, j] += factor * coefficients[begin + row, 4 * i + j]
-    if changed < 0 and steps.inverted[step]:
+    if derived < 0 and steps.inverted[step]:
         x, y, z = X[0, 3], X[1, 3], X[2, 3]
         X[0, 1], X[1, 0] = X[1, 0], X[0, 1]
         X[0, 2], X[2, 0] = X[2, 0], X[0, 2]
@@ -123,52 +131,57 @@ def find_joint(
 
 @compiled
 def place_bands(
-    bands: PackedBands, ranges: np.ndarray, values: np.ndarray, bent: np.ndarray, placed: np.ndarray
+    bands: PackedBands,
+    ranges: np.ndarray,
+    values: np.ndarray,
+    last_values: np.ndarray,
+    placed: np.ndarray,
 ) -> np.ndarray:
-    """Places bands, each in its node's frame, but those whose values are as before.
+    """Place the vertices of bands in their nodes' frames; skip bands whose values have not changed.
 
     Args:
-        ranges: (b, 2) of all values the first of each band's node, and the one after its last.
-        values: (n, m) [rad or m].
-        bent: (n, m) the values before, or NaN; they are written.
-        placed: (n, v, 3) all bands' vertices, written.
+        bands: the packed bands.
+        ranges: (b, 2) range of each band's values [first, end) in the columns of ``values``.
+        values: (n, m) all values [rad or m].
+        last_values: (n, m) values of the previous call, or NaN; overwritten.
+        placed: (n, v, 3) vertices of all bands [m]; overwritten.
 
     Returns:
-        (n, b) bool which bands' values have changed.
+        (n, b) bool, which bands were placed anew.
     """
     basis, joint, product = np.empty((3, 4)), np.empty((3, 4)), np.empty((3, 4))
-    most, x = 0, np.empty(3)
+    max_count, x = 0, np.empty(3)
     for band in range(ranges.shape[0]):
-        most = max(most, bands.starts[band + 1, 1] - bands.starts[band, 1])
-    # The last one is that of the whole way.
-    X_PN = np.zeros((most + 1, 3, 4))
+        max_count = max(max_count, bands.starts[band + 1, 1] - bands.starts[band, 1])
+    # The last transform is the one at the full values.
+    X_PN = np.zeros((max_count + 1, 3, 4))
     changed, steps = np.zeros((values.shape[0], ranges.shape[0]), dtype=np.bool_), bands.steps
     for n in range(values.shape[0]):
         for band in range(ranges.shape[0]):
             begin, end = bands.starts[band], bands.starts[band + 1]
             for k in range(ranges[band, 0], ranges[band, 1]):
-                changed[n, band] |= values[n, k] != bent[n, k]
-                bent[n, k] = values[n, k]
+                changed[n, band] |= values[n, k] != last_values[n, k]
+                last_values[n, k] = values[n, k]
             if not changed[n, band]:
                 continue
             count = end[1] - begin[1]
-            for level in range(count + 1):
-                share = bands.levels[begin[1] + level] if level < count else 1.0
+            for weight in range(count + 1):
+                fraction = bands.weights[begin[1] + weight] if weight < count else 1.0
                 first = ranges[band, 0]
                 for i in range(3):
                     for j in range(4):
-                        X_PN[level, i, j] = 1.0 if i == j else 0.0
+                        X_PN[weight, i, j] = 1.0 if i == j else 0.0
                 for step in range(begin[0], end[0]):
-                    find_joint(steps, step, values[n, first:], share, -1, basis, joint)
-                    multiply(X_PN[level], joint, product)
+                    evaluate_joint(steps, step, values[n, first:], fraction, -1, basis, joint)
+                    multiply(X_PN[weight], joint, product)
                     for i in range(3):
                         for j in range(4):
-                            X_PN[level, i, j] = product[i, j]
+                            X_PN[weight, i, j] = product[i, j]
                     first += steps.sizes[step]
             whole = X_PN[count]
             for vertex in range(begin[2], end[2]):
-                p, X = bands.points[vertex], X_PN[bands.which[vertex]]
-                if bands.turned[band]:
+                p, X = bands.points[vertex], X_PN[bands.weight_index[vertex]]
+                if bands.inverted[band]:
                     for i in range(3):
                         x[i] = p[i] - X[i, 3]
                     for i in range(3):

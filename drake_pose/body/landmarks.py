@@ -16,7 +16,12 @@ from drake_pose.yaml_files import read_yaml, typed_entry
 
 @dataclass
 class Landmark:
-    """A point of the object: (3,) in the frame of the link it is fixed to [m]."""
+    """A named point of the object.
+
+    Attributes:
+        link: the link that the point is fixed to.
+        point: (3,) position in the link's frame [m].
+    """
 
     link: str = ""
     point: np.ndarray = field(default_factory=lambda: np.full(3, np.nan))
@@ -24,21 +29,27 @@ class Landmark:
 
 @dataclass(frozen=True, eq=False)
 class NodeLandmarks:
-    """Landmarks at ``points`` (n, 3) [m] in the frames of a pose tree's ``nodes`` (n,)."""
+    """Landmarks in the frames of a pose tree's nodes.
+
+    Attributes:
+        names: names of the landmarks.
+        nodes: (n,) index of each landmark's node.
+        points: (n, 3) positions in the nodes' frames [m].
+    """
 
     names: tuple[str, ...]
     nodes: Indices
     points: Array
 
     def positions(self, X_WN: Array) -> Array:
-        """The landmarks (..., n, 3) in the world [m], given X_WN (..., nodes, 4, 4)."""
+        """Return the landmarks (..., n, 3) in the world [m], given X_WN (..., nodes, 4, 4)."""
         X = np.asarray(X_WN, dtype=np.float64)[..., self.nodes, :, :]
-        turned = np.einsum("...nij,nj->...ni", X[..., :3, :3], self.points)
-        return np.asarray(turned + X[..., :3, 3])
+        rotated = np.einsum("...nij,nj->...ni", X[..., :3, :3], self.points)
+        return np.asarray(rotated + X[..., :3, 3])
 
 
 def landmarks_file(model_path: Path | str) -> Path:
-    """Where a model's landmarks are looked for: ``landmarks.yaml`` beside the model file."""
+    """Return the path of a model's landmarks: ``landmarks.yaml`` beside the model file."""
     return Path(model_path).with_name("landmarks.yaml")
 
 
@@ -50,7 +61,8 @@ def load_landmarks(model_path: Path | str) -> dict[str, Landmark]:
         landmarks:
           left_elbow: {link: left_forearm, point: [0, 0, 0]}
 
-    Raises ModelError: the file cannot be read; the message names it and the entry.
+    Raises ModelError: the file cannot be read or is invalid; the message names the file and the
+    entry.
     """
     file = landmarks_file(model_path)
     content = read_yaml(file, ModelError)
@@ -71,14 +83,16 @@ def load_landmarks(model_path: Path | str) -> dict[str, Landmark]:
 def landmark_positions(
     model: ParsedModel, landmarks: Mapping[str, Landmark], q: Array, X_WB: Array | None = None
 ) -> Array:
-    """The landmarks (n, 3) in the world [m], in the mapping's order.
+    """Return the landmarks (n, 3) in the world [m], in the mapping's order.
 
     Args:
+        model: the model.
+        landmarks: the landmarks by name.
         q: (nq,) the plant's positions.
-        X_WB: (4, 4) pose of the plant's world frame in the world; None for the identity.
+        X_WB: (4, 4) pose of the plant's world frame in the world; None: the identity.
 
     Raises:
-        SettingsError: q of the wrong size or not finite.
+        SettingsError: q has the wrong size or is not finite.
         UnknownNameError: a landmark's link does not exist.
     """
     positions = np.asarray(q, dtype=np.float64)
@@ -95,11 +109,11 @@ def landmark_positions(
 
 
 def landmarks_of_nodes(tree: PoseTree, landmarks: Mapping[str, Landmark]) -> NodeLandmarks:
-    """The landmarks in the frames of a tree's nodes (welded links included), for many poses.
+    """Return the landmarks in the frames of a tree's nodes, for fast evaluation at many poses.
 
     Raises:
         UnknownNameError: a landmark's link does not exist.
-        ModelError: it moves with no node of the tree, because nothing of it is seen.
+        ModelError: a landmark's link moves with no node, because it has no geometry.
     """
     model = tree.model
     graph = build_link_graph(model, tree.root if tree.root in model.link_meshes else None)
@@ -112,7 +126,7 @@ def landmarks_of_nodes(tree: PoseTree, landmarks: Mapping[str, Landmark]) -> Nod
         if group not in node_of_group:
             raise ModelError(
                 f"{model.path}: landmark '{name}' is on link '{landmark.link}', which moves with "
-                f"no part that is seen; use one of {', '.join(node.name for node in tree.nodes)}"
+                f"no visible part; use one of {', '.join(node.name for node in tree.nodes)}"
             )
         nodes.append(node_of_group[group])
         X_BN = kinematics.pose(model.link_index(tree.nodes[nodes[-1]].name))
@@ -125,7 +139,7 @@ def landmarks_of_nodes(tree: PoseTree, landmarks: Mapping[str, Landmark]) -> Nod
 
 
 def _body(model: ParsedModel, name: str, link: str) -> int:
-    """The index of a landmark's link among the plant's bodies."""
+    """Return the index of a landmark's link among the plant's bodies."""
     if link not in model.link_names:
         where = f"{landmarks_file(model.path)}: '{name}': {model.path.name}"
         raise UnknownNameError("link", link, model.link_names, where)

@@ -1,7 +1,8 @@
-"""URDF and SDFormat files made fit for Drake: links, joints and looks alone, file names absolute.
+"""Sanitising of URDF and SDFormat files before Drake parses them.
 
-Collision geometry, transmissions and what simulators add are never drawn and move nothing, but
-Drake refuses many files because of them.
+Only links, joints and visual geometry are kept, and file names are made absolute. Collision
+geometry, transmissions and simulator elements do not affect silhouettes, but make Drake refuse many
+files.
 """
 
 import math
@@ -29,7 +30,7 @@ from drake_pose.body.model_files import (
 )
 from drake_pose.errors import ModelError
 
-# The children that are read of an element.
+# The child elements that are read, by element.
 _READ = {
     "urdf": {
         "robot": ("link", "joint", "frame", "material", *OLD_XACRO_ELEMENTS),
@@ -51,8 +52,8 @@ _READ = {
         "limit": ("lower", "upper"),
     },
 }  # fmt: skip
-# Others that say nothing of kinematics and looks, of which no warning tells.
-_KNOWN = (
+# Other elements that do not affect kinematics or visual geometry; no warning names them.
+_IGNORED = (
     "collision", "sensor", "plugin", "kinematic", "gravity", "dynamics",
     "gazebo", "transmission", "ros2_control", "mujoco", "group", "group_state",
     "disable_collisions", "end_effector", "virtual_joint", "passive_joint", "contact", "surface",
@@ -67,19 +68,25 @@ _KNOWN = (
     "initial_position",
 )  # fmt: skip
 Limits = dict[str, tuple[float, float]]
+"""Limits (lower, upper) [rad or m] by position name."""
 
 
 def sanitise_urdf(path: Path, finder: FileFinder, warn: Warn) -> str:
-    """The text of a URDF file that Drake reads as URDF means it; it may be parsed from anywhere.
+    """Return the text of a URDF file, without relative paths, that Drake reads as URDF defines.
 
-    Raises ModelError, which names the link, joint or mesh at fault.
+    Args:
+        path: the URDF file.
+        finder: finds the files that the URDF names.
+        warn: receives a message for each part that is not read or not enforced.
+
+    Raises ModelError: the file is invalid; the message names the link, joint or mesh.
     """
     root = read_xml(path)
     if root.tag != "robot":
         raise ModelError(f"its outermost element is <{root.tag}>; a URDF file's is <robot>")
     if not root.get("name"):
         root.set("name", path.stem)
-    leave_out(root, _READ["urdf"], _KNOWN, warn)
+    leave_out(root, _READ["urdf"], _IGNORED, warn)
     refuse_macros(root)
     joints = _joints(root)
     ends = [[_end(joint, end) for end in ("parent", "child")] for joint in joints]
@@ -96,13 +103,13 @@ def sanitise_urdf(path: Path, finder: FileFinder, warn: Warn) -> str:
                 raise ModelError(
                     f"joint '{joint.get('name')}': its {end} link '{name}' does not exist"
                 )
-    _give_colours(root)
+    _inline_colours(root)
     for link in root.iterfind("link"):
         for inertial in link.findall("inertial"):
             values = " ".join(v for element in inertial.iter() for v in element.attrib.values())
             try:
                 read_numbers(values, len(values.split()), "")
-            except ModelError:  # Poses do not need it.
+            except ModelError:  # Kinematics do not need the inertia.
                 link.remove(inertial)
         for visual in link.iterfind("visual"):
             _check_urdf_visual(visual, f"link '{link.get('name')}'", path, finder)
@@ -112,23 +119,24 @@ def sanitise_urdf(path: Path, finder: FileFinder, warn: Warn) -> str:
     for joint in _joints(root):
         _check_urdf_joint(joint)
         name = joint.get("name", "")
-        if said := take_mimic(joint, name, leaders if name in leaders else (), warn):
-            ElementTree.SubElement(joint, "mimic", said)
+        if mimic := take_mimic(joint, name, leaders if name in leaders else (), warn):
+            ElementTree.SubElement(joint, "mimic", mimic)
     return xml_text(root)
 
 
 def _joints(root: ElementTree.Element) -> list[ElementTree.Element]:
-    """All joints; a path with a prefix would need a namespace."""
+    """Return all joints, ``drake:joint`` included."""
     return [child for child in root if child.tag in ("joint", "drake:joint")]
 
 
 def _end(joint: ElementTree.Element, end: str) -> str:
-    """The name of a joint's parent or child link; empty where it has none."""
+    """Return the name of a joint's "parent" or "child" link; "" if it has none."""
     element = joint.find(end)
     return "" if element is None else element.get("link", "")
 
 
 def _check_origin(element: ElementTree.Element, where: str) -> None:
+    """Raise ModelError unless an element's <origin> holds finite numbers."""
     for origin in element.iterfind("origin"):
         for name in ("xyz", "rpy"):
             if name in origin.attrib:
@@ -138,13 +146,13 @@ def _check_origin(element: ElementTree.Element, where: str) -> None:
 def _check_urdf_visual(
     visual: ElementTree.Element, where: str, path: Path, finder: FileFinder
 ) -> None:
-    """Refuse what cannot be drawn, and make file names absolute."""
+    """Refuse a <visual> that cannot be drawn, and make its file names absolute."""
     _check_origin(visual, where)
     shapes = visual.findall("geometry/*")
     if not shapes:
         raise ModelError(f"{where}: a <visual> without a shape in its <geometry>")
     for shape in shapes:
-        if _kind_of_shape(shape, where, is_urdf=True) != "mesh":
+        if _checked_shape(shape, where, is_urdf=True) != "mesh":
             continue
         name = shape.get("filename", "")
         if not name.strip():
@@ -158,7 +166,7 @@ def _check_urdf_visual(
 
 
 def _check_urdf_joint(joint: ElementTree.Element) -> None:
-    """Refuse limits that end Drake, and leave out those that do not count."""
+    """Refuse limits that make Drake abort, and remove limits that have no effect."""
     name = joint.get("name", "")
     _check_origin(joint, f"joint '{name}'")
     for axis in joint.iterfind("axis"):
@@ -185,16 +193,16 @@ def _check_urdf_joint(joint: ElementTree.Element) -> None:
             del limit.attrib["velocity"]
 
 
-def _give_colours(root: ElementTree.Element) -> None:
-    """Write out each visual's colour without a name, which Drake wants to be unique."""
-    everywhere = root.findall("material")
+def _inline_colours(root: ElementTree.Element) -> None:
+    """Replace each visual's material by an unnamed colour, because Drake needs unique names."""
+    shared = root.findall("material")
     own = [one for visual in root.iterfind("link/visual") for one in visual.iterfind("material")]
     colours: dict[str, str] = {}
-    for material in [*everywhere, *own]:
+    for material in [*shared, *own]:
         colour = _colour(material)
         if colour is not None:
             colours.setdefault(material.get("name", ""), colour)
-    for material in everywhere:
+    for material in shared:
         root.remove(material)
     for visual in root.iterfind("link/visual"):
         for material in visual.findall("material"):
@@ -206,14 +214,14 @@ def _give_colours(root: ElementTree.Element) -> None:
 
 
 def _colour(material: ElementTree.Element) -> str | None:
-    """The colour of a material, its parts within 0 and 1; None: it has none that can be read."""
+    """Return a material's colour (r, g, b, a) in [0, 1] as text; None if it has no valid one."""
     texts = (colour.get("rgba", "") for colour in material.iterfind("color"))
     return next((colour for t in texts if len(t.split()) == 4 and (colour := colour_text(t))), None)
 
 
-def _kind_of_shape(shape: ElementTree.Element, where: str, *, is_urdf: bool) -> str:
-    """What a shape is; one that cannot be drawn is refused."""
-    # How many numbers each size of each shape has: attributes in URDF, elements in SDFormat.
+def _checked_shape(shape: ElementTree.Element, where: str, *, is_urdf: bool) -> str:
+    """Return the type of a shape; raise ModelError for an unknown type or an invalid size."""
+    # The sizes of each shape and how many numbers each has: URDF attributes, SDFormat elements.
     known: dict[str, dict[str, int]] = {
         "box": {"size": 3},
         "sphere": {"radius": 1},
@@ -225,35 +233,39 @@ def _kind_of_shape(shape: ElementTree.Element, where: str, *, is_urdf: bool) -> 
     known |= {} if is_urdf else {"plane": {}, "empty": {}}
     kind = shape.tag.removeprefix("drake:")
     if kind not in known:
-        raise ModelError(f"{where}: there is no shape <{kind}>; there is: {', '.join(known)}")
+        raise ModelError(f"{where}: there is no shape <{kind}>; use one of {', '.join(known)}")
     for name, count in known[kind].items():
-        # SDFormat's own reader takes sizes that cannot be for 1 m.
+        # SDFormat's own reader replaces an invalid size by 1 m.
         texts = [shape.get(name)] if is_urdf else [one.text for one in shape.iterfind(name)]
         for text in texts:
-            no_size = is_urdf and kind == "sphere"
-            require_size(text, count, f"{where}: {name} of its {kind}", zero=no_size)
+            zero = is_urdf and kind == "sphere"
+            require_size(text, count, f"{where}: {name} of its {kind}", zero=zero)
     return kind
 
 
 def sanitise_sdf(
     path: Path, finder: FileFinder, warn: Warn, sanitise_file: Callable[[Path], Path]
 ) -> tuple[str, Limits]:
-    """The text of an SDFormat file that Drake reads; it may be parsed from anywhere.
+    """Return the text of an SDFormat file, without relative paths, that Drake reads.
 
-    ``sanitise_file`` makes a file that stands in for an included model.
+    Args:
+        path: the SDFormat file.
+        finder: finds the files that the SDFormat file names.
+        warn: receives a message for each part that is not read or not enforced.
+        sanitise_file: returns a sanitised copy of an included model file.
 
     Returns:
-        The text, and the limits (lower, upper) [rad] by position name of universal and screw
-        joints, which Drake's parser passes over.
+        The text, and the limits (lower, upper) [rad] of universal and screw joints by position
+        name, which Drake's parser does not read.
 
-    Raises ModelError: names the link, joint or mesh at fault.
+    Raises ModelError: the file is invalid; the message names the link, joint or mesh.
     """
     root = read_xml(path)
     if root.tag != "sdf":
         raise ModelError(f"its outermost element is <{root.tag}>; an SDFormat file's is <sdf>")
     if "version" not in root.attrib:
         raise ModelError('its <sdf> has no version; write for example <sdf version="1.9">')
-    leave_out(root, _READ["sdf"], _KNOWN, warn)
+    leave_out(root, _READ["sdf"], _IGNORED, warn)
     refuse_macros(root)
     for include in root.iter("include"):
         uri, name = _uri(include, "an <include> without a <uri>")
@@ -267,7 +279,7 @@ def sanitise_sdf(
         for visual in link.iterfind("visual"):
             _check_sdf_visual(visual, where, path, finder)
     for model in [*root.iter("model"), *root.iter("world")]:
-        # Drake refuses joints that couple others, or close a loop of links.
+        # Drake refuses gearboxes and joints that close a loop of links.
         for joint in model.findall("joint"):
             if joint.get("type") == "gearbox":
                 model.remove(joint)
@@ -282,8 +294,8 @@ def sanitise_sdf(
         for joint in joints:
             name = joint.get("name", "")
             for axis in [*joint.findall("axis"), *joint.findall("axis2")]:
-                if said := take_mimic(axis, name, leaders if name in leaders else (), warn):
-                    ElementTree.SubElement(joint, "drake:mimic", said)
+                if mimic := take_mimic(axis, name, leaders if name in leaders else (), warn):
+                    ElementTree.SubElement(joint, "drake:mimic", mimic)
     limits: Limits = {}
     for joint in root.iter("joint"):
         limits.update(_check_sdf_joint(joint))
@@ -291,7 +303,7 @@ def sanitise_sdf(
 
 
 def _uri(element: ElementTree.Element, missing: str) -> tuple[ElementTree.Element, str]:
-    """An element's <uri> and what it names; ModelError, which says ``missing``, where it lacks."""
+    """Return an element's <uri> and its text; ModelError says ``missing`` if there is none."""
     uri = element.find("uri")
     name = "" if uri is None else (uri.text or "").strip()
     if uri is None or not name:
@@ -300,7 +312,7 @@ def _uri(element: ElementTree.Element, missing: str) -> tuple[ElementTree.Elemen
 
 
 def _model_of_folder(folder: Path, name: str) -> Path:
-    """The newest model that a folder's model.config names."""
+    """Return the newest model file that a folder's model.config names."""
     config = folder / "model.config"
     if not config.is_file():
         raise ModelError(f"included model '{name}': {config} does not exist")
@@ -312,7 +324,7 @@ def _model_of_folder(folder: Path, name: str) -> Path:
 
 
 def _check_poses(element: ElementTree.Element, where: str) -> None:
-    """Refuse a pose that holds something else than numbers."""
+    """Raise ModelError unless an element's Euler-angle <pose> holds six finite numbers."""
     for pose in element.iterfind("pose"):
         if (pose.text or "").strip() and pose.get("rotation_format", "euler_rpy") == "euler_rpy":
             read_numbers(pose.text, 6, f"{where}: its <pose>")
@@ -321,7 +333,7 @@ def _check_poses(element: ElementTree.Element, where: str) -> None:
 def _check_sdf_visual(
     visual: ElementTree.Element, where: str, path: Path, finder: FileFinder
 ) -> None:
-    """Refuse what cannot be drawn or would be drawn otherwise, and make file names absolute."""
+    """Refuse a <visual> that Drake cannot draw correctly, and make its file names absolute."""
     _check_poses(visual, where)
     for material in visual.findall("material"):
         for colour in material.findall("diffuse"):
@@ -329,14 +341,14 @@ def _check_sdf_visual(
             if colour.text is None:
                 material.remove(colour)
     for shape in visual.findall("geometry/*"):
-        if _kind_of_shape(shape, where, is_urdf=False) != "mesh":
+        if _checked_shape(shape, where, is_urdf=False) != "mesh":
             continue
         uri, name = _uri(shape, f"{where}: a mesh without a <uri>")
         uri.text = f"file://{finder.resolve(name, path, f'{where}: mesh')}"
         if shape.find("submesh") is not None:
             raise ModelError(
-                f"{where}: Drake shows the whole mesh '{name}', not its <submesh> alone; put that "
-                "part into a file of its own"
+                f"{where}: Drake shows the whole mesh '{name}', not its <submesh> alone; save the "
+                "submesh as a file of its own"
             )
         scale = shape.findtext("scale")
         if scale is not None:
@@ -344,11 +356,11 @@ def _check_sdf_visual(
 
 
 def _check_sdf_joint(joint: ElementTree.Element) -> Limits:
-    """Refuse limits that Drake refuses; returns those that its parser passes over."""
+    """Refuse limits that Drake refuses; return the limits that Drake's parser does not read."""
     name, kind = joint.get("name", "(unnamed)"), joint.get("type", "")
     _check_poses(joint, f"joint '{name}'")
     suffixes = {"universal": {"axis": "_qx", "axis2": "_qy"}, "screw": {"axis": ""}}
-    passed_over: Limits = {}
+    unread: Limits = {}
     for axis in [*joint.findall("axis"), *joint.findall("axis2")]:
         xyz = axis.findtext("xyz")
         if xyz is not None and not any(read_numbers(xyz, 3, f"joint '{name}': its <xyz>")):
@@ -356,5 +368,5 @@ def _check_sdf_joint(joint: ElementTree.Element) -> Limits:
         texts = [axis.findtext(f"limit/{side}") for side in ("lower", "upper")]
         lower, upper = read_limits(texts[0], texts[1], name)
         if axis.tag in suffixes.get(kind, {}) and lower is not None and upper is not None:
-            passed_over[f"{name}{suffixes[kind][axis.tag]}"] = (lower, upper)
-    return passed_over
+            unread[f"{name}{suffixes[kind][axis.tag]}"] = (lower, upper)
+    return unread

@@ -1,7 +1,8 @@
-"""Links and joints as a graph: welded links joined, joints measured, ready for any root.
+"""The graph of welded link groups and joints, from which trees with any root are built.
 
-Every entry of the transform of the supported joints is, in each position separately, a combination
-of 1, cos q, sin q and q, so the plant at four values of each position determines it for all values.
+Each entry of the transform X_AC of a supported joint is a multilinear function of the basis (1, cos
+q, sin q, q) of each of its positions q. Poses of the plant at four values of each position
+therefore determine the transform for all values.
 """
 
 import itertools
@@ -20,7 +21,7 @@ from drake_pose.errors import ModelError
 
 
 def inverse_transforms(X: Array) -> Array:
-    """Inverses of rigid transforms (..., 4, 4)."""
+    """Return the inverses of rigid transforms (..., 4, 4)."""
     inverse = np.zeros_like(X)
     R_transposed = np.swapaxes(X[..., :3, :3], -1, -2)
     inverse[..., :3, :3] = R_transposed
@@ -31,10 +32,13 @@ def inverse_transforms(X: Array) -> Array:
 
 @dataclass(frozen=True)
 class JointMap:
-    """The pose X_AC(values) of a joint's outer link frame C in its inner link frame A.
+    """The pose X_AC(q) of a joint's outer link frame C in its inner link frame A.
 
-    ``coefficients``: (4^k, 16), a row for each product of basis functions of the k positions;
-    ``inverted``: whether a chain walks the joint inwards.
+    Attributes:
+        coefficients: (4^k, 16), one row of X_AC's entries for each product of basis functions of
+            the k positions.
+        position_count: number of positions k.
+        inverted: whether a chain traverses the joint inwards, from C to A.
     """
 
     coefficients: Array
@@ -43,15 +47,20 @@ class JointMap:
 
     @staticmethod
     def measure(pose: Callable[[Array], Array], position_count: int, name: str) -> "JointMap":
-        """Determine the map from X_AC (4, 4) of the plant at given values (k,), k at most three.
+        """Fit the map to poses of the plant.
 
-        Raises ModelError, which names the joint, where it does not move as this class assumes.
+        Args:
+            pose: returns X_AC (4, 4) of the plant at values (k,) [rad or m].
+            position_count: number of positions k, at most three.
+            name: the joint's name, for messages.
+
+        Raises ModelError: the joint does not move as a combination of the basis functions.
         """
-        at = np.array([0.0, np.pi / 2.0, np.pi, -np.pi / 2.0])
-        samples = np.array(list(itertools.product(at, repeat=position_count)))
+        nodes = np.array([0.0, np.pi / 2.0, np.pi, -np.pi / 2.0])
+        samples = np.array(list(itertools.product(nodes, repeat=position_count)))
         samples = samples.reshape(-1, position_count)
         measured = np.array([pose(values).reshape(16) for values in samples])
-        inverse = np.linalg.inv(_basis(at))
+        inverse = np.linalg.inv(_basis(nodes))
         kronecker: NDArray[Any] = np.eye(1)
         for _ in range(position_count):
             kronecker = np.kron(kronecker, inverse)
@@ -63,7 +72,10 @@ class JointMap:
         return joint_map
 
     def transforms(self, values: NDArray[Any]) -> NDArray[Any]:
-        """X_AC (n, 4, 4), inverted or not, at values (n, k) [rad or m], which may be complex."""
+        """Return X_AC (n, 4, 4) at values (n, k) [rad or m], which may be complex.
+
+        The result is not inverted, whether or not ``inverted`` is set.
+        """
         products = np.ones((len(values), 1))
         for column in range(self.position_count):
             basis = _basis(values[:, column])
@@ -74,7 +86,10 @@ class JointMap:
 
 
 def chain_transforms(steps: Sequence[JointMap], values: NDArray[Any]) -> NDArray[Any]:
-    """X (n, 4, 4) over several joints in turn, at their values (n, k), which may be complex."""
+    """Return the transforms (n, 4, 4) along a chain of joints at their values (n, k) [rad or m].
+
+    The values may be complex, for derivatives by complex steps.
+    """
     X: NDArray[Any] = np.broadcast_to(np.eye(4), (len(values), 4, 4))
     start = 0
     for step in steps:
@@ -86,7 +101,7 @@ def chain_transforms(steps: Sequence[JointMap], values: NDArray[Any]) -> NDArray
 
 
 def _basis(values: NDArray[Any]) -> NDArray[Any]:
-    """The basis functions (n, 4): 1, cos q, sin q, q."""
+    """Return the basis functions (n, 4) of values (n,): 1, cos q, sin q, q."""
     return np.stack([np.ones_like(values), np.cos(values), np.sin(values), values], axis=-1)
 
 
@@ -95,8 +110,10 @@ class LinkGroup:
     """Links welded to each other, the one nearest to the world first.
 
     Attributes:
-        name, body: the link and the index of the plant's body whose frame is the group's frame.
-        mesh: the geometry of all its links in the group's frame.
+        name: the link whose frame is the group's frame.
+        links: names of all links of the group.
+        body: index of the named link among the plant's bodies.
+        mesh: the visual geometry of all links in the group's frame.
     """
 
     name: str
@@ -107,11 +124,14 @@ class LinkGroup:
 
 @dataclass(frozen=True)
 class JointEdge:
-    """A joint (its index in the plant) between two groups; the inner one is nearer to the world.
+    """A joint between two groups.
 
     Attributes:
-        positions: indices into q.
-        joint_map: X_inner_outer(values); None for a floating joint.
+        joint: index of the joint in the plant.
+        inner: index of the group nearer to the world.
+        outer: index of the group farther from the world.
+        positions: indices of the joint's positions in q.
+        joint_map: the pose of the outer group in the inner one; None for a floating joint.
     """
 
     joint: int
@@ -121,32 +141,32 @@ class JointEdge:
     joint_map: JointMap | None
 
     def other(self, group: int) -> int:
-        """The group at its other end."""
+        """Return the index of the group at the other end."""
         return self.inner if group == self.outer else self.outer
 
 
 @dataclass(frozen=True)
 class LinkGraph:
-    """All groups, group 0 holding the world, and all edges; a tree."""
+    """All groups and the joints between them, which form a tree; group 0 holds the world."""
 
     groups: tuple[LinkGroup, ...]
     edges: tuple[JointEdge, ...]
 
     def group_of(self, link: str) -> int:
-        """The group that a link belongs to; the link must exist."""
+        """Return the index of the group that a link belongs to; the link must exist."""
         return next(index for index, group in enumerate(self.groups) if link in group.links)
 
-    def seen(self, group: int) -> bool:
-        """Whether a group has geometry."""
+    def has_geometry(self, group: int) -> bool:
+        """Whether a group has visual geometry."""
         return not self.groups[group].mesh.is_empty
 
     def edges_at(self, group: int) -> list[JointEdge]:
-        """The edges that end at a group."""
+        """Return the edges that touch a group."""
         return [edge for edge in self.edges if group in (edge.inner, edge.outer)]
 
 
 class PlantKinematics:
-    """Poses of bodies in the plant's world, with a context of its own."""
+    """Forward kinematics of the plant's bodies, with a context of its own."""
 
     def __init__(self, model: ParsedModel) -> None:
         """Start at the model's default positions."""
@@ -155,24 +175,32 @@ class PlantKinematics:
         self._defaults = model.default_positions
 
     def pose(self, body: int, positions: Mapping[int, float] | None = None) -> Array:
-        """X_B_body (4, 4), B the plant's world, at defaults except for the given positions."""
+        """Return the pose (4, 4) of a body in the plant's world frame at the default positions.
+
+        ``positions`` [rad or m] by index in q replace default positions.
+        """
         q = np.array(self._defaults)
         for index, value in (positions or {}).items():
             q[index] = value
         return self.pose_at(body, q)
 
     def pose_at(self, body: int, q: Array) -> Array:
-        """X_B_body (4, 4) at q (nq,)."""
-        positions: Any = q  # Drake's type stubs name no array type that numpy has.
+        """Return the pose (4, 4) of a body in the plant's world frame at q (nq,)."""
+        positions: Any = q  # Drake's type stubs do not accept numpy's array type.
         self.plant.SetPositions(self.context, positions)
         X = self.plant.EvalBodyPoseInWorld(self.context, self.plant.get_body(BodyIndex(body)))
         return np.asarray(X.GetAsMatrix4())
 
 
 def build_link_graph(model: ParsedModel, preferred_frame: str | None) -> LinkGraph:
-    """Walk the plant outwards from the world; ModelError where the joints form a loop.
+    """Build the graph by traversing the plant outwards from the world.
 
-    ``preferred_frame``: a link whose frame its group shall have; None: the first with geometry.
+    Args:
+        model: the model whose plant is traversed.
+        preferred_frame: a link whose frame its group takes; None: each group takes the frame of its
+            first link with geometry.
+
+    Raises ModelError: the joints form a loop.
     """
     plant = model.plant
     joints = [plant.get_joint(index) for index in plant.GetJointIndices()]
@@ -213,11 +241,11 @@ def build_link_graph(model: ParsedModel, preferred_frame: str | None) -> LinkGra
 def _make_group(
     model: ParsedModel, kinematics: PlantKinematics, bodies: list[int], preferred_frame: str | None
 ) -> LinkGroup:
-    """Join the meshes of welded bodies in one frame."""
+    """Return the group of welded bodies, their meshes joined in one frame."""
     names = link_names(model.plant)
     links = tuple(names[body] for body in bodies)
-    seen = [name for name in links if name in model.link_meshes]
-    name = (seen or links)[0]
+    with_geometry = [name for name in links if name in model.link_meshes]
+    name = (with_geometry or links)[0]
     if preferred_frame is not None and preferred_frame in links:
         name = preferred_frame
     body = bodies[links.index(name)]
@@ -235,13 +263,14 @@ def _make_group(
 def _make_edge(
     kinematics: PlantKinematics, groups: tuple[LinkGroup, ...], joint: Joint, inner: int, outer: int
 ) -> JointEdge:
-    """Measure one joint."""
+    """Return the edge of one joint, with its map fitted to the plant."""
     start, count = joint.position_start(), joint.num_positions()
     positions = tuple(range(start, start + count))
     if joint.type_name() in FLOATING_TYPES:
         return JointEdge(int(joint.index()), inner, outer, positions, None)
 
     def pose(values: Array) -> Array:
+        """Return the outer group's pose (4, 4) in the inner group at the joint's values."""
         given = dict(zip(positions, values, strict=True))
         X_BA = kinematics.pose(groups[inner].body, given)
         return inverse_transforms(X_BA) @ kinematics.pose(groups[outer].body, given)

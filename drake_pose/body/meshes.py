@@ -1,4 +1,4 @@
-"""Triangle meshes, from mesh files and to files that Drake's renderer draws."""
+"""Triangle meshes, read from mesh files and written as files that Drake's renderer draws."""
 
 import functools
 import hashlib
@@ -42,16 +42,18 @@ from drake_pose.errors import ModelError
 
 @dataclass(frozen=True, eq=False)
 class TriangleMesh:
-    """A surface of triangles; not necessarily closed, not necessarily connected. Read-only.
+    """A surface of triangles, which need not be closed or connected. Immutable.
 
-    ``vertices``: (n, 3) [m] in the frame of the link; ``triangles``: (m, 3) indices into them.
+    Attributes:
+        vertices: (n, 3) float64 points [m], usually in a link's frame.
+        triangles: (m, 3) int32 indices of vertices.
     """
 
     vertices: Array
     triangles: NDArray[np.int32]
 
     def __post_init__(self) -> None:
-        """Make private read-only copies, so that nobody can change a mesh that others hold."""
+        """Store private read-only copies of the arrays."""
         vertices = np.array(self.vertices, dtype=np.float64).reshape(-1, 3)
         triangles = np.array(self.triangles, dtype=np.int32).reshape(-1, 3)
         vertices.setflags(write=False)
@@ -61,25 +63,25 @@ class TriangleMesh:
 
     @staticmethod
     def empty() -> "TriangleMesh":
-        """A mesh without triangles: a link that is not seen."""
+        """Return a mesh without triangles."""
         return TriangleMesh(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int32))
 
     @property
     def is_empty(self) -> bool:
-        """True where there is nothing to draw."""
+        """Whether the mesh has no triangles."""
         return len(self.triangles) == 0
 
     def transformed(self, X_AB: Array) -> "TriangleMesh":
-        """The same surface in frame A, given this mesh in frame B and X_AB (4, 4)."""
+        """Return the surface in frame A, given this mesh in frame B and X_AB (4, 4)."""
         vertices_A = self.vertices @ X_AB[:3, :3].T + X_AB[:3, 3]
         return TriangleMesh(vertices_A, self.triangles)
 
 
 def merge_duplicate_vertices(mesh: TriangleMesh) -> TriangleMesh:
-    """Join vertices at exactly the same place, and drop triangles that lose their area by it."""
+    """Return the mesh with equal vertices merged, and without degenerate triangles."""
     if mesh.is_empty:
         return TriangleMesh.empty()
-    # As np.unique of rows, which takes five times as long for a million of them.
+    # Five times as fast as np.unique over a million rows.
     by_place = np.lexsort(mesh.vertices.T)
     ordered = mesh.vertices[by_place]
     begins = np.concatenate([[True], np.any(ordered[1:] != ordered[:-1], axis=1)])
@@ -92,7 +94,7 @@ def merge_duplicate_vertices(mesh: TriangleMesh) -> TriangleMesh:
 
 
 def join_meshes(meshes: Sequence[TriangleMesh]) -> TriangleMesh:
-    """All triangles of several meshes that are given in one common frame."""
+    """Return one mesh with the triangles of several meshes in a common frame."""
     parts = [mesh for mesh in meshes if not mesh.is_empty]
     if not parts:
         return TriangleMesh.empty()
@@ -102,7 +104,7 @@ def join_meshes(meshes: Sequence[TriangleMesh]) -> TriangleMesh:
 
 
 def is_watertight(mesh: TriangleMesh) -> bool:
-    """True where every edge is used exactly once in each of its two directions."""
+    """Return whether every edge is used exactly once in each of its two directions."""
     if mesh.is_empty:
         return False
     edges = np.concatenate([mesh.triangles[:, [0, 1]], mesh.triangles[:, [1, 2]]])
@@ -114,16 +116,16 @@ def is_watertight(mesh: TriangleMesh) -> bool:
 
 
 read_meshes: dict[Path, TriangleMesh] = {}
-"""The meshes of the files that were read last, at the files' own size."""
+"""The 64 meshes read last, unscaled, by resolved file path."""
 
 
 def read_mesh_file(path: Path, scale: Array | None = None) -> TriangleMesh:
-    """The triangles of an OBJ, glTF, GLB, STL or DAE file, duplicate vertices merged.
+    """Return the triangles of an OBJ, glTF, GLB, STL or DAE file, with duplicate vertices merged.
 
-    ``scale``: (3,) factors along x, y and z.
+    ``scale``: (3,) factors along x, y and z; None: the file's own size.
 
-    Raises ModelError: unknown extension, unreadable, no triangle, or a coordinate that is not
-    finite.
+    Raises ModelError: the extension is unknown, the file cannot be read or holds no triangle, or a
+    coordinate is not finite.
     """
     path = path.resolve()
     if path not in read_meshes:
@@ -138,7 +140,7 @@ def read_mesh_file(path: Path, scale: Array | None = None) -> TriangleMesh:
 
 
 def _read_unscaled(path: Path) -> TriangleMesh:
-    """As read_mesh_file, at the file's own size."""
+    """As ``read_mesh_file``, at the file's own size and without the cache."""
     if not path.is_file():
         raise ModelError(f"mesh file {path} does not exist")
     extension = path.suffix.lower()
@@ -168,11 +170,11 @@ def _read_unscaled(path: Path) -> TriangleMesh:
 
 
 def _read_obj(path: Path) -> TriangleMesh:
-    """An OBJ file as Drake itself reads it."""
-    # Drake takes a coordinate that is not a number for zero. To look line by line takes long.
+    """Read an OBJ file as Drake does."""
+    # Drake reads NaN and infinite coordinates as zero. Searching line by line is slow.
     data = path.read_bytes().lower()
-    odd = b"nan" in data or b"inf" in data
-    if odd and re.search(rb"^v\s[^\n]*(nan|inf)", data, re.MULTILINE):
+    may_be_invalid = b"nan" in data or b"inf" in data
+    if may_be_invalid and re.search(rb"^v\s[^\n]*(nan|inf)", data, re.MULTILINE):
         raise ModelError(f"mesh file {path}: a vertex coordinate is not a finite number")
     try:
         surface = ReadObjToTriangleSurfaceMesh(path)
@@ -188,15 +190,15 @@ def _read_obj(path: Path) -> TriangleMesh:
 
 
 def _read_gltf(path: Path) -> TriangleMesh:
-    """A glTF or GLB file, all its parts at their places."""
+    """Read a glTF or GLB file with all its parts in place."""
     mesh = _read_with_trimesh(path, path, path.suffix)
-    # glTF's vertical axis is y, Drake's is z.
+    # Up is y in glTF and z in Drake.
     x, y, z = mesh.vertices.T
     return TriangleMesh(np.stack([x, -z, y], axis=1), mesh.triangles)
 
 
 def _read_stl(path: Path) -> TriangleMesh:
-    """A binary STL file, whatever its header says, or one of text in any encoding."""
+    """Read a binary STL file, whatever its header says, or a text STL file of any encoding."""
     data = path.read_bytes()
     count = int.from_bytes(data[80:84], "little")
     if len(data) == 84 + 50 * count and count > 0:
@@ -209,33 +211,35 @@ def _read_stl(path: Path) -> TriangleMesh:
     words = data.lower().split()
     if not words or not words[0].startswith(b"solid") or b"facet" not in words[:100]:
         raise ModelError(
-            f"mesh file {path} says that it holds {count} triangles, which take {84 + 50 * count} "
-            f"bytes, but it has {len(data)}: it is truncated or damaged"
+            f"mesh file {path} declares {count} triangles, which take {84 + 50 * count} bytes, "
+            f"but has {len(data)} bytes: it is truncated or damaged"
         )
     text = data.decode("ascii", "replace").replace("\ufffd", "?").encode()
     mesh = _read_with_trimesh(path, io.BytesIO(text), ".stl")
     count = max(words.count(b"facet"), words.count(b"vertex") // 3)
     if len(mesh.triangles) != count:
         raise ModelError(
-            f"mesh file {path} begins {count} facets, and {len(mesh.triangles)} can be read: it is "
+            f"mesh file {path} has {count} facets, but {len(mesh.triangles)} can be read: it is "
             "truncated or damaged"
         )
     return mesh
 
 
 def _read_dae(path: Path) -> TriangleMesh:
-    """A COLLADA file, all its parts at their places, in metres; textures are not looked at."""
+    """Read a COLLADA file in metres with all its parts in place; ignore materials."""
     try:
-        import collada  # Slow to import, and needed for DAE files alone.
+        import collada  # Slow to import, and needed for DAE files only.
     except ModuleNotFoundError as error:
         raise ModelError(f"mesh file {path}: install 'pycollada' to read DAE files") from error
-    looks = ("library_images", "library_effects", "library_materials", "bind_material")
+    appearance = ("library_images", "library_effects", "library_materials", "bind_material")
     parts = []
     try:
-        # A material that names a missing texture would take its triangles with it.
+        # pycollada drops triangles whose material names a missing texture.
         root = ElementTree.parse(path).getroot()
         for parent in list(root.iter()):
-            parent[:] = [child for child in parent if child.tag.rpartition("}")[2] not in looks]
+            parent[:] = [
+                child for child in parent if child.tag.rpartition("}")[2] not in appearance
+            ]
         document = collada.Collada(io.BytesIO(ElementTree.tostring(root)))
         if document.scene is None:
             raise ModelError(f"mesh file {path} has no scene: nothing would be drawn")
@@ -248,13 +252,13 @@ def _read_dae(path: Path) -> TriangleMesh:
     except (*_READER_ERRORS, collada.common.DaeError) as error:
         raise ModelError(f"mesh file {path} cannot be read: {error}") from error
     mesh = join_meshes(parts)
-    # As in RViz and Gazebo, <unit> is applied (pinocchio does not), and <up_axis> is not.
+    # As in RViz and Gazebo, <unit> is applied and <up_axis> ignored; pinocchio ignores <unit>.
     unit = document.assetInfo.unitmeter
     return TriangleMesh(mesh.vertices * (1.0 if unit is None else unit), mesh.triangles)
 
 
 def _read_with_trimesh(path: Path, source: Path | io.BytesIO, extension: str) -> TriangleMesh:
-    """What trimesh reads from a file, or from the content of one."""
+    """Return the mesh that trimesh reads from a file or from its content."""
     import trimesh  # Slow to import, and needed for few models.
 
     try:
@@ -264,7 +268,7 @@ def _read_with_trimesh(path: Path, source: Path | io.BytesIO, extension: str) ->
     return TriangleMesh(surface.vertices, surface.faces)
 
 
-# What trimesh, pycollada and their readers raise for broken files.
+# The exceptions that trimesh, pycollada and their readers raise for broken files.
 _READER_ERRORS = (
     ValueError,
     LookupError,
@@ -278,7 +282,7 @@ _READER_ERRORS = (
 
 
 def is_drawn_by_drake(path: Path) -> bool:
-    """True where Drake's VTK renderer draws this mesh file: glTF, and OBJ with normals."""
+    """Return whether Drake's VTK renderer draws a mesh file: glTF, or OBJ with normals."""
     extension = path.suffix.lower()
     if extension == ".gltf":
         return True
@@ -290,32 +294,35 @@ def is_drawn_by_drake(path: Path) -> bool:
 
 @functools.cache
 def workspace() -> Path:
-    """This process's temporary folder for converted files; it is removed at exit."""
+    """Return this process's temporary folder for converted files, which is removed at exit."""
     folder = tempfile.mkdtemp(prefix="drake_pose_")
-    # Not atexit: processes that multiprocessing starts end without it. A fork forgets it, and
-    # leaves the folder to the process that made it.
+    # atexit does not run in processes of multiprocessing. A fork does not inherit Finalize, so
+    # only the process that made the folder removes it.
     Finalize(None, shutil.rmtree, (folder, True), exitpriority=0)
     return Path(folder)
 
 
 def drawable_file(path: Path) -> Path:
-    """An OBJ file with normals, made on the first call, that shows what ``path`` shows."""
+    """Return an OBJ file with normals that shows the same surface as ``path``; make it once."""
     path = path.resolve()
     return _drawable_version(path, path.stat().st_mtime_ns if path.exists() else 0)
 
 
 @functools.cache
-def _drawable_version(path: Path, _: int) -> Path:
-    """As drawable_file, for the file as it was at some time."""
+def _drawable_version(path: Path, _modified: int) -> Path:
+    """As ``drawable_file``; the modification time keys the cache."""
     return write_obj(read_mesh_file(path), path.stem)
 
 
-# The meshes of the files that write_obj wrote: nobody needs to read those.
+# The meshes of the files that write_obj wrote, which need not be read again.
 _written: dict[Path, TriangleMesh] = {}
 
 
 def write_obj(mesh: TriangleMesh, name: str) -> Path:
-    """Write an OBJ file with normals, whose name begins with ``name``, into a temporary folder."""
+    """Write an OBJ file with normals into a temporary folder and return its path.
+
+    The file name begins with ``name``; equal meshes of one name share a file.
+    """
     digest = hashlib.sha256(mesh.vertices.tobytes() + mesh.triangles.tobytes()).hexdigest()[:16]
     path = workspace() / f"{re.sub(r'[^A-Za-z0-9_-]', '_', name)}_{digest}.obj"
     if path not in _written and not path.exists():
@@ -325,12 +332,12 @@ def write_obj(mesh: TriangleMesh, name: str) -> Path:
 
 
 def was_written(path: Path) -> bool:
-    """Whether write_obj wrote a file."""
+    """Return whether ``write_obj`` wrote a file."""
     return path in _written
 
 
 def _write_with_normals(mesh: TriangleMesh, path: Path) -> None:
-    """Write an OBJ file whose vertices have the mean normals of the triangles about them."""
+    """Write an OBJ file whose vertex normals are area-weighted means of triangle normals."""
     triangles = mesh.triangles
     a, b, c = (mesh.vertices[triangles[:, corner]] for corner in range(3))
     area_normals = np.cross(b - a, c - a)
@@ -342,7 +349,7 @@ def _write_with_normals(mesh: TriangleMesh, path: Path) -> None:
         axis=1,
     )
     normals = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
-    # A process that dies of what it does next leaves a whole file or none to that which forked it.
+    # If this process crashes, its parent process finds a complete file or none.
     unfinished = path.with_suffix(".part")
     with unfinished.open("w", encoding="ascii") as file:
         _write_lines(file, "v %.15g %.15g %.15g\n", mesh.vertices)
@@ -352,14 +359,14 @@ def _write_with_normals(mesh: TriangleMesh, path: Path) -> None:
 
 
 def _write_lines(file: TextIO, line: str, rows: NDArray[Any]) -> None:
-    """Write one line a row, many rows at once: a million rows take seconds otherwise."""
+    """Write one formatted line per row, in large chunks for speed."""
     for start in range(0, len(rows), 65536):
         chunk = rows[start : start + 65536]
         file.write((line * len(chunk)) % tuple(chunk.ravel().tolist()))
 
 
 def shape_mesh(shape: Shape) -> TriangleMesh:
-    """A Drake shape as triangles in its own frame; ModelError where it has no surface here."""
+    """Return a Drake shape as triangles in its own frame; ModelError if it has no surface."""
     if isinstance(shape, Box):
         ends = (-0.5, 0.5)
         corners = np.array([[x, y, z] for x in ends for y in ends for z in ends])
@@ -370,17 +377,17 @@ def shape_mesh(shape: Shape) -> TriangleMesh:
         return _ellipsoid_mesh(*[shape.radius()] * 3)
     if isinstance(shape, Ellipsoid):
         return _ellipsoid_mesh(shape.a(), shape.b(), shape.c())
-    # Drake turns VTK's cylinder a quarter about its axis, so the first vertex lies on y.
+    # Drake rotates VTK's cylinder by a quarter turn, so the first vertex lies on y.
     if isinstance(shape, Cylinder):
         half, radii = 0.5 * shape.length(), shape.radius() * np.array([0.0, 1.0, 1.0, 0.0])
         return _round_mesh(radii, np.array([half, half, -half, -half]), np.pi / 2.0)
     if isinstance(shape, Capsule):
         quarter, half = np.linspace(0.0, np.pi / 2.0, 49), 0.5 * shape.length()
         radii, heights = shape.radius() * np.sin(quarter), shape.radius() * np.cos(quarter) + half
-        every = np.concatenate([radii, radii[::-1]]), np.concatenate([heights, -heights[::-1]])
-        return _round_mesh(*every, np.pi / 2.0)
+        profile = np.concatenate([radii, radii[::-1]]), np.concatenate([heights, -heights[::-1]])
+        return _round_mesh(*profile, np.pi / 2.0)
     if isinstance(shape, (Mesh, Convex)) and not shape.source().is_path():
-        raise ModelError("a mesh that lies in memory cannot be read; write it to a file")
+        raise ModelError("an in-memory mesh cannot be read; write it to a file")
     if isinstance(shape, Mesh):
         return read_mesh_file(Path(shape.source().path()), np.asarray(shape.scale3()))
     if isinstance(shape, Convex):
@@ -389,7 +396,7 @@ def shape_mesh(shape: Shape) -> TriangleMesh:
 
 
 def _convex_mesh(shape: Convex) -> TriangleMesh:
-    """The convex hull of a mesh file, its polygons cut into fans."""
+    """Return the convex hull of a mesh file, its polygons split into triangle fans."""
     path = Path(shape.source().path())
     read_mesh_file(path)
     try:
@@ -406,14 +413,20 @@ def _convex_mesh(shape: Convex) -> TriangleMesh:
 
 
 def body_mesh(plant: MultibodyPlant, scene_graph: SceneGraph, body: RigidBody) -> TriangleMesh:
-    """One body's visual geometry in its frame, less ground planes; ModelError names the link."""
+    """Return the visual geometry of one body in its frame, without ground planes.
+
+    Raises ModelError, which names the link: a shape cannot be drawn.
+    """
     return join_meshes(list(labelled_meshes(plant, scene_graph, body).values()))
 
 
 def labelled_meshes(
     plant: MultibodyPlant, scene_graph: SceneGraph, body: RigidBody
 ) -> dict[int, TriangleMesh]:
-    """What is rendered of a body, in its frame, by render label; ModelError names the link."""
+    """Return the rendered geometry of one body in its frame, by label, without ground planes.
+
+    Raises ModelError, which names the link: a shape cannot be drawn.
+    """
     inspector = scene_graph.model_inspector()
     meshes: dict[int, list[TriangleMesh]] = {}
     for geometry in plant.GetVisualGeometriesForBody(body):
@@ -435,12 +448,18 @@ def labelled_meshes(
 def make_drawable(
     plant: MultibodyPlant, scene_graph: SceneGraph | None, instances: Iterable[ModelInstanceIndex]
 ) -> None:
-    """Replace mesh files that Drake's renderer would silently not draw, and hide ground planes.
+    """Replace mesh files that Drake's renderer would silently skip, and hide ground planes.
 
-    STL, DAE, GLB and OBJ without normals become OBJ with normals in a temporary folder. A half
-    space loses its perception role. The world's own geometry is looked at with the instances'.
+    STL, DAE and GLB files and OBJ files without normals are replaced by OBJ files with normals in a
+    temporary folder. A half space loses its perception role. The world body's geometry is included.
 
-    Raises ModelError: a mesh file cannot be drawn, or one must be replaced and scene_graph is None.
+    Args:
+        plant: the plant that registered the geometry.
+        scene_graph: the SceneGraph with the geometry; None: a file that must be replaced is an
+            error.
+        instances: the model instances whose bodies are processed.
+
+    Raises ModelError: a mesh file cannot be drawn, or ``scene_graph`` is missing.
     """
     bodies = [plant.get_body(index) for i in instances for index in plant.GetBodyIndices(i)]
     source = plant.get_source_id()
@@ -463,7 +482,7 @@ def make_drawable(
                 path = Path(shape.source().path())
                 if path.is_file() and is_drawn_by_drake(path):
                     continue
-                scale: Any = shape.scale3()  # Drake's type stubs name no array type that numpy has.
+                scale: Any = shape.scale3()  # Drake's type stubs do not accept numpy's array type.
                 try:
                     replacement = type(shape)(drawable_file(path), scale)
                 except ModelError as error:
@@ -472,26 +491,33 @@ def make_drawable(
 
 
 def draws_given_files(scene_graph: SceneGraph) -> bool:
-    """Whether Drake's renderer reads files that were not written here: meshes, or textures."""
+    """Return whether Drake's renderer reads meshes or textures not written by this package."""
     inspector = scene_graph.model_inspector()
     for geometry in inspector.GetAllGeometryIds(Role.kPerception):
-        shape, looks = inspector.GetShape(geometry), inspector.GetPerceptionProperties(geometry)
+        shape, properties = (
+            inspector.GetShape(geometry),
+            inspector.GetPerceptionProperties(geometry),
+        )
         is_file = isinstance(shape, (Mesh, Convex)) and shape.source().is_path()
         if is_file and not was_written(Path(shape.source().path())):
             return True
-        if looks.HasProperty("phong", "diffuse_map"):
+        if properties.HasProperty("phong", "diffuse_map"):
             return True
     return False
 
 
 def _round_mesh(
-    radii: Array, heights: Array, first: float = 0.0, resolution: int = 50
+    radii: Array, heights: Array, start_angle: float = 0.0, resolution: int = 50
 ) -> TriangleMesh:
-    """A surface about z, closed between rings of radii (n,) at heights (n,) [m], the highest first.
+    """Return a closed surface of revolution about z.
 
-    The first vertex of each ring lies at the angle ``first`` [rad] from x.
+    Args:
+        radii: (n,) ring radii [m], from the top down.
+        heights: (n,) ring heights [m], from the top down.
+        start_angle: angle [rad] of each ring's first vertex from x.
+        resolution: number of vertices of a ring.
     """
-    angle = first + np.arange(resolution) * (2.0 * np.pi / resolution)
+    angle = start_angle + np.arange(resolution) * (2.0 * np.pi / resolution)
     level = np.broadcast_to(heights[:, None], (len(heights), resolution))
     points = np.stack([np.outer(radii, np.cos(angle)), np.outer(radii, np.sin(angle)), level], -1)
     index = np.arange(level.size).reshape(level.shape)
@@ -503,9 +529,9 @@ def _round_mesh(
 
 
 def _ellipsoid_mesh(a: float, b: float, c: float) -> TriangleMesh:
-    """An ellipsoid with half axes a, b, c [m] along x, y and z."""
+    """Return an ellipsoid with half axes a, b, c [m] along x, y and z."""
     polar = np.linspace(0.0, np.pi, 51)
     sine = np.sin(polar)
-    sine[[0, -1]] = 0.0  # Both poles are exact.
+    sine[[0, -1]] = 0.0  # Without rounding, so that each pole becomes one vertex.
     ball = _round_mesh(sine, np.cos(polar))
     return TriangleMesh(ball.vertices * (a, b, c), ball.triangles)

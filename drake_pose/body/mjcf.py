@@ -1,9 +1,9 @@
-"""MJCF files as MuJoCo's own compiler reads them, in the plain MJCF that Drake reads alike.
+"""Sanitising of MJCF files: MuJoCo compiles them, and plain MJCF that Drake reads alike is written.
 
-Drake 1.51 forgets inherited settings, and puts all but the last joint of a body at the parent's
+Drake 1.51 ignores inherited defaults, and places all but the last joint of a body at the parent's
 origin (``multibody/parsing/detail_mujoco_parser.cc``, ParseBody). MuJoCo applies the joints of a
-body one after the other, each about its ``pos`` in the body's frame: as nested bodies with one
-joint each. Collision is left out.
+body one after the other, each about its ``pos`` in the body's frame. They are therefore written as
+nested bodies with one joint each. Collision geometry is left out.
 """
 
 import itertools
@@ -20,23 +20,27 @@ from drake_pose.body.model_files import Warn, read_xml, xml_text
 from drake_pose.errors import ModelError
 
 _ALMOST_MASSLESS = {"pos": "0 0 0", "mass": "1e-6", "diaginertia": "1e-9 1e-9 1e-9"}
-# The group of geoms that are not drawn.
+# The geom group that marks geoms as not drawn.
 _NOT_DRAWN = 5
-# How many of a shape's three sizes count, by MuJoCo's name of the shape; others are not drawn.
+# Number of sizes of each drawn shape, by MuJoCo's name of the shape.
 _SIZES = {"plane": 3, "sphere": 1, "capsule": 2, "ellipsoid": 3, "cylinder": 2, "box": 3, "mesh": 0}
 
 
-Couple = tuple[str, str, float, float]
-"""A joint, the one that it follows, multiplier and offset [rad or m]."""
+MjcfCoupling = tuple[str, str, float, float]
+"""Follower and leader joint, multiplier, and offset [rad or m]."""
 
 
-def sanitise_mjcf(path: Path, warn: Warn) -> tuple[str, list[Couple]]:
-    """The text of an MJCF file, paths absolute, that Drake reads as MuJoCo does.
+def sanitise_mjcf(path: Path, warn: Warn) -> tuple[str, list[MjcfCoupling]]:
+    """Return the text of an MJCF file, with absolute paths, that Drake reads as MuJoCo does.
+
+    Args:
+        path: the MJCF file.
+        warn: receives a message for each constraint that is not enforced.
 
     Returns:
-        The text, and which joints follow others, which Drake's parser passes over.
+        The text, and the couplings between joints, which Drake's parser does not read.
 
-    Raises ModelError: no MJCF, or MuJoCo refuses it; the message names the file, and says why.
+    Raises ModelError: the file is no MJCF, or MuJoCo refuses it; the message says why.
     """
     root = read_xml(path)
     if root.tag != "mujoco":
@@ -45,35 +49,35 @@ def sanitise_mjcf(path: Path, warn: Warn) -> tuple[str, list[Couple]]:
             f"{path}: the outermost element is <{root.tag}>, not <mujoco>; "
             f"{hint.get(root.tag, 'is it a model file?')}"
         )
-    model, couples = _compile(path, warn)
+    model, couplings = _compile(path, warn)
     text = ElementTree.Element("mujoco", model=root.get("model") or path.stem)
     ElementTree.SubElement(text, "compiler", angle="radian")
     asset = ElementTree.SubElement(text, "asset")
     bodies = [ElementTree.SubElement(text, "worldbody")]
     names = [_name(model, address) for address in model.name_bodyadr]
-    # Bodies without a name get one that no other has.
+    # Bodies without a name get a unique one.
     free = (name for number in itertools.count(1) if (name := f"body{number}") not in names)
     for body, name in enumerate([name or next(free) for name in names[1:]], start=1):
         bodies.append(_add_body(model, body, name, bodies[model.body_parentid[body]]))
-    drawn = [geom for geom in range(model.ngeom) if _kind(model, geom)]
-    for mesh in sorted({model.geom_dataid[g] for g in drawn if _kind(model, g) == "mesh"}):
+    drawn = [geom for geom in range(model.ngeom) if _shape_name(model, geom)]
+    for mesh in sorted({model.geom_dataid[g] for g in drawn if _shape_name(model, g) == "mesh"}):
         file = write_obj(_mesh(model, mesh), _name(model, model.name_meshadr[mesh]))
         ElementTree.SubElement(asset, "mesh", name=f"mesh{mesh}", file=str(file))
     for geom in drawn:
-        kind = _kind(model, geom)
-        said = {"type": kind, "rgba": _text(model.geom_rgba[geom])}
-        said |= {"contype": "0", "conaffinity": "0"}
-        said |= {"pos": _text(model.geom_pos[geom]), "quat": _text(model.geom_quat[geom])}
+        kind = _shape_name(model, geom)
+        attributes = {"type": kind, "rgba": _text(model.geom_rgba[geom])}
+        attributes |= {"contype": "0", "conaffinity": "0"}
+        attributes |= {"pos": _text(model.geom_pos[geom]), "quat": _text(model.geom_quat[geom])}
         if kind == "mesh":
-            said["mesh"] = f"mesh{model.geom_dataid[geom]}"
+            attributes["mesh"] = f"mesh{model.geom_dataid[geom]}"
         else:
-            said["size"] = _text(model.geom_size[geom][: _SIZES[kind]])
-        ElementTree.SubElement(bodies[model.geom_bodyid[geom]], "geom", said)
-    return xml_text(text), couples
+            attributes["size"] = _text(model.geom_size[geom][: _SIZES[kind]])
+        ElementTree.SubElement(bodies[model.geom_bodyid[geom]], "geom", attributes)
+    return xml_text(text), couplings
 
 
-def _compile(path: Path, warn: Warn) -> tuple[Any, list[Couple]]:
-    """MuJoCo's model, without what neither moves nor is seen, and which joints follow others."""
+def _compile(path: Path, warn: Warn) -> tuple[Any, list[MjcfCoupling]]:
+    """Return MuJoCo's compiled model without undrawn parts, and the couplings between joints."""
     try:
         import mujoco
     except ModuleNotFoundError as error:
@@ -84,15 +88,15 @@ def _compile(path: Path, warn: Warn) -> tuple[Any, list[Couple]]:
         spec = mujoco.MjSpec.from_file(str(path))
         if spec.flexes:
             raise ModelError(f"{path}: <flex> '{spec.flexes[0].name}' is not rigid: not read")
-        couples = [
-            (one.name1, one.name2, float(one.data[1]), float(one.data[0]))
-            for one in spec.equalities
-            if one.type == mujoco.mjtEq.mjEQ_JOINT and one.active and one.name2
-            if one.data[1] != 0.0 and not np.any(one.data[2:5])
+        couplings = [
+            (equality.name1, equality.name2, float(equality.data[1]), float(equality.data[0]))
+            for equality in spec.equalities
+            if equality.type == mujoco.mjtEq.mjEQ_JOINT and equality.active and equality.name2
+            if equality.data[1] != 0.0 and not np.any(equality.data[2:5])
         ]
-        if count := len(spec.equalities) - len(couples):
+        if count := len(spec.equalities) - len(couplings):
             warn(f"{count} <equality> constraint{'s' * (count > 1)} of the file: not enforced")
-        # Some of it names files that a package of looks lacks.
+        # Removed because some name files that may be missing, such as textures.
         for element in (
             *spec.sensors, *spec.actuators, *spec.equalities, *spec.tendons, *spec.keys,
             *spec.pairs, *spec.excludes, *spec.tuples, *spec.skins, *spec.textures,
@@ -101,11 +105,11 @@ def _compile(path: Path, warn: Warn) -> tuple[Any, list[Couple]]:
         colours = {material.name: material.rgba for material in spec.materials}
         for geom in spec.geoms:
             geom.contype = geom.conaffinity = 0
-            # A geom of this colour has its material's.
+            # MuJoCo's default colour means that the material's colour counts.
             if np.allclose(geom.rgba, (0.5, 0.5, 0.5, 1.0)):
                 geom.rgba = colours.get(geom.material, geom.rgba)
             geom.material = ""
-            # Groups above are collision geometry, which MuJoCo's viewer does not draw.
+            # By convention, groups above 2 are collision geometry, which MuJoCo's viewer hides.
             if geom.group > 2 or not geom.rgba[3] > 0.0:
                 geom.group = _NOT_DRAWN
                 if geom.meshname:
@@ -115,25 +119,25 @@ def _compile(path: Path, warn: Warn) -> tuple[Any, list[Couple]]:
                 material.textures[k] = ""
         used = {geom.meshname for geom in spec.geoms}
         for mesh in spec.meshes:
-            # The looks of a link need not enclose a volume.
+            # Visual meshes need not enclose a volume.
             mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
             if mesh.name not in used:
                 spec.delete(mesh)
         spec.compiler.boundmass, spec.compiler.boundinertia = 1e-6, 1e-9
         spec.compiler.balanceinertia = True
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # What is old in a file still counts.
+            warnings.simplefilter("ignore")  # Deprecated elements still count.
             model = spec.compile()
-        # It couples how far both are from where the file has them.
+        # MuJoCo couples displacements from the reference positions qpos0.
         places = zip(model.name_jntadr, model.jnt_qposadr, strict=True)
         start = {_name(model, name): float(model.qpos0[place]) for name, place in places}
-        return model, [(a, b, k, c + start[a] - k * start[b]) for a, b, k, c in couples]
+        return model, [(a, b, k, c + start[a] - k * start[b]) for a, b, k, c in couplings]
     except (ValueError, RuntimeError, mujoco.FatalError) as error:
         raise ModelError(f"{path}: {' '.join(str(error).split())}") from error
 
 
-def _kind(model: Any, geom: int) -> str:
-    """The name of a geom's shape; empty for one that is not seen, or that Drake does not draw."""
+def _shape_name(model: Any, geom: int) -> str:
+    """Return the name of a geom's shape; "" if the geom is not drawn."""
     import mujoco
 
     if model.geom_group[geom] == _NOT_DRAWN:
@@ -143,12 +147,19 @@ def _kind(model: Any, geom: int) -> str:
 
 
 def _name(model: Any, address: int) -> str:
-    """A name in whatever encoding."""
+    """Return the name at an address, decoded as UTF-8 where possible."""
     return str(model.names[address:].split(b"\0", 1)[0].decode("utf-8", "replace"))
 
 
 def _add_body(model: Any, body: int, name: str, parent: ElementTree.Element) -> ElementTree.Element:
-    """Writes a body with joints j1 .. jn as n nested bodies of one joint each; the innermost."""
+    """Write a body with n joints as n nested bodies of one joint each; return the innermost.
+
+    Args:
+        model: MuJoCo's compiled model.
+        body: index of the body.
+        name: name of the innermost body.
+        parent: the element to write into.
+    """
     first = model.body_jntadr[body]
     joints = range(first, first + model.body_jntnum[body])
     pose = {"pos": _text(model.body_pos[body]), "quat": _text(model.body_quat[body])}
@@ -171,24 +182,25 @@ def _add_body(model: Any, body: int, name: str, parent: ElementTree.Element) -> 
 
 
 def _add_joint(model: Any, joint: int, body: ElementTree.Element) -> None:
+    """Write one joint of the compiled model into a body element."""
     name = _name(model, model.name_jntadr[joint])
-    said = {"name": name} if name else {}
+    attributes = {"name": name} if name else {}
     kind = ("free", "ball", "slide", "hinge")[model.jnt_type[joint]]
     if kind == "free":
-        ElementTree.SubElement(body, "freejoint", said)
+        ElementTree.SubElement(body, "freejoint", attributes)
         return
-    said |= {"type": kind, "pos": _text(model.jnt_pos[joint]), "limited": "false"}
+    attributes |= {"type": kind, "pos": _text(model.jnt_pos[joint]), "limited": "false"}
     if kind != "ball":
-        said["axis"] = _text(model.jnt_axis[joint])
-        said["ref"] = repr(float(model.qpos0[model.jnt_qposadr[joint]]))
-        said["damping"] = repr(float(np.ravel(model.dof_damping[model.jnt_dofadr[joint]])[0]))
+        attributes["axis"] = _text(model.jnt_axis[joint])
+        attributes["ref"] = repr(float(model.qpos0[model.jnt_qposadr[joint]]))
+        attributes["damping"] = repr(float(np.ravel(model.dof_damping[model.jnt_dofadr[joint]])[0]))
     if model.jnt_limited[joint]:
-        said |= {"limited": "true", "range": _text(model.jnt_range[joint])}
-    ElementTree.SubElement(body, "joint", said)
+        attributes |= {"limited": "true", "range": _text(model.jnt_range[joint])}
+    ElementTree.SubElement(body, "joint", attributes)
 
 
 def _mesh(model: Any, mesh: int) -> TriangleMesh:
-    """A mesh in the frame in which MuJoCo keeps it."""
+    """Return a mesh of the compiled model in MuJoCo's own mesh frame."""
     first, count = model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]
     begin, triangles = model.mesh_faceadr[mesh], model.mesh_facenum[mesh]
     return merge_duplicate_vertices(
@@ -199,5 +211,5 @@ def _mesh(model: Any, mesh: int) -> TriangleMesh:
 
 
 def _text(values: ArrayLike) -> str:
-    """Numbers as an attribute, without loss."""
+    """Return numbers as attribute text without loss of precision."""
     return " ".join(repr(float(value)) for value in np.ravel(values))

@@ -1,4 +1,4 @@
-"""The articulated model: what a file says about links, joints, limits and looks, read once."""
+"""Articulated models: links, joints, limits and visual geometry of a file or a Drake plant."""
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -30,7 +30,7 @@ from drake_pose.body.parsed_model import (
     link_names,
     load_skin,
 )
-from drake_pose.body.parsing import ModelSource, check_in_child, limit_kinds
+from drake_pose.body.parsing import ModelSource, check_in_child, summarise_warnings
 from drake_pose.body.plant_source import PlantSource
 from drake_pose.body.pose_tree import PoseTree
 from drake_pose.body.root import RootRotation
@@ -38,16 +38,19 @@ from drake_pose.body.tree_builder import build_pose_tree
 from drake_pose.body.urdf_shape import Vectors, reshaped, with_base_joints
 from drake_pose.errors import ModelError
 
-OBJECT = "target"
-"""The link of an object that stands in the world beside a robot."""
+TARGET = "target"
+"""Name of the link that carries a calibration target."""
 
-OBJECT_POSITIONS = tuple(f"{OBJECT}_{move}_{axis}" for move in ("shift", "turn") for axis in "xyz")
-"""The positions that move it: shifts along its axes [m], then turns about them [rad]."""
+TARGET_POSITIONS = tuple(f"{TARGET}_{move}_{axis}" for move in ("shift", "turn") for axis in "xyz")
+"""Names of the target's positions: translations [m] along x, y, z, then rotations [rad]."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ArticulatedModel(ParsedModel):
-    """An articulated object, from which pose trees are made (``ParsedModel``); never changes."""
+    """An articulated object, with methods that build pose trees and models of another shape.
+
+    The attributes are those of ``ParsedModel``. A model is immutable.
+    """
 
     def pose_tree(
         self,
@@ -57,20 +60,21 @@ class ArticulatedModel(ParsedModel):
         root_rotation: RootRotation | None = None,
         held: Mapping[str, float] | None = None,
     ) -> PoseTree:
-        """The tree in which poses are searched (``drake_pose.body.pose_tree.PoseTree``).
+        """Return the tree in which poses are searched (``drake_pose.body.pose_tree.PoseTree``).
 
         Args:
-            root: the link to start from; None for the one nearest to the plant's world.
-            root_position: (3,) where the origin of that link's frame is in the world [m].
-            root_rotation: how that link may be turned; None for the base joint's own limits, as it
-                stands at the default positions where it floats, or free where the tree is turned
-                over.
-            held: positions that are not searched, by name, with their value [rad or m].
+            root: name of the root link; None: the link with geometry nearest to the plant's world.
+            root_position: (3,) position of the root link's frame origin in the world [m]; None: as
+                in the model file, which is possible for the plant's own root only.
+            root_rotation: admissible rotations of the root link; None: those of the base joint. A
+                floating base then keeps its rotation at the default positions, and a re-rooted tree
+                rotates freely.
+            held: values [rad or m] of positions that are not searched, by name.
 
         Raises:
-            UnknownNameError: no such link or joint.
-            ModelError: the link has no geometry, or the file's joints allow no pose tree.
-            SettingsError: a position or value that is not finite or missing; or held beyond limits.
+            UnknownNameError: the root link or a held position does not exist.
+            ModelError: the root has no visual geometry, or the model's joints allow no pose tree.
+            SettingsError: a position or value is missing, not finite, or outside the joint limits.
         """
         return build_pose_tree(self, root, root_position, root_rotation, held)
 
@@ -81,33 +85,36 @@ class ArticulatedModel(ParsedModel):
         scene_graph: SceneGraph,
         model_instances: Sequence[ModelInstanceIndex] | None = None,
     ) -> "ArticulatedModel":
-        """The model of bodies in a finalized plant, as of a diagram: q is the plant's own.
+        """Return the model of a finalized plant's bodies; its q is the plant's q.
 
-        Joints, limits, default positions, looks and render labels are the plant's. The bodies of
-        other model instances, and what stands in the world, are not the model's: they hide nothing,
-        and their positions stay at their defaults.
+        Joints, limits, default positions, visual geometry and render labels are the plant's. Bodies
+        of other model instances and the geometry of the world body are not part of the model: they
+        occlude nothing, and their positions keep their defaults.
 
         Args:
-            plant: finalized, and registered with the SceneGraph; do not change it afterwards.
-            model_instances: whose bodies are seen; None: all.
+            plant: a finalized plant that is registered with ``scene_graph``; do not change it
+                later.
+            scene_graph: the SceneGraph that holds the plant's geometry.
+            model_instances: the instances whose bodies are drawn; None: all.
 
-        Raises ModelError: the plant is not finalized or not registered, an instance has no bodies
-        with visual geometry, or as for a file.
+        Raises:
+            ModelError: the plant is not finalized or not registered, no chosen body has visual
+                geometry, or its joints or geometry cannot be used.
         """
         name = plant.get_name() or "the plant"
         if not isinstance(plant, MultibodyPlant) or not plant.is_finalized():
             raise ModelError(f"{name} is not finalized: call plant.Finalize() first")
         source_id = plant.get_source_id()
         if source_id is None or not scene_graph.model_inspector().SourceIsRegistered(source_id):
-            raise ModelError(f"{name} is not registered with the SceneGraph that was given")
-        every = [ModelInstanceIndex(k) for k in range(1, plant.num_model_instances())]
-        chosen = every if model_instances is None else list(model_instances)
-        seen = [body for instance in chosen for body in plant.GetBodyIndices(instance)]
+            raise ModelError(f"{name} is not registered with the given SceneGraph")
+        all_instances = [ModelInstanceIndex(k) for k in range(1, plant.num_model_instances())]
+        chosen = all_instances if model_instances is None else list(model_instances)
+        bodies = [body for instance in chosen for body in plant.GetBodyIndices(instance)]
         path = Path(name)
-        with _naming(path):
+        with _model_errors(path):
             positions, remarks = describe_positions(plant, {}, name)
-        meshes = _seen_meshes(path, plant, scene_graph, seen)
-        looks = [labelled_meshes(plant, scene_graph, plant.get_body(body)) for body in seen]
+        meshes = _visual_meshes(path, plant, scene_graph, bodies)
+        labelled = [labelled_meshes(plant, scene_graph, plant.get_body(body)) for body in bodies]
         return cls(
             path=path,
             name=plant.GetModelInstanceName(chosen[-1]),
@@ -116,15 +123,17 @@ class ArticulatedModel(ParsedModel):
             **positions,
             link_meshes=MappingProxyType(meshes),
             skin=(),
-            warnings=tuple(limit_kinds(remarks)),
-            _source=PlantSource(plant, scene_graph, seen),
-            labels=frozenset(label for meshes in looks for label in meshes),
+            warnings=tuple(summarise_warnings(remarks)),
+            _source=PlantSource(plant, scene_graph, bodies),
+            labels=frozenset(label for meshes in labelled for label in meshes),
         )
 
     def without(self, links: Collection[str]) -> "ArticulatedModel":
-        """The same without the looks of some links, and the skin between them and others.
+        """Return the model without the visual geometry of some links and without their skin bands.
 
-        Raises UnknownNameError for an unknown link, ModelError for no URDF or nothing seen.
+        Raises:
+            UnknownNameError: a link does not exist.
+            ModelError: the model is no URDF, or no visual geometry is left.
         """
         return self.reshaped(hidden=links)
 
@@ -132,30 +141,37 @@ class ArticulatedModel(ParsedModel):
         self,
         *,
         hidden: Collection[str] = (),
-        factors: Vectors = MappingProxyType({}),
-        moves: Vectors = MappingProxyType({}),
-        shifts: Vectors = MappingProxyType({}),
+        link_scales: Vectors = MappingProxyType({}),
+        link_shifts: Vectors = MappingProxyType({}),
+        joint_shifts: Vectors = MappingProxyType({}),
     ) -> "ArticulatedModel":
-        """The same with links and joints otherwise; positions mean what they did.
+        """Return the model with links scaled, shifted or hidden and joints shifted.
+
+        The positions q keep their meaning.
 
         Args:
-            hidden: links without looks, and without skin between them and others.
-            factors: (3,) by link: so many times its size along its frame's axes.
-            moves: (3,) by link: how far its looks and joints lie elsewhere on it [m]; bands stay.
-            shifts: (3,) by joint: how far it stands elsewhere on its parent link [m].
+            hidden: links that lose their visual geometry and their skin bands.
+            link_scales: (3,) scale factors along the axes of a link's frame, by link.
+            link_shifts: (3,) shift [m] of a link's visual geometry and of the joints that it
+                carries, in the link's frame, by link. Skin bands are not shifted.
+            joint_shifts: (3,) shift [m] of a joint's origin in its parent link's frame, by joint.
 
         Raises:
-            UnknownNameError: no such link.
-            ModelError: no URDF, or nothing is seen any more.
+            UnknownNameError: a link does not exist.
+            ModelError: the model is no URDF, or no visual geometry is left.
         """
-        for name in (*hidden, *factors, *moves):
+        for name in (*hidden, *link_scales, *link_shifts):
             self.link_index(name)
         text = reshaped(
-            self._urdf().text, hidden=hidden, factors=factors, moves=moves, shifts=shifts
+            self._urdf().text,
+            hidden=hidden,
+            link_scales=link_scales,
+            link_shifts=link_shifts,
+            joint_shifts=joint_shifts,
         )
         kept = [band for band in self.skin if not {band.parent, band.child} & set(hidden)]
-        # A band grows with the link in whose frame it is.
-        sizes = [factors.get(band.child, (1.0, 1.0, 1.0)) for band in kept]
+        # A band is given in its child link's frame, so it scales with that link.
+        sizes = [link_scales.get(band.child, (1.0, 1.0, 1.0)) for band in kept]
         meshes = [
             TriangleMesh(band.mesh.vertices * size, band.mesh.triangles)
             for band, size in zip(kept, sizes, strict=True)
@@ -164,8 +180,11 @@ class ArticulatedModel(ParsedModel):
         return self._changed(text, skin)
 
     def with_base_joints(self, X_WB: Array) -> "ArticulatedModel":
-        """The same on BASE_JOINTS, which are 0 at X_WB (4, 4); ModelError for no URDF."""
-        from scipy.spatial.transform import Rotation  # Slow to import; reading needs none.
+        """Return the model mounted on the six ``BASE_JOINTS``, which are zero at X_WB (4, 4).
+
+        Raises ModelError: the model is no URDF.
+        """
+        from scipy.spatial.transform import Rotation  # Slow to import.
 
         rpy = Rotation.from_matrix(X_WB[:3, :3]).as_euler("xyz")
         text = with_base_joints(self._urdf().text, X_WB[:3, 3].tolist(), rpy.tolist())
@@ -173,24 +192,27 @@ class ArticulatedModel(ParsedModel):
         positions, _ = describe_positions(moved.plant, self._source.limits, str(self.path))
         return replace(moved, **positions)
 
-    def before_object(self, link: str, mesh: TriangleMesh, X_WO: Array) -> "ArticulatedModel":
-        """The joints between the world and a link, and a rigid object that stands in the world.
+    def with_target(self, link: str, mesh: TriangleMesh, X_WO: Array) -> "ArticulatedModel":
+        """Return the robot with a calibration target on six joints; only the target has geometry.
 
-        What matters to a camera on the link: only the object has looks, the world and the link are
-        dots. The robot's base stays where its default positions put it.
+        The model serves a camera that is mounted on ``link``: the world and the link become tiny
+        triangles, and links without a joint keep their pose at the default positions.
 
         Args:
-            mesh: the object's surface in its frame O.
-            X_WO: (4, 4) where it stands at OBJECT_POSITIONS of zero.
+            link: the link that carries the camera.
+            mesh: the target's surface in its own frame O.
+            X_WO: (4, 4) pose of the target in the world when all TARGET_POSITIONS are zero.
 
-        Raises UnknownNameError, ModelError: no such link; the file is refused in another plant.
+        Raises:
+            UnknownNameError: the link does not exist.
+            ModelError: Drake refuses the model in the new plant.
         """
         self.link_index(link)
         plant, scene_graph = MultibodyPlant(time_step=0.0), SceneGraph()
         plant.RegisterAsSourceForSceneGraph(scene_graph)
-        # Nothing of the robot is seen, so its meshes are not read again.
+        # Only the target has visual geometry, so the robot's meshes are not read again.
         self._source.parse(plant, None)
-        # What no joint holds is welded where it stands at the default positions.
+        # A link without a joint is welded at its pose at the default positions.
         joints = [plant.get_joint(index) for index in plant.GetJointIndices()]
         carried = {int(joint.child_body().index()) for joint in joints}
         kinematics, world = PlantKinematics(self), plant.world_frame()
@@ -198,11 +220,11 @@ class ArticulatedModel(ParsedModel):
             if index not in carried:
                 base = plant.get_body(BodyIndex(index)).body_frame()
                 plant.WeldFrames(world, base, RigidTransform(kinematics.pose(index)))
-        # Six joints, one after another, move the object by at most 10 m or 10 rad.
-        frame = plant.AddFrame(FixedOffsetFrame(f"{OBJECT}_start", world, RigidTransform(X_WO)))
-        instance = plant.AddModelInstance(OBJECT)
-        for k, name in enumerate(OBJECT_POSITIONS):
-            last = OBJECT if k == len(OBJECT_POSITIONS) - 1 else f"{name}_end"
+        # Six joints in series move the target by at most 10 m and 10 rad.
+        frame = plant.AddFrame(FixedOffsetFrame(f"{TARGET}_start", world, RigidTransform(X_WO)))
+        instance = plant.AddModelInstance(TARGET)
+        for k, name in enumerate(TARGET_POSITIONS):
+            last = TARGET if k == len(TARGET_POSITIONS) - 1 else f"{name}_end"
             body = plant.AddRigidBody(last, instance, SpatialInertia.Zero())
             kind, axis = PrismaticJoint if k < 3 else RevoluteJoint, np.eye(3)[k % 3]
             joint: Joint = kind(name, frame, body.body_frame(), axis, -10.0, 10.0)
@@ -216,23 +238,23 @@ class ArticulatedModel(ParsedModel):
             plant=plant,
             scene_graph=scene_graph,
             **positions,
-            link_meshes=MappingProxyType({self.link_names[0]: dot, link: dot, OBJECT: mesh}),
+            link_meshes=MappingProxyType({self.link_names[0]: dot, link: dot, TARGET: mesh}),
             skin=(),
         )
 
     @property
     def changes_shape(self) -> bool:
-        """Whether the methods above can be called, which a URDF allows."""
+        """Whether the model is a URDF, which ``reshaped`` and ``with_base_joints`` require."""
         return self._source.kind == "urdf"
 
     def _urdf(self) -> ModelSource:
-        """What Drake reads in the file's place."""
+        """Return the URDF source; ModelError for a model of another kind."""
         if not isinstance(self._source, ModelSource) or not self.changes_shape:
             raise ModelError(f"{self.path}: only the shape of a URDF model can be changed")
         return self._source
 
     def _changed(self, text: str, skin: Sequence[SkinBand]) -> "ArticulatedModel":
-        """The same read from another text."""
+        """Return the model parsed again from another URDF text, with another skin."""
         source = self._urdf().with_text(text)
         plant, scene_graph, _, _ = _parse(self.path, source)
         plant.Finalize()
@@ -240,7 +262,7 @@ class ArticulatedModel(ParsedModel):
             self,
             plant=plant,
             scene_graph=scene_graph,
-            link_meshes=MappingProxyType(_seen_meshes(self.path, plant, scene_graph)),
+            link_meshes=MappingProxyType(_visual_meshes(self.path, plant, scene_graph)),
             skin=tuple(skin),
             _source=source,
         )
@@ -257,16 +279,18 @@ def load_model(
 
     Args:
         path: a URDF, SDFormat, MJCF (.xml) or model directives (.dmd.yaml) file.
-        package_paths: folders for ``package://name/...``, by name. Others are looked for on the way
-            up from the file and in ROS_PACKAGE_PATH; ``drake_pose`` is known already.
-        limits: (lower, upper) [rad or m] by position name instead of the file's; the only way to
-            limit planar joints, whose limits Drake's parser does not read.
-        check: first read the file in a child process, so that a file that crashes or hangs Drake or
-            eats all memory does not do so here. Once for each file's content; it takes as long as
-            reading, and half a second more in a process of several threads, which cannot be forked.
+        package_paths: folders of ``package://name/...`` by package name. Other packages are
+            searched for in the folders above the file and in ROS_PACKAGE_PATH; ``drake_pose`` is
+            always known.
+        limits: (lower, upper) [rad or m] by position name, which replace the file's limits. Planar
+            joints need them, because Drake's parser does not read their limits.
+        check: read the file in a child process first, so that a file that crashes or hangs Drake or
+            takes all memory cannot harm this process. The check is made once for each file content
+            and takes as long as reading, and half a second more where this process has several
+            threads and cannot be forked.
 
     Raises:
-        ModelError: the file cannot be used; the message names the file and link or joint.
+        ModelError: the file cannot be used; the message names the file and the link or joint.
         UnknownNameError: ``limits`` names a position that does not exist.
     """
     given = {name: (float(low), float(high)) for name, (low, high) in (limits or {}).items()}
@@ -281,13 +305,13 @@ def load_model(
 def read_model(
     path: Path, packages: Mapping[str, str], limits: Mapping[str, tuple[float, float]]
 ) -> ArticulatedModel:
-    """As load_model, in this process and without the check."""
+    """Read a model as ``load_model`` does, in this process and without the check."""
     source = ModelSource(path, packages)
     plant, scene_graph, instances, warnings = _parse(path, source)
-    with _naming(path):
+    with _model_errors(path):
         plant.Finalize()
         positions, remarks = describe_positions(plant, {**source.limits, **limits}, str(path))
-    meshes = _seen_meshes(path, plant, scene_graph)
+    meshes = _visual_meshes(path, plant, scene_graph)
     return ArticulatedModel(
         path=path,
         name=plant.GetModelInstanceName(instances[0]),
@@ -296,17 +320,17 @@ def read_model(
         **positions,
         link_meshes=MappingProxyType(meshes),
         skin=load_skin(path, link_names(plant)),
-        warnings=tuple(limit_kinds([*warnings, *remarks])),
+        warnings=tuple(summarise_warnings([*warnings, *remarks])),
         _source=source,
     )
 
 
 @contextmanager
-def _naming(path: Path) -> Iterator[None]:
-    """Let what Drake and this package refuse be a ModelError that names the file."""
+def _model_errors(path: Path) -> Iterator[None]:
+    """Convert errors raised inside the context to a ModelError that names the file."""
     try:
         yield
-    # Drake ends the process, which Python sees as SystemExit, at some values.
+    # Drake aborts on some invalid values, which Python sees as SystemExit.
     except (ModelError, RuntimeError, SystemExit) as error:
         raise ModelError(f"{path}: {error}") from error
 
@@ -314,35 +338,42 @@ def _naming(path: Path) -> Iterator[None]:
 def _parse(
     path: Path, source: ModelSource
 ) -> tuple[MultibodyPlant, SceneGraph, list[ModelInstanceIndex], list[str]]:
-    """A plant of a model that is not finalized, its SceneGraph, instances, and warnings."""
+    """Parse a model into a new plant that is not finalized, with drawable mesh files.
+
+    Returns:
+        The plant, its SceneGraph, the model instances, and warnings about the file.
+    """
     plant = MultibodyPlant(time_step=0.0)
     scene_graph = SceneGraph()
     plant.RegisterAsSourceForSceneGraph(scene_graph)
     instances, warnings = source.parse(plant, scene_graph)
     if not instances:
         raise ModelError(f"{path} holds no model")
-    with _naming(path):
+    with _model_errors(path):
         make_drawable(plant, scene_graph, instances)
     return plant, scene_graph, instances, warnings
 
 
-def _seen_meshes(
+def _visual_meshes(
     path: Path,
     plant: MultibodyPlant,
     scene_graph: SceneGraph,
     bodies: Sequence[BodyIndex] | None = None,
 ) -> dict[str, TriangleMesh]:
-    """The visual geometry of each link that has some; bodies: of these alone."""
+    """Return the visual geometry of each link that has some, by link name.
+
+    ``bodies``: the bodies to read; None: all. Raises ModelError: no body has visual geometry.
+    """
     names = link_names(plant)
     chosen = [BodyIndex(k) for k in range(len(names))] if bodies is None else bodies
-    with _naming(path):
+    with _model_errors(path):
         meshes = {
             names[int(body)]: body_mesh(plant, scene_graph, plant.get_body(body)) for body in chosen
         }
     meshes = {name: mesh for name, mesh in meshes.items() if not mesh.is_empty}
     if not meshes:
         raise ModelError(
-            f"{path} has no visual geometry: nothing would be seen; give its links <visual> "
+            f"{path} has no visual geometry: nothing would be drawn; give its links <visual> "
             "elements (MJCF: geoms of a group below 3)"
         )
     return meshes

@@ -1,4 +1,4 @@
-"""XML model files: read as leniently as robots' own programs do, checked before Drake sees them."""
+"""Lenient reading of XML model files, checks of their values, and search for named files."""
 
 import math
 import os
@@ -15,21 +15,22 @@ from pydrake.multibody.parsing import PackageMap
 from drake_pose.errors import ModelError, UnknownNameError
 
 OLD_XACRO_ELEMENTS = ("macro", "include")
-"""Of xacro before it had a prefix, directly in <robot>."""
+"""Elements directly in <robot> of old xacro files, which have no ``xacro:`` prefix."""
 
 Warn = Callable[[str], None]
-"""Takes what of a file is not read, or not enforced."""
+"""Receives a message about a part of a file that is not read or not enforced."""
 
 
 def read_xml(path: Path) -> ElementTree.Element:
-    """The outermost element of an XML file; comments are left out.
+    """Return the root element of an XML file, without comments.
 
-    As tinyxml, with which ROS, Drake and MuJoCo read: what stands before ``<?xml`` may be blank, a
-    comment may hold ``--``, a prefix is part of the name whether it is declared or not, an entity
-    that nobody declares is plain text, and text in UTF-8 that is none is taken for Latin-1. Nothing
-    outside the file is read.
+    The file is read as leniently as by tinyxml, which ROS, Drake and MuJoCo use: blank space may
+    precede ``<?xml``, a comment may contain ``--``, a prefix is part of a name whether or not it is
+    declared, an undeclared entity is plain text, and text that is not valid UTF-8 is read as
+    Latin-1. External entities are refused.
 
-    Raises ModelError: unreadable, or not well-formed; the message names the file and the line.
+    Raises ModelError: the file cannot be read or is not well-formed; the message names the file and
+    the line.
     """
     try:
         data = path.read_bytes()
@@ -40,18 +41,18 @@ def read_xml(path: Path) -> ElementTree.Element:
     except UnicodeDecodeError:
         text = data.decode("iso-8859-1")
     blank_lines = text[: len(text) - len(text.lstrip())].count("\n")
-    text = re.sub(r"(?s)<!--.*?-->", lambda one: "\n" * one[0].count("\n"), text.lstrip())
+    text = re.sub(r"(?s)<!--.*?-->", lambda comment: "\n" * comment[0].count("\n"), text.lstrip())
     if "<!ENTITY" not in text:
         text = re.sub(r"&(?!(?:#\d+|#x[0-9a-fA-F]+|lt|gt|amp|quot|apos);)", "&amp;", text)
     builder = ElementTree.TreeBuilder()
     try:
-        # Without a separator, a prefix stays a part of the name.
+        # Without a namespace separator, a prefix stays part of the name.
         parser = expat.ParserCreate("utf-8")
         parser.buffer_text = True
         parser.StartElementHandler = builder.start
         parser.EndElementHandler = builder.end
         parser.CharacterDataHandler = builder.data
-        # Zero: an error, where expat itself would pass over the entity without a word.
+        # Zero makes an external entity an error; expat's default ignores it silently.
         parser.ExternalEntityRefHandler = lambda *_: 0
         parser.Parse(text.encode("utf-8"), True)
     except expat.ExpatError as error:
@@ -63,12 +64,15 @@ def read_xml(path: Path) -> ElementTree.Element:
 
 
 def xml_text(root: ElementTree.Element) -> str:
-    """The text of an element that parse_xml made."""
+    """Return the text of an element tree from ``read_xml``."""
     return ElementTree.tostring(root, encoding="unicode")
 
 
 def read_numbers(text: str | None, count: int, where: str) -> list[float]:
-    """The finite numbers in a text; else ModelError, in which ``where`` names link or joint."""
+    """Return the ``count`` finite numbers in a text.
+
+    Raises ModelError: the text holds anything else; the message begins with ``where``.
+    """
     words = (text or "").split()
     try:
         numbers = [float(word) for word in words]
@@ -81,15 +85,15 @@ def read_numbers(text: str | None, count: int, where: str) -> list[float]:
 
 
 def require_size(text: str | None, count: int, where: str, *, zero: bool = False) -> None:
-    """Raise ModelError for a size not above zero (or zero); ``where`` names the link."""
+    """Raise ModelError for a size that is not positive; ``zero`` allows zero."""
     for number in read_numbers(text, count, where):
         if number < 0.0 or (number == 0.0 and not zero):
-            least = "must not be negative" if zero else "must be above 0"
-            raise ModelError(f"{where} is '{text}'; it {least}")
+            bound = "must not be negative" if zero else "must be above 0"
+            raise ModelError(f"{where} is '{text}'; it {bound}")
 
 
 def colour_text(text: str | None) -> str | None:
-    """Three or four parts of a colour, brought between 0 and 1; None where it is none."""
+    """Return three or four colour components clamped to [0, 1]; None for an invalid colour."""
     count = 3 if len((text or "").split()) == 3 else 4
     try:
         return " ".join(f"{min(max(part, 0.0), 1.0):g}" for part in read_numbers(text, count, ""))
@@ -98,7 +102,7 @@ def colour_text(text: str | None) -> str | None:
 
 
 def require_scale(text: str, count: int, where: str) -> None:
-    """Refuse what is no scale of a mesh; ``where`` names the link and the mesh."""
+    """Raise ModelError for a mesh scale that is not ``count`` non-zero numbers."""
     if 0.0 in read_numbers(text, count, where):
         raise ModelError(f"{where} is '{text}'; no factor may be 0")
 
@@ -106,7 +110,10 @@ def require_scale(text: str, count: int, where: str) -> None:
 def read_limits(
     lower_text: str | None, upper_text: str | None, name: str
 ) -> tuple[float | None, float | None]:
-    """The limits of a joint; None: not given, or infinite. ModelError for NaN or crossed ones."""
+    """Return a joint's lower and upper limit; None for a limit that is missing or infinite.
+
+    Raises ModelError: a limit is no number or NaN, or the lower one is above the upper one.
+    """
     texts = (lower_text, upper_text)
     try:
         values = [None if text is None else float(text) for text in texts]
@@ -118,7 +125,7 @@ def read_limits(
     lower, upper = values
     if lower is not None and upper is not None and lower > upper:
         raise ModelError(
-            f"joint '{name}': lower limit {lower:g} is above upper limit {upper:g}; exchange them"
+            f"joint '{name}': lower limit {lower:g} is above upper limit {upper:g}; swap them"
         )
     finite = [None if value is None or math.isinf(value) else value for value in values]
     return finite[0], finite[1]
@@ -130,23 +137,27 @@ def leave_out(
     known: Collection[str],
     warn: Warn,
 ) -> None:
-    """Remove from an element the children that are not read; those with a prefix stay.
+    """Remove child elements that are not read; those with a namespace prefix stay.
 
-    ``read``: by element, the children that are read, all where an element is not named; ``known``:
-    elements that say nothing of kinematics and looks, of which ``warn`` is not told.
+    Args:
+        root: the element whose descendants are filtered.
+        read: names of the child elements to keep, by element; an element that is not listed keeps
+            all.
+        known: names of elements that are removed without a warning.
+        warn: receives a message for each other removed element.
     """
-    waiting = [root]
-    while waiting:
-        element = waiting.pop()
+    stack = [root]
+    while stack:
+        element = stack.pop()
         kept = read.get(element.tag)
         for child in list(element):
             if kept is None or child.tag in kept or ":" in child.tag:
-                waiting.append(child)
+                stack.append(child)
                 continue
             element.remove(child)
             if child.tag not in known:
                 name = f" '{element.get('name')}'" if element.get("name") else ""
-                warn(f"{element.tag}{name}: the element <{child.tag}> is not known and left out")
+                warn(f"{element.tag}{name}: the element <{child.tag}> is unknown and left out")
 
 
 def open_loops(
@@ -155,21 +166,29 @@ def open_loops(
     ends: Sequence[Sequence[str]],
     warn: Warn,
 ) -> None:
-    """Remove the joints of a model that close a loop; ``ends`` are the two links of each."""
-    # First the joint that names a link as its child first: Drake cannot turn every kind over.
+    """Remove the joints of a model that close a loop of links.
+
+    Args:
+        model: the element that contains the joints.
+        joints: the joint elements.
+        ends: the parent and the child link of each joint.
+        warn: receives a message for each removed joint.
+    """
+    # Keep the first joint that names a link as its child: Drake cannot invert every joint type.
     children = [child for _, child in ends]
     order = sorted(range(len(joints)), key=lambda i: children[i] in children[:i])
-    group: dict[str, str] = {}
+    parent_of: dict[str, str] = {}
 
     def find(link: str) -> str:
-        while link in group:
-            link = group[link]
+        """Return the representative of a link's connected component."""
+        while link in parent_of:
+            link = parent_of[link]
         return link
 
     for index in order:
-        one, other = map(find, ends[index])
-        if one != other:
-            group[other] = one
+        first, second = map(find, ends[index])
+        if first != second:
+            parent_of[second] = first
             continue
         model.remove(joints[index])
         warn(
@@ -179,23 +198,27 @@ def open_loops(
 
 
 FOLLOWING = ("revolute", "continuous", "prismatic")
-"""The types of joints that can follow one another."""
+"""The joint types that can follow another joint."""
 
 
 def take_mimic(
     parent: ElementTree.Element, name: str, leaders: Collection[str], warn: Warn
 ) -> dict[str, str] | None:
-    """Remove a joint's <mimic>, of attributes or elements; what Drake's has in its place.
+    """Remove a joint's <mimic> and return the attributes of the one that Drake enforces, or None.
 
-    ``leaders``: the joints that can be followed; ``warn`` is told of others.
+    Args:
+        parent: the element that contains <mimic>, with its values as attributes or elements.
+        name: the joint's name.
+        leaders: names of the joints that can be followed.
+        warn: receives a message for a <mimic> that is not enforced.
     """
-    found, usual = None, {"multiplier": "1", "offset": "0", "reference": "0"}
+    found, defaults = None, {"multiplier": "1", "offset": "0", "reference": "0"}
     for mimic in parent.findall("mimic"):
         parent.remove(mimic)
-        said = {key: mimic.get(key, mimic.findtext(key)) for key in usual}
+        given = {key: mimic.get(key, mimic.findtext(key)) for key in defaults}
         multiplier, offset, reference = (
-            read_numbers(said[key] or text, 1, f"joint '{name}': {key} of its <mimic>")[0]
-            for key, text in usual.items()
+            read_numbers(given[key] or text, 1, f"joint '{name}': {key} of its <mimic>")[0]
+            for key, text in defaults.items()
         )
         leader = mimic.get("joint", "")
         if leader in leaders and leader != name and multiplier:
@@ -210,7 +233,7 @@ def take_mimic(
 
 
 def refuse_macros(root: ElementTree.Element) -> None:
-    """Raise ModelError for a file that xacro has not expanded: links would be missing."""
+    """Raise ModelError for a file with unexpanded xacro macros."""
     left = [f"<{child.tag}>" for child in root if child.tag in OLD_XACRO_ELEMENTS]
     for element in root.iter():
         if element.tag.startswith("xacro:"):
@@ -220,13 +243,13 @@ def refuse_macros(root: ElementTree.Element) -> None:
                 left.append(f"'{value.strip()[:60]}' in <{element.tag}>")
     if left:
         raise ModelError(
-            f"it still holds xacro macros, such as {left[0]}: links and joints would be missing; "
-            "expand it first: xacro robot.urdf.xacro > robot.urdf (PyPI: xacro)"
+            f"it has unexpanded xacro macros, such as {left[0]}: links and joints would be "
+            "missing; expand it first: xacro robot.urdf.xacro > robot.urdf (PyPI: xacro)"
         )
 
 
 def package_folder() -> Path:
-    """The folder of bundled models, in the wheel or checkout; ModelError where there is none."""
+    """Return the folder of bundled models in the wheel or checkout; ModelError if it is missing."""
     library = Path(__file__).resolve().parents[1]
     for folder in (library / "urdf", library.parent / "urdf"):
         if (folder / "package.xml").is_file():
@@ -238,12 +261,13 @@ def package_folder() -> Path:
 
 
 def package_map(package_paths: Mapping[str, Path | str] | None = None) -> PackageMap:
-    """Drake's PackageMap with ``drake_pose`` and further folders by name, and nothing to download.
+    """Return Drake's PackageMap with ``drake_pose`` and the given folders by package name.
 
-    Raises ModelError where a folder or the bundled models do not exist.
+    ``drake_models`` is removed, so that nothing is downloaded. Raises ModelError: a folder does not
+    exist.
     """
     packages = PackageMap()
-    # Drake would fetch its own models from the net, and wait for it.
+    # Drake would download its own models.
     packages.Remove("drake_models")
     packages.AddPackageXml(package_folder() / "package.xml")
     for name, folder in (package_paths or {}).items():
@@ -256,20 +280,26 @@ def package_map(package_paths: Mapping[str, Path | str] | None = None) -> Packag
 
 
 class FileFinder:
-    """The files that a model's ``package://``, ``model://``, ``file://`` and plain names mean.
+    """Resolves the ``package://``, ``model://``, ``file://`` and plain file names in a model file.
 
-    A package is, in this order, one that is given, a bundled one, a folder on the way up from the
-    file that names it, or a folder of the environment's search paths. Raises ModelError where a
-    folder does not exist.
+    A package is searched for, in this order, among the given packages, the bundled one, the folders
+    above the file that names it, and the folders of the search-path environment variables.
+
+    Raises ModelError: a given package folder does not exist.
     """
 
     def __init__(self, package_paths: Mapping[str, Path | str] | None = None) -> None:
         self._known = package_map(package_paths)
 
     def resolve(self, name: str, file: Path, what: str) -> Path:
-        """The absolute path of a file or folder that a model file names; ``what`` is for messages.
+        """Return the absolute path of a file or folder that a model file names.
 
-        Raises ModelError: the package is unknown, the file does not exist, or it is not local.
+        Args:
+            name: the name in the model file.
+            file: the model file.
+            what: what the name stands for, for messages.
+
+        Raises ModelError: the package is unknown, or the file does not exist or is not local.
         """
         uri = re.fullmatch(r"(?s)(?P<scheme>[A-Za-z][\w+.-]*)://(?P<rest>.*)", name.strip())
         if uri is None:
@@ -283,18 +313,18 @@ class FileFinder:
             if not paths:
                 raise ModelError(
                     f"{what} '{name}': package '{package}' is not known: no package.xml or folder "
-                    f"of that name on the way up from {file.parent}, nor in ROS_PACKAGE_PATH; give "
+                    f"of that name in or above {file.parent}, nor in ROS_PACKAGE_PATH; give "
                     f"--package {package}=FOLDER (in Python package_paths)"
                 )
         else:
-            raise ModelError(f"{what} '{name}' is not a file; fetch it and name it by its path")
+            raise ModelError(f"{what} '{name}' is not a local file; download it and give its path")
         for path in paths:
             if path.exists():
                 return Path(os.path.abspath(path))
         raise ModelError(f"{what} '{name}': {os.path.abspath(paths[0])} does not exist")
 
     def _package_folders(self, name: str, file: Path) -> list[Path]:
-        """Where a package may lie, the likeliest place first; one alone where it is known."""
+        """Return the folders where a package may be, in order of precedence."""
         if self._known.Contains(name):
             return [Path(self._known.GetPath(name))]
         if not re.fullmatch(r"\w[\w.-]*", name):
@@ -311,7 +341,7 @@ class FileFinder:
             for text in filter(None, os.environ.get(variable, "").split(os.pathsep)):
                 found += _folders_at(Path(text) / inside, name)
         if not found:
-            # Packages in the repositories of a workspace.
+            # Packages in repositories of a ROS workspace.
             packages = PackageMap.MakeEmpty()
             packages.PopulateFromRosPackagePath()
             known = [one for one in packages.GetPackageNames() if one.strip() == name]
@@ -320,7 +350,7 @@ class FileFinder:
 
 
 def _folders_at(folder: Path, name: str) -> list[Path]:
-    """A folder where it is the package, and the one of the package's name in it."""
+    """Return a folder if it is the package itself, and its subfolder of the package's name."""
     names = [folder.name]
     with suppress(ModelError, OSError):
         if (folder / "package.xml").is_file():
@@ -330,7 +360,10 @@ def _folders_at(folder: Path, name: str) -> list[Path]:
 
 
 def bundled_model(name: str) -> Path:
-    """The file of a model that drake_pose ships, such as "woman"; UnknownNameError lists them."""
+    """Return the file of a bundled model, for example "woman".
+
+    Raises UnknownNameError, which lists the bundled models.
+    """
     folder = package_folder()
     known = {path.parent.name: path for path in sorted(folder.glob("*/*.urdf"))}
     named = {key: folder / key / f"{key}.urdf" for key in known}

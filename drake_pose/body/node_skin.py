@@ -1,9 +1,13 @@
-"""Bands of skin of a pose tree's nodes, and of a model for Drake.
+"""Skin bands of a pose tree's nodes, and of a model for Drake.
 
-A vertex of weight w lies where it would lie if it belonged to the child and the joints had gone
-only w of their way: p_A(values) = X_AB(w values) p_B, with A the parent's frame, B the child's and
-p_B its place at rest. For one joint that is the blend of dual quaternions; for several it never
-collapses or jumps, however far they turn.
+A vertex of weight w lies where it would lie if it belonged to the child link and the joints had
+moved by the fraction w of their values q:
+
+    p_A(q) = X_AB(w q) p_B
+
+with A the parent's frame, B the child's frame and p_B the vertex at rest. For one joint this is
+dual quaternion blending. For several joints the band neither collapses nor jumps, however far they
+turn.
 """
 
 from collections.abc import Collection
@@ -33,31 +37,34 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class NodeSkin:
-    """The band of skin between a node and its parent, in the node's frame N.
+    """The skin band between a node and its parent, in the node's frame N.
 
     Attributes:
         mesh: the closed band at rest (all joints at zero).
-        weights: (v,) float64 read-only in 0..1: how far each vertex goes with the link that is
-            farther from the plant's world: the node, or its parent where ``turned``.
-        colour: (r, g, b) in 0..1.
-        turned: whether the tree is turned over here: the node is nearer to the plant's world.
-        steps: the joints from the node's parent to the node.
+        weights: (v,) float64 read-only weights in [0, 1] with which vertices move with the link
+            farther from the plant's world: the node, or its parent if ``inverted``.
+        colour: (r, g, b) in [0, 1].
+        inverted: whether the node, not its parent, is nearer to the plant's world.
+        steps: the joints from the parent to the node.
     """
 
     mesh: TriangleMesh
     weights: Array
     colour: tuple[float, float, float]
-    turned: bool
+    inverted: bool
     steps: tuple[JointMap, ...]
 
     @property
     def triangles(self) -> NDArray[np.int32]:
-        """(m, 3) int32, read-only, indices into the vertices, the same at all values."""
+        """(m, 3) int32 read-only indices of vertices, the same at all values."""
         return self.mesh.triangles
 
     def vertices(self, values: Array) -> Array:
-        """The vertices (n, v, 3) [m] in the node's frame at its values (n, k) [rad or m]."""
-        from drake_pose.body.joint_kernel import place_bands  # Slow to import: it needs numba.
+        """Return the vertices (n, v, 3) [m] in the node's frame at its values (n, k) [rad or m].
+
+        Raises SettingsError: the values have the wrong shape.
+        """
+        from drake_pose.body.joint_kernel import place_bands  # Slow to import.
 
         count = sum(step.position_count for step in self.steps)
         values = np.ascontiguousarray(values, dtype=np.float64)
@@ -71,26 +78,26 @@ class NodeSkin:
 
     @cached_property
     def packed(self) -> "PackedBands":
-        """The band in the kernel's arrays."""
+        """The band in the arrays that the kernel takes."""
         from drake_pose.body.joint_kernel import PackedBands, pack_steps
 
         points = self.mesh.vertices
-        if self.turned:
+        if self.inverted:
             X_PN = _pose_at_rest(self.steps)
             points = points @ X_PN[:3, :3].T + X_PN[:3, 3]
-        levels, which = np.unique(self.weights, return_inverse=True)
+        weights, weight_index = np.unique(self.weights, return_inverse=True)
         return PackedBands(
-            starts=np.array([[0, 0, 0], [len(self.steps), len(levels), len(points)]]),
+            starts=np.array([[0, 0, 0], [len(self.steps), len(weights), len(points)]]),
             steps=pack_steps(self.steps),
-            levels=levels,
-            which=which.reshape(-1).astype(np.int64),
+            weights=weights,
+            weight_index=weight_index.reshape(-1).astype(np.int64),
             points=np.array(points, dtype=np.float64, order="C"),
-            turned=np.array([self.turned]),
+            inverted=np.array([self.inverted]),
         )
 
 
 def _pose_at_rest(steps: tuple[JointMap, ...]) -> Array:
-    """A chain's transform (4, 4) with all its positions at zero."""
+    """Return a chain's transform (4, 4) with all positions at zero."""
     count = sum(step.position_count for step in steps)
     rest: Array = chain_transforms(steps, np.zeros((1, count)))[0]
     return rest
@@ -99,25 +106,33 @@ def _pose_at_rest(steps: tuple[JointMap, ...]) -> Array:
 def find_skin(
     model: ParsedModel, graph: LinkGraph, parent: int, group: int, steps: tuple[JointMap, ...]
 ) -> NodeSkin | None:
-    """The band between the groups of a node's parent and the node (``steps`` between), or None."""
+    """Return the skin band between a node and its parent, or None.
+
+    Args:
+        model: the model with the bands.
+        graph: the model's link graph.
+        parent: index of the parent's link group.
+        group: index of the node's link group.
+        steps: the joints from the parent to the node.
+    """
     for band in model.skin:
         ends = (graph.group_of(band.parent), graph.group_of(band.child))
         if ends not in ((parent, group), (group, parent)):
             continue
-        turned = ends != (parent, group)
+        inverted = ends != (parent, group)
         kinematics = PlantKinematics(model)
         X_GB = inverse_transforms(kinematics.pose(graph.groups[ends[1]].body))
         mesh = band.mesh.transformed(X_GB @ kinematics.pose(model.link_index(band.child)))
-        if turned:
+        if inverted:
             mesh = mesh.transformed(inverse_transforms(_pose_at_rest(steps)))
-        return NodeSkin(mesh, band.weights, band.colour, turned, steps)
+        return NodeSkin(mesh, band.weights, band.colour, inverted, steps)
     return None
 
 
-def require_placed(
+def require_neighbours(
     model: ParsedModel, graph: LinkGraph, pairs: Collection[tuple[int, int]]
 ) -> None:
-    """Raise ModelError for a band that no (parent, node) pair of groups carries."""
+    """Raise ModelError for a band whose links are not one of the (parent, node) pairs of groups."""
     for band in model.skin:
         ends = (graph.group_of(band.parent), graph.group_of(band.child))
         if ends not in pairs and ends[::-1] not in pairs:
@@ -129,9 +144,9 @@ def require_placed(
 
 
 class ModelSkin:
-    """A model's bands in the frame of the plant's world, as Drake and Meshcat want them.
+    """A model's skin bands in the frame of the plant's world, for Drake and Meshcat.
 
-    Raises ModelError where a band does not join two neighbours.
+    Raises ModelError: no joints lead outwards from a band's parent to its child.
     """
 
     def __init__(self, model: ParsedModel) -> None:
@@ -149,11 +164,11 @@ class ModelSkin:
 
     @property
     def meshes(self) -> tuple[TriangleMesh, ...]:
-        """The bands at rest, each in its child's frame."""
+        """The bands at rest, each in its child link's frame."""
         return tuple(band.mesh for band in self.bands)
 
     def vertices(self, q: Array) -> list[Array]:
-        """Each band's vertices (v, 3) [m] in the plant's world at positions q (nq,)."""
+        """Return each band's vertices (v, 3) [m] in the plant's world at positions q (nq,)."""
         placed = []
         for body, positions, skin in self._parts:
             X_BN = self._kinematics.pose_at(body, q)
@@ -165,7 +180,7 @@ class ModelSkin:
 def _chain(
     model: ParsedModel, graph: LinkGraph, band: SkinBand
 ) -> tuple[tuple[JointMap, ...], tuple[int, ...]]:
-    """The joints outwards from a band's parent to its child, and their positions."""
+    """Return the joints outwards from a band's parent to its child, and their indices in q."""
     inner, outer = graph.group_of(band.parent), graph.group_of(band.child)
     steps: list[JointMap] = []
     positions: list[int] = []
@@ -175,7 +190,7 @@ def _chain(
         if edge is None or edge.joint_map is None:
             raise ModelError(
                 f"{skin_file(model.path)}: band '{band.parent}' - '{band.child}': no joints lead "
-                "outwards from the one to the other; are they exchanged?"
+                "outwards from the first to the second; are they exchanged?"
             )
         steps.insert(0, edge.joint_map)
         positions = [*edge.positions, *positions]

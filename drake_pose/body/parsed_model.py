@@ -1,7 +1,8 @@
-"""The skin: bands of surface between two links that bend with the joints between them.
+"""Positions, limits and skin of a model file, as Drake reads them.
 
-After Kameda, Minoh, Ikeda (section 2). A band is a closed mesh drawn at rest, all joints at zero;
-each point follows the joints by its weight, from 0 at the parent's end to 1 at the child's.
+The skin consists of bands: closed surfaces between two links that deform with the joints between
+them (Kameda, Minoh, Ikeda, section 2). A band is given at rest, with all joints at zero. Each
+vertex has a weight, from 0 at the parent link's end to 1 at the child link's.
 """
 
 from collections.abc import Mapping, Sequence
@@ -26,12 +27,14 @@ from drake_pose.yaml_files import read_yaml, typed_entry
 
 @dataclass(frozen=True, eq=False)
 class SkinBand:
-    """A band of surface between two links; the parent is nearer to the world.
+    """A band of surface between two links; the parent link is nearer to the world.
 
     Attributes:
-        mesh: the closed band at rest (all joints at zero), in the child's frame.
-        weights: (n,) float64 read-only in 0..1: 0 stays with the parent, 1 goes with the child.
-        colour: (r, g, b) in 0..1.
+        parent: name of the link that vertices of weight 0 move with.
+        child: name of the link that vertices of weight 1 move with.
+        mesh: the closed surface [m] at rest (all joints at zero), in the child link's frame.
+        weights: (n,) weight of each vertex in [0, 1], read-only.
+        colour: (r, g, b) in [0, 1].
     """
 
     parent: str
@@ -41,24 +44,28 @@ class SkinBand:
     colour: tuple[float, float, float] = (0.8, 0.8, 0.8)
 
     def __post_init__(self) -> None:
-        """Make a private read-only copy of the weights, without the rounding of the vertices."""
+        """Store a read-only copy of the weights, rounded to six digits."""
         weights = np.asarray(self.weights, dtype=np.float64).round(6)
         weights.setflags(write=False)
         object.__setattr__(self, "weights", weights)
 
 
 def skin_file(model_path: Path) -> Path:
-    """Where a model's skin is declared: ``woman.skin.yaml`` beside ``woman.urdf``."""
+    """Return the path of a model's skin file: ``woman.skin.yaml`` beside ``woman.urdf``."""
     return model_path.with_suffix(".skin.yaml")
 
 
 def load_skin(model_path: Path, link_names: Sequence[str]) -> tuple[SkinBand, ...]:
-    """Read the skin declared beside a model file; none where there is no such file.
+    """Read the skin file beside a model file; return () where there is none.
 
-    Each entry of ``bands`` has ``parent`` and ``child``, names of links; ``mesh``, a closed mesh in
-    the child's frame at rest, its path relative to the file; ``axis`` (3 numbers, in the child's
-    frame), ``begin`` and ``end`` [m]: along the axis, measured from the child's origin, a vertex's
-    weight rises smoothly from 0 at ``begin`` to 1 at ``end``; and ``colour`` (r, g, b; optional).
+    Each entry of ``bands`` has these fields:
+
+    - ``parent``, ``child``: names of the two links.
+    - ``mesh``: a closed mesh file in the child link's frame at rest, relative to the skin file.
+    - ``axis``: (3,) a direction in the child link's frame.
+    - ``begin``, ``end``: distances [m] from the child link's origin along the axis. The weight of a
+      vertex rises smoothly from 0 at ``begin`` to 1 at ``end``.
+    - ``colour``: (r, g, b), optional.
 
     Raises:
         ModelError: the file or a mesh cannot be used.
@@ -83,7 +90,7 @@ def load_skin(model_path: Path, link_names: Sequence[str]) -> tuple[SkinBand, ..
 
 @dataclass
 class BandEntry:
-    """A band in a skin file; see load_skin."""
+    """A band as a skin file has it; see ``load_skin``."""
 
     parent: str = ""
     child: str = ""
@@ -95,7 +102,11 @@ class BandEntry:
 
 
 def _make_band(path: Path, entry: dict[str, Any], link_names: Sequence[str]) -> SkinBand:
-    """One band, after checks."""
+    """Check one entry of a skin file and return its band.
+
+    The weight is the smoothstep w = f^2 (3 - 2 f) of the fraction f of the way from ``begin`` to
+    ``end``.
+    """
     where = f"{path}: band '{entry.get('parent')}' - '{entry.get('child')}'"
     given = typed_entry(entry, BandEntry, where, ModelError)
     for link in (given.parent, given.child):
@@ -116,9 +127,9 @@ def _make_band(path: Path, entry: dict[str, Any], link_names: Sequence[str]) -> 
     if not is_watertight(mesh):
         raise ModelError(f"{where}: {given.mesh} is not closed; close the band's ends")
     along = mesh.vertices @ (axis / np.linalg.norm(axis))
-    share = np.clip((along - begin) / (end - begin), 0.0, 1.0)
+    fraction = np.clip((along - begin) / (end - begin), 0.0, 1.0)
     red, green, blue = colour.tolist()
-    weights = share**2 * (3.0 - 2.0 * share)
+    weights = fraction**2 * (3.0 - 2.0 * fraction)
     return SkinBand(given.parent, given.child, mesh, weights, (red, green, blue))
 
 
@@ -140,25 +151,29 @@ _KINDS: dict[str, tuple[PositionKind, ...]] = {
 FLOATING_TYPES = ("rpy_floating", "quaternion_floating")
 
 _FULL_TURN = 2.0 * np.pi
-# Limits written with ten digits are a full turn.
+# Limits of a full turn, written with ten digits, must pass [rad].
 _ROUNDING = 1e-9
 
 
 def turns_around(lower: Array, upper: Array, periodic: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Which values (k,) can take every direction inside their limits (k,)."""
+    """Return (k,) which periodic positions have limits (k,) [rad] of a full turn or more."""
     return np.asarray(periodic & (upper - lower >= _FULL_TURN - _ROUNDING))
 
 
 def one_turn(lower: Any, upper: Any, near: Any) -> tuple[Any, Any]:
-    """Limits (k,), and of those wider than a turn the turn inside them nearest to values (k,)."""
+    """Return limits (k,) [rad] that span at most one turn.
+
+    Limits that are wider are narrowed to the full turn inside them whose middle is nearest to
+    ``near`` (k,).
+    """
     low = np.clip(near - np.pi, lower, np.maximum(upper - _FULL_TURN, lower))
     return low, np.minimum(low + _FULL_TURN, upper)
 
 
 def nearest_turn(values: Array, near: Array, periodic: NDArray[np.bool_] | bool) -> Array:
-    """Values (k,), periodic ones moved by full turns to within half a turn of ``near``.
+    """Return values (k,) [rad], periodic ones moved by full turns to within half a turn of near.
 
-    What is half a turn away on either side stays there.
+    A value exactly half a turn away stays on its side.
     """
     turns = np.round((values - near) / _FULL_TURN)
     return np.asarray(np.where(periodic, values - _FULL_TURN * turns, values))
@@ -167,17 +182,19 @@ def nearest_turn(values: Array, near: Array, periodic: NDArray[np.bool_] | bool)
 def describe_positions(
     plant: MultibodyPlant, given: Mapping[str, tuple[float, float]], where: str
 ) -> tuple[dict[str, Any], list[str]]:
-    """Names, kinds and limits of all positions of a finalized plant, and warnings.
-
-    The first are what ParsedModel has of positions, by attribute.
+    """Return names, kinds, limits and couplings of a finalized plant's positions, and warnings.
 
     Args:
-        given: limits (lower, upper) [rad or m] by position name that replace the plant's own.
-        where: the model's file, for messages.
+        plant: a finalized plant.
+        given: limits (lower, upper) [rad or m] by position name that replace the plant's limits.
+        where: the model file, for messages.
+
+    Returns:
+        The attributes of ``ParsedModel`` that describe positions, by name, and the warnings.
 
     Raises:
         UnknownNameError: ``given`` names a position that does not exist.
-        ModelError: names a joint of an unknown type, or with limits that cannot be searched.
+        ModelError: a joint has an unknown type, or limits that cannot be searched.
     """
     names = plant.GetPositionNames(add_model_instance_prefix=False, always_add_suffix=False)
     scoped = plant.GetPositionNames(add_model_instance_prefix=True, always_add_suffix=False)
@@ -204,18 +221,18 @@ def describe_positions(
             periodic[i] = kinds[i] == "angle" and kind != "screw"
             if kind not in FLOATING_TYPES:
                 default, limits = float(defaults[i]), given.get(names[i])
-                found = _searched_limits(joint, i - first, names[i], default, limits)
+                found = _search_limits(joint, i - first, names[i], default, limits)
                 lower[i], upper[i], free[i], remark = found
                 warnings += [remark] * bool(remark)
-    couplings = _resolved(read_couplings(plant), names)
-    warnings += _share_limits(couplings, names, (lower, upper, periodic, free))
+    couplings = _resolve_chains(read_couplings(plant), names)
+    warnings += _intersect_limits(couplings, names, (lower, upper, periodic, free))
     free &= periodic
     defaults = np.clip(defaults, lower, upper)
     for follower, leader, multiplier, offset in couplings:
         defaults[follower] = multiplier * defaults[leader] + offset
     for array in (lower, upper, defaults, periodic, free):
         array.setflags(write=False)
-    told: dict[str, Any] = {
+    attributes: dict[str, Any] = {
         "position_names": tuple(names),
         "position_kinds": tuple(kinds),
         "lower": lower,
@@ -225,11 +242,14 @@ def describe_positions(
         "turns_freely": free,
         "couplings": couplings,
     }
-    return told, warnings
+    return attributes, warnings
 
 
-def _resolved(found: Sequence[Coupling], names: Sequence[str]) -> tuple[Coupling, ...]:
-    """Couplings whose leaders follow no other position."""
+def _resolve_chains(found: Sequence[Coupling], names: Sequence[str]) -> tuple[Coupling, ...]:
+    """Return the couplings with leaders that follow no other position.
+
+    Raises ModelError: two positions are coupled in two ways.
+    """
     of = {k: Coupling(k, k, 1.0, 0.0) for one in found for k in one[:2]}
     for one in found:
         own, other = of[one.follower], of[one.leader]
@@ -247,15 +267,20 @@ def _resolved(found: Sequence[Coupling], names: Sequence[str]) -> tuple[Coupling
     return tuple(one for k, one in sorted(of.items()) if one.leader != k)
 
 
-def _share_limits(
+def _intersect_limits(
     couplings: Sequence[Coupling],
     names: Sequence[str],
     arrays: tuple[Array, Array, NDArray[np.bool_], NDArray[np.bool_]],
 ) -> list[str]:
-    """Lets positions that follow one another have the same limits; warnings.
+    """Intersect the limits of coupled positions in place; return warnings.
 
-    ``arrays``: lower, upper, periodic and turns_freely of ParsedModel, which are changed. Limits
-    of a follower that leave one value alone are not taken (PR2's have the wrong sign).
+    A follower whose limits leave its leader a single value loses these limits (PR2's have the wrong
+    sign).
+
+    Args:
+        couplings: couplings whose leaders follow no other position.
+        names: the position names, for messages.
+        arrays: lower, upper, periodic and turns_freely of ``ParsedModel``, changed in place.
     """
     lower, upper, periodic, free = arrays
     warnings = []
@@ -264,14 +289,14 @@ def _share_limits(
         if free[follower]:
             continue
         ends = np.sort((np.array([lower[follower], upper[follower]]) - offset) / multiplier)
-        whole = [-np.inf, np.inf] if free[leader] else [lower[leader], upper[leader]]
-        low, high = max(ends[0], whole[0]), min(ends[1], whole[1])
-        told = f"joint '{names[follower]}' follows joint '{names[leader]}' (<mimic>: "
-        told += f"{multiplier:g} x {offset:+g}), but their limits leave "
+        leader_range = [-np.inf, np.inf] if free[leader] else [lower[leader], upper[leader]]
+        low, high = max(ends[0], leader_range[0]), min(ends[1], leader_range[1])
+        conflict = f"joint '{names[follower]}' follows joint '{names[leader]}' (<mimic>: "
+        conflict += f"{multiplier:g} x {offset:+g}), but their limits leave "
         if low > high + _ROUNDING:
-            raise ModelError(f"{told}no value for both; widen them")
-        if high - low <= _ROUNDING < whole[1] - whole[0]:
-            warnings.append(f"{told}{low:g} alone: the first one's are not taken")
+            raise ModelError(f"{conflict}no value for both; widen them")
+        if high - low <= _ROUNDING < leader_range[1] - leader_range[0]:
+            warnings.append(f"{conflict}only {low:g}: the follower's limits are ignored")
             continue
         lower[leader], upper[leader], free[leader] = low, max(low, high), False
     for follower, leader, multiplier, offset in couplings:
@@ -281,13 +306,15 @@ def _share_limits(
     return warnings
 
 
-def _searched_limits(
+def _search_limits(
     joint: Joint, index: int, name: str, default: float, given: tuple[float, float] | None
 ) -> tuple[float, float, bool, str]:
-    """The limits of one position of a joint, whether they mean none, and a remark or "".
+    """Return the limits of one position for the search, whether they are ignored, and a warning.
 
-    Limits more than four turns, a hundred turns of a screw, or a kilometre apart are written for
-    none. An angle turns freely then, and is searched in one turn about its default.
+    The warning is "" where there is none.
+
+    Limits more than four turns apart (a hundred turns for a screw, a kilometre for a slide) count
+    as no limits. An angle without limits is searched over one turn about its default.
     """
     kind = joint.type_name()
     is_length, is_screw = _KINDS[kind][index] == "length", kind == "screw"
@@ -306,10 +333,10 @@ def _searched_limits(
     if high - low <= widest * (1.0 + _ROUNDING):
         return low, high, False, ""
     unlimited, one_sided = low == -high == -np.inf, np.isinf(low) != np.isinf(high)
-    if is_length:  # Slides may say where the object stands: see tree_builder.
+    if is_length:  # Such slides may place the object in the world: see tree_builder.
         remark = f"{title} has limits of {low:g} and {high:g} m, more than {widest:g} m apart: "
-        told = unlimited or one_sided
-        return -np.inf, np.inf, True, "" if told else f"{remark}they are taken as none"
+        remark = "" if unlimited or one_sided else f"{remark}they are ignored"
+        return -np.inf, np.inf, True, remark
     advice = (
         "give it a lower and an upper limit in the model file (or to load_model: "
         f"limits={{'{name}': (low, high)}})"
@@ -321,39 +348,45 @@ def _searched_limits(
             "values can be searched"
         )
     start, end = one_turn(low, high, default)
-    answers = f"{np.degrees(start):.6g} to {np.degrees(start + _FULL_TURN):.6g} degrees"
+    searched = f"{np.degrees(start):.6g} to {np.degrees(start + _FULL_TURN):.6g} degrees"
     remark = ""
     if is_screw:
-        remark = f"{title} is a screw without limits: searched from {answers}; {advice}"
+        remark = f"{title} is a screw without limits: searched from {searched}; {advice}"
     elif not unlimited:
         remark = (
             f"{title} has limits of {low:g} and {high:g} rad, more than {turns:g} turns apart: it "
-            f"is taken to turn freely, and answers are given from {answers}"
+            f"is taken to turn freely, and its angle is reported from {searched}"
         )
     return float(start), float(end), True, remark
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ParsedModel:
-    """What a model file says, as Drake understands it. Never changes.
+    """What a model file says, as Drake reads it. Immutable.
 
-    What describes q is in the plant's order; its arrays (nq,) are read-only.
+    Arrays about positions have shape (nq,), are in the order of the plant's q, and are read-only.
 
     Attributes:
         position_names: the joint's name, or ``joint_suffix`` for joints of several positions.
         position_kinds: "angle" [rad], "length" [m] or "quaternion".
-        lower, upper: limits [rad or m]; half a turn either side of the default position for a joint
-            that turns freely; infinite for a floating body's pose and slides without limits.
-        default_positions: Drake's default positions moved inside the limits.
-        periodic: angles that look the same after a full turn: all but those of screws.
-        turns_freely: angles without limits, or with limits so wide that they mean none.
-        couplings: which positions follow others; no leader follows another one.
-        plant: a finalized MultibodyPlant, to make contexts from; do not change it.
+        lower, upper: limits [rad or m]. A joint that turns freely has half a turn either side of
+            its default position; a floating body's pose and slides without limits have infinite
+            ones.
+        default_positions: Drake's default positions, moved inside the limits.
+        periodic: whether the position is an angle with the same pose after a full turn, which all
+            angles but those of screws are.
+        turns_freely: whether the position is an angle without limits, or with limits so wide that
+            they are ignored.
+        couplings: positions that follow others; no leader follows another position.
+        path: the model file.
+        name: the model's name.
+        plant: a finalized MultibodyPlant, from which contexts are made; do not change it.
+        scene_graph: the SceneGraph with the plant's geometry.
         link_meshes: the visual geometry of each link that has some, in the link's frame.
-        skin: the bands of surface that bend with the joints (``load_skin``); usually none.
-        warnings: what is not read of the file or not enforced, which limits were not taken as they
-            are written, and what Drake remarked.
-        labels: the render labels of what is seen, of a plant that somebody else made; else None.
+        skin: the bands of surface that deform with the joints (``load_skin``).
+        warnings: parts of the file that are not read or not enforced, limits that are ignored, and
+            Drake's own warnings.
+        labels: the render labels of the bodies of a model from ``from_plant``; else None.
     """
 
     position_names: tuple[str, ...]
@@ -375,7 +408,7 @@ class ParsedModel:
     labels: frozenset[int] | None = None
 
     def __repr__(self) -> str:
-        """One line: what it is, and how large."""
+        """Return one line with the model's name, file, number of positions and number of links."""
         return (
             f"<{type(self).__name__} '{self.name}' of {self.path}: "
             f"{len(self.position_names)} positions, {len(self.link_meshes)} links with a surface>"
@@ -384,16 +417,16 @@ class ParsedModel:
     def add_to(
         self, plant: MultibodyPlant, scene_graph: SceneGraph | None = None, *, prefix: str = ""
     ) -> list[ModelInstanceIndex]:
-        """Add the same model to another plant, for example one of a diagram; its new instances.
+        """Add the model to another plant, for example a diagram's, and return its model instances.
 
         Mesh files that Drake would not draw are replaced as in this model. Add renderers to the
-        SceneGraph after this call: Drake's VTK renderer rejects an OBJ file without normals at the
-        moment it is parsed.
+        SceneGraph after this call, because Drake's VTK renderer rejects an OBJ file without normals
+        as soon as it is parsed.
 
         Args:
             plant: a plant that is not finalized.
-            scene_graph: the SceneGraph it is or shall be registered with; None for no geometry.
-            prefix: put before the model's name, to tell several copies apart.
+            scene_graph: the SceneGraph to register the plant with; None: add no geometry.
+            prefix: put before the model's name, so that several copies have different names.
 
         Raises ModelError: Drake refuses the model in that plant.
         """
@@ -404,24 +437,24 @@ class ParsedModel:
 
     @cached_property
     def link_names(self) -> tuple[str, ...]:
-        """All links, seen or not, in the order of the plant's bodies; the first is the world."""
+        """All links, with or without geometry, in the order of the plant's bodies."""
         return link_names(self.plant)
 
     def link_index(self, name: str) -> int:
-        """The index of a link among the plant's bodies; UnknownNameError where there is none."""
+        """Return a link's index among the plant's bodies; UnknownNameError if it does not exist."""
         if name not in self.link_names:
             raise UnknownNameError("link", name, self.link_names, str(self.path))
         return self.link_names.index(name)
 
     def position_index(self, name: str) -> int:
-        """Where a position stands in q; UnknownNameError where none has that name."""
+        """Return a position's index in q; UnknownNameError if it does not exist."""
         if name not in self.position_names:
             raise UnknownNameError("joint", name, self.position_names, str(self.path))
         return self.position_names.index(name)
 
 
 def link_names(plant: MultibodyPlant) -> tuple[str, ...]:
-    """A unique name for each body, in the plant's order: ``instance::link`` where links repeat."""
+    """Return a unique name for each body, ``instance::link`` where a link's name repeats."""
     bodies = [plant.get_body(BodyIndex(index)) for index in range(plant.num_bodies())]
     plain = [body.name() for body in bodies]
     return tuple(

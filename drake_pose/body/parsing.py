@@ -1,4 +1,7 @@
-"""One model file, as a cured text, into one Drake plant; every failure is a ModelError."""
+"""Parsing of a model file into a Drake plant, after its text is sanitised and checked.
+
+Every failure is a ModelError that names the file.
+"""
 
 import copy
 import faulthandler
@@ -27,22 +30,24 @@ from pydrake.multibody.tree import ModelInstanceIndex
 
 from drake_pose.body.link_files import Limits, sanitise_sdf, sanitise_urdf
 from drake_pose.body.meshes import TriangleMesh, draws_given_files, read_meshes, workspace
-from drake_pose.body.mjcf import Couple, sanitise_mjcf
+from drake_pose.body.mjcf import MjcfCoupling, sanitise_mjcf
 from drake_pose.body.model_files import FileFinder
 from drake_pose.body.plant_source import add_coupler
 from drake_pose.errors import DrakePoseError, ModelError
 
 
 class ModelSource:
-    """A model file and the cured text that Drake parses in its place.
+    """A model file and the sanitised text that Drake parses in its place.
 
     Attributes:
-        kind: what Drake's parser calls that kind of text.
-        warnings: what of the file is not read, or not enforced, each once.
-        limits: limits (lower, upper) [rad] by position name that Drake's parser passes over.
+        path: the model file.
+        text: the sanitised text.
+        kind: the file type that Drake's parser expects: "urdf", "sdf", "xml" or "dmd.yaml".
+        warnings: parts of the file that are not read or not enforced, each once.
+        limits: limits (lower, upper) [rad] by position name that Drake's parser does not read.
 
-    Raises ModelError: missing, unreadable, of an unknown kind, or it cannot be cured; the message
-    names the file and the link, joint or mesh.
+    Raises ModelError: the file is missing, unreadable, of an unknown type, or cannot be sanitised;
+    the message names the file and the link, joint or mesh.
     """
 
     def __init__(self, path: Path, package_paths: Mapping[str, str]) -> None:
@@ -53,14 +58,14 @@ class ModelSource:
         self.path = path
         self.warnings: list[str] = []
         self.limits: Limits = {}
-        self._couples: list[Couple] = []
+        self._couplings: list[MjcfCoupling] = []
         self._finder = FileFinder(package_paths)
-        self._stand_ins: dict[Path, Path] = {}
-        self._under_way: list[Path] = []
+        self._copies: dict[Path, Path] = {}
+        self._open_files: list[Path] = []
         self.text, self.kind = self._sanitise(path)
 
     def with_text(self, text: str) -> "ModelSource":
-        """The same file with another text."""
+        """Return a copy of the source with another text."""
         other = copy.copy(self)
         other.text = text
         return other
@@ -68,11 +73,12 @@ class ModelSource:
     def parse(
         self, plant: MultibodyPlant, scene_graph: SceneGraph | None, prefix: str = ""
     ) -> tuple[list[ModelInstanceIndex], list[str]]:
-        """Add the model to a plant; its new instances, and what is worth knowing of the file.
+        """Add the model to a plant; return its model instances and the warnings about the file.
 
         Args:
             plant: a plant that is not finalized.
-            scene_graph: to register geometry with; None where the plant is registered already.
+            scene_graph: the SceneGraph to register the plant with; None: the plant is registered
+                already or gets no geometry.
             prefix: put before the model's name.
 
         Raises ModelError: Drake cannot read the model.
@@ -84,33 +90,34 @@ class ModelSource:
         with captured_warnings() as warnings:
             try:
                 instances = parser.AddModelsFromString(self.text, self.kind)
-                for one, other, *how in self._couples:
+                for follower_name, leader_name, *relation in self._couplings:
                     follower, leader = (
-                        plant.GetJointByName(name, instances[0]) for name in (one, other)
+                        plant.GetJointByName(name, instances[0])
+                        for name in (follower_name, leader_name)
                     )
-                    add_coupler(plant, follower, leader, *how)
-            # Drake ends the process, which Python sees as SystemExit, at some values.
+                    add_coupler(plant, follower, leader, *relation)
+            # Drake aborts on some invalid values, which Python sees as SystemExit.
             except (RuntimeError, ValueError, SystemExit) as error:
-                # SDFormat's reader says where in its error, and what in a warning before it.
+                # SDFormat's error names the place; a warning before it names the reason.
                 where = [text.split("Msg: ")[-1] for text in warnings if "Error" in text]
-                # Some of Drake's messages hold whole files.
+                # Some of Drake's messages contain whole files.
                 text = "; ".join([*where, str(error).strip()])[:1000]
-                text = self._name_originals(text, self.path.name)
+                text = self._restore_names(text, self.path.name)
                 raise ModelError(
-                    f"{self.path}: {text or 'Drake refuses this model without saying why'}"
+                    f"{self.path}: {text or 'Drake refuses this model without a reason'}"
                 ) from error
-        # Inertias play no role in what is seen.
+        # Inertias have no effect on silhouettes.
         about_inertia = ("invalid inertia", "parsing inertia matrix", "as central inertia")
         remarks = [
-            self._name_originals(warning, str(self.path))
+            self._restore_names(warning, str(self.path))
             for warning in warnings
             if not any(mark in warning for mark in about_inertia)
         ]
         return list(instances), [*self.warnings, *remarks]
 
     def _sanitise(self, path: Path) -> tuple[str, str]:
-        """The text that is parsed in place of a file, and the kind of it."""
-        # What Drake's parser calls each kind of file.
+        """Return the text that Drake parses in place of a file, and its file type."""
+        # The file type of each extension, by the name that Drake's parser has for it.
         kinds = {".urdf": "urdf", ".sdf": "sdf", ".xml": "xml", ".mjcf": "xml"}
         kinds |= dict.fromkeys((".yaml", ".yml"), "dmd.yaml")
         kind = kinds.get(path.suffix.lower())
@@ -119,79 +126,87 @@ class ModelSource:
             if path.suffix.lower() == ".xacro":
                 what = f"expand it first: xacro {path.name} > {path.stem} (PyPI: xacro)"
             raise ModelError(
-                f"model file {path}: '{path.suffix}' is not a kind of file that Drake's Parser "
+                f"model file {path}: '{path.suffix}' is not a file type that Drake's Parser "
                 f"reads; {what}"
             )
-        if path in self._under_way or len(self._under_way) > 20:
+        if path in self._open_files or len(self._open_files) > 20:
             raise ModelError(f"{path} includes itself")
-        self._under_way.append(path)
+        self._open_files.append(path)
         try:
             if kind == "urdf":
                 text = sanitise_urdf(path, self._finder, self._warn)
             elif kind == "xml":
-                text, couples = sanitise_mjcf(path, self._warn)
-                if len(self._under_way) == 1:
-                    self._couples = couples
-                elif couples:
-                    self._warn(f"{path}: joints of an included MJCF follow no others")
+                text, couplings = sanitise_mjcf(path, self._warn)
+                if len(self._open_files) == 1:
+                    self._couplings = couplings
+                elif couplings:
+                    self._warn(f"{path}: couplings of joints in an included MJCF are not enforced")
             elif kind == "sdf":
-                text, limits = sanitise_sdf(path, self._finder, self._warn, self._stand_in)
-                if len(self._under_way) == 1:
+                text, limits = sanitise_sdf(path, self._finder, self._warn, self._sanitised_copy)
+                if len(self._open_files) == 1:
                     self.limits = limits
             else:
-                text = _sanitise_directives(path, self._finder, self._stand_in)
+                text = _sanitise_directives(path, self._finder, self._sanitised_copy)
             return text, kind
         except ModelError as error:
             reason = str(error)
             raise ModelError(reason if str(path) in reason else f"{path}: {reason}") from error
         finally:
-            self._under_way.pop()
+            self._open_files.pop()
 
-    def _stand_in(self, path: Path) -> Path:
-        """A file with the cured text of another one."""
+    def _sanitised_copy(self, path: Path) -> Path:
+        """Return a temporary file with the sanitised text of another file; make it once."""
         path = path.resolve()
-        if path not in self._stand_ins:
+        if path not in self._copies:
             text, kind = self._sanitise(path)
             folder = Path(tempfile.mkdtemp(prefix="model_", dir=workspace()))
-            stand_in = folder / f"{path.name.partition('.')[0]}.{kind}"
-            stand_in.write_text(text, encoding="utf-8")
-            self._stand_ins[path] = stand_in
-        return self._stand_ins[path]
+            copied = folder / f"{path.name.partition('.')[0]}.{kind}"
+            copied.write_text(text, encoding="utf-8")
+            self._copies[path] = copied
+        return self._copies[path]
 
     def _warn(self, text: str) -> None:
+        """Add a warning unless it is there already."""
         if text not in self.warnings:
             self.warnings.append(text)
 
-    def _name_originals(self, text: str, where: str) -> str:
-        """A message of Drake's with the files' own names; ``where`` is the main file's."""
-        for path, stand_in in self._stand_ins.items():
-            text = re.sub(re.escape(str(stand_in)) + r"(:\d+)?", str(path).replace("\\", "/"), text)
-        # Lines are those of the cured text, which help nobody.
+    def _restore_names(self, text: str, where: str) -> str:
+        """Return Drake's message with original file names instead of the sanitised copies'.
+
+        ``where``: the name of the main file.
+        """
+        for path, copied in self._copies.items():
+            text = re.sub(re.escape(str(copied)) + r"(:\d+)?", str(path).replace("\\", "/"), text)
+        # Line numbers are left out: they count lines of the sanitised text.
         return re.sub(
             r"<(literal|data)-string>(\.[\w.]+\w)?(:\d+)?", where.replace("\\", "/"), text
         )
 
 
-def limit_kinds(warnings: Sequence[str], most: int = 10) -> list[str]:
-    """Warnings, at most ten of those that differ in names and numbers alone, and their count."""
+def summarise_warnings(warnings: Sequence[str], max_count: int = 10) -> list[str]:
+    """Return the warnings, at most ``max_count`` of each kind, and how many more there are.
+
+    Warnings are of one kind if they differ in quoted names and numbers only.
+    """
     by_kind: dict[str, list[str]] = {}
     for warning in warnings:
         kind = re.sub(r"'[^']*'|-?\d[\d.e+-]*", "", warning)
         by_kind.setdefault(kind, []).append(warning)
     shown = []
     for alike in by_kind.values():
-        shown += alike[:most]
-        if len(alike) > most:
-            shown[-1] += f" ... and {len(alike) - most} more of this kind"
+        shown += alike[:max_count]
+        if len(alike) > max_count:
+            shown[-1] += f" ... and {len(alike) - max_count} more of this kind"
     return shown
 
 
 @contextmanager
 def captured_warnings() -> Iterator[list[str]]:
-    """Collect what Drake logs meanwhile instead of printing it; each text once, in order."""
+    """Collect Drake's log messages inside the context, each once, instead of printing them."""
     texts: list[str] = []
 
     def collect(record: logging.LogRecord) -> bool:
+        """Store a warning's text; suppress all records."""
         text = record.getMessage().strip()
         if record.levelno >= logging.WARNING and text not in texts:
             texts.append(text)
@@ -208,18 +223,21 @@ def captured_warnings() -> Iterator[list[str]]:
 def _sanitise_directives(
     path: Path, finder: FileFinder, sanitise_file: Callable[[Path], Path]
 ) -> str:
-    """The text of model directives, tags and aliases kept, that name the files' stand-ins."""
+    """Return the text of model directives in which every file is replaced by its sanitised copy.
+
+    YAML tags and aliases are kept. ``sanitise_file`` returns the copy of a file.
+    """
     try:
         node = top = yaml.compose(path.read_bytes(), Loader=yaml.SafeLoader)
     except OSError as error:
         raise ModelError(f"it cannot be read: {error.strerror}") from error
     except (yaml.YAMLError, ValueError) as error:
-        raise ModelError(f"it is no YAML: {' '.join(str(error).split())}") from error
+        raise ModelError(f"it is not YAML: {' '.join(str(error).split())}") from error
     except RecursionError:
         raise ModelError("it is nested too deeply") from None
     if node is None:
         raise ModelError("it is empty; expected 'directives:'")
-    # The scalars that name a file, each once, and the directive that they belong to.
+    # Visit each YAML node once, together with the directive that it belongs to.
     waiting, seen = [("", node)], set()
     while waiting:
         directive, node = waiting.pop()
@@ -227,7 +245,7 @@ def _sanitise_directives(
             continue
         seen.add(id(node))
         if isinstance(node, yaml.SequenceNode):
-            waiting += [(directive, one) for one in reversed(node.value)]
+            waiting += [(directive, item) for item in reversed(node.value)]
             continue
         for key, value in node.value:
             if key.value != "file" or not isinstance(value, yaml.ScalarNode):
@@ -240,63 +258,74 @@ def _sanitise_directives(
 
 
 TIME_LIMIT_SECONDS = 60.0
+"""Timeout for reading a model in a child process."""
+
 MEMORY_LIMIT_BYTES = 2 * 2**30
+"""Memory that a child process may take for reading a model."""
 
 Reader = Callable[[Path, Mapping[str, str], Mapping[str, tuple[float, float]]], Any]
-"""Reads a model file: its path, its packages, and limits [rad or m] by position name."""
+"""Reads a model from its path, package folders, and limits [rad or m] by position name."""
 
 
 def check_in_child(
     read: Reader, path: Path, packages: Mapping[str, str], limits: Mapping[str, tuple[float, float]]
 ) -> None:
-    """Read a model and prepare its drawing in a child process with a time and memory limit.
+    """Read a model and prepare its rendering in a child process with a time and a memory limit.
 
-    Drawing is prepared where it takes files that were given; those written here Drake can draw.
-    Drake 1.51 can crash on a broken glTF, a texture or a file that includes itself, and a YAML
-    alias bomb takes all memory. A success is remembered while the file's content stays the same.
-    A process of one thread forks the child, which has then imported everything; others start one.
+    Drake 1.51 can crash on a broken glTF file, a texture, or a file that includes itself, and a
+    YAML alias bomb takes all memory. Rendering is prepared only where the renderer reads given
+    files: files written by this package are known to be drawable. A success is remembered for the
+    same file content.
 
-    Raises ModelError: the model cannot be used, or reading it crashed, hung or took too much
+    A process of one thread forks the child, which then needs no imports; others start a new
+    process.
+
+    Raises ModelError: the model cannot be used, or reading crashed, timed out or took too much
     memory.
     """
     try:
         digest = hashlib.sha256(path.read_bytes()).hexdigest()
     except OSError as error:
         raise ModelError(f"model file {path} cannot be read: {error.strerror}") from error
-    _check(read, str(path), json.dumps(dict(packages)), json.dumps(dict(limits)), digest)
+    _check_cached(read, str(path), json.dumps(dict(packages)), json.dumps(dict(limits)), digest)
 
 
 @functools.lru_cache(maxsize=64)
-def _check(read: Reader, path: str, packages: str, limits: str, _digest: str) -> None:
-    """Raise why the model cannot be used; the digest only tells versions of the file apart."""
+def _check_cached(read: Reader, path: str, packages: str, limits: str, _digest: str) -> None:
+    """Raise ModelError if the model cannot be used; ``_digest`` keys the cache by file content."""
     try:
         try:
-            # Where nothing but this thread runs, a fork lacks nothing; so on Linux alone.
+            # Forking is safe in a process of one thread; threads can be counted on Linux only.
             may_fork = len(os.listdir("/proc/self/task")) == 1
         except OSError:
             may_fork = False
         if may_fork and not multiprocessing.current_process().daemon:
-            reason = _ask_fork(read, path, packages, limits)
+            reason = _check_in_fork(read, path, packages, limits)
         else:
-            reason = _ask_process(path, packages, limits)
+            reason = _check_in_subprocess(path, packages, limits)
     except TimeoutError:
         raise ModelError(
-            f"{path}: reading it takes more than {TIME_LIMIT_SECONDS:g} s; does it include itself?"
+            f"{path}: reading takes more than {TIME_LIMIT_SECONDS:g} s; does it include itself?"
         ) from None
     except ChildProcessError as error:
         raise ModelError(
-            f"{path}: reading it {error}; it or a file it names is broken, includes itself, or "
-            f"needs more than {MEMORY_LIMIT_BYTES // 2**30} GiB of memory"
+            f"{path}: reading {error}; this file or one that it names is broken, includes itself, "
+            f"or needs more than {MEMORY_LIMIT_BYTES // 2**30} GiB of memory"
         ) from None
     if reason:
         raise ModelError(reason)
 
 
 def why_unusable(read: Reader, path: str, packages: str, limits: str) -> str:
-    """Why a model cannot be used ("": it can), in this process, which may die of it.
+    """Return why a model cannot be used, or "" if it can; call it in a process that may crash.
 
-    ``packages`` and ``limits`` are JSON. From here on the process has MEMORY_LIMIT_BYTES more than
-    it has now, and leaves no core.
+    The process may take MEMORY_LIMIT_BYTES more memory afterwards, and leaves no core dump.
+
+    Args:
+        read: the function that reads the model.
+        path: the model file.
+        packages: package folders by name, as JSON.
+        limits: limits [rad or m] by position name, as JSON.
     """
     with suppress(ImportError, ValueError, OSError):
         import resource  # Absent on Windows.
@@ -318,24 +347,30 @@ def why_unusable(read: Reader, path: str, packages: str, limits: str) -> str:
         return f"{path}: {error}"
     except MemoryError:
         size = f"{MEMORY_LIMIT_BYTES // 2**30} GiB"
-        return f"{path}: reading it needs more than {size} of memory; make its meshes smaller"
+        return f"{path}: reading needs more than {size} of memory; make its meshes smaller"
     return ""
 
 
-def _ask_fork(read: Reader, path: str, packages: str, limits: str) -> str:
-    """What a fork of this process answers; TimeoutError, or ChildProcessError for how it ended."""
+def _check_in_fork(read: Reader, path: str, packages: str, limits: str) -> str:
+    """Return ``why_unusable`` from a fork of this process, and keep the meshes that it read.
+
+    Raises:
+        TimeoutError: the fork did not answer in time.
+        ChildProcessError: the fork ended without an answer; the message says how.
+    """
     fork = multiprocessing.get_context("fork")
     receiver, sender = fork.Pipe(duplex=False)
-    workspace()  # Here, for what the fork writes there to be removed at this process's end.
-    with tempfile.TemporaryFile() as remarks:
-        words = (sender, remarks.fileno(), read, path, packages, limits)
-        child = fork.Process(target=_answer, args=words)
+    # Made before the fork, so that this process removes what the fork writes there.
+    workspace()
+    with tempfile.TemporaryFile() as output:
+        arguments = (sender, output.fileno(), read, path, packages, limits)
+        child = fork.Process(target=_run_check, args=arguments)
         child.start()
         sender.close()
         try:
             if not receiver.poll(TIME_LIMIT_SECONDS):
                 raise TimeoutError
-            with suppress(EOFError):  # It died.
+            with suppress(EOFError):  # The fork died.
                 reason, meshes = receiver.recv()
                 read_meshes.update({file: TriangleMesh(*mesh) for file, mesh in meshes.items()})
                 return str(reason)
@@ -343,26 +378,26 @@ def _ask_fork(read: Reader, path: str, packages: str, limits: str) -> str:
             receiver.close()
             child.kill()
             child.join()
-        remarks.seek(0)
-        said = remarks.read().decode("utf-8", "replace")
-        raise ChildProcessError(_ending(child.exitcode or 0, said))
+        output.seek(0)
+        text = output.read().decode("utf-8", "replace")
+        raise ChildProcessError(_describe_exit(child.exitcode or 0, text))
 
 
-def _answer(
-    sender: Connection, remarks: int, read: Reader, path: str, packages: str, limits: str
+def _run_check(
+    sender: Connection, output: int, read: Reader, path: str, packages: str, limits: str
 ) -> None:
-    """What the fork does: it answers with the meshes that it read, too, and leaves at once."""
+    """Send the result of ``why_unusable`` and the meshes that were read, then exit the fork."""
     faulthandler.disable()
     for descriptor in (1, 2):
-        os.dup2(remarks, descriptor)
+        os.dup2(output, descriptor)
     reason = why_unusable(read, path, packages, limits)
     sender.send((reason, {f: (m.vertices, m.triangles) for f, m in read_meshes.items()}))
     os._exit(0)
 
 
-def _ask_process(path: str, packages: str, limits: str) -> str:
-    """What a process of its own answers, which takes longer; raises as _ask_fork."""
-    # It leaves at once: what a broken file left behind may crash on the way out.
+def _check_in_subprocess(path: str, packages: str, limits: str) -> str:
+    """As ``_check_in_fork`` in a newly started process, which takes longer."""
+    # os._exit skips clean-up, which may crash after a broken file.
     program = (
         "import json, os, sys\n"
         "from drake_pose.body.model import read_model\n"
@@ -377,9 +412,9 @@ def _ask_process(path: str, packages: str, limits: str) -> str:
             env={
                 **os.environ,
                 "PYTHONPATH": os.pathsep.join(filter(None, folders)),
-                # With threads of its own VTK takes twice as long.
+                # VTK takes twice as long with several threads.
                 "LP_NUM_THREADS": "0",
-                # What it leaves when it ends is removed at this process's end.
+                # This process removes the child's temporary files at exit.
                 "TMPDIR": str(workspace()),
             },
             stdin=subprocess.DEVNULL,
@@ -391,14 +426,14 @@ def _ask_process(path: str, packages: str, limits: str) -> str:
         )
     except subprocess.TimeoutExpired:
         raise TimeoutError from None
-    said = end.stdout.strip().splitlines()
-    if end.returncode == 0 and said:
-        return str(json.loads(said[-1]))
-    raise ChildProcessError(_ending(end.returncode, end.stderr))
+    lines = end.stdout.strip().splitlines()
+    if end.returncode == 0 and lines:
+        return str(json.loads(lines[-1]))
+    raise ChildProcessError(_describe_exit(end.returncode, end.stderr))
 
 
-def _ending(status: int, remarks: str) -> str:
-    """How a process ended that did not answer."""
+def _describe_exit(status: int, output: str) -> str:
+    """Return how a process ended that sent no answer, from its exit status and output."""
     if status < 0:
         return f"crashed Drake ({signal.Signals(-status).name})"
-    return f"failed ({(remarks.strip().splitlines() or [f'exit status {status}'])[-1]})"
+    return f"failed ({(output.strip().splitlines() or [f'exit status {status}'])[-1]})"

@@ -1,4 +1,4 @@
-"""A finalized plant as the source of a model: copies of it are made in other plants."""
+"""A finalized plant as the source of a model, and copies of it in other plants."""
 
 from collections.abc import Callable, Collection
 from typing import Any, NamedTuple
@@ -32,7 +32,7 @@ from drake_pose.errors import ModelError
 
 
 def _screw_axis(joint: ScrewJoint) -> Any:
-    """The axis (3,) of a screw in its frame F, which Drake's Python does not say."""
+    """Return a screw joint's axis (3,) in its frame F, which pydrake does not expose."""
     plant = joint.GetParentPlant()
     context = plant.CreateDefaultContext()
     q = np.array(plant.GetPositions(context))
@@ -43,7 +43,7 @@ def _screw_axis(joint: ScrewJoint) -> Any:
 
 
 _Make = Callable[[Any, str, Frame, Frame], Joint]
-# Damping plays no role in what is seen.
+# The copies have no damping, which does not affect poses.
 _JOINTS: dict[str, _Make] = {
     "weld": lambda joint, *where: WeldJoint(*where, joint.X_FM()),
     "revolute": lambda joint, *where: RevoluteJoint(*where, joint.revolute_axis()),
@@ -58,7 +58,10 @@ _JOINTS: dict[str, _Make] = {
 
 
 class Coupling(NamedTuple):
-    """A position that follows another one: q[follower] = multiplier * q[leader] + offset."""
+    """A position that follows another one: q[follower] = multiplier * q[leader] + offset.
+
+    The offset's unit is rad or m.
+    """
 
     follower: int
     leader: int
@@ -67,14 +70,14 @@ class Coupling(NamedTuple):
 
 
 def read_couplings(plant: MultibodyPlant) -> list[Coupling]:
-    """The couplers of a finalized plant, which its Python tells through InverseKinematics alone.
+    """Return the coupler constraints of a finalized plant.
 
-    None of a plant with tendons, which InverseKinematics refuses: all its constraints are counted
-    as not enforced then.
+    pydrake exposes them through InverseKinematics only, which refuses plants with tendons. Such a
+    plant has no couplings here, and all its constraints are reported as not enforced.
     """
     if plant.num_constraints() == 0:
         return []
-    from pydrake.multibody.inverse_kinematics import InverseKinematics  # It imports the solvers.
+    from pydrake.multibody.inverse_kinematics import InverseKinematics  # Slow to import.
 
     try:
         program = InverseKinematics(plant, with_joint_limits=False).prog()
@@ -85,7 +88,7 @@ def read_couplings(plant: MultibodyPlant) -> list[Coupling]:
         index = program.FindDecisionVariableIndices(binding.variables())
         (row,), (offset,) = binding.evaluator().GetDenseA(), binding.evaluator().lower_bound()
         if np.count_nonzero(row) == 2:
-            # The follower's factor is 1; where both could be it, the later one is.
+            # The follower has the factor 1; if both have it, the second is the follower.
             k = int(row[1] == 1.0)
             found.append(Coupling(index[k], index[1 - k], -row[1 - k] / row[k], offset / row[k]))
     return found
@@ -94,39 +97,40 @@ def read_couplings(plant: MultibodyPlant) -> list[Coupling]:
 def add_coupler(
     plant: MultibodyPlant, follower: Joint, leader: Joint, multiplier: float, offset: float
 ) -> None:
-    """Let a joint follow another one, as Drake's parser does: not where its solver cannot."""
+    """Add a coupler constraint, unless the plant's contact solver does not support them."""
     if plant.get_discrete_contact_solver() == DiscreteContactSolver.kSap:
         plant.AddCouplerConstraint(follower, leader, multiplier, offset)
 
 
 class PlantSource:
-    """A plant that somebody else made, in place of a model file (``ModelSource``).
+    """An existing plant in place of a model file (``ModelSource``).
 
     Attributes:
         kind: "plant".
-        limits: none but the plant's own.
+        limits: empty; the limits are the plant's own.
 
     Args:
-        plant: finalized.
-        scene_graph: the one that it is registered with.
-        seen: the bodies whose geometry is the model's.
+        plant: a finalized plant.
+        scene_graph: the SceneGraph that the plant is registered with.
+        drawn: the bodies whose geometry belongs to the model.
     """
 
     kind = "plant"
 
     def __init__(
-        self, plant: MultibodyPlant, scene_graph: SceneGraph, seen: Collection[BodyIndex]
+        self, plant: MultibodyPlant, scene_graph: SceneGraph, drawn: Collection[BodyIndex]
     ) -> None:
-        self.plant, self.scene_graph, self.seen = plant, scene_graph, frozenset(seen)
+        self.plant, self.scene_graph, self.drawn = plant, scene_graph, frozenset(drawn)
         self.limits: dict[str, tuple[float, float]] = {}
 
     def parse(
         self, plant: MultibodyPlant, scene_graph: SceneGraph | None, prefix: str = ""
     ) -> tuple[list[ModelInstanceIndex], list[str]]:
-        """Copy all bodies and joints, so that q means the same, and the geometry that is seen.
+        """Copy all bodies and joints, which keeps the meaning of q, and the drawn bodies' geometry.
 
-        Args, returns: as ``ModelSource.parse``. Raises ModelError: a joint is of a type that cannot
-        be copied.
+        Arguments and return values are those of ``ModelSource.parse``.
+
+        Raises ModelError: a joint has a type that cannot be copied.
         """
         if scene_graph is not None and not plant.geometry_source_is_registered():
             plant.RegisterAsSourceForSceneGraph(scene_graph)
@@ -142,9 +146,9 @@ class PlantSource:
             body = old.get_body(index)
             instance, inertia = instances[body.model_instance()], body.default_spatial_inertia()
             bodies[index] = plant.AddRigidBody(body.name(), instance, inertia)
-            if index in self.seen and plant.geometry_source_is_registered():
+            if index in self.drawn and plant.geometry_source_is_registered():
                 for geometry in old.GetVisualGeometriesForBody(body):
-                    # A geometry has its looks, but for its label, which each plant gives itself.
+                    # Each plant assigns its own render labels, so the label is not copied.
                     name = inspector.GetName(geometry).rpartition("::")[2]
                     X_BG, shape = inspector.GetPoseInFrame(geometry), inspector.GetShape(geometry)
                     own = GeometryInstance(X_BG, shape, name)
@@ -159,7 +163,9 @@ class PlantSource:
         joints = [old.get_joint(index) for index in old.GetJointIndices()]
         for joint in joints:
             if joint.type_name() not in _JOINTS:
-                raise ModelError(f"joint '{joint.name()}' of type '{joint.type_name()}': no copy")
+                raise ModelError(
+                    f"joint '{joint.name()}' of type '{joint.type_name()}' cannot be copied"
+                )
             instance = instances[joint.model_instance()]
             ends = []
             for end, frame in ("F", joint.frame_on_parent()), ("M", joint.frame_on_child()):

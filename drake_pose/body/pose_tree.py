@@ -1,7 +1,13 @@
-"""The pose tree: the rigid parts of an object, each placed by its own few joint values.
+"""The pose tree: the rigid parts of an object, each placed by the values of a few joints.
 
-After Kameda, Minoh, Ikeda (section 2), with any number of positions of any joints to a node; the
-tree may start at any link, and its nodes' transforms come from Drake's plant.
+After Kameda, Minoh, Ikeda (section 2), with any number of joints between two nodes. The pose of
+node N in its parent P is
+
+    X_PN = X_PA R(rotation values) T_1(values) T_2(values) ...
+
+with X_PA a constant, R the rotation of a root, and T_k the transforms of the joints, which are
+fitted to Drake's plant. A tree may start at any link; joints between the root and the world are
+then inverted.
 """
 
 import itertools
@@ -26,19 +32,20 @@ from drake_pose.errors import SettingsError, UnknownNameError
 
 @dataclass(frozen=True, eq=False)
 class PoseTreeNode:
-    """One part of the object: a rigid surface, and a band that bends with its values.
+    """One part of the object: a rigid surface, and a skin band that deforms with the node's values.
 
     Attributes:
-        name: the link that carries the geometry; its frame is the node's frame N.
-        parent, children: indices in ``PoseTree.nodes``; a parent of -1 is the world.
-        depth: steps to the root; a root has 0.
-        positions: indices into the plant's q, in order of rotation from the parent to the node; ()
-            for a fixed node and for a root that is turned by a RootRotation.
-        value_names: the names of the node's values: its position names, or those of the
-            RootRotation.
-        mesh: the rigid part in frame N, welded links included; empty where several parts hang on
-            a link that is not seen.
-        skin: the band between the parent and the node; None where the model declares none.
+        name: the link whose frame is the node's frame N.
+        parent: index of the parent in ``PoseTree.nodes``; -1: the world.
+        children: indices of the children.
+        depth: number of edges to the root.
+        positions: indices of the node's positions in the plant's q, in order from the parent to the
+            node; () for a fixed node and for a root with a RootRotation.
+        position_names: names of these positions.
+        value_names: names of the node's values: its position names, or those of the RootRotation.
+        mesh: the rigid surface in frame N, welded links included; empty where the link has no
+            geometry and only joins several parts.
+        skin: the band between the parent and the node; None: the model declares none.
     """
 
     name: str
@@ -52,7 +59,7 @@ class PoseTreeNode:
     skin: NodeSkin | None = None
 
     def surface(self, values: Array) -> TriangleMesh:
-        """The node's whole surface in frame N at its values (k,): the rigid part, then the band."""
+        """Return the surface in frame N at values (k,): the rigid part, then the band."""
         if self.skin is None:
             return self.mesh
         bent = self.skin.vertices(np.asarray(values)[None])[0]
@@ -64,20 +71,22 @@ class PoseTreeNode:
 
 @dataclass(frozen=True, eq=False)
 class NodePlacement:
-    """How a node's values place it: X_PN = X_PA R(rotation values) step(values) step(values) ...
+    """How values place a node: X_PN = X_PA R(rotation values) T_1(values) T_2(values) ...
 
-    A node whose joints follow its parent's has no values of its own.
+    A node whose joints all follow its parent's joints has no values of its own.
 
     Attributes:
-        X_PA: (4, 4), the identity but for roots.
-        rotation: turns a root that has a RootRotation.
-        lower, upper: (k,) limits of the values [rad or m], equal where held, one turn where free.
-        defaults: (k,) [rad or m].
-        is_angle: (k,) bool, angles, else lengths.
-        periodic: (k,) bool, angles that look the same after a full turn.
-        turns_freely: (k,) bool, angles without limits that are searched.
-        follows: for each value of the steps its position in q, which of the parent's values it
-            follows, and how; (): the node has values of its own.
+        X_PA: (4, 4) constant transform; the identity except for roots.
+        rotation: the rotation of a root; None: the node has none.
+        steps: the joints from the parent to the node.
+        lower, upper: (k,) limits of the values [rad or m]; equal where a value is held, one turn
+            wide for an angle without limits.
+        defaults: (k,) default values [rad or m].
+        is_angle: (k,) bool, whether a value is an angle; else a length.
+        periodic: (k,) bool, whether the value is an angle with the same pose after a full turn.
+        turns_freely: (k,) bool, whether the value is an angle without limits that is not held.
+        follows: for each position of the steps: its index in q, the parent's value that it follows,
+            multiplier and offset; (): the node has values of its own.
     """
 
     X_PA: Array
@@ -101,38 +110,42 @@ def place_node(
     steps: tuple[JointMap, ...],
     follows: tuple[Coupling, ...] = (),
 ) -> NodePlacement:
-    """The placement of a node with these positions in q, or of a root that a rotation turns."""
+    """Return the placement of a node with positions in q, or of a root with a RootRotation."""
     if rotation is not None:
         lower, upper = rotation.lower, rotation.upper
-        every, none = np.full(len(lower), True), np.full(len(lower), False)
-        limited = every if rotation.kind == "limited" else none
+        all_true, all_false = np.full(len(lower), True), np.full(len(lower), False)
+        limited = all_true if rotation.kind == "limited" else all_false
         middle = 0.5 * (lower + upper)
-        return NodePlacement(X_PA, rotation, steps, lower, upper, middle, every, limited, none)
+        return NodePlacement(
+            X_PA, rotation, steps, lower, upper, middle, all_true, limited, all_false
+        )
     index = list(positions)
-    known = np.array([position in held for position in index], dtype=np.bool_)
+    is_held = np.array([position in held for position in index], dtype=np.bool_)
     values = np.array([held.get(position, 0.0) for position in index])
-    lower = np.where(known, values, model.lower[index])
-    upper = np.where(known, values, model.upper[index])
-    defaults = np.where(known, values, model.default_positions[index])
+    lower = np.where(is_held, values, model.lower[index])
+    upper = np.where(is_held, values, model.upper[index])
+    defaults = np.where(is_held, values, model.default_positions[index])
     is_angle = np.array([model.position_kinds[i] != "length" for i in index], dtype=np.bool_)
     free = model.turns_freely[index] & (lower < upper)
     periodic = model.periodic[index]
-    told = (lower, upper, defaults, is_angle, periodic, free)
-    return NodePlacement(X_PA, None, steps, *told, follows)
+    properties = (lower, upper, defaults, is_angle, periodic, free)
+    return NodePlacement(X_PA, None, steps, *properties, follows)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class PoseTree:
-    """All nodes of an object, parents before children. Never changes.
+    """All nodes of an object, parents before children. Immutable.
 
     Attributes:
-        nodes: the nodes; the order depends on the model and the root alone.
+        model: the model from which the tree was built.
+        nodes: the nodes; their order depends on the model and the root only.
         leaves: indices of the nodes without children.
-        held: values of positions that are not searched, by index into q.
-        unobserved_positions: names of positions that move nothing that is seen, or that the root's
+        held: values [rad or m] of positions that are not searched, by index in q.
+        unobserved_positions: names of positions that move no visual geometry or that the root's
             pose replaces; they keep their default values.
-        followers: the positions that follow those that are searched.
-        root: name of the root node; "world" where the plant's own roots are kept.
+        followers: couplings of the positions that follow searched positions.
+        root: name of the root node; "world" if the plant's own roots are kept.
+        placements: how each node is placed in its parent.
     """
 
     model: ParsedModel
@@ -147,43 +160,45 @@ class PoseTree:
     _rebuild: "Callable[[Array], PoseTree] | None" = field(default=None, repr=False)
 
     def __repr__(self) -> str:
-        """One line: whose it is, and how large."""
+        """Return one line with the model and the number of nodes and values."""
         values = sum(len(node.value_names) for node in self.nodes)
         return f"<PoseTree of {self.model!r}: {len(self.nodes)} nodes, {values} values>"
 
     def __post_init__(self) -> None:
-        """Freeze the mapping."""
+        """Make ``held`` read-only."""
         object.__setattr__(self, "held", MappingProxyType(dict(self.held)))
 
     @property
     def turns_root_freely(self) -> bool:
-        """Whether the first root is turned by a rotation vector, in all ways."""
+        """Whether the first root rotates freely, by a rotation vector."""
         rotation = self.placements[0].rotation
         return rotation is not None and rotation.kind == "free"
 
     @cached_property
     def subtrees(self) -> tuple[tuple[int, ...], ...]:
-        """For each node itself and all that hang on it, rising."""
+        """For each node, the ascending indices of the node and all its descendants."""
         below = [[i] for i in range(len(self.nodes))]
         for i in reversed(range(len(self.nodes))):
             below[i] += [j for child in self.nodes[i].children for j in below[child]]
         return tuple(tuple(sorted(nodes)) for nodes in below)
 
     def with_root_position(self, root_position: Array) -> "PoseTree":
-        """The same tree with the root's origin at another known position (3,) [m].
+        """Return the tree with the root's origin at another position (3,) in the world [m].
 
-        Raises SettingsError where there is no single root, ModelError where base joints forbid it.
+        Raises:
+            SettingsError: the tree has several roots, or was not made by ``pose_tree``.
+            ModelError: the base joints cannot move the root there.
         """
         if self._rebuild is None:
             raise SettingsError("only a tree made by ArticulatedModel.pose_tree can be moved")
         return self._rebuild(root_position)
 
     def source(self, node: int) -> int:
-        """The node whose values place a node: itself, or its parent where its joints follow."""
+        """Return the node whose values place a node: itself, or the parent that it follows."""
         return self.nodes[node].parent if self.placements[node].follows else node
 
     def node_index(self, name: str) -> int:
-        """The node of a link; UnknownNameError where no node has that name."""
+        """Return the index of the node of a link; UnknownNameError if there is none."""
         names = [node.name for node in self.nodes]
         if name not in names:
             raise UnknownNameError("node", name, names, str(self.model.path))
@@ -196,19 +211,20 @@ class PoseTree:
         intervals: Mapping[str, float] | None = None,
         length_interval: float = 0.05,
     ) -> Array:
-        """The node's sampling grid (n, k): every combination of its positions' samples.
+        """Return a node's sampling grid (n, k): every combination of its values' samples.
 
-        A position is sampled as in ``axis_samples``, at its one value where it is held; the last
-        position changes fastest.
+        A value is sampled by ``axis_samples``; a held value has one sample. The last value changes
+        fastest.
 
         Args:
-            interval: for angles [rad].
-            intervals: intervals of single positions or root values, by name [rad or m].
-            length_interval: for lengths [m].
+            node: index of the node.
+            interval: sampling interval of angles [rad].
+            intervals: intervals [rad or m] of single positions or root values, by name.
+            length_interval: sampling interval of lengths [m].
 
         Raises:
-            SettingsError: an interval that is not positive, or a grid that is too large.
-            UnknownNameError: ``intervals`` names something that does not exist.
+            SettingsError: an interval is not positive, or the grid is too large.
+            UnknownNameError: a name in ``intervals`` does not exist.
         """
         intervals = intervals or {}
         known = [name for node in self.nodes for name in node.value_names]
@@ -240,26 +256,34 @@ class PoseTree:
         return product_grid(axes, self.nodes[node].name)
 
     def value_bounds(self, node: int) -> tuple[Array, Array]:
-        """Limits (k,) for the search [rad or m], or one turn about the default position."""
+        """Return the search limits (k,), (k,) of a node's values [rad or m].
+
+        An angle that can take every direction is searched over the turn about its default.
+        """
         given, around = self.placements[node], self.turns_around(node)
         low, high = one_turn(given.lower, given.upper, given.defaults)
         return np.where(around, low, given.lower), np.where(around, high, given.upper)
 
     def value_limits(self, node: int) -> tuple[Array, Array]:
-        """Limits (k,) of a node's values [rad or m]; equal where held, infinite where free."""
+        """Return the limits (k,), (k,) of a node's values [rad or m].
+
+        They are equal for a held value and infinite for an angle without limits.
+        """
         given = self.placements[node]
         lower = np.where(given.turns_freely, -np.inf, given.lower)
         return lower, np.where(given.turns_freely, np.inf, given.upper)
 
     def turns_around(self, node: int) -> NDArray[np.bool_]:
-        """Which of a node's values (k,) are periodic angles whose limits leave every direction."""
+        """Return (k,) which of a node's values are angles that can take every direction."""
         given = self.placements[node]
         return turns_around(given.lower, given.upper, given.periodic)
 
     def relative_transforms(self, node: int, values: Array) -> Array:
-        """X_PN (n, 4, 4) in the parent (or W) at values (n, k) of the node that is its source.
+        """Return X_PN (n, 4, 4), the node's poses in its parent or in the world.
 
-        Raises SettingsError for a wrong width.
+        ``values`` are (n, k) values of the node ``source(node)`` [rad or m].
+
+        Raises SettingsError: the number of columns is wrong.
         """
         values = np.asarray(values, dtype=np.float64)
         names = self.nodes[self.source(node)].value_names
@@ -277,18 +301,21 @@ class PoseTree:
         return X
 
     def step_values(self, node: int, values: Array) -> Array:
-        """Of a node's joints (n, j), at values (n, k) of the node that is its source."""
+        """Return the values (n, j) of a node's joints, given values (n, k) of ``source(node)``."""
         if not self.placements[node].follows:
             return values
         _, columns, multipliers, offsets = zip(*self.placements[node].follows, strict=True)
         return np.asarray(values[:, list(columns)] * multipliers + offsets)
 
     def node_poses(self, values: Sequence[Array]) -> Array:
-        """X_WN (n_nodes, 4, 4), given each node's values (k_i,)."""
+        """Return X_WN (nodes, 4, 4), given each node's values (k_i,) [rad or m]."""
         return self.node_poses_batch([np.asarray(v, dtype=np.float64)[None] for v in values])[0]
 
     def node_poses_batch(self, values: Sequence[Array]) -> Array:
-        """X_WN (n, n_nodes, 4, 4) at each node's (n, k_i); SettingsError for a wrong width."""
+        """Return X_WN (n, nodes, 4, 4), given each node's values (n, k_i) [rad or m].
+
+        Raises SettingsError: the number of arrays or columns is wrong.
+        """
         if len(values) != len(self.nodes):
             raise SettingsError(f"{len(self.nodes)} arrays of values expected, got {len(values)}")
         X_WN = np.empty((len(values[0]), len(self.nodes), 4, 4))
@@ -298,24 +325,30 @@ class PoseTree:
         return X_WN
 
     def default_values(self) -> list[Array]:
-        """Each node's values (k_i,) at the model's default positions and the root as given."""
+        """Return each node's values (k_i,) at the model's default positions."""
         return [np.array(placement.defaults) for placement in self.placements]
 
     def positions_from(self, values: Sequence[Array]) -> tuple[Array, Array]:
-        """The plant's own positions that put every link where the tree does at each node's (k_i,).
+        """Return the plant's positions that put every link where the tree puts it.
+
+        Args:
+            values: each node's values (k_i,) [rad or m].
 
         Returns:
-            q (nq,) and X_WB (4, 4), the pose of the plant's world frame B in the world W; X_WB is
-            the identity where the plant's base joint can take up the root's pose.
+            q (nq,), and X_WB (4, 4), the pose of the plant's world frame B in the world W. X_WB is
+            the identity where the plant's base joints can take up the root's pose.
 
-        Raises ModelError: the base joints cannot be solved for.
+        Raises ModelError: the base joints cannot reach the root's pose.
         """
         return self._base.solve(self.model, self._completed(values), self.node_poses(values))
 
     def positions_with_root_at(
         self, values: Sequence[Array], root_position: Array
     ) -> tuple[Array, Array]:
-        """As with_root_position at (3,) [m] and positions_from, but no tree is built."""
+        """Return ``positions_from`` with the root's origin at another position (3,) [m].
+
+        No new tree is built unless the plant's base is fixed.
+        """
         if self._base.kind == "constant":
             return self.with_root_position(root_position).positions_from(values)
         X_WN = self.node_poses(values)
@@ -329,7 +362,7 @@ class PoseTree:
         return self._base.solve(self.model, self._completed(values), X_WN)
 
     def _completed(self, values: Sequence[Array]) -> Array:
-        """The plant's positions (nq,) as far as the values and what is held tell them."""
+        """Return q (nq,) from values, held positions, followers and defaults."""
         q = np.array(self.model.default_positions)
         for index, value in self.held.items():
             q[index] = value
@@ -341,9 +374,10 @@ class PoseTree:
         return q
 
     def values_from_positions(self, q: Array, X_WB: Array | None = None) -> list[Array]:
-        """Each node's values (k_i,) at the plant's q (nq,): the inverse of positions_from.
+        """Return each node's values (k_i,) at the plant's q (nq,); inverse of ``positions_from``.
 
-        X_WB (4, 4), the pose of the plant's world frame, moves a root with a RootRotation alone.
+        ``X_WB``: (4, 4) pose of the plant's world frame, used for roots with a RootRotation only;
+        None: the identity.
         """
         q = np.asarray(q, dtype=np.float64)
         values = []
@@ -359,14 +393,22 @@ class PoseTree:
 
 
 def axis_samples(
-    lower: float, upper: float, interval: float, *, is_angle: bool, most: int = 5_000_000
+    lower: float, upper: float, interval: float, *, is_angle: bool, max_samples: int = 5_000_000
 ) -> list[float]:
-    """The multiples of the interval inside the limits, by size, the negative of two equals first.
+    """Return the multiples of ``interval`` inside the limits, sorted by magnitude, negative first.
 
-    The middle of the finite limits [rad or m] where no multiple lies inside. A full turn of an
-    angle gives each direction once. Raises SettingsError for more samples than ``most``.
+    Where no multiple lies inside, the middle of the limits is the only sample. A full turn of an
+    angle has each direction once.
+
+    Args:
+        lower, upper: limits [rad or m].
+        interval: sampling interval [rad or m].
+        is_angle: whether values a full turn apart are the same.
+        max_samples: largest number of samples.
+
+    Raises SettingsError: there would be more samples.
     """
-    # A multiple that misses a limit by rounding alone still counts as inside.
+    # A multiple that misses a limit by rounding only counts as inside.
     rounding = 1e-9
     first = math.ceil(lower / interval - rounding)
     last = math.floor(upper / interval + rounding)
@@ -374,31 +416,31 @@ def axis_samples(
         first = last - math.ceil(2.0 * math.pi / interval - rounding) + 1
     if last < first:
         return [0.5 * (lower + upper)]
-    if last - first >= most:
+    if last - first >= max_samples:
         raise SettingsError(
             f"a sampling interval of {interval:g} makes {last - first + 1} samples of one joint, "
-            f"at most {most} are allowed: use a larger interval"
+            f"at most {max_samples} are allowed: use a larger interval"
         )
     multiples = sorted(range(first, last + 1), key=lambda multiple: (abs(multiple), multiple))
     return [min(max(multiple * interval, lower), upper) for multiple in multiples]
 
 
-def product_grid(axes: Sequence[Sequence[float]], node: str, most: int = 5_000_000) -> Array:
-    """All combinations (n, k) of the axes' samples, the last axis changing fastest.
+def product_grid(axes: Sequence[Sequence[float]], node: str, max_samples: int = 5_000_000) -> Array:
+    """Return all combinations (n, k) of the samples of k axes; the last axis changes fastest.
 
-    Raises SettingsError, which names the node, for more of them than ``most``.
+    Raises SettingsError, which names the node: there are more than ``max_samples`` combinations.
     """
     size = math.prod(len(axis) for axis in axes)
-    if size > most:
+    if size > max_samples:
         raise SettingsError(
-            f"node '{node}' would have {size} samples, at most {most} are allowed: "
+            f"node '{node}' would have {size} samples, at most {max_samples} are allowed: "
             "use a larger sampling interval or hold some of its joints"
         )
     return np.array(list(itertools.product(*axes)), dtype=np.float64).reshape(size, len(axes))
 
 
 def require_tree(tree: object) -> None:
-    """Refuses, by a SettingsError, what is no pose tree: most often the model that has one."""
+    """Raise SettingsError for an object that is no pose tree, such as a model."""
     if not isinstance(tree, PoseTree):
         what = f"a {type(tree).__name__}" + (f", '{tree.name}'" if hasattr(tree, "name") else "")
-        raise SettingsError(f"a pose tree is needed, as model.pose_tree() gives it, not {what}")
+        raise SettingsError(f"a pose tree is needed, as model.pose_tree() returns, not {what}")

@@ -1,4 +1,4 @@
-"""Is this model fit for use, and if not, why: the facts behind ``drake-pose check FILE``."""
+"""The report on a model file behind ``drake-pose check FILE``: its parts, warnings and errors."""
 
 import math
 from collections.abc import Iterable, Mapping
@@ -12,18 +12,23 @@ from drake_pose.arrays import Array
 from drake_pose.body.link_graph import build_link_graph
 from drake_pose.body.meshes import TriangleMesh, is_watertight
 from drake_pose.body.model import ArticulatedModel, load_model
-from drake_pose.body.parsing import limit_kinds
+from drake_pose.body.parsing import summarise_warnings
 from drake_pose.body.pose_tree import PoseTree
 from drake_pose.errors import DrakePoseError
 
 
 @dataclass(frozen=True)
 class ModelReport:
-    """What was found in a model file, surprises, and what forbids its use.
+    """What a model file holds, what may be unexpected, and what forbids its use.
 
-    ``nodes``: the pose tree's: name, parent, triangles, whether it is watertight, and the joints:
-    name, kind, lower and upper limit in degrees (angles) or metres (lengths), and the joint that
-    one follows, and how in rad and m ("": none).
+    Attributes:
+        path: the model file.
+        name: the model's name.
+        nodes: one dictionary for each node of the pose tree: name, parent, number of triangles,
+            whether it is watertight, and joints. A joint has name, kind, lower and upper limit [deg
+            or m], and the joint that it follows with multiplier and offset [rad or m] ("": none).
+        warnings: what may be unexpected.
+        errors: why the model cannot be used.
     """
 
     path: Path
@@ -34,14 +39,14 @@ class ModelReport:
 
     @property
     def usable(self) -> bool:
-        """True where there is no error."""
+        """Whether there is no error."""
         return not self.errors
 
 
 def describe_model(
     path: Path | str, *, package_paths: Mapping[str, Path | str] | None = None
 ) -> ModelReport:
-    """Read a model and report on it; problems of the model become ``errors``, never exceptions."""
+    """Return a report on a model file; a problem of the model becomes an entry of ``errors``."""
     path = Path(path)
     try:
         model = load_model(path, package_paths=package_paths)
@@ -58,13 +63,13 @@ def describe_model(
 
 
 def _describe_node(tree: PoseTree, index: int) -> dict[str, Any]:
-    """The facts of one node."""
+    """Return the dictionary of one node for ``ModelReport.nodes``."""
     model, node = tree.model, tree.nodes[index]
-    led = {one.follower for one in tree.placements[index].follows}
+    followers = {one.follower for one in tree.placements[index].follows}
     follows = {
         one.follower: f"{one.multiplier:g} {model.position_names[one.leader]} {one.offset:+g}"
         for one in tree.followers
-        if one.follower in led
+        if one.follower in followers
     }
     joints = []
     for position in (*node.positions, *follows):
@@ -89,9 +94,9 @@ def _describe_node(tree: PoseTree, index: int) -> dict[str, Any]:
 def model_warnings(
     model: ArticulatedModel, tree: PoseTree, given: Iterable[str] = ()
 ) -> tuple[str, ...]:
-    """Everything worth knowing before a model is used, at most ten warnings of a kind.
+    """Return the warnings about a model and its pose tree, at most ten of each kind.
 
-    ``given`` names the positions that are held as the user wants.
+    ``given``: names of positions that the user holds; no warning names them as held by default.
     """
     warnings = list(model.warnings)
     constraints = model.plant.num_constraints() - len(model.couplings)
@@ -110,7 +115,7 @@ def model_warnings(
             )
     if tree.unobserved_positions and tree.root == "world":
         warnings.append(
-            "these joints move nothing that is seen and keep their default values: "
+            "these joints move no visual geometry and keep their default values: "
             + ", ".join(tree.unobserved_positions)
         )
     warnings += _size_warnings(model, tree)
@@ -122,23 +127,23 @@ def model_warnings(
     ]
     if slides := [name for name in slides if name not in set(given)]:
         warnings.append(
-            "these joints have no limits: they say where the object stands and keep their default "
-            "values, and a root position moves it: " + ", ".join(slides)
+            "these joints have no limits: they place the object in the world and keep their "
+            "default values; a root position moves it: " + ", ".join(slides)
         )
     warnings += [
         f"link '{node.name}' is not watertight: its silhouette may have gaps"
         for node in tree.nodes
         if not node.mesh.is_empty and not is_watertight(node.mesh)
     ]
-    return tuple(limit_kinds(warnings + _symmetry_warnings(model)))
+    return tuple(summarise_warnings(warnings + _symmetry_warnings(model)))
 
 
 def _size_warnings(
     model: ArticulatedModel, tree: PoseTree, smallest: float = 0.02, largest: float = 20.0
 ) -> list[str]:
-    """What lengths and limits no robot or person has.
+    """Return warnings about implausible sizes and about joints with a single possible value.
 
-    smallest, largest: of a body, from end to end in its default pose [m].
+    ``smallest``, ``largest``: plausible extents of the body in its default pose [m].
     """
     poses = tree.node_poses(tree.default_values())
     corners = [
@@ -153,21 +158,21 @@ def _size_warnings(
             f"the body is {size:.3g} m long from end to end: are its lengths and the scale of its "
             "meshes in metres?"
         )
-    still = [
+    immobile = [
         model.position_names[position]
         for node in tree.nodes
         for position in node.positions
         if model.lower[position] == model.upper[position]
     ]
-    if still:
+    if immobile:
         warnings.append(
-            f"the limits of these joints leave one value, so they never move: {', '.join(still)}"
+            f"the limits of these joints leave one value, so they never move: {', '.join(immobile)}"
         )
     return warnings
 
 
 def _symmetry_warnings(model: ArticulatedModel) -> list[str]:
-    """Joints that turn a leaf of the plant about its own axis of symmetry: they cannot be seen."""
+    """Return warnings about joints that rotate a last link about its axis of symmetry."""
     graph = build_link_graph(model, None)
     warnings = []
     for edge in graph.edges:
@@ -192,26 +197,33 @@ def _symmetry_warnings(model: ArticulatedModel) -> list[str]:
 def _is_symmetric(
     mesh: TriangleMesh, X_turn: Array, levels: int = 12, sectors: int = 7, tolerance: float = 0.03
 ) -> bool:
-    """Whether a surface looks the same from all around the axis of a quarter turn X_turn.
+    """Return whether a surface is rotationally symmetric about the axis of a quarter turn.
 
-    At each of so many levels along the axis the largest distance from it differs between sectors
-    by less than this fraction of the largest. Of seven sectors no square passes for round.
+    The largest distance from the axis is compared between sectors, at each of several levels along
+    the axis.
+
+    Args:
+        mesh: the surface.
+        X_turn: (4, 4) a quarter turn about the axis.
+        levels: number of levels along the axis.
+        sectors: number of sectors about the axis; with seven sectors no square passes for round.
+        tolerance: largest difference between sectors, as a fraction of the largest distance.
     """
     axis = np.array([X_turn[2, 1], X_turn[0, 2], X_turn[1, 0]])
     axis -= (X_turn[1, 2], X_turn[2, 0], X_turn[0, 1])
     axis /= np.linalg.norm(axis)
     center = np.linalg.lstsq(np.eye(3) - X_turn[:3, :3], X_turn[:3, 3], rcond=None)[0]
     side = np.linalg.svd(axis[None])[2][1]
-    # Points spread evenly at random over the surface, the same ones each time.
-    corner, along, across = mesh.vertices[mesh.triangles].swapaxes(0, 1)
-    along, across = along - corner, across - corner
-    areas = np.cumsum(np.linalg.norm(np.cross(along, across), axis=1))
+    # Points uniformly at random over the surface, with a fixed seed.
+    corner, edge_u, edge_v = mesh.vertices[mesh.triangles].swapaxes(0, 1)
+    edge_u, edge_v = edge_u - corner, edge_v - corner
+    areas = np.cumsum(np.linalg.norm(np.cross(edge_u, edge_v), axis=1))
     random = np.random.default_rng(0).random((40_000, 3))
-    hit = np.searchsorted(areas, random[:, 0] * areas[-1])
-    # Beyond the third side a parallelogram's half is folded back.
-    beyond = random[:, 1:].sum(axis=1) > 1.0
-    u, v = np.where(beyond, 1.0 - random[:, 1:].T, random[:, 1:].T)[..., None]
-    points = corner[hit] + u * along[hit] + v * across[hit] - center
+    chosen = np.searchsorted(areas, random[:, 0] * areas[-1])
+    # Fold the outer half of each parallelogram back into its triangle.
+    is_outer = random[:, 1:].sum(axis=1) > 1.0
+    u, v = np.where(is_outer, 1.0 - random[:, 1:].T, random[:, 1:].T)[..., None]
+    points = corner[chosen] + u * edge_u[chosen] + v * edge_v[chosen] - center
     height, x, y = points @ axis, points @ side, points @ np.cross(axis, side)
     radius = np.hypot(x, y)
     level = (height - height.min()) / max(float(np.ptp(height)), 1e-12) * levels

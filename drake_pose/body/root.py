@@ -1,4 +1,4 @@
-"""How the root of a pose tree may be turned, and what of the plant takes up its pose."""
+"""Rotation of a pose tree's root, and recovery of the plant's base pose from the root's pose."""
 
 import math
 from collections.abc import Collection, Sequence
@@ -27,16 +27,18 @@ Axis = Literal["x", "y", "z"]
 
 @dataclass(frozen=True, eq=False)
 class RootRotation:
-    """The rotation R_WR of the root link R in the world W: fixed, limited, or free.
+    """The rotation R_WR of the root link R in the world W: fixed, limited or free.
 
-    The rotation's values are an array (k,): nothing when fixed; a rotation vector [rad] relative to
-    R_W0 when free; one angle [rad] for each axis, in order of rotation, when limited:
-    R_WR = R_W0 R(axis 1) R(axis 2) ...
+    The rotation has k values. A fixed rotation has none. The values of a free rotation are a
+    rotation vector r [rad], R_WR = R_W0 exp([r]x). The values of a limited rotation are one angle
+    [rad] for each axis, R_WR = R_W0 R(axis 1) R(axis 2) ...
 
     Attributes:
-        R_W0: (3, 3) the rotation at values of zero, read-only.
+        kind: "fixed", "free" or "limited".
+        R_W0: (3, 3) rotation at values of zero, read-only.
+        axes: the axes of a limited rotation, in order of rotation.
         lower, upper: (k,) limits [rad], read-only.
-        interval: sampling interval [rad]; None for the search's general one.
+        interval: sampling interval [rad]; None: the search's own interval.
     """
 
     kind: Literal["fixed", "free", "limited"]
@@ -48,16 +50,23 @@ class RootRotation:
 
     @staticmethod
     def fixed(rotation: ArrayLike | None = None) -> "RootRotation":
-        """Always R_W0 (3, 3), by default the identity; SettingsError where that is no rotation."""
+        """Return the constant rotation R_W0 (3, 3), by default the identity.
+
+        Raises SettingsError: ``rotation`` is no rotation matrix.
+        """
         return _root_rotation("fixed", (), [], rotation, None)
 
     @staticmethod
     def free(
         interval_deg: float | None = None, rotation: ArrayLike | None = None
     ) -> "RootRotation":
-        """Any rotation, sampled evenly; R_W0 (3, 3) is one of the samples.
+        """Return a free rotation, which a search samples evenly over SO(3).
 
-        Raises SettingsError for no rotation matrix, or an interval that is not positive.
+        Args:
+            interval_deg: sampling interval [deg]; None: the search's own interval.
+            rotation: R_W0 (3, 3), which is one of the samples; None: the identity.
+
+        Raises SettingsError: ``rotation`` is no rotation matrix, or the interval is not positive.
         """
         return _root_rotation("free", (), [(-180.0, 180.0)] * 3, rotation, interval_deg)
 
@@ -68,21 +77,21 @@ class RootRotation:
         rotation: ArrayLike | None = None,
         interval_deg: float | None = None,
     ) -> "RootRotation":
-        """Rotations about one to three different axes, each within limits.
+        """Return rotations about one to three different axes, each within limits.
 
         Args:
-            ranges_deg: (axis letter, lower, upper) [deg] in order of rotation, for example
-                ``[("y", -180, 180), ("z", -10, 10)]``; each axis is the one already turned by
-                those before it.
-            rotation: R_W0 (3, 3); None for the identity.
-            interval_deg: None for the search's general one.
+            ranges_deg: (axis letter, lower, upper) [deg] in order of rotation, for example ``[("y",
+                -180, 180), ("z", -10, 10)]``. Each axis is rotated by the preceding ones.
+            rotation: R_W0 (3, 3); None: the identity.
+            interval_deg: sampling interval [deg]; None: the search's own interval.
 
-        Raises SettingsError: repeated or unknown axes, crossed limits, or not a rotation matrix.
+        Raises SettingsError: axes are repeated or unknown, limits are crossed, or ``rotation`` is
+        no rotation matrix.
         """
         axes = tuple(axis for axis, _, _ in ranges_deg)
         if not axes or len(set(axes)) != len(axes) or not set(axes) <= {"x", "y", "z"}:
             raise SettingsError(
-                f"root rotation axes {axes}: give one to three different of x, y, z"
+                f"root rotation axes {axes}: give one to three different axes of x, y, z"
             )
         for axis, lower, upper in ranges_deg:
             if not -360.0 <= lower <= upper <= 360.0:
@@ -95,14 +104,14 @@ class RootRotation:
 
     @property
     def value_names(self) -> tuple[str, ...]:
-        """A name for each value."""
+        """The name of each value."""
         if self.kind == "free":
             return ("root_rotation_x", "root_rotation_y", "root_rotation_z")
         return tuple(f"root_{axis}" for axis in self.axes)
 
     def rotations(self, values: Array) -> Array:
-        """R_WR (n, 3, 3) at values (n, k) [rad]."""
-        from scipy.spatial.transform import Rotation  # Slow to import; reading needs none.
+        """Return R_WR (n, 3, 3) at values (n, k) [rad]."""
+        from scipy.spatial.transform import Rotation  # Slow to import.
 
         if self.kind == "free":
             return self.R_W0 @ Rotation.from_rotvec(values).as_matrix()
@@ -111,8 +120,12 @@ class RootRotation:
         return np.broadcast_to(self.R_W0, (len(values), 3, 3)).copy()
 
     def values_from(self, R_WR: Array) -> Array:
-        """The values (k,) [rad] of a rotation (3, 3), the nearest there are where it is limited."""
-        from scipy.spatial.transform import Rotation  # Slow to import; reading needs none.
+        """Return the values (k,) [rad] of a rotation R_WR (3, 3).
+
+        A limited rotation has the Euler angles of its axes, moved by full turns towards the middle
+        of its limits. Components about other axes are dropped.
+        """
+        from scipy.spatial.transform import Rotation  # Slow to import.
 
         rotation = Rotation.from_matrix(self.R_W0.T @ R_WR)
         if self.kind == "fixed":
@@ -133,7 +146,7 @@ def _root_rotation(
     rotation: ArrayLike | None,
     interval_deg: float | None,
 ) -> RootRotation:
-    """A RootRotation after checks, its arrays copied and read-only."""
+    """Check the arguments and return a RootRotation with read-only copies of the arrays."""
     R = np.eye(3) if rotation is None else np.array(rotation, dtype=np.float64)
     orthonormal = R.shape == (3, 3) and np.allclose(R @ R.T, np.eye(3), atol=1e-6)
     if not orthonormal or np.linalg.det(R) < 0.0:
@@ -150,12 +163,12 @@ def _root_rotation(
 
 
 def even_rotations(interval: float) -> Array:
-    """Rotation vectors (n, 3) [rad] about ``interval`` [rad] apart, nearest to none first.
+    """Return rotation vectors (n, 3) [rad] about ``interval`` [rad] apart, sorted by angle.
 
-    Rz(azimuth) Ry(polar) Rz(turn - azimuth), with directions on circles of latitude and turns that
-    are multiples of the interval; the samples hold the identity.
+    The rotations are Rz(azimuth) Ry(polar) Rz(spin - azimuth). Directions lie on circles of
+    latitude, spins are multiples of the interval, and the identity is the first sample.
     """
-    from scipy.spatial.transform import Rotation  # Slow to import; reading needs none.
+    from scipy.spatial.transform import Rotation  # Slow to import.
 
     angles = []
     turns = _full_turn(2.0 * math.pi / interval)
@@ -169,26 +182,28 @@ def even_rotations(interval: float) -> Array:
 
 
 def _full_turn(count: float) -> Array:
-    """About so many angles [rad] of a full turn, evenly spaced, zero first; at least one."""
+    """Return about ``count`` (at least one) evenly spaced angles [rad] of a turn, zero first."""
     whole = max(1, round(count))
     return np.asarray(np.arange(whole) * (2.0 * math.pi / whole), dtype=np.float64)
 
 
 @dataclass(frozen=True, eq=False)
 class BasePose:
-    """What takes up the pose of a pose tree that does not start at the plant's world.
+    """How the plant takes up the pose of a tree that does not start at the plant's world.
 
     Attributes:
-        kind: "constant": the plant stands at X_WB; "floating": a floating joint takes the pose;
-            "joints": base joints are solved for; "placed": X_WB moves, for the plant's world is
-            part of the tree, or base joints cannot reach every pose and keep their values.
-        X_WB: (4, 4) for "constant".
-        node: the tree's node that the base positions or the world are known from.
-        body: the plant's body of that node.
-        positions: the base positions in q that are solved for.
+        kind: "constant": the plant's world stands at X_WB. "floating": a floating joint takes up
+            the pose. "joints": base joints are solved for. "placed": X_WB is solved for, because
+            the plant's world is part of the tree or the base joints cannot reach every pose and
+            keep their values.
+        X_WB: (4, 4) pose of the plant's world, for "constant".
+        node: index of the anchor, the tree's node from which the base is solved.
+        body: index of the plant's body of the anchor.
+        positions: indices in q of the base positions that are solved for.
         steps: for "joints", the base joints from the world outwards.
-        chain: for "joints", their positions in q; those that are not solved for are held.
-        joint: for "floating", the joint's index.
+        chain: for "joints", the indices of their positions in q; those not in ``positions`` are
+            held.
+        joint: for "floating", the index of the floating joint.
     """
 
     kind: Literal["constant", "floating", "joints", "placed"]
@@ -201,9 +216,11 @@ class BasePose:
     joint: int = -1
 
     def solve(self, model: ParsedModel, q: Array, X_WN: Array) -> tuple[Array, Array]:
-        """Complete q (nq,) and find X_WB (4, 4), given all node poses X_WN (n_nodes, 4, 4).
+        """Complete the base positions in q (nq,) and return q and X_WB (4, 4).
 
-        Raises ModelError where no base positions give the root's pose.
+        ``X_WN``: (nodes, 4, 4) poses of all nodes in the world.
+
+        Raises ModelError: no values of the base joints reach the root's pose.
         """
         if self.kind == "constant":
             return q, np.array(self.X_WB)
@@ -214,8 +231,8 @@ class BasePose:
         kinematics = PlantKinematics(model)
         if self.kind == "placed":
             return q, X_WA @ inverse_transforms(kinematics.pose_at(self.body, q))
-        # The floating joint puts the anchor body A at X_WA. Drake's type stubs know neither SetPose
-        # nor numpy's array types.
+        # The floating joint puts the anchor body A at X_WA. Drake's type stubs lack SetPose and do
+        # not accept numpy's array types.
         joint: Any = kinematics.plant.get_joint(JointIndex(self.joint))
         child = int(joint.child_body().index())
         X_CA = inverse_transforms(kinematics.pose_at(child, q)) @ kinematics.pose_at(self.body, q)
@@ -224,7 +241,7 @@ class BasePose:
         )
         X_WM = X_WA @ inverse_transforms(X_CA) @ _pose_in_body(joint.frame_on_child())
         X_FM: Any = inverse_transforms(X_WF) @ X_WM
-        # Freed from rounding errors.
+        # Remove rounding errors.
         R_FM = RotationMatrix.ProjectToRotationMatrix(X_FM[:3, :3])
         joint.SetPose(kinematics.context, RigidTransform(R_FM, X_FM[:3, 3]))
         solved = kinematics.plant.GetPositions(kinematics.context)
@@ -232,34 +249,38 @@ class BasePose:
         return q, np.eye(4)
 
     def _solve_joints(self, model: ParsedModel, q: Array, X_WA: Array) -> Array:
-        """Base positions (n,) that put the anchor at X_WA, inside their limits if possible."""
-        from scipy.optimize import least_squares  # Slow to import; reading needs none.
+        """Return base positions (n,) with the anchor at X_WA (4, 4), within limits if possible."""
+        from scipy.optimize import least_squares  # Slow to import.
 
         index = list(self.positions)
         periodic = model.periodic[index]
         lower, upper = model.lower[index], model.upper[index]
         middle = np.mean(one_turn(lower, upper, model.default_positions[index]), axis=0)
-        turns = np.array([model.position_kinds[i] == "angle" for i in index])
+        is_angle = np.array([model.position_kinds[i] == "angle" for i in index])
 
         solved = np.isin(self.chain, index)
 
         def completed(values: Array) -> Array:
-            every = q[list(self.chain)]
-            every[solved] = values
-            return every
+            """Return the values of the whole chain, given the solved ones."""
+            all_values = q[list(self.chain)]
+            all_values[solved] = values
+            return all_values
 
         def residual(values: Array) -> Array:
+            """Return the error (12,) of the anchor's pose."""
             return (chain_transforms(self.steps, completed(values)[None])[0] - X_WA)[:3].reshape(12)
 
         def jacobian(values: Array) -> Array:
+            """Return the derivative (12, n) of the error."""
             return chain_jacobian(self.steps, completed(values))[:, solved]
 
-        # Three turns reach a rotation in two ways, so a few starts find the one inside the limits.
+        # Three rotations reach an orientation in two ways; random starts find the one in limits.
         random = np.random.default_rng(0)
         starts = [q[index]] + [
-            np.where(turns, random.uniform(-np.pi, np.pi, len(index)), q[index]) for _ in range(8)
+            np.where(is_angle, random.uniform(-np.pi, np.pi, len(index)), q[index])
+            for _ in range(8)
         ]
-        outside = None
+        outside_limits = None
         for start in starts:
             found = least_squares(
                 residual, start, jacobian, method="lm", xtol=1e-15, ftol=1e-15, gtol=1e-15
@@ -269,17 +290,20 @@ class BasePose:
             wrapped = nearest_turn(found.x, middle, periodic)
             if np.all((wrapped >= lower - 1e-9) & (wrapped <= upper + 1e-9)):
                 return wrapped
-            outside = wrapped if outside is None else outside
-        if outside is None:
+            outside_limits = wrapped if outside_limits is None else outside_limits
+        if outside_limits is None:
             raise ModelError(
                 f"{model.path}: no values of the base joints "
-                f"{[model.position_names[i] for i in index]} put the root where it should be"
+                f"{[model.position_names[i] for i in index]} reach the root's pose"
             )
-        return outside
+        return outside_limits
 
 
 def chain_jacobian(steps: Sequence[JointMap], values: Array) -> Array:
-    """Derivative (12, k) of the upper rows of a chain's end pose, exact, by complex steps."""
+    """Return the derivative (12, k) of the upper rows of a chain's end pose by its values (k,).
+
+    Complex steps make it exact to rounding.
+    """
     step = 1e-30
     change = chain_transforms(steps, values + 1j * step * np.eye(len(values))).imag / step
     return np.asarray(change[:, :3].reshape(len(values), 12).T, dtype=np.float64)
@@ -292,9 +316,14 @@ def base_of_chain(
     node: int,
     held: Collection[int] = (),
 ) -> BasePose:
-    """How the joints from the world outwards to a node of the tree can take up the node's pose.
+    """Return how the joints from the world outwards to a node take up that node's pose.
 
-    ``held`` positions stay as they are if the others suffice.
+    Args:
+        model: the model.
+        graph: the model's link graph.
+        chain: the joints from the world outwards.
+        node: index of the node in the tree.
+        held: indices in q of positions that keep their values if the others suffice.
     """
     body = graph.groups[chain[-1].outer].body if chain else graph.groups[0].body
     floating = [edge for edge in chain if edge.joint_map is None]
@@ -310,15 +339,20 @@ def base_of_chain(
         slopes = chain_jacobian(steps, values)
         for solved in (~np.isin(positions, list(held)), np.ones(len(positions), dtype=np.bool_)):
             if np.linalg.matrix_rank(slopes[:, solved], tol=1e-5) >= 6:
-                taken = tuple(
-                    p for p, is_solved in zip(positions, solved, strict=True) if is_solved
+                solved_positions = tuple(
+                    p for p, solvable in zip(positions, solved, strict=True) if solvable
                 )
                 return BasePose(
-                    "joints", node=node, body=body, positions=taken, steps=steps, chain=positions
+                    "joints",
+                    node=node,
+                    body=body,
+                    positions=solved_positions,
+                    steps=steps,
+                    chain=positions,
                 )
     return BasePose("placed", node=node, body=body)
 
 
 def _pose_in_body(frame: Frame) -> Array:
-    """A fixed frame's pose (4, 4) in its body."""
+    """Return a fixed frame's pose (4, 4) in its body."""
     return np.asarray(frame.GetFixedPoseInBodyFrame().GetAsMatrix4())

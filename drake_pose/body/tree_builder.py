@@ -1,4 +1,4 @@
-"""Builds a PoseTree: chooses the root, cuts what is not seen, turns joints over where needed."""
+"""Construction of a PoseTree: choice of its root, removal of undrawn links, joint inversion."""
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -14,7 +14,7 @@ from drake_pose.body.link_graph import (
     build_link_graph,
     chain_transforms,
 )
-from drake_pose.body.node_skin import find_skin, require_placed
+from drake_pose.body.node_skin import find_skin, require_neighbours
 from drake_pose.body.parsed_model import ParsedModel
 from drake_pose.body.plant_source import Coupling
 from drake_pose.body.pose_tree import NodePlacement, PoseTree, PoseTreeNode, place_node
@@ -22,15 +22,20 @@ from drake_pose.body.root import BasePose, RootRotation, base_of_chain
 from drake_pose.errors import ModelError, SettingsError, UnknownNameError
 
 Roots = dict[int, tuple[Array, RootRotation | None]]
-"""By branch that hangs on the world: X_WA (4, 4), and how it is turned there."""
+"""X_WA (4, 4) and rotation of each root, by the index of its branch."""
 
 
 @dataclass(frozen=True)
 class Branch:
-    """One node to be: its group, its parent's branch (-1: the world), and the joints between.
+    """A node under construction.
 
-    ``depth``: steps to the root; ``steps`` and ``positions``: the joints in the order walked, and
-    their indices into q; ``follows``: what they follow of the parent's values, without positions.
+    Attributes:
+        group: index of the node's link group.
+        parent: index of the parent branch; -1: the world.
+        depth: number of edges to the root.
+        steps: the joints from the parent to the node, in traversal order.
+        positions: indices of their positions in q.
+        follows: how the joints follow the parent's values; the branch then has no positions.
     """
 
     group: int
@@ -48,12 +53,12 @@ def build_pose_tree(
     root_rotation: RootRotation | None = None,
     held: Mapping[str, float] | None = None,
 ) -> PoseTree:
-    """See ArticulatedModel.pose_tree."""
+    """Build a pose tree; see ``ArticulatedModel.pose_tree``."""
     held, rounding = held or {}, 1e-6
     if root is not None and root not in model.link_names:
         raise UnknownNameError("link", root, model.link_names, str(model.path))
     held_values = {model.position_index(name): float(value) for name, value in held.items()}
-    # What follows, or is followed by, what is held is held, too.
+    # Leaders and followers of held positions are held, too.
     for follower, leader, multiplier, offset in model.couplings:
         if follower in held_values:
             held_values.setdefault(leader, (held_values[follower] - offset) / multiplier)
@@ -64,7 +69,7 @@ def build_pose_tree(
                 one, other = (model.position_names[k] for k in (follower, leader))
                 raise SettingsError(
                     f"joint '{one}' is held at {held_values[follower]:g}, but it follows joint "
-                    f"'{other}' (<mimic>): {wanted:g} [rad or m]; hold one of them alone"
+                    f"'{other}' (<mimic>): {wanted:g} [rad or m]; hold only one of them"
                 )
     for name, value in held.items():
         if not np.isfinite(value):
@@ -79,30 +84,31 @@ def build_pose_tree(
             )
     position = None if root_position is None else _checked_position(root_position)
     graph = build_link_graph(model, root)
-    if root is not None and not graph.seen(graph.group_of(root)):
+    if root is not None and not graph.has_geometry(graph.group_of(root)):
         raise ModelError(
-            f"{model.path}: link '{root}' has no visual geometry, nor has what is welded to it, so "
+            f"{model.path}: link '{root}' has no visual geometry, nor have links welded to it, so "
             f"it cannot be the root; links with geometry: {', '.join(model.link_meshes)}"
         )
     start = _choose_root(model, graph, root, root_rotation)
     rotation = root_rotation or RootRotation.free()
     if start is not None and start[1] and root_rotation is None:
-        # What no joint holds stands as the file has it, unless its turns are asked for.
+        # A floating base keeps its rotation at the default positions, unless one is given.
         X_WR = PlantKinematics(model).pose(graph.groups[start[0]].body)
         rotation = RootRotation.fixed(X_WR[:3, :3])
 
     def build(p_WR: Array | None) -> PoseTree:
+        """Return the tree with the root's origin at p_WR (3,) [m], or as in the model file."""
         if start is None:
             tree = _plant_rooted(model, graph, p_WR, held_values)
         else:
-            tree = _turned_over(model, graph, *start, p_WR, rotation, held_values)
+            tree = _rerooted(model, graph, *start, p_WR, rotation, held_values)
         return replace(tree, _rebuild=lambda moved: build(_checked_position(moved)))
 
     return build(position)
 
 
 def _checked_position(position: Sequence[float] | Array) -> Array:
-    """Three finite numbers."""
+    """Return a position as an array (3,); SettingsError unless it is finite."""
     array = np.array(position, dtype=np.float64)
     if array.shape != (3,) or not np.all(np.isfinite(array)):
         raise SettingsError(f"root position {position}: give three finite numbers [m]")
@@ -112,21 +118,22 @@ def _checked_position(position: Sequence[float] | Array) -> Array:
 def _choose_root(
     model: ParsedModel, graph: LinkGraph, root: str | None, rotation: RootRotation | None
 ) -> tuple[int, bool] | None:
-    """The group that a RootRotation places, and whether it is the plant's own root.
+    """Return the group that a RootRotation places, and whether it is the plant's own root.
 
-    The position of the plant's own root has a default. None: the tree hangs on the plant's world.
+    None: the tree keeps the plant's own roots, which are attached to the plant's world. The plant's
+    own root has a default position; other roots need one.
     """
     floating = _floating_tops(graph)
     if len(floating) > 1:
         names = [graph.groups[group].name for group in floating]
         raise ModelError(
-            f"{model.path}: links {', '.join(names)} float freely, each for itself; a pose tree "
+            f"{model.path}: links {', '.join(names)} float freely and independently; a pose tree "
             "needs one object: weld the others to the world or leave them out"
         )
     asked = None if root is None else graph.group_of(root)
     if floating:
         return floating[0] if asked is None else asked, asked in (None, floating[0])
-    tops = [0] if graph.seen(0) else [b.group for b in _branches(graph, 0) if b.parent < 0]
+    tops = [0] if graph.has_geometry(0) else [b.group for b in _branches(graph, 0) if b.parent < 0]
     if asked is None or (rotation is None and tops == [asked]):
         if rotation is None:
             return None
@@ -138,7 +145,7 @@ def _choose_root(
 
 
 def _floating_tops(graph: LinkGraph) -> list[int]:
-    """For each floating joint that moves something seen, the first group to be a node."""
+    """Return the first node's group behind each floating joint that moves geometry."""
     tops = []
     for edge in graph.edges:
         if edge.joint_map is None:
@@ -148,17 +155,21 @@ def _floating_tops(graph: LinkGraph) -> list[int]:
                     f"'{graph.groups[edge.inner].name}'; only the world may carry a floating joint"
                 )
             branches = _branches(graph, edge.outer)
-            if any(graph.seen(branch.group) for branch in branches):
-                # Other groups that are not seen have several children.
-                behind = [branch.group for branch in branches if branch.parent == 0]
-                only_carries = not graph.seen(edge.outer) and len(behind) == 1
-                tops.append(behind[0] if only_carries else edge.outer)
+            if any(graph.has_geometry(branch.group) for branch in branches):
+                # A group without geometry is a node only if it has several children.
+                children = [branch.group for branch in branches if branch.parent == 0]
+                only_carries = not graph.has_geometry(edge.outer) and len(children) == 1
+                tops.append(children[0] if only_carries else edge.outer)
     return tops
 
 
 def _branches(graph: LinkGraph, start: int) -> list[Branch]:
-    """The nodes reached from a group without crossing a floating joint, by depth, then by body."""
-    # Groups without geometry vanish where they end a chain (with it) or merely continue one.
+    """Return the branches reached from a group without crossing a floating joint.
+
+    Groups without geometry are skipped unless several branches meet there. Branches are sorted by
+    depth, then by body.
+    """
+    # Prune chains that end in a group without geometry.
     edges_at = {
         group: [edge for edge in graph.edges_at(group) if edge.joint_map is not None]
         for group in range(len(graph.groups))
@@ -167,7 +178,7 @@ def _branches(graph: LinkGraph, start: int) -> list[Branch]:
     while pruned:
         pruned = False
         for group, edges in edges_at.items():
-            if len(edges) == 1 and group != start and not graph.seen(group):
+            if len(edges) == 1 and group != start and not graph.has_geometry(group):
                 edge = edges.pop()
                 edges_at[edge.other(group)].remove(edge)
                 pruned = True
@@ -175,7 +186,7 @@ def _branches(graph: LinkGraph, start: int) -> list[Branch]:
     queue: list[tuple[Branch, JointEdge | None]] = [(Branch(start, -1, 0), None)]
     for branch, last in queue:
         group = branch.group
-        is_node = graph.seen(group) or len(edges_at[group]) > 2 or group == start != 0
+        is_node = graph.has_geometry(group) or len(edges_at[group]) > 2 or group == start != 0
         if is_node:
             found.append(branch)
             after = Branch(group, len(found) - 1, branch.depth + 1)
@@ -190,7 +201,7 @@ def _branches(graph: LinkGraph, start: int) -> list[Branch]:
 
 
 def _ordered(graph: LinkGraph, found: list[Branch]) -> list[Branch]:
-    """Branches, parents before children, by depth, then by body."""
+    """Return branches sorted by depth, then by body, with updated parent indices."""
     bodies = [graph.groups[branch.group].body for branch in found]
     order = sorted(range(len(found)), key=lambda i: (found[i].depth, bodies[i]))
     return [
@@ -199,31 +210,34 @@ def _ordered(graph: LinkGraph, found: list[Branch]) -> list[Branch]:
     ]
 
 
-def _let_follow(
+def _attach_followers(
     model: ParsedModel, graph: LinkGraph, branches: list[Branch], held: Collection[int]
 ) -> list[Branch]:
-    """Hang branches on the one whose values all their joints follow, where nothing else moves them.
+    """Reattach branches whose joints all follow one branch's positions as children of that branch.
 
-    So the pose of a node in its parent is told by its own values, or by its parent's.
+    The pose of a node in its parent then depends on its own values only, or on its parent's values
+    only. A branch stays where it is if other joints move it or a skin band is attached to it.
     """
-    alike = _alike(model)
-    bent = {graph.group_of(link) for band in model.skin for link in (band.parent, band.child)}
+    couplings = _couplings_by_position(model)
+    skinned = {graph.group_of(link) for band in model.skin for link in (band.parent, band.child)}
     leaders: dict[int, tuple[int, int]] = {}
     found: list[Branch] = []
     for i, branch in enumerate(branches):
-        known = [alike.get(p) if p not in held else None for p in branch.positions]
-        leads = {leaders[one.leader][0] if one and one.leader in leaders else -1 for one in known}
-        above, lead = branch.parent, min(leads, default=-1)
-        hangs_on = found[above] if above >= 0 else branch
-        beside = lead >= 0 and above == branches[lead].parent
-        below = above == lead or (hangs_on.parent == lead and hangs_on.follows)
-        if lead < 0 or len(leads) > 1 or branch.group in bent or not (beside or below):
+        known = [couplings.get(p) if p not in held else None for p in branch.positions]
+        candidates = {
+            leaders[one.leader][0] if one and one.leader in leaders else -1 for one in known
+        }
+        parent, leader = branch.parent, min(candidates, default=-1)
+        parent_branch = found[parent] if parent >= 0 else branch
+        beside = leader >= 0 and parent == branches[leader].parent
+        below = parent == leader or (parent_branch.parent == leader and parent_branch.follows)
+        if leader < 0 or len(candidates) > 1 or branch.group in skinned or not (beside or below):
             for one, position in zip(known, branch.positions, strict=True):
                 if one:
                     leaders.setdefault(one.leader, (i, position))
-            found.append(replace(branch, depth=hangs_on.depth + (above >= 0)))
+            found.append(replace(branch, depth=parent_branch.depth + (parent >= 0)))
             continue
-        first, steps, follows = found[lead], branch.steps, list[Coupling]()
+        first, steps, follows = found[leader], branch.steps, list[Coupling]()
         if beside:
             last = len(first.positions)
             for step in first.steps[::-1]:
@@ -231,64 +245,66 @@ def _let_follow(
                 own = first.positions[last : last + step.position_count]
                 follows += [Coupling(p, last + k, 1.0, 0.0) for k, p in enumerate(own)]
             steps = *(replace(s, inverted=not s.inverted) for s in first.steps[::-1]), *steps
-        elif above != lead:
-            steps, follows = hangs_on.steps + steps, list(hangs_on.follows)
+        elif parent != leader:
+            steps, follows = parent_branch.steps + steps, list(parent_branch.follows)
         for one in (one for one in known if one):
-            told = _relation(alike, one.follower, leaders[one.leader][1])
-            follows.append(told._replace(leader=first.positions.index(told.leader)))
-        found.append(Branch(branch.group, lead, first.depth + 1, steps, (), tuple(follows)))
+            relation = _relative_coupling(couplings, one.follower, leaders[one.leader][1])
+            follows.append(relation._replace(leader=first.positions.index(relation.leader)))
+        found.append(Branch(branch.group, leader, first.depth + 1, steps, (), tuple(follows)))
     return _ordered(graph, found)
 
 
-def _alike(model: ParsedModel) -> dict[int, Coupling]:
-    """All positions that follow others or are followed, leaders by themselves."""
+def _couplings_by_position(model: ParsedModel) -> dict[int, Coupling]:
+    """Return the coupling of each follower and leader; a leader follows itself."""
     own = {one.leader: Coupling(one.leader, one.leader, 1.0, 0.0) for one in model.couplings}
     return own | {one.follower: one for one in model.couplings}
 
 
-def _relation(alike: Mapping[int, Coupling], follower: int, leader: int) -> Coupling:
-    """How one of two positions that follow the same one follows the other."""
-    one, other = alike[follower], alike[leader]
-    multiplier = one.multiplier / other.multiplier
-    return Coupling(follower, leader, multiplier, one.offset - multiplier * other.offset)
+def _relative_coupling(couplings: Mapping[int, Coupling], follower: int, leader: int) -> Coupling:
+    """Return how one of two positions with a common leader follows the other."""
+    first, second = couplings[follower], couplings[leader]
+    multiplier = first.multiplier / second.multiplier
+    return Coupling(follower, leader, multiplier, first.offset - multiplier * second.offset)
 
 
 def _followers(
     model: ParsedModel, searched: Sequence[int], known: Collection[int]
 ) -> tuple[Coupling, ...]:
-    """Which positions, that are not known, follow those that are searched."""
-    alike, found = _alike(model), []
-    for follower, one in alike.items():
-        own = [p for p in searched if p in alike and alike[p].leader == one.leader]
+    """Return the couplings of positions that follow searched ones and are not known already."""
+    couplings, found = _couplings_by_position(model), []
+    for follower, one in couplings.items():
+        own = [p for p in searched if p in couplings and couplings[p].leader == one.leader]
         if own and follower not in known:
-            found.append(_relation(alike, follower, own[0]))
+            found.append(_relative_coupling(couplings, follower, own[0]))
     return tuple(found)
 
 
 def _plant_rooted(
     model: ParsedModel, graph: LinkGraph, position: Array | None, held: dict[int, float]
 ) -> PoseTree:
-    """The tree that hangs on the plant's world as the file says."""
-    branches = _let_follow(model, graph, _branches(graph, 0), held)
-    # The world is a branch itself where it is seen.
+    """Return the tree with the plant's own roots, which are attached to the plant's world."""
+    branches = _attach_followers(model, graph, _branches(graph, 0), held)
+    # The world is a branch itself if it has geometry.
     on_world = 0 if branches and branches[0].group == 0 else -1
     objects = [branch.positions for branch in branches if branch.parent == on_world]
-    # Slides without limits between the world and its only object say where it stands, as the
-    # position of a floating joint does (planar robots in MJCF have two of them): they are not
-    # searched, and root_position moves the object.
+    # Slides without limits between the world and its only object place it, as a floating joint does
+    # (planar robots in MJCF have two such slides). They are not searched; root_position moves the
+    # object.
     placing = [slide for positions in objects for slide in _unlimited_slides(model, positions)]
     free = [slide for slide in placing if slide not in held]
     if len(objects) > 1 and free:
         raise ModelError(
-            f"{_lack_of_limits(model, free)}; of {len(objects)} objects in the world none can be "
-            "left where it stands"
+            f"{_missing_limits(model, free)}; of {len(objects)} objects in the world none can keep "
+            "its position"
         )
     held = {slide: float(model.default_positions[slide]) for slide in placing} | held
     X_WB = np.eye(4)
     tops = [index for index, branch in enumerate(branches) if branch.parent < 0]
     if position is not None:
         if len(tops) > 1:
-            raise SettingsError("root_position needs a root: several links hang on the world")
+            raise SettingsError(
+                "root_position needs a root: several links are attached to the world"
+            )
         top = branches[tops[0]]
         slides = [model.position_kinds[index] == "length" for index in top.positions[:3]]
         if slides == [True] * 3 and all(s.position_count == 1 for s in top.steps[:3]):
@@ -303,7 +319,10 @@ def _plant_rooted(
 
 
 def _solve_translations(model: ParsedModel, top: Branch, p_WN: Array) -> dict[int, float]:
-    """Values of the three translations that lead to a node and put it at p_WN when it turns."""
+    """Return values [m] of three translations that put a node's origin at p_WN (3,) [m].
+
+    Raises ModelError: later joints move the origin, or the translations do not span all directions.
+    """
     values = model.default_positions[list(top.positions)].copy()
     values[:3] = 0.0
     turned = values.copy()
@@ -323,7 +342,7 @@ def _solve_translations(model: ParsedModel, top: Branch, p_WN: Array) -> dict[in
     return dict(zip(top.positions[:3], solved, strict=True))
 
 
-def _turned_over(
+def _rerooted(
     model: ParsedModel,
     graph: LinkGraph,
     start: int,
@@ -332,15 +351,27 @@ def _turned_over(
     rotation: RootRotation,
     held: dict[int, float],
 ) -> PoseTree:
-    """The tree that starts at a link which is placed in the world by itself."""
+    """Return the tree that starts at a link with its own pose in the world.
+
+    Args:
+        model: the model.
+        graph: the model's link graph.
+        start: index of the root's group.
+        is_own: whether the root is the plant's own root.
+        position: (3,) the root's origin in the world [m]; None: its default position.
+        rotation: the root's rotation.
+        held: values of held positions [rad or m], by index in q.
+
+    Raises SettingsError: a position is missing, or a held position follows from the root's pose.
+    """
     root = graph.groups[start]
     if position is None:
         if not is_own:
             raise SettingsError(
-                f"root '{root.name}': give root_position, where its origin is in the world [m]"
+                f"root '{root.name}': give root_position, its origin's position in the world [m]"
             )
         position = PlantKinematics(model).pose(root.body)[:3, 3]
-    branches = _let_follow(model, graph, _branches(graph, start), held)
+    branches = _attach_followers(model, graph, _branches(graph, start), held)
     X_WA = np.eye(4)
     X_WA[:3, 3] = position
     roots: Roots = {0: (X_WA, rotation)}
@@ -348,7 +379,7 @@ def _turned_over(
     if 0 in groups:
         base = BasePose("placed", node=groups.index(0), body=graph.groups[0].body)
     else:
-        # The edges from the world outwards to the first of the groups.
+        # Find the edges from the world outwards to the nearest group of the tree.
         queue: list[tuple[int, list[JointEdge]]] = [(0, [])]
         for group, chain in queue:
             if group in groups:
@@ -356,7 +387,7 @@ def _turned_over(
             queue += [(e.outer, [*chain, e]) for e in graph.edges if e.inner == group]
         base = base_of_chain(model, graph, chain, groups.index(chain[-1].outer), held)
         if any(edge.joint_map is None for edge in chain):
-            # What is seen in the world beside a floating object makes further roots.
+            # Geometry of the world beside a floating object makes further roots.
             X_WA = PlantKinematics(model).pose(graph.groups[0].body)
             for branch in _branches(graph, 0):
                 if branch.parent < 0:
@@ -382,7 +413,7 @@ def _assemble(
     held: dict[int, float],
     root: str,
 ) -> PoseTree:
-    """Make the nodes."""
+    """Return the pose tree with the nodes of all branches."""
     placements: list[NodePlacement] = []
     nodes: list[PoseTreeNode] = []
     for index, branch in enumerate(branches):
@@ -408,19 +439,19 @@ def _assemble(
     searched = [position for node in nodes for position in node.positions]
     free = [position for position in _unlimited_slides(model, searched) if position not in held]
     if free:
-        raise ModelError(_lack_of_limits(model, free))
-    require_placed(
+        raise ModelError(_missing_limits(model, free))
+    require_neighbours(
         model, graph, {(branches[b.parent].group, b.group) for b in branches if b.parent >= 0}
     )
     followers = _followers(model, searched, {*searched, *base.positions, *held})
-    moved = {*searched, *base.positions, *(one.follower for one in followers)}
+    determined = {*searched, *base.positions, *(one.follower for one in followers)}
     return PoseTree(
         model=model,
         nodes=tuple(nodes),
         leaves=tuple(index for index, node in enumerate(nodes) if not node.children),
         held=held,
         unobserved_positions=tuple(
-            name for index, name in enumerate(model.position_names) if index not in moved
+            name for index, name in enumerate(model.position_names) if index not in determined
         ),
         followers=followers,
         root=root,
@@ -430,13 +461,13 @@ def _assemble(
 
 
 def _unlimited_slides(model: ParsedModel, positions: Sequence[int]) -> list[int]:
-    """Those that are lengths without a lower or without an upper limit."""
+    """Return the positions that are lengths without a finite lower or upper limit."""
     limited = np.isfinite(model.lower) & np.isfinite(model.upper)
     return [i for i in positions if model.position_kinds[i] == "length" and not limited[i]]
 
 
-def _lack_of_limits(model: ParsedModel, positions: Sequence[int]) -> str:
-    """Which joints lack limits, and what to do."""
+def _missing_limits(model: ParsedModel, positions: Sequence[int]) -> str:
+    """Return the message that joints lack limits, with advice."""
     names = [model.position_names[position] for position in positions]
     many = len(names) > 1
     return (

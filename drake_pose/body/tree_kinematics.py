@@ -1,7 +1,7 @@
-"""Poses of a tree's nodes and how they change with its values, fast enough for optimisation.
+"""Compiled forward kinematics of a pose tree, with derivatives by its values.
 
-A tree's values are taken as one flat array here, node after node. The motion that a value gives to
-everything behind it is a twist in the world: dp/dvalue = omega x p + v for a point at p.
+The values of a tree are one flat array here, node after node. A value moves everything behind its
+joint by a twist (omega, v) in the world: dp/dvalue = omega x p + v for a point p.
 """
 
 import math
@@ -14,7 +14,7 @@ import numpy as np
 from pydrake.multibody.tree import Joint, RigidBody
 
 from drake_pose.arrays import Array
-from drake_pose.body.joint_kernel import PackedSteps, find_joint, pack_steps
+from drake_pose.body.joint_kernel import PackedSteps, evaluate_joint, pack_steps
 from drake_pose.body.link_graph import JointMap, PlantKinematics, chain_transforms
 from drake_pose.body.parsed_model import nearest_turn
 from drake_pose.body.pose_tree import PoseTree, require_tree
@@ -23,11 +23,16 @@ from drake_pose.errors import SettingsError
 
 
 class PackedTree(NamedTuple):
-    """A pose tree in the arrays that the kernel walks.
+    """A pose tree in the arrays that the kernel takes.
 
-    parents: (n,); X_PA: (n, 4, 4) constant parts, R_W0 of turned roots included; value_starts:
-    (n + 1,) where each node's values begin, what follows others behind all values; free: (n,) bool
-    which begin with a rotation vector; step_starts: (n + 1,); steps: all joints.
+    Attributes:
+        parents: (n,) index of each node's parent; -1: the world.
+        X_PA: (n, 4, 4) constant transforms, with R_W0 of rotated roots included.
+        value_starts: (n + 1,) index of each node's first value. Joints that follow others have
+            values of their own here, behind all values of the tree.
+        free: (n,) bool, whether the node's values begin with a rotation vector.
+        step_starts: (n + 1,) index of each node's first joint in ``steps``.
+        steps: all joints.
     """
 
     parents: np.ndarray
@@ -40,13 +45,16 @@ class PackedTree(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Motions:
-    """The poses of all nodes and the motions that the parameters give them.
+    """Poses of all nodes and the motions that parameters cause.
 
-    The parameters are the tree's values and, after them, what ``TreeKinematics.motions`` was asked
-    to add. A point of node i at p_W moves with parameter j by ``omega x p_W + v + sigma p_W`` where
-    ``moves[i, j]`` (nodes, m), else not at all; between both there are the motions of joints that
-    follow others, those of ``TreeKinematics.parameters``. X_WN: (nodes, 4, 4); twists: (m, 7)
-    omega, v, sigma, in the world and about its origin.
+    The parameters are the tree's values, then those that ``TreeKinematics.motions`` adds. A point
+    p_W of node i moves with motion j by omega x p_W + v + sigma p_W if ``moves[i, j]``, else not at
+    all. Motions are in the order of ``TreeKinematics.parameters``, then the added parameters.
+
+    Attributes:
+        X_WN: (nodes, 4, 4) poses of the nodes.
+        twists: (m, 7) omega, v, sigma of each motion, in the world and about its origin.
+        moves: (nodes, m) bool, whether the motion moves the node.
     """
 
     X_WN: np.ndarray
@@ -55,14 +63,18 @@ class Motions:
 
 
 class TreeKinematics:
-    """A pose tree's kinematics, compiled; arrays are (m,), value after value, node after node.
+    """Compiled kinematics of a pose tree; arrays (m,) are in the order of the nodes' values.
 
     Attributes:
-        lower, upper: limits [rad or m]; equal where a value is held, infinite where it is an angle
-            that can take every direction.
-        is_angle: whether a value is an angle [rad], else a length [m].
-        turns_around: whether it is an angle that can take every direction.
-        parameters: (e,) the value that makes each motion: each one its own, then those that follow.
+        tree: the pose tree.
+        names: the names of the values.
+        value_nodes: (m,) index of each value's node.
+        lower, upper: (m,) limits [rad or m]; equal where a value is held, infinite where an angle
+            can take every direction.
+        is_angle: (m,) whether the value is an angle [rad]; else a length [m].
+        turns_around: (m,) whether the value is an angle that can take every direction.
+        parameters: (e,) index of the value that causes each motion: first each value's own motion,
+            then those of joints that follow a value.
         packed: the tree as ``find_motions`` takes it.
     """
 
@@ -74,12 +86,12 @@ class TreeKinematics:
         self.value_nodes = np.repeat(np.arange(len(counts)), counts)
         firsts = np.cumsum([0, *counts])
         self._splits = firsts.tolist()
-        led = [
+        followers = [
             (firsts[tree.nodes[i].parent] + one.leader, i, one.multiplier, one.offset)
             for i, placement in enumerate(tree.placements)
             for one in placement.follows
         ]
-        values, nodes, scale, offset = np.array(led, dtype=np.float64).reshape(-1, 4).T
+        values, nodes, scale, offset = np.array(followers, dtype=np.float64).reshape(-1, 4).T
         self.parameters = np.append(np.arange(firsts[-1]), values.astype(np.int64))
         motion_nodes = np.append(self.value_nodes, nodes.astype(np.int64))
         self._scale, self._offset = scale, offset
@@ -91,7 +103,7 @@ class TreeKinematics:
         self.upper = np.where(self.turns_around, np.inf, upper)
         self.is_angle = np.concatenate([placement.is_angle for placement in tree.placements])
         self.packed = _pack_tree(tree, firsts)
-        # (nodes, e + 4) which nodes each motion moves, and the root's shift and growth.
+        # (nodes, e + 4) which nodes each motion moves; last the root's translation and scale.
         moves = np.zeros((len(counts), len(self.parameters) + 4), dtype=np.bool_)
         for i, node in enumerate(tree.nodes):
             if node.parent >= 0:
@@ -101,7 +113,7 @@ class TreeKinematics:
         self._moves = moves
 
     def flatten(self, node_values: Sequence[np.ndarray]) -> np.ndarray:
-        """All values (m,) of each node's values (k_i,); SettingsError for a wrong number."""
+        """Return all values (m,), given each node's (k_i,); SettingsError for a wrong size."""
         parts = [np.asarray(values, dtype=np.float64).reshape(-1) for values in node_values]
         wanted = [len(node.value_names) for node in self.tree.nodes]
         if [len(part) for part in parts] != wanted:
@@ -109,18 +121,22 @@ class TreeKinematics:
         return np.concatenate(parts) if parts else np.zeros(0)
 
     def split(self, values: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Each node's values (k_i,) of all values (m,)."""
+        """Return each node's values (k_i,), given all values (m,)."""
         return tuple(np.asarray(values)[a:b] for a, b in pairwise(self._splits))
 
     def nearest_turns(self, values: np.ndarray, near: np.ndarray | None = None) -> np.ndarray:
-        """The same pose's values (m,), angles that turn around in the turn nearest to ``near``.
+        """Return values (m,) of the same pose, with angles in the turn nearest to ``near``.
 
-        ``near`` is (m,); None: about the default positions, where answers are given.
+        Only angles that can take every direction are moved. ``near``: (m,) [rad or m]; None: the
+        middle of the turn that is searched, which is the turn about the default positions.
         """
         return nearest_turn(values, self._middle if near is None else near, self.turns_around)
 
     def within_limits(self, values: np.ndarray) -> np.ndarray:
-        """The same pose's values (m,), limited periodic angles less the turns beyond limits."""
+        """Return values (m,) of the same pose, with angles moved by full turns into their limits.
+
+        Only angles that can take every direction are moved.
+        """
         limits = [self.tree.value_limits(i) for i in range(len(self.tree.nodes))]
         lower, upper = np.hstack([np.zeros((2, 0)), *limits])
         full = 2.0 * math.pi
@@ -129,50 +145,57 @@ class TreeKinematics:
         return np.where(self.turns_around, values - full * (above - below), values)
 
     def reach(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The limits (m,), or half a turn either side of a pose's angles that turn around."""
+        """Return limits (m,), (m,) around a pose [rad or m].
+
+        An angle that can take every direction has half a turn either side of its value.
+        """
         lower = np.where(self.turns_around, values - math.pi, self.lower)
         return lower, np.where(self.turns_around, values + math.pi, self.upper)
 
     def poses(self, values: np.ndarray) -> np.ndarray:
-        """X_WN (nodes, 4, 4) at values (m,)."""
-        return self._found(values)[0]
+        """Return X_WN (nodes, 4, 4) at values (m,) [rad or m]."""
+        return self._compute(values)[0]
 
-    def _found(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """X_WN (nodes, 4, 4) and the twists (e, 6) of all values, those that follow behind."""
+    def _compute(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return X_WN (nodes, 4, 4) and the twists (e, 6) of all motions at values (m,)."""
         values = np.ascontiguousarray(values, dtype=np.float64)
         if values.shape != (len(self.names),):
             raise SettingsError(f"{len(self.names)} values expected, got shape {values.shape}")
         if len(self.parameters) == len(values):
             return find_motions(self.packed, values)
-        led = self._scale * values[self.parameters[len(values) :]] + self._offset
-        X_WN, turns = find_motions(self.packed, np.append(values, led))
-        turns[len(values) :] *= self._scale[:, None]
-        return X_WN, turns
+        followers = self._scale * values[self.parameters[len(values) :]] + self._offset
+        X_WN, twists = find_motions(self.packed, np.append(values, followers))
+        twists[len(values) :] *= self._scale[:, None]
+        return X_WN, twists
 
     def motions(
         self, values: np.ndarray, *, translation: bool = False, scale: bool = False
     ) -> Motions:
-        """Poses and motions at all values (m,) [rad or m].
+        """Return poses and motions at values (m,) [rad or m].
 
         Args:
-            translation: add a shift of the first root and all behind it along the world's x, y, z.
-            scale: add a uniform growth of these about the first root's origin (per unit).
+            values: (m,) values of the tree.
+            translation: add translations of the first root's tree along the world's x, y and z [m].
+            scale: add a uniform scaling of the first root's tree about the root's origin; the
+                parameter is the log scale.
+
+        Raises SettingsError: the number of values is wrong.
         """
-        X_WN, turns = self._found(values)
+        X_WN, value_twists = self._compute(values)
         count = len(self.parameters)
-        added = 3 * translation + scale
-        twists = np.zeros((count + added, 7))
-        twists[:count, :6] = turns
+        extra_count = 3 * translation + scale
+        twists = np.zeros((count + extra_count, 7))
+        twists[:count, :6] = value_twists
         if translation:
             twists[count : count + 3, 3:6] = np.eye(3)
         if scale:
             twists[-1, 3:6], twists[-1, 6] = -X_WN[0, :3, 3], 1.0
-        # A shift and growth move the same nodes.
-        return Motions(X_WN, twists, self._moves[:, : count + added])
+        # Translation and scale move the same nodes.
+        return Motions(X_WN, twists, self._moves[:, : count + extra_count])
 
 
 def _pack_tree(tree: PoseTree, firsts: np.ndarray) -> PackedTree:
-    """The tree in arrays; turns of a root about its axes are joints like others."""
+    """Return the tree in arrays; the axis rotations of a limited root become joints."""
     starts, end = firsts.copy(), firsts[-1]
     for i, placement in enumerate(tree.placements):
         if placement.follows:
@@ -181,7 +204,7 @@ def _pack_tree(tree: PoseTree, firsts: np.ndarray) -> PackedTree:
     X_PA, free, chains = [], [], []
     for placement in tree.placements:
         X, rotation = np.array(placement.X_PA), placement.rotation
-        turns: tuple[JointMap, ...] = ()
+        rotations: tuple[JointMap, ...] = ()
         if rotation is not None:
             X[:3, :3] = X[:3, :3] @ rotation.R_W0
             for axis in rotation.axes:
@@ -189,10 +212,10 @@ def _pack_tree(tree: PoseTree, firsts: np.ndarray) -> PackedTree:
                 rows[0, :3, :3], rows[0, 3, 3] = np.outer(e, e), 1.0
                 rows[1, :3, :3] = np.eye(3) - np.outer(e, e)
                 rows[2, :3, :3] = np.cross(e, -np.eye(3))
-                turns += (JointMap(rows.reshape(4, 16), 1),)
+                rotations += (JointMap(rows.reshape(4, 16), 1),)
         X_PA.append(X)
         free.append(rotation is not None and rotation.kind == "free")
-        chains.append(turns + placement.steps)
+        chains.append(rotations + placement.steps)
     return PackedTree(
         parents=np.array([node.parent for node in tree.nodes], dtype=np.int64),
         X_PA=np.array(X_PA),
@@ -205,7 +228,7 @@ def _pack_tree(tree: PoseTree, firsts: np.ndarray) -> PackedTree:
 
 @compiled
 def _write_twist(X_WA: np.ndarray, M: np.ndarray, twist: np.ndarray) -> None:
-    """Writes the world's twist (6,) of a twist matrix M (3, 4) in frame A."""
+    """Write the twist (6,) in the world of a twist matrix M (3, 4) in frame A."""
     w0, w1, w2 = M[2, 1], M[0, 2], M[1, 0]
     for i in range(3):
         twist[i] = X_WA[i, 0] * w0 + X_WA[i, 1] * w1 + X_WA[i, 2] * w2
@@ -217,9 +240,11 @@ def _write_twist(X_WA: np.ndarray, M: np.ndarray, twist: np.ndarray) -> None:
 
 
 @compiled
-def _turn_freely(X_WA: np.ndarray, r: np.ndarray, X: np.ndarray, twists: np.ndarray) -> None:
-    """Writes the rotation X (3, 4) of a vector (3,), and the twists (3, 6) of its components."""
-    # Rodrigues's formula; its derivative is the left Jacobian of SO(3), J = I + b K + c K^2.
+def _write_free_rotation(
+    X_WA: np.ndarray, r: np.ndarray, X: np.ndarray, twists: np.ndarray
+) -> None:
+    """Write the rotation X (3, 4) of a rotation vector r (3,) and the twists (3, 6) of r."""
+    # Rodrigues's formula R = I + a K + b K^2, and the left Jacobian of SO(3), J = I + b K + c K^2.
     angle = math.sqrt(r[0] ** 2 + r[1] ** 2 + r[2] ** 2)
     if angle > 1e-4:
         a, b = math.sin(angle) / angle, (1.0 - math.cos(angle)) / angle**2
@@ -229,7 +254,7 @@ def _turn_freely(X_WA: np.ndarray, r: np.ndarray, X: np.ndarray, twists: np.ndar
     J, M = np.empty((3, 3)), np.zeros((3, 4))
     for i in range(3):
         for j in range(3):
-            # K has the entries of the cross product, K^2 = r r^T - |r|^2 I.
+            # K is the cross product matrix of r; K^2 = r r^T - |r|^2 I.
             K = 0.0 if i == j else (r[3 - i - j] if (i - j) % 3 == 1 else -r[3 - i - j])
             KK = r[i] * r[j] - (angle**2 if i == j else 0.0)
             X[i, j] = (1.0 if i == j else 0.0) + a * K + b * KK
@@ -242,7 +267,7 @@ def _turn_freely(X_WA: np.ndarray, r: np.ndarray, X: np.ndarray, twists: np.ndar
 
 @compiled
 def find_motions(packed: PackedTree, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns X_WN (n, 4, 4) and the twists (m, 6) of all values."""
+    """Return X_WN (n, 4, 4) and the twists (m, 6) of all values (m,)."""
     count, steps = packed.parents.shape[0], packed.steps
     X_WN, twists = np.zeros((count, 4, 4)), np.zeros((values.shape[0], 6))
     basis, Y, dT = np.empty((3, 4)), np.empty((3, 4)), np.empty((3, 4))
@@ -254,16 +279,16 @@ def find_motions(packed: PackedTree, values: np.ndarray) -> tuple[np.ndarray, np
         X[3, 3] = 1.0
         first, end = packed.step_starts[node], packed.step_starts[node + 1]
         if packed.free[node]:
-            first -= 1  # Its turn comes before its joints.
+            first -= 1  # The free rotation precedes the joints.
         for step in range(first, end):
             if step < packed.step_starts[node]:
-                _turn_freely(X, values[value:], Y, twists[value:])
+                _write_free_rotation(X, values[value:], Y, twists[value:])
                 value += 3
             else:
-                find_joint(steps, step, values[value:], 1.0, -1, basis, Y)
+                evaluate_joint(steps, step, values[value:], 1.0, -1, basis, Y)
                 for k in range(steps.sizes[step]):
-                    find_joint(steps, step, values[value:], 1.0, k, basis, dT)
-                    # Outwards dT T^-1 with T = Y, inwards -T^-1 dT with T^-1 = Y.
+                    evaluate_joint(steps, step, values[value:], 1.0, k, basis, dT)
+                    # Twist matrix: dT T^-1 with T = Y, or inverted -T^-1 dT with T^-1 = Y.
                     for i in range(3):
                         for j in range(4):
                             M[i, j] = dT[i, 3] if j == 3 and not steps.inverted[step] else 0.0
@@ -283,14 +308,19 @@ def find_motions(packed: PackedTree, values: np.ndarray) -> tuple[np.ndarray, np
     return X_WN, twists
 
 
-class JointOffset(NamedTuple):
-    """How far a joint's origin is from the joint before it.
+class LinkVector(NamedTuple):
+    """The vector from the previous joint's origin (or the world's) to a joint's origin.
 
-    joint: its name; link: its parent link's; node: the pose tree's node that it moves; step: its
-    place among that node's joints; inverted: whether the tree walks it inwards, from its child link
-    to its parent; p_A: (3,) by how far what is behind it in the tree is shifted, in frame A of the
-    parent link, which is the parent node's where step is 0 and it is walked outwards: the offset,
-    or walked inwards its negative; p_L: (3,) the offset in the parent link's frame [m].
+    Attributes:
+        joint: name of the joint.
+        link: name of the joint's parent link.
+        node: index of the node that the joint moves.
+        step: index of the joint among the node's joints.
+        inverted: whether the tree traverses the joint inwards, from its child link to its parent.
+        p_A: (3,) displacement [m] of the tree behind the joint when the vector is added, in frame
+            A. A is the parent link's frame, which is the parent node's if ``step`` is 0 and the
+            joint is not inverted. The displacement is the vector, or its negative if inverted.
+        p_L: (3,) the vector in the parent link's frame [m].
     """
 
     joint: str
@@ -302,14 +332,15 @@ class JointOffset(NamedTuple):
     p_L: Array
 
 
-def joint_offsets(tree: PoseTree, shortest: float = 1e-3) -> tuple[JointOffset, ...]:
-    """Each joint's offset from the joint (or the world) that places the part that carries it.
+def link_vectors(tree: PoseTree, min_length: float = 1e-3) -> tuple[LinkVector, ...]:
+    """Return the vector to each joint from the joint (or the world) that places its parent link.
 
-    Joints without an offset, or with one that is no longer than ``shortest`` [m], are left out.
+    Vectors of at most ``min_length`` [m] are left out.
     """
     model, plant, kinematics = tree.model, tree.model.plant, PlantKinematics(tree.model)
 
     def pose(link: RigidBody) -> Array:
+        """Return a link's pose (4, 4) in the plant's world at the held positions."""
         return kinematics.pose(int(link.index()), tree.held)
 
     joints = [plant.get_joint(index) for index in plant.GetJointIndices()]
@@ -317,7 +348,7 @@ def joint_offsets(tree: PoseTree, shortest: float = 1e-3) -> tuple[JointOffset, 
     inboard = {int(joint.child_body().index()): joint for joint in joints}
     found = []
     for i, (node, placement) in enumerate(zip(tree.nodes, tree.placements, strict=True)):
-        X_BA, at = np.eye(4), 0
+        X_BA, offset = np.eye(4), 0
         follows = placement.follows
         positions = [one.follower for one in follows] if follows else list(node.positions)
         values = model.default_positions[positions] if follows else placement.defaults
@@ -325,28 +356,31 @@ def joint_offsets(tree: PoseTree, shortest: float = 1e-3) -> tuple[JointOffset, 
             parent = model.link_index(tree.nodes[node.parent].name)
             X_BA = kinematics.pose(parent, tree.held)
         for k, step in enumerate(placement.steps):
-            joint = moving[positions[at]]
+            joint = moving[positions[offset]]
             p_B = _offset(joint, inboard, pose)
-            end = at + step.position_count
-            X_BC = X_BA @ chain_transforms([step], values[None, at:end])[0]
-            if np.linalg.norm(p_B) > shortest:
+            end = offset + step.position_count
+            X_BC = X_BA @ chain_transforms([step], values[None, offset:end])[0]
+            if np.linalg.norm(p_B) > min_length:
                 link = joint.parent_body()
                 p_A = -X_BC[:3, :3].T @ p_B if step.inverted else X_BA[:3, :3].T @ p_B
                 p_L = pose(link)[:3, :3].T @ p_B
                 found.append(
-                    JointOffset(joint.name(), link.name(), i, k, bool(step.inverted), p_A, p_L)
+                    LinkVector(joint.name(), link.name(), i, k, bool(step.inverted), p_A, p_L)
                 )
             X_BA = X_BC
-            at = end
+            offset = end
     return tuple(found)
 
 
 def _offset(
     joint: Joint, inboard: Mapping[int, Joint], pose: Callable[[RigidBody], Array]
 ) -> Array:
-    """(3,) to a joint from the origin of the rigid part that carries it, in the plant's world."""
+    """Return the vector (3,) [m] to a joint from the origin of the rigid part that carries it.
+
+    The vector is in the plant's world frame.
+    """
     link = first = joint.parent_body()
-    while (before := inboard.get(int(first.index()))) and before.num_positions() == 0:
-        first = before.parent_body()
+    while (joint_before := inboard.get(int(first.index()))) and joint_before.num_positions() == 0:
+        first = joint_before.parent_body()
     X_LJ = joint.frame_on_parent().GetFixedPoseInBodyFrame().GetAsMatrix4()
     return np.asarray((pose(link) @ X_LJ - pose(first))[:3, 3])

@@ -1,4 +1,4 @@
-"""Changes of a URDF model's shape, made in its text: parts hidden, stretched, moved, re-zeroed."""
+"""Changes to a URDF model's shape, made in its text: hide, scale and shift links and joints."""
 
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Collection, Mapping, Sequence
@@ -12,7 +12,7 @@ from drake_pose.body.model_files import xml_text
 Vectors = Mapping[str, Sequence[float]]
 """(3,) by the name of a link or joint."""
 
-# Drake's own elements keep the prefix that Drake looks for.
+# Keep the prefix of Drake's own elements, which Drake requires.
 ElementTree.register_namespace("drake", "http://drake.mit.edu")
 
 
@@ -20,22 +20,23 @@ def reshaped(
     text: str,
     *,
     hidden: Collection[str] = (),
-    factors: Vectors = MappingProxyType({}),
-    moves: Vectors = MappingProxyType({}),
-    shifts: Vectors = MappingProxyType({}),
-    zeros: Mapping[str, float] | None = None,
+    link_scales: Vectors = MappingProxyType({}),
+    link_shifts: Vectors = MappingProxyType({}),
+    joint_shifts: Vectors = MappingProxyType({}),
+    joint_offsets: Mapping[str, float] | None = None,
 ) -> str:
-    """A URDF text in which links and joints are otherwise.
+    """Return a URDF text with links and joints changed.
 
     Args:
-        hidden: links without looks.
-        factors: so many times a link's size along its frame's axes, with the joints that it
-            carries. A shape that is no mesh is stretched as its kind allows: spheres and capsules
-            by the mean.
-        moves: how far a link's looks, and the joints that it carries, lie elsewhere on it [m].
-        shifts: how far a joint stands elsewhere on its parent link [m].
-        zeros: by how much a joint stands further where it reads the same [rad or m]: its origin is
-            turned about its axis, or shifted along it; its limits stay in place.
+        text: the URDF text.
+        hidden: links that lose their visual geometry.
+        link_scales: (3,) scale factors of a link's visual geometry, and of the origins of the
+            joints that it carries, along the axes of its frame. Shapes other than meshes are scaled
+            as their type allows: spheres and capsule radii by the geometric mean.
+        link_shifts: (3,) shift [m] of a link's visual geometry and of the joints that it carries.
+        joint_shifts: (3,) shift [m] of a joint's origin in its parent link's frame.
+        joint_offsets: offset [rad or m] added to a joint's position: its origin is rotated about
+            its axis or shifted along it, and its limits are moved so that they stay in place.
     """
     root = ElementTree.fromstring(text)
     for link in root.iterfind("link"):
@@ -44,24 +45,29 @@ def reshaped(
             if name in hidden:
                 link.remove(visual)
                 continue
-            if name in factors:
-                _stretch_shapes(visual, np.array(factors[name]))
-            _place(visual, factors.get(name), moves.get(name))
+            if name in link_scales:
+                _scale_shapes(visual, np.array(link_scales[name]))
+            _move_origin(visual, link_scales.get(name), link_shifts.get(name))
     for joint in root.iterfind("joint"):
         parent = joint.find("parent")
         name, link_name = joint.get("name", ""), "" if parent is None else parent.get("link", "")
-        _place(joint, factors.get(link_name), shifts.get(name), moves.get(link_name))
-        if zeros and zeros.get(name):
-            _turn(joint, zeros[name])
+        _move_origin(
+            joint, link_scales.get(link_name), joint_shifts.get(name), link_shifts.get(link_name)
+        )
+        if joint_offsets and joint_offsets.get(name):
+            _offset_joint(joint, joint_offsets[name])
     return xml_text(root)
 
 
 BASE_JOINTS = ("free_x", "free_y", "free_z", "free_turn_z", "free_turn_y", "free_turn_x")
-"""Joints that move a whole model: along the world's axes, then about them, the last one first."""
+"""Joints that move a whole model: along x, y, z of the world, then about z, y, x."""
 
 
-def with_base_joints(text: str, place: Sequence[float], rpy: Sequence[float]) -> str:
-    """A URDF text moved by BASE_JOINTS from a place (3,) [m], turned there by rpy (3,) [rad]."""
+def with_base_joints(text: str, position: Sequence[float], rpy: Sequence[float]) -> str:
+    """Return a URDF text mounted on ``BASE_JOINTS``, which move it from a position (3,) [m].
+
+    At zero its base is rotated by ``rpy`` (3,) [rad].
+    """
     root = ElementTree.fromstring(text)
     for element in root.iter():
         for key in ("name", "link"):
@@ -74,18 +80,18 @@ def with_base_joints(text: str, place: Sequence[float], rpy: Sequence[float]) ->
     parent = "world"
     for k, name in enumerate(BASE_JOINTS):
         ElementTree.SubElement(root, "link", name=f"{name}_link")
-        slides = k < 3
+        is_prismatic = k < 3
         joint = ElementTree.SubElement(
-            root, "joint", name=name, type="prismatic" if slides else "continuous"
+            root, "joint", name=name, type="prismatic" if is_prismatic else "continuous"
         )
         ElementTree.SubElement(joint, "parent", link=parent)
         ElementTree.SubElement(joint, "child", link=f"{name}_link")
-        ElementTree.SubElement(joint, "axis", xyz=_text(np.eye(3)[k if slides else 5 - k]))
-        limit = {"lower": "-100", "upper": "100"} if slides else {}
+        ElementTree.SubElement(joint, "axis", xyz=_text(np.eye(3)[k if is_prismatic else 5 - k]))
+        limit = {"lower": "-100", "upper": "100"} if is_prismatic else {}
         ElementTree.SubElement(joint, "limit", {**limit, "effort": "1", "velocity": "1"})
         parent = f"{name}_link"
-    # The axes along which it moves are the world's; how it is turned comes after them.
-    ElementTree.SubElement(root.findall("joint")[-6], "origin", xyz=_text(place))
+    # The translation axes are the world's; the model's own rotation follows the joints.
+    ElementTree.SubElement(root.findall("joint")[-6], "origin", xyz=_text(position))
     for base in bases:
         joint = ElementTree.SubElement(root, "joint", name=f"free_{base}", type="fixed")
         ElementTree.SubElement(joint, "parent", link=parent)
@@ -94,58 +100,58 @@ def with_base_joints(text: str, place: Sequence[float], rpy: Sequence[float]) ->
     return xml_text(root)
 
 
-def _place(
+def _move_origin(
     element: ElementTree.Element,
-    factor: Sequence[float] | None,
-    *moves: Sequence[float] | Array | None,
+    scale: Sequence[float] | None,
+    *shifts: Sequence[float] | Array | None,
 ) -> None:
-    """Stretch an element's place (3,), then move it."""
-    given = [np.array(move) for move in moves if move is not None]
-    if factor is None and not given:
+    """Scale the origin (3,) of an element, then add shifts (3,) [m]."""
+    vectors = [np.array(shift) for shift in shifts if shift is not None]
+    if scale is None and not vectors:
         return
-    place = np.array(_numbers(_origin(element).get("xyz", "0 0 0")))
-    place = place if factor is None else place * factor
-    _origin(element).set("xyz", _text(sum(given, start=place)))
+    position = np.array(_numbers(_origin(element).get("xyz", "0 0 0")))
+    position = position if scale is None else position * scale
+    _origin(element).set("xyz", _text(sum(vectors, start=position)))
 
 
-def _turn(joint: ElementTree.Element, zero: float) -> None:
-    """Let a joint stand further by a constant [rad or m] where it reads the same."""
-    from scipy.spatial.transform import Rotation  # Slow to import; reading needs none.
+def _offset_joint(joint: ElementTree.Element, offset: float) -> None:
+    """Add a constant [rad or m] to a joint's position by moving its origin and its limits."""
+    from scipy.spatial.transform import Rotation  # Slow to import.
 
     axis_element = joint.find("axis")
     axis = np.array(_numbers("1 0 0" if axis_element is None else axis_element.get("xyz", "")))
     axis /= np.linalg.norm(axis)
     R = Rotation.from_euler("xyz", _numbers(_origin(joint).get("rpy", "0 0 0")))
     if joint.get("type") == "prismatic":
-        _place(joint, None, R.apply(zero * axis))
+        _move_origin(joint, None, R.apply(offset * axis))
     else:
-        _origin(joint).set("rpy", _text((R * Rotation.from_rotvec(zero * axis)).as_euler("xyz")))
+        _origin(joint).set("rpy", _text((R * Rotation.from_rotvec(offset * axis)).as_euler("xyz")))
     limit = joint.find("limit")
     for end in ("lower", "upper"):
         if limit is not None and joint.get("type") != "continuous" and end in limit.attrib:
-            limit.set(end, _text([float(limit.get(end, "0")) - zero]))
+            limit.set(end, _text([float(limit.get(end, "0")) - offset]))
 
 
 def _origin(element: ElementTree.Element) -> ElementTree.Element:
-    """An element's origin, which is made where it has none."""
+    """Return an element's <origin>, which is added where it is missing."""
     origin = element.find("origin")
     return ElementTree.SubElement(element, "origin") if origin is None else origin
 
 
-def _stretch_shapes(visual: ElementTree.Element, factor: Array) -> None:
-    """Make what a visual shows larger; where it is turned, by the mean."""
-    mean = [float(np.prod(factor)) ** (1.0 / 3.0)]
+def _scale_shapes(visual: ElementTree.Element, scale: Array) -> None:
+    """Scale a visual's shapes by (3,) factors; by their geometric mean if it is rotated."""
+    mean = [float(np.prod(scale)) ** (1.0 / 3.0)]
     if any(_numbers(_origin(visual).get("rpy", "0 0 0"))):
-        factor = np.array(mean * 3)
+        scale = np.array(mean * 3)
     for shape in visual.iterfind("geometry/*"):
         if shape.tag.removeprefix("drake:") == "mesh":
             shape.attrib.setdefault("scale", "1 1 1")
-        for name, by in (
-            ("scale", factor), ("size", factor), ("a", factor[:1]), ("b", factor[1:2]),
-            ("c", factor[2:]), ("radius", mean), ("length", factor[2:]),
+        for name, factor in (
+            ("scale", scale), ("size", scale), ("a", scale[:1]), ("b", scale[1:2]),
+            ("c", scale[2:]), ("radius", mean), ("length", scale[2:]),
         ):  # fmt: skip
             if name in shape.attrib:
-                shape.set(name, _text(np.array(_numbers(shape.get(name, ""))) * by))
+                shape.set(name, _text(np.array(_numbers(shape.get(name, ""))) * factor))
 
 
 def _numbers(text: str) -> list[float]:

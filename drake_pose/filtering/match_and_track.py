@@ -25,7 +25,7 @@ from drake_pose.search import (
     View,
     covariance_pose_set,
 )
-from drake_pose.silhouette.pictures.masks import edge_area
+from drake_pose.silhouette.pictures.masks import count_edge_pixels
 
 
 @dataclass(frozen=True, eq=False)
@@ -304,7 +304,7 @@ class MatchAndTrack:
         for camera in observation.cameras:
             drawn = observation.draw(x, camera)
             area += int(np.count_nonzero(drawn))
-            J += edge_area(drawn) * track.measurement.distance
+            J += count_edge_pixels(drawn) * track.measurement.distance
         return J, max(area, 1.0)
 
     def _result(self, track: Track, frame: _GivenFrame) -> PoseEstimate:

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_pose.arrays import Array, Indices
-from drake_pose.body import OBJECT_POSITIONS, PoseTree, chain_transforms
-from drake_pose.body.tree_kinematics import JointOffset, TreeKinematics, joint_offsets
+from drake_pose.body import TARGET_POSITIONS, PoseTree, chain_transforms
+from drake_pose.body.tree_kinematics import LinkVector, TreeKinematics, link_vectors
 from drake_pose.camera.models import Camera
 from drake_pose.compiled import compiled
 from drake_pose.silhouette.outline import (
@@ -99,7 +99,7 @@ class BodyParameters:
         groups: Sequence[int] | None = None,
         radius_scale_names: Sequence[str] = (),
         surfaces: TreeSurfaces | None = None,
-        offsets: Sequence[JointOffset] = (),
+        offsets: Sequence[LinkVector] = (),
     ) -> None:
         bends = surfaces is not None and surfaces.bends
         self._bending = PackedSurfaces(surfaces) if surfaces is not None and bends else None
@@ -219,12 +219,12 @@ def link_scale_name(link: str) -> str:
     return f"length of {link}"
 
 
-def carried_joints(tree: PoseTree, links: Collection[str] | None = None) -> list[JointOffset]:
+def carried_joints(tree: PoseTree, links: Collection[str] | None = None) -> list[LinkVector]:
     """The robot's joints that links, all where None, carry at a distance from their own."""
     return [
         one
-        for one in joint_offsets(tree)
-        if (links is None or one.link in links) and one.joint not in OBJECT_POSITIONS
+        for one in link_vectors(tree)
+        if (links is None or one.link in links) and one.joint not in TARGET_POSITIONS
     ]
 
 

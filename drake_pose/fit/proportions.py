@@ -14,7 +14,7 @@ from scipy.sparse import csr_array, diags_array, eye_array, kron, vstack
 
 from drake_pose.arrays import Array
 from drake_pose.body import ArticulatedModel
-from drake_pose.body.tree_kinematics import TreeKinematics, joint_offsets
+from drake_pose.body.tree_kinematics import TreeKinematics, link_vectors
 from drake_pose.camera.models import Camera
 from drake_pose.errors import ModelError
 from drake_pose.fit.contour_fit import Noise
@@ -72,7 +72,7 @@ class ProportionedBody(BodyParameters):
         self.width_names = tuple(f"log_width_{name}" for name in firsts)
         self._joints = {
             offset.node: offset.joint
-            for offset in joint_offsets(kinematics.tree)
+            for offset in link_vectors(kinematics.tree)
             if offset.step == 0
             and not offset.inverted
             and offset.link == nodes[nodes[offset.node].parent].name
@@ -142,9 +142,11 @@ class ProportionedBody(BodyParameters):
         nodes, shares = self.kinematics.tree.nodes, self.joint_places(theta)
         factors = zip(nodes, self.factors(theta).tolist(), strict=True)
         return model.reshaped(
-            factors={node.name: tuple(row) for node, row in factors},
-            shifts={joint: tuple(shares[i] * self._rest[i]) for i, joint in self._joints.items()},
-            moves={nodes[i].name: tuple(-shares[i] * self._along[i]) for i in self._joints},
+            link_scales={node.name: tuple(row) for node, row in factors},
+            joint_shifts={
+                joint: tuple(shares[i] * self._rest[i]) for i, joint in self._joints.items()
+            },
+            link_shifts={nodes[i].name: tuple(-shares[i] * self._along[i]) for i in self._joints},
         )
 
     def joint_places(self, theta: Array) -> Array:

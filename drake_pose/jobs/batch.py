@@ -187,7 +187,7 @@ def plan_scene(job: SceneJob, out: Path) -> tuple[Task, ...]:
         return (Task(job, out, None, tuple(map(str, range(0, most, settings.every)))),)
     scene = _load(job).of_cameras(settings.cameras)
     scene, asked = scene.every(settings.every, settings.frames)
-    frames = scene.seen_frames(asked)
+    frames = scene.frames_with_files(asked)
     is_whole = job.audit is not None
     # A model is read, in seconds, only if it may be a person's.
     if isinstance(settings, EstimateSettings) and (

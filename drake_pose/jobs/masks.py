@@ -45,7 +45,7 @@ from drake_pose.silhouette.segmentation import (
     Background,
     background_of_recording,
     background_support,
-    cut_box,
+    grab_cut_box,
     learn_background,
     person_region,
 )
@@ -345,14 +345,14 @@ def _by_box(
         usual: least and largest fraction of its box that an object fills.
         margins: by these fractions of its sides the box is enlarged for comparison.
     """
-    mask, (x, y, w, h) = cut_box(picture, box), box
+    mask, (x, y, w, h) = grab_cut_box(picture, box), box
     part = mask.sum() / (w * h)
     again = []
     for share in margins:
         # Around a larger one there may be nothing left.
         with suppress(SettingsError):
             other = (x - share * w, y - share * h, w + 2.0 * share * w, h + 2.0 * share * h)
-            again.append(cut_box(picture, other))
+            again.append(grab_cut_box(picture, other))
     is_good = part == 0.0 or usual[0] <= part <= usual[1]
     warnings = () if is_good else (f"the mask is {part:.1%} of its box: find it another way",)
     return mask, _least_overlap(mask, again), warnings

@@ -260,7 +260,7 @@ def _filter_pictures(hand_filter: TruncatedFilter, sequence: SyntheticSequence) 
     names = ("palm_height", "palm_thickness", "palm_width")
     sizes = sequence.states[0, HAND_STATE.indices(names)]
     factors = sizes / [TWO_FINGERS.sizes[name] for name in names]
-    model = _hand().reshaped(factors={"palm": factors})
+    model = _hand().reshaped(link_scales={"palm": factors})
     q = [
         plant_positions(x, model.position_names, PIXELS_PER_METRE, distance)
         for x in sequence.states

@@ -15,7 +15,7 @@ from scipy.special import stdtr, stdtrit
 from scipy.stats import multivariate_normal
 
 from drake_pose.arrays import Array, Mask
-from drake_pose.body import OBJECT_POSITIONS, PoseTree
+from drake_pose.body import TARGET_POSITIONS, PoseTree
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import RegistrationError, UnknownNameError
 from drake_pose.fit.parameters import POSE_NAMES, carried_joints, link_scale_name
@@ -62,7 +62,7 @@ class JointCalibration:
         focal_deviations: (cameras,) standard deviations over the focal lengths; 0: held.
         inlier_ratios, agrees: of each camera (frames,), judged with all that was found.
         object_values: (6,) by how much an object stands elsewhere whose place is not known,
-            OBJECT_POSITIONS, and object_covariance: (6, 6); empty where there is none.
+            TARGET_POSITIONS, and object_covariance: (6, 6); empty where there is none.
     """
 
     zeros: tuple[KinematicParameter, ...]
@@ -87,7 +87,7 @@ def require_known(tree: PoseTree, names: Sequence[str], lengths: Sequence[str]) 
     Raises UnknownNameError: says which there are.
     """
     own = [name for node in tree.nodes for name in node.value_names]
-    positions = [name for name in own if name not in OBJECT_POSITIONS]
+    positions = [name for name in own if name not in TARGET_POSITIONS]
     for what, asked, known in (
         ("joint", names, positions),
         ("link with a length", lengths, links_with_length(tree)),
@@ -168,7 +168,7 @@ def calibrate_joints(
     X_CW = [one.camera.X_CW for one in cameras]
     offsets = carried_joints(body.tree, lengths)
     asked, looks = [*names, *map(link_scale_name, lengths)], len(POSE_NAMES) + focal
-    standing = [name for name in body.kinematics.names if name in OBJECT_POSITIONS]
+    standing = [name for name in body.kinematics.names if name in TARGET_POSITIONS]
     told: dict[str, KinematicParameter] = {}
     sought: list[str] | None = None
     kept = asked

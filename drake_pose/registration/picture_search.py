@@ -33,7 +33,7 @@ from drake_pose.fit.surfaces import simplify_or_hull
 from drake_pose.registration.posed_frames import PosedFrame, PosedFrames, placed_points
 from drake_pose.registration.register import RegistrationBody, spread_rotations
 from drake_pose.registration.shared_fit import Shared, SharedFit
-from drake_pose.silhouette.outline import NOTHING, Outline, pack
+from drake_pose.silhouette.outline import EMPTY_OUTLINE, Outline, pack
 from drake_pose.silhouette.scoring import draw_mask
 from drake_pose.workers import map_ordered
 
@@ -155,7 +155,7 @@ class PictureSearch:
         coarse, *finer = (simplify_or_hull(body.very_few, count) for count in PICTURES.triangles)
         # Smaller parts do not show in the smallest pictures.
         least = 0.25 * max(one.ball[3] for one in coarse)
-        coarse = tuple(one if one.ball[3] >= least else NOTHING for one in coarse)
+        coarse = tuple(one if one.ball[3] >= least else EMPTY_OUTLINE for one in coarse)
         self._outlines = (coarse, *finer)
         self._X_WN = np.array([body.kinematics.poses(one.values) for one in frames])
         self._levels = dict[int, PyramidLevel]()

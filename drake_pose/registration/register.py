@@ -32,7 +32,7 @@ from drake_pose.registration.posed_frames import (
     placed_points,
 )
 from drake_pose.registration.shared_fit import Shared, SharedFit, fit_pose
-from drake_pose.silhouette.outline import NOTHING, Outline, TreeSurfaces
+from drake_pose.silhouette.outline import EMPTY_OUTLINE, Outline, TreeSurfaces
 from drake_pose.silhouette.scoring import draw_mask, score_bodies
 from drake_pose.workers import map_ordered
 
@@ -105,7 +105,7 @@ class RegistrationBody:
         if seen is not None:
             own = zip(tree.nodes, surfaces.rigid, strict=True)
             surfaces = surfaces.with_rigid(
-                [surface if node.name in seen else NOTHING for node, surface in own]
+                [surface if node.name in seen else EMPTY_OUTLINE for node, surface in own]
             )
         self._surfaces, self._fewest = surfaces, fewest
         self.few = simplify_surfaces(surfaces, FEW)

@@ -18,8 +18,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from drake_pose.arrays import Array, Mask
-from drake_pose.body import OBJECT_POSITIONS
-from drake_pose.body.tree_kinematics import JointOffset, TreeKinematics
+from drake_pose.body import TARGET_POSITIONS
+from drake_pose.body.tree_kinematics import LinkVector, TreeKinematics
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.fit.covariance import (
     Distances,
@@ -137,7 +137,7 @@ class SharedFit:
         X_CW: Sequence[Array],
         constants: Sequence[str] = (),
         *,
-        offsets: Sequence[JointOffset] = (),
+        offsets: Sequence[LinkVector] = (),
         looks: int = len(POSE_NAMES),
         widths: bool = True,
     ) -> None:
@@ -158,10 +158,10 @@ class SharedFit:
         self.names = (*names, *constants)
         deviations = dict.fromkeys(constants, SHARED.constant_deviation)
         # Of where an object stands, once it was found [m, rad].
-        deviations |= dict.fromkeys(OBJECT_POSITIONS, 1.0)
+        deviations |= dict.fromkeys(TARGET_POSITIONS, 1.0)
         deviations |= {f"{one.name}.{CAMERA_NAMES[6]}": SHARED.focal_deviation for one in cameras}
         known = np.array([deviations.get(name, np.inf) for name in self.names])
-        bounded = set(constants) - {*OBJECT_POSITIONS, TIME_OFFSET}
+        bounded = set(constants) - {*TARGET_POSITIONS, TIME_OFFSET}
         most = np.array([SHARED.largest_constant if k in bounded else np.inf for k in self.names])
         unknowns = [Unknowns(self.names, True, -most, most, known)]
         if widths:
@@ -299,7 +299,7 @@ class SharedFit:
         values, deviations = score_nuisances(seen, sizes)
         units = self._offset_units
         # As they stand among the nuisances: what is fitted and an object's place are none.
-        known = {*self.names, *OBJECT_POSITIONS}
+        known = {*self.names, *TARGET_POSITIONS}
         names = [one for one in self._doubting.names if one in units and one not in known]
         if not seen.nuisances or seen.nuisances[0].shape[1] != len(names):
             return {}
@@ -386,7 +386,7 @@ class SharedFit:
         whole = self._doubting
         names, kinematics, units = whole.names, self.seen[0].kinematics, dict(self._offset_units)
         groups: dict[str, list[str]] = {"offsets": [], "scales": [], "lenses": []}
-        groups["offsets"] = [name for name in kinematics.names if name not in OBJECT_POSITIONS]
+        groups["offsets"] = [name for name in kinematics.names if name not in TARGET_POSITIONS]
         for camera in (one.camera for one in self.seen):
             lens = [f"{camera.name}.{name}" for name in CAMERA_NAMES[len(POSE_NAMES) :]]
             units |= zip(lens, (0.01, *[0.005 * camera.focal_x] * 2), strict=True)

@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from drake_pose.arrays import Array
 from drake_pose.body import (
-    OBJECT,
-    OBJECT_POSITIONS,
+    TARGET,
+    TARGET_POSITIONS,
     ArticulatedModel,
     PoseTree,
     RootRotation,
@@ -86,7 +86,7 @@ class StandingObject:
         self.radius = float(np.linalg.norm(vertices - self.middle, axis=1).max())
         self._X_TO = np.eye(4)
         self._X_TO[:3, 3] = self.middle
-        self._bodies = RegistrationBody(self.tree(np.eye(4)), (OBJECT,), FEW)
+        self._bodies = RegistrationBody(self.tree(np.eye(4)), (TARGET,), FEW)
 
     def before(self, robot: ArticulatedModel) -> "StandingObject":
         """The same before the same robot whose joints may stand elsewhere on their links."""
@@ -100,12 +100,12 @@ class StandingObject:
         Raises SettingsError: no joint moves the link.
         """
         mesh = self._mesh.transformed(inverse_transforms(self._X_TO))
-        model = self._robot.before_object(self._link, mesh, X_WT @ self._X_TO)
+        model = self._robot.with_target(self._link, mesh, X_WT @ self._X_TO)
         tree = model.pose_tree(
             self._link,
             root_position=np.zeros(3),
             root_rotation=RootRotation.fixed(),
-            held={**self._held, **dict.fromkeys(OBJECT_POSITIONS, 0.0)},
+            held={**self._held, **dict.fromkeys(TARGET_POSITIONS, 0.0)},
         )
         if len(tree.nodes) < 3:
             raise stands_still(self._robot, self._link)
@@ -122,7 +122,7 @@ class StandingObject:
         return inverse_transforms(np.array([kinematics.poses(one)[node] for one in values]))
 
     def moved(self, X_WT: Array, by: Array) -> Array:
-        """The object's pose (4, 4) at OBJECT_POSITIONS (6,), which are 0 at X_WT (4, 4)."""
+        """The object's pose (4, 4) at TARGET_POSITIONS (6,), which are 0 at X_WT (4, 4)."""
         X = np.eye(4)
         X[:3, 3] = by[:3]
         X[:3, :3] = Rotation.from_euler("XYZ", by[3:]).as_matrix()
@@ -132,7 +132,7 @@ class StandingObject:
         """(6, 6) of the pose's error in the world: a rotation vector [rad] and a shift [m].
 
         Args:
-            covariance: (6, 6) of OBJECT_POSITIONS.
+            covariance: (6, 6) of TARGET_POSITIONS.
         """
         R = X_WT[:3, :3]
         covariance = covariance.copy()
@@ -146,7 +146,7 @@ class StandingObject:
         return J @ covariance @ J.T
 
     def moved_pose(self, seen: ObjectPose, by: Array, covariance: Array) -> ObjectPose:
-        """A pose with its alternatives after OBJECT_POSITIONS (6,), given their covariance."""
+        """A pose with its alternatives after TARGET_POSITIONS (6,), given their covariance."""
         X_WT = self.moved(seen.X_WT, by)
         others = X_WT @ np.linalg.inv(seen.X_WT) @ seen.alternatives
         covariance = self.pose_covariance(X_WT, covariance)
@@ -163,7 +163,7 @@ class StandingObject:
             degrees. (k, 3) the axes.
         """
         few = simplify_surfaces(TreeSurfaces(self._bodies.tree), FEW)
-        outline = few[self._bodies.tree.node_index(OBJECT)]
+        outline = few[self._bodies.tree.node_index(TARGET)]
         corners = outline.vertices[outline.triangles]
         weights = np.linalg.norm(outline.planes[:, :3], axis=1)
         spread = np.einsum("t,tci,tcj->ij", weights, corners, corners)
@@ -447,7 +447,7 @@ class ObjectSearch:
         """A fit of camera and object that begins where a look has them."""
         body = self._standing.body(look[1])
         seen = PosedFrames(body.kinematics, getattr(body, surfaces), camera, frames, spacing)
-        return SharedFit([seen], [inverse_transforms(look[0])], OBJECT_POSITIONS)
+        return SharedFit([seen], [inverse_transforms(look[0])], TARGET_POSITIONS)
 
     def _look(self, fit: SharedFit, found: Shared, look: Look) -> Look:
         """What was found from where a look has camera and object."""

@@ -31,7 +31,7 @@ from drake_pose.silhouette.scoring import (
     prefix_sums,
     score_bodies,
 )
-from drake_pose.silhouette.segmentation import cut, tell_from_background
+from drake_pose.silhouette.segmentation import foreground_log_ratios, grab_cut
 from drake_pose.workers import map_ordered
 
 Likelihood = NDArray[np.float32]
@@ -276,7 +276,7 @@ class PoseAndMask:
             there = [(f, picture) for f, picture in seen if picture is not None]
             moving = [k for k, (f, _) in enumerate(there) if not frames[f].settled]
             if moving:
-                told = tell_from_background(
+                told = foreground_log_ratios(
                     [picture for _, picture in there],
                     [frames[f].chances[c] for f, _ in there],
                     moving,
@@ -353,7 +353,7 @@ def cut_by_foreground(
     # GrabCut's two rounds learn colours of bodies 30 pixels large; a median filter takes specks
     # away.
     every = max(1, int(math.sqrt(np.count_nonzero(foreground > 0.0)) / 30.0))
-    found = cut(picture, labels, 2, every)
+    found = grab_cut(picture, labels, 2, every)
     return np.asarray(cv2.medianBlur(found.astype(np.uint8), 5) > 0)
 
 

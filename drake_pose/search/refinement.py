@@ -54,7 +54,7 @@ class RefinementBody:
         for rigid, skin in zip(surfaces.rigid, surfaces.skins, strict=True):
             shares.append(np.ones(len(rigid.vertices)))
             if skin is not None:
-                shares.append(1.0 - skin.weights if skin.turned else skin.weights)
+                shares.append(1.0 - skin.weights if skin.inverted else skin.weights)
         parents = np.array([node.parent for node in tree.nodes], dtype=np.int64)
         self.skin = np.concatenate(shares), parents
         unlimited = np.full(4, np.inf)

@@ -22,8 +22,8 @@ from drake_pose.silhouette.outline import (
     Outline,
     PackedOutlines,
     find_facings,
+    mutable_copy,
     outline_of_triangles,
-    own_copy,
     pack,
     project,
 )
@@ -343,7 +343,7 @@ def divide_outline(
         cell_starts=starts,
         cell_edges=edges,
         reach=np.array([math.sin(spread)]),
-        packed=own_copy(pack((outline, outline_of_triangles(skin.vertices, skin.triangles)))),
+        packed=mutable_copy(pack((outline, outline_of_triangles(skin.vertices, skin.triangles)))),
         bands=np.ascontiguousarray(np.zeros((0, 0, 3)) if bands is None else bands),
     )
 

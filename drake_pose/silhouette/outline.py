@@ -154,7 +154,7 @@ def _position_in_run(*keys: np.ndarray) -> np.ndarray:
     return index - np.maximum.accumulate(np.where(begins, index, 0))
 
 
-NOTHING = outline_of_triangles(np.zeros((0, 3)), np.zeros((0, 3)))
+EMPTY_OUTLINE = outline_of_triangles(np.zeros((0, 3)), np.zeros((0, 3)))
 """The outline of a part without a surface."""
 
 
@@ -170,7 +170,7 @@ def pack(outlines: tuple[Outline, ...]) -> PackedOutlines:
     )
 
 
-def own_copy(packed: PackedOutlines) -> PackedOutlines:
+def mutable_copy(packed: PackedOutlines) -> PackedOutlines:
     """The surfaces with points, planes and balls that may be changed."""
     return packed._replace(
         points=packed.points.copy(), planes=packed.planes.copy(), balls=packed.balls.copy()
@@ -481,7 +481,7 @@ class PackedSurfaces:
 
     def at(self, values: np.ndarray) -> PackedOutlines:
         """All nodes' surfaces at all values (m,) [rad or m]."""
-        return self._rest if self._bands is None else own_copy(self.bend_to(values))
+        return self._rest if self._bands is None else mutable_copy(self.bend_to(values))
 
     def bend_to(self, values: np.ndarray | None) -> PackedOutlines:
         """As at, in arrays that the thread's next call changes; None: as they are."""
@@ -489,7 +489,7 @@ class PackedSurfaces:
             return self._rest
         if not hasattr(self._threads, "bent"):
             bent, placed = (np.full(shape, np.nan) for shape in self._shapes)
-            self._threads.bent = own_copy(self._rest), bent, placed
+            self._threads.bent = mutable_copy(self._rest), bent, placed
         own, bent, placed = self._threads.bent
         if values is not None:
             values = np.ascontiguousarray(values, dtype=np.float64)[None]

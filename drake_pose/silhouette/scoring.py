@@ -12,7 +12,13 @@ import numpy as np
 
 from drake_pose.camera.models import Camera, ParallelCamera, PinholeCamera
 from drake_pose.errors import CameraError
-from drake_pose.silhouette.outline import BendingOutline, Outline, PackedOutlines, own_copy, pack
+from drake_pose.silhouette.outline import (
+    BendingOutline,
+    Outline,
+    PackedOutlines,
+    mutable_copy,
+    pack,
+)
 from drake_pose.silhouette.span_kernel import paint, paint_labels, score
 
 
@@ -63,7 +69,7 @@ def score_bodies(
             f"not {sums.shape}"
         )
     numbers = np.array(parts, dtype=np.int64).reshape(-1, 4)
-    packed = own_copy(packed) if len(parts) else packed
+    packed = mutable_copy(packed) if len(parts) else packed
     return score(packed, numbers, vertices, poses, camera.kernel_parameters(), sums)
 
 

@@ -141,7 +141,7 @@ def _off(picture: Picture, mean: Picture, tolerance: Picture) -> NDArray[Any]:
     return cv2.cvtColor(off, cv2.COLOR_RGB2GRAY)
 
 
-def tell_from_background(
+def foreground_log_ratios(
     pictures: Sequence[Picture],
     probabilities: Sequence[Floats],
     wanted: Sequence[int],
@@ -215,7 +215,7 @@ def _masked_median(stack: Floats, hidden: NDArray[np.bool_], count: NDArray[np.i
     return np.where(count[:, None] > 0, middle, np.float32(0.0))
 
 
-def cut_box(picture: Picture, box: Sequence[float]) -> Mask:
+def grab_cut_box(picture: Picture, box: Sequence[float]) -> Mask:
     """The object (H, W) in a picture (H, W, 3) and a box x, y, width, height [pixel] around it.
 
     Raises SettingsError where the box lies outside the picture, or is all of it.
@@ -233,10 +233,10 @@ def cut_box(picture: Picture, box: Sequence[float]) -> Mask:
         raise SettingsError("the box is the whole picture: leave some of the surroundings out")
     labels = np.full((height, width), cv2.GC_BGD, dtype=np.uint8)
     labels[top:bottom, left:right] = cv2.GC_PR_FGD
-    return cut(picture, labels)
+    return grab_cut(picture, labels)
 
 
-def cut(
+def grab_cut(
     picture: Picture,
     labels: NDArray[np.uint8],
     iterations: int = 6,

@@ -205,7 +205,7 @@ def _with_other_lengths(body: RegistrationBody, rng: np.random.Generator) -> Reg
     tree, settings = body.tree, EstimateSettings()
     by = {link: rng.normal(0.0, _LENGTH_SD) for link in links_with_length(tree)}
     shifts = {one.joint: (by[one.link] * one.p_L).tolist() for one in carried_joints(tree)}
-    return body.with_tree(make_tree(tree.model.reshaped(shifts=shifts), settings, None))
+    return body.with_tree(make_tree(tree.model.reshaped(joint_shifts=shifts), settings, None))
 
 
 def pose_error(X_WC: Array, true: Array) -> Array:

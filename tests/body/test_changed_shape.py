@@ -31,7 +31,7 @@ def test_a_link_without_looks_is_drawn_by_nobody(body):
 
 def test_a_body_stretched_alike_everywhere_is_seen_larger(body):
     q = np.array([0.1, 1.2, -0.8])
-    double = body.reshaped(factors={name: (2.0, 2.0, 2.0) for name in body.link_names})
+    double = body.reshaped(link_scales={name: (2.0, 2.0, 2.0) for name in body.link_names})
     assert area(double, q) == pytest.approx(area(body, q, scale=2.0), rel=0.02)
     assert area(double, q) > 3.5 * area(body, q)
     tree, larger = body.pose_tree(), double.pose_tree()
@@ -42,7 +42,7 @@ def test_a_body_stretched_alike_everywhere_is_seen_larger(body):
 def test_joints_stand_further_by_their_zeros_and_keep_their_limits(tmp_path):
     zeros = {"x": 0.3, "head_y": 0.2, "neck": -0.4}
     model = load_model(write(tmp_path, JOINTED_BASE_URDF), check=False)
-    text = reshaped(JOINTED_BASE_URDF, zeros=zeros)
+    text = reshaped(JOINTED_BASE_URDF, joint_offsets=zeros)
     other = load_model(write(tmp_path, text, "other.urdf"), check=False)
     offsets = np.array([zeros.get(name, 0.0) for name in model.position_names])
     np.testing.assert_allclose([other.lower, other.upper], [model.lower, model.upper] - offsets)
@@ -55,7 +55,7 @@ def test_joints_stand_further_by_their_zeros_and_keep_their_limits(tmp_path):
 def test_joints_and_looks_lie_elsewhere_on_their_links(tmp_path):
     model = load_model(write(tmp_path, JOINTED_BASE_URDF), check=False)
     shift, move = np.array([0.1, -0.2, 0.3]), np.array([-0.3, 0.1, 0.2])
-    other = model.reshaped(shifts={"neck": shift}, moves={"chest": move})
+    other = model.reshaped(joint_shifts={"neck": shift}, link_shifts={"chest": move})
     q = np.random.default_rng(2).uniform(-0.5, 0.5, len(model.position_names))
     X, Y = link_poses(model, q), link_poses(other, q)
     np.testing.assert_allclose(Y["head"], X["head"])
@@ -67,4 +67,4 @@ def test_joints_and_looks_lie_elsewhere_on_their_links(tmp_path):
         before, after = model.link_meshes[name], other.link_meshes[name]
         np.testing.assert_allclose(after.vertices, before.vertices + by, atol=1e-12)
     with pytest.raises(UnknownNameError, match="tail"):
-        model.reshaped(moves={"tail": move})
+        model.reshaped(link_shifts={"tail": move})

@@ -12,7 +12,7 @@ from pydrake.multibody.plant import (
 from pydrake.systems.framework import DiagramBuilder
 
 from drake_pose.body import ArticulatedModel, describe_model, load_model, model_warnings
-from drake_pose.body.tree_kinematics import TreeKinematics, joint_offsets
+from drake_pose.body.tree_kinematics import TreeKinematics, link_vectors
 from drake_pose.errors import ModelError, SettingsError
 from drake_pose.fit.parameters import BodyParameters
 from drake_pose.fit.surfaces import VERY_FEW, simplify_surfaces
@@ -86,7 +86,7 @@ def test_what_is_not_enforced_is_told_and_what_is_stands_in_the_report(tmp_path)
 def test_motions_against_finite_differences(tmp_path, lengths):
     kinematics, values = drawn(tree_of(tmp_path), np.random.default_rng(1))
     surfaces = simplify_surfaces(TreeSurfaces(kinematics.tree), VERY_FEW)
-    body = BodyParameters(kinematics, surfaces, offsets=joint_offsets(kinematics.tree))
+    body = BodyParameters(kinematics, surfaces, offsets=link_vectors(kinematics.tree))
     logs = [0.0] * 4 + np.linspace(0.1, 0.2, len(body.links)).tolist() if lengths else []
     assert_motions_are_derivatives(body, np.append(values, logs))
 

@@ -82,7 +82,9 @@ def test_links_unknown_or_unseen_and_bad_positions_are_named(tmp_path):
         landmark_positions(model, wrong, q)
     with pytest.raises(UnknownNameError, match=r"'elbow'.*no link 'elbow_link'"):
         landmarks_of_nodes(model.pose_tree(), wrong)
-    with pytest.raises(ModelError, match="'end' is on link 'toe', which moves with no part"):
+    with pytest.raises(
+        ModelError, match="'end' is on link 'toe', which moves with no visible part"
+    ):
         landmarks_of_nodes(model.pose_tree(), {"end": Landmark("toe", np.zeros(3))})
     for bad in (q[:-1], np.full_like(q, np.nan)):
         with pytest.raises(SettingsError, match="finite numbers"):

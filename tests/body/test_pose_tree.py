@@ -129,7 +129,7 @@ def test_slides_without_limits_are_refused_where_they_must_be_searched(tmp_path)
         model.pose_tree()
     held = {"x": 0.0, "z": 0.1, "y": 0.2}
     model.pose_tree(held=held)
-    with pytest.raises(SettingsError, match="several links hang on the world"):
+    with pytest.raises(SettingsError, match="several links are attached to the world"):
         model.pose_tree(root_position=[0.0, 0.0, 0.0], held=held)
     hand = link("hand") + joint("grip", "prismatic", "arm", "hand", limits=None)
     model = load_model(write(tmp_path, planar_robot(hand)), check=False)

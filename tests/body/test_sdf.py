@@ -180,7 +180,7 @@ def test_models_named_by_directives_are_cured_as_if_they_were_read_alone(tmp_pat
         (directives("- add_model: {name: a, file: bad.urdf}"), "link 'a': radius of its sphere"),
         (directives("- bogus: {}"), "bogus"),
         ("", "it is empty"),
-        ("a: [", "it is no YAML"),
+        ("a: [", "it is not YAML"),
     ],
 )
 def test_refusals_of_directives_name_the_file(tmp_path, text, named):

@@ -94,7 +94,7 @@ def test_a_turned_over_tree_has_the_same_band(tmp_path, root):
     assert len(found) == 2
     for expected in skin.vertices(q):
         assert min(np.abs(p_W - expected).max() for p_W in found) < 1e-12
-    turned = [node.skin.turned for node in tree.nodes if node.skin is not None]
+    turned = [node.skin.inverted for node in tree.nodes if node.skin is not None]
     assert any(turned)
 
 

@@ -112,7 +112,7 @@ def test_what_moves_nothing_is_left_out_and_what_is_unknown_is_named(tmp_path):
     assert sorted(model.warnings) == [
         "joint 'elbow' is written to follow joint 'gone' (<mimic>): not enforced, it is searched "
         "by itself",
-        "robot 'thing': the element <bogus> is not known and left out",
+        "robot 'thing': the element <bogus> is unknown and left out",
     ]
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from drake_pose.body import RootRotation, bundled_model, load_model
-from drake_pose.body.tree_kinematics import TreeKinematics, joint_offsets
+from drake_pose.body.tree_kinematics import TreeKinematics, link_vectors
 from drake_pose.camera.models import ParallelCamera, circle_of_cameras
 from drake_pose.fit.contour_fit import Noise
 from drake_pose.fit.evidence import NO_EDGE
@@ -128,7 +128,7 @@ def scaled(tmp_path, request):
     """The tree walks joints outwards from the base, inwards from the finger, and both ways."""
     kinematics = kinematics_of(tmp_path / "odd.urdf", URDF, request.param)
     outlines = [outline_from_mesh(node.mesh) for node in kinematics.tree.nodes]
-    return BodyParameters(kinematics, outlines, offsets=joint_offsets(kinematics.tree))
+    return BodyParameters(kinematics, outlines, offsets=link_vectors(kinematics.tree))
 
 
 def parameters(scaled, logs, placed=(0.0, 0.0, 0.0, 0.0)):
@@ -155,7 +155,7 @@ def test_nodes_stand_where_drake_has_them(link, scaled, tmp_path):
 
 
 def test_a_joint_behind_a_weld_is_moved_from_the_link_s_own_joint(scaled):
-    offset = next(one for one in joint_offsets(scaled.kinematics.tree) if one.link == "mount")
+    offset = next(one for one in link_vectors(scaled.kinematics.tree) if one.link == "mount")
     # The slide stands 0.1 up the wrist and 0.05 along the y axis of what is turned there by 1 rad.
     assert np.linalg.norm(offset.p_L) == pytest.approx(np.hypot(0.1, 0.05))
     np.testing.assert_allclose(offset.p_L, [0.0, 0.05, 0.1], atol=1e-12)

@@ -12,7 +12,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import t as scipy_t
 
-from drake_pose.body import OBJECT_POSITIONS, ArticulatedModel, RootRotation, load_model
+from drake_pose.body import TARGET_POSITIONS, ArticulatedModel, RootRotation, load_model
 from drake_pose.camera.models import ParallelCamera
 from drake_pose.errors import MaskError, RegistrationError
 from drake_pose.fit.covariance import estimate_sizes
@@ -289,7 +289,7 @@ def test_an_object_that_is_round_may_be_turned_about_its_axis_by_anything(
 def test_an_object_s_covariance_is_that_of_its_moves(
     standing: Callable[[str], StandingObject],
 ) -> None:
-    """J sigma J^T, J the derivative of the pose by OBJECT_POSITIONS."""
+    """J sigma J^T, J the derivative of the pose by TARGET_POSITIONS."""
     thing, X_WT = standing("box"), looking_at(PLACE, MIDDLE, 0.4).X_WC
     J = np.zeros((6, 6))
     for k in range(6):
@@ -335,7 +335,7 @@ def test_a_camera_on_a_hand_and_what_it_sees_are_found_together(
     camera, still = looking_at(PLACE, MIDDLE, 0.1).resized(160, 120), np.eye(4)
     X_LC = random_poses(rng, 1)[0]
     values = rng.uniform(-0.12, 0.12, (5, len(thing.body(still).kinematics.names)))
-    values[:, [name in OBJECT_POSITIONS for name in thing.body(still).kinematics.names]] = 0.0
+    values[:, [name in TARGET_POSITIONS for name in thing.body(still).kinematics.names]] = 0.0
     still[:3, 3] = [0.0, 0.0, 0.9] - thing.middle
     X_WT = thing.hand_poses(values).mean(axis=0)
     X_WT[:3, :3] = Rotation.from_matrix(X_WT[:3, :3]).as_matrix()

@@ -10,11 +10,11 @@ from drake_pose.silhouette.segmentation import (
     Background,
     background_of_recording,
     background_support,
-    cut_box,
     find_regions,
+    foreground_log_ratios,
+    grab_cut_box,
     learn_background,
     person_region,
-    tell_from_background,
 )
 from tests.jobs.masks.rooms import texture
 
@@ -101,16 +101,16 @@ def test_background_is_told_from_pictures_of_another_exposure():
         cv2.GaussianBlur(mask.astype(np.float32), (0, 0), 5.0).clip(0.01, 0.99) for mask in masks
     ]
     differs = np.abs(255.0 - 2.0 * room).max(axis=2) > 60.0
-    every = tell_from_background(pictures, probabilities, range(8))
+    every = foreground_log_ratios(pictures, probabilities, range(8))
     for ratio, mask in zip(every, masks, strict=True):
         assert (ratio[~mask] < 0.0).mean() > 0.97
         assert (ratio[mask & differs] > 0.0).mean() > 0.97
     # Of fewer that are wanted the same is told wherever their body is likely.
-    some = tell_from_background(pictures, probabilities, [5, 2])
+    some = foreground_log_ratios(pictures, probabilities, [5, 2])
     for ratio, k in zip(some, (5, 2), strict=True):
         near = probabilities[k] > 0.02
         np.testing.assert_array_equal(ratio[near], every[k][near])
-    alone = tell_from_background(pictures[:1], probabilities[:1], [0])
+    alone = foreground_log_ratios(pictures[:1], probabilities[:1], [0])
     assert not alone[0].any()
 
 
@@ -120,12 +120,12 @@ def test_a_box_around_an_object_cuts_it_out():
     true[50:60, 60:80] = False
     colours = np.where(true[:, :, None], (60, 80, 190), (200, 180, 70))
     picture = (colours + 12.0 * rng.standard_normal(colours.shape)).clip(0, 255).astype(np.uint8)
-    assert intersection_over_union(cut_box(picture, (30, 20, 95, 85)), true) > 0.97
+    assert intersection_over_union(grab_cut_box(picture, (30, 20, 95, 85)), true) > 0.97
     for box in ((300, 20, 95, 85), (30, 20, 95, 1), (30, 20, 1, 85)):
         with pytest.raises(SettingsError, match="outside the picture, 160 x 120 pixels"):
-            cut_box(picture, box)
+            grab_cut_box(picture, box)
     with pytest.raises(SettingsError, match="whole picture"):
-        cut_box(picture, (0, 0, 160, 120))
+        grab_cut_box(picture, (0, 0, 160, 120))
 
 
 def drawn(cut, width):

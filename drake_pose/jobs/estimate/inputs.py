@@ -434,11 +434,11 @@ def follows_person(scene: Scene, model: ArticulatedModel, settings: EstimateSett
         return False
     if len(scene.cameras) < 2 or scene.scale_unknown:
         if wanted:
-            strangers = ", ".join(scene.strangers)
+            unknown_folders = ", ".join(scene.unknown_folders)
             raise SceneError(
                 f"{scene.path}: a person is captured by two calibrated cameras or more, but masks "
                 f"are there of {', '.join(scene.cameras)} alone"
-                + (f"; cameras.yaml lacks {strangers}" if strangers else "")
+                + (f"; cameras.yaml lacks {unknown_folders}" if unknown_folders else "")
             )
         return False
     missing = missing_for_person(model)

@@ -23,7 +23,7 @@ from drake_pose.person.capture import (
 from drake_pose.person.figures import ReadFrame, ViewFaults
 from drake_pose.person.rig_faults import RigFault
 from drake_pose.search import PoseEstimate
-from drake_pose.silhouette.pictures.masks import edge_area
+from drake_pose.silhouette.pictures.masks import count_edge_pixels
 from drake_pose.silhouette.pictures.scene_checks import (
     describe_unreadable,
     frame_ranges,
@@ -193,7 +193,7 @@ def _finish(
         # Without masks, E_total is the strip between both contours over the body's area.
         bodies = [own >= 0 for own in parts.values()]
         area = float(sum(map(np.count_nonzero, bodies))) or 1.0
-        wrong = sum(map(edge_area, bodies)) * distance
+        wrong = sum(map(count_edge_pixels, bodies)) * distance
     pose = PoseEstimate(found, q, np.eye(4), (), wrong, area, stopped_by=FOLLOWED, seconds=seconds)
     answers = ((q, captured.deviations[index]), *captured.rivals.get(index, ()))
     known = record_modes(inputs.model, answers if found else answers[:1])

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from drake_pose.arrays import Array, Mask, Picture
-from drake_pose.body import OBJECT, ArticulatedModel, PoseTree, RootRotation, load_model
+from drake_pose.body import TARGET, ArticulatedModel, PoseTree, RootRotation, load_model
 from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.camera.camera_files import CameraFile, load_camera_file, load_cameras
 from drake_pose.camera.episode import EpisodeCamera
@@ -247,7 +247,7 @@ def _read_episode(
         given=tuple(one for name, one in known.items() if name in placed),
         assumed=frozenset(one.name for one in chosen if one.camera is None),
         recordings={one.name: _recording(one, mapped, default, settings) for one in chosen},
-        seen=(OBJECT,) if standing else mapped.seen if mapped.unseen else None, standing=standing,
+        seen=(TARGET,) if standing else mapped.seen if mapped.unseen else None, standing=standing,
     )  # fmt: skip
     if not isinstance(settings, RegistrationSettings):
         return inputs
@@ -421,7 +421,7 @@ def make_registration_tree(
     From a link on which a camera rides, the masks show what no joint moves.
     """
     if standing is not None:
-        return standing.tree(np.eye(4)), (OBJECT,)
+        return standing.tree(np.eye(4)), (TARGET,)
     tree = make_tree(model, EstimateSettings(hold=settings.hold))
     link = settings.on
     if link is None:
@@ -481,7 +481,7 @@ def _read_frames(inputs: Inputs, wanted: Sequence[str], most: int = 12) -> tuple
         seen = [frame for frame in known if any((name, frame) in scene.masks for name in names)]
         chosen = np.linspace(0, len(seen) - 1, most).round().astype(int)
         wanted = tuple(dict.fromkeys(seen[k] for k in chosen))
-    shown = {name: scene.of_cameras([name]).seen_frames(wanted) for name in names}
+    shown = {name: scene.of_cameras([name]).frames_with_files(wanted) for name in names}
     found = []
     for frame in select_frames(scene.frames, wanted, str(scene.path)):
         masks = {}

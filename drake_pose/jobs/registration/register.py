@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from drake_pose.arrays import Array, Picture
-from drake_pose.body import OBJECT_POSITIONS, PoseTree, reshaped
+from drake_pose.body import TARGET_POSITIONS, PoseTree, reshaped
 from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.camera.models import Camera, PinholeCamera
 from drake_pose.errors import CameraError
@@ -269,7 +269,7 @@ class _Registration:
                 )
             else:
                 values = zip(self.body.kinematics.names, told[0].tolist(), strict=True)
-                positions = {k: one for k, one in values if k not in OBJECT_POSITIONS}
+                positions = {k: one for k, one in values if k not in TARGET_POSITIONS}
                 self.suggestions[name] = {"positions": positions, "difference": told[1]}
         self.seconds[name] = time.perf_counter() - start
         if self._on_camera is not None:
@@ -409,7 +409,7 @@ class _Registration:
         zeros = {one.name: one.value for one in found.zeros if one.significant}
         written = joint_shifts(tree, [one for one in found.lengths if one.significant])
         if shifts:
-            model = model.reshaped(shifts=shifts)
+            model = model.reshaped(joint_shifts=shifts)
         if standing is not None and seen is not None:
             standing = standing.before(model)
             seen = standing.moved_pose(seen, found.object_values, found.object_covariance)
@@ -432,7 +432,7 @@ class _Registration:
             return None
         # With zeros and lengths in its joints' origins; its meshes as seen from the folder.
         text = path.read_text(encoding="utf-8")
-        root = ElementTree.fromstring(reshaped(text, zeros=zeros, shifts=written))
+        root = ElementTree.fromstring(reshaped(text, joint_offsets=zeros, joint_shifts=written))
         for mesh in root.iter("mesh"):
             name = mesh.get("filename", "")
             if "://" not in name:

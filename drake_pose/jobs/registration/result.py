@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from drake_pose.arrays import Array, Picture
-from drake_pose.body import OBJECT_POSITIONS, PoseTree
+from drake_pose.body import TARGET_POSITIONS, PoseTree
 from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.camera.camera_files import dump_cameras
 from drake_pose.camera.drake import dump_scenario
@@ -211,7 +211,7 @@ def write_result(
         for given in (one for one in inputs.given if one.name == name):
             write_comparisons(path, inputs, inputs.of(name), given, found, own)
     names = TreeKinematics(inputs.tree).names
-    names = tuple(name for name in names if name not in OBJECT_POSITIONS)
+    names = tuple(name for name in names if name not in TARGET_POSITIONS)
     for camera in pictures or ():
         # Masks of its frames, and joint positions at their moments by its own clock.
         rows = [["frame", *names]]

@@ -93,7 +93,7 @@ def compare_masks(
     )
 
 
-def edge_area(mask: np.ndarray) -> int:
+def count_edge_pixels(mask: np.ndarray) -> int:
     """How many pixels of a mask (H, W) bool lie on its edge."""
     # What a mask loses to a pixel's neighbours is its edge.
     cross = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))

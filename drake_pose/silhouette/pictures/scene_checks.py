@@ -33,7 +33,7 @@ def read_scene(
     """
     scene = check_scene(load_scene(path, cameras, wanted, sequence)).of_cameras(wanted)
     scene, frames = scene.every(every, frames)
-    return scene, scene.seen_frames(frames)
+    return scene, scene.frames_with_files(frames)
 
 
 def check_scene(scene: Scene) -> Scene:

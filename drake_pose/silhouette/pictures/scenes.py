@@ -48,7 +48,7 @@ class Scene:
         readers: by camera what gives its pictures (H, W, 3) by frame, where no file of its own is.
         times: (frames,) of the frames as recorded [s], nan where nothing tells them.
         joints: what the robot logged of its joints, by time or by frame.
-        strangers: folders of masks that belong to no camera.
+        unknown_folders: folders of masks that belong to no camera.
         warnings: what is wrong with the folder, but leaves enough to go on.
     """
 
@@ -60,7 +60,7 @@ class Scene:
     frame_rate_hz: float | None = None
     scale_unknown: bool = False
     images: Mapping[tuple[str, str], Path] = field(default_factory=dict)
-    strangers: tuple[str, ...] = ()
+    unknown_folders: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
     readers: Mapping[str, Callable[[str], np.ndarray]] = field(default_factory=dict)
     times: Array = field(default_factory=lambda: np.empty(0), compare=False)
@@ -96,7 +96,7 @@ class Scene:
             images={key: file for key, file in self.images.items() if key[0] in used},
         )
 
-    def seen_frames(self, wanted: Sequence[str]) -> tuple[str, ...]:
+    def frames_with_files(self, wanted: Sequence[str]) -> tuple[str, ...]:
         """The wanted frames, as select_frames has them, that a camera has seen.
 
         Raises:
@@ -230,7 +230,7 @@ def load_scene(
             cameras = load_cameras(folder / CAMERA_FILE)
     has_masks = (folder / "masks").is_dir()
     images: dict[tuple[str, str], Path] = {}
-    masks, strangers, warnings = find_masks(folder, cameras) if has_masks else ({}, (), ())
+    masks, unknown_folders, warnings = find_masks(folder, cameras) if has_masks else ({}, (), ())
     if sequence:
         images = find_images(folder, cameras, in_order(frame for _, frame in masks))
     if not (images or has_masks):
@@ -247,7 +247,7 @@ def load_scene(
         sequence,
         frame_rate_hz or rate_hz,
         images=images,
-        strangers=strangers,
+        unknown_folders=unknown_folders,
         # Of pictures with few masks it is no fault that masks are missing.
         warnings=drifts if images else warnings,
     )
@@ -355,7 +355,7 @@ def find_masks(
     flat, foreign = _list_masks(root)
     found = {one.name: _list_masks(root / one.name) for one in _visible(root) if one.is_dir()}
     known = {name: found[name][0] for name in names if name in found}
-    strangers = {name: len(files) for name, (files, _) in found.items() if name not in names}
+    unknown_folders = {name: len(files) for name, (files, _) in found.items() if name not in names}
     if flat and not any(known.values()):
         if len(names) != 1:
             raise SceneError(
@@ -366,8 +366,8 @@ def find_masks(
     others = {name: found[name][1] for name in names if name in found}
     if not any(known.values()):
         text = f"{root}: holds no mask <camera>/<frame>.png of: {', '.join(names)}"
-        if strangers:
-            text += f"; folder {', '.join(strangers)} belongs to no camera of the camera file"
+        if unknown_folders:
+            text += f"; folder {', '.join(unknown_folders)} belongs to no camera of the camera file"
         if files := [f"{name}/{file}" for name, own in others.items() for file in own]:
             text += f"; {files[0]} is {'a folder' if files[0].endswith('/') else 'no PNG picture'}"
         raise SceneError(text)
@@ -376,7 +376,7 @@ def find_masks(
     masks, doubled = _join_frames(known)
     unused, warnings = [name for name in names if not known.get(name)], list[str]()
     lower = {name.lower(): name for name in unused}
-    for name, count in strangers.items():
+    for name, count in unknown_folders.items():
         close = get_close_matches(name.lower(), lower, n=1)
         advice = f"is it '{lower[close[0]]}'?" if close else "calibrate it"
         warnings.append(
@@ -395,7 +395,7 @@ def find_masks(
                 f"{f'masks/{name}' if name else 'masks'}: {left[0]}{more} left out: masks are PNG "
                 "pictures in masks/<camera>"
             )
-    return masks, tuple(strangers), tuple(warnings)
+    return masks, tuple(unknown_folders), tuple(warnings)
 
 
 def find_images(

@@ -35,7 +35,7 @@ SEEN = np.r_[HAND_STATE.indices((*SPREADS, *FLEXIONS)), HAND_STATE.indices(LENGT
 def render():
     """The mask of a state at scale 1, by Drake's renderer."""
     model = load_model(bundled_model("two_finger_hand"), check=False)
-    model = model.reshaped(factors={"palm": (1.0, 1.1, 1.0)})
+    model = model.reshaped(link_scales={"palm": (1.0, 1.1, 1.0)})
     X_WC = np.eye(4)
     X_WC[2, 3] = -1.0
     renderer = LabelRenderer(model, ParallelCamera("top", WIDTH, HEIGHT, 1000.0, *CENTER, X_WC))

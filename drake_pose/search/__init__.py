@@ -1,4 +1,9 @@
-"""Searches for the pose that silhouettes show: on grids of joint values, and continuous ones."""
+"""Search a body's pose in silhouettes without an initial guess.
+
+``PaperSearch`` (Kameda's method) and ``BeamSearch`` search grids of joint values. The multi-start
+search (``MultiStartSearch``) returns continuous values, and ``RootPlacementSearch`` also the root's
+position or the camera's scale.
+"""
 
 from drake_pose.search.beam_search import BeamSearch
 from drake_pose.search.estimates import (

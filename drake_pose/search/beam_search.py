@@ -1,9 +1,10 @@
-"""The beam search: partial poses grow node by node, ranked by what the objective will be.
+"""Search the pose of minimum J on a grid by a beam search over partial poses.
 
-Its first stages let the tolerance lie outside the silhouette and end at a J within it, which
-certifies itself; where they fail, a branch and bound looks for all such poses. Later stages let
-more and more lie outside, weighed against what is covered newly (5). Last, limbs of the best pose
-are searched again.
+Nodes are placed one after another, and after each the hypotheses with the least expected objective
+are kept. The first stages allow only the tolerance outside the silhouette and end at a pose with J
+within it, which is exact. If they fail, a branch and bound enumerates all exact poses. Later stages
+allow more area outside, weighted against the newly covered area (5). Finally the limbs of the best
+pose are searched again.
 """
 
 import copy
@@ -20,8 +21,8 @@ from drake_pose.search.branch_and_bound import PosesWithin, branch_and_bound
 from drake_pose.search.estimates import PoseEstimate, View, require_views
 from drake_pose.search.partial_poses import (
     PartialPoses,
-    Pictures,
     PoseStore,
+    SilhouetteBits,
     coarsen,
 )
 from drake_pose.search.pose_modes import ExaminationSettings, examine, renderer_tolerance
@@ -38,21 +39,25 @@ def grow(
     limit: float = np.inf,
     spare: int = 4,
 ) -> tuple[PartialPoses | None, bool]:
-    """Place one more node in every partial pose and keep the best.
+    """Place one more node in every partial pose and keep the best results.
 
     Args:
-        outside_weight: what a pixel outside counts; one newly covered counts one.
-        limit: drop what cannot come to so small an objective any more [pixel].
-        spare: how many times the width are looked at until enough are found that are not alike.
+        store: the poses of all nodes.
+        partial: the partial poses that are extended.
+        node: the node that is placed.
+        width: beam width: greatest number of partial poses that are kept.
+        outside_weight: cost of a pixel outside, relative to the gain of a newly covered one.
+        limit: partial poses are dropped if no completion can have an objective up to this [pixel].
+        spare: number of candidates from which distinct ones are chosen, as a multiple of ``width``.
 
     Returns:
-        The new ones, best first, None where none stays inside the limit; and whether some were
-            lost.
+        The new partial poses, best first, or None if there is none within the limit; and whether
+        any partial pose within the limit was dropped.
     """
     pairs = store.pairs(partial, node)
     areas, added = store.score(partial, node, pairs)
     if not store.tree_nodes[node].children:
-        # Of those that add nothing at all, the first of each partial pose is enough.
+        # All poses of a leaf that cover no new pixel are equivalent: keep one per partial pose.
         nothing = np.flatnonzero(~areas.any(axis=1))
         if len(nothing) > 1:
             more = nothing[1:][np.diff(pairs[nothing, 0]) == 0]
@@ -62,7 +67,7 @@ def grow(
     beyond = store.nodes[node].areas[pairs[:, 1], 2]
     outside = partial.outside[pairs[:, 0]] + areas[:, 1] + beyond
     costs = outside_weight * outside - partial.covered[pairs[:, 0]] - areas[:, 0]
-    # The smallest costs, equals in their order.
+    # The smallest costs; equal costs keep their order.
     most, lost = spare * width, False
     ordered = np.arange(len(costs))
     if len(costs) > most:
@@ -70,7 +75,7 @@ def grow(
     ordered = ordered[np.argsort(costs[ordered], kind="stable")[:most]]
     made = store.make(partial, node, pairs[ordered], (areas[ordered], added[ordered]))
     pairs = pairs[ordered]
-    # What is out of reach is known after growing only: grow more and rank again.
+    # The unreachable area is known only after placing the node: place more, and rank again.
     grown = width if limit < np.inf else 2 * width
     chosen, made, looked_at = store.choose(partial, made, node, pairs, grown, limit)
     lost = lost or len(looked_at) < len(pairs)
@@ -84,7 +89,14 @@ def grow(
 
 
 class BeamSearch:
-    """Matches silhouettes by the beam search; every answer is examined, or not (None)."""
+    """Estimates poses on a grid of joint values by a beam search.
+
+    Args:
+        tree: the pose tree.
+        settings: the grid and the stages of the search.
+        examination: parameters of the proof of optimality and of the search for poses as good;
+            None: the best pose alone is returned.
+    """
 
     def __init__(
         self,
@@ -118,13 +130,13 @@ class BeamSearch:
         return replace(result, seconds=time.perf_counter() - start)
 
     def without_alternatives(self) -> "BeamSearch":
-        """The same search where only E_total is wanted: no examination."""
+        """Return the same search without proof of optimality and without a pose set."""
         other = copy.copy(self)
         other.examination = None
         return other
 
     def with_stages(self, *stages: Stage) -> "BeamSearch":
-        """The same grid searched in other stages, and no limb searched again."""
+        """Return a search of the same grid in other stages, without searching limbs again."""
         other = copy.copy(self)
         other.settings = replace(self.settings, stages=stages, research_hypotheses=0)
         return other
@@ -134,33 +146,47 @@ class BeamSearch:
         views: Sequence[View],
         root_position: np.ndarray | None = None,
         count: int = 30,
-        alike: float = 0.7,
+        overlap: float = 0.7,
         time_limit: float = np.inf,
     ) -> list[list[np.ndarray]]:
-        """Each node's values in the best whole poses met that do not look alike, best first.
+        """Return the best whole poses that differ visibly, best first.
 
-        Slower than :meth:`match`: the search does not end at J = 0 before it has also looked at
-        poses that leave the silhouette a little.
+        This is slower than :meth:`match`: after an exact pose is found, the first stage that allows
+        area outside the silhouette is still run.
 
         Args:
-            count: at most this many.
-            alike: two poses look alike if each node's pictures have this fraction of their union in
-                common in all views, or it is hidden in both, covering nothing that other nodes
-                do not cover. Above 1: all poses of the grid differ.
-            time_limit: after this time [s], or the settings', no more poses are looked for.
+            views: the silhouettes of one frame.
+            root_position: (3,) the root's position [m]; None: that of the tree.
+            count: greatest number of poses.
+            overlap: two poses are alike if for every node the intersection over union of its
+                projections, areas summed over the views, is at least this, or the node is hidden in
+                both poses (the other nodes cover all of its projection). Above 1: all poses differ.
+            time_limit: time after which the search stops [s]; the settings' limit applies, too.
+
+        Returns:
+            For each pose the values (k,) of each node [rad or m].
 
         Raises:
             SettingsError: if there is no view.
         """
         limits = [one for one in (time_limit, self.settings.time_limit) if one is not None]
         settings = replace(self.settings, time_limit=min(limits))
-        run = _BeamRun(self.body, views, settings, root_position, gathers=True)
+        run = _BeamRun(self.body, views, settings, root_position, collect=True)
         run.search()
-        return [run.scoring.sampled.values_at(one) for one in run.distinct(count, alike)]
+        return [run.scoring.sampled.values_at(one) for one in run.distinct(count, overlap)]
 
 
 class _BeamRun:
-    """One match; it may gather all whole poses that it comes by, or all within the tolerance."""
+    """One run of the beam search.
+
+    Args:
+        body: the sampled body.
+        views: the silhouettes.
+        settings: the stages and limits.
+        root_position: (3,) the root's position [m]; None: that of the tree.
+        collect: whether all whole poses met are collected, for ``distinct``.
+        all_within: whether all poses within the tolerance are enumerated first.
+    """
 
     def __init__(
         self,
@@ -168,54 +194,59 @@ class _BeamRun:
         views: Sequence[View],
         settings: BeamSearchSettings,
         root_position: np.ndarray | None,
-        gathers: bool = False,
+        collect: bool = False,
         all_within: bool = False,
     ) -> None:
         require_views(views)
         limit = settings.time_limit
         self._deadline = np.inf if limit is None else time.perf_counter() + limit
         self._body = body if root_position is None else body.with_root_position(root_position)
-        self._views, self._settings, self._gathers = views, settings, gathers
+        self._views, self._settings, self._collect = views, settings, collect
         self._all = all_within
         given = settings.tolerance
         self._tolerance = renderer_tolerance(views) if given is None else given
         self.scoring = Scoring(self._body.sampled, views)
-        self._gathered: list[tuple[np.ndarray, np.ndarray]] = []
-        self._pictures: dict[bool, Pictures] = {}
+        self._collected: list[tuple[np.ndarray, np.ndarray]] = []
+        self._bits: dict[bool, SilhouetteBits] = {}
         self._stores: dict[float, PoseStore] = {}
         self._samples: np.ndarray | None = None
         self._J, self._first_J = np.inf, np.nan
         self._runs, self._stopped_by = 0, ""
-        # All poses within the tolerance, where they are asked for and there are any.
+        # All poses within the tolerance, if they were asked for and there are any.
         self.within: PosesWithin | None = None
 
     def search(self) -> None:
-        """Run stage after stage until J is within the tolerance or time is up; then polish it."""
+        """Run the stages until J is within the tolerance or time is up, and improve the result."""
         if self._all and self._search_within():
             self._stopped_by = "exact"
             return
         exact, tolerant = (
-            [stage for stage in self._settings.stages if (stage.outside_share == 0.0) == is_exact]
+            [
+                stage
+                for stage in self._settings.stages
+                if (stage.outside_fraction == 0.0) == is_exact
+            ]
             for is_exact in (True, False)
         )
         for stage in exact:
             if self._run_stage(stage) or self._stopped_by or self._is_matched:
                 break
-        if not (self._all or self._gathers or self._stopped_by or self._is_matched):
+        if not (self._all or self._collect or self._stopped_by or self._is_matched):
             self._search_within()
         for k, stage in enumerate(tolerant):
-            enough = self._is_matched and not (self._gathers and k == 0)
+            enough = self._is_matched and not (self._collect and k == 0)
             if self._stopped_by or enough:
                 break
             self._run_stage(stage)
         if self._samples is None:
-            # A pose whatever lies outside; found by one hypothesis alone if a limit was reached.
+            # No stage found a pose: search one without a limit on the area outside, with a single
+            # hypothesis if the time is up.
             width = 1 if self._stopped_by else self._settings.stages[-1].hypotheses
             store = self._store(np.inf)
             start, order = store.start(), self._body.order
             last, _ = self._grow_all(store, start, order, width, 2, limited=False)
             if last is not None:
-                best = int(np.argmin(self._gather(store, last)))
+                best = int(np.argmin(self._score(store, last)))
                 self._keep_if_better(store.samples(last.poses[best]))
         elif self._settings.research_hypotheses and not (self._stopped_by or self._is_matched):
             self._turn_single_nodes(self._samples)
@@ -227,7 +258,7 @@ class _BeamRun:
         return self._J <= self._tolerance
 
     def _search_within(self) -> bool:
-        """Look for all poses within the tolerance, and keep the best; whether there is one."""
+        """Enumerate the poses within the tolerance and keep the best; return whether any exists."""
         left = self._deadline - time.perf_counter()
         limits = BoundLimits(time_limit=max(left, 0.0) if left < np.inf else None)
         found = branch_and_bound(self._body, self._views, self._tolerance, limits)
@@ -238,30 +269,36 @@ class _BeamRun:
         self._keep_if_better(found.graph.central())
         return True
 
-    def _pictures_of(self, exact: bool, coarse_pixels: int = 6000) -> Pictures:
-        """The silhouettes as bits: coarse ones with a band for stages that are not exact.
+    def _bits_of(self, exact: bool, coarse_pixels: int = 6000) -> SilhouetteBits:
+        """Return the silhouettes as bit masks, at full or at coarse resolution.
 
-        ``coarse_pixels``: approximate area of a coarse silhouette; the best pose is scored in full.
+        Stages that are not exact use coarse ones; their best pose is scored at full resolution.
+
+        Args:
+            exact: whether full resolution is needed.
+            coarse_pixels: approximate area of a coarse silhouette [pixel].
         """
-        if exact not in self._pictures:
+        if exact not in self._bits:
             if exact:
                 views, band = self._views, int(self._tolerance)
-                self._pictures[exact] = Pictures(self._body, views, band, in_full=True)
+                self._bits[exact] = SilhouetteBits(self._body, views, band, in_full=True)
             else:
                 views = tuple(coarsen(view, coarse_pixels) for view in self._views)
-                self._pictures[exact] = Pictures(self._body, views)
-        return self._pictures[exact]
+                self._bits[exact] = SilhouetteBits(self._body, views)
+        return self._bits[exact]
 
-    def _store(self, outside_share: float) -> PoseStore:
-        if outside_share not in self._stores:
-            exact = outside_share == 0.0
+    def _store(self, outside_fraction: float) -> PoseStore:
+        """Return the poses of nodes whose area outside is within a fraction of their mean area."""
+        if outside_fraction not in self._stores:
+            exact = outside_fraction == 0.0
             limit = self._tolerance if exact else None
-            pictures = self._pictures_of(exact)
-            self._stores[outside_share] = PoseStore(self._body, pictures, outside_share, limit)
-        return self._stores[outside_share]
+            bits = self._bits_of(exact)
+            store = PoseStore(self._body, bits, outside_fraction, limit)
+            self._stores[outside_fraction] = store
+        return self._stores[outside_fraction]
 
     def _proceed(self) -> bool:
-        """Whether the time allows to go on, after one more node."""
+        """Count one more placed node, and return whether there is time left."""
         self._runs += 1
         if time.perf_counter() >= self._deadline:
             self._stopped_by = "time_limit"
@@ -277,10 +314,18 @@ class _BeamRun:
         limited: bool = True,
         limit: float = np.inf,
     ) -> tuple[PartialPoses | None, bool]:
-        """Place nodes one after another; ``limited``: while the time allows.
+        """Place nodes one after another.
+
+        Args:
+            store: the poses of all nodes.
+            partial: the partial poses that are extended.
+            order: the nodes, in the order in which they are placed.
+            width, outside_weight, limit: as in ``grow``.
+            limited: whether the time limit ends the search.
 
         Returns:
-            The last ones (None: none was left, or the time is up), and whether none was lost.
+            The partial poses with all nodes placed (None: none was left, or the time is up), and
+            whether no partial pose within the limit was dropped.
         """
         complete = True
         for node in order:
@@ -294,9 +339,9 @@ class _BeamRun:
         return partial, complete
 
     def _run_stage(self, stage: Stage) -> bool:
-        """Returns whether the stage lost no hypothesis."""
-        exact = stage.outside_share == 0.0
-        store = self._store(stage.outside_share)
+        """Run one stage, keep its best pose, and return whether no hypothesis was dropped."""
+        exact = stage.outside_fraction == 0.0
+        store = self._store(stage.outside_fraction)
         order = self._body.limb_order if stage.limb_by_limb else self._body.order
         last, complete = self._grow_all(
             store, store.start(), order, stage.hypotheses, stage.outside_weight,
@@ -304,11 +349,11 @@ class _BeamRun:
         )  # fmt: skip
         if last is None:
             return complete
-        Js = self._gather(store, last)
+        Js = self._score(store, last)
         best = int(np.argmin(Js))
         self._keep_if_better(store.samples(last.poses[best]))
         width = self._settings.research_hypotheses
-        if width and (not self._is_matched or (self._gathers and not exact)):
+        if width and (not self._is_matched or (self._collect and not exact)):
             better = self._search_limbs_again(store, order, last.poses[best], float(Js[best]))
             self._keep_if_better(store.samples(better))
         return complete
@@ -316,10 +361,19 @@ class _BeamRun:
     def _search_limbs_again(
         self, store: PoseStore, order: Sequence[int], poses: np.ndarray, J: float
     ) -> np.ndarray:
-        """Better poses (nodes,) in the store, limbs searched again by one and two.
+        """Search single limbs and pairs of limbs again until J does not decrease any further.
 
-        Limbs are the largest subtrees without a fork but the whole tree; of a chain, its outer
-        half.
+        Limbs are the largest subtrees without a fork that are not the whole tree; for a chain, its
+        outer half.
+
+        Args:
+            store: the poses of all nodes.
+            order: the nodes, in the order in which they are placed.
+            poses: (nodes,) the pose of each node in the store.
+            J: the objective of these [pixel].
+
+        Returns:
+            (nodes,) the poses of least J found.
         """
         nodes, subtrees = store.tree_nodes, self._body.sampled.tree.subtrees
         limbs = [
@@ -333,12 +387,12 @@ class _BeamRun:
         for choice in itertools.cycle(choices):
             again = frozenset().union(*choice)
             part = [node for node in order if node in again]
-            # What is placed last need not spare the silhouette for what comes after it.
+            # A limb placed last may cover silhouette that it had left to later nodes before.
             start = store.without(poses, again)
             last, _ = self._grow_all(store, start, part, width, 2)
             if last is None:
                 break
-            Js = self._gather(store, last)
+            Js = self._score(store, last)
             best = int(np.argmin(Js))
             unchanged += 1
             if Js[best] < J:
@@ -347,15 +401,15 @@ class _BeamRun:
                 break
         return poses
 
-    def _turn_single_nodes(self, current: np.ndarray, judged: int = 4) -> None:
-        """Improve samples (nodes,) by turning single nodes, all that hangs on each moving along.
+    def _turn_single_nodes(self, current: np.ndarray, scored: int = 4) -> None:
+        """Improve samples (nodes,) by changing single nodes, which move their descendants along.
 
-        ``judged``: how many of a node's samples, the best by pictures with bands, are judged in
-        full.
+        ``scored``: number of a node's samples, the best at coarse resolution, that are scored at
+        full resolution.
         """
-        scoring, pictures = self.scoring, self._pictures_of(exact=False)
-        sampled, words = scoring.sampled, int(pictures.part_starts[-1])
-        silhouettes = int(pictures.part_starts[len(pictures.views)])
+        scoring, bits = self.scoring, self._bits_of(exact=False)
+        sampled, words = scoring.sampled, int(bits.part_starts[-1])
+        silhouettes = int(bits.part_starts[len(bits.views)])
         J, unchanged = float(scoring.J(current[None])[0]), 0
         sources = np.array([sampled.tree.source(i) for i in range(len(current))])
         nodes = np.flatnonzero(sources == np.arange(len(current))).tolist()
@@ -368,14 +422,14 @@ class _BeamRun:
             far = np.zeros(len(tried), dtype=np.int64)
             still = np.zeros((1, words), dtype=np.uint64)
             for i in set(range(len(current))).difference(moving):
-                far += pictures.draw_node(i, tried[:1, i], X_WN[:1, i], still)[0, 2]
+                far += bits.draw_node(i, tried[:1, i], X_WN[:1, i], still)[0, 2]
             masks = np.repeat(still, len(tried), axis=0)
             for i in moving:
-                far += pictures.draw_node(i, tried[:, i], X_WN[:, i], masks)[:, 2]
+                far += bits.draw_node(i, tried[:, i], X_WN[:, i], masks)[:, 2]
             ones = np.bitwise_count(masks).astype(np.int64)
             outside, covered = ones[:, silhouettes:].sum(axis=1), ones[:, :silhouettes].sum(axis=1)
-            order = np.argsort(pictures.area - covered + outside + far, kind="stable")
-            tried = tried[order[:judged]]
+            order = np.argsort(bits.area - covered + outside + far, kind="stable")
+            tried = tried[order[:scored]]
             Js = scoring.J(tried)
             best = int(np.argmin(Js))
             unchanged += 1
@@ -385,47 +439,50 @@ class _BeamRun:
                 break
         self._keep_if_better(current)
 
-    def _gather(self, store: PoseStore, whole: PartialPoses) -> np.ndarray:
-        """What J is (n,) as the pictures show it; poses are gathered if that is wanted."""
+    def _score(self, store: PoseStore, whole: PartialPoses) -> np.ndarray:
+        """Return J (n,) of whole poses at the store's resolution [pixel], and collect the poses."""
         Js = store.objectives(whole)
-        if self._gathers:
-            area = store.pictures.area
-            self._gathered.append((store.samples(whole.poses), Js / area))
+        if self._collect:
+            area = store.bits.area
+            self._collected.append((store.samples(whole.poses), Js / area))
         return Js
 
     def _keep_if_better(self, samples: np.ndarray) -> None:
-        """Keep samples (nodes,) if their J is the smallest so far."""
+        """Keep samples (nodes,) if their J at full resolution is the smallest so far."""
         J = float(self.scoring.J(samples[None])[0])
         if self._samples is None:
             self._first_J = J
         if J < self._J:
             self._J, self._samples = J, samples
-            self._gathered.append((samples[None], np.array([J / self.scoring.silhouette_area])))
+            self._collected.append((samples[None], np.array([J / self.scoring.silhouette_area])))
 
     def result(self) -> PoseEstimate:
-        """What the search found."""
-        sampled, told = self._body.sampled, dict[str, Any](stopped_by=self._stopped_by)
-        told |= {"runs": self._runs, "first_J": self._first_J}
+        """Return the best pose found."""
+        sampled, statistics = self._body.sampled, dict[str, Any](stopped_by=self._stopped_by)
+        statistics |= {"runs": self._runs, "first_J": self._first_J}
         if self._samples is None:
-            return PoseEstimate.nothing(sampled.tree, **told)
+            return PoseEstimate.nothing(sampled.tree, **statistics)
         values, area = sampled.values_at(self._samples), self.scoring.silhouette_area
-        return PoseEstimate.of_values(sampled.tree, values, self._J, area, **told)
+        return PoseEstimate.of_values(sampled.tree, values, self._J, area, **statistics)
 
-    def distinct(self, count: int, alike: float) -> np.ndarray:
-        """The best poses (m, nodes) gathered of which no two look alike, best first."""
-        if not self._gathered:
+    def distinct(self, count: int, overlap: float) -> np.ndarray:
+        """Return samples (m, nodes) of the best collected poses that differ, best first.
+
+        ``count`` and ``overlap`` as in ``BeamSearch.best_poses``.
+        """
+        if not self._collected:
             return np.empty((0, len(self._body.sampled.values)), dtype=np.int32)
-        samples, errors = (np.concatenate(both) for both in zip(*self._gathered, strict=True))
+        samples, errors = (np.concatenate(both) for both in zip(*self._collected, strict=True))
         samples = samples[np.argsort(errors, kind="stable")]
         samples = samples[np.sort(np.unique(samples, axis=0, return_index=True)[1])]
-        # Poses compared in one go, and poses scored in full.
+        # Number of poses compared at a time, and of poses scored at full resolution.
         chunk, most = 8 * count, 2 * count
         chosen = samples[:0]
-        looks = self._draw(chosen)
+        drawn = self._draw(chosen)
         for begin in range(0, len(samples), chunk):
             more = samples[begin : begin + chunk]
             masks, areas, hidden = (
-                np.concatenate(both) for both in zip(looks, self._draw(more), strict=True)
+                np.concatenate(both) for both in zip(drawn, self._draw(more), strict=True)
             )
             kept = list(range(len(chosen)))
             for i in range(len(chosen), len(masks)):
@@ -433,31 +490,31 @@ class _BeamRun:
                     break
                 common = np.bitwise_count(masks[i] & masks[kept]).sum(axis=2, dtype=np.int64)
                 union = areas[i] + areas[kept] - common
-                same = (common >= alike * union) | (hidden[i] & hidden[kept])
+                same = (common >= overlap * union) | (hidden[i] & hidden[kept])
                 if not same.all(axis=1).any():
                     kept.append(i)
             chosen = np.concatenate([chosen, more])[kept]
-            looks = masks[kept], areas[kept], hidden[kept]
+            drawn = masks[kept], areas[kept], hidden[kept]
             if len(chosen) >= most:
                 break
         return np.asarray(chosen[np.argsort(self.scoring.J(chosen), kind="stable")[:count]])
 
     def _draw(self, samples: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """What nodes look like at samples (n, nodes), in pictures with bands.
+        """Draw each node of poses with samples (n, nodes), at coarse resolution.
 
         Returns:
-            Masks (n, nodes, W) uint64, areas (n, nodes) [pixel], and (n, nodes) bool whether a
-            node adds nothing to what the others of its pose cover.
+            (n, nodes, W) uint64 bit masks of the nodes, (n, nodes) their areas [pixel], and
+            (n, nodes) bool whether the other nodes of the pose cover all of a node's projection.
         """
-        pictures, X_WN = self._pictures_of(exact=False), self.scoring.sampled.poses(samples)
+        bits, X_WN = self._bits_of(exact=False), self.scoring.sampled.poses(samples)
         poses, nodes = samples.shape
-        by_node = np.zeros((nodes, poses, int(pictures.part_starts[-1])), dtype=np.uint64)
+        by_node = np.zeros((nodes, poses, int(bits.part_starts[-1])), dtype=np.uint64)
         drawn = [
-            pictures.draw_node(node, samples[:, node], X_WN[:, node], by_node[node])
+            bits.draw_node(node, samples[:, node], X_WN[:, node], by_node[node])
             for node in range(nodes)
         ]
         masks, areas = by_node.swapaxes(0, 1), np.stack(drawn, axis=1)
-        # What the others of its pose cover twice and once tells what a node alone adds.
+        # A pixel is covered by a node alone if the node covers it and it is not covered twice.
         once, twice = np.zeros_like(masks[:, 0]), np.zeros_like(masks[:, 0])
         for node in range(nodes):
             twice |= once & masks[:, node]

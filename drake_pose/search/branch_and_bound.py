@@ -1,10 +1,10 @@
-"""All poses of the grid whose objective is no greater than a limit, found layer by layer.
+"""Enumerate all poses of a grid whose objective J is at most a limit, by branch and bound.
 
-A partial pose is dropped only if no completion can be within the limit: what lies outside the
-silhouette stays outside, and what no later node can reach stays uncovered. The sum of the two
-bounds the objective of all completions from below. Nothing else is dropped unless there is too
-much of it, and the search then says so. The poses found, which may be very many, are kept as a
-graph of partial poses.
+Nodes are placed one after another. The area outside the silhouette stays outside, and silhouette
+that no later node can reach stays uncovered, so the sum of these two areas is a lower bound of J of
+all completions of a partial pose. A partial pose is dropped only if this bound exceeds the limit,
+or if there are too many, which is reported. The result may hold very many poses and is stored as a
+layered graph of partial poses.
 """
 
 from collections.abc import Sequence
@@ -17,9 +17,9 @@ from drake_pose.search.pair_kernel import NO_CHILDREN, prune_pairs, unite
 from drake_pose.search.partial_poses import (
     LimitReached,
     PartialPoses,
-    Pictures,
     PoseStore,
     RowTable,
+    SilhouetteBits,
     expand_groups,
 )
 from drake_pose.search.sampled_body import SampledBody
@@ -28,10 +28,13 @@ from drake_pose.search.settings import BoundLimits
 
 @dataclass(frozen=True)
 class Layer:
-    """The edges that place one node, by origin and sample.
+    """The edges of the graph that place one node, sorted by origin and sample.
 
-    ``origins``: (m,) int64 states they start from; ``samples``: (m,) int64; ``ends``: (m,) int64
-    states of the next layer.
+    Args:
+        node: the node that is placed.
+        origins: (m,) int64 states of this layer from which the edges start.
+        samples: (m,) int64 samples of the node.
+        ends: (m,) int64 states of the next layer at which the edges end.
     """
 
     node: int
@@ -40,21 +43,24 @@ class Layer:
     ends: np.ndarray
 
     def chosen(self, edges: np.ndarray) -> "Layer":
-        """Some of the edges, (m,) bool."""
+        """Return the layer with a subset of its edges, (m,) bool."""
         return Layer(self.node, self.origins[edges], self.samples[edges], self.ends[edges])
 
 
 class PartialPoseGraph:
-    """A set of poses of the grid; states not between the first (0) and a last are left out.
+    """A set of poses of a grid, stored as the paths of a layered graph.
+
+    A path from state 0 of the first layer to a last state is a pose. States that are on no path are
+    removed.
 
     Attributes:
-        layers: one for each node.
-        Js: (last states,) the objective of the poses that end in each [pixel].
-        ways: for each layer, and for the last states, (states,) how many partial poses lead there.
+        layers: one layer for each node.
+        Js: (last states,) the objective of the poses that end in each last state [pixel].
+        ways: for each layer, and for the last states, (states,) number of paths to each state.
     """
 
     def __init__(self, layers: Sequence[Layer], Js: np.ndarray) -> None:
-        # Leave out states that lead nowhere or are led to from nowhere, and number the rest anew.
+        # Remove states that are on no complete path, and number the others consecutively.
         origins = [layer.origins for layer in layers[1:]] + [np.arange(len(Js))]
         reached = [np.array([True])]
         for layer, following in zip(layers, origins, strict=True):
@@ -80,23 +86,23 @@ class PartialPoseGraph:
 
     @classmethod
     def of_pose(cls, samples: np.ndarray, J: float) -> "PartialPoseGraph":
-        """The set of one pose, samples (nodes,), with objective J."""
+        """Make the set of one pose, samples (nodes,), with objective J [pixel]."""
         zero = np.zeros(1, dtype=np.int64)
         layers = [Layer(node, zero, np.array([t]), zero) for node, t in enumerate(samples)]
         return cls(layers, np.array([J]))
 
     @property
     def size(self) -> float:
-        """How many poses there are; a float because they may be very many."""
+        """Number of poses; a float, since it may exceed the range of int64."""
         return float(self.ways[-1].sum()) if len(self.Js) else 0.0
 
     @property
     def best_J(self) -> float:
-        """The smallest objective; infinite where there is no pose."""
+        """Smallest objective [pixel]; infinite if the set is empty."""
         return float(self.Js.min(initial=np.inf))
 
     def objective(self, samples: np.ndarray) -> float | None:
-        """The objective of a pose, samples (nodes,), or None if it is not in the set."""
+        """Return J of a pose, samples (nodes,) [pixel]; None if the pose is not in the set."""
         state = 0
         for layer in self.layers:
             begin, end = np.searchsorted(layer.origins, [state, state + 1])
@@ -108,32 +114,36 @@ class PartialPoseGraph:
         return float(self.Js[state])
 
     def contains(self, samples: np.ndarray) -> bool:
-        """Whether a pose, samples (nodes,), is in the set."""
+        """Return whether a pose, samples (nodes,), is in the set."""
         return self.objective(samples) is not None
 
-    def samples_seen(self) -> list[np.ndarray]:
-        """For each node the samples that occur in any pose, smallest first."""
-        seen: list[np.ndarray] = [np.zeros(0, dtype=np.int64)] * len(self.layers)
+    def samples_used(self) -> list[np.ndarray]:
+        """Return for each node the samples that occur in any pose, in increasing order."""
+        used: list[np.ndarray] = [np.zeros(0, dtype=np.int64)] * len(self.layers)
         for layer in self.layers:
-            seen[layer.node] = np.unique(layer.samples)
-        return seen
+            used[layer.node] = np.unique(layer.samples)
+        return used
 
     def restricted(self, allowed: Sequence[np.ndarray]) -> "PartialPoseGraph":
-        """The poses that take allowed samples alone, (samples,) bool of each node."""
+        """Return the poses all of whose samples are allowed, (samples,) bool for each node."""
         layers = [layer.chosen(allowed[layer.node][layer.samples]) for layer in self.layers]
         return PartialPoseGraph(layers, self.Js)
 
     def up_to(self, J: float) -> "PartialPoseGraph":
-        """Those poses whose objective is no greater."""
+        """Return the poses whose objective is at most J [pixel]."""
         kept = self.Js <= J
         last = self.layers[-1].chosen(kept[self.layers[-1].ends])
         last = replace(last, ends=(np.cumsum(kept) - 1)[last.ends])
         return PartialPoseGraph([*self.layers[:-1], last], self.Js[kept])
 
     def central(self) -> np.ndarray:
-        """Samples (nodes,) of a best pose, where most ways lead; ValueError if there is none."""
+        """Return samples (nodes,) of a pose of least J, in the part of the graph with most paths.
+
+        Raises:
+            ValueError: if the set is empty.
+        """
         if not self.size:
-            raise ValueError("a pose was asked of an empty set")
+            raise ValueError("an empty set has no central pose")
         samples = np.empty(len(self.layers), dtype=np.int64)
         best = self.Js == self.Js.min()
         state = int(np.argmax(np.where(best, self.ways[-1], -1.0)))
@@ -146,14 +156,14 @@ class PartialPoseGraph:
 
 @dataclass(frozen=True)
 class PosesWithin:
-    """What a branch and bound found.
+    """Result of a branch and bound.
 
     Attributes:
-        J_limit: the limit [pixel].
-        graph: the poses; every one is within the limit.
-        complete: whether it holds all poses within the limit.
-        limited: whether a limit of the search left some out.
-        lower_bound: no pose of the grid that is not in the graph has a smaller objective [pixel].
+        J_limit: the limit of the objective [pixel].
+        graph: poses of the grid with J up to the limit.
+        complete: whether the graph holds all of them.
+        limited: whether poses may be missing because a limit of the search was reached.
+        lower_bound: lower bound of J of all poses of the grid that are not in the graph [pixel].
     """
 
     J_limit: float
@@ -170,16 +180,23 @@ def branch_and_bound(
     limits: BoundLimits | None = None,
     kept_samples: np.ndarray | None = None,
 ) -> PosesWithin:
-    """Find all poses of the grid whose objective is no greater than a limit.
+    """Find all poses of the grid whose objective is at most a limit.
 
-    ``kept_samples``: (nodes,) of a pose that is never dropped for want of room. Some are missing if
-    a limit was reached, or an area beyond the bands around the silhouettes is counted twice.
+    Poses are missing if a limit of the search was reached, or if areas of several nodes overlap
+    beyond the bands around the silhouettes, where they are added.
+
+    Args:
+        body: the sampled body.
+        views: the silhouettes of one frame.
+        J_limit: the greatest objective [pixel].
+        limits: limits of the search.
+        kept_samples: (nodes,) samples of a pose that is kept even if there are too many.
     """
     return _BranchAndBound(body, views, J_limit, limits or BoundLimits(), kept_samples).run()
 
 
 class _BranchAndBound:
-    """One search; arguments as branch_and_bound."""
+    """One run of ``branch_and_bound``, which has the same arguments."""
 
     def __init__(
         self,
@@ -191,28 +208,28 @@ class _BranchAndBound:
     ) -> None:
         self.order = body.limb_order
         self.J_limit, self.limits = J_limit, limits
-        # Bands so wide that nothing within the limit lies beyond, if masks get no more words than
-        # this; bands are no narrower than 8 pixels.
+        # Bands as wide as the limit, so that no pose within the limit has area beyond them. They
+        # are narrowed, but not below 8 pixels, if masks would have more words than this.
         most_words, least_band = 2000, 8
         sides = (view.mask.shape[i] for view in views for i in (0, 1))
         band = max(1, int(min(J_limit, max(sides)))) if J_limit >= 1.0 else 0
-        self.pictures = Pictures(body, views, band, in_full=True)
-        while band > least_band and self.pictures.part_starts[-1] > most_words:
+        self.bits = SilhouetteBits(body, views, band, in_full=True)
+        while band > least_band and self.bits.part_starts[-1] > most_words:
             band //= 2
-            self.pictures = Pictures(body, views, band, in_full=True)
-        self.store = PoseStore(body, self.pictures, outside_limit=J_limit, limits=limits)
+            self.bits = SilhouetteBits(body, views, band, in_full=True)
+        self.store = PoseStore(body, self.bits, outside_limit=J_limit, limits=limits)
         self.nodes = self.store.tree_nodes
         self.reaches = _SubtreeReaches(self.store)
         self._layers: list[Layer] = []
         self._complete = True
         self._limited = False
         self._lower_bound = np.inf
-        # The partial pose that the pose to be kept is in; -1: none.
+        # Index of the partial pose that the pose to be kept extends; -1: none.
         self._kept = -1 if kept_samples is None else 0
         self._kept_samples = np.zeros(0) if kept_samples is None else kept_samples
 
     def run(self) -> PosesWithin:
-        """Place all nodes."""
+        """Place all nodes and return the poses found."""
         partial = self.store.start()
         while len(self._layers) < len(self.nodes):
             try:
@@ -226,22 +243,31 @@ class _BranchAndBound:
                 layers = [Layer(i, nothing, nothing, nothing) for i in range(len(self.nodes))]
                 graph = PartialPoseGraph(layers, np.zeros(0))
                 return PosesWithin(self.J_limit, graph, False, True, bound)
-        # All nodes are placed: the bounds are the objectives, but for what is beyond the bands.
-        highs = partial.bounds + partial.far[:, 1] - partial.far[:, 0]
+        # All nodes are placed: the bounds are the objectives, except for areas beyond the bands,
+        # of which the bound has the largest and the upper limit of J the sum.
+        highs = partial.bounds + partial.beyond[:, 1] - partial.beyond[:, 0]
         graph = PartialPoseGraph(self._layers, highs).up_to(self.J_limit)
         self._drop(partial.bounds[highs > self.J_limit])
         bound = min(self._lower_bound, float(np.floor(self.J_limit)) + 1.0)
         return PosesWithin(self.J_limit, graph, self._complete, self._limited, bound)
 
     def _drop(self, bounds: np.ndarray, limited: bool = False) -> None:
-        """Note that partial poses with these bounds are dropped though they might lead to poses."""
+        """Record the bounds (n,) of dropped partial poses that may lead to poses in the limit.
+
+        ``limited``: whether a limit of the search is the reason.
+        """
         if len(bounds):
             self._complete = False
             self._limited = self._limited or limited
             self._lower_bound = min(self._lower_bound, float(bounds.min()))
 
     def _choose(self, partial: PartialPoses) -> tuple[PartialPoses, int, np.ndarray]:
-        """The node to place next, and the pairs (p, 2) int32 to look at."""
+        """Choose the node to place next.
+
+        Returns:
+            The partial poses, perhaps fewer; the node; and (p, 2) int32 pairs of a partial pose and
+            a pose of the node that are to be evaluated.
+        """
         placed = {layer.node for layer in self._layers}
         waiting = [
             i for i in self.order if i not in placed and self.nodes[i].parent in (-1, *placed)
@@ -255,7 +281,7 @@ class _BranchAndBound:
         node = waiting[int(np.argmin(totals))]
         partial = self._fit_pairs(partial, node)
         pairs = self.store.pairs(partial, node)
-        # More pairs than these are worth a look at what later nodes can really cover.
+        # With more pairs than this it is faster to prune them by what later nodes can cover.
         if min(totals) > 300:
             for other in waiting:
                 if np.diff(self.store.groups(partial, other)).sum() <= self.limits.pairs:
@@ -265,7 +291,10 @@ class _BranchAndBound:
         return partial, node, pairs
 
     def _pruned_pairs(self, partial: PartialPoses, node: int, waiting: Sequence[int]) -> np.ndarray:
-        """Those pairs that leave no more than what the waiting nodes can really cover."""
+        """Return the pairs (p, 2) after which the waiting nodes can still cover enough.
+
+        Unlike the bound of a partial pose, this uses the poses that the waiting nodes can take.
+        """
         pairs = self.store.pairs(partial, node)
         below = self.reaches.child_rows(node, pairs[:, 1])
         others = [
@@ -273,21 +302,21 @@ class _BranchAndBound:
             for other in waiting
             if other != node
         ]
-        table, everything = self.reaches.table, self.pictures.everything
-        uncovered = everything & ~partial.masks[:, : len(everything)]
+        table, all_pixels = self.reaches.table, self.bits.all_pixels
+        uncovered = all_pixels & ~partial.masks[:, : len(all_pixels)]
         for rows in others:
             uncovered &= ~table[rows]
         room = np.floor(self.J_limit - partial.least_outside).astype(np.int64)
-        stored, views = self.store.nodes[node], len(self.pictures.views)
+        stored, views = self.store.nodes[node], len(self.bits.views)
         good = prune_pairs(uncovered, room, pairs, stored.runs, stored.words, views, below, table)
         return pairs[good]
 
     def _place(self, partial: PartialPoses, node: int, pairs: np.ndarray) -> PartialPoses:
-        """Place a node as pairs (p, 2) say, and note the edges."""
+        """Place a node at the pairs (p, 2) of partial pose and pose, and add the layer."""
         store = self.store
         made = store.make(partial, node, pairs, store.score(partial, node, pairs))
         firsts, made, numbers = store.choose(
-            partial, made, node, pairs, len(pairs), far_matters=True
+            partial, made, node, pairs, len(pairs), keep_beyond=True
         )
         samples = store.nodes[node].samples[pairs[:, 1]].astype(np.int64)
         if self._kept >= 0:
@@ -307,7 +336,7 @@ class _BranchAndBound:
         return store.with_masks(partial, made.chosen(kept), node, pairs[firsts[kept]])
 
     def _fit_pairs(self, partial: PartialPoses, node: int) -> PartialPoses:
-        """Keep as many of the best as make no more pairs than allowed."""
+        """Return the best partial poses whose number of pairs with the node is within the limit."""
         counts = np.diff(self.store.groups(partial, node)).ravel()
         kept = self._keep(partial, counts, self.limits.pairs)
         if kept.all():
@@ -321,11 +350,15 @@ class _BranchAndBound:
         return partial.chosen(kept)
 
     def _keep(self, partial: PartialPoses, counts: np.ndarray, limit: float) -> np.ndarray:
-        """Which (B,) bool of those that may lead to poses: the best, by counts (B,) to a limit."""
+        """Return which partial poses are kept, (B,) bool.
+
+        Those whose bound exceeds the limit of J are dropped. If the sum of ``counts`` (B,) exceeds
+        ``limit``, only the best are kept.
+        """
         alive = partial.bounds <= self.J_limit
         if counts[alive].sum() <= limit:
             return np.asarray(alive)
-        # What lies outside counts twice: it stays outside, while what is not covered yet may be
+        # The area outside has weight 2, since it stays outside, while uncovered silhouette may be
         # covered by a later node.
         costs = np.where(alive, partial.costs(2), np.iinfo(np.int64).max)
         if self._kept >= 0:
@@ -339,21 +372,23 @@ class _BranchAndBound:
 
 
 class _SubtreeReaches:
-    """What a node and its descendants can cover of the silhouettes, by pose of its parent.
+    """The silhouette that a node and its descendants can cover, for each pose of its parent.
 
-    ``table``: (r, w) uint64 unions; the rows beyond those in use are zero.
+    Attributes:
+        table: (r, w) uint64 bit masks, unions over all poses; rows that are not in use are zero.
     """
 
     def __init__(self, store: PoseStore) -> None:
         self._store = store
-        self.table = np.zeros((256, len(store.pictures.everything)), dtype=np.uint64)
+        self.table = np.zeros((256, len(store.bits.all_pixels)), dtype=np.uint64)
         self._used = 0
         self._rows = [RowTable(1) for _ in store.tree_nodes]
 
     def rows(self, node: int, parents: np.ndarray, tries: int = 5000) -> np.ndarray:
-        """For poses (n,) of the node's parent the rows of ``table``, within the store's limits.
+        """Return the rows (n,) of ``table`` for poses (n,) of the node's parent.
 
-        ``tries``: where more poses of the node are to be tried, a disc that holds all will do.
+        ``tries``: if more poses of the node would have to be drawn, the disc that contains the
+        projections of all of them is used instead.
         """
         known, store = self._rows[node], self._store
         missing = known.missing(parents)
@@ -373,12 +408,15 @@ class _SubtreeReaches:
             store.reserve(8 * self._used * self.table.shape[1])
             more = np.zeros((self._used, self.table.shape[1]), dtype=np.uint64)
             self.table = np.concatenate([self.table, more])
-        unite(self.table, made, groups, runs, words, len(store.pictures.views), below)
+        unite(self.table, made, groups, runs, words, len(store.bits.views), below)
         known.make(missing, made[:, None])
         return known.rows[parents, 0]
 
     def child_rows(self, node: int, poses: np.ndarray) -> np.ndarray:
-        """(children, all poses) int64 the rows of a node's children at poses (n,) of the node."""
+        """Return (children, all poses) int64 rows of the node's children.
+
+        Only the columns of the given poses (n,) of the node are set.
+        """
         children = self._store.tree_nodes[node].children
         rows = np.zeros((len(children), len(self._store.nodes[node].samples)), dtype=np.int64)
         for row, child in zip(rows, children, strict=True):

@@ -1,4 +1,8 @@
-"""What a search is given, and the poses in modes that searches and trackers answer."""
+"""Input and output types of searches and trackers: views, pose estimates and pose sets.
+
+A ``PoseEstimate`` is one pose. Its ``PoseSet`` holds all poses that explain the silhouettes equally
+well, grouped into modes (``PoseMode``), with an interval for each joint (``JointEstimate``).
+"""
 
 import math
 from collections.abc import Sequence
@@ -13,20 +17,23 @@ from drake_pose.camera.models import Camera
 from drake_pose.errors import MaskError, SettingsError
 
 UNEXPLAINED = 0.5
-"""From this E_total on, the pose is no explanation of the silhouettes."""
+"""A pose with E_total at or above this does not explain the silhouettes."""
 
 TRACKED = "tracked"
-"""``PoseEstimate.stopped_by`` of a pose that was tracked from the frame before."""
+"""``PoseEstimate.stopped_by`` of a pose that was tracked from the previous frame."""
 
 
 @dataclass(frozen=True)
 class View:
-    """What one calibrated camera sees of the body: the silhouette S, (height, width) bool.
+    """A calibrated camera and the body's silhouette in its image.
 
-    A mask of numbers with two values is true where it has the larger one.
+    Args:
+        camera: the camera.
+        mask: (height, width) the silhouette S. An array of numbers with at most two values is
+            converted to bool, true where it has the larger value.
 
     Raises:
-        MaskError: the mask is not of the camera's size, has more than two values, or is empty.
+        MaskError: if the mask has not the camera's size, has more than two values, or is empty.
     """
 
     camera: Camera
@@ -57,7 +64,7 @@ class View:
 
 
 def require_views(views: Sequence[View]) -> None:
-    """Refuses, by a SettingsError, a match with no view, or with one that is in no list."""
+    """Raise a SettingsError if there are no views, or a single View in place of a sequence."""
     if isinstance(views, View):
         raise SettingsError("a match needs a list of views, as [view], not one View")
     if not views:
@@ -66,14 +73,15 @@ def require_views(views: Sequence[View]) -> None:
 
 @dataclass(frozen=True)
 class JointEstimate:
-    """What the silhouettes say about one value of the pose tree.
+    """Interval of one value of the pose tree, as determined by the silhouettes.
 
     Args:
-        name: of the position (or of the root's angle).
-        determined: True: it lies between low and high; False: it is free, and low and high are
-            the ends of what was seen.
-        low, high: the interval or the range [rad or m]; of an angle that turns around it may go
-            beyond its limits, as the same directions a full turn before or after.
+        name: name of the position (or of the root's angle).
+        determined: True: the value lies between ``low`` and ``high``; False: the silhouettes do
+            not determine the value, and ``low`` and ``high`` are the extremes that were found.
+        low, high: ends of the interval [rad or m]. For an angle that turns around they may lie
+            beyond the limits by full turns.
+        turns_around: whether the value is an angle that can make a full turn.
     """
 
     name: str
@@ -83,13 +91,23 @@ class JointEstimate:
     turns_around: bool = False
 
     def holds(self, value: float, margin: float = 1e-9) -> bool:
-        """Whether a value lies in the interval or range; full turns make no difference."""
+        """Return whether a value [rad or m] lies in the interval, up to full turns of an angle.
+
+        ``margin``: the interval is widened by this on both sides [rad or m].
+        """
         if self.turns_around:
             value -= 2.0 * math.pi * round((value - 0.5 * (self.low + self.high)) / (2.0 * math.pi))
         return self.low - margin <= value <= self.high + margin
 
     def widened(self, other: "JointEstimate", moved: float) -> "JointEstimate":
-        """What both say; since the other one's instant the value has changed by ``moved``."""
+        """Return the smallest interval that contains this one and another, shifted by ``moved``.
+
+        The value is determined only if it is determined in both.
+
+        Args:
+            other: the interval at an earlier time.
+            moved: change of the value since then [rad or m].
+        """
         if self.turns_around:
             middle = 0.5 * (self.low + self.high - other.low - other.high) - moved
             moved += 2.0 * math.pi * round(middle / (2.0 * math.pi))
@@ -104,7 +122,13 @@ class JointEstimate:
 def joint_estimates(
     kinematics: TreeKinematics, low: np.ndarray, high: np.ndarray, determined: np.ndarray
 ) -> tuple[JointEstimate, ...]:
-    """What is known of each of a pose tree's values: ends and whether determined (m,)."""
+    """Return a JointEstimate for each of a pose tree's m values.
+
+    Args:
+        kinematics: the tree's kinematics.
+        low, high: (m,) ends of the intervals [rad or m].
+        determined: (m,) bool whether each value is determined.
+    """
     return tuple(
         JointEstimate(name, bool(known), float(least), float(most), bool(around))
         for name, known, least, most, around in zip(
@@ -114,7 +138,10 @@ def joint_estimates(
 
 
 def following_joints(tree: PoseTree, joints: Sequence[JointEstimate]) -> tuple[JointEstimate, ...]:
-    """What is known of the positions that follow a pose tree's values, of which joints tell."""
+    """Return the estimates of mimic joints, computed from those of the joints they follow.
+
+    ``joints``: estimates of the pose tree's values.
+    """
     known, names = {joint.name: joint for joint in joints}, tree.model.position_names
     found = []
     for follower, leader, multiplier, offset in tree.followers:
@@ -126,14 +153,15 @@ def following_joints(tree: PoseTree, joints: Sequence[JointEstimate]) -> tuple[J
 
 @dataclass(frozen=True)
 class PoseMode:
-    """Poses that differ by small steps, with one that stands for all.
+    """One mode of the solution: a connected set of poses, and a representative.
 
     Args:
         q: (nq,) the representative's positions in the plant's order [rad, m].
         X_WB: (4, 4) pose of the plant's world frame B in the world W.
-        J: its objective (1) [pixel].
-        joints: each value of the pose tree, node after node, as far as this mode goes.
-        size: how many poses were found in it.
+        node_values: for each node (k_i,) the representative's values in the pose tree [rad or m].
+        J: the representative's objective, equation (1) [pixel].
+        joints: the mode's interval of each value of the pose tree, in the order of the nodes.
+        size: number of poses found in the mode.
     """
 
     q: np.ndarray
@@ -152,21 +180,21 @@ class PoseMode:
         joints: tuple[JointEstimate, ...],
         size: float = 1.0,
     ) -> "PoseMode":
-        """The mode of a pose tree's values, (k_i,) of each node."""
+        """Make a mode from its representative's values in the pose tree, (k_i,) for each node."""
         return cls(*tree.positions_from(node_values), tuple(node_values), J, joints, size)
 
 
 @dataclass(frozen=True)
 class PoseSet:
-    """All poses found that are as good as the best within the noise.
+    """All poses found whose objective exceeds the best one by no more than the noise.
 
     Args:
-        modes: best first; of equals the larger one first.
-        joints: each value of the pose tree, node after node, over all modes.
-        tolerance: the greatest excess over the best pose's J, or cost of the edges [pixel].
-        complete: whether no pose within the tolerance was left out (on the grid, for a search on
-            a grid).
-        mode_count: how many modes there are; ``modes`` may hold only the first of them.
+        modes: modes, sorted by objective; of equal ones the larger first.
+        joints: interval of each value of the pose tree over all modes, in the order of the nodes.
+        tolerance: greatest excess over the best pose's objective J, or over its edge cost [pixel].
+        complete: whether every pose within the tolerance (of the grid, for a search on a grid) is
+            in the set.
+        mode_count: number of modes; ``modes`` may hold only the first of them.
     """
 
     modes: tuple[PoseMode, ...]
@@ -177,11 +205,14 @@ class PoseSet:
 
     @property
     def determined(self) -> tuple[bool, ...]:
-        """For each value of the pose tree whether it is determined."""
+        """Whether each value of the pose tree is determined."""
         return tuple(joint.determined for joint in self.joints)
 
     def position_intervals(self, tree: PoseTree) -> np.ndarray:
-        """``determined``, ``low`` and ``high``, (3, nq), of positions; NaN: not in the tree."""
+        """Return (3, nq) ``determined``, ``low`` and ``high`` of the plant's positions.
+
+        Columns of positions that are not in the tree are NaN. Mimic joints are included.
+        """
         joints = (*self.joints, *following_joints(tree, self.joints))
         known = {joint.name: (joint.determined, joint.low, joint.high) for joint in joints}
         names = tree.model.position_names
@@ -190,31 +221,34 @@ class PoseSet:
 
 @dataclass(frozen=True)
 class PoseEstimate:
-    """The pose that a search or a tracker found.
+    """The pose found by a search or a tracker. Equation numbers are those of Kameda's paper.
 
     Args:
-        found: False if there is no pose (q is NaN then), or none that can be relied on.
-        q: (nq,), the positions in the plant's order [rad, m].
-        X_WB: (4, 4), pose of the plant's world frame B in the scene's world W; the identity
+        found: False if there is no pose (``q`` is NaN then), or no reliable one.
+        q: (nq,) positions in the plant's order [rad, m].
+        X_WB: (4, 4) pose of the plant's world frame B in the scene's world W; the identity
             unless the plant's own joints cannot place the body.
+        node_values: for each node (k_i,) its values in the pose tree [rad or m].
         J: area of the exclusive or of body and silhouette, summed over the views (1) [pixel].
-        area: the silhouettes' area [pixel].
-        stopped_by: "end" if a search ran to its end, "exact" if J = 0 ended it, or the limit that
-            stopped it; TRACKED for a pose that no search found.
-        root_position: (3,) the root's origin in the world [m] where it was estimated; of a parallel
-            camera's single picture the part along its axis is arbitrary.
-        scale: the ratio of a parallel camera's pixels a metre to those that it was given with;
-            1 where the scale was known.
-        pose_set: all poses found that are as good, and what is known of each joint; None if the
-            search did not ask.
-        lower_bound: no pose of the search's grid has a smaller J than this [pixel].
-        runs: how often a node was placed (step 3 of Kameda's search), or contours were compared.
-        first_J: of the first whole pose, before the re-estimation of section 5.2 [pixel]; None: of
-            the answer.
+        area: total area of the silhouettes [pixel].
+        stopped_by: "end" if the search ran to its end, "exact" if an exact pose ended it, the name
+            of the limit that stopped it, or TRACKED for a tracked pose.
+        seconds: wall time of the search [s].
+        root_position: (3,) the root's origin in the world [m], if it was estimated. Of a single
+            parallel view the component along the camera's axis is arbitrary.
+        scale: ratio of a parallel camera's estimated to its given ``pixels_per_metre``; 1 where the
+            scale was known.
+        pose_set: all poses found that are as good, with the intervals of joints; None if these
+            were not computed.
+        lower_bound: lower bound of J over the search's grid [pixel].
+        budget_spent: whether a limit on poses, time or memory ended the proof of optimality, or
+            the search for poses as good, before it was complete.
+        runs: number of times a node was placed (step 3 of Kameda's search), or of comparisons of
+            contours.
+        first_J: J of the first whole pose, before the re-estimation of section 5.2 [pixel]; None
+            if that pose is the answer.
         outside_limit: the paper's threshold r in each view [pixel].
-        interval_seconds: wall time of the intervals alone, which is part of ``seconds``.
-        budget_spent: whether a limit on poses, time or memory ended the proof, or the search for
-            poses as good, before all was settled.
+        interval_seconds: part of ``seconds`` in which intervals were computed [s].
     """
 
     found: bool
@@ -239,42 +273,50 @@ class PoseEstimate:
     def of_values(
         cls, tree: PoseTree, node_values: Sequence[np.ndarray], J: float, area: float, **more: Any
     ) -> "PoseEstimate":
-        """The estimate with a pose tree's values, (k_i,) of each node; ``more``: other fields."""
+        """Make the estimate of a pose tree's values, (k_i,) for each node; ``more``: other fields.
+
+        ``J`` and ``area`` in pixels.
+        """
         q, X_WB = tree.positions_from(node_values)
         return cls(True, q, X_WB, tuple(node_values), J, area, **more)
 
     @classmethod
     def nothing(cls, tree: PoseTree, **more: Any) -> "PoseEstimate":
-        """The answer where no pose was found; ``more``: other fields."""
+        """Make the estimate that reports that no pose was found; ``more``: other fields."""
         missing = np.full(len(tree.model.position_names), np.nan)
         return cls(False, missing, np.eye(4), (), math.nan, math.nan, **more)
 
     @property
     def E_total(self) -> float:
-        """J over the silhouettes' area (9)."""
+        """J divided by the silhouettes' area (9)."""
         return self.J / self.area
 
     @property
     def first_E_total(self) -> float:
-        """E_total of the first whole pose, before any re-estimation; E_total where it is that."""
+        """E_total of the first whole pose, before any re-estimation."""
         return (self.J if self.first_J is None else self.first_J) / self.area
 
     @property
     def explained(self) -> bool:
-        """Whether the pose explains the silhouettes at least roughly (UNEXPLAINED)."""
+        """Whether E_total is below UNEXPLAINED: the pose explains the silhouettes roughly."""
         return bool(self.found and self.E_total < UNEXPLAINED)
 
     @property
     def proved_optimal(self) -> bool:
-        """Whether it is proved that no pose of the search's grid has a smaller J."""
+        """Whether no pose of the search's grid has a smaller J, by the lower bound."""
         return bool(self.found and self.lower_bound >= self.J)
 
-    def widened(self, begun: "PoseEstimate | None") -> "PoseEstimate":
-        """A tracked pose whose joints are as open as the modes that its track began with."""
-        before = None if begun is None else begun.pose_set
-        if begun is None or before is None or self.pose_set is None or before.mode_count < 2:
+    def widened(self, first: "PoseEstimate | None") -> "PoseEstimate":
+        """Return this tracked pose with joint intervals that include all modes of the first pose.
+
+        A joint that was ambiguous where the track began stays ambiguous: each interval is united
+        with that of ``first``, shifted by the change of the value since. If ``first`` is None or
+        has fewer than two modes, this estimate is returned unchanged.
+        """
+        before = None if first is None else first.pose_set
+        if first is None or before is None or self.pose_set is None or before.mode_count < 2:
             return self
-        values = np.concatenate(self.node_values) - np.concatenate(begun.node_values)
+        values = np.concatenate(self.node_values) - np.concatenate(first.node_values)
         joints = tuple(
             now.widened(then, float(moved))
             for now, then, moved in zip(self.pose_set.joints, before.joints, values, strict=True)
@@ -283,12 +325,15 @@ class PoseEstimate:
         return replace(self, pose_set=known)
 
     def turned(self, tree: PoseTree, turns: Sequence[np.ndarray]) -> "PoseEstimate":
-        """The same pose with full turns (k_i,) [rad] added to each node's values."""
+        """Return the same pose with full turns added to its angles and their intervals.
+
+        ``turns``: for each node (k_i,) multiples of 2 pi, or 0 for lengths [rad].
+        """
 
         def pose(one: PoseMode | PoseEstimate) -> dict[str, Any]:
             q = np.array(one.q)
             for node, added in zip(tree.nodes, turns, strict=True):
-                # The values of a root that is turned by a RootRotation are no positions.
+                # A root turned by a RootRotation has values, but no positions.
                 if node.positions:
                     q[list(node.positions)] += added
             values = tuple(np.add(*both) for both in zip(one.node_values, turns, strict=True))

@@ -55,7 +55,7 @@ class ExactSearch:
             if left <= 0.0:
                 return None
             views = problem.views
-            starts = grid.best_poses(views, root_position, own.starts, own.alike, left)
+            starts = grid.best_poses(views, root_position, own.starts, own.overlap, left)
             poses = [self.body.parameters(start, root_position) for start in starts]
             found = self._descend(problem, poses, deadline)
             if found is None:
@@ -63,7 +63,7 @@ class ExactSearch:
             pair = [*([reached] if reached else []), found]
             reached, worse = min(pair, key=lambda one: one.J), max(one.J for one in pair)
             enough = own.exact * length
-            if reached.J <= enough or (len(pair) > 1 and worse <= own.agreeing * reached.J):
+            if reached.J <= enough or (len(pair) > 1 and worse <= own.agreement * reached.J):
                 break
         if reached is None:
             return None
@@ -79,7 +79,7 @@ class ExactSearch:
         start = min((parameters for parameters, _, _ in coarse), key=problem.J)
         first_J = float(problem.J(start))
         size = float(np.sqrt(problem.area / len(problem.views)))
-        hopeless = max(self._settings.hopeless, self._settings.hopeless_share * size)
+        hopeless = max(self._settings.hopeless, self._settings.hopeless_fraction * size)
         if first_J > hopeless * length:
             return None
         reached = self.escape(problem, start, deadline)
@@ -91,7 +91,7 @@ class ExactSearch:
         """The pose reached from parameters (m + 4,), parts placed anew where that is better."""
         fine, _, steps = descend(problem, start, self.body.freedom(), PASSES.fine)
         about = NeighbourhoodSearch(problem, self._parts)
-        enough = self._settings.enough * problem.border_length
+        enough = self._settings.good * problem.border_length
         parameters, J = about.improve(fine, enough, deadline)
         return ExactPose(parameters, J, float(problem.J(start)), steps, about)
 
@@ -112,7 +112,7 @@ class ExactSearch:
     ) -> tuple[ExactPose, PoseSet]:
         """The best pose, and all that are as good, of a tree with its root where it is."""
         own, others = self._settings, []
-        for _ in range(own.better):
+        for _ in range(own.replacements):
             limit = reached.J + own.tolerance * problem.border_length
             others = reached.about.others(reached.parameters, limit, own.same)
             if not others or problem.J(others[0]) >= reached.J:

@@ -236,7 +236,7 @@ class _MultiStartRun:
         """The coarse search's poses, refined but not to the end, best first."""
         own = self._settings
         self._coarse = CoarseSearch(self._body, self._clean.views, None if self._proceed() else 1)
-        starts = self._coarse.choose_distinct(self._coarse.find(), own.starts, own.apart)
+        starts = self._coarse.choose_distinct(self._coarse.find(), own.starts, own.separation)
         return refine_best(self._fit, self._values(starts), self._passes, self._proceed)
 
     def _looks_exact(self, values: np.ndarray) -> bool:
@@ -283,14 +283,14 @@ class _MultiStartRun:
         own = self._settings
         for _ in range(rounds):
             found = []
-            for pose in pool[: own.sought_about]:
+            for pose in pool[: own.explored]:
                 if any(pose.values is values for values in self._done) or not self._proceed():
                     continue
                 self._done.append(pose.values)
                 others = self._others(pose.values)
                 found += others
                 least = min((one.cost for one in others), default=math.inf)
-                if self._several and least > own.better * pool[0].cost:
+                if self._several and least > own.improvement * pool[0].cost:
                     break
             pool = distinct([*pool, *found], self._survivors, self._kinematics.turns_around)
         return pool
@@ -308,7 +308,7 @@ class _MultiStartRun:
         not; in a single one other parts may hide either. What masks lack, or have besides, is not
         mended by another start: then there is none.
         """
-        share = self._settings.limbs[self._several]
+        share = self._settings.limb_radii[self._several]
         radius, thick, wrongs = max(1.0, share * self._fit.size), np.zeros(2, dtype=np.int64), []
         views = self._clean.views
         for wrong, view in zip(self._clean.wrong(self._parameters(values)), views, strict=True):
@@ -338,19 +338,21 @@ class _MultiStartRun:
 
         def search_again(nodes: tuple[int, ...]) -> list[np.ndarray]:
             again = self._coarse.find_again(X_WN, nodes)
-            return self._values(self._coarse.choose_distinct(again, own.tried, own.apart), values)
+            return self._values(
+                self._coarse.choose_distinct(again, own.alternatives, own.separation), values
+            )
 
         limbs = [one for one in below if 2 * len(one) <= len(X_WN)]
         tried += itertools.chain.from_iterable(map_ordered(search_again, limbs))
         look = AnnealingStage(own.medium[0].scale, own.coarse[0].spacing)
         best_looks = []
-        for group, count in ((flipped, own.flipped), (tried, own.tried)):
+        for group, count in ((flipped, own.flipped), (tried, own.alternatives)):
             costs = map_ordered(lambda one: self._fit.cost(one, look), group)
             looks = [FittedPose(*pair) for pair in zip(group, costs, strict=True)]
             best_looks += distinct(looks, count, kinematics.turns_around, 0.5 * own.interval)
         followed = [one.values for one in best_looks]
         if self._several:
-            return refine_best(self._fit, followed, own.following, self._proceed)
+            return refine_best(self._fit, followed, own.alternative_passes, self._proceed)
 
         def follow(one: np.ndarray) -> FittedPose | None:
             return self._fit.refine(one, own.medium) if self._proceed() else None

@@ -1,8 +1,11 @@
-"""Kernels of the searches on the grid: pairs of a partial pose and a pose of the next node.
+"""Kernels of the searches on grids: evaluate pairs of a partial pose and a pose of the next node.
 
-A partial pose is a row of words, the pixels that its nodes cover. Its hash is the sum of half-word
-values times random numbers, modulo 2^64: because new pixels only add to it, the hash of a pair
-costs a look at the new pixels alone, and equal masks have equal hashes however they came about.
+The pixels covered by a partial pose are a bit mask, (W,) uint64. Its hash is
+
+    h = sum_i (low half of word i) k_2i + (high half of word i) k_2i+1   modulo 2^64
+
+with random odd keys k. New pixels only add to h, so the hash of a pair needs the new pixels alone,
+and equal masks have equal hashes.
 """
 
 from typing import Any, NamedTuple
@@ -19,7 +22,7 @@ _MIX = np.uint64(0x9E3779B97F4A7C15)
 
 
 def _count_bits(typing_context: Any, word: types.Type) -> Any:
-    """The number of ones of a uint64: one instruction of the processor."""
+    """Return the number of ones of a uint64, by one processor instruction."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         return builder.ctpop(arguments[0])
@@ -30,11 +33,14 @@ def _count_bits(typing_context: Any, word: types.Type) -> Any:
 count_bits: Any = intrinsic(_count_bits)
 
 
-class Reaches(NamedTuple):
-    """What the nodes that are still to come can cover at most.
+class ReachablePixels(NamedTuple):
+    """Pixels of the silhouettes that nodes still to be placed can cover at most.
 
-    runs: (r, V, 3) int64 and words: (n,) uint64 pixels of the silhouettes in their reach; rows:
-    (m, p) int64 the row of runs, for each node to come whose parent is placed and each pair.
+    Attributes:
+        runs: (r, V, 3) int64 as in ``score_pairs``, for V views.
+        words: (n,) uint64 as in ``score_pairs``.
+        rows: (m, p) int64 the row of ``runs`` for each of m nodes that can be placed next, and each
+            of p pairs.
     """
 
     runs: np.ndarray
@@ -43,13 +49,13 @@ class Reaches(NamedTuple):
 
 
 def random_keys(count: int) -> np.ndarray:
-    """(count,) uint64 odd numbers for hashes; always the same, so that answers are."""
+    """Return (count,) uint64 odd keys for hashes; the seed is fixed, so results are repeatable."""
     generator = np.random.default_rng(2718)
     return generator.integers(0, 2**64, count, dtype=np.uint64) | np.uint64(1)
 
 
 def hash_mask(mask: np.ndarray, keys: np.ndarray) -> np.uint64:
-    """The hash of a mask (W,), with keys (2 W,)."""
+    """Return the hash of a bit mask (W,) uint64 with keys (2 W,)."""
     halves = np.column_stack([mask & _LOW_HALF, mask >> _HALF]).ravel()
     return np.uint64((halves * keys).sum(dtype=np.uint64))
 
@@ -63,18 +69,20 @@ def score_pairs(
     silhouettes: int,
     keys: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """What poses of the next node would add to partial poses.
+    """Return the areas that poses of the next node add to partial poses.
 
     Args:
-        masks: (B, W) uint64 what these cover.
-        pairs: (p, 2) int32 partial pose and pose.
-        runs: (n, K, 3) int64 of each pose, for each part of a mask, the first word, the number
-            of words and where they begin in words (m,) uint64.
-        silhouettes: how many parts come first that are silhouettes; the others are bands.
-        keys: (2 W,) uint64 of the hashes.
+        masks: (B, W) uint64 bit masks of the partial poses.
+        pairs: (p, 2) int32 indices of partial pose and pose of the next node.
+        runs: (n, K, 3) int64 for each of n poses and each of the K parts of a mask: the first word
+            in the mask, the number of words, and the index of the first in ``words``.
+        words: (m,) uint64 the pixels of all poses.
+        silhouettes: number of parts that are silhouettes, which come first; the others are bands.
+        keys: (2 W,) uint64 keys of the hashes.
 
     Returns:
-        (p, 2) int64 silhouette and band newly covered [pixel]; (p,) uint64 what hashes gain.
+        (p, 2) int64 newly covered area of silhouettes and of bands [pixel], and (p,) uint64 the
+        increase of the hash.
     """
     areas = np.zeros((pairs.shape[0], 2), dtype=np.int64)
     codes = np.zeros(pairs.shape[0], dtype=np.uint64)
@@ -101,86 +109,90 @@ def choose_pairs(
     pairs: np.ndarray,
     runs: np.ndarray,
     words: np.ndarray,
-    everything: np.ndarray,
-    reaches: Reaches,
+    all_pixels: np.ndarray,
+    reachable: ReachablePixels,
     width: int,
-    codes: np.ndarray,
-    openings: np.ndarray,
+    state_hashes: np.ndarray,
+    frontier_hashes: np.ndarray,
     outside: np.ndarray,
     limit: float,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The first pairs that are not equal, and what no later node can cover after each.
+    """Choose the first distinct pairs, and compute the area that no later node can cover.
 
     Args:
-        masks, pairs, runs, words: as in score_pairs.
-        everything: (w,) uint64 all pixels of the silhouettes.
-        reaches: of the nodes to come.
-        width: the greatest number that is chosen.
-        codes: (p,) uint64 the same where pairs are equal in what matters later.
-        openings: (p,) uint64 equal where the nodes with children to come stand alike; then only
-            pairs within the limit are chosen, and of those alike none that covers a part of what
-            another before it covers, which has no more outside. Or (0,): all are chosen.
-        outside: (p,) int64 the area outside [pixel].
-        limit: of what is outside and what no later node can cover together [pixel].
+        masks, pairs, runs, words: as in ``score_pairs``.
+        all_pixels: (w,) uint64 all pixels of the silhouettes.
+        reachable: the pixels that the nodes still to be placed can cover.
+        width: greatest number of pairs that are chosen.
+        state_hashes: (p,) uint64 hashes, equal for pairs after which the search goes on alike.
+        frontier_hashes: (p,) uint64 hashes of the poses of nodes with children still to be placed.
+            If it is not empty, pairs beyond the limit are dropped, and so are dominated ones: those
+            whose frontier hash equals that of an earlier pair that covers a superset of the
+            silhouette and has no more area outside. (0,): neither is dropped.
+        outside: (p,) int64 area outside the silhouettes [pixel].
+        limit: greatest sum of the area outside and the unreachable area [pixel].
 
     Returns:
-        (n,) int64 the pairs chosen; (n,) int64 pixels of the silhouettes that each leaves; and of
-        each pair that was looked at the place among those chosen, -1 for none.
+        (n,) int64 the chosen pairs; (n,) int64 the silhouette area that is unreachable after each
+        [pixel]; and for each examined pair its index among the chosen ones, -1 if it was dropped.
     """
     made = min(width, pairs.shape[0])
-    chosen, left = np.empty(made, dtype=np.int64), np.empty(made, dtype=np.int64)
-    exact = openings.shape[0] > 0
-    covered = np.empty((made if exact else 1, masks.shape[1]), dtype=np.uint64)
-    rest = np.empty_like(everything)
+    chosen, unreachable = np.empty(made, dtype=np.int64), np.empty(made, dtype=np.int64)
+    prunes = frontier_hashes.shape[0] > 0
+    covered = np.empty((made if prunes else 1, masks.shape[1]), dtype=np.uint64)
+    rest = np.empty_like(all_pixels)
     bits = 4
     while 1 << bits < 2 * pairs.shape[0]:
         bits += 1
     last = (1 << bits) - 1
     slots = np.full(last + 1, -1, dtype=np.int64)
-    numbers = np.empty(pairs.shape[0], dtype=np.int64)
-    count, seen = 0, 0
-    while seen < pairs.shape[0] and count < made:
-        i = seen
-        seen += 1
-        slot = np.int64((codes[i] * _MIX) >> np.uint64(64 - bits))
-        while slots[slot] >= 0 and codes[slots[slot]] != codes[i]:
+    places = np.empty(pairs.shape[0], dtype=np.int64)
+    count, examined = 0, 0
+    while examined < pairs.shape[0] and count < made:
+        i = examined
+        examined += 1
+        slot = np.int64((state_hashes[i] * _MIX) >> np.uint64(64 - bits))
+        while slots[slot] >= 0 and state_hashes[slots[slot]] != state_hashes[i]:
             slot = (slot + 1) & last
         if slots[slot] >= 0:
-            numbers[i] = numbers[slots[slot]]
+            places[i] = places[slots[slot]]
             continue
         slots[slot] = i
-        numbers[i] = -1
+        places[i] = -1
         h, c = pairs[i, 0], pairs[i, 1]
-        own = covered[count if exact else 0]
+        own = covered[count if prunes else 0]
         copy_into(own, masks[h])
         for part in range(runs.shape[1]):
             begin, place = runs[c, part, 0], runs[c, part, 2]
             for k in range(runs[c, part, 1]):
                 own[begin + k] |= words[place + k]
-        for k in range(everything.shape[0]):
-            rest[k] = everything[k] & ~own[k]
-        for m in range(reaches.rows.shape[0]):
-            row = reaches.rows[m, i]
-            for part in range(reaches.runs.shape[1]):
-                begin, place = reaches.runs[row, part, 0], reaches.runs[row, part, 2]
-                for k in range(reaches.runs[row, part, 1]):
-                    rest[begin + k] &= ~reaches.words[place + k]
-        lost = np.uint64(0)
-        for k in range(everything.shape[0]):
-            lost += count_bits(rest[k])
-        useless = exact and outside[i] + np.int64(lost) > limit
-        for other in range(count if exact else 0):
-            if useless:
+        for k in range(all_pixels.shape[0]):
+            rest[k] = all_pixels[k] & ~own[k]
+        for m in range(reachable.rows.shape[0]):
+            row = reachable.rows[m, i]
+            for part in range(reachable.runs.shape[1]):
+                begin, place = reachable.runs[row, part, 0], reachable.runs[row, part, 2]
+                for k in range(reachable.runs[row, part, 1]):
+                    rest[begin + k] &= ~reachable.words[place + k]
+        unreached = np.uint64(0)
+        for k in range(all_pixels.shape[0]):
+            unreached += count_bits(rest[k])
+        dropped = prunes and outside[i] + np.int64(unreached) > limit
+        for other in range(count if prunes else 0):
+            if dropped:
                 break
-            if openings[chosen[other]] == openings[i] and outside[chosen[other]] <= outside[i]:
+            if (
+                frontier_hashes[chosen[other]] == frontier_hashes[i]
+                and outside[chosen[other]] <= outside[i]
+            ):
                 k = 0
-                while k < everything.shape[0] and own[k] & ~covered[other, k] == np.uint64(0):
+                while k < all_pixels.shape[0] and own[k] & ~covered[other, k] == np.uint64(0):
                     k += 1
-                useless = k == everything.shape[0]
-        if not useless:
-            chosen[count], left[count], numbers[i] = i, np.int64(lost), count
+                dropped = k == all_pixels.shape[0]
+        if not dropped:
+            chosen[count], unreachable[count], places[i] = i, np.int64(unreached), count
             count += 1
-    return chosen[:count], left[:count], numbers[:seen]
+    return chosen[:count], unreachable[:count], places[:examined]
 
 
 @compiled
@@ -193,13 +205,16 @@ def unite(
     parts: int,
     child_rows: np.ndarray,
 ) -> None:
-    """Add what poses of a node, and its descendants at these, cover to rows of a table.
+    """Add the pixels covered by groups of poses of a node, and by its descendants, to table rows.
 
     Args:
-        table: (r, w) uint64 masks; rows: (n,) int64 those to write.
-        groups: (n, 2) int64 where the poses of each begin and end.
-        runs, words: as in score_pairs; the first ``parts`` of each pose are looked at.
-        child_rows: (children, poses) int64 the row of the table for each child and pose.
+        table: (r, w) uint64 bit masks, changed in place.
+        rows: (n,) int64 the rows that are changed.
+        groups: (n, 2) int64 first pose and end of the group of each row.
+        runs, words: as in ``score_pairs``.
+        parts: number of parts of a mask that are used, from the first.
+        child_rows: (children, poses) int64 the row of the table with the pixels of each child and
+            its descendants, for each pose of the node.
     """
     for g in range(groups.shape[0]):
         union = table[rows[g]]
@@ -215,11 +230,14 @@ def unite(
 
 
 NO_CHILDREN = np.zeros((0, 0), dtype=np.int64)
-"""The ``child_rows`` of who asks for the poses alone."""
+"""``child_rows`` if only the node's own pixels are wanted."""
 
 
 def unite_poses(masks: np.ndarray, poses: np.ndarray, runs: np.ndarray, words: np.ndarray) -> None:
-    """Add the pixels of one pose (n,) each to masks (n, W), in place."""
+    """Add the pixels of one pose to each mask, in place.
+
+    ``masks``: (n, W) uint64, ``poses``: (n,), ``runs`` and ``words`` as in ``score_pairs``.
+    """
     groups = np.column_stack([poses, poses + 1]).astype(np.int64)
     unite(masks, np.arange(len(masks)), groups, runs, words, runs.shape[1], NO_CHILDREN)
 
@@ -235,13 +253,14 @@ def prune_pairs(
     child_rows: np.ndarray,
     table: np.ndarray,
 ) -> np.ndarray:
-    """Which pairs (p,) bool of a partial pose and a pose can still cover enough.
+    """Return which pairs leave few enough pixels uncovered, (p,) bool.
 
     Args:
-        uncovered: (B, w) uint64 what no other node can cover, for each partial pose.
-        room: (B,) int64 this many pixels of it may stay uncovered.
-        pairs, runs, words, silhouettes: as in score_pairs.
-        child_rows, table: as in unite.
+        uncovered: (B, w) uint64 pixels of the silhouettes that no other node can cover, for each
+            partial pose.
+        room: (B,) int64 greatest number of these that may stay uncovered.
+        pairs, runs, words, silhouettes: as in ``score_pairs``.
+        child_rows, table: as in ``unite``.
     """
     good = np.ones(pairs.shape[0], dtype=np.bool_)
     places = np.empty(uncovered.shape[1], dtype=np.int64)

@@ -1,9 +1,9 @@
-"""Partial poses of the searches on a grid, and the one expansion: one more node is placed.
+"""Store the partial poses of the searches on grids, and extend them by one node.
 
-The poses that a node takes in one search are drawn once and shared by all hypotheses. What matters
-of a partial pose for all that is still to come is what it covers, what it leaves outside, and the
-poses of the nodes that have children to come. Partial poses equal in this are one; those are known
-by sums of random numbers modulo 2^64 (``pair_kernel``).
+Each pose of a node is drawn once per search, as a bit mask, and shared by all hypotheses. The
+further course of the search depends only on the pixels that a partial pose covers, its area outside
+the silhouettes, and the poses of the nodes with children still to be placed. Partial poses that are
+equal in these are merged; they are recognised by hashes (``pair_kernel``).
 """
 
 import time
@@ -16,7 +16,7 @@ import numpy as np
 from drake_pose.camera.models import ParallelCamera
 from drake_pose.search.estimates import View
 from drake_pose.search.pair_kernel import (
-    Reaches,
+    ReachablePixels,
     choose_pairs,
     hash_mask,
     random_keys,
@@ -36,13 +36,13 @@ from drake_pose.silhouette.bit_kernel import (
 
 
 class LimitReached(Exception):
-    """Raised to leave a search that has no time or no room left."""
+    """Raised when a search has reached its limit of time, memory or drawn poses."""
 
 
 def coarsen(view: View, pixels: int) -> View:
-    """The view at the whole fraction of its size that shows about this many silhouette pixels.
+    """Return the view reduced by an integer factor to about this silhouette area [pixel].
 
-    A pixel is in the silhouette if at least half of those that it replaces are.
+    A pixel belongs to the silhouette if at least half of the pixels that it replaces do.
     """
     factor, camera = round(float(np.sqrt(view.mask.sum() / pixels))), view.camera
     if factor < 2:
@@ -60,20 +60,25 @@ def coarsen(view: View, pixels: int) -> View:
     return View(replace(camera, width=width, height=height, **coarse), 2 * counts >= factor**2)
 
 
-class Pictures:
-    """The silhouettes of one instant as bits: parts of one long mask, silhouettes before bands.
+class SilhouetteBits:
+    """The silhouettes of one frame, and bands around them, as parts of one bit mask.
+
+    The parts are the silhouettes of all views, and after them their bands, if there are any. In the
+    silhouettes and bands the area of several nodes is that of their union; beyond the bands areas
+    of nodes are added.
 
     Attributes:
-        has_bands: whether pixels outside the silhouettes have bits, too.
+        has_bands: whether there are bands.
         coarse: whether surfaces of many triangles may be simplified.
-        part_starts: (parts + 1,) where each part begins, and the mask's length [word].
-        area: the silhouettes' area [pixel].
-        everything: (w,) uint64 all pixels of the silhouettes.
+        part_starts: (parts + 1,) first word of each part, and the number of words of the mask.
+        area: total area of the silhouettes [pixel].
+        all_pixels: (w,) uint64 bit mask of all pixels of the silhouettes.
 
     Args:
-        band: distance from a silhouette up to which areas outside are a union, not a sum [pixel];
-            0: none.
-        in_full: never simplify a surface, so that areas are those of the definition.
+        body: the sampled body.
+        views: the silhouettes.
+        band: width of the bands [pixel]; 0: no bands.
+        in_full: whether surfaces are never simplified, so that areas are exact.
     """
 
     def __init__(
@@ -88,9 +93,9 @@ class Pictures:
         ]
         pixels = [int(view.inside[-1, -1]) for view in self.bit_views]
         self.area = float(sum(pixels))
-        # In as many words as each part has.
+        # Each silhouette fills its words from the first bit; the remaining bits are zero.
         ones = [np.arange((count // WORD + 1) * WORD) < count for count in pixels]
-        self.everything = np.packbits(np.concatenate(ones), bitorder="little").view(np.uint64)
+        self.all_pixels = np.packbits(np.concatenate(ones), bitorder="little").view(np.uint64)
         if self.has_bands:
             pixels += [int(view.band[-1, -1]) for view in self.bit_views]
         self.part_starts = np.concatenate([[0], np.cumsum([n // WORD + 1 for n in pixels])])
@@ -98,10 +103,18 @@ class Pictures:
     def draw_node(
         self, node: int, samples: np.ndarray, X_WN: np.ndarray, masks: np.ndarray
     ) -> np.ndarray:
-        """Add a node's pictures at samples (n,), poses X_WN (n, 4, 4), to masks (n, W) uint64.
+        """Draw a node at n poses into masks (n, W) uint64, which are changed in place.
+
+        There must be bands.
+
+        Args:
+            node: the node.
+            samples: (n,) its samples.
+            X_WN: (n, 4, 4) its poses at these samples.
+            masks: (n, W) bit masks to which the node's pixels are added.
 
         Returns:
-            (n, 3) int64 areas in the silhouettes, the bands, which there must be, and beyond.
+            (n, 3) int64 the node's area in the silhouettes, in the bands and beyond them [pixel].
         """
         starts, views = self.part_starts, len(self.views)
         total = np.zeros((len(X_WN), 3), dtype=np.int64)
@@ -117,14 +130,17 @@ class Pictures:
 
 
 class RowTable:
-    """Rows of numbers (k,) by index, made where they are first asked for."""
+    """A table of integer rows (k,) that are computed when they are first needed."""
 
     def __init__(self, width: int) -> None:
         self.rows = np.zeros((0, width), dtype=np.int64)
         self._made = np.zeros(0, dtype=np.bool_)
 
     def missing(self, indices: np.ndarray) -> np.ndarray:
-        """Of indices those, each once, whose rows are not made; they count as made from now."""
+        """Return the distinct indices, of those given, whose rows are not yet stored.
+
+        The table grows to hold them; their rows must be stored by ``make``.
+        """
         size = int(indices.max(initial=0)) + 1
         if len(self.rows) < size:
             more = np.zeros((size - len(self.rows) + 64, self.rows.shape[1]), dtype=np.int64)
@@ -137,13 +153,17 @@ class RowTable:
         return np.flatnonzero(wanted & ~self._made)
 
     def make(self, indices: np.ndarray, rows: np.ndarray) -> None:
-        """Take in rows (n, k)."""
+        """Store rows (n, k) at indices (n,)."""
         self.rows[indices], self._made[indices] = rows, True
 
 
 @dataclass
 class _Poses:
-    """Poses of one node: arrays that grow by whole groups."""
+    """Drawn poses of one node, in groups with the same pose of the parent.
+
+    ``samples``: (n,) int32; ``X_WN``: (n, 4, 4); ``areas``: (n, 3) int32 area in the silhouettes,
+    in the bands and beyond [pixel]; ``runs``, ``words``: as in ``score_pairs``.
+    """
 
     samples: np.ndarray
     X_WN: np.ndarray
@@ -154,16 +174,16 @@ class _Poses:
 
 @dataclass(frozen=True)
 class PartialPoses:
-    """Poses of the same nodes.
+    """B partial poses in which the same nodes are placed.
 
     Attributes:
-        masks: (B, W) uint64 the pixels covered.
-        poses: (B, nodes) int32 the pose of each node in the PoseStore; -1: not placed.
-        hashes: (B,) uint64 of the masks.
-        covered: (B,) int64 the silhouettes' area covered [pixel].
-        outside: (B,) int64 the area outside [pixel]; beyond the bands a sum over the nodes.
-        far: (B, 2) int64 the greatest and the summed area of a node beyond the bands [pixel].
-        lost: (B,) int64 the silhouettes' area that no later node can reach [pixel].
+        masks: (B, W) uint64 bit masks of the covered pixels.
+        poses: (B, nodes) int32 index of each node's pose in the PoseStore; -1: not placed.
+        hashes: (B,) uint64 hashes of the masks.
+        covered: (B,) int64 covered area of the silhouettes [pixel].
+        outside: (B,) int64 area outside the silhouettes, beyond the bands a sum over nodes [pixel].
+        beyond: (B, 2) int64 greatest and summed area of the nodes beyond the bands [pixel].
+        unreachable: (B,) int64 area of the silhouettes that no later node can cover [pixel].
     """
 
     masks: np.ndarray
@@ -171,56 +191,69 @@ class PartialPoses:
     hashes: np.ndarray
     covered: np.ndarray
     outside: np.ndarray
-    far: np.ndarray
-    lost: np.ndarray
+    beyond: np.ndarray
+    unreachable: np.ndarray
 
     def __len__(self) -> int:
         return len(self.poses)
 
     def chosen(self, kept: np.ndarray) -> "PartialPoses":
-        """Some of them, by their indices or by (B,) bool."""
+        """Return a subset, by indices or (B,) bool."""
         return PartialPoses(*[array[kept] for array in vars(self).values()])
 
     @property
     def least_outside(self) -> np.ndarray:
-        """(B,) int64 no completion leaves a smaller area outside [pixel]."""
-        return np.asarray(self.outside - self.far[:, 1] + self.far[:, 0])
+        """(B,) int64 lower bound of the area outside of all completions [pixel]."""
+        return np.asarray(self.outside - self.beyond[:, 1] + self.beyond[:, 0])
 
     @property
     def bounds(self) -> np.ndarray:
-        """(B,) int64 no completion has a smaller objective [pixel]."""
-        return np.asarray(self.least_outside + self.lost)
+        """(B,) int64 lower bound of the objective of all completions [pixel]."""
+        return np.asarray(self.least_outside + self.unreachable)
 
     def costs(self, outside_weight: int) -> np.ndarray:
-        """(B,) int64 to rank by: what is covered already counts one a pixel."""
-        return np.asarray(outside_weight * (self.outside + self.lost) - self.covered)
+        """Return (B,) int64 the costs by which partial poses are ranked [pixel].
+
+        ``outside_weight``: cost of a pixel outside or unreachable; a covered pixel gains one.
+        """
+        return np.asarray(outside_weight * (self.outside + self.unreachable) - self.covered)
 
 
 class PoseStore:
-    """All poses of nodes whose area outside is within a limit, and what they make together.
+    """The poses of nodes whose area outside is within a limit, drawn when first needed.
 
-    The one expansion of all searches: it places nodes in partial poses.
+    A pose of a node is given by its index in the store. The methods ``pairs``, ``score``, ``make``,
+    ``choose`` and ``with_masks``, in this order, place one node in partial poses.
+
+    Attributes:
+        nodes: for each node its drawn poses.
+        reach_runs, reach_words: reachable pixels, as in ``ReachablePixels``.
+        words: number of words W of a bit mask.
 
     Args:
-        outside_share: of a node's mean projected area.
-        outside_limit: instead of a share of it, this area [pixel].
-        limits: on what is drawn; methods raise LimitReached where one is reached. None: none.
+        body: the sampled body.
+        bits: the silhouettes.
+        outside_fraction: greatest area outside of a node, all views together, as a fraction of its
+            mean projected area.
+        outside_limit: greatest area outside of a node [pixel]; it replaces the fraction.
+        limits: limits of time, memory and drawn poses; None: no limits. The methods that draw raise
+            LimitReached when one is reached.
     """
 
     def __init__(
         self,
         body: SampledBody,
-        pictures: Pictures,
-        outside_share: float = np.inf,
+        bits: SilhouetteBits,
+        outside_fraction: float = np.inf,
         outside_limit: float | None = None,
         limits: BoundLimits | None = None,
     ) -> None:
-        self.body, self.pictures, self.limits = body, pictures, limits
+        self.body, self.bits, self.limits = body, bits, limits
         self.tree_nodes = body.sampled.tree.nodes
         self.deadline = np.inf if limits is None else limits.deadline
-        self._outside_share, self._outside_limit = outside_share, outside_limit
+        self._outside_fraction, self._outside_limit = outside_fraction, outside_limit
         self._reserved = 0
-        parts = len(pictures.part_starts) - 1
+        parts = len(bits.part_starts) - 1
         self.nodes = [
             _Poses(
                 np.empty(0, dtype=np.int32),
@@ -231,19 +264,24 @@ class PoseStore:
             )
             for _ in self.tree_nodes
         ]
-        # For each node and pose of its parent: where its poses begin and end; and what it reaches.
+        # For each node and pose of its parent: first and end of the node's poses; and the row of
+        # ``reach_runs`` with the pixels that the node and its descendants can reach.
         self._groups = [RowTable(2) for _ in self.nodes]
         self._reach_rows = [RowTable(1) for _ in self.nodes]
-        self.reach_runs = np.empty((0, len(pictures.views), 3), dtype=np.int64)
+        self.reach_runs = np.empty((0, len(bits.views), 3), dtype=np.int64)
         self.reach_words = np.empty(0, dtype=np.uint64)
-        self.words = int(pictures.part_starts[-1])
+        self.words = int(bits.part_starts[-1])
         keys = random_keys(2 * self.words + len(self.nodes) + 2)
         self._mask_keys = keys[: 2 * self.words]
         self._node_keys = keys[2 * self.words : -2]
-        self._far_keys = keys[-2:]
+        self._beyond_keys = keys[-2:]
 
     def reserve(self, size: int = 0) -> None:
-        """Notes memory [byte]; raises LimitReached where it is too much, or the time is over."""
+        """Add to the memory in use [byte], and check the limits.
+
+        Raises:
+            LimitReached: if memory, time or the number of drawn poses exceeds its limit.
+        """
         self._reserved += size
         if self.limits is None:
             return
@@ -254,45 +292,46 @@ class PoseStore:
         if late or used > self.limits.memory or drawn > self.limits.poses:
             raise LimitReached
 
-    def _in_turn(self, missing: np.ndarray, together: int) -> Iterator[np.ndarray]:
-        """Poses (n,) of a parent, ``together`` at a time, within the limits."""
-        for begin in range(0, len(missing), together):
+    def _batches(self, missing: np.ndarray, batch: int) -> Iterator[np.ndarray]:
+        """Yield poses (n,) of a parent in batches, and check the limits before each."""
+        for begin in range(0, len(missing), batch):
             self.reserve()
-            yield missing[begin : begin + together]
+            yield missing[begin : begin + batch]
 
-    def pose_groups(self, node: int, parents: np.ndarray, together: int = 100_000) -> np.ndarray:
-        """Where the node's poses, drawn where missing, begin and end (n, 2) by parent (n,).
+    def pose_groups(self, node: int, parents: np.ndarray, batch: int = 100_000) -> np.ndarray:
+        """Return (n, 2) first index and end of the node's poses, for poses (n,) of its parent.
 
-        ``together``: the number tried before the limits are looked at again.
+        Missing ones are drawn. ``batch``: number of poses tried between checks of the limits.
         """
         known = self._groups[node]
-        together = max(1, together // len(self.body.sampled.X_PN[node]))
-        for missing in self._in_turn(known.missing(parents), together):
+        batch = max(1, batch // len(self.body.sampled.X_PN[node]))
+        for missing in self._batches(known.missing(parents), batch):
             counts = self._draw(node, missing)
             ends = len(self.nodes[node].samples) - counts.sum() + np.cumsum(counts)
             known.make(missing, np.column_stack([ends - counts, ends]))
         return known.rows[parents]
 
     def samples(self, poses: np.ndarray) -> np.ndarray:
-        """The samples (..., nodes) that the nodes take at poses (..., nodes)."""
+        """Return the samples (..., nodes) of the nodes' poses (..., nodes)."""
         return np.stack(
             [stored.samples[poses[..., i]] for i, stored in enumerate(self.nodes)], axis=-1
         )
 
-    def reach_rows(self, node: int, parents: np.ndarray, together: int = 20_000) -> np.ndarray:
-        """For poses (n,) of the node's parent the rows of ``reach_runs`` of what it can reach.
+    def reach_rows(self, node: int, parents: np.ndarray, batch: int = 20_000) -> np.ndarray:
+        """Return (n,) rows of ``reach_runs`` of a node, for poses (n,) of its parent.
 
-        ``together``: the number drawn before the limits are looked at again.
+        A row has the pixels in the projection of a ball that contains the node and its descendants
+        at all samples. ``batch``: number of balls drawn between checks of the limits.
         """
-        known, views = self._reach_rows[node], self.pictures.bit_views
+        known, views = self._reach_rows[node], self.bits.bit_views
         ball = self.body.reach_balls[node]
-        for missing in self._in_turn(known.missing(parents), together):
+        for missing in self._batches(known.missing(parents), batch):
             runs = np.empty((len(missing), len(views), 3), dtype=np.int64)
             used, pieces = len(self.reach_words), [self.reach_words]
             X_WP = self._parent_poses(node, missing)
             for index, view in enumerate(views):
                 view_runs, words = draw_discs(view, X_WP, ball[:3], ball[3])
-                runs[:, index] = view_runs + np.array([self.pictures.part_starts[index], 0, used])
+                runs[:, index] = view_runs + np.array([self.bits.part_starts[index], 0, used])
                 used += len(words)
                 pieces.append(words)
             known.make(missing, len(self.reach_runs) + np.arange(len(missing))[:, None])
@@ -301,19 +340,19 @@ class PoseStore:
         return known.rows[parents, 0]
 
     def parents(self, poses: np.ndarray, node: int) -> np.ndarray:
-        """The poses (B,) of a node's parent among poses (B, nodes); 0 for a root."""
+        """Return (B,) the poses of a node's parent, from poses (B, nodes); 0 for a root."""
         parent = self.tree_nodes[node].parent
         if parent < 0:
             return np.zeros(len(poses), dtype=np.int32)
         return np.asarray(poses[:, parent])
 
     def _parent_poses(self, node: int, parents: np.ndarray) -> np.ndarray:
-        """X_WP (n, 4, 4) of poses (n,) of the node's parent."""
+        """Return X_WP (n, 4, 4) of poses (n,) of the node's parent."""
         parent = self.tree_nodes[node].parent
         return np.eye(4)[None] if parent < 0 else self.nodes[parent].X_WN[parents]
 
     def _draw(self, node: int, parents: np.ndarray) -> np.ndarray:
-        """Draw the node for poses of its parent; returns how many poses each adds."""
+        """Draw the node for poses (n,) of its parent; return (n,) the number of poses of each."""
         X_WP = self._parent_poses(node, parents)
         X_PN = self.body.sampled.X_PN[node]
         pairs = np.empty((len(X_WP) * len(X_PN), 2), dtype=np.int32)
@@ -322,11 +361,11 @@ class PoseStore:
         if self.body.sampled.tree.source(node) != node:
             taken = self.nodes[self.tree_nodes[node].parent].samples[parents]
             pairs = pairs[pairs[:, 1] == taken[pairs[:, 0]]]
-        views = self.pictures.bit_views
-        # The area that may lie outside the silhouettes in all views together [pixel].
-        limit = self._outside_share if self._outside_limit is None else self._outside_limit
+        views = self.bits.bit_views
+        # Greatest area outside the silhouettes in all views together [pixel].
+        limit = self._outside_fraction if self._outside_limit is None else self._outside_limit
         if self._outside_limit is None and 0.0 < limit < np.inf:
-            areas = [self.body.mean_area(node, view.camera) for view in self.pictures.views]
+            areas = [self.body.mean_area(node, view.camera) for view in self.bits.views]
             limit *= sum(areas)
         for view in views:
             left = prune_by_balls(
@@ -335,9 +374,7 @@ class PoseStore:
             pairs = pairs[left]
         drawn: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
         for index, view in enumerate(views):
-            celled = self.body.celled_outline(
-                node, self.pictures.views[index].camera, self.pictures.coarse
-            )
+            celled = self.body.celled_outline(node, self.bits.views[index].camera, self.bits.coarse)
             kept, view_areas, view_runs, words = draw_bits(celled, view, X_WP, X_PN, pairs, limit)
             pairs = pairs[kept]
             drawn = [(a[kept], r[kept], w) for a, r, w in drawn] + [(view_areas, view_runs, words)]
@@ -345,7 +382,7 @@ class PoseStore:
             kept = sum(one[:, 1:].sum(axis=1) for one, _, _ in drawn) <= limit
             pairs = pairs[kept]
             drawn = [(a[kept], r[kept], w) for a, r, w in drawn]
-        poses, starts = self.nodes[node], self.pictures.part_starts
+        poses, starts = self.nodes[node], self.bits.part_starts
         runs = np.empty((len(pairs), len(starts) - 1, 3), dtype=np.int64)
         total = np.zeros((len(pairs), 3), dtype=np.int32)
         used = len(poses.words)
@@ -362,7 +399,7 @@ class PoseStore:
         return np.bincount(pairs[:, 0], minlength=len(X_WP))
 
     def start(self) -> PartialPoses:
-        """The partial pose that has placed nothing."""
+        """Return the one partial pose in which no node is placed."""
         zero = np.zeros(1, dtype=np.int64)
         return PartialPoses(
             np.zeros((1, self.words), dtype=np.uint64),
@@ -372,7 +409,10 @@ class PoseStore:
         )  # fmt: skip
 
     def without(self, poses: np.ndarray, nodes: frozenset[int]) -> PartialPoses:
-        """One with poses (nodes,) but of some nodes, given with all their descendants."""
+        """Return the partial pose with poses (nodes,) from which some nodes are removed.
+
+        ``nodes``: these nodes, with all their descendants.
+        """
         start = self.start()
         start.poses[0] = poses
         start.poses[0, list(nodes)] = -1
@@ -380,7 +420,7 @@ class PoseStore:
             stored, pose = self.nodes[node], start.poses[0, node : node + 1]
             unite_poses(start.masks, pose, stored.runs, stored.words)
             start.outside[0] += int(stored.areas[pose[0], 2])
-        silhouettes = int(self.pictures.part_starts[len(self.pictures.views)])
+        silhouettes = int(self.bits.part_starts[len(self.bits.views)])
         ones = np.bitwise_count(start.masks[0])
         start.covered[0] = ones[:silhouettes].sum()
         start.outside[0] += ones[silhouettes:].sum()
@@ -388,25 +428,30 @@ class PoseStore:
         return start
 
     def objectives(self, whole: PartialPoses) -> np.ndarray:
-        """(B,) what the objective of whole poses is, as far as the pictures show [pixel]."""
-        return np.asarray(self.pictures.area - whole.covered + whole.outside)
+        """Return (B,) the objective of whole poses at the resolution of the bit masks [pixel]."""
+        return np.asarray(self.bits.area - whole.covered + whole.outside)
 
     def groups(self, partial: PartialPoses, node: int) -> np.ndarray:
-        """Where the node's poses begin and end (B, 2) that each may take."""
+        """Return (B, 2) first index and end of the poses that the node can take in each."""
         if len(partial) == 0:
             return np.zeros((0, 2), dtype=np.int64)
         return self.pose_groups(node, self.parents(partial.poses, node))
 
     def pairs(self, partial: PartialPoses, node: int) -> np.ndarray:
-        """(p, 2) int32 each partial pose with each pose that it may take."""
+        """Return (p, 2) int32 pairs of each partial pose and each pose that the node can take."""
         groups = self.groups(partial, node)
         return np.column_stack(expand_groups(groups[:, 0], groups[:, 1])).astype(np.int32)
 
     def score(
         self, partial: PartialPoses, node: int, pairs: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Areas newly covered (p, 2) of silhouette and band [pixel], and what hashes gain (p,)."""
-        stored, views = self.nodes[node], len(self.pictures.views)
+        """Return the areas added by pairs (p, 2) of partial pose and pose of the node.
+
+        Returns:
+            (p, 2) newly covered area of silhouettes and of bands [pixel]; (p,) uint64 the increase
+            of the hash.
+        """
+        stored, views = self.nodes[node], len(self.bits.views)
         return score_pairs(partial.masks, pairs, stored.runs, stored.words, views, self._mask_keys)
 
     def make(
@@ -416,22 +461,25 @@ class PoseStore:
         pairs: np.ndarray,
         scores: tuple[np.ndarray, np.ndarray],
     ) -> PartialPoses:
-        """What pairs (p, 2), scored, make, without their masks; ``lost`` is not known."""
+        """Return the partial poses made by pairs (p, 2), without masks and unreachable areas.
+
+        ``scores``: the pairs' result of ``score``.
+        """
         areas, added = scores
-        origins, beyond = pairs[:, 0], self.nodes[node].areas[pairs[:, 1], 2]
+        origins, added_beyond = pairs[:, 0], self.nodes[node].areas[pairs[:, 1], 2]
         poses = partial.poses[origins]
         poses[:, node] = pairs[:, 1]
-        far = partial.far[origins]
-        np.maximum(far[:, 0], beyond, out=far[:, 0])
-        far[:, 1] += beyond
+        beyond = partial.beyond[origins]
+        np.maximum(beyond[:, 0], added_beyond, out=beyond[:, 0])
+        beyond[:, 1] += added_beyond
         return PartialPoses(
             masks=np.zeros((len(pairs), 0), dtype=np.uint64),
             poses=poses,
             hashes=partial.hashes[origins] + added,
             covered=partial.covered[origins] + areas[:, 0],
-            outside=partial.outside[origins] + areas[:, 1] + beyond,
-            far=far,
-            lost=np.zeros(len(pairs), dtype=np.int64),
+            outside=partial.outside[origins] + areas[:, 1] + added_beyond,
+            beyond=beyond,
+            unreachable=np.zeros(len(pairs), dtype=np.int64),
         )
 
     def choose(
@@ -442,51 +490,60 @@ class PoseStore:
         pairs: np.ndarray,
         width: int,
         limit: float = np.inf,
-        far_matters: bool = False,
+        keep_beyond: bool = False,
     ) -> tuple[np.ndarray, PartialPoses, np.ndarray]:
-        """The first of what pairs (p, 2) made that are not equal, at most ``width``.
+        """Choose the first distinct partial poses that were made by pairs (p, 2).
 
         Args:
-            limit: where it is finite, the greatest sum of what is outside and what no later node
-                can reach [pixel]; and where the nodes with children to come stand alike, none is
-                chosen that covers less than another.
-            far_matters: those are not equal that differ beyond the bands.
+            partial: the partial poses before the node was placed.
+            made: those made by the pairs.
+            node: the node that was placed.
+            pairs: (p, 2) the pairs of partial pose and pose of the node.
+            width: greatest number that is chosen.
+            limit: if it is finite, the greatest lower bound of the objective [pixel]; also, one
+                that is dominated by an earlier one is dropped, as described in ``choose_pairs``.
+            keep_beyond: whether partial poses that differ only in the area beyond the bands are
+                kept apart.
 
         Returns:
-            Their indices; themselves, without masks; of each pair looked at the place among
-                them, or -1.
+            Indices (n,) of the chosen pairs; their partial poses, without masks; and for each
+            examined pair its index among the chosen ones, -1 if it was dropped.
         """
         placed = np.flatnonzero(partial.poses[0] >= 0).tolist() if len(partial) else ()
         is_open, waiting = self.body.frontier(frozenset((*placed, node)))
-        openings = made.poses[:, is_open].astype(np.uint64) @ self._node_keys[is_open]
-        codes = made.hashes + openings
-        if far_matters:
-            codes += made.far.astype(np.uint64) @ self._far_keys
-        # What later nodes can reach.
+        frontier_hashes = made.poses[:, is_open].astype(np.uint64) @ self._node_keys[is_open]
+        state_hashes = made.hashes + frontier_hashes
+        if keep_beyond:
+            state_hashes += made.beyond.astype(np.uint64) @ self._beyond_keys
+        # The pixels that later nodes can reach.
         rows = np.empty((len(waiting), len(pairs)), dtype=np.int64)
         for i, other in enumerate(waiting if len(pairs) else ()):
             own = self.tree_nodes[other].parent == node
             parents = pairs[:, 1] if own else self.parents(partial.poses, other)[pairs[:, 0]]
             rows[i] = self.reach_rows(other, parents)
         stored = self.nodes[node]
-        chosen, lost, places = choose_pairs(
-            partial.masks, pairs, stored.runs, stored.words, self.pictures.everything,
-            Reaches(self.reach_runs, self.reach_words, rows), width, codes,
-            openings if limit < np.inf else openings[:0], made.least_outside, limit,
+        chosen, unreachable, places = choose_pairs(
+            partial.masks, pairs, stored.runs, stored.words, self.bits.all_pixels,
+            ReachablePixels(self.reach_runs, self.reach_words, rows), width, state_hashes,
+            frontier_hashes if limit < np.inf else frontier_hashes[:0], made.least_outside, limit,
         )  # fmt: skip
-        return chosen, replace(made.chosen(chosen), lost=lost), places
+        return chosen, replace(made.chosen(chosen), unreachable=unreachable), places
 
     def with_masks(
         self, partial: PartialPoses, made: PartialPoses, node: int, pairs: np.ndarray
     ) -> PartialPoses:
-        """What pairs made, with the masks."""
+        """Return ``made``, the partial poses made by pairs (n, 2), with their masks."""
         masks, stored = partial.masks[pairs[:, 0]], self.nodes[node]
         unite_poses(masks, pairs[:, 1], stored.runs, stored.words)
         return replace(made, masks=masks)
 
 
 def expand_groups(begins: np.ndarray, ends: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The places of groups, given by where they begin and end (n,), and before them the groups."""
+    """Return the indices in all groups, given by the first and the end of each group (n,).
+
+    Returns:
+        (m,) the group of each index, and (m,) the indices.
+    """
     counts = ends - begins
     groups = np.repeat(np.arange(len(counts)), counts)
     return groups, np.arange(len(groups)) + (begins - np.cumsum(counts) + counts)[groups]

@@ -390,7 +390,7 @@ class NeighbourhoodSearch:
         """
         J, own = float(self.problem.J(parameters)), self._settings
         rounds = own.rounds * (2 if everywhere else 1)
-        same = own.better * self.problem.border_length
+        same = own.least_decrease * self.problem.border_length
         least = own.least_error * self.problem.area
         last = np.inf if tries is None else int(self._tried.sum()) + tries
         while J > enough and self._tried.sum() < last and time.perf_counter() < deadline:
@@ -423,7 +423,7 @@ class NeighbourhoodSearch:
         for k in range(len(self.search.parts), len(self._parts)):
             self._try(parameters, J, k, False)
         known, kept = [parameters], []
-        spare = own.spare * problem.border_length
+        spare = own.alternative_excess * problem.border_length
         everything = problem.body.freedom()
 
         def is_known(pose: np.ndarray, poses: Sequence[np.ndarray]) -> bool:
@@ -436,10 +436,10 @@ class NeighbourhoodSearch:
             start[freedom.columns] = values
             if is_known(start, known):
                 continue
-            refined, _, _ = descend(problem, start, freedom, own.end)
+            refined, _, _ = descend(problem, start, freedom, own.final)
             J = float(problem.J(refined))
             if limit < J <= limit + spare and not is_known(refined, known):
-                refined, _, _ = descend(problem, refined, everything, own.end)
+                refined, _, _ = descend(problem, refined, everything, own.final)
                 J = float(problem.J(refined))
             if J <= limit and not is_known(refined, known):
                 kept.append((J, refined))
@@ -464,24 +464,24 @@ class NeighbourhoodSearch:
         starts = [self.search.mirror(parameters, part, view) for view in problem.views]
         if erring and not part.exchanged:
             starts += self.search.propose(problem, parameters, part)
-        rough, near = [], J + own.near * length
+        rough, near = [], J + own.second_excess * length
         for start in starts:
             if part.exchanged:
-                refined, apart, _ = descend(problem, start, freedom, own.reflected)
-                if near < apart <= J + own.mended * length:
+                refined, apart, _ = descend(problem, start, freedom, own.mirrored)
+                if near < apart <= J + own.repaired_excess * length:
                     # Limits keep parts from being mirrored: without another place for them the
                     # whole mirrored body would be given up.
                     refined, _, _ = descend(problem, refined, freedom, own.whole)
                     mending = NeighbourhoodSearch(problem, self.search, reflections=False)
-                    refined, apart = mending.improve(refined, near, tries=own.mendings)
+                    refined, apart = mending.improve(refined, near, tries=own.repair_tries)
             else:
-                refined, apart, _ = descend(problem, start, freedom, own.far, still)
-            if apart <= J + own.hopeful * length:
+                refined, apart, _ = descend(problem, start, freedom, own.placed, still)
+            if apart <= J + own.first_excess * length:
                 rough.append((apart, refined))
         rough.sort(key=lambda pair: pair[0])
         found: list[tuple[float, np.ndarray]] = []
-        for _, start in rough[: own.pursued]:
-            refined, apart, _ = descend(problem, start, freedom, own.nearer, still)
+        for _, start in rough[: own.refined]:
+            refined, apart, _ = descend(problem, start, freedom, own.second, still)
             if apart <= near:
                 refined, _, _ = descend(problem, refined, freedom, own.fine, still)
                 found.append((float(problem.J(refined)), refined))
@@ -489,15 +489,15 @@ class NeighbourhoodSearch:
         self._others += [
             (other_J, freedom, other[columns])
             for other_J, other in found
-            if other_J <= J + own.kept * length
+            if other_J <= J + own.stored_excess * length
         ]
         least, best = min(found, key=lambda pair: pair[0], default=(np.inf, parameters))
-        if least > J + own.equal * length:
+        if least > J + own.whole_excess * length:
             return parameters, np.inf
         whole, _, _ = descend(problem, best, problem.body.freedom(), own.whole)
         whole_J = float(problem.J(whole))
         best, least = (whole, whole_J) if whole_J < least else (best, least)
-        if least > J - own.better * length:
+        if least > J - own.least_decrease * length:
             return parameters, np.inf
         self._others.append((J, freedom, parameters[columns]))
         return best, least

@@ -1,11 +1,11 @@
-"""All poses of the grid as good as the best within the noise, in modes; is the best proved?
+"""Find all poses of a grid that are as good as the best, group them into modes, and prove the best.
 
 Two samples of a node are neighbours if no value differs by more than a step of the grid, or if they
-place the node alike. The samples of a node that occur fall into clusters of neighbours of
-neighbours; a mode is a choice of one cluster for each node.
+give the node the same pose. The samples that occur in the set form clusters: connected components
+of neighbours. A mode is a choice of one cluster for each node.
 
-A complete branch and bound without a find proves that J is greater than its limit everywhere: just
-below the best J known. An incomplete one gives a smaller bound.
+A complete branch and bound with the limit just below the best known J that finds no pose proves
+that the best pose is optimal. An incomplete one gives a smaller lower bound.
 """
 
 import math
@@ -31,9 +31,10 @@ from drake_pose.search.settings import BoundLimits
 
 
 def grid_steps(grid: np.ndarray) -> np.ndarray:
-    """The spacing of each column (k,) of a node's grid (n, k); infinite where it has one value.
+    """Return the spacing of each column of a node's grid: (k,) [rad or m].
 
-    A grid that is no product of its columns has the spacing of its nearest neighbours.
+    It is infinite for a column with a single value. If the grid (n, k) is not the product of its
+    columns, all columns get the median distance between nearest neighbours.
     """
     columns = [np.unique(np.round(column, 9)) for column in grid.T]
     if np.prod([len(column) for column in columns], initial=1.0) == len(grid):
@@ -50,15 +51,17 @@ def estimate_joints(
     *,
     complete: bool = True,
 ) -> tuple[JointEstimate, ...]:
-    """Report each value of a tree, node after node.
+    """Return the interval of each value of a tree over a set of poses, in the order of the nodes.
 
-    A value is determined if it spans no more than one step of its grid; half a step is added on
-    both sides, because the truth may lie between the grid's values.
+    A value is determined if it spans at most one step of its grid. Half a step is then added on
+    both sides, because the true value may lie between the grid's values.
 
     Args:
-        samples: for each node (n,) those of its samples that occur.
-        about: for each node (k,) the answer, near whose turn angles are given that turn around.
-        complete: whether these are all; else nothing is determined but what cannot move.
+        sampled: the sampled tree.
+        samples: for each node (n,) its samples that occur in the set.
+        about: for each node (k,) the values of the answer; intervals of angles that turn around are
+            given in the turn nearest to these [rad or m].
+        complete: whether the set is complete; if not, only values that cannot move are determined.
     """
     reports = []
     for i, node in enumerate(sampled.tree.nodes):
@@ -68,7 +71,7 @@ def estimate_joints(
         for k, name in enumerate(node.value_names):
             values = np.unique(np.round(sampled.values[i][samples[i], k], 12))
             if around[k]:
-                # Angles of one turn, rising from the widest gap between them.
+                # Order the angles within one turn, starting after the widest gap.
                 full = 2.0 * np.pi
                 gaps = np.diff(values, append=values[0] + full)
                 first = (int(np.argmax(gaps)) + 1) % len(values)
@@ -87,7 +90,10 @@ def estimate_joints(
 
 
 def cluster_samples(sampled: SampledTree, node: int, samples: np.ndarray) -> np.ndarray:
-    """The cluster (all samples,) int64 of each sample of a node that occurs; -1 of the others."""
+    """Return the cluster of each sample of a node, (all samples,) int64; -1 if it does not occur.
+
+    ``samples``: (n,) the samples that occur.
+    """
     grid = sampled.values[node]
     labels = np.full(len(grid), -1, dtype=np.int64)
     if grid.shape[1] == 0 or len(samples) == 1:
@@ -96,13 +102,13 @@ def cluster_samples(sampled: SampledTree, node: int, samples: np.ndarray) -> np.
     steps = grid_steps(grid)
     scaled = np.where(np.isfinite(steps), grid[samples] / steps, 0.0)
     rotation = sampled.tree.placements[node].rotation
-    # A rotation vector of half a turn is the same as its opposite, or nearly so.
+    # Opposite rotation vectors of half a turn are the same rotation.
     around = sampled.tree.turns_around(node) | (rotation is not None and rotation.kind == "free")
     turns = np.where(around, 2.0 * np.pi / steps, 0.0)
     scaled = np.where(turns > 0.0, np.mod(scaled, np.where(turns > 0.0, turns, 1.0)), scaled)
     tree = cKDTree(scaled - np.where(turns > 0.0, 0.0, scaled.min(axis=0)), boxsize=turns)
     near = tree.query_pairs(1.01, p=np.inf, output_type="ndarray")
-    # With two axes in line, other values place the node alike.
+    # Different values give the same pose where two axes coincide.
     X_PN = sampled.X_PN[node][samples, :3].reshape(len(samples), -1)
     alike = cKDTree(X_PN).query_pairs(1e-6, output_type="ndarray")
     links = np.vstack([near, alike])
@@ -115,10 +121,16 @@ def cluster_samples(sampled: SampledTree, node: int, samples: np.ndarray) -> np.
 def split_into_modes(
     graph: PartialPoseGraph, labels: list[np.ndarray], most_pairs: int = 200_000
 ) -> list[tuple[float, float, np.ndarray]]:
-    """The modes of a graph by clusters of samples: J [pixel], poses, clusters (nodes,).
+    """Return the modes of a set of poses, sorted by J and, if equal, by size, largest first.
 
-    Best first, of equals the larger first. ``most_pairs``: beyond this number of pairs of a state
-    and a mode, later nodes are not told apart any more.
+    Args:
+        graph: the set.
+        labels: for each node (all samples,) the cluster of each sample.
+        most_pairs: above this number of pairs of a state and a mode, the clusters of later nodes
+            are ignored.
+
+    Returns:
+        For each mode its least J [pixel], its number of poses, and (nodes,) its clusters.
     """
     states, modes = np.zeros(1, dtype=np.int64), np.zeros(1, dtype=np.int64)
     sizes: np.ndarray = np.ones(1)
@@ -126,7 +138,7 @@ def split_into_modes(
     for layer in graph.layers:
         found = labels[layer.node][layer.samples]
         several = found.max(initial=0) > 0 and len(states) < most_pairs
-        # Edges alike in origin, cluster and end are one.
+        # Merge edges with the same origin, cluster and end.
         keys = np.column_stack([layer.origins, found if several else 0 * found, layer.ends])
         bundles, weights = np.unique(keys, axis=0, return_counts=True)
         begins = np.searchsorted(bundles[:, 0], states)
@@ -150,7 +162,13 @@ def split_into_modes(
 
 @dataclass(frozen=True)
 class GridPoseSet(PoseSet):
-    """A set of poses of the grid that tells of any pose whether it is in it."""
+    """A set of poses of a grid, with a test of membership.
+
+    Args:
+        graph: the poses.
+        sampled: the sampled tree.
+        budget_spent: whether a limit of the search may have left out poses.
+    """
 
     graph: PartialPoseGraph
     sampled: SampledTree
@@ -158,11 +176,11 @@ class GridPoseSet(PoseSet):
 
     @property
     def size(self) -> float:
-        """How many poses there are."""
+        """Number of poses."""
         return self.graph.size
 
     def contains(self, node_values: Sequence[np.ndarray]) -> bool:
-        """Whether a pose of the grid, the values of each node, is in the set."""
+        """Return whether a pose, given by the values (k,) of each node, is in the set."""
         samples = samples_at(self.sampled, node_values)
         return samples is not None and self.graph.contains(samples)
 
@@ -177,19 +195,23 @@ def find_modes(
     limits: BoundLimits | None = None,
     within: PosesWithin | None = None,
 ) -> GridPoseSet:
-    """Find all poses of the grid as good as the best, of samples (nodes,) with objective J [pixel].
+    """Find all poses of the grid that are as good as the best, and group them into modes.
 
     Args:
-        tolerance: a pose counts as good as the best if its objective is greater by no more than
-            this [pixel]; None: up to what two renderers differ by where the best is within that
-            (``renderer_tolerance``), else 5 % of the contours' length.
-        most: how many modes are described at most.
-        within: all poses within a tolerance of exactness, where they are known: the tolerance is
-            that then.
+        body: the sampled body.
+        views: the silhouettes of one frame.
+        samples: (nodes,) samples of the best known pose.
+        J: its objective [pixel].
+        tolerance: greatest excess of the objective of a pose that is as good [pixel]. None: if the
+            best pose is within ``renderer_tolerance``, all poses within that; else 5 % of the
+            contours' length.
+        most: greatest number of modes that are described.
+        limits: limits of the search.
+        within: all exact poses, if they are known; the tolerance is then their limit of J.
 
     Returns:
-        The set. It holds the best pose known, and if a better one turns up, that one and those
-            within the tolerance of it.
+        The set. If a better pose than the known one is found, the set holds the poses within the
+        tolerance of the better one.
     """
     if within is not None:
         tolerance = within.J_limit - J
@@ -204,17 +226,17 @@ def find_modes(
     if graph.size == 0.0:
         graph, complete = PartialPoseGraph.of_pose(samples, J), False
     sampled, described = body.sampled, []
-    seen = graph.samples_seen()
+    seen = graph.samples_used()
     labels = [cluster_samples(sampled, node, own) for node, own in enumerate(seen)]
     modes = split_into_modes(graph, labels)
     for mode_J, size, clusters in modes[:most]:
         own = graph.restricted(
             [label == cluster for label, cluster in zip(labels, clusters, strict=True)]
         )
-        # The pose given stands for its own mode if it is a best one.
+        # The given pose represents its mode if it is one of the best in it.
         first = samples if own.objective(samples) == mode_J else own.central()
         values = sampled.values_at(first)
-        joints = estimate_joints(sampled, own.samples_seen(), values, complete=complete)
+        joints = estimate_joints(sampled, own.samples_used(), values, complete=complete)
         described.append(PoseMode.of_values(sampled.tree, values, mode_J, joints, size))
     return GridPoseSet(
         modes=tuple(described),
@@ -229,11 +251,14 @@ def find_modes(
 
 
 def samples_at(sampled: SampledTree, node_values: Sequence[np.ndarray]) -> np.ndarray | None:
-    """The samples (nodes,) of a pose of the grid; None if it is not on the grid."""
+    """Return samples (nodes,) of a pose, given by each node's values (k,); None if not on the grid.
+
+    Values may differ from the grid's by 1e-6.
+    """
     samples = np.zeros(len(sampled.values), dtype=np.int64)
     for i, (grid, values) in enumerate(zip(sampled.values, node_values, strict=True)):
         if grid.shape[1] == 0:
-            # Where its joints follow its parent's it takes the parent's sample.
+            # A node whose joints mimic its parent's has the parent's sample.
             samples[i] = samples[sampled.tree.source(i)]
             continue
         gaps = np.abs(grid - np.asarray(values)).max(axis=1)
@@ -244,18 +269,18 @@ def samples_at(sampled: SampledTree, node_values: Sequence[np.ndarray]) -> np.nd
 
 
 def contour_length(views: Sequence[View]) -> int:
-    """How many pixels of the silhouettes have a neighbour in the picture that is in none."""
+    """Return the number of silhouette pixels with a 4-neighbour in the image outside [pixel]."""
     return sum(
         int((view.mask & ~binary_erosion(view.mask, border_value=1)).sum()) for view in views
     )
 
 
 def renderer_tolerance(views: Sequence[View]) -> float:
-    """By how much two renderers' silhouettes of one pose may differ [pixel].
+    """Return the greatest expected difference of two renderers' silhouettes of one pose [pixel].
 
-    Measured between Drake's VTK renderer, which snaps vertices to 1/256 pixel in float32, and the
-    areas that are scored: .1 % of the contour's pixels on average for pictures of 80 to 1280
-    pixels, one independently of the other. This is five standard deviations above that.
+    Drake's VTK renderer, which snaps vertices to 1/256 pixel in float32, and the scored areas were
+    compared on images of 80 to 1280 pixels: on average .1 % of the contour's pixels differ, each
+    independently of the others. The result is five standard deviations above that mean.
     """
     expected = 0.001 * contour_length(views)
     return math.floor(expected + 5.0 * math.sqrt(expected) + 1.0)
@@ -263,18 +288,20 @@ def renderer_tolerance(views: Sequence[View]) -> float:
 
 @dataclass(frozen=True)
 class ExaminationSettings:
-    """Parameters of an examination.
+    """Parameters of the proof of optimality and of the search for all poses as good.
 
     Args:
-        proof_time_limit: the proof ends after this time [s], proved or not; None: no limit, 0: it
-            is not tried. An answer with J = 0 needs none.
-        mode_time_limit: the same of the search for all poses as good; it then answers with those
-            it has, and no joint is called determined.
-        proof_poses: the proof ends after this number of poses of nodes is drawn: unlike a
-            limit on time, with the same result on every machine.
-        mode_poses: the same of the search for all poses as good: about two seconds.
-        memory: of each of the two, for what it keeps; it ends as if its time were over [byte].
-        modes: how many modes are described at most.
+        proof_time_limit: time after which the proof is given up [s]; None: no limit; 0: no proof is
+            tried. A pose with J = 0 needs no proof.
+        mode_time_limit: time limit of the search for all poses as good [s]; None: no limit. When it
+            is reached the set is incomplete and no joint is determined.
+        proof_poses: number of drawn poses of nodes after which the proof is given up. Unlike a
+            time limit it gives the same result on every machine.
+        mode_poses: the same limit for the search for all poses as good; the default takes about two
+            seconds.
+        memory: memory limit of each of the two; reaching it has the effect of the time limit
+            [byte].
+        modes: greatest number of modes that are described.
         tolerance: as in ``find_modes`` [pixel].
 
     Raises:
@@ -297,7 +324,7 @@ class ExaminationSettings:
         self.limits("mode"), self.limits("proof")
 
     def limits(self, step: str) -> BoundLimits:
-        """Those of the "proof", or of the search for all poses as good, of a "mode"."""
+        """Return the limits of a step: "proof", or "mode" for the search for all poses as good."""
         poses, seconds = getattr(self, f"{step}_poses"), getattr(self, f"{step}_time_limit")
         return BoundLimits(poses=poses, memory=self.memory, time_limit=seconds)
 
@@ -310,12 +337,22 @@ def examine(
     root_position: np.ndarray | None = None,
     within: PosesWithin | None = None,
 ) -> PoseEstimate:
-    """The result, or a better pose, with ``lower_bound``, ``budget_spent`` and ``pose_set``.
+    """Prove that a pose of the grid is optimal, and find all poses that are as good.
 
-    ``within``: all poses within a tolerance of exactness, where the search has found them.
+    Args:
+        body: the sampled body.
+        views: the silhouettes of one frame.
+        result: the pose that is examined.
+        settings: limits and tolerance.
+        root_position: (3,) the root's position [m]; None: that of the tree.
+        within: all exact poses, if they are known.
+
+    Returns:
+        The result with ``lower_bound``, ``budget_spent`` and ``pose_set``; with a better pose, if
+        one was found. A result without a pose is returned unchanged.
 
     Raises:
-        SettingsError: if the result is not of the body's grid.
+        SettingsError: if the result is not on the body's grid.
     """
     if not result.found:
         return result
@@ -339,7 +376,7 @@ def examine(
     if J < result.J:
         q, X_WB, values = best.q, best.X_WB, best.node_values
         result = replace(result, q=q, X_WB=X_WB, node_values=values, J=J)
-    # A complete set has all that is as good or better.
+    # A complete set contains every pose with a smaller J.
     lower_bound = J if answer.complete else min(lower_bound, J)
     return replace(
         result,

@@ -34,7 +34,7 @@ from drake_pose.camera.models import Camera, ParallelCamera
 from drake_pose.errors import SettingsError
 from drake_pose.search.beam_search import BeamSearch, grow
 from drake_pose.search.estimates import PoseEstimate, View
-from drake_pose.search.partial_poses import Pictures, PoseStore, coarsen
+from drake_pose.search.partial_poses import PoseStore, SilhouetteBits, coarsen
 from drake_pose.search.parts import NeighbourhoodSearch, PartSearch
 from drake_pose.search.refinement import Pass, RefinementBody, RefinementProblem, descend
 from drake_pose.search.sampled_body import SampledBody
@@ -98,7 +98,7 @@ def find_root_places(
     p_CR = _in_camera(camera, body.sampled.X_PN[0][0, :3, 3])
     # Places (n, 2) in the picture where the root can be seen, or beyond its edge [pixel].
     low, high = _box(main.mask)
-    spacing = _extent(main.mask) / own.across
+    spacing = _extent(main.mask) / own.positions_across
     beyond = (own.cut_off - 1.0) * _extent(main.mask)
     size = np.array([camera.width, camera.height])
     low = np.where(low < 1, -beyond, low - 0.5 * spacing)
@@ -166,8 +166,8 @@ def whereabouts(views: Sequence[View], p_WR: np.ndarray) -> np.ndarray:
             size = camera.pixels_per_metre
         else:
             size = 1.0 / max(float(depth[0]), camera.near)
-        spacing = _extent(view.mask) / own.across
-        here += [*(place[0] / spacing), np.log(size) / np.log(own.ratio)]
+        spacing = _extent(view.mask) / own.positions_across
+        here += [*(place[0] / spacing), np.log(size) / np.log(own.scale_ratio)]
     return np.array(here)
 
 
@@ -235,7 +235,7 @@ def choose_root_samples(
     )
     everywhere = np.pad(np.ones((inner, inner), dtype=np.bool_), 1)
     placed = place_body(body, p_WR[None], np.arange(rotations))
-    bits = Pictures(placed, [View(window, everywhere)], band=1)
+    bits = SilhouetteBits(placed, [View(window, everywhere)], band=1)
     masks = np.zeros((rotations, int(bits.part_starts[-1])), dtype=np.uint64)
     bits.draw_node(0, np.arange(rotations), placed.sampled.X_PN[0], masks)
     pixels = np.unpackbits(masks.view(np.uint8), axis=1, count=inner**2, bitorder="little")
@@ -276,12 +276,12 @@ def _pixel_sizes(
     smallest, likely, largest = np.sqrt(float(view.mask.sum()) / np.array([high, middle, low]))
     if _touches_edge(view.mask):
         largest *= own.cut_off
-    step = np.log(own.ratio)
+    step = np.log(own.scale_ratio)
     steps = np.arange(
         np.floor(np.log(smallest / likely) / step), np.ceil(np.log(largest / likely) / step) + 1
     )
     steps = steps[np.argsort(np.abs(steps), kind="stable")]
-    return np.asarray(likely * own.ratio**steps)
+    return np.asarray(likely * own.scale_ratio**steps)
 
 
 def _touches_edge(mask: np.ndarray) -> bool:
@@ -307,7 +307,7 @@ def _near(view: View, places: np.ndarray) -> np.ndarray:
     distances = distance_transform_edt(~view.mask)
     inside = np.clip(places, 0, np.array(view.mask.shape)[::-1] - 1)
     column, row = np.rint(inside).astype(np.int64).T
-    near = distances[row, column] <= 0.75 * extent / own.across
+    near = distances[row, column] <= 0.75 * extent / own.positions_across
     over = np.linalg.norm(places - inside, axis=1)
     return np.asarray(near & (over <= (own.cut_off - 1.0) * extent))
 
@@ -337,7 +337,7 @@ def _places_in_space(
     """
     own, extent = RootPlacementSettings(), _extent(main.mask) / size
     half = 0.75 * extent * (own.cut_off if _touches_edge(main.mask) else 1.0)
-    spacing = extent / own.across
+    spacing = extent / own.positions_across
     steps = spacing * np.arange(-np.ceil(half / spacing), np.ceil(half / spacing) + 1)
     points = middle + np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), -1).reshape(-1, 3)
     for view in views:
@@ -424,16 +424,16 @@ class RootPlacementSearch:
         # How many poses each search of a layer has found.
         counts: list[int] = []
 
-        def search(outside_share: float, layer: RootPlaces) -> list[_Placed]:
+        def search(outside_fraction: float, layer: RootPlaces) -> list[_Placed]:
             if any(counts) and time.perf_counter() >= deadline:
                 return []
-            found = self._search_layer(layer, width, outside_share)
+            found = self._search_layer(layer, width, outside_fraction)
             counts.append(len(found))
             return found
 
-        for outside_share in (own.outside_share, math.inf):
+        for outside_fraction in (own.outside_fraction, math.inf):
             if not placed:
-                searched = map_ordered(partial(search, outside_share), layers)
+                searched = map_ordered(partial(search, outside_fraction), layers)
                 placed += itertools.chain.from_iterable(searched)
         runs = len(counts) * len(self.tree.nodes)
         if not placed:
@@ -466,17 +466,22 @@ class RootPlacementSearch:
             first_J=first_J,
         )
 
-    def _search_layer(self, layer: RootPlaces, width: int, outside_share: float) -> list[_Placed]:
+    def _search_layer(
+        self, layer: RootPlaces, width: int, outside_fraction: float
+    ) -> list[_Placed]:
         """The best whole poses of a scale or depth, of each root placement the best."""
         if len(layer.positions) == 0:
             return []
-        own, views = self._numbers, [coarsen(view, self._numbers.pixels) for view in layer.views]
+        own, views = (
+            self._numbers,
+            [coarsen(view, self._numbers.coarse_pixels) for view in layer.views],
+        )
         quota, factor = math.ceil(own.quota * width), own.root_factor
         chosen = choose_root_samples(
             self.body, views, layer.positions, own.root_spare * factor * quota, own.outside_weight
         )
         body = place_body(self.body, layer.positions, chosen)
-        store = PoseStore(body, Pictures(body, views), outside_share)
+        store = PoseStore(body, SilhouetteBits(body, views), outside_fraction)
         # The position of each of the root's samples; none has more than its quota at any time.
         places, hypotheses = chosen // len(self.sampled.X_PN[0]), store.start()
         for node in self.body.order:
@@ -492,7 +497,7 @@ class RootPlacementSearch:
             kept = np.flatnonzero(rank < factor * quota)[: factor * width]
             hypotheses, factor = grown.chosen(kept), 1
         # As many pixels as in the silhouettes themselves.
-        Js = _area(layer.views) / store.pictures.area * store.objectives(hypotheses)
+        Js = _area(layer.views) / store.bits.area * store.objectives(hypotheses)
         samples = store.samples(hypotheses.poses)
         order = np.argsort(Js, kind="stable")
         firsts = np.sort(np.unique(samples[order, 0], return_index=True)[1])[: own.starts]
@@ -518,7 +523,7 @@ class RootPlacementSearch:
             p_WR, own = self._root_of(one), self._numbers
             starts = (
                 replace(one, parameters=self._refined.parameters(values, p_WR))
-                for values in self._grid.best_poses(one.views, p_WR, own.again, own.alike)
+                for values in self._grid.best_poses(one.views, p_WR, own.poses_again, own.overlap)
             )
             return [self._settle(start, PASSES.coarse, moves) for start in starts]
 
@@ -534,7 +539,7 @@ class RootPlacementSearch:
             pool += found or []
         pool.sort(key=attrgetter("J"))
         best = min([*pool, *starts], key=attrgetter("J"))
-        enough, ends = self._numbers.enough * _area(best.views), [best]
+        enough, ends = self._numbers.good_E_total * _area(best.views), [best]
 
         def finish(one: _Placed) -> _Placed | None:
             # One that fits well enough ends it; what is finished beside that one is left out below.
@@ -575,7 +580,7 @@ class RootPlacementSearch:
         """The pose refined to the end, and what fits badly placed anew."""
         near = self._settle(start, PASSES.fine[:2], moves)
         problem = RefinementProblem(self._refined, near.views)
-        enough = self._numbers.enough * problem.area
+        enough = self._numbers.good_E_total * problem.area
         about = NeighbourhoodSearch(problem, self._parts)
         parameters, J = about.improve(near.parameters, enough, deadline)
         better = replace(near, parameters=parameters, J=float(J))

@@ -1,4 +1,8 @@
-"""A sampled pose tree: its areas in several views, and what makes its nodes quick to draw."""
+"""Sample a pose tree's joint values on a grid and score the poses against silhouettes.
+
+``SampledTree`` holds the grid of each node, ``Scoring`` computes areas and the objective J in the
+views, and ``SampledBody`` adds bounding and inscribed balls by which nodes are rejected quickly.
+"""
 
 import copy
 from collections.abc import Sequence
@@ -22,21 +26,26 @@ from drake_pose.silhouette.scoring import (
     subtract_body,
 )
 
-# Of each view what is left of the silhouette: (H, W) uint8, and prefix sums (2, H, W + 1) of the
-# silhouette and of that.
+# For each view: (H, W) uint8 the part of the silhouette that is not covered, and (2, H, W + 1)
+# row-wise prefix sums of the silhouette and of that part.
 Regions = list[tuple[np.ndarray, np.ndarray]]
 
 
 class SampledTree:
-    """A pose tree with every node's sampling grid, made once and matched to many pictures.
+    """A pose tree with a sampling grid for each node.
+
+    A grid pose is given by its samples (nodes,): the index of each node's sample.
 
     Attributes:
-        values: for each node (n, k) its values at its samples [rad or m].
-        X_PN: for each node (n, 4, 4) its poses in its parent at its samples: at the parent's where
-            its joints follow the parent's, so that it takes the sample that the parent takes.
-        outlines: the rigid part of each node's surface: all of it where the model has no skin.
-        bands: for each node (n, v, 3) the vertices of its band of skin at its samples, in the
-            node's frame [m]; None for a node without one.
+        tree: the pose tree.
+        values: for each node (n, k) its k values at its n samples [rad or m].
+        X_PN: for each node (n, 4, 4) its poses in its parent's frame P at its samples. A node whose
+            joints mimic its parent's has a pose for each of the parent's samples, and always takes
+            the parent's sample.
+        surfaces: the surfaces of all nodes.
+        outlines: the rigid part of each node's surface; the whole surface if the model has no skin.
+        bands: for each node (n, v, 3) the vertices of its deformable band of skin at its samples,
+            in the node's frame [m]; None for a node without one.
     """
 
     def __init__(self, tree: PoseTree, settings: GridSettings) -> None:
@@ -52,11 +61,14 @@ class SampledTree:
             None if node.skin is None else node.skin.vertices(values)
             for node, values in zip(tree.nodes, self.values, strict=True)
         ]
-        # The same few samples are drawn again and again.
+        # A search draws few different samples many times.
         self._bent_outline = lru_cache(maxsize=256)(self._bend)
 
     def outlines_at(self, nodes: Sequence[int], samples: np.ndarray) -> list[Outline]:
-        """The whole surfaces of nodes at their samples (len(nodes),), each in its node's frame."""
+        """Return the whole surface of each of the nodes at its sample, in the node's frame.
+
+        ``samples``: (len(nodes),) sample of each of these nodes.
+        """
         return [
             self.outlines[node]
             if self.bands[node] is None
@@ -65,6 +77,7 @@ class SampledTree:
         ]
 
     def _bend(self, node: int, sample: int) -> Outline:
+        """Return a node's surface with its band of skin deformed as at a sample."""
         bending, bands = self.surfaces.bending[node], self.bands[node]
         return (
             self.outlines[node] if bending is None or bands is None else bending.at(bands[sample])
@@ -78,10 +91,17 @@ class SampledTree:
         camera: Camera,
         prefixes: np.ndarray,
     ) -> np.ndarray:
-        """Areas of the union of nodes at many poses: (n, 1 + k) int64, as score_bodies.
+        """Return areas of the union of some nodes' projections, for many poses.
 
-        At samples (n, nodes) and poses X_CN (n, nodes, 4, 4), with prefix sums (k, H, W + 1) of
-        sets.
+        Args:
+            nodes: the nodes that are drawn.
+            samples: (n, len(nodes)) their samples.
+            X_CN: (n, len(nodes), 4, 4) their poses in the camera.
+            camera: the camera.
+            prefixes: (k, H, W + 1) row-wise prefix sums of k sets of pixels.
+
+        Returns:
+            (n, 1 + k) int64 the area of the union, and of its intersection with each set [pixel].
         """
         bands = [(column, self.bands[node]) for column, node in enumerate(nodes)]
         placed = [band[samples[:, column]] for column, band in bands if band is not None]
@@ -91,7 +111,7 @@ class SampledTree:
         return score_bodies(surfaces, X_CN, camera, prefixes, placed)
 
     def with_root_position(self, root_position: np.ndarray) -> "SampledTree":
-        """The same with the root at another position (3,) [m]; all but the root is shared."""
+        """Return a copy with the root at (3,) [m]; the data of all other nodes is shared."""
         moved = copy.copy(self)
         moved.tree = self.tree.with_root_position(root_position)
         moved.values, moved.X_PN = list(self.values), list(self.X_PN)
@@ -101,7 +121,7 @@ class SampledTree:
         return moved
 
     def poses(self, samples: np.ndarray) -> np.ndarray:
-        """X_WN (n, nodes, 4, 4) at samples (n, nodes)."""
+        """Return X_WN (n, nodes, 4, 4) at samples (n, nodes)."""
         X_WN = np.empty((*samples.shape, 4, 4))
         for i, node in enumerate(self.tree.nodes):
             X_PN = self.X_PN[i][samples[:, self.tree.source(i)]]
@@ -109,10 +129,11 @@ class SampledTree:
         return X_WN
 
     def values_at(self, samples: np.ndarray) -> list[np.ndarray]:
-        """The values of each node at samples (nodes,)."""
+        """Return each node's values (k,) at samples (nodes,) [rad or m]."""
         return [grid[t] for grid, t in zip(self.values, samples, strict=True)]
 
     def _sample(self, node: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return a node's values (n, k) and poses X_PN (n, 4, 4); k is 0 for a mimic joint."""
         settings, source = self._settings, self.tree.source(node)
         values = self.tree.grid(
             source, settings.interval, settings.intervals, settings.length_interval
@@ -122,7 +143,15 @@ class SampledTree:
 
 
 class Scoring:
-    """Scores poses of a sampled tree against the silhouettes of one instant, one or more."""
+    """Scores poses of a sampled tree against the silhouettes of one frame, in one or more views.
+
+    S is the silhouette, P_i the projection of node i; equation numbers are those of Kameda's paper.
+
+    Attributes:
+        silhouette_prefixes: for each view (1, H, W + 1) row-wise prefix sums of the silhouette.
+        silhouette_area: total area of the silhouettes [pixel].
+        X_CW: (4, 4) pose of the world in each view's camera.
+    """
 
     def __init__(self, sampled: SampledTree, views: Sequence[View]) -> None:
         self.sampled = sampled
@@ -132,17 +161,23 @@ class Scoring:
         self.X_CW = [np.asarray(view.camera.X_CW) for view in self.views]
 
     def candidate_poses(self, node: int, X_WP: np.ndarray) -> np.ndarray:
-        """Poses X_WN of a node at all its samples, (n, 4, 4), for a pose of its parent."""
+        """Return X_WN (n, 4, 4) of a node at all its samples, with its parent at X_WP (4, 4)."""
         return X_WP @ self.sampled.X_PN[node]
 
     def candidate_areas(
         self, node: int, samples: np.ndarray, X_WN: np.ndarray, regions: Regions
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Areas of a node at samples (n,) and their poses X_WN (n, 4, 4).
+        """Return areas of a node outside the silhouette and in the uncovered part of it.
+
+        Args:
+            node: the node i.
+            samples: (n,) its samples.
+            X_WN: (n, 4, 4) its poses at these samples.
+            regions: the uncovered part of the silhouette in each view.
 
         Returns:
-            area(P_i minus S) in each view, (views, n) (4), and area(region and P_i) summed over
-            the views, (n,) (5), (7).
+            (views, n) area(P_i minus S) in each view (4), and (n,) area(region and P_i) summed over
+            the views (5), (7) [pixel].
         """
         outside, covered = [], np.zeros(len(X_WN))
         for view, (_, prefixes), X_CW in zip(self.views, regions, self.X_CW, strict=True):
@@ -153,7 +188,10 @@ class Scoring:
         return np.array(outside), covered
 
     def uncovered(self, nodes: Sequence[int], samples: np.ndarray, X_WN: np.ndarray) -> Regions:
-        """S minus the projections of some nodes (3), (6); samples and X_WN are of all nodes."""
+        """Return S minus the projections of some nodes (3), (6).
+
+        ``samples``: (nodes,), ``X_WN``: (nodes, 4, 4) of all nodes of the tree.
+        """
         regions = [
             (view.mask.astype(np.uint8), np.repeat(sums, 2, axis=0))
             for view, sums in zip(self.views, self.silhouette_prefixes, strict=True)
@@ -165,13 +203,13 @@ class Scoring:
     def subtract(
         self, regions: Regions, nodes: Sequence[int], samples: np.ndarray, X_WN: np.ndarray
     ) -> None:
-        """Take the projections of nodes at samples (k,), poses (k, 4, 4), out of regions."""
+        """Remove the projections of k nodes, at samples (k,) and X_WN (k, 4, 4), from regions."""
         outlines = self.sampled.outlines_at(nodes, samples)
         for view, X_CW, (mask, prefixes) in zip(self.views, self.X_CW, regions, strict=True):
             subtract_body(mask, prefixes[1], outlines, X_CW @ X_WN, view.camera)
 
     def J(self, samples: np.ndarray) -> np.ndarray:
-        """The objective (1) [pixel] (n,) of poses at samples (n, nodes)."""
+        """Return the objective (1) of poses at samples (n, nodes): (n,) [pixel]."""
         total, X_WN = np.full(len(samples), self.silhouette_area), self.sampled.poses(samples)
         everything = range(len(self.sampled.outlines))
         for view, prefixes, X_CW in zip(
@@ -184,12 +222,18 @@ class Scoring:
     def draw(
         self, nodes: Sequence[int], samples: np.ndarray, X_WN: np.ndarray, view: int
     ) -> np.ndarray:
-        """The union of nodes' projections, (H, W) bool, in the view of an index."""
+        """Return the union of k nodes' projections in one view, (H, W) bool.
+
+        ``samples``: (k,), ``X_WN``: (k, 4, 4), ``view``: index of the view.
+        """
         outlines = self.sampled.outlines_at(nodes, samples)
         return draw_mask(outlines, self.X_CW[view] @ X_WN, self.views[view].camera)
 
     def mean_node_areas(self, X_WN: np.ndarray) -> list[float]:
-        """Mean area of a node with geometry in each view [pixel], at the first samples' poses."""
+        """Return for each view the mean area of the nodes that have geometry [pixel].
+
+        ``X_WN``: (nodes, 4, 4) poses at the first sample of each node.
+        """
         first = np.zeros((1, 1), dtype=np.int64)
         solid = [i for i, node in enumerate(self.sampled.tree.nodes) if len(node.mesh.triangles)]
         means = []
@@ -207,39 +251,48 @@ class Scoring:
 
 
 class PoseSearch(Protocol):
-    """A search for the pose that silhouettes show: what systems and programs need of any."""
+    """Interface of all searches for the pose of a body in silhouettes."""
 
     @property
     def tree(self) -> PoseTree:
-        """The pose tree that is searched."""
+        """The pose tree whose values are searched."""
 
     @property
     def sampled(self) -> SampledTree:
         """The pose tree with its sampling grids."""
 
     def match(self, views: Sequence[View], root_position: np.ndarray | None = None) -> PoseEstimate:
-        """Estimate the pose; ``root_position``: (3,) [m] where it is not the tree's own."""
+        """Estimate the pose of the body in the views of one frame.
+
+        Args:
+            views: the silhouettes, at least one.
+            root_position: (3,) position of the root's origin in the world [m]; None: that of the
+                tree.
+        """
 
 
 class SampledBody:
-    """A sampled tree with what makes its nodes quick to draw and to reject; made once.
+    """A sampled tree with precomputed balls and orders for the searches on grids.
 
     Attributes:
-        surface_areas: the mean area of each node's parallel projection from all sides [m^2].
-        order: the nodes in the order in which they are placed: the ends of limbs last.
-        limb_order: the same, but one limb after another.
-        ball_radii: for each node (k,) radii of balls that its picture covers [m]: balls inside the
-            node, and inside its children about points that their joints leave where they are.
-        p_PB: for each node (n, k, 3) their centres in its parent's frame at each sample [m].
-        forked: for each node whether it or one that hangs on it has several children.
-        reach_balls: (nodes, 4) centre in the parent's frame and radius [m] of a ball that holds the
-            node and its descendants at all samples.
+        sampled: the sampled tree.
+        surface_areas: for each node the mean area of its parallel projections over all directions
+            [m^2].
+        order: the nodes in the order in which they are placed, ends of limbs last.
+        limb_order: the nodes in the order in which they are placed limb by limb.
+        ball_radii: for each node (k,) radii of inscribed balls, whose projection the node's
+            projection contains [m]. They lie inside the node, or inside a child around a point
+            that the child's joint does not move.
+        p_PB: for each node (n, k, 3) the balls' centres in its parent's frame at each sample [m].
+        forked: for each node whether it or a descendant has several children.
+        reach_balls: (nodes, 4) centre in the parent's frame, and radius, of a ball that contains
+            the node and its descendants at all samples [m].
     """
 
     def __init__(self, tree: PoseTree, settings: BeamSearchSettings) -> None:
         self.sampled = SampledTree(tree, settings)
-        # The mean projected area of a convex surface is a quarter of its area (Cauchy); a plane's
-        # normal is twice its triangle's area long.
+        # The mean projected area of a convex surface is a quarter of its area (Cauchy). The length
+        # of each plane's normal is twice the area of its triangle.
         self.surface_areas = [
             0.125 * float(np.linalg.norm(outline.planes[:, :3], axis=1).sum())
             for outline in self.sampled.outlines
@@ -259,7 +312,7 @@ class SampledBody:
         self.limb_order = self._find_order(limb_by_limb=True)
 
     def with_root_position(self, root_position: np.ndarray) -> "SampledBody":
-        """The same with the root at another position (3,) [m]; all but the root is shared."""
+        """Return a copy with the root at (3,) [m]; the data of all other nodes is shared."""
         moved = copy.copy(self)
         moved.sampled = self.sampled.with_root_position(root_position)
         moved.p_PB = list(self.p_PB)
@@ -270,7 +323,10 @@ class SampledBody:
         return moved
 
     def frontier(self, placed: frozenset[int]) -> tuple[np.ndarray, list[int]]:
-        """Of placed nodes those with children to come; and the nodes to come whose parent is."""
+        """Return (m,) placed nodes with a child that is not placed, and nodes that can be placed.
+
+        A node can be placed if it is a root or its parent is placed.
+        """
         if placed not in self._frontiers:
             nodes = self.sampled.tree.nodes
             is_open = [i for i in sorted(placed) if not placed.issuperset(nodes[i].children)]
@@ -283,11 +339,14 @@ class SampledBody:
         return self._frontiers[placed]
 
     def celled_outline(self, node: int, camera: Camera, coarse: bool) -> CelledOutline:
-        """The node's surface, or a coarse one, with contour tables that suit a camera."""
+        """Return the node's surface, divided into cells that suit a camera's distance.
+
+        ``coarse``: whether a surface of more than 400 triangles is simplified to 300.
+        """
         spread, outline = 0.0, self.sampled.outlines[node]
         if not isinstance(camera, ParallelCamera):
-            # How far directions to the node's points may differ [rad]. If the node is nearer to the
-            # camera than the nearest root by more than this factor it is drawn without a table.
+            # Greatest angle between the rays to the node's points and to its centre [rad]. A node
+            # nearer to the camera than 0.8 of the nearest root's distance is drawn without a table.
             nearest = 0.8 * self.root_distances(camera).min()
             needed = outline.ball[3] / max(1e-6, nearest)
             spreads = [0.02 * 1.3**k for k in range(13)]
@@ -303,14 +362,14 @@ class SampledBody:
         return self._celled[key]
 
     def mean_area(self, node: int, camera: Camera) -> float:
-        """The node's mean projected area in a camera, seen from all sides [pixel]."""
+        """Return the node's projected area in a camera, averaged over all directions [pixel]."""
         scale = float(camera.kernel_parameters()[1])
         if not isinstance(camera, ParallelCamera):
             scale /= float(self.root_distances(camera).mean())
         return self.surface_areas[node] * scale**2
 
     def root_distances(self, camera: Camera) -> np.ndarray:
-        """From the camera to where the roots can be [m]."""
+        """Return the distances (n,) from the camera to the roots at all their samples [m]."""
         roots = [
             X[:, :3, 3]
             for X, node in zip(self.sampled.X_PN, self.sampled.tree.nodes, strict=True)
@@ -319,8 +378,9 @@ class SampledBody:
         return np.asarray(np.linalg.norm(np.vstack(roots) - camera.X_WC[:3, 3], axis=1))
 
     def _find_balls(self, node: int, hulls: list[VisualHull]) -> np.ndarray:
+        """Return (k, 4) centre and radius of balls covered by a node's projection [m], frame N."""
         balls = [hulls[node].spread_balls(10)]
-        # What lies farthest from the parent's joint leaves the silhouette first.
+        # A ball far from the parent's joint is most likely outside the silhouette: test it first.
         balls[0] = balls[0][np.argsort(-np.linalg.norm(balls[0][:, :3], axis=1), kind="stable")]
         for child in self.sampled.tree.nodes[node].children:
             X_NC = self.sampled.X_PN[child]
@@ -334,15 +394,17 @@ class SampledBody:
         return np.vstack(balls)
 
     def _place_balls(self, node: int) -> np.ndarray:
+        """Return (n, k, 3) centres of a node's balls in its parent's frame at all samples [m]."""
         X_PN = self.sampled.X_PN[node]
         placed = self._p_NB[node] @ np.swapaxes(X_PN[:, :3, :3], 1, 2) + X_PN[:, None, :3, 3]
         return np.ascontiguousarray(placed)
 
     def _find_reaches(self) -> np.ndarray:
+        """Return (nodes, 4) the balls ``reach_balls``."""
         nodes = self.sampled.tree.nodes
         reaches = np.zeros((len(nodes), 4))
         for i in reversed(range(len(nodes))):
-            # A ball about the node's surface, its band at all samples included.
+            # A ball that contains the node's surface, with its band of skin at all samples.
             ball, bands = self.sampled.outlines[i].ball, self.sampled.bands[i]
             if bands is not None:
                 farthest = float(np.linalg.norm(bands - ball[:3], axis=-1).max())
@@ -354,7 +416,7 @@ class SampledBody:
         return reaches
 
     def _find_order(self, limb_by_limb: bool) -> tuple[int, ...]:
-        """Trunk first, then limb after limb, the larger before the smaller."""
+        """Return the nodes in placement order: the trunk, then limbs, larger ones first."""
         nodes, subtrees = self.sampled.tree.nodes, self.sampled.tree.subtrees
         sizes = [round(sum(self.surface_areas[j] for j in below), 5) for below in subtrees]
         placed: list[int] = []
@@ -371,7 +433,11 @@ class SampledBody:
 
 
 def _fixed_points(X_PN: np.ndarray, ball: np.ndarray) -> np.ndarray:
-    """Points (n, 3) of frame N that the samples X_PN leave where they are; none: (0, 3)."""
+    """Return points (n, 3) of frame N that have the same position in P at all samples X_PN [m].
+
+    A single point if the rotations have no common axis; else 61 points of the common axis within
+    ``ball`` (4,), centre and radius [m]; (0, 3) if no point is fixed.
+    """
     A = (X_PN[:, :3, :3] - X_PN[0, :3, :3]).reshape(-1, 3)
     b = (X_PN[0, :3, 3] - X_PN[:, :3, 3]).reshape(-1)
     _, sizes, Vt = np.linalg.svd(A, full_matrices=False)
@@ -386,7 +452,14 @@ def _fixed_points(X_PN: np.ndarray, ball: np.ndarray) -> np.ndarray:
 
 
 def _ball_around(centers: np.ndarray, radii: np.ndarray) -> np.ndarray:
-    """A small ball (4,), centre and radius, that holds balls (Badoiu and Clarkson)."""
+    """Return a small ball (4,), centre and radius, that contains balls.
+
+    It is nearly the smallest one, found by the iteration of Badoiu and Clarkson.
+
+    Args:
+        centers: (n, 3) centres of the balls.
+        radii: (n,) their radii.
+    """
     center = 0.5 * (centers.min(axis=0) + centers.max(axis=0))
     best, best_radius = center, np.inf
     for step in range(2, 50):

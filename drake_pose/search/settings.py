@@ -1,4 +1,8 @@
-"""Settings of the searches on a grid: Kameda's and the beam search."""
+"""Settings of all searches.
+
+Unless a unit is given, lengths and excesses of J are fractions of the quantity that the class's
+docstring names, so that settings do not depend on the size of the images.
+"""
 
 import math
 import time
@@ -14,12 +18,13 @@ from drake_pose.fit.levenberg_marquardt import AnnealingStage
 
 @dataclass(frozen=True)
 class GridSettings:
-    """How the values of a pose tree are sampled.
+    """Sampling intervals of a pose tree's values.
 
     Args:
-        interval: of every angle [rad]; the paper's is 20 degrees.
-        length_interval: of every prismatic position [m].
-        intervals: of single positions by name [rad or m], in place of the two above.
+        interval: sampling interval of every angle [rad]; the paper's is 20 degrees.
+        length_interval: sampling interval of every prismatic position [m].
+        intervals: sampling intervals of single positions, by name [rad or m]; they take precedence
+            over the two above.
 
     Raises:
         SettingsError: if a value is out of its range.
@@ -48,11 +53,11 @@ class PaperSearchSettings(GridSettings):
     """Parameters of Kameda's search (sections 5.1, 5.2 and 6.1 of the paper).
 
     Args:
-        outside_limit: the threshold r of (4) [pixel]: the area of a segment that may lie outside
-            the silhouette, in each view. None: begin with 12.6 % of the mean projected area of a
-            segment (what the paper's 200 pixels are for its body) and double until a pose is found.
-        candidate_limit: K, how many of a node's candidates are kept.
-        run_limit: of runs of step 3; the answer is then the best pose so far.
+        outside_limit: the threshold r of (4) [pixel]: greatest area of a segment outside the
+            silhouette, in each view. None: start with 12.6 % of the mean projected area of a
+            segment (200 pixels for the paper's body) and double until a pose is found.
+        candidate_limit: K, the number of candidates kept for each node.
+        run_limit: greatest number of runs of step 3; the best pose found until then is returned.
 
     Raises:
         SettingsError: if a value is out of its range.
@@ -73,33 +78,34 @@ class Stage:
     """One pass of the beam search over all nodes.
 
     Args:
-        hypotheses: how many are kept after each node.
-        outside_share: the share of a node's mean projected area, both summed over the views, that
-            may lie outside the silhouette; infinite: any.
-        outside_weight: what a pixel outside counts in the ranking; one newly covered counts one.
-        limb_by_limb: place one limb after another, else the ends of all limbs last.
+        hypotheses: beam width: number of hypotheses kept after each node.
+        outside_fraction: greatest area of a node outside the silhouette, as a fraction of the
+            node's mean projected area, both summed over the views; infinite: no limit.
+        outside_weight: cost of a pixel outside the silhouette, relative to the gain of a newly
+            covered pixel.
+        limb_by_limb: True: place one limb after another; False: place the ends of all limbs last.
     """
 
     hypotheses: int
-    outside_share: float = 0.0
+    outside_fraction: float = 0.0
     outside_weight: int = 1
     limb_by_limb: bool = False
 
     def __post_init__(self) -> None:
         if self.hypotheses < 1:
             raise SettingsError(f"a stage needs 1 hypothesis or more, not {self.hypotheses}")
-        if not self.outside_share >= 0.0:
-            raise SettingsError(f"outside_share must be 0 or more, not {self.outside_share}")
+        if not self.outside_fraction >= 0.0:
+            raise SettingsError(f"outside_fraction must be 0 or more, not {self.outside_fraction}")
         if self.outside_weight < 1:
             raise SettingsError(f"outside_weight must be 1 or more, not {self.outside_weight}")
 
 
 EXACT_STAGES = (Stage(20), Stage(160))
-"""For a body that is the object itself. They end at once where it is not; where they fail, one
-branch and bound looks for all poses within the tolerance."""
+"""Stages for a model that fits the object exactly. If no pose fits exactly, they end early; if they
+find none, a branch and bound enumerates all poses within the tolerance."""
 
 TOLERANT_STAGES = (Stage(80, 0.3, 5), Stage(300, 1.0, 2))
-"""For a body that fits badly."""
+"""Stages for a model that fits the object only approximately."""
 
 
 @dataclass(frozen=True)
@@ -107,12 +113,14 @@ class BeamSearchSettings(GridSettings):
     """Parameters of the beam search.
 
     Args:
-        tolerance: a pose whose silhouettes differ by no more [pixel] counts as exact; None: what
-            two renderers differ by (``renderer_tolerance``).
-        stages: the passes, one after another until J is within the tolerance. Of those with no
-            outside share the tolerance is the limit; after them all poses within it are looked for.
-        research_hypotheses: kept while limbs of the winner are searched again; 0: they are not.
-        time_limit: the search returns its best pose so far after this time [s]; None: no limit.
+        tolerance: a pose with J up to this counts as exact [pixel]; None: the difference between
+            two renderers (``renderer_tolerance``).
+        stages: the passes, run one after another until J is within the tolerance. Where
+            ``outside_fraction`` is 0 the tolerance limits the area outside; after these stages a
+            branch and bound enumerates all poses within the tolerance.
+        research_hypotheses: beam width when limbs of the best pose are searched again; 0: limbs are
+            not searched again.
+        time_limit: time after which the best pose found is returned [s]; None: no limit.
 
     Raises:
         SettingsError: if a value is out of its range.
@@ -132,24 +140,25 @@ class BeamSearchSettings(GridSettings):
 
 @dataclass(frozen=True)
 class Pass:
-    """One part of a refinement by pixels."""
+    """One pass of a refinement by pixels."""
 
-    iterations: int  # The greatest number of steps.
-    stride: int  # One row and one column in this many is looked at.
-    scale: float  # Distances beyond it lose weight [pixel].
+    iterations: int  # Greatest number of steps.
+    stride: int  # Every stride-th row and column is compared.
+    scale: float  # Scale of the robust cost: larger distances lose weight [pixel].
     damping: float  # Added to the diagonal of the normal equations [pixel^2/rad^2].
-    longest_step: float = 0.25  # No parameter changes by more in a step [rad or m].
-    slack: float = 0.0  # Distances up to this hardly count [pixel].
+    longest_step: float = 0.25  # Greatest change of a parameter in a step [rad or m].
+    slack: float = 0.0  # Dead zone: distances up to this have hardly any weight [pixel].
 
 
 class RefinementPasses(NamedTuple):
-    """The passes of a refinement by pixels: from far, from near, and to the optimum itself.
+    """Passes of a refinement by pixels: from a coarse pose, from a near one, and to the optimum.
 
-    A pixel is wrong where the contour is more than half a pixel from the border on its line. A
-    smaller distance says nothing: the border lies anywhere between two pixel centres, with equal
-    probability. The mean of least squares leaves 0.02 to 0.03 of the border's pixels wrong; a pose
-    within the bounds that all lines set together leaves 0.005 to 0.015 and is half as far from the
-    true one. The last passes' slack of 0.4 instead of 0.5 keeps it from resting on bounds.
+    A pixel is wrong if the contour is more than half a pixel from the border on the pixel's raster
+    line. A smaller distance carries no information: the border is uniformly distributed between two
+    pixel centres. A least-squares pose leaves 0.02 to 0.03 of the border's pixels wrong. A pose
+    within half a pixel on all lines leaves 0.005 to 0.015 wrong and is half as far from the true
+    pose. The slack of the last passes is 0.4 instead of 0.5 pixels, so that the pose does not end
+    on the bounds of this region.
     """
 
     coarse: tuple[Pass, ...] = (Pass(8, 4, 50.0, 300.0), Pass(8, 4, 10.0, 100.0))
@@ -161,57 +170,63 @@ PASSES = RefinementPasses()
 
 
 class NeighbourhoodSettings(NamedTuple):
-    """Numbers of the search about a pose; limits on J are fractions of the borders' length."""
+    """Parameters of the search around a pose; excesses of J are fractions of the border length."""
 
-    far: tuple[Pass, ...] = (Pass(4, 4, 30.0, 100.0),)  # From a part placed anew.
-    reflected: tuple[Pass, ...] = (Pass(8, 4, 30.0, 100.0), Pass(6, 3, 6.0, 30.0))  # Mirrored.
-    nearer: tuple[Pass, ...] = (Pass(5, 3, 6.0, 30.0),)  # After these.
-    fine: tuple[Pass, ...] = (Pass(6, 2, 2.0, 5.0),)  # To the part's optimum.
-    end: tuple[Pass, ...] = (Pass(6, 1, 1.0, 0.5, slack=0.4),)  # Of other poses that are kept.
+    placed: tuple[Pass, ...] = (Pass(4, 4, 30.0, 100.0),)  # First passes of a part placed anew.
+    # First passes of a mirrored part of the body.
+    mirrored: tuple[Pass, ...] = (Pass(8, 4, 30.0, 100.0), Pass(6, 3, 6.0, 30.0))
+    second: tuple[Pass, ...] = (Pass(5, 3, 6.0, 30.0),)  # Passes after the first ones.
+    fine: tuple[Pass, ...] = (Pass(6, 2, 2.0, 5.0),)  # Passes to the optimum of the part alone.
+    final: tuple[Pass, ...] = (Pass(6, 1, 1.0, 0.5, slack=0.4),)  # Passes of alternative poses.
     whole: tuple[Pass, ...] = (Pass(3, 3, 6.0, 50.0), Pass(3, 2, 2.0, 5.0))  # All parts move.
-    pursued: int = 2  # The number of placements refined after the first pass.
-    hopeful: float = 0.15  # The greatest excess over the best J after the first pass,
-    near: float = 0.03  # after the second,
-    kept: float = 0.03  # and of poses that are kept.
-    mended: float = 0.35  # Mirrored poses up to this excess are mended,
-    mendings: int = 6  # with this many tries.
-    equal: float = 0.01  # Poses up to this excess are refined with all of the body.
-    better: float = 0.003  # A smaller decrease of J is no improvement.
-    spare: float = 0.015  # Others up to this above their limit are refined with all of the body.
-    same_error: float = 0.1  # Errors whose ratio differs from 1 by less are the same.
-    least_error: float = 0.001  # Parts with less error are left for later [fraction of the area].
-    rounds: int = 2  # How often a part is tried; twice as often where all parts are to be tried.
+    refined: int = 2  # Number of placements that get the second passes.
+    # Greatest excess over the current J after the first passes, after the second ones, and of an
+    # alternative pose that is stored.
+    first_excess: float = 0.15
+    second_excess: float = 0.03
+    stored_excess: float = 0.03
+    repaired_excess: float = 0.35  # Mirrored poses up to this excess have their parts placed anew,
+    repair_tries: int = 6  # with this number of tries.
+    whole_excess: float = 0.01  # Poses up to this excess are refined with all parts moving.
+    least_decrease: float = 0.003  # A smaller decrease of J is no improvement.
+    # Alternative poses up to this above their limit are refined with all parts moving.
+    alternative_excess: float = 0.015
+    same_error: float = 0.1  # Errors of a part are equal if they differ by a smaller fraction.
+    least_error: float = 0.001  # Parts with less error are not placed anew [fraction of the area].
+    rounds: int = 2  # Number of tries of each part; doubled where all parts must be tried.
 
 
 class RootPlacementSettings(NamedTuple):
-    """Numbers of the search for the root's place."""
+    """Parameters of the search for the root's position."""
 
-    across: int = 12  # Positions tried across the silhouette.
-    ratio: float = 1.12  # Of neighbouring scales or depths.
-    cut_off: float = 1.5  # A body cut off by the picture may be larger than it looks by this.
-    outside_share: float = (
-        0.6  # Of a node's area that may lie outside: the root is half a step off.
-    )
-    outside_weight: int = 2  # Cost of a pixel outside; one newly covered gains one.
-    hypotheses: int = 500  # Shared among the scales or depths.
-    quota: float = 0.05  # The largest fraction of them with the root at one position.
-    starts: int = 24  # Poses refined from far.
-    finalists: int = 3  # Root positions searched again, and poses refined to the end.
-    again: int = 4  # Poses of each search again.
-    pixels: int = 1500  # Of a coarse silhouette.
-    root_factor: int = 2  # Hypotheses of the root alone, times the width.
-    root_spare: int = 2  # Rotations tried at a position, times its quota.
-    spare: int = 8  # Hypotheses grown before the quota, times the width.
-    alike: float = 0.5  # See ``BeamSearch.best_poses``.
-    enough: float = 0.004  # A pose with a smaller E_total is not searched on.
+    positions_across: int = 12  # Positions tried across the silhouette.
+    scale_ratio: float = 1.12  # Ratio of neighbouring scales or depths.
+    # Factor by which a body cut off by the image border may be larger than its silhouette.
+    cut_off: float = 1.5
+    # Greatest area outside the silhouette [fraction of a node's mean projected area]. It is large
+    # because the root may be half a grid step off.
+    outside_fraction: float = 0.6
+    outside_weight: int = 2  # Cost of a pixel outside, relative to the gain of one newly covered.
+    hypotheses: int = 500  # Beam width, shared among the scales or depths.
+    quota: float = 0.05  # Greatest fraction of the hypotheses with the same root position.
+    starts: int = 24  # Number of poses refined by the coarse passes.
+    finalists: int = 3  # Number of root positions searched again, and of poses refined to the end.
+    poses_again: int = 4  # Number of poses of each search with a known root.
+    coarse_pixels: int = 1500  # Area of a silhouette in the coarse images [pixel].
+    root_factor: int = 2  # Beam width after the root, as a multiple of the beam width.
+    root_spare: int = 2  # Rotations tried at each position, as a multiple of its quota.
+    spare: int = 8  # Hypotheses made before the quota is applied, as a multiple of the beam width.
+    overlap: float = 0.5  # See ``BeamSearch.best_poses``.
+    good_E_total: float = 0.004  # The search ends at a pose with a smaller E_total.
 
 
 @dataclass(frozen=True)
 class ExactSearchSettings:
-    """Numbers of the search of exact masks; limits on J are fractions of the borders' length.
+    """Parameters of the search in exact masks; limits of J are fractions of the border length.
 
-    Of the beam searches on the grids of 20 (0) and 15 degrees (1) each runs only where none before
-    it has led to a good pose: what one grid and order of nodes misses, another often has.
+    The beam searches use grids of 20 degrees (index 0) and 15 degrees (index 1). Each runs only if
+    those before it found no good pose: a pose missed on one grid or in one order of nodes is often
+    found on another.
     """
 
     stages: tuple[tuple[int, Stage], ...] = (
@@ -220,25 +235,28 @@ class ExactSearchSettings:
         (1, Stage(60, 1.0, 2, limb_by_limb=True)),
         (1, Stage(60, 0.3, 5, limb_by_limb=True)),
     )
-    # Masks may be exact if this fraction of their border's pixels is a fitted pose's: .54 to .99 of
-    # bodies that Drake drew (``tests/silhouettes``), .1 to .51 of real arms and people.
+    # Masks may be exact if at least this fraction of their border pixels coincides with the border
+    # of a fitted pose. Bodies drawn by Drake have .54 to .99 (``tests/silhouettes``), real arms and
+    # people .1 to .51.
     coinciding: float = 0.53
-    starts: int = 4  # Poses of each beam search that are refined.
-    alike: float = 0.5  # See ``BeamSearch.best_poses``.
-    # Give up above this J after coarse passes, or where larger, above this times the root of the
-    # mean area [pixel].
+    starts: int = 4  # Number of poses of each beam search that are refined.
+    overlap: float = 0.5  # See ``BeamSearch.best_poses``.
+    # The search gives up if J after the coarse passes exceeds the larger of these two: the second
+    # is a fraction of the root of the mean silhouette area [pixel].
     hopeless: float = 1.5
-    hopeless_share: float = 0.017
-    enough: float = 0.03  # A pose with a smaller J is not searched on: it is the pixels' noise.
+    hopeless_fraction: float = 0.017
+    good: float = 0.03  # The search ends at a pose with a smaller J, which is pixel noise.
     exact: float = 0.18  # A pose with a smaller J is the answer.
-    plausible: float = 0.5  # Above this J the robust pose is the answer.
-    agreeing: float = 1.1  # Two grids agree if the ratio of their Js is smaller: the body misfits.
-    better: int = 3  # How often another pose may replace the best one.
-    tolerance: float = 0.03  # Poses are as good as the best up to this excess.
-    same: float = 0.1  # Poses whose values differ by less are one [rad or m].
-    confidence: float = 0.95  # Probability that an interval holds the true value.
-    noise_factor: float = 1.4  # Standard deviation relative to that of independent distances.
-    misfit: float = 0.025  # Above this J nothing is determined: another pose may be right.
+    plausible: float = 0.5  # Above this J the pose of the robust fit is the answer.
+    # Two grids agree if the ratio of their Js is smaller: the model itself does not fit.
+    agreement: float = 1.1
+    replacements: int = 3  # Greatest number of times that an alternative replaces the best pose.
+    tolerance: float = 0.03  # Greatest excess of J of a pose that is as good as the best.
+    same: float = 0.1  # Poses are equal if no value differs by more [rad or m].
+    confidence: float = 0.95  # Probability that an interval contains the true value.
+    # Ratio of the actual standard deviation to that of statistically independent distances.
+    noise_factor: float = 1.4
+    misfit: float = 0.025  # Above this J no value is determined: another pose may be right.
 
 
 _COARSE = (AnnealingStage(0.1, 0.04, 3), AnnealingStage(0.05, 0.04, 3))
@@ -247,75 +265,86 @@ _MEDIUM = (AnnealingStage(0.05, 0.026, 4), AnnealingStage(0.025, 0.026, 4))
 
 @dataclass(frozen=True)
 class MultiStartSettings:
-    """Numbers of the search of damaged masks; sizes are fractions of the root of the mean area.
+    """Parameters of the search in damaged masks; lengths in units of the root of the mean area.
 
-    In several views a wrong pose costs more from the first stage on. In one view the last stage may
-    decide: there no start is dropped after the first stage.
+    In several views the cost of a wrong pose is higher from the first stage on, so starts are
+    dropped early. In a single view the last stage may decide.
     """
 
-    interval: float = math.radians(15.0)  # Of the angles of coarse poses [rad].
+    interval: float = math.radians(15.0)  # Sampling interval of angles in the coarse search [rad].
     coarse: tuple[AnnealingStage, ...] = _COARSE
     medium: tuple[AnnealingStage, ...] = _MEDIUM
     final: tuple[AnnealingStage, ...] = (AnnealingStage(0.0125, 0.0125, 6),)
-    starts: int = 40  # Coarse poses that are fitted.
-    finalists: int = 4  # Poses that are fitted to the end.
-    # Stages, and the number of poses that go on after them, in one view and in several.
+    starts: int = 40  # Number of coarse poses that are fitted.
+    finalists: int = 4  # Number of poses that are fitted to the end.
+    # Stages, and the number of poses kept after them: in one view, and in several.
     passes: tuple[tuple[tuple[tuple[AnnealingStage, ...], int], ...], ...] = (
         ((_COARSE, 12), (_MEDIUM, 12)),
         ((_COARSE[:1], 20), (_COARSE[1:], 12), (_MEDIUM[:1], 6), (_MEDIUM[1:], 6)),
     )
-    # The same of other explanations, in several views.
-    following: tuple[tuple[tuple[AnnealingStage, ...], int], ...] = (
+    # Stages of alternative poses in several views, and the number kept after them.
+    alternative_passes: tuple[tuple[tuple[AnnealingStage, ...], int], ...] = (
         (_MEDIUM[:1], 4),
         (_MEDIUM[1:], 4),
     )
-    apart: float = 0.13  # Coarse poses differ if a part is seen this far away.
-    rounds: int = 2  # Of searches for other explanations,
-    sought_about: int = 3  # about this many poses,
-    tried: int = 6  # of which this many are fitted each,
-    flipped: int = 3  # and this many made by flips.
-    better: float = 0.98  # In several views they end if costs do not fall to this fraction.
-    limbs: tuple[float, float] = (0.03, 0.04)  # Radius of a limb's disc, in one and several views.
-    beam_starts: int = 10  # If such a disc fits into what is wrong, poses of the beam search,
-    beam_views: int = 2  # in this many views,
-    beam_pixels: int = 3000  # with this many pixels each.
+    # Coarse poses differ if some node's image is at least this far away.
+    separation: float = 0.13
+    rounds: int = 2  # Rounds of the search for alternative poses,
+    explored: int = 3  # number of poses around which alternatives are searched in a round,
+    alternatives: int = 6  # and number of alternatives of each pose that are fitted,
+    flipped: int = 3  # besides this number of flipped poses.
+    # In several views a round ends if no alternative costs less than this fraction of the best.
+    improvement: float = 0.98
+    # Radius of a disc as thick as a limb, in one and in several views.
+    limb_radii: tuple[float, float] = (0.03, 0.04)
+    beam_starts: int = 10  # If a wrong region holds such a disc: number of poses of a beam search,
+    beam_views: int = 2  # number of views that it uses,
+    beam_pixels: int = 3000  # and area of their silhouettes [pixel].
 
 
 class RobustSettings(NamedTuple):
-    """Numbers of the intervals and modes of damaged masks."""
+    """Parameters of the intervals and modes computed from damaged masks."""
 
-    look: AnnealingStage = AnnealingStage(0.0125, 0.026, 2)  # Compares poses.
-    follow: tuple[AnnealingStage, ...] = (  # The others follow a value that is moved.
+    # Stage at which costs of poses are compared.
+    comparison: AnnealingStage = AnnealingStage(0.0125, 0.026, 2)
+    # Stages at which the other values follow a value that is moved.
+    follow: tuple[AnnealingStage, ...] = (
         AnnealingStage(0.025, 0.026, 2),
         AnnealingStage(0.0125, 0.026, 2),
     )
-    fine: AnnealingStage = AnnealingStage(0.025, 0.0125)  # Measures errors, large ones too.
-    significance: float = 1.96  # Standard deviations of the costs' difference that matter.
-    modes: int = 8  # The greatest number.
-    moved: tuple[float, float] = (math.radians(3.0), 0.01)  # Wider intervals are searched [rad, m].
-    longest_steps: tuple[float, float] = (0.5, 0.1)  # Of this search [rad, m],
-    growth: float = 1.6  # each step longer by this factor.
+    measure: AnnealingStage = AnnealingStage(0.025, 0.0125)  # Stage at which errors are measured.
+    # Difference of costs that is significant [standard deviations].
+    significance: float = 1.96
+    modes: int = 8  # Greatest number of modes.
+    # Values whose interval by covariance is wider on a side are moved step by step [rad, m].
+    moved: tuple[float, float] = (math.radians(3.0), 0.01)
+    longest_steps: tuple[float, float] = (0.5, 0.1)  # Longest step of a moved value [rad, m].
+    step_factor: float = 1.6  # Ratio of successive steps.
     one_sided: float = 0.975  # Probability that a value lies below its interval's upper end.
-    camera_motions: int = 6  # Degrees of freedom of a camera's error.
+    camera_freedom: int = 6  # Degrees of freedom of a camera's error.
 
     @staticmethod
     def widest(is_angle: np.ndarray) -> np.ndarray:
-        """(m,) how wide intervals of determined values are at most: 10 degrees or 2 cm a side."""
+        """Return (m,) the greatest width of a determined value's interval [rad or m].
+
+        It is 10 degrees, or 2 cm, on each side. ``is_angle``: (m,) whether a value is an angle.
+        """
         return 2.0 * np.where(is_angle, math.radians(10.0), 0.02)
 
 
 @dataclass(frozen=True)
 class BoundLimits:
-    """How much a branch and bound may look at.
+    """Limits of a branch and bound.
 
     Args:
-        states: how many partial poses are kept after each node.
-        pairs: how many pairs of a partial pose and a pose of the next node are looked at.
-        poses: after this many poses of nodes are drawn it stops.
-        memory: it stops before drawn poses and what they reach take more than this, and keeps fewer
-            partial poses where all would take more than a quarter of it [byte]. What it needs for a
-            moment comes on top, about as much again.
-        time_limit: it stops after this time [s]; None: no limit.
+        states: greatest number of partial poses kept after each node.
+        pairs: greatest number of pairs of a partial pose and a pose of the next node that are
+            evaluated for one node.
+        poses: number of drawn poses of nodes after which the search stops.
+        memory: the search stops before the drawn poses and the areas that they reach take more than
+            this, and it keeps fewer partial poses if all would take more than a quarter of this
+            [byte]. Temporary arrays take about as much again.
+        time_limit: time after which the search stops [s]; None: no limit.
 
     Raises:
         SettingsError: if a value is out of its range.
@@ -336,5 +365,5 @@ class BoundLimits:
 
     @property
     def deadline(self) -> float:
-        """The value of time.perf_counter() at which a search that begins now stops [s]."""
+        """The time.perf_counter() at which a search that starts now must stop [s]."""
         return math.inf if self.time_limit is None else time.perf_counter() + self.time_limit

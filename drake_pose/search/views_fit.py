@@ -242,7 +242,7 @@ def covariance_pose_set(
     """
     kinematics, settings = TreeKinematics(tree), RobustSettings()
     values = kinematics.flatten(pose.node_values)
-    widths = stdtrit(settings.camera_motions * pictures, settings.one_sided) * np.sqrt(
+    widths = stdtrit(settings.camera_freedom * pictures, settings.one_sided) * np.sqrt(
         np.diag(covariance)
     )
     lower, upper = kinematics.reach(values)
@@ -275,7 +275,7 @@ class RobustModes:
 
     def find(self, poses: Sequence[FittedPose], J: Callable[[np.ndarray], float]) -> PoseSet:
         """The poses that fit as well as the best of some, the answer first; J (1) of values."""
-        look = self._settings.look
+        look = self._settings.comparison
         pieces = map_ordered(lambda pose: self._fit.tile_costs(pose.values, look), poses)
         self._pieces = min(pieces, key=lambda one: float(one.sum()))
         modes: list[FittedPose] = []
@@ -289,7 +289,7 @@ class RobustModes:
 
     def around(self, values: np.ndarray, J: float) -> PoseSet:
         """What the silhouettes say about one pose (m,), where no other is looked for."""
-        self._pieces = self._fit.tile_costs(values, self._settings.look)
+        self._pieces = self._fit.tile_costs(values, self._settings.comparison)
         return self._described([self._spread(values, moves=False)], [J])
 
     def _described(self, modes: Sequence[FittedPose], Js: Sequence[float]) -> PoseSet:
@@ -325,7 +325,7 @@ class RobustModes:
 
     def _add_flipped(self, modes: list[FittedPose], mode: FittedPose) -> None:
         """Add what flips make of a mode, as far as it fits: intervals flip as middles do."""
-        kinematics, look = self._kinematics, self._settings.look
+        kinematics, look = self._kinematics, self._settings.comparison
 
         def settle(flip: Flip) -> tuple[np.ndarray, np.ndarray]:
             seen = self._fit.refine(flip.values, (look,)).values
@@ -356,12 +356,12 @@ class RobustModes:
         kinematics, own = self._kinematics, self._settings
         lower, upper = kinematics.reach(values)
         free = np.flatnonzero(upper > lower)
-        seen = self._fit.distances(values, own.fine)
+        seen = self._fit.distances(values, own.measure)
         if self._sizes is None:
             self._sizes = estimate_sizes(seen, kinematics.is_angle)
         covariance = values_covariance(seen, self._sizes, free, kinematics.is_angle)
         low, high = values.copy(), values.copy()
-        freedom = own.camera_motions * self._fit.camera_count
+        freedom = own.camera_freedom * self._fit.camera_count
         widths = stdtrit(freedom, own.one_sided) * np.sqrt(np.diag(covariance))
         low[free], high[free] = values[free] - widths, values[free] + widths
         wide = widths > np.where(kinematics.is_angle[free], *own.moved)
@@ -402,12 +402,12 @@ class RobustModes:
         while lower[index] < found[-1][index] < upper[index] and self._proceed():
             trial = np.clip(found[-1] + min(step, longest) * along, lower, upper)
             looked = self._fit.refine(trial, own.follow, held=(index,)).values
-            costs = self._fit.tile_costs(looked, own.look)
+            costs = self._fit.tile_costs(looked, own.comparison)
             before, worse = worse, vuong_statistic(costs, self._pieces)
             if worse > own.significance:
                 # Costs are parabolas in the rough, and their differences scatter as values differ.
                 share = (own.significance - before) / (worse - before)
                 return [*found, found[-1] + share * (looked - found[-1])]
             found.append(looked)
-            step *= own.growth
+            step *= own.step_factor
         return found

@@ -116,7 +116,7 @@ def test_a_limit_still_answers_and_says_so(maker):
         (BeamSearchSettings, {"research_hypotheses": -1}),
         (BeamSearchSettings, {"time_limit": -1.0}),
         (Stage, {"hypotheses": 0}),
-        (Stage, {"hypotheses": 1, "outside_share": -0.1}),
+        (Stage, {"hypotheses": 1, "outside_fraction": -0.1}),
         (Stage, {"hypotheses": 1, "outside_weight": 0}),
         (ExaminationSettings, {"tolerance": -1.0}),
         (ExaminationSettings, {"modes": 0}),

@@ -12,7 +12,7 @@ from tests.search.bodies import forked_body
 from tests.search.grid_problems import ProblemMaker
 
 INTERVAL = 0.2
-ALIKE = 0.7
+OVERLAP = 0.7
 
 
 @pytest.fixture(scope="module")
@@ -58,7 +58,7 @@ def look_alike(first, second):
             for pose in (first, second)
         ]
         one, other = first[:, node], second[:, node]
-        if any(is_seen) and (one & other).sum() < ALIKE * (one | other).sum():
+        if any(is_seen) and (one & other).sum() < OVERLAP * (one | other).sum():
             return False
     return True
 
@@ -67,7 +67,7 @@ def look_alike(first, second):
 def test_the_list_begins_with_the_best_and_no_two_look_alike(maker, count):
     problem = maker.make(np.random.default_rng(1), views=count, noise=0.0, on_grid=False)
     search = BeamSearch(maker.tree, settings())
-    poses = search.best_poses(problem.views, count=8, alike=ALIKE)
+    poses = search.best_poses(problem.views, count=8, overlap=OVERLAP)
     Js = objectives(problem, poses)
     assert len(poses) == 8
     assert Js[0] == search.match(problem.views).J
@@ -78,7 +78,7 @@ def test_the_list_begins_with_the_best_and_no_two_look_alike(maker, count):
 
 
 def test_all_poses_of_the_grid_differ_if_that_is_wanted(maker, problem):
-    poses = BeamSearch(maker.tree, settings()).best_poses(problem.views, count=10, alike=2.0)
+    poses = BeamSearch(maker.tree, settings()).best_poses(problem.views, count=10, overlap=2.0)
     np.testing.assert_array_equal(objectives(problem, poses), np.sort(problem.Js)[:10])
     assert len({tuple(np.concatenate(values)) for values in poses}) == 10
 

@@ -1,4 +1,4 @@
-"""report.html: what came out, on one page that needs nothing else to be read."""
+"""The page report.html of an estimate, in one file with all pictures, and parts of other pages."""
 
 import base64
 import io
@@ -18,6 +18,7 @@ from matplotlib.figure import Figure
 
 from drake_pose.arrays import Array, Mask
 from drake_pose.body import ArticulatedModel
+from drake_pose.errors import listed
 from drake_pose.files.folder import OVERLAY
 from drake_pose.files.records import SceneEstimate, measured_positions, user_units
 from drake_pose.silhouette.pictures.scenes import Scene
@@ -26,18 +27,18 @@ from drake_pose.silhouette.pictures.scenes import Scene
 def make_report(
     folder: Path, model: ArticulatedModel, scene: Scene, estimate: SceneEstimate
 ) -> str:
-    """The page of an estimate; files and overlays that lie in its folder are linked."""
+    """Return the HTML page of an estimate, with links to the files and overlays in its folder."""
     frames, records, joined = list(estimate.records), estimate.records.values(), scene.sequence
     found = ["found" if record.found else "not-found" for record in records]
-    use = {name: _use(scene, estimate, name) for name in scene.cameras}
+    use = {name: _picture_use(scene, estimate, name) for name in scene.cameras}
     errors = [np.nan if one.E_total is None else 100.0 * one.E_total for one in records]
     ious = [
         (name, np.array([100.0 * record.ious.get(name, np.nan) for record in records]))
         for name in scene.cameras
     ]
     pictures = _pick_pictures(folder, scene, estimate)
-    told, grid, plots = {*found}.union(*use.values()) != {"found", "used"}, None, {}
-    if told:
+    grid, plots = None, {}
+    if {*found}.union(*use.values()) != {"found", "used"}:
         grid = plot_uri(draw_grid(frames, [*use.items(), ("pose", found)]))
     if len(frames) > 1:
         curves = {"errors": [("E_total", np.array(errors))], "ious": ious}
@@ -45,19 +46,21 @@ def make_report(
             least = 0.0 if name == "errors" else None
             plots[name] = plot_uri(plot_curves(frames, values, joined=joined, least=least))
     about = {
-        "poses.csv": "every position of every frame [rad or m]",
-        "joints.csv": "what is known of each joint, and in what interval [deg or m]",
-        "modes.csv": "poses that look the same",
+        "poses.csv": "every position in every frame [rad or m]",
+        "joints.csv": "95 % interval of each joint, and whether it is determined [deg or m]",
+        "modes.csv": "other poses that fit equally well",
         "joint_centres.csv": "anatomical joint centres in the world [m]",
         "joint_centres.trc": "the same as markers [mm], for motion analysis",
         "positions.mot": "every position over time [deg or m], for motion analysis",
         "motion.bvh": "skeleton and motion [cm], for animation",
-        "shapes.png": "the corrected shape of the body over that of the model's file",
-        "replay.html": "plays the estimate in three dimensions",
-        "summary.json": "settings, versions, and all figures of this page",
+        "shapes.png": "the fitted shape of the body over the model file's",
+        "replay.html": "the estimate in three dimensions",
+        "summary.json": "settings, versions and all numbers of this page",
     }
     return page_template("drake_pose.files").render(
         summary=estimate.summary,
+        answer=estimate_answer(model, estimate),
+        kind="estimate",
         title=Path(str(estimate.summary["scene"])).name or str(estimate.summary["scene"]),
         model=model.path.name,
         method=_describe_method(scene, estimate),
@@ -68,24 +71,53 @@ def make_report(
         cameras=[_camera_row(estimate, name, states) for name, states in use.items()],
         grid=grid,
         joined=joined,
-        joints=_describe_joints(model, estimate, joined),
+        joints=_joint_rows(model, estimate, joined),
         pictures=pictures,
         compared_pictures={(one["camera"], one["frame"]) in scene.masks for one in pictures},
         files=[(name, text) for name, text in about.items() if (folder / name).is_file()],
     )
 
 
+def estimate_answer(model: ArticulatedModel, estimate: SceneEstimate) -> str:
+    """Return the result in one or two sentences: poses found, error, and determined joints."""
+    found = [record for record in estimate.records.values() if record.found]
+    count = len(estimate.records)
+    of_frames = "" if count == 1 else f" in {len(found)} of {count} frames"
+    if not found:
+        return "No pose was found." if count == 1 else f"No pose was found in {count} frames."
+    error = "error" if count == 1 else "mean error"
+    error += f" {100.0 * estimate.summary['mean_E_total']:.1f} % of the silhouette"
+    names = [
+        name for name in model.position_names if any(name in record.joints for record in found)
+    ]
+    open_joints = [
+        name
+        for name in names
+        if not all(name in one.joints and one.joints[name]["determined"] for one in found)
+    ]
+    determined = f"{len(names) - len(open_joints)} of {len(names)} joints determined"
+    if not names:
+        return f"Pose found{of_frames}; {error}."
+    if not open_joints:
+        return f"{determined}{of_frames}; {error}."
+    always, not_always = ("", "not") if count == 1 else (" in all of them", "not always")
+    return (
+        f"Pose found{of_frames}; {error}. {determined}{always}; {not_always}: "
+        f"{listed(open_joints)}."
+    )
+
+
 def _describe_method(scene: Scene, estimate: SceneEstimate) -> str:
-    """How the poses were found: searched, or tracked from frame to frame."""
+    """Return how the poses were found, such as ``tracked in 58 frames, 2 searched``."""
     method, states = str(estimate.summary["method"]), estimate.records.values()
     if method == "person" and scene.images:
         method = "person_by_colour"
     text = {
-        "beam": "searched by many hypotheses side by side",
-        "paper": "searched as published",
-        "person": "one person followed by all silhouettes at once",
-        "person_by_colour": "one person followed by colour",
-        "paper_capture": "one person followed by skin-coloured features, as published",
+        "beam": "searched by beam search",
+        "paper": "searched as published by Kameda et al.",
+        "person": "one person, fitted to all silhouettes at once",
+        "person_by_colour": "one person, tracked by colour",
+        "paper_capture": "one person, tracked by skin colour as published by Date et al.",
     }[method]
     tracked = sum(record.found and record.stopped_by == "tracked" for record in states)
     others = estimate.found_count - tracked
@@ -101,59 +133,119 @@ def page_template(package: str, name: str = "report_template.html.j2") -> Templa
         autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True,
         loader=PackageLoader("drake_pose.files", ""),
     )  # fmt: skip
-    environment.tests |= {"infinite": math.isinf, "nan": math.isnan}
     style = files("drake_pose.files").joinpath("report_style.css")
     environment.globals["style"] = Markup(style.read_text(encoding="utf-8").rstrip())
     source = files(package).joinpath(name)
     return environment.from_string(source.read_text(encoding="utf-8"))
 
 
-def _describe_joints(
+def _joint_rows(
     model: ArticulatedModel, estimate: SceneEstimate, joined: bool
 ) -> list[dict[str, Any]]:
-    """All positions that are known in a frame; a plot of each that changes from frame to frame."""
-    records, unit = list(estimate.records.values()), user_units(model)
-    frames, of_kind = list(estimate.records), {"angle": "deg", "length": "m", "quaternion": ""}
+    """Return the rows of the table of joints, with a bar and a plot of each joint.
+
+    Positions are in degrees or mm. Joints without an estimate, and those of a fixed base, have no
+    row.
+    """
+    records, frames = list(estimate.records.values()), list(estimate.records)
     if not records:
         return []
-    q = unit * np.array([record.q for record in records])
-    measured = unit * measured_positions(model, records)
-    limits = unit * [model.lower, model.upper]
-    nothing, joints = {"determined": False, "low": np.nan, "high": np.nan}, []
+    units = {"angle": ("deg", 1.0, 1), "length": ("mm", 1e3, 1), "quaternion": ("", 1.0, 3)}
+    scale = np.array([units[kind][1] for kind in model.position_kinds])
+    to_page = scale * user_units(model)
+    q = to_page * np.array([record.q for record in records])
+    measured = to_page * measured_positions(model, records)
+    limits, rows = to_page * [model.lower, model.upper], list[dict[str, Any]]()
+    unknown = {"determined": False, "low": np.nan, "high": np.nan}
     for k, (name, kind) in enumerate(zip(model.position_names, model.position_kinds, strict=True)):
         ends, own, plot = _ends(q[:, k]), (float(limits[0, k]), float(limits[1, k])), None
-        told = [record.joints.get(name, nothing) for record in records]
-        low, high = np.array([(one["low"], one["high"]) for one in told]).T
-        determined = np.array([one["determined"] for one in told])
-        # A position that stays the same is said in a table.
+        known = [record.joints.get(name, unknown) for record in records]
+        low, high = scale[k] * np.array([(one["low"], one["high"]) for one in known]).T
+        determined = np.array([one["determined"] for one in known])
         if ends[1] - ends[0] >= 1e-9:
             curves = [("measured", measured[:, k]), (name, q[:, k])]
             drawn = plot_curves(
                 frames, curves, joined=joined, limits=own, intervals=(low, high, determined)
             )
             plot = plot_uri(drawn)
-        # Of a base that stands nothing is asked.
         elif np.isnan(ends[0]) or (np.isnan(low).all() and math.isinf(own[0])):
             continue
-        known = np.isfinite(low)
-        joints.append({
-            "name": name, "unit": of_kind[kind], "ends": ends, "interval": _ends(low, high),
-            "determined": determined[known].all(), "any_determined": determined[known].any(),
-            "any_open": (~determined[known]).any(), "measured": _ends(measured[:, k]),
-            "limits": own, "plot": plot,
+        unit, _, digits = units[kind]
+        has_interval, interval = np.isfinite(low), _range(_ends(low, high), digits)
+        if len(records) > 1 and has_interval.any():
+            half = 0.5 * float(np.median((high - low)[has_interval]))
+            interval = f"± {half:.{digits}f}"
+        errors = estimate.summary["joint_errors"].get(name)
+        count, sure = estimate.found_count, int(determined.sum())
+        of_frames = f"{sure} of {count}" if len(records) > 1 else "yes" if sure else "no"
+        rows.append({
+            "name": name, "unit": unit, "estimate": _range(ends, digits), "interval": interval,
+            "determined": of_frames if has_interval.any() else "–",
+            "any_determined": sure > 0, "any_open": has_interval.any() and sure < count,
+            "measured": _range(_ends(measured[:, k]), digits), "limits": _limits_text(own),
+            "mean_error": f"{scale[k] * errors['mean']:.{digits}f}" if errors else "–",
+            "largest_error": f"{scale[k] * errors['greatest']:.{digits}f}" if errors else "–",
+            "bar": _bar(own, ends, _ends(low, high), is_open=sure < count),
+            "plot": plot, "warnings": _warnings_of(estimate, name),
         })  # fmt: skip
-    return joints
+    return rows
+
+
+def _range(ends: tuple[float, float], digits: int) -> str:
+    """Return ``low to high``, one number if both are equal, or a dash where they are unknown."""
+    low, high = ("none" if math.isinf(one) else f"{one:z.{digits}f}" for one in ends)
+    return "–" if math.isnan(ends[0]) else low if low == high else f"{low} to {high}"
+
+
+def _limits_text(limits: tuple[float, float]) -> str:
+    """Return ``lower to upper``, to a tenth at most."""
+    return " to ".join("none" if math.isinf(one) else f"{round(one, 1):g}" for one in limits)
+
+
+def _bar(
+    limits: tuple[float, float],
+    estimate: tuple[float, float],
+    interval: tuple[float, float],
+    *,
+    is_open: bool,
+    least_width: float = 1.0,
+) -> list[dict[str, Any]]:
+    """Return the rectangles of a bar between a joint's limits; none where a limit is infinite.
+
+    Args:
+        limits, estimate, interval: smallest and largest value in one unit; nan where unknown.
+        is_open: whether the joint is not determined in some frame.
+        least_width: width of a single value [percent of the bar].
+    """
+    span = limits[1] - limits[0]
+    if not (math.isfinite(span) and span > 0.0):
+        return []
+    parts = []
+    for kind, ends in (("open" if is_open else "interval", interval), ("estimate", estimate)):
+        if math.isnan(ends[0]):
+            continue
+        left, right = (min(max(100.0 * (x - limits[0]) / span, 0.0), 100.0) for x in ends)
+        width = max(right - left, least_width)
+        left = min(left, 100.0 - width)
+        parts.append({"kind": kind, "left": f"{left:.1f}", "width": f"{width:.1f}"})
+    return parts
+
+
+def _warnings_of(estimate: SceneEstimate, name: str) -> list[int]:
+    """Return the numbers, from 1, of the warnings that name a camera or joint."""
+    texts = dict.fromkeys(estimate.summary["warnings"])
+    return [number for number, text in enumerate(texts, 1) if f"'{name}'" in text]
 
 
 def _ends(*values: Array) -> tuple[float, float]:
-    """The least and the greatest of what is known; nan where nothing is."""
+    """Return the smallest and the largest finite value; nan if there is none."""
     known = np.concatenate(values)
     known = known[np.isfinite(known)]
     return (float(known.min()), float(known.max())) if len(known) else (np.nan, np.nan)
 
 
 def _camera_row(estimate: SceneEstimate, camera: str, states: Sequence[str]) -> dict[str, Any]:
-    """What the table of cameras says: pictures, those used, IoU, and whether it is suspicious."""
+    """Return a row of the table of cameras: number of pictures, of those used, IoU, warnings."""
     records = estimate.records
     ious = {f: one.ious[camera] for f, one in records.items() if camera in one.ious}
     worst = min(ious, key=lambda frame: ious[frame], default=None)
@@ -162,14 +254,14 @@ def _camera_row(estimate: SceneEstimate, camera: str, states: Sequence[str]) -> 
         "pictures": len(states) - states.count("no-picture"),
         "used": states.count("used"),
         "mean": float(np.mean(list(ious.values()))) if ious else None,
-        "least": None if worst is None else ious[worst],
+        "lowest": None if worst is None else ious[worst],
         "worst": worst,
-        "bad": any(f"'{camera}'" in text for text in estimate.summary["warnings"]),
+        "warnings": _warnings_of(estimate, camera),
     }
 
 
-def _use(scene: Scene, estimate: SceneEstimate, camera: str) -> list[str]:
-    """In which frames a camera was used, or was there."""
+def _picture_use(scene: Scene, estimate: SceneEstimate, camera: str) -> list[str]:
+    """Return for each frame whether a camera's picture was used, left out, or missing."""
     states = []
     for frame, record in estimate.records.items():
         has_mask, has_image = (camera, frame) in scene.masks, (camera, frame) in scene.images

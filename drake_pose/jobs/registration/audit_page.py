@@ -8,13 +8,16 @@ from typing import Any
 import numpy as np
 
 from drake_pose.arrays import Array
+from drake_pose.body import PoseTree
 from drake_pose.body.tree_kinematics import TreeKinematics
+from drake_pose.errors import listed
 from drake_pose.files.folder import OVERLAY, REPORT, write_file
 from drake_pose.files.overlay import draw_shapes, encode_png
 from drake_pose.files.report_page import overlay_picture, page_template
 from drake_pose.jobs.registration.inputs import Inputs
 from drake_pose.jobs.registration.result import AS_GIVEN, body_drawer
 from drake_pose.registration.findings import Diagnosis, Finding
+from drake_pose.silhouette.pictures.scene_checks import frame_ranges
 
 OnePicture = tuple[str, str, list[Finding]]
 """A frame, what is wrong there in a few words, and what is corrected in it."""
@@ -46,17 +49,61 @@ def write_audit_page(
         ][: most_pictures * len(inputs.scene.cameras)]
         for kind in (AS_GIVEN, OVERLAY)
     }
+    kinds = dict(zip(inputs.model.position_names, inputs.model.position_kinds, strict=True))
     text = page_template("drake_pose.jobs.registration", "audit_template.html.j2").render(
         summary=summary,
+        answer=audit_answer(summary, kinds),
+        kind="audit",
         title=Path(str(summary["scene"])).resolve().name,
         model=Path(str(summary["model"])).name,
         corrections=[correction_row(one) for one in summary["contradictions"]],
         cameras=[_camera_row(name, summary) for name in _cameras(summary)],
-        joints=_joint_rows(inputs, summary),
+        joints=_joint_rows(inputs.tree, kinds, summary),
         pairs=pictures[AS_GIVEN],
         overlays=pictures[OVERLAY],
     )
     write_file(folder, REPORT, text)
+
+
+def audit_answer(summary: Mapping[str, Any], kinds: Mapping[str, str]) -> str:
+    """Return the result in a few sentences.
+
+    Args:
+        summary: as summary.json.
+        kinds: kind of each position by name: "angle", "length" or "quaternion".
+    """
+    found = summary["contradictions"]
+    common = [one for one in found if one["what"] != "frame"]
+    outliers = [one["name"] for one in found if one["what"] == "frame"]
+    texts = []
+    if len(common) == 1:
+        texts.append(f"Error found: {common[0]['text']}.")
+    elif common:
+        named = listed([f"{one['what']} '{one['name']}'" for one in common])
+        texts.append(f"{len(common)} errors found: {named}.")
+    if outliers:
+        count, named = summary["frame_count"], frame_ranges(outliers, list(summary["frames"]))
+        one_or_more = "is an outlier" if len(outliers) == 1 else "are outliers"
+        texts.append(f"{len(outliers)} of {count} frames {one_or_more}: {named}.")
+    if texts:
+        return " ".join(texts)
+    offsets, detectable = summary["minimum_detectable"], list[str]()
+    for kind in ("angle", "length"):
+        own = [one for name, one in offsets.items() if one is not None and kinds[name] == kind]
+        detectable += [detectable_offset(max(own), kind)] if own else []
+    if not detectable:
+        return "No error found, but no joint offset could have been detected."
+    hidden = [name for name, one in offsets.items() if one is None]
+    but = f", except those of {listed(hidden)}" if hidden else ""
+    return (
+        f"No error found: joint offsets above {' or '.join(detectable)} would have been detected"
+        f"{but}."
+    )
+
+
+def detectable_offset(offset: float, kind: str) -> str:
+    """Return a joint offset [deg or m], as summary.json has it, in degrees or mm to a tenth."""
+    return f"{offset:.1f} deg" if kind == "angle" else f"{1e3 * offset:.1f} mm"
 
 
 def correction_row(one: Mapping[str, Any], normal: float = 1.96) -> dict[str, Any]:
@@ -70,7 +117,7 @@ def correction_row(one: Mapping[str, Any], normal: float = 1.96) -> dict[str, An
             continue
         value, unit = one[key], key.rpartition("_")[2].replace("percent", "%")
         low, high = value - normal * deviation, value + normal * deviation
-        parts.append((f"{value:+.3g} {unit}", f"{low:+.3g} to {high:+.3g} {unit}"))
+        parts.append((f"{value:+z.2f} {unit}", f"{low:+z.2f} to {high:+z.2f} {unit}"))
     return {**one, "parts": parts}
 
 
@@ -93,28 +140,28 @@ def _camera_row(name: str, summary: Mapping[str, Any]) -> dict[str, Any]:
         "frames": len(frames),
         "given": float(np.mean([one["fits"][name] for one in frames])),
         "freed": float(np.mean(freed)) if freed else None,
-        "off": _off(("camera", "clock", "rate", "moved"), name, summary),
+        "off": _errors_of(("camera", "clock", "rate", "moved"), name, summary),
     }
 
 
-def _joint_rows(inputs: Inputs, summary: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Of a joint: what is off in it, or from which offset on that would have been noticed."""
-    kinds = dict(zip(inputs.model.position_names, inputs.model.position_kinds, strict=True))
-    names = [one for one in TreeKinematics(inputs.tree).names if one in kinds]
-    return [
-        {
-            "name": name,
-            "unit": "deg" if kinds[name] == "angle" else "m",
-            "off": _off(("joint", "sign", "log", "link"), name, summary),
-            "asked": name in summary["minimum_detectable"],
-            "minimum_detectable": summary["minimum_detectable"].get(name),
-        }
-        for name in names
-    ]
+def _joint_rows(
+    tree: PoseTree, kinds: Mapping[str, str], summary: Mapping[str, Any]
+) -> list[dict[str, Any]]:
+    """Return the table of joints: errors found, and the minimum detectable offset."""
+    rows = []
+    for name in (one for one in TreeKinematics(tree).names if one in kinds):
+        off, detectable = _errors_of(("joint", "sign", "log", "link"), name, summary), "–"
+        if not off and name in summary["minimum_detectable"]:
+            offset = summary["minimum_detectable"][name]
+            detectable = "none" if offset is None else detectable_offset(offset, kinds[name])
+        elif not off:
+            detectable = "not known"
+        rows.append({"name": name, "off": off, "detectable": detectable})
+    return rows
 
 
-def _off(kinds: Sequence[str], name: str, summary: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """What is off by this name in all frames."""
+def _errors_of(kinds: Sequence[str], name: str, summary: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Return the errors in all frames of this kind and name."""
     told = [one for one in summary["contradictions"] if one["what"] != "frame"]
     return [
         correction_row(one) for one in told if one["cause"] in kinds and one["cause_name"] == name

@@ -18,6 +18,7 @@ from drake_pose.camera.drake import dump_scenario
 from drake_pose.camera.exports import mujoco_cameras, ros_camera_info, ros_transforms
 from drake_pose.camera.models import Camera
 from drake_pose.csv_files import csv_text
+from drake_pose.errors import listed
 from drake_pose.files.folder import OVERLAY, REPORT, without_nan, write_file, write_summary
 from drake_pose.files.overlay import draw_overlay, draw_shapes, encode_png
 from drake_pose.files.records import describe_job, file_digest, versions
@@ -360,6 +361,8 @@ def make_registration_report(folder: Path, summary: Mapping[str, Any]) -> str:
     figures = [(name, plot_offset(one)) for name, one in summary["cameras"].items()]
     return page_template("drake_pose.jobs.registration").render(
         summary=summary,
+        answer=registration_answer(summary["cameras"]),
+        kind="camera poses",
         title=Path(str(summary["scene"])).name or str(summary["scene"]),
         model=Path(str(summary["model"])).name,
         target=first.get("target"),
@@ -376,6 +379,29 @@ def make_registration_report(folder: Path, summary: Mapping[str, Any]) -> str:
         pictures=[picture for picture in pictures if picture is not None],
         pairs=[picture for picture in pairs if picture is not None],
     )
+
+
+def registration_answer(cameras: Mapping[str, Mapping[str, Any]]) -> str:
+    """Return the result in a few sentences, of the parts of summary.json by camera."""
+    parts = list(cameras.values())
+    shift, turn = (
+        max(one[key] for one in parts) for key in ("translation_sd_mm", "rotation_sd_deg")
+    )
+    outliers = sum(len(one["contradictions"]) for one in parts)
+    count = sum(len(one["frames"]) for one in parts)
+    what = "frame" if len(parts) == 1 else "picture" if parts[0]["masks"] == "found" else "mask"
+    words = "Camera found" if len(parts) == 1 else f"{len(parts)} cameras found"
+    up_to = "" if len(parts) == 1 else "up to "
+    texts = [f"{words}, with a standard deviation of {up_to}{shift:.1f} mm and {turn:.2f} deg."]
+    are = "is an outlier" if outliers == 1 else "are outliers"
+    texts.append(f"{outliers} of {count} {what}s {are}.")
+    if ambiguous := [name for name, one in cameras.items() if len(one["modes"]) > 1]:
+        texts.append(f"Other poses fit equally well: {listed(ambiguous)}.")
+    for key, name in (("zeros", "joint offsets"), ("lengths", "link scales")):
+        if found := parts[0][key]:
+            significant = sum(one["significant"] for one in found.values())
+            texts.append(f"{significant} of {len(found)} {name} are significant.")
+    return " ".join(texts)
 
 
 def compared_frames(errors: Mapping[str, float]) -> Sequence[str]:

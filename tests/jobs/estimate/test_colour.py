@@ -186,7 +186,7 @@ def test_where_the_body_is_lost_no_pose_is_written(recording, tmp_path, out):
     assert cameras[1][:3] == ["front", "8", "6"]
     assert "tracked by colour in " in text
     assert "IoU of each camera" not in text
-    assert "What was used in which frame" in text
+    assert "Pictures used in each frame" in text
     assert not (out / "motion.bvh").exists()
 
 

@@ -17,6 +17,7 @@ from drake_pose.jobs.registration.audit_page import corrected
 from drake_pose.registration.findings import Finding
 from drake_pose.silhouette.pictures.masks import write_mask
 from tests.cli import Result, run_to_end
+from tests.files.test_report_page import require_plain_page
 from tests.jobs.registration.arm_scenes import JOINTS, ArmScene, write_arm_scene
 
 
@@ -91,6 +92,9 @@ class TestAudit:
         own.add_to("elbow_turn", np.radians(2.0))
         summary = audit_scene(own.folder, own.model, own.joints, out).summary
         text = (out / "report.html").read_text()
+        answer = require_plain_page(text, summary["warnings"]).by_id["answer"]
+        assert answer.startswith("Error found: joint 'elbow_turn' reads ")
+        assert "1 of 8 frames is an outlier: 0002." in answer
         rows = re.findall(r"<tr>(.*?)</tr>", text, re.S)
         (elbow,) = (row for row in rows if row.startswith("<td>elbow_turn</td>"))
         low, high = map(float, re.search(r"\(([-+.\d]+) to ([-+.\d]+) deg\)", elbow).groups())
@@ -98,7 +102,7 @@ class TestAudit:
         assert high - low < 1.0
         for name, least in summary["minimum_detectable"].items():
             (row,) = (row for row in rows if row.startswith(f"<td>{name}</td>"))
-            assert ("any size" if least is None else f"{least:.3g}") in row
+            assert ("none" if least is None else f"{least:.1f}") in row
         for camera in ("left", "right"):
             assert f"<td>{camera}</td>" in text
             places = out.glob(f"overlay_as_given/{camera}/*.png")

@@ -20,6 +20,7 @@ from drake_pose.jobs.registration.settings import RegistrationSettings
 from drake_pose.registration.register import CameraSearch, FrameMisfit, RegisteredCamera
 from drake_pose.silhouette.pictures.scenes import load_scene
 from tests.cli import Result, assert_refused, run_command, run_json, run_to_end
+from tests.files.test_report_page import require_plain_page
 from tests.jobs.registration.arm_scenes import ArmScene, pose_errors
 from tests.jobs.scenes import TinyScene, write_truth
 from tests.search.arms import arm_cameras, arm_tree
@@ -81,6 +82,9 @@ class TestRegister:
         wrong = [(picture == rgb).all(axis=2).mean() for rgb in (MISSING_RGB, EXCESS_RGB)]
         assert max(wrong) < 0.005
         page = (registered[0] / "report.html").read_text()
+        answer = require_plain_page(page, registered[1]["warnings"]).by_id["answer"]
+        assert answer.startswith("Camera found, with a standard deviation of ")
+        assert answer.endswith("0 of 5 frames are outliers.")
         assert page.count("data:image/jpeg;base64,") == page.count("<tr><td>000") == 5
         assert "contradicts" not in page
         assert "from masks and joint positions" in page

@@ -1,4 +1,4 @@
-"""Names of the arrays that the rooms pass on."""
+"""Type aliases of the numpy arrays used in all subpackages, by element type."""
 
 import numpy as np
 from numpy.typing import NDArray

@@ -1,14 +1,12 @@
-"""How the kernels are compiled: by numba, on their first call, once for all processes.
+"""Compile kernels with numba on their first call and store them for all processes.
 
-A compiled kernel is stored beside its source or, where that folder cannot be written, in the user's
-cache folder (``NUMBA_CACHE_DIR`` names another). Three things are added to numba's own storing:
+A compiled kernel is stored beside its source or, where that folder is not writable, in the user's
+cache folder (``NUMBA_CACHE_DIR`` overrides both). Three things are added to numba's own cache:
 
-- Processes that need the same kernel at the same time compile it once: the first holds a lock on a
-  file, the others wait and load what it has stored.
-- A stored kernel is used only while the functions and numbers that it takes from other modules are
-  what they were; numba itself looks at the kernel's own file alone, and would go on with the old
-  ones after an upgrade.
-- Where kernels are compiled, and where they are stored, is logged (``drake_pose.compiled``).
+- A lock file: when several processes need the same kernel, one compiles and the others load it.
+- The cache key includes the functions and constants that a kernel takes from other modules. numba
+  checks the kernel's own file only and would load a stale kernel after an upgrade.
+- The logger ``drake_pose.compiled`` reports when kernels are compiled and where they are stored.
 """
 
 import functools
@@ -29,7 +27,7 @@ from numba.core.dispatcher import Dispatcher
 
 try:
     import fcntl
-except ImportError:  # Not on Windows: there each process compiles for itself.
+except ImportError:  # Windows has no fcntl: each process compiles its own kernels.
     fcntl = None  # type: ignore[assignment]
 
 _LOGGER = logging.getLogger(__name__)
@@ -45,18 +43,18 @@ def compiled(**options: Any) -> Callable[[_Function], _Function]: ...
 
 
 def compiled(function: Any = None, **options: Any) -> Any:
-    """Decorates a kernel: ``numba.njit`` that holds no GIL, divides as numpy does, and is stored.
+    """Decorate a kernel with ``numba.njit``, without the GIL, with numpy's division, and cached.
 
     Args:
-        function: the kernel, where the decorator stands without brackets.
-        options: of ``numba.njit``, instead of or beside these.
+        function: the kernel, if the decorator is used without parentheses.
+        options: options of ``numba.njit``; they override the defaults.
     """
     if function is None:
         return functools.partial(compiled, **options)
     kernel = njit(**{"nogil": True, "error_model": "numpy", **options})(function)
-    if isinstance(kernel, Dispatcher):  # It is not with NUMBA_DISABLE_JIT.
+    if isinstance(kernel, Dispatcher):  # False under NUMBA_DISABLE_JIT.
         cache: _NoCache | _SharedCache = _NoCache()
-        with suppress(RuntimeError):  # numba's way to say that no folder can be written.
+        with suppress(RuntimeError):  # Raised by numba if no folder is writable.
             cache = _SharedCache(kernel.py_func)
         setattr(kernel, "_cache", cache)  # noqa: B010 - numba's type hints do not know it.
         plain = _without_literals(kernel.get_call_template)
@@ -65,7 +63,7 @@ def compiled(function: Any = None, **options: Any) -> Any:
 
 
 def _without_literals(find_template: Callable[..., Any]) -> Callable[..., Any]:
-    """Lets kernels call a kernel as one of plain numbers: else it is compiled for each literal."""
+    """Drop literal types from call signatures; numba would compile a kernel once per literal."""
 
     def find(args: Any, kws: Any) -> Any:
         plain = {name: types.unliteral(kind) for name, kind in kws.items()}
@@ -75,14 +73,14 @@ def _without_literals(find_template: Callable[..., Any]) -> Callable[..., Any]:
 
 
 class _SharedCache(FunctionCache):
-    """numba's store of one kernel, shared by processes and bound to what the kernel calls."""
+    """Cache of one kernel, shared by processes and keyed by what the kernel calls."""
 
     def __init__(self, py_func: Callable[..., Any]) -> None:
         super().__init__(py_func)
         self._held: int | None = None
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
-        """Returns the stored kernel, or None: the caller compiles it then, and saves it."""
+        """Return the stored kernel, or None; the caller then compiles it and saves it."""
         found = self._load(sig, target_context)
         if found is not None or self._held is not None:
             return found
@@ -96,16 +94,16 @@ class _SharedCache(FunctionCache):
         return found
 
     def _load(self, sig: Any, target_context: Any) -> Any:
-        """The stored kernel, or None; what cannot be read any more is thrown away."""
+        """Return the stored kernel, or None; an unreadable cache is deleted."""
         try:
             return super().load_overload(sig, target_context)
-        # It names the modules of its arguments' types, which may have moved since.
+        # A stored kernel refers to the modules of its argument types, which may have moved.
         except (ImportError, AttributeError, EOFError, pickle.UnpicklingError):
             self.flush()
             return None
 
     def save_overload(self, sig: Any, data: Any) -> None:
-        """Stores a kernel that was compiled."""
+        """Store a compiled kernel and release the lock."""
         try:
             super().save_overload(sig, data)
         finally:
@@ -117,13 +115,15 @@ class _SharedCache(FunctionCache):
             self._held = None
 
     def _index_key(self, sig: Any, codegen: Any) -> tuple[Any, ...]:
-        return (*super()._index_key(sig, codegen), _digest_of_others(self._py_func))
+        return (*super()._index_key(sig, codegen), _dependency_digest(self._py_func))
 
 
 def _lock_file(path: Path, longest_wait: float = 300.0) -> int | None:
-    """Returns a descriptor that holds a lock until it is closed; None where there are no locks.
+    """Return a file descriptor that holds a lock until closed; None if locks are unavailable.
 
-    A process that is stopped while it compiles stops the others for no longer than this time [s].
+    Args:
+        path: the lock file.
+        longest_wait: timeout [s], so that a stopped process cannot block the others for longer.
     """
     if fcntl is None:
         return None
@@ -145,20 +145,20 @@ def _lock_file(path: Path, longest_wait: float = 300.0) -> int | None:
 
 
 class _NoCache(NullCache):
-    """Stands in where no folder can be written: every process compiles for itself."""
+    """Cache used where no folder is writable: every process compiles its own kernels."""
 
     def load_overload(self, sig: Any, target_context: Any) -> None:
-        """Returns None: nothing is stored."""
+        """Return None: nothing is stored."""
         _announce(None, None)
 
 
 @functools.cache
 def _announce(folder: Path | None, beside: Path | None) -> None:
-    """Says once where this process stores what it compiles."""
+    """Log once per process where compiled kernels are stored."""
     if folder is None:
         _LOGGER.warning(
-            "compiling kernels, which takes up to two minutes; they cannot be stored, so every run "
-            "does it again: name a folder that can be written in NUMBA_CACHE_DIR"
+            "compiling kernels takes up to two minutes in every run, because they cannot be "
+            "stored: set NUMBA_CACHE_DIR to a writable folder"
         )
     elif folder == beside:
         _LOGGER.info("compiling kernels: up to two minutes, once")
@@ -166,18 +166,18 @@ def _announce(folder: Path | None, beside: Path | None) -> None:
         _LOGGER.warning("compiling kernels into %s: up to two minutes, once", folder)
 
 
-def _digest_of_others(function: Callable[..., Any]) -> str:
-    """A digest of what a kernel takes from elsewhere: other files' kernels, and plain constants."""
+def _dependency_digest(function: Callable[..., Any]) -> str:
+    """Return a digest of a kernel's dependencies: other files' kernels, and plain constants."""
     own = function.__code__.co_filename
     digest = hashlib.sha256()
-    for name, value in sorted(set(_taken(function, set()))):
+    for name, value in sorted(set(_dependencies(function, set()))):
         if value != own:
             digest.update(f"{name}={file_digest(value) if name == 'file' else value}\n".encode())
     return digest.hexdigest()
 
 
-def _taken(function: Callable[..., Any], seen: set[int]) -> Iterator[tuple[str, str]]:
-    """Files of the kernels below a kernel, as ("file", path), and constants as (name, value)."""
+def _dependencies(function: Callable[..., Any], seen: set[int]) -> Iterator[tuple[str, str]]:
+    """Yield dependencies: ("file", path) of each kernel called, (name, value) of each constant."""
     if id(function) in seen:
         return
     seen.add(id(function))
@@ -185,7 +185,7 @@ def _taken(function: Callable[..., Any], seen: set[int]) -> Iterator[tuple[str, 
     for name in function.__code__.co_names:
         value = function.__globals__.get(name)
         if isinstance(value, Dispatcher):
-            yield from _taken(value.py_func, seen)
+            yield from _dependencies(value.py_func, seen)
         elif isinstance(value, (bool, int, float, str, tuple, type(None))):
             yield name, repr(value)
         elif isinstance(value, (np.ndarray, np.generic)):
@@ -194,16 +194,16 @@ def _taken(function: Callable[..., Any], seen: set[int]) -> Iterator[tuple[str, 
 
 @functools.cache
 def file_digest(path: str) -> str:
-    """SHA-256 of a source file, as it was when this process first asked."""
+    """Return the SHA-256 of a source file, cached at its first use in this process."""
     return hashlib.sha256(Path(path).read_bytes()).hexdigest()
 
 
 @compiled
 def copy_into(target: np.ndarray, source: np.ndarray) -> None:
-    """Writes an array into the beginning of another of as many dimensions.
+    """Copy an array into the leading corner of another one with the same number of dimensions.
 
-    In a kernel ``target[:n] = source`` makes numba compile 38 functions, for a message that says
-    which shapes differ.
+    It replaces ``target[:n] = source``, for which numba compiles 38 functions just to format the
+    error message about mismatched shapes.
     """
     for index in np.ndindex(source.shape):
         target[index] = source[index]
@@ -211,15 +211,15 @@ def copy_into(target: np.ndarray, source: np.ndarray) -> None:
 
 @compiled
 def grow_rows(array: np.ndarray, used: int, rows: int) -> np.ndarray:
-    """Returns an array of this many rows that begins with the first rows in use of another."""
-    wider = np.empty((rows, *array.shape[1:]), dtype=array.dtype)
-    copy_into(wider, array[:used])
-    return wider
+    """Return an array of ``rows`` rows whose first ``used`` rows are copied from ``array``."""
+    grown = np.empty((rows, *array.shape[1:]), dtype=array.dtype)
+    copy_into(grown, array[:used])
+    return grown
 
 
 @compiled
 def multiply(X_AB: np.ndarray, X_BC: np.ndarray, X_AC: np.ndarray) -> None:
-    """Writes the upper three rows of the product of two transforms (3 or 4, 4) into a third."""
+    """Write the upper three rows of X_AB X_BC, each (3 or 4, 4), into X_AC."""
     for i in range(3):
         for j in range(4):
             total = X_AB[i, 0] * X_BC[0, j] + X_AB[i, 1] * X_BC[1, j] + X_AB[i, 2] * X_BC[2, j]
@@ -227,13 +227,13 @@ def multiply(X_AB: np.ndarray, X_BC: np.ndarray, X_AC: np.ndarray) -> None:
 
 
 def kernel_folder() -> Path | None:
-    """The folder where this package's kernels are stored; None where none can be written."""
+    """Return the folder where kernels are stored, or None if no folder is writable."""
     cache = getattr(copy_into, "_cache", None)
     return Path(cache.cache_path) if isinstance(cache, _SharedCache) else None
 
 
 def is_stored(kernel: Callable[..., Any]) -> bool:
-    """Whether a kernel was compiled before, for whatever arguments, and is stored."""
+    """Return whether a compiled kernel is stored, for any argument types."""
     cache = getattr(kernel, "_cache", None)
     if not isinstance(cache, _SharedCache):
         return False

@@ -1,4 +1,4 @@
-"""Small tables of comma-separated values: those that others wrote, and our own."""
+"""Read and write small CSV tables."""
 
 import csv
 import io
@@ -10,32 +10,39 @@ from drake_pose.regular_files import read_regular
 
 
 def csv_text(rows: Iterable[Sequence[object]]) -> str:
-    """The text of a table."""
+    """Return the CSV text of a table's rows."""
     text = io.StringIO()
     csv.writer(text, lineterminator="\n").writerows(rows)
     return text.getvalue()
 
 
 def read_number(cell: str) -> float:
-    """The number that a cell holds; nan where it is empty.
+    """Return the number in a cell; nan if the cell is empty.
 
-    Raises ValueError: it holds none. Python reads 1_8 as 18; tables mean no such thing.
+    Raises:
+        ValueError: the cell is not a number. Digit separators (1_8), which Python accepts, are
+            refused.
     """
     if "_" in cell:
-        raise ValueError(f"'{cell[:40]}' is no number")
+        raise ValueError(f"'{cell[:40]}' is not a number")
     return float(cell or "nan")
 
 
 def read_csv(
     path: Path, error_type: type[DrakePoseError], *, whole_lines: bool = False
 ) -> tuple[list[str], list[tuple[int, list[str]]]]:
-    """Returns the first line's columns, and each other line's number and cells, without spaces.
+    """Return the header of a CSV file, and the line number and cells of each further line.
 
-    whole_lines: what follows the last line break is a row that an interruption cut off.
+    Cells are stripped of surrounding spaces.
+
+    Args:
+        path: the file.
+        error_type: type of the error that is raised.
+        whole_lines: ignore text after the last line break, which an interrupted writer left.
 
     Raises:
-        error_type: names the file; it cannot be read, its columns are separated otherwise, or a
-            line has more or fewer cells.
+        error_type: the file is unreadable or empty, its columns are not separated by commas, or a
+            line has a different number of cells than the header. The message names the file.
     """
     try:
         text = read_regular(path).decode("utf-8-sig")
@@ -48,12 +55,12 @@ def read_csv(
     if not lines:
         raise error_type(f"{path}: is empty")
     (_, header), *rows = lines
-    named = {";": "semicolons", "\t": "tabs"}
-    others = [name for sign, name in named.items() if any(sign in cell for cell in header)]
-    if others:
+    separators = {";": "semicolons", "\t": "tabs"}
+    found = [name for sign, name in separators.items() if any(sign in cell for cell in header)]
+    if found:
         raise error_type(
-            f"{path}: its first line has {others[0]}; columns are separated by commas, and "
-            "decimals begin with a point: save it as CSV with commas"
+            f"{path}: its first line contains {found[0]}; save the table with commas between "
+            "columns and points as decimal separators"
         )
     for line, row in rows:
         if len(row) != len(header):

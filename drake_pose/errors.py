@@ -1,7 +1,6 @@
-"""Exceptions of drake_pose.
+"""Exceptions of drake_pose, and helpers for their messages.
 
-Every message names the file, link, joint, camera or frame at fault, says what was expected, and
-what to do about it.
+A message names the file, link, joint, camera or frame at fault, what was expected, and what to do.
 """
 
 import re
@@ -11,23 +10,23 @@ from contextvars import ContextVar
 
 
 class DrakePoseError(Exception):
-    """Base of all errors that drake_pose raises on purpose."""
+    """Base class of all errors that drake_pose raises deliberately."""
 
 
 class ModelError(DrakePoseError):
-    """A model file cannot be used: unreadable, without visual geometry, without limits, ..."""
+    """A model file is unusable: unreadable, without visual geometry, without limits, ..."""
 
 
 class CameraError(DrakePoseError):
-    """A camera file or a camera's parameters cannot be used."""
+    """A camera file or a camera parameter is invalid."""
 
 
 class MaskError(DrakePoseError):
-    """A mask cannot be used: unreadable, wrong size, empty, full, or not two-valued."""
+    """A mask is unusable: unreadable, of the wrong size, empty, full, or not binary."""
 
 
 class SceneError(DrakePoseError):
-    """A scene folder, or a recorded episode, cannot be used."""
+    """A scene folder or a recorded episode is unusable."""
 
 
 class SettingsError(DrakePoseError):
@@ -35,25 +34,25 @@ class SettingsError(DrakePoseError):
 
 
 class OutputError(DrakePoseError):
-    """A result cannot be written where it was asked for."""
+    """A result cannot be written to the requested place."""
 
 
 class RegistrationError(DrakePoseError):
-    """Silhouettes and joint positions that no pose of a camera explains."""
+    """No camera pose explains the silhouettes and joint positions."""
 
 
 class ClusterError(DrakePoseError):
-    """Workers cannot be started or reached, or are not fit for the work."""
+    """Worker processes cannot be started or reached, or are unfit for the task."""
 
 
 class UnknownNameError(DrakePoseError):
     """A link, joint, camera or frame of that name does not exist.
 
     Args:
-        kind: what was looked up, for example ``"link"``.
-        name: the name that was asked for.
-        known: the names that exist.
-        where: where it was looked up, for example a file's path.
+        kind: kind of the name, for example ``"link"``.
+        name: the unknown name.
+        known: the existing names.
+        where: where the name was looked up, for example a file's path.
     """
 
     def __init__(self, kind: str, name: str, known: Iterable[str], where: str) -> None:
@@ -65,7 +64,7 @@ class UnknownNameError(DrakePoseError):
 
 
 def listed(names: Sequence[str], most: int = 5) -> str:
-    """Names as a message has them: of many the first, and how many more there are."""
+    """Return names joined by commas; beyond ``most`` names only the number of further ones."""
     more = f" and {len(names) - most} more" if len(names) > most else ""
     return ", ".join(names[:most]) + more
 
@@ -75,7 +74,7 @@ _typed: ContextVar[bool] = ContextVar("typed", default=False)
 
 @contextmanager
 def options_in_messages() -> Iterator[None]:
-    """While the command line runs: messages name its options."""
+    """Keep the names of command-line options in messages while the command line runs."""
     token = _typed.set(True)
     try:
         yield
@@ -84,9 +83,10 @@ def options_in_messages() -> Iterator[None]:
 
 
 def for_caller(text: str) -> str:
-    """A message that names options as they are typed, or for a Python call its arguments.
+    """Replace option names in a message by Python argument names, unless the command line runs.
 
-    ``--joints FILE`` becomes ``joints=FILE``, ``--camera`` ``cameras``; commands stay as they are.
+    ``--joints FILE`` becomes ``joints=FILE``, ``--camera`` becomes ``cameras``. Quoted commands
+    (``drake-pose ...``) stay unchanged.
     """
     if _typed.get():
         return text

@@ -1,4 +1,4 @@
-"""Reading files that others named: never a pipe, a socket or a device, whose opening may wait."""
+"""Read regular files only: opening a pipe, socket or device given by a user may block."""
 
 import errno
 import hashlib
@@ -7,10 +7,10 @@ from pathlib import Path
 
 
 def read_regular(path: Path, limit: int = -1) -> bytes:
-    """A file's content, or that of what a link leads to; at most ``limit`` bytes, if not negative.
+    """Return the content of a file (links are followed), at most ``limit`` bytes unless negative.
 
     Raises:
-        OSError: it cannot be read, is no regular file, or larger than 2 GiB; strerror says which.
+        OSError: the file is unreadable, not a regular file, or larger than 2 GiB; see its strerror.
     """
     if require_regular(path) > 1 << 31 and limit < 0:
         raise OSError(errno.EFBIG, "it is larger than 2 GiB", str(path))
@@ -19,12 +19,12 @@ def read_regular(path: Path, limit: int = -1) -> bytes:
 
 
 def digest(path: Path) -> str:
-    """What tells a file's content from another's: SHA-256 of its size and its ends, 1 MiB each.
+    """Return the SHA-256 of a file's size and its first and last MiB, which identifies its content.
 
-    A PNG picture ends with a checksum of all of it, so one that is larger is told apart, too.
+    Large PNG files are identified too, because their last bytes are a checksum of the whole file.
 
     Raises:
-        OSError: it cannot be read, or is no regular file.
+        OSError: the file is unreadable or not a regular file.
     """
     size, end = require_regular(path), 1 << 20
     found = hashlib.sha256(str(size).encode())
@@ -36,10 +36,10 @@ def digest(path: Path) -> str:
 
 
 def require_regular(path: Path) -> int:
-    """A file's size [byte], without opening it: a pipe would wait for its writer.
+    """Return a file's size [byte] without opening the file, since opening a pipe blocks.
 
     Raises:
-        OSError: it is no regular file; strerror says what it is.
+        OSError: it is not a regular file; strerror names its kind.
     """
     kinds = {stat.S_IFDIR: "folder", stat.S_IFIFO: "named pipe", stat.S_IFSOCK: "socket"}
     kinds |= dict.fromkeys((stat.S_IFCHR, stat.S_IFBLK), "device")

@@ -1,6 +1,6 @@
-"""Work that is done side by side on the cores that there are, with the same result on any number.
+"""Map functions over items in threads, with results that do not depend on the number of threads.
 
-Kernels and OpenCV hold no interpreter lock, so threads will do.
+Threads suffice because compiled kernels and OpenCV release the GIL.
 """
 
 import gc
@@ -20,7 +20,11 @@ _CHOSEN: ContextVar[int | None] = ContextVar("workers", default=None)
 
 @contextmanager
 def use_workers(workers: int | None) -> Iterator[None]:
-    """Has so many threads work meanwhile; None: as many as before, at first one for each core."""
+    """Set the number of worker threads inside a ``with`` block.
+
+    Args:
+        workers: number of threads; None: keep the current number, initially one per core.
+    """
     token = _CHOSEN.set(workers or _CHOSEN.get())
     try:
         yield
@@ -31,29 +35,31 @@ def use_workers(workers: int | None) -> Iterator[None]:
 def map_ordered(
     function: Callable[[_Item], _Result], items: Iterable[_Item], workers: int | None = None
 ) -> list[_Result]:
-    """What a function makes of each item, in the items' order.
+    """Return the function's result for each item, in the order of the items.
 
     Args:
-        workers: so many threads; None: as ``use_workers`` says. What a thread maps itself it does
-            alone, as does a process that another one started beside others.
+        function: called with one item, in any thread.
+        items: the items.
+        workers: number of threads; None: as set by ``use_workers``. Nested calls, and calls in
+            child processes of ``multiprocessing``, use a single thread.
     """
-    things = list(items)
-    count = min(len(things), workers or _CHOSEN.get() or _cores())
+    listed = list(items)
+    count = min(len(listed), workers or _CHOSEN.get() or _cores())
     if count < 2:
-        return [function(one) for one in things]
-    # A renderer of Drake's aborts the process where another thread than its own collects it.
+        return [function(one) for one in listed]
+    # Drake's renderer aborts the process if a thread other than its own garbage-collects it.
     collects = gc.isenabled()
     gc.disable()
     try:
         with ThreadPoolExecutor(count, initializer=_CHOSEN.set, initargs=(1,)) as pool:
-            return list(pool.map(function, things))
+            return list(pool.map(function, listed))
     finally:
         if collects:
             gc.enable()
 
 
 def _cores() -> int:
-    """How many cores this process may use."""
+    """Return the number of cores available to this process; 1 in a child process."""
     if multiprocessing.parent_process() is not None:
         return 1
     if hasattr(os, "sched_getaffinity"):

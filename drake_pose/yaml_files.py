@@ -1,4 +1,4 @@
-"""Reading small YAML files that others wrote."""
+"""Read small YAML files written by users or other programs."""
 
 from dataclasses import fields
 from pathlib import Path
@@ -14,12 +14,14 @@ _Schema = TypeVar("_Schema")
 
 
 class _UniqueKeyLoader(yaml.SafeLoader):
-    """A safe loader that refuses NUL, and a key given twice (PyYAML silently keeps the last)."""
+    """Safe loader that refuses NUL characters and duplicate keys (PyYAML keeps the last one)."""
 
     def construct_scalar(self, node: yaml.ScalarNode) -> Any:
         value = super().construct_scalar(node)
         if "\0" in str(value):
-            raise yaml.constructor.ConstructorError(None, None, "a text has a NUL", node.start_mark)
+            raise yaml.constructor.ConstructorError(
+                None, None, "a text contains NUL", node.start_mark
+            )
         return value
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
@@ -32,11 +34,11 @@ class _UniqueKeyLoader(yaml.SafeLoader):
 
 
 class _TaggedLoader(_UniqueKeyLoader):
-    """Keeps the tag of a mapping in it as ``_tag``, as pydrake.common.yaml does."""
+    """Loader that stores the tag of a mapping under ``_tag``, as pydrake.common.yaml does."""
 
 
 def _construct_tagged(loader: _TaggedLoader, suffix: str, node: yaml.Node) -> Any:
-    """The value of a node that has a tag of its own, such as Drake's ``!Rpy``."""
+    """Return the value of a node with a local tag, such as Drake's ``!Rpy``."""
     if isinstance(node, yaml.MappingNode):
         return {"_tag": f"!{suffix}", **loader.construct_mapping(node, deep=True)}
     if isinstance(node, yaml.SequenceNode):
@@ -50,23 +52,26 @@ _TaggedLoader.add_multi_constructor("!", _construct_tagged)
 def read_yaml(
     path: Path, error_type: type[DrakePoseError], *, tags: bool = False, largest: int = 1 << 20
 ) -> Any:
-    """Returns a YAML file's content, plain values only.
+    """Return the content of a YAML file as plain values.
 
-    The file's size is limited. An alias stays a reference, so a small file cannot fill the memory
-    unless its reader walks through every copy.
+    The file's size is limited. Aliases stay references, so a small file cannot exhaust the memory
+    unless the caller walks through every copy.
 
     Args:
         path: the file.
-        error_type: raised, with the file's name, when it cannot be read or is no small YAML file.
-        tags: keep local tags of mappings, as Drake's files have them, under the key ``_tag``.
-        largest: size of a file that is read [byte].
+        error_type: type of the error that is raised.
+        tags: store local tags of mappings, as Drake's files have them, under the key ``_tag``.
+        largest: maximum size of the file [byte].
+
+    Raises:
+        error_type: the file is unreadable, too large or invalid. The message names the file.
     """
     try:
         data = read_regular(path, largest + 1)
     except OSError as error:
         raise error_type(f"{path}: cannot read it: {error.strerror}") from error
     if len(data) > largest:
-        raise error_type(f"{path}: larger than {largest} bytes, which is not expected here")
+        raise error_type(f"{path}: larger than the maximum of {largest} bytes")
     try:
         # The loader derives from yaml.SafeLoader.
         return yaml.load(data, Loader=_TaggedLoader if tags else _UniqueKeyLoader)
@@ -79,13 +84,20 @@ def read_yaml(
 def typed_entry(
     entry: Any, schema: type[_Schema], where: str, error_type: type[DrakePoseError]
 ) -> _Schema:
-    """An entry of a YAML file as an instance of a dataclass, by Drake's ``yaml_load_typed``.
+    """Return an entry of a YAML file as an instance of a dataclass, by ``yaml_load_typed``.
 
-    Raises error_type, which begins with ``where``: a field is unknown or has another type.
+    Args:
+        entry: plain values as from ``read_yaml``.
+        schema: the dataclass.
+        where: start of the error message.
+        error_type: type of the error that is raised.
+
+    Raises:
+        error_type: a field is unknown or has the wrong type.
     """
     try:
         return yaml_load_typed(schema=schema, data=yaml.safe_dump(entry))
-    # What Drake's reader raises for values of other types.
+    # Drake's reader raises any of these for values of the wrong type.
     except (RuntimeError, ValueError, TypeError, AttributeError, AssertionError) as error:
         names = ", ".join(one.name for one in fields(schema))  # type: ignore[arg-type]
         raise error_type(f"{where}: expected a mapping of {names}: {error}") from error

@@ -1,8 +1,8 @@
-"""The one continuous fit: contours of a body drawn to the edges of silhouettes, any unknowns.
+"""Continuous least-squares fits of a body's contours to the edges of silhouettes.
 
-`evidence`: what cameras see of a frame. `kernel`: contours compared with edges, summed to a 12 x 12
-matrix for each camera and node; `colours` and `background`: the same of pictures; `raster_lines`:
-the same of exact masks. `parameters` and `proportions`: what may be unknown of a body and of
-cameras. `levenberg_marquardt`: the minimum. `contour_fit` fits one pose, `problem` several frames
-with shared unknowns; `covariance`: how sure they are.
+`evidence`: edge points of the silhouettes of one frame. `kernel`: contour residuals, accumulated
+in a 12 x 12 matrix per camera and node; `colours` and `background`: the same from colour images;
+`raster_lines`: the same from exact masks. `parameters` and `proportions`: parameters of a body and
+of cameras. `levenberg_marquardt`: the optimiser. `contour_fit` fits one pose, `problem` several
+frames with shared unknowns; `covariance` estimates the uncertainty of the result.
 """

@@ -1,18 +1,16 @@
-"""Pictures of a camera that stands still as evidence of a body's pose, without masks.
+"""Score poses of a body against images of a static camera, without masks.
 
-A body at known positions covers each pixel in some frames; in the others one background shows, or
-one of a few, as where something was put down. For a background and a frame, with s the likelihood
-ratio of the colour under that background to any colour, likelihoods are
+At given body positions the body covers a pixel in some frames; in the others the pixel shows one of
+at most three background colours. With s the likelihood ratio of a pixel's colour under a background
+to any colour, the likelihoods of a pixel in one frame are
 
-    background shows: .92 s + .08        body shows: .25 s + .75
+    background visible: 0.92 s + 0.08        body visible: 0.25 s + 0.75
 
-as backgrounds change now and then, and a body may look like what is behind it. The sum of their
-logarithms over the frames, of the best background, scores a set of frames in which the body covers
-the pixel (``PixelSums``, ``explain``).
+because a background changes now and then, and a body may resemble its background. Log-likelihoods
+are summed over the frames for the best background of each pixel (``PixelSums``, ``explain``).
 
-Once a pose is about known, so are the background of each pixel and the probability that a pixel
-shows the
-body: lines across the contour then measure where its edge is (``fit.colours``).
+Once the pose is approximately known, so are the background of each pixel and the log-odds that the
+pixel shows the body. Search lines across the contour then locate its edge (``fit.colours``).
 """
 
 from collections.abc import Sequence
@@ -34,21 +32,21 @@ from drake_pose.silhouette.span_kernel import fill_rows, find_spans, make_rows
 
 @dataclass(frozen=True)
 class BackgroundModel:
-    """How colours of a body and of what is behind it are distributed.
+    """Colour distributions of a body and of its background.
 
     Args:
-        shown, like_body: the fraction of pixels that look like their background where it shows, and
-            where the body covers it.
+        shown, like_body: fraction of pixels that look like their background where the background is
+            visible, and where the body covers it.
         log_peak: logarithm of the likelihood ratio of a background's own colour to any colour.
-        known_times: this ratio is larger by this factor where it is known which background lies
-            behind a pixel.
+        known_times: factor of this ratio where a pixel's background is known.
         exact: colours within this many standard deviations are as likely as the background's own.
         same: colours within this many standard deviations belong to the background.
-        shaken: standard deviation of a colour per gradient there [pixel], as cameras shake.
-        min_noise: the least standard deviation of a colour [of 255].
-        near: half the width of the strip along a contour where either side may show [pixel].
-        max_log_odds: log-odds are clipped to this.
-        unseen, max_frequent: colours are at least and at most this many times as frequent as any.
+        shaken: standard deviation of the image shift caused by camera shake [pixel].
+        min_noise: minimum standard deviation of a colour [of 255].
+        near: half width of the strip along a contour in which either side may be visible [pixel].
+        max_log_odds: log-odds are clipped to this magnitude.
+        unseen: added to relative colour frequencies, so that an unobserved colour stays possible.
+        max_frequent: maximum of a relative colour frequency (1: all colours equally frequent).
     """
 
     shown: float = 0.92
@@ -69,12 +67,20 @@ MODEL = BackgroundModel()
 
 
 def estimate_gain(picture: Picture | Floats, reference: Floats, rounds: int = 4) -> Floats:
-    """(3, 4) gains and offsets of a picture's channels (H, W, 3) that make a reference's light.
+    """Return the photometric gain that maps an image's colours to those of a reference image.
 
-    A line is fitted to each channel, without outliers. Gains are between a half and two. Pictures
-    are sampled about 160 pixels wide.
+    A robust line is fitted to each channel, on about 160 sampled columns. Slopes are limited to the
+    range 0.5 to 2.
+
+    Args:
+        picture: (H, W, 3) image.
+        reference: (H, W, 3) reference image.
+        rounds: number of fits; after each fit outliers are removed.
+
+    Returns:
+        (3, 4) slopes and offsets of the channels, as ``cv2.transform`` takes them.
     """
-    light = np.zeros((3, 4), np.float32)
+    gain = np.zeros((3, 4), np.float32)
     step = max(1, picture.shape[1] // 160)
     for channel in range(3):
         both = (one[::step, ::step, channel].ravel() for one in (picture, reference))
@@ -83,25 +89,27 @@ def estimate_gain(picture: Picture | Floats, reference: Floats, rounds: int = 4)
         for _ in range(rounds):
             mean_x, mean_y = x[keep].mean(), y[keep].mean()
             off_x = x[keep] - mean_x
-            gain = float(off_x @ (y[keep] - mean_y)) / max(float(off_x @ off_x), 1e-6)
-            gain = min(max(gain, 0.5), 2.0)
-            off = np.abs(gain * (x - mean_x) + mean_y - y)
-            keep = off <= 2.0 * (1.5 * np.median(off) + 1.0)
-        light[channel, [channel, 3]] = gain, mean_y - gain * mean_x
-    return light
+            slope = float(off_x @ (y[keep] - mean_y)) / max(float(off_x @ off_x), 1e-6)
+            slope = min(max(slope, 0.5), 2.0)
+            deviation = np.abs(slope * (x - mean_x) + mean_y - y)
+            keep = deviation <= 2.0 * (1.5 * np.median(deviation) + 1.0)
+        gain[channel, [channel, 3]] = slope, mean_y - slope * mean_x
+    return gain
 
 
-def apply_gain(picture: Picture | Floats, light: Floats) -> Floats:
-    """A picture (H, W, 3) in the reference's light."""
-    return np.asarray(cv2.transform(picture.astype(np.float32), light))
+def apply_gain(picture: Picture | Floats, gain: Floats) -> Floats:
+    """Return an image (H, W, 3) with a photometric gain (3, 4) applied."""
+    return np.asarray(cv2.transform(picture.astype(np.float32), gain))
 
 
 class PixelSums(NamedTuple):
-    """Scores of sets of frames in which a body covers a pixel.
+    """Log-likelihoods of each pixel, from which ``explain`` scores poses.
 
-    shown: (H, W, 3) log-likelihoods of three backgrounds where no frame is covered. more:
-    (H, W, f, 3) what a covered frame adds. none: (H, W) the best of shown. edges: (2, f, H, W)
-    strengths of edges across u and v in each frame, beyond chance.
+    Attributes:
+        shown: (H, W, 3) log-likelihoods of the three backgrounds if no frame is covered.
+        more: (H, W, f, 3) change of each log-likelihood if a frame is covered.
+        none: (H, W) maximum of ``shown``.
+        edges: (2, f, H, W) strength of edges across u and v in each frame, minus its mean.
     """
 
     shown: Floats
@@ -112,13 +120,13 @@ class PixelSums(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Backgrounds:
-    """What may be behind a body, in small pictures of a camera that stands still.
+    """Possible backgrounds of a body, in small images of a static camera.
 
     Args:
-        pictures: (f, H, W, 3) in even light.
-        gains: (3, 4) of each picture, see ``estimate_gain``.
-        colours: (3, H, W, 3) backgrounds, the most frequent first; they may be alike.
-        deviations: (H, W) of a background's colours.
+        pictures: (f, H, W, 3) images after photometric correction.
+        gains: (3, 4) photometric gain of each image, see ``estimate_gain``.
+        colours: (3, H, W, 3) background colours, the most frequent first; they may coincide.
+        deviations: (H, W) standard deviations of a background's colours.
     """
 
     pictures: Floats
@@ -128,18 +136,18 @@ class Backgrounds:
 
     @staticmethod
     def of(pictures: Picture) -> "Backgrounds":
-        """The backgrounds of pictures (f, H, W, 3) red, green, blue."""
+        """Estimate the backgrounds of images (f, H, W, 3) red, green, blue."""
         floats = pictures.astype(np.float32)
         reference = np.median(floats, axis=0)
         gains = tuple(estimate_gain(one, reference) for one in floats)
         even = np.array([apply_gain(*one) for one in zip(floats, gains, strict=True)])
-        off = np.median(_largest(np.abs(even - reference)), axis=0)
-        deviations = _deviations(reference, 1.4826 * float(np.median(off)))
+        deviation = np.median(_largest(np.abs(even - reference)), axis=0)
+        deviations = _deviations(reference, 1.4826 * float(np.median(deviation)))
         return Backgrounds(even, gains, _find_colours(even, deviations), deviations)
 
     @cached_property
     def sums(self) -> PixelSums:
-        """What ``explain`` adds up."""
+        """Log-likelihoods for ``explain``."""
         size, count = self.deviations.shape, len(self.colours)
         total = np.zeros((*size, count), np.float32)
         more = np.empty((*size, len(self.pictures), count), np.float32)
@@ -152,8 +160,8 @@ class Backgrounds:
             more[:, :, f] = np.log(MODEL.like_body * stacked + (1.0 - MODEL.like_body)) - shown
             total += shown
             u, v = (_largest(np.abs(one)) for one in _slopes(picture))
-            # Edges stronger than four standard deviations of the noise count alike. An edge runs
-            # across an axis where the slope along the other one is not much more.
+            # Strength saturates at four standard deviations of the noise. An edge crosses an axis
+            # unless the gradient along the other axis is much larger.
             strength = np.minimum(1.0, np.hypot(u, v) / (4.0 * noise))
             for k, (across, along) in enumerate(((u, v), (v, u))):
                 own = np.where(along <= 1.7 * across, strength, 0.0)
@@ -162,13 +170,13 @@ class Backgrounds:
 
     @cached_property
     def possible(self) -> float:
-        """The most that any sets of frames could explain."""
+        """Upper bound of the log-likelihood gain over all sets of covered frames."""
         sums = self.sums
         best = _largest(sums.shown + np.maximum(sums.more, 0.0).sum(axis=2))
         return float(np.maximum(best - sums.none, 0.0).sum())
 
     def changes(self) -> Floats:
-        """(H, W) in how many frames a pixel does not look like its most frequent background."""
+        """Return (H, W) the number of frames that differ from the most frequent background."""
         found = np.zeros(self.pictures.shape[1:3], np.float32)
         for picture in self.pictures:
             likeness = _likeness(picture, self.colours[0], self.deviations)
@@ -177,29 +185,30 @@ class Backgrounds:
         return found
 
     def showing(self, covered: Mask) -> Mask:
-        """(f, H, W) which frames show the likeliest background of a pixel.
+        """Return (f, H, W) whether a frame shows the likeliest background of a pixel.
 
-        covered: (f, H, W) where the body is known to be, about.
+        Args:
+            covered: (f, H, W) approximate silhouettes of the body.
         """
-        told = self.sums.shown.copy()
+        totals = self.sums.shown.copy()
         for f, own in enumerate(covered):
-            np.add(told, self.sums.more[:, :, f], out=told, where=own[..., None])
-        best = told.argmax(axis=-1)[None, ..., None]
+            np.add(totals, self.sums.more[:, :, f], out=totals, where=own[..., None])
+        best = totals.argmax(axis=-1)[None, ..., None]
         colours = np.take_along_axis(self.colours, best, axis=0)[0]
-        off = _largest(np.abs(self.pictures - colours)) / self.deviations
-        return np.asarray((off < MODEL.same) & ~_grown(covered, MODEL.near))
+        deviation = _largest(np.abs(self.pictures - colours)) / self.deviations
+        return np.asarray((deviation < MODEL.same) & ~_grown(covered, MODEL.near))
 
 
 @dataclass(frozen=True, eq=False)
 class KnownBackground:
-    """What is behind a body whose pose is about known.
+    """The background of a body whose pose is approximately known.
 
     Args:
-        colours: (H, W, 3) of the background.
-        deviations: (H, W) of them.
-        unseen: (H, W) where no frame shows it.
-        on, beside: (COLOURS,) logarithms of how frequent colours are on the body, and beside it,
-            over how frequent they are among all that there can be.
+        colours: (H, W, 3) colours of the background.
+        deviations: (H, W) their standard deviations.
+        unseen: (H, W) whether no frame shows the background.
+        on, beside: (COLOURS,) logarithms of the relative frequencies of colours on the body, and
+            beside it (0: as frequent as if all colours were equally frequent).
     """
 
     colours: Floats
@@ -212,20 +221,21 @@ class KnownBackground:
     def of(
         pictures: Sequence[Picture], gains: Sequence[Floats], showing: Mask, covered: Mask
     ) -> "KnownBackground":
-        """That of pictures (H, W, 3) of any size.
+        """Estimate the background from images of any size.
 
         Args:
-            gains: of each.
-            showing: (f, h, w) which of them show the background, in smaller pictures.
-            covered: (f, H, W) where the body is about.
+            pictures: images (H, W, 3) of the f frames.
+            gains: (3, 4) photometric gain of each image.
+            showing: (f, h, w) whether a frame shows the background, at a lower resolution.
+            covered: (f, H, W) approximate silhouettes of the body.
         """
         height, width = covered.shape[1:]
         total, count = np.zeros((height, width, 3), np.float32), np.zeros((height, width))
         on, beside = (np.zeros(COLOURS) for _ in range(2))
         inside, near = ~_grown(~covered, MODEL.near), _grown(covered, MODEL.near)
         small, means = [], []
-        for f, (picture, light) in enumerate(zip(pictures, gains, strict=True)):
-            even = apply_gain(picture, light)
+        for f, (picture, gain) in enumerate(zip(pictures, gains, strict=True)):
+            even = apply_gain(picture, gain)
             shown = showing[f].astype(np.uint8)
             shown = cv2.resize(shown, (width, height), interpolation=cv2.INTER_NEAREST)
             shows = shown.astype(np.bool_) & ~near[f]
@@ -238,15 +248,20 @@ class KnownBackground:
             small.append((rows, even.reshape(-1, 3)[rows]))
         colours = (total / np.maximum(count, 1.0)[..., None]).astype(np.float32)
         means = [_largest(np.abs(own - colours.reshape(-1, 3)[rows])) for rows, own in small]
-        off = np.concatenate([*means, np.zeros(1, np.float32)])
-        deviations = _deviations(colours, 1.4826 * float(np.median(off)))
+        deviation = np.concatenate([*means, np.zeros(1, np.float32)])
+        deviations = _deviations(colours, 1.4826 * float(np.median(deviation)))
         return KnownBackground(
             colours, deviations, count == 0, _log_frequencies(on), _log_frequencies(beside)
         )
 
-    def foreground(self, picture: Picture, light: Floats) -> Floats:
-        """(H, W) log-odds that each pixel of a picture shows the body."""
-        even = apply_gain(picture, light)
+    def foreground(self, picture: Picture, gain: Floats) -> Floats:
+        """Return (H, W) log-odds that each pixel of an image shows the body.
+
+        Args:
+            picture: (H, W, 3) image.
+            gain: (3, 4) its photometric gain.
+        """
+        even = apply_gain(picture, gain)
         numbers = colour_numbers(np.clip(even, 0.0, 255.0).astype(np.uint8))
         likeness = _likeness(even, self.colours, self.deviations) * np.float32(MODEL.known_times)
         shown = np.log(MODEL.shown * likeness + (1.0 - MODEL.shown))
@@ -254,7 +269,7 @@ class KnownBackground:
 
 
 def foreground_picture(foreground: Floats) -> Picture:
-    """Encode log-odds (H, W) as a picture (H, W, 3); ``foreground_of_colours`` decodes it."""
+    """Return an image (H, W, 3) that encodes log-odds (H, W), see ``foreground_of_colours``."""
     most = MODEL.max_log_odds
     share = (np.clip(foreground, -most, most) + most) / (2.0 * most)
     number = np.rint(share * (COLOURS - 1)).astype(np.uint16)
@@ -263,7 +278,7 @@ def foreground_picture(foreground: Floats) -> Picture:
 
 
 def foreground_of_colours(nodes: int) -> Floats:
-    """Tables (nodes, 3, COLOURS) that decode a ``foreground_picture`` for `compare_lines`."""
+    """Return (nodes, 3, COLOURS) tables with which `compare_lines` decodes a foreground_picture."""
     known = np.zeros((nodes, len(Colour), COLOURS), np.float32)
     known[:, Colour.FOREGROUND] = np.exp(
         np.linspace(-MODEL.max_log_odds, MODEL.max_log_odds, COLOURS)
@@ -274,13 +289,13 @@ def foreground_of_colours(nodes: int) -> Floats:
 def mask_of_foreground(
     foreground: Floats, covered: Mask, smooth: float = 0.7, reach: float = 0.1
 ) -> Mask:
-    """Where log-odds (H, W) are for the body.
+    """Return a mask (H, W) of the pixels that more likely show the body.
 
     Args:
         foreground: (H, W) log-odds.
-        covered: (H, W) where the body is about.
+        covered: (H, W) approximate silhouette of the body.
         smooth: standard deviation of the Gaussian that smooths the log-odds [pixel].
-        reach: a mask ends within this distance of where the body is about [root of its area].
+        reach: the mask stays within this distance of ``covered`` [square root of its area].
     """
     limit = max(MODEL.near, round(reach * float(np.sqrt(np.count_nonzero(covered)))))
     near = _grown(covered[None], limit)[0]
@@ -290,39 +305,53 @@ def mask_of_foreground(
 
 
 def _largest(channels: Floats) -> Floats:
-    """(...) the largest of three numbers (..., 3), ten times faster than numpy finds it."""
+    """Return the maximum over the last axis of (..., 3), ten times faster than numpy does."""
     red, green, blue = np.moveaxis(channels, -1, 0)
     return np.maximum(np.maximum(red, green), blue)
 
 
 def _slopes(picture: Floats) -> tuple[Floats, Floats]:
-    """(H, W, 3) how colours change along u and v [a pixel]."""
+    """Return (H, W, 3) colour gradients along u and v [per pixel]."""
     u, v = (cv2.Sobel(picture, cv2.CV_32F, *by, scale=0.125) for by in ((1, 0), (0, 1)))
     return np.asarray(u), np.asarray(v)
 
 
 def _deviations(picture: Floats, noise: float) -> Floats:
-    """(H, W) of the colours of a background (H, W, 3)."""
+    """Return (H, W) standard deviations of a background's colours (H, W, 3).
+
+    Args:
+        picture: the background.
+        noise: standard deviation of the noise [of 255].
+    """
     gradient = _largest(np.hypot(*_slopes(picture)))
     white = max(MODEL.min_noise, noise)
     return np.sqrt(white**2 + (MODEL.shaken * gradient) ** 2).astype(np.float32)
 
 
 def _grown(masks: Mask, by: int) -> Mask:
-    """(f, H, W) masks that are larger on all sides by a number of pixels."""
+    """Return masks (f, H, W) dilated by a number of pixels."""
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * by + 1,) * 2)
     return np.array([cv2.dilate(one.astype(np.uint8), disc) for one in masks]).astype(np.bool_)
 
 
 def _likeness(pictures: Floats, colours: Floats, deviations: Floats) -> Floats:
-    """(..., H, W) likelihood ratios of colours (..., H, W, 3) under a background to any colour."""
-    off = _largest(np.abs(pictures - colours)) / deviations
-    beyond = np.maximum(off - MODEL.exact, 0.0)
+    """Return (..., H, W) likelihood ratios of colours under a background to any colour.
+
+    Args:
+        pictures: (..., H, W, 3) colours.
+        colours, deviations: (H, W, 3) background and (H, W) its standard deviations.
+    """
+    deviation = _largest(np.abs(pictures - colours)) / deviations
+    beyond = np.maximum(deviation - MODEL.exact, 0.0)
     return np.asarray(np.exp(MODEL.log_peak - 0.5 * beyond**2), np.float32)
 
 
 def _log_frequencies(numbers: Array) -> Floats:
-    """(COLOURS,) logarithms of how frequent colours are of (COLOURS,) pixels; neighbours share."""
+    """Return (COLOURS,) log relative colour frequencies, smoothed over neighbouring colours.
+
+    Args:
+        numbers: (COLOURS,) number of pixels of each colour.
+    """
     counts = numbers.reshape(16, 16, 16)
     for axis in range(3):
         counts = convolve1d(counts, [0.25, 0.5, 0.25], axis, mode="nearest")
@@ -331,24 +360,29 @@ def _log_frequencies(numbers: Array) -> Floats:
 
 
 def _find_colours(pictures: Floats, deviations: Floats, rows: int = 8) -> Floats:
-    """(3, H, W, 3) the colours that most frames share, then those that most of the others do.
+    """Return (3, H, W, 3) the colours shared by most frames, then by most of the remaining frames.
 
-    Colours of all pairs of frames are compared, in strips of rows that stay in the cache.
+    The colours of all pairs of frames are compared, in strips of rows that fit in the cache.
+
+    Args:
+        pictures: (f, H, W, 3) images after photometric correction.
+        deviations: (H, W) standard deviations of a background's colours.
+        rows: height of a strip [pixel].
     """
     strips = []
     for k in range(0, pictures.shape[1], rows):
         own, count = pictures[:, k : k + rows], len(pictures)
-        off = np.zeros((count, count, *own.shape[1:3]), np.float32)
+        deviation = np.zeros((count, count, *own.shape[1:3]), np.float32)
         for f, picture in enumerate(own):
-            off[f, f:] = _largest(np.abs(own[f:] - picture)) / deviations[k : k + rows]
-            off[f:, f] = off[f, f:]
-        close = off < MODEL.same
-        # Of equal numbers the closer ones.
-        support = np.where(close, np.float32(1.0) - np.float32(0.01) * off, np.float32(0.0))
+            deviation[f, f:] = _largest(np.abs(own[f:] - picture)) / deviations[k : k + rows]
+            deviation[f:, f] = deviation[f, f:]
+        close = deviation < MODEL.same
+        # Among colours with equally many supporters prefer the closer ones.
+        support = np.where(close, np.float32(1.0) - np.float32(0.01) * deviation, np.float32(0.0))
         left, found = np.ones(own.shape[:3], bool), list[Floats]()
         for _ in range(3):
-            told = np.einsum("fghw,ghw->fhw", support, left.astype(np.float32))
-            best = np.where(left, told, -1.0).argmax(axis=0)
+            totals = np.einsum("fghw,ghw->fhw", support, left.astype(np.float32))
+            best = np.where(left, totals, -1.0).argmax(axis=0)
             shared = np.take_along_axis(close, best[None, None], axis=0)[0] & left
             number = shared.sum(axis=0)[..., None]
             mean = (own * shared[..., None]).sum(axis=0) / np.maximum(number, 1)
@@ -359,10 +393,10 @@ def _find_colours(pictures: Floats, deviations: Floats, rows: int = 8) -> Floats
 
 
 class Explained(IntEnum):
-    """What ``explain`` sums up.
+    """Indices of the sums of ``explain``.
 
-    GAIN: the log-likelihood beyond that of no body. CONTOUR: the edges' strength beyond chance
-    along the outlines. OUTLINE: their length [pixel]. AREA: the bodies' [pixel].
+    GAIN: log-likelihood minus that without a body. CONTOUR: edge strength along the outlines, minus
+    its expectation. OUTLINE: length of the outlines [pixel]. AREA: area of the bodies [pixel].
     """
 
     GAIN = 0
@@ -375,36 +409,36 @@ class Explained(IntEnum):
 def explain(
     packed: PackedOutlines,
     X_CN: Array,
-    still: Mask,
+    is_static: Mask,
     camera: Array,
     sums: PixelSums,
     side: float,
     squares: int,
     always_covered: float = 0.3,
 ) -> tuple[Array, Array]:
-    """What a body explains of pictures, by sums over the pixels.
+    """Score the poses of a body in all frames by sums over the pixels.
 
-    Bits of a word for each pixel say in which frames the body covers it. The words' edges are the
-    body's outline in each frame.
+    One 64-bit word per pixel has a bit for each frame in which the body covers the pixel, so at
+    most 32 frames are supported. Where neighbouring words differ lies the body's outline.
 
     Args:
-        packed: the nodes' surfaces.
-        X_CN: (f, nodes, 3, 4) where they stand in the frames.
-        still: (nodes,) which nodes stand at one place in all frames: they are their own background,
-            so that only their outline counts.
+        packed: surfaces of the nodes.
+        X_CN: (f, nodes, 3, 4) poses of the nodes in the frames.
+        is_static: (nodes,) whether a node is static in all frames. Static nodes belong to the
+            background; only their outline is scored.
         camera: (8,) kernel parameters.
-        sums: of the pictures.
-        side, squares: the gain is also told by (squares, squares) squares of a side [pixel]; 0:
-            it is not.
+        sums: log-likelihoods of the images.
+        side, squares: the gain is also summed in (squares, squares) tiles of this side [pixel],
+            modulo ``squares``; 0: it is not.
         always_covered: factor of the gain of pixels that the body covers in all frames, whose
-            background is not known.
+            background is unknown.
 
     Returns:
-        (4,) sums by ``Explained``; (squares, squares) the gain in each square.
+        (4,) sums by ``Explained``, and (squares, squares) the gain of each tile.
     """
     height, width = sums.none.shape
     frames, one = X_CN.shape[0], np.uint64(1)
-    told, pieces = np.zeros(4), np.zeros((squares, squares))
+    totals, tiles = np.zeros(4), np.zeros((squares, squares))
     words = np.zeros((height, width), dtype=np.uint64)
     rows, crossings = make_rows(packed, camera)
     top, bottom = height, 0
@@ -412,8 +446,8 @@ def explain(
         for node in range(X_CN.shape[1]):
             crossings = fill_rows(packed, node, node + 1, X_CN[f], camera, crossings, rows)
             top, bottom = min(top, rows.reach[0]), max(bottom, rows.reach[1])
-            # Higher bits are those of what stands still.
-            bit = one << np.uint64(f + frames if still[node] else f)
+            # Static nodes use the upper bits.
+            bit = one << np.uint64(f + frames if is_static[node] else f)
             for row in range(rows.reach[0], rows.reach[1]):
                 for k in range(find_spans(row, crossings, rows.counts, rows.changes, rows.spans)):
                     for column in range(rows.spans[k, 0], rows.spans[k, 1]):
@@ -430,7 +464,7 @@ def explain(
                 left, f = covered, 0
                 while left != 0:
                     if left & one:
-                        told[Explained.AREA] += 1.0
+                        totals[Explained.AREA] += 1.0
                         a += sums.more[row, column, f, 0]
                         b += sums.more[row, column, f, 1]
                         c += sums.more[row, column, f, 2]
@@ -439,9 +473,9 @@ def explain(
                 gain = max(a, b, c) - sums.none[row, column]
                 if covered == every:
                     gain = always_covered * max(gain, 0.0)
-                told[Explained.GAIN] += gain
+                totals[Explained.GAIN] += gain
                 if squares > 0:
-                    pieces[int(row / side) % squares, int(column / side) % squares] += gain
+                    tiles[int(row / side) % squares, int(column / side) % squares] += gain
             left_of = words[row, column - 1] if column > 0 else word
             right_of = words[row, column + 1] if column < width - 1 else word
             above = words[row - 1, column] if row > 0 else word
@@ -455,8 +489,8 @@ def explain(
                         strength = sums.edges[0, f % frames, row, column]
                     if across_v >> np.uint64(f) & one:
                         strength = max(strength, sums.edges[1, f % frames, row, column])
-                    told[Explained.CONTOUR] += strength
-                    told[Explained.OUTLINE] += 1.0
+                    totals[Explained.CONTOUR] += strength
+                    totals[Explained.OUTLINE] += 1.0
                 left >>= one
                 f += 1
-    return told, pieces
+    return totals, tiles

@@ -1,19 +1,18 @@
-"""Pictures as evidence of a body's pose: colours along lines across the body's contour.
+"""Residuals of a body's contour from colour images, along search lines across the contour.
 
-Of every part of a body it is known how frequent colours are on it and beside it. Along a line
-across the contour the pixels' colours then say where the edge lies, and how surely: the colours are
-compared with those that were to be expected if the edge lay at each of twelve offsets. The mean of
-the offsets is a residual and their variance its weight, so that lines over which body and
-background look alike count for little. What covers the body puts edges far from where neighbouring
-lines have them: the cost saturates as that of silhouettes' edges does.
+For each part of a body there are histograms of the colours on the part and beside it. Along a
+search line across the contour, the colours are compared with those expected if the edge lay at each
+of twelve offsets. The mean of the offset's posterior is a residual and its variance gives the
+weight, so a line where body and background look alike has little weight. An occluder moves the edge
+far from where neighbouring lines see it; the cost saturates as for silhouette edges.
 
-The idea is that of region-based trackers: Prisacariu and Reid 2012, Tjaden et al. 2018, Stoiber et
-al. 2022 (SRT3D), 2023 (M3T). Two things differ. Only the contour of the whole body is looked at,
-beyond which the background begins, and lines end where the model says that another part of the body
-or the other side of a thin one begins. And what a line says is divided by what the window of
-offsets would say by itself, so that a line that says nothing has no weight.
+The method follows region-based trackers (Prisacariu and Reid 2012, Tjaden et al. 2018, Stoiber et
+al. 2022 (SRT3D) and 2023 (M3T)), with two differences. Only the contour of the whole body is used,
+beyond which the background begins, and a line ends where the model has another part of the body or
+the other side of a thin part. The posterior is divided by the window's own contribution, so that a
+line without information has zero weight.
 
-Nothing is kept here between frames: a tracker keeps the histograms, and gets new ones.
+This module keeps no state: a tracker stores the histograms and passes them in.
 """
 
 import math
@@ -30,7 +29,13 @@ from drake_pose.camera.models import Camera
 from drake_pose.compiled import compiled
 from drake_pose.errors import SettingsError
 from drake_pose.fit.contour_fit import Comparison, Noise, camera_weights, pack_cameras
-from drake_pose.fit.kernel import Sum, add_pull, add_pulls, count_distance, seen_from
+from drake_pose.fit.kernel import (
+    Sum,
+    accumulate_residuals,
+    add_residual,
+    poses_in_camera,
+    robust_weight,
+)
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.fit.parameters import Placement
 from drake_pose.silhouette.contour_points import sample_contour
@@ -38,11 +43,11 @@ from drake_pose.silhouette.outline import Outline, PackedOutlines
 from drake_pose.silhouette.scoring import draw_labels
 
 COLOURS = 4096
-"""Number of colours that histograms tell apart: 16 steps of red, green and blue."""
+"""Number of bins of a colour histogram: 16 levels each of red, green and blue."""
 
 
 class Colour(IntEnum):
-    """Rows of a node's histograms: frequencies on it and beside it, and their ratio."""
+    """Rows of a node's histograms: colour frequencies on it and beside it, and their ratio."""
 
     ON = 0
     BESIDE = 1
@@ -50,25 +55,28 @@ class Colour(IntEnum):
 
 
 class LineSettings(NamedTuple):
-    """Lines across a contour.
+    """Search lines across a contour.
 
     Attributes:
-        offsets: number of the edge's offsets along a line.
+        offsets: number of edge offsets evaluated along a line.
         blocks: number of blocks of pixels on either side of the contour: four beyond the last
             offset.
-        pixels: number of pixels that are read of a block: its others say the same.
-        blocks_across: least number of blocks across the thinnest part, where they are coarser than
-            a pixel.
-        trust: a block is believed to be on the right side with at most this above one half.
-        speaks: a line counts if the window's variance is this factor above the edge's.
-        spacing: from line to line along the contour [pixel], where the step is one.
-        correlation: length of contour whose lines err together [pixel].
-        steps: from offset to offset, round after round [pixel]; the last is that of all further
-            rounds.
-        widths: of the strips inside and outside of the contour in which colours are counted
+        pixels: maximum number of pixels sampled per block.
+        blocks_across: minimum number of blocks across the thinnest part, where blocks are larger
+            than a pixel.
+        trust: maximum excess over 1/2 of the probability that a block lies on the side its colours
+            suggest.
+        speaks: a line is used if the variance of a uniform offset exceeds the edge's variance by
+            this factor.
+        spacing: distance between lines along the contour [pixel], at a step of one pixel.
+        correlation: length of contour over which the errors of lines are correlated [pixel].
+        steps: distance between offsets in successive rounds [pixel]; the last value applies to all
+            further rounds.
+        widths: widths of the strips inside and outside the contour in which colours are counted
             [pixel].
-        rate: weight of a frame's colours in the histograms after it.
-        agreeing: a line whose edge seems to be further from the contour [pixel] teaches nothing.
+        rate: weight of a new frame's colours in the histograms.
+        agreeing: a line whose edge is further from the contour than this [pixel] does not update
+            the histograms.
     """
 
     offsets: int = 12
@@ -89,18 +97,19 @@ LINES = LineSettings()
 
 
 def colour_numbers(pixels: Picture) -> NDArray[np.intp]:
-    """(...) the colours of pixels (..., 3 or 4), as histograms count them."""
+    """Return (...) histogram indices of the colours of pixels (..., 3 or 4)."""
     red, green, blue = np.moveaxis(pixels[..., :3].astype(np.intp) >> 4, -1, 0)
     return (red * 16 + green) * 16 + blue
 
 
 @dataclass(frozen=True, eq=False)
 class PartColours:
-    """What parts look like to whichever camera, learned where the body is known to be.
+    """Characteristic colours of a body's parts, learnt from any cameras at a known pose.
 
     Args:
-        known: (nodes, COLOURS) which colours are a part's own.
-        usual: (nodes,) the share of its pixels that had them there; nan: it was not seen.
+        known: (nodes, COLOURS) whether a colour is characteristic of a part.
+        usual: (nodes,) fraction of the part's pixels with these colours at that pose; nan: the part
+            was occluded.
     """
 
     known: Mask
@@ -113,8 +122,15 @@ class PartColours:
         X_WN: Array,
         views: Iterable[tuple[Camera, Picture]],
     ) -> "PartColours":
-        """Those of cameras' histograms, of a body of these surfaces at X_WN (nodes, 4, 4)."""
-        # Rarer colours than this fraction of the pixels are not a part's own.
+        """Learn the colours of parts.
+
+        Args:
+            histograms: (nodes, 3, COLOURS) histograms of each camera.
+            outlines: surface of each node.
+            X_WN: (nodes, 4, 4) poses of the nodes.
+            views: cameras and their images (H, W, 3).
+        """
+        # A characteristic colour covers at least this fraction of the part's pixels.
         known = np.any([one[:, Colour.ON] > 4e-4 for one in histograms], axis=0)
         own = PartColours(known, np.ones(len(known)))
         return PartColours(known, own._shares(outlines, X_WN, views))
@@ -122,9 +138,13 @@ class PartColours:
     def shown(
         self, outlines: Sequence[Outline], X_WN: Array, views: Iterable[tuple[Camera, Picture]]
     ) -> Array:
-        """(nodes,) how many times the usual share shows: of the median, as light changes all."""
-        shares = self._shares(outlines, X_WN, views) / self.usual
-        return np.asarray(shares / max(float(np.nanmedian([*shares, 1.0])), 1e-9))
+        """Return (nodes,) fraction of each part's pixels with its colours, relative to ``usual``.
+
+        The values are divided by their median, because illumination changes affect all parts.
+        Arguments as for ``learned``.
+        """
+        frequencies = self._shares(outlines, X_WN, views) / self.usual
+        return np.asarray(frequencies / max(float(np.nanmedian([*frequencies, 1.0])), 1e-9))
 
     def _shares(
         self, outlines: Sequence[Outline], X_WN: Array, views: Iterable[tuple[Camera, Picture]]
@@ -136,24 +156,24 @@ class PartColours:
             parts = labels[seen] - 1
             np.add.at(counts[0], parts, self.known[parts, colour_numbers(picture[seen])])
             np.add.at(counts[1], parts, 1.0)
-        # Fewer than a hundred pixels say nothing of a part.
+        # A hundred visible pixels are needed to evaluate a part.
         return np.where(counts[1] < 100, np.nan, counts[0] / np.maximum(counts[1], 1.0))
 
 
 def search_line_step(number: int) -> int:
-    """From offset to offset of lines in a round, counted from 0 [pixel]."""
+    """Return the distance between offsets of search lines [pixel] in a round, counted from 0."""
     return LINES.steps[min(number, len(LINES.steps) - 1)]
 
 
 def uninformed_histograms(cameras: int, nodes: int) -> Floats:
-    """What is known of a body that was never seen: nothing."""
+    """Return uninformative histograms (cameras, nodes, 3, COLOURS): all colour ratios are one."""
     known = np.zeros((cameras, nodes, len(Colour), COLOURS), dtype=np.float32)
     known[:, :, Colour.FOREGROUND] = 1.0
     return known
 
 
 def check_picture(camera: Camera, picture: Picture) -> Picture:
-    """A picture as kernels take it: a copy where it cannot be written or lies in pieces.
+    """Return an image as kernels take it; a copy unless it is contiguous and writeable.
 
     Raises:
         SettingsError: it is not (H, W, 3) or (H, W, 4) bytes of the camera's size.
@@ -161,13 +181,13 @@ def check_picture(camera: Camera, picture: Picture) -> Picture:
     shape = (camera.height, camera.width)
     if picture.dtype != np.uint8 or picture.ndim != 3 or picture.shape[2] not in (3, 4):
         raise SettingsError(
-            f"camera '{camera.name}': a picture of red, green and blue bytes expected, got "
+            f"camera '{camera.name}': expected an image of red, green and blue bytes, got "
             f"{picture.shape} {picture.dtype}"
         )
     if picture.shape[:2] != shape:
         raise SettingsError(
-            f"camera '{camera.name}': picture of {picture.shape[1]} x {picture.shape[0]} pixels, "
-            f"{camera.width} x {camera.height} expected"
+            f"camera '{camera.name}': expected an image of {camera.width} x {camera.height} "
+            f"pixels, got {picture.shape[1]} x {picture.shape[0]}"
         )
     return np.require(picture, requirements=["C", "W"])
 
@@ -177,30 +197,30 @@ def add_pictures(
     cameras: Sequence[Camera],
     pictures: Sequence[Picture | None],
     histograms: Floats,
-    step: AnnealingStage,
+    stage: AnnealingStage,
     noise: Noise,
     pixels: int,
 ) -> None:
-    """Adds what pictures say to what silhouettes say, in place.
+    """Add the residuals of colour images to those of silhouettes, in place.
 
     Args:
-        compared: of all cameras.
+        compared: comparison with the silhouettes of all cameras.
         cameras: the cameras.
-        pictures: of each; None: no lines are looked at in it.
-        histograms: what is known of the colours.
-        step: the scale of the residuals, and the spacing of lines [pixel].
-        noise: of lines [pixel].
-        pixels: from offset to offset along lines.
+        pictures: image of each camera; None: none.
+        histograms: (cameras, nodes, 3, COLOURS) colour histograms.
+        stage: scale of the residuals and spacing of the lines [pixel].
+        noise: noise of search lines [pixel].
+        pixels: distance between offsets along a line [pixel].
     """
     placed = compared.placement
     packed = pack_cameras(cameras)
-    weights = camera_weights(packed, placed, step, noise, 1.0)
+    weights = camera_weights(packed, placed, stage, noise, 1.0)
     for c, picture in enumerate(pictures):
         if picture is not None:
             compare_lines(
                 placed.packed, placed.X_WN, (packed[0][c], packed[1][c]), picture, histograms[c],
                 weights[c], pixels, compared.A[c], compared.b[c], compared.sums[c],
-                compared.wide[c],
+                compared.bias_terms[c],
             )  # fmt: skip
 
 
@@ -210,17 +230,17 @@ def weigh_parts(
     pictures: Sequence[Picture | None],
     noisiest: float = 2.0,
 ) -> None:
-    """Gives parts whose lines scatter more than those of others less weight, in place.
+    """Reduce the weight of parts whose search lines scatter more than average, in place.
 
-    A part has few lines that err independently: its variance is taken half way, on a scale of
-    logarithms, between its own and that of all.
+    A part has few independent lines, so the geometric mean of its own variance and that of all
+    parts is used.
 
     Args:
-        compared: of all cameras.
-        deviation: the least of lines [pixel].
-        pictures: of each camera; None: its silhouettes are not weighed.
-        noisiest: the largest standard deviation that a part's lines are given [pixel]: lines of a
-            part that is far off must still show where it is.
+        compared: comparison of all cameras.
+        deviation: minimum standard deviation of a line [pixel].
+        pictures: image of each camera; None: its silhouettes keep their weight.
+        noisiest: maximum standard deviation of a part's lines [pixel], so that the lines of a
+            misplaced part still pull.
     """
     shown = [c for c, picture in enumerate(pictures) if picture is not None]
     squares, weight = (compared.sums[shown, :-1, k] for k in (Sum.SQUARES, Sum.WEIGHT))
@@ -232,15 +252,15 @@ def weigh_parts(
 
 
 def part_distances(sums: Array, closest: float = 0.7, shortest: float = 20.0) -> Array:
-    """(nodes,) how far each part is from the contour that colours show [pixel].
+    """Return (nodes,) distance of each part from its contour in colour images [pixel]; 0: unknown.
 
-    What covers a part in one camera says nothing against it where another sees it: the mean over
-    cameras is that of one over the distances' squares. 0: of the part too little is said.
+    The harmonic mean of the squared distances over the cameras is used, so that an occluder in one
+    camera does not count against a part that another camera sees.
 
     Args:
-        sums: (cameras, nodes + 1, 6) of pictures, as of `compare_contours`.
-        closest: a part is no closer to a contour [pixel].
-        shortest: a part with less contour is not evaluated [pixel].
+        sums: (cameras, nodes + 1, 6) sums over images, as of `compare_contours`.
+        closest: minimum of a distance [pixel].
+        shortest: a part with less contour than this is not evaluated [pixel].
     """
     squares, weight, length = (sums[:, :-1, k] for k in (Sum.SQUARES, Sum.WEIGHT, Sum.COMPARED))
     own = np.maximum(closest**2, squares / np.maximum(weight, 1e-12))
@@ -254,20 +274,20 @@ def update_histograms(
     cameras: Sequence[Camera],
     pictures: Sequence[Picture | None],
     histograms: Floats,
-    surely: bool = False,
+    pose_is_known: bool = False,
 ) -> Floats:
-    """What is known of the colours after a frame.
+    """Return colour histograms (cameras, nodes, 3, COLOURS) updated with the images of a frame.
 
     Args:
-        placed: the body where it stands.
+        placed: the body at its estimated pose.
         cameras: the cameras.
-        pictures: of each; None: it teaches nothing.
-        histograms: what was known before.
-        surely: whether the pose is known, so that all lines teach and old colours are forgotten.
+        pictures: image of each camera; None: its histograms stay.
+        histograms: histograms before the frame.
+        pose_is_known: the pose is known: all lines are used, and the old histograms are discarded.
     """
     known = histograms.copy()
     packed = pack_cameras(cameras)
-    rate, agreeing = (1.0, math.inf) if surely else (LINES.rate, LINES.agreeing)
+    rate, agreeing = (1.0, math.inf) if pose_is_known else (LINES.rate, LINES.agreeing)
     for c, picture in enumerate(pictures):
         if picture is not None:
             learn_colours(
@@ -290,47 +310,47 @@ def compare_lines(
     A: Array,
     b: Array,
     sums: Array,
-    wide: Array,
-    width: float = 0.0,
+    bias_terms: Array,
+    bias: float = 0.0,
 ) -> None:
-    """Adds what one camera's picture says of the nodes' affine motions.
+    """Add the residuals of one camera's image along search lines to A, b, sums and bias_terms.
 
     Args:
-        packed: the nodes' surfaces.
-        X_WN: (nodes, 4, 4).
+        packed: surfaces of the nodes.
+        X_WN: (nodes, 4, 4) poses of the nodes.
         camera: X_CW (4, 4) and kernel parameters (8,).
-        picture: (H, W, 3 or 4).
-        histograms: (nodes, 3, COLOURS) what is known of the nodes' colours.
+        picture: (H, W, 3 or 4) image.
+        histograms: (nodes, 3, COLOURS) colour histograms.
         weights: (4,) as of `compare_contours`.
-        step: from offset to offset [pixel].
-        A, b, sums, wide: (nodes, 12, 12), (nodes, 12), (nodes + 1, 6) and (nodes, 13) added to, as
-            of `compare_contours`; lengths are of lines that say something, by how much they do.
-        width: by which the body looks too wide on all sides [pixel].
+        step: distance between offsets [pixel].
+        A, b, sums, bias_terms: (nodes, 12, 12), (nodes, 12), (nodes + 1, 6) and (nodes, 13), added
+            to, as of `compare_contours`. A line's length is weighted by its information.
+        bias: boundary bias: the image shows the body wider by this on all sides [pixel].
     """
-    contour = sample_contour(packed, seen_from(camera[0], X_WN), camera[1], weights[2])
+    contour = sample_contour(packed, poses_in_camera(camera[0], X_WN), camera[1], weights[2])
     uv, normals, lengths, nodes, p_N, clearances = contour
     noise = (weights[1] / 2.5) ** 2
-    pulls = np.zeros((len(uv), 7))
+    point_sums = np.zeros((len(uv), 7))
     scratch, place = np.empty((3, 2 * LINES.blocks + 2)), np.empty(2)
     for i in range(len(uv)):
         node = nodes[i]
         for k in range(2):
-            place[k] = uv[i, k] + width * normals[i, k]
+            place[k] = uv[i, k] + bias * normals[i, k]
         edge, variance = _find_edge(
             picture, histograms[node], place, normals[i], clearances[i], step, scratch
         )
         if variance > 0.0:
             length = 2.0 * lengths[i] / (1.0 + variance / noise)
-            weight, _ = count_distance(sums, node, weights, length, edge)
-            add_pull(pulls, i, normals[i, 0], normals[i, 1], edge, weight)
-            pulls[i, 5], pulls[i, 6] = weight * normals[i, 0], weight * normals[i, 1]
-            wide[node, 12] += weight * edge
-    add_pulls(A, b, wide, X_WN, camera, p_N, nodes, nodes, pulls)
+            weight, _ = robust_weight(sums, node, weights, length, edge)
+            add_residual(point_sums, i, normals[i, 0], normals[i, 1], edge, weight)
+            point_sums[i, 5], point_sums[i, 6] = weight * normals[i, 0], weight * normals[i, 1]
+            bias_terms[node, 12] += weight * edge
+    accumulate_residuals(A, b, bias_terms, X_WN, camera, p_N, nodes, nodes, point_sums)
 
 
 @compiled
 def _colour(picture: Picture, u: float, v: float) -> int:
-    """The colour at a place [pixel]; -1 outside of the picture."""
+    """Return the colour index of the pixel at (u, v) [pixel]; -1 outside the image."""
     column, row = math.floor(u + 0.5), math.floor(v + 0.5)
     if column < 0 or row < 0 or column >= picture.shape[1] or row >= picture.shape[0]:
         return -1
@@ -350,26 +370,39 @@ def _find_edge(
     step: int,
     scratch: Array,
 ) -> tuple[float, float]:
-    """Where the edge lies on a line, outwards, and the variance [pixel]; -1: nothing is said."""
+    """Locate the edge on a search line.
+
+    Args:
+        picture: (H, W, 3 or 4) image.
+        histograms: (3, COLOURS) histograms of the node.
+        uv, normal: (2,) point of the contour and its outward normal [pixel].
+        clearance: (2,) distance inwards and outwards [pixel] over which the line crosses no other
+            contour.
+        step: distance between offsets [pixel].
+        scratch: (3, 2 blocks + 2) work space.
+
+    Returns:
+        The edge's offset outwards [pixel], and its variance [pixel^2]; -1: no information.
+    """
     blocks, on, beside = scratch[0], scratch[1], scratch[2]
     # The variance of an edge that lies anywhere in the window [steps^2].
     anywhere = (LINES.offsets**2 - 1) / 12.0
-    # Of a thin part coarse blocks would see little, and too much of what is beyond.
+    # On a thin part, coarse blocks would reach across it and mix in what lies beyond.
     step = max(1, min(step, int(clearance[0] / LINES.blocks_across)))
     pixels = min(step, LINES.pixels)
-    apart = step / pixels
+    pixel_spacing = step / pixels
     for k in range(-LINES.blocks, LINES.blocks + 1):
         foreground = 1.0
         for pixel in range(pixels):
-            r = k * step + apart * (pixel + 0.5) - 0.5 * step
+            r = k * step + pixel_spacing * (pixel + 0.5) - 0.5 * step
             colour = _colour(picture, uv[0] + r * normal[0], uv[1] + r * normal[1])
             if colour >= 0:
                 foreground *= histograms[Colour.FOREGROUND, colour]
         share = foreground / (1.0 + foreground)
-        # How much more likely than not the block is on the body; 0: its colours do not say.
+        # Twice the excess over 1/2 of the probability that the block is on the body.
         blocks[k + LINES.blocks] = 4.0 * LINES.trust * (share - 0.5)
     inner, outer = clearance[0] / step, clearance[1] / step
-    # How likely the colours of all blocks before one are, on the body and beside it.
+    # Cumulative likelihoods of the blocks before each one, on the body and beside it.
     on[0] = beside[0] = 1.0
     for k in range(2 * LINES.blocks + 1):
         on[k + 1] = on[k] * (1.0 + blocks[k])
@@ -393,9 +426,9 @@ def _find_edge(
     if total < 1e-30:
         return 0.0, -1.0
     mean = first / total
-    # An edge between two offsets has the least variance.
+    # The variance is at least that of a uniform distribution between two offsets.
     variance = max(second / total - mean * mean, 1.0 / 12.0)
-    # The window alone would say 0 +- its own width: what the colours say is the rest.
+    # Subtract the information of the window itself, which says 0 +- its width.
     information = 1.0 / variance - 1.0 / anywhere
     if variance * LINES.speaks > anywhere:
         return 0.0, -1.0
@@ -419,24 +452,24 @@ def learn_colours(
     rare: float = 1e-4,
     fewest: float = 20.0,
 ) -> None:
-    """Counts the colours on both sides of a body's contour, and forgets old ones.
+    """Update a camera's colour histograms from both sides of a body's contour, in place.
 
     Args:
         packed, X_WN, camera, picture: as of `compare_lines`.
-        histograms: (nodes, 3, COLOURS) changed.
-        spacing: of the contour's points [pixel].
-        widths: (2,) of the strips inside and outside that are counted [pixel].
-        rate: weight of the new colours; 1 where no colours of the node are known yet.
-        agreeing: lines on which the edge seems to be further from the contour than this teach
-            nothing [pixel]; inf: all do.
-        step: from offset to offset [pixel] of lines that say where the edge is, on both sides of
-            which colours are then counted; 0: they are counted on both sides of the contour.
-        region: (H, W) where the body is known to be seen: it says what is on the body and what is
-            beside it. (0, 0): that is not known.
-        rare: added to frequencies, so that colours below it count as never seen [of all pixels].
-        fewest: fewer pixels on one side of a node's contour teach nothing.
+        histograms: (nodes, 3, COLOURS) histograms, changed.
+        spacing: distance between search lines along the contour [pixel].
+        widths: (2,) widths of the strips inside and outside the contour that are counted [pixel].
+        rate: weight of the new colours; 1 where a node has no colours yet.
+        agreeing: a line whose edge is further from the contour than this is ignored [pixel]; inf:
+            no line is ignored.
+        step: distance between offsets [pixel] of the lines that locate the edge, on both sides of
+            which colours are then counted; 0: colours are counted on both sides of the contour.
+        region: (H, W) known silhouette of the body, which decides what is on the body and what is
+            beside it; (0, 0): unknown.
+        rare: added to frequencies, so that rarer colours count as unobserved [fraction of pixels].
+        fewest: minimum number of pixels on a side of a node's contour for an update.
     """
-    X_CN = seen_from(camera[0], X_WN)
+    X_CN = poses_in_camera(camera[0], X_WN)
     uv, normals, _, nodes, _, clearances = sample_contour(packed, X_CN, camera[1], spacing)
     counts = np.zeros((len(histograms), 2, COLOURS), dtype=np.float32)
     totals = np.zeros((len(histograms), 2))
@@ -471,12 +504,14 @@ def learn_colours(
                 totals[node, where] += 1.0
     for node in range(len(histograms)):
         for side in range(2):
-            shares, total = histograms[node, side], totals[node, side]
+            frequencies, total = histograms[node, side], totals[node, side]
             if total >= fewest:
-                # Where no colours are known yet the new ones are all.
-                share = rate if shares.any() else 1.0
+                # The first colours of a node replace the empty histogram.
+                share = rate if frequencies.any() else 1.0
                 for colour in range(COLOURS):
-                    shares[colour] += share * (counts[node, side, colour] / total - shares[colour])
+                    frequencies[colour] += share * (
+                        counts[node, side, colour] / total - frequencies[colour]
+                    )
         for colour in range(COLOURS):
             on_it, beside_it = (
                 histograms[node, Colour.ON, colour],

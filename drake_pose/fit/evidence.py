@@ -1,4 +1,4 @@
-"""What a fit needs of a silhouette: the points of its edge, with normals."""
+"""Edge points of silhouettes, with normals, as the evidence of a fit."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -12,13 +12,13 @@ from drake_pose.compiled import compiled
 
 
 class EdgePoints(NamedTuple):
-    """Points of a silhouette's edge in one picture, from top to bottom.
+    """Points of a silhouette's edge in one image, from top to bottom.
 
     Attributes:
-        uv: (n, 2) [pixel].
-        normals: (n, 2) unit normals out of the silhouette.
-        lengths: (n,) the length of edge that each stands for [pixel].
-        middle: (2,) the silhouette's middle [pixel]; nan where it is empty.
+        uv: (n, 2) points [pixel].
+        normals: (n, 2) unit normals, pointing out of the silhouette.
+        lengths: (n,) length of edge that each point represents [pixel].
+        middle: (2,) centroid of the largest contour [pixel]; nan if there is no edge.
     """
 
     uv: Array
@@ -28,17 +28,17 @@ class EdgePoints(NamedTuple):
 
 
 NO_EDGE = EdgePoints(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0), np.full(2, np.nan))
-"""Of a picture in which nothing is seen, or of none."""
+"""The edge of an empty silhouette."""
 
 
 class Evidence(NamedTuple):
-    """The edges of one frame's silhouettes, camera after camera.
+    """Edges of the silhouettes of one frame, ordered by camera.
 
     Attributes:
-        uv: (n, 2) [pixel], v ascending in each camera.
-        normals: (n, 2) unit normals out of the silhouettes.
-        lengths: (n,) the length of edge that each point stands for [pixel].
-        starts: (cameras + 1,) int64 where each camera's points begin.
+        uv: (n, 2) points [pixel], v ascending in each camera.
+        normals: (n, 2) unit normals, pointing out of the silhouettes.
+        lengths: (n,) length of edge that each point represents [pixel].
+        starts: (cameras + 1,) index of each camera's first point.
     """
 
     uv: Array
@@ -48,15 +48,15 @@ class Evidence(NamedTuple):
 
 
 class Observation(NamedTuple):
-    """What cameras see of a body in one frame, and what is known of its joints then.
+    """Evidence of one frame, and known joint values.
 
     Attributes:
-        edges: of its silhouettes, camera after camera.
-        values: (k,) known values of the first k parameters of a ``Problem``, such as encoders'
-            readings [rad or m]; the others are 0.
-        foreground: of each camera a picture (H, W, 3) whose colours are log-odds
-            (``fit.background``), or None; empty: of none.
-        rates: (m,) velocities of the pose tree's values [rad/s or m/s]; None: not known.
+        edges: edges of the silhouettes.
+        values: (k,) known values of the first k parameters of a ``Problem``, such as encoder
+            readings [rad or m]; the remaining parameters are 0.
+        foreground: per camera an image (H, W, 3) that encodes log-odds (``fit.background``), or
+            None; empty for none.
+        rates: (m,) velocities of the pose tree's values [rad/s or m/s]; None: unknown.
     """
 
     edges: Evidence
@@ -66,7 +66,7 @@ class Observation(NamedTuple):
 
 
 def pack_evidence(edges: Sequence[EdgePoints]) -> Evidence:
-    """The edges of each camera's silhouette in one; one without points says nothing."""
+    """Return the edges of all cameras' silhouettes in one tuple of arrays."""
     return Evidence(
         np.concatenate([np.zeros((0, 2)), *(edge.uv for edge in edges)]),
         np.concatenate([np.zeros((0, 2)), *(edge.normals for edge in edges)]),
@@ -75,8 +75,8 @@ def pack_evidence(edges: Sequence[EdgePoints]) -> Evidence:
     )
 
 
-def widened(evidence: Evidence, widths: Array) -> Evidence:
-    """The edges of silhouettes that are wider (c,) on all sides [pixel], or narrower."""
+def offset_edges(evidence: Evidence, widths: Array) -> Evidence:
+    """Return edges moved outwards by widths (c,) [pixel] along their normals; negative: inwards."""
     counts = np.diff(evidence.starts)
     uv = evidence.uv + np.repeat(widths, counts)[:, None] * evidence.normals
     order = np.concatenate(
@@ -89,12 +89,12 @@ def widened(evidence: Evidence, widths: Array) -> Evidence:
 
 
 def find_edge_points(region: Mask, spacing: float, chord: int = 3) -> EdgePoints:
-    """Points of a silhouette's edge, holes included; the picture's border is no edge.
+    """Return points of a silhouette's edge, including holes; the image border is not an edge.
 
     Args:
         region: (H, W) the silhouette.
-        spacing: from point to point [pixel].
-        chord: the edge's direction is that of a chord over this many pixels to both sides.
+        spacing: distance between points along the edge [pixel].
+        chord: the edge's direction is that of a chord to this many pixels on both sides.
     """
     contours, _ = cv2.findContours(region.view(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
     chains = [chain.reshape(-1, 2) for chain in contours if len(chain) > 2 * chord + 1]
@@ -102,7 +102,7 @@ def find_edge_points(region: Mask, spacing: float, chord: int = 3) -> EdgePoints
         return NO_EDGE
     starts = np.cumsum([0, *(len(chain) for chain in chains)])
     moments = [cv2.moments(chain) for chain in chains]
-    # Holes run the other way round, but OpenCV's moments are positive for them, too.
+    # Holes have the opposite orientation, but OpenCV's moments are positive for them, too.
     largest = max(moments, key=lambda one: one["m00"])
     area = max(largest["m00"], 1e-9)
     uv, normals, lengths = _sample(
@@ -126,7 +126,15 @@ def _sample(
     height: int,
     chord: int,
 ) -> tuple[Array, Array, Array]:
-    """Points, normals and lengths along closed chains of pixels (n, 2)."""
+    """Return points, normals and lengths along closed chains of pixels.
+
+    Args:
+        pixels: (n, 2) pixels of all chains.
+        starts: (chains + 1,) index of each chain's first pixel.
+        spacing: distance between points [pixel].
+        width, height: size of the image [pixel].
+        chord: as of find_edge_points.
+    """
     capacity = int(2 * len(pixels) / spacing) + 2 * len(starts)
     uv, normals, lengths = np.empty((capacity, 2)), np.empty((capacity, 2)), np.empty(capacity)
     found = 0
@@ -144,11 +152,11 @@ def _sample(
             size = np.sqrt(du * du + dv * dv)
             if size < 0.5 * chord:
                 continue
-            # OpenCV runs with the region to the left: outwards is to the right, y down.
+            # OpenCV's chains have the region on their left, so the outward normal points right.
             n0, n1 = -dv / size, du / size
             normals[found, 0], normals[found, 1] = n0, n1
-            # The outermost pixels' centres lie half a pixel inside of the edge, along the rows or
-            # the columns: whichever cross it.
+            # The outermost pixel centres lie half a pixel inside the edge, along the rows or the
+            # columns, whichever cross it.
             inside = 0.5 * max(abs(n0), abs(n1))
             uv[found, 0], uv[found, 1] = x + inside * n0, y + inside * n1
             lengths[found] = size / (2 * chord) * count / points

@@ -1,12 +1,11 @@
-"""The inner loop of the fit: a body's contour and a silhouette's edge, compared both ways.
+"""The inner loop of the fit: residuals between a body's contour and the edges of silhouettes.
 
-Every point of the body's contour is drawn to the nearest point of the silhouette's edge that faces
-alike, and every point of the edge draws the nearest point of the contour. The cost of a distance r
-saturates (Geman and McClure 1987): c^2 r^2 / (r^2 + c^2), so that what has no counterpart costs
-something and pulls at nothing.
+Every point of the body's contour is matched to the nearest edge point with a similar normal, and
+every edge point to the nearest contour point. The cost of a distance r saturates (Geman and McClure
+1987), c^2 r^2 / (r^2 + c^2), so an unmatched point costs c^2 and exerts no pull.
 
-How a distance changes is linear in the affine motion, 12 numbers, of the node that the point lies
-on. So the points of a node add up to a 12 x 12 matrix, however many unknowns move it.
+A distance changes linearly in the affine motion (12 numbers) of the node on which its point lies,
+so the points of a node add up to one 12 x 12 matrix, independent of the number of unknowns.
 """
 
 import math
@@ -21,15 +20,15 @@ from drake_pose.silhouette.contour_points import sample_contour
 from drake_pose.silhouette.outline import PackedOutlines
 
 REACH = 4.0
-"""Distances beyond this many scales do not correspond."""
+"""Maximum distance of matched points [scales of the cost]."""
 
 
 class Sum(IntEnum):
     """Columns of the sums of ``compare_contours``.
 
-    COMPARED: length of contour. FITTING: length of what fits to within the scale. CLOSE: one minus
-    the cost in squares of the scale, along the contour [all in units of length]. COST, and SQUARES
-    of the distances, both weighted as in A and b. WEIGHT: the weights' sum.
+    COMPARED: length of contour. FITTING: length of contour with a residual below the scale. CLOSE:
+    integral of 1 / (1 + (r / scale)^2) along the contour [all in units of length]. COST: the cost.
+    SQUARES: weighted sum of squared residuals. WEIGHT: sum of these weights.
     """
 
     COMPARED = 0
@@ -41,23 +40,23 @@ class Sum(IntEnum):
 
 
 @compiled
-def nearest_alike(
+def match_points(
     uv: Array, normals: Array, other_uv: Array, others: Array, reach: float,
-    least_cosine: float = 0.3, most_squares: float = 64.0,
+    min_cosine: float = 0.3, max_cells: float = 64.0,
 ) -> Indices:  # fmt: skip
-    """The nearest point that faces alike; -1 where none is.
+    """Return for each point the nearest other point with a similar normal.
 
-    The others are put into squares, and squares are looked at from each point outwards.
+    The other points are sorted into a grid of square cells, which is searched in growing rings.
 
     Args:
-        uv, normals: (n, 2) points of a contour or an edge.
-        other_uv, others: (k, 2) points of the other one, and their normals.
-        reach: farther points do not correspond [pixel].
-        least_cosine: of the angle between the normals of points that correspond.
-        most_squares: in a row.
+        uv, normals: (n, 2) points and unit normals of a contour or an edge.
+        other_uv, others: (k, 2) points and unit normals of the other one.
+        reach: maximum distance of a match [pixel].
+        min_cosine: minimum cosine of the angle between matched normals.
+        max_cells: maximum number of cells along a side of the grid.
 
     Returns:
-        (n,) indices.
+        (n,) indices of the matched points; -1: no match.
     """
     found = np.full(len(uv), -1, dtype=np.int64)
     if len(other_uv) == 0:
@@ -67,22 +66,22 @@ def nearest_alike(
     for j in range(len(other_uv)):
         left, right = min(left, other_uv[j, 0]), max(right, other_uv[j, 0])
         top, bottom = min(top, other_uv[j, 1]), max(bottom, other_uv[j, 1])
-    side = max(reach / 8.0, max(right - left, bottom - top) / most_squares)
+    side = max(reach / 8.0, max(right - left, bottom - top) / max_cells)
     share = 1.0 / side
     columns, rows = int((right - left) * share) + 1, int((bottom - top) * share) + 1
-    squares = np.empty(len(other_uv), dtype=np.int64)
+    cells = np.empty(len(other_uv), dtype=np.int64)
     starts = np.zeros(rows * columns + 2, dtype=np.int64)
     for j in range(len(other_uv)):
         row, column = int((other_uv[j, 1] - top) * share), int((other_uv[j, 0] - left) * share)
-        squares[j] = row * columns + column
-        starts[squares[j] + 1] += 1
+        cells[j] = row * columns + column
+        starts[cells[j] + 1] += 1
     for square in range(rows * columns + 1):
         starts[square + 1] += starts[square]
     order, sorted_others = np.empty(len(other_uv), dtype=np.int64), np.empty((len(other_uv), 4))
     for j in range(len(other_uv) - 1, -1, -1):
-        # Where a square ends is counted down to where it begins.
-        starts[squares[j] + 1] -= 1
-        k = starts[squares[j] + 1]
+        # The end index of a cell is decremented down to its start index.
+        starts[cells[j] + 1] -= 1
+        k = starts[cells[j] + 1]
         order[k], sorted_others[k, 0], sorted_others[k, 1] = j, other_uv[j, 0], other_uv[j, 1]
         sorted_others[k, 2], sorted_others[k, 3] = others[j, 0], others[j, 1]
     for i in range(len(uv)):
@@ -97,10 +96,10 @@ def nearest_alike(
                     alike = (
                         normals[i, 0] * sorted_others[k, 2] + normals[i, 1] * sorted_others[k, 3]
                     )
-                    # No branch, which the processor would guess wrong.
-                    is_nearer = (square < best) & (alike >= least_cosine)
+                    # Branch-free, because the branch would be mispredicted often.
+                    is_nearer = (square < best) & (alike >= min_cosine)
                     best, nearest = (square, k) if is_nearer else (best, nearest)
-            # All points that are nearer than the ring is wide have been compared.
+            # All points within the ring's radius have been compared.
             if best <= (ring * side) ** 2:
                 break
         if nearest >= 0:
@@ -115,57 +114,59 @@ def compare_contours(
     cameras: tuple[Array, Array],
     edges: Evidence,
     weights: Array,
-    squares: int,
+    tiles_per_side: int,
     side: float,
-    widths: bool,
+    with_bias: bool,
 ) -> tuple[Array, Array, Array, Array, Array]:
-    """What each camera says of the nodes' affine motions.
+    """Return the quadratic cost of the nodes' affine motions for each camera.
 
-    The cost is x^T A x - 2 b^T x and what it is now, for x the rows of a node's affine motion
-    (3, 4), which moves a point at p_W by M p_W + v.
+    The cost is x^T A x - 2 b^T x plus the current cost. x (12,) are the rows of a node's affine
+    motion (M v) (3, 4), which moves a point at p_W by M p_W + v.
 
     Args:
-        packed: the nodes' surfaces.
-        X_WN: (nodes, 4, 4).
+        packed: surfaces of the nodes.
+        X_WN: (nodes, 4, 4) poses of the nodes.
         cameras: X_CW (c, 4, 4) and kernel parameters (c, 8).
-        edges: of their silhouettes.
-        weights: (c, 4) of each camera: units of length a pixel, the cost's scale and the spacing of
-            the body's contour [pixel], and the weight of a pixel of contour.
-        squares: k, number of squares of each picture's rows and columns; 0: none.
-        side: of the squares [pixel]; beyond k they are counted from 0 again.
-        widths: whether derivatives by the silhouettes' widths are wanted.
+        edges: edges of the silhouettes.
+        weights: (c, 4) per camera: units of length per pixel, scale of the cost [pixel], spacing of
+            the body's contour points [pixel], and weight per pixel of contour length.
+        tiles_per_side: k, number of tiles per row and column in which the cost is summed; 0: none.
+        side: side of a tile [pixel]; tile indices are taken modulo k.
+        with_bias: compute derivatives by the silhouettes' boundary bias.
 
     Returns:
-        A (c, nodes, 12, 12), lower triangles, and b (c, nodes, 12); sums (c, nodes + 1, 6) by
-        ``Sum`` of each node's contour, and of all edges in the last row; (c, k, k) the cost by
-        squares of the picture; and (c, nodes, 13)
-        the derivatives of b, and of half the cost, by the silhouettes' growth [pixel].
+        A (c, nodes, 12, 12), lower triangles.
+        b (c, nodes, 12).
+        Sums (c, nodes + 1, 6) by ``Sum`` of each node's contour, and of all edges in the last row.
+        Cost (c, k, k) of each tile.
+        Derivatives (c, nodes, 13) of b (12,) and of half the cost by the boundary bias [pixel].
     """
     count, nodes = len(weights), len(X_WN)
     A, b = np.zeros((count, nodes, 12, 12)), np.zeros((count, nodes, 12))
-    sums, pieces = np.zeros((count, nodes + 1, 6)), np.zeros((count, squares, squares))
-    wide = np.zeros((count, nodes, 13))
+    sums, tiles = np.zeros((count, nodes + 1, 6)), np.zeros((count, tiles_per_side, tiles_per_side))
+    bias_terms = np.zeros((count, nodes, 13))
     for c in range(count):
         begin, end = edges.starts[c], edges.starts[c + 1]
         if begin == end:
             continue
         camera, own_sums, own_weights = (cameras[0][c], cameras[1][c]), sums[c], weights[c]
-        unit, scale, spacing, worth = weights[c, 0], weights[c, 1], weights[c, 2], weights[c, 3]
-        contour = sample_contour(packed, seen_from(camera[0], X_WN), camera[1], spacing)
-        # Named here, arrays are not counted as used again for each pair.
+        unit, scale, spacing = weights[c, 0], weights[c, 1], weights[c, 2]
+        length_weight = weights[c, 3]
+        contour = sample_contour(packed, poses_in_camera(camera[0], X_WN), camera[1], spacing)
+        # Local names avoid numba's reference counting in the inner loop.
         uv, normals, lengths, owners = contour.uv, contour.normals, contour.lengths, contour.nodes
         edge_uv, edge_normals = edges.uv[begin:end], edges.normals[begin:end]
         edge_lengths = edges.lengths[begin:end]
-        of_point = nearest_alike(uv, normals, edge_uv, edge_normals, REACH * scale)
-        of_edge = nearest_alike(edge_uv, edge_normals, uv, normals, REACH * scale)
+        of_point = match_points(uv, normals, edge_uv, edge_normals, REACH * scale)
+        of_edge = match_points(edge_uv, edge_normals, uv, normals, REACH * scale)
         n = len(uv)
-        pulls = np.zeros((n, 7))
+        point_sums = np.zeros((n, 7))
         for pair in range(n + len(edge_uv)):
             i = pair if pair < n else of_edge[pair - n]
             j = of_point[pair] if pair < n else pair - n
             length = lengths[i] if pair < n else edge_lengths[j]
             counted = owners[i] if pair < n else nodes
-            cost = worth * length * scale * scale
+            cost = length_weight * length * scale * scale
             if i < 0 or j < 0:
                 own_sums[counted, Sum.COMPARED] += length * unit
                 own_sums[counted, Sum.COST] += cost
@@ -174,23 +175,27 @@ def compare_contours(
                 share = 1.0 / math.sqrt(n0 * n0 + n1 * n1)
                 n0, n1 = share * n0, share * n1
                 r = (edge_uv[j, 0] - uv[i, 0]) * n0 + (edge_uv[j, 1] - uv[i, 1]) * n1
-                weight, cost = count_distance(own_sums, counted, own_weights, length, r)
-                add_pull(pulls, i, n0, n1, r, weight)
-                if widths:
+                weight, cost = robust_weight(own_sums, counted, own_weights, length, r)
+                add_residual(point_sums, i, n0, n1, r, weight)
+                if with_bias:
                     grows = weight * (edge_normals[j, 0] * n0 + edge_normals[j, 1] * n1)
-                    pulls[i, 5] += grows * n0
-                    pulls[i, 6] += grows * n1
-                    wide[c, owners[i], 12] += grows * r
-            if squares > 0:
+                    point_sums[i, 5] += grows * n0
+                    point_sums[i, 6] += grows * n1
+                    bias_terms[c, owners[i], 12] += grows * r
+            if tiles_per_side > 0:
                 u, v = (uv[i, 0], uv[i, 1]) if pair < n else (edge_uv[j, 0], edge_uv[j, 1])
-                pieces[c, math.floor(v / side) % squares, math.floor(u / side) % squares] += cost
-        add_pulls(A[c], b[c], wide[c], X_WN, camera, contour.p_N, owners, owners, pulls)
-    return A, b, sums, pieces, wide
+                tiles[
+                    c, math.floor(v / side) % tiles_per_side, math.floor(u / side) % tiles_per_side
+                ] += cost
+        accumulate_residuals(
+            A[c], b[c], bias_terms[c], X_WN, camera, contour.p_N, owners, owners, point_sums
+        )
+    return A, b, sums, tiles, bias_terms
 
 
 @compiled
-def seen_from(X_CW: Array, X_WN: Array) -> Array:
-    """X_CN (nodes, 4, 4)."""
+def poses_in_camera(X_CW: Array, X_WN: Array) -> Array:
+    """Return X_CN (nodes, 4, 4), the poses of nodes in a camera."""
     X_CN = np.zeros_like(X_WN)
     for node in range(len(X_WN)):
         multiply(X_CW, X_WN[node], X_CN[node])
@@ -199,26 +204,26 @@ def seen_from(X_CW: Array, X_WN: Array) -> Array:
 
 
 @compiled
-def count_distance(
+def robust_weight(
     sums: Array, row: int, weights: Array, length: float, r: float
 ) -> tuple[float, float]:
-    """Counts a distance in a row of the sums of `compare_contours`.
+    """Return the weight and cost of a residual, and add it to a row of the sums.
 
     Args:
-        sums: (rows, 6) added to.
-        row: the node's.
+        sums: (rows, 6) sums of `compare_contours`, added to.
+        row: row of the sums.
         weights: (4,) as of `compare_contours`.
-        length: of the contour that the point stands for [pixel].
-        r: the distance [pixel].
+        length: length of contour that the point represents [pixel].
+        r: the residual [pixel].
 
     Returns:
-        What its square weighs, and the cost.
+        The weight of the squared residual, and the cost.
     """
-    unit, scale, worth = weights[0], weights[1], weights[3]
+    unit, scale, length_weight = weights[0], weights[1], weights[3]
     t = (r / scale) ** 2
     share = 1.0 / (1.0 + t)
-    cost = worth * length * r * r * share
-    weight = worth * length * share * share
+    cost = length_weight * length * r * r * share
+    weight = length_weight * length * share * share
     sums[row, Sum.COMPARED] += length * unit
     sums[row, Sum.FITTING] += length * unit * (t < 1.0)
     sums[row, Sum.CLOSE] += length * unit * share
@@ -229,38 +234,38 @@ def count_distance(
 
 
 @compiled
-def add_pull(pulls: Array, i: int, n0: float, n1: float, r: float, weight: float) -> None:
-    """Adds a weighted distance r [pixel] along (n0, n1) to a row of the pulls of `add_pulls`."""
-    pulls[i, 0] += weight * n0 * n0
-    pulls[i, 1] += weight * n0 * n1
-    pulls[i, 2] += weight * n1 * n1
-    pulls[i, 3] += weight * n0 * r
-    pulls[i, 4] += weight * n1 * r
+def add_residual(point_sums: Array, i: int, n0: float, n1: float, r: float, weight: float) -> None:
+    """Add a weighted residual r [pixel] along (n0, n1) to row i of (n, 7) point sums."""
+    point_sums[i, 0] += weight * n0 * n0
+    point_sums[i, 1] += weight * n0 * n1
+    point_sums[i, 2] += weight * n1 * n1
+    point_sums[i, 3] += weight * n0 * r
+    point_sums[i, 4] += weight * n1 * r
 
 
 @compiled
-def add_pulls(
-    A: Array, b: Array, wide: Array, X_WN: Array, camera: tuple[Array, Array], p_N: Array,
-    nodes: Indices, owners: Indices, pulls: Array,
+def accumulate_residuals(
+    A: Array, b: Array, bias_terms: Array, X_WN: Array, camera: tuple[Array, Array], p_N: Array,
+    nodes: Indices, owners: Indices, point_sums: Array,
 ) -> None:  # fmt: skip
-    """Adds what pulls at points in a picture to the nodes' A, lower triangles, and b.
+    """Add the residuals at points of an image to the nodes' A (lower triangles) and b.
 
-    All that pulls at one point of a contour is added up in the picture first.
+    All residuals at one point of a contour must have been summed by `add_residual` first.
 
     Args:
-        A, b, wide: (nodes, 12, 12), (nodes, 12) and (nodes, 13) added to, as of
+        A, b, bias_terms: (nodes, 12, 12), (nodes, 12) and (nodes, 13) added to, as of
             `compare_contours`.
-        X_WN: (nodes, 4, 4).
+        X_WN: (nodes, 4, 4) poses of the nodes.
         camera: X_CW (4, 4) and kernel parameters (8,).
-        p_N: (n, 3) the points.
-        nodes, owners: (n,) the nodes in which they are given, and with which they are moved.
-        pulls: (n, 7) sums over what pulls at each, weighted: of n n^T (00, 01, 11), of n r and of
-            n times by how much r grows as the silhouette grows by a pixel.
+        p_N: (n, 3) positions of the points in their nodes [m].
+        nodes, owners: (n,) the node in which a point is given, and the node that moves it.
+        point_sums: (n, 7) weighted sums over the residuals r with normal n at each point: n n^T
+            (00, 01, 11), n r, and n times the derivative of r by the boundary bias.
     """
     X_CW, lens = camera
     p, rows, H = np.ones(4), np.zeros((2, 3)), np.zeros((3, 3))
-    for i in range(len(pulls)):
-        if pulls[i, 0] + pulls[i, 2] == 0.0:
+    for i in range(len(point_sums)):
+        if point_sums[i, 0] + point_sums[i, 2] == 0.0:
             continue
         node, owner = nodes[i], owners[i]
         for k in range(3):
@@ -280,24 +285,24 @@ def add_pulls(
             rows[0, k] = lens[1] * share * (X_CW[0, k] - X_CW[2, k] * u)
             rows[1, k] = lens[2] * share * (X_CW[1, k] - X_CW[2, k] * v)
         for k in range(3):
-            across = pulls[i, 0] * rows[0, k] + pulls[i, 1] * rows[1, k]
-            along = pulls[i, 1] * rows[0, k] + pulls[i, 2] * rows[1, k]
+            across = point_sums[i, 0] * rows[0, k] + point_sums[i, 1] * rows[1, k]
+            along = point_sums[i, 1] * rows[0, k] + point_sums[i, 2] * rows[1, k]
             for c in range(k + 1):
                 H[k, c] = across * rows[0, c] + along * rows[1, c]
         for k in range(3):
-            pull = pulls[i, 3] * rows[0, k] + pulls[i, 4] * rows[1, k]
+            row_sum = point_sums[i, 3] * rows[0, k] + point_sums[i, 4] * rows[1, k]
             for c in range(4):
-                b[owner, 4 * k + c] += pull * p[c]
+                b[owner, 4 * k + c] += row_sum * p[c]
             for m in range(k + 1):
                 for j in range(4):
                     slope = H[k, m] * p[j]
                     for c in range(4):
                         A[owner, 4 * k + j, 4 * m + c] += slope * p[c]
-        if pulls[i, 5] != 0.0 or pulls[i, 6] != 0.0:
+        if point_sums[i, 5] != 0.0 or point_sums[i, 6] != 0.0:
             for k in range(3):
-                grows = pulls[i, 5] * rows[0, k] + pulls[i, 6] * rows[1, k]
+                grows = point_sums[i, 5] * rows[0, k] + point_sums[i, 6] * rows[1, k]
                 for c in range(4):
-                    wide[owner, 4 * k + c] += grows * p[c]
+                    bias_terms[owner, 4 * k + c] += grows * p[c]
     for node in range(len(A)):
         for k in range(11):
             for c in range(k + 1, 12):
@@ -305,25 +310,25 @@ def add_pulls(
 
 
 @compiled
-def collect(
+def assemble_normal_equations(
     A: Array, b: Array, motions: Array, starts: Indices, owners: Indices, parameters: Indices,
     size: int,
 ) -> tuple[Array, Array]:  # fmt: skip
-    """The normal equations H dx = -g of all parameters.
+    """Return the normal equations H dx = -g of all parameters.
 
     Args:
-        A, b: of compare_contours.
+        A, b: (nodes, 12, 12) and (nodes, 12) as of compare_contours.
         motions: (k, 12) affine motions.
-        starts: (nodes + 1,) which motions, of owners, are those of each node.
-        owners: (s,) motions, node after node.
-        parameters: (s,) the parameter that makes each.
-        size: how many parameters there are.
+        starts: (nodes + 1,) index of each node's first entry in owners.
+        owners: (s,) indices of motions, ordered by node.
+        parameters: (s,) the parameter that causes each motion.
+        size: number of parameters.
 
     Returns:
-        (size, size) and (size,).
+        H (size, size) and g (size,).
     """
     H, g = np.zeros((size, size)), np.zeros(size)
-    pull = np.empty(12)
+    row_sum = np.empty(12)
     for node in range(len(A)):
         begin, end = starts[node], starts[node + 1]
         if A[node, 3, 3] + A[node, 7, 7] + A[node, 11, 11] == 0.0:
@@ -331,14 +336,14 @@ def collect(
         for s in range(begin, end):
             motion = motions[owners[s]]
             for k in range(12):
-                pull[k] = 0.0
+                row_sum[k] = 0.0
                 for c in range(12):
-                    pull[k] += (A[node, k, c] if c <= k else A[node, c, k]) * motion[c]
+                    row_sum[k] += (A[node, k, c] if c <= k else A[node, c, k]) * motion[c]
                 g[parameters[s]] -= motion[k] * b[node, k]
             for t in range(begin, s + 1):
                 product = 0.0
                 for k in range(12):
-                    product += motions[owners[t], k] * pull[k]
+                    product += motions[owners[t], k] * row_sum[k]
                 H[parameters[s], parameters[t]] += product
                 if t < s:
                     H[parameters[t], parameters[s]] += product

@@ -1,11 +1,16 @@
-"""Levenberg and Marquardt's method inside limits, for frames that share some of their unknowns.
+"""Levenberg-Marquardt with limits, for frames that share some of their unknowns.
 
-(H + d diag(H) + e mean(diag(H)) I) x = -g; unknowns at a limit that x would leave are held.
+Each step x solves
 
-The scale of the cost shrinks from round to round, so first everything within reach pulls and in the
-end only what fits (graduated non-convexity, Blake and Zisserman 1987). Frames couple through what
-they share: each frame's own unknowns are eliminated first (Schur complement). Those of frames that
-follow one another may also couple by a motion, which is linear in them.
+    (H + d diag(H) + e mean(diag(H)) I) x = -g
+
+with the damping d and a constant e; an unknown at a limit that x would leave is fixed. Steps are
+accepted if the cost decreases.
+
+The scale of the cost shrinks from stage to stage, so at first all matched points pull and in the
+end only the inliers (graduated non-convexity, Blake and Zisserman 1987). Frames are coupled by
+shared unknowns: each frame's own unknowns are eliminated first (Schur complement). Own unknowns of
+successive frames may also be coupled by a linear motion prior.
 """
 
 from collections.abc import Callable, Sequence
@@ -23,12 +28,12 @@ from drake_pose.errors import SettingsError
 
 @dataclass(frozen=True)
 class AnnealingStage:
-    """A part of a fit at one scale; lengths in m, or in the fit's unit of length.
+    """Part of a fit with a constant scale; lengths in m, or in the fit's unit of length.
 
     Args:
-        scale: the distance at which a point of a contour loses three quarters of its pull.
-        spacing: of the points of the body's contour.
-        iterations: maximum number of steps; a single one is taken untried.
+        scale: distance at which a point's weight drops to a quarter.
+        spacing: distance between points of the body's contour.
+        iterations: maximum number of steps; a single step is taken without checking the cost.
     """
 
     scale: float
@@ -45,15 +50,15 @@ class AnnealingStage:
 
 @dataclass(frozen=True)
 class StepSettings:
-    """How steps are made.
+    """Settings of the steps.
 
     Args:
-        longest: no unknown changes by more in a step [rad, m or a logarithm].
-        damping: fraction of the diagonal that is added to it at first.
-        even_damping: fraction of the diagonal's mean that is added: unobservable unknowns stay.
-        least_damping, most_damping: limits of the damping; a step that needs more ends the round.
-        next_damping: no round begins with more damping.
-        standstill: a step that lowers the cost by a smaller share of it ends the round.
+        longest: maximum change of an unknown per step [rad, m or a logarithm].
+        damping: initial fraction of the diagonal that is added to it.
+        even_damping: fraction of the diagonal's mean that is added; it fixes unobservable unknowns.
+        least_damping, most_damping: limits of the damping; a step that needs more ends the stage.
+        next_damping: maximum damping at the start of a stage.
+        standstill: a step that reduces the cost by a smaller fraction ends the stage.
     """
 
     longest: float = 0.35
@@ -67,12 +72,12 @@ class StepSettings:
 
 @dataclass(frozen=True, eq=False)
 class Equations:
-    """The normal equations H dx = -g of frames at some values.
+    """The normal equations H dx = -g of frames at given unknowns.
 
     Attributes:
-        H: (frames, u, u) with each frame's own unknowns first, then the shared ones.
+        H: (frames, u, u), each frame's own unknowns first, then the shared ones.
         g: (frames, u).
-        cost: what the steps shall lessen.
+        cost: the cost.
     """
 
     H: Array
@@ -85,24 +90,29 @@ class LinearPrior:
     """Normal priors of linear combinations of all frames' own unknowns x (frames p,).
 
     Attributes:
-        rows: (k, frames p) of which rows x has the prior.
-        mean: (k,) its mean.
-        information: (k,) one over its variance.
+        rows: (k, frames p) the combinations: rows x has the prior.
+        mean: (k,) means.
+        information: (k,) inverse variances.
     """
 
     rows: csr_array
     mean: Array
     information: Array
 
-    def added_to(self, equations: Equations, own: Array) -> Equations:
-        """Equations with the slope and cost at own unknowns; the curvature is no frame's own."""
-        off = self.rows @ own.ravel() - self.mean
+    def add_to(self, equations: Equations, own: Array) -> Equations:
+        """Return equations with the prior's gradient and cost added; H stays, see ``curvature``.
+
+        Args:
+            equations: equations of the frames.
+            own: (frames, p) own unknowns.
+        """
+        residual = self.rows @ own.ravel() - self.mean
         g = equations.g.copy()
-        g[:, : own.shape[1]] += (self.rows.T @ (self.information * off)).reshape(own.shape)
-        return Equations(equations.H, g, equations.cost + float(self.information @ off**2))
+        g[:, : own.shape[1]] += (self.rows.T @ (self.information * residual)).reshape(own.shape)
+        return Equations(equations.H, g, equations.cost + float(self.information @ residual**2))
 
     def curvature(self) -> csc_array:
-        """(frames p, frames p)."""
+        """Return the prior's information matrix (frames p, frames p)."""
         return csc_array(self.rows.T @ diags_array(self.information) @ self.rows)
 
 
@@ -111,45 +121,45 @@ def minimise(
     own: Array,
     shared: Array,
     limits: tuple[Array, Array],
-    rounds: Sequence[AnnealingStage],
+    stages: Sequence[AnnealingStage],
     settings: StepSettings | None = None,
     coupling: LinearPrior | None = None,
 ) -> tuple[Array, Array, float, int]:
-    """The unknowns with the least cost near where they start, inside their limits.
+    """Minimise the cost within limits, from an initial guess.
 
     Args:
-        evaluate: the equations at own (frames, p) and shared (q,) unknowns; what a coupling says is
-            added to them.
-        own, shared: to start from.
+        evaluate: returns the equations at own (frames, p) and shared (q,) unknowns and a stage,
+            without the coupling.
+        own, shared: (frames, p) and (q,) initial guess.
         limits: lower and upper (p + q,), own unknowns first.
-        rounds: one after another.
-        settings: how steps are made.
-        coupling: what is known of the own unknowns of several frames together.
+        stages: the annealing stages.
+        settings: settings of the steps.
+        coupling: prior that couples the own unknowns of several frames.
 
     Returns:
-        own and shared unknowns; the cost at the last evaluation, which is before the last step
-        where that was taken untried; and the number of evaluations.
+        Own and shared unknowns; the cost at the last evaluation, which precedes the last step if
+        that was taken without checking the cost; and the number of evaluations.
     """
     settings = settings or StepSettings()
     curvature = None if coupling is None else coupling.curvature()
 
-    def evaluated(own: Array, shared: Array, part: AnnealingStage) -> Equations:
-        found = evaluate(own, shared, part)
-        return found if coupling is None else coupling.added_to(found, own)
+    def evaluated(own: Array, shared: Array, stage: AnnealingStage) -> Equations:
+        found = evaluate(own, shared, stage)
+        return found if coupling is None else coupling.add_to(found, own)
 
     lower, upper = limits
     p = own.shape[1]
     own, shared = np.clip(own, lower[:p], upper[:p]), np.clip(shared, lower[p:], upper[p:])
     damping, evaluations, cost = settings.damping, 0, np.inf
-    for part in rounds:
-        equations = evaluated(own, shared, part)
+    for stage in stages:
+        equations = evaluated(own, shared, stage)
         evaluations, cost = evaluations + 1, equations.cost
-        for _ in range(part.iterations):
+        for _ in range(stage.iterations):
             trial = damped_step(equations, own, shared, limits, damping, settings, curvature)
-            if part.iterations == 1:
+            if stage.iterations == 1:
                 own, shared = trial
                 break
-            tried = evaluated(*trial, part)
+            tried = evaluated(*trial, stage)
             evaluations += 1
             if tried.cost < cost:
                 gain = 1.0 - tried.cost / cost
@@ -174,38 +184,53 @@ def damped_step(
     settings: StepSettings,
     curvature: csc_array | None = None,
 ) -> tuple[Array, Array]:
-    """Own and shared unknowns after a damped step that stays inside the limits."""
+    """Return own (frames, p) and shared (q,) unknowns after a damped step within the limits.
+
+    Args:
+        equations: equations at the unknowns.
+        own, shared: (frames, p) and (q,) current unknowns.
+        limits: lower and upper (p + q,).
+        damping: fraction of the diagonal that is added to it.
+        settings: settings of the steps.
+        curvature: (frames p, frames p) of a coupling.
+    """
     lower, upper = limits
     p = own.shape[1]
-    shares = damping, settings.even_damping
+    fractions = damping, settings.even_damping
     if curvature is None:
-        steps, change = _solved(equations.H, equations.g, own, shared, lower, upper, shares)
+        own_steps, shared_step = _solve_frames(
+            equations.H, equations.g, own, shared, lower, upper, fractions
+        )
     else:
-        steps, change = _solved_together(equations, own, shared, limits, shares, curvature)
-    # Shared unknowns are held back with the frames that they move.
-    longest = max(float(np.abs(steps).max(initial=0.0)), float(np.abs(change).max(initial=0.0)))
-    share = min(1.0, settings.longest / max(longest, 1e-300))
+        own_steps, shared_step = _solve_coupled(
+            equations, own, shared, limits, fractions, curvature
+        )
+    # All steps are shortened by the same factor, so shared and own unknowns stay consistent.
+    longest = max(
+        float(np.abs(own_steps).max(initial=0.0)), float(np.abs(shared_step).max(initial=0.0))
+    )
+    factor = min(1.0, settings.longest / max(longest, 1e-300))
     return (
-        np.clip(own + share * steps, lower[:p], upper[:p]),
-        np.clip(shared + share * change, lower[p:], upper[p:]),
+        np.clip(own + factor * own_steps, lower[:p], upper[:p]),
+        np.clip(shared + factor * shared_step, lower[p:], upper[p:]),
     )
 
 
-def _solved_together(
+def _solve_coupled(
     equations: Equations,
     own: Array,
     shared: Array,
     limits: tuple[Array, Array],
-    shares: tuple[float, float],
+    fractions: tuple[float, float],
     curvature: csc_array,
 ) -> tuple[Array, Array]:
-    """As _solved, of frames whose own unknowns couple by a curvature."""
+    """As _solve_frames, for frames whose own unknowns are coupled by a curvature."""
     lower, upper = limits
     frames, p = own.shape
     H, g = equations.H, equations.g
     whole = csc_array(block_diag(list(H[:, :p, :p])) + curvature)
     diagonal = whole.diagonal()
-    damped = shares[0] * diagonal + shares[1] * diagonal.mean() + 1e-9
+    damped = fractions[0] * diagonal + fractions[1] * diagonal.mean() + 1e-9
     slopes = g[:, :p].ravel(), g[:, p:].sum(axis=0)
     free = _is_free(own, slopes[0].reshape(frames, p), lower[:p], upper[:p]).ravel()
     loose = _is_free(shared, slopes[1], lower[p:], upper[p:])
@@ -214,30 +239,37 @@ def _solved_together(
     solved = factors.solve(np.column_stack([-slopes[0][free], mixed]))
     S = H[:, p:, p:].sum(axis=0)[np.ix_(loose, loose)]
     if len(S):
-        S[np.diag_indices(len(S))] += shares[0] * np.diag(S) + shares[1] * np.diag(S).mean()
-    change, steps = np.zeros(len(shared)), np.zeros(frames * p)
+        S[np.diag_indices(len(S))] += fractions[0] * np.diag(S) + fractions[1] * np.diag(S).mean()
+    shared_step, own_steps = np.zeros(len(shared)), np.zeros(frames * p)
     slope = slopes[1][loose] + mixed.T @ solved[:, 0]
-    change[loose] = np.linalg.solve(S - mixed.T @ solved[:, 1:], -slope)
-    steps[free] = solved[:, 0] - solved[:, 1:] @ change[loose]
-    return steps.reshape(frames, p), change
+    shared_step[loose] = np.linalg.solve(S - mixed.T @ solved[:, 1:], -slope)
+    own_steps[free] = solved[:, 0] - solved[:, 1:] @ shared_step[loose]
+    return own_steps.reshape(frames, p), shared_step
 
 
 def _is_free(x: Array, g: Array, lower: Array, upper: Array) -> NDArray[np.bool_]:
-    """Whether unknowns do not stand at a limit that they would leave."""
+    """Return whether each unknown can move: it is not at a limit that it would leave."""
     return np.asarray(~((x <= lower) & (g > 0.0) | (x >= upper) & (g < 0.0)))
 
 
 @compiled
-def _solved(
+def _solve_frames(
     H: Array,
     g: Array,
     own: Array,
     shared: Array,
     lower: Array,
     upper: Array,
-    shares: tuple[float, float],
+    fractions: tuple[float, float],
 ) -> tuple[Array, Array]:
-    """Damped steps of own (frames, p) and shared unknowns (q,), none of them out of a limit."""
+    """Return damped steps of own (frames, p) and shared (q,) unknowns that leave no limit.
+
+    Args:
+        H, g: (frames, u, u) and (frames, u) as of ``Equations``.
+        own, shared: current unknowns.
+        lower, upper: (p + q,) limits.
+        fractions: fractions of each diagonal element and of the diagonal's mean that are added.
+    """
     frames, p = own.shape
     q = len(shared)
     S = np.zeros((q, q + 1))
@@ -246,37 +278,43 @@ def _solved(
             S[k, q] -= g[frame, p + k]
             for column in range(q):
                 S[k, column] += H[frame, p + k, p + column]
-    is_held = _damp(S, shared, lower[p:], upper[p:], shares)
-    # Of each frame its own unknowns' equations, those of the shared ones beside them: [A C -g].
+    is_held = _damp(S, shared, lower[p:], upper[p:], fractions)
+    # Per frame, the equations of its own unknowns with the shared columns beside them: [A C -g].
     M = np.empty((frames, p, p + q + 1))
     for frame in range(frames):
         for row in range(p):
             for column in range(p + q):
                 M[frame, row, column] = H[frame, row, column]
             M[frame, row, p + q] = -g[frame, row]
-        _damp(M[frame], own[frame], lower[:p], upper[:p], shares)
+        _damp(M[frame], own[frame], lower[:p], upper[:p], fractions)
         eliminate(M[frame])
         for k in range(q):
             for row in range(p):
                 for column in range(0 if is_held[k] else q + 1):
                     S[k, column] -= H[frame, p + k, row] * M[frame, row, p + column]
     eliminate(S)
-    steps = np.empty((frames, p))
+    own_steps = np.empty((frames, p))
     for frame in range(frames):
         for row in range(p):
-            steps[frame, row] = M[frame, row, p + q]
+            own_steps[frame, row] = M[frame, row, p + q]
             for k in range(q):
-                steps[frame, row] -= M[frame, row, p + k] * S[k, q]
-    return steps, S[:, q].copy()
+                own_steps[frame, row] -= M[frame, row, p + k] * S[k, q]
+    return own_steps, S[:, q].copy()
 
 
 @compiled
 def _damp(
-    M: Array, x: Array, lower: Array, upper: Array, shares: tuple[float, float]
+    M: Array, x: Array, lower: Array, upper: Array, fractions: tuple[float, float]
 ) -> NDArray[np.bool_]:
-    """Adds to the diagonal of [H ... -g] shares of each element and of the mean, in place.
+    """Damp the equations [H ... -g] (n, columns) in place, and fix unknowns at limits.
 
-    Returns which unknowns stand at a limit that they would leave: they are to be 0 instead.
+    Args:
+        M: the equations; the last column is -g.
+        x, lower, upper: (n,) unknowns and limits.
+        fractions: fractions of each diagonal element and of the diagonal's mean that are added.
+
+    Returns:
+        (n,) whether an unknown is at a limit that it would leave; its step is fixed at 0.
     """
     n, last = len(x), M.shape[1] - 1
     is_held = np.empty(n, dtype=np.bool_)
@@ -292,23 +330,24 @@ def _damp(
             M[k] = 0.0
             M[k, k] = 1.0
         else:
-            M[k, k] += shares[0] * M[k, k] + shares[1] * total / free + 1e-9
+            M[k, k] += fractions[0] * M[k, k] + fractions[1] * total / free + 1e-9
     return is_held
 
 
 @compiled
 def eliminate(M: Array) -> None:
-    """Makes [A B] (n, n + k) into [1 A^-1 B], A positive definite: Gauss and Jordan's elimination.
+    """Replace [A B] (n, n + k) by [I A^-1 B] in place, by Gauss-Jordan elimination.
 
-    LAPACK gains nothing on matrices this small, and takes long to be compiled in.
+    A must be positive definite. LAPACK is not faster on such small matrices, and slow to compile
+    in.
     """
     n, columns = M.shape
     for k in range(n):
-        share = 1.0 / M[k, k]
+        factor = 1.0 / M[k, k]
         for column in range(k, columns):
-            M[k, column] *= share
+            M[k, column] *= factor
         for row in range(n):
-            share = M[row, k]
-            if row != k and share != 0.0:
+            factor = M[row, k]
+            if row != k and factor != 0.0:
                 for column in range(k, columns):
-                    M[row, column] -= share * M[k, column]
+                    M[row, column] -= factor * M[k, column]

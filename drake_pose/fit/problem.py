@@ -1,9 +1,9 @@
-"""A fit of several frames: unknowns of each frame, unknowns that all frames share, observations.
+"""Fit several frames at once, with unknowns of each frame and unknowns shared by all frames.
 
-An unknown is added to one parameter of a frame. So a joint's position is an unknown of each frame
-that is added to the joint's value; its offset is a shared unknown that is added to the same value,
-where an encoder's readings are held; a segment's length is a shared unknown, added to a shape
-joint's value.
+Each unknown is added to one parameter of a frame. A joint position, for example, is an unknown of
+each frame added to the joint's value; a joint offset is a shared unknown added to the same value,
+which holds the encoder reading; a segment's length is a shared unknown added to the value of a
+shape joint.
 """
 
 from collections.abc import Callable, Sequence
@@ -28,7 +28,7 @@ from drake_pose.fit.contour_fit import (
     symmetric,
 )
 from drake_pose.fit.covariance import ComparedMask
-from drake_pose.fit.evidence import Observation, widened
+from drake_pose.fit.evidence import Observation, offset_edges
 from drake_pose.fit.kernel import Sum
 from drake_pose.fit.levenberg_marquardt import (
     AnnealingStage,
@@ -40,22 +40,22 @@ from drake_pose.fit.levenberg_marquardt import (
 from drake_pose.fit.parameters import CAMERA_NAMES, BodyParameters, CameraParameters, Placement
 from drake_pose.workers import map_ordered
 
-BOUNDARY_BIAS = "width"
-"""Parameter of each camera: by how much its silhouettes are too wide on all sides [pixel]."""
+BOUNDARY_BIAS = "boundary_bias"
+"""Parameter of each camera: excess width of its silhouettes on all sides [pixel]."""
 
 TIME_OFFSET = "time_offset"
-"""Parameter of a frame: by how much later than its positions its pictures were taken [s]."""
+"""Parameter of a frame: delay of its images relative to its joint positions [s]."""
 
 
 @dataclass(frozen=True, eq=False)
 class Unknowns:
-    """Parameters of frames that are unknown.
+    """Unknown parameters of frames.
 
     Args:
-        names: of the u parameters, see ``parameter_names``.
-        shared: whether they are the same in all frames.
-        lower, upper: limits of all, or (u,) of each [rad, m, pixel or a logarithm].
-        deviation: standard deviation of all, or (u,) of each, about what is expected.
+        names: (u,) names of the parameters, see ``parameter_names``.
+        shared: whether all frames share them.
+        lower, upper: limits, scalar or (u,) [rad, m, pixel or a logarithm].
+        deviation: standard deviation of the prior, scalar or (u,); infinite: no prior.
     """
 
     names: Sequence[str]
@@ -67,15 +67,15 @@ class Unknowns:
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """The unknowns of a problem that fit best.
+    """The best fit of a problem.
 
     Attributes:
         own: (frames, p) each frame's own unknowns.
-        shared: (q,) those of all frames.
+        shared: (q,) shared unknowns.
         parameters: (frames, n) all parameters of the frames.
-        cost: of all frames, priors included.
-        ending: evaluates the normal equations and the inlier ratios at the end, when asked for.
-        coupling: what was known of the frames' own unknowns together.
+        cost: cost of all frames, including priors.
+        ending: evaluates the final normal equations and inlier ratios on first use.
+        coupling: prior that couples the frames' own unknowns.
     """
 
     own: Array
@@ -87,18 +87,18 @@ class Solution:
 
     @property
     def equations(self) -> Equations:
-        """The normal equations, priors included but for the coupling."""
+        """The final normal equations, including priors but not the coupling."""
         return self.ending()[0]
 
     @property
     def inlier_ratios(self) -> Array:
-        """(frames, cameras) fraction of both contours' lengths that fits."""
+        """(frames, cameras) fraction of both contours' length whose residual is below the scale."""
         return self.ending()[1]
 
     def own_deviations(self) -> Array:
-        """(frames, p) standard deviations of own unknowns, shared ones being unknown, too.
+        """Return (frames, p) standard deviations of own unknowns, marginalised over shared ones.
 
-        They are 100 [of the unknown's unit] at most, where nothing is observed.
+        They are at most 100 [in the unknown's unit], reached if nothing is observed.
         """
         frames, p = self.own.shape
         H = self.equations.H
@@ -114,35 +114,40 @@ class Solution:
 
 
 def parameter_names(body: BodyParameters, cameras: Sequence[Camera]) -> tuple[str, ...]:
-    """All parameters of a frame: the body's, TIME_OFFSET, CAMERA_NAMES of each camera, WIDTHs."""
-    looks = [f"{camera.name}.{name}" for camera in cameras for name in CAMERA_NAMES]
-    widths = [f"{camera.name}.{BOUNDARY_BIAS}" for camera in cameras]
-    return (*body.names, TIME_OFFSET, *looks, *widths)
+    """Return the names of all parameters of a frame, in order.
+
+    They are the body's parameters, TIME_OFFSET, CAMERA_NAMES of each camera, and BOUNDARY_BIAS of
+    each camera.
+    """
+    camera_names = [f"{camera.name}.{name}" for camera in cameras for name in CAMERA_NAMES]
+    biases = [f"{camera.name}.{BOUNDARY_BIAS}" for camera in cameras]
+    return (*body.names, TIME_OFFSET, *camera_names, *biases)
 
 
 class Problem:
-    """Unknowns of frames of a body that the same cameras see.
+    """Unknowns of several frames of a body seen by the same cameras.
 
     Attributes:
-        body: the body.
-        names: of the u unknowns: the p of each frame first, then the q shared ones.
-        entries: (u,) the parameter of a frame that each is added to.
+        body: parameters of the body.
+        names: names of the u unknowns: the p own ones of each frame, then the q shared ones.
+        entries: (u,) index of the frame parameter to which each unknown is added.
         own_count: p.
-        information: (u,) one over the variance of each, without pictures.
+        information: (u,) inverse variances of the unknowns' priors.
 
     Args:
-        body: the body.
+        body: parameters of the body.
         cameras: the cameras.
-        unknowns: which parameters are unknown.
-        pivot: (3,) or (cameras, 3) the point in the world about which cameras turn [m]; None: the
-            root's place.
-        noise: of contours; None: a pixel's, or ``Noise()`` where lengths are in metres.
-        steps: how steps are made.
-        pixels: the unit of length of rounds and noise [pixel], of all cameras or (cameras,); None:
+        unknowns: the unknown parameters.
+        pivot: (3,) or (cameras, 3) point in the world about which cameras rotate [m]; None: the
+            root's position.
+        noise: noise of contours; None: a weight of one per pixel, or ``Noise()`` if lengths are in
+            metres.
+        steps: settings of the optimiser's steps.
+        pixels: unit of length of stages and noise [pixel], scalar or (cameras,); None: the size of
             a metre at the root.
 
     Raises:
-        UnknownNameError: an unknown that is no parameter.
+        UnknownNameError: an unknown is not a parameter.
     """
 
     def __init__(
@@ -182,19 +187,19 @@ class Problem:
             )
         )
         self._contours = ContourFit(kinematics, body.outlines, noise, steps, pixels, body)
-        self._count, self._first_look = len(every), len(body.names) + 1
-        self._first_width = len(every) - len(cameras)
-        self._widths = np.flatnonzero(self.entries >= self._first_width)
+        self._count, self._first_camera = len(every), len(body.names) + 1
+        self._first_bias = len(every) - len(cameras)
+        self._biases = np.flatnonzero(self.entries >= self._first_bias)
         self._of_foreground = foreground_of_colours(len(body.outlines))
-        self._fixed = not np.any(self.entries >= self._first_look)
-        # A body is placed faster that neither grows nor is shifted.
+        self._fixed = not np.any(self.entries >= self._first_camera)
+        # Placing a body is faster without shift, scale or radius unknowns.
         self._values = len(kinematics.names)
         places = (self.entries >= self._values) & (self.entries < len(body.names))
-        self._stays = not places.any()
-        # A body without unknowns stands still, and all its nodes move with the camera.
-        self._stands = not np.any(self.entries <= len(body.names))
+        self._values_only = not places.any()
+        # Without unknowns of the body all nodes share the camera's motion.
+        self._is_static = not np.any(self.entries <= len(body.names))
         self._placed: dict[bytes, Placement] = {}
-        self._last_look: tuple[bytes, tuple[Array, Array, Array]] = (
+        self._last_cameras: tuple[bytes, tuple[Array, Array, Array]] = (
             b"",
             self._cameras.place(np.zeros(len(self._cameras.names))),
         )
@@ -202,25 +207,25 @@ class Problem:
     def solve(
         self,
         observations: Sequence[Observation],
-        rounds: Sequence[AnnealingStage],
+        stages: Sequence[AnnealingStage],
         start: tuple[Array, Array] | None = None,
         *,
         expected: tuple[Array, Array] | None = None,
         shared_information: Array | None = None,
         coupling: LinearPrior | None = None,
     ) -> Solution:
-        """The unknowns that fit best, near where they start.
+        """Return the best fit near an initial guess.
 
         Args:
-            observations: the frames.
-            rounds: the parts of the fit.
-            start: (frames, p) own and (q,) shared unknowns; None: all 0.
-            expected: mean of the unknowns' prior; None: where the fit starts.
-            shared_information: (q, q) further information about the shared unknowns.
-            coupling: what is known of all frames' own unknowns together.
+            observations: evidence of the frames.
+            stages: the annealing stages.
+            start: initial guess of own (frames, p) and shared (q,) unknowns; None: 0.
+            expected: mean of the unknowns' prior; None: the initial guess.
+            shared_information: (q, q) further information matrix of the shared unknowns.
+            coupling: prior that couples all frames' own unknowns.
 
         Raises:
-            SettingsError: shapes that do not fit each other.
+            SettingsError: shapes do not match.
         """
         frames, p, q = len(observations), self.own_count, len(self.names) - self.own_count
         own, shared = (np.zeros((frames, p)), np.zeros(q)) if start is None else start
@@ -231,14 +236,14 @@ class Problem:
             )
         about = (own.copy(), shared.copy()) if expected is None else expected
 
-        def evaluate(own: Array, shared: Array, step: AnnealingStage) -> Equations:
-            return self._equations(observations, (own, shared), about, step, shared_information)[0]
+        def evaluate(own: Array, shared: Array, stage: AnnealingStage) -> Equations:
+            return self._equations(observations, (own, shared), about, stage, shared_information)[0]
 
         limits = self._lower, self._upper
         own, shared, cost = minimise(
-            evaluate, own, shared, limits, rounds, self._contours.steps, coupling
+            evaluate, own, shared, limits, stages, self._contours.steps, coupling
         )[:3]
-        at, last = (own, shared), rounds[-1]
+        at, last = (own, shared), stages[-1]
         return Solution(
             own,
             shared,
@@ -252,14 +257,14 @@ class Problem:
         self,
         observations: Sequence[Observation],
         at: tuple[Array, Array],
-        step: AnnealingStage,
+        stage: AnnealingStage,
         expected: tuple[Array, Array] | None = None,
     ) -> Equations:
-        """The normal equations at own and shared unknowns; arguments as of ``solve``."""
-        return self._equations(observations, at, expected or at, step, None)[0]
+        """Return the normal equations at own and shared unknowns; arguments as of ``solve``."""
+        return self._equations(observations, at, expected or at, stage, None)[0]
 
     def parameters(self, observations: Sequence[Observation], own: Array, shared: Array) -> Array:
-        """(frames, n) all parameters at own (frames, p) and shared (q,) unknowns."""
+        """Return (frames, n) all parameters at own (frames, p) and shared (q,) unknowns."""
         theta = np.zeros((len(observations), self._count))
         for row, one in zip(theta, observations, strict=True):
             row[: len(one.values)] = one.values
@@ -272,145 +277,145 @@ class Problem:
         observations: Sequence[Observation],
         at: tuple[Array, Array],
         about: tuple[Array, Array],
-        step: AnnealingStage,
+        stage: AnnealingStage,
         shared_information: Array | None,
     ) -> tuple[Equations, Array]:
-        """The equations, and the inlier ratios (frames, cameras)."""
+        """Return the equations, and the inlier ratios (frames, cameras)."""
         p, u, frames = self.own_count, len(self.names), len(observations)
         H, g, cost = np.zeros((frames, u, u)), np.zeros((frames, u)), 0.0
         ratios = []
         masks = zip(observations, self.parameters(observations, *at), strict=True)
         for k, (own_H, own_g, sums) in enumerate(
-            map_ordered(lambda mask: self._frame(*mask, step), masks)
+            map_ordered(lambda mask: self._frame(*mask, stage), masks)
         ):
             H[k], g[k] = own_H, own_g
             cost += float(sums[:, :, Sum.COST].sum())
             lengths = np.maximum(sums[:, :, Sum.COMPARED].sum(axis=1), 1e-9)
             ratios.append(sums[:, :, Sum.FITTING].sum(axis=1) / lengths)
-            off = at[0][k] - about[0][k]
+            deviation = at[0][k] - about[0][k]
             own_information = self.information[:p]
             H[k, range(p), range(p)] += own_information
-            g[k, :p] += own_information * off
-            cost += float(own_information @ off**2)
+            g[k, :p] += own_information * deviation
+            cost += float(own_information @ deviation**2)
         information = np.diag(self.information[p:])
         if shared_information is not None:
             information = information + shared_information
-        off = at[1] - about[1]
-        # The prior of what is shared counts once: with the first frame.
+        deviation = at[1] - about[1]
+        # The prior of the shared unknowns is added once, to the first frame.
         H[0, p:, p:] += information
-        g[0, p:] += information @ off
-        return Equations(H, g, cost + float(off @ information @ off)), np.array(ratios)
+        g[0, p:] += information @ deviation
+        return Equations(H, g, cost + float(deviation @ information @ deviation)), np.array(ratios)
 
     def _frame(
-        self, seen: Observation, theta: Array, step: AnnealingStage
+        self, frame: Observation, theta: Array, stage: AnnealingStage
     ) -> tuple[Array, Array, Array]:
-        """A frame's equations of the unknowns, and its sums."""
-        compared, (_, _, motions) = self.compare(seen, theta, step)
+        """Return H (u, u), g (u,) and the sums (cameras, nodes + 1, 6) of a frame."""
+        compared, (_, _, motions) = self.compare(frame, theta, stage)
         if self._fixed:
-            moves = self._moves(compared, motions, 0, seen.rates)
-            told = [(moves, compared.A.sum(axis=0), compared.b.sum(axis=0))]
+            moves = self._moves(compared, motions, 0, frame.rates)
+            terms = [(moves, compared.A.sum(axis=0), compared.b.sum(axis=0))]
         else:
-            told = [
-                (self._moves(compared, motions, c, seen.rates), A, b)
+            terms = [
+                (self._moves(compared, motions, c, frame.rates), A, b)
                 for c, (A, b) in enumerate(zip(compared.A, compared.b, strict=True))
             ]
         u = len(self.entries)
         H, g = np.zeros((u, u)), np.zeros(u)
-        for moves, A, b in told:
-            if self._stands:
+        for moves, A, b in terms:
+            if self._is_static:
                 moves, A, b = moves[:1], A.sum(axis=0)[None], b.sum(axis=0)[None]
             rows, pulled = (
                 np.swapaxes(one, 0, 1).reshape(u, -1) for one in (moves, moves @ symmetric(A))
             )
             H += rows @ pulled.T
             g -= rows @ b.ravel()
-        for k in self._widths:
-            # Of a silhouette that is wider all distances are less.
-            c = self.entries[k] - self._first_width
-            g[k] = -compared.wide[c, :, 12].sum()
+        for k in self._biases:
+            # Every residual decreases as the silhouette becomes wider.
+            c = self.entries[k] - self._first_bias
+            g[k] = -compared.bias_terms[c, :, 12].sum()
             H[k] = H[:, k] = np.einsum(
-                "nux,nx->u", told[0 if self._fixed else c][0], compared.wide[c, :, :12]
+                "nux,nx->u", terms[0 if self._fixed else c][0], compared.bias_terms[c, :, :12]
             )
             H[k, k] = compared.sums[c][:, Sum.WEIGHT].sum()
         return H, g, compared.sums
 
     def compare(
-        self, seen: Observation, theta: Array, step: AnnealingStage
+        self, frame: Observation, theta: Array, stage: AnnealingStage
     ) -> tuple[Comparison, tuple[Array, Array, Array]]:
-        """A frame's contours compared with its silhouettes at all parameters (n,).
+        """Compare a frame's contours with its silhouettes at all parameters (n,).
 
         Returns:
-            the comparison, and the cameras as of ``CameraParameters.place``.
+            The comparison, and the cameras as of ``CameraParameters.place``.
         """
         places = self.place_cameras(theta)
-        views = self._views(seen, theta)
-        own = self._of_body(theta, seen.rates)
-        # Where the body stands still in each frame it is placed once.
+        views = self._views(frame, theta)
+        own = self._of_body(theta, frame.rates)
+        # A body without unknowns is placed once per distinct set of values.
         placed = self._placed.get(key := own.tobytes()) or self.body.place(own)
-        if self._stands:
+        if self._is_static:
             self._placed[key] = placed
-        weights = self._contours.weights(views.cameras, placed, step)
-        compared = compare_views(views, placed, weights, len(self._widths) > 0)
-        for c, picture in enumerate(seen.foreground):
+        weights = self._contours.weights(views.cameras, placed, stage)
+        compared = compare_views(views, placed, weights, len(self._biases) > 0)
+        for c, picture in enumerate(frame.foreground):
             if picture is not None:
-                # Lines nearer than three pixels say the same; offsets are 0.4 scales apart.
+                # Lines closer than three pixels are redundant; offsets are 0.4 scales apart.
                 own = weights[c].copy()
                 own[2] = max(own[2], 3.0)
-                offset, width = max(1, round(own[1] * 0.4)), theta[self._first_width + c]
+                offset, bias = max(1, round(own[1] * 0.4)), theta[self._first_bias + c]
                 compare_lines(
                     placed.packed, placed.X_WN, (places[0][c], places[1][c]), picture,
                     self._of_foreground, own, offset, compared.A[c], compared.b[c],
-                    compared.sums[c], compared.wide[c], width,
+                    compared.sums[c], compared.bias_terms[c], bias,
                 )  # fmt: skip
         return compared, places
 
     def tile_costs(
-        self, seen: Observation, theta: Array, step: AnnealingStage, side: float
+        self, frame: Observation, theta: Array, stage: AnnealingStage, side: float
     ) -> Array:
-        """(cameras, k, k) the costs at all parameters (n,) by squares of a side [pixel]."""
-        views = self._views(seen, theta)
-        return self._contours.tile_costs(views, self._of_body(theta, seen.rates), step, side)
+        """Return the costs at all parameters (n,) in tiles of a side [pixel], (cameras, k, k)."""
+        views = self._views(frame, theta)
+        return self._contours.tile_costs(views, self._of_body(theta, frame.rates), stage, side)
 
     def _of_body(self, theta: Array, rates: Array | None) -> Array:
-        """The body's parameters, the tree's values alone where all others are 0."""
+        """Return the body's parameters; only the tree's values (m,) if all others are 0."""
         own = theta[: len(self.body.names)]
         if rates is not None:
             own = own.copy()
             own[: self._values] += rates * theta[len(own)]
-        return own[: self._values] if self._stays and not own[self._values :].any() else own
+        return own[: self._values] if self._values_only and not own[self._values :].any() else own
 
-    def _views(self, seen: Observation, theta: Array) -> Views:
-        """The cameras, and their silhouettes as wide as they are."""
-        widths = theta[self._first_width :]
-        edges = widened(seen.edges, -widths) if widths.any() else seen.edges
+    def _views(self, frame: Observation, theta: Array) -> Views:
+        """Return the cameras, and the edges corrected for the boundary bias."""
+        biases = theta[self._first_bias :]
+        edges = offset_edges(frame.edges, -biases) if biases.any() else frame.edges
         return Views(self.place_cameras(theta)[:2], edges)
 
     def place_cameras(self, theta: Array) -> tuple[Array, Array, Array]:
-        """The cameras at all parameters (n,), as of ``CameraParameters.place``."""
-        look = theta[self._first_look : self._first_width]
-        # One frame after another mostly asks for the same.
-        if look.tobytes() != self._last_look[0]:
-            self._last_look = look.tobytes(), self._cameras.place(look)
-        return self._last_look[1]
+        """Return the cameras at all parameters (n,), as of ``CameraParameters.place``."""
+        camera_part = theta[self._first_camera : self._first_bias]
+        # Successive frames mostly have the same camera parameters.
+        if camera_part.tobytes() != self._last_cameras[0]:
+            self._last_cameras = camera_part.tobytes(), self._cameras.place(camera_part)
+        return self._last_cameras[1]
 
     def compared_masks(
-        self, observations: Sequence[Observation], parameters: Array, step: AnnealingStage
+        self, observations: Sequence[Observation], parameters: Array, stage: AnnealingStage
     ) -> list[ComparedMask]:
-        """What each silhouette says at all parameters (frames, n).
+        """Return the comparison with each silhouette at all parameters (frames, n).
 
-        Its values are the unknowns but widths: each frame's own, then the shared ones.
+        Its values are the unknowns except boundary biases, each frame's own ones first.
         """
-        chosen, frames = self.entries < self._first_width, len(observations)
+        chosen, frames = self.entries < self._first_bias, len(observations)
         p = int(np.count_nonzero(chosen[: self.own_count]))
         q = int(np.count_nonzero(chosen[self.own_count :]))
         found = []
-        for k, (seen, theta) in enumerate(zip(observations, parameters, strict=True)):
-            compared, (X_CW, kernel, motions) = self.compare(seen, theta, step)
+        for k, (frame, theta) in enumerate(zip(observations, parameters, strict=True)):
+            compared, (X_CW, kernel, motions) = self.compare(frame, theta, stage)
             X_WN = compared.placement.X_WN
             sizes = 1.0 / pixels_per_metre((X_CW, kernel), X_WN[:, :3, 3].mean(axis=0))
             for c in np.flatnonzero(compared.A.any(axis=(1, 2, 3))).tolist():
-                told = self._moves(compared, motions, c, seen.rates)[:, chosen]
-                own, shared = np.split(told, [p], axis=1)
+                terms = self._moves(compared, motions, c, frame.rates)[:, chosen]
+                own, shared = np.split(terms, [p], axis=1)
                 moves = np.zeros((len(X_WN), frames * p + q, 12))
                 moves[:, k * p : (k + 1) * p], moves[:, frames * p :] = own, shared
                 A = symmetric(compared.A[c])
@@ -422,7 +427,10 @@ class Problem:
     def _moves(
         self, compared: Comparison, motions: Array, camera: int, rates: Array | None
     ) -> Array:
-        """(nodes, u, 12) how the unknowns move the nodes before a camera; widths move none."""
+        """Return (nodes, u, 12) motions of the nodes, as seen by a camera, caused by the unknowns.
+
+        Boundary biases move no node.
+        """
         entries, placement = self.entries, compared.placement
         moves = np.zeros((len(placement.X_WN), len(entries), 12))
         own, late = entries < len(self.body.names), entries == len(self.body.names)
@@ -431,7 +439,9 @@ class Problem:
             moves[:, own] = dense[:, entries[own]]
             if late.any() and rates is not None:
                 moves[:, late] = np.einsum("nmk,m->nk", dense[:, : len(rates)], rates)[:, None]
-        look = entries - self._first_look - camera * len(CAMERA_NAMES)
-        turned = (look >= 0) & (look < len(CAMERA_NAMES)) & (entries < self._first_width)
-        moves[:, turned] = motions[camera, look[turned]]
+        camera_part = entries - self._first_camera - camera * len(CAMERA_NAMES)
+        turned = (
+            (camera_part >= 0) & (camera_part < len(CAMERA_NAMES)) & (entries < self._first_bias)
+        )
+        moves[:, turned] = motions[camera, camera_part[turned]]
         return moves

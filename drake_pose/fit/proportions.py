@@ -1,10 +1,9 @@
-"""A body whose parts may be longer and wider than its model's: unknowns of its proportions.
+"""Fit the proportions of a body: its parts may be longer and wider than the model's.
 
-Each part is stretched along one axis of its frame, that along which it carries what hangs on it,
-and widened across it. So bones get their own lengths and flesh its own radius scale, which
-silhouettes of somebody else than the model's measures show. Where a limb begins, its joint may lie
-further out in the flesh than the model's: at rest nothing changes, but the limb bends elsewhere.
-The model's joints keep their meaning.
+Each part is stretched along one axis of its frame, towards the parts that it carries, and
+scaled across that axis. So bones get individual lengths and flesh individual widths. Where a limb
+begins, its joint may also move along the part, inside its flesh: the rest pose is unchanged, but
+the limb bends elsewhere. The values of the model's joints keep their meaning.
 """
 
 from collections.abc import Sequence
@@ -27,28 +26,29 @@ from drake_pose.fit.parameters import (
     affine_motions,
     affine_of,
     owners_of,
-    stretched,
+    scale_surfaces,
 )
 from drake_pose.fit.problem import Problem, Solution, Unknowns
 from drake_pose.silhouette.outline import TreeSurfaces
 
 
 class ProportionedBody(BodyParameters):
-    """A body's parameters: its tree's values, ROOT_NAMES, lengths, widths, places of joints.
+    """Parameters of a body: tree values, ROOT_NAMES, log lengths, log widths, and joint positions.
 
-    A limb is a chain of nodes of which each carries the next alone. Lengths are those of nodes,
-    widths those of limbs, and places those of the joints with which limbs begin.
+    A limb is a chain of nodes that each carry only the next one. There is one length per node, one
+    width per limb, and one position per joint at which a limb begins.
 
     Attributes:
-        axes: (nodes,) the axis 0, 1 or 2 of its frame along which each node is long.
-        limbs: (nodes,) the limb that each node belongs to.
-        placed: the nodes whose joints, with which limbs begin, may lie elsewhere in the flesh.
+        axes: (nodes,) axis 0, 1 or 2 of each node's frame along which its length is scaled.
+        limbs: (nodes,) index of each node's limb.
+        placed: nodes at which limbs begin and whose joints may move.
 
     Args:
-        kinematics: the pose tree's.
-        surfaces: the pose tree's.
+        kinematics: kinematics of the pose tree.
+        surfaces: surfaces of the pose tree.
 
-    Raises ModelError: joints follow others.
+    Raises:
+        ModelError: the model has mimic joints.
     """
 
     def __init__(self, kinematics: TreeKinematics, surfaces: TreeSurfaces) -> None:
@@ -57,8 +57,8 @@ class ProportionedBody(BodyParameters):
         if len(kinematics.parameters) > len(kinematics.names):
             name = model.position_names[kinematics.tree.followers[0].leader]
             raise ModelError(
-                f"{model.path}: joints follow '{name}' (<mimic>): the lengths of such a body "
-                f"cannot be estimated; hold it: --hold {name}=VALUE [deg or m]"
+                f"{model.path}: joints mimic '{name}' (<mimic>), and the proportions of such a "
+                f"body cannot be estimated; hold it: --hold {name}=VALUE [deg or m]"
             )
         self.limbs = np.zeros(len(nodes), dtype=np.int64)
         firsts: list[str] = []
@@ -89,7 +89,7 @@ class ProportionedBody(BodyParameters):
         )
         values = kinematics.flatten(kinematics.tree.default_values())
         X_WN = kinematics.poses(values)
-        # Of each node the axis, how long it is along it [m], and the same at rest in the parent.
+        # Each node's axis, its length vector [m], and the same vector at rest in the parent.
         self.axes = np.zeros(len(nodes), dtype=np.int64)
         self._along, self._rest = np.zeros((2, len(nodes), 3))
         for i, node in enumerate(nodes):
@@ -106,7 +106,7 @@ class ProportionedBody(BodyParameters):
             if node.parent >= 0:
                 self._rest[i] = X_WN[node.parent, :3, :3].T @ self._rest[i]
         self._parents = np.array([node.parent for node in nodes])
-        # Which nodes each motion of `place` moves, in its order, and which parameter makes it.
+        # Which nodes each motion of `place` moves, in its order, and which parameter causes it.
         count, every = len(kinematics.names) + len(ROOT_NAMES), np.arange(len(nodes))
         below = np.eye(len(nodes), dtype=np.bool_)
         for i, parent in enumerate(self._parents):
@@ -120,11 +120,11 @@ class ProportionedBody(BodyParameters):
             kinematics.motions(values).moves, np.ones((len(nodes), 4), np.bool_), own, own,
             hung, hung, below[:, self.placed],
         )  # fmt: skip
-        made_by = np.arange(count), lengths, widths, lengths[by], widths[by], places
-        self._owners = owners_of(np.hstack(moves), np.concatenate(made_by))
+        caused_by = np.arange(count), lengths, widths, lengths[by], widths[by], places
+        self._owners = owners_of(np.hstack(moves), np.concatenate(caused_by))
 
     def factors(self, theta: Array) -> Array:
-        """(nodes, 3) scale of each node along its frame's axes."""
+        """Return (nodes, 3) the scale of each node along the axes of its frame."""
         count = len(self.kinematics.names) + len(ROOT_NAMES)
         nodes = len(self.limbs)
         lengths = theta[count : count + nodes]
@@ -134,62 +134,68 @@ class ProportionedBody(BodyParameters):
         return np.asarray(np.exp(logs))
 
     def applied_to(self, model: ArticulatedModel, theta: Array) -> ArticulatedModel:
-        """A model, the tree's or one like it, with the proportions of all parameters (n,).
+        """Return a model with the proportions of all parameters (n,).
+
+        Args:
+            model: the tree's model, or one like it.
+            theta: (n,) parameters.
 
         Raises:
-            ModelError: its file is no URDF.
+            ModelError: the model's file is not a URDF.
         """
-        nodes, shares = self.kinematics.tree.nodes, self.joint_places(theta)
+        nodes, joint_shifts = self.kinematics.tree.nodes, self.joint_places(theta)
         factors = zip(nodes, self.factors(theta).tolist(), strict=True)
         return model.reshaped(
             link_scales={node.name: tuple(row) for node, row in factors},
             joint_shifts={
-                joint: tuple(shares[i] * self._rest[i]) for i, joint in self._joints.items()
+                joint: tuple(joint_shifts[i] * self._rest[i]) for i, joint in self._joints.items()
             },
-            link_shifts={nodes[i].name: tuple(-shares[i] * self._along[i]) for i in self._joints},
+            link_shifts={
+                nodes[i].name: tuple(-joint_shifts[i] * self._along[i]) for i in self._joints
+            },
         )
 
     def joint_places(self, theta: Array) -> Array:
-        """(nodes,) how far along each part its joint is moved, over the part's length."""
-        shares = np.zeros(len(self.limbs))
-        shares[self.placed] = theta[len(self.names) - len(self.placed) : len(self.names)]
-        return shares
+        """Return (nodes,) shift of each part's joint along the part [part's length]."""
+        joint_shifts = np.zeros(len(self.limbs))
+        joint_shifts[self.placed] = theta[len(self.names) - len(self.placed) : len(self.names)]
+        return joint_shifts
 
     def place(self, theta: Array) -> Placement:
-        """The body at all parameters (n,)."""
+        """Place the body at all parameters (n,)."""
         kinematics = self.kinematics
         count = len(kinematics.names)
         at_rest = kinematics.motions(theta[:count])
-        scale, shares = self.factors(theta), self.joint_places(theta)
+        scale, joint_shifts = self.factors(theta), self.joint_places(theta)
         R = at_rest.X_WN[:, :3, :3]
-        # How a node's frame, stretched, maps a vector in the world.
+        # Stretch of each node as a linear map of vectors in the world.
         maps = np.einsum("nik,nk,njk->nij", R, scale, R)
         places = at_rest.X_WN[:, :3, 3].copy()
-        # Where a part's flesh is beside its joint, and where the joint is beside the file's.
-        back = -np.einsum("nik,nk,n->ni", R, self._along, shares)
+        # Offset of a part's flesh from its joint, and offset of the joint from its model position.
+        back = -np.einsum("nik,nk,n->ni", R, self._along, joint_shifts)
         carried = np.zeros_like(places)
         for i, node in enumerate(kinematics.tree.nodes):
             if node.parent >= 0:
                 apart = at_rest.X_WN[i, :3, 3] - at_rest.X_WN[node.parent, :3, 3]
                 carried[i] = maps[node.parent] @ apart
                 places[i] = places[node.parent] + back[node.parent] + carried[i]
-                places[i] += shares[i] * (R[node.parent] @ self._rest[i])
-        shift, growth = theta[count : count + 3], float(np.exp(theta[count + 3]))
-        moved = places[0] + shift - growth * places[0]
-        # M (k, 3, 3) and v (k, 3) that values, the root's shift and its growth make: what is moved
-        # by M p + v has not grown about the root yet, nor is it shifted.
+                places[i] += joint_shifts[i] * (R[node.parent] @ self._rest[i])
+        shift, root_scale = theta[count : count + 3], float(np.exp(theta[count + 3]))
+        moved = places[0] + shift - root_scale * places[0]
+        # M (k, 3, 3) and v (k, 3) of values, root translation and root scale. M p + v applies to
+        # points before the root's scaling and translation.
         nodes = kinematics.value_nodes
         affine = affine_motions(at_rest.twists).reshape(-1, 3, 4)
         turned = affine[:, :, :3]
         velocity = np.einsum("kij,kj->ki", turned, at_rest.X_WN[nodes, :3, 3]) + affine[:, :, 3]
-        # The first root is what carries nothing stretched.
+        # The first root has no parent that stretches its motion.
         by = np.concatenate([maps, np.eye(3)[None]])[self._parents[nodes]]
         velocity = np.einsum("kij,kj->ki", by, velocity)
         of_values = velocity - np.einsum("kij,kj->ki", turned, places[nodes])
-        # What moves the root moves the point about which the body has grown.
-        of_values += (1.0 / growth - 1.0) * velocity * (nodes == 0)[:, None]
+        # Values that move the root also move the centre of the root's scaling.
+        of_values += (1.0 / root_scale - 1.0) * velocity * (nodes == 0)[:, None]
         M = [turned, np.zeros((3, 3, 3)), np.eye(3)[None]]
-        v = [of_values, np.eye(3) / growth, -places[:1]]
+        v = [of_values, np.eye(3) / root_scale, -places[:1]]
         hanging = np.flatnonzero(self._parents >= 0)
         along = R[np.arange(len(R)), :, self.axes]
         long = along[:, :, None] * along[:, None]
@@ -205,11 +211,11 @@ class ProportionedBody(BodyParameters):
         turning = np.concatenate(M)
         all_M[: len(turning)] = turning
         X_WN = at_rest.X_WN.copy()
-        X_WN[:, :3, :3] *= growth
-        X_WN[:, :3, 3] = moved + growth * places
-        packed = stretched(self._at(theta[:count]), scale)
-        # A node's rigid part moves with its joint's place; bands stay at the joints.
-        flesh = -self._along * shares[:, None]
+        X_WN[:, :3, :3] *= root_scale
+        X_WN[:, :3, 3] = moved + root_scale * places
+        packed = scale_surfaces(self._at(theta[:count]), scale)
+        # A node's rigid surface moves with its joint's position; skin bands stay at the joints.
+        flesh = -self._along * joint_shifts[:, None]
         for i in self.placed.tolist():
             vertices = packed.starts[i, 0] + np.arange(len(self.outlines[i].vertices))
             triangles = packed.starts[i, 1] + np.arange(len(self.outlines[i].triangles))
@@ -217,21 +223,21 @@ class ProportionedBody(BodyParameters):
             packed.planes[3, triangles] += flesh[i] @ packed.planes[:3, triangles]
             packed.balls[i, :3] += flesh[i]
             packed.balls[i, 3] += np.linalg.norm(flesh[i])
-        motions = affine_of(all_M, growth * all_v - all_M @ moved)
+        motions = affine_of(all_M, root_scale * all_v - all_M @ moved)
         return Placement(packed, X_WN, motions, *self._owners)
 
 
 def sequence_prior(
     frames: int, usual: tuple[Array, Array, Array], acceleration: Array
 ) -> LinearPrior:
-    """What is known without pictures of p unknowns of frames that follow one another.
+    """Return the prior of p unknowns in successive frames: usual values and smooth motion.
 
     Args:
-        frames: their number, three or more.
-        usual: phi (k, p) of which phi x has the mean (k,), with the information (k,), one over the
-            variance.
-        acceleration: (p,) standard deviation of an unknown about where the two frames before it
-            lead.
+        frames: number of frames, at least three.
+        usual: phi (k, p), mean (k,) and information (k,), the inverse variance, of phi x in each
+            frame.
+        acceleration: (p,) standard deviation of an unknown about its linear extrapolation from the
+            two preceding frames.
     """
     phi, mean, information = usual
     motion = diags_array([1.0, -2.0, 1.0], offsets=[0, 1, 2], shape=(frames - 2, frames))
@@ -249,31 +255,31 @@ def fit_proportions(
     camera: Camera,
     frames: Sequence[EdgePoints],
     starts: Array,
-    rounds: Sequence[AnnealingStage],
+    stages: Sequence[AnnealingStage],
     noise: Noise,
     limits: tuple[Array, Array],
     prior: LinearPrior,
 ) -> tuple[Solution, Array]:
-    """The proportions of a body that several frames of one camera show, its pose near in each.
+    """Fit a body's proportions, and its pose in each frame, to several frames of one camera.
 
     Args:
-        body: the body.
+        body: parameters of the body.
         camera: the camera.
-        frames: the edges that it sees, of three frames or more.
-        starts: (frames, k) about what the tree's values and ROOT_NAMES are; or (frames, n) all
-            parameters, those of proportions as in the first frame.
-        rounds: the parts of the fit [pixel].
-        noise: of contours [pixel].
-        limits: lower and upper (p,) of the tree's values that are free, then of ROOT_NAMES.
-        prior: of the same unknowns of all frames.
+        frames: edges of the silhouettes of three or more frames.
+        starts: (frames, k) initial guess of the tree's values and ROOT_NAMES, or (frames, n) of all
+            parameters, with the proportions taken from the first frame.
+        stages: the annealing stages [pixel].
+        noise: noise of contours [pixel].
+        limits: lower and upper (p,) limits of the free tree values, then of ROOT_NAMES.
+        prior: prior of these unknowns in all frames.
 
     Returns:
-        the solution, and standard deviations (frames, k) of the tree's values and ROOT_NAMES, 0
-        where they were held.
+        The solution, and the standard deviations (frames, k) of the tree's values and ROOT_NAMES, 0
+        for fixed values.
     """
     kinematics = body.kinematics
     moving = np.array(kinematics.names)[kinematics.lower < kinematics.upper].tolist()
-    # Standard deviations: as people differ.
+    # Standard deviations of the variation between people.
     problem = Problem(
         body,
         [camera],
@@ -293,8 +299,8 @@ def fit_proportions(
     held[:, problem.entries] = 0.0
     seen = [Observation(pack_evidence([e]), row) for e, row in zip(frames, held, strict=True)]
     found = problem.solve(
-        seen, rounds, (first, shared), expected=(first, np.zeros(len(common))), coupling=prior
+        seen, stages, (first, shared), expected=(first, np.zeros(len(common))), coupling=prior
     )
-    off = np.zeros((len(frames), len(kinematics.names) + len(ROOT_NAMES)))
-    off[:, own] = found.own_deviations()
-    return found, off
+    deviations = np.zeros((len(frames), len(kinematics.names) + len(ROOT_NAMES)))
+    deviations[:, own] = found.own_deviations()
+    return found, deviations

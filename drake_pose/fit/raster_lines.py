@@ -1,12 +1,12 @@
-"""Evidence exact to hundredths of a pixel on exact masks: contours compared along raster lines.
+"""Residuals accurate to hundredths of a pixel on exact masks, along raster lines.
 
-Along every row (and column) the contour of the body and the border of the silhouette are crossed a
-few times, each time into or out of the covered part. Each crossing of the one is compared with the
-nearest of the same sense of the other, in both directions; their distance d along the line times
-the cosine c between line and contour normal is a residual [pixel], of weight
-c / 2 / (1 + (d c / scale)^2) (Geman and McClure 1987). A silhouette drawn by pixels has its border
-half way between two pixels there, which is where the truth is on average. As with edge points, what
-the crossings of a node say adds up to a 12 x 12 matrix.
+Along every row (and column) the contour of the body and the border of the silhouette have a few
+crossings, alternately entering and leaving. Each crossing is matched to the nearest one of the same
+sense of the other, in both directions. With d the distance along the line and c the cosine between
+the line and the contour's normal, the residual is d c [pixel] and its weight
+c / 2 / (1 + (d c / scale)^2) (Geman and McClure 1987). The border of a rasterised silhouette lies
+half way between two pixels, which is unbiased. As with edge points, the crossings of a node add up
+to a 12 x 12 matrix.
 """
 
 import math
@@ -16,7 +16,7 @@ import numpy as np
 
 from drake_pose.arrays import Array, Indices, Mask
 from drake_pose.compiled import compiled
-from drake_pose.fit.kernel import add_pull, add_pulls, seen_from
+from drake_pose.fit.kernel import accumulate_residuals, add_residual, poses_in_camera
 from drake_pose.silhouette.contour_points import (
     find_crossings,
     find_line_spans,
@@ -26,10 +26,12 @@ from drake_pose.silhouette.outline import PackedOutlines
 
 
 class Border(NamedTuple):
-    """Where a silhouette's border crosses rows and columns of pixel centres.
+    """Crossings of a silhouette's border with rows and columns of pixel centres.
 
-    rows: (H + 1,) where each row's crossings begin, and (n,) u, half way between two pixels;
-    columns: (W + 1,) and (m,) v likewise.
+    Attributes:
+        rows: (H + 1,) index of each row's first crossing, and (n,) u of the crossings, half way
+            between two pixels.
+        columns: (W + 1,) index of each column's first crossing, and (m,) v likewise.
     """
 
     rows: tuple[Indices, Array]
@@ -37,7 +39,7 @@ class Border(NamedTuple):
 
     @classmethod
     def nothing(cls, height: int, width: int) -> "Border":
-        """Of an empty picture."""
+        """Return the border of an empty mask."""
         return cls(
             (np.zeros(height + 1, dtype=np.int64), np.zeros(0)),
             (np.zeros(width + 1, dtype=np.int64), np.zeros(0)),
@@ -45,11 +47,11 @@ class Border(NamedTuple):
 
     @property
     def length(self) -> float:
-        """About how long it is [pixel]: crossings a pixel are 4 / pi on average."""
+        """Approximate length [pixel]: there are 4 / pi crossings per pixel on average."""
         return (len(self.rows[1]) + len(self.columns[1])) * math.pi / 4.0
 
     def covered(self, step: int, shape: tuple[int, ...]) -> Mask:
-        """What it bounds, in a picture (h, w) of every step-th row and column."""
+        """Return the mask (h, w) inside the border, on every step-th row and column."""
         starts, places = self.rows
         rows = np.repeat(np.arange(len(starts) - 1), np.diff(starts))
         chosen = rows % step == 0
@@ -60,7 +62,7 @@ class Border(NamedTuple):
 
 
 def find_border(mask: Mask) -> Border:
-    """The border of a silhouette (H, W); what lies beyond the picture counts as outside."""
+    """Return the border of a silhouette (H, W); pixels beyond the image count as outside."""
     found = []
     for pixels in (mask.view(np.uint8), mask.T.view(np.uint8)):
         lines, places = np.nonzero(np.diff(np.pad(pixels, ((0, 0), (1, 1)))))
@@ -74,9 +76,9 @@ def compare_raster(
     packed: PackedOutlines,
     skin: tuple[Array, Indices],
     X_WN: Array,
-    wanted: Mask,
+    is_moving: Mask,
     camera: tuple[Array, Array],
-    still: Border,
+    static_border: Border,
     border: Border,
     lines: tuple[int, int],
     scale: float,
@@ -84,46 +86,46 @@ def compare_raster(
     A: Array,
     b: Array,
 ) -> tuple[float, float, float]:
-    """Adds one camera's evidence of the nodes' affine motions.
+    """Add one camera's quadratic cost of the nodes' affine motions to A and b.
 
     Args:
-        packed: the nodes' surfaces.
-        skin: (v,) by what fraction each vertex follows its own node, and not that node's parent;
-            (nodes,) the parents.
-        X_WN: (nodes, 4, 4).
-        wanted: (nodes,) which nodes move.
+        packed: surfaces of the nodes.
+        skin: (v,) fraction by which each vertex follows its own node rather than that
+            node's parent; (nodes,) indices of the parents.
+        X_WN: (nodes, 4, 4) poses of the nodes.
+        is_moving: (nodes,) whether a node moves.
         camera: X_CW (4, 4) and kernel parameters (8,).
-        still: the border of all other nodes' union.
-        border: the silhouette's.
-        lines: the step from row to row and column to column that are looked at, and the first.
+        static_border: border of the union of all other nodes.
+        border: border of the silhouette.
+        lines: step between the rows and columns used, and index of the first one.
         scale: residuals beyond it lose weight [pixel].
-        slack: distances count by what they are beyond it; 0: all count [pixel].
-        A, b: (nodes, 12, 12), lower triangles, and (nodes, 12) added to, as of `compare_contours`.
+        slack: only the excess of a distance over this counts [pixel]; 0: the whole distance counts.
+        A, b: (nodes, 12, 12), lower triangles, and (nodes, 12), added to, as of `compare_contours`.
 
     Returns:
-        Number of pixels that either body or silhouette covers, estimated from the rows; the sum of
-        all weights; and that of the weighted squares of the residuals.
+        Number of pixels covered by exactly one of body and silhouette, estimated from the rows; sum
+        of all weights; weighted sum of squared residuals.
     """
     stride, offset = lines
-    segments = find_segments(packed, seen_from(camera[0], X_WN), camera[1], wanted)
+    segments = find_segments(packed, poses_in_camera(camera[0], X_WN), camera[1], is_moving)
     ends = segments.ends
     apart, total, squares = 0.0, 0.0, 0.0
     spans = np.empty((ends.shape[0] + 1, 2), dtype=np.int64)
-    most = 2 * ends.shape[0] + 2 + max(len(still.rows[1]), len(still.columns[1]))
+    most = 2 * ends.shape[0] + 2 + max(len(static_border.rows[1]), len(static_border.columns[1]))
     chosen = np.empty(most, dtype=np.int64)
     places, slopes = np.empty(most), np.empty(most)
     weights, residuals = np.empty(most), np.empty(most)
-    wide = np.zeros((len(X_WN), 13))
+    bias_terms = np.zeros((len(X_WN), 13))
     for across in range(2):
         border_starts, border_places = border[across]
-        still_starts, still_places = still[across]
+        still_starts, still_places = static_border[across]
         extent = camera[1][6 + across] - 0.5
         count = (int(camera[1][7 - across]) - 1 - offset) // stride + 1
         crossings = find_crossings(segments, across, float(offset), float(stride), count)
-        # Of each crossing, and once more where skin follows another node, too.
-        p_N, pulls = np.empty((2 * len(crossings[1]), 3)), np.zeros((2 * len(crossings[1]), 7))
-        labels = np.empty((2, len(pulls)), dtype=np.int64)
-        pulling = 0
+        # One entry per crossing, and a second one where skin follows two nodes.
+        p_N, point_sums = np.empty((2 * len(crossings[1]), 3)), np.zeros((2 * len(crossings[1]), 7))
+        labels = np.empty((2, len(point_sums)), dtype=np.int64)
+        entry_count = 0
         for line in range(count):
             at = offset + line * stride
             first, end = border_starts[at], border_starts[at + 1]
@@ -154,41 +156,46 @@ def compare_raster(
                     continue
                 node = segments.nodes[s]
                 low, high = ends[s, 1 - across], ends[s, 3 - across]
-                share = (at - low) / (high - low)
-                # Straight in the picture is not at even pace along the edge (perspective).
+                along = (at - low) / (high - low)
+                # Perspective-correct interpolation along the edge.
                 near, far = segments.depths[s, 0], segments.depths[s, 1]
-                share = share * near / (share * near + (1.0 - share) * far)
+                along = along * near / (along * near + (1.0 - along) * far)
                 i, j = segments.vertices[s, 0], segments.vertices[s, 1]
-                # The normal that points on along the line, as the residuals do.
+                # The normal points in the direction of the line, as residuals do.
                 du, dv = ends[s, 2] - ends[s, 0], ends[s, 3] - ends[s, 1]
                 size = math.sqrt(du * du + dv * dv)
                 size = size if (high > low) == (across == 0) else -size
                 weight, residual = stride * weights[k], residuals[k] / weights[k]
                 total += weight
                 squares += weight * residual * residual
-                # A share of a weight for each node that the point follows: the slope is exact, and
-                # the curvature no less than it is.
-                own = (1.0 - share) * skin[0][i] + share * skin[0][j]
-                for part in range(2 if own < 1.0 else 1):
-                    labels[0, pulling] = node
-                    labels[1, pulling] = node if part == 0 else skin[1][node]
+                # Split the weight among the nodes that the point follows: the gradient is exact,
+                # and the curvature an upper bound.
+                own_fraction = (1.0 - along) * skin[0][i] + along * skin[0][j]
+                for part in range(2 if own_fraction < 1.0 else 1):
+                    labels[0, entry_count] = node
+                    labels[1, entry_count] = node if part == 0 else skin[1][node]
                     for axis in range(3):
                         begin, after = packed.points[axis, i], packed.points[axis, j]
-                        p_N[pulling, axis] = (1.0 - share) * begin + share * after
-                    share_of_it = own if part == 0 else 1.0 - own
-                    add_pull(pulls, pulling, dv / size, -du / size, -residual, share_of_it * weight)
-                    pulling += 1
+                        p_N[entry_count, axis] = (1.0 - along) * begin + along * after
+                    fraction = own_fraction if part == 0 else 1.0 - own_fraction
+                    add_residual(
+                        point_sums, entry_count, dv / size, -du / size, -residual, fraction * weight
+                    )
+                    entry_count += 1
         nodes, owners = labels
-        add_pulls(A, b, wide, X_WN, camera, p_N, nodes[:pulling], owners[:pulling], pulls[:pulling])
+        accumulate_residuals(
+            A, b, bias_terms, X_WN, camera, p_N, nodes[:entry_count], owners[:entry_count],
+            point_sums[:entry_count],
+        )  # fmt: skip
     return stride * apart, total, squares
 
 
 @compiled
 def find_body_border(
-    packed: PackedOutlines, X_WN: Array, wanted: Mask, camera: tuple[Array, Array]
+    packed: PackedOutlines, X_WN: Array, is_moving: Mask, camera: tuple[Array, Array]
 ) -> Border:
-    """The border of the wanted nodes' union; arguments as of compare_raster."""
-    segments = find_segments(packed, seen_from(camera[0], X_WN), camera[1], wanted)
+    """Return the border of the union of the moving nodes; arguments as of compare_raster."""
+    segments = find_segments(packed, poses_in_camera(camera[0], X_WN), camera[1], is_moving)
     spans = np.empty((segments.ends.shape[0] + 1, 2), dtype=np.int64)
     borders = []
     for across in range(2):
@@ -208,24 +215,28 @@ def find_body_border(
 
 @compiled
 def _unite_line(
-    spans: Indices, found: int, moving: Array, still: Array, first: int, end: int, places: Array,
-    chosen: Indices,
+    spans: Indices, found: int, moving: Array, static_border: Array, first: int, end: int,
+    places: Array, chosen: Indices,
 ) -> int:  # fmt: skip
-    """Writes where a line enters and leaves the union of moving and still surfaces; their number.
+    """Write where a line enters and leaves the union of moving and static surfaces.
 
     Args:
-        spans, found, moving: the line's moving spans, as from ``find_line_spans``.
-        still: the still surfaces' crossings, of this line from ``first`` to ``end``.
-        places, chosen: written; chosen is the crossing of the moving surfaces, or -1.
+        spans, found, moving: the line's spans of moving surfaces, as from ``find_line_spans``.
+        static_border: crossings of the static surfaces; those of this line are ``first`` to
+            ``end``.
+        places, chosen: output: positions [pixel], and index of the moving crossing or -1.
+
+    Returns:
+        Number of positions.
     """
     count, depth, i, j = 0, 0, 0, first
     while i < 2 * found or j < end:
         k = spans[i // 2, i % 2] if i < 2 * found else -1
-        if j >= end or (k >= 0 and moving[k] < still[j]):
+        if j >= end or (k >= 0 and moving[k] < static_border[j]):
             place, step = moving[k], 1 - 2 * (i % 2)
             i += 1
         else:
-            k, place, step = -1, still[j], 1 - 2 * ((j - first) % 2)
+            k, place, step = -1, static_border[j], 1 - 2 * ((j - first) % 2)
             j += 1
         if depth == 0 or depth + step == 0:
             places[count], chosen[count] = place, k
@@ -238,9 +249,9 @@ def _unite_line(
 def _pixels_apart(
     places: Array, count: int, border: Array, first: int, end: int, width: int
 ) -> float:
-    """Number of a line's pixels whose centre either body or silhouette covers, but not both.
+    """Return the number of a line's pixel centres covered by exactly one of body and silhouette.
 
-    Arguments as of _compare_line; width: the line's length.
+    Arguments as of _compare_line; width: the line's length [pixel].
     """
     length, open_at, inside = 0.0, -0.5, False
     i, j = 0, first
@@ -262,19 +273,20 @@ def _compare_line(
     places: Array, slopes: Array, count: int, border: Array, first: int, end: int, extent: float,
     scale: float, slack: float, weights: Array, residuals: Array,
 ) -> None:  # fmt: skip
-    """Writes each contour crossing's weight and weighted residual.
+    """Write the weight and the weighted residual of each contour crossing.
 
     Args:
-        places: (count,) the contour's crossings, in turns in and out.
-        slopes: (count,) cosines between the line and the contour's normal there.
-        border: the silhouette's crossings, of this line from ``first`` to ``end``.
-        extent: the picture's end [pixel].
+        places: (count,) positions of the contour's crossings, alternately entering and leaving.
+        slopes: (count,) cosines between the line and the contour's normal.
+        border: positions of the silhouette's crossings; those of this line are ``first`` to
+            ``end``.
+        extent: end of the image along the line [pixel].
         scale, slack: as of compare_raster.
-        weights, residuals: written.
+        weights, residuals: output.
     """
     for k in range(count):
         weights[k] = residuals[k] = 0.0
-    # First each crossing of the contour with the nearest of the border, then the other way round.
+    # Match each contour crossing to the nearest border crossing, then vice versa.
     for one in range(count + end - first):
         begin, after = (first + one % 2, end) if one < count else ((one - count) % 2, count)
         nearest, best = -1, math.inf
@@ -293,7 +305,7 @@ def _compare_line(
                 hinge = math.copysign(beyond, best) * slopes[nearest]
                 residuals[nearest] += weight * hinge
                 weights[nearest] += weight
-            # Enough to choose among the poses that all bounds allow.
+            # A small weight inside the slack selects among poses that satisfy all bounds.
             weight *= 0.03
         weights[nearest] += weight
         residuals[nearest] += weight * residual

@@ -1,7 +1,7 @@
-"""Simplified surfaces on disk, beside the compiled kernels: the next process loads them.
+"""Cache of simplified surfaces on disk, beside the compiled kernels, for later processes.
 
-A file's name is a digest of all that it was made of. It begins with a digest of what follows, so a
-file that was cut or changed is made again. Where no folder can be written nothing is stored.
+A file's name is a digest of everything the surface depends on. The file starts with a digest of its
+content; a truncated or modified file is replaced. If no folder is writable, nothing is stored.
 """
 
 import hashlib
@@ -24,15 +24,15 @@ def stored(
     least_time: float = 0.1,
     most_files: int = 500,
 ) -> Outline:
-    """A surface from its file, or made and stored.
+    """Return a surface from its file, or make and store it.
 
     Args:
-        made_of: what tells this surface from all others, with what may change how it is made.
-        make: makes it.
-        least_time: what is made in less [s] is not stored: such surfaces are many, of persons
-            whose shape is fitted, and a file saves little.
-        most_files: those that were not used for longest are removed beyond so many (a surface of
-            2500 triangles takes 60 kB).
+        made_of: everything the surface depends on, including versions of the code that makes it.
+        make: makes the surface.
+        least_time: minimum time [s] of making a surface for it to be stored. Fits of persons make
+            many surfaces faster than this, and a file saves little.
+        most_files: maximum number of files (60 kB for 2500 triangles); the least recently used ones
+            are removed.
     """
     kernels = kernel_folder()
     if kernels is None:
@@ -46,14 +46,14 @@ def stored(
         start = time.perf_counter()
         outline = make()
         if time.perf_counter() - start >= least_time:
-            with suppress(OSError):  # A full disk, or a folder of somebody else's.
+            with suppress(OSError):  # The disk is full or the folder is not writable.
                 _write(path, outline)
                 _remove_oldest(path.parent, most_files)
     return outline
 
 
 def _read(path: Path) -> Outline | None:
-    """A stored surface; None where there is none, or the file is not what was written."""
+    """Return a stored surface; None if there is no file, or its content was altered."""
     try:
         content = path.read_bytes()
         if hashlib.sha256(content[32:]).digest() != content[:32]:
@@ -68,7 +68,7 @@ def _read(path: Path) -> Outline | None:
 
 
 def _write(path: Path, outline: Outline) -> None:
-    """Stores a surface all at once: processes that store the same one do not meet."""
+    """Store a surface atomically, so that processes storing the same one do not interfere."""
     buffer = io.BytesIO()
     np.savez(buffer, vertices=outline.vertices, triangles=outline.triangles)
     payload = buffer.getvalue()
@@ -84,7 +84,7 @@ def _write(path: Path, outline: Outline) -> None:
 
 
 def _remove_oldest(folder: Path, most: int) -> None:
-    """Removes the files that were not used for longest, and what stopped processes left."""
+    """Remove the least recently used files, including leftovers of killed processes."""
     ages = sorted((one.stat().st_mtime, one) for one in folder.iterdir() if one.is_file())
     for _, one in ages[: max(0, len(ages) - most)]:
         with suppress(OSError):

@@ -1,4 +1,4 @@
-"""Surfaces of few triangles: what a fit needs of a body shows with them."""
+"""Simplify surfaces to few triangles, which suffice for a fit."""
 
 from collections.abc import Sequence
 from functools import lru_cache
@@ -19,19 +19,19 @@ from drake_pose.silhouette.outline import Outline, TreeSurfaces, outline_from_me
 from drake_pose.version import VERSION
 
 MANY, FEW, VERY_FEW = 2500, 400, 80
-"""Triangles of a node: where a pixel counts, for a still, and for a person in real time."""
+"""Triangles per node: for pixel accuracy, for a single frame, and for a person in real time."""
 
-# The simplifier keeps its surface in globals, and lets other threads run: two at once mix theirs.
+# The simplifier keeps its surface in globals and releases the GIL: it is not thread-safe.
 _SIMPLIFIER = Lock()
 
 
 def simplify_rigid_parts(surfaces: TreeSurfaces, count: int) -> TreeSurfaces:
-    """The surfaces with few triangles in each rigid part; bands of skin stay and bend."""
+    """Return surfaces with about ``count`` triangles per rigid part; skin bands stay and bend."""
     return surfaces.with_rigid([_simplified(rigid, count) for rigid in surfaces.rigid])
 
 
 def simplify_surfaces(surfaces: TreeSurfaces, count: int = FEW) -> tuple[Outline, ...]:
-    """The nodes' surfaces, skin at rest, with few triangles (Garland and Heckbert's metric)."""
+    """Return each node's surface, skin at rest, with about ``count`` triangles."""
     outlines = []
     for node, rigid in enumerate(surfaces.rigid):
         bending = surfaces.bending[node]
@@ -40,37 +40,40 @@ def simplify_surfaces(surfaces: TreeSurfaces, count: int = FEW) -> tuple[Outline
 
 
 def simplify_outlines(outlines: Sequence[Outline], count: int = 160) -> tuple[Outline, ...]:
-    """Surfaces of few triangles with fewer still, which takes a fraction of what the first took."""
+    """Return simplified surfaces simplified further, much faster than from the originals."""
     return tuple(_simplified(outline, count) for outline in outlines)
 
 
 def reduce_meshes(
     meshes: Sequence[TriangleMesh], total: int, rounds: int = 4
 ) -> list[TriangleMesh]:
-    """Meshes with about so many triangles in all; each keeps its share, or 100 at least.
+    """Return meshes with about ``total`` triangles in all, at least 100 each.
 
-    ``rounds``: how often they are simplified at most: what has holes and slivers keeps several
-    times as many at once.
+    Args:
+        meshes: the meshes; each keeps its fraction of the triangles.
+        total: number of triangles.
+        rounds: maximum number of simplifications; meshes with holes and slivers keep several times
+            as many triangles in a single one.
     """
-    light = list(meshes)
+    reduced = list(meshes)
     for _ in range(rounds):
-        given = sum(len(mesh.triangles) for mesh in light)
+        given = sum(len(mesh.triangles) for mesh in reduced)
         if given <= 1.2 * total:
             break
-        for k, mesh in enumerate(light):
+        for k, mesh in enumerate(reduced):
             count = max(100, round(total * len(mesh.triangles) / given))
             if len(mesh.triangles) > count:
                 few = _simplified(outline_from_mesh(mesh), count)
-                light[k] = TriangleMesh(few.vertices, few.triangles)
-    return light
+                reduced[k] = TriangleMesh(few.vertices, few.triangles)
+    return reduced
 
 
 def simplify_or_hull(
     outlines: Sequence[Outline], count: int, limit: float = 3.0
 ) -> tuple[Outline, ...]:
-    """Surfaces with few triangles each.
+    """Return surfaces with about ``count`` triangles each.
 
-    A surface that will not simplify below `limit` times as many becomes its convex hull.
+    A surface that cannot be simplified below ``limit * count`` triangles becomes its convex hull.
     """
     found = []
     for outline in outlines:
@@ -84,26 +87,26 @@ def simplify_or_hull(
 
 
 def with_radius_scales(outlines: Sequence[Outline], radius_scales: Array) -> tuple[Outline, ...]:
-    """Surfaces, each as many times as wide across its y axis as radius scales (nodes,) say."""
-    wider = []
+    """Return surfaces scaled across their y axes by radius scales (nodes,)."""
+    scaled = []
     for outline, radius_scale in zip(outlines, radius_scales, strict=True):
         vertices = outline.vertices * [radius_scale, 1.0, radius_scale]
-        wider.append(outline_from_mesh(TriangleMesh(vertices, outline.triangles)))
-    return tuple(wider)
+        scaled.append(outline_from_mesh(TriangleMesh(vertices, outline.triangles)))
+    return tuple(scaled)
 
 
 def _simplified(outline: Outline, count: int) -> Outline:
-    """A surface with about that number of triangles at most.
+    """Return a surface with at most about ``count`` triangles.
 
-    From pass to pass the simplifier allows larger errors, which are lengths and no shares of the
-    surface's, until triangles are few enough. Slivers it never merges, so with many of those it
-    folds everything else, and may have many triangles left. Such a surface is simplified another
-    way, which is kept where it is nearer to what was given.
+    In each pass the simplifier allows larger errors, in absolute units, until there are few enough
+    triangles. It never merges slivers: with many of them it folds the rest of the surface or leaves
+    many triangles. Such a surface is also simplified in another way, and the closer result is
+    kept.
     """
     if len(outline.triangles) <= count:
         return outline
     if count < FEW and len(outline.triangles) > 4000:
-        # Very few triangles made out of few ones are as near, in a sixth of the time.
+        # Simplifying in two steps is as accurate and takes a sixth of the time.
         few = _simplified(outline, FEW)
         outline = few if len(few.triangles) <= 1.1 * FEW else outline
     vertices = np.ascontiguousarray(outline.vertices, np.float64)
@@ -113,34 +116,36 @@ def _simplified(outline: Outline, count: int) -> Outline:
 
 @lru_cache(maxsize=256)
 def _simplify(vertices: bytes, triangles: bytes, count: int) -> Outline:
-    """A surface of more triangles, by its vertices and triangles.
+    """Return the simplified surface, cached in the process and on disk.
 
-    A process that estimates or audits many scenes of a body simplifies its surfaces once; the next
-    process finds what took long on disk.
+    Args:
+        vertices: bytes of (v, 3) float64.
+        triangles: bytes of (t, 3) int32.
+        count: number of triangles.
     """
-    # Nothing here needs the edges.
+    # The simplification does not need the edges.
     outline = Outline(
         np.frombuffer(vertices, np.float64).reshape(-1, 3),
         np.frombuffer(triangles, np.int32).reshape(-1, 3).copy(),
         np.zeros((0, 5), np.int32),
     )
-    way = f"{fast_simplification.__version__} {VERSION} {file_digest(__file__)} {count}".encode()
-    return stored((way, vertices, triangles), lambda: _make_simple(outline, count))
+    method = f"{fast_simplification.__version__} {VERSION} {file_digest(__file__)} {count}".encode()
+    return stored((method, vertices, triangles), lambda: _make_simple(outline, count))
 
 
 def _make_simple(outline: Outline, count: int) -> Outline:
-    """A surface with about that number of triangles, in the way that is nearer to it."""
+    """Return the closer of two simplifications of a surface to about ``count`` triangles."""
     simplified = collapse_edges(outline, count)
     size = float(np.linalg.norm(np.ptp(outline.vertices, axis=0)))
-    # The distance of a smooth surface falls with the triangles: it is 0.4 to 1.4 times size / count
-    # on all parts of the bundled bodies, from 80 triangles to 400.
+    # The distance of a simplified smooth surface is 0.4 to 1.4 times size / count, on all parts of
+    # the bundled bodies, with 80 to 400 triangles.
     too_far = 2.0 / count * size
     distance = surface_distance(outline, simplified)
     too_many = len(simplified.triangles) > 3.0 * count
     if distance <= too_far and not too_many:
         return simplified
-    # A surface with slivers: the simplifier gets it in a unit in which its largest errors, a few
-    # hundred units, are small. Vertices that are close together are merged before the next time.
+    # A surface with slivers: use a unit in which the simplifier's largest error, a few hundred
+    # units, is small. Close vertices are merged before each further attempt.
     unit = size / (25.0 * count)
     merged = collapse_edges(outline, count, unit)
     for grid in (10.0, 20.0, 40.0):
@@ -156,9 +161,12 @@ def _make_simple(outline: Outline, count: int) -> Outline:
 
 
 def collapse_edges(outline: Outline, count: int, unit: float = 1.0) -> Outline:
-    """A surface whose edges are collapsed till triangles are few, in a unit of length [m].
+    """Return a surface simplified by edge collapses (quadric error metric, Garland and Heckbert).
 
-    By Garland and Heckbert's quadric error metric.
+    Args:
+        outline: the surface.
+        count: number of triangles.
+        unit: unit of length in which the simplifier works [m].
     """
     if len(outline.triangles) <= count:
         return outline
@@ -170,10 +178,10 @@ def collapse_edges(outline: Outline, count: int, unit: float = 1.0) -> Outline:
 
 
 def surface_distance(one: Outline, other: Outline) -> float:
-    """The root mean square distance of two surfaces [m]; infinite where one has no triangles.
+    """Return the root mean square distance of two surfaces [m]; infinite if one has no triangles.
 
-    From points spread evenly over each to the nearest point of the other: what one lacks counts as
-    much as what it has too much.
+    Distances are measured from points spread evenly over each surface to the nearest point of the
+    other one.
     """
     if len(one.triangles) == 0 or len(other.triangles) == 0:
         return np.inf
@@ -182,7 +190,7 @@ def surface_distance(one: Outline, other: Outline) -> float:
 
 
 def _squared_distances(one: Outline, other: Outline) -> Array:
-    """(n,) of points spread over a surface to another one's triangles."""
+    """Return (n,) squared distances of points spread over a surface to another surface [m^2]."""
     points, corners = _spread(one), other.vertices[other.triangles]
     centers = corners.mean(axis=1)
     radii = np.linalg.norm(corners - centers[:, None], axis=2).max(axis=1)
@@ -190,13 +198,13 @@ def _squared_distances(one: Outline, other: Outline) -> Array:
     apart = np.linalg.norm(first - points, axis=1)
     nearest = np.fmin(cKDTree(other.vertices).query(points)[0], apart)
     pairs: list[tuple[NDArray[np.intp], NDArray[np.intp]]] = []
-    # Small triangles first: a few large ones would call for all the small ones around them.
+    # Group triangles by size: large ones would otherwise widen the search for all small ones.
     sizes = float(radii.max()) * 0.25 ** np.arange(6)
     for least, most in zip((*sizes[1:], -1.0), sizes, strict=True):
         own = np.flatnonzero((radii > least) & (radii <= most))
         if not len(own):
             continue
-        # Nothing in the ball around a triangle is nearer than what was found.
+        # Only triangles whose bounding ball comes closer than the best distance are candidates.
         about = cKDTree(centers[own]).query_ball_point(points, nearest + most)
         counts = [len(one) for one in about]
         who = np.repeat(np.arange(len(points)), counts)
@@ -212,7 +220,7 @@ def _squared_distances(one: Outline, other: Outline) -> Array:
 
 
 def _spread(outline: Outline, count: int = 300) -> Array:
-    """Points (count, 3) of a surface, as many in equal areas."""
+    """Return points (count, 3) spread evenly over a surface's area."""
     generator = np.random.default_rng(0)
     areas = np.cumsum(np.linalg.norm(outline.planes[:, :3], axis=1))
     where = np.searchsorted(areas, areas[-1] * (np.arange(count) + 0.5) / count)

@@ -255,12 +255,12 @@ class _Diagnoser:
             pictures = [one for i in spread[k::groups] for one in self._frames[i].pictures]
             seen = self._distances(pictures)
             is_angle = np.append(self._fit.is_angle, np.zeros(len(pictures), bool))
-            sizes.append(estimate_sizes(seen, is_angle, least_camera=0.0)[:5])
+            sizes.append(estimate_sizes(seen, is_angle, min_camera=0.0)[:5])
         return ErrorSizes(*np.median(np.array(sizes), axis=0).tolist())
 
     def _distances(self, pictures: Sequence[ComparedMask]) -> Distances:
         """The distances in pictures; their values are what was free, then each picture's width."""
-        return distances_in_masks(self._fit.outlines, pictures, widths=True)
+        return distances_in_masks(self._fit.outlines, pictures, with_bias=True)
 
     def _info_of(self, fitted: FrameFit, sizes: ErrorSizes, width_sd: float = 2.0) -> _Information:
         """The information of a frame, whose masks' widths are right to a deviation [pixel]."""

@@ -372,7 +372,7 @@ class SharedFit:
         """The distances in all masks that count; values are what is shared, then the widths."""
         seen, _, _, which = self._at(at, which)
         pictures = self.problem.compared_masks(seen, self._parameters(at)[which], step)
-        return distances_in_masks(self.problem.body.outlines, pictures, widths=True)
+        return distances_in_masks(self.problem.body.outlines, pictures, with_bias=True)
 
     def _doubted_distances(
         self, found: Shared, step: AnnealingStage, which: Mask | None

@@ -12,7 +12,7 @@ import numpy as np
 
 from drake_pose.body import PoseTree
 from drake_pose.body.tree_kinematics import TreeKinematics
-from drake_pose.fit.kernel import collect
+from drake_pose.fit.kernel import assemble_normal_equations
 from drake_pose.fit.levenberg_marquardt import Equations, StepSettings, damped_step
 from drake_pose.fit.parameters import BodyParameters, Placement
 from drake_pose.fit.raster_lines import (
@@ -185,7 +185,7 @@ class RefinementProblem:
                 placed.packed, self.body.skin, placed.X_WN, moved, camera, rest, border,
                 (part.stride, offset), part.scale, part.slack, A, b,
             )  # fmt: skip
-        H, g = collect(
+        H, g = assemble_normal_equations(
             A, b, placed.motions, placed.starts, placed.owners, placed.parameters, len(parameters)
         )
         apart, weight, squares = sums.tolist()

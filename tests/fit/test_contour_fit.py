@@ -15,7 +15,7 @@ from drake_pose.fit.contour_fit import (
     symmetric,
 )
 from drake_pose.fit.evidence import find_edge_points
-from drake_pose.fit.kernel import collect, nearest_alike
+from drake_pose.fit.kernel import assemble_normal_equations, match_points
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 
@@ -92,8 +92,8 @@ def test_nearest_points_against_brute_force():
         return uv[np.argsort(uv[:, 1])], np.column_stack([np.cos(angle), np.sin(angle)])
 
     (uv, normals), (edge_uv, edge_normals) = cloud(70), cloud(90)
-    of_point = nearest_alike(uv, normals, edge_uv, edge_normals, 9.0)
-    of_edge = nearest_alike(edge_uv, edge_normals, uv, normals, 9.0)
+    of_point = match_points(uv, normals, edge_uv, edge_normals, 9.0)
+    of_edge = match_points(edge_uv, edge_normals, uv, normals, 9.0)
     distance = np.linalg.norm(uv[:, None] - edge_uv[None], axis=2)
     distance[(normals @ edge_normals.T < 0.3) | (distance >= 9.0)] = np.inf
     for found, expected in ((of_point, distance), (of_edge, distance.T)):
@@ -107,7 +107,9 @@ def test_equations_are_collected_as_dense_products():
     A = np.einsum("nij,nkj->nik", half, half)
     b, motions = generator.normal(size=(2, 12)), generator.normal(size=(5, 12))
     owners, parameters = np.array([0, 2, 1, 3, 4]), np.array([0, 1, 1, 2, 3])
-    H, g = collect(np.tril(A), b, motions, np.array([0, 2, 5]), owners, parameters, 4)
+    H, g = assemble_normal_equations(
+        np.tril(A), b, motions, np.array([0, 2, 5]), owners, parameters, 4
+    )
     expected_H, expected_g = np.zeros((4, 4)), np.zeros(4)
     for node, rows in ((0, [0, 1]), (1, [2, 3, 4])):
         J = np.zeros((12, 4))

@@ -9,7 +9,7 @@ from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.fit.covariance import (
     Distances,
     ErrorSizes,
-    _apriori,
+    _prior_information,
     distances_covariance,
     error_unit,
     estimate_sizes,
@@ -59,11 +59,11 @@ def test_sizes_are_the_likeliest(scale, prior):
     """Restricted likelihood times prior of the sizes' logarithms, whose values are known little."""
     sizes = ErrorSizes(*(scale * np.array([1.5, 1.2, 0.4, 1.0, 2.0])))
     seen, _ = drawn_distances(np.random.default_rng(8), sizes, 60)
-    found = np.log(estimate_sizes(seen, ANGLES, 0.0, prior, settled=1e-4)[:5])
+    found = np.log(estimate_sizes(seen, ANGLES, 0.0, prior, tolerance=1e-4)[:5])
 
     def log_likelihood(t):
         V = np.einsum("k,kij->ij", np.exp(2.0 * t), seen.effects)
-        whole = V + seen.X @ np.linalg.inv(_apriori(ANGLES)) @ seen.X.T
+        whole = V + seen.X @ np.linalg.inv(_prior_information(ANGLES)) @ seen.X.T
         told = np.linalg.slogdet(whole)[1] + seen.y @ np.linalg.solve(whole, seen.y)
         return -0.5 * (told + t @ t / prior**2)
 
@@ -226,7 +226,7 @@ def test_what_is_doubted_is_taken_out_as_likely_as_one_normal_distribution_says(
     seen, _ = drawn_distances(np.random.default_rng(5), sizes, 40)
     _, without = nuisance_covariance(seen, sizes, ANGLES)
     (A,) = seen.nuisances
-    values = seen.X @ np.linalg.inv(_apriori(ANGLES)) @ seen.X.T
+    values = seen.X @ np.linalg.inv(_prior_information(ANGLES)) @ seen.X.T
     whole = distances_covariance(seen, sizes) + 4.0 * A @ A.T + values
     likeliest = 4.0 * A.T @ np.linalg.solve(whole, seen.y)
     np.testing.assert_allclose(without.y, seen.y - A @ likeliest, atol=1e-6)

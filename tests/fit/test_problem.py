@@ -166,7 +166,14 @@ def test_equations_are_the_slope_of_the_cost(body, rig):
 
 @pytest.mark.parametrize(
     "some",
-    ["turn_x center_y", "log_focal", "width", "left_shin_x width", "root_shift_x", "log_girth_odd"],
+    [
+        "turn_x center_y",
+        "log_focal",
+        "boundary_bias",
+        "left_shin_x boundary_bias",
+        "root_shift_x",
+        "log_girth_odd",
+    ],
 )
 def test_equations_of_some_unknowns_are_part_of_those_of_all(body, rig, some):
     """Whatever stands still, of two frames and two cameras; also where all the others are 0."""

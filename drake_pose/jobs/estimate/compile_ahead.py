@@ -14,7 +14,7 @@ from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.compiled import is_stored
 from drake_pose.fit.contour_fit import pack_views
 from drake_pose.fit.evidence import find_edge_points
-from drake_pose.fit.kernel import collect, compare_contours
+from drake_pose.fit.kernel import assemble_normal_equations, compare_contours
 from drake_pose.fit.surfaces import simplify_surfaces
 from drake_pose.search import MultiStartSearch, ViewsFit
 from drake_pose.search.multi_start import small_match
@@ -24,7 +24,7 @@ from drake_pose.silhouette.outline import TreeSurfaces, pack
 @contextmanager
 def compiling_ahead() -> Iterator[None]:
     """Lets a second process compile as long as the kernels are not stored and the block runs."""
-    if is_stored(collect):
+    if is_stored(assemble_normal_equations):
         yield
         return
     command = [sys.executable, "-m", "drake_pose.jobs.estimate.compile_ahead"]

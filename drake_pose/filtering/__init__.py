@@ -1,1 +1,1 @@
-"""Belief within limits: a Kalman filter whose estimates respect linear inequalities."""
+"""Kalman filters whose estimates satisfy linear inequalities, and trackers built on them."""

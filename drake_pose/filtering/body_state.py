@@ -1,4 +1,4 @@
-"""A pose tree's values as a state: what moves, its limits, and where it puts a body."""
+"""The free values of a pose tree as a filter's state: limits, prior, poses and silhouettes."""
 
 import copy
 import math
@@ -14,13 +14,13 @@ from drake_pose.camera.models import Camera, ParallelCamera
 from drake_pose.errors import SettingsError
 from drake_pose.filtering.inequalities import (
     Inequalities,
-    UsualPose,
+    JointPrior,
     couplings_file,
     from_bounds,
     load_couplings,
-    load_usual_pose,
-    say_if_unlimited,
+    load_joint_prior,
     stack,
+    warn_if_unlimited,
 )
 from drake_pose.filtering.state import StateLayout
 from drake_pose.fit.parameters import BodyParameters
@@ -32,107 +32,111 @@ from drake_pose.silhouette.scoring import draw_packed
 Self = TypeVar("Self", bound="BodyState")
 
 ROOT_SHIFT = ("root_shift_x", "root_shift_y", "root_shift_z")
-"""Where the root is in the world, beside where its tree holds it [m]."""
+"""Shift of the root in the world from its place in the pose tree [m]."""
 
 LOG_SCALE = "log_scale"
-"""The logarithm of how much larger the body is seen than a parallel camera's scale says."""
+"""Natural logarithm of the image scale relative to the parallel camera's."""
 
 _ROOT = (*ROOT_SHIFT, LOG_SCALE)
 
 
 class BodyState:
-    """The values of a pose tree that are free to move, as a state, seen by cameras.
+    """The free values of a pose tree as a filter's state, with the cameras that observe them.
 
     Args:
-        moves: whether the root may be elsewhere than where the tree holds it.
-        grows: whether the scale of the one parallel camera is unknown.
-        rest: with so much weight each measurement also says that joints are held as usual.
+        root_moves: whether the root's position in the world is part of the state.
+        scale_unknown: whether the scale of the one parallel camera is part of the state.
+        prior_weight: weight of the joints' prior in each measurement.
 
     Attributes:
-        layout: the state: the tree's values that are free to move, then ROOT_SHIFT and LOG_SCALE,
-            and their rates.
-        usual: how joints are usually held, about the state's moving elements: what the model's
-            couplings file says, and about the middle of their limits, as evenly spread as these are
-            wide, where it says nothing.
+        layout: the tree's free values, then ROOT_SHIFT and LOG_SCALE, and their rates.
+        prior: prior of the joints over the state's moving elements: the model's couplings file, and
+            for other limited joints a normal distribution with the mean and variance of a uniform
+            one between their limits.
 
     Raises:
-        SettingsError: no camera; the tree has no value to estimate; or a scale is unknown and there
-            is not one parallel camera.
+        SettingsError: there is no camera, the tree has no free value, or a scale is unknown and
+            there is not exactly one camera, a parallel one.
     """
 
     def __init__(
         self,
         tree: PoseTree,
         cameras: Sequence[Camera],
-        moves: bool = False,
-        grows: bool = False,
-        rest: float = 0.0,
+        root_moves: bool = False,
+        scale_unknown: bool = False,
+        prior_weight: float = 0.0,
     ) -> None:
         if not cameras:
-            raise SettingsError("a contour needs one camera or more")
-        if grows and (len(cameras) != 1 or not isinstance(cameras[0], ParallelCamera)):
-            raise SettingsError("a scale can be tracked only in one parallel camera's masks")
+            raise SettingsError("a body's state needs one camera or more")
+        if scale_unknown and (len(cameras) != 1 or not isinstance(cameras[0], ParallelCamera)):
+            raise SettingsError("an unknown scale needs exactly one camera, a parallel one")
         self.tree, self.cameras = tree, tuple(cameras)
         self._kinematics = TreeKinematics(tree)
         surfaces = TreeSurfaces(tree)
         self._whole = PackedSurfaces(surfaces)
-        # Few triangles are compared; what is drawn has all of them. Beside bands of skin 160 show
-        # a rigid part to a fraction of a pixel.
+        # Contours are compared with reduced surfaces, silhouettes are drawn with all triangles.
+        # Beside bands of skin 160 triangles show a rigid part to a fraction of a pixel.
         compared = simplify_rigid_parts(surfaces, 160 if surfaces.bends else MANY)
         self._body = BodyParameters(self._kinematics, compared.rigid, surfaces=compared)
         free = self._kinematics.lower < self._kinematics.upper
         names = [n for n, is_free in zip(self._kinematics.names, free, strict=True) if is_free]
-        root = (*(ROOT_SHIFT if moves else ()), *((LOG_SCALE,) if grows else ()))
+        root = (*(ROOT_SHIFT if root_moves else ()), *((LOG_SCALE,) if scale_unknown else ()))
         self.layout = StateLayout((*names, *root), ())
         if not len(self.layout):
-            raise SettingsError(f"{tree.model.path}: all values of its tree are held")
-        self._moves = moves
+            raise SettingsError(f"{tree.model.path}: its pose tree has no free value")
+        self._root_moves = root_moves
         known = [*self._kinematics.names, *_ROOT]
-        self._seen_names = [*self.layout.moving]
-        self._state_index = self.layout.indices(self._seen_names)
-        self._parameter_index = np.array([known.index(name) for name in self._seen_names], np.intp)
+        self._element_names = [*self.layout.moving]
+        self._state_index = self.layout.indices(self._element_names)
+        self._parameter_index = np.array(
+            [known.index(name) for name in self._element_names], np.intp
+        )
         self._values = self._kinematics.flatten(tree.default_values())
         self._known_shift = np.zeros(3)
-        self.usual = self._find_usual()
-        phi, information = self.usual.phi, rest / self.usual.deviation**2
-        self._rest = phi.T @ (information[:, None] * phi), phi.T @ (information * self.usual.mean)
+        self.prior = self._joint_prior()
+        phi, information = self.prior.phi, prior_weight / self.prior.deviation**2
+        self._prior_information = (
+            phi.T @ (information[:, None] * phi),
+            phi.T @ (information * self.prior.mean),
+        )
 
-    def _find_usual(self) -> UsualPose:
+    def _joint_prior(self) -> JointPrior:
         kinematics = self._kinematics
         lower, upper = kinematics.lower, kinematics.upper
         limited = kinematics.is_angle & ~kinematics.turns_around & (lower < upper)
         if self.tree.placements[0].rotation is not None:
-            # How the root is turned is no joint's.
+            # The root's rotation is not a joint.
             limited &= kinematics.value_nodes > 0
-        names, index = self._seen_names, self._parameter_index
+        names, index = self._element_names, self._parameter_index
         file = couplings_file(self.tree.model.path)
-        told = UsualPose(np.zeros((0, len(names))), np.zeros(0), np.zeros(0))
+        listed = JointPrior(np.zeros((0, len(names))), np.zeros(0), np.zeros(0))
         if file.is_file():
-            told = load_usual_pose(file, names)
-        valued = np.flatnonzero((index < len(lower)) & ~told.phi.any(axis=0))
+            listed = load_joint_prior(file, names)
+        valued = np.flatnonzero((index < len(lower)) & ~listed.phi.any(axis=0))
         at = valued[limited[index[valued]]]
         low, high = lower[index[at]], upper[index[at]]
-        return UsualPose(
-            np.vstack([told.phi, np.eye(len(names))[at]]),
-            np.r_[told.mean, 0.5 * (low + high)],
-            np.r_[told.deviation, (high - low) / math.sqrt(12.0)],
+        return JointPrior(
+            np.vstack([listed.phi, np.eye(len(names))[at]]),
+            np.r_[listed.mean, 0.5 * (low + high)],
+            np.r_[listed.deviation, (high - low) / math.sqrt(12.0)],
         )
 
     def is_angle(self, name: str) -> bool:
-        """Whether an element is an angle [rad], else it is a length [m]."""
+        """Return whether an element is an angle [rad]; else it is a length [m] or LOG_SCALE."""
         if name in _ROOT:
             return False
         return bool(self._kinematics.is_angle[self._kinematics.names.index(name)])
 
     def inequalities(self) -> Inequalities:
-        """The limits of all values, and the couplings of the model's file if it has one.
+        """Return the limits of all values, and the inequalities of the model's couplings file.
 
-        Angles that can take every direction have no limits.
+        Angles that turn around have no limits.
 
         Raises:
             ModelError: the couplings file cannot be read.
         """
-        kinematics, names, model = self._kinematics, self._seen_names, self.tree.model
+        kinematics, names, model = self._kinematics, self._element_names, self.tree.model
         lower, upper = (
             np.r_[limits, np.full(len(_ROOT), end)][self._parameter_index]
             for end, limits in ((-np.inf, kinematics.lower), (np.inf, kinematics.upper))
@@ -140,28 +144,28 @@ class BodyState:
         parts = [from_bounds(names, lower, upper)]
         file = couplings_file(model.path)
         if file.is_file():
-            parts.append(load_couplings(file, model.position_names).only_of(names))
-        return say_if_unlimited(stack(parts, names), str(model.path))
+            parts.append(load_couplings(file, model.position_names).restricted_to(names))
+        return warn_if_unlimited(stack(parts, names), str(model.path))
 
     def with_root_position(self: Self, root_position: Array) -> Self:
-        """The same with the root at another known position (3,) in the world [m]."""
+        """Return a copy whose root is at another known position (3,) in the world [m]."""
         other = copy.copy(self)
         other._known_shift = np.asarray(root_position, dtype=np.float64) - self._root(self._values)
         return other
 
     def _root(self, values: Array) -> Array:
-        """(3,) where the tree holds its root [m]."""
+        """Return the position (3,) of the root in the tree [m]."""
         return self._kinematics.poses(values)[0, :3, 3]
 
     def node_values(self, x: Array) -> tuple[Array, ...]:
-        """Each node's values (k_i,) of a state (n,), inside the limits.
+        """Return each node's values (k_i,) at a state (n,), wrapped into the limits.
 
-        The state itself goes on where an angle that can take every direction passes its limits.
+        The state itself is not wrapped where an angle that turns around passes its limits.
         """
         return self._kinematics.split(self._kinematics.within_limits(self._split(x)[0]))
 
     def _split(self, x: Array) -> tuple[Array, Array]:
-        """The tree's values (m,), and the root's shift and growth (4,), of a state (n,)."""
+        """Return the tree's values (m,), and root shift and log scale (4,), of a state (n,)."""
         parameters = np.r_[self._values, np.zeros(len(_ROOT))]
         parameters[self._parameter_index] = x[self._state_index]
         count = len(self._values)
@@ -169,26 +173,26 @@ class BodyState:
         return parameters[:count], parameters[count:]
 
     def scale(self, x: Array) -> float:
-        """So many times the pixels a metre that it was given with the camera has."""
+        """Return the image scale at a state (n,) relative to the camera's."""
         return math.exp(self._split(x)[1][3])
 
     def root_position(self, x: Array) -> Array:
-        """(3,) where the root is in the world, the body in its own size [m]."""
+        """Return the root's position (3,) in the world at a state (n,), body unscaled [m]."""
         values, root = self._split(x)
         p_WR = self._root(values) + root[:3]
         return p_WR if root[3] == 0.0 else slide_root(self._parallel(), p_WR, math.exp(-root[3]))
 
     def _parallel(self) -> ParallelCamera:
-        """The camera whose scale is unknown."""
+        """Return the camera whose scale is unknown."""
         camera = self.cameras[0]
         assert isinstance(camera, ParallelCamera)
         return camera
 
     def positions(self, x: Array) -> tuple[Array, Array]:
-        """The plant's q (nq,) and X_WB (4, 4) of a state (n,), the body in its own size.
+        """Return the plant's q (nq,) and X_WB (4, 4) at a state (n,), for the unscaled body.
 
         Raises:
-            ModelError: the base joints cannot hold the root where it is.
+            ModelError: the base joints cannot reach the root's pose.
         """
         values = self.node_values(x)
         if np.any(self._split(x)[1]):
@@ -196,10 +200,16 @@ class BodyState:
         return self.tree.positions_from(values)
 
     def state(self, q: Array, X_WB: Array | None = None, scale: float = 1.0) -> Array:
-        """(n,) a state at rest of positions (nq,), the plant's world at X_WB (4, 4) and a scale."""
+        """Return a state (n,) at rest.
+
+        Args:
+            q: (nq,) plant positions.
+            X_WB: (4, 4) pose of the plant's world; None: identity.
+            scale: image scale relative to the camera's.
+        """
         values = self._kinematics.flatten(self.tree.values_from_positions(q, X_WB))
         root = np.append(self._known_shift, math.log(scale))
-        if self._moves:
+        if self._root_moves:
             model = self.tree.model
             link = model.link_index(self.tree.nodes[0].name)
             X_BR = PlantKinematics(model).pose_at(link, q)
@@ -210,7 +220,10 @@ class BodyState:
         return self.state_of(np.r_[values, root])
 
     def turned(self, x: Array, rotation: Array) -> Array:
-        """(n,) the state whose root is turned about its origin by (3, 3) in the world.
+        """Return the state (n,) with the root rotated about its own origin.
+
+        Args:
+            rotation: (3, 3) in the world.
 
         Raises:
             SettingsError: the tree's root does not turn freely.
@@ -226,39 +239,46 @@ class BodyState:
         return turned
 
     def prior_distance(self, x: Array) -> float:
-        """The squared Mahalanobis distance of a state (n,) to how joints are usually held."""
-        off = self.usual.phi @ x[self._state_index] - self.usual.mean
-        return float(np.sum((off / self.usual.deviation) ** 2))
+        """Return the squared Mahalanobis distance of a state (n,) from the joints' prior."""
+        off = self.prior.phi @ x[self._state_index] - self.prior.mean
+        return float(np.sum((off / self.prior.deviation) ** 2))
 
-    def continued(self, x: Array, last: Array) -> Array:
-        """The same pose (n,), angles that turn around in the turns nearest to the last state's."""
+    def unwrapped(self, x: Array, last: Array) -> Array:
+        """Return the state (n,) with its periodic angles in the turns nearest to ``last`` (n,)."""
         values = self._split(x)[0]
         turns = self._kinematics.nearest_turns(values, self._split(last)[0]) - values
         turned = x.copy()
         turned[self._state_index] += np.r_[turns, np.zeros(len(_ROOT))][self._parameter_index]
         return turned
 
-    def difference(self, x: Array, seen: Iterable[tuple[Camera, Mask]]) -> tuple[int, int]:
-        """How many pixels differ between a state's body (n,) and masks, and how many these have."""
+    def difference(self, x: Array, views: Iterable[tuple[Camera, Mask]]) -> tuple[int, int]:
+        """Compare the silhouettes of the body at a state with masks.
+
+        Args:
+            views: cameras and masks (H, W).
+
+        Returns:
+            The number of pixels that differ, and the number of mask pixels, over all masks.
+        """
         wrong, area = 0, 0
-        for camera, mask in seen:
+        for camera, mask in views:
             wrong += int(np.count_nonzero(self.draw(x, camera) != mask))
             area += int(np.count_nonzero(mask))
         return wrong, area
 
     def draw(self, x: Array, camera: Camera) -> Mask:
-        """(H, W) what a camera would see of the body at a state (n,)."""
+        """Return the silhouette (H, W) of the body at a state (n,) in a camera."""
         X_WN = self._body.place(self.parameters(x)).X_WN
-        # A band of skin bends by a share of an angle: full turns beyond its limits would show.
+        # A band of skin bends by a fraction of an angle, so that full turns would change it.
         values = self._kinematics.within_limits(self._split(x)[0])
         return draw_packed(self._whole.at(values), camera.X_CW @ X_WN, camera)
 
     def parameters(self, x: Array) -> Array:
-        """The tree's values, the root's shift and the logarithm of growth (m + 4,) of a state."""
+        """Return the parameters (m + 4,) of a state (n,): tree values, root shift and log scale."""
         return np.concatenate(self._split(x))
 
     def state_of(self, parameters: Array) -> Array:
-        """(n,) a state at rest of parameters (m + 4,): the inverse of ``parameters``."""
+        """Return the state (n,) at rest of parameters (m + 4,): the inverse of ``parameters``."""
         held = parameters.copy()
         held[len(self._values) : len(self._values) + 3] -= self._known_shift
         x = np.zeros(len(self.layout))
@@ -266,5 +286,5 @@ class BodyState:
         return x
 
     def node_poses(self, x: Array) -> Array:
-        """X_WN (nodes, 4, 4) at a state (n,), scaled by its growth."""
+        """Return X_WN (nodes, 4, 4) at a state (n,), scaled by its log scale."""
         return self._body.place(self.parameters(x)).X_WN

@@ -1,4 +1,8 @@
-"""The contour of any model in any number of masks, as a measurement of its pose."""
+"""Tracking of a pose tree by its contour in masks and pictures of any number of cameras.
+
+``ContourObservation`` turns a frame into a linear measurement of the state, by comparing the
+model's contour with edges. ``ContourTracker`` feeds these to a ``TruncatedFilter``.
+"""
 
 import math
 from collections.abc import Sequence
@@ -42,16 +46,17 @@ from drake_pose.fit.levenberg_marquardt import AnnealingStage
 
 @dataclass(frozen=True)
 class ContourSettings:
-    """How a contour is measured.
+    """Settings of contour measurements.
 
     Args:
-        spacing: distance between two points of the contour [pixel].
-        deviation: standard deviation of a mask's edge about the body's own contour, at least
+        spacing: distance between two contour points [pixel].
+        deviation: smallest standard deviation of a mask's edge about the body's contour [pixel].
+        correlation: contour length over which errors are correlated; its points count as one
             [pixel].
-        correlation: length of contour whose errors are alike; its points count as one [pixel].
-        reach: distance from the model's contour in which a mask's edge is looked for [pixel].
-        robust_width: deviations at which Geman and McClure's weight has half its influence.
-        negligible: directions with less than this fraction of the largest information are dropped.
+        reach: largest distance between the model's contour and a mask's edge [pixel].
+        robust_width: scale of the Geman-McClure weight [standard deviations].
+        negligible: directions of the state with less than this fraction of the largest information
+            are dropped.
     """
 
     spacing: float = 3.0
@@ -65,15 +70,17 @@ class ContourSettings:
 CONTOUR = ContourSettings()
 
 
-# A pixel of contour has weight one.
+# Weight 1 per pixel of contour.
 _PLAIN = Noise(deviation=1.0, correlation=0.5)
 
 
 class ContourEvidence(NamedTuple):
-    """What a frame shows.
+    """The evidence of a frame.
 
-    views: the edges of masks; pictures: of cameras without a mask, else None; colours: what is
-    known of the body's colours before the frame.
+    Attributes:
+        views: edges of the masks.
+        pictures: by camera, the picture if there is no mask, else None.
+        colours: colour histograms of the body before this frame; None: pictures are not used.
     """
 
     views: Views
@@ -82,51 +89,51 @@ class ContourEvidence(NamedTuple):
 
     @property
     def has_pictures(self) -> bool:
-        """Whether there is one to be compared."""
+        """Whether a picture can be compared."""
         return self.colours is not None and any(one is not None for one in self.pictures)
 
 
 @dataclass(frozen=True, eq=False)
 class ContourMeasurement(LinearObservation):
-    """What masks say of a pose near one state, made for one frame.
+    """The measurement that a frame's contours give, linearised at one state.
 
-    The distances of hundreds of contour points are summed to normal equations, and these are as
-    many numbers with noise 1 as there are directions of the state that they tell something about.
+    The distances of hundreds of contour points are summed to normal equations. Their factorisation
+    gives one scalar measurement with variance 1 for each observable direction of the state.
 
     Attributes:
-        y: (k,) what was measured, 0 at ``at``.
-        share: of the contour that the model shows, what has an edge beside it.
-        distance: root mean square of their distances, robustly weighted [pixel].
-        part_distances: (nodes,) of each part in the pictures [pixel]; 0 where they say too little.
-        compared: the contours, as they were compared at ``at``.
+        y: (k,) measured values; the predicted value at ``at`` is 0.
+        inlier_ratio: fraction of the visible model contour with an edge nearby.
+        distance: robustly weighted root mean square distance of contour and edges [pixel].
+        part_distances: (nodes,) the same by part, in pictures [pixel]; 0 where evidence is too
+            weak.
+        compared: the comparison of the contours at ``at``.
     """
 
     y: Array
-    share: float
+    inlier_ratio: float
     distance: float
     part_distances: Array
     compared: Comparison
 
 
 class ContourObservation(BodyState):
-    """Turns masks and pictures into measurements of a pose tree's values."""
+    """Turns masks and pictures into measurements of a pose tree's state."""
 
-    def look(
+    def gather_evidence(
         self,
         masks: Sequence[Mask | None],
         pictures: Sequence[Picture | None] | None = None,
         colours: Floats | None = None,
     ) -> ContourEvidence:
-        """What a frame shows: the points of masks' edges, found once for all its measurements.
+        """Return the evidence of a frame; edge points are found once for all its measurements.
 
         Args:
-            masks: (H, W) of each camera, in their order; None where there is none.
-            pictures: (H, W, 3 or 4) of each camera; None where there is none. They are compared
-                where there is no mask.
-            colours: what is known of the body's colours; None: nothing, and pictures say nothing.
+            masks: by camera (H, W) or None, in the order of ``cameras``.
+            pictures: by camera (H, W, 3 or 4) or None; used for cameras without a mask.
+            colours: colour histograms of the body; None: pictures are not used.
 
         Raises:
-            SettingsError: masks or pictures that do not fit the cameras.
+            SettingsError: the number or size of masks or pictures does not fit the cameras.
         """
         pictures = [None] * len(masks) if pictures is None else pictures
         for what, given in (("masks", masks), ("pictures", pictures)):
@@ -145,109 +152,112 @@ class ContourObservation(BodyState):
             )
         return ContourEvidence(pack_views(self.cameras, edges), tuple(compared), colours)
 
-    def is_finest(self, number: int) -> bool:
-        """Whether no later measurement of a frame looks at pictures more closely than this one."""
-        return search_line_step(number) == search_line_step(number + 9)
+    def is_finest(self, iteration: int) -> bool:
+        """Return whether search lines in pictures reach their finest spacing at this iteration."""
+        return search_line_step(iteration) == search_line_step(iteration + 9)
 
-    def no_colours(self) -> Floats:
-        """What is known of a body's colours that was never seen."""
+    def uninformed_histograms(self) -> Floats:
+        """Return the colour histograms of a body without observations."""
         return uninformed_histograms(len(self.cameras), len(self._body.outlines))
 
-    def learn(
+    def update_histograms(
         self,
         pictures: Sequence[Picture | None],
         x: Array,
         colours: Floats,
-        surely: bool = False,
-        without: Mask | None = None,
+        pose_is_known: bool = False,
+        excluded_parts: Mask | None = None,
     ) -> Floats:
-        """What is known of the body's colours after a frame.
+        """Return the body's colour histograms updated by a frame.
 
         Args:
-            pictures: of each camera; None where there is none.
-            x: (n,) the state in the frame.
-            surely: whether the pose is known, so that old colours are forgotten.
-            without: (nodes,) parts of which nothing is learned.
+            pictures: by camera (H, W, 3 or 4) or None.
+            x: (n,) the state in this frame.
+            colours: the histograms before this frame.
+            pose_is_known: whether the state is certain, so that the old ones are discarded.
+            excluded_parts: (nodes,) parts whose histograms are kept.
 
         Raises:
-            SettingsError: pictures that do not fit the cameras.
+            SettingsError: a picture does not fit its camera.
         """
         checked = [
             None if picture is None else check_picture(camera, picture)
             for camera, picture in zip(self.cameras, pictures, strict=True)
         ]
         placed = self._body.place(self.parameters(x))
-        known = update_histograms(placed, self.cameras, checked, colours, surely)
-        if without is not None:
-            known[:, without] = colours[:, without]
+        known = update_histograms(placed, self.cameras, checked, colours, pose_is_known)
+        if excluded_parts is not None:
+            known[:, excluded_parts] = colours[:, excluded_parts]
         return known
 
     def measure(
         self,
-        seen: ContourEvidence,
+        evidence: ContourEvidence,
         x: Array,
         distance: float | None = None,
-        number: int = 0,
-        without: Mask | None = None,
+        iteration: int = 0,
+        excluded_parts: Mask | None = None,
     ) -> ContourMeasurement | None:
         """Compare the model's contour at a state with a frame.
 
         Args:
-            distance: about how far they are apart [pixel], of the measurement before; None: as far
-                as is looked.
-            number: how many measurements of the frame were made before: lines in pictures are
-                looked at more closely from one to the next.
-            without: (nodes,) parts of which the pictures say nothing.
+            distance: root mean square distance found by the previous measurement [pixel]; None:
+                edges are searched in the whole reach.
+            iteration: number of measurements of this frame made before; search lines in pictures
+                become finer with it.
+            excluded_parts: (nodes,) parts that are not measured in pictures.
 
         Returns:
-            The measurement; None where no edge is near the contour in any mask or picture.
+            The measurement; None if no edge is near the contour in any mask or picture.
         """
         width = CONTOUR.reach / REACH
         if distance is not None:
             width = min(width, CONTOUR.robust_width * max(CONTOUR.deviation, distance))
-        found = self._compare(seen, x, width, number)
+        found = self._compare(evidence, x, width, iteration)
         if found is None:
             return None
-        shown = np.array([picture is not None for picture in seen.pictures])
-        if without is not None:
-            off = np.ix_(shown, without)
+        shown = np.array([picture is not None for picture in evidence.pictures])
+        if excluded_parts is not None:
+            off = np.ix_(shown, excluded_parts)
             found[0].A[off], found[0].b[off] = 0.0, 0.0
         return self._compress(x, *found, part_distances(found[0].sums[shown]))
 
     def _compare(
-        self, seen: ContourEvidence, x: Array, width: float, number: int
+        self, evidence: ContourEvidence, x: Array, width: float, iteration: int
     ) -> tuple[Comparison, float] | None:
-        """Contours compared with so wide a scale [pixel], and how far they are apart [pixel]."""
+        """Compare the contours with a robust scale [pixel]; also return their distance [pixel]."""
         step = AnnealingStage(width, CONTOUR.spacing)
         placed = self._body.place(self.parameters(x))
-        weights = camera_weights(seen.views.cameras, placed, step, _PLAIN, 1.0)
-        compared = compare_views(seen.views, placed, weights)
-        if seen.colours is not None and seen.has_pictures:
-            pixels = search_line_step(number)
-            # Coarse lines are so wide that they would say the same.
+        weights = camera_weights(evidence.views.cameras, placed, step, _PLAIN, 1.0)
+        compared = compare_views(evidence.views, placed, weights)
+        if evidence.colours is not None and evidence.has_pictures:
+            pixels = search_line_step(iteration)
+            # Coarse search lines are so wide that denser ones would be redundant.
             lines = AnnealingStage(width, LINES.spacing * min(pixels, 2))
             correlation = _PLAIN.correlation * LINES.correlation / CONTOUR.correlation
             noise = replace(_PLAIN, correlation=correlation)
-            add_pictures(compared, self.cameras, seen.pictures, seen.colours, lines, noise, pixels)
-            weigh_parts(compared, CONTOUR.deviation, seen.pictures)
+            add_pictures(
+                compared, self.cameras, evidence.pictures, evidence.colours, lines, noise, pixels
+            )
+            weigh_parts(compared, CONTOUR.deviation, evidence.pictures)
         squares, weight = compared.sums[:, :, [Sum.SQUARES, Sum.WEIGHT]].sum(axis=(0, 1))
         return None if weight <= 0.0 else (compared, math.sqrt(squares / weight))
 
     def _compress(
         self, x: Array, compared: Comparison, distance: float, parts: Array
     ) -> ContourMeasurement:
-        """What the contours say as no more numbers than the state has elements, with noise 1."""
+        """Return the contours' information as at most n independent measurements of variance 1."""
         H, g = normal_equations(compared, len(self._body.names))
         index = self._parameter_index
         scale = max(CONTOUR.deviation, distance)
-        # Both contours say the same: together they count as one.
-        worth = 0.5 / (scale**2 * CONTOUR.correlation)
-        rest_curvature, rest_slope = self._rest
-        slopes = worth * g[index] + rest_curvature @ x[self._state_index] - rest_slope
-        curvature = worth * H[np.ix_(index, index)] + rest_curvature
+        # The two comparisons (model to edge, edge to model) are redundant and count as one.
+        weight = 0.5 / (scale**2 * CONTOUR.correlation)
+        prior_curvature, prior_slope = self._prior_information
+        slopes = weight * g[index] + prior_curvature @ x[self._state_index] - prior_slope
+        curvature = weight * H[np.ix_(index, index)] + prior_curvature
         size, turns = np.linalg.eigh(curvature)
-        told = size > CONTOUR.negligible * max(float(size[-1]), 1e-300)
-        root, turns = np.sqrt(size[told]), turns[:, told]
+        observable = size > CONTOUR.negligible * max(float(size[-1]), 1e-300)
+        root, turns = np.sqrt(size[observable]), turns[:, observable]
         slope = np.zeros((len(root), len(self.layout)))
         slope[:, self._state_index] = root[:, None] * turns.T
         contour = compared.sums[:, :-1].sum(axis=(0, 1))
@@ -259,69 +269,72 @@ class ContourObservation(BodyState):
             y=-(turns.T @ slopes) / root,
             H=slope,
             at=x,
-            share=float(contour[Sum.FITTING] / max(contour[Sum.COMPARED], 1e-9)),
+            inlier_ratio=float(contour[Sum.FITTING] / max(contour[Sum.COMPARED], 1e-9)),
             distance=distance,
             part_distances=parts,
             compared=compared,
         )
 
     def covariance(self, measured: ContourMeasurement, area: float) -> Array:
-        """(m, m) of the tree's values where they were measured, as if the instant stood alone.
+        """Return the covariance (m, m) of the tree's values from one frame's measurement alone.
 
-        Surfaces, masks and cameras err together, see ``fit.covariance``; area: of all silhouettes.
+        Errors of surfaces, masks and cameras are correlated, see ``fit.covariance``.
+
+        Args:
+            area: total area of all silhouettes [pixel].
         """
         unit = error_unit(math.sqrt(area / len(self.cameras)))
         index, size = self._parameter_index, len(self._body.names)
-        is_angle = np.array([self.is_angle(name) for name in self._seen_names])
+        is_angle = np.array([self.is_angle(name) for name in self._element_names])
         moves = measured.compared.placement.dense(size)[:, index]
         cameras = pack_cameras(self.cameras)
-        seen = distances(self._body.outlines, cameras, measured.compared, moves, unit)
-        sizes = estimate_sizes(seen, is_angle)
+        errors = distances(self._body.outlines, cameras, measured.compared, moves, unit)
+        sizes = estimate_sizes(errors, is_angle)
         covariance, count = np.zeros((size, size)), len(self._kinematics.names)
         covariance[np.ix_(index, index)] = values_covariance(
-            seen, sizes, np.arange(len(index)), is_angle
+            errors, sizes, np.arange(len(index)), is_angle
         )
         return covariance[:count, :count]
 
 
 @dataclass(frozen=True)
 class TrackingSettings:
-    """How a body may move, and how its contour is followed.
+    """Settings of a ``ContourTracker`` and of ``MatchAndTrack``.
 
     Args:
-        angle_acceleration: standard deviation of every joint's acceleration [rad/s^2].
-        length_acceleration: of the root's, and of joints that slide [m/s^2].
-        growth_acceleration: of the logarithm of a scale that is unknown [1/s^2].
-        memory: time in which a rate that is not seen fades [s]: a hidden limb comes to rest.
-        rounds: how often the contour is compared anew in each frame; in the first two by masks up
-            to four times as often, as long as the pose changes.
-        root_moves: whether the root may be elsewhere than where the tree holds it.
-        scale_unknown: whether the scale of the one parallel camera is unknown, and may drift.
-        rest_time: in about this time joints that are not seen come to the middle of their limits
-            [s]; it also tells which way they bend where the picture is the same for both. None:
-            they stay where they are.
-        standstill: a frame's pose that changes by less is settled [rad, m].
-        first_rounds: factor of ``rounds`` in the first two frames by masks, whose rates are not
-            known yet.
-        start_angle, start_length, start_growth: standard deviations at the start, of angles [rad],
-            of the root's position and other lengths [m], of the logarithm of an unknown scale.
-        lost_distance: a track is lost whose contour is farther from the masks' edge [pixel].
-        lost_inlier_ratio: a track is lost if a smaller fraction of its contour has an edge near.
-        lost_colour_distance: a part is lost whose contour is farther from a picture's [pixel]:
-            search lines are so short that a wrong pose cannot put them much further off. Such a
-            part teaches no colours.
-        patience: a track that no pose explains is predicted for this time before the best pose
-            that a search finds replaces it [s].
-        search_pause: meanwhile the search is asked once in this time [s].
-        retries: number of frames in which a search that a time limit has ended is asked again.
+        angle_acceleration: standard deviation of the acceleration of joint angles [rad/s^2].
+        length_acceleration: of the root's position and of sliding joints [m/s^2].
+        log_scale_acceleration: of the log scale, if unknown [1/s^2].
+        memory: time constant of the decay of rates [s]; occluded limbs come to rest.
+        rounds: largest number of contour comparisons in a frame.
+        root_moves: whether the root's position in the world is estimated.
+        scale_unknown: whether the scale of the one parallel camera is estimated, and may drift.
+        rest_time: time constant with which unobserved joints return to their prior (the middle of
+            their limits, or that of a couplings file) [s]. It also decides which way joints bend
+            where the silhouette is the same for both. None: no prior.
+        standstill: a frame's iteration ends when the pose changes by less [rad, m].
+        first_rounds: factor on ``rounds`` in the first two frames with masks, when rates are
+            unknown.
+        start_angle, start_length, start_log_scale: standard deviations at the start of angles
+            [rad], of the root's position and other lengths [m], and of the log scale.
+        lost_distance: a track is lost if the distance of its contour from the edges is larger
+            [pixel].
+        lost_inlier_ratio: a track is lost if a smaller fraction of its contour has an edge nearby.
+        lost_colour_distance: a part is lost if the distance of its contour in pictures is larger
+            [pixel]. Search lines are so short that even wrong poses have small distances. The
+            colours of a lost part are not learned.
+        patience: time for which a track without explanation is predicted before the best pose of a
+            search replaces it, however bad [s].
+        search_pause: time between two searches meanwhile [s].
+        retries: number of frames in which a search that reached its time limit is repeated.
 
     Raises:
-        SettingsError: a number that is not positive.
+        SettingsError: a number is not positive.
     """
 
     angle_acceleration: float = 15.0
     length_acceleration: float = 5.0
-    growth_acceleration: float = 0.1
+    log_scale_acceleration: float = 0.1
     memory: float = 0.15
     rounds: int = 4
     root_moves: bool = False
@@ -331,7 +344,7 @@ class TrackingSettings:
     first_rounds: int = 4
     start_angle: float = 0.2
     start_length: float = 0.03
-    start_growth: float = 0.1
+    start_log_scale: float = 0.1
     lost_distance: float = 12.0
     lost_inlier_ratio: float = 0.6
     lost_colour_distance: float = 1.5
@@ -347,13 +360,12 @@ class TrackingSettings:
 
 @dataclass(frozen=True, eq=False)
 class Track:
-    """Where a tracker is after a frame.
+    """The state of a ``ContourTracker`` after a frame.
 
     Attributes:
-        measurement: of the contour at the end; None where no mask was given.
-        lost: whether the contour is far from the masks' edge, or a part's from that which colours
-            show.
-        colours: what is known of the body's colours; None: no picture was seen yet.
+        measurement: of the contour at the final state; None if the frame had no evidence.
+        lost: whether the contour is too far from the edges, or that of a part in pictures.
+        colours: colour histograms of the body; None before the first picture.
     """
 
     state: FilterState
@@ -363,14 +375,13 @@ class Track:
 
 
 class ContourTracker:
-    """Follows a pose tree's values from mask to mask, inside the limits.
+    """Tracks a pose tree's state from frame to frame, inside its limits.
 
     Args:
-        observation: the body and its cameras.
         period: time between two frames [s].
 
     Raises:
-        SettingsError: a period that is not positive.
+        SettingsError: the period is not positive.
     """
 
     def __init__(
@@ -385,7 +396,7 @@ class ContourTracker:
         layout = observation.layout
         scale = {name: period**2 * self.acceleration(name) for name in layout.moving}
         size, none = len(layout), np.zeros(0)
-        # Frames bring their own measurements.
+        # Each frame has its own observation model.
         nothing = LinearObservation((), none, none > 0, np.zeros(size), none, np.zeros((0, size)))
         self.filter = TruncatedFilter(
             layout,
@@ -396,33 +407,33 @@ class ContourTracker:
                 layout.process_noise(scale),
                 None,
             ),
-            # A frame's numbers are not those of the frame before: there are no views to keep.
+            # Measurements of different frames are not comparable, so there are no static views.
             FilterSettings(hypothesis_cap=1, linearisation="tangent", iterations=20),
         )
         self._period = period
 
     def acceleration(self, name: str) -> float:
-        """Of what moves [rad/s^2, m/s^2 or 1/s^2]."""
+        """Return the standard deviation of an element's acceleration [rad/s^2, m/s^2 or 1/s^2]."""
         s = self.settings
         return self._of_kind(
-            name, s.growth_acceleration, s.angle_acceleration, s.length_acceleration
+            name, s.log_scale_acceleration, s.angle_acceleration, s.length_acceleration
         )
 
-    def _of_kind(self, name: str, growth: float, angle: float, length: float) -> float:
-        """One of three numbers: that of what a moving element is."""
+    def _of_kind(self, name: str, log_scale: float, angle: float, length: float) -> float:
+        """Return the one of three numbers that applies to a moving element."""
         if name == LOG_SCALE:
-            return growth
+            return log_scale
         return angle if self.observation.is_angle(name) else length
 
     def start(self, x: Array) -> Track:
-        """Begin at a state (n,), for example the matcher's, as sure of it as the settings say."""
+        """Return the track that starts at a state (n,), with the settings' uncertainty."""
         return Track(self.filter.start(self.start_belief(x)), None, False)
 
     def start_belief(self, x: Array) -> Belief:
-        """What is believed of a state (n,) before inequalities and pictures: what settings say."""
+        """Return the initial belief about a state (n,), before limits and measurements."""
         layout, settings = self.observation.layout, self.settings
-        starts = (settings.start_growth, settings.start_angle, settings.start_length)
-        # What a limb picks up while its rate is remembered.
+        starts = (settings.start_log_scale, settings.start_angle, settings.start_length)
+        # Standard deviation of a rate that accelerates during ``memory``.
         picked_up = self.settings.memory * self._period
         deviations = [
             *(self._of_kind(name, *starts) for name in layout.moving),
@@ -438,19 +449,17 @@ class ContourTracker:
         root_position: Array | None = None,
         pictures: Sequence[Picture | None] | None = None,
     ) -> Track:
-        """The next frame.
+        """Return the track after the next frame.
 
         Args:
-            masks: (H, W) of each camera; None where there is none.
-            first: the frame that the start was made for: nothing has moved since.
-            root_position: (3,) where the root is known to be now, if not where the tree holds it
-                [m].
-            pictures: (H, W, 3 or 4) of each camera; None where there is none. The colours along the
-                contour stand in where there is no mask. What they are is learned from every
-                frame, and at first where the start was.
+            masks: by camera (H, W) or None, in the order of the cameras.
+            first: whether this is the frame that the start was made for, without prediction.
+            root_position: (3,) known position of the root in the world [m]; None: as in the tree.
+            pictures: by camera (H, W, 3 or 4) or None. The colours along the contour are used for
+                cameras without a mask; they are learned from each frame, at first at the start.
 
         Raises:
-            SettingsError: masks or pictures that do not fit the cameras.
+            SettingsError: the number or size of masks or pictures does not fit the cameras.
         """
         observation = self.observation
         if root_position is not None:
@@ -458,29 +467,33 @@ class ContourTracker:
         prediction = track.state if first else self.filter.predict(track.state)
         colours = track.colours
         if pictures is not None and colours is None:
-            colours = observation.no_colours()
+            colours = observation.uninformed_histograms()
             if all(mask is None for mask in masks):
-                colours = observation.learn(pictures, prediction.best.mean, colours, True)
-        seen = observation.look(masks, pictures, colours)
-        state, measurement = self._fit(observation, seen, prediction)
+                colours = observation.update_histograms(
+                    pictures, prediction.best.mean, colours, True
+                )
+        evidence = observation.gather_evidence(masks, pictures, colours)
+        state, measurement = self._fit(observation, evidence, prediction)
         if measurement is None:
             shown = any(one is not None for one in (*masks, *(pictures or ())))
             return Track(state, None, track.lost or shown, colours)
-        astray = self._astray(measurement)
-        if pictures is not None and colours is not None and not astray.all():
-            colours = observation.learn(pictures, state.best.mean, colours, without=astray)
-        if seen.has_pictures and astray.any():
-            state = self._unsure(observation, seen, prediction, state, measurement, astray)
-        return Track(state, measurement, bool(astray.any()), colours)
+        lost_parts = self._lost_parts(measurement)
+        if pictures is not None and colours is not None and not lost_parts.all():
+            colours = observation.update_histograms(
+                pictures, state.best.mean, colours, excluded_parts=lost_parts
+            )
+        if evidence.has_pictures and lost_parts.any():
+            state = self._widened(observation, evidence, prediction, state, measurement, lost_parts)
+        return Track(state, measurement, bool(lost_parts.any()), colours)
 
     def _fit(
-        self, observation: ContourObservation, seen: ContourEvidence, prediction: FilterState
+        self, observation: ContourObservation, evidence: ContourEvidence, prediction: FilterState
     ) -> tuple[FilterState, ContourMeasurement | None]:
-        """A frame's state, and the measurement there; None: the frame says nothing."""
+        """Return a frame's state and the measurement there; None if no edge is near the contour."""
         moving, state = len(observation.layout.moving), prediction
-        measurement = observation.measure(seen, state.best.mean)
+        measurement = observation.measure(evidence, state.best.mean)
         rounds = self.settings.rounds
-        if prediction.step <= 1 and not seen.has_pictures:
+        if prediction.step <= 1 and not evidence.has_pictures:
             rounds *= self.settings.first_rounds
         for k in range(rounds):
             if measurement is None:
@@ -491,41 +504,50 @@ class ContourTracker:
                 k > 0
                 and np.abs((state.best.mean - before)[:moving]).max() < self.settings.standstill
             )
-            # The contour is compared where the state is, or as good as that: lines in pictures are
-            # compared no more often than there are rounds.
-            if seen.has_pictures:
+            # With masks the last comparison is made at the final state. With pictures the number of
+            # comparisons is limited, and the finest search lines must have been reached.
+            if evidence.has_pictures:
                 still = k + 1 == rounds or (still and observation.is_finest(k))
             if still:
                 break
-            measurement = observation.measure(seen, state.best.mean, measurement.distance, k + 1)
+            measurement = observation.measure(
+                evidence, state.best.mean, measurement.distance, k + 1
+            )
         return state, measurement
 
-    def _astray(self, measurement: ContourMeasurement) -> Mask:
-        """(nodes,) parts that are not where pictures show them; all where the whole body is not."""
+    def _lost_parts(self, measurement: ContourMeasurement) -> Mask:
+        """Return which parts (nodes,) are lost in pictures; all if the whole body is lost."""
         whole = measurement.distance > self.settings.lost_distance
-        whole |= measurement.share < self.settings.lost_inlier_ratio
+        whole |= measurement.inlier_ratio < self.settings.lost_inlier_ratio
         return (measurement.part_distances > self.settings.lost_colour_distance) | whole
 
-    def _unsure(
+    def _widened(
         self,
         observation: ContourObservation,
-        seen: ContourEvidence,
+        evidence: ContourEvidence,
         prediction: FilterState,
         state: FilterState,
         measurement: ContourMeasurement,
-        astray: Mask,
+        lost_parts: Mask,
     ) -> FilterState:
-        """Where all lines lead to, as unsure as if those of parts that are astray were not seen.
+        """Return the state with the uncertainty it has without the lost parts' measurements.
 
-        Where more than half of the parts are astray, what is predicted: lines lead anywhere.
+        The shift that lost parts cause is added to the covariance. If more than half of the parts
+        are lost, return the prediction: their search lines are unreliable.
         """
-        found, rest = state.best.mean, None
-        if 2 * np.count_nonzero(astray) > len(astray):
+        found, remaining = state.best.mean, None
+        if 2 * np.count_nonzero(lost_parts) > len(lost_parts):
             return prediction
-        if not astray.all():
+        if not lost_parts.all():
             rounds = self.settings.rounds
-            rest = observation.measure(seen, found, measurement.distance, rounds, astray)
-        expected = prediction if rest is None else self.filter.update(prediction, rest.y, rest)
+            remaining = observation.measure(
+                evidence, found, measurement.distance, rounds, lost_parts
+            )
+        expected = (
+            prediction
+            if remaining is None
+            else self.filter.update(prediction, remaining.y, remaining)
+        )
         moved = found - expected.best.mean
         belief = Belief(found, expected.best.covariance + np.outer(moved, moved))
         return replace(self.filter.start(belief), step=state.step)

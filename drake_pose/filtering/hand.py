@@ -1,7 +1,8 @@
-"""Observing a hand in weak perspective, with the Jacobian: (9) to (13) of Shimada et al.
+"""Observation of a hand in weak perspective, with its Jacobian: (9) to (13) of Shimada et al.
 
-A point p of the palm's frame is seen at wrist + s (M(q) p)_xy, where M = ``|q|^2`` R(q) is a
-polynomial of second degree: the quaternion's squared norm is the scale.
+A point p in the palm's frame has the image wrist + s (M(q) p)_xy, where s is the number of pixels
+per metre, q the palm's quaternion and M(q) = ``|q|^2`` R(q). M is a polynomial of degree two in q,
+and the squared norm of q is the image scale.
 """
 
 import math
@@ -25,7 +26,7 @@ from drake_pose.filtering.hand_model import (
 from drake_pose.filtering.state import Belief
 
 HAND_STATE, MEASURED = TWO_FINGERS.layout, TWO_FINGERS.measured
-"""The two-finger hand's state, and what is measured of it."""
+"""Layout of the two-finger hand's state, and names of its measurements."""
 SPREADS, FLEXIONS, LENGTHS = TWO_FINGERS.spreads, TWO_FINGERS.flexions, TWO_FINGERS.lengths
 
 _QUATERNION, _ANGLES = 2, 6
@@ -36,20 +37,20 @@ class HandObservation:
     """The observation h of (13) for the state ``hand.layout``.
 
     Args:
-        pixels_per_metre: of the image, for scale 1.
-        point_deviation: noise of a joint, a fingertip or the wrist [pixel].
-        angle_deviation, distance_deviation: noise of a line's alpha [rad] and rho [pixel].
-        mirror_slope: (30) holds where a joint's turn moves its segment's end by less than this
-            fraction of what it would move it in the image plane.
-        smallest_change: a mirrored angle that is closer is the same [rad].
-        mirror_reach: mirrored angles farther from the prediction are not tried [deviations].
-        shortest: a segment that is shorter in the picture shows no axis [pixel].
-        scale_deviation: noise of the scale where it is known.
-        rest: number of frames in which how joints are usually held counts as one measurement.
-        hand: which one.
+        pixels_per_metre: of the image at scale 1.
+        point_deviation: standard deviation of a joint, fingertip or the wrist [pixel].
+        angle_deviation, distance_deviation: standard deviation of a line's alpha [rad] and rho
+            [pixel].
+        mirror_slope: (30) holds if a joint's rotation moves its segment's end in the image by less
+            than this fraction of its motion in space.
+        smallest_change: mirrored angles closer to the original are skipped [rad].
+        mirror_reach: mirrored angles farther from the prediction are skipped [standard deviations].
+        shortest: segments shorter in the image have no line [pixel].
+        scale_deviation: standard deviation of a known scale.
+        prior_frames: number of frames in which the joints' prior counts as one measurement.
 
     Raises:
-        SettingsError: a number that is not positive.
+        SettingsError: a number is not positive.
     """
 
     pixels_per_metre: float = 1000.0
@@ -61,7 +62,7 @@ class HandObservation:
     mirror_reach: float = 3.0
     shortest: float = 5.0
     scale_deviation: float = 1e-3
-    rest: float = 30.0
+    prior_frames: float = 30.0
     hand: HandModel = field(default=TWO_FINGERS, repr=False)
 
     def __post_init__(self) -> None:
@@ -71,58 +72,64 @@ class HandObservation:
 
     @cached_property
     def names(self) -> tuple[str, ...]:
-        """What is measured (m)."""
+        """(m) names of the measurements."""
         return self.hand.measured
 
     @cached_property
     def variances(self) -> Array:
-        """(m,) of the noise."""
-        scale, usual = self.names.index("scale"), self.hand.usual
+        """(m,) variances of the measurement noise."""
+        scale, prior = self.names.index("scale"), self.hand.prior
         lines = scale - 2 * len(self.hand.line_ends)
         deviations = np.full(len(self.names), self.point_deviation)
         deviations[lines:scale:2] = self.angle_deviation
         deviations[lines + 1 : scale : 2] = self.distance_deviation
         deviations[scale] = self.scale_deviation
-        if usual is not None:
-            deviations[scale + 1 :] = math.sqrt(self.rest) * usual.deviation
+        if prior is not None:
+            deviations[scale + 1 :] = math.sqrt(self.prior_frames) * prior.deviation
         return deviations**2
 
     @cached_property
     def wraps(self) -> Mask:
-        """(m,) true for the angles."""
+        """(m,) which measurements are angles."""
         return np.array([name.startswith("alpha") for name in self.names])
 
     def predict(self, x: Array) -> tuple[Array, Array]:
-        """Features (m,) of (13) and the scale ``|q|^2``, NaN for short axes; Jacobian (m, n)."""
+        """Return the measurements (m,) of (13), scale ``|q|^2`` and prior; and the Jacobian.
+
+        The Jacobian is (m, n). Lines of short segments are NaN.
+        """
         hand = self.hand
-        h, seen, *_ = self._project(x)
+        h, visible, *_ = self._project(x)
         H = np.zeros((len(self.names), len(x)))
-        H[: len(h), hand.seen] = seen
-        if hand.usual is not None:
-            H[len(h) :, hand.layout.indices(hand.angles)] = hand.usual.phi
+        H[: len(h), hand.visible] = visible
+        if hand.prior is not None:
+            H[len(h) :, hand.layout.indices(hand.angles)] = hand.prior.phi
             h = np.r_[h, H[len(h) :] @ x]
         return h, H
 
     def drawing(self, x: Array) -> Array:
-        """(p, 2) pixels: base, joints, tip of each finger; ends of the palm's four edges."""
+        """Return the drawn points (p, 2) [pixel].
+
+        These are base, joints and tip of each finger, then the ends of the palm's four edges.
+        """
         return np.asarray(self._project(x)[2][:, :2])
 
     def _project(self, x: Array) -> tuple[Array, Array, Array, Array]:
         hand = self.hand
-        return project_hand(x[hand.seen], hand.chains, self.pixels_per_metre, self.shortest)
+        return project_hand(x[hand.visible], hand.chains, self.pixels_per_metre, self.shortest)
 
     def mirrors(self, belief: Belief) -> list[Array]:
-        """Predictions (n,) mirrored at the image plane in one joint, where (30) holds.
+        """Return states (n,) with one joint mirrored at the image plane, where (30) holds.
 
-        A segment that points a little towards the camera looks like one that points as much away
-        from it. Only the angle at its root is changed.
+        A segment that points slightly towards the camera looks like one that points as much away
+        from it. Only the angle at the segment's root changes.
         """
         hand, x, found = self.hand, belief.mean, []
         _, _, points, J = self._project(x)
         flexions = hand.layout.indices(hand.flexions)
         reaches = self.mirror_reach * belief.deviations()[flexions]
         starts, ends = hand.line_ends[: len(flexions)].T
-        own = np.searchsorted(hand.seen, flexions)
+        own = np.searchsorted(hand.visible, flexions)
         a = points[ends] - points[starts]
         b = J[ends, :, own] - J[starts, :, own]
         slopes = np.linalg.norm(b[:, :2], axis=1) / np.maximum(np.linalg.norm(b, axis=1), 1e-9)
@@ -138,10 +145,15 @@ class HandObservation:
 def plant_positions(
     x: Array, names: Sequence[str], pixels_per_metre: float, distance: float | None = None
 ) -> Array:
-    """(nq,) positions of ``urdf/two_finger_hand`` for a state (n,) as in ``HAND_STATE``.
+    """Return positions (nq,) of ``urdf/two_finger_hand`` for a state (n,) with layout HAND_STATE.
 
-    The palm's quaternion is normalised; its position is the wrist's pixel at scale 1, its depth 0:
-    or, before a pinhole so far away on the z axis [m], where its scale and the wrist are seen.
+    Args:
+        x: (n,) the state. Its quaternion is normalised.
+        names: (nq) the plant's positions.
+        pixels_per_metre: of the image at scale 1.
+        distance: None: the palm's position is the wrist's image point at scale 1 and depth 0.
+            Otherwise the distance of a pinhole camera on the z axis [m], in whose image the hand
+            has the state's scale and wrist.
     """
     value = dict(zip(HAND_STATE.names, x, strict=True))
     quaternion = np.array([value[name] for name in QUATERNION])
@@ -158,10 +170,7 @@ def plant_positions(
 
 @compiled
 def scaled_rotation(q: Array) -> tuple[Array, Array]:
-    """The matrix ``|q|^2 R(q)`` (3, 3) of a quaternion (w, x, y, z), and its derivatives (4, 3, 3).
-
-    A polynomial of second degree: the quaternion's squared norm is the scale.
-    """
+    """Return ``|q|^2 R(q)`` (3, 3) of q = (w, x, y, z), and its derivatives (4, 3, 3) by q."""
     w, x, y, z = q
     D = np.empty((4, 3, 3))
     copy_into(D[0], 2 * np.array([[w, -z, y], [z, w, -x], [-y, x, w]]))
@@ -173,10 +182,13 @@ def scaled_rotation(q: Array) -> tuple[Array, Array]:
 
 @compiled
 def _place_finger(x: Array, chains: Chains, finger: int, p: Array, dp: Array) -> None:
-    """The base and all ends of a finger's segments p (k, 3), derivatives (k, 3, n): (9), (10)."""
+    """Compute a finger's base and segment ends p (k, 3) and derivatives dp (k, 3, n): (9), (10).
+
+    p and dp are written in place, in the palm's frame.
+    """
     first, last = chains.firsts[finger], chains.firsts[finger + 1]
-    R, place, point = np.eye(3), np.zeros(3), 0
-    axes, places = np.zeros((last - first, 3)), np.zeros((last - first, 3))
+    R, origin, point = np.eye(3), np.zeros(3), 0
+    axes, origins = np.zeros((last - first, 3)), np.zeros((last - first, 3))
     for s in range(first, last):
         kind, value, own = chains.kinds[s], x[chains.elements[s]], chains.vectors[s]
         v = np.zeros(3)
@@ -184,7 +196,7 @@ def _place_finger(x: Array, chains: Chains, finger: int, p: Array, dp: Array) ->
             for b in range(3):
                 v[a] += R[a, b] * own[b]
         copy_into(axes[s - first], v)
-        copy_into(places[s - first], place)
+        copy_into(origins[s - first], origin)
         if kind == TURN:
             c, i = math.cos(value), math.sin(value)
             for b in range(3):
@@ -197,16 +209,16 @@ def _place_finger(x: Array, chains: Chains, finger: int, p: Array, dp: Array) ->
             continue
         for moved in range(2):
             if moved:
-                place += value * v
+                origin += value * v
             elif point > 0:
                 continue
             if kind != SEGMENT:
                 continue
-            # A point is noted: it depends on all steps up to here.
-            copy_into(p[point], place)
+            # A point depends on all steps up to here.
+            copy_into(p[point], origin)
             for k in range(first, s + moved):
                 e, axis = chains.elements[k], axes[k - first]
-                d0, d1, d2 = place - places[k - first]
+                d0, d1, d2 = origin - origins[k - first]
                 if chains.kinds[k] == TURN:
                     dp[point, 0, e] += axis[1] * d2 - axis[2] * d1
                     dp[point, 1, e] += axis[2] * d0 - axis[0] * d2
@@ -218,21 +230,21 @@ def _place_finger(x: Array, chains: Chains, finger: int, p: Array, dp: Array) ->
 
 @compiled
 def _palm_ends(M: Array, chains: Chains, sizes: Array) -> Array:
-    """(8, 3) ends of the palm's outer edges, PALM_EDGES, as shares of its sizes (3,)."""
+    """Return the ends (8, 3) of PALM_EDGES, the palm's outer edges, as fractions of its sizes."""
     ends = np.zeros((8, 3))
     x, y = M[0, 0], M[1, 0]
-    # Across the palm's axis in the image; the left edge is on the side of positive z.
+    # Across the palm's axis in the image. The left edge is on the side of positive z.
     turned = 1.0 if x * M[1, 2] - y * M[0, 2] >= 0.0 else -1.0
     for k in range(4):
         side = turned if k < 2 else -turned
         best = -np.inf
-        for share in chains.rings[k % 2]:
+        for fraction in chains.rings[k % 2]:
             across = 0.0
             for c in range(3):
-                across += side * (x * M[1, c] - y * M[0, c]) * share[c] * sizes[c]
+                across += side * (x * M[1, c] - y * M[0, c]) * fraction[c] * sizes[c]
             if across > best:
                 best = across
-                copy_into(ends[k], share)
+                copy_into(ends[k], fraction)
     for k in range(2):
         best, sign = -np.inf, 1.0 - 2.0 * k
         for row in chains.rows[k]:
@@ -251,18 +263,17 @@ def _palm_ends(M: Array, chains: Chains, sizes: Array) -> Array:
 def project_hand(
     x: Array, chains: Chains, scale: float, shortest: float
 ) -> tuple[Array, Array, Array, Array]:
-    """All features of the hand.
+    """Project all features of the hand into the image.
 
     Args:
-        x: (n,) what is seen of the state, in the order of ``HandModel.seen``.
-        chains: the hand.
+        x: (n,) the visible part of the state, in the order of ``HandModel.visible``.
         scale: pixels per metre for a quaternion of norm 1.
-        shortest: a line shorter than this in the image has no axis [pixel].
+        shortest: lines shorter in the image are NaN [pixel].
 
     Returns:
-        h (m,) of (13), NaN for lines too short; H (m, n); the points drawn (p, 3), z towards what
-        is beyond the picture, and their derivatives (p, 3, n): base, joints, tip of the fingers,
-        and the ends of the palm's four edges.
+        h (m,) of (13) without the prior; its Jacobian (m, n); the points (p, 3) with z away from
+            the camera: bases, joints and tips of the fingers and ends of the palm's four edges; and
+            their derivatives (p, 3, n).
     """
     n, fingers, lines = len(x), len(chains.firsts) - 1, chains.lines
     M, D = scaled_rotation(x[_QUATERNION:_ANGLES])

@@ -1,6 +1,7 @@
-"""A hand as Shimada et al. see it: a palm, and fingers that are chains of hinges and segments.
+"""Hand models of Shimada et al.: a palm, and fingers that are chains of hinges and segments.
 
-The palm's frame has x towards the fingers, y where they bend to, z across; its origin is the wrist.
+The palm's frame has its origin at the wrist, x towards the fingers, y in the direction in which
+they bend, and z across the palm.
 """
 
 from collections.abc import Mapping, Sequence
@@ -14,28 +15,31 @@ from pydrake.multibody.tree import Joint, RevoluteJoint
 from drake_pose.arrays import Array, Indices
 from drake_pose.body import ArticulatedModel
 from drake_pose.errors import ModelError
-from drake_pose.filtering.inequalities import UsualPose, couplings_file, load_usual_pose
+from drake_pose.filtering.inequalities import JointPrior, couplings_file, load_joint_prior
 from drake_pose.filtering.state import StateLayout
 
 TURN, BASE, SEGMENT = 0, 1, 2
-"""A step along a finger turns what is beyond it, leads to the finger's base, or along a segment."""
+"""Kinds of a step along a finger: a rotation, a translation to its base, or along a segment."""
 
 PALM = ("palm_width", "palm_height", "palm_thickness")
 WRIST = ("wrist_x", "wrist_y")
 QUATERNION = ("palm_qw", "palm_qx", "palm_qy", "palm_qz")
 PALM_EDGES = ("left", "right", "top", "bottom")
 
-# The axes of a hand's palm, y along the fingers and z out of the palm, as those of the state.
+# R_PL: from the palm's link (y along the fingers, z out of the palm) to the palm's frame.
 _FROM_LINK = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])
 
 
 class Chains(NamedTuple):
-    """A hand for the kernel; elements are of what is seen of the state, ``HandModel.seen``.
+    """A hand as arrays for ``project_hand``; elements are indices into ``HandModel.visible``.
 
     Attributes:
-        firsts: (F + 1,) each finger's first step; kinds, elements: (S,), vectors: (S, 3) of steps.
-        rings, rows: as of ``HandModel``; palm: (3,) elements of its height, thickness and width.
-        lines: (L, 2) between which of the points drawn the lines are.
+        firsts: (F + 1,) index of each finger's first step.
+        kinds, elements: (S,) of all steps.
+        vectors: (S, 3) of all steps.
+        rings, rows: see ``HandModel``.
+        palm: (3,) elements of the palm's height, thickness and width.
+        lines: (L, 2) indices of the points that are the lines' ends.
     """
 
     firsts: Indices
@@ -49,12 +53,12 @@ class Chains(NamedTuple):
 
 
 class Step(NamedTuple):
-    """A step outwards along a finger, all joints at 0.
+    """A step from the palm outwards along a finger, with all joints at 0.
 
     Attributes:
-        element: of the state: an angle [rad], a length, or a size of the palm [m].
+        element: name in the state: an angle [rad], a length [m], or a size of the palm [m].
         kind: TURN, BASE or SEGMENT.
-        vector: the axis of a turn, or the way for an element of 1, in the palm's frame.
+        vector: axis of a rotation, or translation per unit of the element, in the palm's frame.
     """
 
     element: str
@@ -64,18 +68,19 @@ class Step(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class HandModel:
-    """A palm that is a convex body, and fingers on it: chains of as many segments each.
+    """A palm that is a convex body, and fingers with the same number of segments each.
 
     Args:
-        fingers: names.
-        steps: of each finger, from the palm's origin to the tip's middle.
-        radii: (F, J + 1) of the fingers at their bases, joints and tips [m].
-        rings: (2, K, 3) the palm's outlines at the wrist and at the fingers, whose convex hull it
-            is, as shares of its height, thickness and width along x, y and z.
-        rows: (2, R, 2, 3) where its far and its near edge may be seen: ends, in such shares.
-        sizes: lengths and the palm's sizes as the model's file says [m].
-        hidden: names of what pictures do not show, among ``measured``.
-        usual: how joints are usually held, over ``angles``; None: nothing is known.
+        fingers: (F) names.
+        steps: of each finger, from the palm's origin to the centre of the fingertip.
+        radii: (F, J + 1) of the fingers at bases, joints and tips [m].
+        rings: (2, K, 3) outlines of the palm at the wrist and at the fingers, as fractions of its
+            height, thickness and width along x, y and z. The palm is their convex hull.
+        rows: (2, R, 2, 3) end points of candidates for its far and its near edge, as such
+            fractions.
+        sizes: lengths and sizes of the palm in the model's file [m].
+        hidden: names among ``measured`` that silhouettes do not show.
+        prior: of the joints, over ``angles``; None: there is none.
     """
 
     fingers: tuple[str, ...]
@@ -85,7 +90,7 @@ class HandModel:
     rows: Array
     sizes: Mapping[str, float]
     hidden: tuple[str, ...] = ()
-    usual: UsualPose | None = None
+    prior: JointPrior | None = None
 
     @cached_property
     def flexions(self) -> tuple[str, ...]:
@@ -99,21 +104,21 @@ class HandModel:
 
     @cached_property
     def lengths(self) -> tuple[str, ...]:
-        """Of the segments, finger by finger."""
+        """The segments' lengths, finger by finger."""
         return tuple(s.element for steps in self.steps for s in steps if s.kind == SEGMENT)
 
     @property
     def angles(self) -> tuple[str, ...]:
-        """All angles."""
+        """All angles: spreads, then flexions."""
         return (*self.spreads, *self.flexions)
 
     @property
     def joints(self) -> range:
-        """Segments of a finger, from 1."""
+        """Numbers of a finger's segments, from 1."""
         return range(1, self.radii.shape[1])
 
     def _turns(self) -> list[list[str]]:
-        """The turns before each segment."""
+        """Return the names of the rotations before each segment."""
         found: list[list[str]] = [[]]
         for step in (step for steps in self.steps for step in steps):
             if step.kind == TURN:
@@ -124,12 +129,15 @@ class HandModel:
 
     @cached_property
     def layout(self) -> StateLayout:
-        """The state (5): wrist in the image [pixel], quaternion, angles; rates; lengths, palm."""
+        """The state (5): wrist [pixel], quaternion, angles; their rates; lengths and palm sizes."""
         return StateLayout((*WRIST, *QUATERNION, *self.angles), (*self.lengths, *PALM))
 
     @cached_property
     def measured(self) -> tuple[str, ...]:
-        """(13): points [pixel]; lines by angle [rad] and distance [pixel]; the scale; the usual."""
+        """The measurements (13).
+
+        Points [pixel]; alpha [rad] and rho [pixel] of lines; scale; prior of the joints.
+        """
         points = [f"{i}{j}" for i in self.fingers for j in (0, *self.joints)]
         lines = [f"{i}{j}" for i in self.fingers for j in self.joints]
         lines += [f"palm_{edge}" for edge in PALM_EDGES]
@@ -138,17 +146,17 @@ class HandModel:
             *(f"point_{point}_{axis}" for point in points for axis in "xy"),
             *(f"{kind}_{line}" for line in lines for kind in ("alpha", "rho")),
             "scale",
-            *(f"usual_{k}" for k in range(0 if self.usual is None else len(self.usual.mean))),
+            *(f"usual_{k}" for k in range(0 if self.prior is None else len(self.prior.mean))),
         )
 
     @cached_property
-    def seen(self) -> Indices:
-        """What the picture depends on, in the state: wrist, quaternion, angles, lengths, palm."""
+    def visible(self) -> Indices:
+        """Indices of the state's elements on which the image depends: all but the rates."""
         return self.layout.indices((*WRIST, *QUATERNION, *self.angles, *self.lengths, *PALM))
 
     @cached_property
     def line_ends(self) -> Indices:
-        """(L, 2) between which of the points drawn the lines are: fingers', then the palm's."""
+        """(L, 2) indices of the lines' end points: the fingers' lines, then the palm's edges."""
         count = len(self.fingers)
         bases = np.arange(count * len(self.joints)) + np.repeat(np.arange(count), len(self.joints))
         starts = np.r_[bases, self.radii.size + np.arange(0, 8, 2)]
@@ -156,7 +164,7 @@ class HandModel:
 
     @cached_property
     def chains(self) -> Chains:
-        """The same as arrays."""
+        """The hand as arrays."""
         names = (*WRIST, *QUATERNION, *self.angles, *self.lengths, *PALM)
         steps = [step for one in self.steps for step in one]
         return Chains(
@@ -172,7 +180,7 @@ class HandModel:
 
 
 def _two_fingers() -> HandModel:
-    """Shimada's hand, figure 5: a box, and two fingers of three segments of one thickness."""
+    """Return the hand of Shimada et al., figure 5: a box, and two fingers of three segments."""
     steps = []
     for i, side in ((1, 0.25), (2, -0.25)):
         own = [
@@ -197,51 +205,54 @@ TWO_FINGERS = _two_fingers()
 
 
 def palm_rotation(R_CL: Array) -> Array:
-    """(3, 3) how the palm's frame is turned, of its link's in a model for ``read_hand``."""
+    """Return R_CP (3, 3) of the palm's frame from R_CL of its link in a model for ``read_hand``."""
     return np.asarray(R_CL @ _FROM_LINK.T)
 
 
 def read_hand(model: ArticulatedModel, palm: str = "palm") -> HandModel:
-    """A hand from a model of one, as ``urdf/hand``: what turns on its palm, and where.
+    """Return the hand of a model such as ``urdf/hand``: the hinges on its palm, and their places.
 
-    The palm's link has its origin at the wrist, y along the fingers, and z out of the palm.
+    Args:
+        model: the model. The palm's link has its origin at the wrist, y along the fingers and z out
+            of the palm.
+        palm: name of the palm's link.
 
     Raises:
-        UnknownNameError: no such link.
-        ModelError: joints on the palm that are no fingers, chains of as many hinges and segments;
-            or a mesh without vertices where a thickness is measured.
+        UnknownNameError: the model has no such link.
+        ModelError: a joint on the palm begins no finger, fingers have different numbers of
+            segments, or a mesh has no vertices where a thickness is measured.
     """
     model.link_index(palm)
     plant, context = model.plant, model.plant.CreateDefaultContext()
-    # No quaternion is zero: a palm that floats stands as by default.
+    # A floating palm keeps its default quaternion, because zero is not a rotation.
     floats = [kind == "quaternion" for kind in model.position_kinds]
     plant.SetPositions(context, np.where(floats, model.default_positions, 0.0))
     X_PW = plant.GetFrameByName(palm).CalcPoseInWorld(context).inverse()
     beyond: dict[str, list[Joint]] = {}
     for joint in map(plant.get_joint, plant.GetJointIndices()):
         beyond.setdefault(joint.parent_body().name(), []).append(joint)
-    chains, places = [], []
+    chains, frames = [], []
     for first in beyond.get(palm, []):
         chain = [first]
         while found := beyond.get(chain[-1].child_body().name()):
             chain += found
-        is_seen = chain[-1].child_body().name() in model.link_meshes
-        if not is_seen or not all(isinstance(joint, RevoluteJoint) for joint in chain):
+        has_mesh = chain[-1].child_body().name() in model.link_meshes
+        if not has_mesh or not all(isinstance(joint, RevoluteJoint) for joint in chain):
             raise ModelError(
-                f"{model.path}: '{first.name()}' on '{palm}' begins no finger, which is a chain of "
-                "hinges whose last link is seen"
+                f"{model.path}: '{first.name()}' on '{palm}' begins no finger: a finger is a chain "
+                "of hinges whose last link has a mesh"
             )
         poses = [X_PW @ j.frame_on_parent().CalcPoseInWorld(context) for j in chain]
         chains.append(chain)
-        places.append([(X.translation(), X.rotation().matrix()) for X in poses])
+        frames.append([(X.translation(), X.rotation().matrix()) for X in poses])
     if not chains or palm not in model.link_meshes:
-        raise ModelError(f"{model.path}: '{palm}' has no fingers, or shows nothing")
+        raise ModelError(f"{model.path}: '{palm}' has no fingers, or no mesh")
     size = np.ptp(model.link_meshes[palm].vertices @ _FROM_LINK.T, axis=0)
-    size[0] = max(float(one[0][0][1]) for one in places)
+    size[0] = max(float(one[0][0][1]) for one in frames)
     sizes = dict(zip(("palm_height", "palm_thickness", "palm_width"), size.tolist(), strict=True))
-    read = [_read_finger(model, *one, size, sizes) for one in zip(chains, places, strict=True)]
+    read = [_read_finger(model, *one, size, sizes) for one in zip(chains, frames, strict=True)]
     if len({len(radii) for _, radii in read}) != 1:
-        raise ModelError(f"{model.path}: the fingers on '{palm}' have not as many segments each")
+        raise ModelError(f"{model.path}: the fingers on '{palm}' differ in the number of segments")
     rings = _palm_rings(model, palm, size[0]) / size
     low, side = rings[0].min(axis=0), 0.8 * np.ptp(rings[0, :, 2]) * np.array([0.5, -0.5])
     depths = 0.5 * np.array([rings[0, :, 1].min(), rings[0, :, 1].max()])
@@ -253,28 +264,35 @@ def read_hand(model: ArticulatedModel, palm: str = "palm") -> HandModel:
         HandModel(names, steps, radii, rings, rows, sizes, hidden),
         couplings_file(model.path),
     )
-    return replace(hand, usual=load_usual_pose(file, hand.angles)) if file.is_file() else hand
+    return replace(hand, prior=load_joint_prior(file, hand.angles)) if file.is_file() else hand
 
 
 def _read_finger(
     model: ArticulatedModel,
     chain: Sequence[Joint],
-    places: Sequence[tuple[Array, Array]],
+    frames: Sequence[tuple[Array, Array]],
     size: Array,
     sizes: dict[str, float],
 ) -> tuple[tuple[Step, ...], list[float]]:
-    """A finger's steps, and its radii [m]; lengths are added to the sizes."""
-    base = _FROM_LINK @ places[0][0] / size
+    """Return a finger's steps and radii [m], and add its lengths to ``sizes``.
+
+    Args:
+        chain: joints of the finger.
+        frames: by joint, origin (3,) and rotation (3, 3) of its parent frame in the palm's link.
+        size: (3,) height, thickness and width of the palm [m].
+        sizes: receives the lengths [m].
+    """
+    base = _FROM_LINK @ frames[0][0] / size
     elements = ("palm_height", "palm_thickness", "palm_width")
     steps = [
         Step(name, BASE, tuple(row)) for name, row in zip(elements, np.diag(base), strict=True)
     ]
     radii, last = [], ""
-    for k, (joint, (place, R)) in enumerate(zip(chain, places, strict=True)):
-        way = place - places[max(k - 1, 0)][0]
-        length = float(np.linalg.norm(way))
+    for k, (joint, (place, R)) in enumerate(zip(chain, frames, strict=True)):
+        offset = place - frames[max(k - 1, 0)][0]
+        length = float(np.linalg.norm(offset))
         if length > 1e-6:
-            steps.append(Step(f"length_{last}", SEGMENT, tuple(_FROM_LINK @ way / length)))
+            steps.append(Step(f"length_{last}", SEGMENT, tuple(_FROM_LINK @ offset / length)))
             sizes[f"length_{last}"] = length
         axis = _FROM_LINK @ R @ joint.revolute_axis()
         steps.append(Step(joint.name(), TURN, tuple(axis)))
@@ -289,14 +307,15 @@ def _read_finger(
 
 
 def _radius(model: ArticulatedModel, link: str, low: float, high: float) -> float:
-    """Half of how wide a link is along its x axis where it lies so far along its y axis [m]."""
+    """Return half of a link's extent along its x axis for low <= y <= high [m]."""
     return 0.5 * float(np.ptp(_band(model, link, low, high)[:, 0]))
 
 
 def _band(model: ArticulatedModel, link: str, low: float, high: float) -> Array:
-    """The vertices (n, 3) of a link that lie so far along its y axis [m].
+    """Return the vertices (n, 3) of a link with low <= y <= high [m].
 
-    Raises ModelError: there is none.
+    Raises:
+        ModelError: there is none.
     """
     vertices = model.link_meshes[link].vertices
     band = vertices[(vertices[:, 1] >= low) & (vertices[:, 1] <= high)]
@@ -317,15 +336,20 @@ def _palm_rings(
     wrist: float = 0.07,
     knuckles: tuple[float, float, float] = (0.78, 0.84, 0.85),
 ) -> Array:
-    """(2, count, 3) a palm's outlines at the wrist and before the knuckles [m].
+    """Return a palm's outlines (2, count, 3) at the wrist and before the knuckles [m].
 
-    Taken from the palm's end to ``wrist``, and between two of ``knuckles`` to stand at the third,
-    all as fractions of its height.
+    Args:
+        palm: name of the palm's link.
+        height: of the palm [m].
+        count: number of points of an outline.
+        wrist: the wrist's outline is that of the vertices up to this height.
+        knuckles: the other outline is that of the vertices between the first two heights, placed at
+            the third. All heights are fractions of ``height``.
     """
     low = float(model.link_meshes[palm].vertices[:, 1].min())
     angles = 2.0 * np.pi * np.arange(count) / count
     directions = np.column_stack([np.cos(angles), np.sin(angles)])
-    bands = ((low, low + wrist * height), [share * height for share in knuckles[:2]])
+    bands = ((low, low + wrist * height), [fraction * height for fraction in knuckles[:2]])
     rings = np.zeros((2, count, 3))
     for ring, (begin, end), x in zip(rings, bands, (low, knuckles[2] * height), strict=True):
         band = _band(model, palm, begin, end) @ _FROM_LINK.T

@@ -1,7 +1,7 @@
-"""The axes of segments in a silhouette, matched to a rough pose.
+"""Measurement of a hand in a silhouette: lines along segments, and fingertips.
 
-Shimada et al., (11), (12) and figure 17: no picture says which part of it shows which segment. A
-rough pose does: each point of the silhouette's edge goes to the side of a segment that is nearest.
+Shimada et al., (11), (12) and figure 17. A silhouette does not say which part of it is which
+segment. A rough pose does: each edge point is assigned to the nearest side of a segment or tip.
 """
 
 import math
@@ -24,24 +24,26 @@ from drake_pose.fit.evidence import EdgePoints, find_edge_points
 
 @dataclass(frozen=True)
 class MatchingSettings:
-    """How edge points are matched to a rough pose's segments.
+    """Settings of the assignment of edge points to the segments of a rough pose.
 
     Args:
         spacing: distance between two edge points [pixel].
-        gates: distance between edge points and a rough side, from match to match [pixel].
-        edge_deviation, correlation: an edge point's standard deviation, and the length of edge
-            whose errors are alike, larger since the next frame errs alike [pixel].
+        gates: largest distance between edge points and a rough side, by iteration [pixel].
+        edge_deviation, correlation: standard deviation of an edge point, and edge length over which
+            errors are correlated, increased because they are also correlated between frames
+            [pixel].
         width_deviation: standard deviation of half a segment's width [pixel].
-        surest_place, surest_angle, surest_tip: least standard deviation of a line's place [pixel]
-            and direction [rad], and of a tip [pixel].
-        largest_angle_deviation, largest_tip_deviation: a line [rad] or a tip [pixel] that is less
-            sure is not measured.
-        facing, facing_tip: least cosine between a point's normal and a side's, or a tip's.
+        min_offset_deviation, min_angle_deviation, min_tip_deviation: smallest standard deviation of
+            a line's offset [pixel] and direction [rad], and of a tip [pixel].
+        max_angle_deviation, max_tip_deviation: a line [rad] or tip [pixel] with a larger standard
+            deviation is not measured.
+        facing, facing_tip: smallest cosine between the normals of an edge point and of a side, or
+            tip.
         end: fraction of a side at each end that is not matched.
-        beside: distance outside a side at which the rough body shows nothing unless the side is
+        beside: distance outside a side at which the rough body must be empty, else the side is
             hidden [pixel].
-        rounds: of the robust fit.
-        shortest: a segment that is shorter in the picture shows no axis [pixel].
+        rounds: iterations of the robust fit.
+        shortest: segments shorter in the image have no line [pixel].
     """
 
     spacing: float = 2.0
@@ -49,11 +51,11 @@ class MatchingSettings:
     edge_deviation: float = 0.35
     correlation: float = 8.0
     width_deviation: float = 0.4
-    surest_place: float = 0.1
-    surest_angle: float = math.radians(0.2)
-    surest_tip: float = 0.15
-    largest_angle_deviation: float = math.radians(10.0)
-    largest_tip_deviation: float = 3.0
+    min_offset_deviation: float = 0.1
+    min_angle_deviation: float = math.radians(0.2)
+    min_tip_deviation: float = 0.15
+    max_angle_deviation: float = math.radians(10.0)
+    max_tip_deviation: float = 3.0
     facing: float = 0.85
     facing_tip: float = 0.7
     end: float = 0.08
@@ -66,14 +68,14 @@ MATCHING = MatchingSettings()
 
 
 class RoughBody(NamedTuple):
-    """What a rough pose shows in one picture [pixel].
+    """The image of a rough pose [pixel].
 
     Attributes:
-        ends: (L, 2, 2) start and end of each segment's axis, or of an edge.
-        widths: (L,) half the width of a segment; 0 for an edge.
-        sides: (L, 2) whether a side may be seen: that of the normal (-y, x), and the other.
-        tips: (T,) the lines that end in a round tip of their width.
-        drawn: (H, W) the body.
+        ends: (L, 2, 2) start and end of each segment's axis, or of a palm edge.
+        widths: (L,) half the width of a segment; 0 for a palm edge.
+        sides: (L, 2) whether a side may be visible: that of the normal (-y, x), and the other.
+        tips: (T,) lines that end in a round tip of their width.
+        drawn: (H, W) the silhouette.
     """
 
     ends: Array
@@ -84,13 +86,14 @@ class RoughBody(NamedTuple):
 
 
 class Axes(NamedTuple):
-    """Lines and tips, NaN where not seen.
+    """Measured lines and tips, NaN where not visible.
 
     Attributes:
-        lines: (L, 2) alpha, the angle from start to end [rad], and rho [pixel]: points (u, v) of a
-            line have rho = v cos(alpha) - u sin(alpha).
+        lines: (L, 2) alpha, the angle from start to end [rad], and rho [pixel]; a line's points (u,
+            v) satisfy rho = v cos(alpha) - u sin(alpha).
         line_covariances: (L, 2, 2).
-        tips: (T, 2) [pixel]; tip_covariances: (T, 2, 2).
+        tips: (T, 2) [pixel].
+        tip_covariances: (T, 2, 2).
     """
 
     lines: Array
@@ -102,11 +105,12 @@ class Axes(NamedTuple):
 def match_axes(
     edge: EdgePoints, rough: RoughBody, gate: float, origin: tuple[float, float] = (0.0, 0.0)
 ) -> Axes:
-    """The axes of segments that a silhouette's edge shows, both sides or one.
+    """Return the segments' axes and tips that a silhouette's edge shows, from both sides or one.
 
     Args:
-        gate: how far from the rough side an edge point may be [pixel].
-        origin: where the picture's point (0, 0) of the lines and tips is [pixel].
+        rough: image of a rough pose.
+        gate: largest distance between an edge point and a rough side [pixel].
+        origin: (2,) image point that is (0, 0) for lines and tips [pixel].
     """
     count = len(rough.ends)
     along = rough.ends[:, 1] - rough.ends[:, 0]
@@ -118,21 +122,23 @@ def match_axes(
     one_sided = (rough.widths > 0) & (sides[:count].min(axis=1) < 0.3 * sides[:count].max(axis=1))
     shift, turn = solution[:count].T
     C = covariance[:count]
-    C[:, 0, 0] += np.where(one_sided, MATCHING.width_deviation**2, 0.0) + MATCHING.surest_place**2
-    C[:, 1, 1] += MATCHING.surest_angle**2
+    C[:, 0, 0] += (
+        np.where(one_sided, MATCHING.width_deviation**2, 0.0) + MATCHING.min_offset_deviation**2
+    )
+    C[:, 1, 1] += MATCHING.min_angle_deviation**2
     middle = rough.ends.mean(axis=1) - origin + shift[:, None] * normal
     alpha = np.arctan2(along[:, 1], along[:, 0]) + np.arctan(turn)
     alpha = np.remainder(alpha + np.pi, 2 * np.pi) - np.pi
     c, s = np.cos(alpha), np.sin(alpha)
     lines = np.column_stack([alpha, c * middle[:, 1] - s * middle[:, 0]])
-    # rho changes with alpha by minus the distance along the axis.
+    # d rho / d alpha is minus the position along the axis.
     J = np.zeros((count, 2, 2))
     J[:, 0, 1], J[:, 1, 0], J[:, 1, 1] = 1.0, 1.0, -(c * middle[:, 0] + s * middle[:, 1])
-    lines[(C[:, 1, 1] > MATCHING.largest_angle_deviation**2) | (size < MATCHING.shortest)] = np.nan
+    lines[(C[:, 1, 1] > MATCHING.max_angle_deviation**2) | (size < MATCHING.shortest)] = np.nan
     tips = rough.ends[rough.tips, 1] - origin + solution[count:]
-    tip_covariances = covariance[count:] + MATCHING.surest_tip**2 * np.eye(2)
+    tip_covariances = covariance[count:] + MATCHING.min_tip_deviation**2 * np.eye(2)
     # The end of a segment that points at the camera may be its joint.
-    unsure = np.linalg.eigvalsh(tip_covariances)[:, 1] > MATCHING.largest_tip_deviation**2
+    unsure = np.linalg.eigvalsh(tip_covariances)[:, 1] > MATCHING.max_tip_deviation**2
     tips[unsure | (size < rough.widths)[rough.tips]] = np.nan
     return Axes(lines, J @ C @ J.transpose(0, 2, 1), tips, tip_covariances)
 
@@ -140,24 +146,25 @@ def match_axes(
 def _match(
     edge: EdgePoints, rough: RoughBody, gate: float, along: Array, normal: Array, size: Array
 ) -> tuple[NDArray[np.intp], NDArray[np.intp], Array, Array, Array]:
-    """Gives each edge point to the visible side or tip that is nearest, within the gate.
+    """Assign each edge point to the nearest visible side or tip within the gate.
 
-    Of the n points that have one: the feature (n,), its side (n,), slope (n, 2) and offset (n,),
-    where offset = slope @ (the feature's two unknowns), and weight (n,).
+    Returns:
+        For the n assigned points: feature (n,), side (n,), slope (n, 2), offset (n,) and weight
+            (n,), where offset = slope @ (the two unknowns of the feature).
     """
     line, side = np.nonzero(rough.sides)
     sign, uv = 1.0 - 2.0 * side, edge.uv
     relative = uv - rough.ends[line, :1]
-    place = np.einsum("cnk,ck->cn", relative, along[line])
+    position = np.einsum("cnk,ck->cn", relative, along[line])
     across = np.einsum("cnk,ck->cn", relative, normal[line])
     outside = sign[:, None] * across - rough.widths[line, None]
     facing = sign[:, None] * (normal[line] @ edge.normals.T)
-    share = place / np.maximum(size[line], 1e-9)[:, None]
+    fraction = position / np.maximum(size[line], 1e-9)[:, None]
     beside = uv + (sign[:, None] * (MATCHING.beside - outside))[..., None] * normal[line, None]
     can = (
         (np.abs(outside) < gate)
         & (facing > MATCHING.facing)
-        & (np.abs(share - 0.5) < 0.5 - MATCHING.end)
+        & (np.abs(fraction - 0.5) < 0.5 - MATCHING.end)
     )
     can &= _is_empty(rough.drawn, beside)
     ends, widths = rough.ends[rough.tips, 1], rough.widths[rough.tips]
@@ -176,7 +183,7 @@ def _match(
     own = nearest[points]
     is_tip = own >= len(line)
     k, t = np.where(is_tip, 0, own), np.where(is_tip, own - len(line), 0)
-    lever = (share[k, points] - 0.5) * size[line[k]]
+    lever = (fraction[k, points] - 0.5) * size[line[k]]
     on_line = np.column_stack([np.ones(len(points)), lever])
     slope = on_line
     offset = sign[k] * outside[k, points]
@@ -189,7 +196,7 @@ def _match(
 
 
 def _is_empty(drawn: NDArray[np.uint8] | Mask, uv: Array) -> Mask:
-    """Whether a picture shows nothing at points (..., 2), the nearest ones inside of it."""
+    """Return whether an image is 0 at points (..., 2), clipped to the image."""
     size = (drawn.shape[1] - 1, drawn.shape[0] - 1)
     u, v = np.moveaxis(np.clip(np.rint(uv).astype(np.intp), 0, size), -1, 0)
     return np.asarray(drawn[v, u] == 0)
@@ -204,7 +211,18 @@ def _solve(
     count: int,
     gate: float,
 ) -> tuple[Array, Array, Array]:
-    """Each feature's unknowns (F, 2), covariance (F, 2, 2), and its sides' weights (F, 2)."""
+    """Fit each feature's two unknowns by iteratively reweighted least squares.
+
+    Args:
+        f, side: (n,) feature and side of each point.
+        g, e: (n, 2) slope and (n,) offset of each point.
+        weight: (n,) of each point.
+        count: number F of features.
+        gate: initial scale of the Geman-McClure weight [pixel].
+
+    Returns:
+        The unknowns (F, 2), their covariances (F, 2, 2), and the weights (F, 2) of both sides.
+    """
 
     def total(values: Array) -> Array:
         return np.asarray(np.bincount(f, values, count), dtype=np.float64)
@@ -212,7 +230,7 @@ def _solve(
     solution = np.zeros((count, 2))
     for k in range(MATCHING.rounds):
         residual = e - np.einsum("nk,nk->n", g, solution[f])
-        # Geman and McClure's weight, of a scale that shrinks to a pixel.
+        # Geman-McClure weight with a scale that shrinks to 2 pixels.
         w = weight / (1.0 + (residual / max(2.0, gate / 3.0**k)) ** 2) ** 2
         N = np.empty((count, 2, 2))
         N[:, 0, 0], N[:, 1, 1] = total(w * g[:, 0] ** 2) + 1e-9, total(w * g[:, 1] ** 2) + 1e-9
@@ -227,7 +245,7 @@ def _solve(
 
 
 def block_covariance(blocks: Array) -> Array:
-    """(2 k, 2 k) with the blocks (k, 2, 2) on the diagonal, else 0."""
+    """Return (2 k, 2 k) with the blocks (k, 2, 2) on its diagonal and 0 elsewhere."""
     count = len(blocks)
     R = np.zeros((count, 2, count, 2))
     R[np.arange(count), :, np.arange(count)] = blocks
@@ -236,25 +254,26 @@ def block_covariance(blocks: Array) -> Array:
 
 @dataclass(frozen=True)
 class HandSearchSettings:
-    """The cross-entropy search for a hand's pose.
+    """Settings of the cross-entropy search for a hand's pose.
 
     Args:
-        searches: at most.
-        poses, elite, rounds: poses of a round, those that the next round is drawn about, rounds.
-        followed: poses whose edges are matched.
+        searches: largest number of searches.
+        poses, elite, rounds: number of poses of a round, of the best ones that define the next
+            round's distribution, and of rounds.
+        tracked: number of poses whose edges are matched.
         wrist_deviation, turn_deviation, angle_deviation, length_deviation: largest standard
             deviations of the first round: wrist [pixel], quaternion, angles [rad], lengths [m].
-        zoom: size of the pictures that are compared, as a multiple of the mask's.
+        zoom: size of the compared images relative to the mask.
         inside, along: standard deviation of a hidden joint or tip across the silhouette's edge, and
             along it [radii].
-        usual_radius: finger's radius for which gates and ``wrist_deviation`` are given [pixel].
+        reference_radius: finger radius for which gates and ``wrist_deviation`` are given [pixel].
     """
 
     searches: int = 3
     poses: int = 120
     elite: int = 15
     rounds: int = 5
-    followed: int = 4
+    tracked: int = 4
     wrist_deviation: float = 8.0
     turn_deviation: float = 0.14
     angle_deviation: float = math.radians(18.0)
@@ -262,19 +281,20 @@ class HandSearchSettings:
     zoom: float = 0.5
     inside: float = 0.5
     along: float = 10.0
-    usual_radius: float = 8.0
+    reference_radius: float = 8.0
 
 
 SEARCH = HandSearchSettings()
 
 
 class HandMeasurement(NamedTuple):
-    """What a silhouette shows of the hand.
+    """The measurement of a hand in a silhouette.
 
     Attributes:
-        y: (m,) as of ``HandObservation``, NaN where hidden; covariance: (m, m) of its noise.
-        rough: (n,) the pose that the edge was matched to.
-        difference: share of the silhouette by which it differs from that pose's.
+        y: (m,) as in ``HandObservation``, NaN where hidden.
+        covariance: (m, m) of its noise.
+        rough: (n,) the pose to which the edge was matched.
+        difference: area in which the silhouette differs from this pose's, as a fraction of its own.
     """
 
     y: Array
@@ -285,16 +305,18 @@ class HandMeasurement(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class HandSilhouette:
-    """Measures the hand in a silhouette, of which nothing says which part it is: figure 17.
+    """Measures a hand in an unlabelled silhouette: figure 17.
 
-    A rough pose, the prediction corrected by what it matches, says which points of the edge show
-    which segment; where its own silhouette is another, poses around the prediction are searched.
+    A rough pose (the prediction, corrected by the measurements it leads to) assigns edge points to
+    segments. If its silhouette differs too much, poses around the prediction are searched.
 
     Args:
-        belief_filter: of a ``HandObservation`` and its hand's state.
-        width, height: of the picture; center: (2,) where the state has its origin [pixel].
-        well_matched: a rough pose whose silhouette differs by more of it is searched for.
-        unmatched: one that differs by more says nothing: nothing is measured.
+        belief_filter: a filter of a ``HandObservation`` and its hand's state.
+        width, height: of the image [pixel].
+        center: (2,) image point that is the origin of the state [pixel].
+        well_matched: largest difference of a rough pose without search, as a fraction of the
+            silhouette.
+        unmatched: largest difference of a rough pose at which anything is measured.
     """
 
     belief_filter: TruncatedFilter
@@ -305,10 +327,13 @@ class HandSilhouette:
     unmatched: float = 0.25
 
     def draw(self, x: Array, zoom: float = 1.0) -> NDArray[np.uint8]:
-        """(zoom H, zoom W) 1 where the hand of a state (n,) is seen: a hull, and round rods."""
+        """Return the silhouette (zoom H, zoom W) of the hand at a state (n,): 1 inside, else 0.
+
+        The palm is a convex hull, fingers are rods with round ends.
+        """
         picture = np.zeros((round(zoom * self.height), round(zoom * self.width)), dtype=np.uint8)
         palm, points, radii = self._outline(x)
-        # OpenCV takes sixteenths of pixels, and draws a quarter of a pixel more.
+        # OpenCV takes sixteenths of pixels, and draws a quarter of a pixel too much.
         palm, points = (16 * (zoom * (uv + 0.5) - 0.5) for uv in (palm, points))
         # A round end is a polygon.
         angles = np.arange(24) * (np.pi / 12.0)
@@ -324,10 +349,14 @@ class HandSilhouette:
     def measure(
         self, mask: Mask, prediction: Belief, scale: float | None = None
     ) -> HandMeasurement:
-        """Measure lines and tips in a silhouette (H, W), beside a prediction; scale: if known.
+        """Measure lines and tips in a silhouette, near a prediction.
+
+        Args:
+            mask: (H, W).
+            scale: known image scale; None: unknown.
 
         Raises:
-            MaskError: a mask of another size.
+            MaskError: the mask has another size.
         """
         if mask.shape != (self.height, self.width):
             raise MaskError(
@@ -350,7 +379,7 @@ class HandSilhouette:
         return found
 
     def _outline(self, x: Array) -> tuple[Array, Array, Array]:
-        """The palm (2 K, 2), what is drawn (p, 2), the fingers' radii (F, J + 1), as seen."""
+        """Return palm (2 K, 2), points (p, 2) and fingers' radii (F, J + 1) in the image."""
         observation, hand = self._observation, self._hand
         width, height, thickness = x[hand.layout.indices(PALM)]
         quaternion, center = x[hand.layout.indices(QUATERNION)], np.array(self.center)
@@ -372,11 +401,11 @@ class HandSilhouette:
 
     @property
     def _unit(self) -> float:
-        """The thickness of fingers, over that which the widths of searches are made for."""
+        """Ratio of the fingers' mean radius to ``reference_radius``."""
         return (
             float(np.mean(self._hand.radii))
             * self._observation.pixels_per_metre
-            / SEARCH.usual_radius
+            / SEARCH.reference_radius
         )
 
     def _rough(self, x: Array) -> RoughBody:
@@ -400,9 +429,9 @@ class HandSilhouette:
         gates: Sequence[float],
         scale: float | None,
     ) -> HandMeasurement:
-        """Measure beside a rough state (n,), which what is measured corrects, again and again."""
+        """Measure near a rough state (n,), which each gate's measurements correct."""
         observation, names = self._observation, self._observation.names
-        at, usual = names.index("scale"), self._hand.usual
+        at, prior = names.index("scale"), self._hand.prior
         lines = slice(at - 2 * len(self._hand.line_ends), at)
         tips = [
             [names.index(f"point_{i}{self._hand.joints[-1]}_{axis}") for axis in "xy"]
@@ -415,17 +444,19 @@ class HandSilhouette:
             for rows, tip, covariance in zip(tips, axes.tips, axes.tip_covariances, strict=True):
                 y[rows], R[np.ix_(rows, rows)] = tip, covariance
             y[[names.index(name) for name in self._hand.hidden]] = np.nan
-            self._draw_in(x, mask, edge, y, R)
+            self._add_hidden_points(x, mask, edge, y, R)
             y[at] = math.nan if scale is None else scale
-            if usual is not None:
-                y[at + 1 :] = usual.mean
+            if prior is not None:
+                y[at + 1 :] = prior.mean
             if k < len(gates) - 1:
                 x = self.belief_filter.corrected(prediction, y, R, x)
         wrong = np.count_nonzero(self.draw(x) != mask)
         return HandMeasurement(y, R, x, wrong / np.count_nonzero(mask))
 
-    def _draw_in(self, x: Array, mask: Mask, edge: EdgePoints, y: Array, R: Array) -> None:
-        """Adds that a finger's joints and tips which are not measured lie in the silhouette."""
+    def _add_hidden_points(
+        self, x: Array, mask: Mask, edge: EdgePoints, y: Array, R: Array
+    ) -> None:
+        """Add measurements to y and R that keep hidden joints and tips inside the silhouette."""
         _, points, radii = self._outline(x)
         for k, (point, radius) in enumerate(zip(points, radii.ravel(), strict=False)):
             rows = slice(2 + 2 * k, 4 + 2 * k)
@@ -435,19 +466,19 @@ class HandSilhouette:
             nearest = edge.uv[np.argmin(np.sum((edge.uv - point) ** 2, axis=1))]
             away = (point - nearest) / max(float(np.linalg.norm(point - nearest)), 1.0)
             y[rows] = nearest - 0.5 * radius * away - self.center
-            # Nothing is known of where along the edge.
+            # The position along the edge is unknown.
             along = SEARCH.along**2 * np.eye(2) + (SEARCH.inside**2 - SEARCH.along**2) * np.outer(
                 away, away
             )
             R[rows, rows] = radius**2 * along
 
     def _search(self, mask: Mask, prediction: Belief, seed: int) -> Array:
-        """(k, n) poses around a prediction whose silhouettes are the most alike: cross-entropy."""
+        """Return poses (k, n) near a prediction with the best silhouettes: cross-entropy search."""
         size = (round(SEARCH.zoom * self.width), round(SEARCH.zoom * self.height))
         small = cv2.resize(mask.view(np.uint8), size, interpolation=cv2.INTER_NEAREST)
         generator, mean = np.random.default_rng(seed), prediction.mean
         rows = self.belief_filter.inequalities
-        seen, hand = self._hand.seen, self._hand
+        visible, hand = self._hand.visible, self._hand
         turn = hand.layout.indices(QUATERNION)
         widest = np.repeat(
             (
@@ -458,12 +489,14 @@ class HandSilhouette:
             ),
             (2, 4, len(hand.angles), len(hand.layout.constant)),
         )
-        narrowed = np.minimum(1.0, widest / np.maximum(prediction.deviations()[seen], 1e-12))
-        P = prediction.covariance[np.ix_(seen, seen)] * np.outer(narrowed, narrowed)
+        narrowed = np.minimum(1.0, widest / np.maximum(prediction.deviations()[visible], 1e-12))
+        P = prediction.covariance[np.ix_(visible, visible)] * np.outer(narrowed, narrowed)
         spread, elite = np.sqrt(np.diag(P)), mean[None]
         for k in range(SEARCH.rounds):
             poses = np.tile(mean, (SEARCH.poses, 1))
-            poses[:, seen] += generator.normal(size=(SEARCH.poses, len(seen))) @ factor_of(P).T
+            poses[:, visible] += (
+                generator.normal(size=(SEARCH.poses, len(visible))) @ factor_of(P).T
+            )
             poses[: len(elite)] = elite
             norms = np.linalg.norm(poses[:, turn], axis=1, keepdims=True)
             poses[:, turn] *= np.linalg.norm(prediction.mean[turn]) / norms
@@ -473,6 +506,6 @@ class HandSilhouette:
             wrong = [np.count_nonzero(self.draw(x, SEARCH.zoom) != small) for x in poses]
             elite = poses[np.argsort(wrong)[: SEARCH.elite]]
             mean = elite.mean(axis=0)
-            off = (elite - mean)[:, seen]
+            off = (elite - mean)[:, visible]
             P = off.T @ off / len(off) + np.diag((0.15 * spread) ** 2) * 0.5**k
-        return elite[: SEARCH.followed]
+        return elite[: SEARCH.tracked]

@@ -1,4 +1,8 @@
-"""Linear inequalities phi^T x <= b on a state, each with a name: (14) to (18) of Shimada et al."""
+"""Named linear inequalities phi^T x <= b on a state: (14) to (18) of Shimada et al.
+
+They come from joint limits and from a couplings file beside the model, which can also hold a prior
+of the joints.
+"""
 
 import math
 import warnings
@@ -19,13 +23,12 @@ from drake_pose.errors import ModelError, SettingsError, UnknownNameError
 
 @dataclass(frozen=True, eq=False)
 class Inequalities:
-    """A stack of rows phi_k^T x <= b_k (18).
+    """Inequalities phi_k^T x <= b_k, k = 1 ... K: (18).
 
     Attributes:
-        columns: (n) the names of the elements of x.
-        rows: (K) what each row says, for messages and logs.
-        phi: (K, n) the rows, read-only.
-        b: (K,) the bounds, read-only.
+        rows: (K) text of each inequality, for messages and logs.
+        phi: (K, n), read-only.
+        b: (K,) bounds, read-only.
     """
 
     columns: tuple[str, ...]
@@ -37,20 +40,20 @@ class Inequalities:
         return len(self.rows)
 
     def margins(self, x: ArrayLike) -> Array:
-        """(K,) b - phi x: how far x (n,) is from each bound, negative where it is beyond."""
+        """Return b - phi x (K,) at x (n,): negative where an inequality is violated."""
         return self.b - self.phi @ np.asarray(x, dtype=np.float64)
 
     def take(self, indices: Iterable[int]) -> "Inequalities":
-        """The rows of these indices, in that order."""
+        """Return the inequalities of these indices, in this order."""
         chosen = list(indices)
         rows = [self.rows[index] for index in chosen]
         return make_inequalities(self.columns, rows, self.phi[chosen], self.b[chosen])
 
     def for_columns(self, columns: Sequence[str]) -> "Inequalities":
-        """The same rows for a state with these elements, for example one with rates too.
+        """Return the same inequalities over other columns, for example with rates added.
 
         Raises:
-            UnknownNameError: a row uses an element that is not there.
+            UnknownNameError: an inequality uses an element that is not among the columns.
         """
         known = list(columns)
         phi = np.zeros((len(self), len(known)))
@@ -62,8 +65,8 @@ class Inequalities:
                 raise UnknownNameError("element", name, known, f"the state (row '{row}')")
         return make_inequalities(known, self.rows, phi, self.b)
 
-    def only_of(self, columns: Sequence[str]) -> "Inequalities":
-        """The rows that use none but these elements, for a state that has these."""
+    def restricted_to(self, columns: Sequence[str]) -> "Inequalities":
+        """Return the inequalities that use only elements among ``columns``, over these columns."""
         absent = [i for i, name in enumerate(self.columns) if name not in columns]
         kept = np.flatnonzero(~self.phi[:, absent].any(axis=1))
         rows = tuple(self.rows[k] for k in kept)
@@ -73,22 +76,22 @@ class Inequalities:
 def make_inequalities(
     columns: Sequence[str], rows: Sequence[str], phi: ArrayLike, b: ArrayLike
 ) -> Inequalities:
-    """Inequalities from columns (n), names of rows (K), phi (K, n) and bounds (K,).
+    """Return checked inequalities from columns (n), row texts (K), phi (K, n) and bounds (K,).
 
     Raises:
-        SettingsError: sizes that do not fit, a number that is not finite, or a row of zeros.
+        SettingsError: the sizes do not fit, a number is not finite, or a row of phi is zero.
     """
     matrix = np.array(phi, dtype=np.float64).reshape(-1, len(columns))
     bounds = np.array(b, dtype=np.float64).ravel()
     if not len(rows) == len(matrix) == len(bounds):
         raise SettingsError(
-            f"{len(rows)} names, {len(matrix)} rows and {len(bounds)} bounds: give one of each"
+            f"{len(rows)} names, {len(matrix)} rows and {len(bounds)} bounds: give as many of each"
         )
     for name, row, bound in zip(rows, matrix, bounds, strict=True):
         if not (np.isfinite(row).all() and np.isfinite(bound)):
-            raise SettingsError(f"inequality '{name}': a number is not finite; leave the row out")
+            raise SettingsError(f"inequality '{name}': a number is not finite; leave it out")
         if not row.any():
-            raise SettingsError(f"inequality '{name}': all factors are zero; leave the row out")
+            raise SettingsError(f"inequality '{name}': all coefficients are zero; leave it out")
     matrix.setflags(write=False)
     bounds.setflags(write=False)
     return Inequalities(tuple(columns), tuple(rows), matrix, bounds)
@@ -101,15 +104,17 @@ def two_sided(
     lower: float,
     upper: float,
 ) -> Inequalities:
-    """Bounds lower <= phi^T x <= upper as two rows, or as one where the other bound is infinite.
+    """Return lower <= phi^T x <= upper as two inequalities; infinite bounds are left out.
+
+    Args:
+        name: begins the text of the rows.
 
     Raises:
-        SettingsError: the bounds are crossed or NaN, or phi is zero.
+        SettingsError: lower > upper, a bound is NaN, or phi is zero.
     """
     if np.isnan(lower) or np.isnan(upper) or lower > upper:
         raise SettingsError(
-            f"inequality '{name}': lower bound {lower:g} and upper bound {upper:g} are crossed; "
-            "give the lower one first"
+            f"inequality '{name}': the lower bound {lower:g} must not exceed the upper {upper:g}"
         )
     row = np.asarray(phi, dtype=np.float64)
     sides = []
@@ -126,10 +131,10 @@ def two_sided(
 
 
 def stack(parts: Sequence[Inequalities], columns: Sequence[str] | None = None) -> Inequalities:
-    """All rows of several sets, over the union of their columns or those given.
+    """Return all rows of several sets, over the union of their columns or over ``columns``.
 
     Raises:
-        UnknownNameError: a row uses an element that is not among the given columns.
+        UnknownNameError: a row uses an element that is not among ``columns``.
     """
     union = dict.fromkeys(name for part in parts for name in part.columns)
     names = list(union if columns is None else columns)
@@ -145,10 +150,15 @@ def stack(parts: Sequence[Inequalities], columns: Sequence[str] | None = None) -
 def from_bounds(
     names: Sequence[str], lower: ArrayLike, upper: ArrayLike, columns: Sequence[str] | None = None
 ) -> Inequalities:
-    """Bounds lower <= x <= upper, element by element; infinite bounds make no row.
+    """Return lower <= x <= upper for each named element; infinite bounds are left out.
+
+    Args:
+        names: (k) elements with bounds.
+        lower, upper: (k,) bounds.
+        columns: elements of the state; ``names`` if not given.
 
     Raises:
-        SettingsError: bounds are crossed.
+        SettingsError: a lower bound exceeds its upper bound.
         UnknownNameError: a name is not among the columns.
     """
     low, high = np.asarray(lower, dtype=np.float64), np.asarray(upper, dtype=np.float64)
@@ -161,10 +171,10 @@ def from_bounds(
 
 
 def from_model(model: ParsedModel) -> Inequalities:
-    """Every finite position limit of a model [rad or m]: (14), and with shape joints (16).
+    """Return the finite position limits of a model [rad or m]: (14), and (16) for shape joints.
 
-    A joint that turns freely has no limit to give, nor one whose limits meet after a full turn. A
-    model without any limit gives an empty set.
+    Joints that turn freely, or whose limits span exactly a full turn, have no limits. The set may
+    be empty.
     """
     meet = np.abs(model.upper - model.lower - 2.0 * np.pi) < 1e-9
     full_turn = model.turns_freely | (model.periodic & meet)
@@ -173,17 +183,19 @@ def from_model(model: ParsedModel) -> Inequalities:
     return from_bounds(model.position_names, lower, upper)
 
 
-def say_if_unlimited(inequalities: Inequalities, where: str) -> Inequalities:
-    """The same; a warning where there are none, which is allowed: nothing is truncated then."""
+def warn_if_unlimited(inequalities: Inequalities, where: str) -> Inequalities:
+    """Return the inequalities unchanged; warn (UserWarning) if there are none."""
     if not len(inequalities):
         warnings.warn(
-            f"{where}: no joint has a limit; nothing will be truncated", UserWarning, stacklevel=3
+            f"{where}: no joint has a limit, so that nothing is truncated",
+            UserWarning,
+            stacklevel=3,
         )
     return inequalities
 
 
 def row_from_terms(columns: Sequence[str], terms: Mapping[str, float], where: str) -> NDArray:
-    """(n,) the factors of a row given by names.
+    """Return the coefficients (n,) of a row from a mapping of names to coefficients.
 
     Raises:
         UnknownNameError: a name is not among the columns.
@@ -197,14 +209,14 @@ def row_from_terms(columns: Sequence[str], terms: Mapping[str, float], where: st
 
 
 def inner_point(inequalities: Inequalities) -> Array:
-    """(n,) a point inside all rows, far from each if that is possible.
+    """Return a point (n,) that satisfies all inequalities, if possible far from each bound.
 
-    The linear program that finds the largest ball inside; where there is none its dual names the
-    rows that clash.
+    It is the centre of the largest ball inside the rows (at most of radius 1), by a linear program.
+    If there is none, the program's dual names the rows that exclude each other.
 
     Raises:
-        SettingsError: no point satisfies all rows with room to spare; the message names the rows
-            that exclude each other.
+        SettingsError: no point lies strictly inside all rows; the message names the conflicting
+            rows.
     """
     count, n = inequalities.phi.shape
     if count == 0:
@@ -215,19 +227,18 @@ def inner_point(inequalities: Inequalities) -> Array:
         c=np.r_[np.zeros(n), -1.0],
         A_ub=np.c_[unit_phi, np.ones(count)],
         b_ub=unit_b,
-        # A radius above 1 buys nothing and may be unbounded.
+        # Without a limit the radius may be unbounded.
         bounds=[(None, None)] * n + [(None, 1.0)],
         method="highs",
     )
     if solution.x is None:
         raise SettingsError(f"the inequalities cannot be checked: {solution.message}")
     radius = float(solution.x[-1])
-    # Rows are scaled to unit length, so a radius is a length in the space of states.
     if radius > 1e-12 * max(1.0, float(np.abs(unit_b).max())):
         return solution.x[:n]
     weights = np.abs(solution.ineqlin.marginals)
     clashing = [inequalities.rows[i] for i in np.flatnonzero(weights > 1e-9)]
-    verb = "exclude each other" if radius < 0 else "leave no room between them"
+    verb = "exclude each other" if radius < 0 else "leave no interior"
     raise SettingsError(
         f"the inequalities {verb}: {'; '.join(clashing)}. Loosen or remove one of them"
     )
@@ -238,11 +249,14 @@ _UNITS = {"": 1.0, "rad": 1.0, "m": 1.0, "deg": math.pi / 180.0, "mm": 1e-3}
 
 @dataclass
 class Difference:
-    """``lower <= first - second <= upper`` or ``|first - second| <= within``.
+    """An entry of ``differences``: bounds of first - second.
+
+    Either ``|first - second| <= within`` or ``lower <= first - second <= upper``.
 
     Attributes:
-        within, lower, upper: bounds in ``unit``; what is not given does not bound.
-        unit: "deg", "mm", "rad", "m", or nothing (the model's own, rad or m).
+        first, second: names of two joints.
+        within, lower, upper: bounds in ``unit``; infinite where not given.
+        unit: "deg", "mm", "rad", "m", or "" (the model's own, rad or m).
     """
 
     first: str = ""
@@ -255,11 +269,12 @@ class Difference:
 
 @dataclass
 class GeneralRow:
-    """lower <= sum of factor x joint <= upper.
+    """An entry of ``rows``: lower <= sum of coefficient x joint <= upper.
 
     Attributes:
-        terms: a factor for each joint.
-        lower, upper: bounds in ``unit``; what is not given does not bound.
+        name: begins the text of the inequality.
+        terms: coefficient by joint.
+        lower, upper: bounds in ``unit``; infinite where not given.
         unit: as in ``Difference``.
     """
 
@@ -271,12 +286,13 @@ class GeneralRow:
 
 
 @dataclass
-class UsualRow:
-    """The sum of factor x joint is usually about mean.
+class PriorRow:
+    """An entry of ``usual``: the sum of coefficient x joint is normally distributed.
 
     Attributes:
-        terms: a factor for each joint.
-        mean, deviation: its mean and standard deviation in ``unit``.
+        name: for messages.
+        terms: coefficient by joint.
+        mean, deviation: mean and standard deviation in ``unit``.
         unit: as in ``Difference``.
     """
 
@@ -289,16 +305,16 @@ class UsualRow:
 
 @dataclass
 class Couplings:
-    """The content of a couplings file."""
+    """The schema of a couplings file."""
 
     differences: list[Difference] = field(default_factory=list)
     rows: list[GeneralRow] = field(default_factory=list)
-    usual: list[UsualRow] = field(default_factory=list)
+    usual: list[PriorRow] = field(default_factory=list)
 
 
 @dataclass(frozen=True, eq=False)
-class UsualPose:
-    """How a body is usually held: phi (k, n) times a state x is normal, mean and deviation (k,)."""
+class JointPrior:
+    """A normal prior of a state x: phi (k, n) x has mean (k,) and standard deviation (k,)."""
 
     phi: Array
     mean: Array
@@ -306,19 +322,22 @@ class UsualPose:
 
 
 def load_couplings(path: Path | str, columns: Sequence[str]) -> Inequalities:
-    """Read the couplings of a YAML file.
+    """Read the inequalities of a couplings file (YAML).
 
     The file has a list ``differences`` (fields of ``Difference``), a list ``rows`` (fields of
-    ``GeneralRow``), or both; and it may have a list ``usual``, see ``load_usual_pose``::
+    ``GeneralRow``), or both; a list ``usual`` is read by ``load_joint_prior``::
 
         differences:
           - {first: flexion_12, second: flexion_13, within: 10, unit: deg}
         rows:
           - {name: curl, terms: {flexion_11: 1, flexion_12: 1}, upper: 150, unit: deg}
 
+    Args:
+        columns: (n) names of the state's elements.
+
     Raises:
-        ModelError: the file cannot be read; the message names it and what is wrong.
-        UnknownNameError: a row names a joint that does not exist.
+        ModelError: the file cannot be read or an entry is invalid.
+        UnknownNameError: an entry names an unknown joint.
     """
     file = Path(path)
     content = _read(file)
@@ -339,7 +358,7 @@ def load_couplings(path: Path | str, columns: Sequence[str]) -> Inequalities:
 
 
 def _difference(one: Difference, file: str) -> tuple[str, GeneralRow]:
-    """A difference as a general row, and where it stands."""
+    """Return the place of a difference for messages, and the difference as a general row."""
     name = f"{one.first} - {one.second}"
     where = f"{file}'{name}'"
     if one.first == one.second:
@@ -352,18 +371,18 @@ def _difference(one: Difference, file: str) -> tuple[str, GeneralRow]:
     return where, GeneralRow(name, {one.first: 1.0, one.second: -1.0}, lower, upper, one.unit)
 
 
-def load_usual_pose(path: Path | str, columns: Sequence[str]) -> UsualPose:
-    """Read how a body is usually held from its couplings file.
+def load_joint_prior(path: Path | str, columns: Sequence[str]) -> JointPrior:
+    """Read the joints' prior from a couplings file.
 
-    The file may have a list ``usual`` (fields of ``UsualRow``)::
+    The file may have a list ``usual`` (fields of ``PriorRow``)::
 
         usual:
           - {name: knuckle, terms: {flexion_11: 1}, mean: 30, deviation: 25, unit: deg}
 
-    Rows about other elements than ``columns`` are left out.
+    Entries that use other elements than ``columns`` are skipped.
 
     Raises:
-        ModelError: the file cannot be read; the message names it and what is wrong.
+        ModelError: the file cannot be read or an entry is invalid.
     """
     file = Path(path)
     phi, moments = [], []
@@ -371,28 +390,28 @@ def load_usual_pose(path: Path | str, columns: Sequence[str]) -> UsualPose:
         where = f"{file}: usual '{row.name}'"
         unit = _unit(row.unit, where)
         if not (math.isfinite(row.mean) and 0 < row.deviation < math.inf):
-            raise ModelError(f"{where}: give a mean, and a deviation that is positive")
+            raise ModelError(f"{where}: give a finite mean and a positive deviation")
         if not any(row.terms.values()):
-            raise ModelError(f"{where}: its terms name no joint with a factor")
+            raise ModelError(f"{where}: its terms name no joint with a coefficient")
         if set(row.terms) <= set(columns):
             phi.append(row_from_terms(columns, row.terms, where))
             moments.append((unit * row.mean, unit * row.deviation))
     mean, deviation = np.reshape(moments, (-1, 2)).T
-    return UsualPose(np.reshape(phi, (-1, len(columns))), mean, deviation)
+    return JointPrior(np.reshape(phi, (-1, len(columns))), mean, deviation)
 
 
 def couplings_file(model_file: Path) -> Path:
-    """Where a model's couplings are looked for: ``hand.couplings.yaml`` beside ``hand.urdf``."""
+    """Return the path of a model's couplings file: ``hand.couplings.yaml`` beside ``hand.urdf``."""
     return model_file.with_name(f"{model_file.name.split('.')[0]}.couplings.yaml")
 
 
 def model_inequalities(model: ParsedModel) -> Inequalities:
-    """All that is known of a model's positions: its limits, and its couplings file if there is one.
+    """Return a model's position limits, and the inequalities of its couplings file if there is one.
 
     Raises:
         ModelError: the couplings file cannot be read.
-        UnknownNameError: it names a joint that does not exist.
-        SettingsError: the rows exclude each other; the message names them.
+        UnknownNameError: the couplings file names an unknown joint.
+        SettingsError: inequalities exclude each other; the message names them.
     """
     parts = [from_model(model)]
     file = couplings_file(model.path)
@@ -400,20 +419,20 @@ def model_inequalities(model: ParsedModel) -> Inequalities:
         parts.append(load_couplings(file, model.position_names))
     whole = stack(parts, model.position_names)
     inner_point(whole)
-    return say_if_unlimited(whole, str(model.path))
+    return warn_if_unlimited(whole, str(model.path))
 
 
 def _read(file: Path, largest: int = 1 << 20) -> Couplings:
     try:
         if file.stat().st_size > largest:
-            raise ModelError(f"{file}: larger than {largest} bytes, which is no couplings")
+            raise ModelError(f"{file}: larger than {largest} bytes, so not a couplings file")
         content = yaml_load_typed(schema=Couplings, data=file.read_text(encoding="utf-8"))
     except OSError as error:
         raise ModelError(f"{file}: cannot read the couplings: {error.strerror}") from error
     except (yaml.YAMLError, RuntimeError, ValueError, TypeError, AttributeError) as error:
         raise ModelError(
-            f"{file}: not a couplings file ({' '.join(str(error).split())}); it has lists "
-            "'differences', 'rows' and 'usual'"
+            f"{file}: not a couplings file ({' '.join(str(error).split())}); a couplings file has "
+            "lists 'differences', 'rows' and 'usual'"
         ) from error
     return content
 

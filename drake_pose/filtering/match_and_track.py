@@ -1,4 +1,4 @@
-"""A body in a sequence: matched first, tracked by its contour, matched again after a loss."""
+"""Pose estimation in a sequence: search, contour tracking, and search again after a loss."""
 
 import math
 import time
@@ -30,16 +30,15 @@ from drake_pose.silhouette.pictures.masks import count_edge_pixels
 
 @dataclass(frozen=True, eq=False)
 class TrackerState:
-    """What is known after a frame.
+    """The state of ``MatchAndTrack`` after a frame.
 
     Attributes:
-        track: of the body; None before the first match, and where none was found.
-        reference: E_total after the last match; a track that explains much less is lost.
-        matches: how often the search has been asked.
-        unexplained: number of frames, up to this one, that no pose explained: the track is
-            predicted through them.
-        retries: number of frames to come in which the search is asked again, since a time limit
-            ended it.
+        reference: E_total after the last match; a track with a much larger one is lost.
+        matches: number of searches so far.
+        unexplained: number of consecutive frames, up to this one, that no pose explains; the track
+            is predicted through them.
+        retries: number of following frames in which the search is repeated because it reached its
+            time limit.
     """
 
     track: Track | None = None
@@ -52,21 +51,29 @@ class TrackerState:
 def make_tracker(
     tree: PoseTree, cameras: Sequence[Camera], period: float, settings: TrackingSettings
 ) -> ContourTracker:
-    """The tracker of a pose tree's contour, with a period between two frames [s].
+    """Return a tracker of a pose tree's contour.
+
+    Args:
+        period: time between two frames [s].
 
     Raises:
-        SettingsError: no camera, a period that is not positive, or a tree without free values.
+        SettingsError: there is no camera, the period is not positive, or the tree has no free
+            value.
     """
-    rest = 0.0 if settings.rest_time is None else period / settings.rest_time
+    prior_weight = 0.0 if settings.rest_time is None else period / settings.rest_time
     observation = ContourObservation(
-        tree, cameras, settings.root_moves, settings.scale_unknown, rest=rest
+        tree, cameras, settings.root_moves, settings.scale_unknown, prior_weight
     )
     return ContourTracker(observation, period, settings)
 
 
 @dataclass(frozen=True, eq=False)
 class _GivenFrame:
-    """What is given of a frame, by camera, the root where it is now, and when it began [s]."""
+    """The evidence of a frame, by camera.
+
+    ``root_position`` (3,) is the root's known position [m], ``begin`` the time at which the
+    processing of the frame started [s].
+    """
 
     views: Sequence[View]
     root_position: Array | None
@@ -76,27 +83,28 @@ class _GivenFrame:
     begin: float
 
     @property
-    def is_blind(self) -> bool:
-        """Whether nothing is seen in the frame."""
+    def has_no_evidence(self) -> bool:
+        """Whether there is neither a mask nor a picture."""
         return all(one is None for one in (*self.masks, *(self.pictures or ())))
 
 
 class MatchAndTrack:
-    """Follows a body from frame to frame, and asks a search where it cannot.
+    """Tracks a body from frame to frame, and searches for it where tracking fails.
 
-    A frame that no pose explains, because the body is hidden or nothing is seen, does not move the
-    track: it is predicted, its deviations grow, and the pose of the frame is not found. A pose that
-    the search finds replaces the prediction only where it explains the masks about as well as poses
-    did before, or where nothing has done so for ``TrackingSettings.patience``.
+    A frame that no pose explains, because the body is hidden or there is no evidence, leaves the
+    track predicted: its standard deviations grow, and the frame's pose is not found. A pose from
+    the search replaces the prediction only if it explains the masks about as well as earlier poses
+    did, or after ``TrackingSettings.patience``.
 
     Args:
-        search: asked in the first frame, and when the track is lost.
+        search: used in the first frame and when the track is lost.
         period: time between two frames [s].
-        search_time: longest search [s]; None: as the search says. What a limit cuts short is
-            searched again in the next frames.
+        search_time: time limit of a ``MultiStartSearch`` [s]; None: the search's own. A search that
+            reaches it is repeated in the next frames.
 
     Raises:
-        SettingsError: no camera, a period that is not positive, or a tree without free values.
+        SettingsError: there is no camera, the period is not positive, or the tree has no free
+            value.
     """
 
     def __init__(
@@ -121,32 +129,31 @@ class MatchAndTrack:
         pictures: Mapping[str, Picture] | None = None,
         start: Array | None = None,
     ) -> tuple[TrackerState, PoseEstimate]:
-        """The next frame.
+        """Process the next frame.
 
         Args:
-            views: the cameras' masks; there may be none where there are pictures.
-            root_position: (3,) where the root is known to be now [m].
-            pictures: (H, W, 3 or 4) by camera; the colours along the contour stand in where a
-                camera has no mask.
-            start: (nq,) about where the body is now, if it is known: the search is asked only where
-                masks contradict it.
+            views: the cameras' masks; may be empty if there are pictures.
+            root_position: (3,) known position of the root [m]; None: as in the tree.
+            pictures: by camera (H, W, 3 or 4); the colours along the contour are used for cameras
+                without a mask.
+            start: (nq,) approximate positions in this frame, if known; the search is then used only
+                if the masks do not fit them.
 
         Returns:
-            What is known now, and the pose. ``stopped_by`` is TRACKED where it was tracked. Where
-            no pose explains the masks, or nothing is seen, ``found`` is false and the pose is what
-            is predicted, or the start where there is one. Where the track is lost in pictures
-            without masks, no pose is found; it is followed all the same, and found again if the
-            contour fits again.
+            The new state, and the pose. ``stopped_by`` is TRACKED if the pose was tracked. If no
+                pose explains the masks, or there is no evidence, ``found`` is false and the pose is
+                the prediction, or ``start`` if given. A track lost in pictures without masks is
+                continued with ``found`` false until its contour fits again.
 
         Raises:
-            SettingsError: masks or pictures that do not fit the cameras.
+            SettingsError: masks or pictures do not fit the cameras.
         """
         begin, observation = time.perf_counter(), self.tracker.observation
         names = [camera.name for camera in observation.cameras]
-        seen = {view.camera.name: view.mask for view in views}
+        given = {view.camera.name: view.mask for view in views}
         if root_position is not None:
             observation = observation.with_root_position(root_position)
-        masks = [seen.get(name) for name in names]
+        masks = [given.get(name) for name in names]
         shown = [pictures.get(name) for name in names] if pictures else None
         frame = _GivenFrame(views, root_position, observation, masks, shown, begin)
         tracked: tuple[Track, PoseEstimate] | None = None
@@ -158,16 +165,16 @@ class MatchAndTrack:
                     return self._match(last, tracked, frame, None)
                 return TrackerState(track, last.reference, last.matches), tracked[1]
         if start is not None:
-            begun = self._begin(start, last, frame)
-            if begun[1].found or not views:
-                return begun
+            started = self._begin(start, last, frame)
+            if started[1].found or not views:
+                return started
         if not views:
-            return self._go_on(last, tracked, frame)
+            return self._without_evidence(last, tracked, frame)
         return self._match(last, tracked, frame, start)
 
-    def with_intervals(self, followed: TrackerState, pose: PoseEstimate) -> PoseEstimate:
-        """A frame's pose that was tracked, with what its contours alone say of each joint."""
-        track = followed.track
+    def with_intervals(self, state: TrackerState, pose: PoseEstimate) -> PoseEstimate:
+        """Return a tracked pose with the joints' intervals from this frame's contours alone."""
+        track = state.track
         if track is None or track.measurement is None:
             return pose
         observation = self.tracker.observation
@@ -182,31 +189,31 @@ class MatchAndTrack:
         frame: _GivenFrame,
         start: Array | None,
     ) -> tuple[TrackerState, PoseEstimate]:
-        """The best of what was tracked, if anything, and of what the search finds.
+        """Return the better of the tracked pose, if any, and of the search's.
 
-        Where neither explains the masks: the start that was given, or what is predicted.
+        If neither explains the masks, return the given start or the prediction.
         """
-        settings, followed = self.settings, last.track
+        settings, last_track = self.settings, last.track
         unexplained = last.unexplained + 1
         pause = max(1, round(settings.search_pause / self._period))
         found, matches = [] if tracked is None else [tracked], last.matches
         retries = max(0, last.retries - 1)
-        if followed is None or last.retries or unexplained % pause == 1 % pause:
+        if last_track is None or last.retries or unexplained % pause == 1 % pause:
             matches += 1
             matched = self._search.match(frame.views, frame.root_position)
-            found += self._looked(matched, followed, frame)
+            found += self._search_candidates(matched, last_track, frame)
             if matched.stopped_by != "time_limit":
                 retries = 0
             elif not last.retries:
                 retries = settings.retries
-            if not found and followed is None and start is None:
+            if not found and last_track is None and start is None:
                 return TrackerState(None, 0.0, matches, 0, retries), matched
         limit = self._limit(last.reference)
-        explained = [one for one in found if followed is None or one[1].E_total <= limit]
+        explained = [one for one in found if last_track is None or one[1].E_total <= limit]
         if not explained and unexplained * self._period > settings.patience:
             explained = found
-        if start is not None and (followed is None or not explained):
-            # Measured positions are no worse for masks that nothing explains.
+        if start is not None and (last_track is None or not explained):
+            # Measured positions are kept if no pose explains the masks.
             explained = [one for one in found if one[1].E_total <= self._limit(0.0)]
         if explained:
             track, result = min(explained, key=lambda pair: pair[1].E_total)
@@ -214,33 +221,33 @@ class MatchAndTrack:
         if start is not None:
             track = self.tracker.start(self._state(start, last, frame))
         else:
-            assert followed is not None
-            track = self._follow(followed, frame, False, blind=True)
+            assert last_track is not None
+            track = self._follow(last_track, frame, False, ignore_evidence=True)
         result = replace(self._result(track, frame), found=False)
         return TrackerState(track, last.reference, matches, unexplained, retries), result
 
-    def _looked(
+    def _search_candidates(
         self, matched: PoseEstimate, last: Track | None, frame: _GivenFrame
     ) -> list[tuple[Track, PoseEstimate]]:
-        """A pose that the search found, as it is and followed in its frame; none if none was."""
+        """Return the pose of a search, as it is and tracked in its frame; empty if not found."""
         if not matched.found:
             return []
         x = frame.observation.state(matched.q, matched.X_WB, matched.scale)
         if last is not None:
-            # A search does not know how often an angle has turned round.
-            x = frame.observation.continued(x, last.state.best.mean)
-            matched = self._turned(matched, frame.observation.node_values(x))
+            # A search does not know the number of full turns of an angle.
+            x = frame.observation.unwrapped(x, last.state.best.mean)
+            matched = self._unwrapped(matched, frame.observation.node_values(x))
         first = self.tracker.start(x)
-        followed = self._follow(first, frame, True)
-        # The first look of a track is at what the search found, whose modes are its own.
-        looked = replace(self._result(followed, frame), pose_set=matched.pose_set)
-        # The searched pose may fit better: the colours of this frame are learned all the same.
-        return [(followed, looked), (replace(first, colours=followed.colours), matched)]
+        refined = self._follow(first, frame, True)
+        # The pose was refined from the search's, so that the search's pose set still applies.
+        tracked = replace(self._result(refined, frame), pose_set=matched.pose_set)
+        # The unrefined pose may fit better; it keeps the colours learned in this frame.
+        return [(refined, tracked), (replace(first, colours=refined.colours), matched)]
 
     def _begin(
         self, start: Array, last: TrackerState, frame: _GivenFrame
     ) -> tuple[TrackerState, PoseEstimate]:
-        """A track that begins where the body is known to be."""
+        """Return a track that starts at known positions."""
         track = self._follow(self.tracker.start(self._state(start, last, frame)), frame, True)
         result = self._result(track, frame)
         reference = result.E_total if frame.views else UNEXPLAINED
@@ -248,33 +255,40 @@ class MatchAndTrack:
         return TrackerState(track, reference, last.matches), replace(result, found=found)
 
     def _state(self, start: Array, last: TrackerState, frame: _GivenFrame) -> Array:
-        """The tracker's state (n,) at positions (nq,), angles in the turns of the last track."""
+        """Return the tracker's state (n,) at positions (nq,), angles in the last track's turns."""
         x = frame.observation.state(start)
         if last.track is None:
             return x
-        return frame.observation.continued(x, last.track.state.best.mean)
+        return frame.observation.unwrapped(x, last.track.state.best.mean)
 
-    def _go_on(
+    def _without_evidence(
         self, last: TrackerState, tracked: tuple[Track, PoseEstimate] | None, frame: _GivenFrame
     ) -> tuple[TrackerState, PoseEstimate]:
-        """What is known where neither a track nor a mask nor a start says where the body is."""
+        """Return the state and pose for a frame without masks, start and valid track."""
         if tracked is None:
             default = self._search.tree.model.default_positions
             nowhere = self.tracker.observation.state(default)
             result = self._result(self.tracker.start(nowhere), frame)
             return last, replace(result, found=False)
-        # The search is asked at once where something is seen again.
+        # With unexplained = 0 the next frame with evidence is searched at once.
         return replace(last, track=tracked[0], unexplained=0), replace(tracked[1], found=False)
 
-    def _follow(self, track: Track, frame: _GivenFrame, first: bool, blind: bool = False) -> Track:
-        """The next frame; first: it is the one that the track begins in; blind: it is not seen."""
-        if blind:
+    def _follow(
+        self, track: Track, frame: _GivenFrame, first: bool, ignore_evidence: bool = False
+    ) -> Track:
+        """Return the track after a frame.
+
+        Args:
+            first: whether the track starts in this frame.
+            ignore_evidence: whether the track is only predicted.
+        """
+        if ignore_evidence:
             masks = [None] * len(frame.masks)
             return self.tracker.follow(track, masks, first, frame.root_position)
         return self.tracker.follow(track, frame.masks, first, frame.root_position, frame.pictures)
 
-    def _turned(self, matched: PoseEstimate, node_values: Sequence[Array]) -> PoseEstimate:
-        """A pose in the turns of a track that goes on."""
+    def _unwrapped(self, matched: PoseEstimate, node_values: Sequence[Array]) -> PoseEstimate:
+        """Return a pose of a search with its angles in the turns of ``node_values``."""
         turns = [
             2.0 * np.pi * np.round((now - then) / (2.0 * np.pi))
             for now, then in zip(node_values, matched.node_values, strict=True)
@@ -284,17 +298,17 @@ class MatchAndTrack:
     def _is_lost(
         self, track: Track, result: PoseEstimate, reference: float, frame: _GivenFrame
     ) -> bool:
-        """Whether nothing is seen, or a track left the contour, or explains too little."""
+        """Return whether evidence is missing, the track left the contour, or E_total is high."""
         explains = not frame.views or result.E_total <= self._limit(reference)
-        return frame.is_blind or track.lost or not explains
+        return frame.has_no_evidence or track.lost or not explains
 
     @staticmethod
     def _limit(reference: float) -> float:
-        """The largest E_total of a pose that explains the masks, by that after the last match."""
+        """Return the largest E_total of a pose that explains the masks, given the reference's."""
         return min(1.5 * reference + 0.1, UNEXPLAINED)
 
     def _difference(self, track: Track, frame: _GivenFrame) -> tuple[float, float]:
-        """The area where the body differs from what is seen, and the body's [pixel]."""
+        """Return the area where body and evidence differ, and the body's area [pixel]."""
         observation, x = frame.observation, track.state.best.mean
         if frame.views:
             return observation.difference(x, [(view.camera, view.mask) for view in frame.views])
@@ -308,7 +322,7 @@ class MatchAndTrack:
         return J, max(area, 1.0)
 
     def _result(self, track: Track, frame: _GivenFrame) -> PoseEstimate:
-        """The pose of a track, and how well it explains what is seen."""
+        """Return the pose of a track, and how well it explains the evidence."""
         observation, x = frame.observation, track.state.best.mean
         q, X_WB = observation.positions(x)
         J, area = self._difference(track, frame)

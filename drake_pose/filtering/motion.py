@@ -1,4 +1,8 @@
-"""How a state moves from one step to the next: (6), linear or not."""
+"""Motion models of a filter: x' = f(x) + w with w ~ N(0, U), linear or not.
+
+Equation numbers in this subpackage are those of Shimada, Shirai, Kuno and Miura; (6) is the
+prediction of the state.
+"""
 
 import math
 from collections.abc import Mapping
@@ -13,50 +17,56 @@ from drake_pose.errors import SettingsError
 from drake_pose.filtering.linearisation import (
     Function,
     Linear,
-    differences,
-    linear_over,
-    values_alone,
+    function_without_jacobian,
+    linearise_over,
+    numerical_jacobian,
 )
 from drake_pose.filtering.state import Belief, StateLayout
 
 
 class MotionModel(Protocol):
-    """What a filter must know about a step: (6)."""
+    """The motion of a state over one step, as a filter needs it: (6)."""
 
     @property
     def noise(self) -> Array:
-        """(n, n) U, the covariance of what a step adds."""
+        """(n, n) process noise covariance U of one step."""
 
     @property
     def period(self) -> float | None:
-        """The time that a step takes [s]; None: rates are per step, whatever time it takes."""
+        """Duration of a step [s]; None: rates are per step, whatever its duration."""
 
     def predict(self, x: Array) -> tuple[Array, Array]:
-        """The state (n,) a step after x, and its Jacobian (n, n)."""
+        """Return the state (n,) one step after x, and the Jacobian (n, n) of the step."""
 
 
 @dataclass(frozen=True, eq=False)
 class LinearMotion:
-    """The ``MotionModel`` x -> transition x: (n, n); noise and period as of the protocol."""
+    """A linear ``MotionModel`` x -> transition x.
+
+    Args:
+        transition: (n, n) state transition matrix A.
+        noise: (n, n) process noise covariance U.
+        period: duration of a step [s]; None: rates are per step.
+    """
 
     transition: Array
     noise: Array
     period: float | None
 
     def predict(self, x: Array) -> tuple[Array, Array]:
-        """Its value (n,) and the transition."""
+        """Return ``transition @ x`` (n,) and the transition (n, n)."""
         return self.transition @ x, self.transition
 
 
 @dataclass(frozen=True, eq=False)
 class FunctionMotion:
-    """The ``MotionModel`` of any function of the state, for example a plant's dynamics.
+    """A ``MotionModel`` from any function of the state, for example a plant's dynamics.
 
     Args:
-        function: x (n,) to the state (n,) a period later.
-        noise: (n, n) the covariance of what a step adds.
-        period: the time that a step takes [s].
-        jacobian: x (n,) to (n, n); None: by differences.
+        function: maps the state x (n,) to the state (n,) one step later.
+        noise: (n, n) process noise covariance U.
+        period: duration of a step [s]; None: rates are per step.
+        jacobian: maps x (n,) to the function's Jacobian (n, n); None: central differences.
     """
 
     function: Function
@@ -65,11 +75,11 @@ class FunctionMotion:
     jacobian: Function | None = None
 
     def predict(self, x: Array) -> tuple[Array, Array]:
-        """Its value (n,) and Jacobian (n, n)."""
+        """Return the function's value (n,) at x and its Jacobian (n, n)."""
         value = np.asarray(self.function(x), dtype=np.float64)
         if self.jacobian is not None:
             return value, np.asarray(self.jacobian(x), dtype=np.float64)
-        return value, differences(self.function, x, np.zeros(value.shape, dtype=np.bool_))
+        return value, numerical_jacobian(self.function, x, np.zeros(value.shape, dtype=np.bool_))
 
 
 def constant_velocity(
@@ -78,23 +88,27 @@ def constant_velocity(
     period: float,
     memory: float = math.inf,
 ) -> LinearMotion:
-    """Rates that wander, per second: what is predicted for a time does not depend on the period.
+    """Return a constant-velocity model whose rates are driven by white noise.
+
+    Each rate v obeys dv = -v / memory dt + noise. The discretisation is exact (Van Loan), so the
+    prediction over a given time does not depend on the period.
 
     Args:
-        rate_changes: for each moving element the standard deviation of what its rate changes by in
-            a second, if nothing fades [unit/s]; four times as much in sixteen seconds.
-        period: the time that a step takes [s].
-        memory: rates fade to 1 / e of themselves in this time [s].
+        rate_changes: by moving element, the standard deviation of the change of its rate in one
+            second without decay [unit/s]. It grows with the square root of time: over 16 s it is 4
+            times as large.
+        period: duration of a step [s].
+        memory: time constant of the rates' exponential decay [s]; infinite: no decay.
 
     Raises:
-        UnknownNameError: a name does not move.
-        SettingsError: a period or memory that is not positive; an element is missing, or its
-            deviation is negative or not finite.
+        UnknownNameError: a name in ``rate_changes`` is not a moving element.
+        SettingsError: the period or the memory is not positive, or a moving element's standard
+            deviation is missing, negative or not finite.
     """
     if not (0.0 < period < math.inf and memory > 0.0):
         raise SettingsError(f"period {period} and memory {memory} of a motion must be positive")
     deviations = np.sqrt(np.diag(layout.process_noise(rate_changes)))
-    # The exact step of d rate = -rate / memory dt + noise (Van Loan).
+    # Van Loan's discretisation of dv = -v / memory dt + noise.
     F, Q = np.array([[0.0, 1.0], [0.0, -1.0 / memory]]), np.diag([0.0, 1.0])
     power = expm(period * np.block([[-F, Q], [np.zeros((2, 2)), F.T]]))
     step = power[2:, 2:].T
@@ -107,7 +121,12 @@ def constant_velocity(
 
 
 def require_models(layout: StateLayout, observation: object, motion: object) -> None:
-    """Refuse (SettingsError) models of a filter that are none, or whose sizes do not fit."""
+    """Check that an observation and a motion are models whose sizes fit a state layout.
+
+    Raises:
+        SettingsError: a model lacks an attribute of its protocol, or an array has the wrong shape
+            or is not finite.
+    """
     n = len(layout)
     needed = {
         "observation": (observation, ("names", "variances", "wraps", "predict", "mirrors")),
@@ -117,7 +136,7 @@ def require_models(layout: StateLayout, observation: object, motion: object) -> 
         missing = [part for part in parts if not hasattr(model, part)]
         if missing:
             raise SettingsError(
-                f"a filter's {name} is a model with {', '.join(parts)}; "
+                f"a filter's {name} model needs {', '.join(parts)}; "
                 f"{type(model).__name__} has no {', '.join(missing)}"
             )
     m = len(observation.names)  # type: ignore[attr-defined]
@@ -131,17 +150,22 @@ def require_models(layout: StateLayout, observation: object, motion: object) -> 
     for name, (array, size) in sizes.items():
         if np.shape(array) != size or not np.isfinite(array).all():
             raise SettingsError(
-                f"{name}: {size} finite numbers, not an array of {np.shape(array)}; the state has "
-                f"{n} elements, and {m} numbers are measured"
+                f"{name}: expected {size} finite numbers, got shape {np.shape(array)}; the state "
+                f"has {n} elements and the observation {m} measurements"
             )
 
 
-def step_from(motion: MotionModel, belief: Belief, spread: bool) -> Linear:
-    """A step made linear: at a belief's mean, or over the belief."""
+def step_from(motion: MotionModel, belief: Belief, over_belief: bool) -> Linear:
+    """Return a step linearised at a belief's mean, or over the belief (``linearise_over``).
+
+    Args:
+        belief: where to linearise.
+        over_belief: whether to linearise over the belief instead of at its mean.
+    """
     if isinstance(motion, LinearMotion):
         nothing = np.zeros(len(belief.mean))
         return Linear(nothing, nothing, motion.transition)
-    if spread:
+    if over_belief:
         still = np.zeros(len(belief.mean), dtype=np.bool_)
-        return linear_over(motion.predict, belief, still, values_alone(motion))
+        return linearise_over(motion.predict, belief, still, function_without_jacobian(motion))
     return Linear(belief.mean, *motion.predict(belief.mean))

@@ -1,9 +1,9 @@
-"""A recorded sequence fitted as a whole: proportions and all poses at once, with how sure they are.
+"""Joint fit of a recorded sequence: link scales and all poses at once, with standard deviations.
 
-Poses that follow one another smoothly, the proportions that they share and what is usual are fitted
-together by Levenberg and Marquardt's method (a smoother). Of several starts, those that explain the
-sequence about as well as the best are kept: one parallel view cannot tell them apart, as it looks
-the same mirrored in depth. These starts are poses that explain the first frame, followed.
+A smoother: the motion between poses, the shared proportions and the joints' prior are fitted
+together by Levenberg-Marquardt. One parallel view is ambiguous, because it looks the same mirrored
+in depth. Therefore several starts are tracked and fitted, and fits whose cost is close to the best
+are kept.
 """
 
 from collections.abc import Sequence
@@ -27,31 +27,34 @@ from drake_pose.silhouette.outline import TreeSurfaces
 
 @dataclass(frozen=True)
 class SequenceSettings:
-    """How a recorded sequence is fitted; chosen on ``hand_sequences``.
+    """Settings of the fit of a recorded sequence; chosen on ``hand_sequences``.
 
     Args:
-        same: fits are one whose angles differ by less, root mean square over all frames [rad].
-        triangles: of each rigid part.
-        spacing: distance between two points of a silhouette's edge [pixel].
-        rounds: the parts of a fit [pixel].
-        memory: pictures closer in time say the same; together they count as one [s].
+        same_fit: two fits are the same if the root mean square difference of each angle over all
+            frames is below this [rad].
+        triangles: number of triangles of each rigid part.
+        spacing: distance between two edge points of a silhouette [pixel].
+        rounds: annealing stages of a fit.
+        memory: correlation time of the frames' errors; frames in this time count as one [s].
         deviation, correlation: standard deviation of the body's contour about a mask's edge, and
-            the length of contour whose errors are alike [pixel]: flesh is not that of who is seen,
-            along a finger's bone.
-        start_frames: frames through which starts are followed.
-        tilt: starts are tilted by this about both axes of the picture, either way [rad].
-        settling: comparisons of a start with the first frame.
-        apart: starts that are closer are one [rad].
+            contour length over which errors are correlated [pixel]; the model's flesh differs from
+            the person's along a whole finger bone.
+        start_frames: number of frames through which starts are tracked.
+        tilt: starts are tilted by plus and minus this angle about both image axes [rad].
+        settling_iterations: number of comparisons of a start with the first frame.
+        start_distance: starts closer than this in all elements are the same [rad].
         worse_start: starts whose E_total in the first frame exceeds the best by more are dropped.
-        followed_starts, fitted_starts: starts that are followed, and fitted, at most.
-        prior_weight: E_total that a squared deviation of a joint from its usual angle counts as.
-        worse_fit: fits whose cost is more than this multiple of the best one's are dropped: with
-            flesh that is not the hand's the better of two fits may be the wrong one.
-        interval_factor: of the standard deviations of intervals. Errors of flesh are alike in all
-            frames: without it 80 to 99 % of the joints lay in 95 % intervals, 68 % in ``grasp``.
+        tracked_starts, fitted_starts: largest number of starts that are tracked, and fitted.
+        prior_weight: E_total equivalent of one squared standard deviation of a joint from its
+            prior.
+        worse_fit: fits with a cost above this multiple of the best are dropped. With a hand of
+            other proportions of flesh, the better of two fits may be the wrong one.
+        interval_factor: factor on the standard deviations of intervals, because flesh errors are
+            the same in all frames. Without it 80 to 99 % of the joints were in their 95 %
+            intervals, in ``grasp`` 68 %.
     """
 
-    same: float = 0.1
+    same_fit: float = 0.1
     triangles: int = 160
     spacing: float = 2.0
     rounds: tuple[AnnealingStage, ...] = (
@@ -64,10 +67,10 @@ class SequenceSettings:
     correlation: float = 75.0
     start_frames: int = 90
     tilt: float = 0.7
-    settling: int = 4
-    apart: float = 0.2
+    settling_iterations: int = 4
+    start_distance: float = 0.2
     worse_start: float = 0.03
-    followed_starts: int = 6
+    tracked_starts: int = 6
     prior_weight: float = 0.0003
     fitted_starts: int = 6
     worse_fit: float = 1.3
@@ -79,13 +82,13 @@ SEQUENCE = SequenceSettings()
 
 @dataclass(frozen=True, eq=False)
 class TrackedStart:
-    """A start and how well the frames after it are explained.
+    """A start and its track through the following frames.
 
     Args:
-        states: (n,) the state in each frame.
-        track: in the last frame followed.
+        states: state (n,) of each frame.
+        track: in the last frame.
         errors: E_total of each frame.
-        prior_distances: of each frame, see ``ContourObservation.prior_distance``.
+        prior_distances: of each frame, see ``BodyState.prior_distance``.
     """
 
     states: tuple[Array, ...]
@@ -100,14 +103,17 @@ class TrackedStart:
 
     @property
     def cost(self) -> float:
-        """What tells the better of two."""
+        """The mean E_total plus the weighted prior: lower is better."""
         return float(np.mean(self.errors)) + SEQUENCE.prior_weight * float(
             np.mean(self.prior_distances)
         )
 
 
 def tilted(observation: ContourObservation, x: Array, tilt: Sequence[float]) -> Array:
-    """(n,) a state whose root is turned about the axes x, y of the first camera's picture [rad].
+    """Return a state (n,) with its root rotated about the x and y axes of the first camera.
+
+    Args:
+        tilt: rotation vector's x and y [rad].
 
     Raises:
         SettingsError: the tree's root does not turn freely.
@@ -122,42 +128,49 @@ def find_start(
     x: Array,
     masks: Sequence[Sequence[Mask | None]],
 ) -> list[TrackedStart]:
-    """The poses to be followed in frames of all cameras' masks, best first, from a state (n,)."""
+    """Return tracked starts for a sequence fit, sorted by cost, ascending.
+
+    Args:
+        x: (n,) state about which starts are tilted.
+        masks: for each frame, all cameras' masks.
+    """
     observation = tracker.observation
     steps = (0.0, SEQUENCE.tilt, -SEQUENCE.tilt)
     candidates = []
     for tilt in [(a, b) for a in steps for b in steps]:
         track = tracker.start(tilted(observation, x, tilt))
-        for _ in range(SEQUENCE.settling):
+        for _ in range(SEQUENCE.settling_iterations):
             track = tracker.follow(tracker.start(track.state.best.mean), masks[0], first=True)
-        candidates.append(_judged(observation, track, masks[0]))
+        candidates.append(_evaluated(observation, track, masks[0]))
     candidates.sort(key=lambda one: one.cost)
     kept: list[TrackedStart] = []
     for one in candidates:
         if (
             one.errors[0] > candidates[0].errors[0] + SEQUENCE.worse_start
-            or len(kept) >= SEQUENCE.followed_starts
+            or len(kept) >= SEQUENCE.tracked_starts
         ):
             continue
         moving = len(observation.layout.moving)
-        if all(np.abs(one.x - other.x)[:moving].max() > SEQUENCE.apart for other in kept):
+        if all(np.abs(one.x - other.x)[:moving].max() > SEQUENCE.start_distance for other in kept):
             kept.append(one)
     for frame in masks[1 : SEQUENCE.start_frames]:
-        kept = [_judged(observation, tracker.follow(one.track, frame), frame, one) for one in kept]
+        kept = [
+            _evaluated(observation, tracker.follow(one.track, frame), frame, one) for one in kept
+        ]
     return sorted(kept, key=lambda one: one.cost)
 
 
-def _judged(
+def _evaluated(
     observation: ContourObservation,
     track: Track,
     masks: Sequence[Mask | None],
     before: TrackedStart | None = None,
 ) -> TrackedStart:
-    """A start and what it has explained, one frame more."""
+    """Return a start extended by one frame, evaluated on its masks."""
     x = track.state.best.mean
     pairs = zip(observation.cameras, masks, strict=True)
-    seen = [(camera, mask) for camera, mask in pairs if mask is not None]
-    wrong, area = observation.difference(x, seen)
+    visible = [(camera, mask) for camera, mask in pairs if mask is not None]
+    wrong, area = observation.difference(x, visible)
     error, prior = wrong / max(area, 1), observation.prior_distance(x)
     if before is None:
         return TrackedStart((x,), track, (error,), (prior,))
@@ -168,9 +181,10 @@ def _judged(
 
 @dataclass(frozen=True, eq=False)
 class FittedSequence:
-    """One explanation of a sequence: its proportions, and its pose in every frame.
+    """One explanation of a sequence: proportions and all poses.
 
-    deviations: (frames, k) of the tree's values and ROOT_NAMES.
+    Attributes:
+        deviations: (frames, k) standard deviations of the tree's values and ROOT_NAMES.
     """
 
     body: ProportionedBody
@@ -178,7 +192,7 @@ class FittedSequence:
     deviations: Array
 
     def estimates(self, frame: int) -> tuple[JointEstimate, ...]:
-        """What is known of each of the tree's values in a frame."""
+        """Return the estimate of each of the tree's values in a frame, with 95 % intervals."""
         kinematics = self.body.kinematics
         count, around = len(kinematics.names), kinematics.turns_around
         values = self.fitted.parameters[frame, :count]
@@ -195,7 +209,7 @@ def fit_sequence(
     starts: Sequence[Sequence[Array]],
     period: float,
 ) -> list[FittedSequence]:
-    """The explanations of a sequence of one camera's masks, best first.
+    """Return the explanations of one camera's masks, sorted by cost, ascending.
 
     Args:
         masks: of the frames, three or more.
@@ -211,18 +225,18 @@ def fit_sequence(
     camera = observation.cameras[0]
 
     def fit(frames: Indices, begin: Array, last: bool) -> FittedSequence:
-        apart = period * float(frames[1] - frames[0])
-        worth = min(1.0, apart / SEQUENCE.memory)
-        noise = Noise(SEQUENCE.deviation, SEQUENCE.correlation / worth)
+        time_step = period * float(frames[1] - frames[0])
+        weight = min(1.0, time_step / SEQUENCE.memory)
+        noise = Noise(SEQUENCE.deviation, SEQUENCE.correlation / weight)
         rounds = SEQUENCE.rounds[-1:] if last else SEQUENCE.rounds
-        usual, rest_time = observation.usual, tracker.settings.rest_time
-        information = (0.0 if rest_time is None else apart / rest_time) / usual.deviation**2
+        joints, rest_time = observation.prior, tracker.settings.rest_time
+        information = (0.0 if rest_time is None else time_step / rest_time) / joints.deviation**2
         names = observation.layout.moving
-        accelerations = np.array([tracker.acceleration(name) for name in names]) * apart**2
-        prior = sequence_prior(len(frames), (usual.phi, usual.mean, information), accelerations)
-        seen = [edges[k] for k in frames.tolist()]
+        accelerations = np.array([tracker.acceleration(name) for name in names]) * time_step**2
+        prior = sequence_prior(len(frames), (joints.phi, joints.mean, information), accelerations)
+        used = [edges[k] for k in frames.tolist()]
         limits = _limits(observation)
-        found = fit_proportions(body, camera, seen, begin, rounds, noise, limits, prior)
+        found = fit_proportions(body, camera, used, begin, rounds, noise, limits, prior)
         return FittedSequence(body, *found)
 
     coarse = []
@@ -249,11 +263,12 @@ def pose_set(
     poses: Sequence[tuple[Array, Array, float]],
     frame: int,
 ) -> PoseSet:
-    """What all explanations of a sequence say of a frame.
+    """Return the pose set of a frame: one family per explanation, and the union of their intervals.
 
     Args:
         explanations: best first.
-        poses: q (nq,), X_WB (4, 4) and the objective (1) J [pixel] of each in the frame.
+        poses: for each explanation q (nq,), X_WB (4, 4) and the objective (1) J [pixel] in this
+            frame.
     """
     modes = []
     for one, (q, X_WB, J) in zip(explanations, poses, strict=True):
@@ -270,22 +285,22 @@ def pose_set(
 
 
 def _are_same(one: FittedSequence, other: FittedSequence) -> bool:
-    """Whether two fits are the same explanation: no value is far off in all frames together."""
+    """Return whether two fits agree in all angles within SEQUENCE.same_fit."""
     kinematics = one.body.kinematics
     count = len(kinematics.names)
     values, others = one.fitted.parameters[:, :count], other.fitted.parameters[:, :count]
     off = (kinematics.nearest_turns(values, others) - others)[:, kinematics.is_angle]
-    return bool(np.sqrt(np.square(off).mean(axis=0)).max(initial=0.0) < SEQUENCE.same)
+    return bool(np.sqrt(np.square(off).mean(axis=0)).max(initial=0.0) < SEQUENCE.same_fit)
 
 
 def _are_determined(kinematics: TreeKinematics, low: Array, high: Array) -> Array:
-    """Which intervals are shorter than half a value's range, that of an angle a turn at most."""
+    """Return which intervals are shorter than half a value's range, for angles at most one turn."""
     ranges = np.minimum(kinematics.upper - kinematics.lower, 2.0 * np.pi)
     return np.asarray(high - low < 0.5 * ranges)
 
 
 def _limits(observation: ContourObservation) -> tuple[Array, Array]:
-    """(p,) lower and upper limits of what moves."""
+    """Return lower and upper limits (p,) of the moving elements."""
     names, limits = list(observation.layout.moving), observation.inequalities()
     lower, upper = np.full(len(names), -np.inf), np.full(len(names), np.inf)
     for phi, b in zip(limits.for_columns(names).phi, limits.b, strict=True):
@@ -299,5 +314,8 @@ def _limits(observation: ContourObservation) -> tuple[Array, Array]:
 
 
 def _interpolated(every: Indices, picked: Indices, parameters: Array) -> Array:
-    """(frames, n) parameters between those of some frames, and beyond as in the last of them."""
+    """Interpolate parameters (frames, n) of the ``picked`` frames linearly at ``every`` frame.
+
+    Beyond the last picked frame its parameters are repeated.
+    """
     return np.column_stack([np.interp(every, picked, column) for column in parameters.T])

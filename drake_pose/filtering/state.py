@@ -1,6 +1,7 @@
-"""What a state vector means, how it moves, and what is believed of it: (5), (6) and (8).
+"""The layout of a filter's state, its linear motion and process noise, and beliefs about it.
 
-Shimada, Shirai, Kuno and Miura; A of (8) is a step at constant velocity, U of (6) its noise.
+A state is (moving elements, their rates, constants). Equation numbers are those of Shimada, Shirai,
+Kuno and Miura.
 """
 
 from collections.abc import Mapping, Sequence
@@ -15,16 +16,22 @@ from drake_pose.errors import SettingsError, UnknownNameError
 
 
 def factor_of(covariance: Array, names: Sequence[str] = (), what: str = "the belief") -> Array:
-    """(n, n) L with L L^T = covariance; variances of zero are allowed.
+    """Return L (n, n) with L L^T = covariance; the covariance may be singular.
+
+    Args:
+        covariance: (n, n), symmetric and positive semidefinite.
+        names: (n) names of the elements, for messages; their indices if empty.
+        what: subject of messages.
 
     Raises:
-        SettingsError: the covariance is indefinite; it says what has it, and which element it is.
+        SettingsError: the covariance is indefinite; the message names the element that contributes
+            most to the negative eigenvalue.
     """
     try:
         return np.asarray(np.linalg.cholesky(covariance), dtype=np.float64)
     except np.linalg.LinAlgError:
         pass
-    # Semidefinite: scaled to correlations, so that small variances are not lost beside large ones.
+    # Semidefinite. Correlations keep small variances from being lost beside large ones.
     scale = np.sqrt(np.abs(np.diag(covariance)))
     scale[scale == 0] = 1.0
     values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
@@ -32,37 +39,40 @@ def factor_of(covariance: Array, names: Sequence[str] = (), what: str = "the bel
         k = int(np.argmax(np.abs(vectors[:, 0])))
         raise SettingsError(
             f"{what}: the covariance is indefinite; the lowest eigenvalue of its correlations is "
-            f"{values[0]:.3g}, and '{names[k] if names else k}' has the largest part in it"
+            f"{values[0]:.3g}, to which '{names[k] if names else k}' contributes most"
         )
     root = (scale[:, None] * vectors) * np.sqrt(np.maximum(values, 0.0))
     return np.ascontiguousarray(root)
 
 
 def covariance_from(factor: Array) -> Array:
-    """(n, n) L L^T of (n, k) L: symmetric, and positive definite after rounding if it can be."""
+    """Return L L^T (n, n) of L (n, k), symmetric and if possible positive definite.
+
+    The diagonal is inflated by up to about 1e-9, relative, until a Cholesky factorisation succeeds.
+    """
     product = factor @ factor.T
     product = 0.5 * (product + product.T)
-    growth = 1e-15
-    while growth < 1e-9:
+    inflation = 1e-15
+    while inflation < 1e-9:
         try:
             np.linalg.cholesky(product)
             break
         except np.linalg.LinAlgError:
-            product[np.diag_indices_from(product)] *= 1.0 + growth
-            growth *= 10.0
+            product[np.diag_indices_from(product)] *= 1.0 + inflation
+            inflation *= 10.0
     return product
 
 
 @dataclass(frozen=True)
 class StateLayout:
-    """The elements of a state: what moves, its rates, and what never changes.
+    """The elements of a state: moving ones, their rates, and constants.
 
     Args:
-        moving: (m) names of what moves at constant velocity but for noise.
-        constant: (k) names of what never changes, for example lengths.
+        moving: (m) names of the elements that have a rate.
+        constant: (k) names of the elements that do not change, for example lengths.
 
     Raises:
-        SettingsError: a name is given twice.
+        SettingsError: a name occurs twice.
     """
 
     moving: tuple[str, ...]
@@ -83,39 +93,44 @@ class StateLayout:
         return 2 * len(self.moving) + len(self.constant)
 
     def index(self, name: str) -> int:
-        """Where an element stands.
+        """Return the index of an element in the state.
 
         Raises:
-            UnknownNameError: there is none of that name.
+            UnknownNameError: the state has no element of this name.
         """
         if name not in self.names:
             raise UnknownNameError("element", name, self.names, "the state")
         return self.names.index(name)
 
     def indices(self, names: Sequence[str]) -> NDArray[np.intp]:
-        """Where these elements stand."""
+        """Return the indices of elements in the state; raises as ``index``."""
         return np.array([self.index(name) for name in names], dtype=np.intp)
 
-    def transition(self, fading: float = 1.0) -> Array:
-        """(n, n) A of (8): a step at constant velocity, rates per step; see ``constant_velocity``.
+    def transition(self, decay: float = 1.0) -> Array:
+        """Return A (n, n) of (8): a constant-velocity step with rates per step.
 
-        ``fading`` is left of a rate, 1 in (8).
+        Args:
+            decay: factor on the rates in a step; 1 in (8). ``constant_velocity`` has rates per
+                second.
         """
         m = len(self.moving)
         A = np.eye(len(self))
-        A[:m, m : 2 * m] = fading * np.eye(m)
-        A[m : 2 * m, m : 2 * m] = fading * np.eye(m)
+        A[:m, m : 2 * m] = decay * np.eye(m)
+        A[m : 2 * m, m : 2 * m] = decay * np.eye(m)
         return A
 
     def process_noise(self, accelerations: Mapping[str, float]) -> Array:
-        """(n, n) U of (6): an acceleration that is constant during each step; 0 for constants.
+        """Return U (n, n) of (6) from accelerations that are constant during each step.
+
+        Constants have no noise.
 
         Args:
-            accelerations: standard deviation for each moving element [unit per step^2].
+            accelerations: by moving element, the standard deviation of its acceleration
+                [unit/step^2].
 
         Raises:
-            UnknownNameError: a name does not move.
-            SettingsError: an element is missing, or its deviation is negative or not finite.
+            UnknownNameError: a name is not a moving element.
+            SettingsError: a moving element's standard deviation is missing, negative or not finite.
         """
         m = len(self.moving)
         U = np.zeros((len(self), len(self)))
@@ -126,7 +141,7 @@ class StateLayout:
             deviation = accelerations.get(name, -1.0)
             if not 0 <= deviation < np.inf:
                 raise SettingsError(
-                    f"'{name}' needs the standard deviation of what changes its rate, 0 or more"
+                    f"'{name}' needs the standard deviation of its acceleration, 0 or more"
                 )
             pair = [i, m + i]
             U[np.ix_(pair, pair)] = deviation**2 * np.array([[0.25, 0.5], [0.5, 1.0]])
@@ -135,7 +150,7 @@ class StateLayout:
 
 @dataclass(frozen=True, eq=False)
 class Belief:
-    """A normal distribution over a state: mean (n,) and covariance (n, n)."""
+    """A normal distribution of the state: mean (n,) and covariance (n, n)."""
 
     mean: Array
     covariance: Array
@@ -146,7 +161,7 @@ class Belief:
         return factor_of(self.covariance)
 
     def deviations(self) -> Array:
-        """(n,) standard deviations."""
+        """Return the standard deviations (n,)."""
         return np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
 
 
@@ -156,17 +171,23 @@ def make_belief(
     layout: StateLayout | None = None,
     what: str = "the belief",
 ) -> Belief:
-    """A belief from a mean (n,) and covariance (n, n), checked, and made exactly symmetric.
+    """Return a belief from a mean and a covariance, after checking both.
+
+    Args:
+        mean: (n,).
+        covariance: (n, n); made exactly symmetric.
+        layout: the state's elements, for messages; None: elements are named by their indices.
+        what: subject of messages.
 
     Raises:
-        SettingsError: sizes that do not fit, NaN, infinity, asymmetry, or a covariance that is
-            indefinite; where the layout is given, it names the element.
+        SettingsError: the shapes do not fit, a number is not finite, or the covariance is not
+            symmetric or is indefinite.
     """
     q = np.array(mean, dtype=np.float64)
     Q = np.array(covariance, dtype=np.float64, order="C")
     if q.ndim != 1 or Q.shape != (q.size, q.size):
         raise SettingsError(
-            f"mean {q.shape} and covariance {Q.shape} do not fit: give (n,) and (n, n)"
+            f"mean {q.shape} and covariance {Q.shape} do not fit; expected (n,) and (n, n)"
         )
     if layout is not None and q.size != len(layout):
         raise SettingsError(

@@ -1,4 +1,8 @@
-"""Several explanations of the same measurements, weighed against each other."""
+"""A Kalman filter inside linear inequalities that keeps several weighted hypotheses.
+
+Shimada, Shirai, Kuno and Miura, sections 4 and 5: prediction, update from each hypothesis and its
+mirrored ones, truncation, rejection, and weighting of what is left.
+"""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -12,16 +16,16 @@ import numpy as np
 from drake_pose.arrays import Array
 from drake_pose.errors import SettingsError
 from drake_pose.filtering.inequalities import Inequalities, inner_point
-from drake_pose.filtering.linearisation import Linear, require_slope
+from drake_pose.filtering.linearisation import Linear, require_jacobian
 from drake_pose.filtering.motion import LinearMotion, MotionModel, require_models, step_from
 from drake_pose.filtering.state import Belief, StateLayout, make_belief
 from drake_pose.filtering.truncated_normal import (
     Truncated,
     clip,
-    join_rows,
+    merge_rows,
     truncate_joint,
     truncate_sequential,
-    unlimited,
+    untruncated,
 )
 from drake_pose.filtering.update import (
     Measurement,
@@ -34,28 +38,28 @@ from drake_pose.filtering.update import (
 from drake_pose.filtering.views import (
     RepeatedView,
     StaticView,
-    anchored,
+    after_step,
+    anchored_observation,
     begin_repeated_view,
-    moved,
     next_view,
 )
 
 
 @dataclass(frozen=True, eq=False)
 class Hypothesis:
-    """One explanation.
+    """One hypothesis of the state.
 
     Attributes:
-        belief: mean and covariance, inside the limits.
-        free: what is believed without the present limits; the next step is predicted from it.
-        log_weight: logarithm of its weight among all.
-        log_evidence: the same without what the present limits say of it.
-        born: the step it was made at by mirroring; 0 for the first.
-        place: which of those made at that step it is: both tell it from all others.
-        active: names of the rows that cut its belief in the last step.
-        sites: of the last truncation, where the next one begins; see ``Truncated``.
-        tangent: (n,) where the first frame of the present view was linearised.
-        repeated: what is believed within a view that lasts; None in its first frame.
+        belief: mean and covariance inside the limits.
+        free: the belief without the limits of this step; the next step is predicted from it.
+        log_weight: logarithm of its weight among all hypotheses.
+        log_evidence: the same without the probability of the limits in this step.
+        born: step in which it was made by mirroring; 0 for the first.
+        place: index among the hypotheses made in that step; unique together with ``born``.
+        active: names of the inequalities that changed its belief in the last step.
+        sites: of the last truncation, where the next one starts; see ``Truncated``.
+        tangent: (n,) state at which the first frame of the current view was linearised.
+        repeated: belief within a static view from its second frame on; None in its first.
     """
 
     belief: Belief
@@ -71,19 +75,20 @@ class Hypothesis:
 
     @property
     def weight(self) -> float:
-        """Between 0 and 1."""
+        """Its weight, between 0 and 1."""
         return math.exp(self.log_weight)
 
 
 @dataclass(frozen=True)
 class Rejection:
-    """A hypothesis that was given up.
+    """A hypothesis that was removed.
 
     Attributes:
-        hypothesis: as it was then; for a constraint its belief is that without the limits.
-        reason: "constraint", "weight", "twin" or "cap".
-        row: the violated inequality's name, for a constraint.
-        c: its c_k (24), for a constraint.
+        step: number of the step.
+        hypothesis: as it was then; for "constraint" with the belief before truncation.
+        reason: "constraint", "weight", "twin" (a duplicate) or "cap".
+        row: name of the violated inequality, for "constraint".
+        c: c_k (24) of this inequality, for "constraint".
     """
 
     step: int
@@ -94,7 +99,7 @@ class Rejection:
 
 
 def normalise(hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
-    """The same with weights that add up to 1, the heaviest first."""
+    """Return the hypotheses with weights that sum to 1, sorted by weight, descending."""
     ordered = sorted(hypotheses, key=lambda h: -h.log_weight)
     logs = np.array([h.log_weight for h in ordered])
     total = logs[0] + math.log(np.exp(logs - logs[0]).sum())
@@ -104,10 +109,17 @@ def normalise(hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
     ]
 
 
-def merge_twins(
+def merge_duplicates(
     hypotheses: Sequence[Hypothesis], distance: float, step: int
 ) -> tuple[list[Hypothesis], list[Rejection]]:
-    """Keep the heavier of any two nearer than so many deviations, with the weight of both."""
+    """Merge hypotheses whose means are close, and return those kept and the rejections.
+
+    Args:
+        hypotheses: sorted by weight, descending. Of two close ones the first is kept with the sum
+            of their weights.
+        distance: largest difference in any element at which two are the same [standard deviations].
+        step: number of the step, for the rejections.
+    """
     kept: list[Hypothesis] = []
     rejected = []
     for candidate in hypotheses:
@@ -129,7 +141,10 @@ def merge_twins(
 def prune(
     hypotheses: Sequence[Hypothesis], cap: int, smallest_weight: float, step: int
 ) -> tuple[list[Hypothesis], list[Rejection]]:
-    """Keep at most ``cap``, and none lighter than ``smallest_weight``; always the heaviest."""
+    """Return the ``cap`` heaviest hypotheses of at least ``smallest_weight``, and the rejections.
+
+    The heaviest is always kept. ``step``: number of the step, for the rejections.
+    """
     ordered = normalise(hypotheses)
     kept = [h for h in ordered[1:cap] if h.weight >= smallest_weight]
     rejected = [
@@ -149,35 +164,36 @@ LINEARISATIONS: tuple[Linearisation, ...] = get_args(Linearisation)
 
 @dataclass(frozen=True)
 class FilterSettings:
-    """How a ``TruncatedFilter`` works.
+    """Settings of a ``TruncatedFilter``.
 
-    The defaults are for any system: they were chosen on a planar arm of three links of unknown
-    lengths (``tests/benchmarks/filters.py``), and are about as sure as they are right there, also
-    where elbow and tip alone are seen. What the hand of Shimada et al. needs is in
-    ``papers.shimada.experiment_settings``.
+    The defaults were chosen on a planar arm of three links of unknown lengths
+    (``tests/benchmarks/filters.py``). There the estimated covariance about matches the errors, also
+    if only elbow and tip are visible. ``papers.shimada.experiment_settings`` has the settings for
+    the hand of Shimada et al.
 
     Args:
-        truncation: "joint" (all rows at once), "sequential" (the paper's), "clip" (only the mean
-            is moved inside) or "none".
-        linearisation: "spread" (over all that is believed: what a tangent leaves out counts as
-            noise) or "tangent" (at one point, the paper's).
-        iterations: linearisations of an update at most; 1 for the paper's. More of them are nearer
-            to the most probable state where that is sharp, and too sure where it is not.
-        persistence: what a line leaves out of a measurement stays the same for about this time, so
-            that further frames do not average it away [s]; for "spread".
-        hypothesis_cap: how many hypotheses are kept at most; 1 for none but the best.
-        smallest_weight: lighter hypotheses are given up.
-        novelty: a measurement shows nothing new if noise alone would make it differ as much
-            from the one that began the view with more than this probability, such as 1e-9, see
-            ``views``. 0: every frame is new, as in the paper; so it is always with "sequential"
-            and "clip".
-        twin_distance: hypotheses that are closer in every element are one [deviations].
-        tolerance: of the joint truncation [deviations].
-        rough_iterations: linearisations of hypotheses that are compared before they are kept.
-        rejected_below: a hypothesis is given up whose c_k (24) of a row is below this.
+        truncation: "joint" (all rows at once), "sequential" (the paper's), "clip" (only the mean is
+            moved inside) or "none".
+        linearisation: "spread" (over the belief, with the remainder's covariance as noise; see
+            ``linearise_over``) or "tangent" (at one point, the paper's).
+        iterations: largest number of linearisations of an update; 1 in the paper. More come closer
+            to a sharp maximum of the posterior, and are overconfident where it is not sharp.
+        persistence: correlation time of the linearisation error of a measurement, so that frames in
+            this time do not average it away [s]; for "spread".
+        hypothesis_cap: largest number of hypotheses; 1: only the best.
+        smallest_weight: hypotheses with a smaller weight are removed.
+        novelty: p-value below which a measurement differs from the first of its static view and
+            begins a new one, for example 1e-9; see ``views``. 0: each frame is a new view, as in
+            the paper, and always with "sequential" and "clip".
+        twin_distance: hypotheses closer than this in all elements are merged [standard deviations].
+        tolerance: of the joint truncation [standard deviations].
+        rough_iterations: largest number of linearisations for rough states, and smallest for
+            mirrored hypotheses with "spread".
+        rejected_below: a hypothesis with a smaller c_k (24) of any row is removed [standard
+            deviations].
 
     Raises:
-        SettingsError: a value out of its range.
+        SettingsError: a value is out of range.
     """
 
     truncation: Truncation = "joint"
@@ -214,14 +230,15 @@ class FilterSettings:
 
 @dataclass(frozen=True, eq=False)
 class FilterState:
-    """What a filter believes after a step.
+    """The state of a filter after a step.
 
     Attributes:
-        step: how many measurements have been used.
-        hypotheses: the heaviest first, at least one.
-        rejections: what was given up in the last step.
-        distance, count: of the best hypothesis' last update; see ``Updated``.
-        view: what has been seen since the last new view.
+        step: number of measurements used.
+        hypotheses: sorted by weight, descending; at least one.
+        rejections: hypotheses removed in the last step.
+        distance, count: squared Mahalanobis distance and number of measurements of the best
+            hypothesis' last update; see ``Updated``.
+        view: the current static view.
     """
 
     step: int
@@ -238,7 +255,7 @@ class FilterState:
 
     @property
     def overall(self) -> Belief:
-        """Mean and covariance of all hypotheses together: wide where they disagree."""
+        """Mean and covariance of the mixture of all hypotheses."""
         weights = np.array([one.weight for one in self.hypotheses])
         means = np.array([one.belief.mean for one in self.hypotheses])
         mean = weights @ means / weights.sum()
@@ -247,30 +264,29 @@ class FilterState:
         return Belief(mean, (within + between) / weights.sum())
 
 
-def _require_class(given: object, kind: type, said: str) -> None:
+def _require_class(given: object, kind: type, subject: str) -> None:
     if not isinstance(given, kind):
-        raise SettingsError(f"{said} {kind.__name__}, not {type(given).__name__}")
+        raise SettingsError(f"{subject} {kind.__name__}, not {type(given).__name__}")
 
 
 class TruncatedFilter:
-    """A Kalman filter of nonlinear measurements whose belief stays inside linear inequalities.
+    """A Kalman filter for nonlinear measurements whose belief stays inside linear inequalities.
 
-    Shimada, Shirai, Kuno and Miura, sections 4 and 5, with differences, each of which can be set
-    back: all rows are truncated at once; measurements are linearised over the truncated belief; and
-    with "joint" the next step is predicted from the belief without its limits, which would else
-    count again in every step and make it ever surer.
+    It follows Shimada, Shirai, Kuno and Miura, sections 4 and 5, with three differences, each of
+    which ``FilterSettings`` can undo. All rows are truncated at once. Measurements are linearised
+    over the truncated belief. With "joint" the next step is predicted from the belief without its
+    limits: these would otherwise count again in each step and make the filter overconfident.
 
     Args:
-        inequalities: the rows, over any elements of the state.
-        motion: how the state moves in a step, see ``constant_velocity``.
+        inequalities: over any elements of the state.
 
     Attributes:
-        novelty: of the settings, or 0 where the truncation keeps no views.
+        novelty: of the settings, or 0 if the truncation does not support static views.
 
     Raises:
-        SettingsError: contradictory rows, named; a noise that is indefinite; models or settings of
-            another kind or shape.
-        UnknownNameError: a row is about an element that the state lacks.
+        SettingsError: rows exclude each other, the process noise is indefinite, or a model or
+            settings have the wrong type or shape.
+        UnknownNameError: an inequality uses an element that the state lacks.
     """
 
     def __init__(
@@ -291,25 +307,25 @@ class TruncatedFilter:
         inner_point(self.inequalities)
         noise = make_belief(np.zeros(len(layout)), motion.noise, layout, "the motion's noise")
         self._U = noise.covariance
-        self._rows = join_rows(self.inequalities)
+        self._rows = merge_rows(self.inequalities)
         self._checked = False
         self._set(FilterSettings() if settings is None else settings)
 
     def _set(self, settings: FilterSettings) -> None:
         _require_class(settings, FilterSettings, "a filter's settings are")
         self.settings = settings
-        # What is truncated and fed back has no offsets to keep.
+        # Offsets of a static view cannot be kept if the truncated belief is fed back.
         feeds_back = settings.truncation in ("sequential", "clip")
         self.novelty = 0.0 if feeds_back else settings.novelty
-        self._spread = 0.0
+        self._remainder_weight = 0.0
         if settings.linearisation == "spread":
-            # A step of unknown time counts as one of 30 in a second.
-            self._spread = max(1.0, settings.persistence / (self.motion.period or 1 / 30))
+            # A step of unknown duration counts as 1/30 s.
+            self._remainder_weight = max(1.0, settings.persistence / (self.motion.period or 1 / 30))
         is_free = settings.truncation == "none" or not self.inequalities
         self._limits: Truncate | None = None if is_free else self._truncate
 
     def with_settings(self, settings: FilterSettings) -> "TruncatedFilter":
-        """The same filter with other settings; states of one are states of the other."""
+        """Return the same filter with other settings; it can continue from states of this one."""
         if settings is self.settings:
             return self
         other = copy(self)
@@ -317,55 +333,64 @@ class TruncatedFilter:
         return other
 
     def start(self, belief: Belief) -> FilterState:
-        """The state before the first measurement, truncated (but for "none").
+        """Return the state before the first measurement, truncated (except for "none").
 
-        The first call compares the models' Jacobians with differences, at the belief's mean.
+        The first call compares the models' Jacobians with central differences at the belief's mean.
 
         Raises:
-            SettingsError: a belief that does not fit, or is indefinite; a Jacobian that is wrong.
+            SettingsError: the belief has the wrong size or is indefinite, or a Jacobian is wrong.
         """
         _require_class(belief, Belief, "a filter starts at a")
         checked = make_belief(belief.mean, belief.covariance, self.layout)
         truncated = self._cut(checked, np.zeros((0, 2)))
         if not self._checked:
-            names, seen, motion = self.layout.names, self.observation, self.motion
-            require_slope(
-                seen.predict, truncated.mean, seen.names, names, seen.wraps, "the observation"
+            names, model, motion = self.layout.names, self.observation, self.motion
+            require_jacobian(
+                model.predict, truncated.mean, model.names, names, model.wraps, "the observation"
             )
             if not isinstance(motion, LinearMotion):
                 still = np.zeros(len(names), dtype=np.bool_)
-                require_slope(motion.predict, truncated.mean, names, names, still, "the motion")
+                require_jacobian(motion.predict, truncated.mean, names, names, still, "the motion")
             self._checked = True
         return FilterState(0, (self._finish(Hypothesis(checked, checked), checked, truncated),))
 
     def predict(self, state: FilterState) -> FilterState:
-        """One step of the motion: (6), for every hypothesis."""
+        """Return the state after one step of the motion, for each hypothesis: (6)."""
         stepped = []
         for h in state.hypotheses:
-            # Linear where the state can be, also for what is believed without limits.
+            # Linearised inside the limits, also for the belief without limits.
             step = self._step(h.belief)
-            repeated = h.repeated.moved(step, self._U) if h.repeated else None
-            free = repeated.state() if repeated else moved(h.free, step, self._U)
-            belief = moved(h.belief, step, self._U)
+            repeated = h.repeated.after_step(step, self._U) if h.repeated else None
+            free = repeated.state() if repeated else after_step(h.free, step, self._U)
+            belief = after_step(h.belief, step, self._U)
             stepped.append(replace(h, belief=belief, free=free, repeated=repeated))
         return replace(state, hypotheses=tuple(stepped), rejections=())
 
     def predicted(self, belief: Belief) -> Belief:
-        """A belief after one step of the motion: (6)."""
-        return moved(belief, self._step(belief), self._U)
+        """Return a belief after one step of the motion: (6)."""
+        return after_step(belief, self._step(belief), self._U)
 
     def _step(self, belief: Belief) -> Linear:
-        return step_from(self.motion, belief, self._spread > 0)
+        return step_from(self.motion, belief, self._remainder_weight > 0)
 
     def corrected(self, prediction: Belief, y: Array, variances: Array, start: Array) -> Array:
-        """(n,) the mean of a prediction after a measurement, without hypotheses: a rough state.
+        """Return a rough state (n,): the mean after a measurement, from one hypothesis.
 
         Args:
-            start: (n,) where to linearise first; y (m,) and variances as for ``update``.
+            y, variances: as in ``update``.
+            start: (n,) where to linearise first.
         """
-        seen = make_measurement(self.observation, y, variances)
+        measurement = make_measurement(self.observation, y, variances)
         few = min(self.settings.iterations, self.settings.rough_iterations)
-        rough = update(prediction, seen, few, start, False, self._limits, spread=self._spread)
+        rough = update(
+            prediction,
+            measurement,
+            few,
+            start,
+            False,
+            self._limits,
+            remainder_weight=self._remainder_weight,
+        )
         return rough.truncated.mean
 
     def update(
@@ -375,30 +400,33 @@ class TruncatedFilter:
         observation: ObservationModel | None = None,
         variances: Array | None = None,
     ) -> FilterState:
-        """Use a measurement y (m,), NaN where occluded: section 5, steps 2 to 6.
+        """Return the state after a measurement: section 5, steps 2 to 6.
 
         Args:
-            observation: what is measured, if not what the filter was made for.
-            variances: (m,) of this measurement's noise, or its covariance (m, m), finite where it
+            y: (m,) measurement, NaN where occluded.
+            observation: the measurement's model; None: that of the filter.
+            variances: noise variances (m,) or covariance (m, m) of this measurement, finite where y
                 is; None: the model's.
 
         Raises:
-            SettingsError: the measurement does not fit.
+            SettingsError: the measurement does not fit the model.
         """
         step, settings = state.step + 1, self.settings
-        seen = make_measurement(observation or self.observation, y, variances)
-        view = next_view(state.view, seen, self.novelty)
+        measurement = make_measurement(observation or self.observation, y, variances)
+        view = next_view(state.view, measurement, self.novelty)
         if view.count > 1:
-            branches = [self._repeat(h, seen) for h in state.hypotheses]
+            branches = [self._repeat(h, measurement) for h in state.hypotheses]
         else:
             places = count()
-            branches = [b for h in state.hypotheses for b in self._branches(h, seen, step, places)]
+            branches = [
+                b for h in state.hypotheses for b in self._branches(h, measurement, step, places)
+            ]
         alive, rejected = self._reject(branches, step)
         finished = [
             self._finish(h, done.belief, done.truncated, done.log_likelihood) for h, done in alive
         ]
         leader = max(range(len(finished)), key=lambda i: finished[i].log_weight)
-        merged, twins = merge_twins(normalise(finished), self.settings.twin_distance, step)
+        merged, twins = merge_duplicates(normalise(finished), self.settings.twin_distance, step)
         kept, pruned = prune(merged, settings.hypothesis_cap, settings.smallest_weight, step)
         best = alive[leader][1]
         return FilterState(
@@ -406,44 +434,50 @@ class TruncatedFilter:
         )
 
     def _branches(
-        self, hypothesis: Hypothesis, seen: Measurement, step: int, places: Iterator[int]
+        self, hypothesis: Hypothesis, measurement: Measurement, step: int, places: Iterator[int]
     ) -> list[Branch]:
-        """A hypothesis updated at its prediction, and at each mirrored one, which are counted."""
+        """Update a hypothesis from its prediction, and from each mirrored prediction.
+
+        ``places`` numbers the mirrored hypotheses of this step.
+        """
         own = replace(hypothesis, repeated=None)
         iterations = self.settings.iterations
         starts = [(own, own.belief.mean)]
         if self.settings.hypothesis_cap > 1:
-            for start in seen.model.mirrors(own.belief):
+            for start in measurement.model.mirrors(own.belief):
                 starts.append((replace(own, born=step, place=next(places)), start))
-        # A belief that is as wide as its mirror is far would hold both: each begins at its place.
-        alone = self._spread > 0 and len(starts) == 1
-        if self._spread > 0 and not alone:
+        # A belief wide enough to include its mirrored state would mix the two, so that each is
+        # linearised at its own start.
+        alone = self._remainder_weight > 0 and len(starts) == 1
+        if self._remainder_weight > 0 and not alone:
             iterations = max(iterations, self.settings.rough_iterations)
         return [
             (
                 h,
                 update(
                     h.free,
-                    seen,
+                    measurement,
                     iterations,
                     None if alone else start,
                     tempered=h is own,
                     truncate=self._limits,
                     sites=h.sites,
-                    spread=self._spread,
+                    remainder_weight=self._remainder_weight,
                 ),
             )
             for h, start in starts
         ]
 
-    def _repeat(self, hypothesis: Hypothesis, seen: Measurement) -> Branch:
-        """A hypothesis updated by a further frame of the same view."""
+    def _repeat(self, hypothesis: Hypothesis, measurement: Measurement) -> Branch:
+        """Update a hypothesis by another frame of the same static view."""
         repeated = hypothesis.repeated
         if repeated is None:
             repeated = begin_repeated_view(
-                seen.model, hypothesis.free, hypothesis.belief, hypothesis.tangent
+                measurement.model, hypothesis.free, hypothesis.belief, hypothesis.tangent
             )
-        tangent = seen._replace(model=anchored(seen.model, repeated.tangent))
+        tangent = measurement._replace(
+            model=anchored_observation(measurement.model, repeated.tangent)
+        )
         updated = update(repeated.belief, tangent)
         repeated = replace(repeated, belief=updated.belief)
         belief = repeated.state()
@@ -454,7 +488,7 @@ class TruncatedFilter:
     def _reject(
         self, branches: Sequence[Branch], step: int
     ) -> tuple[list[Branch], list[Rejection]]:
-        """Section 5, step 5: give up what lies far beyond a row, but never all."""
+        """Remove branches far beyond a row, but never all of them: section 5, step 5."""
         if len(branches) == 1 or self._limits is None:
             return list(branches), []
         alive, rejected, worst_c = [], [], []
@@ -476,13 +510,13 @@ class TruncatedFilter:
     def _finish(
         self, hypothesis: Hypothesis, free: Belief, result: Truncated, log_likelihood: float = 0.0
     ) -> Hypothesis:
-        """The hypothesis after its update, weighed by the measurement and by the limits."""
+        """Return a hypothesis after its update, weighted by the likelihood and by the limits."""
         active = tuple(self.inequalities.rows[k] for k in np.flatnonzero(result.active))
         belief = Belief(result.mean, result.covariance)
         evidence = hypothesis.log_evidence + log_likelihood
         weight = evidence + result.log_probability
         if self.settings.truncation != "joint":
-            # The paper's: the next step is predicted from the truncated belief.
+            # As in the paper, the next step is predicted from the truncated belief.
             free, evidence = belief, weight
         return replace(
             hypothesis,
@@ -496,8 +530,8 @@ class TruncatedFilter:
         )
 
     def _cut(self, belief: Belief, sites: Array) -> Truncated:
-        """A belief truncated by the limits, if there are any."""
-        return unlimited(belief) if self._limits is None else self._limits(belief, sites)
+        """Truncate a belief by the limits, if there are any."""
+        return untruncated(belief) if self._limits is None else self._limits(belief, sites)
 
     def _truncate(self, belief: Belief, sites: Array) -> Truncated:
         if self.settings.truncation == "sequential":

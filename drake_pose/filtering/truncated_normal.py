@@ -1,9 +1,10 @@
-"""The part of a normal distribution inside linear inequalities: its mean and its covariance.
+"""Mean and covariance of a normal distribution truncated by linear inequalities.
 
-By expectation propagation, or by the paper's rows one after another.
+``truncate_joint`` uses expectation propagation (EP) over all rows; ``truncate_sequential`` is (21)
+to (29) of Shimada et al., one row after another.
 
-A belief N(mean, L L^T) is kept by its factor L; a site multiplies it by exp(-tau s^2 / 2 + nu s),
-s = direction^T x, and changes mean and factor in place.
+A belief N(mean, L L^T) is represented by its factor L. A site (tau, nu) of EP multiplies its
+density by exp(-tau s^2 / 2 + nu s) with s = direction^T x, and changes mean and factor in place.
 """
 
 import math
@@ -19,25 +20,25 @@ from drake_pose.filtering.inequalities import Inequalities
 from drake_pose.filtering.state import Belief, covariance_from
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(64)
-# Beyond this many standard deviations a bound takes away less than 1e-18.
+# Bounds farther than this [standard deviations] remove a probability below 1e-18.
 _FAR = 9.0
 _HALF_LOG_TWO_PI = 0.5 * math.log(2.0 * math.pi)
 
 
 @compiled
 def interval_moments(lower: float, upper: float) -> tuple[float, float, float]:
-    """Moments of a standard normal variable, given that it lies between two bounds.
+    """Return moments of a standard normal variable truncated to an interval.
 
-    (25) to (27) of Shimada et al. are the case ``lower = -inf``. Their closed form cancels to
-    nothing below c = -8. This integrates the density relative to its largest value, over the part
-    where it counts, so that all terms are positive: 13 digits for any bounds, be they 1e7
-    standard deviations away or 1e-12 apart.
+    (25) to (27) of Shimada et al. are the case ``lower = -inf``; their closed form loses all digits
+    by cancellation below c = -8. This integrates the density relative to its maximum by
+    Gauss-Legendre quadrature, over the part that matters, so that all terms are positive. The
+    result has 13 digits for bounds 1e7 standard deviations away or 1e-12 apart.
 
     Args:
-        lower, upper: lower < upper; infinite for none.
+        lower, upper: the interval, lower < upper; may be infinite.
 
     Returns:
-        The logarithm of the probability of the interval, the mean and the variance inside it.
+        The logarithm of the interval's probability, and the mean and the variance inside it.
     """
     if lower < -_FAR and upper > _FAR:
         return 0.0, 0.0, 1.0
@@ -46,8 +47,8 @@ def interval_moments(lower: float, upper: float) -> tuple[float, float, float]:
         mirror = -1.0
         lower, upper = -upper, -lower
     anchor = max(lower, 0.0)
-    # x = anchor + u; the density falls by anchor u + u^2 / 2.
-    # It is followed down to exp(-40) of its largest value: 4e-18.
+    # With x = anchor + u the log density falls by anchor u + u^2 / 2. The integral ends where the
+    # density is exp(-40) = 4e-18 of its maximum.
     reach = 80.0 / (anchor + math.sqrt(anchor * anchor + 80.0))
     low = max(lower - anchor, -reach)
     high = min(upper - anchor, reach)
@@ -70,7 +71,7 @@ def interval_moments(lower: float, upper: float) -> tuple[float, float, float]:
 
 @compiled
 def project(mean: Array, factor: Array, direction: Array) -> tuple[float, Array]:
-    """direction^T mean, and direction^T L (k,), whose square is the variance along it."""
+    """Return direction^T mean, and direction^T L (k,), whose squared norm is the variance."""
     n, k = factor.shape
     projected = np.zeros(k)
     value = 0.0
@@ -86,7 +87,13 @@ def project(mean: Array, factor: Array, direction: Array) -> tuple[float, Array]
 def apply_sites(
     mean: Array, factor: Array, directions: Array, sites: Array, left_out: int, scale: float
 ) -> float:
-    """Multiply a belief by all sites (S, 2: tau, nu) times ``scale`` but one, in place.
+    """Multiply a belief by sites scaled by ``scale``, in place.
+
+    Args:
+        mean, factor: (n,) and (n, k) L of the covariance L L^T, changed in place.
+        directions, sites: (S, n) and (S, 2: tau, nu).
+        left_out: index of a site that is skipped; -1: none.
+        scale: factor on tau and nu.
 
     Returns:
         The logarithm of the product's integral.
@@ -119,10 +126,15 @@ def apply_sites(
 def interval_site(
     value: float, variance: float, lower: float, upper: float
 ) -> tuple[float, float, float]:
-    """The site with which a belief along a line has its mean and variance between two bounds.
+    """Return the site that gives a normal belief along a line its moments between two bounds.
+
+    Args:
+        value, variance: mean and variance of the belief along the line.
+        lower, upper: bounds; may be infinite.
 
     Returns:
-        tau and nu, 0 where both bounds are far, and the logarithm of the probability between them.
+        tau and nu, 0 where both bounds are more than _FAR standard deviations away, and the
+            logarithm of the probability between the bounds.
     """
     deviation = math.sqrt(variance)
     alpha, beta = (lower - value) / deviation, (upper - value) / deviation
@@ -144,22 +156,22 @@ def propagate(
     tolerance: float,
     sweep_limit: int,
 ) -> tuple[float, int]:
-    """Find the sites that stand for lower <= directions x <= upper under a normal belief.
+    """Find the sites that represent lower <= directions x <= upper under a normal belief, by EP.
 
-    Each site is the normal factor with which the rest of the belief has the mean and the variance
-    that it has inside the site's own two bounds. Nothing depends on the order of the rows once the
-    sites have settled.
+    Each site is the normal factor that gives the belief without this site (the cavity) its mean and
+    variance inside the site's own two bounds. The converged result does not depend on the order of
+    the rows.
 
     Args:
-        base_mean, base_factor: (n,) and (n, n) of the belief without any of the bounds.
-        directions, lower, upper: (S, n), (S,) and (S,), infinite for none.
+        base_mean, base_factor: (n,) and (n, n) of the belief without bounds.
+        directions, lower, upper: (S, n), (S,) and (S,); bounds may be infinite.
         sites: (S, 2) tau and nu to start from, changed in place.
-        tolerance: of the change of a marginal's mean and variance in a sweep, in standard
-            deviations and relative.
-        sweep_limit: after half of these sweeps the steps are halved.
+        tolerance: largest change in a sweep of a marginal's mean [standard deviations] and,
+            relative, of its variance.
+        sweep_limit: largest number of sweeps; steps are halved in the second half of them.
 
     Returns:
-        The logarithm of the probability of all bounds together, and the sweeps made.
+        The logarithm of the probability that all bounds hold, and the number of sweeps made.
     """
     count = sites.shape[0]
     corrections = np.zeros(count)
@@ -171,15 +183,15 @@ def propagate(
         largest = 0.0
         step = 1.0 if 2 * sweep <= sweep_limit else 0.5
         for i in range(count):
-            # Mean and variance along the direction of the belief without this site.
+            # Mean and variance of the cavity along the direction.
             value, projected = project(mean, factor, directions[i])
             variance = (projected * projected).sum()
             rest = 1.0 - sites[i, 0] * variance
-            # Dividing a site out is safe while the belief without it is not much wider.
+            # Dividing out a site is accurate unless the site removed nearly all variance.
             if rest > 1e-3:
                 value, variance = (value - sites[i, 1] * variance) / rest, variance / rest
             else:
-                # The site has taken nearly all variance: build that belief from the start.
+                # Otherwise the cavity is built from the base belief and the other sites.
                 other_mean, other_factor = base_mean.copy(), base_factor.copy()
                 apply_sites(other_mean, other_factor, directions, sites, i, 1.0)
                 value, projected = project(other_mean, other_factor, directions[i])
@@ -205,7 +217,7 @@ def propagate(
         if largest < tolerance:
             break
         if largest > 1e-3:
-            # Rounding must not add up over steps that change much.
+            # Rebuilt from the base, so that rounding errors of large steps do not accumulate.
             copy_into(mean, base_mean)
             copy_into(factor, base_factor)
             apply_sites(mean, factor, directions, sites, -1, 1.0)
@@ -218,16 +230,16 @@ def propagate(
 def cut_one_by_one(
     mean: Array, factor: Array, phi: Array, b: Array, skip_above: float, c: Array
 ) -> float:
-    """Truncate by (21) to (29), in place.
+    """Truncate a belief by one row after another, (21) to (29), in place.
 
     Args:
         mean, factor: (n,) and (n, k) L of the covariance L L^T, changed in place.
-        phi, b: (K, n) and (K,) the rows.
-        skip_above: rows with a larger c_k are left out.
-        c: (K,) receives (24) at each row's turn, infinite for rows without variance.
+        phi, b: (K, n) and (K,) of the inequalities phi x <= b.
+        skip_above: rows with a larger c_k are skipped.
+        c: (K,) receives (24) of each row before it is used; infinite for rows without variance.
 
     Returns:
-        The logarithm of the probability of all rows, as the chain of cuts has it.
+        The logarithm of the probability that all rows hold: the product over the sequence.
     """
     total, site = 0.0, np.empty((1, 2))
     for row in range(phi.shape[0]):
@@ -250,21 +262,21 @@ def cut_one_by_one(
 
 
 SKIP_ABOVE = 5.0
-"""Rows with a larger c_k are left out: they would move the mean by less than 2e-6 deviations."""
+"""Rows with a larger c_k are skipped; each would move the mean by less than 2e-6 deviations."""
 
 
 @dataclass(frozen=True, eq=False)
 class Truncated(Belief):
-    """A truncated belief, whose covariance is positive definite where the given one was.
+    """A truncated belief; its covariance is positive definite if that of the given belief is.
 
     Attributes:
-        c: (K,) of (24), before the truncation: how many standard deviations inside of each row
-            the mean was, negative if beyond; infinite where the row has no variance. For the
-            sequential form, at the row's turn.
-        active: (K,) whether the row took part (c_k at most SKIP_ABOVE).
-        log_probability: logarithm of the probability that all rows held, as estimated.
-        sites: what the joint form knows about each direction of ``JointRows`` (S, 2); empty for
-            the others.
+        c: (K,) (24) before truncation: margin of the mean from each row [standard deviations],
+            negative where the row is violated, infinite where it has no variance. In the sequential
+            form, before this row is used.
+        active: (K,) whether the row changed the belief (c_k at most SKIP_ABOVE).
+        log_probability: estimated logarithm of the probability that all rows hold.
+        sites: (S, 2) EP sites of the directions of ``MergedRows``; empty unless ``truncate_joint``
+            made the belief.
     """
 
     c: Array
@@ -274,17 +286,17 @@ class Truncated(Belief):
 
 
 @dataclass(frozen=True, eq=False)
-class JointRows:
-    """Inequalities with parallel rows merged, in an order of their own.
+class MergedRows:
+    """Inequalities with parallel rows merged into two-sided bounds along unit directions.
 
-    Rows along one line, whatever their length and sign, become one pair of bounds, so that a row
-    given twice counts once.
+    Rows along the same line, of any length and sign, become one pair of bounds; duplicated rows
+    count once.
 
     Attributes:
-        used: (m,) the elements of the state that occur in a row.
+        used: (m,) indices of the state's elements that occur in a row.
         directions: (S, m) unit vectors over the used elements.
-        lower, upper: (S,) bounds along them, infinite for none.
-        group: (K,) the direction of each row.
+        lower, upper: (S,) bounds along the directions; may be infinite.
+        group: (K,) index of each row's direction.
         whole: (S, n) the directions over all elements.
     """
 
@@ -297,24 +309,24 @@ class JointRows:
     whole: Array
 
 
-def join_rows(inequalities: Inequalities) -> JointRows:
-    """Prepare inequalities for ``truncate_joint``; worth keeping when they are used often.
+def merge_rows(inequalities: Inequalities) -> MergedRows:
+    """Merge parallel rows for ``truncate_joint``; keep the result if it is used repeatedly.
 
     Raises:
-        SettingsError: two parallel rows exclude each other; it names them.
+        SettingsError: two parallel rows exclude each other; the message names them.
     """
     phi = inequalities.phi
     used = np.flatnonzero(phi.any(axis=0))
     if not len(phi):
         none, nothing = np.zeros((0, 0)), np.zeros(0)
         whole = np.zeros((0, phi.shape[1]))
-        return JointRows(inequalities, used, none, nothing, nothing, used, whole)
+        return MergedRows(inequalities, used, none, nothing, nothing, used, whole)
     norms = np.linalg.norm(phi, axis=1)
     unit = phi[:, used] / norms[:, None]
     leading = unit[np.arange(len(phi)), np.argmax(np.abs(unit) > 1e-9, axis=1)]
     signs = np.sign(leading)
     unit, bounds = unit * signs[:, None], inequalities.b / norms
-    # Adding 0 makes -0 into 0, which np.unique tells apart.
+    # Adding 0 turns -0 into 0, which np.unique treats as different.
     keys = np.round(unit, 12) + 0.0
     directions, group = np.unique(keys, axis=0, return_inverse=True)
     group = group.ravel()
@@ -325,29 +337,29 @@ def join_rows(inequalities: Inequalities) -> JointRows:
     for index in np.flatnonzero(~(lower < upper)):
         names = [inequalities.rows[k] for k in np.flatnonzero(group == index)]
         raise SettingsError(
-            f"the inequalities leave no room between them: {'; '.join(names)}. Loosen one of them"
+            f"the inequalities leave no interior: {'; '.join(names)}. Loosen or remove one of them"
         )
     whole = np.zeros((len(directions), phi.shape[1]))
     whole[:, used] = directions
-    return JointRows(inequalities, used, directions, lower, upper, group, whole)
+    return MergedRows(inequalities, used, directions, lower, upper, group, whole)
 
 
 def _margins(belief: Belief, inequalities: Inequalities) -> Array:
-    """(K,) c_k of (24); a row without variance has an infinite one.
+    """Return c_k (K,) of (24), infinite for rows without variance.
 
     Raises:
-        SettingsError: a belief of another size; or a row without variance is not satisfied.
+        SettingsError: the belief has another size, or a row without variance is violated.
     """
     mean, covariance = belief.mean, belief.covariance
     if inequalities.phi.shape[1] != mean.size:
         raise SettingsError(
-            f"the inequalities are about {inequalities.phi.shape[1]} elements, the belief about "
-            f"{mean.size}; use Inequalities.for_columns"
+            f"the inequalities have {inequalities.phi.shape[1]} columns, the belief {mean.size} "
+            "elements; use Inequalities.for_columns"
         )
     phi, margins = np.abs(inequalities.phi), inequalities.margins(mean)
     variance = np.einsum("ki,ki->k", inequalities.phi @ covariance, inequalities.phi)
     size = phi @ np.sqrt(np.abs(np.diag(covariance)))
-    # What rounding makes of a variance of zero.
+    # A smaller variance is zero up to rounding.
     solid = variance > 1e-30 + 1e-23 * size**2
     c = np.full(len(margins), np.inf)
     c[solid] = margins[solid] / np.sqrt(variance[solid])
@@ -356,24 +368,23 @@ def _margins(belief: Belief, inequalities: Inequalities) -> Array:
     if len(beyond):
         row, excess = inequalities.rows[beyond[0]], -margins[beyond[0]]
         raise SettingsError(
-            f"inequality '{row}' is not satisfied by {excess:.3g}, and the "
-            "belief has no variance along it; start from a belief that allows it"
+            f"inequality '{row}' is violated by {excess:.3g}, and the belief has no variance "
+            "along it; start from a belief that satisfies it"
         )
     return c
 
 
 def truncate_sequential(belief: Belief, inequalities: Inequalities) -> Truncated:
-    """Truncate by one row after the other: (21) to (29) of Shimada et al.
+    """Truncate a belief by one row after another: (21) to (29) of Shimada et al.
 
-    With s^2 = phi^T Q phi the rotations of (21) to (23) multiply out to
-    q + Q phi nu / s and Q - (Q phi)(Q phi)^T (1 - S) / s^2, with S = 1 + c nu - nu^2 of (26). The
-    covariance is changed through its factor, which keeps it positive definite.
-
-    The result depends on the order of the rows.
+    With s^2 = phi^T Q phi the rotations of (21) to (23) multiply out to the mean q + Q phi nu / s
+    and the covariance Q - (Q phi)(Q phi)^T (1 - S) / s^2, where S = 1 + c nu - nu^2 of (26). The
+    update is applied to the covariance's factor, which keeps it positive definite. The result
+    depends on the order of the rows.
 
     Raises:
-        SettingsError: sizes that do not fit, an indefinite covariance, or a row without variance
-            that is not satisfied.
+        SettingsError: the sizes do not fit, the covariance is indefinite, or a row without variance
+            is violated.
     """
     c = _margins(belief, inequalities)
     q, factor = belief.mean.copy(), belief.root.copy()
@@ -383,32 +394,32 @@ def truncate_sequential(belief: Belief, inequalities: Inequalities) -> Truncated
 
 def truncate_joint(
     belief: Belief,
-    rows: JointRows | Inequalities,
+    rows: MergedRows | Inequalities,
     tolerance: float = 1e-9,
     start: Array | None = None,
 ) -> Truncated:
-    """Truncate by all rows at once: moments by expectation propagation.
+    """Truncate a belief by all rows at once: moments by expectation propagation.
 
-    The result does not depend on the order of the rows, or on how often a row is given. It is
-    exact where all rows are parallel to one line; against long Gibbs sampling on table 1's rows
-    of Shimada et al. with table 2's variances it is within 0.06 standard deviations and 0.18 of
-    the covariance (the sequential form: 1.6 and 4.8).
+    The result depends neither on the order of the rows nor on duplicates. It is exact if all rows
+    are parallel. Compared with long Gibbs sampling on the rows of table 1 of Shimada et al. with
+    the variances of table 2, its errors are at most 0.06 standard deviations in the mean and 0.18
+    relative in the covariance (sequential form: 1.6 and 4.8).
 
     Args:
-        rows: the inequalities, prepared by ``join_rows`` or not.
-        tolerance: of the marginals' change from sweep to sweep.
-        start: (S, 2) sites of a similar problem to begin with, which saves sweeps; may be empty.
+        rows: the inequalities, or these merged by ``merge_rows``.
+        tolerance: largest change of the marginals in the last sweep, see ``propagate``.
+        start: (S, 2) initial sites of a similar problem, which saves sweeps; may be empty.
 
     Raises:
-        SettingsError: as for ``truncate_sequential``, or parallel rows that exclude each other.
+        SettingsError: as for ``truncate_sequential``, or parallel rows exclude each other.
     """
-    joint = join_rows(rows) if isinstance(rows, Inequalities) else rows
+    joint = merge_rows(rows) if isinstance(rows, Inequalities) else rows
     inequalities = joint.inequalities
     c = _margins(belief, inequalities)
     sites = np.zeros((len(joint.directions), 2))
     if start is not None and len(start):
         sites[:] = start
-    # (m, m) of the elements used: R^T R of the others' factor, whatever its rank.
+    # (m, m) factor of the used elements' covariance; a QR decomposition works for any rank.
     base = np.asarray(np.linalg.qr(belief.root[joint.used].T, mode="r")).T.copy()
     reach = np.abs(inequalities.b)
     for limit in (400, 10_000):
@@ -424,7 +435,7 @@ def truncate_joint(
         )
         q, factor = belief.mean.copy(), belief.root.copy()
         apply_sites(q, factor, joint.whole, sites, -1, 1.0)
-        # Rows thousands of deviations away, almost parallel, settle slowly.
+        # Nearly parallel rows thousands of standard deviations away converge slowly.
         inside = reach + np.abs(inequalities.phi) @ np.abs(q)
         if sweeps < limit or np.all(inequalities.margins(q) >= -1e-10 * inside):
             break
@@ -433,10 +444,10 @@ def truncate_joint(
 
 
 def clip(belief: Belief, inequalities: Inequalities) -> Truncated:
-    """Move the mean to the nearest point inside the rows; the covariance stays as it is.
+    """Move a belief's mean to a nearby point inside the rows; the covariance stays unchanged.
 
-    What is done where no truncation is at hand. Nearest in the sense of the covariance, one
-    violated row after the other, until none is left or 100 rounds are over.
+    A baseline for comparison. The mean is projected in the metric of the covariance onto the most
+    violated row, until no row is violated or 100 projections are made.
 
     Raises:
         SettingsError: as for ``truncate_sequential``.
@@ -453,7 +464,7 @@ def clip(belief: Belief, inequalities: Inequalities) -> Truncated:
     return Truncated(q, belief.covariance, c, c < 0, 0.0)
 
 
-def unlimited(belief: Belief) -> Truncated:
-    """A belief that no row cuts."""
+def untruncated(belief: Belief) -> Truncated:
+    """Return a belief as the result of a truncation without rows."""
     nothing = np.zeros(0)
     return Truncated(belief.mean, belief.covariance, nothing, nothing > 0, 0.0)

@@ -1,7 +1,9 @@
-"""The update of an extended Kalman filter, repeated where it linearises: (19), (20).
+"""Measurement update of an extended Kalman filter, iterated, with truncation: (19), (20).
 
-With S = H P H^T + R and K = P H^T S^-1 the mean moves by K (y - h) and the covariance becomes, in
-Joseph's form, (I - K H) P (I - K H)^T + K R K^T: positive also where rounding is not kind.
+With S = H P H^T + R and K = P H^T S^-1 the mean moves by K (y - h), and the covariance becomes, in
+Joseph's form, (I - K H) P (I - K H)^T + K R K^T, which stays positive in spite of rounding. Here x
+(n,) is the state with covariance P, y (m,) the measurement with noise covariance R, and h(x) the
+observation with Jacobian H.
 """
 
 import math
@@ -19,44 +21,48 @@ from drake_pose.errors import SettingsError, UnknownNameError
 from drake_pose.filtering.linearisation import (
     Function,
     Linear,
-    difference,
-    differences,
-    linear_over,
-    values_alone,
+    function_without_jacobian,
+    linearise_over,
+    numerical_jacobian,
+    wrapped_difference,
 )
 from drake_pose.filtering.state import Belief
-from drake_pose.filtering.truncated_normal import Truncated, unlimited
+from drake_pose.filtering.truncated_normal import Truncated, untruncated
 
 Truncate = Callable[[Belief, Array], Truncated]
 
 
 class ObservationModel(Protocol):
-    """What a filter must know about its measurements: (7)."""
+    """An observation y = h(x) + noise, as a filter needs it: (7)."""
 
     @property
     def names(self) -> tuple[str, ...]:
-        """(m) what is measured."""
+        """(m) names of the measurements."""
 
     @property
     def variances(self) -> Array:
-        """(m,) of the measurement noise."""
+        """(m,) variances of the measurement noise."""
 
     @property
     def wraps(self) -> Mask:
-        """(m,) which measurements are angles [rad], equal after a full turn."""
+        """(m,) which measurements are angles [rad], compared modulo a full turn."""
 
     def predict(self, x: Array) -> tuple[Array, Array]:
-        """h(x) (m,) and its Jacobian (m, n); NaN in h where nothing can be seen at x."""
+        """Return h(x) (m,), NaN where occluded, and its Jacobian (m, n)."""
 
     def mirrors(self, belief: Belief) -> list[Array]:
-        """States that look like the mean: the mirrored predictions of section 5."""
+        """Return states (n,) that look like the mean: the mirrored predictions of section 5."""
 
 
 @dataclass(frozen=True, eq=False)
 class LinearObservation:
     """The ``ObservationModel`` h + H (x - at), without mirrors.
 
-    names (m), variances (m,) and wraps (m,) as of the protocol; at (n,); h (m,); H (m, n).
+    Attributes:
+        names, variances, wraps: (m), (m,) and (m,); see ``ObservationModel``.
+        at: (n,) point of linearisation.
+        h: (m,) value at ``at``.
+        H: (m, n) Jacobian.
     """
 
     names: tuple[str, ...]
@@ -67,29 +73,28 @@ class LinearObservation:
     H: Array
 
     def predict(self, x: Array) -> tuple[Array, Array]:
-        """Its value (m,) and H."""
+        """Return the value (m,) at x (n,), and H (m, n)."""
         return self.h + self.H @ (x - self.at), self.H
 
     def mirrors(self, belief: Belief) -> list[Array]:
-        """None."""
+        """Return no mirrored states."""
         return []
 
 
 @dataclass(frozen=True, eq=False)
 class FunctionObservation:
-    """The ``ObservationModel`` of any function of the state, without mirrors.
+    """An ``ObservationModel`` from any function of the state, without mirrors.
 
     Args:
-        names: (m) what is measured.
-        deviations: standard deviation of the measurement noise, one for all or (m,).
-        function: x (n,) to what would be measured without noise (m,); NaN where nothing can be
-            seen at x.
-        jacobian: x (n,) to (m, n); None: by differences, at 2 n calls of the function.
-        angles: those of names that are angles [rad], equal after a full turn.
+        names: (m) names of the measurements.
+        deviations: standard deviation of the measurement noise, scalar or (m,).
+        function: maps x (n,) to the noise-free measurement (m,); NaN where occluded.
+        jacobian: maps x (n,) to (m, n); None: central differences, 2 n evaluations.
+        angles: names of the measurements that are angles [rad], compared modulo a full turn.
 
     Raises:
-        SettingsError: deviations that are not positive, or not one or (m,); a name given twice.
-        UnknownNameError: an angle that is not measured.
+        SettingsError: deviations are not positive or have another shape, or a name occurs twice.
+        UnknownNameError: a name in ``angles`` is not a measurement.
     """
 
     names: tuple[str, ...]
@@ -100,12 +105,12 @@ class FunctionObservation:
 
     def __post_init__(self) -> None:
         if isinstance(self.names, str) or len(set(self.names)) != len(self.names):
-            raise SettingsError(f"what is measured has different names, not {self.names!r}")
+            raise SettingsError(f"measurements need different names, not {self.names!r}")
         size = np.shape(self.deviations)
         if size not in ((), (len(self.names),)) or not (np.asarray(self.deviations) > 0).all():
             raise SettingsError(
-                f"the deviations of {len(self.names)} measurements are one positive number, or "
-                f"as many, not {self.deviations!r}"
+                f"the deviations of {len(self.names)} measurements must be one positive number "
+                f"or as many, not {self.deviations!r}"
             )
         for name in self.angles:
             if name not in self.names:
@@ -113,7 +118,7 @@ class FunctionObservation:
 
     @cached_property
     def variances(self) -> Array:
-        """(m,) of the measurement noise."""
+        """(m,) variances of the measurement noise."""
         return np.full(len(self.names), 1.0) * np.square(self.deviations)
 
     @cached_property
@@ -122,20 +127,20 @@ class FunctionObservation:
         return np.array([name in self.angles for name in self.names], dtype=np.bool_)
 
     def predict(self, x: Array) -> tuple[Array, Array]:
-        """Its value (m,) and Jacobian (m, n)."""
+        """Return the function's value (m,) at x (n,), and its Jacobian (m, n)."""
         value = np.asarray(self.function(x), dtype=np.float64)
         if self.jacobian is not None:
             return value, np.asarray(self.jacobian(x), dtype=np.float64)
-        turning = self.wraps if value.shape == self.wraps.shape else np.zeros(0, dtype=np.bool_)
-        return value, differences(self.function, x, turning)
+        is_angle = self.wraps if value.shape == self.wraps.shape else np.zeros(0, dtype=np.bool_)
+        return value, numerical_jacobian(self.function, x, is_angle)
 
     def mirrors(self, belief: Belief) -> list[Array]:
-        """None."""
+        """Return no mirrored states."""
         return []
 
 
 class Measurement(NamedTuple):
-    """A measurement y (m,), NaN where occluded, of a model, with its noise's covariance (m, m)."""
+    """A measurement y (m,) of a model, NaN where occluded, and its noise covariance (m, m)."""
 
     model: ObservationModel
     y: Array
@@ -148,11 +153,11 @@ class Updated:
 
     Attributes:
         belief: without limits.
-        truncated: by the limits.
-        log_likelihood: logarithm of the measurement's probability density, from the normal
-            distribution fitted at the mean.
-        distance: the squared distance of mean and measurement from the prediction: chi-squared
-            with ``count`` degrees of freedom if all is as modelled.
+        truncated: inside the limits.
+        log_likelihood: log probability density of the measurement under the linearised model.
+        distance: squared Mahalanobis distance of the innovation; chi-squared distributed with
+            ``count`` degrees of freedom if the models are right.
+        count: number of measurements used.
     """
 
     belief: Belief
@@ -165,14 +170,15 @@ class Updated:
 def make_measurement(
     model: ObservationModel, y: Array, variances: Array | None = None
 ) -> Measurement:
-    """A measurement y (m,), NaN where occluded, and its noise, else the model's.
+    """Return a checked measurement.
 
     Args:
-        variances: (m,) of its noise, or the noise's covariance (m, m); finite where y is.
+        y: (m,) NaN where occluded.
+        variances: noise variances (m,) or covariance (m, m), finite where y is; None: the model's.
 
     Raises:
-        SettingsError: a wrong size, infinity, or a variance of something measured that is not
-            positive.
+        SettingsError: a wrong shape, an infinite number, or a variance of a finite measurement that
+            is not positive.
     """
     m = len(model.names)
     for values, shapes in ((y, [(m,)]), (variances, [(m,), (m, m)])):
@@ -180,8 +186,8 @@ def make_measurement(
             continue
         if np.shape(values) not in shapes:
             raise SettingsError(
-                f"a measurement has the shape {np.shape(values)}; the model measures "
-                f"{m} numbers (NaN where occluded)"
+                f"a measurement has the shape {np.shape(values)}; the model has {m} measurements "
+                "(NaN where occluded)"
             )
         infinite = np.argwhere(np.isinf(values))
         if len(infinite):
@@ -201,84 +207,95 @@ def make_measurement(
 
 def update(
     prediction: Belief,
-    seen: Measurement,
+    measurement: Measurement,
     iterations: int = 1,
     start: Array | None = None,
     tempered: bool = True,
     truncate: Truncate | None = None,
     sites: Array | None = None,
-    spread: float = 0.0,
+    remainder_weight: float = 0.0,
 ) -> Updated:
-    """Fuse a belief with a measurement, and truncate it.
+    """Update a belief by a measurement, and truncate it.
 
-    With one iteration this is (19) and (20), linearised at ``start``, and the truncation after it.
-    With more, the measurement is linearised anew at the mean of the truncated belief, until that
-    stays where it is: a tangent taken where the state cannot be says little about where it can be.
+    One iteration is (19) and (20), linearised at ``start``, followed by the truncation. With more
+    iterations the measurement is linearised again at the mean of the truncated belief until that
+    converges, because a tangent at a state outside the limits may be useless inside.
 
     Args:
-        start: (n,) where to linearise first; the predicted mean if not given.
-        tempered: whether a far start is approached with more noise than there is, which would
-            draw a mirrored one back to the prediction.
-        truncate: a belief, and sites (S, 2) to begin with, to a result; None: there are no limits.
-        sites: of the last truncation.
-        spread: 0: the measurement is linearised at a point. Else over the belief, but for a start
-            that is given, see ``linear_over``; what that leaves out counts as this many times its
-            covariance, as it repeats itself from frame to frame.
+        iterations: largest number of linearisations.
+        start: (n,) point of the first linearisation; None: the predicted mean.
+        tempered: whether the first iterations use inflated noise if the start fits badly. Not for a
+            mirrored start, which inflated noise would draw back to the prediction.
+        truncate: maps a belief and initial sites (S, 2) to the truncated belief; None: no limits.
+        sites: (S, 2) sites of the last truncation.
+        remainder_weight: 0: linearise at a point. Otherwise linearise over the belief (unless
+            ``start`` is given), and add this multiple of the remainder's covariance to the noise;
+            more than 1, as the remainder repeats from frame to frame. See ``linearise_over``.
 
     Raises:
-        SettingsError: the belief has no density inside the limits, or a variance is not positive.
+        SettingsError: the belief violates a row along which it has no variance, or a noise variance
+            is not positive.
     """
     sites, temperature = np.zeros((0, 2)) if sites is None else sites, 1.0
-    x, width = prediction.mean if start is None else start, None
-    if spread and start is None:
+    x, range_covariance = prediction.mean if start is None else start, None
+    if remainder_weight and start is None:
         first = prediction if truncate is None else truncate(prediction, sites)
-        x, width = first.mean, first.covariance
-    # A first guess far off is approached with more noise than there is, cooled from step to step:
-    # narrow curved valleys, such as that of a known scale, would stop a descent. Steps below
-    # ``settled`` deviations end it; later ones are halved, as tangents may point to and fro.
+        x, range_covariance = first.mean, first.covariance
+    # Annealing: a start that fits badly is updated with inflated noise, which is reduced from step
+    # to step. Narrow curved valleys, for example of a known scale, would otherwise stop it.
+    # Steps below ``settled`` standard deviations end it; later steps are halved, as tangents may
+    # make it oscillate.
     good_fit, cooling, full_steps = 9.0, 6.0, 8
     settled = 0.01 if truncate is None else 0.3
-    if not np.isfinite(seen.y).any():
-        iterations, width = 1, None
-    P, values = prediction.covariance, values_alone(seen.model)
+    if not np.isfinite(measurement.y).any():
+        iterations, range_covariance = 1, None
+    P, values = prediction.covariance, function_without_jacobian(measurement.model)
     for made in range(iterations):
-        # Made linear at x: innovation = H (x - prediction) + noise, over what is measured there.
-        _, h, H, left_out = (
-            linear_over(seen.model.predict, Belief(x, width), seen.model.wraps, values)
-            if width is not None
-            else Linear(x, *seen.model.predict(x))
+        # Linearised at x, over the measurements that are visible there.
+        _, h, H, remainder = (
+            linearise_over(
+                measurement.model.predict,
+                Belief(x, range_covariance),
+                measurement.model.wraps,
+                values,
+            )
+            if range_covariance is not None
+            else Linear(x, *measurement.model.predict(x))
         )
-        rows = np.isfinite(seen.y) & np.isfinite(h)
+        rows = np.isfinite(measurement.y) & np.isfinite(h)
         count = int(np.count_nonzero(rows))
-        residual = difference(seen.y[rows], h[rows], seen.model.wraps[rows])
-        H, plain = H[rows], seen.covariance[np.ix_(rows, rows)]
-        if left_out is not None:
-            plain = plain + spread * left_out[np.ix_(rows, rows)]
+        residual = wrapped_difference(measurement.y[rows], h[rows], measurement.model.wraps[rows])
+        H, R = H[rows], measurement.covariance[np.ix_(rows, rows)]
+        if remainder is not None:
+            R = R + remainder_weight * remainder[np.ix_(rows, rows)]
         innovation = residual + H @ (x - prediction.mean)
-        if made == 0 and iterations > 1 and tempered and not spread:
-            misfit = float(residual @ np.linalg.solve(plain, residual)) / max(count, 1)
+        if made == 0 and iterations > 1 and tempered and not remainder_weight:
+            misfit = float(residual @ np.linalg.solve(R, residual)) / max(count, 1)
             temperature = max(1.0, misfit / good_fit)
         belief, log_likelihood, distance = prediction, 0.0, 0.0
         if count:
-            noise, HP = temperature * plain, H @ P
+            noise, HP = temperature * R, H @ P
             root, failed = dpotrf(HP @ H.T + noise, lower=1)
             if failed:
                 raise SettingsError(
                     "the covariance of the innovation is not positive definite: give every "
                     "measurement a positive variance"
                 )
-            weighed = dpotrs(root, innovation, lower=1)[0]
-            distance = float(innovation @ weighed)
+            weighted = dpotrs(root, innovation, lower=1)[0]
+            distance = float(innovation @ weighted)
             log_determinant = 2.0 * float(np.log(np.diag(root)).sum())
             log_likelihood = -0.5 * (distance + log_determinant + count * math.log(2 * math.pi))
             gain = dpotrs(root, HP, lower=1)[0].T
-            rest = prediction.root - gain @ (H @ prediction.root)
-            covariance = rest @ rest.T + gain @ noise @ gain.T
-            mean = prediction.mean + P @ (H.T @ weighed)
+            reduced = prediction.root - gain @ (H @ prediction.root)
+            covariance = reduced @ reduced.T + gain @ noise @ gain.T
+            mean = prediction.mean + P @ (H.T @ weighted)
             belief = Belief(mean, 0.5 * (covariance + covariance.T))
-        truncated = unlimited(belief) if truncate is None else truncate(belief, sites)
+        truncated = untruncated(belief) if truncate is None else truncate(belief, sites)
         sites = truncated.sites
-        step, width = truncated.mean - x, truncated.covariance if spread else None
+        step, range_covariance = (
+            truncated.mean - x,
+            truncated.covariance if remainder_weight else None,
+        )
         size = np.abs(step / np.maximum(belief.deviations(), 1e-12)).max()
         if temperature == 1.0 and size < settled:
             break

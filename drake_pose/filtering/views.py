@@ -1,10 +1,10 @@
-"""One view for long: frames that show the same teach nothing new.
+"""Static views: successive frames that show the same measurement within noise.
 
-What one view may tell in all, and no more. A filter linearised anew in every frame of a static view
-becomes ever surer: the flaw that Shimada et al. state in section 7. Here a view keeps the tangent
-of its first frame; what that leaves out is an offset of each measurement, unknown, the same in all
-frames of the view, of the size of the curvature at its first frame, estimated beside the state and
-forgotten when the view ends.
+A filter that linearises anew in each frame of a static view becomes overconfident (Shimada et al.,
+section 7), because the linearisation error is the same in all its frames. Here a view keeps the
+tangent of its first frame. The linearisation error is estimated beside the state as an unknown
+offset of each measurement, with the size of the curvature at the first frame, and dropped when the
+view ends.
 """
 
 from dataclasses import dataclass
@@ -14,35 +14,36 @@ import numpy as np
 from scipy.special import chdtri
 
 from drake_pose.arrays import Array
-from drake_pose.filtering.linearisation import Linear, difference
+from drake_pose.filtering.linearisation import Linear, wrapped_difference
 from drake_pose.filtering.state import Belief, factor_of
 from drake_pose.filtering.update import LinearObservation, Measurement, ObservationModel
 
 
 @dataclass(frozen=True, eq=False)
 class StaticView:
-    """Frames that show the same: the measurement (m,) of the first, and how many."""
+    """A static view: the first frame's measurement (m,) and the number of its frames so far."""
 
     reference: Array
     count: int
 
 
-def next_view(view: StaticView | None, seen: Measurement, significance: float) -> StaticView:
-    """The view a measurement belongs to: the one so far, or one that begins with it.
+def next_view(view: StaticView | None, measurement: Measurement, significance: float) -> StaticView:
+    """Return the view that a measurement belongs to: the current one, or a new one.
 
     Args:
-        significance: a view is new when noise alone would make it differ so much from the reference
-            with no more than this probability; 0: every one is new.
+        view: the current view; None: there is none.
+        significance: a view is new if noise alone exceeds its distance from the view's reference
+            with no more than this probability; 0: every view is new.
     """
-    y = seen.y
+    y = measurement.y
     if view is None or significance == 0 or len(view.reference) != len(y):
         return StaticView(y, 1)
-    change = difference(y, view.reference, seen.model.wraps)
+    change = wrapped_difference(y, view.reference, measurement.model.wraps)
     both = np.isfinite(change)
     new_rows = np.isfinite(y) & ~np.isfinite(view.reference)
     if new_rows.any() or not both.any():
         return StaticView(y, 1)
-    size = float(np.sum(change[both] ** 2 / (2.0 * np.diag(seen.covariance)[both])))
+    size = float(np.sum(change[both] ** 2 / (2.0 * np.diag(measurement.covariance)[both])))
     is_new = size > _largest_change(significance, int(np.count_nonzero(both)))
     return StaticView(y, 1) if is_new else StaticView(view.reference, view.count + 1)
 
@@ -53,7 +54,7 @@ def _largest_change(significance: float, count: int) -> float:
 
 
 def measure_curvature(model: ObservationModel, belief: Belief) -> Array:
-    """(m,) mean square of what the tangent at a belief's mean leaves out of a measurement.
+    """Return the mean squares (m,) of the linearisation error of a measurement over a belief.
 
     By second differences along the columns of the covariance's root.
     """
@@ -65,40 +66,40 @@ def measure_curvature(model: ObservationModel, belief: Belief) -> Array:
         step = np.zeros_like(belief.mean)
         step[used] = column
         ends = [model.predict(belief.mean + sign * step)[0] for sign in (1.0, -1.0)]
-        bend = 0.5 * sum(difference(end, h, model.wraps) for end in ends)
+        bend = 0.5 * sum(wrapped_difference(end, h, model.wraps) for end in ends)
         # E[(b z^2)^2] = 3 b^2 for a standard normal z.
         total += 3.0 * np.nan_to_num(bend) ** 2
     return total
 
 
-def moved(belief: Belief, step: Linear, U: Array) -> Belief:
-    """The belief (6) after a step with noise of covariance U (n, n)."""
-    noise = U if step.rest is None else U + step.rest
+def after_step(belief: Belief, step: Linear, U: Array) -> Belief:
+    """Return the belief after a linearised step with process noise covariance U (n, n): (6)."""
+    noise = U if step.remainder is None else U + step.remainder
     P = step.slope @ belief.covariance @ step.slope.T + noise
     return Belief(step.value + step.slope @ (belief.mean - step.at), 0.5 * (P + P.T))
 
 
 @dataclass(frozen=True, eq=False)
 class RepeatedView:
-    """What is believed within a view: the state, and beside it the tangent's offsets.
+    """The belief within a static view: the state and the offsets of the tangent.
 
     Attributes:
-        tangent: (n,) where the view's first frame was linearised.
-        belief: over n + m numbers: the state, then what the tangent leaves out of each measurement.
+        tangent: (n,) state at which the view's first frame was linearised.
+        belief: over n + m numbers: the state, then the linearisation error of each measurement.
     """
 
     tangent: Array
     belief: Belief
 
     def state(self) -> Belief:
-        """The belief about the state alone."""
+        """Return the marginal belief of the state (n,)."""
         n = len(self.tangent)
         return Belief(self.belief.mean[:n].copy(), self.belief.covariance[:n, :n].copy())
 
-    def moved(self, step: Linear, U: Array) -> "RepeatedView":
-        """A step with noise of covariance U (n, n); the offsets stay as they are."""
+    def after_step(self, step: Linear, U: Array) -> "RepeatedView":
+        """Return the view after a step with process noise covariance U (n, n); offsets stay."""
         n, P = len(self.tangent), self.belief.covariance.copy()
-        state = moved(self.state(), step, U)
+        state = after_step(self.state(), step, U)
         mean = np.r_[state.mean, self.belief.mean[n:]]
         P[:n, :n] = state.covariance
         P[:n, n:] = step.slope @ P[:n, n:]
@@ -107,16 +108,16 @@ class RepeatedView:
 
 
 def begin_repeated_view(
-    model: ObservationModel, free: Belief, seen: Belief, tangent: Array
+    model: ObservationModel, free: Belief, state: Belief, tangent: Array
 ) -> RepeatedView:
-    """A view's second frame: nothing is known yet of the offsets but how large they may be.
+    """Return a view at its second frame; the offsets have mean 0 and the curvature as variance.
 
     Args:
-        free: the prediction of the second frame, without its limits.
-        seen: how far the state may be from the tangent, where the curvature is measured.
-        tangent: (n,) where the first frame was linearised.
+        free: the prediction for the second frame, without limits.
+        state: belief whose covariance is the range over which the curvature is measured.
+        tangent: (n,) state at which the first frame was linearised.
     """
-    curvature = measure_curvature(model, Belief(tangent, seen.covariance))
+    curvature = measure_curvature(model, Belief(tangent, state.covariance))
     n, m = len(tangent), len(curvature)
     P = np.zeros((n + m, n + m))
     P[:n, :n] = free.covariance
@@ -124,8 +125,11 @@ def begin_repeated_view(
     return RepeatedView(tangent, Belief(np.r_[free.mean, np.zeros(m)], P))
 
 
-def anchored(model: ObservationModel, tangent: Array) -> LinearObservation:
-    """A model held at the tangent (n,) of one state, with offsets: linear in both, (n + m,)."""
+def anchored_observation(model: ObservationModel, tangent: Array) -> LinearObservation:
+    """Return a model linearised at ``tangent`` (n,), with an offset for each measurement.
+
+    It is linear in (state, offsets) (n + m,).
+    """
     h, H = model.predict(tangent)
     at, slope = np.r_[tangent, np.zeros(len(h))], np.hstack([H, np.eye(len(h))])
     return LinearObservation(model.names, model.variances, model.wraps, at, h, slope)

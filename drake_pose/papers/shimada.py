@@ -197,7 +197,7 @@ def experiment_filter(
     for name, factor in (("noise", noise), ("acceleration", acceleration)):
         if not 0 < factor < math.inf:
             raise SettingsError(f"{name} must be a positive factor, not {factor}")
-    rows = model_inequalities(_hand()).only_of(HAND_STATE.names)
+    rows = model_inequalities(_hand()).restricted_to(HAND_STATE.names)
     usual = HandObservation(pixels_per_metre=PIXELS_PER_METRE)
     observation = replace(
         usual,

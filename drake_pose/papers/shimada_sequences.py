@@ -397,13 +397,13 @@ def run_sequence(
     guess = Belief(np.r_[moving, np.zeros(len(moving)), sizes], np.diag(deviations**2))
     # Sizes are within half and one and a half of the model's.
     limits = from_bounds(layout.constant, 0.5 * sizes, 1.5 * sizes, layout.names)
-    rows = stack([model_inequalities(model).only_of(layout.names), limits], layout.names)
+    rows = stack([model_inequalities(model).restricted_to(layout.names), limits], layout.names)
     # Accelerations per frame^2 at 30 Hz; a rate that is not seen fades within .15 s.
     noise = acceleration * (30.0 * period) ** 2 * of_kinds(2.0, 0.008, 1.5)
     U = layout.process_noise(dict(zip(layout.moving, noise.tolist(), strict=True)))
     A = layout.transition(math.exp(-period / 0.15))
     # How a hand is usually held is told once a second.
-    observation = HandObservation(scale, rest=1.0 / period, hand=hand)
+    observation = HandObservation(scale, prior_frames=1.0 / period, hand=hand)
     motion, settings = LinearMotion(A, U, None), settings or experiment_settings("joint")
     hand_filter = TruncatedFilter(layout, observation, rows, motion, settings)
     center, frames = (camera.center_x, camera.center_y), len(inputs.frames)

@@ -4,11 +4,11 @@ import pytest
 from drake_pose.filtering.hand import HAND_STATE
 from drake_pose.filtering.linearisation import Linear
 from drake_pose.filtering.state import Belief
-from drake_pose.filtering.truncated_filter import Hypothesis, merge_twins, normalise, prune
+from drake_pose.filtering.truncated_filter import Hypothesis, merge_duplicates, normalise, prune
 from drake_pose.filtering.update import make_measurement, update
 from drake_pose.filtering.views import (
     RepeatedView,
-    anchored,
+    anchored_observation,
     begin_repeated_view,
     measure_curvature,
     next_view,
@@ -76,7 +76,7 @@ def test_a_thousand_frames_tell_the_sum_of_state_and_offset_and_no_more():
     """Against the closed form: prior, offset and mean noise as one normal distribution."""
     prior = Belief(np.zeros(1), np.array([[0.09]]))
     repeated = begin_repeated_view(Parabola(), prior, prior, np.zeros(1))
-    tangent = anchored(Parabola(), repeated.tangent)
+    tangent = anchored_observation(Parabola(), repeated.tangent)
     C = measure_curvature(Parabola(), prior)[0]
     frames, y = 1000, 0.4
     for _ in range(frames):
@@ -94,7 +94,7 @@ def test_a_thousand_frames_tell_the_sum_of_state_and_offset_and_no_more():
 def test_the_anchored_jacobian_against_differences(hand):
     _, observation, sequence = hand
     x = sequence.states[5]
-    tangent = anchored(observation, x)
+    tangent = anchored_observation(observation, x)
     n, m = len(x), len(observation.names)
     z = np.r_[sequence.states[6], np.random.default_rng(0).normal(size=m)]
     h, H = tangent.predict(z)
@@ -110,7 +110,7 @@ def test_offsets_stay_while_the_state_moves(hand):
     repeated = begin_repeated_view(observation, guess, guess, guess.mean)
     A, U = HAND_STATE.transition(), f.predict(f.start(sequence.guess)).hypotheses[0].free.covariance
     n = len(HAND_STATE)
-    moved = repeated.moved(Linear(np.zeros(n), np.zeros(n), A), U)
+    moved = repeated.after_step(Linear(np.zeros(n), np.zeros(n), A), U)
     n = len(HAND_STATE)
     np.testing.assert_allclose(moved.state().mean, A @ guess.mean)
     np.testing.assert_allclose(moved.state().covariance, A @ guess.covariance @ A.T + U)
@@ -144,7 +144,7 @@ def test_weights_add_up_to_one_and_keep_their_ratios(common):
 def test_twins_are_one_with_the_weight_of_both():
     """Nearer than so many deviations of the heavier in every element."""
     some = normalise([at(0.0, 0.0, 2.0), at(0.55, -1.0), at(0.65, -2.0), at(0.7, -3.0)])
-    kept, rejected = merge_twins(some, 0.3, 7)
+    kept, rejected = merge_duplicates(some, 0.3, 7)
     assert [one.belief.mean[0] for one in kept] == [0.0, 0.65]
     assert [(one.step, one.reason) for one in rejected] == [(7, "twin")] * 2
     assert total(kept) == pytest.approx(1.0)
@@ -152,7 +152,7 @@ def test_twins_are_one_with_the_weight_of_both():
     np.testing.assert_allclose(gains(kept), -2.0)
     # However small a deviation is: .2 of it apart, and .4.
     small = normalise([at(0.0, 0.0, 1e-3), at(0.2e-3, -1.0, 1e-3), at(0.4e-3, -2.0, 1e-3)])
-    kept, _ = merge_twins(small, 0.3, 7)
+    kept, _ = merge_duplicates(small, 0.3, 7)
     assert [one.belief.mean[0] for one in kept] == [0.0, 0.4e-3]
 
 

@@ -5,7 +5,7 @@ import pytest
 
 from drake_pose.errors import SettingsError, UnknownNameError
 from drake_pose.filtering.inequalities import from_bounds
-from drake_pose.filtering.linearisation import linear_over
+from drake_pose.filtering.linearisation import linearise_over
 from drake_pose.filtering.motion import FunctionMotion, LinearMotion, constant_velocity
 from drake_pose.filtering.state import Belief, StateLayout
 from drake_pose.filtering.truncated_filter import FilterSettings, TruncatedFilter
@@ -200,14 +200,14 @@ def test_a_line_over_a_belief_has_the_mean_and_covariance_of_a_quadratic():
         return A @ x + 0.5 * np.einsum("kij,i,j->k", C, x, x), A + C @ x
 
     line, called = (
-        linear_over(function, belief, np.zeros(2, dtype=bool), values)
+        linearise_over(function, belief, np.zeros(2, dtype=bool), values)
         for values in (None, lambda x: function(x)[0])
     )
     for one, other in zip(line, called, strict=True):
         np.testing.assert_allclose(other, one, atol=1e-9)
     x = belief.mean + generator.normal(size=(400_000, 3)) @ root.T
     values = x @ A.T + 0.5 * np.einsum("kij,ni,nj->nk", C, x, x)
-    spread = line.slope @ belief.covariance @ line.slope.T + line.rest
+    spread = line.slope @ belief.covariance @ line.slope.T + line.remainder
     scale = np.sqrt(np.diag(spread))
     np.testing.assert_allclose(line.value / scale, values.mean(axis=0) / scale, atol=0.01)
     np.testing.assert_allclose(
@@ -217,11 +217,11 @@ def test_a_line_over_a_belief_has_the_mean_and_covariance_of_a_quadratic():
 
 def test_a_line_over_a_belief_without_width_is_the_tangent():
     covariance = np.diag([0.04, 0.0, 0.0])
-    line = linear_over(END.predict, Belief(START.mean, covariance), END.wraps)
+    line = linearise_over(END.predict, Belief(START.mean, covariance), END.wraps)
     np.testing.assert_allclose(line.slope[:, 2], end_slope(START.mean)[:, 2])
-    narrow = linear_over(END.predict, Belief(START.mean, 1e-14 * np.eye(3)), END.wraps)
+    narrow = linearise_over(END.predict, Belief(START.mean, 1e-14 * np.eye(3)), END.wraps)
     np.testing.assert_allclose(narrow.slope, end_slope(START.mean), atol=1e-6)
-    assert np.abs(narrow.rest).max() < 1e-20
+    assert np.abs(narrow.remainder).max() < 1e-20
 
 
 @pytest.mark.parametrize("memory", [np.inf, 0.4])

@@ -34,14 +34,16 @@ def test_it_leads_back_to_the_truth_that_drake_rendered(body):
     x_true = observation.state(truth)
     masks = [LabelRenderer(body, camera).mask(truth)]
     x, measured = descend(
-        observation, observation.look(masks), x_true + np.r_[0.12, -0.15, 0.1, np.zeros(3)]
+        observation,
+        observation.gather_evidence(masks),
+        x_true + np.r_[0.12, -0.15, 0.1, np.zeros(3)],
     )
     q, X_WB = observation.positions(x)
     # Segments of 12 to 24 pixels: a quarter of a pixel is a degree.
     np.testing.assert_allclose(q, truth, atol=np.radians(2.5))
     np.testing.assert_allclose(X_WB, np.eye(4), atol=1e-9)
     assert measured.distance < 0.6
-    assert measured.share > 0.95
+    assert measured.inlier_ratio > 0.95
     drawn = observation.draw(x, camera)
     assert np.count_nonzero(drawn != masks[0]) < 0.02 * np.count_nonzero(masks[0])
 
@@ -50,7 +52,10 @@ def test_a_root_that_is_known_elsewhere_and_one_that_is_estimated_there(body):
     home, shift = np.array([0.0, 0.05, 0.04]), np.array([0.0, 0.03, -0.02])
     tree, there = body.pose_tree("trunk", root_position=home), home + shift
     camera = front_camera(200, shift=0.2)
-    held, moves = ContourObservation(tree, [camera]), ContourObservation(tree, [camera], moves=True)
+    held, moves = (
+        ContourObservation(tree, [camera]),
+        ContourObservation(tree, [camera], root_moves=True),
+    )
     q = np.array([0.2, 0.9, -0.6])
     x = moves.state(q)
     at_home = moves.draw(x, camera)
@@ -59,7 +64,7 @@ def test_a_root_that_is_known_elsewhere_and_one_that_is_estimated_there(body):
     seen = held.with_root_position(there).draw(held.state(q), camera)
     assert not np.array_equal(seen, at_home)
     np.testing.assert_array_equal(moves.draw(x, camera), seen)
-    found, _ = descend(moves, moves.look([seen]), moves.state(q), steps=8)
+    found, _ = descend(moves, moves.gather_evidence([seen]), moves.state(q), steps=8)
     np.testing.assert_allclose(found[moves.layout.indices(ROOT_SHIFT)][1:], shift[1:], atol=0.004)
 
 
@@ -75,7 +80,7 @@ def test_slopes_agree_with_finite_differences_of_the_contour(body, monkeypatch):
         for step in (0.1, -0.1):
             x = truth.copy()
             x[element] += step
-            measured = observation.measure(observation.look([mask]), x)
+            measured = observation.measure(observation.gather_evidence([mask]), x)
             expected = measured.H @ (truth - x)
             assert np.linalg.norm(measured.y - expected) < 0.4 * np.linalg.norm(measured.y)
 
@@ -84,12 +89,15 @@ def test_nothing_seen_and_bad_arguments(body):
     camera = front_camera(100)
     observation = ContourObservation(body.pose_tree(), [camera])
     x = observation.state(np.zeros(3))
-    assert observation.measure(observation.look([None]), x) is None
-    assert observation.measure(observation.look([np.zeros((100, 100), dtype=bool)]), x) is None
+    assert observation.measure(observation.gather_evidence([None]), x) is None
+    assert (
+        observation.measure(observation.gather_evidence([np.zeros((100, 100), dtype=bool)]), x)
+        is None
+    )
     with pytest.raises(SettingsError, match="1 masks expected"):
-        observation.look([])
+        observation.gather_evidence([])
     with pytest.raises(SettingsError, match="50 x 50"):
-        observation.look([np.zeros((50, 50), dtype=bool)])
+        observation.gather_evidence([np.zeros((50, 50), dtype=bool)])
     with pytest.raises(SettingsError, match="one camera"):
         ContourObservation(body.pose_tree(), [])
 
@@ -137,12 +145,12 @@ def test_a_pose_goes_on_in_the_turn_of_the_track(model):
     names = observation.layout.names
     swing, luff = names.index("swing"), names.index("luff")
     last = observation.state(np.array([13.0, 3.0]))
-    found = observation.continued(observation.state(np.array([0.4, -2.0])), last)
+    found = observation.unwrapped(observation.state(np.array([0.4, -2.0])), last)
     assert found[swing] == pytest.approx(0.4 + 4.0 * np.pi)
     # Its limits are those of two turns.
     assert found[luff] == pytest.approx(-2.0 + 2.0 * np.pi)
     assert np.all(found[len(observation.layout.moving) :] == 0.0)
-    near = observation.continued(observation.state(np.array([13.1, 3.1])), last)
+    near = observation.unwrapped(observation.state(np.array([13.1, 3.1])), last)
     np.testing.assert_allclose(near[[swing, luff]], [13.1, 3.1])
 
 

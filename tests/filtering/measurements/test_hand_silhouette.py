@@ -17,7 +17,7 @@ from drake_pose.filtering.hand import (
     plant_positions,
 )
 from drake_pose.filtering.hand_silhouette import MATCHING, HandSilhouette, match_axes
-from drake_pose.filtering.linearisation import difference
+from drake_pose.filtering.linearisation import wrapped_difference
 from drake_pose.filtering.state import Belief
 from drake_pose.fit.evidence import find_edge_points
 from drake_pose.papers.shimada import experiment_filter
@@ -57,7 +57,7 @@ def sure_of(x):
 
 def normalised(found, x):
     """(39,) errors in deviations, NaN where hidden."""
-    error = difference(found.y, OBSERVATION.predict(x)[0], OBSERVATION.wraps)
+    error = wrapped_difference(found.y, OBSERVATION.predict(x)[0], OBSERVATION.wraps)
     return error / np.sqrt(np.maximum(np.diag(found.covariance), 1e-12))
 
 
@@ -126,7 +126,7 @@ def test_joints_that_are_drawn_outside_are_told_to_lie_half_a_radius_within(rend
     bent[HAND_STATE.index(SPREADS[0])] -= np.radians(40.0)
     edge, y = find_edge_points(mask, 1.0), np.full(len(MEASURED), np.nan)
     R = np.diag(OBSERVATION.variances)
-    SILHOUETTE._draw_in(bent, mask, edge, y, R)
+    SILHOUETTE._add_hidden_points(bent, mask, edge, y, R)
     told = np.flatnonzero(np.isfinite(y)).reshape(-1, 2)
     assert 2 <= len(told) < 8
     for rows in told:

@@ -80,18 +80,20 @@ def followed(observation, pictures):
 def test_colours_lead_back_to_the_truth(observation, renderer):
     picture = Painter(3)(renderer.mask(TRUTH))
     x = observation.state(TRUTH)
-    colours = observation.learn([picture], x, observation.no_colours(), True)
-    seen = observation.look([None], [picture], colours)
+    colours = observation.update_histograms([picture], x, observation.uninformed_histograms(), True)
+    seen = observation.gather_evidence([None], [picture], colours)
     found, measured = descend(observation, seen, x + np.r_[0.12, -0.15, 0.1, 0, 0, 0], steps=6)
     # Segments of 12 to 24 pixels: a quarter of a pixel is a degree.
     np.testing.assert_allclose(observation.positions(found)[0], TRUTH, atol=np.radians(2.5))
     assert measured.distance < 0.8
-    assert measured.share > 0.9
+    assert measured.inlier_ratio > 0.9
 
 
 def test_learned_colours_are_those_on_both_sides(observation, renderer):
     picture = np.where(renderer.mask(TRUTH)[..., None], ORANGE, GREEN).astype(np.uint8)
-    known = observation.learn([picture], observation.state(TRUTH), observation.no_colours())
+    known = observation.update_histograms(
+        [picture], observation.state(TRUTH), observation.uninformed_histograms()
+    )
     seen = known[0, known[0, :, Colour.ON].sum(axis=-1) > 0]
     assert len(seen) == 3
     for side, colour in ((Colour.ON, ORANGE), (Colour.BESIDE, GREEN)):
@@ -103,10 +105,10 @@ def test_learned_colours_are_those_on_both_sides(observation, renderer):
 
 def test_old_colours_fade_at_the_rate(observation, renderer, monkeypatch):
     monkeypatch.setattr(colours, "LINES", LINES._replace(rate=0.25, agreeing=100.0))
-    mask, known = renderer.mask(TRUTH), observation.no_colours()
+    mask, known = renderer.mask(TRUTH), observation.uninformed_histograms()
     for colour in (ORANGE, np.array([20, 20, 200])):
         picture = np.where(mask[..., None], colour, GREEN).astype(np.uint8)
-        known = observation.learn([picture], observation.state(TRUTH), known)
+        known = observation.update_histograms([picture], observation.state(TRUTH), known)
     shares = known[0, :, Colour.ON, numbered(ORANGE)]
     np.testing.assert_allclose(shares[shares > 0], 0.75, atol=0.06)
 
@@ -114,8 +116,8 @@ def test_old_colours_fade_at_the_rate(observation, renderer, monkeypatch):
 def test_a_body_like_its_background_says_nothing(observation):
     plain = np.full((SIDE, SIDE, 4), 120, dtype=np.uint8)
     x = observation.state(TRUTH)
-    colours = observation.learn([plain], x, observation.no_colours(), True)
-    assert observation.measure(observation.look([None], [plain], colours), x) is None
+    colours = observation.update_histograms([plain], x, observation.uninformed_histograms(), True)
+    assert observation.measure(observation.gather_evidence([None], [plain], colours), x) is None
     tracker, track = followed(observation, [])
     assert tracker.follow(track, [None], pictures=[plain]).lost
 
@@ -205,4 +207,4 @@ def test_a_part_whose_lines_scatter_counts_less():
 )
 def test_pictures_that_do_not_fit_are_named(observation, picture, said):
     with pytest.raises(SettingsError, match=f"front.*{said}"):
-        observation.look([None], [picture], observation.no_colours())
+        observation.gather_evidence([None], [picture], observation.uninformed_histograms())

@@ -154,9 +154,9 @@ def test_bad_settings_and_a_bad_period_are_named(body):
 
 def test_rates_fade_within_the_memory_and_change_by_the_acceleration_of_their_kind(body):
     tree = body.pose_tree("trunk", root_position=np.zeros(3))
-    observation = ContourObservation(tree, [CAMERA], moves=True, grows=True)
+    observation = ContourObservation(tree, [CAMERA], root_moves=True, scale_unknown=True)
     settings = TrackingSettings(
-        angle_acceleration=2.0, length_acceleration=3.0, growth_acceleration=5.0, memory=0.2
+        angle_acceleration=2.0, length_acceleration=3.0, log_scale_acceleration=5.0, memory=0.2
     )
     tracker, n = ContourTracker(observation, 0.05, settings), len(observation.layout)
     moving = observation.layout.moving
@@ -173,7 +173,7 @@ def test_rates_fade_within_the_memory_and_change_by_the_acceleration_of_their_ki
 
 def test_a_start_is_surer_of_what_moves_less(body):
     tree = body.pose_tree("trunk", root_position=np.zeros(3))
-    observation = ContourObservation(tree, [CAMERA], moves=True)
+    observation = ContourObservation(tree, [CAMERA], root_moves=True)
     calm, wild = (
         ContourTracker(observation, PERIOD, TrackingSettings(angle_acceleration=a)).start_belief(
             np.zeros(len(observation.layout))

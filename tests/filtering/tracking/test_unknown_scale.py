@@ -97,7 +97,7 @@ def test_joints_that_are_not_seen_come_to_rest_in_the_middle_of_their_limits(tre
     camera = front_camera(200, shift=0.2)
     moved = {}
     for rest in (0.0, 0.3):
-        observation = ContourObservation(tree, [camera], True, True, rest=rest)
+        observation = ContourObservation(tree, [camera], True, True, prior_weight=rest)
         (x,) = moving_states(tree, camera, 1, np.random.default_rng(3))
         mask = observation.draw(x, camera)
         # The left arm is cut out of the picture.
@@ -128,7 +128,7 @@ def fitted(tree):
     generator = np.random.default_rng(5)
     states = moving_states(tree, camera, FRAMES, generator)
     masks, _ = drawn(tree, camera, states)
-    observation = ContourObservation(tree, [camera], True, True, rest=0.1)
+    observation = ContourObservation(tree, [camera], True, True, prior_weight=0.1)
     tracker = ContourTracker(observation, PERIOD, AT_REST)
     # All frames are off alike in each start, and two of the starts end in one explanation.
     starts = []
@@ -175,7 +175,7 @@ def test_what_an_explanation_says_of_a_frame_is_its_pose_and_its_intervals(fitte
 def observation(body):
     free = RootRotation.free()
     tree = body.pose_tree("trunk", root_position=np.zeros(3), root_rotation=free)
-    return ContourObservation(tree, [front_camera(200, shift=0.2)], True, True, rest=0.03)
+    return ContourObservation(tree, [front_camera(200, shift=0.2)], True, True, prior_weight=0.03)
 
 
 def test_a_tilt_turns_the_root_alone(observation):

@@ -11,7 +11,7 @@ from drake_pose.filtering.inequalities import (
     from_model,
     inner_point,
     load_couplings,
-    load_usual_pose,
+    load_joint_prior,
     make_inequalities,
     model_inequalities,
     stack,
@@ -100,7 +100,7 @@ def test_the_rows_that_clash_are_named_and_no_others():
 
 
 def test_the_inner_point_is_inside_and_no_rows_are_allowed_but_none_without_room():
-    with pytest.raises(SettingsError, match="leave no room"):
+    with pytest.raises(SettingsError, match="leave no interior"):
         inner_point(from_bounds(["a", "b"], [0, 1], [1, 1]))
     rows = from_bounds(["a", "b"], [0, -np.inf], [1, -5])
     assert (rows.margins(inner_point(rows)) > 0).all()
@@ -111,7 +111,7 @@ def test_a_larger_state_and_a_smaller_one():
     rows = from_bounds(["a", "b"], [0, 1], [2, 3])
     larger = rows.for_columns(["rate", "b", "a"])
     np.testing.assert_allclose(larger.margins([99, 1.5, 0.5]), rows.margins([0.5, 1.5]))
-    assert rows.only_of(["b", "c"]).rows == ("b >= 1", "b <= 3")
+    assert rows.restricted_to(["b", "c"]).rows == ("b >= 1", "b <= 3")
     with pytest.raises(UnknownNameError, match="'a'"):
         rows.for_columns(["b"])
 
@@ -123,7 +123,7 @@ def test_a_larger_state_and_a_smaller_one():
         ("differences: [{first: a, second: a, within: 1}]", ["two different"]),
         ("differences: [{first: a, second: b}]", ["nothing is bounded"]),
         ("differences: [{first: a, second: b, within: 1, lower: 0}]", ["either within"]),
-        ("differences: [{first: a, second: b, lower: 1, upper: 0}]", ["a - b", "crossed"]),
+        ("differences: [{first: a, second: b, lower: 1, upper: 0}]", ["a - b", "exceed"]),
         ("differences: [{first: a, second: b, within: 1, unit: ft}]", ["'ft'", "deg"]),
         ("differences: [{first: a, other: b, within: 1}]", ["not a couplings file"]),
         ("rows: [{name: r, terms: {a: .nan}, upper: 1}]", ["'r'", "finite"]),
@@ -155,7 +155,7 @@ def test_how_joints_are_usually_held_in_units_and_about_what_is_estimated(tmp_pa
         "usual: [{name: r, terms: {b: 2, a: -1}, mean: 90, deviation: 45, unit: deg},"
         " {name: other, terms: {c: 1}, mean: 1, deviation: 1}]"
     )
-    usual = load_usual_pose(file, ["a", "b"])
+    usual = load_joint_prior(file, ["a", "b"])
     np.testing.assert_allclose(usual.phi, [[-1, 2]])
     np.testing.assert_allclose(usual.mean, [np.pi / 2])
     np.testing.assert_allclose(usual.deviation, [np.pi / 4])
@@ -178,7 +178,7 @@ def test_bad_rows_of_how_joints_are_held_are_named(tmp_path, row, word):
     file = tmp_path / "bad.couplings.yaml"
     file.write_text(f"usual: [{{name: knuckle, {row}}}]")
     with pytest.raises(ModelError, match=word) as caught:
-        load_usual_pose(file, ["a", "b"])
+        load_joint_prior(file, ["a", "b"])
     assert "bad.couplings.yaml" in str(caught.value)
 
 
@@ -187,9 +187,9 @@ def test_bad_arrays_are_refused():
         make_inequalities(["a"], ["r"], [[1.0]], [np.inf])
     with pytest.raises(SettingsError, match=r"'r'.*zero"):
         make_inequalities(["a"], ["r"], [[0.0]], [1.0])
-    with pytest.raises(SettingsError, match="give one of each"):
+    with pytest.raises(SettingsError, match="give as many of each"):
         make_inequalities(["a"], ["r"], [[0.0]], [1.0, 2.0])
-    with pytest.raises(SettingsError, match="crossed"):
+    with pytest.raises(SettingsError, match="exceed"):
         from_bounds(["a"], [2], [1])
 
 

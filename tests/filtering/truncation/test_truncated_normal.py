@@ -16,7 +16,7 @@ from drake_pose.filtering.state import make_belief
 from drake_pose.filtering.truncated_normal import (
     clip,
     interval_moments,
-    join_rows,
+    merge_rows,
     truncate_joint,
     truncate_sequential,
 )
@@ -259,7 +259,7 @@ def test_a_belief_about_other_elements_is_refused(method):
 def test_parallel_rows_that_exclude_each_other_are_named():
     rows = make_inequalities(["a"], ["up", "down"], [[2.0], [-1.0]], [1.0, -3.0])
     with pytest.raises(SettingsError, match="up; down"):
-        join_rows(rows)
+        merge_rows(rows)
 
 
 def test_clipping_moves_the_mean_inside_and_nothing_else():

@@ -230,10 +230,10 @@ def test_transition_and_noise():
 @pytest.mark.parametrize(
     ("make", "word"),
     [
-        (lambda: make_measurement(Linear(), np.zeros(3)), "measures 2"),
+        (lambda: make_measurement(Linear(), np.zeros(3)), "has 2 measurements"),
         (lambda: make_measurement(Linear(), np.array([0, np.inf])), "'b' is infinite"),
         (lambda: make_measurement(Linear(), np.ones(2), np.array([1, -1])), "'b' must be positive"),
-        (lambda: make_measurement(Linear(), np.ones(2), np.ones(3)), "measures 2"),
+        (lambda: make_measurement(Linear(), np.ones(2), np.ones(3)), "has 2 measurements"),
         (lambda: make_belief([np.nan, 0], np.eye(2)), "'0' is NaN"),
         (lambda: make_belief([0, 0], [[1, np.inf], [np.inf, 1]]), "NaN or infinity"),
         (lambda: make_belief([0, 0], [[1, 0.5], [0, 1]]), "symmetric"),
@@ -244,7 +244,10 @@ def test_transition_and_noise():
             "'angle' is NaN",
         ),
         (lambda: make_filter().start(Belief(np.zeros(2), np.eye(2))), "3"),
-        (lambda: make_filter().start(Belief(np.ones(3), np.diag([1.0, 1, -1]))), "'length' has"),
+        (
+            lambda: make_filter().start(Belief(np.ones(3), np.diag([1.0, 1, -1]))),
+            "'length' contributes",
+        ),
         (lambda: make_filter(truncation="x"), "truncation"),
         (lambda: make_filter(iterations=0), "iterations"),
         (lambda: make_filter(smallest_weight=1.0), "smallest_weight"),

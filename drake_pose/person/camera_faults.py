@@ -26,27 +26,28 @@ class FaultSettings(NamedTuple):
 
     Args:
         rounds: scales at which a camera's motion is fitted [m].
-        lowered: leaving the camera out must lower the others' misfit to this fraction.
-        alike: other cameras whose misfit is at most this factor above the lowest are suspected too.
+        max_misfit: leaving the camera out must lower the others' misfit to this fraction.
+        similar_misfit: cameras are suspected, too, whose misfit is at most this factor above the
+            lowest.
         min_metres, min_pixels: least displacement at the person [m] and in the picture [pixel]: a
             surface is known to 2 cm, and an edge to a pixel.
-        explained: a motion explains a camera's silhouettes if their inlier ratio is at least this
-            fraction of the others'.
+        explained_ratio: a motion explains a camera's silhouettes if their inlier ratio exceeds
+            this fraction of the others'.
     """
 
     rounds: tuple[float, ...] = (0.4, 0.3, 0.2, 0.15, 0.1, 0.07, 0.05, 0.05)
-    lowered: float = 0.8
-    alike: float = 1.1
+    max_misfit: float = 0.8
+    similar_misfit: float = 1.1
     min_metres: float = 0.035
     min_pixels: float = 2.0
-    explained: float = 0.9
+    explained_ratio: float = 0.9
 
 
 FAULT = FaultSettings()
 
 
 @dataclass(frozen=True, eq=False)
-class FrameView:
+class FrameEdges:
     """A frame: edge points of the regions by camera, and an approximate pose (m,) [rad, m]."""
 
     edges: Mapping[str, EdgePoints]
@@ -63,8 +64,8 @@ class CameraMotion:
         pixels: RMS displacement of the person's joints in its pictures [pixel].
         metres: the same at the person's distance [m].
         turn: rotation of the person in its pictures, clockwise [rad].
-        share_before, share_after: inlier ratio of the contours with the calibration, and after the
-            motion.
+        inlier_ratio_before, inlier_ratio_after: of the contours, with the calibration and after
+            the motion.
     """
 
     X_WC: Array
@@ -72,8 +73,8 @@ class CameraMotion:
     pixels: float
     metres: float
     turn: float
-    share_before: float
-    share_after: float
+    inlier_ratio_before: float
+    inlier_ratio_after: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,8 +86,8 @@ class CameraFault:
         motion: how it has moved; turns about the camera itself may be undetermined.
         is_explained: whether the motion explains the silhouettes. If not, the masks may be poor,
             mirrored, or another camera's.
-        rivals: cameras that may be at fault instead.
-        others_share: inlier ratio of the other cameras' contours without this one.
+        alternatives: cameras that may be at fault instead.
+        others_inlier_ratio: inlier ratio of the other cameras' contours without this one.
         first: index of the first frame in which it is at fault.
         is_left_out: whether it was left out.
     """
@@ -94,13 +95,13 @@ class CameraFault:
     name: str
     motion: CameraMotion
     is_explained: bool
-    rivals: tuple[str, ...]
-    others_share: float
+    alternatives: tuple[str, ...]
+    others_inlier_ratio: float
     first: int = 0
     is_left_out: bool = False
 
 
-class CameraJudge:
+class CameraComparison:
     """Compares cameras with each other by a person that they see.
 
     Args:
@@ -113,9 +114,9 @@ class CameraJudge:
         self, fit: ContourFit, cameras: Mapping[str, Camera], held: Mask | None = None
     ) -> None:
         self._fit, self._cameras, self._held = fit, cameras, held
-        self._without: dict[tuple[FrameView, str], tuple[Array, float]] = {}
+        self._without: dict[tuple[FrameEdges, str], tuple[Array, float]] = {}
 
-    def pose_without(self, frame: FrameView, left_out: str) -> tuple[Array, float]:
+    def pose_without(self, frame: FrameEdges, left_out: str) -> tuple[Array, float]:
         """Return a frame's pose (m,) by all cameras but one, and these cameras' inlier ratio."""
         if (frame, left_out) in self._without:
             return self._without[frame, left_out]
@@ -132,7 +133,7 @@ class CameraJudge:
         self._without[frame, left_out] = found.values, found.inlier_ratio
         return found.values, found.inlier_ratio
 
-    def share(self, camera: Camera, edge: EdgePoints, values: Array) -> float:
+    def inlier_ratio(self, camera: Camera, edge: EdgePoints, values: Array) -> float:
         """Return the inlier ratio of the contours in one picture, for values (m,)."""
         return self._fit.compare(
             pack_views([camera], [edge]), values, AnnealingStage(0.05, 0.05)
@@ -168,16 +169,16 @@ class CameraJudge:
         seen = [Observation(pack_evidence([edge]), values) for edge, values in pairs]
         rounds = [AnnealingStage(scale, 0.05) for scale in scales]
         nothing, solutions = np.zeros((len(pairs), 0)), []
-        for start in (np.zeros(3), _way_to_regions(camera, edges, places)):
+        for start in (np.zeros(3), _shift_to_regions(camera, edges, places)):
             shift = np.concatenate([np.zeros(3), camera.X_CW[:3, :3] @ start])
             solved = problem.solve(seen, rounds, (nothing, shift), expected=(nothing, np.zeros(6)))
             X_CW = problem.place_cameras(solved.parameters[0])[0][0]
             moved = camera.with_pose(np.linalg.inv(X_CW))
             solutions.append(self._describe(camera, moved, pairs, points))
             # A large motion may end on the wrong side of the body: try the regions' middles, too.
-            if solutions[0].share_after > FAULT.explained:
+            if solutions[0].inlier_ratio_after > FAULT.explained_ratio:
                 break
-        return max(solutions, key=lambda one: one.share_after)
+        return max(solutions, key=lambda one: one.inlier_ratio_after)
 
     def _describe(
         self,
@@ -193,7 +194,9 @@ class CameraJudge:
         sine = (
             offsets_before[:, 0] * offsets_after[:, 1] - offsets_before[:, 1] * offsets_after[:, 0]
         ).sum()
-        ratios = [np.mean([self.share(one, *pair) for pair in pairs]) for one in (camera, moved)]
+        ratios = [
+            np.mean([self.inlier_ratio(one, *pair) for pair in pairs]) for one in (camera, moved)
+        ]
         return CameraMotion(
             moved.X_WC,
             (after - before).mean(axis=0),
@@ -204,7 +207,7 @@ class CameraJudge:
             float(ratios[1]),
         )
 
-    def find_fault(self, frames: Sequence[FrameView]) -> CameraFault | None:
+    def find_fault(self, frames: Sequence[FrameEdges]) -> CameraFault | None:
         """Return the camera that disagrees most with the others, or None.
 
         Only frames that three or more cameras see are used.
@@ -219,7 +222,7 @@ class CameraJudge:
             poses, ratios = zip(*(self.pose_without(frame, "") for frame in own), strict=True)
             edges = [frame.edges[name] for frame in own]
             motion = self.motion(name, edges, poses, (0.1, 0.07, 0.05))
-            fits = motion.share_before > FAULT.explained * float(np.mean(ratios))
+            fits = motion.inlier_ratio_before > FAULT.explained_ratio * float(np.mean(ratios))
             return not fits or motion.metres > 0.2 * FAULT.min_metres
 
         # With few cameras the pose follows each of them, and this quick test would miss faults.
@@ -237,12 +240,13 @@ class CameraJudge:
             others_ratio = float(np.mean([others for _, others in without]))
             count = float(np.mean([len(frame.edges) for frame in own]))
             best = (
-                (count - 1.0) * others_ratio + max(motion.share_after, motion.share_before)
+                (count - 1.0) * others_ratio
+                + max(motion.inlier_ratio_after, motion.inlier_ratio_before)
             ) / count
             misfits[name] = (1.0 - best) / max(1.0 - float(np.mean(ratios)), 1e-3)
             found[name] = motion, others_ratio
         suspects = sorted(misfits, key=lambda one: misfits[one])
-        if not suspects or misfits[suspects[0]] > FAULT.lowered:
+        if not suspects or misfits[suspects[0]] > FAULT.max_misfit:
             return None
         # With three cameras it is unknown which one disagrees with the others, and two of them
         # predict the third one's picture only half as well.
@@ -252,40 +256,40 @@ class CameraJudge:
         moved = [
             one
             for one in suspects
-            if misfits[one] <= FAULT.alike * misfits[suspects[0]]
+            if misfits[one] <= FAULT.similar_misfit * misfits[suspects[0]]
             and found[one][0].metres >= metres
             and found[one][0].pixels >= FAULT.min_pixels
         ]
         if not moved:
             return None
-        first, alike = moved[0], np.inf if has_few else FAULT.alike * misfits[moved[0]]
+        first, limit = moved[0], np.inf if has_few else FAULT.similar_misfit * misfits[moved[0]]
         motion, others_ratio = found[first]
-        rivals = [
+        alternatives = [
             one
             for one in suspects
-            if one != first and misfits[one] < alike and found[one][0].metres > FAULT.min_metres
+            if one != first and misfits[one] < limit and found[one][0].metres > FAULT.min_metres
         ]
         explained = not has_few and is_explained(motion, others_ratio)
-        return CameraFault(first, motion, explained, tuple(rivals), others_ratio)
+        return CameraFault(first, motion, explained, tuple(alternatives), others_ratio)
 
 
-def _way_to_regions(camera: Camera, edges: Sequence[EdgePoints], places: Array) -> Array:
+def _shift_to_regions(camera: Camera, edges: Sequence[EdgePoints], places: Array) -> Array:
     """Return the mean shift (3,) from bodies' middles to the rays of regions' middles [m]."""
-    ways = [np.zeros(3)]
+    shifts = [np.zeros(3)]
     for edge, own in zip(edges, places, strict=True):
         if len(edge.uv):
             origin, direction = viewing_rays(camera, edge.middle[None])
             across = origin[0] - own.mean(axis=0)
-            ways.append(across - (across @ direction[0]) * direction[0])
-    return np.asarray(np.sum(ways, axis=0) / max(len(ways) - 1, 1))
+            shifts.append(across - (across @ direction[0]) * direction[0])
+    return np.asarray(np.sum(shifts, axis=0) / max(len(shifts) - 1, 1))
 
 
-def is_explained(motion: CameraMotion, others_share: float) -> bool:
+def is_explained(motion: CameraMotion, others_inlier_ratio: float) -> bool:
     """Return whether a camera's motion makes its silhouettes fit nearly as well as the others'."""
-    return motion.share_after > FAULT.explained * others_share
+    return motion.inlier_ratio_after > FAULT.explained_ratio * others_inlier_ratio
 
 
-def moved_since(before: Sequence[float], after: Sequence[float]) -> int:
+def first_moved_frame(before: Sequence[float], after: Sequence[float]) -> int:
     """Estimate when a camera moved, from the inlier ratios before and after its motion.
 
     Args:

@@ -21,11 +21,11 @@ from drake_pose.fit.colours import PartColours
 from drake_pose.fit.contour_fit import ContourFit, PoseFit
 from drake_pose.fit.evidence import EdgePoints, find_edge_points
 from drake_pose.person.camera_faults import (
+    CameraComparison,
     CameraFault,
-    CameraJudge,
-    FrameView,
+    FrameEdges,
+    first_moved_frame,
     is_explained,
-    moved_since,
 )
 from drake_pose.person.figures import PersonRecording, ReadFrame, ViewFaults
 from drake_pose.person.pose_tracker import PersonPoseTracker, TrackState
@@ -52,30 +52,30 @@ class PersonCapture:
 
     Args:
         q: (frames, nq) the plant's positions [rad, m]; nan where no person was found.
-        shares: (frames,) inlier ratio of the contours; 0 where no person was seen.
+        inlier_ratios: (frames,) inlier ratio of the contours; 0 where no person was seen.
         shape: the person's; None where the model has no shape joints.
         outlines: simplified surfaces of the tree's nodes with the person's radius scales.
         tree: the model's pose tree.
         deviations: (frames, nq) standard deviations of q [rad, m] by pictures and limits, or nan.
-        rivals: (q, deviations) of distinct alternative poses that fit as well, by frame. Only
+        alternatives: (q, deviations) of distinct alternative poses that fit as well, by frame. Only
             frames in which the person was searched have any.
     """
 
     q: Array
-    shares: Array
+    inlier_ratios: Array
     shape: PersonShape | None
     outlines: tuple[Outline, ...]
     tree: PoseTree
     deviations: Array
-    rivals: dict[int, tuple[tuple[Array, Array], ...]] = field(default_factory=dict)
+    alternatives: dict[int, tuple[tuple[Array, Array], ...]] = field(default_factory=dict)
 
     @staticmethod
-    def begun(count: int, shape: PersonShape | None, fit: ContourFit) -> "PersonCapture":
+    def empty(count: int, shape: PersonShape | None, fit: ContourFit) -> "PersonCapture":
         """Return a capture of `count` frames without poses."""
         q = np.full((count, len(fit.tree.model.position_names)), np.nan)
         return PersonCapture(q, np.zeros(count), shape, fit.outlines, fit.tree, q.copy())
 
-    def note(
+    def store(
         self,
         frame: int,
         tracker: PersonPoseTracker,
@@ -84,7 +84,10 @@ class PersonCapture:
     ) -> None:
         """Store the pose of a frame and its standard deviations, given what was seen."""
         lengths = None if self.shape is None else self.shape.covariance
-        self.q[frame], self.shares[frame] = tracker.positions(state.values), state.share
+        self.q[frame], self.inlier_ratios[frame] = (
+            tracker.positions(state.values),
+            state.inlier_ratio,
+        )
         self.deviations[frame] = tracker.deviations(state.values, seen, lengths)
 
 
@@ -117,18 +120,18 @@ def capture_person(
     if not len(frames):
         raise SettingsError("a recording needs one frame or more")
     capture = _Capture(tree, cameras, read, is_sequence)
-    shape, states = capture.measure(frames)
+    shape, states = capture.measure_shape(frames)
     tracker = capture.tracker
-    captured = PersonCapture.begun(count or len(frames), shape, tracker.fit)
+    captured = PersonCapture.empty(count or len(frames), shape, tracker.fit)
 
     def finish(frame: int, state: TrackState | None, seen: FrameViews) -> None:
         if state is not None:
-            captured.note(frame, tracker, state, seen)
+            captured.store(frame, tracker, state, seen)
         if on_frame is not None:
             on_frame(frame)
 
     capture.follow_all(frames, states, finish)
-    captured.rivals.update(capture.rivals)
+    captured.alternatives.update(capture.alternatives)
     return captured
 
 
@@ -149,8 +152,8 @@ class _Capture:
         self._bare, is_shape = ContourFit(tree, noise=NOISE), shape_values(tree)
         self.tracker = PersonPoseTracker(self._bare, LENIENT, is_shape)
         # Whether the model has shape joints to be fitted.
-        self._is_measured = bool(is_shape.any())
-        self.rivals: dict[int, tuple[tuple[Array, Array], ...]] = {}
+        self._has_shape = bool(is_shape.any())
+        self.alternatives: dict[int, tuple[tuple[Array, Array], ...]] = {}
         # Frames used for the shape are needed three times. By frame and camera: the region, packed
         # to bits along the rows, and its edge.
         self._kept: dict[int, dict[str, tuple[NDArray[np.uint8], EdgePoints]]] = {}
@@ -167,7 +170,7 @@ class _Capture:
         pairs = zip(cameras, masks.values(), strict=True)
         return FrameViews(cameras, [see_silhouette(one, edge_spacing(c)) for c, one in pairs])
 
-    def measure(
+    def measure_shape(
         self, frames: Sequence[int], first: int = 40, fitted: int = 10
     ) -> tuple[PersonShape | None, dict[int, TrackState]]:
         """Fit the shape to `fitted` of the `first` frames, and give it to the tracker.
@@ -175,7 +178,7 @@ class _Capture:
         Returns:
             The shape, None where the model has no shape joints; and the states in these frames.
         """
-        if not self._is_measured:
+        if not self._has_shape:
             return None, {}
         frames = frames[:first]
         for frame in frames:
@@ -188,13 +191,13 @@ class _Capture:
             rough = self.follow_all(frames, {})
             poses = {k: one.values for k in chosen if (one := rough[k])}
         else:
-            explained = {k: self.explained(k) for k in chosen}
+            explained = {k: self.find_explanations(k) for k in chosen}
             poses = {k: own[0].fit.values for k, own in explained.items() if own}
-        shape, self.tracker = self._measured(list(poses), list(poses.values()))
+        shape, self.tracker = self._fit_shape(list(poses), list(poses.values()))
         states = zip(poses, shape.poses, strict=True)
         return shape, {k: self.tracker.start(pose) for k, pose in states}
 
-    def _measured(
+    def _fit_shape(
         self, frames: Sequence[int], poses: Sequence[Array]
     ) -> tuple[PersonShape, PersonPoseTracker]:
         """Fit the shape to frames with these poses (m,); return it with a tracker that has it."""
@@ -204,7 +207,7 @@ class _Capture:
         shaped, plan = ContourFit(fit.kinematics, shape.outlines, NOISE), self.tracker.plan
         return shape, PersonPoseTracker(shaped, LENIENT, shape_values(fit.tree), shape.values, plan)
 
-    def explained(self, frame: int, begun: PoseFit | None = None) -> list["_Explanation"]:
+    def find_explanations(self, frame: int, start: PoseFit | None = None) -> list["_Explanation"]:
         """Return the distinct poses that explain a frame, best first; empty where nobody is seen.
 
         Where the shape is unknown, the shape of a first fit is used in the search, and each
@@ -212,35 +215,35 @@ class _Capture:
         wrong pose may fit better than the right one.
 
         Args:
-            begun: the first fit, if it exists already.
+            start: the first fit, if it exists already.
         """
         seen, tracker = self._see(frame), self.tracker
-        if self._is_measured:
-            begun = begun or next(iter(tracker.search.started(seen)), None)
-            if begun is None:
+        if self._has_shape:
+            start = start or next(iter(tracker.search.find_starts(seen)), None)
+            if start is None:
                 return []
-            _, tracker = self._measured([frame], [begun.values])
-        fits = tracker.search.explanations(seen)
-        least = fits[0].closeness - tracker.settings.rival if fits else 0.0
+            _, tracker = self._fit_shape([frame], [start.values])
+        fits = tracker.search.find_explanations(seen)
+        least = fits[0].closeness - tracker.settings.alternative_margin if fits else 0.0
         found = [_Explanation(one, tracker) for one in fits if one.closeness > least]
-        if self._is_measured:
+        if self._has_shape:
             found = [self._with_shape(frame, one.fit.values) for one in found]
         ranked = {id(one.fit): one for one in found}
-        unlike = tracker.search.unlike(one.fit for one in found)
+        unlike = tracker.search.distinct(one.fit for one in found)
         found = [ranked[id(fit)] for fit in unlike]
-        self.rivals[frame] = tuple(
+        self.alternatives[frame] = tuple(
             (own.positions(fit.values), own.deviations(fit.values, seen))
             for fit, own in found[1:]
-            if fit.closeness > unlike[0].closeness - tracker.settings.alike
+            if fit.closeness > unlike[0].closeness - tracker.settings.ambiguity_margin
         )
         return found
 
     def _with_shape(self, frame: int, values: Array) -> "_Explanation":
         """Refine a pose (m,) of a frame together with the person's shape."""
         seen = self._see(frame)
-        shape, own = self._measured([frame], [values])
-        shaped = own.search.refined(shape.poses[0], seen)
-        return _Explanation(own.search.mended(shaped, seen), own)
+        shape, own = self._fit_shape([frame], [values])
+        shaped = own.search.refine(shape.poses[0], seen)
+        return _Explanation(own.search.improve_limbs(shaped, seen), own)
 
     def follow_all(
         self,
@@ -254,12 +257,14 @@ class _Capture:
         def follow(state: TrackState | None, frame: int, last: int) -> TrackState | None:
             seen = self._see(frame)
             if state is None and not self._is_sequence:
-                found[frame] = self._found_anew(frame, known.get(frame))
+                found[frame] = self._search_frame(frame, known.get(frame))
             else:
                 found[frame] = self.tracker.follow(state, seen)
             if state is not None and abs(frame - last) > 1:
                 anew = self.tracker.follow(None, seen)
-                found[frame] = max(found[frame], anew, key=lambda one: one.share if one else 0.0)
+                found[frame] = max(
+                    found[frame], anew, key=lambda one: one.inlier_ratio if one else 0.0
+                )
             if finish is not None:
                 finish(frame, found[frame], seen)
             return found[frame]
@@ -280,18 +285,18 @@ class _Capture:
                 state, last = follow(state, frame, last), frame
         return found
 
-    def _found_anew(self, frame: int, known: TrackState | None) -> TrackState | None:
+    def _search_frame(self, frame: int, known: TrackState | None) -> TrackState | None:
         """Return the state in a frame by itself, with the tracker's shape."""
         if known is None:
-            explained = self.explained(frame)
+            explained = self.find_explanations(frame)
             if not explained:
                 return None
             fit, own = explained[0]
             if own is self.tracker:
                 return self.tracker.start(fit.values, fit.inlier_ratio)
-            known = self.tracker.start(self.tracker.worn(fit.values))
+            known = self.tracker.start(self.tracker.with_held(fit.values))
         seen, search = self._see(frame), self.tracker.search
-        fit = search.mended(search.refined(known.values, seen), seen)
+        fit = search.improve_limbs(search.refine(known.values, seen), seen)
         return self.tracker.start(fit.values, fit.inlier_ratio)
 
     def _best_start(
@@ -303,7 +308,7 @@ class _Capture:
         """
         best: tuple[int, PoseFit] | None = None
         for frame in spread_over(frames, tried):
-            for one in self.tracker.search.started(self._see(frame)):
+            for one in self.tracker.search.find_starts(self._see(frame)):
                 if best is None or one.closeness > best[1].closeness:
                     best = frame, one
             if best is not None and best[1].inlier_ratio > enough:
@@ -312,7 +317,7 @@ class _Capture:
             raise SettingsError(
                 f"two cameras see no person in any of {tried} frames: give masks that show one"
             )
-        fit, self.tracker = self.explained(*best)[0]
+        fit, self.tracker = self.find_explanations(*best)[0]
         return best[0], self.tracker.start(fit.values, fit.inlier_ratio)
 
 
@@ -355,7 +360,7 @@ def capture_by_colour(
         fit, LENIENT, shape_values(tree), None if shape is None else shape.values
     )
     places = {frame: k for k, frame in enumerate(masked)}
-    captured, distances = PersonCapture.begun(count, shape, fit), np.full(count, np.nan)
+    captured, distances = PersonCapture.empty(count, shape, fit), np.full(count, np.nan)
     state: TrackState | None = None
     colours: KnownColours = {}
     own: PartColours | None = None
@@ -368,9 +373,12 @@ def capture_by_colour(
             state = tracker.start(values)
             if last is not None and not last.is_lost:
                 state = replace(state, step=values - last.values)
-            captured.q[frame], captured.shares[frame] = known.q[place], known.shares[place]
+            captured.q[frame], captured.inlier_ratios[frame] = (
+                known.q[place],
+                known.inlier_ratios[place],
+            )
             captured.deviations[frame] = known.deviations[place]
-            colours = views.learned(fit, values, masked[frame])
+            colours = views.updated_colours(fit, values, masked[frame])
             shown = zip(views.cameras, views.pictures, strict=True)
             X_WN = fit.kinematics.poses(values)
             own = PartColours.learned(colours.values(), fit.outlines, X_WN, shown)
@@ -380,15 +388,15 @@ def capture_by_colour(
             if frame in starts and (state is None or state.is_lost):
                 began = tracker.start(tracker.values(starts[frame]))
                 if not views.known:
-                    learned = views.learned(fit, began.values)
+                    learned = views.updated_colours(fit, began.values)
                     views = ColourViews(views.cameras, views.pictures, learned)
                 state = tracker.follow_by_colour(began, views)
             if state is not None and state.is_lost:
-                captured.shares[frame] = state.share
+                captured.inlier_ratios[frame] = state.inlier_ratio
                 state = replace(state, step=np.zeros(len(state.values)))
             elif state is not None:
-                colours = views.learned(fit, state.values)
-                captured.note(frame, tracker, state, views)
+                colours = views.updated_colours(fit, state.values)
+                captured.store(frame, tracker, state, views)
                 distances[frame] = tracker.distance_by_colour(state.values, views)
         if on_frame is not None:
             on_frame(frame)
@@ -421,14 +429,14 @@ def capture_checked(
     count: int,
     is_sequence: bool = True,
     on_frame: Callable[[int], None] | None = None,
-    carved: int = 3,
-    least_left: int = 3,
+    hull_frames: int = 3,
+    min_cameras: int = 3,
 ) -> CheckedCapture:
     """Capture a recording as `capture_person` does, and find its faults.
 
     Args:
-        carved: number of frames whose visual hull is compared with the silhouettes.
-        least_left: a camera is left out only if at least this number of others remains.
+        hull_frames: number of frames whose visual hull is compared with the silhouettes.
+        min_cameras: a camera is left out only if at least this number of others remains.
 
     Raises:
         CameraError: the person is smaller or taller than people are.
@@ -437,8 +445,10 @@ def capture_checked(
         SettingsError: two cameras see a person in no frame.
     """
     recording = require_person(PersonRecording(cameras, read, count, is_sequence), count)
-    rig = find_rig_fault(cameras, [recording.read(k) for k in spread_over(recording.seen, carved)])
-    if rig is not None and rig.is_undone:
+    rig = find_rig_fault(
+        cameras, [recording.read(k) for k in spread_over(recording.seen, hull_frames)]
+    )
+    if rig is not None and rig.is_identified:
         undo = rig.undo
         undone = PersonRecording(cameras, lambda k: undo(read(k)), count, is_sequence)
         recording = require_person(undone, count)
@@ -449,18 +459,18 @@ def capture_checked(
         captured = capture_person(
             tree, cameras, recording.read, recording.seen, count, is_sequence, report
         )
-        judge = _Judge(tree, cameras, recording, captured)
-        found = [judge.dated(one) for one in found]
-        fault = judge.find()
+        comparison = _CaptureComparison(tree, cameras, recording, captured)
+        found = [comparison.reevaluate(one) for one in found]
+        fault = comparison.find()
         if fault is None:
             break
         others = len(recording.cameras_at(fault.first)) - 1
-        fault = replace(fault, is_left_out=others >= least_left and not fault.rivals)
+        fault = replace(fault, is_left_out=others >= min_cameras and not fault.alternatives)
         found.append(fault)
         if not fault.is_left_out:
             break
         recording.leave_out(fault.name, fault.first)
-    if found and rig is not None and not rig.is_undone:
+    if found and rig is not None and not rig.is_identified:
         rig = None
     return CheckedCapture(captured, recording.faults(), tuple(found), rig, recording.read)
 
@@ -491,7 +501,7 @@ def require_person(recording: PersonRecording, count: int) -> PersonRecording:
     return recording
 
 
-class _Judge(CameraJudge):
+class _CaptureComparison(CameraComparison):
     """Compares the cameras of a captured recording with each other."""
 
     def __init__(
@@ -518,7 +528,7 @@ class _Judge(CameraJudge):
         for frame in picked:
             masks = self._recording.read(frame).items()
             edges = {name: self._edge(name, mask) for name, mask in masks}
-            views.append(FrameView(edges, self._values[frame]))
+            views.append(FrameEdges(edges, self._values[frame]))
         fault = self.find_fault(views)
         if fault is None or not fault.is_explained:
             # A camera that moved in the middle of the recording disagrees in the last part only.
@@ -527,12 +537,12 @@ class _Judge(CameraJudge):
             return None
         own = [k for k, view in enumerate(views) if fault.name in view.edges]
         poses = [self.pose_without(views[k], fault.name)[0] for k in own]
-        since = self._since(fault, [views[k].edges[fault.name] for k in own], poses)
+        since = self._first_frame(fault, [views[k].edges[fault.name] for k in own], poses)
         # It may have moved at any time between two compared frames.
         first = 0 if since == 0 else picked[own[min(since, len(own)) - 1]] + 1
         return replace(fault, first=first)
 
-    def dated(self, fault: CameraFault) -> CameraFault:
+    def reevaluate(self, fault: CameraFault) -> CameraFault:
         """Evaluate a left-out camera again, by the poses captured without it."""
         seen = {k: self._recording.read(k, with_all=True).get(fault.name) for k in self._values}
         frames = [k for k, mask in seen.items() if mask is not None]
@@ -544,13 +554,13 @@ class _Judge(CameraJudge):
             if not late:
                 break
             motion = self.motion(fault.name, [edges[k] for k in late], [poses[k] for k in late])
-            explained = is_explained(motion, fault.others_share)
+            explained = is_explained(motion, fault.others_inlier_ratio)
             fault = replace(fault, motion=motion, is_explained=explained)
-            since = min(self._since(fault, edges, poses), len(frames) - 1)
+            since = min(self._first_frame(fault, edges, poses), len(frames) - 1)
             fault = replace(fault, first=frames[since])
         return fault
 
-    def _since(
+    def _first_frame(
         self, fault: CameraFault, edges: Sequence[EdgePoints], poses: Sequence[Array]
     ) -> int:
         """Return the index of the first picture in which a camera is at fault.
@@ -559,11 +569,11 @@ class _Judge(CameraJudge):
         """
         camera = self._cameras[fault.name]
         before, after = (
-            [self.share(one, e, values) for e, values in zip(edges, poses, strict=True)]
+            [self.inlier_ratio(one, e, values) for e, values in zip(edges, poses, strict=True)]
             for one in (camera, camera.with_pose(fault.motion.X_WC))
         )
-        least = 0.7 * fault.others_share
-        return moved_since(before, [max(one, least) for one in after])
+        least = 0.7 * fault.others_inlier_ratio
+        return first_moved_frame(before, [max(one, least) for one in after])
 
     def _edge(self, name: str, mask: Mask) -> EdgePoints:
         return find_edge_points(mask, edge_spacing(self._cameras[name]))

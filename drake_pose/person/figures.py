@@ -28,7 +28,7 @@ ReadFrame = Callable[[int], Mapping[str, Mask]]
 # Largest distance of a person's middle from the ray of one of the person's figures [m].
 
 # Middles of one person's silhouettes lie no farther apart [m].
-_WITHIN = 0.35
+_MAX_RAY_DISTANCE = 0.35
 
 
 class Figure(NamedTuple):
@@ -118,13 +118,13 @@ def _coarse(mask: Mask) -> tuple[Picture, int]:
 
 
 def find_persons(
-    cameras: Sequence[Camera], figures: Sequence[Sequence[Figure]], looked_at: int = 8
+    cameras: Sequence[Camera], figures: Sequence[Sequence[Figure]], examined: int = 8
 ) -> tuple[Person, ...]:
     """Return the persons that two or more cameras see, the best supported first.
 
     Args:
         figures: of each camera's mask.
-        looked_at: number of places with the best support that are examined in each round.
+        examined: number of places with the best support that are examined in each round.
     """
     if all(len(own) <= 1 for own in figures):
         taken = {k: 0 for k, own in enumerate(figures) if own}
@@ -132,7 +132,10 @@ def find_persons(
             return ()
         person = _person(cameras, figures, taken)
         place = person.place[None]
-        if max(metres_off(cameras[k], figures[k][0].middle, place)[0] for k in taken) < _WITHIN:
+        if (
+            max(ray_distances(cameras[k], figures[k][0].middle, place)[0] for k in taken)
+            < _MAX_RAY_DISTANCE
+        ):
             return (person,)
     free = [set(range(len(own))) for own in figures]
     middles = [np.array([figure.middle for figure in own]).reshape(-1, 2) for own in figures]
@@ -142,11 +145,11 @@ def find_persons(
             np.isin(np.arange(len(own)), list(rest))
             for own, rest in zip(figures, free, strict=True)
         ]
-        places = meeting_points(cameras, middles, 2.0 * _WITHIN, is_candidate)
+        places = meeting_points(cameras, middles, 2.0 * _MAX_RAY_DISTANCE, is_candidate)
         best: tuple[float, float, Person] | None = None
         scores, nearest = _support(cameras, figures, free, places)
         # Places with the same nearest figures belong to one person.
-        for chosen in dict.fromkeys(map(tuple, nearest[np.argsort(-scores)[:looked_at]].tolist())):
+        for chosen in dict.fromkeys(map(tuple, nearest[np.argsort(-scores)[:examined]].tolist())):
             taken = {k: i for k, i in enumerate(chosen) if i >= 0}
             if len(taken) < 2:
                 continue
@@ -158,7 +161,7 @@ def find_persons(
             person = _person(cameras, figures, taken)
             if best is None or (float(score[0]), person.area) > best[:2]:
                 best = float(score[0]), person.area, person
-        if best is None or (persons and not is_another(best[2], persons)):
+        if best is None or (persons and not is_separate(best[2], persons)):
             return tuple(persons)
         persons.append(best[2])
         for camera, index in best[2].figures.items():
@@ -206,7 +209,7 @@ def _support(
         if not own:
             scores += misses * is_visible
             continue
-        distances = np.array([metres_off(camera, figure.middle, places) for figure in own])
+        distances = np.array([ray_distances(camera, figure.middle, places) for figure in own])
         distances[[i for i in range(len(own)) if i not in free[k]]] = np.inf
         nearest = distances.argmin(axis=0)
         distance = distances.min(axis=0)
@@ -214,15 +217,15 @@ def _support(
         with np.errstate(invalid="ignore"):
             within = (uv[:, None] >= boxes[:, :2]) & (uv[:, None] <= boxes[:, 2:])
         covered = np.any(np.all(within, axis=2), axis=1)
-        fits = is_visible & (distance < _WITHIN)
+        fits = is_visible & (distance < _MAX_RAY_DISTANCE)
         taken[:, k] = np.where(fits, nearest, -1)
         points = np.where(covered, covers, misses)
-        points[fits] = 1.0 - 0.5 * distance[fits] / _WITHIN
+        points[fits] = 1.0 - 0.5 * distance[fits] / _MAX_RAY_DISTANCE
         scores += points * is_visible
     return scores, taken
 
 
-def is_another(
+def is_separate(
     person: Person, persons: Sequence[Person], least_area: float = 0.25, apart: float = 0.5
 ) -> bool:
     """Return whether a person is separate from all others, and no part of their silhouettes.
@@ -241,7 +244,7 @@ def pixels_per_metre(camera: Camera, place: Array) -> float:
     return float(contour_fit.pixels_per_metre(contour_fit.pack_cameras([camera]), place)[0])
 
 
-def metres_off(camera: Camera, uv: Array, places: Array) -> Array:
+def ray_distances(camera: Camera, uv: Array, places: Array) -> Array:
     """Return the distances (n,) of places (n, 3) from the ray of a pixel (2,) [m]."""
     origin, direction = viewing_rays(camera, uv[None])
     across = places - origin
@@ -293,7 +296,7 @@ def sort_figures(
         taken = {one.figures[k] for one in others if k in one.figures}
         away: list[Figure] = []
         for i, figure in enumerate(own):
-            off = metres_off(camera, figure.middle, person.place[None])[0]
+            off = ray_distances(camera, figure.middle, person.place[None])[0]
             if person.figures.get(k) == i:
                 hidden = [one for one in others if k not in one.figures]
                 merged |= any(covers(camera, figure, one) for one in hidden)
@@ -301,7 +304,7 @@ def sort_figures(
                 merged = True
             elif (
                 i in taken
-                or metres_off(camera, figure.middle, places).min(initial=np.inf) < off
+                or ray_distances(camera, figure.middle, places).min(initial=np.inf) < off
                 or (
                     k in person.figures
                     and off >= far
@@ -334,7 +337,7 @@ def keep_person(
         return dict(masks), None, (), ()
     if place is None:
         middle = middle_of_view(list(used.values()))
-        person = max(persons, key=lambda one: _standing(one, middle))
+        person = max(persons, key=lambda one: _prominence(one, middle))
     else:
         person = min(persons, key=lambda one: float(np.linalg.norm(one.place - place)))
     found = sort_figures(cameras, figures, persons, person)
@@ -374,11 +377,11 @@ def follow_one(
         The person in each frame: without figures where hidden for a while, None where absent.
     """
     if not is_sequence:
-        return [max(own, key=lambda one: _standing(one, middle), default=None) for own in frames]
+        return [max(own, key=lambda one: _prominence(one, middle), default=None) for own in frames]
     tracks = find_tracks(frames)
     if not tracks:
         return [None] * len(frames)
-    main = max(tracks, key=lambda track: sum(_standing(one, middle)[0] for one in track.values()))
+    main = max(tracks, key=lambda track: sum(_prominence(one, middle)[0] for one in track.values()))
     # A person who is present only while the main one is absent is taken for the same person.
     for track in sorted(tracks, key=len, reverse=True):
         if not set(range(min(track), max(track) + 1)) & set(main):
@@ -419,7 +422,7 @@ def find_tracks(
     return tracks
 
 
-def _standing(person: Person, middle: Array) -> tuple[float, float]:
+def _prominence(person: Person, middle: Array) -> tuple[float, float]:
     """Return the sort key of the most prominent person: area first, then nearness to the middle."""
     return person.area, -float(np.linalg.norm(person.place - middle))
 

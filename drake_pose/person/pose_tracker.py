@@ -136,25 +136,25 @@ class TrackState:
 
     Args:
         values, step: (m,) values of the pose tree, and their change since the last frame [rad, m].
-        share, usual: inlier ratio of the contours, and the ratio that is usual.
-        troubled: number of successive frames with a low inlier ratio. Negative: the person was
-            found anew, and the remaining headings are tried in as many frames.
-        worst: lowest inlier ratio of a part, where the person is tracked by colours.
+        inlier_ratio, usual_ratio: inlier ratio of the contours, and the usual one.
+        troubled_frames: number of successive frames with a low inlier ratio. Negative: the person
+            was found anew, and the remaining headings are tried in as many frames.
+        worst_part: lowest inlier ratio of a part, where the person is tracked by colours.
     """
 
     values: Array
     step: Array
-    share: float
-    usual: float
-    troubled: int = 0
-    worst: float = 1.0
+    inlier_ratio: float
+    usual_ratio: float
+    troubled_frames: int = 0
+    worst_part: float = 1.0
 
     @property
     def is_lost(self) -> bool:
         """Whether the inlier ratio is too low for the pose to be valid."""
         return (
-            self.share < PersonSettings.lost_below * self.usual
-            or self.worst < PersonSettings.part_lost_below
+            self.inlier_ratio < PersonSettings.lost_below * self.usual_ratio
+            or self.worst_part < PersonSettings.part_lost_below
         )
 
 
@@ -194,12 +194,14 @@ class PersonPoseTracker:
         self._rest = rest
         self.search = PersonSearch(fit, self.plan, settings, self._information, self._held, rest)
 
-    def start(self, values: Array, share: float = 1.0) -> TrackState:
+    def start(self, values: Array, inlier_ratio: float = 1.0) -> TrackState:
         """Return the state of a motionless person at values (m,) with this inlier ratio."""
         still = np.zeros(len(values))
-        return TrackState(np.array(values, dtype=np.float64), still, share, self.settings.usual)
+        return TrackState(
+            np.array(values, dtype=np.float64), still, inlier_ratio, self.settings.usual_ratio
+        )
 
-    def worn(self, values: Array) -> Array:
+    def with_held(self, values: Array) -> Array:
         """Return values (m,) in which held ones are the tracker's."""
         return np.where(self._held, self._rest, values)
 
@@ -215,7 +217,7 @@ class PersonPoseTracker:
         """Return the pose tree's values (m,) at positions q (nq,)."""
         return np.array(q, dtype=np.float64)[self._order]
 
-    def place(self, values: Array) -> Array:
+    def trunk_middle(self, values: Array) -> Array:
         """Return the middle of the trunk (3,) in the world at values (m,) [m]."""
         return self.plan.trunk_middle(self.fit.kinematics.poses(values))
 
@@ -243,36 +245,40 @@ class PersonPoseTracker:
         """
         settings = self.settings
         if last is None:
-            found = self.search.found(frame, range(settings.headings))
+            found = self.search.find_person(frame, range(settings.headings))
             return None if found is None else self.start(found.values, found.inlier_ratio)
-        fitted = self._fitted(last, frame)
-        enough = last.usual - settings.retry_below
-        lost = fitted.inlier_ratio < settings.lost_below * last.usual
+        fitted = self._fit_predicted(last, frame)
+        enough = last.usual_ratio - settings.retry_below
+        lost = fitted.inlier_ratio < settings.lost_below * last.usual_ratio
         # Limbs are searched again in the first four troubled frames, then in every eighth.
-        is_due = 0 <= last.troubled < 4 or last.troubled % 8 == 0
+        is_due = 0 <= last.troubled_frames < 4 or last.troubled_frames % 8 == 0
         due = fitted.inlier_ratio < enough and is_due
         if due and not lost:
-            first, limbs = last.troubled * settings.limbs_a_frame, settings.limbs_a_frame
-            fitted = self.search.mended(fitted, frame, enough, first, limbs)
-        share, doubted = fitted.inlier_ratio, last.troubled < 0
+            first, limbs = last.troubled_frames * settings.limbs_a_frame, settings.limbs_a_frame
+            fitted = self.search.improve_limbs(fitted, frame, enough, first, limbs)
+        ratio, is_unconfirmed = fitted.inlier_ratio, last.troubled_frames < 0
         state = TrackState(
             fitted.values,
-            fitted.values - last.values if last.troubled == 0 else np.zeros(len(last.values)),
-            share,
-            max(share, last.usual + (share - last.usual) / settings.memory),
-            last.troubled + 1 if doubted or share < enough else 0,
+            fitted.values - last.values
+            if last.troubled_frames == 0
+            else np.zeros(len(last.values)),
+            ratio,
+            max(ratio, last.usual_ratio + (ratio - last.usual_ratio) / settings.memory),
+            last.troubled_frames + 1 if is_unconfirmed or ratio < enough else 0,
         )
-        hopeless = due and share < enough and last.troubled > 0
-        if not (lost or doubted or hopeless):
+        is_hopeless = due and ratio < enough and last.troubled_frames > 0
+        if not (lost or is_unconfirmed or is_hopeless):
             return state
         # The person is searched anew in some headings, and replaced if that fits better.
-        headings = settings.headings_of(last.troubled)
-        found = self.search.found(frame, headings, last.values, last.usual)
-        if found is None or found.inlier_ratio <= share:
+        headings = settings.headings_of(last.troubled_frames)
+        found = self.search.find_person(frame, headings, last.values, last.usual_ratio)
+        if found is None or found.inlier_ratio <= ratio:
             return state
-        left = last.troubled + 1 if doubted else 1 - settings.cycle
+        remaining = last.troubled_frames + 1 if is_unconfirmed else 1 - settings.cycle
         return replace(
-            self.start(found.values, found.inlier_ratio), usual=state.usual, troubled=left
+            self.start(found.values, found.inlier_ratio),
+            usual_ratio=state.usual_ratio,
+            troubled_frames=remaining,
         )
 
     def follow_by_colour(
@@ -283,7 +289,7 @@ class PersonPoseTracker:
         A limb that does not show its own colours is searched again. If none of its new placements
         shows them, the person is lost.
         """
-        fitted, shown = self._fitted(last, colours), 1.0
+        fitted, shown = self._fit_predicted(last, colours), 1.0
         if own is not None:
 
             def shows(values: Array) -> Array:
@@ -294,7 +300,7 @@ class PersonPoseTracker:
             for limb in self.plan.limbs.values():
                 worst = float(np.nanmin([*ratios[limb.nodes], 1.0]))
                 if worst < enough:
-                    placed = self.search.placed_by_colour(fitted.values, limb, colours, own.known)
+                    placed = self.search.place_by_colour(fitted.values, limb, colours, own.known)
                     scored = [(one, np.nan_to_num(shows(one.values))) for one in placed]
                     shown_again = [one for one in scored if one[1][limb.nodes].min() >= enough]
                     if shown_again:
@@ -303,9 +309,11 @@ class PersonPoseTracker:
                 shown = min(shown, worst)
         step = fitted.values - last.values
         lengths, fitting = fitted.sums[:-1, [Sum.COMPARED, Sum.FITTING]].T
-        seen_enough = lengths >= self.settings.telling
+        seen_enough = lengths >= self.settings.min_contour
         least = np.min(fitting / np.maximum(lengths, 1e-9), where=seen_enough, initial=shown)
-        return TrackState(fitted.values, step, fitted.inlier_ratio, last.usual, worst=float(least))
+        return TrackState(
+            fitted.values, step, fitted.inlier_ratio, last.usual_ratio, worst_part=float(least)
+        )
 
     def distance_by_colour(self, values: Array, colours: ColourViews) -> float:
         """Return the RMS distance of contour and colours' edge at values (m,) [pixel], or nan."""
@@ -314,9 +322,9 @@ class PersonPoseTracker:
         squares, weight = sums[:, :, [Sum.SQUARES, Sum.WEIGHT]].sum(axis=(0, 1))
         return float(np.sqrt(squares / weight)) if weight > 0.0 else float("nan")
 
-    def _fitted(self, last: TrackState, seen: FrameViews | ColourViews) -> PoseFit:
+    def _fit_predicted(self, last: TrackState, seen: FrameViews | ColourViews) -> PoseFit:
         """Fit a frame from the pose that the last frames predict."""
-        expected = last.values + self.settings.carry * last.step
+        expected = last.values + self.settings.step_fraction * last.step
         prior = Prior(expected, self._information)
         compare = partial(seen.compare, self.fit)
         return self.fit.fit(compare, expected, self.settings.follow, prior, self._held)

@@ -35,7 +35,7 @@ class RigFault:
     filled: Mapping[str, float]
 
     @property
-    def is_undone(self) -> bool:
+    def is_identified(self) -> bool:
         """Whether the fault was identified, so that `undo` mends it."""
         return bool(self.mirrored or self.exchanged)
 
@@ -53,18 +53,18 @@ def find_rig_fault(
     cameras: Mapping[str, Camera],
     frames: Sequence[Mapping[str, Mask]],
     *,
-    sound: float = 0.01,
-    left: float = 0.03,
-    explained: float = 0.35,
-    contradicting: float = 0.3,
+    sound_below: float = 0.01,
+    remaining_below: float = 0.03,
+    remaining_fraction: float = 0.35,
+    faulty_above: float = 0.3,
 ) -> RigFault | None:
     """Find what is wrong with a rig as a whole, from one person's masks in some frames.
 
     Args:
-        sound: the rig is sound if less than this fraction of the silhouettes is unfilled.
-        left, explained: a change is accepted if less than this fraction remains unfilled, and less
-            than this part of what was unfilled.
-        contradicting: above this unfilled fraction a rig is at fault, even if no change helps.
+        sound_below: the rig is sound if less than this fraction of the silhouettes is unfilled.
+        remaining_below, remaining_fraction: a change is accepted if less than `remaining_below` of
+            the silhouettes and less than `remaining_fraction` of the unfilled part stay unfilled.
+        faulty_above: above this unfilled fraction a rig is at fault, even if no change helps.
 
     Returns:
         The fault; None if there is none, or too little is unfilled.
@@ -75,7 +75,7 @@ def find_rig_fault(
     first: dict[tuple[str, tuple[int, ...]], Indices] = {}
     filled = _filled(cameras, frames, RigFault((), (), {}), first)
     unfilled = 1.0 - float(np.mean(list(filled.values())))
-    if unfilled < sound:
+    if unfilled < sound_below:
         return None
     best, least = RigFault((), (), filled), unfilled
     sizes = {name: (cameras[name].width, cameras[name].height) for name in filled}
@@ -89,9 +89,9 @@ def find_rig_fault(
         remains = 1.0 - float(np.mean(list(filled_so.values())))
         if remains < least:
             best, least = guess, remains
-    if least < min(left, explained * unfilled):
+    if least < min(remaining_below, remaining_fraction * unfilled):
         return best
-    return RigFault((), (), filled) if unfilled > contradicting else None
+    return RigFault((), (), filled) if unfilled > faulty_above else None
 
 
 def _filled(

@@ -40,61 +40,61 @@ class PersonSettings:
 
     Args:
         follow, search: stages of a frame's fit from the predicted pose, and from a coarse guess.
-        carry: fraction of the last frame's step that is predicted for the next.
+        step_fraction: fraction of the last frame's step that is predicted for the next.
         angle_deviation, length_deviation: standard deviations of the prediction [rad, m].
         retry_below: limbs are searched again where the inlier ratio is below the usual one by this.
         lost_below: the person is lost below this fraction of the usual inlier ratio.
         part_lost_below: a person tracked by colour is lost where a part's ratio is below this.
         memory: number of frames over which the usual inlier ratio is averaged.
-        usual: usual inlier ratio at the start.
-        telling: least contour of a part in all cameras for the part's ratio to count [m].
+        usual_ratio: usual inlier ratio at the start.
+        min_contour: least contour of a part in all cameras for the part's ratio to count [m].
         headings: number of headings, evenly spread, in which a lost person is searched.
         headings_a_frame: number of them in each frame of a sequence.
         limbs_a_frame: number of doubtful limbs searched in each frame of a sequence.
-        limb_fits: a limb is doubtful below this inlier ratio of its contour.
-        limb_gain: a limb is doubtful if another of its poses covers unexplained silhouette better,
-            by this part of the limb.
-        limb_shows: a limb is doubtful if its visible contour is shorter than this fraction of its
-            length, in the mean of the cameras.
-        fitted: fraction of the fresh starts that is fitted, the most promising first.
-        mended: number of fresh starts whose doubtful limbs are searched.
+        min_limb_ratio: a limb is doubtful below this inlier ratio of its contour.
+        limb_gain: a limb is doubtful if the score of another of its poses is higher by this: the
+            fraction of the limb that covers unexplained silhouette.
+        min_limb_contour: a limb is doubtful if its visible contour, in the mean of the cameras, is
+            shorter than this fraction of its length.
+        fitted_fraction: fraction of the fresh starts that is fitted, the most promising first.
+        searched_starts: number of fresh starts whose doubtful limbs are searched.
         placements: number of placements of a limb by its colours that are fitted.
-        unalike: poses of a limb are distinct if their tips are farther apart than this [m].
-        near: poses of a limb are about the same if no point is farther apart than this [m].
-        rival: an alternative pose's limbs are searched, too, if its closeness is lower by at most
-            this, before both are compared.
-        alike: an alternative pose is as good if its closeness is lower by at most this; chosen on
-            36 drawn persons of other measures and clothes before four cameras.
-        judged: number of fit stages after which guesses are ranked.
-        rougher: factor on the spacing of contour points in these stages.
+        distinct_distance: limb poses with tips farther apart than this are distinct [m].
+        same_distance: limb poses with no point farther apart than this are about the same [m].
+        alternative_margin: the limbs of an alternative pose are searched before it is compared if
+            its closeness is lower by at most this.
+        ambiguity_margin: an alternative pose is as good if its closeness is lower by at most this;
+            chosen on 36 drawn persons of other measures and clothes before four cameras.
+        ranking_stages: number of fit stages after which guesses are ranked.
+        ranking_spacing: factor on the spacing of contour points in these stages.
     """
 
     follow: tuple[AnnealingStage, ...]
     search: tuple[AnnealingStage, ...]
-    carry: float = 0.7
+    step_fraction: float = 0.7
     angle_deviation: float = 0.3
     length_deviation: float = 0.15
     retry_below: float = 0.03
     lost_below: float = 0.75
     part_lost_below: float = 0.4
     memory: float = 60.0
-    usual: float = 0.95
-    telling: float = 0.3
+    usual_ratio: float = 0.95
+    min_contour: float = 0.3
     headings: int = 12
     headings_a_frame: int = 3
     limbs_a_frame: int = 2
-    limb_fits: float = 0.8
+    min_limb_ratio: float = 0.8
     limb_gain: float = 0.15
-    limb_shows: float = 0.5
-    fitted: float = 0.5
-    mended: int = 3
+    min_limb_contour: float = 0.5
+    fitted_fraction: float = 0.5
+    searched_starts: int = 3
     placements: int = 3
-    unalike: float = 0.25
-    near: float = 0.15
-    rival: float = 0.15
-    alike: float = 0.02
-    judged: int = 3
-    rougher: float = 1.5
+    distinct_distance: float = 0.25
+    same_distance: float = 0.15
+    alternative_margin: float = 0.15
+    ambiguity_margin: float = 0.02
+    ranking_stages: int = 3
+    ranking_spacing: float = 1.5
 
     def __post_init__(self) -> None:
         if not self.follow or not self.search:
@@ -155,7 +155,7 @@ class PlannedLimb(NamedTuple):
     weights: Array
     length: float
 
-    def places(self, X_WT: Array) -> Array:
+    def points_at(self, X_WT: Array) -> Array:
         """Return the points (n, m, 3) in the world [m] where the trunk is at X_WT (4, 4)."""
         placed = self.samples_T.reshape(-1, 3) @ X_WT[:3, :3].T + X_WT[:3, 3]
         return np.asarray(placed.reshape(self.samples_T.shape))
@@ -244,7 +244,7 @@ class BodyPlan:
         samples_T = ((samples_W - X_WT[:3, 3]) @ X_WT[:3, :3]).reshape(count, -1, 3)
         a, b, c = self.landmarks.positions(X_WN[0])[joints]
         length = float(np.linalg.norm(b - a) + np.linalg.norm(c - b))
-        weights = crowding(samples_T)
+        weights = crowding_weights(samples_T)
         return PlannedLimb(nodes, values, joints, poses, samples_T, weights, length)
 
     def samples(self, limb: PlannedLimb, X_WN: Array) -> Array:
@@ -260,7 +260,7 @@ class BodyPlan:
         return np.asarray(a[:, None] + steps)
 
 
-def crowding(samples: Array, apart: float = 0.08) -> Array:
+def crowding_weights(samples: Array, apart: float = 0.08) -> Array:
     """Return weights (n, m) of points (n, m, 3): 1 / (m times the number of points nearby).
 
     Points of a limb that are nearer to each other than `apart` [m] fill the same space.
@@ -294,7 +294,7 @@ class PersonSearch:
         self._fit, self._plan, self._settings = fit, plan, settings
         self._information, self._held, self._rest = information, held, rest
 
-    def mended(
+    def improve_limbs(
         self,
         fitted: PoseFit,
         frame: FrameViews,
@@ -309,36 +309,36 @@ class PersonSearch:
             first: index of the doubtful limb to begin with; 0 is the worst.
             limbs: number of limbs searched; None: all doubtful ones.
         """
-        best = _better(fitted, self.refined(fitted.values, frame))
+        best = _better(fitted, self.refine(fitted.values, frame))
         if best.inlier_ratio >= enough:
             return best
-        doubtful = self._doubtful(best, frame)
+        doubtful = self._doubtful_limbs(best, frame)
         begin = first % len(doubtful)
         chosen = (doubtful[begin:] + doubtful[:begin])[:limbs]
-        return self._searched(best, chosen, frame, enough)
+        return self._search_limbs(best, chosen, frame, enough)
 
-    def _searched(
+    def _search_limbs(
         self, best: PoseFit, limbs: Iterable[PlannedLimb], frame: FrameViews, enough: float
     ) -> PoseFit:
         """Search limbs again, one after another, until the inlier ratio is enough."""
         for limb in limbs:
-            scores, _ = self._scores(best.values, limb, frame)
-            guesses = self._unalike(best.values, limb, scores, 2)
+            scores, _ = self._score_poses(best.values, limb, frame)
+            guesses = self._distinct_poses(best.values, limb, scores, 2)
             # It may be bent the wrong way: try it at rest, and the most relaxed pose nearby.
             X_WN = self._fit.kinematics.poses(best.values)
-            off = self._off(best.values, limb, self._plan.samples(limb, X_WN))
-            near = limb.poses[off < self._settings.near]
+            distances = self._distances(best.values, limb, self._plan.samples(limb, X_WN))
+            near = limb.poses[distances < self._settings.same_distance]
             effort = np.abs(near - limb.poses[0]).sum(axis=1)
             for pose in (limb.poses[0], *near[np.argsort(effort, kind="stable")[:1]]):
                 guesses.append(best.values.copy())
                 guesses[-1][limb.values] = pose
             for values in guesses:
-                best = _better(best, self.refined(values, frame))
+                best = _better(best, self.refine(values, frame))
             if best.inlier_ratio >= enough:
                 break
         return best
 
-    def found(
+    def find_person(
         self,
         frame: FrameViews,
         headings: Sequence[int],
@@ -353,45 +353,45 @@ class PersonSearch:
             enough: inlier ratio at which no more limbs are searched.
         """
         if len(headings) == self._settings.headings:
-            return next(iter(self.explanations(frame, known)), None)
-        begun = self._begun(frame, headings, known)
+            return next(iter(self.find_explanations(frame, known)), None)
+        starts = self._fresh_starts(frame, headings, known)
         limbs = self._settings.limbs_a_frame
-        return self.mended(begun[0], frame, enough, limbs=limbs) if begun else None
+        return self.improve_limbs(starts[0], frame, enough, limbs=limbs) if starts else None
 
-    def explanations(self, frame: FrameViews, known: Array | None = None) -> list[PoseFit]:
+    def find_explanations(self, frame: FrameViews, known: Array | None = None) -> list[PoseFit]:
         """Return distinct poses that explain a frame, best first.
 
         The doubtful limbs of each are searched before they are compared. Empty where fewer than
-        two cameras see a person; `known` as in `found`.
+        two cameras see a person; `known` as in `find_person`.
         """
-        found, best = self.started(frame, known), None
+        found, best = self.find_starts(frame, known), None
         while found and best is not (leading := max(found, key=lambda one: one.closeness)):
             best = leading
-            others = [self.refined(values, frame) for values in self._exchanged(best.values)]
-            least = best.closeness - self._settings.rival
-            found += [self.mended(one, frame) for one in others if one.closeness > least]
+            others = [self.refine(values, frame) for values in self._similar_poses(best.values)]
+            least = best.closeness - self._settings.alternative_margin
+            found += [self.improve_limbs(one, frame) for one in others if one.closeness > least]
         if best is not None:
-            found.append(self._searched(best, self._plan.limbs.values(), frame, math.inf))
-        return self.unlike(found)
+            found.append(self._search_limbs(best, self._plan.limbs.values(), frame, math.inf))
+        return self.distinct(found)
 
-    def started(self, frame: FrameViews, known: Array | None = None) -> list[PoseFit]:
+    def find_starts(self, frame: FrameViews, known: Array | None = None) -> list[PoseFit]:
         """Return the most promising fresh starts of all headings, doubtful limbs searched."""
-        begun = self._begun(frame, range(self._settings.headings), known)
-        return [self.mended(one, frame) for one in begun[: self._settings.mended]]
+        starts = self._fresh_starts(frame, range(self._settings.headings), known)
+        return [self.improve_limbs(one, frame) for one in starts[: self._settings.searched_starts]]
 
-    def unlike(self, fits: Iterable[PoseFit]) -> list[PoseFit]:
+    def distinct(self, fits: Iterable[PoseFit]) -> list[PoseFit]:
         """Return the fits that differ in some joint's place from all better ones, best first."""
         found: list[PoseFit] = []
         kept: list[Array] = []
         for one in sorted(fits, key=lambda one: -one.closeness):
             places = self._plan.landmarks.positions(self._fit.kinematics.poses(one.values))
             off = [np.linalg.norm(places - other, axis=-1).max() for other in kept]
-            if all(far > self._settings.unalike for far in off):
+            if all(far > self._settings.distinct_distance for far in off):
                 found.append(one)
                 kept.append(places)
         return found
 
-    def _begun(
+    def _fresh_starts(
         self, frame: FrameViews, headings: Sequence[int], known: Array | None
     ) -> list[PoseFit]:
         """Fit the most promising fresh starts with some headings; best first."""
@@ -400,8 +400,8 @@ class PersonSearch:
             return []
         guesses = [self._guess(frame, heading, middle, known) for heading in headings]
         guesses.sort(key=lambda one: -one.closeness)
-        promising = guesses[: math.ceil(self._settings.fitted * len(guesses))]
-        fitted = [self.refined(one.values, frame) for one in promising]
+        promising = guesses[: math.ceil(self._settings.fitted_fraction * len(guesses))]
+        fitted = [self.refine(one.values, frame) for one in promising]
         return sorted(fitted, key=lambda one: -one.closeness)
 
     def _guess(
@@ -411,31 +411,31 @@ class PersonSearch:
         values = self._rest.copy() if known is None else np.where(self._held, known, self._rest)
         if self._plan.heading is not None:
             values[self._plan.heading] = 2.0 * np.pi * heading / self._settings.headings
-        values = self._judged(self._stand_at(values, middle), frame).values
+        values = self._fit_coarsely(self._move_trunk(values, middle), frame).values
         placed = np.ones(len(self._fit.outlines), dtype=np.bool_)
         for limb in self._plan.limbs.values():
             placed[limb.nodes] = False
         for limb in self._plan.limbs.values():
-            scores, _ = self._scores(values, limb, frame, placed)
-            values = self._unalike(values, limb, scores, 1)[0]
+            scores, _ = self._score_poses(values, limb, frame, placed)
+            values = self._distinct_poses(values, limb, scores, 1)[0]
             placed[limb.nodes] = True
-        return self._judged(values, frame)
+        return self._fit_coarsely(values, frame)
 
-    def _judged(self, values: Array, frame: FrameViews) -> PoseFit:
+    def _fit_coarsely(self, values: Array, frame: FrameViews) -> PoseFit:
         """Fit by a few stages to the scoring cameras."""
-        prior, rougher = Prior(values, 0.1 * self._information), self._settings.rougher
+        prior, coarser = Prior(values, 0.1 * self._information), self._settings.ranking_spacing
         rounds = [
-            replace(one, spacing=rougher * one.spacing)
-            for one in self._settings.search[: self._settings.judged]
+            replace(one, spacing=coarser * one.spacing)
+            for one in self._settings.search[: self._settings.ranking_stages]
         ]
-        return self._fit.fit(frame.coarse, values, rounds, prior, self._held)
+        return self._fit.fit(frame.scoring_edges, values, rounds, prior, self._held)
 
-    def refined(self, values: Array, frame: FrameViews | ColourViews) -> PoseFit:
+    def refine(self, values: Array, frame: FrameViews | ColourViews) -> PoseFit:
         """Fit from a coarse guess, with a weak prior."""
         prior, rounds = Prior(values, 0.1 * self._information), self._settings.search
         return self._fit.fit(partial(frame.compare, self._fit), values, rounds, prior, self._held)
 
-    def _doubtful(self, fitted: PoseFit, frame: FrameViews) -> list[PlannedLimb]:
+    def _doubtful_limbs(self, fitted: PoseFit, frame: FrameViews) -> list[PlannedLimb]:
         """Return the limbs that fit badly, hardly show or would cover more elsewhere, worst first.
 
         The worst limb is always among them.
@@ -447,14 +447,14 @@ class PersonSearch:
         for limb in self._plan.limbs.values():
             ratio = ratios[limb.nodes].min()
             shown = lengths[limb.nodes].sum() / (limb.length * len(frame.cameras))
-            scores, now = self._scores(fitted.values, limb, frame)
+            scores, now = self._score_poses(fitted.values, limb, frame)
             gain = float(scores.max() - now)
-            doubtful = ratio < settings.limb_fits or shown < settings.limb_shows
+            doubtful = ratio < settings.min_limb_ratio or shown < settings.min_limb_contour
             found.append((not (doubtful or gain > settings.limb_gain), ratio - gain, limb))
         found.sort(key=lambda one: one[:2])
         return [limb for k, (good, _, limb) in enumerate(found) if k == 0 or not good]
 
-    def _scores(
+    def _score_poses(
         self, values: Array, limb: PlannedLimb, frame: FrameViews, placed: Mask | None = None
     ) -> tuple[Array, float]:
         """Score a limb's poses by the unexplained silhouette that they cover, -1 to 1.
@@ -469,24 +469,28 @@ class PersonSearch:
         others = np.ones(len(X_WN), dtype=np.bool_) if placed is None else placed.copy()
         others[limb.nodes] = False
         outlines = [self._fit.outlines[node] for node in np.flatnonzero(others)]
-        places = limb.places(X_WN[self._plan.trunk])
+        places = limb.points_at(X_WN[self._plan.trunk])
         here = self._plan.samples(limb, X_WN)[None]
-        scores, now, weights = np.zeros(len(places)), 0.0, crowding(here)
-        for camera, region in zip(*frame.small, strict=True):
+        scores, now, weights = np.zeros(len(places)), 0.0, crowding_weights(here)
+        for camera, region in zip(*frame.scoring_regions, strict=True):
             # 1 in the silhouette where no other node shows, 0 where one does, -1 outside.
             pixel_scores = np.where(region, 1, -1).astype(np.int8)
             pixel_scores[region & draw_mask(outlines, camera.X_CW @ X_WN[others], camera)] = 0
             scores += sum_at_points(camera, pixel_scores, places, limb.weights)[0]
             now += float(sum_at_points(camera, pixel_scores, here, weights)[0][0])
-        return scores / len(frame.judges), now / len(frame.judges)
+        return scores / len(frame.scoring), now / len(frame.scoring)
 
-    def _unalike(self, values: Array, limb: PlannedLimb, scores: Array, count: int) -> list[Array]:
+    def _distinct_poses(
+        self, values: Array, limb: PlannedLimb, scores: Array, count: int
+    ) -> list[Array]:
         """Return values (m,) for the `count` distinct poses of a limb with the best scores (n,)."""
         found: list[Array] = []
         tips: list[Array] = []
         for index in np.argsort(-scores):
             tip = limb.samples_T[index, -1]
-            if all(np.linalg.norm(tip - other) > self._settings.unalike for other in tips):
+            if all(
+                np.linalg.norm(tip - other) > self._settings.distinct_distance for other in tips
+            ):
                 tips.append(tip)
                 found.append(values.copy())
                 found[-1][limb.values] = limb.poses[index]
@@ -494,11 +498,11 @@ class PersonSearch:
                     break
         return found
 
-    def placed_by_colour(
+    def place_by_colour(
         self, values: Array, limb: PlannedLimb, views: ColourViews, own: Mask
     ) -> list[PoseFit]:
         """Fit after placing a limb where its own colours (nodes, COLOURS) show most."""
-        places = limb.places(self._fit.kinematics.poses(values)[self._plan.trunk])
+        places = limb.points_at(self._fit.kinematics.poses(values)[self._plan.trunk])
         half, first, scores = len(limb.nodes) // 2, self._plan.upper_samples, np.zeros(len(places))
         for camera, picture in zip(views.cameras, views.pictures, strict=True):
             colours = colour_numbers(picture)
@@ -510,10 +514,10 @@ class PersonSearch:
                 weights = np.ascontiguousarray(limb.weights[points])
                 here = np.ascontiguousarray(places[points])
                 scores += sum_at_points(camera, own_colours, here, weights)[0]
-        chosen = self._unalike(values, limb, scores, self._settings.placements)
-        return [self.refined(one, views) for one in chosen]
+        chosen = self._distinct_poses(values, limb, scores, self._settings.placements)
+        return [self.refine(one, views) for one in chosen]
 
-    def _exchanged(self, values: Array) -> list[Array]:
+    def _similar_poses(self, values: Array) -> list[Array]:
         """Return values (m,) of similar silhouettes: arms or legs exchanged, or turned about."""
         plan, found = self._plan, []
         X_WN = self._fit.kinematics.poses(values)
@@ -521,22 +525,22 @@ class PersonSearch:
             other = values.copy()
             if turn and plan.heading is not None:
                 other[plan.heading] += turn
-                other = self._stand_at(other, plan.trunk_middle(X_WN))
+                other = self._move_trunk(other, plan.trunk_middle(X_WN))
             for part in parts:
                 for side, other_side in (("left", "right"), ("right", "left")):
                     limb, there = plan.limbs[f"{side}_{part}"], plan.limbs[f"{other_side}_{part}"]
-                    off = self._off(other, limb, plan.samples(there, X_WN))
-                    other[limb.values] = limb.poses[np.argmin(off)]
+                    distances = self._distances(other, limb, plan.samples(there, X_WN))
+                    other[limb.values] = limb.poses[np.argmin(distances)]
             found.append(other)
         return found
 
-    def _off(self, values: Array, limb: PlannedLimb, samples_W: Array) -> Array:
+    def _distances(self, values: Array, limb: PlannedLimb, samples_W: Array) -> Array:
         """Return each limb pose's largest distance (n,) from points along a limb (m, 3) [m]."""
         X_WT = self._fit.kinematics.poses(values)[self._plan.trunk]
         samples_T = (samples_W - X_WT[:3, 3]) @ X_WT[:3, :3]
         return np.asarray(np.linalg.norm(limb.samples_T - samples_T, axis=2).max(axis=1))
 
-    def _stand_at(self, values: Array, middle: Array) -> Array:
+    def _move_trunk(self, values: Array, middle: Array) -> Array:
         """Return values (m,) shifted so that the trunk's middle is at a place (3,) [m]."""
         kinematics = self._fit.kinematics
         off = middle - self._plan.trunk_middle(kinematics.poses(values))

@@ -92,7 +92,7 @@ class ColourViews:
                 )  # fmt: skip
         return Comparison(A, b, sums, wide, placement)
 
-    def learned(
+    def updated_colours(
         self,
         fit: ContourFit,
         values: Array,
@@ -208,32 +208,32 @@ class FrameViews:
         return pack_views(self.cameras, [view.edge for view in self.views])
 
     @cached_property
-    def seers(self) -> list[int]:
+    def nonempty(self) -> list[int]:
         """Indices of the cameras whose silhouette is not empty."""
         return [k for k, view in enumerate(self.views) if len(view.edge.uv)]
 
     @cached_property
-    def judges(self) -> list[int]:
-        """Indices of at most five cameras, spread over `seers`, that score coarse guesses."""
-        count = min(5, len(self.seers))
-        chosen = np.linspace(0, len(self.seers), count, endpoint=False).astype(int)
-        return [self.seers[k] for k in chosen]
+    def scoring(self) -> list[int]:
+        """Indices of at most five cameras, spread over `nonempty`, that score coarse guesses."""
+        count = min(5, len(self.nonempty))
+        chosen = np.linspace(0, len(self.nonempty), count, endpoint=False).astype(int)
+        return [self.nonempty[k] for k in chosen]
 
     @cached_property
-    def small(self) -> tuple[list[Camera], list[Mask]]:
+    def scoring_regions(self) -> tuple[list[Camera], list[Mask]]:
         """The scoring cameras and their regions, subsampled to about 120 rows of pixels."""
-        strides = {k: max(1, len(self.views[k].region) // 120) for k in self.judges}
+        strides = {k: max(1, len(self.views[k].region) // 120) for k in self.scoring}
         return (
             [_coarser(self.cameras[k], n) for k, n in strides.items()],
             [self.views[k].region[::n, ::n] for k, n in strides.items()],
         )
 
     @cached_property
-    def coarse(self) -> Views:
+    def scoring_edges(self) -> Views:
         """The scoring cameras and every other point of their edges."""
-        edges = [self.views[k].edge for k in self.judges]
+        edges = [self.views[k].edge for k in self.scoring]
         return pack_views(
-            [self.cameras[k] for k in self.judges],
+            [self.cameras[k] for k in self.scoring],
             [
                 EdgePoints(edge.uv[::2], edge.normals[::2], 2.0 * edge.lengths[::2], edge.middle)
                 for edge in edges
@@ -245,10 +245,11 @@ class FrameViews:
 
         None where fewer than two silhouettes are not empty.
         """
-        if len(self.seers) < 2:
+        if len(self.nonempty) < 2:
             return None
         return triangulate(
-            [self.cameras[k] for k in self.seers], [self.views[k].edge.middle for k in self.seers]
+            [self.cameras[k] for k in self.nonempty],
+            [self.views[k].edge.middle for k in self.nonempty],
         )
 
 

@@ -162,7 +162,7 @@ class PersonTracker(MemorySystem):
         if len(moment.seen.showing) < 2 and colours is not None and last is not None:
             if not colours.known and not last.is_lost:
                 # The person was set: these are the first pictures.
-                learned = colours.learned(self._tracker.fit, last.values)
+                learned = colours.updated_colours(self._tracker.fit, last.values)
                 colours = ColourViews(colours.cameras, colours.pictures, learned)
             found, seen = self._tracker.follow_by_colour(last, colours), colours
             moment, seers = _Moment(FrameViews((), ())), {one.name for one in seen.cameras}
@@ -177,7 +177,7 @@ class PersonTracker(MemorySystem):
         if self._with_deviations:
             changed["deviations"] = np.full(len(known["last_positions"]), np.nan)
         if found is None and last is not None:
-            found = TrackState(last.values, np.zeros(len(last.step)), 0.0, last.usual)
+            found = TrackState(last.values, np.zeros(len(last.step)), 0.0, last.usual_ratio)
         if found is None:
             return changed
         clean = moment.seen.without(moment.merged)
@@ -185,7 +185,7 @@ class PersonTracker(MemorySystem):
             # Its inlier ratio is that of the cameras that show this person alone.
             fit, step = self._tracker.fit, self._tracker.settings.follow[-1]
             sums = clean.compare(fit, fit.body.place(found.values), step).sums
-            found = replace(found, share=inlier_ratio_of(sums))
+            found = replace(found, inlier_ratio=inlier_ratio_of(sums))
         watched = self._remembered if moment.others else max(known["watched"][0] - 1.0, 0.0)
         changed |= {"watched": np.array([watched]), "elapsed": np.array([elapsed])}
         changed |= self._packed(found)
@@ -195,7 +195,7 @@ class PersonTracker(MemorySystem):
                 changed["deviations"] = self._tracker.deviations(found.values, seen)
             if colours is not None:
                 regions = {k.name: view.region for k, view in clean.pairs if shows_somebody(view)}
-                learned = colours.learned(self._tracker.fit, found.values, regions)
+                learned = colours.updated_colours(self._tracker.fit, found.values, regions)
                 packed = known["colours"].reshape(self._colours_shape)
                 for k, name in enumerate(self._colours.cameras):
                     if name in learned:
@@ -206,7 +206,11 @@ class PersonTracker(MemorySystem):
     def _packed(self, person: TrackState) -> dict[str, Array]:
         """What is known of the person, as vectors."""
         q = self._tracker.positions(person.values)
-        numbers = {"share": person.share, "usual": person.usual, "troubled": person.troubled}
+        numbers = {
+            "share": person.inlier_ratio,
+            "usual": person.usual_ratio,
+            "troubled": person.troubled_frames,
+        }
         return {
             "estimated_positions": np.full(len(q), np.nan) if person.is_lost else q,
             "values": person.values,
@@ -228,11 +232,11 @@ class PersonTracker(MemorySystem):
         self, last: TrackState | None, moment: "_Moment", is_watching: bool
     ) -> "tuple[TrackState | None, _Moment]":
         """The next state, and what the cameras see of the person alone."""
-        is_sorted = last is None or last.troubled != 0 or is_watching
+        is_sorted = last is None or last.troubled_frames != 0 or is_watching
         if is_sorted:
             moment = self._alone(moment.seen, last)
         found = self._follow_one(last, moment.seen)
-        if not is_sorted and (found is None or found.troubled != 0):
+        if not is_sorted and (found is None or found.troubled_frames != 0):
             alone = self._alone(moment.seen, last)
             if alone.others:
                 return self._follow_one(last, alone.seen), alone
@@ -248,7 +252,7 @@ class PersonTracker(MemorySystem):
         Cameras in which the person and another are one figure are left out where three others show
         somebody.
         """
-        place = None if last is None else self._tracker.place(last.values)
+        place = None if last is None else self._tracker.trunk_middle(last.values)
         alone, cut, merged = keep_views(seen, place)
         clean = alone.without(merged)
         if merged and len(clean.showing) >= 3:

@@ -10,7 +10,7 @@ from drake_pose.fit.contour_fit import ContourFit
 from drake_pose.person.date.skeleton import load_skeleton
 from drake_pose.person.date.walking import make_motion
 from drake_pose.person.pose_tracker import PersonPoseTracker
-from drake_pose.person.search import EXACT, LENIENT, crowding
+from drake_pose.person.search import EXACT, LENIENT, crowding_weights
 from drake_pose.person.shape import NOISE
 from drake_pose.person.views import FrameViews, see_silhouette
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
@@ -113,7 +113,7 @@ class TestTracker:
         assert world.tracker.follow(None, frame) is None
         values = world.tracker.values(world.pose())
         state = world.tracker.follow(world.tracker.start(values), frame)
-        assert state.share == 0.0
+        assert state.inlier_ratio == 0.0
         np.testing.assert_allclose(state.values, values, atol=1e-6)
 
     def test_all_headings_are_tried_the_first_ones_all_around(self):
@@ -145,7 +145,7 @@ class TestPlan:
     def test_points_beside_each_other_count_less(self):
         samples = np.zeros((1, 3, 3))
         samples[0, 2, 0] = 1.0
-        np.testing.assert_allclose(crowding(samples), [[1 / 6, 1 / 6, 1 / 3]])
+        np.testing.assert_allclose(crowding_weights(samples), [[1 / 6, 1 / 6, 1 / 3]])
 
     def test_model_without_landmarks_is_refused(self):
         hand = load_model(bundled_model("two_finger_hand"), check=False)

@@ -16,8 +16,8 @@ def test_small_pictures_show_every_so_many_pixels():
     cameras = [pinhole, flat]
     seen = FrameViews(cameras, [see_silhouette(ellipse(c.height, c.width), 4.0) for c in cameras])
     points = np.random.default_rng(0).normal([0.0, 0.0, 1.0], 0.3, (20, 3))
-    assert len(seen.judges) == 2
-    for k, small, region in zip(seen.judges, *seen.small, strict=True):
+    assert len(seen.scoring) == 2
+    for k, small, region in zip(seen.scoring, *seen.scoring_regions, strict=True):
         step = cameras[k].height // 120
         assert step > 1
         np.testing.assert_allclose(step * small.project(points)[0], cameras[k].project(points)[0])

@@ -64,7 +64,7 @@ def test_diagram_is_the_plain_functions_in_turn(studio, cameras, backgrounds, tr
         positions = tracker.positions(state.values)
         np.testing.assert_array_equal(run["estimated_positions"], positions)
         known = capture.estimator.known_person(own)
-        for name in ("share", "usual", "troubled", "step"):
+        for name in ("inlier_ratio", "usual_ratio", "troubled_frames", "step"):
             np.testing.assert_array_equal(getattr(known, name), getattr(state, name))
     elbow = studio.model.position_index("left_upper_arm_z")
     assert np.degrees(positions[elbow] - q[elbow]) == pytest.approx(0.0, abs=3.0)
@@ -78,10 +78,10 @@ def test_person_said_to_be_lost_has_no_estimated_positions(cameras, backgrounds,
     state = tracker.start(tracker.values(path[1]))
     capture.estimator.set_person(own, state)
     np.testing.assert_allclose(estimated.Eval(context), path[1])
-    lost = type(state)(state.values, state.step, 0.1, state.usual)
+    lost = type(state)(state.values, state.step, 0.1, state.usual_ratio)
     capture.estimator.set_person(own, lost)
     assert np.isnan(estimated.Eval(context)).all()
-    assert capture.estimator.known_person(own).share == 0.1
+    assert capture.estimator.known_person(own).inlier_ratio == 0.1
 
 
 def test_every_camera_needs_a_background(cameras, backgrounds, tracker):

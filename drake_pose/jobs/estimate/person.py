@@ -80,7 +80,7 @@ def follow_person(
             own = X_WN, read(index), reader, float(distances[index])
             yield _finish(inputs, captured, index, *own, seconds, overlay)
         unread = describe_unreadable(reader.refused, inputs.scene.frames)
-        doubts = describe_rivals(captured, inputs.frames)
+        doubts = describe_alternatives(captured, inputs.frames)
         result.warnings += (*unread, *faults, *doubts)
 
     return inputs, finished()
@@ -195,10 +195,10 @@ def _finish(
         area = float(sum(map(np.count_nonzero, bodies))) or 1.0
         wrong = sum(map(count_edge_pixels, bodies)) * distance
     pose = PoseEstimate(found, q, np.eye(4), (), wrong, area, stopped_by=FOLLOWED, seconds=seconds)
-    answers = ((q, captured.deviations[index]), *captured.rivals.get(index, ()))
+    answers = ((q, captured.deviations[index]), *captured.alternatives.get(index, ()))
     known = record_modes(inputs.model, answers if found else answers[:1])
     return inputs.finish(
-        frame, pose, masks, parts, shown, share=float(captured.shares[index]), **known
+        frame, pose, masks, parts, shown, share=float(captured.inlier_ratios[index]), **known
     )
 
 
@@ -206,7 +206,7 @@ def describe_faults(checked: CheckedCapture, frames: Sequence[str]) -> tuple[str
     """All that was wrong with a recording whose frames have these names."""
     return (
         *describe_views(checked.views, frames),
-        *describe_fit(checked.captured.shares.tolist()),
+        *describe_fit(checked.captured.inlier_ratios.tolist()),
         *describe_rig(checked.rig),
         *(describe_camera(one, frames) for one in checked.cameras),
     )
@@ -257,12 +257,12 @@ def describe_fit(shares: Sequence[float], usual_from: float = 0.6) -> tuple[str,
     return (text,)
 
 
-def describe_rivals(captured: PersonCapture, frames: Sequence[str]) -> tuple[str, ...]:
+def describe_alternatives(captured: PersonCapture, frames: Sequence[str]) -> tuple[str, ...]:
     """Warnings of frames that another pose explains as well, and where it differs."""
     model, found = captured.tree.model, []
     marks = load_landmarks(model.path)
-    for k, rivals in sorted(captured.rivals.items()):
-        for number, (q, _) in enumerate(rivals, start=2):
+    for k, alternatives in sorted(captured.alternatives.items()):
+        for number, (q, _) in enumerate(alternatives, start=2):
             if not np.isfinite(captured.q[k]).all():
                 continue
             here, there = (landmark_positions(model, marks, one) for one in (captured.q[k], q))
@@ -302,11 +302,12 @@ def describe_camera(fault: CameraFault, frames: Sequence[str]) -> str:
     motion = fault.motion
     since = "" if fault.first == 0 else f" since frame {frames[fault.first]}"
     action = f"left out{since}" if fault.is_left_out else "used all the same"
-    whose = _cameras([fault.name, *fault.rivals], "or")
+    whose = _cameras([fault.name, *fault.alternatives], "or")
     if not fault.is_explained:
         return (
-            f"{whose} contradicts the others{since}: {100.0 * motion.share_before:.0f} % of its "
-            f"contours fit what they see, {100.0 * fault.others_share:.0f} % of theirs do; "
+            f"{whose} contradicts the others{since}: {100.0 * motion.inlier_ratio_before:.0f} % of "
+            "its contours fit what they see, "
+            f"{100.0 * fault.others_inlier_ratio:.0f} % of theirs do; "
             f"{action}. Are its masks poor, mirrored or another camera's, or has it moved far?"
         )
     right, down = motion.shift

@@ -353,7 +353,7 @@ class _FrameWriter:
             values = tracker.values(q)
             X_WN = tracker.fit.kinematics.poses(values)
             if others > 0.0:
-                masks, *_ = keep_person(cameras, masks, tracker.place(values))
+                masks, *_ = keep_person(cameras, masks, tracker.trunk_middle(values))
             bodies = {
                 name: draw_mask(tracker.fit.outlines, cameras[name].X_CW @ X_WN, cameras[name])
                 for name in masks

@@ -50,7 +50,7 @@ def known(recording: PersonScene, monkeypatch: pytest.MonkeyPatch) -> list[int]:
             on_frame(k)
         captured = PersonCapture(
             q=q,
-            shares=np.ones(count),
+            inlier_ratios=np.ones(count),
             shape=None,
             outlines=ContourFit(tree).outlines,
             tree=tree,
@@ -104,7 +104,7 @@ def test_a_pose_that_explains_a_frame_as_well_is_given_and_named(
         checked = follow(*given)
         other = recording.truth[1].copy()
         other[recording.person.position_index("left_upper_arm_z")] += np.radians(60.0)
-        checked.captured.rivals[1] = ((other, np.full(len(other), 0.01)),)
+        checked.captured.alternatives[1] = ((other, np.full(len(other), 0.01)),)
         return checked
 
     monkeypatch.setattr(person, "capture_checked", doubtful)

@@ -74,7 +74,7 @@ def test_followed_from_a_start_without_any_mask(person, cameras, recording):
     # The person has moved on by more than that.
     assert joint_errors(person, truth[0], truth[-1]).max() > 100.0
     assert np.mean(errors) < 15.0
-    assert np.all(found.shares > 0.8)
+    assert np.all(found.inlier_ratios > 0.8)
     angles = [k for k, kind in enumerate(person.position_kinds) if kind == "angle"]
     assert np.all(found.deviations[:, angles] > 0.0)
 
@@ -96,7 +96,7 @@ def test_a_limb_without_its_own_colours_is_searched_again_or_said_to_be_lost(
     pictures, masks, q = (one[0] for one in recording)
     tracker = PersonPoseTracker(ContourFit(person.pose_tree(), noise=NOISE))
     fit, values, seen = tracker.fit, tracker.values(q), list(pictures.values())
-    known = ColourViews(list(cameras.values()), seen, {}).learned(fit, values, masks)
+    known = ColourViews(list(cameras.values()), seen, {}).updated_colours(fit, values, masks)
     views = ColourViews(list(cameras.values()), seen, known)
     pairs = list(zip(views.cameras, seen, strict=True))
     X_WN = fit.kinematics.poses(values)
@@ -125,7 +125,7 @@ class TestLearning:
         views = ColourViews(list(cameras.values()), list(pictures.values()), {})
         wrong = []
         for regions in (None, masks):
-            known = views.learned(fit, tracker.values(off), regions)
+            known = views.updated_colours(fit, tracker.values(off), regions)
             # Red is little in the room.
             on = sum(one[:, Colour.ON].reshape(-1, 16, 256)[:, :7].sum() for one in known.values())
             seen = sum((one[:, Colour.ON].sum(axis=1) > 0.0).sum() for one in known.values())
@@ -136,6 +136,6 @@ class TestLearning:
 
         # A camera of which nothing is known says nothing.
         state = tracker.follow_by_colour(tracker.start(tracker.values(q)), views)
-        assert state.share == 0.0
+        assert state.inlier_ratio == 0.0
         assert state.is_lost
         assert np.isnan(tracker.distance_by_colour(state.values, views))

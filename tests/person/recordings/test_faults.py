@@ -13,10 +13,10 @@ from drake_pose.errors import CameraError, MaskError, SettingsError
 from drake_pose.fit.contour_fit import ContourFit
 from drake_pose.fit.evidence import find_edge_points
 from drake_pose.person.camera_faults import (
+    CameraComparison,
     CameraFault,
-    CameraJudge,
-    FrameView,
-    moved_since,
+    FrameEdges,
+    first_moved_frame,
 )
 from drake_pose.person.capture import require_person
 from drake_pose.person.figures import (
@@ -28,7 +28,7 @@ from drake_pose.person.figures import (
     find_persons,
     find_tracks,
     follow_one,
-    is_another,
+    is_separate,
     keep_person,
     keep_views,
     middle_of_view,
@@ -50,15 +50,15 @@ class Stage:
     poses: np.ndarray
     masks: Masks
 
-    def frames(self, masks: Masks) -> list[FrameView]:
+    def frames(self, masks: Masks) -> list[FrameEdges]:
         tracker = PersonPoseTracker(self.fit)
         return [
-            FrameView({n: find_edge_points(m, 2.0) for n, m in own.items()}, tracker.values(q))
+            FrameEdges({n: find_edge_points(m, 2.0) for n, m in own.items()}, tracker.values(q))
             for own, q in zip(masks, self.poses, strict=True)
         ]
 
     def find(self, masks: Masks) -> CameraFault | None:
-        return CameraJudge(self.fit, self.cameras).find_fault(self.frames(masks))
+        return CameraComparison(self.fit, self.cameras).find_fault(self.frames(masks))
 
     def seen_by_moved(self, name: str, turn: float, shift: tuple[float, float, float]) -> Masks:
         """What the rig sees where a camera was turned about the vertical [deg] and shifted [m]."""
@@ -116,7 +116,7 @@ class TestMovedCamera:
 
         fault = four.find(three(four.seen_by_moved("camera_1", 6.0, (0.0, 0.0, 0.0))))
         assert fault is not None
-        assert "camera_1" in (fault.name, *fault.rivals)
+        assert "camera_1" in (fault.name, *fault.alternatives)
         assert not fault.is_explained
         assert four.find(three(four.masks)) is None
 
@@ -136,8 +136,8 @@ class TestMovedCamera:
         frames = four.frames(four.masks)
         camera = four.cameras["camera_0"]
         edges = [frame.edges["camera_0"] for frame in frames]
-        judge = CameraJudge(four.fit, four.cameras)
-        motion = judge.motion("camera_0", edges, [frame.values for frame in frames])
+        comparison = CameraComparison(four.fit, four.cameras)
+        motion = comparison.motion("camera_0", edges, [frame.values for frame in frames])
         assert motion.pixels < 0.5
         np.testing.assert_allclose(motion.X_WC[:3, 3], camera.X_WC[:3, 3], atol=0.05)
 
@@ -148,17 +148,20 @@ class TestMovedCamera:
         X_WC = camera.X_WC.copy()
         X_WC[:3, :3] = X_WC[:3, :3] @ Rotation.from_euler("z", 0.1).as_matrix()
         points = four.fit.kinematics.poses(view.values)[:, :3, 3]
-        judge, pairs = CameraJudge(four.fit, four.cameras), [(view.edges["camera_0"], view.values)]
-        motion = judge._describe(camera, camera.with_pose(X_WC), pairs, points)
+        comparison, pairs = (
+            CameraComparison(four.fit, four.cameras),
+            [(view.edges["camera_0"], view.values)],
+        )
+        motion = comparison._describe(camera, camera.with_pose(X_WC), pairs, points)
         assert motion.turn == pytest.approx(-0.1)
-        assert motion.share_after < motion.share_before
+        assert motion.inlier_ratio_after < motion.inlier_ratio_before
 
     def test_since_when_it_has_moved(self) -> None:
         good, bad = [0.9, 0.95, 0.9], [0.2, 0.1, 0.3]
-        assert moved_since([*good, *bad], [*bad, *good]) == 3
-        assert moved_since(bad, good) == 0
-        assert moved_since(good, bad) == 3
-        assert moved_since([0.9, 0.3, 0.9, 0.2, 0.1], [0.1, 0.4, 0.2, 0.9, 0.9]) == 3
+        assert first_moved_frame([*good, *bad], [*bad, *good]) == 3
+        assert first_moved_frame(bad, good) == 0
+        assert first_moved_frame(good, bad) == 3
+        assert first_moved_frame([0.9, 0.3, 0.9, 0.2, 0.1], [0.1, 0.4, 0.2, 0.9, 0.9]) == 3
 
 
 class TestRig:
@@ -345,12 +348,12 @@ class TestOthers:
             return Person(np.array([x, 0.0, z]), {}, area)
 
         first = person(0.0, 100.0)
-        assert is_another(person(2.0, 90.0), [first])
-        assert not is_another(person(2.0, 1.0), [first])
-        assert not is_another(person(0.1, 90.0), [first])
+        assert is_separate(person(2.0, 90.0), [first])
+        assert not is_separate(person(2.0, 1.0), [first])
+        assert not is_separate(person(0.1, 90.0), [first])
         # Whatever is above one is oneself.
-        assert not is_another(person(0.0, 90.0, 3.0), [first])
-        assert not is_another(person(2.1, 90.0), [first, person(2.0, 100.0)])
+        assert not is_separate(person(0.0, 90.0, 3.0), [first])
+        assert not is_separate(person(2.1, 90.0), [first, person(2.0, 100.0)])
 
 
 class TestRecord:

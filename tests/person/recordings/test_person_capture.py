@@ -101,7 +101,7 @@ class TestCapture:
             lambda k: {name: scene.read(name, frames[k]) for name in scene.cameras},
             range(len(frames)), is_sequence=False,
         )  # fmt: skip
-        assert captured.shares.min() > 0.88
+        assert captured.inlier_ratios.min() > 0.88
         assert np.ptp(np.unwrap(captured.q[:, shaped_person.position_index("head_y")])) < np.pi / 2
 
     @pytest.mark.slow

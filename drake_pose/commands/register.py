@@ -160,7 +160,7 @@ def _print_registration(result: SceneRegistration) -> None:
     shown, which = worst_frames([misfit.E_total for _, misfit in misfits])
     frames = Table("camera", "frame", "E_total", "IoU", "", title=f"Masks and robot{which}")
     for name, misfit in (misfits[k] for k in shown):
-        word = "" if misfit.agrees else "contradicts the others"
+        word = "" if misfit.is_inlier else "contradicts the others"
         shares = percent(misfit.E_total), percent(misfit.iou)
         frames.add_row(escape(name), escape(misfit.frame), *shares, word)
     table = Table(
@@ -169,7 +169,7 @@ def _print_registration(result: SceneRegistration) -> None:
     )  # fmt: skip
     for name, found in result.registered.items():
         one = result.summary["cameras"][name]
-        agreeing = len(found.frames) - len(found.contradictions)
+        agreeing = len(found.frames) - len(found.outliers)
         table.add_row(
             escape(name),
             ", ".join(f"{p:.4f}" for p in found.camera.X_WC[:3, 3]),

@@ -51,7 +51,7 @@ from drake_pose.jobs.episodes_table import episodes_table
 from drake_pose.jobs.estimate.inputs import follows_person
 from drake_pose.jobs.estimate.scene import estimate_scene
 from drake_pose.jobs.registration.audit import audit_scene
-from drake_pose.jobs.registration.inputs import looks_at_pictures
+from drake_pose.jobs.registration.inputs import uses_pictures
 from drake_pose.jobs.registration.settings import AuditSettings
 from drake_pose.silhouette.pictures.scene_checks import frame_ranges
 from drake_pose.silhouette.pictures.scenes import Scene, load_scene
@@ -181,7 +181,7 @@ def plan_scene(job: SceneJob, out: Path) -> tuple[Task, ...]:
         DrakePoseError: the scene cannot be read.
     """
     settings = job.settings
-    if isinstance(settings, AuditSettings) and looks_at_pictures(job.scene, settings):
+    if isinstance(settings, AuditSettings) and uses_pictures(job.scene, settings):
         episode = open_episode(job.scene, joints=_joints(job), episode=settings.episode)
         most = max(len(one.times) for one in episode.cameras.values())
         return (Task(job, out, None, tuple(map(str, range(0, most, settings.every)))),)
@@ -241,7 +241,7 @@ def _joints(job: SceneJob) -> Path | None:
 def _require_same_masks(task: Task) -> None:
     """Refuses a finished scene whose masks were replaced; of chunks, those that join them do."""
     settings = task.job.settings
-    is_episode = isinstance(settings, AuditSettings) and looks_at_pictures(task.job.scene, settings)
+    is_episode = isinstance(settings, AuditSettings) and uses_pictures(task.job.scene, settings)
     if task.index is not None or is_episode:
         return
     scene = _load(task.job)

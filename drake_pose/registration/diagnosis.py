@@ -42,7 +42,7 @@ class DiagnosisSettings(NamedTuple):
     significance: float = 1e-4
     min_pixels: float = 1.0
     min_joint_pixels: float = 0.3
-    least_focal: float = 0.001
+    focal_sd_floor: float = 0.001
     min_information: float = 1.0
 
 
@@ -205,7 +205,7 @@ class _Diagnoser:
         usual = 4.0 if self._moved else 0.4
         explained = explained_frames([one.inlier_ratios[1] for one in self._frames])
 
-        def judge(kept: Mask) -> tuple[Array, Array]:
+        def evaluate(kept: Mask) -> tuple[Array, Array]:
             common = self._common(self._sum(kept))
             residuals = [self._residual(info, *common) for info in self._info]
             return np.array([one.p_value for one in residuals]), common[0]
@@ -217,12 +217,12 @@ class _Diagnoser:
             self._info = [self._info_of(one, sizes) for one in self._frames]
             self._surface = sizes.surface
             # Contradicting frames no longer make errors seem large.
-            agreeing, together = likeliest_frames(explained, judge, usual), 4
+            agreeing, together = likeliest_inliers(explained, evaluate, usual), 4
         total, frames = self._sum(agreeing), list[FrameDiagnosis]()
-        for fitted, info, agrees, is_explained in zip(
+        for fitted, info, is_inlier, is_explained in zip(
             self._frames, self._info, agreeing, explained, strict=True
         ):
-            common = self._common(total.plus(info, -1.0) if agrees else total)
+            common = self._common(total.plus(info, -1.0) if is_inlier else total)
             residual = self._residual(info, *common)
             tests = [residual.test(cause) for cause in self._causes(fitted)]
             # Each of the tests may find something by chance.
@@ -252,7 +252,7 @@ class _Diagnoser:
         spread = [which[k] for k in np.linspace(0, len(which) - 1, count).round().astype(int)]
         sizes = []
         for k in range(groups):
-            pictures = [one for i in spread[k::groups] for one in self._frames[i].pictures]
+            pictures = [one for i in spread[k::groups] for one in self._frames[i].compared_masks]
             seen = self._distances(pictures)
             is_angle = np.append(self._fit.is_angle, np.zeros(len(pictures), bool))
             sizes.append(estimate_sizes(seen, is_angle, min_camera=0.0)[:5])
@@ -264,11 +264,11 @@ class _Diagnoser:
 
     def _info_of(self, fitted: FrameFit, sizes: ErrorSizes, width_sd: float = 2.0) -> _Information:
         """The information of a frame, whose masks' widths are right to a deviation [pixel]."""
-        known = float(SHARED.known_beforehand)
-        if not fitted.pictures:
-            return self._nothing._replace(lengths=fitted.weights, freedom=known)
+        known = float(SHARED.prior_freedom)
+        if not fitted.compared_masks:
+            return self._nothing._replace(lengths=fitted.outline_lengths, freedom=known)
         if fitted.name not in self._seen:
-            self._seen[fitted.name] = self._distances(fitted.pictures)
+            self._seen[fitted.name] = self._distances(fitted.compared_masks)
         seen = self._seen[fitted.name]
         own, widths = np.split(seen.X, [len(self._fit.names)], axis=1)
         X = own * self._fit.deviations
@@ -280,10 +280,12 @@ class _Diagnoser:
         freedom = known + len(seen.y) - rank
         scale = max((known + residual) / freedom, 1.0)
         outlines = self._nothing.outlines.copy()
-        for one in fitted.pictures:
+        for one in fitted.compared_masks:
             moves = one.moves * self._fit.deviations[:, None]
             outlines += moves @ one.A @ np.swapaxes(moves, 1, 2)
-        return _Information(N, h, PX.T @ seen.bends, outlines, fitted.weights, scale, freedom)
+        return _Information(
+            N, h, PX.T @ seen.bends, outlines, fitted.outline_lengths, scale, freedom
+        )
 
     def _sum(self, kept: Mask) -> _Information:
         """The information of some frames, each by the scale of its errors."""
@@ -319,11 +321,11 @@ class _Diagnoser:
             for k, name in enumerate(fit.joints)
         ]
         for c, name in enumerate(names):
-            if fitted is None or c in {one.camera for one in fitted.pictures}:
+            if fitted is None or c in {one.camera for one in fitted.compared_masks}:
                 own = slice(joints + c * six, joints + (c + 1) * six)
                 causes.append(_Cause("camera", name, eye[:, own], deviations[own], six))
         if len(names) > 1:
-            causes.append(_Cause("base", "base", fit.base_moves(), np.ones(six), six))
+            causes.append(_Cause("base", "base", fit.base_jacobian(), np.ones(six), six))
         if fitted is not None or self._moved:
             return causes
         groups = [("", [*range(len(names))])] if len(names) > 1 else []
@@ -331,7 +333,7 @@ class _Diagnoser:
         for where, group in groups:
             # A single camera was rather moved than has its principal point elsewhere.
             many, rank = ("", 6.5) if where else ("s", 2.0)
-            focal, center = fit.focal_moves(group), fit.center_moves(group)
+            focal, center = fit.focal_jacobian(group), fit.center_jacobian(group)
             if focal.any():
                 causes.append(_Cause("focal", f"focal length{many}{where}", focal, np.ones(1), 1))
             text = f"principal point{many}{where}"
@@ -341,15 +343,15 @@ class _Diagnoser:
     def _finding(self, sufficient: Sequence[_Cause], pixels: float) -> Finding:
         """The first of the causes that suffice, and its rivals."""
         best, *others = sufficient
-        rivals = [one.name for one in others]
+        alternatives = [one.name for one in others]
         seen_by_one = len(self._fit.camera_names) == 1
         if seen_by_one and any(one.kind == "camera" for one in sufficient):
-            rivals.append("base")
+            alternatives.append("base")
         kind, name = best.kind, best.name
         variances = np.maximum(np.diag(best.covariance), 0.0)
         if kind == "focal":
             # A body is seen larger as if it were nearer to a thousandth of its depth at best.
-            variances = variances + DIAGNOSIS.least_focal**2
+            variances = variances + DIAGNOSIS.focal_sd_floor**2
         x, sd = best.amount * best.units, np.sqrt(variances) * best.units
         # Poses turn and shift; a joint does one of them; the rest is shifts.
         turns = len(x) // 2 if kind in ("camera", "base") else 0
@@ -362,11 +364,11 @@ class _Diagnoser:
         at_body = 0.0
         if kind == "camera":
             # A camera that turns where it stands shifts the body.
-            own, at_body = self._fit.camera_motion(name), size(x[3:])
+            own, at_body = self._fit.camera_jacobian(name), size(x[3:])
             covariance = best.covariance * np.outer(best.units, best.units)
             x[3:], sd[3:] = own @ x, np.sqrt(np.diag(own @ covariance @ own.T))
         sizes = (size(x[:turns]), size(x[turns:]), size(sd[:turns]), size(sd[turns:]))
-        off = (*sizes, min(pixels, self._most), best.p_value, tuple(rivals))
+        off = (*sizes, min(pixels, self._most), best.p_value, tuple(alternatives))
         return Finding(kind, name, *off, at_body=at_body)
 
     def _joints_finding(self, kind: str, residual: _Residual) -> Finding:
@@ -396,7 +398,9 @@ class _Diagnoser:
             alone = residual.sufficient(tests, DIAGNOSIS.min_pixels, 0.1)
             causes = [one for one in causes if one.kind != "base" or alone]
         every = range(len(self._fit.camera_names))
-        shifted = residual.test(_Cause("center", "", self._fit.center_moves(every), np.ones(2), 2))
+        shifted = residual.test(
+            _Cause("center", "", self._fit.center_jacobian(every), np.ones(2), 2)
+        )
         others = [residual.test(one).gain for one in causes if one.kind != "center"]
         center = None
         if is_half_pixel(shifted.amount, shifted.covariance) and shifted.gain > max(others):
@@ -428,7 +432,7 @@ class _Diagnoser:
             ]
             moves = np.hstack([one.moves for one in (*own, *free)])
             whole_test, first = whole.test(_Cause("", "", moves, np.ones(0), 0)), 0
-            for best, *rivals in found:
+            for best, *alternatives in found:
                 k = slice(first, first + len(best.amount))
                 first = k.stop
                 better = best._replace(
@@ -438,7 +442,7 @@ class _Diagnoser:
                 least = DIAGNOSIS.min_joint_pixels if best.kind == "joint" else DIAGNOSIS.min_pixels
                 # Beside the others there may be nothing left of it.
                 if pixels >= least or (best.kind, best.name) in self._asked:
-                    findings.append(self._finding([better, *rivals], pixels))
+                    findings.append(self._finding([better, *alternatives], pixels))
         named = [one[0].name for one in found]
         noticed = _minimum_detectable(residual, [one for one in joints if one.name not in named])
         return tuple(findings), center, noticed
@@ -487,9 +491,9 @@ def _minimum_detectable(residual: _Residual, causes: Sequence[_Cause]) -> dict[s
     return found
 
 
-def likeliest_frames(
+def likeliest_inliers(
     explained: Mask,
-    judge: Callable[[Mask], tuple[Array, Array]],
+    evaluate: Callable[[Mask], tuple[Array, Array]],
     usual_deviation: float = 0.4,
     *,
     outlier_cost: float = 3.0,
@@ -513,13 +517,13 @@ def likeliest_frames(
         starts.append(np.arange(len(explained)) == k)
     for kept in starts:
         for _ in range(max_iterations):
-            p_values, x = judge(kept)
+            p_values, x = evaluate(kept)
             now = explained & (p_values > DIAGNOSIS.significance)
             if (now == kept).all():
                 break
             kept = now
         else:
-            x = judge(kept)[1]
+            x = evaluate(kept)[1]
         off = x / usual_deviation
         unlikely = outlier_cost * np.count_nonzero(~kept) + 0.5 * float(off @ off)
         if unlikely < least:

@@ -38,7 +38,7 @@ class Finding:
     shift_sd: float
     pixels: float
     p_value: float
-    rivals: tuple[str, ...] = ()
+    alternatives: tuple[str, ...] = ()
     joints: Mapping[str, float] = field(default_factory=dict)
     at_body: float = 0.0
     link: str = ""
@@ -83,6 +83,6 @@ class Diagnosis:
     minimum_detectable: Mapping[str, float] = field(default_factory=dict)
 
     @property
-    def contradicting(self) -> tuple[str, ...]:
+    def outliers(self) -> tuple[str, ...]:
         """The frames that contradict the others."""
         return tuple(one.frame for one in self.frames if one.finding is not None)

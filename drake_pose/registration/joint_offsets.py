@@ -1,9 +1,9 @@
-"""Whether the zeros of joints and the lengths of links are right, which are the same in all frames.
+"""Calibrate joint offsets and link scales, the same in all frames, together with camera poses.
 
-A zero is added to an encoder's readings; a length is a factor of a link's joints' distances from
-its own. They are fitted together with the cameras' poses. What turns with the camera, such as the
-zero of a first joint whose base looks alike from all sides, cannot be told, and is named instead of
-guessed.
+A joint offset is added to an encoder's positions. A link scale multiplies the distances of the
+joints that a link carries from its own joint. A parameter that the silhouettes cannot separate from
+others, such as the offset of a first joint whose base is round, is reported as not determined,
+together with the parameters that it is correlated with.
 """
 
 import math
@@ -21,20 +21,22 @@ from drake_pose.errors import RegistrationError, UnknownNameError
 from drake_pose.fit.parameters import POSE_NAMES, carried_joints, link_scale_name
 from drake_pose.registration.posed_frames import PosedFrame, PosedFrames
 from drake_pose.registration.register import RegisteredCamera, RegistrationBody
-from drake_pose.registration.shared_fit import SHARED, Shared, SharedFit
+from drake_pose.registration.shared_fit import SHARED, SharedFit, SharedValues
 
 
 @dataclass(frozen=True)
 class KinematicParameter:
-    """What is added to an encoder's positions, or by what share of it a link is longer.
+    """An estimated joint offset, or the relative change of a link's scale.
 
     Args:
-        value: what is to be added [rad, m or 1], 0 where it is not determined.
-        deviation: its standard deviation; infinite where it is not determined.
-        low, high: the ends of its 95 % interval.
-        significant: whether it is not 0, at 5 % over all that were asked for (Bonferroni). So it
-            may be insignificant although its 95 % interval does not hold 0.
-        gauge: what it cannot be told from, or, where it is determined, by still parts alone.
+        name: of the joint or link.
+        value: the offset [rad or m] or the relative change of the scale; 0 if not determined.
+        deviation: its standard deviation; infinite if not determined.
+        low, high: its 95 % interval.
+        significant: whether it differs from 0 at the 5 % level over all requested parameters
+            (Bonferroni). Its 95 % interval may exclude 0 although it is not significant.
+        gauge: names of the unknowns that it is strongly correlated with; for a determined
+            parameter, those that only static parts separate it from.
     """
 
     name: str
@@ -47,80 +49,81 @@ class KinematicParameter:
 
     @property
     def determined(self) -> bool:
-        """Whether the silhouettes tell it."""
+        """Whether the silhouettes determine it."""
         return math.isfinite(self.deviation)
 
 
 @dataclass(frozen=True, eq=False)
 class JointCalibration:
-    """Zeros and lengths, and the cameras with them.
+    """Joint offsets, link scales, and the cameras fitted with them.
 
     Args:
-        zeros, lengths: of the joints and links that were asked for.
-        cameras: with the poses and focal lengths that fit these.
+        offsets, link_scales: of the requested joints and links.
+        cameras: the cameras with their fitted poses and focal lengths.
         covariances: (cameras, 6, 6), see ``RegisteredCamera``.
-        focal_deviations: (cameras,) standard deviations over the focal lengths; 0: held.
-        inlier_ratios, agrees: of each camera (frames,), judged with all that was found.
-        object_values: (6,) by how much an object stands elsewhere whose place is not known,
-            TARGET_POSITIONS, and object_covariance: (6, 6); empty where there is none.
+        focal_deviations: (cameras,) standard deviations over the focal lengths; 0: not fitted.
+        object_values: (6,) the calibration target's TARGET_POSITIONS; empty without a target.
+        object_covariance: (6, 6) their covariance; empty without a target.
+        inlier_ratios, is_inlier: for each camera (frames,), with the fitted parameters.
     """
 
-    zeros: tuple[KinematicParameter, ...]
-    lengths: tuple[KinematicParameter, ...]
+    offsets: tuple[KinematicParameter, ...]
+    link_scales: tuple[KinematicParameter, ...]
     cameras: tuple[PinholeCamera, ...]
     covariances: Array
     focal_deviations: Array
     object_values: Array
     object_covariance: Array
     inlier_ratios: tuple[Array, ...]
-    agrees: tuple[Mask, ...]
+    is_inlier: tuple[Mask, ...]
 
 
-def links_with_length(tree: PoseTree) -> tuple[str, ...]:
-    """The links that carry a joint at a distance from their own."""
+def scalable_links(tree: PoseTree) -> tuple[str, ...]:
+    """Return the links that carry a joint away from their own joint, so that a scale matters."""
     return tuple(dict.fromkeys(one.link for one in carried_joints(tree)))
 
 
-def require_known(tree: PoseTree, names: Sequence[str], lengths: Sequence[str]) -> None:
-    """Refuses names of which there is no position, or no link with a length.
+def require_parameters(tree: PoseTree, joints: Sequence[str], links: Sequence[str]) -> None:
+    """Refuse names that are no positions of the tree, or no scalable links.
 
-    Raises UnknownNameError: says which there are.
+    Raises UnknownNameError: lists the known names.
     """
     own = [name for node in tree.nodes for name in node.value_names]
     positions = [name for name in own if name not in TARGET_POSITIONS]
-    for what, asked, known in (
-        ("joint", names, positions),
-        ("link with a length", lengths, links_with_length(tree)),
+    for what, names, known in (
+        ("joint", joints, positions),
+        ("link with a length", links, scalable_links(tree)),
     ):
-        for name in asked:
+        for name in names:
             if name not in known:
                 raise UnknownNameError(what, name, known, str(tree.model.path))
 
 
-def require_enough(count: int, zeros: int, lengths: int) -> None:
-    """Refuses fewer frames than a number of zeros and lengths needs.
+def require_frame_count(count: int, joints: int, links: int) -> None:
+    """Refuse fewer frames than parameters, or fewer than two.
 
-    Raises RegistrationError: says how many there are.
+    Raises RegistrationError: states the numbers.
     """
-    if count < max(2, zeros + lengths):
+    if count < max(2, joints + links):
         raise RegistrationError(
-            f"{zeros} joints' zeros and {lengths} links' lengths need as many frames of "
-            f"differing poses, and two or more; there are {count}: give more frames, or name fewer"
+            f"the offsets of {joints} joints and the lengths of {links} links need as many frames "
+            f"with different poses, and at least two; there are {count}: give more frames, or name "
+            "fewer joints and links"
         )
 
 
-def require_explained_still(ratio: float, before: float, most_lost: float = 0.05) -> None:
-    """Refuses a fit whose mean inlier ratio is smaller than where it began.
+def require_fit_kept(ratio: float, before: float, most_lost: float = 0.05) -> None:
+    """Refuse a fit whose mean inlier ratio fell by more than `most_lost`.
 
-    most_lost: by more: 0.3 and more where the fit went to another optimum.
+    A fit that converged to another optimum loses 0.3 or more.
 
-    Raises RegistrationError: says both ratios.
+    Raises RegistrationError: states both ratios.
     """
     if ratio < before - most_lost:
         raise RegistrationError(
-            f"the fit of cameras and joint offsets ends where {ratio:.0%} of the contours fit, and "
-            f"began where {before:.0%} did: it has lost the robot; ask for fewer offsets, or give "
-            "more frames. Nothing was written"
+            f"the fit of cameras and joint offsets lost the robot: {ratio:.0%} of the contours fit "
+            f"at its end, {before:.0%} at its start; ask for fewer offsets, or give more frames. "
+            "Nothing was written"
         )
 
 
@@ -128,136 +131,138 @@ def calibrate_joints(
     body: RegistrationBody,
     cameras: Sequence[RegisteredCamera],
     frames: Sequence[Sequence[PosedFrame]],
-    names: Sequence[str],
+    joints: Sequence[str],
     focal: bool = False,
-    lengths: Sequence[str] = (),
+    links: Sequence[str] = (),
     level: float = 0.05,
     start: Mapping[str, float] | None = None,
     still_factor: float = 1.0,
 ) -> JointCalibration:
-    """The zeros of some joints and lengths of links, fitted together with the cameras' poses.
+    """Fit joint offsets and link scales together with the cameras' poses.
 
-    All that are determined stay in the fit, significant or not: one that is held at 0 because
-    chance could explain it would move the cameras. In the end they are drawn towards 0 as far as
-    their own sizes say (``drawn_together``); the covariance stays that of the fit.
+    Parameters that are not determined are dropped one fit after another. Insignificant ones stay:
+    holding them at 0 would bias the cameras. In the end values shrink towards 0
+    (``shrink_constants``); the covariance stays that of the fit.
 
     Args:
-        cameras: as they were registered with the model's zeros and lengths; no two of one name.
-        frames: what each of them sees.
-        names: of the positions whose zeros are asked for.
-        focal: whether the cameras' focal lengths are asked for, too.
-        lengths: the links whose lengths are asked for.
-        level: probability that a calibration finds anything significant by chance.
-        start: zeros that the cameras were found with, by name, where the fit begins [rad or m].
-        still_factor: of the standard deviation of what goes with a camera, such as the offset of a
-            first joint. Parts that stand still alone tell the two apart, and pictures show those
-            parts badly: 2.5 there (six rooms with an SO-101, whose first offset was off by .1 to 3
-            standard deviations).
+        cameras: as registered with the model's offsets and scales, with distinct names.
+        frames: the frames of each camera.
+        joints: names of the positions whose offsets are fitted.
+        focal: whether the cameras' focal lengths are fitted.
+        links: the links whose scales are fitted.
+        level: probability that anything is significant by chance.
+        start: initial offsets by name [rad or m].
+        still_factor: factor of the standard deviation of parameters correlated with a camera, such
+            as a first joint's offset: only static parts separate the two, and pictures show these
+            badly. 2.5 for pictures (six rooms with an SO-101, whose first offset was off by 0.1 to
+            3 standard deviations).
 
     Raises:
-        UnknownNameError: a name that is no position of the body's, or no link with a length.
-        RegistrationError: fewer frames than zeros and lengths, or the fit ends where it explains
-            less than where it began.
+        UnknownNameError: the body has no such position, or no such scalable link.
+        RegistrationError: there are fewer frames than parameters, or the fit lost the robot.
     """
-    require_known(body.tree, names, lengths)
-    require_enough(sum(len(one) for one in frames), len(names), len(lengths))
+    require_parameters(body.tree, joints, links)
+    require_frame_count(sum(len(one) for one in frames), len(joints), len(links))
     seen = [
-        PosedFrames(body.kinematics, body.all, one.camera, each)
+        PosedFrames(body.kinematics, body.full, one.camera, each)
         for one, each in zip(cameras, frames, strict=True)
     ]
     X_CW = [one.camera.X_CW for one in cameras]
-    offsets = carried_joints(body.tree, lengths)
-    asked, looks = [*names, *map(link_scale_name, lengths)], len(POSE_NAMES) + focal
-    standing = [name for name in body.kinematics.names if name in TARGET_POSITIONS]
-    told: dict[str, KinematicParameter] = {}
+    offsets = carried_joints(body.tree, links)
+    requested, per_camera = [*joints, *map(link_scale_name, links)], len(POSE_NAMES) + focal
+    target_positions = [name for name in body.kinematics.names if name in TARGET_POSITIONS]
+    parameters: dict[str, KinematicParameter] = {}
     sought: list[str] | None = None
-    kept = asked
+    kept = requested
     while kept != sought:
         sought = kept
-        fit = SharedFit(seen, X_CW, [*standing, *sought], offsets=offsets, looks=looks)
+        names = [*target_positions, *sought]
+        fit = SharedFit(seen, X_CW, names, offsets=offsets, camera_unknowns=per_camera)
         begin = fit.start
         begin.shared[:] = [(start or {}).get(name, 0.0) for name in fit.names]
-        if sought == asked:
+        if sought == requested:
             before = float(fit.inlier_ratios(begin).mean())
-        # Constants that are off let good frames contradict, so all count at first.
-        fit, found = fit.from_found(fit.fit(SHARED.rounds_with_constants, begin))
-        which = fit.agreeing(fit.inlier_ratios(found))
-        fit, found = fit.from_found(fit.fit(SHARED.rounds_with_constants, found, which))
-        # Each picture tells how large errors are by six motions.
-        freedom = max(1, 6 * int(np.count_nonzero(which)) - len(fit.names))
-        own, shared = fit.covariances(found, which)
-        covariance, least = own + shared, level / max(1, len(asked))
+        # Wrong parameters make outliers of good frames, so the first fit includes all frames.
+        fit, found = fit.from_found(fit.fit(SHARED.stages_with_constants, begin))
+        included = fit.inliers(fit.inlier_ratios(found))
+        fit, found = fit.from_found(fit.fit(SHARED.stages_with_constants, found, included))
+        # Each mask contributes six affine motions to the estimate of the error sizes.
+        freedom = max(1, 6 * int(np.count_nonzero(included)) - len(fit.names))
+        own, shared = fit.covariances(found, included)
+        covariance, least = own + shared, level / max(1, len(requested))
         values = describe_constants(fit, found, freedom, least, covariance, sought)
         if all(one.determined for one in values.values()):
-            covariance = as_the_cost_bends(fit, found, which, own) + shared
+            covariance = widen_to_cost_curvature(fit, found, included, own) + shared
             values = describe_constants(fit, found, freedom, least, covariance, sought)
             if all(one.determined for one in values.values()):
-                # Significant is what is so beside the others, once all can be told.
+                # Significance is tested jointly once all parameters are determined.
                 most = float(stdtrit(freedom, 1.0 - 0.5 * least))
                 beside = significant_constants(fit, found, covariance, sought, most)
                 values = {k: replace(one, significant=k in beside) for k, one in values.items()}
-        told |= values
+        parameters |= values
         kept = [name for name in sought if values[name].determined]
-    found = found._replace(shared=drawn_together(fit, found, covariance, sought))
-    covariance, gauges = wider_with_cameras(fit, covariance, still_factor)
+    found = found._replace(shared=shrink_constants(fit, found, covariance, sought))
+    covariance, gauges = widen_with_cameras(fit, covariance, still_factor)
     again = describe_constants(
         fit, found, freedom, least, covariance, sought, determined=0.2 * still_factor
     )
-    told |= {
-        k: replace(one, significant=told[k].significant, gauge=gauges.get(k, one.gauge))
+    parameters |= {
+        k: replace(one, significant=parameters[k].significant, gauge=gauges.get(k, one.gauge))
         for k, one in again.items()
     }
     ratios = fit.inlier_ratios(found)
-    require_explained_still(float(ratios.mean()), before)
+    require_fit_kept(float(ratios.mean()), before)
     deviations = np.sqrt(np.diag(covariance))[: len(seen) * fit.per_camera]
     first = len(fit.names) - len(fit.constants)
-    stands = slice(first, first + len(standing))
+    target_rows = slice(first, first + len(target_positions))
     return JointCalibration(
-        tuple(told[name] for name in names),
-        tuple(replace(told[link_scale_name(link)], name=link) for link in lengths),
+        tuple(parameters[name] for name in joints),
+        tuple(replace(parameters[link_scale_name(link)], name=link) for link in links),
         tuple(fit.cameras(found)),
         fit.camera_covariances(found, covariance),
         deviations[fit.per_camera - 1 :: fit.per_camera] if focal else np.zeros(len(seen)),
-        found.shared[stands],
-        covariance[stands, stands],
+        found.shared[target_rows],
+        covariance[target_rows, target_rows],
         tuple(ratios[fit.rows == c] for c in range(len(seen))),
-        tuple(fit.agreeing(ratios)[fit.rows == c] for c in range(len(seen))),
+        tuple(fit.inliers(ratios)[fit.rows == c] for c in range(len(seen))),
     )
 
 
-def drawn_together(fit: SharedFit, found: Shared, covariance: Array, names: Sequence[str]) -> Array:
-    """(u,) what is shared, if constants are as large as those of their kind seem to be.
+def shrink_constants(
+    fit: SharedFit, found: SharedValues, covariance: Array, names: Sequence[str]
+) -> Array:
+    """Return the shared values (u,) with the named constants shrunk towards 0.
 
-    Joint offsets of angles, those of slides, and link scales have a standard deviation each, the
-    most likely one by their estimates (empirical Bayes; Efron and Morris 1975): where most offsets
-    are small one that hardly shows is likely to be, and the cameras follow.
+    Angular offsets, linear offsets and link scales each get a prior standard deviation, the most
+    likely one given their estimates (empirical Bayes; Efron and Morris 1975). Correlated values,
+    such as the cameras', follow.
     """
-    kinematics, told = fit.seen[0].kinematics, np.zeros(len(fit.names))
+    kinematics, information = fit.views[0].kinematics, np.zeros(len(fit.names))
     kinds = dict(zip(kinematics.names, kinematics.is_angle.tolist(), strict=True))
     for kind in (True, False, None):
         rows = [fit.names.index(name) for name in names if kinds.get(name) is kind]
         if rows:
             x, C = found.shared[rows], covariance[np.ix_(rows, rows)]
-            # From a hundredth of a degree or a fiftieth of a millimetre to what was assumed.
+            # From 0.001 degrees or 0.02 mm up to the prior of the fit.
             sizes = np.geomspace(1e-4, 1.0, 60) * SHARED.constant_deviation
             likely = [
                 multivariate_normal(cov=C + size**2 * np.eye(len(x))).logpdf(x) for size in sizes
             ]
-            told[rows] = sizes[int(np.argmax(likely))] ** -2 - SHARED.constant_deviation**-2
-    known = told > 0.0
-    # The posterior by what is known more of these constants.
+            information[rows] = sizes[int(np.argmax(likely))] ** -2 - SHARED.constant_deviation**-2
+    known = information > 0.0
+    # Kalman update with the additional prior information.
     gain = covariance[:, known] @ np.linalg.inv(
-        covariance[np.ix_(known, known)] + np.diag(1.0 / told[known])
+        covariance[np.ix_(known, known)] + np.diag(1.0 / information[known])
     )
     return np.asarray(found.shared - gain @ found.shared[known])
 
 
 def significant_constants(
-    fit: SharedFit, found: Shared, covariance: Array, names: Sequence[str], most: float
+    fit: SharedFit, found: SharedValues, covariance: Array, names: Sequence[str], most: float
 ) -> list[str]:
-    """Those of some constants that are off by more deviations once the others are held at 0.
+    """Return the constants that exceed `most` standard deviations when the others are held at 0.
 
-    The least significant one is held first, and the others follow it (backward elimination).
+    Backward elimination: the least significant constant is held at 0 first, and the others follow.
     """
     rows, kept = [fit.names.index(name) for name in names], list(names)
     x, C = found.shared[rows], covariance[np.ix_(rows, rows)]
@@ -273,37 +278,43 @@ def significant_constants(
     return kept
 
 
-def as_the_cost_bends(fit: SharedFit, found: Shared, which: Mask, covariance: Array) -> Array:
-    """(u, u) the covariance, larger along constants whose cost bends less than it should.
+def widen_to_cost_curvature(
+    fit: SharedFit, found: SharedValues, included: Mask, covariance: Array
+) -> Array:
+    """Return the covariance (u, u) enlarged along constants whose cost has too little curvature.
 
-    A round base that turns looks as before, but the edges of its mesh's facets seem to move until
-    others take their place: what they tell is not true, and the slope of the cost knows it.
+    When a round base turns, the edges of its mesh's facets seem to move until others take their
+    place. They add information to the normal equations which the cost itself does not have.
     """
     found_covariance = covariance.copy()
     for k in range(len(fit.names) - len(fit.constants), len(fit.names)):
         along = covariance[:, k] / math.sqrt(covariance[k, k])
-        # It is looked two standard deviations to either side; no bend is a thousandth.
-        bends, said = fit.bend(found, 2.0 * along, SHARED.rounds_with_constants[-1], which)
-        share = min(1.0, max(1e-3, bends / said))
-        found_covariance += (1.0 / share - 1.0) * np.outer(along, along)
+        # Differences over two standard deviations; the ratio is clipped at a thousandth.
+        measured, predicted = fit.cost_curvature(
+            found, 2.0 * along, SHARED.stages_with_constants[-1], included
+        )
+        ratio = min(1.0, max(1e-3, measured / predicted))
+        found_covariance += (1.0 / ratio - 1.0) * np.outer(along, along)
     return found_covariance
 
 
-def wider_with_cameras(
-    fit: SharedFit, covariance: Array, factor: float, goes_with: float = 0.9
+def widen_with_cameras(
+    fit: SharedFit, covariance: Array, factor: float, min_correlation: float = 0.9
 ) -> tuple[Array, dict[str, tuple[str, ...]]]:
-    """(u, u) the covariance, wider by a factor along constants that go with a camera.
-
-    Which these are, each with the camera's unknowns that it goes with; none if the factor is 1.
+    """Enlarge the covariance (u, u) by a factor along constants correlated with a camera.
 
     Args:
-        goes_with: least correlation.
+        factor: of the standard deviations; 1: nothing changes.
+        min_correlation: minimum correlation.
+
+    Returns:
+        the covariance, and the correlated unknowns of cameras by constant.
     """
     deviations, cameras = np.sqrt(np.diag(covariance)), len(fit.names) - len(fit.constants)
     wider, gauges = covariance.copy(), dict[str, tuple[str, ...]]()
     for k in range(cameras, len(fit.names)) if factor > 1.0 else ():
         correlations = covariance[k, :cameras] / (deviations[k] * deviations[:cameras])
-        with_it = np.flatnonzero(np.abs(correlations) > goes_with)
+        with_it = np.flatnonzero(np.abs(correlations) > min_correlation)
         if len(with_it):
             along = covariance[:, k] / deviations[k]
             wider += (factor**2 - 1.0) * np.outer(along, along)
@@ -313,40 +324,41 @@ def wider_with_cameras(
 
 def describe_constants(
     fit: SharedFit,
-    found: Shared,
+    found: SharedValues,
     freedom: int,
     level: float,
     covariance: Array,
     names: Sequence[str],
     *,
     determined: float = 0.2,
-    goes_with: float = 0.9,
+    min_correlation: float = 0.9,
 ) -> dict[str, KinematicParameter]:
-    """Some constants by name, each with its 95 % interval, or what it goes with.
+    """Describe constants by name: 95 % interval, significance, and correlated unknowns.
 
     Args:
+        freedom: degrees of freedom of Student's t distribution.
         level: p-value below which a constant is significant.
-        determined: largest deviation of what is determined, over that of what was known before.
-        goes_with: least correlation with what a constant cannot be told from.
+        determined: maximum standard deviation of a determined constant, over the prior's.
+        min_correlation: minimum correlation of the unknowns listed for an undetermined constant.
     """
     deviations = np.sqrt(np.diag(covariance))
-    told = {}
+    parameters = {}
     for name in names:
         k = fit.names.index(name)
         value, deviation = float(found.shared[k]), float(deviations[k])
-        at_bound = abs(value) > 0.98 * SHARED.largest_constant
+        at_bound = abs(value) > 0.98 * SHARED.max_constant
         if at_bound or deviation > determined * SHARED.constant_deviation:
-            goes = np.abs(covariance[:, k]) > goes_with * deviations * deviation
-            gauge = tuple(fit.names[j] for j in np.flatnonzero(goes) if j != k)
+            correlated = np.abs(covariance[:, k]) > min_correlation * deviations * deviation
+            gauge = tuple(fit.names[j] for j in np.flatnonzero(correlated) if j != k)
             ends = (-math.inf, math.inf)
-            told[name] = KinematicParameter(name, 0.0, math.inf, *ends, False, gauge)
+            parameters[name] = KinematicParameter(name, 0.0, math.inf, *ends, False, gauge)
             continue
         width = float(stdtrit(freedom, 1.0 - 0.5 * 0.05)) * deviation
         p_value = 2.0 * float(stdtr(freedom, -abs(value) / deviation))
         low, middle, high = value - width, value, value + width
-        if name not in fit.seen[0].kinematics.names:
-            # A length was fitted as a logarithm.
+        if name not in fit.views[0].kinematics.names:
+            # The unknown of a link scale is its logarithm.
             deviation *= math.exp(value)
             low, middle, high = math.expm1(low), math.expm1(middle), math.expm1(high)
-        told[name] = KinematicParameter(name, middle, deviation, low, high, p_value < level)
-    return told
+        parameters[name] = KinematicParameter(name, middle, deviation, low, high, p_value < level)
+    return parameters

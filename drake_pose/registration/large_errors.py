@@ -17,7 +17,7 @@ from drake_pose.arrays import Array, Mask
 from drake_pose.camera.models import Camera, PinholeCamera
 from drake_pose.registration.per_frame_fit import FrameFit
 from drake_pose.registration.posed_frames import SeenFrame, common_size, reduced_sums
-from drake_pose.registration.register import RegistrationBody, spread
+from drake_pose.registration.register import RegistrationBody, evenly_spaced
 from drake_pose.silhouette.scoring import draw_mask, score_bodies
 from drake_pose.workers import map_ordered
 
@@ -50,31 +50,31 @@ class LargeErrorSettings(NamedTuple):
     """
 
     side: float = 100.0
-    step: float = 5.0
+    coarse_step: float = 5.0
     fine_step: float = 1.0
-    places: int = 13
-    left: float = 0.8
-    left_of_one: float = 0.97
-    mended: float = 2.0
-    improved: float = 0.7
-    as_good: float = 0.85
-    constant: float = 0.8
-    again: float = 2.0
-    again_focal: float = 0.02
-    near_angle: float = 6.0
-    near_place: float = 0.01
-    near_focal: float = 0.04
-    frames: int = 10
-    seen: float = 0.8
-    unseen: float = 0.35
-    least_shown: float = 0.02
+    slide_steps: int = 13
+    max_remaining: float = 0.8
+    max_remaining_of_joint: float = 0.97
+    min_mending: float = 2.0
+    min_improved_frames: float = 0.7
+    equivalent_gain: float = 0.85
+    constant_gain: float = 0.8
+    restart_angle: float = 2.0
+    restart_focal: float = 0.02
+    reach_angle: float = 6.0
+    reach_shift: float = 0.01
+    reach_focal: float = 0.04
+    frame_count: int = 10
+    min_joint_inlier_ratio: float = 0.8
+    max_misplaced_inlier_ratio: float = 0.35
+    min_outline_fraction: float = 0.02
 
 
 LARGE = LargeErrorSettings()
 
 
 @dataclass(frozen=True, eq=False)
-class Reading:
+class Correction:
     """What may be wrong with a whole scene, and how it reads once that is put right.
 
     Args:
@@ -95,12 +95,12 @@ class Reading:
     rank: float = 1.0
 
 
-def as_it_is(frame: SeenFrame) -> SeenFrame:
+def unchanged(frame: SeenFrame) -> SeenFrame:
     """A frame of which nothing is changed."""
     return frame
 
 
-def as_read(readings: Sequence[Reading], frame: SeenFrame) -> SeenFrame:
+def apply_corrections(readings: Sequence[Correction], frame: SeenFrame) -> SeenFrame:
     """A frame with what some readings put right, one after the other."""
     for one in readings:
         frame = one.of(frame)
@@ -121,17 +121,17 @@ class LargeErrorSearch:
         self, body: RegistrationBody, cameras: Sequence[Camera], frames: Sequence[SeenFrame]
     ) -> None:
         self._body, self._cameras = body, tuple(cameras)
-        self._frames = spread(frames, LARGE.frames)
+        self._frames = evenly_spaced(frames, LARGE.frame_count)
         self._share = min(1.0, LARGE.side / common_size(cameras, self._frames))
         self._sums = dict[int, tuple[Mask, NDArray[np.int32]]]()
 
     def find(
         self,
-        readings: Sequence[Reading],
+        readings: Sequence[Correction],
         joints: Sequence[str],
-        left: float = LARGE.left,
+        left: float = LARGE.max_remaining,
         likely: Collection[str] = (),
-    ) -> Reading | None:
+    ) -> Correction | None:
         """What explains the silhouettes much better than what is given; None: nothing does.
 
         Args:
@@ -141,7 +141,7 @@ class LargeErrorSearch:
             likely: joints that fits say are off: of these it may be all of it, and half of the
                 frames need not gain.
         """
-        given = self.misfits(Reading("", "", self._cameras, as_it_is))
+        given = self.misfits(Correction("", "", self._cameras, unchanged))
         told = [(one, self.misfits(one)) for one in readings]
         for name in joints:
             told += self._of_joint(name)
@@ -149,19 +149,19 @@ class LargeErrorSearch:
             (one, own.sum())
             for one, own in told
             if own.sum() <= (1.0 if one.name in likely else left) * given.sum()
-            and np.mean(own < given) >= (0.5 if one.name in likely else LARGE.improved)
+            and np.mean(own < given) >= (0.5 if one.name in likely else LARGE.min_improved_frames)
             and not _is_near(self._body, one)
         ]
         alike = [one for one in explained if one[0].kind != "log"]
         free = min((left for one, left in explained if one.kind == "log"), default=np.inf)
         most = min((left for _, left in alike), default=np.inf)
-        if given.sum() - most < LARGE.constant * (given.sum() - free) or not alike:
+        if given.sum() - most < LARGE.constant_gain * (given.sum() - free) or not alike:
             alike, most = [one for one in explained if one[0].kind == "log"], free
-        enough = given.sum() - LARGE.as_good * (given.sum() - most)
+        enough = given.sum() - LARGE.equivalent_gain * (given.sum() - most)
         best = [one for one in alike if one[1] <= enough]
         return min(best, key=lambda one: (one[0].rank, one[1]))[0] if best else None
 
-    def misfits(self, reading: Reading) -> Array:
+    def misfits(self, reading: Correction) -> Array:
         """(frames,) area that is in body or silhouette alone, of all cameras [pixel]."""
         frames = map(reading.of, self._frames)
         rows = [self._compare(one, one.values[None], reading.cameras)[0] for one in frames]
@@ -175,29 +175,31 @@ class LargeErrorSearch:
         X_WN = np.array([kinematics.poses(one) for one in values])
         for camera in self._cameras if cameras is None else cameras:
             if camera.name in frame.masks:
-                mask, small = frame.masks[camera.name], smaller(camera, self._share)
+                mask, small = frame.masks[camera.name], downscaled(camera, self._share)
                 if id(mask) not in self._sums:
                     # The mask is kept, so that no other one has its place in memory.
                     self._sums[id(mask)] = mask, reduced_sums(mask, small)
                 sums = self._sums[id(mask)][1]
                 X_CN = camera.X_CW @ X_WN
-                found = score_bodies(self._body.very_few, X_CN, small, sums[None])
+                found = score_bodies(self._body.coarse, X_CN, small, sums[None])
                 left += found[:, 0] + float(sums[:, -1].sum()) - 2.0 * found[:, 1]
         return left
 
-    def _of_joint(self, name: str) -> list[tuple[Reading, Array]]:
+    def _of_joint(self, name: str) -> list[tuple[Correction, Array]]:
         """What may be wrong with a joint's positions, and the misfits that it leaves."""
         kinematics = self._body.kinematics
         j, frames = kinematics.names.index(name), self._frames
         angle, q = bool(kinematics.is_angle[j]), np.array([one.values[j] for one in frames])
         low, high = float(kinematics.lower[j]), float(kinematics.upper[j])
-        step, fine = np.radians([LARGE.step, LARGE.fine_step])
+        step, fine = np.radians([LARGE.coarse_step, LARGE.fine_step])
         if not angle:
-            step = (high - low) / (LARGE.places - 1)
-            fine = step / LARGE.step * LARGE.fine_step
-        grid = np.arange(-np.pi, np.pi, step) if angle else np.linspace(low, high, LARGE.places)
+            step = (high - low) / (LARGE.slide_steps - 1)
+            fine = step / LARGE.coarse_step * LARGE.fine_step
+        grid = (
+            np.arange(-np.pi, np.pi, step) if angle else np.linspace(low, high, LARGE.slide_steps)
+        )
         beside = np.arange(-4, 5) * fine
-        near = np.radians(LARGE.near_angle) if angle else LARGE.near_place
+        near = np.radians(LARGE.reach_angle) if angle else LARGE.reach_shift
 
         def compare(k: int, places: Array) -> Array:
             values = np.tile(frames[k].values, (len(places), 1))
@@ -212,9 +214,9 @@ class LargeErrorSearch:
             rows = zip(places, profile, strict=True)
             return np.array([np.interp(one, grid, own, period=period) for one, own in rows])
 
-        told, tried = list[tuple[Reading, Array]](), np.arange(-np.pi, np.pi, fine)
+        told, tried = list[tuple[Correction, Array]](), np.arange(-np.pi, np.pi, fine)
         if not angle:
-            tried = np.linspace(low - high, high - low, 8 * LARGE.places)
+            tried = np.linspace(low - high, high - low, 8 * LARGE.slide_steps)
         for sign, kind in ((1.0, "offset"), (-1.0, "sign")):
             costs = [at(sign * q + by).sum() for by in tried]
             about = tried[int(np.argmin(costs))]
@@ -224,9 +226,9 @@ class LargeErrorSearch:
             by = float(about + beside[best])
             if sign < 0.0:
                 plain = np.array([compare(k, -q[[k]])[0] for k in range(len(frames))])
-                told.append((self.joint_reading("sign", name, -1.0, 0.0, 0.0), plain))
+                told.append((self.joint_correction("sign", name, -1.0, 0.0, 0.0), plain))
             rank = 1.0 if sign > 0.0 else 2.0
-            reading = self.joint_reading(kind, name, sign, by, rank)
+            reading = self.joint_correction(kind, name, sign, by, rank)
             told.append((reading, exact[:, best]))
         inside = np.ones(len(grid), bool)
         if angle and high - low < 2.0 * np.pi:
@@ -243,12 +245,14 @@ class LargeErrorSearch:
         if np.median(np.abs(off - np.median(off))) <= near:
             # A constant, as well as single frames tell.
             return told
-        free = Reading(
-            "log", name, self._cameras, self._seen_anew(j, grid[inside], beside), 0.0, 3.0
+        free = Correction(
+            "log", name, self._cameras, self._refound(j, grid[inside], beside), 0.0, 3.0
         )  # fmt: skip
         return [*told, (free, exact.min(axis=1))]
 
-    def joint_reading(self, kind: str, name: str, sign: float, by: float, rank: float) -> Reading:
+    def joint_correction(
+        self, kind: str, name: str, sign: float, by: float, rank: float
+    ) -> Correction:
         """Another sign of a joint's positions (sign -1), and what is added then [rad or m]."""
         j = self._body.kinematics.names.index(name)
 
@@ -257,9 +261,9 @@ class LargeErrorSearch:
             values[j] = sign * values[j] + by
             return replace(frame, values=values)
 
-        return Reading(kind, name, self._cameras, changed, by, rank)
+        return Correction(kind, name, self._cameras, changed, by, rank)
 
-    def _seen_anew(self, j: int, grid: Array, beside: Array) -> Callable[[SeenFrame], SeenFrame]:
+    def _refound(self, j: int, grid: Array, beside: Array) -> Callable[[SeenFrame], SeenFrame]:
         """A frame with a joint where it is seen."""
 
         def changed(frame: SeenFrame) -> SeenFrame:
@@ -274,7 +278,7 @@ class LargeErrorSearch:
         return changed
 
 
-def smaller(camera: Camera, share: float) -> Camera:
+def downscaled(camera: Camera, share: float) -> Camera:
     """A camera of pictures that are a share as large; a parallel one as it is."""
     if not isinstance(camera, PinholeCamera):
         return camera
@@ -282,7 +286,7 @@ def smaller(camera: Camera, share: float) -> Camera:
     return camera.resized(width, height)
 
 
-def mask_shares(
+def mask_excess_and_lack(
     body: RegistrationBody,
     camera: Camera,
     values: Array,
@@ -297,10 +301,10 @@ def mask_shares(
             of one that shows nothing of the usual one.
         band: what is nearer to the outlines [pixel] is none of it.
     """
-    small = smaller(camera, min(1.0, LARGE.side / size))
+    small = downscaled(camera, min(1.0, LARGE.side / size))
     share = small.width / camera.width
     seen = np.diff(reduced_sums(mask, small), axis=1).astype(np.uint8)
-    drawn = draw_mask(body.few, camera.X_CW @ body.kinematics.poses(values), small)
+    drawn = draw_mask(body.medium, camera.X_CW @ body.kinematics.poses(values), small)
     side = 2 * max(1, round(band * share)) + 1
     ball = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
     wide, wide_seen = (cv2.dilate(one.astype(np.uint8), ball) for one in (drawn, seen))
@@ -309,29 +313,32 @@ def mask_shares(
     return float(more) / area, float(less) / area
 
 
-def _is_near(body: RegistrationBody, one: Reading) -> bool:
+def _is_near(body: RegistrationBody, one: Correction) -> bool:
     """Whether fits reach what is off."""
     if one.kind == "offset":
         j = body.kinematics.names.index(one.name)
-        near = np.radians(LARGE.near_angle) if body.kinematics.is_angle[j] else LARGE.near_place
+        near = np.radians(LARGE.reach_angle) if body.kinematics.is_angle[j] else LARGE.reach_shift
         return abs(one.amount) <= near
-    return one.kind == "focal" and abs(one.amount) <= LARGE.near_focal
+    return one.kind == "focal" and abs(one.amount) <= LARGE.reach_focal
 
 
-def shares_moved(fits: Sequence[FrameFit], joints: Sequence[str]) -> dict[str, float]:
+def joint_inlier_ratios(fits: Sequence[FrameFit], joints: Sequence[str]) -> dict[str, float]:
     """By joint, what share fits of the outlines of all links that it moves, in all frames."""
-    moves = [picture.moves.any(axis=2) for one in fits for picture in one.pictures]
+    moves = [picture.moves.any(axis=2) for one in fits for picture in one.compared_masks]
     if not moves:
         return {}
     moved = np.any(moves, axis=0)[:, : len(joints)].astype(float)
-    lengths, fit = np.sum([one.fitting for one in fits], axis=0).T @ moved
+    lengths, fit = np.sum([one.matched_lengths for one in fits], axis=0).T @ moved
     shares = fit / np.maximum(lengths, 1e-9)
     return {name: float(shares[k]) for k, name in enumerate(joints) if lengths[k] > 0.0}
 
 
-def links_not_seen(fits: Sequence[FrameFit]) -> list[tuple[int, float]]:
+def mismatched_links(fits: Sequence[FrameFit]) -> list[tuple[int, float]]:
     """Nodes of whose outlines hardly anything fits in all frames, and what share."""
-    lengths, fitting = np.sum([one.fitting for one in fits], axis=0).T
+    lengths, fitting = np.sum([one.matched_lengths for one in fits], axis=0).T
     shares = fitting / np.maximum(lengths, 1e-9)
-    shown = lengths >= LARGE.least_shown * max(float(lengths.sum()), 1e-9)
-    return [(int(k), float(shares[k])) for k in np.flatnonzero(shown & (shares < LARGE.unseen))]
+    shown = lengths >= LARGE.min_outline_fraction * max(float(lengths.sum()), 1e-9)
+    return [
+        (int(k), float(shares[k]))
+        for k in np.flatnonzero(shown & (shares < LARGE.max_misplaced_inlier_ratio))
+    ]

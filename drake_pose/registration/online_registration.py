@@ -25,7 +25,7 @@ from drake_pose.registration.register import (
     E_total,
     RegisteredCamera,
     RegistrationBody,
-    areas,
+    overlap_areas,
 )
 
 
@@ -86,7 +86,7 @@ class OnlineState:
     """What is known of a camera; never changed, so that copies share it.
 
     Args:
-        keyframes, contradicting: the frames kept, and the last ones that contradict the pose, the
+        keyframes, outlier_frames: the frames kept, and the last ones that contradict the pose, the
             oldest first; the body stands differently in all of them.
         registered: the camera as it was found; None: not yet.
         contradictions: how many frames without a gap have contradicted the pose.
@@ -96,9 +96,9 @@ class OnlineState:
     """
 
     keyframes: tuple[PosedFrame, ...] = ()
-    contradicting: tuple[PosedFrame, ...] = ()
+    outlier_frames: tuple[PosedFrame, ...] = ()
     registered: RegisteredCamera | None = None
-    contradictions: int = 0
+    outlier_count: int = 0
     moves: int = 0
     distances: tuple[float, ...] = ()
 
@@ -129,7 +129,7 @@ class OnlineRegistration:
         """What is known of the camera's pose."""
         if state.registered is None:
             return CameraStatus.NOT_REGISTERED
-        if state.contradictions >= self.settings.newest:
+        if state.outlier_count >= self.settings.newest:
             return CameraStatus.CONTRADICTED
         return CameraStatus.REGISTERED
 
@@ -159,14 +159,14 @@ class OnlineRegistration:
     ) -> OnlineState:
         """After the camera was found; near: the keyframe in which the body stands alike."""
         if near is not None:
-            posed = PosedFrames(self.body.kinematics, self.body.few, registered.camera, [frame])
-            left = E_total(areas(posed, registered.camera.X_CW[None], np.inf))[0, 0]
+            posed = PosedFrames(self.body.kinematics, self.body.medium, registered.camera, [frame])
+            left = E_total(overlap_areas(posed, registered.camera.X_CW[None], np.inf))[0, 0]
             if left <= registered.frames[near].E_total + self.settings.tolerance:
-                return replace(state, contradicting=(), contradictions=0)
+                return replace(state, outlier_frames=(), outlier_count=0)
         keyframes = self._kept(state.keyframes, frame, near)
         again = self._search.refine(registered.camera, keyframes)
         newest = again.frames[-1]
-        if not (newest.agrees and newest.inlier_ratio >= self._least_inlier_ratio(registered)):
+        if not (newest.is_inlier and newest.inlier_ratio >= self._least_inlier_ratio(registered)):
             return self._contradict(state, registered, frame)
         # The pose, or that of the newest keyframes alone where they say otherwise.
         state = _registered(state, again, keyframes)
@@ -174,7 +174,7 @@ class OnlineRegistration:
         if len(state.keyframes) <= len(last):
             return state
         alone = self._search.refine(again.camera, last)
-        if alone.contradictions:
+        if alone.outliers:
             return state
         if self._is_elsewhere(state, alone, again):
             return _registered(state, alone, last, moved=True)
@@ -185,9 +185,9 @@ class OnlineRegistration:
         self, state: OnlineState, registered: RegisteredCamera, frame: PosedFrame
     ) -> OnlineState:
         """Another frame contradicts; the camera elsewhere, where they agree with one another."""
-        near, settings = self._nearest(frame, state.contradicting), self.settings
-        frames = self._kept(state.contradicting, frame, near)
-        state = replace(state, contradicting=frames, contradictions=state.contradictions + 1)
+        near, settings = self._nearest(frame, state.outlier_frames), self.settings
+        frames = self._kept(state.outlier_frames, frame, near)
+        state = replace(state, outlier_frames=frames, outlier_count=state.outlier_count + 1)
         if near is not None or len(frames) < settings.newest:
             return state
         least, X_WC = self._least_inlier_ratio(registered), registered.camera.X_WC
@@ -230,7 +230,7 @@ class OnlineRegistration:
 
     def _is_found(self, found: RegisteredCamera, count: int, least: float) -> bool:
         """Whether `count` frames, and more than half, agree, with inlier ratios of `least`."""
-        agreeing = [frame for frame in found.frames if frame.agrees]
+        agreeing = [frame for frame in found.frames if frame.is_inlier]
         return (
             not len(found.alternatives)
             and len(agreeing) >= max(count, len(found.frames) // 2 + 1)
@@ -262,7 +262,7 @@ class OnlineRegistration:
 
     def _points(self, frame: PosedFrame) -> Array:
         """(n, 3) of the body in the world."""
-        return placed_points(self.body.very_few, self.body.kinematics.poses(frame.values))
+        return placed_points(self.body.coarse, self.body.kinematics.poses(frame.values))
 
 
 def pose_difference(X_WC: Array, from_X_WC: Array) -> Array:
@@ -281,7 +281,9 @@ def _registered(
     state: OnlineState, found: RegisteredCamera, frames: Sequence[PosedFrame], moved: bool = False
 ) -> OnlineState:
     """The state in which the frames that agree are kept; moved: the camera is elsewhere."""
-    pairs = [(one, frame) for one, frame in zip(frames, found.frames, strict=True) if frame.agrees]
+    pairs = [
+        (one, frame) for one, frame in zip(frames, found.frames, strict=True) if frame.is_inlier
+    ]
     kept = replace(found, frames=tuple(frame for _, frame in pairs))
     keyframes = tuple(one for one, _ in pairs)
     return OnlineState(keyframes, (), kept, 0, state.moves + moved, state.distances)

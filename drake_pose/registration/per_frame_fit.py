@@ -38,10 +38,10 @@ class FrameFit:
     """
 
     name: str
-    pictures: tuple[ComparedMask, ...]
+    compared_masks: tuple[ComparedMask, ...]
     inlier_ratios: tuple[Mapping[str, float], Mapping[str, float]]
-    weights: Array
-    fitting: Array
+    outline_lengths: Array
+    matched_lengths: Array
 
 
 class PerFrameFit:
@@ -119,12 +119,12 @@ class PerFrameFit:
         for part in (rounds, rounds[-2:]):
             found = self._few.solve([base], part, change, expected=start)
             change = found.own, found.shared
-            theta = self.with_widths(base, found.parameters[0])
+            theta = self.with_boundary_biases(base, found.parameters[0])
             held = self._all.parameters([given], *start)[0]
             base = given._replace(values=np.append(held[:-count], theta[-count:]))
-        held = self.with_widths(given, held)
+        held = self.with_boundary_biases(given, held)
         before, after = (
-            self._all.compare(given, one, SHARED.told_apart)[0] for one in (held, theta)
+            self._all.compare(given, one, SHARED.inlier_stage)[0] for one in (held, theta)
         )
         told = after
         costs = [float(one.sums[:, :, Sum.COST].sum()) for one in (before, after)]
@@ -135,7 +135,7 @@ class PerFrameFit:
             frame.name,
             tuple(
                 one._replace(b=one.b + np.einsum("nkl,npl,p->nk", one.A, one.moves, change[0][0]))
-                for one in self._all.compared_masks([given], theta[None], SHARED.told_apart)
+                for one in self._all.compared_masks([given], theta[None], SHARED.inlier_stage)
             ),
             (self._inlier_ratios(before, frame), self._inlier_ratios(after, frame)),
             # Edges are shared out among the nodes.
@@ -147,7 +147,7 @@ class PerFrameFit:
         sums = zip(self.camera_names, compared.sums, strict=True)
         return {name: inlier_ratio_of(one) for name, one in sums if name in frame.masks}
 
-    def with_widths(self, seen: Observation, theta: Array) -> Array:
+    def with_boundary_biases(self, seen: Observation, theta: Array) -> Array:
         """All parameters (n,), the silhouettes as much wider on all sides as fits best [pixel]."""
         widths, count = np.linspace(-3.0, 3.0, 5), len(self.cameras)
         found, costs = theta.copy(), np.full((len(widths), count), np.inf)
@@ -155,7 +155,7 @@ class PerFrameFit:
         for k, beside in ((1, None), (2, None), (3, None), (0, 1), (4, 3)):
             if beside is None or (np.argmin(costs, axis=0) == beside).any():
                 found[-count:] = widths[k]
-                compared, _ = self._few.compare(seen, found, SHARED.told_apart)
+                compared, _ = self._few.compare(seen, found, SHARED.inlier_stage)
                 costs[k] = compared.sums[:, :, Sum.COST].sum(axis=1)
         best = np.clip(np.argmin(costs, axis=0), 1, len(widths) - 2)
         low, middle, high = (np.choose(best + k, costs) for k in (-1, 0, 1))
@@ -164,7 +164,7 @@ class PerFrameFit:
         found[-count:] = widths[best] + np.clip(step, -1.0, 1.0) * (widths[1] - widths[0])
         return found
 
-    def base_moves(self) -> Array:
+    def base_jacobian(self) -> Array:
         """(p, 6) how what is free follows a turn [rad] and shift [m] of the base, in deviations.
 
         All cameras see the base move about their common pivot.
@@ -177,7 +177,7 @@ class PerFrameFit:
             moves[first + 3 : first + 6, 3:] = R_CW
         return np.asarray(moves / self.deviations[:, None])
 
-    def center_moves(self, cameras: Sequence[int]) -> Array:
+    def center_jacobian(self, cameras: Sequence[int]) -> Array:
         """(p, 2) as base_moves, of a pixel by which principal points are shifted along x and y.
 
         At depth z a body is seen shifted by z over the focal length: a shift, and a turn, but for
@@ -192,7 +192,7 @@ class PerFrameFit:
             of_x[1], of_y[0] = (0.0, 0.0) if kind == 1.0 else (1.0 / focal_x, -1.0 / focal_y)
         return np.asarray(moves / self.deviations[:, None])
 
-    def focal_moves(self, cameras: Sequence[int]) -> Array:
+    def focal_jacobian(self, cameras: Sequence[int]) -> Array:
         """(p, 1) as base_moves, of focal lengths that are larger by all of themselves.
 
         A body is seen as it would be if it were nearer by that share of its depth; to a parallel
@@ -204,7 +204,7 @@ class PerFrameFit:
                 moves[len(self.joints) + 6 * c + 5] = -self._depth(c)
         return np.asarray(moves / self.deviations[:, None])
 
-    def camera_motion(self, camera: str) -> Array:
+    def camera_jacobian(self, camera: str) -> Array:
         """(3, 6) how a camera itself moves along its axes [m] by what its POSE_NAMES say it is off.
 
         These turn and shift the body about its middle, as the camera sees it.

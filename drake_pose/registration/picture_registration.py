@@ -26,7 +26,7 @@ from drake_pose.registration.picture_search import (
     choose_frames,
     evidence,
     node_places,
-    see_picture,
+    segment_picture,
 )
 from drake_pose.registration.posed_frames import PosedFrame, PosedFrames
 from drake_pose.registration.register import (
@@ -35,7 +35,7 @@ from drake_pose.registration.register import (
     RegistrationBody,
     frame_misfits,
 )
-from drake_pose.registration.shared_fit import SHARED, SharedFit, agreeing_share
+from drake_pose.registration.shared_fit import SHARED, SharedFit, inlier_threshold
 from drake_pose.silhouette.scoring import draw_mask
 from drake_pose.workers import map_ordered
 
@@ -74,7 +74,7 @@ class Recording:
         """The same with left and right exchanged in all pictures."""
         return replace(self, read=lambda k: np.ascontiguousarray(self.read(k)[:, ::-1]))
 
-    def with_zeros(self, zeros: Array) -> "Recording":
+    def with_offsets(self, zeros: Array) -> "Recording":
         """The same with (m,) added to all values."""
         return replace(self, values_at=lambda offset: self.values_at(offset) + zeros)
 
@@ -186,7 +186,7 @@ def _register(
     """
     chosen, moving = frames
     search = PictureSearch(body, camera, posed_pictures(recording, chosen, 0.0))
-    fitted = map_ordered(search.approach, search.search()[:looks])
+    fitted = map_ordered(search.coarse_fit, search.search()[:looks])
     near = sorted((one for one in fitted if one is not None), key=lambda one: -evidence(*one[1]))
     if not near:
         raise _unexplained(camera, "no pose shows the body in two pictures")
@@ -196,16 +196,18 @@ def _register(
     close = [
         one.X_CW for one, _ in near[1:] if vuong_statistic(pieces, level.pieces(one.X_CW)) <= 1.96
     ]
-    again = map_ordered(search.approach, close)
+    again = map_ordered(search.coarse_fit, close)
     alike = [one[0].X_CW for one in again if one is not None]
     alternatives = level.distinct([start.X_CW, *alike])[1:]
     both, clock = [*chosen, *moving], NO_CLOCK
     if recording.times is not None:
-        clock = scan_offsets(body, start, recording, both)
-    return fit_pictures(body, Begun(start, both, clock, alternatives), recording, focal, zeros)
+        clock = scan_time_offsets(body, start, recording, both)
+    return fit_pictures(
+        body, PictureStart(start, both, clock, alternatives), recording, focal, zeros
+    )
 
 
-class Begun(NamedTuple):
+class PictureStart(NamedTuple):
     """A search that is done: the camera, frames that are fitted, the clock, other poses X_CW."""
 
     camera: PinholeCamera
@@ -214,7 +216,7 @@ class Begun(NamedTuple):
     alternatives: Sequence[Array]
 
     @classmethod
-    def of(cls, one: PictureRegistration) -> "Begun":
+    def of(cls, one: PictureRegistration) -> "PictureStart":
         """A camera that was found already."""
         rows = [one.recording.names.index(frame.name) for frame in one.frames]
         others = [np.linalg.inv(X) for X in one.found.alternatives]
@@ -223,7 +225,7 @@ class Begun(NamedTuple):
 
 def fit_pictures(
     body: RegistrationBody,
-    begun: Begun,
+    start: PictureStart,
     recording: Recording,
     focal: bool = False,
     zeros: Sequence[str] = (),
@@ -244,39 +246,41 @@ def fit_pictures(
 
     Raises RegistrationError: no pose explains the pictures.
     """
-    at_rate = begun.clock.drift
-    without = begun._replace(clock=replace(begun.clock, drift=0.0))
-    steady = best, as_now, begun, assumed = _settle(body, without, recording, focal, zeros)
+    at_rate = start.clock.drift
+    without = start._replace(clock=replace(start.clock, drift=0.0))
+    steady = best, as_now, start, assumed = _fit_until_stable(
+        body, without, recording, focal, zeros
+    )
     if recording.times is None:
         return _describe(*steady, focal)
     if at_rate:
         clock = replace(without.clock, drift=at_rate)
-        begun = without._replace(clock=clock)
-        best, as_now, begun, assumed = _settle(body, begun, recording, focal, zeros)
-    since, span = _mean_time(recording, begun.rows), float(np.ptp(recording.times))
+        start = without._replace(clock=clock)
+        best, as_now, start, assumed = _fit_until_stable(body, start, recording, focal, zeros)
+    since, span = _mean_time(recording, start.rows), float(np.ptp(recording.times))
     for left in range(most_fits, -1, -1):
-        rows = [recording.names.index(frame.name) for frame in best.fit.seen[0].frames]
-        later = (recording.times[rows] - since)[best.agree]
-        more, deviation = best.fit.growth(
-            best.found, TIME_OFFSET, later, best.agree, best.covariance
+        rows = [recording.names.index(frame.name) for frame in best.fit.views[0].frames]
+        later = (recording.times[rows] - since)[best.inliers]
+        more, deviation = best.fit.fit_slope(
+            best.found, TIME_OFFSET, later, best.inliers, best.covariance
         )
-        clock = replace(begun.clock, drift_deviation=deviation)
-        begun = begun._replace(clock=clock)
+        clock = replace(start.clock, drift_deviation=deviation)
+        start = start._replace(clock=clock)
         if abs(more) < max(deviation, min_drift / span) or not left:
             break
-        begun = begun._replace(clock=replace(clock, drift=clock.drift + more))
-        best, as_now, begun, assumed = _settle(body, begun, recording, focal, zeros)
-    told = abs(begun.clock.drift) > drift_sds * begun.clock.drift_deviation
-    return _describe(*((best, as_now, begun, assumed) if told else steady), focal)
+        start = start._replace(clock=replace(clock, drift=clock.drift + more))
+        best, as_now, start, assumed = _fit_until_stable(body, start, recording, focal, zeros)
+    told = abs(start.clock.drift) > drift_sds * start.clock.drift_deviation
+    return _describe(*((best, as_now, start, assumed) if told else steady), focal)
 
 
-def _settle(
+def _fit_until_stable(
     body: RegistrationBody,
-    begun: Begun,
+    start: PictureStart,
     recording: Recording,
     focal: bool,
     zeros: Sequence[str],
-) -> tuple[PictureFit, Recording, Begun, Array]:
+) -> tuple[PictureFit, Recording, PictureStart, Array]:
     """A fit with the drift of the clock that has begun.
 
     It is fitted again, so often at most, where an offset moved by 20 ms or a zero by 0.3 degrees.
@@ -285,22 +289,22 @@ def _settle(
         the fit; the recording, whose joints' clock drifts no more; the camera and the clock that
         were found, but for the offset's deviation; (m,) what was added to the frames' values.
     """
-    camera, offset, names = begun.camera, begun.clock.value, body.kinematics.names
+    camera, offset, names = start.camera, start.clock.value, body.kinematics.names
     constants = ((TIME_OFFSET,) if recording.times is not None else ()) + tuple(zeros)
     turned, left = np.zeros(len(names)), 4 if zeros else 2
-    as_now = recording.with_drift(begun.clock.drift, _mean_time(recording, begun.rows))
+    as_now = recording.with_drift(start.clock.drift, _mean_time(recording, start.rows))
     while True:
-        frames, left = posed_pictures(as_now.with_zeros(turned), begun.rows, offset), left - 1
+        frames, left = posed_pictures(as_now.with_offsets(turned), start.rows, offset), left - 1
         best = PictureSearch(body, camera, frames).fit(camera, constants, focal)
         if best is None:
             raise _unexplained(camera, "the body leaves the pictures")
         found = dict(zip(best.fit.names, best.found.shared.tolist(), strict=True))
         camera, by = best.camera, found.get(TIME_OFFSET, 0.0)
         assumed, turn = turned, np.array([found.get(name, 0.0) for name in names])
-        most = SHARED.largest_constant
+        most = SHARED.max_constant
         offset, turned = offset + by, np.clip(turned + turn, -most, most)
         if not left or (abs(by) < 0.02 and np.abs(turn).max() < np.radians(0.3)):
-            done = begun._replace(camera=camera, clock=replace(begun.clock, value=offset))
+            done = start._replace(camera=camera, clock=replace(start.clock, value=offset))
             return best, as_now, done, assumed
 
 
@@ -313,7 +317,7 @@ def choose_pictures(
     body: RegistrationBody,
     camera: PinholeCamera,
     recording: Recording,
-    count: int = PICTURES.searched,
+    count: int = PICTURES.search_frames,
     *,
     moving: int = 8,
     slow_share: float = 0.6,
@@ -357,23 +361,25 @@ def choose_pictures(
     return known[chosen].tolist(), known[fast].tolist()
 
 
-def posed_pictures(recording: Recording, which: Sequence[int], offset: float) -> list[PosedPicture]:
+def posed_pictures(
+    recording: Recording, indices: Sequence[int], offset: float
+) -> list[PosedPicture]:
     """Some frames with their pictures; those whose joints are not logged are left out."""
     values, rates = recording.values_at(offset), recording.rates_at(offset)
     return [
         PosedPicture(
             recording.names[k], values[k], recording.read(k), None if rates is None else rates[k]
         )
-        for k in which
+        for k in indices
         if np.isfinite(values[k]).all()
     ]
 
 
-def scan_offsets(
+def scan_time_offsets(
     body: RegistrationBody,
     camera: PinholeCamera,
     recording: Recording,
-    which: Sequence[int],
+    indices: Sequence[int],
     *,
     rates: Sequence[float] = (-0.2, -0.15, -0.1, -0.05, 0.05, 0.1, 0.15, 0.2, 0.25),
     start_within: float = 0.3,
@@ -389,7 +395,7 @@ def scan_offsets(
         much_better: a rate explains this many times as much as the best offset does.
     """
     offsets = np.linspace(-1.0, 1.0, 81)
-    frames = posed_pictures(recording, which, 0.0)
+    frames = posed_pictures(recording, indices, 0.0)
     level = PictureSearch(body, camera, frames).compared
     names = [one.name for one in frames]
     rows = [recording.names.index(name) for name in names]
@@ -428,7 +434,7 @@ def scan_offsets(
 def _describe(
     best: PictureFit,
     recording: Recording,
-    begun: Begun,
+    start: PictureStart,
     zeros: Array,
     focal: bool,
     *,
@@ -455,8 +461,8 @@ def _describe(
 
     Raises RegistrationError: it does not explain the pictures.
     """
-    fit, (seen,) = best.fit, best.fit.seen
-    ratio = float(best.ratios[best.agree].mean())
+    fit, (seen,) = best.fit, best.fit.views
+    ratio = float(best.ratios[best.inliers].mean())
     told = evidence(best.explained, best.contour)
     if (
         best.explained < min_explained
@@ -465,30 +471,31 @@ def _describe(
         or told < min_evidence
     ):
         raise _unexplained(
-            begun.camera,
+            start.camera,
             f"at best {max(best.explained, 0.0):.0%} of what changes is explained "
             f"({min_explained:.0%} at least), {ratio:.0%} of the contours fit "
             f"({min_ratio:.0%} at least), and edges along them are stronger than elsewhere by "
-            f"{best.contour:.2f} ({min_contour} at least); the first, and {PICTURES.contours:g} "
-            f"times the last, are {told:.2f} together ({min_evidence} at least)",
+            f"{best.contour:.2f} ({min_contour} at least); the first, and "
+            f"{PICTURES.contour_weight:g} times the last, are {told:.2f} together "
+            f"({min_evidence} at least)",
         )
     deviations = np.sqrt(np.diag(best.covariance))
     pose = fit.camera_covariances(best.found, best.covariance)[0]
     found = RegisteredCamera(
-        best.camera, pose, frame_misfits(seen, best.camera.X_CW, best.ratios, best.agree),
-        np.array([np.linalg.inv(X) for X in begun.alternatives]).reshape(-1, 4, 4),
+        best.camera, pose, frame_misfits(seen, best.camera.X_CW, best.ratios, best.inliers),
+        np.array([np.linalg.inv(X) for X in start.alternatives]).reshape(-1, 4, 4),
     )  # fmt: skip
     distance = float(np.linalg.norm(best.camera.X_WC[:3, 3] - seen.middle))
     if found.translation_sd > max_sd * distance or found.rotation_sd > max_sd:
         raise _unexplained(
-            begun.camera,
+            start.camera,
             f"the best, {distance:.1f} m away, has a standard deviation of "
             f"{1e3 * found.translation_sd:.0f} mm and {np.degrees(found.rotation_sd):.1f} degrees",
         )
     clock = None
     if TIME_OFFSET in fit.names:
         deviation = float(deviations[fit.names.index(TIME_OFFSET)])
-        clock = replace(begun.clock, deviation=deviation if deviation < max_clock_sd else np.inf)
+        clock = replace(start.clock, deviation=deviation if deviation < max_clock_sd else np.inf)
     return PictureRegistration(
         found,
         tuple(replace(frame, values=frame.values - zeros) for frame in seen.frames),
@@ -511,7 +518,7 @@ def _unexplained(camera: PinholeCamera, why: str) -> RegistrationError:
     )
 
 
-def judge_pictures(
+def evaluate_pictures(
     body: RegistrationBody,
     one: PictureRegistration,
     found: RegisteredCamera,
@@ -537,11 +544,11 @@ def judge_pictures(
     """
     count = len(one.recording.names)
     rows = np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int)).tolist()
-    overlaps = [frame.iou for frame in one.found.frames if frame.agrees]
+    overlaps = [frame.iou for frame in one.found.frames if frame.is_inlier]
     min_iou = min_overlap * float(np.median(overlaps))
-    least = agreeing_share(one.fit.ratios)
+    least = inlier_threshold(one.fit.ratios)
     known, camera = one.fit.background, found.camera
-    outlines = simplify_or_hull(body.very_few, PICTURES.triangles[-1])
+    outlines = simplify_or_hull(body.coarse, PICTURES.triangles[-1])
     offset = 0.0 if one.offset is None else one.offset.value
 
     def see(posed: PosedPicture) -> tuple[str, PosedFrame | None] | None:
@@ -549,22 +556,22 @@ def judge_pictures(
         if covered.mean() < shown:
             return None
         light = estimate_gain(posed.picture, known.colours)
-        return posed.name, see_picture(posed, known, light, covered)
+        return posed.name, segment_picture(posed, known, light, covered)
 
     frames, misfits, lost = list[PosedFrame](), list[FrameMisfit](), list[str]()
     for k in range(0, len(rows), at_once):
         pictures = posed_pictures(
-            one.recording.with_zeros(one.zeros), rows[k : k + at_once], offset
+            one.recording.with_offsets(one.zeros), rows[k : k + at_once], offset
         )
         told = [each for each in map_ordered(see, pictures) if each is not None]
         lost += [name for name, frame in told if frame is None]
         seen = [frame for _, frame in told if frame is not None]
         if seen:
-            whole = PosedFrames(body.kinematics, body.all, camera, seen)
-            fit = SharedFit([whole], [camera.X_CW], widths=False)
+            whole = PosedFrames(body.kinematics, body.full, camera, seen)
+            fit = SharedFit([whole], [camera.X_CW], fit_biases=False)
             ratios = fit.inlier_ratios(fit.start)
             misfits += [
-                replace(each, agrees=each.agrees or each.iou >= min_iou)
+                replace(each, is_inlier=each.is_inlier or each.iou >= min_iou)
                 for each in frame_misfits(whole, camera.X_CW, ratios, ratios >= least)
             ]
             # Odds fill the memory.

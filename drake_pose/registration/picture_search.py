@@ -31,8 +31,8 @@ from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.fit.parameters import POSE_NAMES
 from drake_pose.fit.surfaces import simplify_or_hull
 from drake_pose.registration.posed_frames import PosedFrame, PosedFrames, placed_points
-from drake_pose.registration.register import RegistrationBody, spread_rotations
-from drake_pose.registration.shared_fit import Shared, SharedFit
+from drake_pose.registration.register import RegistrationBody, uniform_rotations
+from drake_pose.registration.shared_fit import SharedFit, SharedValues
 from drake_pose.silhouette.outline import EMPTY_OUTLINE, Outline, pack
 from drake_pose.silhouette.scoring import draw_mask
 from drake_pose.workers import map_ordered
@@ -48,11 +48,11 @@ class PictureSettings(NamedTuple):
     rate_step: rates are differences of positions this long before and after [s].
     """
 
-    searched: int = 12
+    search_frames: int = 12
     triangles: tuple[int, int, int] = (12, 40, 100)
-    compared: int = 160
-    learned: int = 320
-    contours: float = 4.0
+    compare_width: int = 160
+    background_width: int = 320
+    contour_weight: float = 4.0
     rate_step: float = 0.05
 
 
@@ -88,7 +88,7 @@ class PictureFit:
     """
 
     fit: SharedFit
-    found: Shared
+    found: SharedValues
     background: KnownBackground
     explained: float
     contour: float
@@ -104,21 +104,21 @@ class PictureFit:
         return self.fit.inlier_ratios(self.found)
 
     @cached_property
-    def agree(self) -> Mask:
+    def inliers(self) -> Mask:
         """(frames,) which frames fit nearly as well as the best."""
-        return self.fit.agreeing(self.ratios)
+        return self.fit.inliers(self.ratios)
 
     @cached_property
     def covariance(self) -> Array:
         """(u, u) of the errors of all that the frames share."""
-        return np.asarray(np.sum(self.fit.covariances(self.found, self.agree), axis=0))
+        return np.asarray(np.sum(self.fit.covariances(self.found, self.inliers), axis=0))
 
 
 def node_places(body: RegistrationBody, values: Array) -> Array:
     """(f, n, 3) the middles of the nodes that show, in frames with values (f, m) [m]."""
-    shown = [k for k, one in enumerate(body.very_few) if len(one.vertices)]
+    shown = [k for k, one in enumerate(body.coarse) if len(one.vertices)]
     X_WN = np.array([body.kinematics.poses(one)[shown] for one in values])
-    middles = np.array([body.very_few[k].ball[:3] for k in shown])
+    middles = np.array([body.coarse[k].ball[:3] for k in shown])
     return np.asarray(np.einsum("fnij,nj->fni", X_WN[..., :3, :3], middles) + X_WN[..., :3, 3])
 
 
@@ -152,7 +152,7 @@ class PictureSearch:
         self, body: RegistrationBody, camera: PinholeCamera, frames: Sequence[PosedPicture]
     ) -> None:
         self._body, self._camera, self.frames = body, camera, tuple(frames)
-        coarse, *finer = (simplify_or_hull(body.very_few, count) for count in PICTURES.triangles)
+        coarse, *finer = (simplify_or_hull(body.coarse, count) for count in PICTURES.triangles)
         # Smaller parts do not show in the smallest pictures.
         least = 0.25 * max(one.ball[3] for one in coarse)
         coarse = tuple(one if one.ball[3] >= least else EMPTY_OUTLINE for one in coarse)
@@ -163,7 +163,7 @@ class PictureSearch:
     @property
     def compared(self) -> "PyramidLevel":
         """In which poses are compared."""
-        return self._level(PICTURES.compared)
+        return self._level(PICTURES.compare_width)
 
     def search(
         self,
@@ -196,7 +196,7 @@ class PictureSearch:
             found = level.distinct([X for _, X in improved], most)
         return found
 
-    def approach(self, X_CW: Array) -> tuple[PinholeCamera, tuple[float, float]] | None:
+    def coarse_fit(self, X_CW: Array) -> tuple[PinholeCamera, tuple[float, float]] | None:
         """A camera fitted roughly from where it stands, and what it explains in `compared`.
 
         None where the body leaves the pictures.
@@ -206,10 +206,10 @@ class PictureSearch:
         for scales in rough:
             camera = small.with_pose(np.linalg.inv(X_CW))
             known, covered = self._learn(camera, frames)
-            seen = self._see(camera, frames, known, covered, self._outlines[-1])
+            seen = self._segment(camera, frames, known, covered, self._outlines[-1])
             if seen is None:
                 return None
-            fit = SharedFit([seen], [X_CW], widths=False)
+            fit = SharedFit([seen], [X_CW], fit_biases=False)
             X_CW = fit.cameras(fit.fit(_stages(scales, seen)))[0].X_CW
         return self._camera.with_pose(np.linalg.inv(X_CW)), self.compared.explained(X_CW)
 
@@ -228,31 +228,33 @@ class PictureSearch:
         # Backgrounds are learned anew before each row of steps.
         for scales, outlines in (
             ((*(5.0,) * 4, *(3.0,) * 4), self._outlines[-1]),
-            ((*(3.0,) * 2, *(2.0,) * 3, *(1.0,) * 3), self._body.few),
+            ((*(3.0,) * 2, *(2.0,) * 3, *(1.0,) * 3), self._body.medium),
         ):
             known, covered = self._learn(camera, self.frames)
-            seen = self._see(camera, self.frames, known, covered, outlines)
+            seen = self._segment(camera, self.frames, known, covered, outlines)
             if seen is None:
                 return None
-            fit = SharedFit([seen], [camera.X_CW], constants, looks=looks, widths=False)
-            which = fit.agreeing(fit.inlier_ratios(fit.start))
-            found = fit.fit(_stages(scales, seen), which=which)
+            fit = SharedFit(
+                [seen], [camera.X_CW], constants, camera_unknowns=looks, fit_biases=False
+            )
+            included = fit.inliers(fit.inlier_ratios(fit.start))
+            found = fit.fit(_stages(scales, seen), included=included)
             camera = fit.cameras(found)[0]
         assert seen is not None
-        whole = PosedFrames(self._body.kinematics, self._body.all, camera, seen.frames)
-        fit = SharedFit([whole], [camera.X_CW], constants, looks=looks)
+        whole = PosedFrames(self._body.kinematics, self._body.full, camera, seen.frames)
+        fit = SharedFit([whole], [camera.X_CW], constants, camera_unknowns=looks)
         # The camera is where it was found now; the constants are not.
         constant = np.arange(len(fit.names)) >= fit.per_camera
         found = fit.start._replace(shared=np.where(constant, found.shared, 0.0))
-        which = fit.agreeing(fit.inlier_ratios(found))
-        found = fit.fit(_stages((0.75,) * 7, whole), found, which)
+        included = fit.inliers(fit.inlier_ratios(found))
+        found = fit.fit(_stages((0.75,) * 7, whole), found, included)
         camera = fit.cameras(found)[0]
         return PictureFit(fit, found, known, *self.compared.explained(camera.X_CW))
 
     @cached_property
     def _small(self) -> tuple[list[PosedPicture], PinholeCamera]:
         """The frames with pictures as backgrounds are learned in, and their camera."""
-        camera = self._level(PICTURES.learned).camera
+        camera = self._level(PICTURES.background_width).camera
         size = camera.width, camera.height
         return [
             replace(
@@ -268,7 +270,7 @@ class PictureSearch:
         self, camera: PinholeCamera, frames: Sequence[PosedPicture]
     ) -> tuple[KnownBackground, Mask]:
         """What is behind the body before a camera, and where that is (f, H, W)."""
-        level = self._level(PICTURES.learned)
+        level = self._level(PICTURES.background_width)
         small = camera.resized(level.camera.width, level.camera.height)
         poses = camera.X_CW @ self._X_WN
         both = [
@@ -279,7 +281,7 @@ class PictureSearch:
         showing = level.backgrounds.showing(both[0])
         return KnownBackground.of(pictures, gains, showing, both[1]), both[1]
 
-    def _see(
+    def _segment(
         self,
         camera: PinholeCamera,
         frames: Sequence[PosedPicture],
@@ -293,10 +295,10 @@ class PictureSearch:
             covered: (f, H, W) where the body is about; frames that do not show it tell nothing.
             outlines: the surfaces that are compared.
         """
-        gains = self._level(PICTURES.learned).backgrounds.gains
+        gains = self._level(PICTURES.background_width).backgrounds.gains
 
         def see(k: int) -> PosedFrame | None:
-            return see_picture(frames[k], known, gains[k], covered[k])
+            return segment_picture(frames[k], known, gains[k], covered[k])
 
         posed = [one for one in map_ordered(see, range(len(frames))) if one is not None]
         if len(posed) < 2:
@@ -306,7 +308,7 @@ class PictureSearch:
     def _level(self, width: int) -> "PyramidLevel":
         if width not in self._levels:
             k = (width > 64) + (width > 120)
-            count = PICTURES.searched if width < PICTURES.compared else len(self.frames)
+            count = PICTURES.search_frames if width < PICTURES.compare_width else len(self.frames)
             pictures = [one.picture for one in self.frames[:count]]
             self._levels[width] = PyramidLevel(
                 self._outlines[k], self._camera, pictures, self._X_WN[:count], width
@@ -323,7 +325,7 @@ def _stages(scales: Sequence[float], seen: PosedFrames) -> list[AnnealingStage]:
     return [AnnealingStage(one, 0.5 * one) for one in sizes.tolist()]
 
 
-def see_picture(
+def segment_picture(
     one: PosedPicture, known: KnownBackground, light: Floats, covered: Mask
 ) -> PosedFrame | None:
     """A picture with its log-odds and a mask of these; None where no body shows.
@@ -344,7 +346,7 @@ def evidence(explained: float, contour: float) -> float:
 
     Sums over contours are misled: a wrong pose that shows more of the body has longer ones.
     """
-    return explained + PICTURES.contours * contour
+    return explained + PICTURES.contour_weight * contour
 
 
 class PyramidLevel:
@@ -384,8 +386,8 @@ class PyramidLevel:
         most = np.zeros(len(outlines))
         np.maximum.at(most, owners, moves)
         # What hardly moves beside the body's size stands still.
-        self._still = most < 0.06 * size
-        moving = points[:, ~self._still[owners]]
+        self._static = most < 0.06 * size
+        moving = points[:, ~self._static[owners]]
         self._points = (moving if moving.size else points).reshape(-1, 3)
         self._middle = self._points.mean(axis=0)
         off = self._points - self._middle
@@ -398,7 +400,7 @@ class PyramidLevel:
         """
         X_CN = X_CW[:3] @ (self._X_WN if X_WN is None else X_WN)
         sums = self.backgrounds.sums
-        return explain(self._packed, X_CN, self._still, self._parameters, sums, 1.0, 0)[0]
+        return explain(self._packed, X_CN, self._static, self._parameters, sums, 1.0, 0)[0]
 
     def explained(self, X_CW: Array) -> tuple[float, float]:
         """Of a pose (4, 4) the share of all that could be explained, and edges beyond chance."""
@@ -434,7 +436,7 @@ class PyramidLevel:
         """(k, k) what a pose (4, 4) explains, by squares, `squares` along its longer side."""
         side = max(self.camera.width, self.camera.height) / squares
         pieces = explain(
-            self._packed, X_CW[:3] @ self._X_WN, self._still, self._parameters,
+            self._packed, X_CW[:3] @ self._X_WN, self._static, self._parameters,
             self.backgrounds.sums, side, squares,
         )  # fmt: skip
         return pieces[1]
@@ -450,7 +452,7 @@ class PyramidLevel:
         middle = np.array([float((changes * one).sum()) / total for one in (u, v)])
         squares = (u - middle[0]) ** 2 + (v - middle[1]) ** 2
         spread = max(float(np.sqrt((changes * squares).sum() / total)), 2.0)
-        R_CW = np.concatenate([spread_rotations(rotations), upright_rotations(rotations)])
+        R_CW = np.concatenate([uniform_rotations(rotations), upright_rotations(rotations)])
         points = self._points[:: max(1, len(self._points) // 200)] - self._middle
         p_C = np.einsum("nij,pj->npi", R_CW, points)
         sizes = np.sqrt((p_C[..., :2] ** 2).sum(axis=2).mean(axis=1))

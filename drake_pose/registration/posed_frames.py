@@ -141,7 +141,7 @@ class PosedFrames:
             for frame in self.frames
         ]
 
-    def smaller(self, side: float) -> PinholeCamera:
+    def downscaled(self, side: float) -> PinholeCamera:
         """The camera, its pictures so small that the root of the silhouettes' area is a side."""
         camera, share = self.camera, min(1.0, side / self.size)
         width, height = (max(8, round(share * one)) for one in (camera.width, camera.height))

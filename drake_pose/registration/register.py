@@ -1,9 +1,10 @@
-"""Where a camera stands, told by silhouettes of a body whose joint positions are known.
+"""Register a camera from silhouettes of a body at known joint positions.
 
-No guess is needed: all rotations are tried, each with the body where the silhouettes are; the best
-are fitted, first to everything within reach and in the end only to what fits (graduated
-non-convexity), so that tools which the model lacks, hidden parts and wrong frames pull no more. A
-frame then agrees with the others or contradicts them.
+No initial guess is needed. For each of many rotations R_CW, the position p_CW follows from the
+silhouettes' bounds. The best hypotheses are fitted to the contours by graduated non-convexity:
+first to all contour points within reach, finally to inliers only. Tools missing from the model,
+occluded parts and wrong frames therefore do not bias the pose. Each frame is then an inlier or an
+outlier of the final pose.
 """
 
 import copy
@@ -31,21 +32,22 @@ from drake_pose.registration.posed_frames import (
     PosedFrames,
     placed_points,
 )
-from drake_pose.registration.shared_fit import Shared, SharedFit, fit_pose
+from drake_pose.registration.shared_fit import SharedFit, SharedValues, fit_pose
 from drake_pose.silhouette.outline import EMPTY_OUTLINE, Outline, TreeSurfaces
 from drake_pose.silhouette.scoring import draw_mask, score_bodies
 from drake_pose.workers import map_ordered
 
 
 class CameraSearchSettings(NamedTuple):
-    """How cameras are searched for and fitted.
+    """Stages and thresholds of the camera search.
 
-    coarse, fine, last: parts of fits, one after the other. coarse_spacing, fine_spacing: of
-    silhouettes' edge points in the first two [root of the silhouettes' area]. first_side,
-    second_side: sides of silhouettes in the pictures in which starts, and coarse fits, are compared
-    [pixel]. significance: poses are as good whose cost is larger by no more standard deviations of
-    the difference. piece: side of the squares whose costs are compared [root of the area]: what is
-    missing or too much is about as large.
+    coarse, fine, last: the stages of three successive fits. coarse_spacing, fine_spacing: spacing
+    of the silhouettes' edge points in the first two fits [square root of the silhouettes' area].
+    start_side, refined_side: square root of the silhouettes' area in the downscaled pictures in
+    which starts and coarsely fitted poses are ranked [pixel]. significance: poses fit equally well
+    if their costs differ by at most this many standard deviations of the difference. block_size:
+    side of the image blocks whose costs are compared [square root of the area], about the size of
+    missing or additional parts.
     """
 
     coarse: tuple[AnnealingStage, ...] = tuple(
@@ -64,10 +66,10 @@ class CameraSearchSettings(NamedTuple):
     )
     coarse_spacing: float = 1.0 / 40.0
     fine_spacing: float = 1.0 / 80.0
-    first_side: float = 40.0
-    second_side: float = 100.0
+    start_side: float = 40.0
+    refined_side: float = 100.0
     significance: float = 1.96
-    piece: float = 0.2
+    block_size: float = 0.2
 
 
 SEARCH = CameraSearchSettings()
@@ -75,49 +77,49 @@ SEARCH = CameraSearchSettings()
 T = TypeVar("T")
 Corner = tuple[float, float, float]
 Box = tuple[Corner, Corner]
-"""The least and the largest corner along the world's axes [m]."""
+"""Minimum and maximum corner of a box along the world's axes [m]."""
 
 
 class RegistrationBody:
-    """A body's surfaces, as fine as searching and fitting a camera need them.
+    """A body's surfaces at three levels of detail.
 
     Attributes:
-        very_few, few, all: a surface for each node.
+        coarse, medium, full: one surface for each node of the tree, with few, more, and all
+            triangles.
 
     Args:
-        seen: the nodes that silhouettes show; all where None.
-        fewest: number of triangles of a node where it has very few.
-        radius_scales: (nodes,) how many times as wide nodes are across their y axes as the
-            model's; 1 where None.
+        visible_nodes: names of the nodes that the silhouettes show; None: all.
+        coarse_triangles: number of triangles of each node at the coarse level.
+        radius_scales: (nodes,) factors of the nodes' widths across their y axes; None: 1.
     """
 
     def __init__(
         self,
         tree: PoseTree,
-        seen: Collection[str] | None = None,
-        fewest: int = VERY_FEW,
+        visible_nodes: Collection[str] | None = None,
+        coarse_triangles: int = VERY_FEW,
         radius_scales: Array | None = None,
     ) -> None:
         self.tree, self.kinematics = tree, TreeKinematics(tree)
         surfaces = TreeSurfaces(tree)
         if radius_scales is not None:
             surfaces = surfaces.with_rigid(with_radius_scales(surfaces.rigid, radius_scales))
-        if seen is not None:
+        if visible_nodes is not None:
             own = zip(tree.nodes, surfaces.rigid, strict=True)
             surfaces = surfaces.with_rigid(
-                [surface if node.name in seen else EMPTY_OUTLINE for node, surface in own]
+                [surface if node.name in visible_nodes else EMPTY_OUTLINE for node, surface in own]
             )
-        self._surfaces, self._fewest = surfaces, fewest
-        self.few = simplify_surfaces(surfaces, FEW)
-        self.all = simplify_surfaces(surfaces, np.iinfo(np.int64).max)
+        self._surfaces, self._coarse_triangles = surfaces, coarse_triangles
+        self.medium = simplify_surfaces(surfaces, FEW)
+        self.full = simplify_surfaces(surfaces, np.iinfo(np.int64).max)
 
     @cached_property
-    def very_few(self) -> tuple[Outline, ...]:
-        """Surfaces for searches: what only fits does without them."""
-        return simplify_surfaces(self._surfaces, self._fewest)
+    def coarse(self) -> tuple[Outline, ...]:
+        """Surfaces for searches, made when they are first used: fits do not need them."""
+        return simplify_surfaces(self._surfaces, self._coarse_triangles)
 
     def with_tree(self, tree: PoseTree) -> "RegistrationBody":
-        """The same surfaces on another tree with the same nodes."""
+        """Return the same surfaces on another tree with the same nodes."""
         other = copy.copy(self)
         other.tree, other.kinematics = tree, TreeKinematics(tree)
         return other
@@ -125,91 +127,106 @@ class RegistrationBody:
 
 @dataclass(frozen=True, eq=False)
 class FrameMisfit:
-    """How well one frame fits a camera's pose; one that does not agree did not count."""
+    """How well one frame fits a camera's pose.
+
+    Args:
+        frame: the frame's name.
+        E_total: area in body or silhouette alone, over the silhouette's area.
+        iou: intersection over union of body and silhouette.
+        inlier_ratio: fraction of both contours' lengths that fits.
+        is_inlier: whether the frame agrees with the others; outliers did not count in the fit.
+    """
 
     frame: str
     E_total: float
     iou: float
     inlier_ratio: float
-    agrees: bool
+    is_inlier: bool
 
 
 class _UncertainPose:
-    """A pose whose errors' covariance is known: deviations are root mean squares over the axes."""
+    """A pose with the (6, 6) covariance of its error."""
 
     covariance: Array
 
     @property
     def rotation_sd(self) -> float:
-        """Standard deviation of the rotation [rad]."""
+        """Standard deviation of the rotation, root mean square over the axes [rad]."""
         return float(np.sqrt(np.trace(self.covariance[:3, :3]) / 3.0))
 
     @property
     def translation_sd(self) -> float:
-        """Standard deviation of the place [m]."""
+        """Standard deviation of the position, root mean square over the axes [m]."""
         return float(np.sqrt(np.trace(self.covariance[3:, 3:]) / 3.0))
 
 
 @dataclass(frozen=True, eq=False)
-class ObjectPose(_UncertainPose):
-    """Where an object stands that a camera on a robot's link has seen.
+class TargetPose(_UncertainPose):
+    """The pose of a calibration target seen by a camera on a robot's link.
 
     Args:
-        X_WT: (4, 4) the pose of its frame T in the robot's world.
-        covariance: (6, 6) of the pose's error: a rotation vector [rad] and a shift [m], both along
-            the world's axes.
-        alternatives: (n, 4, 4) other poses X_WT at which it looks alike.
-        round_about: (k, 3) axes through its middle, in its frame T, about which it looks alike at
-            every angle, so that no picture tells how it is turned about them.
+        X_WT: (4, 4) pose of the target's frame T in the robot's world.
+        covariance: (6, 6) covariance of the pose's error: rotation vector [rad] and translation
+            [m], both along the world's axes.
+        alternatives: (n, 4, 4) other poses X_WT at which the target looks the same.
+        symmetry_axes: (k, 3) axes in frame T, through the target's middle, about which the target
+            is round: its rotation about them is not observable.
     """
 
     X_WT: Array
     covariance: Array
     alternatives: Array
-    round_about: Array
+    symmetry_axes: Array
 
 
 @dataclass(frozen=True, eq=False)
 class RegisteredCamera(_UncertainPose):
-    """Where a camera stands.
+    """A camera's estimated pose.
 
     Args:
-        camera: with its pose X_WC.
-        covariance: (6, 6) of the pose's error: a rotation vector [rad] and a shift [m], both along
-            the world's axes.
-        alternatives: (n, 4, 4) other poses X_WC that fit no worse, as far as can be told.
-        seen_object: where the object stands that was seen, if its place was not known.
+        camera: the camera at its estimated pose X_WC.
+        covariance: (6, 6) covariance of the pose's error: rotation vector [rad] and translation
+            [m], both along the world's axes.
+        frames: how well each frame fits.
+        alternatives: (n, 4, 4) other poses X_WC that fit equally well.
+        target: the pose of the calibration target, where it was estimated.
     """
 
     camera: PinholeCamera
     covariance: Array
     frames: tuple[FrameMisfit, ...]
     alternatives: Array = field(default_factory=lambda: np.zeros((0, 4, 4)))
-    seen_object: ObjectPose | None = None
+    target: TargetPose | None = None
 
     @property
-    def contradictions(self) -> tuple[str, ...]:
-        """The frames that contradict the others."""
-        return tuple(frame.frame for frame in self.frames if not frame.agrees)
+    def outliers(self) -> tuple[str, ...]:
+        """Names of the outlier frames."""
+        return tuple(frame.frame for frame in self.frames if not frame.is_inlier)
 
 
 class CameraSearch:
-    """Finds where a camera stands: numbers of rotations that are tried, and that are fitted."""
+    """Finds a camera's pose without an initial guess.
+
+    Args:
+        body: the surfaces.
+        rotations: number of rotations from which the search starts.
+        fitted: number of the best starts that are fitted.
+    """
 
     def __init__(self, body: RegistrationBody, rotations: int = 3000, fitted: int = 30) -> None:
         self._body, self._fitted_count = body, fitted
-        self._R_CW = spread_rotations(rotations)
+        self._R_CW = uniform_rotations(rotations)
 
     def rough(self) -> "CameraSearch":
-        """A search that is faster, and less sure."""
+        """Return a faster, less reliable search."""
         return CameraSearch(self._body, rotations=2000, fitted=15)
 
     def register(self, camera: PinholeCamera, frames: Sequence[PosedFrame]) -> RegisteredCamera:
-        """Finds the camera's pose; that which it has is not used.
+        """Estimate the camera's pose; its current pose is not used.
 
         Raises:
-            MaskError: a mask of another size than the camera's picture, or an empty one.
-            RegistrationError: no frames, or no pose explains them.
+            MaskError: a mask is empty, or its size differs from the camera's.
+            RegistrationError: there are no frames.
         """
         if not frames:
             raise RegistrationError(
@@ -219,83 +236,89 @@ class CameraSearch:
         return self._fitted(camera, frames, self.search(camera, frames))
 
     def refine(self, camera: PinholeCamera, frames: Sequence[PosedFrame]) -> RegisteredCamera:
-        """Finds the camera's pose within some pixels of that which it has, without alternatives.
+        """Refine the camera's current pose, which must be within some pixels; no alternatives.
 
-        Raises MaskError: a mask of another size than the camera's picture, or an empty one.
+        Raises MaskError: a mask is empty, or its size differs from the camera's.
         """
         return self._fitted(camera, frames, [camera.X_CW])
 
     def _fitted(
-        self, camera: PinholeCamera, frames: Sequence[PosedFrame], looks: Sequence[Array]
+        self, camera: PinholeCamera, frames: Sequence[PosedFrame], starts: Sequence[Array]
     ) -> RegisteredCamera:
-        """The best of the poses that are fitted from some X_CW (4, 4), and those as good.
+        """Return the best pose fitted from starts X_CW (4, 4), and those that fit equally well.
 
-        Some of many frames tell near what poses all of them are fitted.
+        At most 24 frames narrow the starts down; all frames enter the final fit.
         """
-        kinematics, some = self._body.kinematics, spread(frames, 24)
-        fine = PosedFrames(kinematics, self._body.few, camera, some, SEARCH.fine_spacing)
-        last = PosedFrames(kinematics, self._body.all, camera, some, LAST_SPACING)
-        halfway = map_ordered(partial(fit_pose, fine, rounds=SEARCH.fine), looks)
-        begun = [SharedFit([fine], [X], widths=False) for X in halfway]
-        side = max(1.0, SEARCH.piece * fine.size)
-        pieces = [fit.tile_costs(fit.start, side) for fit in begun]
-        order = np.argsort([one.sum() for one in pieces], kind="stable")
-        # Those that are far worse than the best now are not fitted to the end.
-        likely = [halfway[k] for k in order if vuong_statistic(pieces[k], pieces[order[0]]) <= 6.0]
-        likely = distinct(fine, likely)
-        fitted = distinct(last, map_ordered(partial(fit_pose, last, rounds=SEARCH.last), likely))
+        kinematics, some = self._body.kinematics, evenly_spaced(frames, 24)
+        fine = PosedFrames(kinematics, self._body.medium, camera, some, SEARCH.fine_spacing)
+        last = PosedFrames(kinematics, self._body.full, camera, some, LAST_SPACING)
+        halfway = map_ordered(partial(fit_pose, fine, rounds=SEARCH.fine), starts)
+        fits = [SharedFit([fine], [X], fit_biases=False) for X in halfway]
+        side = max(1.0, SEARCH.block_size * fine.size)
+        costs = [fit.tile_costs(fit.start, side) for fit in fits]
+        order = np.argsort([one.sum() for one in costs], kind="stable")
+        # Poses far worse than the best are dropped half-way.
+        likely = [halfway[k] for k in order if vuong_statistic(costs[k], costs[order[0]]) <= 6.0]
+        likely = distinct_poses(fine, likely)
+        fitted = distinct_poses(
+            last, map_ordered(partial(fit_pose, last, rounds=SEARCH.last), likely)
+        )
         if len(some) < len(frames):
-            last = PosedFrames(kinematics, self._body.all, camera, frames, LAST_SPACING)
+            last = PosedFrames(kinematics, self._body.full, camera, frames, LAST_SPACING)
         fits = [SharedFit([last], [X_CW]) for X_CW in fitted]
-        return describe_fitted([*zip(fits, map_ordered(with_widths, fits), strict=True)])[0]
+        return select_best([*zip(fits, map_ordered(fit_to_inliers, fits), strict=True)])[0]
 
     def search(
         self, camera: PinholeCamera, frames: Sequence[PosedFrame], kept: int = 6
     ) -> list[Array]:
-        """Poses X_CW (4, 4) near which the best one may be, best first; `kept` at most."""
+        """Return up to `kept` pose hypotheses X_CW (4, 4), best first."""
         body = self._body
         posed = PosedFrames(
-            body.kinematics, body.very_few, camera, spread(frames), SEARCH.coarse_spacing
+            body.kinematics, body.coarse, camera, evenly_spaced(frames), SEARCH.coarse_spacing
         )
 
         def best_first(X_CW: Sequence[Array] | Array, side: float) -> list[Array]:
-            # A frame counts one at most.
-            off = np.minimum(E_total(areas(posed, np.asarray(X_CW), side)), 1.0).mean(axis=1)
+            # The error of a frame is clipped at 1.
+            off = np.minimum(E_total(overlap_areas(posed, np.asarray(X_CW), side)), 1.0).mean(
+                axis=1
+            )
             return [X_CW[k] for k in np.argsort(off, kind="stable")]
 
         starts = np.tile(np.eye(4), (len(self._R_CW), 1, 1))
         starts[:, :3, :3] = self._R_CW
-        starts[:, :3, 3] = place_by_bounds(posed, self._R_CW)
-        looks = best_first(starts, SEARCH.first_side)[: self._fitted_count]
+        starts[:, :3, 3] = positions_from_bounds(posed, self._R_CW)
+        hypotheses = best_first(starts, SEARCH.start_side)[: self._fitted_count]
         for part, count in ((SEARCH.coarse[:3], 12), (SEARCH.coarse[3:], kept)):
-            found = map_ordered(partial(fit_pose, posed, rounds=part), looks)
-            looks = distinct(posed, best_first(found, SEARCH.second_side))[:count]
-        return looks
+            found = map_ordered(partial(fit_pose, posed, rounds=part), hypotheses)
+            hypotheses = distinct_poses(posed, best_first(found, SEARCH.refined_side))[:count]
+        return hypotheses
 
 
-def describe_fitted(
-    fitted: Sequence[tuple[SharedFit, Shared]],
+def select_best(
+    fitted: Sequence[tuple[SharedFit, SharedValues]],
 ) -> tuple[RegisteredCamera, Array, list[int]]:
-    """The best of some fitted poses of a camera; which fit no worse, best first.
+    """Select the best of a camera's fitted poses.
 
-    Between these, the covariance (u, u) of what is shared in the best one.
+    Returns:
+        the camera, with distinct poses that fit equally well as alternatives; the (u, u) covariance
+        of the best fit's shared unknowns; and the indices of all equally good fits, best first.
     """
-    side = max(1.0, SEARCH.piece * fitted[0][0].seen[0].size)
-    pieces = [fit.tile_costs(found, side) for fit, found in fitted]
-    order = np.argsort([one.sum() for one in pieces], kind="stable")
+    side = max(1.0, SEARCH.block_size * fitted[0][0].views[0].size)
+    costs = [fit.tile_costs(found, side) for fit, found in fitted]
+    order = np.argsort([one.sum() for one in costs], kind="stable")
     fit, best = fitted[order[0]]
-    (seen,), (camera,) = fit.seen, fit.cameras(best)
+    (posed,), (camera,) = fit.views, fit.cameras(best)
     ratios = fit.inlier_ratios(best)
-    agree = fit.agreeing(ratios)
-    misfits = frame_misfits(seen, camera.X_CW, ratios, agree)
-    # A frame that contradicts fits no pose, so it tells none from another.
-    counted = [one[agree] for one in pieces]
+    inliers = fit.inliers(ratios)
+    misfits = frame_misfits(posed, camera.X_CW, ratios, inliers)
+    # An outlier frame fits no pose, so it does not discriminate between poses.
+    counted = [one[inliers] for one in costs]
     worse = [vuong_statistic(one, counted[order[0]]) for one in counted]
     as_good = [int(k) for k in order if worse[k] <= SEARCH.significance]
-    # Fits that began apart may have ended in one pose.
-    looks = [fitted[k][0].cameras(fitted[k][1])[0].X_CW for k in as_good]
-    alike = distinct(seen, looks)
-    covariance = sum(fit.covariances(best, agree))
+    # Fits from different starts may have converged to the same pose.
+    poses = [fitted[k][0].cameras(fitted[k][1])[0].X_CW for k in as_good]
+    alike = distinct_poses(posed, poses)
+    covariance = sum(fit.covariances(best, inliers))
     registered = RegisteredCamera(
         camera,
         fit.camera_covariances(best, covariance)[0],
@@ -306,50 +329,59 @@ def describe_fitted(
 
 
 def frame_misfits(
-    seen: PosedFrames, X_CW: Array, ratios: Array, agrees: NDArray[np.bool_]
+    posed: PosedFrames, X_CW: Array, ratios: Array, inliers: NDArray[np.bool_]
 ) -> tuple[FrameMisfit, ...]:
-    """How well frames fit a camera's pose (4, 4); inlier ratios and which agree (frames,)."""
-    found = areas(seen, X_CW[None], np.inf)[0]
-    told = (E_total(found), intersection_over_union(found), ratios, agrees)
-    rows = zip(seen.frames, *(one.tolist() for one in told), strict=True)
+    """Describe how well frames fit a camera's pose.
+
+    Args:
+        X_CW: (4, 4) the world's pose in the camera.
+        ratios: (frames,) inlier ratios.
+        inliers: (frames,) which frames are inliers.
+    """
+    found = overlap_areas(posed, X_CW[None], np.inf)[0]
+    columns = (E_total(found), intersection_over_union(found), ratios, inliers)
+    rows = zip(posed.frames, *(one.tolist() for one in columns), strict=True)
     return tuple(FrameMisfit(frame.name, *row) for frame, *row in rows)
 
 
-def spread(frames: Sequence[T], most: int = 8) -> list[T]:
-    """Some of many frames, from the first to the last."""
+def evenly_spaced(frames: Sequence[T], most: int = 8) -> list[T]:
+    """Return at most `most` items, evenly spaced from the first to the last."""
     count = min(len(frames), most)
     return [frames[k] for k in np.linspace(0, len(frames) - 1, count).round().astype(int)]
 
 
-def distinct(frames: PosedFrames, X_CW: Sequence[Array], apart: float = 0.03) -> list[Array]:
-    """Those of some poses (4, 4) that show the bodies elsewhere than all before them.
+def distinct_poses(frames: PosedFrames, X_CW: Sequence[Array], apart: float = 0.03) -> list[Array]:
+    """Return the poses X_CW (4, 4) that place the body apart from every pose kept before.
 
-    apart: the distance of bodies that are elsewhere [root of the area].
+    apart: minimum root mean square distance of the body's points in the picture
+        [square root of the silhouettes' area].
     """
     points = frames.some_points
     uv = [frames.camera.with_pose(np.linalg.inv(X)).project(points)[0] for X in X_CW]
 
     def differ(i: int, j: int) -> bool:
-        # A point behind the camera is nowhere.
+        # A point behind one of the cameras counts as apart by one silhouette size.
         off = np.nan_to_num(uv[i] - uv[j], nan=frames.size)
         return bool(np.sqrt((off**2).sum(axis=1).mean()) > apart * frames.size)
 
-    return [X_CW[k] for k in apart_from_before(range(len(X_CW)), differ)]
+    return [X_CW[k] for k in keep_distinct(range(len(X_CW)), differ)]
 
 
-def with_widths(fit: SharedFit, most: int = 5, settled: float = 1e-4) -> Shared:
-    """What was fitted to the frames that agree, the widths of their silhouettes among it.
+def fit_to_inliers(fit: SharedFit, most: int = 5, settled: float = 1e-4) -> SharedValues:
+    """Fit camera and boundary biases to the inlier frames, reselecting them after each fit.
 
-    It is fitted again, at most so many times, where frames have come to agree or not, or the camera
-    has moved by more than ``settled`` [rad, m].
+    Args:
+        most: maximum number of fits.
+        settled: fits end once the inliers stay the same and no shared unknown changes by more
+            [rad, m].
     """
-    agree, found = fit.agreeing(fit.inlier_ratios(fit.start)), fit.start
+    inliers, found = fit.inliers(fit.inlier_ratios(fit.start)), fit.start
     for k in range(most):
-        before, used = found, agree
-        found = fit.fit(SEARCH.last if k == 0 else SEARCH.last[-1:], found, agree)
-        agree = fit.agreeing(fit.inlier_ratios(found))
+        before, used = found, inliers
+        found = fit.fit(SEARCH.last if k == 0 else SEARCH.last[-1:], found, inliers)
+        inliers = fit.inliers(fit.inlier_ratios(found))
         moved = np.abs(found.shared - before.shared).max()
-        if k > 0 and np.array_equal(agree, used) and moved < settled:
+        if k > 0 and np.array_equal(inliers, used) and moved < settled:
             break
     return found
 
@@ -364,34 +396,36 @@ def suggest_pose(
     seed: int = 0,
     width: int = 160,
 ) -> tuple[Array, float] | None:
-    """The pose, of random ones inside the limits, whose silhouettes differ most.
+    """Suggest joint positions at which ambiguous camera poses become distinguishable.
 
-    A joint without limits is taken to turn once around.
+    Random positions within the joint limits are tried (one full turn for a joint without limits).
 
     Args:
-        X_WC: the camera's poses that are to be told apart, (4, 4) each, two or more.
-        keep_out: what the body must not touch; points of its surfaces are asked.
-        width: of the pictures in which silhouettes are compared, about [pixel].
+        X_WC: two or more poses (4, 4) of the camera to distinguish.
+        keep_out: boxes that no point of the body's coarse surfaces may enter.
+        tried: number of random positions.
+        seed: of the random numbers.
+        width: approximate width of the pictures in which silhouettes are compared [pixel].
 
     Returns:
-        its values (m,) of the pose tree [rad or m], and of the two camera poses that it tells apart
-        least the area in which their silhouettes differ, over the mean area of both; None where no
-        pose was found that is seen from all camera poses and touches nothing.
+        the pose tree's values (m,) [rad or m], and the area in which the two most similar
+        silhouettes differ, over their mean area. None: no position is visible from all camera poses
+        and free of the boxes.
     """
     generator, kinematics = np.random.default_rng(seed), body.kinematics
     lower = np.where(np.isfinite(kinematics.lower), kinematics.lower, -np.pi)
     upper = np.where(np.isfinite(kinematics.upper), kinematics.upper, np.pi)
-    share = min(1.0, width / camera.width)
-    size = (max(1, round(share * camera.width)), max(1, round(share * camera.height)))
+    scale = min(1.0, width / camera.width)
+    size = (max(1, round(scale * camera.width)), max(1, round(scale * camera.height)))
     cameras = [camera.with_pose(one).resized(*size) for one in X_WC]
     best: tuple[Array, float] | None = None
     for _ in range(tried):
         values = generator.uniform(lower, upper)
         X_WN = kinematics.poses(values)
-        points = placed_points(body.very_few, X_WN)
+        points = placed_points(body.coarse, X_WN)
         if any(np.all((points >= low) & (points <= high), axis=1).any() for low, high in keep_out):
             continue
-        masks = [draw_mask(body.very_few, one.X_CW @ X_WN, one) for one in cameras]
+        masks = [draw_mask(body.coarse, one.X_CW @ X_WN, one) for one in cameras]
         if not all(mask.any() for mask in masks):
             continue
         difference = min(
@@ -403,8 +437,8 @@ def suggest_pose(
     return best
 
 
-def apart_from_before(items: Iterable[T], differ: Callable[[T, T], bool]) -> list[T]:
-    """Those of some items that differ from all that were kept before them."""
+def keep_distinct(items: Iterable[T], differ: Callable[[T, T], bool]) -> list[T]:
+    """Return the items that differ from every item kept before them."""
     kept: list[T] = []
     for item in items:
         if all(differ(item, one) for one in kept):
@@ -412,38 +446,38 @@ def apart_from_before(items: Iterable[T], differ: Callable[[T, T], bool]) -> lis
     return kept
 
 
-def spread_rotations(count: int) -> Array:
-    """(count, 3, 3) rotations spread evenly (super-Fibonacci spirals, Alexa, CVPR 2022)."""
+def uniform_rotations(count: int) -> Array:
+    """Return (count, 3, 3) evenly spread rotations (super-Fibonacci spirals, Alexa, CVPR 2022)."""
     s = np.arange(count) + 0.5
     t = s / count
     d = 2.0 * np.pi * s
     r, R = np.sqrt(t), np.sqrt(1.0 - t)
-    # Psi is the positive root of x^4 = x + 4.
+    # Psi = 1.5337... is the positive root of x^4 = x + 4.
     a, b = d / np.sqrt(2.0), d / 1.533751168755204288118041
     q = np.stack([r * np.sin(a), r * np.cos(a), R * np.sin(b), R * np.cos(b)], axis=-1)
     return Rotation.from_quat(q).as_matrix()
 
 
-def place_by_bounds(frames: PosedFrames, R_CW: Array) -> Array:
-    """(n, 3) p_CW at which the body's bounds in the pictures are those of the silhouettes.
+def positions_from_bounds(frames: PosedFrames, R_CW: Array) -> Array:
+    """Return positions p_CW (n, 3) at which the body's bounds match the silhouettes' bounds.
 
-    A side of a silhouette that the picture's border cuts off says nothing, and sides that are far
-    off say little (Geman and McClure's weights).
+    The distances of the bounds are minimised by Gauss-Newton steps, the last ones with Geman and
+    McClure's weights. Sides at the picture's border are ignored.
 
     Args:
-        R_CW: (n, 3, 3) the camera's rotations.
+        R_CW: (n, 3, 3) the world's rotations in the camera.
     """
     bodies = [np.einsum("nij,pj->npi", R_CW, points) for points in frames.points]
-    bounds, shown = zip(*[_bounds(frame.mask) for frame in frames.frames], strict=True)
+    bounds, shown = zip(*[_mask_bounds(frame.mask) for frame in frames.frames], strict=True)
     middles = R_CW @ frames.middle
-    # As if all of the bodies were equally far.
+    # Initial guess as if all of the body were at the same depth.
     f, c = frames.intrinsics
     spans = np.mean([np.ptp(body[:, :, :2], axis=1) for body in bodies], axis=0)
     size = np.mean([bound[1] - bound[0] for bound in bounds], axis=0)
     depth = np.linalg.norm(spans * f, axis=1) / max(float(np.linalg.norm(size)), 1.0)
     middle = np.mean([bound.mean(axis=0) for bound in bounds], axis=0)
     p_CW = np.column_stack([(middle - c) / f * depth[:, None], depth]) - middles
-    # Steps of Gauss and Newton's method, the last ones robust ones.
+    # Gauss-Newton steps; the last three are robust.
     for k in range(5):
         H, g = np.zeros((len(R_CW), 3, 3)), np.zeros((len(R_CW), 3))
         for body, bound, sides in zip(bodies, bounds, shown, strict=True):
@@ -465,16 +499,16 @@ def add_bound_equations(
     H: Array,
     g: Array,
 ) -> None:
-    """Adds the normal equations of a frame's bounds to H (n, 3, 3) and g (n, 3).
+    """Add one frame's normal equations of bounds to H (n, 3, 3) and g (n, 3).
 
     Args:
-        p_C: (n, points, 3) the body in the camera.
-        bound: the silhouette's bounds, and which of them count.
-        robust: whether what is far off says little.
+        p_C: (n, points, 3) the body's points in the camera [m].
+        bound: the silhouette's bounds (2, 2), and which of them count, see `_mask_bounds`.
+        robust: whether large distances are down-weighted.
     """
     f, c = frames.intrinsics
     rows = np.arange(len(p_C))
-    # Points are no nearer to the camera than a share of the bodies' extent.
+    # A minimum depth keeps the projection finite.
     z = np.maximum(p_C[..., 2], 0.05 * frames.extent)
     uv = p_C[..., :2] / z[..., None] * f + c
     for side, axis in np.argwhere(bound[1]):
@@ -485,33 +519,33 @@ def add_bound_equations(
         J[:, 2] = -(uv[rows, i, axis] - c[axis]) / z[rows, i]
         weight = np.ones(len(p_C))
         if robust:
-            # What is off by half the silhouettes' size says a quarter of what it would.
+            # A distance of half the silhouettes' size has a quarter of its full weight.
             weight = (1.0 + (off / (0.5 * frames.size)) ** 2) ** -2
         H += weight[:, None, None] * J[:, :, None] * J[:, None, :]
         g += (weight * off)[:, None] * J
 
 
-def _bounds(mask: NDArray[np.bool_]) -> tuple[Array, NDArray[np.bool_]]:
-    """(2, 2) least and largest u, v of a silhouette's edge, and which of them the border leaves."""
+def _mask_bounds(mask: NDArray[np.bool_]) -> tuple[Array, NDArray[np.bool_]]:
+    """Return least and greatest u, v (2, 2) of a silhouette, and which are off the border."""
     v, u = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
     bounds = np.array([[u[0] - 0.5, v[0] - 0.5], [u[-1] + 0.5, v[-1] + 0.5]])
     height, width = mask.shape
-    seen = np.array([[u[0] > 1, v[0] > 1], [u[-1] < width - 2, v[-1] < height - 2]])
-    return bounds, seen
+    inside = np.array([[u[0] > 1, v[0] > 1], [u[-1] < width - 2, v[-1] < height - 2]])
+    return bounds, inside
 
 
-def areas(frames: PosedFrames, X_CW: Array, side: float) -> Array:
-    """The areas of body, silhouette and what both share, in frames seen from some poses.
+def overlap_areas(frames: PosedFrames, X_CW: Array, side: float) -> Array:
+    """Return the areas of body, silhouette and their intersection in all frames.
 
     Args:
-        X_CW: (n, 4, 4) the world's poses in the camera.
-        side: the root of the silhouettes' area in the pictures that are compared [pixel], if the
-            camera's are not smaller.
+        X_CW: (n, 4, 4) poses of the world in the camera.
+        side: square root of the silhouettes' area in the downscaled pictures that are compared
+            [pixel]; pictures are never enlarged.
 
     Returns:
-        (n, frames, 3) [pixel].
+        (n, frames, 3) [pixel of the downscaled pictures].
     """
-    camera = frames.smaller(side)
+    camera = frames.downscaled(side)
     found = np.empty((len(X_CW), len(frames.frames), 3))
 
     def score(k: int) -> None:
@@ -524,12 +558,12 @@ def areas(frames: PosedFrames, X_CW: Array, side: float) -> Array:
 
 
 def E_total(found: Array) -> Array:
-    """(...) the area that is in body or silhouette alone, over the silhouette's; found (..., 3)."""
+    """Return the area in body or silhouette alone over the silhouette's; found (..., 3) areas."""
     body, mask, both = np.moveaxis(found, -1, 0)
     return np.asarray((body + mask - 2.0 * both) / np.maximum(mask, 1.0))
 
 
 def intersection_over_union(found: Array) -> Array:
-    """(...) of body and silhouette; found (..., 3) of areas."""
+    """Return the intersection over union of body and silhouette; found (..., 3) areas."""
     body, mask, both = np.moveaxis(found, -1, 0)
     return np.asarray(both / np.maximum(body + mask - both, 1.0))

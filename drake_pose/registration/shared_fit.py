@@ -71,7 +71,7 @@ class SharedFitSettings(NamedTuple):
             contours against priors of single frames.
     """
 
-    rounds_with_constants: tuple[AnnealingStage, ...] = (
+    stages_with_constants: tuple[AnnealingStage, ...] = (
         AnnealingStage(0.12, 0.02),
         AnnealingStage(0.09, 0.02),
         AnnealingStage(0.07, 0.02),
@@ -81,13 +81,13 @@ class SharedFitSettings(NamedTuple):
         AnnealingStage(0.01, 0.01),
         *(5 * (AnnealingStage(0.005, 0.005, 6),)),
     )
-    told_apart: AnnealingStage = AnnealingStage(0.025, 0.01)
-    fitted: AnnealingStage = AnnealingStage(0.005, 0.005)
+    inlier_stage: AnnealingStage = AnnealingStage(0.025, 0.01)
+    final_stage: AnnealingStage = AnnealingStage(0.005, 0.005)
     steps: StepSettings = StepSettings(longest=0.3, damping=1e-2, even_damping=1e-6)
     constant_deviation: float = 0.2
-    largest_constant: float = 0.6
+    max_constant: float = 0.6
     focal_deviation: float = 0.1
-    known_beforehand: int = 20
+    prior_freedom: int = 20
     prior_deviation: float = 3.0
     min_inlier_ratio: float = 0.7
     point_error: float = 4.0
@@ -97,19 +97,19 @@ class SharedFitSettings(NamedTuple):
 SHARED = SharedFitSettings()
 
 
-def agreeing_share(ratios: Array) -> float:
+def inlier_threshold(ratios: Array) -> float:
     """The least inlier ratio of a mask that agrees with the others of its camera, (n,) ratios."""
     return float(SHARED.min_inlier_ratio * np.sort(ratios)[-2:].mean())
 
 
-class Shared(NamedTuple):
+class SharedValues(NamedTuple):
     """What was found.
 
     shared: (u,) by the names of a fit; widths: (rows,) of masks [pixel], 0 where they do not count.
     """
 
     shared: Array
-    widths: Array
+    biases: Array
 
 
 class SharedFit:
@@ -138,11 +138,15 @@ class SharedFit:
         constants: Sequence[str] = (),
         *,
         offsets: Sequence[LinkVector] = (),
-        looks: int = len(POSE_NAMES),
-        widths: bool = True,
+        camera_unknowns: int = len(POSE_NAMES),
+        fit_biases: bool = True,
     ) -> None:
-        self.seen, self.constants, self._X_CW = tuple(seen), tuple(constants), tuple(X_CW)
-        self._options: dict[str, Any] = {"offsets": offsets, "looks": looks, "widths": widths}
+        self.views, self.constants, self._X_CW = tuple(seen), tuple(constants), tuple(X_CW)
+        self._options: dict[str, Any] = {
+            "offsets": offsets,
+            "camera_unknowns": camera_unknowns,
+            "fit_biases": fit_biases,
+        }
         first, body = seen[0], seen[0].body
         if offsets:
             body = BodyParameters(first.kinematics, first.outlines, offsets=offsets)
@@ -153,8 +157,10 @@ class SharedFit:
         cameras = [
             one.camera.with_pose(np.linalg.inv(X)) for one, X in zip(seen, X_CW, strict=True)
         ]
-        self.per_camera = looks
-        names = [f"{camera.name}.{name}" for camera in cameras for name in CAMERA_NAMES[:looks]]
+        self.per_camera = camera_unknowns
+        names = [
+            f"{camera.name}.{name}" for camera in cameras for name in CAMERA_NAMES[:camera_unknowns]
+        ]
         self.names = (*names, *constants)
         deviations = dict.fromkeys(constants, SHARED.constant_deviation)
         # Of where an object stands, once it was found [m, rad].
@@ -162,9 +168,9 @@ class SharedFit:
         deviations |= {f"{one.name}.{CAMERA_NAMES[6]}": SHARED.focal_deviation for one in cameras}
         known = np.array([deviations.get(name, np.inf) for name in self.names])
         bounded = set(constants) - {*TARGET_POSITIONS, TIME_OFFSET}
-        most = np.array([SHARED.largest_constant if k in bounded else np.inf for k in self.names])
+        most = np.array([SHARED.max_constant if k in bounded else np.inf for k in self.names])
         unknowns = [Unknowns(self.names, True, -most, most, known)]
-        if widths:
+        if fit_biases:
             # Masks are wider or narrower by at most six pixels.
             every = parameter_names(body, cameras)
             unknowns.append(Unknowns(every[-len(cameras) :], lower=-6.0, upper=6.0))
@@ -174,44 +180,46 @@ class SharedFit:
         )  # fmt: skip
 
     @property
-    def start(self) -> Shared:
+    def start(self) -> SharedValues:
         """All as it is given."""
-        return Shared(np.zeros(len(self.names)), np.zeros(len(self.rows)))
+        return SharedValues(np.zeros(len(self.names)), np.zeros(len(self.rows)))
 
     def fit(
         self,
         rounds: Sequence[AnnealingStage],
-        start: Shared | None = None,
-        which: Mask | None = None,
-    ) -> Shared:
+        start: SharedValues | None = None,
+        included: Mask | None = None,
+    ) -> SharedValues:
         """Fits all from where it starts to those of the masks (rows,) that count."""
-        seen, at, expected, which = self._at(start or self.start, which)
+        seen, at, expected, included = self._at(start or self.start, included)
         found = self.problem.solve(seen, rounds, at, expected=expected)
         widths = np.zeros(len(self.rows))
-        widths[which] = found.own.sum(axis=1)
-        return Shared(found.shared, widths)
+        widths[included] = found.own.sum(axis=1)
+        return SharedValues(found.shared, widths)
 
-    def from_found(self, found: Shared) -> tuple["SharedFit", Shared]:
+    def from_found(self, found: SharedValues) -> tuple["SharedFit", SharedValues]:
         """The same fit, whose cameras' unknowns count from where they were found."""
         X_CW = [camera.X_CW for camera in self.cameras(found)]
         count = self.per_camera * len(X_CW)
         shared = found.shared.copy()
         shared[:count].reshape(len(X_CW), -1)[:, : len(POSE_NAMES)] = 0.0
-        fit = SharedFit(self.seen, X_CW, self.constants, **self._options)
-        return fit, Shared(shared, found.widths)
+        fit = SharedFit(self.views, X_CW, self.constants, **self._options)
+        return fit, SharedValues(shared, found.biases)
 
-    def equations(self, at: Shared, step: AnnealingStage, which: Mask | None = None) -> Equations:
+    def equations(
+        self, at: SharedValues, step: AnnealingStage, included: Mask | None = None
+    ) -> Equations:
         """The normal equations of the masks (rows,) that count, own unknowns first."""
-        seen, unknowns, expected, _ = self._at(at, which)
+        seen, unknowns, expected, _ = self._at(at, included)
         return self.problem.equations(seen, unknowns, step, expected)
 
-    def bend(
-        self, found: Shared, by: Array, step: AnnealingStage, which: Mask | None = None
+    def cost_curvature(
+        self, found: SharedValues, by: Array, step: AnnealingStage, included: Mask | None = None
     ) -> tuple[float, float]:
         """How much the cost bends upwards as what is shared moves by (u,), by slopes and by H."""
         p = self.problem.own_count
         less, here, more = (
-            self.equations(Shared(found.shared + sign * by, found.widths), step, which)
+            self.equations(SharedValues(found.shared + sign * by, found.biases), step, included)
             for sign in (-1.0, 0.0, 1.0)
         )
         known = float(self.problem.information[p:] @ by**2)
@@ -219,43 +227,43 @@ class SharedFit:
         said = float(by @ here.H.sum(axis=0)[p:, p:] @ by)
         return 0.5 * float(by @ slopes) - known, said - known
 
-    def inlier_ratios(self, found: Shared) -> Array:
+    def inlier_ratios(self, found: SharedValues) -> Array:
         """(rows,) of both contours' lengths, what fits."""
 
         def ratio(mask: tuple[Observation, Array]) -> float:
-            return self.problem.compare(*mask, SHARED.told_apart)[0].inlier_ratio
+            return self.problem.compare(*mask, SHARED.inlier_stage)[0].inlier_ratio
 
         masks = zip(self._observations, self._parameters(found), strict=True)
         return np.array(map_ordered(ratio, masks))
 
-    def agreeing(self, ratios: Array) -> Mask:
+    def inliers(self, ratios: Array) -> Mask:
         """(rows,) which masks fit nearly as well as the two of their camera that fit best."""
-        own = [ratios[self.rows == c] for c in range(len(self.seen))]
-        return np.concatenate([one >= agreeing_share(one) for one in own])
+        own = [ratios[self.rows == c] for c in range(len(self.views))]
+        return np.concatenate([one >= inlier_threshold(one) for one in own])
 
-    def tile_costs(self, found: Shared, side: float) -> Array:
+    def tile_costs(self, found: SharedValues, side: float) -> Array:
         """(rows, k, k) costs by squares of the pictures of a side [pixel]."""
 
         def costs(mask: tuple[Observation, Array, int]) -> Array:
-            return self.problem.tile_costs(*mask[:2], SHARED.told_apart, side)[mask[2]]
+            return self.problem.tile_costs(*mask[:2], SHARED.inlier_stage, side)[mask[2]]
 
         masks = zip(self._observations, self._parameters(found), self.rows.tolist(), strict=True)
         return np.array(map_ordered(costs, masks))
 
-    def cameras(self, found: Shared) -> list[PinholeCamera]:
+    def cameras(self, found: SharedValues) -> list[PinholeCamera]:
         """The cameras as they were found."""
         X_CW, kernel, _ = self.problem.place_cameras(self._parameters(found)[0])
         return [
             replace(one.camera, X_WC=np.linalg.inv(X), focal_x=float(k[1]), focal_y=float(k[2]))
-            for one, X, k in zip(self.seen, X_CW, kernel, strict=True)
+            for one, X, k in zip(self.views, X_CW, kernel, strict=True)
         ]
 
-    def covariances(self, found: Shared, which: Mask | None = None) -> tuple[Array, Array]:
+    def covariances(self, found: SharedValues, included: Mask | None = None) -> tuple[Array, Array]:
         """(u, u) each: of the errors of what is shared, told by the masks (rows,) that count.
 
         Of contours that err, and what is off alike in all frames adds.
         """
-        seen = self._doubted_distances(found, SHARED.fitted, which)
+        seen = self._distances_with_nuisances(found, SHARED.final_stage, included)
         is_angle = np.zeros(seen.X.shape[1], bool)
         sizes = estimate_sizes(seen, is_angle, 0.0, SHARED.prior_deviation)
         doubted, seen = nuisance_covariance(seen, sizes, is_angle)
@@ -264,11 +272,11 @@ class SharedFit:
         # Wrong intrinsics err alike in all frames: the pose follows, and nothing is left of it. So
         # where parts are seen to err, a calibration is trusted to a pixel at best. What comes again
         # where a part stands still may be the part's surface: none of it counts as noise here.
-        seen = self._doubted_distances(found, SHARED.told_apart, which)
+        seen = self._distances_with_nuisances(found, SHARED.inlier_stage, included)
         seen = seen._replace(effects=seen.effects[[0, 0, 2, 3, 4]])
         sizes = estimate_sizes(seen, np.zeros(seen.X.shape[1], bool), 0.0, SHARED.prior_deviation)
         pixels = min(1.0, (sizes.surface**2 + sizes.mask**2) / 0.2**2)
-        for c, (one, camera) in enumerate(zip(self.seen, self.cameras(found), strict=True)):
+        for c, (one, camera) in enumerate(zip(self.views, self.cameras(found), strict=True)):
             depth = float(camera.X_CW[2, :3] @ one.middle + camera.X_CW[2, 3])
             size = pixels * depth / one.camera.focal_x
             turn = size / one.extent
@@ -279,7 +287,7 @@ class SharedFit:
         return covariance[own, own], doubted[own, own]
 
     def likely_offsets(
-        self, found: Shared, which: Mask, min_score: float = 6.0, smallest: float = 2.0
+        self, found: SharedValues, included: Mask, min_score: float = 6.0, smallest: float = 2.0
     ) -> dict[str, tuple[float, float]]:
         """Joint offsets, each by itself, that explain what all frames that count have in common.
 
@@ -293,14 +301,14 @@ class SharedFit:
         Returns:
             value and standard deviation by joint [rad or m], the likeliest one first.
         """
-        seen = self._doubted_distances(found, SHARED.told_apart, which)
+        seen = self._distances_with_nuisances(found, SHARED.inlier_stage, included)
         angles = np.zeros(seen.X.shape[1], bool)
         sizes = estimate_sizes(seen, angles, 0.0, SHARED.prior_deviation)
         values, deviations = score_nuisances(seen, sizes)
         units = self._offset_units
         # As they stand among the nuisances: what is fitted and an object's place are none.
         known = {*self.names, *TARGET_POSITIONS}
-        names = [one for one in self._doubting.names if one in units and one not in known]
+        names = [one for one in self._nuisance_fit.names if one in units and one not in known]
         if not seen.nuisances or seen.nuisances[0].shape[1] != len(names):
             return {}
         scored = zip(names, values, deviations, strict=False)
@@ -311,8 +319,8 @@ class SharedFit:
         }
         return dict(sorted(told.items(), key=lambda one: -abs(one[1][0]) / one[1][1]))
 
-    def growth(
-        self, found: Shared, name: str, weights: Array, which: Mask, covariance: Array
+    def fit_slope(
+        self, found: SharedValues, name: str, weights: Array, included: Mask, covariance: Array
     ) -> tuple[float, float]:
         """How a constant grows with what the masks that count weigh, were it to grow.
 
@@ -324,7 +332,7 @@ class SharedFit:
             covariance: (u, u) of what is shared.
         """
         p, at = self.problem.own_count, self.names.index(name)
-        equations = self.equations(found, SHARED.fitted, which)
+        equations = self.equations(found, SHARED.final_stage, included)
         H, g = equations.H, equations.g
         more = np.einsum("f,fi->fi", weights, H[:, p + at])
         own = weights**2 * H[:, p + at, p + at]
@@ -339,7 +347,7 @@ class SharedFit:
         scale = covariance[at, at] / said
         return -float(inverse[-1] @ left), float(np.sqrt(scale * inverse[-1, -1]))
 
-    def camera_covariances(self, found: Shared, covariance: Array) -> Array:
+    def camera_covariances(self, found: SharedValues, covariance: Array) -> Array:
         """(cameras, 6, 6) of the poses' errors in the world, covariance being of what is shared."""
         X_CW, _, motions = self.problem.place_cameras(self._parameters(found)[0])
         own = [slice(k, k + 6) for k in self.per_camera * np.arange(len(X_CW))]
@@ -347,35 +355,40 @@ class SharedFit:
         return np.array([pose_covariance(X, J[:6], covariance[k, k]) for X, J, k in several])
 
     def _at(
-        self, at: Shared, which: Mask | None
+        self, at: SharedValues, included: Mask | None
     ) -> tuple[list[Observation], tuple[Array, Array], tuple[Array, Array], Mask]:
         """Masks that count; their own and shared unknowns; what these are expected to be.
 
         Then which masks (rows,) those are.
         """
-        which = np.ones(len(self.rows), bool) if which is None else which
-        own, seen = self._own(at)[which], [self._observations[k] for k in np.flatnonzero(which)]
-        return seen, (own, at.shared), (np.zeros_like(own), np.zeros(len(self.names))), which
+        included = np.ones(len(self.rows), bool) if included is None else included
+        own, seen = (
+            self._own(at)[included],
+            [self._observations[k] for k in np.flatnonzero(included)],
+        )
+        return seen, (own, at.shared), (np.zeros_like(own), np.zeros(len(self.names))), included
 
-    def _own(self, at: Shared) -> Array:
+    def _own(self, at: SharedValues) -> Array:
         """(rows, own unknowns): of each mask the width of its camera's."""
         own = np.zeros((len(self.rows), self.problem.own_count))
         if own.size:
-            own[np.arange(len(own)), self.rows] = at.widths
+            own[np.arange(len(own)), self.rows] = at.biases
         return own
 
-    def _parameters(self, at: Shared) -> Array:
+    def _parameters(self, at: SharedValues) -> Array:
         """(rows, n) all parameters."""
         return self.problem.parameters(self._observations, self._own(at), at.shared)
 
-    def distances(self, at: Shared, step: AnnealingStage, which: Mask | None = None) -> Distances:
+    def distances(
+        self, at: SharedValues, step: AnnealingStage, included: Mask | None = None
+    ) -> Distances:
         """The distances in all masks that count; values are what is shared, then the widths."""
-        seen, _, _, which = self._at(at, which)
-        pictures = self.problem.compared_masks(seen, self._parameters(at)[which], step)
+        seen, _, _, included = self._at(at, included)
+        pictures = self.problem.compared_masks(seen, self._parameters(at)[included], step)
         return distances_in_masks(self.problem.body.outlines, pictures, with_bias=True)
 
-    def _doubted_distances(
-        self, found: Shared, step: AnnealingStage, which: Mask | None
+    def _distances_with_nuisances(
+        self, found: SharedValues, step: AnnealingStage, included: Mask | None
     ) -> Distances:
         """The distances in all masks that count; values are what is shared, then the widths.
 
@@ -383,20 +396,20 @@ class SharedFit:
         degree or two millimetres], link scales, each and all alike [1 %], and lenses [1 % of the
         focal length; half a percent of it where the principal point lies].
         """
-        whole = self._doubting
-        names, kinematics, units = whole.names, self.seen[0].kinematics, dict(self._offset_units)
+        whole = self._nuisance_fit
+        names, kinematics, units = whole.names, self.views[0].kinematics, dict(self._offset_units)
         groups: dict[str, list[str]] = {"offsets": [], "scales": [], "lenses": []}
         groups["offsets"] = [name for name in kinematics.names if name not in TARGET_POSITIONS]
-        for camera in (one.camera for one in self.seen):
+        for camera in (one.camera for one in self.views):
             lens = [f"{camera.name}.{name}" for name in CAMERA_NAMES[len(POSE_NAMES) :]]
             units |= zip(lens, (0.01, *[0.005 * camera.focal_x] * 2), strict=True)
             groups["lenses"] += lens
-        looks = [f"{one.camera.name}.{name}" for one in self.seen for name in POSE_NAMES]
+        looks = [f"{one.camera.name}.{name}" for one in self.views for name in POSE_NAMES]
         groups["scales"] = [name for name in names if name not in units and name not in looks]
         shared = np.zeros(len(names))
         own = [names.index(name) for name in self.names]
         shared[own] = found.shared
-        distances = whole.distances(Shared(shared, found.widths), step, which)
+        distances = whole.distances(SharedValues(shared, found.biases), step, included)
         nuisances = []
         for kind, members in groups.items():
             doubted = [k for k, name in enumerate(names) if k not in own and name in members]
@@ -412,26 +425,26 @@ class SharedFit:
     @property
     def _offset_units(self) -> dict[str, float]:
         """By what joints' offsets are doubted: half a degree or two millimetres [rad or m]."""
-        kinematics = self.seen[0].kinematics
+        kinematics = self.views[0].kinematics
         units = np.where(kinematics.is_angle, np.radians(0.5), 0.002)
         return dict(zip(kinematics.names, units.tolist(), strict=True))
 
     @cached_property
-    def _doubting(self) -> "SharedFit":
+    def _nuisance_fit(self) -> "SharedFit":
         """The same fit, all unknown that is doubted."""
-        kinematics = self.seen[0].kinematics
+        kinematics = self.views[0].kinematics
         offsets = carried_joints(kinematics.tree)
         free = np.flatnonzero(kinematics.lower < kinematics.upper)
         zeros = [name for name in (kinematics.names[k] for k in free) if name not in self.constants]
         lengths = dict.fromkeys(link_scale_name(one.link) for one in offsets)
         names = [*self.constants, *zeros, *(one for one in lengths if one not in self.constants)]
-        options = self._options | {"offsets": offsets, "looks": len(CAMERA_NAMES)}
-        return SharedFit(self.seen, self._X_CW, names, **options)
+        options = self._options | {"offsets": offsets, "camera_unknowns": len(CAMERA_NAMES)}
+        return SharedFit(self.views, self._X_CW, names, **options)
 
 
 def fit_pose(seen: PosedFrames, X_CW: Array, rounds: Sequence[AnnealingStage]) -> Array:
     """X_CW (4, 4) fitted to all frames from where it starts; silhouettes keep their widths."""
-    fit = SharedFit([seen], [X_CW], widths=False)
+    fit = SharedFit([seen], [X_CW], fit_biases=False)
     return fit.cameras(fit.fit(rounds))[0].X_CW
 
 
@@ -473,9 +486,7 @@ def scatter_factor(seen: Distances, sizes: ErrorSizes, shared: int) -> float:
     design, left = np.concatenate(designs), np.concatenate(lefts)
     by, _, rank, _ = np.linalg.lstsq(design, left)
     off = left - design @ by
-    scale = (SHARED.known_beforehand + float(off @ off)) / (
-        SHARED.known_beforehand + len(off) - rank
-    )
+    scale = (SHARED.prior_freedom + float(off @ off)) / (SHARED.prior_freedom + len(off) - rank)
     # Frames that agree by chance are no surer.
     return max(scale, 1.0)
 
@@ -489,7 +500,7 @@ def adjust_bundle(
     is_length: Mask,
     parts: Sequence[str] = (),
     groups: Sequence[int] | None = None,
-    telling_frames: int = 4,
+    covariance_frames: int = 4,
 ) -> tuple[list[PinholeCamera], Array, Array, Array]:
     """Fits poses and cameras together, in the end as finely as the model is like the body.
 
@@ -523,10 +534,10 @@ def adjust_bundle(
     deviations = np.where(is_length, 0.03, 0.5) / worth
     pose, lengths = (
         Unknowns(
-            np.array(kinematics.names)[which].tolist(), shared, kinematics.lower[which],
-            kinematics.upper[which], deviations[which],
+            np.array(kinematics.names)[included].tolist(), shared, kinematics.lower[included],
+            kinematics.upper[included], deviations[included],
         )
-        for which, shared in ((free, False), (is_length, True))
+        for included, shared in ((free, False), (is_length, True))
     )  # fmt: skip
     radius_scales = [name for name in body.names if name.startswith(RADIUS_SCALE_PREFIX)]
     poses = [f"{cameras[k].name}.{name}" for k in looks for name in POSE_NAMES]
@@ -561,7 +572,7 @@ def adjust_bundle(
     # The covariance is that of some frames, and of some distances in them, several an unknown: a
     # surface that is not the body's is so in all frames. How far it is off shows at a scale at
     # which nothing is left out because it is off.
-    some = np.unique(np.linspace(0, len(seen) - 1, telling_frames).round().astype(int))
+    some = np.unique(np.linspace(0, len(seen) - 1, covariance_frames).round().astype(int))
     uncut = AnnealingStage(0.08, 0.015)
     pictures = fit.compared_masks([seen[k] for k in some], found.parameters[some], uncut)
     distances = distances_in_masks(body.outlines, pictures, 1000)

@@ -155,7 +155,7 @@ def _numbers(known: OnlineState) -> list[float]:
     iou = np.nan
     if known.registered is not None:
         iou = float(np.mean([frame.iou for frame in known.registered.frames]))
-    return [len(known.keyframes), known.contradictions, known.moves, iou]
+    return [len(known.keyframes), known.outlier_count, known.moves, iou]
 
 
 ESTIMATE_COLOUR = Rgba(0.0, 0.45, 0.70, 0.6)

@@ -168,7 +168,7 @@ def _outcome(
             zeros.append(abs(off))
         else:
             false += bool(told["significant"])
-    contradicting = set(one.contradictions)
+    contradicting = set(one.outliers)
     is_wrong = (episode.times >= wrong[0]) & (episode.times < wrong[1])
     between = np.abs(episode.times[:, None] - np.array(wrong)).min(axis=1) < _BETWEEN
     named = np.array([f"{k:04d}" in contradicting for k in range(len(episode.times))])

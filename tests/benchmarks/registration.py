@@ -29,9 +29,9 @@ from drake_pose.fit.parameters import carried_joints
 from drake_pose.jobs.estimate.inputs import make_tree
 from drake_pose.jobs.registration.inputs import read_inputs
 from drake_pose.jobs.registration.settings import RegistrationSettings
-from drake_pose.registration.joint_offsets import links_with_length
+from drake_pose.registration.joint_offsets import scalable_links
 from drake_pose.registration.posed_frames import PosedFrame, PosedFrames
-from drake_pose.registration.register import CameraSearch, RegistrationBody, areas
+from drake_pose.registration.register import CameraSearch, RegistrationBody, overlap_areas
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from tests.benchmarks.tables import print_table
 
@@ -178,9 +178,9 @@ def measure_camera(
     if misfit:
         zeros = rng.normal(0.0, _ZERO_SD, len(body.kinematics.names)) * body.kinematics.is_angle
         frames = [replace(one, values=one.values + zeros) for one in frames]
-        growth, (x, y) = np.exp(rng.normal(0.0, _FOCAL_SD)), rng.normal(0.0, _CENTER_SD, 2)
+        fit_slope, (x, y) = np.exp(rng.normal(0.0, _FOCAL_SD)), rng.normal(0.0, _CENTER_SD, 2)
         camera = replace(
-            camera, focal_x=camera.focal_x * growth, focal_y=camera.focal_y * growth,
+            camera, focal_x=camera.focal_x * fit_slope, focal_y=camera.focal_y * fit_slope,
             center_x=camera.center_x + x, center_y=camera.center_y + y,
         )  # fmt: skip
     if worn:
@@ -196,14 +196,14 @@ def measure_camera(
     seconds = time.process_time() - start
     error = pose_error(found.camera.X_WC, camera.X_WC)
     inside = np.abs(error) < 1.96 * np.sqrt(np.diag(found.covariance))
-    named = found.contradictions == wrong
+    named = found.outliers == wrong
     return CameraOutcome(*_sizes(error), int(np.count_nonzero(inside)), named, seconds)
 
 
 def _with_other_lengths(body: RegistrationBody, rng: np.random.Generator) -> RegistrationBody:
     """The arm whose links are a little longer or shorter."""
     tree, settings = body.tree, EstimateSettings()
-    by = {link: rng.normal(0.0, _LENGTH_SD) for link in links_with_length(tree)}
+    by = {link: rng.normal(0.0, _LENGTH_SD) for link in scalable_links(tree)}
     shifts = {one.joint: (by[one.link] * one.p_L).tolist() for one in carried_joints(tree)}
     return body.with_tree(make_tree(tree.model.reshaped(joint_shifts=shifts), settings, None))
 
@@ -262,8 +262,8 @@ def _recorded_rows(data: Path) -> Iterator[list[str]]:
             if cameras:
                 off = _sizes(pose_error(found.camera.X_WC, camera.X_WC))
                 distance = f"{off[0]:.1f} mm, {off[1]:.2f} deg"
-                posed = PosedFrames(body.kinematics, body.all, camera, frames)
-                seen, mask, both = areas(posed, camera.X_CW[None], np.inf)[0].T
+                posed = PosedFrames(body.kinematics, body.full, camera, frames)
+                seen, mask, both = overlap_areas(posed, camera.X_CW[None], np.inf)[0].T
                 iou += f" ({np.mean(both / (seen + mask - both)):.3f})"
             named = f"{', '.join(found.contradictions) or 'none'} of {len(frames)}"
             yield [f"{name} ({joints}), {camera.name}", distance, iou, named, f"{seconds:.1f} s"]

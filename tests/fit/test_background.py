@@ -27,7 +27,7 @@ def episode(tmp_path_factory):
 
 def drawn(episode, X_CW):
     """(f, H, W) masks of the body, and the kernel's arguments."""
-    outlines = episode.body.very_few
+    outlines = episode.body.coarse
     poses = [X_CW @ episode.body.kinematics.poses(values) for values in episode.values]
     masks = np.array([draw_mask(outlines, X, episode.camera) for X in poses])
     return masks, (pack(outlines), np.ascontiguousarray(np.array(poses)[:, :, :3]))

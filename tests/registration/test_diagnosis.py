@@ -17,7 +17,7 @@ from drake_pose.registration.diagnosis import (
     diagnose_frames,
     explained_frames,
     is_half_pixel,
-    likeliest_frames,
+    likeliest_inliers,
 )
 from drake_pose.registration.findings import Diagnosis, Finding
 from drake_pose.registration.per_frame_fit import FrameFit, PerFrameFit
@@ -60,7 +60,7 @@ def test_the_likeliest_set_of_frames_agrees(shift: float, kept: slice) -> None:
     """
     off = np.array([shift, shift + 0.01, shift - 0.01, shift, 0.0, 0.01])
 
-    def judge(chosen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def evaluate(chosen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         weight = 1.0 / 0.02**2
         # Without any frame what is given is right to within a tolerance.
         variance = 1.0 / ((1.0 if chosen.any() else 1e4) + weight * chosen.sum())
@@ -69,7 +69,7 @@ def test_the_likeliest_set_of_frames_agrees(shift: float, kept: slice) -> None:
 
     expected = np.zeros(6, bool)
     expected[kept] = True
-    np.testing.assert_array_equal(likeliest_frames(np.ones(6, bool), judge), expected)
+    np.testing.assert_array_equal(likeliest_inliers(np.ones(6, bool), evaluate), expected)
 
 
 @pytest.mark.parametrize("ratio", [0.49, 0.51, 0.74, 0.76])
@@ -120,7 +120,7 @@ def audit(
 ) -> Diagnosis:
     """Pictures by the cameras taken, audited with the positions and cameras that are told."""
     frames = seen(model, body, [(*one, taken) for one in zip(poses, given, strict=True)])
-    fit = PerFrameFit(body.kinematics, (body.few, body.all), told or taken, frames)
+    fit = PerFrameFit(body.kinematics, (body.medium, body.full), told or taken, frames)
     return diagnose_frames(fit, [fit.fit(frame) for frame in frames])
 
 
@@ -131,7 +131,7 @@ def right(model, body, poses, cameras) -> Callable[[int], tuple[PerFrameFit, lis
     @cache
     def fitted(count: int) -> tuple[PerFrameFit, list[FrameFit]]:
         frames = seen(model, body, [(pose, pose, cameras[:count]) for pose in poses])
-        fit = PerFrameFit(body.kinematics, (body.few, body.all), cameras[:count], frames)
+        fit = PerFrameFit(body.kinematics, (body.medium, body.full), cameras[:count], frames)
         return fit, [fit.fit(frame) for frame in frames]
 
     return fitted
@@ -145,7 +145,7 @@ def with_wrong(model, body, poses, right) -> Callable[..., Finding]:
         fit, fits = right(len(taken))
         frames = seen(model, body, [(poses[WRONG], values, taken)] * (WRONG + 1))
         found = diagnose_frames(fit, [*fits[:WRONG], fit.fit(frames[WRONG]), *fits[WRONG + 1 :]])
-        assert (found.contradicting, found.common) == ((f"{WRONG:04d}",), ())
+        assert (found.outliers, found.common) == ((f"{WRONG:04d}",), ())
         assert found.frames[WRONG].finding is not None
         return found.frames[WRONG].finding
 
@@ -163,7 +163,7 @@ class TestAuditFrames:
         self, model, body, poses, cameras, right
     ) -> None:
         found = diagnose_frames(*right(1))
-        assert (found.contradicting, found.common) == ((), ())
+        assert (found.outliers, found.common) == ((), ())
         least = found.minimum_detectable
         assert least.keys() == {*TreeKinematics(body.tree).names}
         assert 0.0 < least["elbow_turn"] < np.radians(1.0)
@@ -191,7 +191,7 @@ class TestAuditFrames:
     def test_a_joint_whose_zero_is_off(self, model, body, poses, cameras) -> None:
         given = joint_off(poses, 3, slice(None), -2.0)
         found = audit(model, body, poses, given, cameras[:1])
-        assert found.contradicting == ()
+        assert found.outliers == ()
         assert [(one.kind, one.name) for one in found.common] == [("joint", "elbow_turn")]
         assert np.degrees(found.common[0].angle) == pytest.approx(2.0, abs=0.2)
 
@@ -199,11 +199,11 @@ class TestAuditFrames:
         for count, by in ((2, [0.0, 0.0, 0.01]), (1, [0.0, 0.01, 0.005])):
             told = [*cameras[: count - 1], moved(cameras[count - 1], by)]
             found = audit(model, body, poses, poses, cameras[:count], told)
-            assert found.contradicting == ()
+            assert found.outliers == ()
             assert [(one.kind, one.name) for one in found.common] == [("camera", told[-1].name)]
             assert found.common[0].shift == pytest.approx(np.linalg.norm(by), abs=0.003)
         # Seen by one camera alone it may be the base.
-        assert "base" in found.common[0].rivals
+        assert "base" in found.common[0].alternatives
 
     def test_lenses_that_are_told_wrongly(self, model, body, poses, cameras) -> None:
         """Of both cameras, by what must be added to what is given."""
@@ -211,7 +211,7 @@ class TestAuditFrames:
             replace(one, focal_x=1.04 * one.focal_x, focal_y=1.04 * one.focal_y) for one in cameras
         ]
         found = audit(model, body, poses, poses, cameras, longer)
-        assert found.contradicting == ()
+        assert found.outliers == ()
         (first, *_) = found.common
         assert (first.kind, first.name) == ("focal", "focal lengths")
         assert first.shift == pytest.approx(-0.04, abs=0.006)
@@ -225,7 +225,7 @@ class TestAuditFrames:
 
 
 def test_masks_of_another_size_and_empty_ones_are_refused(body, poses, cameras) -> None:
-    mask, surfaces = np.ones((480, 640), bool), (body.few, body.all)
+    mask, surfaces = np.ones((480, 640), bool), (body.medium, body.full)
     frame = SeenFrame("0007", poses[0], {"left": mask[:100]})
     with pytest.raises(MaskError, match=r"'left', frame '0007'.*640 x 480"):
         PerFrameFit(body.kinematics, surfaces, cameras[:1], [frame])

@@ -42,7 +42,7 @@ class TestCalibrateJoints:
         frames = misread(see(model, body, camera, 4, 4), zeros)
         registered = known(camera)
         found = calibrate_joints(body, [registered], [frames], NAMES)
-        for zero, true in zip(found.zeros, off, strict=True):
+        for zero, true in zip(found.offsets, off, strict=True):
             assert zero.value == pytest.approx(true, abs=np.radians(0.2))
             assert abs(zero.value - true) < 4.0 * zero.deviation
             assert zero.significant == (true != 0.0)
@@ -64,13 +64,13 @@ class TestCalibrateJoints:
             registered.append(CameraSearch(body).refine(camera, frames[-1]))
             alone.append(calibrate_joints(body, registered[-1:], frames[-1:], ["elbow_turn"]))
         found = calibrate_joints(
-            body, registered, frames, ["elbow_turn"], lengths=["shoulder", "elbow"]
+            body, registered, frames, ["elbow_turn"], links=["shoulder", "elbow"]
         )
-        (zero,) = found.zeros
+        (zero,) = found.offsets
         assert zero.low < np.radians(2.0) < zero.high
         assert zero.significant
-        assert zero.deviation < max(one.zeros[0].deviation for one in alone)
-        for one in found.lengths:
+        assert zero.deviation < max(one.offsets[0].deviation for one in alone)
+        for one in found.link_scales:
             assert one.low < 0.0 < one.high
             assert not one.significant
         for camera, place in zip(found.cameras, places, strict=True):
@@ -82,27 +82,27 @@ class TestCalibrateJoints:
         """All that is seen of this arm hangs on its first joint."""
         frames = see(model, body, camera, 3, 4)
         found = calibrate_joints(body, [known(camera)], [frames], ["turret_turn"])
-        assert not found.zeros[0].determined
-        assert not found.zeros[0].significant
-        assert any("turn" in name or "shift" in name for name in found.zeros[0].gauge)
+        assert not found.offsets[0].determined
+        assert not found.offsets[0].significant
+        assert any("turn" in name or "shift" in name for name in found.offsets[0].gauge)
 
     def test_refuses(self, model, body, camera) -> None:
         frames, registered = see(model, body, camera, 1, 4), known(camera)
         with pytest.raises(UnknownNameError, match="knee"):
             calibrate_joints(body, [registered], [frames], ["knee"])
         with pytest.raises(UnknownNameError, match=r"no link with a length 'hand'.*turret"):
-            calibrate_joints(body, [registered], [frames], [], lengths=["hand"])
+            calibrate_joints(body, [registered], [frames], [], links=["hand"])
         with pytest.raises(RegistrationError, match="more frames"):
             calibrate_joints(body, [registered], [frames], NAMES)
 
 
 def test_the_cost_bends_as_the_normal_equations_say(model, body, camera) -> None:
     frames = see(model, body, camera, 4, 4)
-    seen = PosedFrames(body.kinematics, body.all, camera, frames)
+    seen = PosedFrames(body.kinematics, body.full, camera, frames)
     fit = SharedFit([seen], [camera.X_CW], ["elbow_turn"])
     by = np.append(np.zeros(6), np.radians(0.1))
     step = AnnealingStage(0.005, 0.005)
-    bends, said = fit.bend(fit.start, by, step)
+    bends, said = fit.cost_curvature(fit.start, by, step)
     assert said > 0.0
     assert bends == pytest.approx(said, rel=0.5)
     # And as its own differences say, but for what was known beforehand.

@@ -20,12 +20,13 @@ from drake_pose.fit.evidence import Observation
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.fit.parameters import BodyParameters
 from drake_pose.fit.problem import parameter_names
+from drake_pose.registration.hand_eye import hand_eye_starts, rotation_spread
 from drake_pose.registration.joint_offsets import (
-    as_the_cost_bends,
     describe_constants,
-    drawn_together,
+    shrink_constants,
     significant_constants,
-    wider_with_cameras,
+    widen_to_cost_curvature,
+    widen_with_cameras,
 )
 from drake_pose.registration.online_registration import pose_difference
 from drake_pose.registration.per_frame_fit import PerFrameFit
@@ -33,26 +34,24 @@ from drake_pose.registration.posed_frames import PosedFrame, PosedFrames, SeenFr
 from drake_pose.registration.register import (
     E_total,
     RegistrationBody,
-    _bounds,
+    _mask_bounds,
     add_bound_equations,
     intersection_over_union,
-    place_by_bounds,
-    spread_rotations,
+    positions_from_bounds,
+    uniform_rotations,
 )
 from drake_pose.registration.shared_fit import (
     SHARED,
-    Shared,
     SharedFit,
+    SharedValues,
     adjust_bundle,
     scatter_factor,
 )
 from drake_pose.registration.standing_object import (
-    ObjectSearch,
-    StandingObject,
-    distinct_turns,
-    hand_eye_starts,
-    require_turns,
-    turns_between,
+    CalibrationTarget,
+    TargetSearch,
+    distinct_motions,
+    require_rotation,
 )
 from drake_pose.silhouette.scoring import draw_mask
 from tests.registration.arm_pictures import errors, looking_at, see
@@ -67,19 +66,21 @@ STEP = AnnealingStage(0.02, 0.02)
 def posed(model: ArticulatedModel, body: RegistrationBody) -> PosedFrames:
     camera = looking_at(PLACE, MIDDLE, 0.1)
     frames = see(model, body, camera, 2, 4)
-    return PosedFrames(body.kinematics, body.very_few, camera, frames, 0.02)
+    return PosedFrames(body.kinematics, body.coarse, camera, frames, 0.02)
 
 
 def with_zero(posed: PosedFrames) -> SharedFit:
     """A fit of a camera, its focal length and a joint's zero."""
-    return SharedFit([posed], [posed.camera.X_CW], posed.kinematics.names[3:4], looks=7)
+    return SharedFit([posed], [posed.camera.X_CW], posed.kinematics.names[3:4], camera_unknowns=7)
 
 
 def test_what_is_known_beforehand_pulls_by_what_it_says(posed: PosedFrames) -> None:
     fit, free = with_zero(posed), with_zero(posed)
     free.problem.information = np.zeros_like(free.problem.information)
     shared = np.array([0.01, 0.0, -0.01, 0.002, 0.003, 0.0, 0.04, -0.03])
-    with_prior, without = (one.equations(Shared(shared, np.zeros(2)), STEP) for one in (fit, free))
+    with_prior, without = (
+        one.equations(SharedValues(shared, np.zeros(2)), STEP) for one in (fit, free)
+    )
     known = np.array([0.0] * 6 + [SHARED.focal_deviation**-2, SHARED.constant_deviation**-2])
     H, g = with_prior.H - without.H, with_prior.g - without.g
     np.testing.assert_allclose(H.sum(axis=0)[1:, 1:], np.diag(known), atol=1e-6)
@@ -92,13 +93,13 @@ def test_slopes_of_the_cost_are_those_of_the_equations(posed: PosedFrames) -> No
     fit, own = with_zero(posed), np.zeros(2)
     at = np.array([0.02, -0.01, 0.02, 0.01, 0.01, 0.01, 0.02, 0.03])
     wide = AnnealingStage(0.2, 0.01)
-    g = fit.equations(Shared(at, own), wide).g.sum(axis=0)[1:]
+    g = fit.equations(SharedValues(at, own), wide).g.sum(axis=0)[1:]
     for k, slope in enumerate(g):
         by = 2e-3 * np.eye(8)[k]
-        more, less = (fit.equations(Shared(at + s * by, own), wide).cost for s in (1.0, -1.0))
+        more, less = (fit.equations(SharedValues(at + s * by, own), wide).cost for s in (1.0, -1.0))
         assert (more - less) / 8e-3 == pytest.approx(slope, abs=0.1 * np.abs(g).max()), k
-    wider, narrower = (fit.equations(Shared(at, own + w), wide).cost for w in (0.25, -0.25))
-    widths = fit.equations(Shared(at, own), wide).g[:, 0]
+    wider, narrower = (fit.equations(SharedValues(at, own + w), wide).cost for w in (0.25, -0.25))
+    widths = fit.equations(SharedValues(at, own), wide).g[:, 0]
     assert (wider - narrower) / 1.0 == pytest.approx(float(widths.sum()), rel=0.05)
 
 
@@ -106,13 +107,13 @@ def test_a_camera_s_covariance_is_that_of_its_moves(posed: PosedFrames) -> None:
     """J sigma J^T, J the derivative of X_WC by POSE_NAMES."""
     fit = SharedFit([posed], [posed.camera.X_CW])
     at = np.array([0.1, -0.2, 0.3, 0.02, 0.03, -0.01])
-    X_WC, J = fit.cameras(Shared(at, np.zeros(2)))[0].X_WC, np.zeros((6, 6))
+    X_WC, J = fit.cameras(SharedValues(at, np.zeros(2)))[0].X_WC, np.zeros((6, 6))
     for k in range(6):
-        X = fit.cameras(Shared(at + 1e-6 * np.eye(6)[k], np.zeros(2)))[0].X_WC
+        X = fit.cameras(SharedValues(at + 1e-6 * np.eye(6)[k], np.zeros(2)))[0].X_WC
         turn = X[:3, :3] @ X_WC[:3, :3].T
         J[:, k] = [turn[2, 1], turn[0, 2], turn[1, 0], *(X[:3, 3] - X_WC[:3, 3])]
     covariance = np.diag([1.0, 4.0, 9.0, 0.1, 0.2, 0.3])
-    found = fit.camera_covariances(Shared(at, np.zeros(2)), covariance)[0]
+    found = fit.camera_covariances(SharedValues(at, np.zeros(2)), covariance)[0]
     np.testing.assert_allclose(found, (J / 1e-6) @ covariance @ (J / 1e-6).T, atol=1e-4)
 
 
@@ -145,7 +146,7 @@ def test_a_wider_mask_is_told_from_a_nearer_camera(posed: PosedFrames) -> None:
     ]
     wide = PosedFrames(posed.kinematics, posed.outlines, posed.camera, frames, posed.spacing)
     fits = [SharedFit([one], [posed.camera.X_CW]) for one in (posed, wide)]
-    exact, wider = (fit.fit([AnnealingStage(0.02, 0.01, 6)]).widths for fit in fits)
+    exact, wider = (fit.fit([AnnealingStage(0.02, 0.01, 6)]).biases for fit in fits)
     np.testing.assert_allclose(wider - exact, 2.0, atol=0.4)
 
 
@@ -182,34 +183,38 @@ def test_a_border_that_a_silhouette_touches_bounds_nothing() -> None:
     ):
         mask = np.zeros((20, 20), bool)
         mask[top : bottom + 1, left : right + 1] = True
-        bounds, seen = _bounds(mask)
+        bounds, seen = _mask_bounds(mask)
         np.testing.assert_array_equal(
             bounds, [[left - 0.5, top - 0.5], [right + 0.5, bottom + 0.5]]
         )
         assert seen.tolist() == [[left > 1, top > 1], [right < 18, bottom < 18]]
 
 
-def test_a_hand_turns_about_one_axis_or_two(standing: Callable[[str], StandingObject]) -> None:
+def test_a_hand_turns_about_one_axis_or_two(
+    make_target: Callable[[str], CalibrationTarget],
+) -> None:
     """Angles between turns about known axes; frames that tell too little are refused."""
     z, x = (Rotation.from_rotvec(0.3 * axis).as_matrix() for axis in np.eye(3)[[2, 0]])
-    np.testing.assert_allclose(turns_between(np.array([np.eye(3), z])), [0.3, 0.0, 0.0], atol=1e-9)
-    assert turns_between(np.array([np.eye(3), z, x]))[1] > 0.1
-    thing = standing("box")
+    np.testing.assert_allclose(
+        rotation_spread(np.array([np.eye(3), z])), [0.3, 0.0, 0.0], atol=1e-9
+    )
+    assert rotation_spread(np.array([np.eye(3), z, x]))[1] > 0.1
+    thing = make_target("box")
     values = np.zeros((3, len(thing.body(np.eye(4)).kinematics.names)))
     turning = values + np.random.default_rng(1).uniform(-0.8, 0.8, values.shape)
     for some, refused in ((values, "by 0 degrees"), (turning[:2], "too few"), (turning, None)):
         frames = [PosedFrame("", one, np.ones((2, 2), bool)) for one in some]
         with nullcontext() if refused is None else pytest.raises(RegistrationError, match=refused):
-            require_turns("eye", thing, frames)
+            require_rotation("eye", thing, frames)
 
 
 def test_a_body_is_placed_where_its_bounds_are_the_silhouettes(posed: PosedFrames) -> None:
     camera = posed.camera
-    p_CW = place_by_bounds(posed, camera.X_CW[None, :3, :3])[0]
+    p_CW = positions_from_bounds(posed, camera.X_CW[None, :3, :3])[0]
     assert np.linalg.norm(p_CW - camera.X_CW[:3, 3]) < 0.03
     # Before the camera it is whatever rotation is tried.
-    R_CW = spread_rotations(200)
-    depths = (place_by_bounds(posed, R_CW) + R_CW @ posed.middle)[:, 2]
+    R_CW = uniform_rotations(200)
+    depths = (positions_from_bounds(posed, R_CW) + R_CW @ posed.middle)[:, 2]
     assert depths.min() >= 0.5 * posed.extent - 1e-9
 
 
@@ -231,11 +236,11 @@ LOOKS = {
 
 
 @pytest.fixture(scope="module")
-def standing(
+def make_target(
     model: ArticulatedModel, tmp_path_factory: pytest.TempPathFactory
-) -> Callable[[str], StandingObject]:
+) -> Callable[[str], CalibrationTarget]:
     @cache
-    def stand(name: str) -> StandingObject:
+    def stand(name: str) -> CalibrationTarget:
         path = tmp_path_factory.mktemp("thing") / "thing.urdf"
         looks = f"<geometry>{LOOKS[name][0]}</geometry>"
         shape = f'<visual><origin xyz="0.3 0 0.1"/>{looks}</visual>'
@@ -243,21 +248,21 @@ def standing(
         tree = load_model(path, check=False).pose_tree(
             "thing", root_position=np.zeros(3), root_rotation=RootRotation.fixed()
         )
-        return StandingObject(model, "roll", {}, tree)
+        return CalibrationTarget(model, "roll", {}, tree)
 
     return stand
 
 
 @pytest.mark.parametrize("name", LOOKS)
 def test_turns_after_which_an_object_looks_alike(
-    name: str, standing: Callable[[str], StandingObject]
+    name: str, make_target: Callable[[str], CalibrationTarget]
 ) -> None:
     _, turns, axes, apart = LOOKS[name]
-    thing = standing(name)
+    thing = make_target(name)
     found, about = thing.symmetry
-    assert (len(found), len(about), len(distinct_turns(found, about))) == (turns, axes, apart)
+    assert (len(found), len(about), len(distinct_motions(found, about))) == (turns, axes, apart)
     np.testing.assert_allclose(found[0], np.eye(4), atol=1e-12)
-    points = thing.alone.all[0].vertices
+    points = thing.in_own_frame.full[0].vertices
     assert np.linalg.norm(points - [0.3, 0.0, 0.1], axis=1).max() == pytest.approx(thing.radius)
     corners = np.abs(points - thing.middle).max(axis=0)
     for X in found:
@@ -270,15 +275,17 @@ def test_turns_of_a_round_object_differ_where_its_axis_points_elsewhere() -> Non
     rotvecs = np.radians([[0, 0, 0], [0, 0, 15], [30, 0, 0], [30, 0, 0], [0, 8, 0], [180, 0, 0]])
     turns = np.tile(np.eye(4), (6, 1, 1))
     turns[:, :3, :3] = Rotation.from_rotvec(rotvecs).as_matrix()
-    round_about_z = distinct_turns(turns, np.array([[0.0, 0.0, 1.0]]))
+    round_about_z = distinct_motions(turns, np.array([[0.0, 0.0, 1.0]]))
     np.testing.assert_array_equal(round_about_z, turns[[0, 2, 4, 5]])
 
 
 def test_an_object_that_is_round_may_be_turned_about_its_axis_by_anything(
-    standing: Callable[[str], StandingObject],
+    make_target: Callable[[str], CalibrationTarget],
 ) -> None:
     X_WT = looking_at(PLACE, MIDDLE, 0.4).X_WC
-    box, can = (standing(name).pose_covariance(X_WT, 1e-6 * np.eye(6)) for name in ("box", "can"))
+    box, can = (
+        make_target(name).pose_covariance(X_WT, 1e-6 * np.eye(6)) for name in ("box", "can")
+    )
     axis = X_WT[:3, 2]
     assert axis @ box[:3, :3] @ axis == pytest.approx(1e-6)
     assert axis @ can[:3, :3] @ axis == pytest.approx(np.pi**2 / 3.0, rel=1e-3)
@@ -287,10 +294,10 @@ def test_an_object_that_is_round_may_be_turned_about_its_axis_by_anything(
 
 
 def test_an_object_s_covariance_is_that_of_its_moves(
-    standing: Callable[[str], StandingObject],
+    make_target: Callable[[str], CalibrationTarget],
 ) -> None:
     """J sigma J^T, J the derivative of the pose by TARGET_POSITIONS."""
-    thing, X_WT = standing("box"), looking_at(PLACE, MIDDLE, 0.4).X_WC
+    thing, X_WT = make_target("box"), looking_at(PLACE, MIDDLE, 0.4).X_WC
     J = np.zeros((6, 6))
     for k in range(6):
         X = thing.moved(X_WT, 1e-6 * np.eye(6)[k])
@@ -307,15 +314,15 @@ def test_masks_of_another_size_and_empty_ones_are_refused(
     for mask in (np.ones((10, 10), bool), np.zeros((480, 640), bool)):
         frame = PosedFrame("0007", posed.frames[0].values, mask)
         with pytest.raises(MaskError, match="camera 'eye', frame '0007'"):
-            PosedFrames(body.kinematics, body.few, posed.camera, [frame])
+            PosedFrames(body.kinematics, body.medium, posed.camera, [frame])
 
 
 def test_poses_of_an_object_are_one_that_show_it_alike(
-    standing: Callable[[str], StandingObject],
+    make_target: Callable[[str], CalibrationTarget],
 ) -> None:
     """Nearer to each other than a share of its radius, or turned as its looks repeat."""
-    thing = standing("box")
-    search, X = ObjectSearch(thing), looking_at(PLACE, MIDDLE, 0.4).X_WC
+    thing = make_target("box")
+    search, X = TargetSearch(thing), looking_at(PLACE, MIDDLE, 0.4).X_WC
     near, far = X.copy(), X.copy()
     near[0, 3] += 0.1 * thing.radius
     far[0, 3] += 0.3 * thing.radius
@@ -327,25 +334,25 @@ def test_poses_of_an_object_are_one_that_show_it_alike(
 
 
 def test_a_camera_on_a_hand_and_what_it_sees_are_found_together(
-    standing: Callable[[str], StandingObject],
+    make_target: Callable[[str], CalibrationTarget],
 ) -> None:
     """From near both, and told from other looks; a region that is none of it is not chosen."""
-    thing = standing("box")
-    search, rng = ObjectSearch(thing), np.random.default_rng(6)
+    thing = make_target("box")
+    search, rng = TargetSearch(thing), np.random.default_rng(6)
     camera, still = looking_at(PLACE, MIDDLE, 0.1).resized(160, 120), np.eye(4)
     X_LC = random_poses(rng, 1)[0]
     values = rng.uniform(-0.12, 0.12, (5, len(thing.body(still).kinematics.names)))
     values[:, [name in TARGET_POSITIONS for name in thing.body(still).kinematics.names]] = 0.0
     still[:3, 3] = [0.0, 0.0, 0.9] - thing.middle
-    X_WT = thing.hand_poses(values).mean(axis=0)
+    X_WT = thing.link_poses(values).mean(axis=0)
     X_WT[:3, :3] = Rotation.from_matrix(X_WT[:3, :3]).as_matrix()
     true = np.array([X_LC, X_WT @ X_LC @ still])
 
     def mask(X_CT: np.ndarray) -> np.ndarray:
-        return draw_mask(thing.alone.all, X_CT[None], camera)
+        return draw_mask(thing.in_own_frame.full, X_CT[None], camera)
 
     frames = [
-        PosedFrame(f"{k}", row, mask(search.seen_from(true[None], row)[0]))
+        PosedFrame(f"{k}", row, mask(search.poses_in_camera(true[None], row)[0]))
         for k, row in enumerate(values)
     ]
     other = PosedFrame("0", values[0], np.roll(frames[0].mask, 30, axis=1))
@@ -358,7 +365,7 @@ def test_a_camera_on_a_hand_and_what_it_sees_are_found_together(
     both = search._misfits(camera, [[other, frames[0]], [frames[1]]], true[None], 100.0)
     assert both[0] < 0.05
     fit = search._fit(camera, frames, off)
-    found = search._look(fit, fit.fit([STEP] * 12), off)
+    found = search._fitted(fit, fit.fit([STEP] * 12), off)
     began, ended = search._misfits(camera, [[one] for one in frames], np.array([off, found]), 100.0)
     assert ended < 0.3 * began
     # One look after a turn that shows the object alike is the same, others are not.
@@ -376,13 +383,13 @@ def looking_off(turn: float, shift: list[float]) -> np.ndarray:
 
 NAMED = SimpleNamespace(
     names=("pose", "elbow", "length of arm"),
-    seen=[SimpleNamespace(kinematics=SimpleNamespace(names=("elbow",)))],
+    views=[SimpleNamespace(kinematics=SimpleNamespace(names=("elbow",)))],
     constants=("elbow", "length of arm"),
 )
 
 
-def shared(*values: float) -> Shared:
-    return Shared(np.array(values), np.zeros(0))
+def shared(*values: float) -> SharedValues:
+    return SharedValues(np.array(values), np.zeros(0))
 
 
 @pytest.mark.parametrize("share", [0.99, 1.01])
@@ -438,12 +445,14 @@ def test_what_bends_the_cost_less_than_it_should_is_as_much_less_sure(
     covariance = np.cov(rng.normal(size=(3, 9)))
     asked: list[np.ndarray] = []
 
-    def bend(found, by, step, which):
+    def cost_curvature(found, by, step, included):
         asked.append(by)
         return share * 7.0, 7.0
 
-    fit = SimpleNamespace(names=NAMED.names, constants=("length of arm",), bend=bend)
-    found = as_the_cost_bends(fit, shared(0, 0, 0), np.ones(1, bool), covariance)
+    fit = SimpleNamespace(
+        names=NAMED.names, constants=("length of arm",), cost_curvature=cost_curvature
+    )
+    found = widen_to_cost_curvature(fit, shared(0, 0, 0), np.ones(1, bool), covariance)
     assert found[2, 2] == pytest.approx(times * covariance[2, 2])
     # Along what goes with it; across it nothing changes.
     (along,) = asked
@@ -482,14 +491,14 @@ def test_a_bundle_finds_poses_and_a_camera_together(body: RegistrationBody) -> N
     true = rng.uniform(-0.8, 0.8, (3, len(kinematics.names)))
     for k, values in enumerate(true):
         X_WN = kinematics.poses(values)
-        masks = {one.name: draw_mask(body.few, one.X_CW @ X_WN, one) for one in cameras}
+        masks = {one.name: draw_mask(body.medium, one.X_CW @ X_WN, one) for one in cameras}
         frames.append(SeenFrame(f"{k}", values + rng.normal(0.0, 0.02, len(values)), masks))
     X_WC = cameras[1].X_WC.copy()
     X_WC[:3, 3] += [0.02, -0.02, 0.02]
     given = [cameras[0], cameras[1].with_pose(X_WC)]
     nothing = np.zeros(len(kinematics.names), bool)
     (camera,), (covariance,), values, radius_scales = adjust_bundle(
-        kinematics, body.few, given, ("b",), frames, nothing, telling_frames=1
+        kinematics, body.medium, given, ("b",), frames, nothing, covariance_frames=1
     )
     shift, turn = errors(camera.X_WC, cameras[1].X_WC)
     assert shift < 0.012
@@ -514,14 +523,14 @@ def per_frame(body: RegistrationBody, posed: PosedFrames) -> tuple[PerFrameFit, 
     camera = posed.camera
     flat = ParallelCamera("flat", 640, 480, 300.0, camera.center_x, camera.center_y, camera.X_WC)
     frames = [SeenFrame(one.name, one.values, {"eye": one.mask}) for one in posed.frames]
-    surfaces = (body.few, body.all)
+    surfaces = (body.medium, body.full)
     return PerFrameFit(body.kinematics, surfaces, [camera, flat], frames), frames
 
 
 @pytest.mark.parametrize("wider", [-2, 1, 2])
 def test_masks_are_as_much_wider_as_they_were_made(per_frame, body, wider: int) -> None:
     fit, (frame, *_) = per_frame
-    posed_body = body.kinematics, body.few
+    posed_body = body.kinematics, body.medium
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * abs(wider) + 1,) * 2)
     widths = []
     for by in (0, wider):
@@ -532,7 +541,7 @@ def test_masks_are_as_much_wider_as_they_were_made(per_frame, body, wider: int) 
         seen = Observation(made.edges(fit.cameras, fit.size / 100.0))
         theta = np.zeros(len(parameter_names(BodyParameters(*posed_body), fit.cameras)))
         theta[: len(frame.values)] = frame.values
-        widths.append(fit.with_widths(seen, theta)[-2])
+        widths.append(fit.with_boundary_biases(seen, theta)[-2])
     assert widths[1] - widths[0] == pytest.approx(wider, abs=0.35)
 
 
@@ -545,13 +554,13 @@ def test_cameras_that_move_like_a_pixel_or_a_longer_lens_see_that(per_frame) -> 
         p_C = np.array([[x, y, z] for x in (-0.1, 0.1) for y in (-0.1, 0.1)])
         first = len(fit.joints) + 6 * k
         rows = slice(first, first + 6)
-        for axis, moves in enumerate(fit.center_moves([k]).T):
+        for axis, moves in enumerate(fit.center_jacobian([k]).T):
             turn, shift = np.split((moves * fit.deviations)[rows], 2)
             pivot = np.array([0.0, 0.0, z])
             moved = (p_C - pivot) @ Rotation.from_rotvec(turn).as_matrix().T + pivot + shift
             off = still.project(moved)[0] - still.project(p_C)[0]
             np.testing.assert_allclose(off.mean(axis=0), np.eye(2)[axis], atol=0.02)
-        shift = (fit.focal_moves([k])[:, 0] * fit.deviations)[rows][3:]
+        shift = (fit.focal_jacobian([k])[:, 0] * fit.deviations)[rows][3:]
         moved, larger = p_C + 1e-4 * shift, np.array([camera.center_x, camera.center_y])
         off = (still.project(moved)[0] - still.project(p_C)[0]) / 1e-4
         is_flat = isinstance(camera, ParallelCamera)
@@ -568,7 +577,7 @@ def test_offsets_and_the_camera_that_goes_with_them_come_nearer_by_their_size(
     """Monte Carlo: mean squared errors over those of the fit, of six offsets and of a pose."""
     rng, names = np.random.default_rng(2), tuple("abcdef")
     kinematics = SimpleNamespace(names=names, is_angle=np.ones(6, bool))
-    fit = SimpleNamespace(names=("pose", *names), seen=[SimpleNamespace(kinematics=kinematics)])
+    fit = SimpleNamespace(names=("pose", *names), views=[SimpleNamespace(kinematics=kinematics)])
     # The pose takes up what the first offset errs by.
     A = np.diag([0.002, *([0.01] * 6)])
     A[0, 1] = -0.02
@@ -576,7 +585,7 @@ def test_offsets_and_the_camera_that_goes_with_them_come_nearer_by_their_size(
     for _ in range(200):
         true = np.append(0.0, size * rng.normal(size=6))
         seen = true + A @ rng.normal(size=7)
-        drawn = drawn_together(fit, Shared(seen, np.zeros(0)), A @ A.T, names)
+        drawn = shrink_constants(fit, SharedValues(seen, np.zeros(0)), A @ A.T, names)
         errors.append([np.square(drawn - true), np.square(seen - true)])
     after, before = np.mean(errors, axis=0)
     for ratio in (after[0] / before[0], after[1:].sum() / before[1:].sum()):
@@ -588,9 +597,9 @@ def test_a_first_joint_is_as_unsure_as_pictures_of_still_parts() -> None:
     fit = SimpleNamespace(names=("eye.turn_y", "base", "elbow"), constants=("base", "elbow"))
     A = np.array([[1.0, 0.1, 0.0], [1.0, 0.0, 0.0], [0.2, 0.0, 1.0]])
     covariance = A @ A.T
-    same, none = wider_with_cameras(fit, covariance, 1.0)
+    same, none = widen_with_cameras(fit, covariance, 1.0)
     np.testing.assert_array_equal(same, covariance)
-    wider, gauges = wider_with_cameras(fit, covariance, 2.5)
+    wider, gauges = widen_with_cameras(fit, covariance, 2.5)
     assert (none, gauges) == ({}, {"base": ("eye.turn_y",)})
     np.testing.assert_allclose(wider[1, 1], 2.5**2 * covariance[1, 1])
     np.testing.assert_allclose(wider[0, 0] - covariance[0, 0], 2.5**2 - 1.0)

@@ -65,8 +65,8 @@ class ScriptedSearch:
             for frame in frames
         ]
         misfits = [
-            FrameMisfit(frame.name, 0.02, 0.98, 0.97 if agrees else 0.2, agrees)
-            for frame, agrees in zip(frames, agreeing, strict=True)
+            FrameMisfit(frame.name, 0.02, 0.98, 0.97 if is_inlier else 0.2, is_inlier)
+            for frame, is_inlier in zip(frames, agreeing, strict=True)
         ]
         covariance = np.diag(np.full(6, self.deviation**2))
         alternatives = np.tile(np.eye(4), (others, 1, 1))
@@ -181,7 +181,7 @@ class TestMovedCamera:
         assert state.registered is known.registered
         state, statuses = follow(online, state, [frame("here", TURNS[6])])
         assert statuses == [REGISTERED]
-        assert (state.moves, state.contradicting) == (0, ())
+        assert (state.moves, state.outlier_frames) == (0, ())
 
     def test_a_pose_that_is_not_known_well_is_corrected_and_has_not_moved(
         self, online, search, known

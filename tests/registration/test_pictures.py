@@ -12,16 +12,16 @@ from drake_pose.errors import RegistrationError
 from drake_pose.fit.background import Explained
 from drake_pose.fit.problem import TIME_OFFSET
 from drake_pose.registration.picture_registration import (
-    Begun,
     PictureRegistration,
+    PictureStart,
     Recording,
     TimeOffset,
     choose_pictures,
+    evaluate_pictures,
     fit_pictures,
-    judge_pictures,
     posed_pictures,
     register_pictures,
-    scan_offsets,
+    scan_time_offsets,
 )
 from drake_pose.registration.picture_search import (
     PictureSearch,
@@ -32,7 +32,7 @@ from drake_pose.registration.picture_search import (
     node_places,
     upright_rotations,
 )
-from drake_pose.registration.standing_object import require_seen
+from drake_pose.registration.standing_object import require_detections
 from tests.benchmarks.registration import pose_error
 from tests.registration.arm_pictures import errors
 from tests.registration.episodes import LATE, PaintedEpisode
@@ -45,7 +45,7 @@ NO_SCORES = np.zeros((0, 2))
 def level(episode: PaintedEpisode) -> PyramidLevel:
     X_WN = np.array([episode.body.kinematics.poses(one) for one in episode.values[:LEVEL_FRAMES]])
     pictures = episode.pictures[:LEVEL_FRAMES]
-    return PyramidLevel(episode.body.very_few, episode.camera, pictures, X_WN, 80)
+    return PyramidLevel(episode.body.coarse, episode.camera, pictures, X_WN, 80)
 
 
 def test_starts_show_a_body_where_pictures_change_and_about_as_large(level: PyramidLevel) -> None:
@@ -183,7 +183,7 @@ def test_a_recording_s_clock_and_zeros(episode, recording) -> None:
     at = 1.1 * given.times - 0.2
     np.testing.assert_allclose(drifting.values_at(0.3), episode.values_at(at + 0.3))
     np.testing.assert_allclose(
-        given.with_zeros(np.arange(5.0)).values_at(0.0) - given.values_at(0.0),
+        given.with_offsets(np.arange(5.0)).values_at(0.0) - given.values_at(0.0),
         np.tile(np.arange(5.0), (16, 1)),
     )
     slopes = (episode.values_at(at + 1e-4) - episode.values_at(at - 1e-4)) / 2e-4
@@ -195,7 +195,7 @@ def test_a_recording_s_clock_and_zeros(episode, recording) -> None:
 
 
 def test_a_clock_is_told_by_what_its_offsets_explain(episode, recording) -> None:
-    clock = scan_offsets(episode.body, episode.camera, recording(), range(0, 16, 2))
+    clock = scan_time_offsets(episode.body, episode.camera, recording(), range(0, 16, 2))
     offset, scores = clock.value, clock.scores
     assert (offset, clock.drift) == (pytest.approx(LATE, abs=0.012), 0.0)
     assert scores[:, 1].max() == 1.0
@@ -207,7 +207,9 @@ def test_a_clock_is_told_by_what_its_offsets_explain(episode, recording) -> None
         before = np.min(by) <= -0.31
         return np.full((16, 5), np.nan) if before else episode.values_at(episode.times + by)
 
-    told = scan_offsets(episode.body, episode.camera, recording(values_at=logged), range(0, 16, 2))
+    told = scan_time_offsets(
+        episode.body, episode.camera, recording(values_at=logged), range(0, 16, 2)
+    )
     assert told.value == offset
     assert told.scores[0, 0] == pytest.approx(-0.3)
 
@@ -224,7 +226,7 @@ def test_a_rate_that_is_far_off_is_told_with_the_offset_of_the_middle(
         return episode.values_at(first + since / (1.0 + rate) + LATE)
 
     shown = range(0, 16, 2)
-    told = scan_offsets(episode.body, episode.camera, recording(values_at=logged), shown)
+    told = scan_time_offsets(episode.body, episode.camera, recording(values_at=logged), shown)
     assert told.drift == pytest.approx(rate)
     middle = float(np.mean(episode.times[list(shown)] - first))
     assert told.value == pytest.approx(rate * middle, abs=0.051)
@@ -242,14 +244,14 @@ def test_a_search_ends_about_where_the_camera_is(episode) -> None:
     shift, turn = errors(np.linalg.inv(found[0]), episode.camera.X_WC)
     assert shift < 0.15
     assert turn < np.radians(8.0)
-    camera, told = search.approach(found[0])
+    camera, told = search.coarse_fit(found[0])
     shift, turn = errors(camera.X_WC, episode.camera.X_WC)
     assert shift < 0.01
     assert turn < np.radians(0.5)
     assert told == search.compared.explained(camera.X_CW)
     assert evidence(*told) == pytest.approx(told[0] + 4.0 * told[1])
     # A body that leaves the pictures is not fitted.
-    assert search.approach(np.diag([-1.0, 1.0, -1.0, 1.0]) @ found[0]) is None
+    assert search.coarse_fit(np.diag([-1.0, 1.0, -1.0, 1.0]) @ found[0]) is None
 
 
 def test_parts_that_are_small_or_stand_still_do_not_carry_a_search(episode) -> None:
@@ -258,11 +260,11 @@ def test_parts_that_are_small_or_stand_still_do_not_carry_a_search(episode) -> N
     assert search.compared.camera.width == 160
     assert search._level(64) is search._level(64)
     shown = [[len(one.vertices) > 0 for one in outlines] for outlines in search._outlines]
-    radii = np.array([one.ball[3] for one in episode.body.very_few])
+    radii = np.array([one.ball[3] for one in episode.body.coarse])
     assert shown[1] == shown[2] == (radii > 0).tolist()
     assert shown[0] == (radii >= 0.25 * radii.max()).tolist()
     # What moves by less than six hundredths of the body's size stands still.
-    outlines, counts = episode.body.very_few, set()
+    outlines, counts = episode.body.coarse, set()
     for share in np.geomspace(0.02, 0.3, 8):
         values = episode.values[:6].mean(axis=0)
         values = values + share * (episode.values[:6] - values)
@@ -275,8 +277,8 @@ def test_parts_that_are_small_or_stand_still_do_not_carry_a_search(episode) -> N
         everything = np.concatenate([one.reshape(-1, 3) for one in places])
         size = np.linalg.norm(everything.std(axis=0))
         moves = [np.linalg.norm(np.ptp(one, axis=0), axis=1).max(initial=0.0) for one in places]
-        np.testing.assert_array_equal(level._still, np.array(moves) < 0.06 * size)
-        counts.add(int(level._still.sum()))
+        np.testing.assert_array_equal(level._static, np.array(moves) < 0.06 * size)
+        counts.add(int(level._static.sum()))
     assert len(counts) > 2
 
 
@@ -286,8 +288,8 @@ def registered(episode, recording) -> PictureRegistration:
     turn = np.eye(4)
     turn[:3, :3] = Rotation.from_rotvec(np.radians([0.5, -0.6, 0.6])).as_matrix()
     near = episode.camera.with_pose(turn @ episode.camera.X_WC)
-    begun = Begun(near, range(0, 16, 3), TimeOffset(LATE - 0.01, np.inf, NO_SCORES), ())
-    return fit_pictures(episode.body, begun, recording())
+    start = PictureStart(near, range(0, 16, 3), TimeOffset(LATE - 0.01, np.inf, NO_SCORES), ())
+    return fit_pictures(episode.body, start, recording())
 
 
 def test_a_clock_is_fitted_with_a_camera_and_told_as_surely_as_it_is(registered, episode) -> None:
@@ -299,7 +301,7 @@ def test_a_clock_is_fitted_with_a_camera_and_told_as_surely_as_it_is(registered,
     assert abs(clock.value - LATE) < 4.0 * clock.deviation
     assert clock.deviation < 0.003
     assert clock.drift == 0.0
-    assert all(one.agrees for one in registered.found.frames)
+    assert all(one.is_inlier for one in registered.found.frames)
     # Masks and log-odds are those of the joints' values before the last step.
     values = episode.values_at(episode.times[::3] + LATE - 0.01)
     np.testing.assert_allclose([one.values for one in registered.frames], values)
@@ -318,13 +320,13 @@ def test_pictures_are_judged_by_where_the_others_show_a_body(registered, episode
         values_at=lambda offset: registered.recording.values_at(offset) - zeros,
     )
     one = replace(registered, recording=shown, zeros=zeros)
-    frames, misfits, lost = judge_pictures(episode.body, one, registered.found)
+    frames, misfits, lost = evaluate_pictures(episode.body, one, registered.found)
     told = {one.frame: one for one in misfits}
-    assert {name for name, one in told.items() if not one.agrees} | {*lost} == {
+    assert {name for name, one in told.items() if not one.is_inlier} | {*lost} == {
         "0005",
         "0009",
     }
-    assert min(one.iou for one in told.values() if one.agrees) > 0.9
+    assert min(one.iou for one in told.values() if one.is_inlier) > 0.9
     expected = {f"{k:04d}": row - zeros for k, row in enumerate(episode.values)}
     for frame in frames:
         np.testing.assert_allclose(frame.values, expected[frame.name], atol=0.01)
@@ -333,14 +335,14 @@ def test_pictures_are_judged_by_where_the_others_show_a_body(registered, episode
     away = np.eye(4)
     away[:3, :3] = np.diag([-1.0, 1.0, -1.0])
     behind = registered.found.camera.with_pose(registered.found.camera.X_WC @ away)
-    nothing = judge_pictures(episode.body, one, replace(registered.found, camera=behind))
+    nothing = evaluate_pictures(episode.body, one, replace(registered.found, camera=behind))
     assert nothing == ((), (), ())
 
 
 @pytest.mark.parametrize(("count", "of", "enough"), [(3, 4, False), (4, 8, True), (4, 9, False)])
 def test_a_target_is_seen_in_four_pictures_and_half_of_them(count, of, enough) -> None:
     with nullcontext() if enough else pytest.raises(RegistrationError, match=f"{count} of {of}"):
-        require_seen("hand", count, of)
+        require_detections("hand", count, of)
 
 
 def near(camera, degrees=2.0):
@@ -373,7 +375,7 @@ def test_a_drift_and_a_focal_length_are_fitted_on_lines(episode, recording):
     fitted = search(drifting).fit(near(episode.camera, 0.5), (TIME_OFFSET,))
     every = np.ones(len(later), bool)
     covariance = sum(fitted.fit.covariances(fitted.found, every))
-    drift, deviation = fitted.fit.growth(fitted.found, TIME_OFFSET, later, every, covariance)
+    drift, deviation = fitted.fit.fit_slope(fitted.found, TIME_OFFSET, later, every, covariance)
     assert drift == pytest.approx(0.005, abs=0.002)
     assert 0.0 < deviation < 0.004
     # The wrong focal length is told, too.

@@ -10,8 +10,8 @@ from drake_pose.registration.posed_frames import PosedFrame
 from drake_pose.registration.register import (
     CameraSearch,
     RegistrationBody,
-    spread_rotations,
     suggest_pose,
+    uniform_rotations,
 )
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from tests.registration.arm_pictures import errors, looking_at, see
@@ -42,7 +42,7 @@ class TestCameraSearch:
         shift, turn = errors(found.camera.X_WC, camera.X_WC)
         assert shift < 2e-3
         assert turn < np.radians(0.1)
-        assert not found.contradictions
+        assert not found.outliers
         assert not len(found.alternatives)
         assert shift < 4.0 * np.sqrt(3.0) * found.translation_sd < 0.01
         assert all(frame.iou > 0.99 for frame in found.frames)
@@ -55,7 +55,7 @@ class TestCameraSearch:
         frames[3] = PosedFrame("0003", -frames[3].values, frames[3].mask)
         found = CameraSearch(body).register(camera, frames)
         shift, turn = errors(found.camera.X_WC, camera.X_WC)
-        assert found.contradictions == ("0003",)
+        assert found.outliers == ("0003",)
         assert shift < 3e-3
         assert turn < np.radians(0.15)
 
@@ -67,7 +67,7 @@ class TestCameraSearch:
 
 class TestSpreadRotations:
     def test_no_rotation_is_far_from_all(self) -> None:
-        R = spread_rotations(3000)
+        R = uniform_rotations(3000)
         assert np.allclose(R @ np.swapaxes(R, 1, 2), np.eye(3), atol=1e-12)
         others = Rotation.random(500, random_state=3).as_matrix()
         trace_parts = np.einsum("nij,kij->kn", R, others)
@@ -94,7 +94,7 @@ class TestSuggestPose:
         kinematics = body.kinematics
         assert np.all((values >= kinematics.lower) & (values <= kinematics.upper))
         X_WN = kinematics.poses(values)
-        for outline, X in zip(body.all, X_WN, strict=True):
+        for outline, X in zip(body.full, X_WN, strict=True):
             # Its surfaces' points, but for what the coarse ones leave out.
             assert (outline.vertices @ X[0, :3] + X[0, 3]).min() > BEHIND[1][0] - 0.02
         q, X_WB = body.tree.positions_from(kinematics.split(values))

@@ -25,7 +25,7 @@ def episode(tmp_path_factory):
 
 def drawn(episode, values):
     body = episode.body
-    return draw_mask(body.all, episode.camera.X_CW @ body.kinematics.poses(values), episode.camera)
+    return draw_mask(body.full, episode.camera.X_CW @ body.kinematics.poses(values), episode.camera)
 
 
 def test_poses_come_nearer_and_masks_are_what_is_drawn(episode):
@@ -100,7 +100,7 @@ def test_what_agrees_better_is_searched_nearer(share, agreements, left):
 
 
 def test_smaller_pictures_are_those_of_smaller_cameras(episode):
-    small = PictureLevel((episode.camera,), [[episode.pictures[0]], [None]]).smaller(0.5)
+    small = PictureLevel((episode.camera,), [[episode.pictures[0]], [None]]).downscaled(0.5)
     (camera,), ((picture,), (nothing,)) = small
     assert picture.shape == (camera.height, camera.width, 3) == (60, 80, 3)
     assert nothing is None

@@ -30,7 +30,7 @@ from drake_pose.jobs.registration.diagnosis import (
     say_lost,
     shift_unit,
 )
-from drake_pose.jobs.registration.inputs import Inputs, read_inputs
+from drake_pose.jobs.registration.inputs import RegistrationInputs, read_inputs
 from drake_pose.jobs.registration.large_errors import SceneComparison
 from drake_pose.jobs.registration.result import (
     describe_pictures,
@@ -43,10 +43,10 @@ from drake_pose.jobs.registration.settings import AuditSettings
 from drake_pose.registration.diagnosis import DIAGNOSIS
 from drake_pose.registration.findings import Diagnosis, Finding
 from drake_pose.registration.picture_registration import (
-    Begun,
     PictureRegistration,
+    PictureStart,
+    evaluate_pictures,
     fit_pictures,
-    judge_pictures,
     register_pictures,
 )
 from drake_pose.registration.posed_frames import PosedFrame, SeenFrame
@@ -101,12 +101,12 @@ def audit_scene(
         inputs = read_inputs(Path(scene), Path(model), table, own, settings)
         pictures = _Pictures()
         if inputs.recordings:
-            given, (inputs, pictures) = inputs, _look_at_episode(inputs)
+            given, (inputs, pictures) = inputs, _find_cameras(inputs)
             compared = SceneComparison(inputs, on_frame).run()
             zeros = [one.name for one in compared.found.common if one.kind == "joint"]
             if zeros:
                 # Masks were found with these as they are, and lean on them.
-                inputs, pictures = _look_at_episode(given, pictures, zeros)
+                inputs, pictures = _find_cameras(given, pictures, zeros)
                 compared = SceneComparison(inputs).run()
         else:
             compared = SceneComparison(inputs, on_frame).run()
@@ -114,7 +114,7 @@ def audit_scene(
     found = replace(found, common=(*pictures.findings, *found.common))
     seconds = time.perf_counter() - begin
     warnings = [*inputs.warnings, *compared.warnings, *_doubts(inputs, found, unseen)]
-    names = [camera.name for camera in inputs.held]
+    names = [camera.name for camera in inputs.known_cameras]
     units = zip(inputs.model.position_names, user_units(inputs.model), strict=True)
     noticed = {
         name: unit * found.minimum_detectable[name]
@@ -125,7 +125,7 @@ def audit_scene(
     summary = {
         "contradictions": _describe_contradictions(found),
         "frame_count": len(found.frames),
-        "agreeing_count": len(found.frames) - len(found.contradicting),
+        "agreeing_count": len(found.frames) - len(found.outliers),
         "frames": {
             one.frame: {
                 "agrees": one.finding is None,
@@ -175,9 +175,12 @@ class _Pictures:
     names: Mapping[str, tuple[str, str]] = field(default_factory=dict)
 
 
-def _look_at_episode(
-    inputs: Inputs, before: _Pictures | None = None, zeros: Sequence[str] = (), near: float = 0.08
-) -> tuple[Inputs, _Pictures]:
+def _find_cameras(
+    inputs: RegistrationInputs,
+    before: _Pictures | None = None,
+    zeros: Sequence[str] = (),
+    near: float = 0.08,
+) -> tuple[RegistrationInputs, _Pictures]:
     """Finds each camera of an episode in its pictures, and masks in all of these.
 
     Args:
@@ -191,29 +194,32 @@ def _look_at_episode(
         RegistrationError: no pose of a camera explains its pictures.
     """
     path = inputs.scene.path
-    if not inputs.given:
+    if not inputs.given_cameras:
         raise SceneError(
             f"{path}: no camera has an X_WC that could be audited; give a camera file "
             "(--cameras FILE), or find out where they stand: drake-pose register"
         )
-    alone, body = len(inputs.given) == 1, RegistrationBody(inputs.tree, inputs.seen)
-    warnings = say_left_out(inputs.recordings, [one.name for one in inputs.given])
+    alone, body = (
+        len(inputs.given_cameras) == 1,
+        RegistrationBody(inputs.tree, inputs.visible_nodes),
+    )
+    warnings = say_left_out(inputs.recordings, [one.name for one in inputs.given_cameras])
     held, findings, pictures = list[Camera](), list[Finding](), dict[str, PictureRegistration]()
     names, frames = dict[str, tuple[str, str]](), list[SeenFrame]()
-    for given in inputs.given:
+    for given in inputs.given_cameras:
         name, recording = given.name, inputs.recordings[given.name]
         if before is None:
             one = register_pictures(body, given, recording, zeros=zeros)
         else:
-            one = fit_pictures(body, Begun.of(before.found[name]), recording, zeros=zeros)
+            one = fit_pictures(body, PictureStart.of(before.found[name]), recording, zeros=zeros)
         pictures[name] = one
         values = np.array([frame.values + one.zeros for frame in one.frames])
         off = compare_camera(body, given, one.found, values, alone)
-        is_near = off.pixels < near * one.fit.fit.seen[0].size
+        is_near = off.pixels < near * one.fit.fit.views[0].size
         held.append(given if is_near else one.found.camera)
         findings += [] if is_near or off.p_value > DIAGNOSIS.significance else [off]
         findings += compare_clock(body, one, recording)
-        seen, _, lost = judge_pictures(body, one, one.found)
+        seen, _, lost = evaluate_pictures(body, one, one.found)
         for frame in seen:
             known = frame.name if alone else f"{name}-{frame.name}"
             names[known] = name, frame.name
@@ -225,15 +231,15 @@ def _look_at_episode(
         inputs,
         scene=replace(inputs.scene, frames=tuple(names)),
         warnings=(*inputs.warnings, *warnings),
-        held=tuple(held),
-        given=tuple(one for one in inputs.given if one.name in far),
-        wanted=tuple(names),
+        known_cameras=tuple(held),
+        given_cameras=tuple(one for one in inputs.given_cameras if one.name in far),
+        audited_frames=tuple(names),
         frames=tuple(frames),
     )
     return looked, _Pictures(pictures, tuple(findings), names)
 
 
-def _doubts(inputs: Inputs, found: Diagnosis, unseen: Sequence[str]) -> list[str]:
+def _doubts(inputs: RegistrationInputs, found: Diagnosis, unseen: Sequence[str]) -> list[str]:
     """What a user should know of the frames, and of the file of cameras."""
     warnings = list[str]()
     if found.center is not None:
@@ -250,7 +256,7 @@ def _doubts(inputs: Inputs, found: Diagnosis, unseen: Sequence[str]) -> list[str
     if unseen:
         named = frame_ranges(unseen, inputs.scene.frames)
         warnings.append(f"frame {named}: the masks show nothing: there is nothing to compare")
-    count, agreeing = len(found.frames), len(found.frames) - len(found.contradicting)
+    count, agreeing = len(found.frames), len(found.frames) - len(found.outliers)
     wrong_log = any(one.kind in ("sign", "log") for one in found.common)
     if 2 * agreeing < count and not wrong_log:
         warnings.append(
@@ -262,26 +268,26 @@ def _doubts(inputs: Inputs, found: Diagnosis, unseen: Sequence[str]) -> list[str
 
 def _write_result(
     path: Path,
-    inputs: Inputs,
+    inputs: RegistrationInputs,
     found: Diagnosis,
     pictures: _Pictures,
     overlay: bool,
     summary: Mapping[str, Any],
 ) -> None:
     """Summary and page, and the robot at its encoders' positions over what is at fault."""
-    named, shown = found.contradicting if overlay else (), {}
+    named, shown = found.outliers if overlay else (), {}
     for frame in named if pictures.names else ():
         camera_name, name = pictures.names[frame]
         shown[frame] = inputs.recordings[camera_name].picture(name)
-    for camera in inputs.held if named else ():
+    for camera in inputs.known_cameras if named else ():
         name, titled = camera.name, []
         for one in map(inputs.read, named):
             if name in one.masks:
                 fits = percent(summary["frames"][one.name]["fits"][name])
                 title = f"{name}  frame {one.name}  CONTRADICTS the others  {fits} fits"
                 titled.append((PosedFrame(one.name, one.values, one.masks[name]), title))
-        write_overlays(path, inputs.tree, camera, titled, inputs.seen, shown)
-    for given in inputs.given if overlay else ():
+        write_overlays(path, inputs.tree, camera, titled, inputs.visible_nodes, shown)
+    for given in inputs.given_cameras if overlay else ():
         own = pictures.found[given.name]
         write_comparisons(path, inputs, own.frames, given, own.found, own.pictures)
     write_summary(path, summary)
@@ -312,7 +318,7 @@ def _describe_contradictions(found: Diagnosis) -> list[dict[str, Any]]:
                 f"shift_sd_{unit}": factor * one.shift_sd,
                 "pixels": one.pixels,
                 "p_value": one.p_value,
-                "rivals": list(one.rivals),
+                "rivals": list(one.alternatives),
                 "joints": dict(one.joints),
             }
         )

@@ -14,7 +14,7 @@ from drake_pose.errors import listed
 from drake_pose.files.folder import OVERLAY, REPORT, write_file
 from drake_pose.files.overlay import draw_shapes, encode_png
 from drake_pose.files.report_page import overlay_picture, page_template
-from drake_pose.jobs.registration.inputs import Inputs
+from drake_pose.jobs.registration.inputs import RegistrationInputs
 from drake_pose.jobs.registration.result import AS_GIVEN, body_drawer
 from drake_pose.registration.findings import Diagnosis, Finding
 from drake_pose.silhouette.pictures.scene_checks import frame_ranges
@@ -25,7 +25,7 @@ OnePicture = tuple[str, str, list[Finding]]
 
 def write_audit_page(
     folder: Path,
-    inputs: Inputs,
+    inputs: RegistrationInputs,
     found: Diagnosis,
     summary: Mapping[str, Any],
     overlay: bool = True,
@@ -44,7 +44,7 @@ def write_audit_page(
         kind: [
             one
             for camera in inputs.scene.cameras
-            for frame in sorted(frames, key=found.contradicting.__contains__, reverse=True)
+            for frame in sorted(frames, key=found.outliers.__contains__, reverse=True)
             if (one := overlay_picture(folder, camera, frame, None, kind)) is not None
         ][: most_pictures * len(inputs.scene.cameras)]
         for kind in (AS_GIVEN, OVERLAY)
@@ -168,11 +168,11 @@ def _errors_of(kinds: Sequence[str], name: str, summary: Mapping[str, Any]) -> l
     ]
 
 
-def _draw_outlines(folder: Path, inputs: Inputs, found: Diagnosis, most: int) -> None:
+def _draw_outlines(folder: Path, inputs: RegistrationInputs, found: Diagnosis, most: int) -> None:
     """Draws the robot at positions as given and as found, where joints explain what is off."""
     names = TreeKinematics(inputs.tree).names
     common = [one for one in found.common if corrected(np.zeros(len(names)), names, one)]
-    draw, chosen = body_drawer(inputs.tree, inputs.seen), list[OnePicture]()
+    draw, chosen = body_drawer(inputs.tree, inputs.visible_nodes), list[OnePicture]()
     for one in sorted(found.frames, key=lambda one: -one.pixels):
         own = [] if one.finding is None or one.finding in found.common else [one.finding]
         told = [*common, *(x for x in own if corrected(np.zeros(len(names)), names, x))]
@@ -183,7 +183,7 @@ def _draw_outlines(folder: Path, inputs: Inputs, found: Diagnosis, most: int) ->
         values = seen.values
         for finding in told:
             (values,) = corrected(values, names, finding)
-        for camera in (one for one in inputs.held if one.name in seen.masks):
+        for camera in (one for one in inputs.known_cameras if one.name in seen.masks):
             given = seen.of(camera.name)
             bodies = [draw(camera, replace(given, values=v)) >= 0 for v in (seen.values, values)]
             title = f"{camera.name}  frame {frame}  joints {of}"

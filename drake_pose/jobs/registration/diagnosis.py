@@ -25,28 +25,28 @@ from drake_pose.registration.register import (
     SEARCH,
     CameraSearch,
     E_total,
-    ObjectPose,
     RegisteredCamera,
     RegistrationBody,
-    areas,
-    spread,
+    TargetPose,
+    evenly_spaced,
+    overlap_areas,
 )
 from drake_pose.registration.shared_fit import SHARED, SharedFit
-from drake_pose.registration.standing_object import ObjectSearch
+from drake_pose.registration.standing_object import TargetSearch
 from drake_pose.silhouette.pictures.scene_checks import frame_ranges
 from drake_pose.silhouette.scoring import require_visible
 
-Search = CameraSearch | ObjectSearch
+Search = CameraSearch | TargetSearch
 """What finds a camera, and may find it again with other settings."""
 
 
-def find_misfit(found: RegisteredCamera, min_inlier_ratio: float = 0.65) -> str | None:
+def explain_misfit(found: RegisteredCamera, min_inlier_ratio: float = 0.65) -> str | None:
     """What is wrong with a pose that does not explain the masks; None where it does.
 
     min_inlier_ratio: of the two frames that fit best. A robot that is the masks' leaves 0.83 and
     more, with holes and tools; mirrored masks, another robot's or exchanged frames 0.6 at most.
     """
-    agreeing = [frame for frame in found.frames if frame.agrees]
+    agreeing = [frame for frame in found.frames if frame.is_inlier]
     left = _left(found)
     ratio = float(np.mean(np.sort([frame.inlier_ratio for frame in found.frames])[-2:]))
     if len(found.frames) > 1 and len(agreeing) < 2:
@@ -64,7 +64,7 @@ def find_misfit(found: RegisteredCamera, min_inlier_ratio: float = 0.65) -> str 
 
 def _left(found: RegisteredCamera) -> float:
     """E_total in the median of the frames that agree."""
-    return float(np.median([frame.E_total for frame in found.frames if frame.agrees]))
+    return float(np.median([frame.E_total for frame in found.frames if frame.is_inlier]))
 
 
 def require_explained(
@@ -79,7 +79,7 @@ def require_explained(
 
     Raises RegistrationError: says how much remains, what would fit, and what to look at.
     """
-    misfit = find_misfit(found)
+    misfit = explain_misfit(found)
     if misfit is None:
         return
     search, better = search.rough(), []
@@ -88,7 +88,7 @@ def require_explained(
             other = search.register(camera, seen)
         except RegistrationError:
             continue
-        if find_misfit(other) is None and _left(other) < much_better * _left(found):
+        if explain_misfit(other) is None and _left(other) < much_better * _left(found):
             better.append(text)
     advice = "; ".join(better) or (
         "are these masks of this robot or object, are the joint positions those of these frames, "
@@ -105,7 +105,7 @@ def _alternatives(
     camera: PinholeCamera, frames: Sequence[PosedFrame], most: int = 5
 ) -> Iterator[tuple[str, PinholeCamera, list[PosedFrame]]]:
     """What else may be the case: a text, and the camera and some frames as they would be then."""
-    some = spread(frames, most)
+    some = evenly_spaced(frames, most)
     turned = [
         PosedFrame(frame.name, frame.values, np.ascontiguousarray(frame.mask[:, ::-1]))
         for frame in some
@@ -141,7 +141,9 @@ def require_seen_by(
         own, refused = [one for one in frames if camera.name in one.masks], list[CameraError]()
         for frame in own:
             try:
-                require_visible(body.few, camera.X_CW @ body.kinematics.poses(frame.values), camera)
+                require_visible(
+                    body.medium, camera.X_CW @ body.kinematics.poses(frame.values), camera
+                )
             except CameraError as error:
                 refused.append(error)
         if own and len(refused) == len(own):
@@ -154,8 +156,8 @@ def say_held(
     """Says so where a camera whose X_WC is given does not see the robot where it stands."""
     if not frames:
         return []
-    posed = PosedFrames(body.kinematics, body.all, camera, frames)
-    left = float(np.median(E_total(areas(posed, camera.X_CW[None], np.inf)[0])))
+    posed = PosedFrames(body.kinematics, body.full, camera, frames)
+    left = float(np.median(E_total(overlap_areas(posed, camera.X_CW[None], np.inf)[0])))
     if left < BADLY_EXPLAINED:
         return []
     return [
@@ -211,12 +213,12 @@ def check_focal_length(
         RegistrationError: it is wrong, and with it the camera's distance.
     """
     given = found.camera
-    counted = [frame for frame, fit in zip(frames, found.frames, strict=True) if fit.agrees]
-    few = spread(counted, most)
+    counted = [frame for frame, fit in zip(frames, found.frames, strict=True) if fit.is_inlier]
+    few = evenly_spaced(counted, most)
     if len(few) < 2:
         return found.covariance, []
-    seen = PosedFrames(body.kinematics, body.all, given, few)
-    fit = SharedFit([seen], [given.X_CW], looks=len(POSE_NAMES) + 1)
+    seen = PosedFrames(body.kinematics, body.full, given, few)
+    fit = SharedFit([seen], [given.X_CW], camera_unknowns=len(POSE_NAMES) + 1)
     camera = fit.cameras(fit.fit((*SEARCH.fine, *SEARCH.last)))[0]
     if abs(math.log(camera.focal_x / given.focal_x)) < 0.6 * off_by:
         return found.covariance, []
@@ -309,7 +311,7 @@ def _picture_shift(
     """
     places = []
     for camera, values in (one, other):
-        points = [placed_points(body.very_few, body.kinematics.poses(row)) for row in values]
+        points = [placed_points(body.coarse, body.kinematics.poses(row)) for row in values]
         places.append(camera.project(np.concatenate(points))[0])
     squares = ((places[0] - places[1]) ** 2).sum(axis=1)
     most = math.hypot(one[0].width, one[0].height)
@@ -337,8 +339,8 @@ def say_off(one: Finding, verb: str = "off") -> str:
         return say_drift(one.name, one.shift, one.shift_sd)
     name = "the base" if one.kind == "base" else f"{one.kind} '{one.name}'"
     name = f"the {one.name}" if one.kind in ("focal", "center") else name
-    if one.rivals:
-        name += f" (or {', '.join(one.rivals)}: the masks cannot tell)"
+    if one.alternatives:
+        name += f" (or {', '.join(one.alternatives)}: the masks cannot tell)"
     angle, angle_sd = np.degrees([one.angle, one.angle_sd]).tolist()
     unit, factor = shift_unit(one.kind)
     shift, shift_sd = factor * one.shift, factor * one.shift_sd
@@ -419,14 +421,14 @@ def say_likely_offsets(
     body: RegistrationBody, found: RegisteredCamera, frames: Sequence[PosedFrame]
 ) -> list[str]:
     """That joint offsets would explain what all frames of a camera have in common."""
-    agreeing = {one.frame for one in found.frames if one.agrees}
-    some = spread([one for one in frames if one.name in agreeing], 24)
+    agreeing = {one.frame for one in found.frames if one.is_inlier}
+    some = evenly_spaced([one for one in frames if one.name in agreeing], 24)
     if not some:
         return []
-    seen = PosedFrames(body.kinematics, body.all, found.camera, some, LAST_SPACING)
+    seen = PosedFrames(body.kinematics, body.full, found.camera, some, LAST_SPACING)
     fit = SharedFit([seen], [found.camera.X_CW])
     agree = np.ones(len(some), bool)
-    likely = fit.likely_offsets(fit.fit(SHARED.rounds_with_constants[-1:], fit.start, agree), agree)
+    likely = fit.likely_offsets(fit.fit(SHARED.stages_with_constants[-1:], fit.start, agree), agree)
     turns = dict(zip(body.kinematics.names, body.kinematics.is_angle, strict=True))
     for name, one in likely.items():
         unit, factor = ("deg", math.degrees(1.0)) if turns[name] else ("mm", 1e3)
@@ -471,14 +473,14 @@ def last_before_change(wrong: Sequence[bool], least: int = 2) -> int | None:
     return int(turns[0])
 
 
-def say_outliers(found: RegisteredCamera, of_pictures: bool = False) -> list[str]:
+def say_outliers(found: RegisteredCamera, from_pictures: bool = False) -> list[str]:
     """What a user should know of a camera's frames that contradict, and of other poses.
 
     Raises RegistrationError: half of the masks or more contradict the others. In pictures those of
         the fit agree, and the others may be dark or blurred.
     """
     name, frames = found.camera.name, [frame.frame for frame in found.frames]
-    wrong, texts, moved = found.contradictions, [], ""
+    wrong, texts, moved = found.outliers, [], ""
     last = last_before_change([one in wrong for one in frames])
     if last is not None:
         moved = f" Were camera or base moved after frame '{frames[last]}'?"
@@ -491,7 +493,7 @@ def say_outliers(found: RegisteredCamera, of_pictures: bool = False) -> list[str
         )
         if 2 * right <= len(frames):
             supporting = frame_ranges([one for one in frames if one not in wrong], frames)
-            if not of_pictures:
+            if not from_pictures:
                 raise RegistrationError(
                     f"camera '{name}': half of the frames or more contradict the others, "
                     f"{len(wrong)} of {len(frames)}: {frame_ranges(wrong, frames)}.{moved} Either "
@@ -516,8 +518,8 @@ def say_outliers(found: RegisteredCamera, of_pictures: bool = False) -> list[str
 
 def say_zeros(found: JointCalibration) -> list[str]:
     """What a user should know of zeros and lengths."""
-    asked = [(f"joint '{one.name}': its zero", one) for one in found.zeros]
-    asked += [(f"link '{one.name}': its length", one) for one in found.lengths]
+    asked = [(f"joint '{one.name}': its zero", one) for one in found.offsets]
+    asked += [(f"link '{one.name}': its length", one) for one in found.link_scales]
     if asked and not any(one.significant for _, one in asked):
         return [
             "none of the zeros and lengths that were asked for is significant beside what else may "
@@ -540,11 +542,11 @@ def say_zeros(found: JointCalibration) -> list[str]:
     ]
 
 
-def say_object(seen: ObjectPose) -> list[str]:
+def say_object(seen: TargetPose) -> list[str]:
     """What a user should know of an object whose place was found."""
     texts = []
-    if len(seen.round_about):
-        axes = "; ".join(", ".join(f"{x:.3f}" for x in axis) for axis in seen.round_about)
+    if len(seen.symmetry_axes):
+        axes = "; ".join(", ".join(f"{x:.3f}" for x in axis) for axis in seen.symmetry_axes)
         texts.append(
             f"the target looks alike at every angle about an axis ({axes} in its frame), so how it "
             "is turned about it is not determined; where the camera is does not depend on it"
@@ -557,27 +559,27 @@ def say_object(seen: ObjectPose) -> list[str]:
     return texts
 
 
-def say_common(registered: Iterable[RegisteredCamera], *, of_pictures: bool = False) -> list[str]:
+def say_common(registered: Iterable[RegisteredCamera], *, from_pictures: bool = False) -> list[str]:
     """Whose fault it is where several cameras see a frame that contradicts the others."""
-    agrees: dict[str, dict[str, bool]] = {}
+    is_inlier: dict[str, dict[str, bool]] = {}
     sets, looked_at = dict[str, list[str]](), dict[str, set[str]]()
     for found in registered:
         for one in found.frames:
-            agrees.setdefault(one.frame, {})[found.camera.name] = one.agrees
-        sets[found.camera.name] = [one.frame for one in found.frames if one.agrees]
+            is_inlier.setdefault(one.frame, {})[found.camera.name] = one.is_inlier
+        sets[found.camera.name] = [one.frame for one in found.frames if one.is_inlier]
         looked_at[found.camera.name] = {one.frame for one in found.frames}
-    frames, masks = list(agrees), dict[str, list[str]]()
-    positions = [k for k, own in agrees.items() if len(own) > 1 and not any(own.values())]
-    for frame, own in agrees.items():
+    frames, masks = list(is_inlier), dict[str, list[str]]()
+    positions = [k for k, own in is_inlier.items() if len(own) > 1 and not any(own.values())]
+    for frame, own in is_inlier.items():
         for name in (name for name, right in own.items() if any(own.values()) and not right):
             masks.setdefault(name, []).append(frame)
-    why = "something hides the robot there" if of_pictures else "their masks are not"
+    why = "something hides the robot there" if from_pictures else "their masks are not"
     texts = [
         f"cameras '{a}' and '{b}' rest on no common frame: '{a}' on {frame_ranges(own, frames)}, "
         f"'{b}' on {frame_ranges(other, frames)}: if cameras or base were moved between, their "
         "poses are of two moments and do not belong together"
         for (a, own), (b, other) in combinations(sets.items(), 2)
-        if looked_at[a] & looked_at[b] and not {*own} & {*other} and not of_pictures
+        if looked_at[a] & looked_at[b] and not {*own} & {*other} and not from_pictures
     ]
     if positions:
         texts.append(

@@ -36,16 +36,24 @@ from drake_pose.jobs.registration.positions import (
     read_known_positions,
 )
 from drake_pose.jobs.registration.settings import ALL, AuditSettings, RegistrationSettings
-from drake_pose.registration.joint_offsets import links_with_length, require_enough, require_known
+from drake_pose.registration.joint_offsets import (
+    require_frame_count,
+    require_parameters,
+    scalable_links,
+)
 from drake_pose.registration.picture_registration import Recording
 from drake_pose.registration.posed_frames import PosedFrame, SeenFrame
-from drake_pose.registration.standing_object import StandingObject, require_turns, stands_still
+from drake_pose.registration.standing_object import (
+    CalibrationTarget,
+    fixed_link_error,
+    require_rotation,
+)
 from drake_pose.silhouette.pictures.scene_checks import check_scene, read_scene
 from drake_pose.silhouette.pictures.scenes import CAMERA_FILE, Scene, load_scene, select_frames
 
 
 @dataclass(frozen=True)
-class Inputs:
+class RegistrationInputs:
     """What is registered or audited: a robot at known joint positions, and what cameras see.
 
     Args:
@@ -77,16 +85,16 @@ class Inputs:
     joints: Path | None
     cameras: Path | None
     warnings: tuple[str, ...]
-    held: tuple[Camera, ...] = ()
-    searched: tuple[PinholeCamera, ...] = ()
-    given: tuple[PinholeCamera, ...] = ()
-    assumed: frozenset[str] = frozenset()
+    known_cameras: tuple[Camera, ...] = ()
+    searched_cameras: tuple[PinholeCamera, ...] = ()
+    given_cameras: tuple[PinholeCamera, ...] = ()
+    assumed_focal: frozenset[str] = frozenset()
     left_out: tuple[str, ...] = ()
     recordings: Mapping[str, Recording] = field(default_factory=dict)
-    wanted: tuple[str, ...] = ()
+    audited_frames: tuple[str, ...] = ()
     frames: tuple[SeenFrame, ...] = ()
-    seen: tuple[str, ...] | None = None
-    standing: StandingObject | None = None
+    visible_nodes: tuple[str, ...] | None = None
+    target: CalibrationTarget | None = None
     zeros: tuple[str, ...] = ()
     lengths: tuple[str, ...] = ()
 
@@ -99,7 +107,7 @@ class Inputs:
         """A frame's positions, and the held cameras' masks but for those that show nothing."""
         if frame in self._known:
             return self._known[frame]
-        names = [one.name for one in self.held if (one.name, frame) in self.scene.masks]
+        names = [one.name for one in self.known_cameras if (one.name, frame) in self.scene.masks]
         masks = {name: read_mask_of(self.scene, name, frame, may_be_empty=True) for name in names}
         seen = {name: mask for name, mask in masks.items() if mask.any()}
         return SeenFrame(frame, self.positions.of(frame, next(iter(masks), "")), seen)
@@ -112,7 +120,7 @@ class Inputs:
         """What a camera sees."""
         return [one.of(camera) for one in self.frames if camera in one.masks]
 
-    def moved(self, values: Iterable[Array]) -> tuple[SeenFrame, ...]:
+    def with_values(self, values: Iterable[Array]) -> tuple[SeenFrame, ...]:
         """The frames at other values (m,) of the tree."""
         frames = zip(self.frames, values, strict=True)
         return tuple(replace(one, values=own) for one, own in frames)
@@ -143,14 +151,14 @@ def read_mask_of(
     return mask
 
 
-def looks_at_pictures(path: Path, settings: AuditSettings) -> bool:
+def uses_pictures(path: Path, settings: AuditSettings) -> bool:
     """Whether a scene is looked at as an episode: it is one, or is said to be."""
     return settings.pictures or is_episode(path, settings)
 
 
 def read_inputs(
     scene: Path, model: Path, joints: Path | None, cameras: Path | None, settings: AuditSettings
-) -> Inputs:
+) -> RegistrationInputs:
     """Reads and checks everything, by its settings for a registration or for an audit.
 
     Args:
@@ -162,7 +170,7 @@ def read_inputs(
 
     Raises DrakePoseError: names the file, camera, frame, column or joint at fault.
     """
-    if looks_at_pictures(scene, settings):
+    if uses_pictures(scene, settings):
         return _read_episode(scene, model, joints, cameras, settings)
     if not scene.is_dir():
         raise SceneError(f"{scene}: no such folder; a scene has {CAMERA_FILE} and masks")
@@ -194,8 +202,8 @@ def read_inputs(
             "all frames show the robot in one pose, to a degree: errors of a joint's zero and of a "
             "camera that are the same in all frames can hardly be told apart"
         )
-    return Inputs(
-        found, robot, tree, positions, joints, cameras, tuple(warnings), held, wanted=frames
+    return RegistrationInputs(
+        found, robot, tree, positions, joints, cameras, tuple(warnings), held, audited_frames=frames
     )
 
 
@@ -215,7 +223,7 @@ def _own_joints(scene: Path, robot: ArticulatedModel, settings: AuditSettings) -
 
 def _read_episode(
     path: Path, model: Path, joints: Path | None, cameras: Path | None, settings: AuditSettings
-) -> Inputs:
+) -> RegistrationInputs:
     """What an episode holds; its frames are seen while cameras are found."""
     episode = open_episode(path, joints=joints, episode=settings.episode)
     if episode.joints is None:
@@ -223,12 +231,12 @@ def _read_episode(
             f"{path}: holds no joint positions, and none are given (--joints FILE): pictures alone "
             "do not tell where a robot stands"
         )
-    robot, standing = load_model(model, package_paths=settings.packages), None
+    robot, target = load_model(model, package_paths=settings.packages), None
     if isinstance(settings, RegistrationSettings):
-        standing = _read_target(robot, settings)
+        target = _read_target(robot, settings)
     tree = make_tree(robot, EstimateSettings(hold=settings.hold))
-    if standing is not None:
-        tree = standing.tree(np.eye(4))
+    if target is not None:
+        tree = target.tree(np.eye(4))
     mapped = map_log(path, episode.joints, tree, settings)
     warnings = [*episode.warnings, *robot.warnings, *mapped.warnings]
     if mapped.unseen:
@@ -241,13 +249,14 @@ def _read_episode(
     known = {one.name: _known_camera(one) for one in chosen}
     kinematics = TreeKinematics(tree)
     default = kinematics.flatten(tree.default_values())
-    inputs = Inputs(
+    inputs = RegistrationInputs(
         Scene(path, known, (), {}), robot, tree, KnownPositions(path, kinematics, {}),
-        joints, cameras, tuple(warnings), searched=tuple(known.values()),
-        given=tuple(one for name, one in known.items() if name in placed),
-        assumed=frozenset(one.name for one in chosen if one.camera is None),
+        joints, cameras, tuple(warnings), searched_cameras=tuple(known.values()),
+        given_cameras=tuple(one for name, one in known.items() if name in placed),
+        assumed_focal=frozenset(one.name for one in chosen if one.camera is None),
         recordings={one.name: _recording(one, mapped, default, settings) for one in chosen},
-        seen=(TARGET,) if standing else mapped.seen if mapped.unseen else None, standing=standing,
+        visible_nodes=(TARGET,) if target else mapped.seen if mapped.unseen else None,
+        target=target,
     )  # fmt: skip
     if not isinstance(settings, RegistrationSettings):
         return inputs
@@ -291,7 +300,9 @@ def _recording(
     return Recording(names, values_at, read, times)
 
 
-def _read_target(model: ArticulatedModel, settings: RegistrationSettings) -> StandingObject | None:
+def _read_target(
+    model: ArticulatedModel, settings: RegistrationSettings
+) -> CalibrationTarget | None:
     """The object that cameras on a link see, before the robot; None: they see the robot."""
     if settings.target is None:
         return None
@@ -303,7 +314,7 @@ def _read_target(model: ArticulatedModel, settings: RegistrationSettings) -> Sta
     other = load_model(settings.target, package_paths=settings.packages)
     held = make_tree(model, EstimateSettings(hold=settings.hold)).held
     named = {model.position_names[index]: value for index, value in held.items()}
-    return StandingObject(model, settings.on, named, make_tree(other, EstimateSettings()))
+    return CalibrationTarget(model, settings.on, named, make_tree(other, EstimateSettings()))
 
 
 def _read_masks(
@@ -312,7 +323,7 @@ def _read_masks(
     joints: Path | None,
     cameras: Path | None,
     settings: RegistrationSettings,
-) -> Inputs:
+) -> RegistrationInputs:
     """A scene of masks; joints that no table tells are estimated from known cameras."""
     if cameras is None and not (path / CAMERA_FILE).exists():
         raise SceneError(
@@ -323,8 +334,8 @@ def _read_masks(
     scene = check_scene(load_scene(path, file.cameras))
     scene, frames = scene.every(settings.every, settings.frames)
     searched, held = _select_cameras(scene, file, settings)
-    table, standing = None, _read_target(robot, settings)
-    if joints is not None and standing is None:
+    table, target = None, _read_target(robot, settings)
+    if joints is not None and target is None:
         table = read_true_angles(joints, robot.position_names)
     if joints is None or (table is not None and table.is_estimate):
         # Only measured joint positions tell these.
@@ -336,7 +347,7 @@ def _read_masks(
                 )
     if table is not None and table.bases:
         robot, table = put_on_base(robot, table)
-    tree, seen = make_registration_tree(robot, settings, standing)
+    tree, seen = make_registration_tree(robot, settings, target)
     kinematics = TreeKinematics(tree)
     zeros, lengths = _select_parameters(robot, kinematics, settings)
     if joints is None:
@@ -355,14 +366,14 @@ def _read_masks(
         "is left out of the camera file that is written"
         for name in left_out
     ]
-    inputs = Inputs(
+    inputs = RegistrationInputs(
         scene, robot, tree, positions, joints, cameras, (), held, searched,
         tuple(one for one in searched if one.name not in unplaced and settings.on is None),
-        left_out=left_out, seen=seen, standing=standing, zeros=zeros, lengths=lengths,
+        left_out=left_out, visible_nodes=seen, target=target, zeros=zeros, lengths=lengths,
     )  # fmt: skip
     inputs = replace(inputs, frames=_read_frames(inputs, frames))
     if zeros or lengths or settings.focal:
-        require_enough(sum(len(inputs.of(name)) for name in found), len(zeros), len(lengths))
+        require_frame_count(sum(len(inputs.of(name)) for name in found), len(zeros), len(lengths))
     return replace(inputs, warnings=(*warnings, *_say_poses(inputs)))
 
 
@@ -414,14 +425,14 @@ def _select_cameras(
 def make_registration_tree(
     model: ArticulatedModel,
     settings: RegistrationSettings,
-    standing: StandingObject | None = None,
+    target: CalibrationTarget | None = None,
 ) -> tuple[PoseTree, tuple[str, ...] | None]:
     """The pose tree, and which of its nodes the masks show; None: all.
 
     From a link on which a camera rides, the masks show what no joint moves.
     """
-    if standing is not None:
-        return standing.tree(np.eye(4)), (TARGET,)
+    if target is not None:
+        return target.tree(np.eye(4)), (TARGET,)
     tree = make_tree(model, EstimateSettings(hold=settings.hold))
     link = settings.on
     if link is None:
@@ -437,7 +448,7 @@ def make_registration_tree(
         link, root_position=np.zeros(3), root_rotation=RootRotation.fixed(), held=held
     )
     if not {node.name for node in moved.nodes[1:]} & set(base):
-        raise stands_still(model, link)
+        raise fixed_link_error(model, link)
     return moved, tuple(base)
 
 
@@ -450,8 +461,8 @@ def _select_parameters(
         free = np.flatnonzero(kinematics.lower < kinematics.upper)
         zeros = tuple(kinematics.names[k] for k in free)
     if ALL in lengths:
-        lengths = links_with_length(kinematics.tree)
-    require_known(kinematics.tree, zeros, lengths)
+        lengths = scalable_links(kinematics.tree)
+    require_parameters(kinematics.tree, zeros, lengths)
     if settings.lengths and not model.changes_shape:
         raise SettingsError(
             f"{model.path}: lengths of links are found of URDF models alone, whose joints' origins "
@@ -460,7 +471,9 @@ def _select_parameters(
     return zeros, lengths
 
 
-def _read_frames(inputs: Inputs, wanted: Sequence[str], most: int = 12) -> tuple[SeenFrame, ...]:
+def _read_frames(
+    inputs: RegistrationInputs, wanted: Sequence[str], most: int = 12
+) -> tuple[SeenFrame, ...]:
     """What cameras see; a bad mask of one that is to be found is refused.
 
     Of cameras that are held there is what can be compared with them. With positions that were
@@ -468,7 +481,7 @@ def _read_frames(inputs: Inputs, wanted: Sequence[str], most: int = 12) -> tuple
     of them, so more add little.
     """
     scene, positions = inputs.scene, inputs.positions
-    names, estimated = [one.name for one in inputs.searched], positions.is_estimate
+    names, estimated = [one.name for one in inputs.searched_cameras], positions.is_estimate
     if estimated:
         asked = select_frames(scene.frames, wanted, str(scene.path))
         known = [frame for frame in asked if positions.has(frame)]
@@ -505,7 +518,7 @@ def _read_frames(inputs: Inputs, wanted: Sequence[str], most: int = 12) -> tuple
                 f"camera '{camera}': no mask shows the body in the frames in which its pose was "
                 f"estimated: {', '.join(wanted)}"
             )
-    if estimated and not any(c.name in one.masks for c in inputs.held for one in found):
+    if estimated and not any(c.name in one.masks for c in inputs.known_cameras for one in found):
         raise SceneError(
             f"{scene.path}: the joint positions were estimated, so they are fitted together with "
             "the cameras, but no camera with an X_WC has a mask of those frames: leave X_WC of the "
@@ -514,7 +527,7 @@ def _read_frames(inputs: Inputs, wanted: Sequence[str], most: int = 12) -> tuple
     return tuple(found)
 
 
-def _say_poses(inputs: Inputs) -> list[str]:
+def _say_poses(inputs: RegistrationInputs) -> list[str]:
     """What of the body, and how it moves, a user should know.
 
     Raises RegistrationError: the link before an object does not turn enough.
@@ -526,10 +539,10 @@ def _say_poses(inputs: Inputs) -> list[str]:
             "the person: on a real recording cameras were off by up to three of their standard "
             "deviations"
         )
-    for camera in inputs.searched:
+    for camera in inputs.searched_cameras:
         frames = inputs.of(camera.name)
-        if inputs.standing is not None:
-            require_turns(camera.name, inputs.standing, frames)
+        if inputs.target is not None:
+            require_rotation(camera.name, inputs.target, frames)
         # Estimated poses differ that do so by more times what measured ones do.
         rows, times = (one.values for one in frames), 5.0 if estimated else 1.0
         if not inputs.positions.are_one_pose(rows, times):

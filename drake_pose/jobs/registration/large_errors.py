@@ -11,22 +11,22 @@ from drake_pose.errors import CameraError, MaskError, RegistrationError
 from drake_pose.files.settings import percent
 from drake_pose.jobs.registration.diagnosis import (
     compare_camera,
-    find_misfit,
+    explain_misfit,
     last_before_change,
     require_seen_by,
 )
-from drake_pose.jobs.registration.inputs import Inputs
-from drake_pose.jobs.registration.readings import focal_reading, scene_readings
+from drake_pose.jobs.registration.inputs import RegistrationInputs
+from drake_pose.jobs.registration.readings import focal_correction, scene_corrections
 from drake_pose.registration.diagnosis import DIAGNOSIS, diagnose_frames
 from drake_pose.registration.findings import Diagnosis, Finding
 from drake_pose.registration.large_errors import (
     LARGE,
+    Correction,
     LargeErrorSearch,
-    Reading,
-    as_read,
-    links_not_seen,
-    mask_shares,
-    shares_moved,
+    apply_corrections,
+    joint_inlier_ratios,
+    mask_excess_and_lack,
+    mismatched_links,
 )
 from drake_pose.registration.online_registration import pose_difference
 from drake_pose.registration.per_frame_fit import FrameFit, PerFrameFit
@@ -35,13 +35,13 @@ from drake_pose.registration.register import (
     CameraSearch,
     RegisteredCamera,
     RegistrationBody,
-    spread,
+    evenly_spaced,
 )
 from drake_pose.silhouette.pictures.scene_checks import frame_ranges
 
 
 @dataclass(frozen=True, eq=False)
-class Compared:
+class SceneFit:
     """All frames compared with what is given, or with what that may be meant to be.
 
     Args:
@@ -56,7 +56,7 @@ class Compared:
     """
 
     cameras: tuple[Camera, ...]
-    readings: tuple[Reading, ...]
+    readings: tuple[Correction, ...]
     fit: PerFrameFit
     fits: tuple[FrameFit, ...]
     shares: Mapping[tuple[str, str], tuple[float, float]]
@@ -67,28 +67,28 @@ class Compared:
 
     def of(self, frame: SeenFrame) -> SeenFrame:
         """A frame as it is read."""
-        return as_read(self.readings, frame)
+        return apply_corrections(self.readings, frame)
 
     def joint_off(self, name: str) -> Finding | None:
         """What fits say of a joint that is so far off that they should begin anew from there."""
         off = [one for one in self.found.common if (one.kind, one.name) == ("joint", name)]
-        return next((one for one in off if abs(one.angle) > np.radians(LARGE.again)), None)
+        return next((one for one in off if abs(one.angle) > np.radians(LARGE.restart_angle)), None)
 
     @property
     def focal_off(self) -> Finding | None:
         """The same of focal lengths."""
         off = [one for one in self.found.common if one.kind == "focal"]
-        return next((one for one in off if abs(one.shift) > LARGE.again_focal), None)
+        return next((one for one in off if abs(one.shift) > LARGE.restart_focal), None)
 
     @property
-    def shares_moved(self) -> dict[str, float]:
+    def joint_inlier_ratios(self) -> dict[str, float]:
         """By joint, what share fits of the outlines of all links that it moves."""
-        return shares_moved(self.fits, self.fit.joints)
+        return joint_inlier_ratios(self.fits, self.fit.joints)
 
     @property
     def is_doubtful(self) -> bool:
         """Whether half of the frames or more contradict the others."""
-        return 2 * len(self.found.contradicting) >= len(self.found.frames)
+        return 2 * len(self.found.outliers) >= len(self.found.frames)
 
     @property
     def inlier_ratio(self) -> float:
@@ -106,17 +106,20 @@ class SceneComparison:
 
     def __init__(
         self,
-        inputs: Inputs,
+        inputs: RegistrationInputs,
         on_frame: Callable[[int], None] | None = None,
         sample_size: int = 20,
     ) -> None:
         self._inputs, self._on_frame = inputs, on_frame
-        self.body, frames = RegistrationBody(inputs.tree, inputs.seen), inputs.wanted
-        sample = [inputs.read(frame) for frame in spread(frames, sample_size)]
+        self.body, frames = (
+            RegistrationBody(inputs.tree, inputs.visible_nodes),
+            inputs.audited_frames,
+        )
+        sample = [inputs.read(frame) for frame in evenly_spaced(frames, sample_size)]
         self._sample = [one for one in sample if one.masks]
-        self._names = frozenset(inputs.wanted)
+        self._names = frozenset(inputs.audited_frames)
 
-    def run(self, most: int = 3) -> Compared:
+    def run(self, most: int = 3) -> SceneFit:
         """Does it.
 
         most: number of large errors that are put right, one after the other.
@@ -127,25 +130,28 @@ class SceneComparison:
         """
         inputs = self._inputs
         try:
-            require_seen_by(self.body, inputs.held, self._sample)
+            require_seen_by(self.body, inputs.known_cameras, self._sample)
         except CameraError as error:
-            if not inputs.recordings and (one := self._search(inputs.held, [])) is not None:
+            if (
+                not inputs.recordings
+                and (one := self._search(inputs.known_cameras, [])) is not None
+            ):
                 raise CameraError(
                     f"{error}; {one.name}: so the robot is where it is seen"
                 ) from None
             raise
-        given = self._compare(inputs.held, ())
-        now = self._put_right(given, most)
+        given = self._compare(inputs.known_cameras, ())
+        now = self._correct(given, most)
         if now.is_doubtful:
             # What leaves most frames unexplained is no cause.
-            placed = self._look_for_cameras(given)
-            now = given if placed is None else self._put_right(placed, most)
+            placed = self._search_cameras(given)
+            now = given if placed is None else self._correct(placed, most)
         return self._finish(given if now.is_doubtful else now)
 
-    def _put_right(self, now: Compared, most: int) -> Compared:
+    def _correct(self, now: SceneFit, most: int) -> SceneFit:
         """With as many large errors put right as are found."""
         for _ in range(most):
-            reading = self._look(now)
+            reading = self._find_correction(now)
             if reading is None:
                 break
             again = self._compare(reading.cameras, (*now.readings, reading))
@@ -153,28 +159,33 @@ class SceneComparison:
             if reading.kind == "focal":
                 told = now.focal_off
             if told is not None and (told.angle + told.shift) * reading.amount > 0.0:
-                now = self._tell(now, again, reading, told)
+                now = self._record(now, again, reading, told)
                 continue
             if again.inlier_ratio <= now.inlier_ratio:
                 break
             if not now.is_doubtful:
-                before, after = now.shares_moved[reading.name], again.shares_moved[reading.name]
-                if LARGE.mended * (1.0 - after) > 1.0 - before:
+                before, after = (
+                    now.joint_inlier_ratios[reading.name],
+                    again.joint_inlier_ratios[reading.name],
+                )
+                if LARGE.min_mending * (1.0 - after) > 1.0 - before:
                     break
-            now = self._tell(now, again, reading)
+            now = self._record(now, again, reading)
         return now
 
-    def _finish(self, now: Compared) -> Compared:
+    def _finish(self, now: SceneFit) -> SceneFit:
         """With links that are not seen, and cameras that moved; frames of a wrong log are wrong."""
         found = now.found
         rests = {(one.kind, one.name): one for one in found.common}
-        findings = [_with_rest(one, rests.pop((one.kind, one.name), None)) for one in now.findings]
+        findings = [
+            _add_remaining(one, rests.pop((one.kind, one.name), None)) for one in now.findings
+        ]
         # Where a joint is in each frame is found to the search's step.
         by_search = {("joint", one.name) for one in now.findings if one.kind == "log"}
         common = tuple(one for key, one in rests.items() if key not in by_search)
         found = replace(found, common=common)
         known = {one.link for one in findings if one.link}
-        for k, share in () if now.is_doubtful else links_not_seen(now.fits):
+        for k, share in () if now.is_doubtful else mismatched_links(now.fits):
             node = self.body.tree.nodes[k].name
             if node not in known:
                 text = (
@@ -192,8 +203,8 @@ class SceneComparison:
         common = (*findings, *moved, *found.common)
         warnings = (*now.warnings, *self._say_masks(now))
         # Where outlines do not fit, what would be noticed is not told by how they would move.
-        shares = now.shares_moved
-        enough = LARGE.seen * max(shares.values(), default=0.0)
+        shares = now.joint_inlier_ratios
+        enough = LARGE.min_joint_inlier_ratio * max(shares.values(), default=0.0)
         noticed = {
             name: least if shares.get(name, 0.0) >= enough else np.inf
             for name, least in found.minimum_detectable.items()
@@ -202,7 +213,7 @@ class SceneComparison:
         return replace(now, found=found, findings=(), warnings=warnings)
 
     def _find_moved(
-        self, now: Compared, found: Diagnosis, least: int = 2
+        self, now: SceneFit, found: Diagnosis, least: int = 2
     ) -> tuple[list[Finding], Diagnosis]:
         """Whether cameras or the base moved between two frames, and what frames are left then.
 
@@ -218,7 +229,7 @@ class SceneComparison:
                 continue
             again = diagnose_frames(now.fit, [now.fits[k] for k in rows], moved=True)
             places, agreeing = list(again.common), [*{one.frame for one in again.frames}]
-            if again.contradicting or any(one.kind not in ("camera", "base") for one in places):
+            if again.outliers or any(one.kind not in ("camera", "base") for one in places):
                 frames = [now.of(self._inputs.read(found.frames[k].frame)) for k in rows]
                 own = [one for one in now.cameras if one.name in cameras]
                 placed = self._placed(frames, own)
@@ -251,15 +262,15 @@ class SceneComparison:
         search, placed = CameraSearch(self.body), dict[str, tuple[RegisteredCamera, Finding]]()
         for camera in cameras:
             own = [one.of(camera.name) for one in frames if camera.name in one.masks]
-            own = spread(own, LARGE.frames)
+            own = evenly_spaced(own, LARGE.frame_count)
             if not isinstance(camera, PinholeCamera) or len(own) < least:
                 continue
             try:
                 found = search.register(camera, own)
             except RegistrationError:
                 continue
-            agreeing = len(found.frames) - len(found.contradictions)
-            if find_misfit(found) is not None or 2 * agreeing <= len(own):
+            agreeing = len(found.frames) - len(found.outliers)
+            if explain_misfit(found) is not None or 2 * agreeing <= len(own):
                 continue
             values = np.array([one.values for one in own])
             off = compare_camera(self.body, camera, found, values, len(cameras) == 1)
@@ -268,7 +279,7 @@ class SceneComparison:
         return placed
 
     def _say_masks(
-        self, now: Compared, more: float = 0.08, more_in_one: float = 0.15, less: float = 0.25
+        self, now: SceneFit, more: float = 0.08, more_in_one: float = 0.15, less: float = 0.25
     ) -> list[str]:
         """What masks show beside the robot, and lack of it, in frames that agree otherwise.
 
@@ -277,7 +288,7 @@ class SceneComparison:
                 and more, and in fewer. Real masks of arms show less than .02 more, and lack .15 at
                 most.
         """
-        texts, names, wrong = list[str](), self._inputs.scene.frames, now.found.contradicting
+        texts, names, wrong = list[str](), self._inputs.scene.frames, now.found.outliers
         for camera in (one.name for one in now.cameras):
             own = {frame: two for (name, frame), two in now.shares.items() if name == camera}
             black = [frame for frame, two in own.items() if two[0] == 0.0 and two[1] > less]
@@ -301,7 +312,7 @@ class SceneComparison:
                     texts.append(f"camera '{camera}': {said}")
         return texts
 
-    def _compare(self, cameras: Sequence[Camera], readings: tuple[Reading, ...]) -> Compared:
+    def _compare(self, cameras: Sequence[Camera], readings: tuple[Correction, ...]) -> SceneFit:
         """Fits all frames as they are read."""
         inputs, fitted, unseen = self._inputs, list[FrameFit](), list[str]()
 
@@ -309,20 +320,20 @@ class SceneComparison:
             raise MaskError(
                 f"{inputs.scene.path}: no mask shows the body; it must be white in them"
             )
-        body, sample = self.body, [as_read(readings, one) for one in self._sample]
+        body, sample = self.body, [apply_corrections(readings, one) for one in self._sample]
         shares = dict[tuple[str, str], tuple[float, float]]()
-        fit = PerFrameFit(body.kinematics, (body.few, body.all), cameras, sample)
-        for done, name in enumerate(inputs.wanted, 1):
+        fit = PerFrameFit(body.kinematics, (body.medium, body.full), cameras, sample)
+        for done, name in enumerate(inputs.audited_frames, 1):
             seen = inputs.read(name)
             if seen.masks:
-                seen = as_read(readings, seen)
+                seen = apply_corrections(readings, seen)
                 fitted.append(fit.fit(seen))
                 for camera in cameras:
                     mask = seen.masks.get(camera.name)
                     if mask is None and (camera.name, name) in inputs.scene.masks:
                         mask = np.zeros((camera.height, camera.width), bool)
                     if mask is not None:
-                        own = mask_shares(body, camera, seen.values, mask, fit.size)
+                        own = mask_excess_and_lack(body, camera, seen.values, mask, fit.size)
                         shares[camera.name, name] = own
             else:
                 unseen.append(name)
@@ -330,33 +341,37 @@ class SceneComparison:
                 self._on_frame(done)
         asked = [(_KINDS[one.kind], one.name) for one in readings if one.kind in _KINDS]
         found = diagnose_frames(fit, fitted, asked)
-        return Compared(tuple(cameras), readings, fit, tuple(fitted), shares, tuple(unseen), found)
+        return SceneFit(tuple(cameras), readings, fit, tuple(fitted), shares, tuple(unseen), found)
 
-    def _look(self, now: Compared) -> Reading | None:
+    def _find_correction(self, now: SceneFit) -> Correction | None:
         """What is wrong by much; nothing is looked for where nothing is doubtful."""
         sample = [now.of(one) for one in self._sample]
         if now.is_doubtful:
             of_scene = not now.readings
-            return self._search(now.cameras, now.fit.joints, LARGE.left, sample, of_scene)
+            return self._search(now.cameras, now.fit.joints, LARGE.max_remaining, sample, of_scene)
         off = [name for name in now.fit.joints if now.joint_off(name) is not None]
-        shares = now.shares_moved.items()
-        doubted = [name for name, share in shares if share < LARGE.seen or name in off]
+        shares = now.joint_inlier_ratios.items()
+        doubted = [
+            name for name, share in shares if share < LARGE.min_joint_inlier_ratio or name in off
+        ]
         if doubted:
-            reading = self._search(now.cameras, doubted, LARGE.left_of_one, sample, False, off)
+            reading = self._search(
+                now.cameras, doubted, LARGE.max_remaining_of_joint, sample, False, off
+            )
             if reading is not None:
                 return reading
         # Fits are linear about where they begin.
         if off:
             by = next(one.angle for one in now.found.common if one.name == off[0])
             search = LargeErrorSearch(self.body, now.cameras, sample)
-            return search.joint_reading("offset", off[0], 1.0, by, 0.0)
+            return search.joint_correction("offset", off[0], 1.0, by, 0.0)
         lens = now.focal_off
         if lens is None or any(one.kind == "focal" for one in now.readings):
             return None
         group = [one.name for one in now.cameras if f"'{one.name}'" in lens.name]
-        return focal_reading(now.cameras, group, lens.name, 1.0 + lens.shift)
+        return focal_correction(now.cameras, group, lens.name, 1.0 + lens.shift)
 
-    def _look_for_cameras(self, now: Compared) -> Compared | None:
+    def _search_cameras(self, now: SceneFit) -> SceneFit | None:
         """With cameras as they are found in the frames, where these explain what is seen."""
         if self._inputs.recordings:
             return None
@@ -371,22 +386,22 @@ class SceneComparison:
         self,
         cameras: Sequence[Camera],
         joints: Sequence[str],
-        left: float = LARGE.left,
+        left: float = LARGE.max_remaining,
         sample: Sequence[SeenFrame] | None = None,
         scene: bool = True,
         likely: Collection[str] = (),
-    ) -> Reading | None:
+    ) -> Correction | None:
         inputs = self._inputs
-        readings = list[Reading]()
+        readings = list[Correction]()
         if scene and not inputs.recordings:
-            values = [inputs.read(name).values for name in inputs.wanted]
-            readings = list(scene_readings(cameras, values, inputs.wanted))
+            values = [inputs.read(name).values for name in inputs.audited_frames]
+            readings = list(scene_corrections(cameras, values, inputs.audited_frames))
         search = LargeErrorSearch(self.body, cameras, sample or self._sample)
         return search.find(readings, joints, left, likely)
 
-    def _tell(
-        self, before: Compared, now: Compared, reading: Reading, told: Finding | None = None
-    ) -> Compared:
+    def _record(
+        self, before: SceneFit, now: SceneFit, reading: Correction, told: Finding | None = None
+    ) -> SceneFit:
         """With what was put right as a finding; told: of a joint, what fits have said of it."""
         kind, name, warnings = _KINDS.get(reading.kind, reading.kind), reading.name, before.warnings
         off = Finding(kind, name, 0.0, 0.0, 0.0, 0.0, self._pixels(before, now), 0.0)
@@ -397,7 +412,7 @@ class SceneComparison:
                 if told is not None and abs(size - told.angle) < 1e-9:
                     off = told
             else:
-                step = LARGE.near_focal if of_focal else LARGE.near_place
+                step = LARGE.reach_focal if of_focal else LARGE.reach_shift
                 off = replace(off, shift=size, shift_sd=step)
                 if told is not None and abs(size - told.shift) < 1e-9:
                     off = told
@@ -412,14 +427,16 @@ class SceneComparison:
         ]
         if earlier:
             findings.remove(earlier[0])
-            off = replace(off, angle=off.angle + earlier[0].angle, rivals=earlier[0].rivals)
+            off = replace(
+                off, angle=off.angle + earlier[0].angle, alternatives=earlier[0].alternatives
+            )
         return replace(now, findings=(*findings, off), warnings=warnings)
 
     def _turns(self, joint: str) -> bool:
         kinematics = self.body.kinematics
         return bool(kinematics.is_angle[kinematics.names.index(joint)])
 
-    def _differing(self, off: Finding, before: Compared, reading: Reading) -> Finding:
+    def _differing(self, off: Finding, before: SceneFit, reading: Correction) -> Finding:
         """How far a joint is from its log, in words and as the largest difference."""
         j = self.body.kinematics.names.index(reading.name)
         frames = [before.of(one) for one in self._sample]
@@ -447,14 +464,14 @@ class SceneComparison:
         off = np.abs(kinematics.poses(moved) - kinematics.poses(values)).max(axis=(1, 2))
         return next((tree.nodes[k].name for k in np.flatnonzero(off > 1e-9)), "")
 
-    def _pixels(self, before: Compared, now: Compared) -> float:
+    def _pixels(self, before: SceneFit, now: SceneFit) -> float:
         """How far the parts that move are elsewhere in the pictures, root mean square [pixel]."""
         squares, kinematics = list[Array](), self.body.kinematics
         for frame in self._sample:
             X = [kinematics.poses(one.of(frame).values) for one in (before, now)]
             for one, other in zip(before.cameras, now.cameras, strict=True):
                 places = [
-                    camera.project(placed_points(self.body.very_few, X_WN))[0]
+                    camera.project(placed_points(self.body.coarse, X_WN))[0]
                     for camera, X_WN in zip((one, other), X, strict=True)
                 ]
                 own = ((places[0] - places[1]) ** 2).sum(axis=1)
@@ -464,7 +481,7 @@ class SceneComparison:
         return float(np.sqrt(every.mean())) if len(every) else 0.0
 
 
-def _with_rest(one: Finding, rest: Finding | None) -> Finding:
+def _add_remaining(one: Finding, rest: Finding | None) -> Finding:
     """What the search found and what fits add to it; they tell nothing where no frame agrees."""
     if rest is None:
         return one
@@ -473,7 +490,7 @@ def _with_rest(one: Finding, rest: Finding | None) -> Finding:
         shift = (1.0 + one.shift) * (1.0 + rest.shift) - 1.0
     angle = one.angle + rest.angle
     told = replace(rest, angle=angle, shift=shift, pixels=one.pixels)
-    return replace(told, p_value=one.p_value, rivals=one.rivals)
+    return replace(told, p_value=one.p_value, alternatives=one.alternatives)
 
 
 def changed_after(found: Diagnosis, cameras: Collection[str], least: int) -> tuple[list[int], str]:

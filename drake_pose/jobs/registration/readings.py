@@ -10,11 +10,11 @@ from scipy.spatial.transform import Rotation
 
 from drake_pose.arrays import Array
 from drake_pose.camera.models import Camera, PinholeCamera
-from drake_pose.registration.large_errors import Reading, as_it_is
+from drake_pose.registration.large_errors import Correction, unchanged
 from drake_pose.registration.posed_frames import SeenFrame
 
 
-def scene_readings(
+def scene_corrections(
     cameras: Sequence[Camera],
     values: Sequence[Array],
     frames: Sequence[str],
@@ -35,7 +35,7 @@ def scene_readings(
         1.4,
         2.0,
     ),
-) -> Iterator[Reading]:
+) -> Iterator[Correction]:
     """What else may be meant by a scene whose cameras stand somewhere: what users get wrong.
 
     Args:
@@ -49,32 +49,34 @@ def scene_readings(
                 one.with_pose(change(one.X_WC)) if one.name in group else one for one in cameras
             ]
             whose = "every X_WC" if len(group) > 1 else f"X_WC of camera '{group[0]}'"
-            yield Reading("reading", f"{whose} {text}", tuple(moved), as_it_is, 0.0, 2 - len(group))
+            yield Correction(
+                "reading", f"{whose} {text}", tuple(moved), unchanged, 0.0, 2 - len(group)
+            )
     for a, b in list(combinations(range(len(cameras)), 2))[:pairs]:
         other = list(cameras)
         other[a] = cameras[a].with_pose(cameras[b].X_WC)
         other[b] = cameras[b].with_pose(cameras[a].X_WC)
         text = f"cameras '{cameras[a].name}' and '{cameras[b].name}' seem to be exchanged"
-        yield Reading("reading", text, tuple(other), as_it_is)
+        yield Correction("reading", text, tuple(other), unchanged)
     for group in _groups(cameras):
         whose = "all cameras" if len(group) > 1 else f"camera '{group[0]}'"
         text = f"the masks of {whose} seem to be mirrored: turn the pictures back"
-        yield Reading("reading", text, tuple(cameras), _mirrored(group))
+        yield Correction("reading", text, tuple(cameras), _mirrored(group))
         if not all(isinstance(one, PinholeCamera) for one in cameras if one.name in group):
             continue
         text = "focal lengths" if len(cameras) > 1 and len(group) > 1 else "focal length of camera"
         text += "" if len(group) > 1 else f" '{group[0]}'"
         for factor in factors:
-            yield focal_reading(cameras, group, text, factor)
+            yield focal_correction(cameras, group, text, factor)
     for which, by in (("next", 1), ("previous", -1)) if len(frames) > 2 else ():
         rows = dict(zip(frames, np.roll(np.array(values), -by, axis=0), strict=True))
         text = f"the masks fit with the joint positions of the {which} frame"
-        yield Reading("reading", text, tuple(cameras), partial(_with_row, rows))
+        yield Correction("reading", text, tuple(cameras), partial(_with_row, rows))
 
 
-def focal_reading(
+def focal_correction(
     cameras: Sequence[Camera], group: Collection[str], text: str, factor: float
-) -> Reading:
+) -> Correction:
     """Cameras of a group, or all where it is empty, with focal lengths that are a factor longer."""
     changed = [
         replace(one, focal_x=factor * one.focal_x, focal_y=factor * one.focal_y)
@@ -82,7 +84,7 @@ def focal_reading(
         else one
         for one in cameras
     ]
-    return Reading("focal", text, tuple(changed), as_it_is, factor - 1.0)
+    return Correction("focal", text, tuple(changed), unchanged, factor - 1.0)
 
 
 def _groups(cameras: Sequence[Camera]) -> list[tuple[str, ...]]:

@@ -31,7 +31,11 @@ from drake_pose.jobs.registration.diagnosis import (
     say_outliers,
     say_zeros,
 )
-from drake_pose.jobs.registration.inputs import Inputs, make_registration_tree, read_inputs
+from drake_pose.jobs.registration.inputs import (
+    RegistrationInputs,
+    make_registration_tree,
+    read_inputs,
+)
 from drake_pose.jobs.registration.result import (
     check_exports,
     compared_frames,
@@ -48,7 +52,7 @@ from drake_pose.registration.joint_offsets import KinematicParameter, calibrate_
 from drake_pose.registration.picture_registration import (
     PictureRegistration,
     choose_pictures,
-    judge_pictures,
+    evaluate_pictures,
     posed_pictures,
     register_pictures,
 )
@@ -56,19 +60,19 @@ from drake_pose.registration.posed_frames import PosedFrames, SeenFrame
 from drake_pose.registration.register import (
     CameraSearch,
     E_total,
-    ObjectPose,
     RegisteredCamera,
     RegistrationBody,
-    areas,
+    TargetPose,
     intersection_over_union,
+    overlap_areas,
     suggest_pose,
 )
 from drake_pose.registration.shared_fit import adjust_bundle
 from drake_pose.registration.standing_object import (
-    ObjectSearch,
-    StandingObject,
-    find_in_pictures,
-    require_seen,
+    CalibrationTarget,
+    TargetSearch,
+    find_target_frames,
+    require_detections,
 )
 from drake_pose.workers import use_workers
 
@@ -127,13 +131,13 @@ def register_scene(
     with use_workers(settings.workers):
         inputs = read_inputs(Path(scene), Path(model), table, own, settings)
         work = _Registration(inputs, settings, on_camera)
-        check_exports(settings.exports, [*inputs.held, *inputs.searched])
+        check_exports(settings.exports, [*inputs.known_cameras, *inputs.searched_cameras])
         work.find()
         start = time.perf_counter()
         if work.inputs.positions.is_estimate:
             work.refit_poses()
         urdf = work.find_zeros(folder) if work.has_constants else None
-        work.judge()
+        work.evaluate()
         described = work.describe((time.perf_counter() - start) / len(work.registered))
     placed = {
         name: work.registered[name].camera if name in work.registered else camera
@@ -166,13 +170,13 @@ class _Registration:
     """
 
     def __init__(
-        self, inputs: Inputs, settings: RegistrationSettings, on_camera: OnCamera | None
+        self, inputs: RegistrationInputs, settings: RegistrationSettings, on_camera: OnCamera | None
     ) -> None:
         self.inputs, self._settings, self._on_camera = inputs, settings, on_camera
         self.body = RegistrationBody(
-            inputs.tree, inputs.seen, radius_scales=inputs.positions.radius_scales
+            inputs.tree, inputs.visible_nodes, radius_scales=inputs.positions.radius_scales
         )
-        self._held = [one for one in inputs.held if isinstance(one, PinholeCamera)]
+        self._held = [one for one in inputs.known_cameras if isinstance(one, PinholeCamera)]
         self.warnings = list(inputs.warnings)
         self.registered = dict[str, RegisteredCamera]()
         self.seconds = dict[str, float]()
@@ -192,7 +196,7 @@ class _Registration:
         """Whether there is more to find in all frames together."""
         asked = self._settings
         # Cameras that see one object are found one after another, but it stands in one place.
-        several = self.inputs.standing is not None and len(self.registered) > 1
+        several = self.inputs.target is not None and len(self.registered) > 1
         focal = asked.focal and not self.pictures
         return bool(asked.zeros or asked.lengths or focal or several)
 
@@ -208,13 +212,13 @@ class _Registration:
             for camera in self._held:
                 self.warnings += say_held(self.body, camera, inputs.of(camera.name))
             self._find_each()
-        elif inputs.standing is not None:
-            self._find_target(inputs.standing)
+        elif inputs.target is not None:
+            self._find_target(inputs.target)
         else:
             frames = list[SeenFrame]()
-            for camera in inputs.searched:
+            for camera in inputs.searched_cameras:
                 name, start = camera.name, time.perf_counter()
-                focal = self._settings.focal or name in inputs.assumed
+                focal = self._settings.focal or name in inputs.assumed_focal
                 one = register_pictures(
                     self.body, camera, inputs.recordings[name], focal, inputs.zeros
                 )
@@ -226,7 +230,7 @@ class _Registration:
                     for frame in one.frames
                 ]  # fmt: skip
                 self.pictures[name] = one
-                self.warnings += say_pictures(one, name in inputs.assumed)
+                self.warnings += say_pictures(one, name in inputs.assumed_focal)
                 self._note(one.found, start)
             self.inputs = replace(inputs, frames=tuple(frames))
 
@@ -237,20 +241,20 @@ class _Registration:
 
         Raises RegistrationError: no pose of a camera explains its masks.
         """
-        inputs, standing, seen = self.inputs, self.inputs.standing, None
-        search: Search = CameraSearch(self.body) if standing is None else ObjectSearch(standing)
+        inputs, target, seen = self.inputs, self.inputs.target, None
+        search: Search = CameraSearch(self.body) if target is None else TargetSearch(target)
         measured = not inputs.positions.is_estimate
-        for camera in inputs.searched:
+        for camera in inputs.searched_cameras:
             start, frames = time.perf_counter(), inputs.of(camera.name)
             found = search.register(camera, frames)
             if measured:
                 require_explained(search, found, frames)
-            if standing is not None:
-                if found.seen_object is not None:
-                    seen, self.body = found.seen_object, standing.body(found.seen_object.X_WT)
+            if target is not None:
+                if found.target is not None:
+                    seen, self.body = found.target, target.body(found.target.X_WT)
                     search = CameraSearch(self.body)
                     self.warnings += say_object(seen)
-                found = replace(found, seen_object=seen)
+                found = replace(found, target=seen)
             self._note(found, start)
         self.inputs = replace(inputs, tree=self.body.tree)
 
@@ -275,20 +279,20 @@ class _Registration:
         if self._on_camera is not None:
             self._on_camera(len(self.registered))
 
-    def _find_target(self, standing: StandingObject, most: int = 24) -> None:
+    def _find_target(self, target: CalibrationTarget, most: int = 24) -> None:
         """Finds masks of an object in some pictures from a link, and each camera in these."""
         inputs, frames, start = self.inputs, list[SeenFrame](), time.perf_counter()
-        body = standing.body(np.eye(4))
-        for camera in inputs.searched:
+        body = target.body(np.eye(4))
+        for camera in inputs.searched_cameras:
             name = camera.name
-            if name in inputs.assumed:
+            if name in inputs.assumed_focal:
                 raise CameraError(
                     f"camera '{name}': its focal length is unknown, without which pictures of a "
                     "target do not tell how far away it is; calibrate it"
                 )
             recording = inputs.recordings[name]
             rows, _ = choose_pictures(body, camera, recording, most)
-            seen = find_in_pictures(standing, camera, posed_pictures(recording, rows, 0.0))
+            seen = find_target_frames(target, camera, posed_pictures(recording, rows, 0.0))
             self.seen[name] = {one.name: recording.picture(one.name) for one in seen}
             frames += [SeenFrame(one.name, one.values, {name: one.mask}) for one in seen]
             lost = [recording.names[k] for k in rows if recording.names[k] not in self.seen[name]]
@@ -298,10 +302,10 @@ class _Registration:
         seconds = time.perf_counter() - start
         self._find_each()
         for name, found in self.registered.items():
-            require_seen(name, len(found.frames) - len(found.contradictions), len(self.seen[name]))
+            require_detections(name, len(found.frames) - len(found.outliers), len(self.seen[name]))
             self.seconds[name] += seconds / len(self.registered)
 
-    def judge(self, shown: int = 20) -> None:
+    def evaluate(self, shown: int = 20) -> None:
         """Says what a user should know of the cameras with all that was found.
 
         shown: number of pictures of each camera that are kept of those that contradict.
@@ -313,11 +317,11 @@ class _Registration:
         # All pictures of cameras that were found in some of them.
         for name, one in self.pictures.items():
             recording, found = one.recording, self.registered[name]
-            seen, misfits, lost = judge_pictures(body, replace(one, zeros=self._zeros), found)
+            seen, misfits, lost = evaluate_pictures(body, replace(one, zeros=self._zeros), found)
             frames += [SeenFrame(k.name, k.values + self._zeros, {name: k.mask}) for k in seen]
             found = self.registered[name] = replace(found, frames=misfits)
             errors = {k.frame: k.E_total for k in found.frames}
-            wanted = (*found.contradictions[:shown], *compared_frames(errors))
+            wanted = (*found.outliers[:shown], *compared_frames(errors))
             pictures = {k: recording.picture(k) for k in wanted}
             self.pictures[name] = replace(one, pictures={**one.pictures, **pictures})
             if lost:
@@ -325,7 +329,7 @@ class _Registration:
         if frames:
             inputs = self.inputs = replace(inputs, frames=tuple(frames))
         for name, found in self.registered.items():
-            if inputs.standing is not None:
+            if inputs.target is not None:
                 require_determined(found)
             picture = self.pictures.get(name)
             focal_found = picture is not None and picture.focal_deviation
@@ -341,7 +345,7 @@ class _Registration:
                 self.warnings += texts
                 found = self.registered[name] = replace(found, covariance=covariance)
             self.warnings += say_outliers(found, picture is not None or name in self.seen)
-        self.warnings += say_common(self.registered.values(), of_pictures=bool(self.pictures))
+        self.warnings += say_common(self.registered.values(), from_pictures=bool(self.pictures))
 
     def describe(self, more: float) -> dict[str, dict[str, Any]]:
         """The cameras' parts of the summary, each of which took so long more [s]."""
@@ -361,7 +365,7 @@ class _Registration:
         Raises RegistrationError: no pose of a camera explains its masks.
         """
         inputs, registered = self.inputs, self.registered
-        wrong = {name: found.contradictions for name, found in registered.items()}
+        wrong = {name: found.outliers for name, found in registered.items()}
         frames = []
         for one in inputs.frames:
             own = {c: m for c, m in one.masks.items() if one.name not in wrong.get(c, ())}
@@ -371,12 +375,12 @@ class _Registration:
         if not missing_for_person(inputs.model):
             shape = (shape_values(inputs.tree), *shape_parts(inputs.tree))
         adjusted, covariances, values, radius_scales = adjust_bundle(
-            self.body.kinematics, self.body.few, cameras, registered, frames, *shape
+            self.body.kinematics, self.body.medium, cameras, registered, frames, *shape
         )
-        self.inputs = replace(inputs, frames=inputs.moved(values))
+        self.inputs = replace(inputs, frames=inputs.with_values(values))
         known = inputs.positions.radius_scales
         radius_scales = radius_scales * (1.0 if known is None else known)
-        self.body = RegistrationBody(inputs.tree, inputs.seen, radius_scales=radius_scales)
+        self.body = RegistrationBody(inputs.tree, inputs.visible_nodes, radius_scales=radius_scales)
         for camera, covariance in zip(adjusted, covariances, strict=True):
             self._found_again(self.body.kinematics, camera, covariance)
             found = self.registered[camera.name]
@@ -395,36 +399,36 @@ class _Registration:
         inputs, names, cameras = self.inputs, self.body.kinematics.names, self.registered
         found = calibrate_joints(
             self.body, list(cameras.values()), [inputs.of(name) for name in cameras],
-            inputs.zeros, self._settings.focal, lengths=inputs.lengths,
+            inputs.zeros, self._settings.focal, links=inputs.lengths,
             start=self._zeros_in_pictures(), still_factor=2.5 if self.pictures else 1.0,
         )  # fmt: skip
         self.parameters = describe_parameters(found, self.body.kinematics)
         self.warnings += say_zeros(found)
-        offsets = {one.name: one.value for one in found.zeros}
+        offsets = {one.name: one.value for one in found.offsets}
         self._zeros = np.array([offsets.get(name, 0.0) for name in names])
-        model, tree, standing = inputs.model, inputs.tree, inputs.standing
-        seen = next(iter(cameras.values())).seen_object
-        shifts = joint_shifts(tree, found.lengths)
+        model, tree, target = inputs.model, inputs.tree, inputs.target
+        seen = next(iter(cameras.values())).target
+        shifts = joint_shifts(tree, found.link_scales)
         # The file keeps what chance may explain; the cameras were fitted with all.
-        zeros = {one.name: one.value for one in found.zeros if one.significant}
-        written = joint_shifts(tree, [one for one in found.lengths if one.significant])
+        zeros = {one.name: one.value for one in found.offsets if one.significant}
+        written = joint_shifts(tree, [one for one in found.link_scales if one.significant])
         if shifts:
             model = model.reshaped(joint_shifts=shifts)
-        if standing is not None and seen is not None:
-            standing = standing.before(model)
-            seen = standing.moved_pose(seen, found.object_values, found.object_covariance)
-            tree = standing.tree(seen.X_WT)
+        if target is not None and seen is not None:
+            target = target.before(model)
+            seen = target.moved_pose(seen, found.object_values, found.object_covariance)
+            tree = target.tree(seen.X_WT)
         elif shifts:
             tree, _ = make_registration_tree(model, self._settings)
         values = [one.values + self._zeros for one in inputs.frames]
-        self.inputs = replace(inputs, model=model, tree=tree, frames=inputs.moved(values))
+        self.inputs = replace(inputs, model=model, tree=tree, frames=inputs.with_values(values))
         kinematics = TreeKinematics(tree)
-        judged = zip(found.inlier_ratios, found.agrees, strict=True)
+        judged = zip(found.inlier_ratios, found.is_inlier, strict=True)
         told = zip(found.cameras, found.covariances, judged, strict=True)
-        for camera, covariance, (ratios, agrees) in told:
+        for camera, covariance, (ratios, is_inlier) in told:
             before = self.registered[camera.name]
-            rows = zip(before.frames, ratios.tolist(), agrees.tolist(), strict=True)
-            again = [replace(one, inlier_ratio=ratio, agrees=own) for one, ratio, own in rows]
+            rows = zip(before.frames, ratios.tolist(), is_inlier.tolist(), strict=True)
+            again = [replace(one, inlier_ratio=ratio, is_inlier=own) for one, ratio, own in rows]
             self.registered[camera.name] = replace(before, frames=tuple(again))
             self._found_again(kinematics, camera, covariance, seen)
         path = inputs.model.path
@@ -451,16 +455,16 @@ class _Registration:
         kinematics: TreeKinematics,
         camera: PinholeCamera,
         covariance: Array,
-        seen: ObjectPose | None = None,
+        seen: TargetPose | None = None,
     ) -> None:
         """A camera where it was found now, with its frames' misfits; which agree is known."""
         before = self.registered[camera.name]
-        frames = PosedFrames(kinematics, self.body.all, camera, self.inputs.of(camera.name))
-        found = areas(frames, camera.X_CW[None], np.inf)[0]
+        frames = PosedFrames(kinematics, self.body.full, camera, self.inputs.of(camera.name))
+        found = overlap_areas(frames, camera.X_CW[None], np.inf)[0]
         misfits = zip(before.frames, E_total(found), intersection_over_union(found), strict=True)
         again = [replace(one, E_total=float(off), iou=float(iou)) for one, off, iou in misfits]
         self.registered[camera.name] = replace(
-            before, camera=camera, covariance=covariance, frames=tuple(again), seen_object=seen
+            before, camera=camera, covariance=covariance, frames=tuple(again), target=seen
         )
 
 

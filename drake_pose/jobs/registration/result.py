@@ -26,12 +26,12 @@ from drake_pose.files.replay import Pictures, import_rerun, make_recording
 from drake_pose.files.report_page import new_plot, overlay_picture, page_template, plot_uri
 from drake_pose.files.settings import percent
 from drake_pose.jobs.registration.diagnosis import say_drift, say_reading
-from drake_pose.jobs.registration.inputs import Inputs
+from drake_pose.jobs.registration.inputs import RegistrationInputs
 from drake_pose.jobs.registration.settings import AuditSettings
 from drake_pose.registration.joint_offsets import JointCalibration, KinematicParameter
 from drake_pose.registration.picture_registration import PictureRegistration
 from drake_pose.registration.posed_frames import PosedFrame
-from drake_pose.registration.register import ObjectPose, RegisteredCamera
+from drake_pose.registration.register import RegisteredCamera, TargetPose
 from drake_pose.silhouette.outline import outline_from_mesh
 from drake_pose.silhouette.pictures.masks import encode_mask
 from drake_pose.silhouette.pictures.scenes import CAMERA_FILE
@@ -52,15 +52,15 @@ def describe_camera(
         suggestion: a pose of the robot that would tell poses apart.
         link: on which the camera rides, in whose frame its pose is then.
     """
-    pose, seen, X = "X_WC" if link is None else "X_LC", found.seen_object, found.camera.X_WC
+    pose, seen, X = "X_WC" if link is None else "X_LC", found.target, found.camera.X_WC
     target = {}
     if seen is not None:
         target = {
             **describe_pose("X_WT", seen.X_WT, seen),
             "modes": [{"X_WT": one.tolist()} for one in (seen.X_WT, *seen.alternatives)],
-            "determined": not len(seen.round_about),
+            "determined": not len(seen.symmetry_axes),
             "covariance": seen.covariance.tolist(),
-            "round_about": seen.round_about.tolist(),
+            "round_about": seen.symmetry_axes.tolist(),
         }
     return {
         **({} if link is None else {"link": link}),
@@ -70,10 +70,10 @@ def describe_camera(
         "suggestion": suggestion,
         **({"target": target} if target else {}),
         "seconds": seconds,
-        "contradictions": list(found.contradictions),
+        "contradictions": list(found.outliers),
         "frames": {
             frame.frame: {
-                "agrees": frame.agrees,
+                "agrees": frame.is_inlier,
                 "E_total": frame.E_total,
                 "iou": frame.iou,
                 "share": frame.inlier_ratio,
@@ -83,7 +83,7 @@ def describe_camera(
     }
 
 
-def describe_pose(name: str, X: Array, found: RegisteredCamera | ObjectPose) -> dict[str, Any]:
+def describe_pose(name: str, X: Array, found: RegisteredCamera | TargetPose) -> dict[str, Any]:
     """A pose (4, 4), and how sure it is."""
     return {
         name: X.tolist(),
@@ -152,13 +152,13 @@ def describe_parameters(
     turns = dict(zip(kinematics.names, kinematics.is_angle, strict=True))
     units = {True: ("deg", math.degrees(1.0)), False: ("mm", 1e3)}
     return {
-        "zeros": {one.name: describe(one, *units[bool(turns[one.name])]) for one in found.zeros},
-        "lengths": {one.name: describe(one, "percent", 1e2) for one in found.lengths},
+        "zeros": {one.name: describe(one, *units[bool(turns[one.name])]) for one in found.offsets},
+        "lengths": {one.name: describe(one, "percent", 1e2) for one in found.link_scales},
     }
 
 
 def describe_run(
-    inputs: Inputs, settings: AuditSettings, warnings: Sequence[str], seconds: float
+    inputs: RegistrationInputs, settings: AuditSettings, warnings: Sequence[str], seconds: float
 ) -> dict[str, Any]:
     """What summary.json says of every run: its files, and how it was made."""
     joints = inputs.joints
@@ -176,7 +176,7 @@ def describe_run(
 
 def write_result(
     path: Path,
-    inputs: Inputs,
+    inputs: RegistrationInputs,
     cameras: Mapping[str, Camera],
     registered: Mapping[str, RegisteredCamera],
     summary: Mapping[str, Any],
@@ -199,7 +199,7 @@ def write_result(
     for name, found in registered.items() if overlay else ():
         titles = [
             f"{name}  frame {one.frame}  E_total {percent(one.E_total)}  IoU {one.iou:.2f}  "
-            f"{'agrees' if one.agrees else 'CONTRADICTS the others'}"
+            f"{'agrees' if one.is_inlier else 'CONTRADICTS the others'}"
             for one in found.frames
         ]
         own = pictures[name] if pictures else {}
@@ -208,8 +208,8 @@ def write_result(
             for one in zip(inputs.of(name), titles, strict=True)
             if not own or one[0].name in own
         ]
-        write_overlays(path, inputs.tree, found.camera, titled, inputs.seen, own)
-        for given in (one for one in inputs.given if one.name == name):
+        write_overlays(path, inputs.tree, found.camera, titled, inputs.visible_nodes, own)
+        for given in (one for one in inputs.given_cameras if one.name == name):
             write_comparisons(path, inputs, inputs.of(name), given, found, own)
     names = TreeKinematics(inputs.tree).names
     names = tuple(name for name in names if name not in TARGET_POSITIONS)
@@ -233,7 +233,7 @@ def write_result(
                 "errors": ["turn_x", "turn_y", "turn_z", "x", "y", "z"],
                 "covariance": found.covariance,
                 "alternatives": found.alternatives,
-                "contradictions": list(found.contradictions),
+                "contradictions": list(found.outliers),
                 **{key: one[key] for key in ("zeros", "lengths", "target") if one.get(key)},
             }
         )
@@ -268,14 +268,14 @@ def write_overlays(
 
 def write_comparisons(
     folder: Path,
-    inputs: Inputs,
+    inputs: RegistrationInputs,
     frames: Sequence[PosedFrame],
     given: Camera,
     found: RegisteredCamera,
     pictures: Mapping[str, Picture],
 ) -> None:
     """Draws the robot as a camera that was given would see it, and as the one that was found."""
-    draw = body_drawer(inputs.tree, inputs.seen)
+    draw = body_drawer(inputs.tree, inputs.visible_nodes)
     errors = {one.frame: one.E_total for one in found.frames}
     for frame in (one for one in frames if one.name in compared_frames(errors)):
         shown: NDArray[Any] = pictures.get(frame.name, frame.mask)
@@ -443,7 +443,7 @@ def check_exports(formats: Collection[str], cameras: Iterable[Camera]) -> None:
 def write_exports(
     folder: Path,
     formats: Collection[str],
-    inputs: Inputs,
+    inputs: RegistrationInputs,
     cameras: Iterable[Camera],
     links: Mapping[str, str],
     pictures: Pictures,

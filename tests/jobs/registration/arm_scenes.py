@@ -11,7 +11,7 @@ import numpy as np
 from drake_pose.body import load_model
 from drake_pose.camera.camera_files import load_cameras, save_cameras
 from drake_pose.camera.models import Camera
-from drake_pose.jobs.registration.inputs import Inputs, read_inputs
+from drake_pose.jobs.registration.inputs import RegistrationInputs, read_inputs
 from drake_pose.jobs.registration.settings import RegistrationSettings
 from tests.jobs.scenes import edit_camera, write_masks
 from tests.registration.arm_pictures import errors
@@ -29,7 +29,7 @@ class ArmScene:
     joints: Path
     cameras: dict[str, Camera]
 
-    def read(self) -> Inputs:
+    def read(self) -> RegistrationInputs:
         """As a registration takes them."""
         return read_inputs(self.folder, self.model, self.joints, None, RegistrationSettings())
 

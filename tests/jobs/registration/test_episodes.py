@@ -17,7 +17,7 @@ from drake_pose.files.settings import EstimateSettings
 from drake_pose.jobs.estimate.inputs import read_inputs as read_estimate_inputs
 from drake_pose.jobs.estimate.measurements import is_episode
 from drake_pose.jobs.registration.audit import audit_scene
-from drake_pose.jobs.registration.inputs import Inputs, read_inputs
+from drake_pose.jobs.registration.inputs import RegistrationInputs, read_inputs
 from drake_pose.jobs.registration.register import register_scene
 from drake_pose.jobs.registration.settings import RegistrationSettings
 from drake_pose.silhouette.pictures.scenes import load_scene
@@ -45,7 +45,7 @@ def read(
     joints: Path | None = None,
     cameras: Path | None = None,
     **settings: Any,
-) -> Inputs:
+) -> RegistrationInputs:
     return read_inputs(scene, painted.path, joints, cameras, RegistrationSettings(**settings))
 
 
@@ -93,8 +93,8 @@ def test_a_folder_of_recordings_names_them(episode, tmp_path, command):
 def test_joints_are_where_their_log_says_at_the_pictures_times(episode):
     _, painted = episode
     found = read(*episode)
-    assert found.seen is None
-    assert not found.assumed
+    assert found.visible_nodes is None
+    assert not found.assumed_focal
     (recording,) = found.recordings.values()
     for offset in (0.0, 0.07):
         # Between rows of the log a swing is straight.
@@ -114,19 +114,19 @@ def test_parts_that_unlogged_joints_move_are_not_looked_at(episode, tmp_path):
     times, table = np.arange(0.0, 6.0, 0.1), tmp_path / "some.csv"
     write_log(table, times, painted.values_at(times)[:, :3], NAMES[:3])
     found = read(*episode, table)
-    assert found.seen == ("box0", "box1", "box2")
+    assert found.visible_nodes == ("box0", "box1", "box2")
     assert any("box3, box4" in text for text in found.warnings)
-    assert read(*episode, table, hold={"joint3": 0.0, "joint4": 10.0}).seen is None
+    assert read(*episode, table, hold={"joint3": 0.0, "joint4": 10.0}).visible_nodes is None
 
 
 def test_a_focal_length_that_nobody_knows_is_a_usual_one(episode, tmp_path):
     scene, painted = episode
     for name in ("images", "joint_angles.csv"):
         (tmp_path / name).symlink_to(scene / name)
-    assert read(tmp_path, painted).assumed == {"camera"}
+    assert read(tmp_path, painted).assumed_focal == {"camera"}
     given = read(tmp_path, painted, None, scene / "cameras.yaml")
     assert given.scene.cameras["camera"].focal_x == painted.camera.focal_x
-    assert not given.assumed
+    assert not given.assumed_focal
 
 
 def test_whether_a_camera_s_place_is_given(episode, tmp_path):

@@ -257,7 +257,7 @@ def test_a_change_is_where_all_frames_on_one_side_contradict(wrong, last) -> Non
 def test_cameras_that_rest_on_frames_of_two_moments_are_told_so() -> None:
     def camera(name: str, agreeing: str) -> SimpleNamespace:
         frames = [
-            SimpleNamespace(frame=f"{k}", agrees=one == "1") for k, one in enumerate(agreeing)
+            SimpleNamespace(frame=f"{k}", is_inlier=one == "1") for k, one in enumerate(agreeing)
         ]
         return SimpleNamespace(camera=SimpleNamespace(name=name), frames=frames)
 

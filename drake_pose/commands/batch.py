@@ -1,4 +1,4 @@
-"""The command `drake-pose batch`, and what it shows."""
+"""The command `drake-pose batch`."""
 
 from __future__ import annotations
 
@@ -41,13 +41,14 @@ def batch(
     resume: Resume = False,
     json: Json = False,
 ) -> None:
-    """Estimate or audit many scenes on several worker processes, long scenes in chunks of frames.
+    """Estimate or audit many scenes in worker processes; long scenes are cut into chunks of frames.
 
-    The result of each scene is that of estimate. A scene that fails is named and does not stop the
-    others. Ctrl-C keeps the finished chunks. The workers of a Dask scheduler must have the same
-    version of drake_pose, and find scenes, models and DIR under the same paths.
+    Each scene gets the result folder that estimate or audit would write. A scene that fails is
+    named and does not stop the others. Ctrl-C keeps the finished chunks. The workers of a Dask
+    scheduler must have the same version of drake_pose, and find scenes, models and the output
+    folder at the same paths.
 
-    The job file has the settings of estimate by their names in Python (EstimateSettings):
+    The job file holds settings of estimate by their names in Python (EstimateSettings):
 
         chunk: 100
         defaults: {replay: false}
@@ -56,17 +57,17 @@ def batch(
           walker: {scene: recordings/walker}
           robot: {scene: recordings/robot, model: arm.urdf, audit: recordings/robot/joints.csv}
 
-    A scene that has audit is audited; what contradicts is in DIR/contradictions.csv.
+    A scene with the key audit is audited; all errors are listed in contradictions.csv.
 
         drake-pose batch jobs.yaml --out results/all --workers 2
 
     Args:
         jobs: The job file (YAML).
-        workers: Number of worker processes on this machine; 0: none. Default: one for each core, or
-            none where the extra cluster is not installed.
-        scheduler: Address of a Dask scheduler whose workers are used instead, like
+        workers: Number of worker processes on this machine; 0: this process does the work. Default:
+            one for each core, or 0 if the extra cluster is not installed.
+        scheduler: Address of a Dask scheduler whose workers are used instead, such as
             tcp://10.0.0.7:8786.
-        chunk: Frames in a chunk. Default: that of the job file.
+        chunk: Number of frames in a chunk. Default: that of the job file.
     """
     from drake_pose.jobs.batch import run_batch
     from drake_pose.jobs.batch_file import read_job
@@ -76,7 +77,7 @@ def batch(
     if workers and scheduler is not None:
         raise UsageError("give --workers or --scheduler, not both")
     if workers is None and scheduler is None and not has_dask():
-        warn('this process does all the work; for one a core: pip install "drake_pose[cluster]"')
+        warn('one process does all the work; to use all cores: pip install "drake_pose[cluster]"')
         workers = 0
     with ExitStack() as opened:
         client = None
@@ -105,12 +106,9 @@ def batch(
 
 
 def _print_batch(result: Batch, most: int = 4) -> None:
-    """A row a scene, and where the results are; of what contradicts in an audited one the first.
-
-    The texts of all stand in contradictions.csv.
-    """
+    """Print a row for each scene, with the first few errors of audited ones, and the folder."""
     estimates = Table("scene", "state", "found", "E_total", "chunks", "seconds", title="Batch")
-    audits = Table("scene", "state", "agree", "contradicts the rest", "seconds", title="Audits")
+    audits = Table("scene", "state", "consistent", "errors", "seconds", title="Audits")
     for name, state in result.scenes.items():
         totals, seconds = state.totals, f"{state.seconds:.1f}"
         count = "found_count" if state.job.audit is None else "agreeing_count"

@@ -1,4 +1,7 @@
-"""Options that several commands have, and how commands speak: results on stdout, else stderr."""
+"""Options that several commands share, and functions that print.
+
+Results go to stdout; messages, warnings and progress bars to stderr.
+"""
 
 from __future__ import annotations
 
@@ -21,21 +24,24 @@ if TYPE_CHECKING:
     from drake_pose.files.records import FrameRecord
 
 SPREAD = Parameter("*")
-"""The fields of a settings class are options."""
+"""Makes each field of a settings class an option of its own."""
 
 Model = Annotated[
-    Path, Parameter(["--model", "-m"], help="The body: URDF, SDFormat, MJCF or .dmd.yaml.")
+    Path, Parameter(["--model", "-m"], help="Model file: URDF, SDFormat, MJCF or .dmd.yaml.")
 ]
-Out = Annotated[Path, Parameter(["--out", "-o"], help="Folder for the result; new or empty.")]
+Out = Annotated[
+    Path, Parameter(["--out", "-o"], help="Folder for the result. It must be new or empty.")
+]
 Pictures = Annotated[
-    Path | None, Parameter(["--out", "-o"], help="Folder for pictures. Default: none are written.")
+    Path | None,
+    Parameter(["--out", "-o"], help="Folder for pictures. Default: no pictures are written."),
 ]
-Resume = Annotated[bool, Parameter(help="Continue an interrupted result in --out.")]
+Resume = Annotated[bool, Parameter(help="Continue the interrupted result in --out.")]
 Replay = Annotated[bool, Parameter(negative="--no-replay", help="Write replay.html.")]
 Overlay = Annotated[
     bool, Parameter(negative="--no-overlay", help="Write overlay/<camera>/<frame>.png.")
 ]
-Browser = Annotated[bool, Parameter(negative="--no-browser", help="Open the page in the browser.")]
+Browser = Annotated[bool, Parameter(negative="--no-browser", help="Open the page in a browser.")]
 Json = Annotated[bool, Parameter(help="Print the result as JSON.")]
 Truth = Annotated[
     Path | None,
@@ -48,29 +54,29 @@ Seed = Annotated[int, within(0), Parameter(help="Seed of the random numbers.")]
 
 
 class UsageError(Exception):
-    """Options that do not go together; exit status 2."""
+    """Options that exclude each other; exit status 2."""
 
 
 def say(message: str) -> None:
-    """Writes a line to stderr; what a file's name would do to the terminal is spelt out."""
+    """Print a line to stderr; characters that are not printable are escaped."""
     safe = (c if c.isprintable() or c == "\n" else repr(c)[1:-1] for c in message)
     print("".join(safe), file=sys.stderr, flush=True)
 
 
 def warn(message: str) -> None:
-    """Writes a warning to stderr."""
+    """Print a warning to stderr."""
     say(f"drake-pose: warning: {message}")
 
 
 def print_json(value: Mapping[str, Any]) -> None:
-    """Writes JSON to stdout; numbers that are not finite become null."""
+    """Print JSON to stdout; numbers that are not finite become null."""
     from drake_pose.files.folder import without_nan
 
     print(json.dumps(without_nan(value), indent=2, ensure_ascii=False, allow_nan=False))
 
 
 def print_result(result: Any, json: bool, print_text: Callable[[Any], None]) -> None:
-    """Writes a result's warnings to stderr and, to stdout, its summary as JSON or its text."""
+    """Print a result's warnings to stderr, and its summary (JSON) or its text to stdout."""
     for text in result.warnings:
         warn(text)
     if json:
@@ -80,24 +86,24 @@ def print_result(result: Any, json: bool, print_text: Callable[[Any], None]) -> 
 
 
 def output_console() -> Console:
-    """Returns the console for results; a file or pipe gets lines that are not folded."""
+    """Return the console for results; files and pipes get lines of 160 columns."""
     console = Console(highlight=False)
     return console if console.is_terminal else Console(highlight=False, width=160)
 
 
 def print_files(*files: tuple[str, Path]) -> None:
-    """Writes where files are, those that exist, each after a label."""
+    """Print label and path of each file that exists."""
     for label, path in files:
         if path.exists():
             output_console().print(f"{label:<14} {escape(str(path))}", soft_wrap=True)
 
 
 def worst_frames(errors: Sequence[float | None], most: int = 30) -> tuple[list[int], str]:
-    """Which frames a table shows, in their order, and what its title says of that.
+    """Return the indices of the worst frames, ascending, and a text for the table's title.
 
     Args:
-        errors: of each frame; nan or None where nothing was found, which is worst.
-        most: number of frames shown.
+        errors: error of each frame; nan or None if no pose was found, which counts as worst.
+        most: maximum number of frames.
     """
     badness = [math.inf if one is None or math.isnan(one) else one for one in errors]
     shown = sorted(sorted(range(len(errors)), key=lambda k: -badness[k])[:most])
@@ -106,7 +112,7 @@ def worst_frames(errors: Sequence[float | None], most: int = 30) -> tuple[list[i
 
 
 def progress_bar() -> Progress:
-    """A bar on stderr; nothing where stderr is no terminal."""
+    """Return a progress bar on stderr, disabled if stderr is not a terminal."""
     console = Console(stderr=True)
     return Progress(
         TextColumn("{task.description}"),
@@ -120,14 +126,14 @@ def progress_bar() -> Progress:
 
 @contextmanager
 def count_progress(what: str, total: int | None) -> Iterator[Callable[[int], None]]:
-    """A progress bar; the value is a function to call with how many are done."""
+    """Show a progress bar; yields a function to be called with the number of finished items."""
     with progress_bar() as progress:
         task = progress.add_task(what, total=total)
         yield lambda done: progress.update(task, completed=done)
 
 
 class FrameProgress:
-    """A progress bar over frames that also counts those without a pose."""
+    """A progress bar over frames that also counts the frames without a pose."""
 
     def __init__(self) -> None:
         self._progress = progress_bar()
@@ -140,11 +146,11 @@ class FrameProgress:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Take the bar away."""
+        """Remove the bar."""
         self._progress.stop()
 
     def show_stage(self, stage: str, done: int, total: int | None) -> None:
-        """Show what is done before the first frame is finished, each stage by a bar of its own."""
+        """Show the progress of a stage of the work, each stage with its own bar."""
         if stage != self._stage:
             self._progress.remove_task(self._task)
             self._task = self._progress.add_task(stage, total=total)
@@ -152,7 +158,7 @@ class FrameProgress:
         self._progress.update(self._task, completed=done, total=total)
 
     def __call__(self, finished: int, total: int, frame: str, record: FrameRecord | None) -> None:
-        """Show that a frame is finished."""
+        """Count a finished frame."""
         self.show_stage("frames", finished, total)
         if record is not None and not record.found:
             self._lost += 1

@@ -56,33 +56,34 @@ def estimate(
 ) -> None:
     r"""Estimate the joint angles in every frame of a scene.
 
-    A beam search places the body link by link from the root outwards; the best poses are refined
-    to continuous angles by fitting the body's contour to the silhouettes' edges. All cameras are
-    used together. If scene.yaml has sequence: true, the pose is searched in the first frame and
-    tracked from there on. A person before two or more calibrated cameras is followed by all
-    silhouettes at once, lengths and radius scales too, where the model has a person's landmarks
-    and no option of the search is given.
+    A beam search places the body link by link, from the root outwards, and the body's contour is
+    then fitted to the silhouettes' edges to refine the best poses. All cameras are used together.
+    If scene.yaml has sequence: true, the pose is searched in the first frame and tracked in the
+    others. If the model is a person with landmarks.yaml and two or more cameras are calibrated, the
+    person is fitted to all silhouettes at once, link lengths and radius scales included, unless an
+    option of the search is given.
 
-    Files in DIR: report.html, which shows all of it; poses.csv (a row a frame: every joint's
-    position in rad or m, E_total, seconds); joints.csv (which joints the silhouettes determine,
-    and their 95 % intervals); modes.csv (poses that look the same); summary.json; overlay/;
-    replay.html; of a sequence also a MOT file, and of a person or hand TRC and BVH files. E_total
-    is the area where body and silhouettes differ, over the silhouettes' area. Ctrl-C keeps the
-    finished frames.
+    Files in the output folder: report.html (start here); poses.csv (for each frame every joint's
+    position [rad or m], E_total and seconds); joints.csv (95 % interval of each joint, and whether
+    the silhouettes determine it); modes.csv (other poses that fit equally well); summary.json;
+    overlay/; replay.html; for a sequence also a MOT file, and for a person or hand TRC and BVH
+    files. E_total is the area where body and silhouettes differ, divided by the silhouettes' area.
+    Ctrl-C keeps the finished frames.
 
-    A robot arm whose base is at the world's origin, seen by two cameras:
+    Example, a robot arm whose base is at the world's origin, and two cameras:
 
         drake-pose estimate ../shared/data/arm_two_views --out results/arm \
           --model ../shared/data/arm_two_views/med7/med7.urdf
 
     Args:
         scene: Folder with cameras.yaml and masks/<camera>/<frame>.png; or with masks/<frame>.png
-            alone, of a camera without calibration. A sequence may have
+            alone, for one camera without calibration. A sequence may have
             images/<camera>/<frame>.png or .jpg, or videos/<camera>.mp4, and a mask of the first
             frame only. Or a robot's recorded episode: pictures or videos with a joint log, a
-            LeRobot data set, DROID's raw folder or a bag; the body is followed by colour from where
-            the log says that it begins.
-        cameras: Camera file in place of the scene's or episode's own, as register writes it.
+            LeRobot data set, a raw folder of DROID or a ROS bag; the robot is tracked by colour,
+            starting at the first logged joint positions.
+        cameras: Camera file to use instead of the scene's or episode's own, such as one that
+            register has written.
     """
     from drake_pose.jobs.estimate.compile_ahead import compiling_ahead
     from drake_pose.jobs.estimate.scene import estimate_scene
@@ -102,11 +103,11 @@ def demo(
     out: Annotated[Path, Parameter(alias="-o")] = Path("results/demo"),
     json: Json = False,
 ) -> None:
-    """Estimate the pose in a stored real mask: a man balancing on a beam, seen by one camera.
+    """Estimate a man's pose from one silhouette that comes with the program.
 
-    Only the position of his right ankle is known. The search begins at that foot and finds all
-    other joint angles, as in Kameda, Minoh and Ikeda's experiment with real people. The model is a
-    man of average measures, not fitted to this man.
+    The man balances on a beam before one camera. Only the position of his right ankle is known: the
+    search starts at that foot and finds all other joint angles, as in the experiment of Kameda,
+    Minoh and Ikeda with real people. The model has average proportions, not those of this man.
 
         drake-pose demo --out results/demo
 
@@ -124,13 +125,13 @@ def demo(
 
 
 def _print_estimate(result: SceneEstimate) -> None:
-    """Prints a row a frame, of many the worst; joint errors if there is a truth; the files."""
+    """Print the worst frames, joint errors if ground truth is given, totals and files."""
     console = output_console()
     kinds = zip(result.position_names, result.position_kinds, strict=True)
     angles = {name for name, kind in kinds if kind == "angle"}
     compared = {f: one.joint_errors for f, one in result.records.items() if one.joint_errors}
     if result.summary["method"] == "person":
-        console.print("One person was followed by all silhouettes at once (--method person).")
+        console.print("One person was fitted to all silhouettes at once (--method person).")
         table = Table("camera", "frames", "mean IoU")
         for camera, one in result.summary["cameras"].items():
             table.add_row(escape(camera), str(one["frames"]), percent(one["mean_iou"]))
@@ -165,7 +166,7 @@ def _print_estimate(result: SceneEstimate) -> None:
 
 
 def _print_demo(result: SceneEstimate) -> None:
-    """The only frame's joint angles, the error, the seconds and where the picture is."""
+    """Print the joint angles, error and time of the only frame, and where the overlay is."""
     from drake_pose.files.folder import OVERLAY
 
     console = output_console()
@@ -182,8 +183,9 @@ def _print_demo(result: SceneEstimate) -> None:
     if result.folder is not None:
         print_files(*(("overlay", path) for path in (result.folder / OVERLAY).glob("*/*.png")))
     console.print(
-        "The picture tells agreement (light grey), missing (blue) and excess (orange) apart. "
-        "Kameda, Minoh and Ikeda report 22.3 % for six pictures of a woman, with a model of her."
+        "Overlay: body and silhouette agree (light grey), silhouette only (blue), body only "
+        "(orange). Kameda, Minoh and Ikeda report an error of 22.3 % for six pictures of a woman, "
+        "with a model of her."
     )
 
 
@@ -192,11 +194,11 @@ def _print_totals(console: Console, result: SceneEstimate) -> None:
 
     summary = result.summary
     console.print(f"found          {result.found_count} of {len(result.records)} frames")
-    console.print(f"E_total        {percent(summary['mean_E_total'])} in the mean")
-    console.print(f"seconds        {summary['median_seconds']:.2f} a frame in the median")
+    console.print(f"E_total        {percent(summary['mean_E_total'])} on average")
+    console.print(f"seconds        {summary['median_seconds']:.2f} per frame (median)")
     if summary["mean_iou"] is not None:
         frames = f"{summary['compared_count']} of {len(result.records)} frames"
-        console.print(f"IoU            {percent(summary['mean_iou'])} in the mean of {frames}")
+        console.print(f"IoU            {percent(summary['mean_iou'])} on average, {frames}")
     if result.folder is not None:
         files = {"poses": POSES, "report": REPORT, "replay": REPLAY}
         print_files(*((label, result.folder / file) for label, file in files.items()))
@@ -217,42 +219,41 @@ def capture(
     replay: Replay = True,
     json: Json = False,
 ) -> None:
-    """Capture the motion of one person before several calibrated cameras, from masks or live.
+    """Capture the motion of one person with several calibrated cameras, from masks or live.
 
-    Nothing need be known of the person: lengths and radius scales are fitted to the first frames.
-    This is estimate with the bundled person as the model, of a sequence of frames unless
-    scene.yaml has
-    sequence: false. Pictures or videos need masks of the first frame alone, in two cameras or more;
-    with --start no mask. If the folder has sources.yaml beside cameras.yaml, frames are captured as
-    they come, from live cameras in real time, until Ctrl-C.
+    No measurement of the person is needed: link lengths and radius scales are fitted to the first
+    frames. The command is estimate with the bundled person as the model; frames are a sequence
+    unless scene.yaml has sequence: false. Pictures or videos need a mask of the first frame only,
+    in two or more cameras, and none with --start. If the folder has sources.yaml beside
+    cameras.yaml, frames are captured as they arrive, from live cameras in real time, until Ctrl-C.
 
         drake-pose capture STUDIO --out results/person --seconds 60
 
     Args:
         scene: Folder with cameras.yaml and masks, pictures or videos; or with a sources.yaml.
-        model: A person with landmarks.yaml beside it. Default: the bundled one.
-        method: person: by all silhouettes at once; paper: by skin seen in colour pictures, and a
-            search for elbows and knees, all as Date et al. print it.
+        model: Model of a person with landmarks.yaml beside it. Default: the bundled person.
+        method: person: fit the person to all silhouettes at once; paper: detect skin in colour
+            pictures and search for elbows and knees, as published by Date et al.
     """
     settings, live = settings or CaptureSettings(), live or LiveSettings()
     of_masks = bool(truth or resume or set(changed(settings)) - {"packages"})
-    # The name of SOURCES; its module would make every command's start slow.
+    # Not SOURCES of camera.sources: importing that module would slow the start of every command.
     has_sources = (scene / "sources.yaml").is_file()
     of_person = bool(live.shape or not live.fit_shape)
     if method != "person" and (of_masks or of_person):
         raise UsageError(
             "--camera, --frame, --every, --truth, --start, --no-track, --resume, --shape "
-            "and --no-fit-shape are for --method person"
+            "and --no-fit-shape need --method person"
         )
     if method == "person" and live.faces is not None:
-        raise UsageError("--face-camera and --faces are for --method paper")
+        raise UsageError("--face-camera and --faces need --method paper")
     if has_sources and of_masks:
         raise UsageError(
-            "--camera, --frame, --every, --truth, --start, --no-track and --resume are for a "
-            f"folder of masks or pictures; {scene} has a sources.yaml"
+            "--camera, --frame, --every, --truth, --start, --no-track and --resume need a folder "
+            f"of masks or pictures, but {scene} has a sources.yaml"
         )
     if method == "person" and not has_sources and live != LiveSettings():
-        raise UsageError(f"{scene} has no sources.yaml, which that option is for")
+        raise UsageError(f"{scene} has no sources.yaml, which options of live capture need")
     if method == "person" and not has_sources:
         from drake_pose.jobs.estimate.inputs import bundled_person
 
@@ -270,7 +271,7 @@ def capture(
     studio = load_live_scene(scene)
     live = replace(live, replay=replay, packages=settings.packages)
     if method != "person" and any(one.live for one in studio.specifications.values()):
-        say("drake-pose: stand upright before the cameras, both arms spread to the sides")
+        say("drake-pose: stand upright in view of the cameras, both arms spread to the sides")
     with FrameProgress() as progress:
 
         def show(count: int, _: bool) -> None:
@@ -280,13 +281,13 @@ def capture(
     for text in result.troubles:
         warn(text)
     if result.interrupted:
-        say("drake-pose: ended by Ctrl-C; all frames are kept")
+        say("drake-pose: stopped by Ctrl-C; all frames are kept")
     found = result.estimate
     if json:
         print_json(found.summary)
     elif found.records:
         _print_estimate(found)
-        # What became of the pictures of each camera, and when it stopped and returned.
+        # Use of each camera's pictures, and the times at which it stopped and returned.
         table = Table("camera", "pictures used", "unusable", "too late", "stopped and returned")
         for name, source in found.summary["sources"].items():
             changes = [
@@ -299,14 +300,14 @@ def capture(
     if not found.records:
         raise SceneError("no camera gave a picture")
     if not found.found_count:
-        raise SceneError("nobody was found in any frame")
+        raise SceneError("no person was found in any frame")
 
 
 def empty_room(folder: Path, /, *, pictures: Annotated[int, within(1)] = 30) -> None:
-    """Take pictures of the empty room with the cameras of a sources.yaml.
+    """Take background pictures of the empty room with the cameras of a sources.yaml.
 
-    Live capture finds the person as what differs from these pictures. Leave the room first, and
-    take them again when the light changes or a camera moves.
+    Live capture segments the person as the region that differs from these pictures. Leave the room
+    first, and take new ones after the light changes or a camera moves.
 
         drake-pose empty-room STUDIO
 

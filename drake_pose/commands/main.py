@@ -1,4 +1,7 @@
-"""The command line `drake-pose`. Heavy modules are imported inside the commands."""
+"""The command line `drake-pose`.
+
+Commands import heavy modules inside their functions, so that `--help` starts quickly.
+"""
 
 import inspect
 import os
@@ -25,12 +28,12 @@ from drake_pose.version import VERSION
 
 
 def _unfold(text: str) -> str:
-    """Paragraphs in one line each; examples, which are indented, stay line by line."""
+    """Join the lines of each paragraph; indented examples keep their lines."""
     return re.sub(r"(?<=\S)\n(?=\S)", " ", inspect.cleandoc(text))
 
 
 class _Formatter(DefaultFormatter):
-    """Joins the lines of a docstring that is an option's help, which are then folded anew."""
+    """Joins the lines of an option's help, which the terminal then wraps."""
 
     def __call__(self, console: Console, options: ConsoleOptions, panel: HelpPanel) -> None:
         for entry in panel.entries:
@@ -41,7 +44,7 @@ class _Formatter(DefaultFormatter):
 
 
 def _program(name: str, help: str, *commands: Callable[..., None]) -> App:
-    """A program of commands: functions, which their docstrings describe."""
+    """Return a program whose commands are functions; their docstrings are the help texts."""
 
     def show_default(value: object) -> str | None:
         return None if value in (None, (), {}) or isinstance(value, bool) else str(value)
@@ -71,38 +74,38 @@ def _program(name: str, help: str, *commands: Callable[..., None]) -> App:
 
 app = _program(
     "drake-pose",
-    """Joint angles of articulated objects from silhouettes.
+    """Estimate joint angles of articulated objects from silhouettes.
 
-    Input: any model file that Drake reads (URDF, SDFormat, MJCF), and a scene: a folder with
+    Input: a model file that Drake reads (URDF, SDFormat, MJCF) and a scene, which is a folder with
     cameras.yaml and black and white masks/<camera>/<frame>.png. Output: the joint angles in each
-    frame, which of them the silhouettes determine and how well, and other poses that look the same.
-    No training, no GPU. For a first result run drake-pose demo.
+    frame, their 95 % intervals, which of them the silhouettes determine, and other poses that fit
+    equally well. No training and no GPU are needed. For a first result run drake-pose demo.
 
-    Exit status: 0 done, 1 failed (the message says what is at fault), 2 wrong usage.""",
+    Exit status: 0 success, 1 failure (the message names the cause), 2 wrong usage.""",
     estimate, capture, register, audit, masks, batch, walk, demo, check, undistort, empty_room,
 )  # fmt: skip
 app.command(
     _program(
         "reproduce",
-        "Run a paper's experiment and show its figures beside ours.",
+        "Run a paper's experiment and show its published results beside ours.",
         *(kameda, shimada, date, reproduce_all),
     )
 )
 
 
 def main(words: Sequence[str] | None = None) -> None:
-    """Runs the command line.
+    """Run the command line.
 
     Args:
-        words: what follows the program's name; those it was started with where not given.
+        words: arguments after the program's name; None: those of this process.
 
     Raises:
-        SystemExit: the exit status, if it is not 0.
+        SystemExit: with the exit status, if it is not 0.
     """
-    # Read when numpy is first imported: of small matrices, threads that wait for each other cost up
-    # to ten times the product where other processes want the cores, as a batch's do.
+    # OpenBLAS reads this when numpy is first imported. Its threads slow products of small matrices
+    # down by up to ten times while other processes, such as a batch's workers, use the cores.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    # Whoever stops the program otherwise, such as a service's manager, means what Ctrl-C means.
+    # SIGTERM and SIGHUP, as a service manager sends them, act like Ctrl-C.
     for ending in (signal.SIGTERM, signal.SIGHUP):
         if signal.getsignal(ending) is signal.SIG_DFL:
             signal.signal(ending, signal.default_int_handler)
@@ -111,13 +114,13 @@ def main(words: Sequence[str] | None = None) -> None:
 
 
 def _run(words: Sequence[str] | None) -> None:
-    """Reads the command line and does what it says."""
+    """Parse the arguments and run the command; errors become one line and an exit status."""
     try:
         command, bound, _ = app.parse_args(words, exit_on_error=False, print_error=False)
     except (CycloptsError, SettingsError) as error:
         _stop(str(error), 2)
     except KeyboardInterrupt:
-        # What a command needs is imported, and compiled, while its words are read.
+        # Parsing imports modules, which may compile kernels.
         _stop("interrupted before anything was written")
     try:
         command(*bound.args, **bound.kwargs)
@@ -131,16 +134,16 @@ def _run(words: Sequence[str] | None) -> None:
         out = bound.arguments["out"]
         if not out.is_dir():
             _stop("interrupted before anything was written")
-        _stop(f"interrupted; what is finished is in {out}; go on with --resume")
+        _stop(f"interrupted; the finished part is in {out}; continue with --resume")
     except OSError as error:
-        # Where no command expects it, such as in a folder that may not be searched.
+        # An error that no command handles, such as a folder without search permission.
         _stop(f"{error.filename or 'the system'}: {error.strerror or error}")
     except UnicodeEncodeError as error:
         near = error.object[max(0, error.start - 40) : error.end + 40]
-        _stop(f"{near!r}: the name of this file or folder is no UTF-8 text; rename it")
+        _stop(f"{near!r}: the name of this file or folder is not UTF-8; rename it")
     except SystemExit as error:
-        # Drake raises SystemExit where one of its C++ demands fails, and exits without a word.
-        _stop(f"Drake stopped with a failed demand: {error}")
+        # Drake raises SystemExit where DRAKE_DEMAND fails.
+        _stop(f"a DRAKE_DEMAND failed in Drake: {error}")
 
 
 def _stop(message: str, status: int = 1) -> NoReturn:

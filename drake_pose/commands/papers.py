@@ -35,21 +35,21 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class KamedaOptions:
-    """Options of experiment A; those that mean nothing beside others are refused."""
+    """Options of experiment A of Kameda et al."""
 
     seed: Annotated[int | None, within(0)] = None
     """Seed of the random poses. Default: 0."""
     seeds: Annotated[int | None, within(1)] = None
-    """Run this many seeds, and show how far the figures spread. Default: 1."""
+    """Number of seeds; with several the spread of the results is shown. Default: 1."""
     method: Literal["paper", "beam"] | None = None
-    """paper: the paper's alone; beam: beam search beside it. Default: paper."""
+    """paper: the published search alone; beam: compare it with beam search. Default: paper."""
     angles: Literal["grid", "continuous"] | None = None
-    """grid: true angles and samples are multiples of 20 degrees, as in the paper; continuous: any
-    true angles, and poses are refined between the samples. Default: grid."""
+    """grid: true angles and samples are multiples of 20 degrees, as in the paper; continuous: true
+    angles are arbitrary, and poses are refined between the samples. Default: grid."""
     outside_limit: Annotated[float | None, within(0.0), Parameter(metavar="R")] = None
-    """The paper's r: area of a segment that may lie outside [pixel]. Default: 200."""
+    """The paper's r: area of a segment that may lie outside the mask [pixel]. Default: 200."""
     candidates: Annotated[int | None, within(1), Parameter(metavar="K")] = None
-    """The paper's K: candidates kept for each segment. Default: 5."""
+    """The paper's K: number of candidates kept for each segment. Default: 5."""
     interval: Annotated[float | None, within(1.0, 90.0)] = None
     """Sampling interval [deg]. Default: 20."""
     views: Annotated[int | None, within(1)] = None
@@ -57,7 +57,7 @@ class KamedaOptions:
     out: Pictures = None
 
     def refuse(self, needed: str, *but: str) -> None:
-        """Refuses what was given, except some options: it needs another one."""
+        """Raise a UsageError if an option other than ``but`` was given: it needs ``needed``."""
         for field in fields(self):
             if field.name not in but and getattr(self, field.name) is not None:
                 raise UsageError(f"--{field.name.replace('_', '-')} needs {needed}")
@@ -70,16 +70,17 @@ def kameda(
     options: Annotated[KamedaOptions | None, SPREAD] = None,
     json: Json = False,
 ) -> None:
-    """Kameda, Minoh and Ikeda: poses of a woman (A), real silhouettes of a man (B), a hand (C).
+    """Kameda, Minoh and Ikeda: poses of a woman (A), of a man in real pictures (B), of a hand (C).
 
-    The pose is searched given nothing but the position of the head (A), an ankle (B) or the wrist
-    (C). The table shows the paper's figures beside ours.
+    The pose is searched from one silhouette and the position of the head (A), an ankle (B) or the
+    wrist (C). The table shows the published results beside ours.
 
         drake-pose reproduce kameda --images 20
 
     Args:
-        experiment: A: random poses, drawn; B: six pictures of a person; C: two pictures of a hand.
-        images: Number of silhouettes; of B and C all that there are or fewer.
+        experiment: A: rendered silhouettes of random poses; B: six pictures of a man; C: two
+            pictures of a hand.
+        images: Maximum number of silhouettes.
     """
     one = options or KamedaOptions()
     is_continuous = one.angles == "continuous"
@@ -108,7 +109,7 @@ def kameda(
         else:
             limit = 200.0 if one.outside_limit is None else one.outside_limit
             interval = one.interval or 20.0
-            # Beside ours the paper's search makes no more than the paper's own images.
+            # For the comparison the published search runs on as many images as in the paper.
             is_beam = one.method == "beam"
             few = min(images, int(poses.PAPER["images"])) if is_beam else images
             paper = poses.experiment_search(limit, one.candidates or 5, interval)
@@ -129,31 +130,32 @@ def kameda(
 
 @dataclass(frozen=True, kw_only=True)
 class ShimadaOptions:
-    """Options of the experiments with hands, of which some go without others."""
+    """Options of the experiments with hands; some exclude each other."""
 
     runs: Annotated[int | None, within(1)] = None
-    """Number of sequences for each of r_13 = 35 and 40. Default: 50; with --pictures 10."""
+    """Number of sequences for each of r_13 = 35 and 40. Default: 50, with --pictures 10."""
     seed: Seed = 0
     truncation: Literal["sequential", "joint", "clip", "none", "all"] | None = None
-    """sequential is the paper's, default with --hypotheses; else joint; or all."""
+    """Truncation of the belief by the inequalities; sequential is the published one, all compares
+    all of them. Default: joint, with --hypotheses sequential."""
     observed: Literal["lines", "lines_wrist", "full"] | None = None
-    """What is measured. lines: axes of segments, fingertips and the palm's outline, as in the
-    paper; lines_wrist: the wrist's place, too; full: all points. Default: lines."""
+    """Measurements. lines: axes of segments, fingertips and the palm's contour, as in the paper;
+    lines_wrist: also the wrist's position; full: all points. Default: lines."""
     iterations: Annotated[int | None, within(1)] = None
-    """Linearisations of an update at most; the paper's filter has 1. Default: 20; with --hypotheses
-    1."""
+    """Maximum number of linearisations in an update; the published filter has 1. Default: 20, with
+    --hypotheses 1."""
     hypotheses: bool = False
-    """Another experiment, figure 9: fingers bend through the image plane; which hypotheses are
-    made, and what rejects the wrong ones."""
+    """Run the experiment of figure 9 instead: fingers bend through the image plane. Shows which
+    hypotheses are created, and what rejects the wrong ones."""
     pictures: bool = False
-    """Silhouettes by Drake's renderer instead of numbers with noise."""
+    """Measure silhouettes drawn by Drake's renderer instead of noisy numbers."""
     sequence: tuple[Path, ...] = ()
-    """With --pictures: recorded silhouettes of a right hand, cut off at the wrist, in one view of
-    unknown scale, instead (a scene with sequence: true); repeat for several."""
+    """With --pictures: use recorded silhouettes instead, of a right hand cut off at the wrist, in
+    one view of unknown scale (a scene with sequence: true); repeat for several."""
     noise: float = 1.0
-    """So many times the noise of the numbers, which the filter is told."""
+    """Factor of the measurement noise; the filter knows it."""
     acceleration: float = 1.0
-    """So many times the accelerations that the filter expects."""
+    """Factor of the accelerations that the filter expects."""
     out: Pictures = None
 
 
@@ -163,9 +165,9 @@ def shimada(
     """Shimada, Shirai, Kuno and Miura: joint angles and lengths of a synthetic hand, one camera.
 
     A two-finger hand moves, turns and flexes for 55 frames, measured with noise. A Kalman filter
-    starts from wrong angles and lengths and corrects both, its belief truncated by the limits and
-    couplings of the paper's table 1. The paper's own experiment is one of numbers (section 6); with
-    --pictures Drake's renderer shows the hand, and silhouettes are all that is seen (figure 17).
+    starts from wrong angles and lengths and corrects both; its belief is truncated by the limits
+    and couplings of the paper's table 1. The published experiment measures numbers (section 6);
+    with --pictures the measurements are silhouettes from Drake's renderer (figure 17).
 
         drake-pose reproduce shimada --runs 20 --out results/shimada
         drake-pose reproduce shimada --pictures --out results/figure_17
@@ -174,13 +176,13 @@ def shimada(
     one = options or ShimadaOptions()
     is_all = one.truncation == "all"
     if is_all and (one.hypotheses or one.out is not None):
-        raise UsageError("--truncation all goes without --hypotheses and --out")
+        raise UsageError("--truncation all excludes --hypotheses and --out")
     if one.pictures and (one.hypotheses or one.observed or one.noise != 1.0):
-        raise UsageError("--pictures goes without --hypotheses, --observed and --noise")
+        raise UsageError("--pictures excludes --hypotheses, --observed and --noise")
     if one.hypotheses and (one.noise, one.acceleration) != (1.0, 1.0):
-        raise UsageError("--hypotheses goes without --noise and --acceleration")
+        raise UsageError("--hypotheses excludes --noise and --acceleration")
     if one.sequence and (not one.pictures or one.runs or is_all):
-        raise UsageError("--sequence goes with --pictures, without --runs or truncation all")
+        raise UsageError("--sequence needs --pictures and excludes --runs and --truncation all")
     figures: Mapping[str, Any]
     with _experiment(one.out) as count:
         from drake_pose.filtering.truncated_filter import TRUNCATIONS
@@ -235,20 +237,20 @@ def date(
 ) -> None:
     """Date, Yoshimatsu, Arita and Taniguchi: a moving person before many calibrated cameras.
 
-    A simulated person walks, reaches, leans, crouches, turns and crosses the arms. Compared are the
-    paper's inverse kinematics alone, the paper's search for elbows and knees, and one fit to all
-    silhouettes at once. Times are those of one core, without rendering.
+    A simulated person walks, reaches, leans, crouches, turns and crosses the arms. The table
+    compares the published inverse kinematics, the published search for elbows and knees, and one
+    fit to all silhouettes at once. Times are for one core, without rendering.
 
         drake-pose reproduce date --cameras 5 --frames 120 --out results/date
 
     Args:
-        cameras: Number of cameras, including the one at the face; the paper has 9.
+        cameras: Number of cameras, including the one before the face; the paper has 9.
         frames: Number of frames; fewer than 120 do not show all motions.
-        method: Whose figures lead. paper: the paper's, all as printed (rectangles on one circle,
-            the waist by 0.55, 0.225, 0.225, feet nearest to their last places), alone; silhouette:
-            a fit to all silhouettes beside it.
-        walk: Another experiment, section 6.2 and figure 8: the gestures of its table 1 walk an
-            avatar through a place. Always captured by the paper's method.
+        method: paper: the published method alone, with its rules as printed (rectangles on one
+            circle, waist weights 0.55, 0.225 and 0.225, feet nearest to their last positions);
+            silhouette: compare it with a fit to all silhouettes.
+        walk: Run the experiment of section 6.2 and figure 8 instead: the gestures of table 1 walk
+            an avatar through a place. Captured by the published method.
     """
     with _experiment(out) as count:
         from drake_pose.papers.date import run_experiment
@@ -267,14 +269,14 @@ def date(
 
 
 def reproduce_all(*, out: Out, short: bool = False, resume: Resume = False) -> None:
-    """Run the experiments of the three papers, and make one page about them, report.html.
+    """Run the experiments of the three papers and write one page about them, report.html.
 
-    An experiment that is finished is kept: after Ctrl-C, --resume goes on with the others.
+    Finished experiments are kept: after Ctrl-C, --resume continues with the others.
 
         drake-pose reproduce all --out results/papers
 
     Args:
-        short: A few images and runs only, to see that it works.
+        short: Use only a few images and runs, to see whether it works.
     """
     with _experiment(out, resume) as count:
         from drake_pose.papers.all_experiments import reproduce_all as run
@@ -285,7 +287,7 @@ def reproduce_all(*, out: Out, short: bool = False, resume: Resume = False) -> N
 
 @contextmanager
 def _experiment(out: Path | None, resume: bool = False) -> Iterator[Count]:
-    """Claims an empty folder for results; the value begins a progress bar, ending the last."""
+    """Lock the folder for results; yields a function that starts the next progress bar."""
     from drake_pose.files.folder import claimed
 
     with ExitStack() as bars, nullcontext() if out is None else claimed(out, resume):
@@ -303,7 +305,7 @@ def _show(
     json: bool,
     warnings: Sequence[str] = (),
 ) -> None:
-    """Prints what came out."""
+    """Print warnings, then results as JSON or as tables."""
     for text in warnings:
         warn(text)
     if json:

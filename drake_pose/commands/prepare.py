@@ -1,4 +1,4 @@
-"""The commands `drake-pose check`, `masks`, `undistort`: before an estimate."""
+"""The commands `drake-pose check`, `masks` and `undistort`."""
 
 from __future__ import annotations
 
@@ -29,16 +29,16 @@ if TYPE_CHECKING:
 
 
 def check(file: Path, /, *, package: Packages | None = None, json: Json = False) -> None:
-    """Check whether a model is fit for pose estimation, and if not, why.
+    """Check whether a model can be used for pose estimation, and if not, why.
 
-    A fit model has visual geometry, and limits on every prismatic joint that is searched. The
+    A usable model has visual geometry, and limits on every prismatic joint that is searched. The
     table shows the pose tree in the order of the search: each link, its parent, the joints between
-    them in the order of rotation with their limits, and the link's number of triangles. Exit
-    status 1: not fit.
+    them in the order of rotation with their limits, and the number of triangles. Exit status 1: the
+    model cannot be used.
 
-    Collision geometry, transmissions and plugins are not read. Joints that follow others (mimic)
-    are one unknown with them; loops and gearboxes are named in a warning and not enforced. Expand
-    xacro macros first.
+    Collision geometry, transmissions and plugins are not read. A joint that mimics another one
+    shares its unknown. Loops and gearboxes are named in a warning and not enforced. Expand xacro
+    macros first.
 
         drake-pose check urdf/woman/woman.urdf
         drake-pose check arm.urdf --package arm_description=ros/arm_description
@@ -72,21 +72,21 @@ def check(file: Path, /, *, package: Packages | None = None, json: Json = False)
         warn(text)
     if report.errors:
         raise ModelError("; ".join(report.errors))
-    say("drake-pose: fit for use")
+    say("drake-pose: the model is fit for use")
 
 
 def undistort(
     folder: Path, /, *, cameras: Path, out: Annotated[Path, Parameter(alias="-o")]
 ) -> None:
-    """Remove the lenses' distortion from pictures.
+    """Remove lens distortion from pictures.
 
         drake-pose undistort RECORDING --cameras calibration.toml --out SCENE
 
     Args:
         folder: Folder with images/<camera>/<frame>.png or .jpg.
-        cameras: Camera file with distortion: of ROS, Kalibr, OpenCV, anipose, Pose2Sim, Caliscope,
-            or cameras.yaml.
-        out: Folder for the pictures, and for cameras.yaml of the pictures without distortion.
+        cameras: Camera file with distortion, as ROS, Kalibr, OpenCV, anipose, Pose2Sim or Caliscope
+            write it, or cameras.yaml.
+        out: Folder for the undistorted pictures and their cameras.yaml.
     """
     from drake_pose.jobs.undistort import undistort_pictures
 
@@ -103,27 +103,27 @@ def masks(
     overlay: Annotated[bool, Parameter(negative="--no-overlay")] = True,
     json: Json = False,
 ) -> None:
-    """Make a scene of masks: of masks that other tools wrote, or of pictures.
+    """Make a scene of masks, from masks of other tools or from pictures.
 
     Masks of other tools are COCO files, black and white pictures, or black and white videos. In
-    pictures and videos an object is found by the empty room (--background), a box (--box), or the
-    object's own model (--model with --start): pose and mask are found in turn. A median of the
-    pictures stands for the empty room only where the body leaves every place; the command says
-    where it does not.
+    pictures and videos the object is segmented by one of: a background picture of the empty room
+    (--background), a box (--box), or the object's model (--model and --start), whose pose and mask
+    are estimated alternately. --background median takes each pixel's median over the recording,
+    which works only if the body does not stay in one place; the command warns if it does.
 
-    Files in SCENE: masks/; cameras.yaml and scene.yaml; overlay/, the pictures with the masks'
-    outlines: look at them; summary.json, each mask's area, refusal and warnings.
+    Files in SCENE: masks/; cameras.yaml; scene.yaml; overlay/ (the pictures with the masks'
+    contours: look at them); summary.json (area and warnings of each mask, and why it was rejected).
 
-    A photograph, the object in a box:
+    Example, a photograph with the object in a box:
 
         drake-pose masks photograph.jpg --out scene --box 120,80,300,260
 
     Args:
-        source: Folder with images/<camera>/<frame>.png or .jpg, or videos/<camera>.mp4, or pictures
-            of a single camera; a picture, a video; a COCO file (.json); an episode of a LeRobot
-            data set or DROID, or a ROS bag.
-        out: Folder for the scene; new or empty.
-        overlay: Write the pictures with the masks' outlines, overlay/<camera>/<frame>.jpg.
+        source: Folder with images/<camera>/<frame>.png or .jpg, with videos/<camera>.mp4, or with
+            pictures of a single camera; a picture; a video; a COCO file (.json); an episode of a
+            LeRobot data set or DROID; or a ROS bag.
+        out: Folder for the scene. It must be new or empty.
+        overlay: Write the pictures with the masks' contours, overlay/<camera>/<frame>.jpg.
     """
     from drake_pose.jobs.masks import make_masks
 
@@ -133,7 +133,7 @@ def masks(
 
 
 def _print_masks(result: SceneMasks) -> None:
-    """How many masks each camera has, then where they are."""
+    """Print the number and sizes of each camera's masks, and the scene's folder."""
     console = output_console()
     for name, frames in result.summary["cameras"].items():
         good = [one["area"] for one in frames.values() if "area" in one]

@@ -43,30 +43,31 @@ def register(
     overlay: Overlay = True,
     json: Json = False,
 ) -> None:
-    r"""Find where cameras stand, from masks or a robot's recorded episode: no board, no guess.
+    r"""Find camera poses from a robot's silhouettes or a recorded episode, without a board.
 
-    All rotations of a camera are tried; the best are fitted by the robot's contour, in the end only
-    to what fits. The answer has a standard deviation for place and rotation, other poses that fit
-    no worse, and the frames that contradict the others. The focal length and principal point of
-    each camera must be known, and the pictures be free of distortion. The world is the model's: the
-    robot's base, in most files. Five poses that differ much are enough. Cameras that have an X_WC
-    are held, and compared with the robot.
+    All rotations of a camera are searched, without an initial guess, and the best poses are fitted
+    to the robot's contour; contour points that do not fit are outliers. The result is the pose with
+    the standard deviations of position and rotation, other poses that fit equally well, and the
+    frames that are outliers. Focal length and principal point of each camera must be known, and the
+    pictures must be free of distortion. The world is the model's, in most files the robot's base.
+    Five poses that differ much are enough. Cameras that have an X_WC are held, and compared with
+    the robot.
 
-    Without joint positions the body's poses are estimated from the cameras that have an X_WC: one
-    for a robot on its base, two for a person; then poses and missing cameras are fitted together.
+    Without joint positions the body's poses are estimated from the cameras that have an X_WC (one
+    for a robot with a fixed base, two for a person), and refined together with the missing cameras.
     --joints may also be the poses.csv of an estimate, in which the base may move.
 
-    An episode needs no masks: pictures or videos beside joint positions by time or frame, a LeRobot
-    data set, a folder of DROID, a ROS bag. The robot must move in view of a camera that stands
-    still, or that rides on it (--on) and sees a --target. Of one that stands still is found, too,
-    by how much pictures and joints are out of step, and an unknown focal length.
+    An episode needs no masks: pictures or videos with joint positions by time or frame, a LeRobot
+    data set, a raw folder of DROID, or a ROS bag. The robot must move in view of a static camera,
+    or carry the camera (--on) with a --target in view. For a static camera the time offset between
+    pictures and joints is estimated as well, and the focal length if it is unknown.
 
-    Files in DIR: cameras.yaml, which estimate reads; report.html, which shows all of it;
-    registration.yaml (6 x 6 covariance, other poses); summary.json; overlay/, overlay_as_given/; of
-    an episode masks/ and joint_angles.csv, a scene of the frames that were looked at; with --export
-    ros/, mujoco.xml, drake.yaml, rerun.rrd.
+    Files in the output folder: report.html (start here); cameras.yaml, which estimate reads;
+    registration.yaml (6 x 6 covariance, other poses); summary.json; overlay/; overlay_as_given/;
+    for an episode masks/ and joint_angles.csv, which make the folder a scene; with --export ros/,
+    mujoco.xml, drake.yaml or rerun.rrd.
 
-    A robot arm whose camera was not measured, and an episode of DROID:
+    Examples, a robot arm before one camera, and an episode of DROID:
 
         drake-pose register ../shared/data/arm_one_view --out results/camera \
           --model ../shared/data/arm_two_views/med7/med7.urdf \
@@ -76,12 +77,13 @@ def register(
           --model ../shared/data/droid_episodes/robot/panda_robotiq.urdf
 
     Args:
-        scene: Folder with cameras.yaml, in which X_WC may be missing, and
-            masks/<camera>/<frame>.png; or an episode: a folder or file.
-        joints: Joint positions of every frame [rad or m]: a CSV file with the column frame and one
-            for each joint; of an episode also by time. Default: the recording's own
-            (joint_angles.csv); without any they are estimated from the cameras that have an X_WC.
-        cameras: Camera file in place of the scene's or episode's own.
+        scene: Folder with masks/<camera>/<frame>.png and cameras.yaml, in which X_WC may be
+            missing; or an episode, a folder or file.
+        joints: Joint positions in every frame [rad or m]: CSV file with the column frame (an
+            episode may have time instead) and one column for each joint. Default: the scene's
+            joint_angles.csv or the episode's joint log; without either they are estimated from the
+            cameras that have an X_WC.
+        cameras: Camera file to use instead of the scene's or episode's own.
     """
     from drake_pose.jobs.registration.register import register_scene
 
@@ -105,26 +107,26 @@ def audit(
     overlay: Overlay = True,
     json: Json = False,
 ) -> None:
-    r"""Say which frames, cameras or joints contradict the rest.
+    r"""Find errors in joint positions, cameras and frames of a scene.
 
-    Each frame is fitted by itself with its joints and cameras free to move a little. What all
-    frames are off alike is the fault of a joint's zero, of a camera or of the base; a frame is
-    named that is off from the others. Named is what is significant, errors of masks and surfaces
-    counted, and moves outlines by a pixel or more. Of causes that explain the masks equally well
-    all are told: with one camera, a base that has moved looks like a camera that has.
+    Each frame is fitted by itself, with its joints and cameras free to move a little. A deviation
+    that all frames share is an error of a joint offset, a camera or the base; a frame that deviates
+    from the others is an outlier. An error is reported if it is significant, given the errors of
+    masks and surfaces, and moves the contours by a pixel or more. All causes that explain the masks
+    equally well are reported: with one camera, a moved base cannot be distinguished from a moved
+    camera.
 
-    Errors that are too large for that are searched: joints' offsets and signs over their whole
-    range, focal lengths, exchanged cameras, mirrored masks, conventions of X_WC, cameras that moved
-    half-way.
+    Larger errors are searched: joint offsets and signs over the joints' whole range, focal lengths,
+    exchanged cameras, mirrored masks, conventions of X_WC, and cameras that moved during the
+    recording.
 
-    An episode, as register takes it, needs no masks: each camera is found in its pictures without
-    the given one, which is then compared with it; and by how much pictures and joints are out of
-    step is told.
+    An episode, as for register, needs no masks: each camera is found in its pictures without the
+    given pose, which is then compared with the one found. Errors of the clocks are reported, too.
 
-    Files in DIR: report.html, a page with all of it; summary.json; overlay/ of the frames that
-    contradict the others; overlay_as_given/, the robot as given and as found.
+    Files in the output folder: report.html (start here); summary.json; overlay/ of the frames that
+    are outliers; overlay_as_given/, the robot as given and as found.
 
-    Whose positions are not those of the pictures:
+    Example, a scene whose joint positions do not belong to the pictures:
 
         drake-pose audit ../shared/data/franka_one_view \
           --model ../shared/data/franka_one_view/panda/panda.urdf \
@@ -132,13 +134,13 @@ def audit(
           --joints ../shared/data/franka_one_view/joint_angles.csv
 
     Args:
-        scene: Folder with cameras.yaml and masks/<camera>/<frame>.png; or an episode: a folder or
+        scene: Folder with cameras.yaml and masks/<camera>/<frame>.png; or an episode, a folder or
             file.
-        joints: Joint positions of every frame [rad or m]: a CSV file with the column frame and one
-            for each joint; of an episode also by time. Default: the recording's own
-            (joint_angles.csv).
-        out: Folder for the result; new or empty.
-        cameras: Camera file in place of the scene's or episode's own.
+        joints: Joint positions in every frame [rad or m]: CSV file with the column frame (an
+            episode may have time instead) and one column for each joint. Default: the scene's
+            joint_angles.csv or the episode's joint log.
+        out: Folder for the result. It must be new or empty. Default: no files are written.
+        cameras: Camera file to use instead of the scene's or episode's own.
     """
     from drake_pose.jobs.registration.audit import audit_scene
 
@@ -150,7 +152,7 @@ def audit(
 
 
 def _print_registration(result: SceneRegistration) -> None:
-    """A row a frame and camera, of many the worst; where cameras stand, and how sure that is."""
+    """Print the worst frames, the camera poses with standard deviations, and other estimates."""
     from drake_pose.files.folder import REPORT
     from drake_pose.jobs.registration.result import PARAMETERS, parameter_rows
     from drake_pose.silhouette.pictures.scenes import CAMERA_FILE
@@ -160,11 +162,11 @@ def _print_registration(result: SceneRegistration) -> None:
     shown, which = worst_frames([misfit.E_total for _, misfit in misfits])
     frames = Table("camera", "frame", "E_total", "IoU", "", title=f"Masks and robot{which}")
     for name, misfit in (misfits[k] for k in shown):
-        word = "" if misfit.is_inlier else "contradicts the others"
+        word = "" if misfit.is_inlier else "outlier"
         shares = percent(misfit.E_total), percent(misfit.iou)
         frames.add_row(escape(name), escape(misfit.frame), *shares, word)
     table = Table(
-        "camera", "place [m]", "sd [mm]", "sd [deg]", "poses", "frames", "mean IoU", "seconds",
+        "camera", "position [m]", "sd [mm]", "sd [deg]", "poses", "inliers", "mean IoU", "seconds",
         title="Cameras in the robot's world",
     )  # fmt: skip
     for name, found in result.registered.items():
@@ -198,53 +200,56 @@ def _print_registration(result: SceneRegistration) -> None:
         if one["suggestion"]:
             values = ", ".join(f"{k}={v:.3f}" for k, v in one["suggestion"]["positions"].items())
             console.print(
-                escape(f"camera '{name}': a picture at {values} would tell its poses apart")
+                escape(
+                    f"camera '{name}': a picture at {values} would show which of its poses is right"
+                )
             )
     if result.folder is not None:
         print_files(("cameras", result.folder / CAMERA_FILE), ("report", result.folder / REPORT))
 
 
 def _say_clock(one: Mapping[str, Any]) -> str:
-    """How a camera's clock stands to the joints', and its focal length, where that was found."""
+    """Return a text of a camera's time offset and focal length, as far as they were estimated."""
     texts = []
     if one["time_offset_s"] is not None:
         value, deviation = 1e3 * one["time_offset_s"], 1e3 * one["time_offset_sd_s"]
         word = "later" if value > 0.0 else "earlier"
         texts.append(
-            f"its pictures show the joints of {abs(value):.0f} ms {word} by the joint log's clock "
+            f"its pictures show the joints {abs(value):.0f} ms {word} than their time stamps say "
             f"(sd {deviation:.0f} ms)"
         )
     if one["focal_sd_px"] is not None:
         texts.append(f"focal length {one['focal_px']:.1f} pixels (sd {one['focal_sd_px']:.1f})")
-    return "; ".join(texts) or "its clock is not told apart from the joints'"
+    return "; ".join(texts) or "its time offset is not determined"
 
 
 def _say_target(target: Mapping[str, Any]) -> str:
-    """Where an object was found."""
+    """Return a text of the target's estimated position."""
     place = ", ".join(f"{row[3]:.4f}" for row in target["X_WT"][:3])
     return (
         f"target at {place} m in the robot's world, sd {target['translation_sd_mm']:.2f} mm, "
-        f"{target['rotation_sd_deg']:.3f} deg; poses that look alike: {len(target['modes'])}"
+        f"{target['rotation_sd_deg']:.3f} deg; "
+        f"poses in which it looks the same: {len(target['modes'])}"
     )
 
 
 def _print_audit(result: SceneAudit) -> None:
-    """A row for each contradiction, then how many frames agree."""
+    """Print the errors, the number of consistent frames, and minimum detectable offsets."""
     console = output_console()
     contradictions = result.summary["contradictions"]
     if contradictions:
-        table = Table("contradicts the rest", title="Masks, cameras and joint positions")
+        table = Table("error", title="Errors in joint positions, cameras and frames")
         for one in contradictions:
             table.add_row(escape(one["text"]))
         console.print(table)
     count, agree = result.summary["frame_count"], result.summary["agreeing_count"]
-    console.print(f"{agree} of {count} frames agree")
+    console.print(f"{agree} of {count} frames are consistent")
     if not contradictions:
         but = ", but see the warnings" if result.warnings else ""
-        say(f"drake-pose: nothing contradicts the rest{but}")
+        say(f"drake-pose: no error found{but}")
     if result.summary["minimum_detectable"]:
-        noticed = result.summary["minimum_detectable"].items()
-        told = ", ".join(f"{k} {'-' if one is None else f'{one:.2g}'}" for k, one in noticed)
-        console.print(f"not noticed    joints off by less than {told} (deg or m)", soft_wrap=True)
+        offsets = result.summary["minimum_detectable"].items()
+        told = ", ".join(f"{k} {'-' if one is None else f'{one:.2g}'}" for k, one in offsets)
+        console.print(f"not detectable joint offsets below {told} (deg or m)", soft_wrap=True)
     if result.folder is not None:
         print_files(("result", result.folder))

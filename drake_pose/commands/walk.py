@@ -29,41 +29,41 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class WalkOptions:
-    """Who walks, and how it is shown.
+    """What moves the avatar, and how it is shown.
 
     Raises:
-        SettingsError: options do not go together.
+        SettingsError: options exclude each other.
     """
 
     simulate: bool = False
-    """Play a simulated person's motion."""
+    """Play the motion of a simulated person."""
     live: Annotated[Path | None, Parameter(metavar="FOLDER")] = None
-    """Walk as the person before live cameras: folder with sources.yaml."""
+    """Folder with sources.yaml: the avatar walks as the person before these live cameras."""
     shape: Shape = None
     method: Literal["stance", "paper"] = "stance"
-    """stance: standing ahead or behind walks; paper: only while walking on the spot."""
+    """stance: standing ahead of or behind the start walks; paper: walking on the spot does."""
     model: Path | None = None
-    """The result's model, if it is not a bundled one."""
+    """Model file of the result. Default: the bundled model of that name."""
     package: Packages = field(default_factory=dict)
     rate: Annotated[float | None, within(0.0)] = None
     """Frame rate of the result [Hz]. Default: that of its summary.json."""
     seconds: Seconds = None
     """Stop after this time of the walk [s]."""
     speed: Annotated[float, within(0.0)] = 1.0
-    """Speed relative to real time; 0: as fast as possible."""
+    """Playback speed relative to real time; 0: as fast as possible."""
     port: Annotated[int | None, within(1024, 65535)] = None
-    """Port of the page. Default: a free one."""
+    """Port of the page. Default: any free port."""
     browser: Browser = True
     wait: Annotated[bool | None, Parameter(negative="--no-wait")] = None
-    """Start a result or --simulate when a browser shows the page, and again when its button is
-    pressed, until Ctrl-C or --seconds; or start at once and play once. Default: --wait with
+    """--wait: start playing when a browser shows the page, and again when its button is pressed,
+    until Ctrl-C or --seconds. --no-wait: start at once and play once. Default: --wait with
     --browser, else --no-wait."""
 
     def __post_init__(self) -> None:
         if self.live is None and self.shape:
-            raise SettingsError("--shape is for --live")
+            raise SettingsError("--shape needs --live")
         if self.package and self.model is None:
-            raise SettingsError("--package is for --model")
+            raise SettingsError("--package needs --model")
         if self.rate == 0.0:
             raise SettingsError("--rate must be above 0")
 
@@ -77,22 +77,22 @@ def walk(
 ) -> None:
     """Walk through a garden in the browser as an avatar that moves like the captured person.
 
-    The person's place and direction are commands: facing right or left turns the view, standing
-    ahead of or behind the place of the first frame walks forward or backward. The page can be
-    opened on this machine only.
+    The person's position and direction are commands: facing right or left turns the view, standing
+    ahead of or behind the position in the first frame walks forward or backward. Only browsers on
+    this machine can open the page.
 
         drake-pose walk results/person
 
     Args:
-        result: Result folder of capture that is played. Default: none, the arrow keys walk.
+        result: Result folder of capture to play. Default: none, the arrow keys move the avatar.
     """
     options = options or WalkOptions()
     if sum([options.simulate, result is not None, options.live is not None]) > 1:
-        raise UsageError("give a result, --simulate or --live, not two of them")
+        raise UsageError("give only one of a result, --simulate and --live")
     if result is None and options.live is None and options.model is not None:
-        raise UsageError("--model is for a result or --live")
+        raise UsageError("--model needs a result or --live")
     if options.rate is not None and result is None:
-        raise UsageError("--rate is for a result")
+        raise UsageError("--rate needs a result")
     from drake_pose.jobs.live import walk as walking
 
     if options.live is not None:
@@ -110,7 +110,7 @@ def walk(
 
     def ask() -> bool:
         if waits and options.seconds is None:
-            say("drake-pose: the end; space or the page's button plays it again, Ctrl-C ends")
+            say("drake-pose: end; space or the page's button plays again, Ctrl-C quits")
             return walking.wait_for_replay(page)
         return False
 
@@ -133,11 +133,11 @@ def walk(
 
 
 def _open_page(options: WalkOptions, waits: bool) -> Meshcat:
-    """The page, shown in the browser where there is one; waits until it is, or says it is not."""
+    """Open the page in a browser; if ``waits``, wait until one shows it, else warn if none does."""
     from drake_pose.jobs.live.walk import open_page, wait_for_browser
 
     page = open_page(options.port)
-    say(f"drake-pose: {page.web_url()} - arrow keys walk and turn, Ctrl-C ends")
+    say(f"drake-pose: {page.web_url()} - arrow keys walk and turn, Ctrl-C quits")
     shown = options.browser and webbrowser.open(page.web_url()) and wait_for_browser(page, 10.0)
     if waits and not shown:
         say("drake-pose: waiting until a browser shows the page")

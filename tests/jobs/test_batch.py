@@ -235,7 +235,7 @@ def test_without_the_extra_this_process_works_and_workers_are_refused(tmp_path, 
     assert 'pip install "drake_pose[cluster]"' in refused.stderr
     assert not out.exists()
     done = run_to_end(*words, status=1)
-    assert 'this process does all the work; for one a core: pip install "dr' in done.stderr
+    assert 'one process does all the work; to use all cores: pip install "dr' in done.stderr
     assert "scene 'gone'" in done.stderr
     assert json.loads((out / "batch.json").read_text())["scenes"]["gone"]["state"] == "failed"
 

@@ -76,7 +76,7 @@ def test_estimate_follows_a_person_and_says_so(
     recording: PersonScene, known: list[int], out: Path
 ) -> None:
     result, summary = run_estimate(recording, out)
-    assert "followed by all silhouettes" in result.stdout
+    assert "fitted to all silhouettes" in result.stdout
     assert known == [FRAMES]
     assert {path.name for path in out.iterdir()} == FILES | {"overlay"}
     assert summary["complete"] is True

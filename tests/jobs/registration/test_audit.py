@@ -111,7 +111,7 @@ class TestAudit:
     def test_without_out_the_table_is_printed(self, audited) -> None:
         result = run(audited, "--frame", "0:4")
         assert "frame '0002'" in result.stdout
-        assert "4 of 5 frames agree" in result.stdout
+        assert "4 of 5 frames are consistent" in result.stdout
 
     def test_a_camera_file_of_another_place(self, audited, tmp_path: Path) -> None:
         """One camera was told to stand 2 cm beside where it took the pictures."""

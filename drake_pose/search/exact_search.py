@@ -1,7 +1,7 @@
-"""The search where masks are exact: the beam search's best poses, refined by pixels.
+"""Search the pose in exact masks: refine the best poses of beam searches by pixels.
 
-A pose that leaves hardly a pixel of the silhouettes' borders wrong certifies itself and the masks.
-Where masks are damaged, or the body is another one, ``multi_start`` does not call this search.
+A pose that leaves hardly a border pixel wrong is certainly right, and so are the masks. For damaged
+masks, or a model that does not fit the object, ``multi_start`` uses the robust fit instead.
 """
 
 import time
@@ -25,17 +25,30 @@ from drake_pose.search.views_fit import FittedPose, describe_modes
 
 
 class ExactPose(NamedTuple):
-    """A pose reached by pixels: parameters, J and first J [pixel], steps, and what is about it."""
+    """A pose refined by pixels.
+
+    Args:
+        parameters: (m + 4,) parameters of the pose, as in ``RefinementBody``.
+        J: its objective [pixel].
+        first_J: objective of the start [pixel].
+        steps: number of steps of the refinement.
+        neighbourhood: the search around the pose, which holds alternative poses.
+    """
 
     parameters: np.ndarray
     J: float
     first_J: float
     steps: int
-    about: NeighbourhoodSearch
+    neighbourhood: NeighbourhoodSearch
 
 
 class ExactSearch:
-    """Searches exact silhouettes on grids of 20 and 15 degrees and refines what it finds."""
+    """Searches poses in exact silhouettes by beam searches and refinement by pixels.
+
+    Args:
+        grids: beam searches on grids of 20 and of 15 degrees, which the settings' stages refer to.
+        settings: parameters; None: the defaults.
+    """
 
     def __init__(
         self, grids: Sequence[BeamSearch], settings: ExactSearchSettings | None = None
@@ -48,7 +61,16 @@ class ExactSearch:
     def find(
         self, problem: RefinementProblem, root_position: np.ndarray | None, deadline: float
     ) -> ExactPose | None:
-        """The best pose reached; None where none comes near, or the time is up."""
+        """Return the best pose found.
+
+        Args:
+            problem: the silhouettes.
+            root_position: (3,) the root's position [m]; None: that of the tree.
+            deadline: time.perf_counter() at which the search ends [s].
+
+        Returns:
+            The pose; None if J of all poses is hopelessly large, or the time is up.
+        """
         own, length, reached = self._settings, problem.border_length, None
         for grid in self._grids:
             left = deadline - time.perf_counter()
@@ -62,18 +84,21 @@ class ExactSearch:
                 return None
             pair = [*([reached] if reached else []), found]
             reached, worse = min(pair, key=lambda one: one.J), max(one.J for one in pair)
-            enough = own.exact * length
-            if reached.J <= enough or (len(pair) > 1 and worse <= own.agreement * reached.J):
+            agree = len(pair) > 1 and worse <= own.agreement * reached.J
+            if reached.J <= own.exact * length or agree:
                 break
         if reached is None:
             return None
-        last, _ = reached.about.improve(reached.parameters, 0.0, deadline, everywhere=True)
+        last, _ = reached.neighbourhood.improve(reached.parameters, 0.0, deadline, everywhere=True)
         return self._end(problem, reached, last)
 
     def _descend(
         self, problem: RefinementProblem, poses: Sequence[np.ndarray], deadline: float
     ) -> ExactPose | None:
-        """The best pose reached from some, its parts placed anew; None where none comes near."""
+        """Refine poses (m + 4,), place parts of the best one anew, and return the result.
+
+        None if J is hopelessly large after the coarse passes.
+        """
         freedom, length = self.body.freedom(), problem.border_length
         coarse = [descend(problem, pose, freedom, PASSES.coarse) for pose in poses]
         start = min((parameters for parameters, _, _ in coarse), key=problem.J)
@@ -82,23 +107,26 @@ class ExactSearch:
         hopeless = max(self._settings.hopeless, self._settings.hopeless_fraction * size)
         if first_J > hopeless * length:
             return None
-        reached = self.escape(problem, start, deadline)
+        reached = self.refine(problem, start, deadline)
         if first_J <= reached.J:
             reached = reached._replace(parameters=start, J=first_J)
         return reached._replace(steps=reached.steps + sum(steps for _, _, steps in coarse))
 
-    def escape(self, problem: RefinementProblem, start: np.ndarray, deadline: float) -> ExactPose:
-        """The pose reached from parameters (m + 4,), parts placed anew where that is better."""
+    def refine(self, problem: RefinementProblem, start: np.ndarray, deadline: float) -> ExactPose:
+        """Refine parameters (m + 4,), and place parts of the body anew where J decreases."""
         fine, _, steps = descend(problem, start, self.body.freedom(), PASSES.fine)
-        about = NeighbourhoodSearch(problem, self._parts)
-        enough = self._settings.good * problem.border_length
-        parameters, J = about.improve(fine, enough, deadline)
-        return ExactPose(parameters, J, float(problem.J(start)), steps, about)
+        neighbourhood = NeighbourhoodSearch(problem, self._parts)
+        good = self._settings.good * problem.border_length
+        parameters, J = neighbourhood.improve(fine, good, deadline)
+        return ExactPose(parameters, J, float(problem.J(start)), steps, neighbourhood)
 
     def _end(
         self, problem: RefinementProblem, reached: ExactPose, parameters: np.ndarray
     ) -> ExactPose:
-        """What was reached from there, if it is better, where answers are given."""
+        """Refine parameters (m + 4,) by the last passes, and return the best pose.
+
+        The result is the best of the pose reached before, the parameters and their refinement.
+        """
         last, _, steps = descend(problem, parameters, self.body.freedom(), PASSES.last)
         best = min((reached.parameters, parameters, last), key=problem.J)
         return reached._replace(
@@ -110,11 +138,14 @@ class ExactSearch:
     def modes(
         self, problem: RefinementProblem, reached: ExactPose, tree: PoseTree
     ) -> tuple[ExactPose, PoseSet]:
-        """The best pose, and all that are as good, of a tree with its root where it is."""
+        """Return the best pose, which may be an alternative of the given one, and its pose set.
+
+        ``tree``: the pose tree, with its root where the body is.
+        """
         own, others = self._settings, []
         for _ in range(own.replacements):
             limit = reached.J + own.tolerance * problem.border_length
-            others = reached.about.others(reached.parameters, limit, own.same)
+            others = reached.neighbourhood.others(reached.parameters, limit, own.same)
             if not others or problem.J(others[0]) >= reached.J:
                 break
             reached = self._end(problem, reached, others[0])
@@ -128,30 +159,35 @@ def find_intervals(
     tree: PoseTree | None = None,
     settings: ExactSearchSettings | None = None,
 ) -> PoseSet:
-    """What exact silhouettes say of each value.
+    """Return the pose set of exact silhouettes: modes, and an interval for each value.
 
-    Where more pixels are wrong than a found pose leaves, the pose may be another one altogether:
-    nothing is known then. Where intervals missed the truth on drawn bodies, it was by another
-    optimum, and no margin would have held it; about the true optimum they held 99 %.
+    The covariance of the values x, of which the limits are a prior of the variance of a uniform
+    distribution, is
+
+        C = (H / s^2 + diag(12 / span^2))^-1,   s = noise_factor max(1 / sqrt(12), rms distance)
+
+    If J is above ``settings.misfit``, another pose may be right and no value is determined. On
+    drawn bodies 99 % of the intervals around the true optimum contained the true value.
 
     Args:
         problem: the silhouettes.
-        others: (m + 4,) each: other poses that are as good, best first.
+        others: (m + 4,) each: alternative poses that are as good, best first.
         parameters: (m + 4,) the best pose, refined.
         tree: the pose tree, with its root where the body is; None: the body's.
+        settings: parameters; None: the defaults.
 
     Returns:
-        The poses that are as good, the best leading the first mode.
+        The set, with the best pose as the representative of the first mode.
     """
     own = settings or ExactSearchSettings()
     body, kinematics = problem.body, problem.body.kinematics
     count = len(kinematics.names)
     free = body.freedom()
     equations, squares = problem.equations(parameters, free, PASSES.fine[-1])
-    # At least that of a border that lies anywhere between two pixel centres [pixel^2]; and larger
-    # than if the distances of all rows and columns were independent.
+    # The variance [pixel^2] is at least that of a border distributed uniformly between two pixel
+    # centres. The factor accounts for the correlation of neighbouring distances.
     variance = own.noise_factor**2 * max(1.0 / 12.0, squares)
-    # Limits are worth what a value spread evenly between them is.
+    # The limits are a prior with the variance of a uniform distribution between them.
     spans = np.clip(body.upper[free.columns] - body.lower[free.columns], 1e-6, 2.0 * np.pi)
     information = equations.H[0] / variance + np.diag(12.0 / spans**2)
     covariance = np.zeros((count, count))
@@ -161,9 +197,9 @@ def find_intervals(
     near = np.maximum(margins, own.same)
     groups = [[parameters]]
     for other in others:
-        # The same pose is not another one for a full turn.
+        # Poses that differ by full turns are equal.
         pose = body.nearest_turns(other, parameters)
-        # What differs less is the same optimum, not quite reached.
+        # A pose this near is the same optimum, not fully converged.
         if np.abs(pose - parameters).max() <= own.same:
             continue
         of_group = (g for g in groups if np.all(np.abs(pose - g[0])[:count] <= near))

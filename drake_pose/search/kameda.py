@@ -1,6 +1,8 @@
-"""Kameda's search: one silhouette to joint angles, node by node (sections 5.1 and 5.2).
+"""Estimate joint angles from a silhouette by Kameda's search (sections 5.1 and 5.2 of the paper).
 
-With several views every area is summed over the views, and (4) holds in each view.
+Section 5.1 places node after node at the best of its sampled poses, with backtracking. Section 5.2
+re-estimates the leaves together, and then single inner nodes. In several views all areas are
+summed over the views, and condition (4) must hold in each view.
 """
 
 import time
@@ -20,7 +22,10 @@ from drake_pose.search.settings import PaperSearchSettings
 class NodeList:
     """The candidate list of one node, best first: JAC_i(1), JAC_i(2), ...
 
-    ``samples``: (n,) indices into the node's grid; X_WN: (n, 4, 4); ``adopted``: u_i, in use.
+    Args:
+        samples: (n,) samples of the candidates.
+        X_WN: (n, 4, 4) their poses.
+        adopted: u_i, index of the adopted candidate, from 0.
     """
 
     samples: np.ndarray
@@ -29,12 +34,17 @@ class NodeList:
 
     @property
     def has_untried(self) -> bool:
-        """Whether a candidate after the adopted one is left."""
+        """Whether there is a candidate after the adopted one."""
         return self.adopted + 1 < len(self.samples)
 
 
 class PaperSearch:
-    """Matches silhouettes with a pose tree by the paper's search; grids are made once."""
+    """Estimates poses on a grid of joint values by the paper's search.
+
+    Args:
+        tree: the pose tree.
+        settings: the grid and the paper's parameters; None: the defaults.
+    """
 
     def __init__(self, tree: PoseTree, settings: PaperSearchSettings | None = None) -> None:
         self.tree = tree
@@ -72,7 +82,20 @@ class PaperSearch:
 
 
 class PaperRun:
-    """One run of the search with a given threshold r."""
+    """One run of the search with a fixed threshold r.
+
+    Args:
+        scoring: the sampled tree and the silhouettes.
+        settings: the paper's parameters.
+        outside_limit: the threshold r in each view [pixel].
+        runs: number of runs of step 3 before this run.
+
+    Attributes:
+        lists: candidate lists of the nodes that are placed.
+        best_J, best_samples: the best pose found, its objective [pixel] and samples (nodes,).
+        first_J: objective of the first whole pose [pixel].
+        stopped_by: "end" or "run_limit".
+    """
 
     def __init__(
         self,
@@ -93,7 +116,7 @@ class PaperRun:
     # Section 5.1
 
     def search(self) -> None:
-        """Run sections 5.1 and 5.2 to their end, or to the run limit."""
+        """Run sections 5.1 and 5.2 to the end, or up to the limit of runs."""
         while self._complete():
             J = float(self.scoring.J(self._adopted()[0][None])[0])
             if self.best_J == np.inf:
@@ -104,10 +127,13 @@ class PaperRun:
                 return
 
     def _complete(self) -> bool:
-        """Steps 1 to 6 until every node has its angles; False if no pose is left (or allowed)."""
+        """Run steps 1 to 6 until every node is placed.
+
+        Return False if no pose is left or the limit of runs is reached.
+        """
         uncovered: Regions | None = None
         while len(self.lists) < len(self.nodes):
-            # Step 1: the node whose parent is done that is the fewest steps from the root.
+            # Step 1: of the nodes whose parent is placed, the one nearest to the root.
             waiting = (
                 i
                 for i, node in enumerate(self.nodes)
@@ -135,7 +161,11 @@ class PaperRun:
         return True
 
     def make_list(self, node: int, uncovered: Regions) -> NodeList | None:
-        """Steps 3 to 5: sample, keep what stays inside (4), score (5), sort, keep the best K."""
+        """Run steps 3 to 5 and return the candidate list; None if no pose satisfies (4).
+
+        Poses are sampled, those inside the silhouette (4) are scored (5) and sorted, and the best K
+        are kept. ``uncovered``: the part of the silhouette that no placed node covers.
+        """
         parent = self.nodes[node].parent
         X_WN = self.scoring.candidate_poses(
             node, np.eye(4) if parent < 0 else self._adopted()[1][parent]
@@ -149,14 +179,14 @@ class PaperRun:
         inside = np.flatnonzero((outside <= limits).all(axis=0))
         if len(inside) == 0:
             return None
-        # A stable sort: equal scores keep the grid's order, which begins nearest to zero.
+        # The sort is stable: equal scores keep the grid's order, which starts nearest to zero.
         best = inside[np.argsort(-covered[inside], kind="stable")]
         if len(self.nodes[node].mesh.triangles):
             best = best[: self.settings.candidate_limit]
         return NodeList(samples[best], X_WN[best])
 
     def _adopt(self, node: int, candidate: int) -> None:
-        """Adopt a candidate of an inner node and give up all that hangs on the node."""
+        """Adopt a candidate of a node, and remove all its descendants."""
         self.lists[node] = replace(self.lists[node], adopted=candidate)
         for below in self.scoring.sampled.tree.subtrees[node]:
             if below != node:
@@ -165,10 +195,15 @@ class PaperRun:
     # Section 5.2
 
     def _combine_leaves(self, combinations: int = 100_000, block: int = 4_000_000) -> float:
-        """Section 5.2.1: adopt the best combination of leaves' candidates; how much J falls.
+        """Adopt the best combination of the leaves' candidates; return the decrease of J [pixel].
 
-        All are tried if there are no more ``combinations``; else each leaf's in turn. ``block``:
-        combinations times pixel patterns that are looked at in one piece of arrays.
+        This is section 5.2.1.
+
+        Args:
+            combinations: if there are more combinations, the candidates of one leaf after another
+                are tried, until J does not decrease any further.
+            block: greatest number of array entries (combinations times pixel patterns) that are
+                processed at a time.
         """
         leaves = [i for i, node in enumerate(self.nodes) if not node.children]
         counts = [len(self.lists[leaf].samples) for leaf in leaves]
@@ -177,8 +212,8 @@ class PaperRun:
         patterns, gains = self._patterns(leaves)
         columns = np.cumsum([0, *counts[:-1]])
 
-        def worth(choices: np.ndarray) -> np.ndarray:
-            """Silhouette covered less outside covered [pixel], (n,), of choices (n, leaves)."""
+        def gain(choices: np.ndarray) -> np.ndarray:
+            """Return (n,) covered silhouette minus area outside [pixel] of choices (n, leaves)."""
             total = np.empty(len(choices))
             step = max(1, block // max(1, len(patterns)))
             for begin in range(0, len(choices), step):
@@ -188,31 +223,33 @@ class PaperRun:
             return total
 
         current = np.array([self.lists[leaf].adopted for leaf in leaves])
-        first = best = worth(current[None])[0]
+        first = best = gain(current[None])[0]
         together = np.prod(counts, dtype=np.float64) <= combinations
         every = list(range(len(leaves)))
         groups = [every] if together else [[k] for k in every]
         unchanged = 0
         while unchanged < len(groups):
-            # A leaf's candidates after another's, while that is an improvement; or all at once.
+            # The candidates of one leaf after another while J decreases, or of all at once.
             group = groups.pop(0)
             groups.append(group)
             tried = np.indices([counts[k] for k in group]).reshape(len(group), -1).T
             choices = np.repeat(current[None], len(tried), axis=0)
             choices[:, group] = tried
-            worths = worth(choices)
-            i = int(np.argmax(worths))
+            tried_gains = gain(choices)
+            i = int(np.argmax(tried_gains))
             unchanged += 1
-            if worths[i] > best:
-                best, current, unchanged = worths[i], choices[i], 1
+            if tried_gains[i] > best:
+                best, current, unchanged = tried_gains[i], choices[i], 1
         for leaf, candidate in zip(leaves, current.tolist(), strict=True):
             self.lists[leaf] = replace(self.lists[leaf], adopted=candidate)
         return float(best - first)
 
     def _patterns(self, leaves: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
-        """Distinct sets (n, candidates) bool of leaves' candidates that cover a pixel, their worth.
+        """Group the pixels that no inner node covers by the leaves' candidates that cover them.
 
-        Of pixels that no inner node covers.
+        Returns:
+            (n, candidates) bool the distinct sets of candidates, and (n,) for each set the number
+            of its pixels in the silhouettes minus the number outside.
         """
         inner = [i for i, node in enumerate(self.nodes) if node.children]
         adopted = [array[inner] for array in self._adopted()]
@@ -236,7 +273,10 @@ class PaperRun:
         return np.concatenate(all_patterns), np.concatenate(all_gains)
 
     def _adopt_most_exposed(self) -> bool:
-        """Section 5.2.2: adopt the most exposed node's candidate; False if A becomes empty."""
+        """Adopt a better candidate of the most exposed inner node (section 5.2.2).
+
+        Return False if no node has a better candidate (the paper's set A becomes empty).
+        """
         covers = []
         samples, poses = self._adopted()
         for i, node in enumerate(self.nodes):
@@ -249,11 +289,11 @@ class PaperRun:
             _, cover = self.scoring.candidate_areas(
                 i, current.samples[rest], current.X_WN[rest], exposed
             )
-            # argmax takes the first of equals: the adopted candidate stays unless one is better.
+            # argmax returns the first maximum: the adopted candidate stays if none is better.
             best = int(np.argmax(cover))
             covers.append((cover[best], i, current.adopted + best))
-        # Nodes whose best candidate is the adopted one leave A one after another, largest cover
-        # first, until one is met that has a better candidate.
+        # Nodes are removed from A in the order of their cover, largest first, until one has a
+        # better candidate than the adopted one.
         for _, i, candidate in sorted(covers, key=lambda entry: (-entry[0], entry[1])):
             if candidate > self.lists[i].adopted:
                 self._adopt(i, candidate)
@@ -263,7 +303,10 @@ class PaperRun:
     # Poses and answers
 
     def _adopted(self) -> tuple[np.ndarray, np.ndarray]:
-        """Samples (nodes,) and X_WN (nodes, 4, 4); 0 and the identity of nodes not done."""
+        """Return the adopted samples (nodes,) and X_WN (nodes, 4, 4).
+
+        A node that is not placed has sample 0 and the identity.
+        """
         samples = np.zeros(len(self.nodes), dtype=np.int64)
         poses = np.tile(np.eye(4), (len(self.nodes), 1, 1))
         for node, current in self.lists.items():
@@ -272,14 +315,15 @@ class PaperRun:
         return samples, poses
 
     def _keep_if_better(self, J: float) -> None:
+        """Keep the adopted pose if its objective J [pixel] is the smallest so far."""
         if J < self.best_J:
             self.best_J, self.best_samples = J, self._adopted()[0]
 
     def result(self) -> PoseEstimate:
-        """What the search found, as plain arrays."""
-        sampled, told = self.scoring.sampled, dict[str, Any](stopped_by=self.stopped_by)
-        told |= {"runs": self.runs, "first_J": self.first_J, "outside_limit": self.outside_limit}
+        """Return the best pose found."""
+        sampled, more = self.scoring.sampled, dict[str, Any](stopped_by=self.stopped_by)
+        more |= {"runs": self.runs, "first_J": self.first_J, "outside_limit": self.outside_limit}
         if self.best_J == np.inf:
-            return PoseEstimate.nothing(sampled.tree, **told)
+            return PoseEstimate.nothing(sampled.tree, **more)
         values, area = sampled.values_at(self.best_samples), self.scoring.silhouette_area
-        return PoseEstimate.of_values(sampled.tree, values, self.best_J, area, **told)
+        return PoseEstimate.of_values(sampled.tree, values, self.best_J, area, **more)

@@ -227,7 +227,7 @@ class _MultiStartRun:
         exact, own, J = self._search.exact, self._search.exact_settings, self._J(values)
         length = self._problem.border_length
         if self._proceed():
-            other = exact.escape(self._problem, self._parameters(values), self._deadline)
+            other = exact.refine(self._problem, self._parameters(values), self._deadline)
             found = min((one for one in (found, other) if one), key=lambda one: one.J)
         explained = found is not None and found.J < min(J, own.plausible * length)
         return found if explained else None
@@ -246,7 +246,7 @@ class _MultiStartRun:
             return False
         if self._search.exact_masks:
             return True
-        wrong, kernel = self._problem.wrong(self._parameters(values)), np.ones((3, 3), np.uint8)
+        wrong, kernel = self._problem.mismatch(self._parameters(values)), np.ones((3, 3), np.uint8)
         met = length = 0
         for off, view in zip(wrong, self._problem.views, strict=True):
             borders = []
@@ -311,7 +311,7 @@ class _MultiStartRun:
         share = self._settings.limb_radii[self._several]
         radius, thick, wrongs = max(1.0, share * self._fit.size), np.zeros(2, dtype=np.int64), []
         views = self._clean.views
-        for wrong, view in zip(self._clean.wrong(self._parameters(values)), views, strict=True):
+        for wrong, view in zip(self._clean.mismatch(self._parameters(values)), views, strict=True):
             for side, one in enumerate((wrong & ~view.mask, wrong & view.mask)):
                 distances = cv2.distanceTransform(one.astype(np.uint8), cv2.DIST_L2, 5)
                 thick[side] += distances.max() > radius

@@ -1,14 +1,15 @@
-"""Ways out of a bad match: parts of the body placed anew or mirrored in depth, the rest as it is.
+"""Escape from local optima: place parts of the body anew, or mirror them in depth.
 
-A local refinement cannot turn a hand round or take a leg from behind the other. So parts of the
-body - ends of limbs, whole limbs, single inner nodes - are searched again on their sampling grids,
-hung on the continuous pose of the rest and scored by what they cover newly, rightly or wrongly.
-Seen by one camera, a part mirrored in depth looks nearly the same, and so does half of the body if
-its left and its right are exchanged: the mirror image of a body is a body again then.
+A local refinement cannot turn a hand around or move a leg from behind the other. Parts of the body
+(ends of limbs, whole limbs, single inner nodes) are therefore searched again on their sampling
+grids, with the other nodes at their continuous pose, and scored by the silhouette that they newly
+cover minus the area newly covered outside. In a single view a part mirrored in depth has nearly the
+same projection, and so has half of the body with left and right exchanged.
 
-The search about a pose is a variable neighbourhood descent (Mladenovic and Hansen 1997): what comes
-near the pose's J is refined, and the pose moves there where that is better. It ends where each part
-near an error was tried with that error. Poses found that are nearly as good are kept.
+The search around a pose is a variable neighbourhood descent (Mladenovic and Hansen 1997): poses
+with J near that of the current pose are refined, and the best becomes the current pose if its J is
+smaller. The search ends when each part near an error has been tried. Poses that are nearly as good
+are stored.
 """
 
 import itertools
@@ -27,18 +28,18 @@ from drake_pose.silhouette.outline import pack
 from drake_pose.silhouette.scoring import prefix_sums
 from drake_pose.silhouette.span_kernel import score
 
-# X_CW, kernel parameters and prefix sums (2, H, W + 1) of a coarse view.
+# For a coarse view: X_CW, the camera's kernel parameters and (2, H, W + 1) prefix sums.
 _Region = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 @dataclass(frozen=True)
 class Part:
-    """Nodes that are placed anew or mirrored together.
+    """A part of the body that is placed anew or mirrored.
 
-    Attributes:
-        nodes: parents before children; the first one's joint stays.
-        sources: for each the node whose mirror image it becomes.
-        held: nodes that hang on these but stay as they are.
+    Args:
+        nodes: its nodes, parents before children.
+        sources: for each node the node whose mirror image it becomes.
+        held: children of these nodes that keep their pose.
     """
 
     nodes: tuple[int, ...]
@@ -47,12 +48,15 @@ class Part:
 
     @property
     def exchanged(self) -> bool:
-        """Whether it is much of the body, left and right exchanged, which is only mirrored."""
+        """Whether left and right are exchanged; such a part is mirrored, but not placed anew."""
         return self.nodes != self.sources
 
 
 def find_parts(tree: PoseTree, longest: int = 3) -> tuple[Part, ...]:
-    """The ends of all limbs, one to ``longest`` nodes, and the nodes of the trunk one by one."""
+    """Return the parts that are placed anew.
+
+    They are the ends of all limbs with one to ``longest`` nodes, and each node of the trunk alone.
+    """
     chains = []
     for leaf in tree.leaves:
         chain = [leaf]
@@ -70,7 +74,11 @@ def find_parts(tree: PoseTree, longest: int = 3) -> tuple[Part, ...]:
 
 
 def find_reflections(tree: PoseTree) -> tuple[Part, ...]:
-    """What may be mirrored: all that hangs on a node with pairs of limbs, and these limbs alone."""
+    """Return the parts that are mirrored with left and right exchanged.
+
+    They are, for each node with a pair of limbs of equal length below it, its whole subtree; and
+    for the node that has the pair, its subtree without the children that are in no pair.
+    """
     partners = dict(enumerate(range(len(tree.nodes))))
     limbs: dict[tuple[int, int], list[int]] = {}
     owners: set[int] = set()
@@ -100,7 +108,16 @@ def find_reflections(tree: PoseTree) -> tuple[Part, ...]:
 
 
 class PartSearch:
-    """Searches parts of a body again, on grids (n, k) of each node's values."""
+    """Searches and mirrors parts of a body.
+
+    Attributes:
+        parts: the parts that are placed anew.
+        reflections: the parts that are mirrored with left and right exchanged.
+
+    Args:
+        body: the body.
+        grids: for each node (n, k) its values at its samples [rad or m].
+    """
 
     def __init__(self, body: RefinementBody, grids: Sequence[np.ndarray]) -> None:
         self.body = body
@@ -108,7 +125,7 @@ class PartSearch:
         self._grids = list(grids)
         sources = [grids[body.tree.source(i)] for i in range(len(grids))]
         self._X_PN = [body.tree.relative_transforms(i, grid) for i, grid in enumerate(sources)]
-        # Bands of skin are small, and where they are depends on the sample.
+        # Bands of skin are left out: they are small, and their shape depends on the sample.
         self._outlines = simplify_rigid_parts(body.surfaces, 200).rigid
         nodes = body.kinematics.value_nodes
         self._columns = [np.flatnonzero(nodes == i) for i in range(len(grids))]
@@ -116,13 +133,15 @@ class PartSearch:
         self._signs = self._mirror_signs()
 
     def _mirror_signs(self, count: int = 5, least: float = 0.01) -> dict[int, np.ndarray]:
-        """By node the signs (k,) of its partner's values in the mirrored body.
+        """Return by node the signs (k,) by which its values follow from its partner's in a mirror.
 
-        Left and right are along that axis of the nodes' frames along which most nodes mirror.
+        The mirror plane is perpendicular to that axis of the nodes' frames for which most nodes
+        have such signs.
 
         Args:
             count: number of values at which relative transforms are compared.
-            least: nodes whose transforms differ by more from the mirrored ones are left out [m, 1].
+            least: greatest difference of a node's transforms from the mirrored ones, in entries of
+                the matrix [m or 1]; nodes with a greater one are left out.
         """
         tree, best = self.body.tree, dict[int, np.ndarray]()
         pairs = {(n, s) for r in self.reflections for n, s in zip(r.nodes, r.sources, strict=True)}
@@ -152,21 +171,30 @@ class PartSearch:
         count: int = 3,
         widths: tuple[int, ...] = (40, 12, 8),
         spare: int = 4,
-        alike: float = 0.35,
+        same: float = 0.35,
         coarse_pixels: int = 3000,
     ) -> list[np.ndarray]:
-        """At most ``count`` other placements of a part of a pose (m + 4,), the best first.
+        """Return other placements of a part, the best first.
 
         Args:
-            widths: hypotheses kept for the first, second, ... node of a part.
-            spare: this many times more are scored with what the part itself hides.
-            alike: placements whose nodes' middles are all nearer are one [node radii].
-            coarse_pixels: approximate area of the silhouettes as they are looked at.
+            problem: the body and the silhouettes.
+            parameters: (m + 4,) the pose.
+            part: the part that is placed anew.
+            count: greatest number of placements.
+            widths: number of hypotheses kept after the first, second, ... node of the part.
+            spare: number of hypotheses that are scored as the union of the part's nodes, as a
+                multiple of the width.
+            same: placements are equal if the centres of all nodes are nearer than this [radii of
+                the nodes] and the entries of their rotation matrices than twice this.
+            coarse_pixels: approximate area of the reduced silhouettes [pixel].
+
+        Returns:
+            (m + 4,) parameters of each placement.
         """
         X_WN = self.body.poses(parameters)
-        others = problem.still(parameters, np.isin(np.arange(len(X_WN)), part.nodes))
-        # What the part may cover in each coarse view: silhouette and outside, less what others
-        # cover; with the camera's X_CW and kernel parameters.
+        others = problem.fixed_borders(parameters, np.isin(np.arange(len(X_WN)), part.nodes))
+        # The sets whose areas are counted in each coarse view: silhouette, and outside of it,
+        # without the pixels that other nodes cover.
         regions: list[_Region] = []
         step = max(1, round((problem.area / (coarse_pixels * len(problem.views))) ** 0.5))
         for view, border in zip(problem.views, others, strict=True):
@@ -189,8 +217,9 @@ class PartSearch:
             kept = np.repeat(np.arange(len(samples)), len(tried))
             which = np.tile(np.arange(len(tried)), len(samples))
             if self.body.tree.source(node) != node:
-                same = which == samples[kept, -1]
-                kept, which, X_new = kept[same], which[same], X_new[same]
+                # A node whose joints mimic its parent's takes the parent's sample.
+                mimics = which == samples[kept, -1]
+                kept, which, X_new = kept[mimics], which[mimics], X_new[mimics]
             scores = gains[kept] + self._score(regions, [node], X_new[:, None])
             if place > 0:
                 best = np.argsort(-scores, kind="stable")[: spare * width]
@@ -202,27 +231,29 @@ class PartSearch:
             best = np.argsort(-scores, kind="stable")[:width]
             samples, X_part, gains = samples[best], X_part[best], scores[best]
         proposed: list[np.ndarray] = []
-        middles = self._middles(X_part, part.nodes)
+        centers = self._centers(X_part, part.nodes)
         left = np.ones(len(X_part), dtype=np.bool_)
         while left.any() and len(proposed) < count:
-            # The best one that differs in where some node is or how it is turned.
+            # The best of the placements that differ from all chosen ones.
             i = int(np.argmax(left))
             turned = np.abs(X_part[:, :, :3, :3] - X_part[i, :, :3, :3]).max(axis=(2, 3))
-            gaps = np.linalg.norm(middles - middles[i], axis=2)
-            far = gaps > alike * self._balls[list(part.nodes), 3]
-            left &= np.any(far | (turned > 2.0 * alike), axis=1)
+            gaps = np.linalg.norm(centers - centers[i], axis=2)
+            far = gaps > same * self._balls[list(part.nodes), 3]
+            left &= np.any(far | (turned > 2.0 * same), axis=1)
             placed = parameters.copy()
             for node, sample in zip(part.nodes, samples[i], strict=True):
                 placed[self._columns[node]] = self._grids[node][sample]
-            proposed.append(self._hold(placed, X_WN, part.held))
+            proposed.append(self._restore(placed, X_WN, part.held))
         return proposed
 
     def errors_near(self, problem: RefinementProblem, parameters: np.ndarray) -> np.ndarray:
-        """For each part the area (parts,) wrong in any view within the part's reach [pixel]."""
-        # Areas are only compared: every second row will do.
+        """Return (parts,) the area of the mismatch within reach of each part, over all views.
+
+        ``parameters``: (m + 4,) the pose. The areas [pixel] are estimated from every second row.
+        """
         areas, stride = np.zeros(len(self.parts)), 2
         discs = self.reaches(problem, parameters)
-        for wrong, places in zip(problem.wrong(parameters), discs, strict=True):
+        for wrong, places in zip(problem.mismatch(parameters), discs, strict=True):
             v, u = np.nonzero(wrong[::stride])
             x, y, r = places.T[:, :, None]
             inside = (u - x) ** 2 + (stride * v - y) ** 2 < r**2
@@ -230,10 +261,13 @@ class PartSearch:
         return areas
 
     def reaches(self, problem: RefinementProblem, parameters: np.ndarray) -> np.ndarray:
-        """For each view a disc in the picture that each part stays in (views, parts, 3) [pixel]."""
+        """Return discs that contain each part whatever its joint values, (views, parts, 3) [pixel].
+
+        A disc is given by the u and v of its centre and its radius. ``parameters``: (m + 4,).
+        """
         p_WN = self.body.poses(parameters)[:, :3, 3]
         origins = p_WN[[part.nodes[0] for part in self.parts]]
-        # From joint to joint, and from the last one to the surface's end.
+        # The distances from joint to joint, and from the last joint to the end of the surface.
         ends = np.linalg.norm(self._balls[:, :3], axis=1) + self._balls[:, 3]
         radii = np.array([ends[part.nodes[-1]] for part in self.parts])
         for k, part in enumerate(self.parts):
@@ -248,7 +282,10 @@ class PartSearch:
     def _score(
         self, regions: Sequence[_Region], nodes: Sequence[int], X_WN: np.ndarray
     ) -> np.ndarray:
-        """The area that nodes at poses X_WN (n, k, 4, 4) cover rightly less that wrongly, (n,)."""
+        """Return (n,) silhouette minus outside area newly covered by k nodes, over all views.
+
+        ``X_WN``: (n, k, 4, 4) poses of the nodes. Areas in pixels of the coarse views.
+        """
         packed = pack(tuple(self._outlines[i] for i in nodes))
         total = np.zeros(len(X_WN))
         no_parts, no_bands = np.zeros((0, 4), dtype=np.int64), np.zeros((0, 0, 3))
@@ -259,29 +296,37 @@ class PartSearch:
         return total
 
     def mirror(self, parameters: np.ndarray, part: Part, view: View, steps: int = 20) -> np.ndarray:
-        """The parameters with a part mirrored in a view's depth about its first joint, nearly.
+        """Return parameters with a part mirrored in a view's depth about its first joint.
 
-        Seen by parallel rays, the middle of each node stays where it is seen.
+        The centre of each node is brought near to its mirror image, which under parallel projection
+        is at the same place in the image.
 
         Args:
-            steps: of Gauss and Newton's method, at most.
+            parameters: (m + 4,) the pose.
+            part: the part.
+            view: the view whose optical axis is the direction of depth.
+            steps: greatest number of Gauss-Newton steps.
         """
         X_WN = self.body.poses(parameters)
         depth = view.camera.X_WC[:3, 2]
-        middles = self._middles(X_WN[list(part.sources)], part.sources)
-        away = (middles - X_WN[part.nodes[0], :3, 3]) @ depth
-        wanted, nodes = middles - 2.0 * np.outer(away, depth), list(part.nodes)
+        centers = self._centers(X_WN[list(part.sources)], part.sources)
+        depths = (centers - X_WN[part.nodes[0], :3, 3]) @ depth
+        wanted, nodes = centers - 2.0 * np.outer(depths, depth), list(part.nodes)
         columns = np.concatenate([self._columns[node] for node in nodes])
         p_N = self._balls[nodes, :3]
         if part.exchanged:
             parameters = self._exchanged(parameters, part, wanted)
-        moved = self._bring(parameters, nodes, p_N, wanted, columns, (steps, 0.5, 1e-4))
-        return self._hold(moved, X_WN, part.held)
+        moved = self._move_points(parameters, nodes, p_N, wanted, columns, (steps, 0.5, 1e-4))
+        return self._restore(moved, X_WN, part.held)
 
     def _exchanged(self, parameters: np.ndarray, part: Part, wanted: np.ndarray) -> np.ndarray:
-        """The parameters with a part's left and right exchanged, its first node turned to fit.
+        """Return parameters with a part's left and right exchanged, and its first node turned.
 
-        ``wanted``: (k, 3) where the middles of its nodes should be [m].
+        Args:
+            parameters: (m + 4,) the pose.
+            part: the part, of k nodes.
+            wanted: (k, 3) the wanted centres of its nodes in the world [m]. The first node takes
+                the sample that comes nearest to these.
         """
         moved, first = parameters.copy(), part.nodes[0]
         for node, source in zip(part.nodes[1:], part.sources[1:], strict=True):
@@ -290,24 +335,29 @@ class PartSearch:
         moved = np.clip(moved, self.body.lower, self.body.upper)
         X_WN, parent = self.body.poses(moved), self.body.tree.nodes[first].parent
         X_1W = np.linalg.inv(X_WN[first])
-        p_1 = self._middles(X_WN[list(part.nodes)], part.nodes) @ X_1W[:3, :3].T + X_1W[:3, 3]
+        p_1 = self._centers(X_WN[list(part.nodes)], part.nodes) @ X_1W[:3, :3].T + X_1W[:3, 3]
         tried = (np.eye(4) if parent < 0 else X_WN[parent]) @ self._X_PN[first]
         placed = np.einsum("nij,kj->nki", tried[:, :3, :3], p_1) + tried[:, None, :3, 3]
         nearest = np.argmin(np.square(placed - wanted).sum(axis=(1, 2)))
         moved[self._columns[first]] = self._grids[first][nearest]
         return moved
 
-    def _hold(self, parameters: np.ndarray, X_WN: np.ndarray, nodes: Sequence[int]) -> np.ndarray:
-        """The parameters with nodes brought back to about X_WN by their own values."""
+    def _restore(
+        self, parameters: np.ndarray, X_WN: np.ndarray, nodes: Sequence[int]
+    ) -> np.ndarray:
+        """Return parameters (m + 4,) with some nodes moved back to X_WN by their own values.
+
+        ``X_WN``: (all nodes, 4, 4) wanted poses.
+        """
         for node in nodes:
             radius = max(float(self._balls[node, 3]), 1e-6)
             p_N = radius * np.vstack([np.zeros(3), np.eye(3), -np.eye(3)])
             wanted = p_N @ X_WN[node, :3, :3].T + X_WN[node, :3, 3]
             columns, points = self._columns[node], [node] * len(p_N)
-            parameters = self._bring(parameters, points, p_N, wanted, columns, (4, 1.0, 0.0))
+            parameters = self._move_points(parameters, points, p_N, wanted, columns, (4, 1.0, 0.0))
         return parameters
 
-    def _bring(
+    def _move_points(
         self,
         parameters: np.ndarray,
         nodes: Sequence[int],
@@ -316,10 +366,16 @@ class PartSearch:
         columns: np.ndarray,
         how: tuple[int, float, float],
     ) -> np.ndarray:
-        """The parameters, some columns changed so that points (n, 3) of nodes come to places.
+        """Return parameters that bring points of nodes to wanted positions, by Gauss-Newton steps.
 
-        By Gauss and Newton's method; ``how``: the number of steps, the longest step [rad or m] and
-        the damping [m^2]. A step of less than 0.002 ends it.
+        Args:
+            parameters: (m + 4,) the start.
+            nodes: (n,) the node of each point.
+            p_N: (n, 3) the points in the nodes' frames [m].
+            wanted: (n, 3) wanted positions in the world [m].
+            columns: indices of the parameters that change. A step in which all change by less than
+                0.002 [rad or m] is the last.
+            how: number of steps, longest step [rad or m] and damping [m^2].
         """
         lower, upper = self.body.lower[columns], self.body.upper[columns]
         (steps, longest, damping), moved = how, parameters.copy()
@@ -327,7 +383,7 @@ class PartSearch:
             placed = self.body.place(moved, bent=False)
             X = placed.X_WN[list(nodes)]
             p_W = np.einsum("kij,kj->ki", X[:, :3, :3], p_N) + X[:, :3, 3]
-            # How the points move with the parameters (3 n, k).
+            # Jacobian of the points with respect to the parameters, (3 n, k).
             motions = placed.dense(len(placed.motions))[list(nodes)][:, columns]
             motions = motions.reshape(len(p_W), -1, 3, 4)
             A = np.einsum("nkij,nj->nik", motions[..., :3], p_W) + motions[..., 3].transpose(
@@ -344,20 +400,26 @@ class PartSearch:
                 break
         return moved
 
-    def _middles(self, X_WN: np.ndarray, nodes: Sequence[int]) -> np.ndarray:
-        """The middles (..., k, 3) of some nodes at X_WN (..., k, 4, 4) in the world [m]."""
+    def _centers(self, X_WN: np.ndarray, nodes: Sequence[int]) -> np.ndarray:
+        """Return centres (..., k, 3) of k nodes at X_WN (..., k, 4, 4), in the world [m]."""
         p_N = self._balls[list(nodes), :3]
         return np.asarray(np.einsum("...kij,kj->...ki", X_WN[..., :3, :3], p_N) + X_WN[..., :3, 3])
 
 
 class NeighbourhoodSearch:
-    """Searches about a pose for placements of parts; ``reflections``: half of the body, too."""
+    """Searches around a pose for other placements of parts, and stores alternative poses.
+
+    Args:
+        problem: the body and the silhouettes.
+        search: the parts of the body.
+        reflections: whether, in a single view, parts are mirrored with left and right exchanged.
+    """
 
     def __init__(
         self, problem: RefinementProblem, search: PartSearch, *, reflections: bool = True
     ) -> None:
         self.problem, self.search = problem, search
-        # What is mirrored in the depth of one camera another one sees.
+        # In several views a part mirrored in the depth of one is visible in another.
         mirrored = search.reflections if reflections and len(problem.views) == 1 else ()
         self._parts = (*search.parts, *mirrored)
         self._freedoms = [
@@ -365,9 +427,10 @@ class NeighbourhoodSearch:
             for part in self._parts
         ]
         self._sizes = np.array([len(part.nodes) for part in self._parts])
-        self._seen = np.full(len(self._parts), np.inf)
+        # The error near each part after its last try, and the number of its tries.
+        self._left_error = np.full(len(self._parts), np.inf)
         self._tried = np.zeros(len(self._parts), dtype=np.int64)
-        # Other placements: J, the freedom of what is placed, and where.
+        # Alternative placements: J [pixel], the placed part's freedom, and its parameters.
         self._others: list[tuple[float, Freedom, np.ndarray]] = []
         self._settings = NeighbourhoodSettings()
 
@@ -380,13 +443,17 @@ class NeighbourhoodSearch:
         everywhere: bool = False,
         tries: int | None = None,
     ) -> tuple[np.ndarray, float]:
-        """Better parameters than those (m + 4,) of a refined pose, and their J.
+        """Place parts of a refined pose anew while J decreases.
 
         Args:
-            enough: J with which it ends [pixel].
-            deadline: it ends when ``time.perf_counter`` says so.
-            everywhere: try each part at least once.
-            tries: it ends after this many; None: no limit.
+            parameters: (m + 4,) the pose.
+            enough: the search ends when J is at most this [pixel].
+            deadline: time.perf_counter() at which the search ends [s].
+            everywhere: whether each part is tried at least once, even without an error near it.
+            tries: greatest number of tries; None: no limit.
+
+        Returns:
+            Parameters (m + 4,) of the best pose, and its J [pixel].
         """
         J, own = float(self.problem.J(parameters)), self._settings
         rounds = own.rounds * (2 if everywhere else 1)
@@ -395,31 +462,34 @@ class NeighbourhoodSearch:
         last = np.inf if tries is None else int(self._tried.sum()) + tries
         while J > enough and self._tried.sum() < last and time.perf_counter() < deadline:
             errors = self._errors_near(parameters, J)
-            # A part is tried again only where the error near it is not the one it left.
-            worth = ((errors >= least) | everywhere) & (self._tried < rounds)
-            worth &= np.abs(errors - self._seen) > np.maximum(own.same_error * errors, same)
-            if not worth.any():
+            # A part is tried again only if the error near it has changed since its last try.
+            due = ((errors >= least) | everywhere) & (self._tried < rounds)
+            due &= np.abs(errors - self._left_error) > np.maximum(own.same_error * errors, same)
+            if not due.any():
                 break
-            # Half a body is mirrored after its parts.
+            # Half of the body is mirrored only after single parts.
             parts = len(self.search.parts)
-            if worth[:parts].any():
-                worth[parts:] = False
-            chosen = int(np.argmax(np.where(worth, errors / self._sizes, -1.0)))
+            if due[:parts].any():
+                due[parts:] = False
+            chosen = int(np.argmax(np.where(due, errors / self._sizes, -1.0)))
             self._tried[chosen] += 1
             better, better_J = self._try(parameters, J, chosen, bool(errors[chosen] >= least))
             if better_J < J:
                 parameters, J = better, better_J
                 errors = self._errors_near(parameters, J)
-            self._seen[chosen] = errors[chosen]
+            self._left_error[chosen] = errors[chosen]
         return parameters, J
 
     def others(self, parameters: np.ndarray, limit: float, same: float) -> list[np.ndarray]:
-        """Other poses than the best (m + 4,) up to a limit of J, refined to the end, best first.
+        """Return alternative poses with J up to a limit, refined to the end, best first.
 
-        ``same``: poses none of whose values differ by more are one [rad or m].
+        Args:
+            parameters: (m + 4,) the best pose.
+            limit: greatest J [pixel].
+            same: poses are equal if no parameter differs by more [rad or m].
         """
         problem, own, J = self.problem, self._settings, float(self.problem.J(parameters))
-        # The body's halves were mirrored in other poses, if at all.
+        # Until now reflections were tried at other poses, or not at all.
         for k in range(len(self.search.parts), len(self._parts)):
             self._try(parameters, J, k, False)
         known, kept = [parameters], []
@@ -427,7 +497,7 @@ class NeighbourhoodSearch:
         everything = problem.body.freedom()
 
         def is_known(pose: np.ndarray, poses: Sequence[np.ndarray]) -> bool:
-            # A pose is not another one for a full turn.
+            # Poses that differ by full turns are equal.
             gaps = [problem.body.nearest_turns(pose, other) - other for other in poses]
             return any(float(np.abs(gap).max()) <= same for gap in gaps)
 
@@ -449,41 +519,51 @@ class NeighbourhoodSearch:
         return [pose for _, pose in kept]
 
     def _errors_near(self, parameters: np.ndarray, J: float) -> np.ndarray:
-        """For each part the area (parts,) wrong within its reach [pixel]."""
+        """Return (parts,) the error near each part [pixel]; that of reflections is J."""
         errors = self.search.errors_near(self.problem, parameters)
         return np.append(errors, np.full(len(self._parts) - len(errors), J))
 
     def _try(
         self, parameters: np.ndarray, J: float, chosen: int, erring: bool
     ) -> tuple[np.ndarray, float]:
-        """The best pose that a part leads to, and its J; what is nearly as good is kept."""
+        """Mirror a part, and place it anew, and store the alternatives that are nearly as good.
+
+        Args:
+            parameters: (m + 4,) the current pose.
+            J: its objective [pixel].
+            chosen: index of the part.
+            erring: whether there is an error near the part; if not, the part is only mirrored.
+
+        Returns:
+            The parameters of the best pose and its J [pixel]; the given parameters and infinity if
+            J does not decrease.
+        """
         problem, length, own = self.problem, self.problem.border_length, self._settings
         part, freedom = self._parts[chosen], self._freedoms[chosen]
-        still = problem.still(parameters, freedom.moved)
-        # Where no error is near, a part is only mirrored.
+        fixed_borders = problem.fixed_borders(parameters, freedom.moved)
         starts = [self.search.mirror(parameters, part, view) for view in problem.views]
         if erring and not part.exchanged:
             starts += self.search.propose(problem, parameters, part)
         rough, near = [], J + own.second_excess * length
         for start in starts:
             if part.exchanged:
-                refined, apart, _ = descend(problem, start, freedom, own.mirrored)
-                if near < apart <= J + own.repaired_excess * length:
-                    # Limits keep parts from being mirrored: without another place for them the
-                    # whole mirrored body would be given up.
+                refined, cost, _ = descend(problem, start, freedom, own.mirrored)
+                if near < cost <= J + own.repaired_excess * length:
+                    # Joint limits may prevent some nodes from being mirrored. They are placed anew,
+                    # so that the mirrored body is not rejected because of them.
                     refined, _, _ = descend(problem, refined, freedom, own.whole)
-                    mending = NeighbourhoodSearch(problem, self.search, reflections=False)
-                    refined, apart = mending.improve(refined, near, tries=own.repair_tries)
+                    repair = NeighbourhoodSearch(problem, self.search, reflections=False)
+                    refined, cost = repair.improve(refined, near, tries=own.repair_tries)
             else:
-                refined, apart, _ = descend(problem, start, freedom, own.placed, still)
-            if apart <= J + own.first_excess * length:
-                rough.append((apart, refined))
+                refined, cost, _ = descend(problem, start, freedom, own.placed, fixed_borders)
+            if cost <= J + own.first_excess * length:
+                rough.append((cost, refined))
         rough.sort(key=lambda pair: pair[0])
         found: list[tuple[float, np.ndarray]] = []
         for _, start in rough[: own.refined]:
-            refined, apart, _ = descend(problem, start, freedom, own.second, still)
-            if apart <= near:
-                refined, _, _ = descend(problem, refined, freedom, own.fine, still)
+            refined, cost, _ = descend(problem, start, freedom, own.second, fixed_borders)
+            if cost <= near:
+                refined, _, _ = descend(problem, refined, freedom, own.fine, fixed_borders)
                 found.append((float(problem.J(refined)), refined))
         columns = freedom.columns
         self._others += [

@@ -1,8 +1,13 @@
-"""A refinement to a local optimum of silhouettes' difference J, drawn by pixels.
+"""Refine a pose to a local optimum of the area J in which drawn body and silhouette differ.
 
-Levenberg and Marquardt's steps (H + d diag(H) + d0 I) x = -g on the distances between the body's
-contour and the silhouette's border (see ``fit.raster_lines``). Passes look at few lines of the
-raster first and let far distances count, then at all lines and near distances only.
+The Levenberg-Marquardt steps x solve
+
+    (H + d diag(H) + d0 I) x = -g
+
+with H, g the normal equations of the distances between the body's contour and the silhouette's
+border along raster lines (``fit.raster_lines``), and the damping d (relative), d0 [pixel^2/rad^2].
+The first passes use few lines and a large scale of distances, the last ones all lines and a small
+scale.
 """
 
 from collections.abc import Sequence
@@ -28,17 +33,29 @@ from drake_pose.silhouette.scoring import draw_packed
 
 
 class Freedom(NamedTuple):
-    """The parameters that may change, columns (k,) int64, and which nodes moved (nodes,) bool."""
+    """The parameters of a refinement that may change.
+
+    Args:
+        columns: (k,) int64 their indices.
+        moved: (nodes,) bool which nodes they move.
+    """
 
     columns: np.ndarray
     moved: np.ndarray
 
 
 class RefinementBody:
-    """A pose tree ready for refinement, made once and matched to many pictures.
+    """A pose tree prepared for refinement.
 
-    The parameters (m + 4,) are the tree's m values and, after them, ROOT_NAMES; their limits
-    ``lower`` and ``upper`` are infinite where an angle turns around.
+    The parameters (m + 4,) of a pose are the tree's m values [rad or m] and ROOT_NAMES: the shift
+    of the root [m] and the body's log scale.
+
+    Attributes:
+        tree, kinematics: the pose tree and its kinematics.
+        surfaces: the surfaces of all nodes.
+        skin: for each packed vertex the fraction of its motion that is its own node's (the rest is
+            that of the node's parent), and (nodes,) the parents of all nodes.
+        lower, upper: (m + 4,) limits of the parameters, infinite where an angle turns around.
     """
 
     def __init__(self, tree: PoseTree) -> None:
@@ -47,16 +64,16 @@ class RefinementBody:
         self._parameters = BodyParameters(self.kinematics, surfaces.rigid)
         middle = np.clip(0.0, self.kinematics.lower, self.kinematics.upper)
         moves = self.kinematics.motions(middle, translation=True, scale=True).moves
-        # What follows a value hangs on what the value moves.
+        # Mimic joints move only nodes that their leading value moves, too.
         self._moves = np.hstack([moves[:, : len(middle)], moves[:, -4:]])
         self._packed = PackedSurfaces(surfaces)
-        shares = []
+        weights = []
         for rigid, skin in zip(surfaces.rigid, surfaces.skins, strict=True):
-            shares.append(np.ones(len(rigid.vertices)))
+            weights.append(np.ones(len(rigid.vertices)))
             if skin is not None:
-                shares.append(1.0 - skin.weights if skin.inverted else skin.weights)
+                weights.append(1.0 - skin.weights if skin.inverted else skin.weights)
         parents = np.array([node.parent for node in tree.nodes], dtype=np.int64)
-        self.skin = np.concatenate(shares), parents
+        self.skin = np.concatenate(weights), parents
         unlimited = np.full(4, np.inf)
         self.lower = np.concatenate([self.kinematics.lower, -unlimited])
         self.upper = np.concatenate([self.kinematics.upper, unlimited])
@@ -64,9 +81,11 @@ class RefinementBody:
     def parameters(
         self, node_values: Sequence[np.ndarray], root_position: np.ndarray | None = None
     ) -> np.ndarray:
-        """The parameters (m + 4,) of a pose of the body's own size.
+        """Return the parameters (m + 4,) of a pose at the model's own scale.
 
-        ``root_position``: (3,) where the first root is [m]; None: where the tree says.
+        Args:
+            node_values: for each node (k,) its values [rad or m].
+            root_position: (3,) position of the first root [m]; None: that of the tree.
         """
         parameters = np.append(self.kinematics.flatten(node_values), np.zeros(4))
         if root_position is not None:
@@ -74,20 +93,23 @@ class RefinementBody:
         return parameters
 
     def node_values(self, parameters: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Each node's values."""
+        """Return each node's values (k,) [rad or m] at parameters (m + 4,)."""
         return self.kinematics.split(parameters[:-4])
 
     def nearest_turns(self, parameters: np.ndarray, near: np.ndarray | None = None) -> np.ndarray:
-        """The same pose's parameters, angles in the turn nearest to others (m + 4,).
+        """Return parameters (m + 4,) of the same pose, with angles in the turn nearest to ``near``.
 
-        Without others, where answers are given: see ``TreeKinematics.nearest_turns``.
+        ``near``: (m + 4,); None: the turn of ``TreeKinematics.nearest_turns``.
         """
         values = None if near is None else near[:-4]
         turned = self.kinematics.nearest_turns(parameters[:-4], values)
         return np.concatenate([turned, parameters[-4:]])
 
     def freedom(self, nodes: Sequence[int] | None = None, extra: Sequence[int] = ()) -> Freedom:
-        """The values of some nodes (None: all) that are not held, and some of ROOT_NAMES."""
+        """Return the parameters that may change: values of some nodes that have a range.
+
+        ``nodes``: these nodes; None: all. ``extra``: indices into ROOT_NAMES of further parameters.
+        """
         kinematics = self.kinematics
         chosen = kinematics.upper > kinematics.lower
         if nodes is not None:
@@ -100,9 +122,12 @@ class RefinementBody:
     def place(
         self, parameters: np.ndarray, *, bent: bool = True, rooted: bool = False
     ) -> Placement:
-        """The body at parameters (m + 4,), in arrays that the next call changes.
+        """Return the body placed at parameters (m + 4,), in arrays that the next call overwrites.
 
-        ``bent``: else its skin stays; ``rooted``: whether it says how ROOT_NAMES move it, too.
+        Args:
+            parameters: (m + 4,) the pose.
+            bent: whether the skin is deformed to the pose; else it keeps its last shape.
+            rooted: whether motions by ROOT_NAMES are included even if these are zero.
         """
         rooted = rooted or bool(parameters[-4:].any())
         values = parameters if rooted else parameters[:-4]
@@ -110,14 +135,17 @@ class RefinementBody:
         return self._parameters.place(values)._replace(packed=packed)
 
     def poses(self, parameters: np.ndarray) -> np.ndarray:
-        """Poses X_WN (nodes, 4, 4), scaled where the body has grown."""
+        """Return X_WN (nodes, 4, 4) at parameters (m + 4,), scaled by the log scale."""
         return self.place(parameters, bent=False).X_WN
 
 
 class RefinementProblem:
-    """The pose of one body in the silhouettes of one instant.
+    """One body and the silhouettes of one frame, compared pixel by pixel.
 
-    ``area`` of the silhouettes, and about how long their borders are, ``border_length`` [pixel].
+    Attributes:
+        body, views: the body and the silhouettes.
+        area: total area of the silhouettes [pixel].
+        border_length: approximate length of their borders [pixel].
 
     Raises:
         SettingsError: if there is no view.
@@ -135,8 +163,11 @@ class RefinementProblem:
         self._nothing = [Border.nothing(*view.mask.shape) for view in views]
         self.border_length = sum(border.length for border in self._silhouettes)
 
-    def wrong(self, parameters: np.ndarray) -> list[np.ndarray]:
-        """In each view the pixels (H, W) bool that body or silhouette covers, but not both."""
+    def mismatch(self, parameters: np.ndarray) -> list[np.ndarray]:
+        """Return for each view (H, W) bool the pixels that either body or silhouette covers.
+
+        ``parameters``: (m + 4,) the pose of the body.
+        """
         placed = self.body.place(parameters)
         return [
             draw_packed(placed.packed, view.camera.X_CW @ placed.X_WN, view.camera) != view.mask
@@ -144,11 +175,11 @@ class RefinementProblem:
         ]
 
     def J(self, parameters: np.ndarray) -> int:
-        """Pixels that body or silhouette covers, but not both, in all views together (1)."""
-        return sum(int(np.count_nonzero(wrong)) for wrong in self.wrong(parameters))
+        """Return the objective (1) at parameters (m + 4,): the area of the mismatch [pixel]."""
+        return sum(int(np.count_nonzero(one)) for one in self.mismatch(parameters))
 
-    def still(self, parameters: np.ndarray, moved: np.ndarray) -> list[Border]:
-        """The border in each view of all nodes but some (nodes,) bool."""
+    def fixed_borders(self, parameters: np.ndarray, moved: np.ndarray) -> list[Border]:
+        """Return for each view the border of all nodes that are not moved, (nodes,) bool."""
         if moved.all():
             return self._nothing
         placed = self.body.place(parameters)
@@ -162,34 +193,41 @@ class RefinementProblem:
         freedom: Freedom,
         part: Pass,
         offset: int = 0,
-        still: Sequence[Border] | None = None,
+        fixed_borders: Sequence[Border] | None = None,
     ) -> tuple[Equations, float]:
-        """The normal equations of some parameters at a pose (m + 4,).
+        """Return the normal equations of the distances along raster lines.
 
         Args:
-            offset: the first line that is looked at.
-            still: the border in each view of what they do not move; None: made here.
+            parameters: (m + 4,) the pose.
+            freedom: the k parameters that may change.
+            part: stride, scale and slack of the comparison.
+            offset: first raster line that is compared, below the stride.
+            fixed_borders: the border in each view of the nodes that do not move; None: computed
+                here.
 
         Returns:
-            H (1, k, k) and g (1, k) of distances along raster lines, their cost about J [pixel];
-                and the mean of weighted squared distances [pixel^2].
+            The equations, H (1, k, k) and g (1, k), whose cost is approximately J [pixel]; and the
+            mean of the weighted squared distances [pixel^2].
         """
         free, moved = freedom
-        still = self.still(parameters, moved) if still is None else still
+        if fixed_borders is None:
+            fixed_borders = self.fixed_borders(parameters, moved)
         rooted = bool((free >= len(parameters) - 4).any())
         placed = self.body.place(parameters, rooted=rooted)
         nodes = len(placed.X_WN)
         A, b, sums = np.zeros((nodes, 12, 12)), np.zeros((nodes, 12)), np.zeros(3)
-        for camera, rest, border in zip(self._cameras, still, self._silhouettes, strict=True):
+        for camera, fixed, border in zip(
+            self._cameras, fixed_borders, self._silhouettes, strict=True
+        ):
             sums += compare_raster(
-                placed.packed, self.body.skin, placed.X_WN, moved, camera, rest, border,
+                placed.packed, self.body.skin, placed.X_WN, moved, camera, fixed, border,
                 (part.stride, offset), part.scale, part.slack, A, b,
             )  # fmt: skip
         H, g = assemble_normal_equations(
             A, b, placed.motions, placed.starts, placed.owners, placed.parameters, len(parameters)
         )
-        apart, weight, squares = sums.tolist()
-        equations = Equations(H[np.ix_(free, free)][None], g[free][None], apart)
+        cost, weight, squares = sums.tolist()
+        equations = Equations(H[np.ix_(free, free)][None], g[free][None], cost)
         return equations, squares / max(weight, 1e-9)
 
 
@@ -198,30 +236,36 @@ def descend(
     parameters: np.ndarray,
     freedom: Freedom,
     passes: Sequence[Pass],
-    still: Sequence[Border] | None = None,
+    fixed_borders: Sequence[Border] | None = None,
     standstill: float = 5e-4,
     damping: float = 1e-3,
 ) -> tuple[np.ndarray, float, int]:
-    """Refine some of the parameters (m + 4,), one pass after another.
+    """Refine some of the parameters of a pose by passes of Levenberg-Marquardt steps.
 
-    ``still``: the border in each view of what they do not move; None: made here. A step of less
-    than ``standstill`` [rad or m] ends a pass; ``damping``: a share of the diagonal, which keeps
-    the equations solvable.
+    Args:
+        problem: the body and the silhouettes.
+        parameters: (m + 4,) the start.
+        freedom: the parameters that may change.
+        passes: the passes, run one after another.
+        fixed_borders: the border in each view of the nodes that do not move; None: computed here.
+        standstill: a pass ends when no parameter changes by more in a step [rad or m].
+        damping: relative damping d of the normal equations, which makes them solvable.
 
     Returns:
-        The parameters with the least difference met in the last pass, that difference as far as
-            its lines show it [pixel], and the number of steps.
+        The parameters of least cost in the last pass, this cost, an estimate of J from the compared
+        lines [pixel], and the number of steps.
     """
     free = freedom.columns
     limits = problem.body.lower[free], problem.body.upper[free]
-    still = problem.still(parameters, freedom.moved) if still is None else still
+    if fixed_borders is None:
+        fixed_borders = problem.fixed_borders(parameters, freedom.moved)
     steps, least = 0, np.inf
     for part in passes:
         settings = StepSettings(part.longest_step, damping, 0.0)
         best, least = parameters, np.inf
         for iteration in range(part.iterations + 1):
             offset = iteration % part.stride
-            equations, _ = problem.equations(parameters, freedom, part, offset, still)
+            equations, _ = problem.equations(parameters, freedom, part, offset, fixed_borders)
             if equations.cost < least:
                 best, least = parameters, equations.cost
             if iteration == part.iterations:

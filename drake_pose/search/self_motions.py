@@ -1,9 +1,9 @@
-"""Other values of a chain's joints that leave most of the body where it is.
+"""Find other joint values of a chain that leave the links behind it in place (self-motions).
 
-Two joints whose axes are parallel can turn against each other, and three whose first and last axes
-can be brought into line may be flipped (A1 + 180, -A2, A3 + 180): what hangs on the last joint
-stays where it is, or nearly so, and only the links between turn. A refinement does not find its way
-from one of these to another.
+Counter-turns: two joints with nearly parallel axes turn by opposite angles. Flips: three joints
+with angles (a1, a2, a3) take (a1 + pi, -a2, a3 + pi), if the first and last axes can be aligned,
+as in a spherical wrist. The links behind the last joint keep their pose, or nearly so, and only the
+links between move. A local refinement does not get from one of these poses to another.
 """
 
 import math
@@ -17,9 +17,13 @@ from drake_pose.body.tree_kinematics import TreeKinematics
 
 @dataclass(frozen=True, eq=False)
 class Flip:
-    """Values (m,) with three joints of a chain flipped, or several such flips one after another.
+    """A pose with three joints of a chain flipped, once or several times in succession.
 
-    ``changed``: (m,) bool, turned by 180 degrees or mirrored; ``mirrored``: turned round.
+    Args:
+        values: (m,) the flipped values [rad or m].
+        changed: (m,) bool which values were turned by pi or mirrored.
+        mirrored: (m,) bool which values have the opposite direction of motion: a2 becomes -a2 or
+            pi - a2.
     """
 
     values: np.ndarray
@@ -30,9 +34,13 @@ class Flip:
 def counter_turns(
     kinematics: TreeKinematics, values: np.ndarray, interval: float, parallel: float = 0.8
 ) -> list[np.ndarray]:
-    """Values (m,) with pairs of joints of nearly parallel axes turned against each other.
+    """Return poses (m,) in which two joints with nearly parallel axes turn by opposite angles.
 
-    ``parallel``: the cosine of the angle between the axes is at least this.
+    Args:
+        kinematics: kinematics of the pose tree.
+        values: (m,) the pose [rad or m].
+        interval: the angles are multiples of this, up to a full turn [rad].
+        parallel: least cosine of the angle between the axes.
     """
     motions = kinematics.motions(values)
     turns, moves = motions.twists[:, :3], motions.moves
@@ -53,13 +61,16 @@ def counter_turns(
 
 
 def flips(kinematics: TreeKinematics, values: np.ndarray, count: int = 16) -> list[Flip]:
-    """Poses with joints of a chain flipped, where what hangs on the last stays.
+    """Return flipped poses within the limits in which the links behind the flipped joints stay.
 
-    ``count``: the greatest number looked at; those outside the limits are left out.
+    Args:
+        kinematics: kinematics of the pose tree.
+        values: (m,) the pose [rad or m].
+        count: greatest number of flips that are examined, those outside the limits included.
     """
     untouched = np.zeros(len(values), dtype=np.bool_)
     known = [Flip(values, untouched, untouched)]
-    # Triples (n, 3) of angles, each at most two movable angles behind the one before it.
+    # Triples (n, 3) of angles, each at most two movable angles behind the previous one.
     pairs = sorted(_chained_pairs(kinematics, kinematics.motions(values).moves))
     chained = [(*pair, last) for pair in pairs for middle, last in pairs if middle == pair[1]]
     triples = np.array(chained, dtype=np.int64).reshape(-1, 3)
@@ -69,7 +80,7 @@ def flips(kinematics: TreeKinematics, values: np.ndarray, count: int = 16) -> li
             break
         for flip in _single_flips(kinematics, one, triples):
             gaps = flip.values - np.array([other.values for other in known])
-            # Less full turns, from -pi to pi.
+            # Differences from -pi to pi.
             gaps = np.abs((gaps + math.pi) % (2.0 * math.pi) - math.pi)
             if gaps.max(axis=1).min() > 1e-6:
                 known.append(flip)
@@ -88,18 +99,23 @@ def _single_flips(
     stays: float = 1e-3,
     nearly: float = 0.02,
 ) -> list[Flip]:
-    """One flip more, limits left aside; triples (n, 3) of joints.
+    """Return poses with one more triple of joints flipped, regardless of limits.
 
-    ``stays``: what a flip may move, as a share of the body's size; ``nearly``: how far cosines are
-    from where they are if all stays: wider.
+    Args:
+        kinematics: kinematics of the pose tree.
+        start: the pose.
+        triples: (n, 3) indices of angles.
+        stays: greatest motion of the last link, as a fraction of the body's size, or in the entries
+            of its rotation matrix.
+        nearly: greatest error of the cosines by which triples are preselected.
     """
     motions = kinematics.motions(start.values)
     size = float(np.ptp(motions.X_WN[:, :3, 3], axis=0).max()) + 1e-9
     middles = start.values[triples[:, 1]]
     mirrored = np.stack([-middles, math.pi - middles], axis=1)
-    # What hangs on the last joint can have its old direction: half turns about two axes make a turn
-    # about what is perpendicular to both, by twice the angle between them, and the turns of the
-    # middle joint must undo it.
+    # Condition for the last link to keep its orientation: half turns about two axes are together a
+    # turn about their common perpendicular by twice the angle between them. The middle joint must
+    # be perpendicular to both axes, and its change must undo this turn.
     first, middle, last = motions.twists[triples, :3].transpose(1, 0, 2)
     across = np.abs(np.stack([first * middle, last * middle]).sum(axis=2)).max(axis=0) < nearly
     doubled = 2.0 * (first * last).sum(axis=1) ** 2 - 1.0
@@ -121,7 +137,10 @@ def _single_flips(
 
 
 def _chained_pairs(kinematics: TreeKinematics, moves: np.ndarray) -> list[tuple[int, int]]:
-    """Pairs of angles, the second at most two movable angles behind the first on its chain."""
+    """Return pairs of angles of which the second is one or two movable angles behind the first.
+
+    ``moves``: (nodes, m) which nodes each value moves.
+    """
     movable = np.flatnonzero((kinematics.upper > kinematics.lower) & kinematics.is_angle)
     nodes = kinematics.value_nodes
     pairs = []
@@ -134,9 +153,10 @@ def _chained_pairs(kinematics: TreeKinematics, moves: np.ndarray) -> list[tuple[
 def _inside(
     kinematics: TreeKinematics, values: np.ndarray, changed: Iterable[int]
 ) -> np.ndarray | None:
-    """The values, turned by full turns into their limits; None where that cannot be.
+    """Return values (m,) with full turns added so that they are within their limits, else None.
 
-    Angles that turn around are brought to where answers are given.
+    ``changed``: indices of the values that are brought into their limits. Angles that turn around
+    are given in the turn nearest to their defaults.
     """
     values = kinematics.nearest_turns(values)
     for index in changed:

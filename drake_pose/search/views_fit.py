@@ -1,11 +1,11 @@
-"""The robust fit of one instant's silhouettes, however damaged, and what silhouettes leave open.
+"""Fit a body robustly to the silhouettes of one frame, and compute modes and joint intervals.
 
-Where neither scale nor distance of a body is known, lengths in a picture are only told by the
-silhouettes themselves: the unit of length is the root of their mean area.
+The unit of length in an image is the root of the silhouettes' mean area, since neither the scale
+nor the distance of the body may be known.
 
-A covariance says how far a right pose may be off. Other optima show whether another pose fits as
-well: those as good are modes of their own. Exact masks, drawn by pixels, and damaged
-masks or bodies that fit badly are treated apart (``find_intervals``, ``RobustModes``).
+The covariance of the fit gives intervals of the values around one optimum. Other optima that fit as
+well are further modes. ``RobustModes`` computes both for damaged masks and models that fit only
+approximately; ``exact_search.find_intervals`` is the counterpart for exact masks.
 """
 
 import itertools
@@ -54,10 +54,13 @@ from drake_pose.workers import map_ordered
 
 
 class FittedPose(NamedTuple):
-    """A pose found: values (m,), what does not fit [pixel], and what its values may be.
+    """A fitted pose, and its mode's intervals.
 
-    Costs are comparable at one scale and spacing. ``low``, ``high``: (m,) the ends of intervals,
-    where they are known; ``size``: how many poses are in it.
+    Args:
+        values: (m,) values of the pose tree [rad or m].
+        cost: robust cost [pixel]; comparable only at the same scale and spacing.
+        low, high: (m,) ends of the intervals [rad or m]; (0,) if they were not computed.
+        size: number of poses in the mode.
     """
 
     values: np.ndarray
@@ -68,16 +71,19 @@ class FittedPose(NamedTuple):
 
 
 class ViewsFit:
-    """One body and the silhouettes of one instant.
+    """The robust fit of one body to the silhouettes of one frame.
 
     Attributes:
-        size: the root of the silhouettes' mean area [pixel], the unit of length of all rounds.
-        edge_length: the length of the silhouettes' edges [pixel].
-        evaluations: how often contours were compared.
+        size: root of the silhouettes' mean area [pixel], the unit of length of all stages.
+        edge_length: length of the silhouettes' edges [pixel].
+        camera_count: number of views.
+        evaluations: number of comparisons of contours until now.
 
     Args:
-        outlines: a surface for each node; few triangles will do, see ``simplify_surfaces``.
-        rough: those of rough rounds, of fewer triangles; None: the same.
+        kinematics: kinematics of the pose tree.
+        outlines: a surface for each node; few triangles suffice, see ``simplify_surfaces``.
+        views: the silhouettes.
+        rough: surfaces with fewer triangles, for stages of large spacing; None: ``outlines``.
     """
 
     def __init__(
@@ -89,16 +95,16 @@ class ViewsFit:
     ) -> None:
         self.kinematics = kinematics
         self.size = math.sqrt(float(np.mean([np.count_nonzero(view.mask) for view in views])))
-        # A pixel of contour counts one, whatever its noise: the cost is in pixels.
+        # Unit weight per pixel of contour, so that the cost is in pixels.
         even = Noise(deviation=1.0, correlation=0.5 / self.size**3)
         steps = StepSettings(longest=0.3, damping=1e-2, even_damping=1e-3)
         cameras = [view.camera for view in views]
         self._levels = []
-        # From one point of a silhouette's edge to the next, as a share of its size, in rough rounds
-        # and in others.
-        spacings = 1.0 / 50.0, 1.0 / 80.0
-        for surfaces, share in zip((rough or outlines, outlines), spacings, strict=True):
-            spacing = max(1.0, share * self.size // 1.0)
+        # Distance of neighbouring points of a silhouette's edge, as a fraction of its size, at
+        # rough and at fine stages.
+        fractions = 1.0 / 50.0, 1.0 / 80.0
+        for surfaces, fraction in zip((rough or outlines, outlines), fractions, strict=True):
+            spacing = max(1.0, fraction * self.size // 1.0)
             edges = [find_edge_points(view.mask, spacing) for view in views]
             fit = ContourFit(kinematics, surfaces, even, steps, pixels=self.size)
             self._levels.append((fit, pack_views(cameras, edges)))
@@ -106,77 +112,87 @@ class ViewsFit:
         self.camera_count = len(views)
         self.evaluations, self._counting = 0, Lock()
 
-    def cost(self, values: np.ndarray, step: AnnealingStage) -> float:
-        """What does not fit at values (m,) [pixel]."""
+    def cost(self, values: np.ndarray, stage: AnnealingStage) -> float:
+        """Return the robust cost at values (m,) [pixel]."""
         self._count(1)
-        fit, views = self._level(step)
-        sums = fit.compare(views, values, step).sums
-        return float(sums[..., Sum.COST].sum()) / self._scale(step) ** 2
+        fit, views = self._level(stage)
+        sums = fit.compare(views, values, stage).sums
+        return float(sums[..., Sum.COST].sum()) / self._scale(stage) ** 2
 
-    def distances(self, values: np.ndarray, step: AnnealingStage) -> Distances:
-        """What is left of the contours' distances at values (m,)."""
+    def distances(self, values: np.ndarray, stage: AnnealingStage) -> Distances:
+        """Return the residuals of the contours' distances at values (m,)."""
         self._count(1)
-        fit, views = self._level(step)
-        compared = fit.compare(views, values, step)
+        fit, views = self._level(stage)
+        compared = fit.compare(views, values, stage)
         moves, unit = compared.placement.dense(len(values)), error_unit(self.size)
         return distances(fit.outlines, views.cameras, compared, moves, unit)
 
-    def tile_costs(self, values: np.ndarray, step: AnnealingStage) -> np.ndarray:
-        """What does not fit at values (m,), by pieces of the pictures that err on their own.
+    def tile_costs(self, values: np.ndarray, stage: AnnealingStage) -> np.ndarray:
+        """Return the robust cost at values (m,) in each tile of the images [pixel].
 
-        What is missing or too much is about as large as a piece, a fifth of the silhouettes' size.
+        The errors of different tiles are regarded as independent. A tile's side is a fifth of the
+        silhouettes' size, about the size of usual defects of masks.
         """
         self._count(1)
         side = max(1.0, 0.2 * self.size)
-        fit, views = self._level(step)
-        costs = fit.tile_costs(views, values, step, side)
-        return costs / self._scale(step) ** 2
+        fit, views = self._level(stage)
+        costs = fit.tile_costs(views, values, stage, side)
+        return costs / self._scale(stage) ** 2
 
     def refine(
-        self, values: np.ndarray, rounds: Sequence[AnnealingStage], held: Sequence[int] = ()
+        self, values: np.ndarray, stages: Sequence[AnnealingStage], held: Sequence[int] = ()
     ) -> FittedPose:
-        """Refine values (m,), but for some that are held, by indices."""
+        """Return the pose fitted from values (m,), with the cost at the last stage.
+
+        Args:
+            values: (m,) the start [rad or m].
+            stages: stages of the fit, run one after another.
+            held: indices of values that do not change.
+        """
         fixed = self.kinematics.upper <= self.kinematics.lower
         fixed[list(held)] = True
-        fit, views = self._level(rounds[-1])
-        found = fit.fit(views, values, rounds, None, fixed)
+        fit, views = self._level(stages[-1])
+        found = fit.fit(views, values, stages, None, fixed)
         self._count(found.evaluations)
-        return FittedPose(found.values, found.cost / self._scale(rounds[-1]) ** 2)
+        return FittedPose(found.values, found.cost / self._scale(stages[-1]) ** 2)
 
-    def _level(self, step: AnnealingStage) -> tuple[ContourFit, Views]:
-        """The fit and the views as finely as a step looks at them; rough: so far apart or more."""
-        return self._levels[step.spacing < 0.026]
+    def _level(self, stage: AnnealingStage) -> tuple[ContourFit, Views]:
+        """Return fit and views for a stage: fine ones below a spacing of 0.026, else rough ones."""
+        return self._levels[stage.spacing < 0.026]
 
     def _count(self, evaluations: int) -> None:
         with self._counting:  # Threads fit side by side.
             self.evaluations += evaluations
 
-    def _scale(self, step: AnnealingStage) -> float:
-        return max(FINEST_SCALE, step.scale * self.size)
+    def _scale(self, stage: AnnealingStage) -> float:
+        """Return a stage's scale [pixel]."""
+        return max(FINEST_SCALE, stage.scale * self.size)
 
 
 def refine_best(
     fit: ViewsFit,
     starts: Sequence[np.ndarray],
-    parts: Sequence[tuple[Sequence[AnnealingStage], int]],
+    passes: Sequence[tuple[Sequence[AnnealingStage], int]],
     proceed: Callable[[], bool],
 ) -> list[FittedPose]:
-    """Refine many poses, after each pass only the best of those that still differ.
+    """Refine many poses, and keep after each pass only the best distinct ones.
 
     Args:
+        fit: the body and the silhouettes.
         starts: each (m,), best first.
-        parts: rounds, and how many poses are kept after each.
+        passes: for each pass its stages, and the number of poses kept after it.
+        proceed: returns whether there is time left; if not, only the first pose is refined.
 
     Returns:
         The poses kept after the last pass, best first; at least one.
     """
     values = list(starts)
     kept: list[FittedPose] = []
-    for rounds, count in parts:
+    for stages, count in passes:
 
-        def refined(start: tuple[int, np.ndarray], rounds: Any = rounds) -> FittedPose | None:
-            # The first in any case, others while there is time.
-            return fit.refine(start[1], rounds) if start[0] == 0 or proceed() else None
+        def refined(start: tuple[int, np.ndarray], stages: Any = stages) -> FittedPose | None:
+            # The first pose is always refined, so that there is a result.
+            return fit.refine(start[1], stages) if start[0] == 0 or proceed() else None
 
         found = [one for one in map_ordered(refined, enumerate(values)) if one is not None]
         kept = distinct(found, count, fit.kinematics.turns_around)
@@ -190,9 +206,14 @@ def distinct(
     turns_around: np.ndarray | bool = False,
     apart: float = 0.05,
 ) -> list[FittedPose]:
-    """The best poses some value of which is more than ``apart`` [rad or m] from better ones.
+    """Return the best distinct poses, sorted by cost.
 
-    ``turns_around``: (m,) the values that are the same after a full turn.
+    Args:
+        poses: the poses.
+        count: greatest number of poses that are returned.
+        turns_around: (m,) whether each value is an angle that is the same after a full turn.
+        apart: a pose is distinct if some value differs by more than this from that of every better
+            pose [rad or m].
     """
     chosen: list[FittedPose] = []
     for pose in sorted(poses, key=lambda one: one.cost):
@@ -214,10 +235,19 @@ def describe_modes(
     tolerance: float,
     is_known: bool,
 ) -> PoseSet:
-    """The set of modes, the best first; where it is not known, no value is determined."""
+    """Return the pose set of some modes.
+
+    Args:
+        kinematics: kinematics of the pose tree.
+        tree: the pose tree.
+        modes: the modes with their intervals, best first.
+        Js: the objective (1) of each [pixel].
+        tolerance: as in ``PoseSet`` [pixel].
+        is_known: whether intervals are reliable; if not, no value is determined.
+    """
 
     def joints(some: Sequence[FittedPose]) -> tuple[JointEstimate, ...]:
-        # All in the turns nearest to the first one.
+        # Angles of all modes are given in the turn nearest to the first one.
         first = some[0].values
         turns = [kinematics.nearest_turns(one.values, first) - one.values for one in some]
         lower, upper = kinematics.reach(first)
@@ -234,15 +264,20 @@ def describe_modes(
 
 
 def covariance_pose_set(
-    tree: PoseTree, pose: PoseEstimate, covariance: np.ndarray, pictures: int
+    tree: PoseTree, pose: PoseEstimate, covariance: np.ndarray, image_count: int
 ) -> PoseSet:
-    """What the covariance (m, m) of the tree's values says about a pose, where no other is sought.
+    """Return the pose set of a single pose, with intervals from a covariance.
 
-    The size of errors was estimated from ``pictures`` pictures.
+    Args:
+        tree: the pose tree.
+        pose: the pose.
+        covariance: (m, m) covariance of the tree's values.
+        image_count: number of images from which the sizes of errors were estimated; it sets the
+            degrees of freedom of Student's distribution.
     """
     kinematics, settings = TreeKinematics(tree), RobustSettings()
     values = kinematics.flatten(pose.node_values)
-    widths = stdtrit(settings.camera_freedom * pictures, settings.one_sided) * np.sqrt(
+    widths = stdtrit(settings.camera_freedom * image_count, settings.one_sided) * np.sqrt(
         np.diag(covariance)
     )
     lower, upper = kinematics.reach(values)
@@ -252,17 +287,22 @@ def covariance_pose_set(
         high=np.minimum(values + widths, upper),
     )
     described = describe_modes(kinematics, tree, [mode], [pose.J], 0.0, True)
-    # The tree may hold its root elsewhere.
+    # Keep the pose's own root, which may differ from the tree's.
     own = replace(described.modes[0], q=pose.q, X_WB=pose.X_WB)
     return replace(described, modes=(own,))
 
 
 class RobustModes:
-    """The modes of one match, where parts, masks and cameras err together.
+    """Computes the modes and intervals of one match with damaged masks.
 
-    What no pose explains, such as a part that is missing in a mask, costs all poses alike and says
-    nothing. A value that may go far is moved step by step, the others following, until what does
-    not fit any more is significant.
+    Poses are compared by the difference of their costs, so defects that no pose explains, such as a
+    part missing in a mask, cancel. A value with a wide interval is moved step by step, with the
+    other values fitted, until the increase of the cost is significant (profile likelihood).
+
+    Args:
+        fit: the body and the silhouettes.
+        proceed: returns whether there is time left.
+        settings: parameters.
     """
 
     def __init__(
@@ -270,48 +310,55 @@ class RobustModes:
     ) -> None:
         self._fit, self._kinematics, self._proceed = fit, fit.kinematics, proceed
         self._settings = settings or RobustSettings()
-        self._pieces, self._tolerance = np.zeros(0), 0.0
+        self._best_costs, self._tolerance = np.zeros(0), 0.0
         self._sizes: ErrorSizes | None = None
 
     def find(self, poses: Sequence[FittedPose], J: Callable[[np.ndarray], float]) -> PoseSet:
-        """The poses that fit as well as the best of some, the answer first; J (1) of values."""
-        look = self._settings.comparison
-        pieces = map_ordered(lambda pose: self._fit.tile_costs(pose.values, look), poses)
-        self._pieces = min(pieces, key=lambda one: float(one.sum()))
+        """Return the set of poses that fit as well as the best of some.
+
+        Args:
+            poses: fitted poses; the first is the answer and the representative of the first mode.
+            J: returns the objective (1) at values (m,) [pixel].
+        """
+        stage = self._settings.comparison
+        costs = map_ordered(lambda pose: self._fit.tile_costs(pose.values, stage), poses)
+        self._best_costs = min(costs, key=lambda one: float(one.sum()))
         modes: list[FittedPose] = []
-        for k, (pose, one) in enumerate(zip(poses, pieces, strict=True)):
+        for k, (pose, one) in enumerate(zip(poses, costs, strict=True)):
             as_good = self._is_as_good(one)
-            is_new = (as_good or k == 0) and not self._is_in(modes, pose.values)
+            is_new = (as_good or k == 0) and not self._add_to_known(modes, pose.values)
             if is_new and self._has_room(modes):
-                modes.append(self._spread(pose.values))
+                modes.append(self._with_intervals(pose.values))
                 self._add_flipped(modes, modes[-1])
-        return self._described(modes, [J(one.values) for one in modes])
+        return self._pose_set(modes, [J(one.values) for one in modes])
 
     def around(self, values: np.ndarray, J: float) -> PoseSet:
-        """What the silhouettes say about one pose (m,), where no other is looked for."""
-        self._pieces = self._fit.tile_costs(values, self._settings.comparison)
-        return self._described([self._spread(values, moves=False)], [J])
+        """Return the set of the single pose with values (m,) and objective J [pixel]."""
+        self._best_costs = self._fit.tile_costs(values, self._settings.comparison)
+        return self._pose_set([self._with_intervals(values, moves=False)], [J])
 
-    def _described(self, modes: Sequence[FittedPose], Js: Sequence[float]) -> PoseSet:
-        # A fit of which most does not fit can be wrong altogether: no robust estimate outlives it.
-        known = float(self._pieces.sum()) <= self._fit.edge_length
+    def _pose_set(self, modes: Sequence[FittedPose], Js: Sequence[float]) -> PoseSet:
+        # If the cost exceeds one per pixel of edge, most of the contour does not fit, and the pose
+        # may be entirely wrong: the intervals are not reliable.
+        known = float(self._best_costs.sum()) <= self._fit.edge_length
         tree = self._kinematics.tree
         return describe_modes(self._kinematics, tree, modes, Js, self._tolerance, known)
 
-    def _is_as_good(self, pieces: np.ndarray) -> bool:
-        """Whether costs by pieces are not significantly above the best pose's."""
-        as_good = vuong_statistic(pieces, self._pieces) <= self._settings.significance
+    def _is_as_good(self, costs: np.ndarray) -> bool:
+        """Return whether costs by tiles are not significantly above those of the best pose."""
+        as_good = vuong_statistic(costs, self._best_costs) <= self._settings.significance
         if as_good:
-            self._tolerance = max(self._tolerance, float((pieces - self._pieces).sum()))
+            self._tolerance = max(self._tolerance, float((costs - self._best_costs).sum()))
         return as_good
 
     def _has_room(self, modes: Sequence[FittedPose]) -> bool:
+        """Return whether one more mode is allowed by their number and the time."""
         return not modes or (len(modes) < self._settings.modes and self._proceed())
 
-    def _is_in(self, modes: list[FittedPose], values: np.ndarray) -> bool:
-        """Whether some mode holds a pose; it is counted there.
+    def _add_to_known(self, modes: list[FittedPose], values: np.ndarray) -> bool:
+        """Return whether values (m,) belong to one of the modes, and if so add them to it.
 
-        What is free in a mode may be anything: that widens it.
+        Values that a mode does not determine may differ: they widen its intervals.
         """
         widest = self._settings.widest(self._kinematics.is_angle)
         for i, mode in enumerate(modes):
@@ -324,23 +371,23 @@ class RobustModes:
         return False
 
     def _add_flipped(self, modes: list[FittedPose], mode: FittedPose) -> None:
-        """Add what flips make of a mode, as far as it fits: intervals flip as middles do."""
-        kinematics, look = self._kinematics, self._settings.comparison
+        """Add the flipped poses of a mode that fit as well as the best, with flipped intervals."""
+        kinematics, stage = self._kinematics, self._settings.comparison
 
         def settle(flip: Flip) -> tuple[np.ndarray, np.ndarray]:
-            seen = self._fit.refine(flip.values, (look,)).values
-            return seen, self._fit.tile_costs(seen, look)
+            fitted = self._fit.refine(flip.values, (stage,)).values
+            return fitted, self._fit.tile_costs(fitted, stage)
 
         others = flips(kinematics, mode.values) if self._has_room(modes) else []
-        for flip, (seen, pieces) in zip(others, map_ordered(settle, others), strict=True):
+        for flip, (fitted, costs) in zip(others, map_ordered(settle, others), strict=True):
             if not self._has_room(modes):
                 return
-            if not self._is_as_good(pieces) or self._is_in(modes, seen):
+            if not self._is_as_good(costs) or self._add_to_known(modes, fitted):
                 continue
-            values = kinematics.nearest_turns(seen)
+            values = kinematics.nearest_turns(fitted)
             below, above = mode.values - mode.low, mode.high - mode.values
             lower, upper = kinematics.reach(mode.values)
-            # Where a limit ended the interval, the flipped one may go further.
+            # An interval that ended at a joint's limit may extend further after the flip.
             below = np.where(flip.changed & (mode.low <= lower + 1e-9), math.inf, below)
             above = np.where(flip.changed & (mode.high >= upper - 1e-9), math.inf, above)
             swapped = np.where(flip.mirrored, [above, below], [below, above])
@@ -351,63 +398,76 @@ class RobustModes:
             )
             modes.append(FittedPose(values, low=low, high=high))
 
-    def _spread(self, values: np.ndarray, moves: bool = True) -> FittedPose:
-        """What the values (m,) may be about a pose; unless it moves them, by covariance alone."""
+    def _with_intervals(self, values: np.ndarray, moves: bool = True) -> FittedPose:
+        """Return the pose with values (m,) and its intervals.
+
+        ``moves``: whether values with a wide interval are moved; else the intervals follow from the
+        covariance alone.
+        """
         kinematics, own = self._kinematics, self._settings
         lower, upper = kinematics.reach(values)
         free = np.flatnonzero(upper > lower)
-        seen = self._fit.distances(values, own.measure)
+        residuals = self._fit.distances(values, own.measure)
         if self._sizes is None:
-            self._sizes = estimate_sizes(seen, kinematics.is_angle)
-        covariance = values_covariance(seen, self._sizes, free, kinematics.is_angle)
+            self._sizes = estimate_sizes(residuals, kinematics.is_angle)
+        covariance = values_covariance(residuals, self._sizes, free, kinematics.is_angle)
         low, high = values.copy(), values.copy()
-        freedom = own.camera_freedom * self._fit.camera_count
-        widths = stdtrit(freedom, own.one_sided) * np.sqrt(np.diag(covariance))
+        degrees_of_freedom = own.camera_freedom * self._fit.camera_count
+        widths = stdtrit(degrees_of_freedom, own.one_sided) * np.sqrt(np.diag(covariance))
         low[free], high[free] = values[free] - widths, values[free] + widths
         wide = widths > np.where(kinematics.is_angle[free], *own.moved)
 
-        def move(way: tuple[int, float]) -> list[np.ndarray]:
-            column, sign = way
+        def move(direction: tuple[int, float]) -> list[np.ndarray]:
+            column, sign = direction
             along = np.zeros(len(values))
             along[free] = sign * covariance[:, column] / covariance[column, column]
-            return self._move(values, int(free[column]), along, float(widths[column]))
+            return self._profile(values, int(free[column]), along, float(widths[column]))
 
-        # Where the covariance lets a value go to its limit it need not be moved.
-        ways = [
+        # A value is not moved towards a limit that lies within its interval by covariance.
+        directions = [
             (column, sign)
             for column in np.flatnonzero(wide & moves).tolist()
             for sign, open_end in ((-1.0, low > lower), (1.0, high < upper))
             if open_end[free[column]]
         ]
-        found = [values, *itertools.chain.from_iterable(map_ordered(move, ways))]
-        # Poses found while one value was moved show what others may be, too.
+        found = [values, *itertools.chain.from_iterable(map_ordered(move, directions))]
+        # Poses found while one value was moved may widen the intervals of other moved values.
         moved = free[wide]
         low[moved] = np.minimum(low[moved], np.min(found, axis=0)[moved])
         high[moved] = np.maximum(high[moved], np.max(found, axis=0)[moved])
         return FittedPose(values, low=np.maximum(low, lower), high=np.minimum(high, upper))
 
-    def _move(
+    def _profile(
         self, values: np.ndarray, index: int, along: np.ndarray, width: float
     ) -> list[np.ndarray]:
-        """Poses (m,) that fit as well, a value moved from some, the others following along (m,).
+        """Move one value step by step, with the others fitted, while the pose fits as well.
 
-        ``width``: how far the value may go in any case.
+        Args:
+            values: (m,) the pose from which the value is moved [rad or m].
+            index: the value that is moved.
+            along: (m,) change of all values per unit of the moved one.
+            width: first step [rad or m].
+
+        Returns:
+            Values (m,) of the poses, the first the given one. The last is interpolated to where the
+            increase of the cost becomes significant.
         """
         own = self._settings
         longest = own.longest_steps[0 if self._kinematics.is_angle[index] else 1]
         lower, upper = self._kinematics.lower.copy(), self._kinematics.upper.copy()
-        # Beyond half a turn the values come back from the other side.
+        # An angle that turns around is moved by at most half a turn.
         lower[index], upper[index] = (ends[index] for ends in self._kinematics.reach(values))
         step, found, worse = width, [values], 0.0
         while lower[index] < found[-1][index] < upper[index] and self._proceed():
             trial = np.clip(found[-1] + min(step, longest) * along, lower, upper)
-            looked = self._fit.refine(trial, own.follow, held=(index,)).values
-            costs = self._fit.tile_costs(looked, own.comparison)
-            before, worse = worse, vuong_statistic(costs, self._pieces)
+            fitted = self._fit.refine(trial, own.follow, held=(index,)).values
+            costs = self._fit.tile_costs(fitted, own.comparison)
+            before, worse = worse, vuong_statistic(costs, self._best_costs)
             if worse > own.significance:
-                # Costs are parabolas in the rough, and their differences scatter as values differ.
-                share = (own.significance - before) / (worse - before)
-                return [*found, found[-1] + share * (looked - found[-1])]
-            found.append(looked)
+                # The cost is roughly a parabola and the standard deviation of a difference grows
+                # linearly, so the statistic is interpolated linearly.
+                fraction = (own.significance - before) / (worse - before)
+                return [*found, found[-1] + fraction * (fitted - found[-1])]
+            found.append(fitted)
             step *= own.step_factor
         return found

@@ -1,4 +1,4 @@
-"""What an audit finds: of all frames, and of each."""
+"""Results of an audit: errors common to all frames, and errors of single frames."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -8,26 +8,27 @@ from drake_pose.fit.covariance import ErrorSizes
 
 @dataclass(frozen=True)
 class Finding:
-    """By how much something is off.
+    """An error in what is given: joint positions, cameras, clocks or masks.
 
     Args:
-        kind: "joint", "camera", "base", "focal", "center", "clock", "rate" of a clock, "joints"
-            where several are off, or "unexplained" where nothing within reach explains a frame;
-            of all frames "sign" or "log" of a joint, "link", "reading" of what is given, or
-            "moved" after a frame.
-        name: of the joint, or the camera: "" where it is all of them; what is read wrongly.
-        angle, shift: what must be added [rad, m]; of joints the largest; of focal lengths the shift
-            is relative, of principal points in pixels, of a camera's pose the way of the camera
-            itself, of a camera's clock by how much later its
-            pictures' joints are in the log [s], of its rate how much faster the log's runs [s/s].
+        kind: what is wrong. "joint": an offset; "camera" or "base": its pose; "focal": focal
+            lengths; "center": principal points; "clock": a camera's time offset; "rate": its
+            drift; "joints": several joints; "unexplained": nothing within reach explains the frame.
+            In all frames also "sign" or "log": a joint's column in the log; "link": a link's shape;
+            "reading": the meaning of what is given; "moved": a pose that changed after a frame.
+        name: of the joint or camera, "" for several; for a "reading" a sentence.
+        angle, shift: correction to be added [rad, m]. Of several joints, the largest. Focal lengths
+            [relative], principal points [pixel]; a camera's shift is that of its own centre. Clock
+            [s]: how much later the pictures' joint positions are logged. Rate [s/s]: how much
+            faster the log's clock runs.
         angle_sd, shift_sd: their standard deviations.
-        pixels: how far it moves the outlines of the parts that it moves, root mean square.
-        p_value: probability of a deviation this large where nothing is off.
-        rivals: names of alternative causes that explain it as well.
-        joints: by how much joints are off where several are [rad or m].
+        pixels: root mean square distance by which it moves the outlines it affects [pixel].
+        p_value: probability of an error at least as large if nothing is wrong.
+        alternatives: names of other causes that explain it equally well.
+        joints: corrections by joint, where several are wrong [rad or m].
         at_body: how far a camera's error shifts the body [m].
-        link: that is not where the log of a joint says.
-        text: what happened, in words, where no number says it.
+        link: the misplaced link; of a "moved" finding "camera" or "base".
+        text: details in words.
     """
 
     kind: str
@@ -47,33 +48,35 @@ class Finding:
 
 @dataclass(frozen=True)
 class FrameDiagnosis:
-    """What was found of one frame.
+    """The diagnosis of one frame.
 
     Args:
-        given, fitted: by camera, the inlier ratio with everything as given, and once fitted.
-        pixels: how far the outlines are off from what all frames have in common.
-        finding: what contradicts the other frames; None: it agrees.
+        frame: its name.
+        given_ratios, fitted_ratios: inlier ratios by camera, as given and with the frame fitted.
+        pixels: root mean square distance of the outlines from the pose common to all frames
+            [pixel].
+        finding: the error, for an outlier frame; None for an inlier.
     """
 
     frame: str
-    given: Mapping[str, float]
-    fitted: Mapping[str, float]
+    given_ratios: Mapping[str, float]
+    fitted_ratios: Mapping[str, float]
     pixels: float
     finding: Finding | None
 
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """What contradicts the rest.
+    """The result of an audit.
 
     Args:
-        frames: of each frame.
-        common: what is off in all frames that agree.
-        sizes: of contours' errors [pixel].
-        center: all principal points are off by half a pixel along x and y: by how much, and
-            standard deviations (2,) [pixel]; None: they are not.
-        minimum_detectable: smallest offset of each joint that is not named that would be, in all
-            frames [rad or m].
+        frames: the diagnosis of each frame.
+        common: errors common to all inlier frames.
+        sizes: standard deviations of contour errors [pixel].
+        center: correction of all principal points and its standard deviation, (2,) each [pixel],
+            where they are off by half a pixel along x and y; otherwise None.
+        minimum_detectable: by joint without a finding, the smallest offset in all frames that
+            would be detected [rad or m].
     """
 
     frames: tuple[FrameDiagnosis, ...]
@@ -84,5 +87,5 @@ class Diagnosis:
 
     @property
     def outliers(self) -> tuple[str, ...]:
-        """The frames that contradict the others."""
+        """Names of the outlier frames."""
         return tuple(one.frame for one in self.frames if one.finding is not None)

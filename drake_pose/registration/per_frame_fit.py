@@ -1,7 +1,7 @@
-"""Each frame fitted by itself, its joints and cameras free to move a little from where they are.
+"""Fit each frame by itself, with small corrections of all joints and cameras as unknowns.
 
-What is given is where a fit begins, and its prior. What is left of the distances is linear in what
-is given about where the fit ends.
+The given values are the start and the mean of the prior. The residual distances are returned as
+linear functions of the corrections, for the diagnosis of all frames.
 """
 
 from collections.abc import Mapping, Sequence
@@ -26,15 +26,16 @@ from drake_pose.silhouette.outline import Outline
 
 @dataclass(frozen=True, eq=False)
 class FrameFit:
-    """A frame whose joints and cameras were fitted.
+    """A frame with fitted joints and cameras.
 
     Args:
-        pictures: the contours compared with each camera's silhouette where the fit ended, and told
-            as distances from what is given; their values are the joints' and POSE_NAMES of each
-            camera.
-        inlier_ratios: before and after, by camera.
-        weights: (nodes,) how much of the contours of each node was compared [pixel].
-        fitting: (nodes, 2) lengths of each node's contours that were compared and that fit.
+        name: the frame's name.
+        compared_masks: the comparison of the contours with each mask, linearised at the end of the
+            fit. Distances are measured from the given values; the unknowns are the corrections of
+            the joints and of the POSE_NAMES of each camera.
+        inlier_ratios: by camera, with given and with fitted values.
+        outline_lengths: (nodes,) weighted length of each node's contours [pixel].
+        matched_lengths: (nodes, 2) lengths of each node's contours compared, and fitting [pixel].
     """
 
     name: str
@@ -45,23 +46,22 @@ class FrameFit:
 
 
 class PerFrameFit:
-    """Fits frames, each by itself, with all that is given free to move.
+    """Fits frames, each by itself, with joints and cameras as unknowns.
 
     Attributes:
-        outlines: all of the surfaces.
-        cameras: where they are said to stand.
-        size: the root of the silhouettes' median area [pixel].
-        names: of the p values that move: the joints, and POSE_NAMES of each camera.
-        deviations: (p,) how far what is given may be off: standard deviations [rad or m].
+        outlines: the full surface of each node.
+        cameras: the cameras at their given poses.
+        size: square root of the silhouettes' median area [pixel].
+        names: names of the p unknowns: the joints, and POSE_NAMES of each camera.
+        deviations: (p,) prior standard deviations of the corrections [rad or m].
 
     Args:
-        outlines: a surface for each node: of few triangles, with which frames are fitted, and all,
-            with which they are compared in the end.
-        cameras: the cameras, where they are said to stand.
-        frames: some frames, which tell how large silhouettes are, and where the body is.
+        outlines: surfaces of the nodes, simplified for the fit, and full for the final comparison.
+        cameras: the cameras at their given poses.
+        frames: a sample of frames, for the silhouettes' size and the body's position.
 
     Raises:
-        MaskError: a mask of another size than its camera's picture, or no mask shows the body.
+        MaskError: a mask's size differs from its camera's, or no mask shows the body.
     """
 
     def __init__(
@@ -76,19 +76,19 @@ class PerFrameFit:
         joints = np.flatnonzero(kinematics.lower < kinematics.upper)
         self.camera_names = tuple(camera.name for camera in cameras)
         self.joints = tuple(kinematics.names[k] for k in joints)
-        looks = tuple(f"{camera.name}.{name}" for camera in cameras for name in POSE_NAMES)
-        self.names = (*self.joints, *looks)
+        poses = tuple(f"{camera.name}.{name}" for camera in cameras for name in POSE_NAMES)
+        self.names = (*self.joints, *poses)
         turns = np.tile([name.startswith("turn") for name in POSE_NAMES], len(cameras))
         self.is_angle = np.concatenate([kinematics.is_angle[joints], turns])
-        # How far joints, and cameras about the body, may be off: standard deviations [rad, m].
+        # Prior standard deviations of joints, and of cameras about the body [rad, m].
         of_joints = np.where(kinematics.is_angle[joints], 0.1, 0.02)
         self.deviations = np.concatenate([of_joints, np.full(len(turns), 0.05)])
-        worth = SHARED.point_error * np.sqrt(SHARED.error_length)
+        error = SHARED.point_error * np.sqrt(SHARED.error_length)
         self._middle = middle_of(kinematics, frames)
-        self._few, self._all = (
+        self._simplified, self._full = (
             Problem(
                 BodyParameters(kinematics, one), cameras,
-                [Unknowns(self.names, deviation=self.deviations / worth)], pivot=self._middle,
+                [Unknowns(self.names, deviation=self.deviations / error)], pivot=self._middle,
                 steps=StepSettings(longest=0.2, damping=1e-3, even_damping=1e-6),
                 pixels=self.size,
             )
@@ -101,15 +101,16 @@ class PerFrameFit:
         scales: Sequence[float] = (0.12, 0.09, 0.07, 0.05, 0.04, 0.03, 0.025),
         already: float = 1.3,
     ) -> FrameFit:
-        """Fits a frame.
+        """Fit one frame.
 
         Args:
             frame: the frame.
-            scales: of the rounds [root of the silhouettes' area].
-            already: where given values cost at most this multiple of the fitted ones' cost,
-                distances are linear about them: what hardly shows may have moved far.
+            scales: scales of the annealing stages [square root of the silhouettes' area].
+            already: if the cost at the given values is at most this multiple of the fitted cost,
+                distances are linearised about the given values: weakly observable unknowns may have
+                moved far without effect on the cost.
 
-        Raises MaskError: a mask of another size than its camera's picture.
+        Raises MaskError: a mask's size differs from its camera's.
         """
         edges = frame.edges(self.cameras, 0.01 * self.size)
         start, count = (np.zeros((1, len(self.names))), np.zeros(0)), len(self.cameras)
@@ -117,30 +118,30 @@ class PerFrameFit:
         change, base = start, given
         rounds = [AnnealingStage(scale, 0.02) for scale in scales]
         for part in (rounds, rounds[-2:]):
-            found = self._few.solve([base], part, change, expected=start)
+            found = self._simplified.solve([base], part, change, expected=start)
             change = found.own, found.shared
             theta = self.with_boundary_biases(base, found.parameters[0])
-            held = self._all.parameters([given], *start)[0]
+            held = self._full.parameters([given], *start)[0]
             base = given._replace(values=np.append(held[:-count], theta[-count:]))
         held = self.with_boundary_biases(given, held)
         before, after = (
-            self._all.compare(given, one, SHARED.inlier_stage)[0] for one in (held, theta)
+            self._full.compare(given, one, SHARED.inlier_stage)[0] for one in (held, theta)
         )
-        told = after
+        compared = after
         costs = [float(one.sums[:, :, Sum.COST].sum()) for one in (before, after)]
         if costs[0] <= already * costs[1]:
-            theta, told, change = held, before, start
-        weights = told.sums[:, :, Sum.WEIGHT].sum(axis=0)
+            theta, compared, change = held, before, start
+        weights = compared.sums[:, :, Sum.WEIGHT].sum(axis=0)
         return FrameFit(
             frame.name,
             tuple(
                 one._replace(b=one.b + np.einsum("nkl,npl,p->nk", one.A, one.moves, change[0][0]))
-                for one in self._all.compared_masks([given], theta[None], SHARED.inlier_stage)
+                for one in self._full.compared_masks([given], theta[None], SHARED.inlier_stage)
             ),
             (self._inlier_ratios(before, frame), self._inlier_ratios(after, frame)),
-            # Edges are shared out among the nodes.
+            # The last row, of the mask's edges, is distributed among the nodes.
             weights[:-1] * weights.sum() / max(float(weights[:-1].sum()), 1e-9),
-            told.sums[:, :-1, [Sum.COMPARED, Sum.FITTING]].sum(axis=0),
+            compared.sums[:, :-1, [Sum.COMPARED, Sum.FITTING]].sum(axis=0),
         )
 
     def _inlier_ratios(self, compared: Comparison, frame: SeenFrame) -> dict[str, float]:
@@ -148,26 +149,30 @@ class PerFrameFit:
         return {name: inlier_ratio_of(one) for name, one in sums if name in frame.masks}
 
     def with_boundary_biases(self, seen: Observation, theta: Array) -> Array:
-        """All parameters (n,), the silhouettes as much wider on all sides as fits best [pixel]."""
-        widths, count = np.linspace(-3.0, 3.0, 5), len(self.cameras)
-        found, costs = theta.copy(), np.full((len(widths), count), np.inf)
-        # The narrowest and the widest are looked at where the cost goes on falling that way.
+        """Return all parameters (n,) with the cheapest boundary bias of each mask [pixel].
+
+        The cost is evaluated at biases from -3 to 3 pixels and interpolated by a parabola.
+        """
+        biases, count = np.linspace(-3.0, 3.0, 5), len(self.cameras)
+        found, costs = theta.copy(), np.full((len(biases), count), np.inf)
+        # The outermost biases are evaluated only where the cost falls towards them.
         for k, beside in ((1, None), (2, None), (3, None), (0, 1), (4, 3)):
             if beside is None or (np.argmin(costs, axis=0) == beside).any():
-                found[-count:] = widths[k]
-                compared, _ = self._few.compare(seen, found, SHARED.inlier_stage)
+                found[-count:] = biases[k]
+                compared, _ = self._simplified.compare(seen, found, SHARED.inlier_stage)
                 costs[k] = compared.sums[:, :, Sum.COST].sum(axis=1)
-        best = np.clip(np.argmin(costs, axis=0), 1, len(widths) - 2)
+        best = np.clip(np.argmin(costs, axis=0), 1, len(biases) - 2)
         low, middle, high = (np.choose(best + k, costs) for k in (-1, 0, 1))
         bend = low - 2.0 * middle + high
         step = np.where(bend > 0.0, 0.5 * (low - high) / np.where(bend > 0.0, bend, 1.0), 0.0)
-        found[-count:] = widths[best] + np.clip(step, -1.0, 1.0) * (widths[1] - widths[0])
+        found[-count:] = biases[best] + np.clip(step, -1.0, 1.0) * (biases[1] - biases[0])
         return found
 
     def base_jacobian(self) -> Array:
-        """(p, 6) how what is free follows a turn [rad] and shift [m] of the base, in deviations.
+        """Return the derivative (p, 6) of the unknowns by a motion of the base [rad, m].
 
-        All cameras see the base move about their common pivot.
+        All Jacobians are in units of the unknowns' standard deviations. A motion of the base moves
+        the body about its middle in every camera.
         """
         moves = np.zeros((len(self.names), 6))
         for c, camera in enumerate(self.cameras):
@@ -178,10 +183,10 @@ class PerFrameFit:
         return np.asarray(moves / self.deviations[:, None])
 
     def center_jacobian(self, cameras: Sequence[int]) -> Array:
-        """(p, 2) as base_moves, of a pixel by which principal points are shifted along x and y.
+        """Return the derivative (p, 2) of the unknowns by principal points along x and y [pixel].
 
-        At depth z a body is seen shifted by z over the focal length: a shift, and a turn, but for
-        what the turn changes of the depth.
+        A pixel shifts a body at depth z by z over the focal length, and turns it by one over the
+        focal length; the turn's effect on the depth is neglected.
         """
         moves = np.zeros((len(self.names), 2))
         for c in cameras:
@@ -193,10 +198,10 @@ class PerFrameFit:
         return np.asarray(moves / self.deviations[:, None])
 
     def focal_jacobian(self, cameras: Sequence[int]) -> Array:
-        """(p, 1) as base_moves, of focal lengths that are larger by all of themselves.
+        """Return the derivative (p, 1) of the unknowns by a relative change of focal lengths.
 
-        A body is seen as it would be if it were nearer by that share of its depth; to a parallel
-        camera it is as near as ever.
+        A longer focal length makes the body seem nearer by that fraction of its depth; in a
+        parallel camera nothing changes.
         """
         moves = np.zeros((len(self.names), 1))
         for c in cameras:
@@ -205,15 +210,15 @@ class PerFrameFit:
         return np.asarray(moves / self.deviations[:, None])
 
     def camera_jacobian(self, camera: str) -> Array:
-        """(3, 6) how a camera itself moves along its axes [m] by what its POSE_NAMES say it is off.
+        """Return the derivative (3, 6) of a camera's centre by its POSE_NAMES, along its axes [m].
 
-        These turn and shift the body about its middle, as the camera sees it.
+        POSE_NAMES turn and shift the body about its middle, in the camera's frame.
         """
         X_CW = self.cameras[self.camera_names.index(camera)].X_CW
         middle = X_CW[:3, :3] @ self._middle + X_CW[:3, 3]
         return np.hstack([np.cross(np.eye(3), middle).T, -np.eye(3)])
 
     def _depth(self, camera: int) -> float:
-        """How far the body's middle is before a camera [m]."""
+        """Return the depth of the body's middle in a camera [m]."""
         X_CW = self.cameras[camera].X_CW
         return float(X_CW[2, :3] @ self._middle + X_CW[2, 3])

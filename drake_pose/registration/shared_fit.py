@@ -1,13 +1,13 @@
-"""Cameras, and what all frames share beside them, fitted together with the masks' widths.
+"""Fit cameras and other unknowns shared by all frames, together with the masks' boundary biases.
 
-A mask that is too wide on all sides makes its body seem nearer. Each mask's width is unknown, too:
-thin links and their distances from one another tell the two apart.
+A mask that is too wide on all sides makes its body seem nearer. The boundary bias of each mask is
+therefore unknown, too; thin links and the distances between links separate it from the depth.
 
-Covariances: contours do not err point by point. There are the noise of points, the surface of a
-part in all frames alike, its edge in one mask, and each frame as a whole (``fit.covariance``). The
-residuals at the scale of the fit tell the sizes of these errors; frames scatter as these say, or by
-a factor more. What is off alike in all frames and is not fitted, offsets, link scales and lenses,
-moves what is fitted: its size is estimated, too.
+Covariances: contour errors are correlated. They have a component for each point, for a part's
+surface in all frames, for a part's edge in one mask, and for each frame (``fit.covariance``). Their
+sizes are estimated from the residuals, and a variance factor from the scatter between frames. Joint
+offsets, link scales and lens errors that are not fitted are nuisance parameters: their estimated
+sizes enlarge the covariance.
 """
 
 from collections.abc import Collection, Sequence
@@ -48,27 +48,26 @@ from drake_pose.workers import map_ordered
 
 
 class SharedFitSettings(NamedTuple):
-    """Numbers of fits of cameras and of what all frames share.
+    """Stages, priors and thresholds of fits of shared unknowns.
 
     Args:
-        rounds_with_constants: the parts of a fit that has constants to find beside cameras. The
-            last one comes again and again: what hardly shows, such as an offset that turns with the
-            camera, gains so little in a step that a round ends before it is there.
-        told_apart: the scale at which frames that agree are told from outliers.
-        fitted: the scale at which cameras were fitted in the end.
-        steps: how steps are made.
+        stages_with_constants: stages of a fit of cameras and constants. The last one is repeated:
+            weakly observable constants, such as an offset correlated with the camera, converge
+            slowly, and a stage ends when the cost hardly falls.
+        inlier_stage: stage at which inliers and outliers are classified.
+        final_stage: last stage of the fit of cameras.
+        steps: step control.
         constant_deviation: prior standard deviation of joint offsets [rad or m] and of the
             logarithms of link scales.
-        largest_constant: largest joint offset [rad or m] or logarithm of a link scale: without it a
-            gripper that hardly shows turned by 130 degrees.
-        focal_deviation: the prior standard deviation of the logarithms of focal lengths.
-        known_beforehand: the scale of frames' errors is known beforehand as well as this number of
-            distances tells it.
-        prior_deviation: standard deviation of the logarithms of errors' sizes: a factor of twenty.
-        min_inlier_ratio: a mask agrees if its inlier ratio is at least this fraction of the mean of
-            the camera's two best.
-        point_error, error_length: contours err by this along this length [pixel]: weight of
-            contours against priors of single frames.
+        max_constant: largest joint offset [rad or m] or logarithm of a link scale; without it, the
+            offset of a hardly visible gripper became 130 degrees.
+        focal_deviation: prior standard deviation of the logarithms of focal lengths.
+        prior_freedom: degrees of freedom of the prior of the frames' variance factor.
+        prior_deviation: prior standard deviation of the logarithms of error sizes: a factor of 20.
+        min_inlier_ratio: a mask is an inlier if its inlier ratio is at least this fraction of the
+            mean of its camera's two best.
+        point_error, error_length: contours err by `point_error` along `error_length` [pixel]; this
+            weights contours against the priors of single frames.
     """
 
     stages_with_constants: tuple[AnnealingStage, ...] = (
@@ -98,14 +97,15 @@ SHARED = SharedFitSettings()
 
 
 def inlier_threshold(ratios: Array) -> float:
-    """The least inlier ratio of a mask that agrees with the others of its camera, (n,) ratios."""
+    """Return the minimum inlier ratio of an inlier; ratios (n,) of one camera's masks."""
     return float(SHARED.min_inlier_ratio * np.sort(ratios)[-2:].mean())
 
 
 class SharedValues(NamedTuple):
-    """What was found.
+    """Values of a fit's unknowns.
 
-    shared: (u,) by the names of a fit; widths: (rows,) of masks [pixel], 0 where they do not count.
+    shared: (u,) values in the order of ``SharedFit.names``. biases: (rows,) boundary biases of the
+    masks [pixel], 0 for excluded masks.
     """
 
     shared: Array
@@ -113,27 +113,29 @@ class SharedValues(NamedTuple):
 
 
 class SharedFit:
-    """Fits what the frames of several cameras share.
+    """Fits unknowns that the frames of one or several cameras share.
 
     Attributes:
-        seen: what each camera sees.
-        problem: all frames' unknowns.
-        rows: (rows,) index of each mask's camera, ascending.
+        views: the frames of each camera.
+        problem: the least-squares problem of all masks.
+        rows: (rows,) index of each mask's camera, ascending; a row is one mask.
         names: of the u shared unknowns: those of each camera, then the constants.
         per_camera: number of unknowns of each camera.
         constants: names of the body's parameters to which an unknown constant is added in all
-            frames: values of the pose tree, and lengths.
+            frames: values of the pose tree, and link scales.
 
     Args:
-        X_CW: (4, 4) for each camera, where a fit begins.
-        offsets: joints whose places on their links are unknown.
-        looks: number of CAMERA_NAMES, the first ones, that are unknown of each camera.
-        widths: whether the masks' are.
+        views: the frames of each camera.
+        X_CW: poses (4, 4) of the world in each camera at which the unknowns are 0.
+        constants: see the attribute.
+        offsets: vectors from links' joints to the joints that they carry, for link scales.
+        camera_unknowns: number of unknowns of each camera, the first ones of CAMERA_NAMES.
+        fit_biases: whether the masks' boundary biases are unknown.
     """
 
     def __init__(
         self,
-        seen: Sequence[PosedFrames],
+        views: Sequence[PosedFrames],
         X_CW: Sequence[Array],
         constants: Sequence[str] = (),
         *,
@@ -141,29 +143,25 @@ class SharedFit:
         camera_unknowns: int = len(POSE_NAMES),
         fit_biases: bool = True,
     ) -> None:
-        self.views, self.constants, self._X_CW = tuple(seen), tuple(constants), tuple(X_CW)
+        self.views, self.constants, self._X_CW = tuple(views), tuple(constants), tuple(X_CW)
         self._options: dict[str, Any] = {
-            "offsets": offsets,
-            "camera_unknowns": camera_unknowns,
-            "fit_biases": fit_biases,
-        }
-        first, body = seen[0], seen[0].body
+            "offsets": offsets, "camera_unknowns": camera_unknowns, "fit_biases": fit_biases,
+        }  # fmt: skip
+        first, body = views[0], views[0].body
         if offsets:
             body = BodyParameters(first.kinematics, first.outlines, offsets=offsets)
-        self.rows = np.repeat(np.arange(len(seen)), [len(one.frames) for one in seen])
+        self.rows = np.repeat(np.arange(len(views)), [len(one.frames) for one in views])
         self._observations = [
-            frame for c, one in enumerate(seen) for frame in one.observations(c, len(seen))
+            frame for c, one in enumerate(views) for frame in one.observations(c, len(views))
         ]
         cameras = [
-            one.camera.with_pose(np.linalg.inv(X)) for one, X in zip(seen, X_CW, strict=True)
+            one.camera.with_pose(np.linalg.inv(X)) for one, X in zip(views, X_CW, strict=True)
         ]
-        self.per_camera = camera_unknowns
-        names = [
-            f"{camera.name}.{name}" for camera in cameras for name in CAMERA_NAMES[:camera_unknowns]
-        ]
+        self.per_camera, own = camera_unknowns, CAMERA_NAMES[:camera_unknowns]
+        names = [f"{camera.name}.{name}" for camera in cameras for name in own]
         self.names = (*names, *constants)
         deviations = dict.fromkeys(constants, SHARED.constant_deviation)
-        # Of where an object stands, once it was found [m, rad].
+        # The calibration target's pose is found before and hardly constrained here [m, rad].
         deviations |= dict.fromkeys(TARGET_POSITIONS, 1.0)
         deviations |= {f"{one.name}.{CAMERA_NAMES[6]}": SHARED.focal_deviation for one in cameras}
         known = np.array([deviations.get(name, np.inf) for name in self.names])
@@ -171,17 +169,17 @@ class SharedFit:
         most = np.array([SHARED.max_constant if k in bounded else np.inf for k in self.names])
         unknowns = [Unknowns(self.names, True, -most, most, known)]
         if fit_biases:
-            # Masks are wider or narrower by at most six pixels.
+            # Boundary biases are at most six pixels.
             every = parameter_names(body, cameras)
             unknowns.append(Unknowns(every[-len(cameras) :], lower=-6.0, upper=6.0))
         self.problem = Problem(
-            body, cameras, unknowns, pivot=np.array([one.middle for one in seen]),
-            steps=SHARED.steps, pixels=np.array([one.size for one in seen]),
+            body, cameras, unknowns, pivot=np.array([one.middle for one in views]),
+            steps=SHARED.steps, pixels=np.array([one.size for one in views]),
         )  # fmt: skip
 
     @property
     def start(self) -> SharedValues:
-        """All as it is given."""
+        """All unknowns at 0."""
         return SharedValues(np.zeros(len(self.names)), np.zeros(len(self.rows)))
 
     def fit(
@@ -190,15 +188,15 @@ class SharedFit:
         start: SharedValues | None = None,
         included: Mask | None = None,
     ) -> SharedValues:
-        """Fits all from where it starts to those of the masks (rows,) that count."""
+        """Fit all unknowns to the included masks (rows,), from a start."""
         seen, at, expected, included = self._at(start or self.start, included)
         found = self.problem.solve(seen, rounds, at, expected=expected)
-        widths = np.zeros(len(self.rows))
-        widths[included] = found.own.sum(axis=1)
-        return SharedValues(found.shared, widths)
+        biases = np.zeros(len(self.rows))
+        biases[included] = found.own.sum(axis=1)
+        return SharedValues(found.shared, biases)
 
     def from_found(self, found: SharedValues) -> tuple["SharedFit", SharedValues]:
-        """The same fit, whose cameras' unknowns count from where they were found."""
+        """Return the same fit with the cameras' unknowns counted from their found poses."""
         X_CW = [camera.X_CW for camera in self.cameras(found)]
         count = self.per_camera * len(X_CW)
         shared = found.shared.copy()
@@ -209,14 +207,18 @@ class SharedFit:
     def equations(
         self, at: SharedValues, step: AnnealingStage, included: Mask | None = None
     ) -> Equations:
-        """The normal equations of the masks (rows,) that count, own unknowns first."""
+        """Return the normal equations of the included masks (rows,), own unknowns first."""
         seen, unknowns, expected, _ = self._at(at, included)
         return self.problem.equations(seen, unknowns, step, expected)
 
     def cost_curvature(
         self, found: SharedValues, by: Array, step: AnnealingStage, included: Mask | None = None
     ) -> tuple[float, float]:
-        """How much the cost bends upwards as what is shared moves by (u,), by slopes and by H."""
+        """Return the cost's curvature along a step `by` (u,), without priors.
+
+        Returns:
+            by^T H by from differences of the gradient at +-by, and from the normal equations.
+        """
         p = self.problem.own_count
         less, here, more = (
             self.equations(SharedValues(found.shared + sign * by, found.biases), step, included)
@@ -224,11 +226,11 @@ class SharedFit:
         )
         known = float(self.problem.information[p:] @ by**2)
         slopes = (more.g - less.g).sum(axis=0)[p:]
-        said = float(by @ here.H.sum(axis=0)[p:, p:] @ by)
-        return 0.5 * float(by @ slopes) - known, said - known
+        predicted = float(by @ here.H.sum(axis=0)[p:, p:] @ by)
+        return 0.5 * float(by @ slopes) - known, predicted - known
 
     def inlier_ratios(self, found: SharedValues) -> Array:
-        """(rows,) of both contours' lengths, what fits."""
+        """Return the inlier ratio (rows,) of each mask: the fraction of both contours that fits."""
 
         def ratio(mask: tuple[Observation, Array]) -> float:
             return self.problem.compare(*mask, SHARED.inlier_stage)[0].inlier_ratio
@@ -237,12 +239,12 @@ class SharedFit:
         return np.array(map_ordered(ratio, masks))
 
     def inliers(self, ratios: Array) -> Mask:
-        """(rows,) which masks fit nearly as well as the two of their camera that fit best."""
+        """Return which masks (rows,) are inliers among those of their camera."""
         own = [ratios[self.rows == c] for c in range(len(self.views))]
         return np.concatenate([one >= inlier_threshold(one) for one in own])
 
     def tile_costs(self, found: SharedValues, side: float) -> Array:
-        """(rows, k, k) costs by squares of the pictures of a side [pixel]."""
+        """Return the costs (rows, k, k) by square tiles of a side [pixel]."""
 
         def costs(mask: tuple[Observation, Array, int]) -> Array:
             return self.problem.tile_costs(*mask[:2], SHARED.inlier_stage, side)[mask[2]]
@@ -251,7 +253,7 @@ class SharedFit:
         return np.array(map_ordered(costs, masks))
 
     def cameras(self, found: SharedValues) -> list[PinholeCamera]:
-        """The cameras as they were found."""
+        """Return the cameras at their found poses and focal lengths."""
         X_CW, kernel, _ = self.problem.place_cameras(self._parameters(found)[0])
         return [
             replace(one.camera, X_WC=np.linalg.inv(X), focal_x=float(k[1]), focal_y=float(k[2]))
@@ -259,19 +261,20 @@ class SharedFit:
         ]
 
     def covariances(self, found: SharedValues, included: Mask | None = None) -> tuple[Array, Array]:
-        """(u, u) each: of the errors of what is shared, told by the masks (rows,) that count.
+        """Estimate the covariance of the shared unknowns from the included masks (rows,).
 
-        Of contours that err, and what is off alike in all frames adds.
+        Returns:
+            two (u, u) parts: from contour errors, and from nuisance parameters and calibrations.
         """
         seen = self._distances_with_nuisances(found, SHARED.final_stage, included)
         is_angle = np.zeros(seen.X.shape[1], bool)
         sizes = estimate_sizes(seen, is_angle, 0.0, SHARED.prior_deviation)
-        doubted, seen = nuisance_covariance(seen, sizes, is_angle)
+        nuisance, seen = nuisance_covariance(seen, sizes, is_angle)
         covariance = values_covariance(seen, sizes, np.arange(len(is_angle)), is_angle)
         covariance *= scatter_factor(seen, sizes, len(self.names))
-        # Wrong intrinsics err alike in all frames: the pose follows, and nothing is left of it. So
-        # where parts are seen to err, a calibration is trusted to a pixel at best. What comes again
-        # where a part stands still may be the part's surface: none of it counts as noise here.
+        # Wrong intrinsics are the same in all frames, and the pose absorbs them without residuals.
+        # So a calibration is trusted to a pixel at best where surfaces are seen to err. Repeated
+        # noise of a static part may be an error of its surface: none of it counts as noise here.
         seen = self._distances_with_nuisances(found, SHARED.inlier_stage, included)
         seen = seen._replace(effects=seen.effects[[0, 0, 2, 3, 4]])
         sizes = estimate_sizes(seen, np.zeros(seen.X.shape[1], bool), 0.0, SHARED.prior_deviation)
@@ -282,54 +285,58 @@ class SharedFit:
             turn = size / one.extent
             off = np.array([turn, turn, turn, size, size, size * depth / one.extent, turn])
             at = np.arange(self.per_camera) + c * self.per_camera
-            doubted[at, at] += off[: self.per_camera] ** 2
+            nuisance[at, at] += off[: self.per_camera] ** 2
         own = slice(len(self.names))
-        return covariance[own, own], doubted[own, own]
+        return covariance[own, own], nuisance[own, own]
 
     def likely_offsets(
         self, found: SharedValues, included: Mask, min_score: float = 6.0, smallest: float = 2.0
     ) -> dict[str, tuple[float, float]]:
-        """Joint offsets, each by itself, that explain what all frames that count have in common.
+        """Find joint offsets, each by itself, that explain the residuals common to all frames.
 
-        An offset of three degrees comes out as 2 to 3, at scores of 30 to 140. With links 1 %
-        longer, offsets of .3 degrees and a focal length 1 % off they are .7 degrees at most.
+        A true offset of 3 degrees is estimated as 2 to 3, with scores of 30 to 140. Links 1 %
+        longer, offsets of 0.3 degrees and a focal length 1 % off give 0.7 degrees at most.
 
         Args:
-            min_score: smallest value over its standard deviation.
-            smallest: smallest value [half a degree or two millimetres].
+            min_score: minimum ratio of a value to its standard deviation.
+            smallest: minimum value [half a degree or two millimetres].
 
         Returns:
-            value and standard deviation by joint [rad or m], the likeliest one first.
+            value and standard deviation by joint [rad or m], highest score first.
         """
         seen = self._distances_with_nuisances(found, SHARED.inlier_stage, included)
         angles = np.zeros(seen.X.shape[1], bool)
         sizes = estimate_sizes(seen, angles, 0.0, SHARED.prior_deviation)
         values, deviations = score_nuisances(seen, sizes)
         units = self._offset_units
-        # As they stand among the nuisances: what is fitted and an object's place are none.
+        # In the order of the first group of nuisances.
         known = {*self.names, *TARGET_POSITIONS}
         names = [one for one in self._nuisance_fit.names if one in units and one not in known]
         if not seen.nuisances or seen.nuisances[0].shape[1] != len(names):
             return {}
         scored = zip(names, values, deviations, strict=False)
-        told = {
+        likely = {
             name: (float(value * units[name]), float(deviation * units[name]))
             for name, value, deviation in scored
             if abs(value) > max(smallest, min_score * deviation)
         }
-        return dict(sorted(told.items(), key=lambda one: -abs(one[1][0]) / one[1][1]))
+        return dict(sorted(likely.items(), key=lambda one: -abs(one[1][0]) / one[1][1]))
 
     def fit_slope(
         self, found: SharedValues, name: str, weights: Array, included: Mask, covariance: Array
     ) -> tuple[float, float]:
-        """How a constant grows with what the masks that count weigh, were it to grow.
+        """Estimate the slope of a constant that varies linearly with a weight of each mask.
 
-        One Gauss-Newton step of a further unknown, whose derivatives are in each mask the
-        constant's times the mask's weight, beside all others; and its standard deviation.
+        With constant + slope * weight in place of the constant, one Gauss-Newton step from slope 0
+        is made in all unknowns.
 
         Args:
-            weights: of the masks that count.
-            covariance: (u, u) of what is shared.
+            name: of the constant, such as the time offset, whose slope over time is the drift.
+            weights: of the included masks.
+            covariance: (u, u) of the shared unknowns, which scales the standard deviation.
+
+        Returns:
+            the slope and its standard deviation.
         """
         p, at = self.problem.own_count, self.names.index(name)
         equations = self.equations(found, SHARED.final_stage, included)
@@ -343,12 +350,12 @@ class SharedFit:
         S += 1e-9 * np.eye(len(S))
         left = (g[:, p:] - np.einsum("fpi,fp->fi", gains, g[:, :p])).sum(axis=0)
         inverse = np.linalg.inv(S)
-        said = np.linalg.inv(S[:-1, :-1])[at, at]
-        scale = covariance[at, at] / said
+        predicted = np.linalg.inv(S[:-1, :-1])[at, at]
+        scale = covariance[at, at] / predicted
         return -float(inverse[-1] @ left), float(np.sqrt(scale * inverse[-1, -1]))
 
     def camera_covariances(self, found: SharedValues, covariance: Array) -> Array:
-        """(cameras, 6, 6) of the poses' errors in the world, covariance being of what is shared."""
+        """Return the poses' covariances (cameras, 6, 6) from that of the shared unknowns (u, u)."""
         X_CW, _, motions = self.problem.place_cameras(self._parameters(found)[0])
         own = [slice(k, k + 6) for k in self.per_camera * np.arange(len(X_CW))]
         several = zip(X_CW, motions, own, strict=True)
@@ -357,32 +364,27 @@ class SharedFit:
     def _at(
         self, at: SharedValues, included: Mask | None
     ) -> tuple[list[Observation], tuple[Array, Array], tuple[Array, Array], Mask]:
-        """Masks that count; their own and shared unknowns; what these are expected to be.
-
-        Then which masks (rows,) those are.
-        """
+        """Return the included observations, their unknowns, the prior means, and which masks."""
         included = np.ones(len(self.rows), bool) if included is None else included
-        own, seen = (
-            self._own(at)[included],
-            [self._observations[k] for k in np.flatnonzero(included)],
-        )
+        own = self._own(at)[included]
+        seen = [self._observations[k] for k in np.flatnonzero(included)]
         return seen, (own, at.shared), (np.zeros_like(own), np.zeros(len(self.names))), included
 
     def _own(self, at: SharedValues) -> Array:
-        """(rows, own unknowns): of each mask the width of its camera's."""
+        """Return the own unknowns (rows, cameras): each mask's bias in its camera's column."""
         own = np.zeros((len(self.rows), self.problem.own_count))
         if own.size:
             own[np.arange(len(own)), self.rows] = at.biases
         return own
 
     def _parameters(self, at: SharedValues) -> Array:
-        """(rows, n) all parameters."""
+        """Return all parameters (rows, n) of the problem."""
         return self.problem.parameters(self._observations, self._own(at), at.shared)
 
     def distances(
         self, at: SharedValues, step: AnnealingStage, included: Mask | None = None
     ) -> Distances:
-        """The distances in all masks that count; values are what is shared, then the widths."""
+        """Return the distances in the included masks, by shared unknowns, then boundary biases."""
         seen, _, _, included = self._at(at, included)
         pictures = self.problem.compared_masks(seen, self._parameters(at)[included], step)
         return distances_in_masks(self.problem.body.outlines, pictures, with_bias=True)
@@ -390,30 +392,30 @@ class SharedFit:
     def _distances_with_nuisances(
         self, found: SharedValues, step: AnnealingStage, included: Mask | None
     ) -> Distances:
-        """The distances in all masks that count; values are what is shared, then the widths.
+        """Return the distances in the included masks, with nuisance parameters.
 
-        What may be off alike in all frames, and is not shared, is doubted: joints' offsets [half a
-        degree or two millimetres], link scales, each and all alike [1 %], and lenses [1 % of the
-        focal length; half a percent of it where the principal point lies].
+        Nuisances may be off in all frames alike and are not fitted: joint offsets [half a degree or
+        2 mm], link scales, each and all together [1 %], focal lengths [1 %] and principal points
+        [half a percent of the focal length].
         """
-        whole = self._nuisance_fit
-        names, kinematics, units = whole.names, self.views[0].kinematics, dict(self._offset_units)
+        full = self._nuisance_fit
+        names, kinematics, units = full.names, self.views[0].kinematics, dict(self._offset_units)
         groups: dict[str, list[str]] = {"offsets": [], "scales": [], "lenses": []}
         groups["offsets"] = [name for name in kinematics.names if name not in TARGET_POSITIONS]
         for camera in (one.camera for one in self.views):
             lens = [f"{camera.name}.{name}" for name in CAMERA_NAMES[len(POSE_NAMES) :]]
             units |= zip(lens, (0.01, *[0.005 * camera.focal_x] * 2), strict=True)
             groups["lenses"] += lens
-        looks = [f"{one.camera.name}.{name}" for one in self.views for name in POSE_NAMES]
-        groups["scales"] = [name for name in names if name not in units and name not in looks]
+        poses = [f"{one.camera.name}.{name}" for one in self.views for name in POSE_NAMES]
+        groups["scales"] = [name for name in names if name not in units and name not in poses]
         shared = np.zeros(len(names))
         own = [names.index(name) for name in self.names]
         shared[own] = found.shared
-        distances = whole.distances(SharedValues(shared, found.biases), step, included)
+        distances = full.distances(SharedValues(shared, found.biases), step, included)
         nuisances = []
         for kind, members in groups.items():
-            doubted = [k for k, name in enumerate(names) if k not in own and name in members]
-            Z = distances.X[:, doubted] * [units.get(names[k], 0.01) for k in doubted]
+            members_free = [k for k, name in enumerate(names) if k not in own and name in members]
+            Z = distances.X[:, members_free] * [units.get(names[k], 0.01) for k in members_free]
             nuisances.append(np.column_stack([Z, Z.sum(axis=1)]) if kind == "scales" else Z)
         values = np.array([*own, *range(len(names), distances.X.shape[1])])
         return distances._replace(
@@ -424,39 +426,40 @@ class SharedFit:
 
     @property
     def _offset_units(self) -> dict[str, float]:
-        """By what joints' offsets are doubted: half a degree or two millimetres [rad or m]."""
+        """Units of nuisance joint offsets by joint: half a degree or 2 mm [rad or m]."""
         kinematics = self.views[0].kinematics
         units = np.where(kinematics.is_angle, np.radians(0.5), 0.002)
         return dict(zip(kinematics.names, units.tolist(), strict=True))
 
     @cached_property
     def _nuisance_fit(self) -> "SharedFit":
-        """The same fit, all unknown that is doubted."""
+        """The same fit with all nuisances among its unknowns."""
         kinematics = self.views[0].kinematics
         offsets = carried_joints(kinematics.tree)
         free = np.flatnonzero(kinematics.lower < kinematics.upper)
-        zeros = [name for name in (kinematics.names[k] for k in free) if name not in self.constants]
-        lengths = dict.fromkeys(link_scale_name(one.link) for one in offsets)
-        names = [*self.constants, *zeros, *(one for one in lengths if one not in self.constants)]
+        joints = [kinematics.names[k] for k in free if kinematics.names[k] not in self.constants]
+        scales = dict.fromkeys(link_scale_name(one.link) for one in offsets)
+        names = [*self.constants, *joints, *(one for one in scales if one not in self.constants)]
         options = self._options | {"offsets": offsets, "camera_unknowns": len(CAMERA_NAMES)}
         return SharedFit(self.views, self._X_CW, names, **options)
 
 
-def fit_pose(seen: PosedFrames, X_CW: Array, rounds: Sequence[AnnealingStage]) -> Array:
-    """X_CW (4, 4) fitted to all frames from where it starts; silhouettes keep their widths."""
-    fit = SharedFit([seen], [X_CW], fit_biases=False)
+def fit_pose(view: PosedFrames, X_CW: Array, rounds: Sequence[AnnealingStage]) -> Array:
+    """Return X_CW (4, 4) fitted to all frames from a start, without boundary biases."""
+    fit = SharedFit([view], [X_CW], fit_biases=False)
     return fit.cameras(fit.fit(rounds))[0].X_CW
 
 
 def pose_covariance(X_CW: Array, motions: Array, covariance: Array) -> Array:
-    """(6, 6) of a camera's error in the world: a rotation vector [rad], a shift [m].
+    """Return the (6, 6) covariance of a camera's pose X_WC in the world [rad, m].
 
     Args:
-        X_CW: (4, 4) of the camera.
-        motions: (6, 12) of all that it sees, as of ``CameraParameters.place``.
-        covariance: (6, 6) of these.
+        X_CW: (4, 4) the world's pose in the camera.
+        motions: (6, 12) affine motions of the scene for each unknown of the pose, see
+            ``CameraParameters.place``.
+        covariance: (6, 6) of these unknowns.
     """
-    # Where all that it sees moves one way, it moves the other way.
+    # The camera moves opposite to the scene.
     by = -motions.reshape(6, 3, 4)
     p_WC = -X_CW[:3, :3].T @ X_CW[:3, 3]
     turns = np.stack([by[:, 2, 1], by[:, 0, 2], by[:, 1, 0]])
@@ -465,29 +468,32 @@ def pose_covariance(X_CW: Array, motions: Array, covariance: Array) -> Array:
 
 
 def scatter_factor(seen: Distances, sizes: ErrorSizes, shared: int) -> float:
-    """By what factor frames disagree more about what they share than errors say: of variances.
+    """Return the factor, at least 1, by which frames scatter more than the error sizes predict.
 
-    Each frame's distances along what it tells of the shared values, its width put right, are
-    normal with a known covariance about what these values make of them.
+    Each frame's distances are projected onto the directions that inform about the shared values,
+    after removal of its boundary bias. There their covariance is known, and the weighted sum of
+    squared residuals over the degrees of freedom estimates the factor of the variances.
+
+    shared: number of shared values, the first columns of ``seen.X``.
     """
     V = distances_covariance(seen, sizes)
-    designs, lefts = [], []
+    designs, targets = [], []
     for picture in np.unique(seen.pictures):
         rows = np.flatnonzero(seen.pictures == picture)
-        X, widths = np.split(seen.X[rows], [shared], axis=1)
-        X = X - widths @ np.linalg.pinv(widths) @ X
-        U, told, _ = np.linalg.svd(X, full_matrices=False)
-        U = U[:, told > 1e-3 * told.max()]
+        X, biases = np.split(seen.X[rows], [shared], axis=1)
+        X = X - biases @ np.linalg.pinv(biases) @ X
+        U, singular, _ = np.linalg.svd(X, full_matrices=False)
+        U = U[:, singular > 1e-3 * singular.max()]
         L = np.linalg.cholesky(U.T @ V[np.ix_(rows, rows)] @ U)
         designs.append(np.linalg.solve(L, U.T @ X))
-        lefts.append(np.linalg.solve(L, U.T @ seen.y[rows]))
+        targets.append(np.linalg.solve(L, U.T @ seen.y[rows]))
     if not designs:
         return 1.0
-    design, left = np.concatenate(designs), np.concatenate(lefts)
-    by, _, rank, _ = np.linalg.lstsq(design, left)
-    off = left - design @ by
+    design, target = np.concatenate(designs), np.concatenate(targets)
+    by, _, rank, _ = np.linalg.lstsq(design, target)
+    off = target - design @ by
     scale = (SHARED.prior_freedom + float(off @ off)) / (SHARED.prior_freedom + len(off) - rank)
-    # Frames that agree by chance are no surer.
+    # A scatter below the prediction is chance and does not reduce the variances.
     return max(scale, 1.0)
 
 
@@ -502,36 +508,35 @@ def adjust_bundle(
     groups: Sequence[int] | None = None,
     covariance_frames: int = 4,
 ) -> tuple[list[PinholeCamera], Array, Array, Array]:
-    """Fits poses and cameras together, in the end as finely as the model is like the body.
+    """Fit unknown cameras, all poses and the body's shape to all silhouettes (bundle adjustment).
 
-    Cameras that are found from estimated joint positions are off with them. So all are fitted to
-    all silhouettes at once (bundle adjustment), with lengths and radius scales that all frames
-    share; cameras whose places are known hold the whole.
+    Cameras registered with estimated joint positions inherit their errors. So cameras, positions,
+    lengths and radius scales are fitted together; cameras with known poses fix the world frame.
 
     Args:
-        cameras: all cameras, those that are unknown near where they stand.
+        outlines: a surface for each node.
+        cameras: all cameras; the unknown ones near their poses.
         unknown: names of the cameras whose poses are unknown.
-        frames: what they see, with approximate values of the body.
+        frames: the masks, with approximate values of the body.
         is_length: (m,) which of the pose tree's values are lengths, the same in all frames.
-        parts: names of the parts that have a radius_scale: how wide they are across their y axes.
-        groups: (nodes,) which of these each node belongs to, or -1; None: none.
-        telling_frames: number of frames from which covariances are estimated.
+        parts: names of the parts that have a radius scale, a factor of the width across y.
+        groups: (nodes,) index of each node's part, or -1; None: no parts.
+        covariance_frames: number of frames from which covariances are estimated.
 
     Returns:
-        the c unknown cameras with their poses; (c, 6, 6) covariances of these, as of
-        ``RegisteredCamera``; (frames, m) values, lengths among them [rad or m]; and (nodes,)
-        radius scales over the model's.
+        the c unknown cameras at their poses; their (c, 6, 6) covariances, see ``RegisteredCamera``;
+        the values (frames, m) [rad or m]; and the radius scales (nodes,).
 
     Raises:
-        MaskError: a mask of another size than its camera's picture, or no mask shows the body.
+        MaskError: a mask's size differs from its camera's, or no mask shows the body.
     """
     values, size = np.array([frame.values for frame in frames]), common_size(cameras, frames)
     body = BodyParameters(kinematics, outlines, groups, parts)
     free = (kinematics.lower < kinematics.upper) & ~is_length
-    looks = [k for k, camera in enumerate(cameras) if camera.name in unknown]
-    # Known beforehand: estimated angles [rad], places and lengths [m], logarithms of radius scales.
-    worth = SHARED.point_error * np.sqrt(SHARED.error_length)
-    deviations = np.where(is_length, 0.03, 0.5) / worth
+    searched = [k for k, camera in enumerate(cameras) if camera.name in unknown]
+    # Prior standard deviations: angles [rad], places and lengths [m], log radius scales.
+    error = SHARED.point_error * np.sqrt(SHARED.error_length)
+    deviations = np.where(is_length, 0.03, 0.5) / error
     pose, lengths = (
         Unknowns(
             np.array(kinematics.names)[included].tolist(), shared, kinematics.lower[included],
@@ -540,11 +545,11 @@ def adjust_bundle(
         for included, shared in ((free, False), (is_length, True))
     )  # fmt: skip
     radius_scales = [name for name in body.names if name.startswith(RADIUS_SCALE_PREFIX)]
-    poses = [f"{cameras[k].name}.{name}" for k in looks for name in POSE_NAMES]
+    poses = [f"{cameras[k].name}.{name}" for k in searched for name in POSE_NAMES]
     unknowns = [
         pose,
         lengths,
-        Unknowns(radius_scales, True, deviation=0.15 / worth),
+        Unknowns(radius_scales, True, deviation=0.15 / error),
         Unknowns(poses, True),
     ]
     fit = Problem(
@@ -561,7 +566,7 @@ def adjust_bundle(
     shared[:count] = values[0, is_length]
     start = now = values[:, free], shared
     found, rounds = None, [AnnealingStage(0.08, 0.02), AnnealingStage(0.06, 0.02, 3)]
-    # Then as fine as the model is like the body: the finest scale at which 0.7 of contours fit.
+    # The finest scale at which 0.7 of the contours fit: the model's surface is no more exact.
     for scale in (0.04, 0.03, 0.02, 0.01, 0.005):
         rounds.append(AnnealingStage(scale, 0.015, 6))
         tried = fit.solve(seen, rounds, now, expected=start)
@@ -569,24 +574,23 @@ def adjust_bundle(
             break
         found, now, rounds = tried, (tried.own, tried.shared), []
     assert found is not None
-    # The covariance is that of some frames, and of some distances in them, several an unknown: a
-    # surface that is not the body's is so in all frames. How far it is off shows at a scale at
-    # which nothing is left out because it is off.
+    # Covariances use a few frames and at most 1000 distances: errors of the surface are the same in
+    # all frames. They are measured at a scale at which none of the contours are outliers.
     some = np.unique(np.linspace(0, len(seen) - 1, covariance_frames).round().astype(int))
-    uncut = AnnealingStage(0.08, 0.015)
-    pictures = fit.compared_masks([seen[k] for k in some], found.parameters[some], uncut)
-    distances = distances_in_masks(body.outlines, pictures, 1000)
+    coarse = AnnealingStage(0.08, 0.015)
+    masks = fit.compared_masks([seen[k] for k in some], found.parameters[some], coarse)
+    distances = distances_in_masks(body.outlines, masks, 1000)
     turns = [name.split(".")[-1] in CAMERA_NAMES[:3] for name in fit.names[fit.own_count :]]
     is_angle = np.concatenate([np.tile(kinematics.is_angle[free], len(some)), turns])
     sizes = estimate_sizes(distances, is_angle, prior_deviation=SHARED.prior_deviation)
     whole = values_covariance(distances, sizes, np.arange(len(is_angle)), is_angle)
     X_CW, _, motions = fit.place_cameras(found.parameters[0])
-    own = np.arange(len(whole) - len(poses), len(whole)).reshape(len(looks), 6)
-    found_cameras = [replace(cameras[k], X_WC=np.linalg.inv(X_CW[k])) for k in looks]
+    own = np.arange(len(whole) - len(poses), len(whole)).reshape(len(searched), 6)
+    found_cameras = [replace(cameras[k], X_WC=np.linalg.inv(X_CW[k])) for k in searched]
     covariances = [
         pose_covariance(X_CW[k], motions[k, :6], whole[np.ix_(at, at)])
-        for k, at in zip(looks, own, strict=True)
+        for k, at in zip(searched, own, strict=True)
     ]
-    widths = np.exp(np.append(found.shared[count : count + len(parts)], 0.0)[body.groups])
+    factors = np.exp(np.append(found.shared[count : count + len(parts)], 0.0)[body.groups])
     values = found.parameters[:, : values.shape[1]]
-    return found_cameras, np.array(covariances), values, widths
+    return found_cameras, np.array(covariances), values, factors

@@ -129,8 +129,8 @@ def audit_scene(
         "frames": {
             one.frame: {
                 "agrees": one.finding is None,
-                "fits": dict(one.given),
-                "fits_when_freed": dict(one.fitted),
+                "fits": dict(one.given_ratios),
+                "fits_when_freed": dict(one.fitted_ratios),
                 "pixels": one.pixels,
                 "masks": mask_digests(inputs.scene, names, one.frame),
             }

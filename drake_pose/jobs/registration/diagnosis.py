@@ -387,10 +387,10 @@ def say_frame(one: FrameDiagnosis, found: Finding) -> str:
     """What contradicts the others in a frame, in words."""
     pixels = f"outlines by {found.pixels:.1f} pixels"
     if found.kind == "unexplained":
-        worst = min(one.fitted, key=lambda name: one.fitted[name])
+        worst = min(one.fitted_ratios, key=lambda name: one.fitted_ratios[name])
         return (
             f"no positions near those given explain it: in camera '{worst}' "
-            f"{percent(one.fitted[worst])} of the contours fit at best"
+            f"{percent(one.fitted_ratios[worst])} of the contours fit at best"
         )
     most = math.radians(10.0)
     if found.kind == "joint" and abs(found.angle) > most:

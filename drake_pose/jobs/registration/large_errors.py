@@ -223,7 +223,7 @@ class SceneComparison:
         least: number of frames before and after.
         """
         moved, explained = list[Finding](), dict[str, Finding]()
-        for cameras in dict.fromkeys(tuple(one.given) for one in found.frames):
+        for cameras in dict.fromkeys(tuple(one.given_ratios) for one in found.frames):
             rows, last = changed_after(found, cameras, least)
             if not rows:
                 continue
@@ -500,7 +500,7 @@ def changed_after(found: Diagnosis, cameras: Collection[str], least: int) -> tup
         cameras: that see the frames that are looked at.
         least: number of frames before and after; where they are fewer there is no such moment.
     """
-    own = [k for k, one in enumerate(found.frames) if {*one.given} == {*cameras}]
+    own = [k for k, one in enumerate(found.frames) if {*one.given_ratios} == {*cameras}]
     wrong = [found.frames[k].finding is not None for k in own]
     last = last_before_change(wrong, least)
     if last is None:

@@ -1,4 +1,4 @@
-"""Cameras: points in the world to pixels, and camera files.
+"""Camera models, camera files, and images, videos and joint logs of recordings.
 
 Pixel centres are at integers (the OpenCV convention). A camera frame C has x to the right, y down
 and z forward.

@@ -1,4 +1,4 @@
-"""Episodes in bags of ROS 1 and ROS 2 (sqlite3 and mcap), read by rosbags."""
+"""Read episodes from bags of ROS 1 and ROS 2 (sqlite3 and mcap), by the library rosbags."""
 
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
@@ -19,7 +19,7 @@ from drake_pose.camera.picture_files import decode_colours, import_reader
 from drake_pose.errors import CameraError, DrakePoseError, SceneError
 
 BAGS = (".bag", ".mcap", ".db3")
-# Bytes of a pixel, and how OpenCV turns it to red, green, blue.
+# Bytes per pixel, and OpenCV's conversion to red, green, blue.
 _ENCODINGS: dict[str, tuple[int, int | None]] = {
     "rgb8": (3, None),
     "bgr8": (3, cv2.COLOR_BGR2RGB),
@@ -32,30 +32,32 @@ _ENCODINGS: dict[str, tuple[int, int | None]] = {
     "bayer_grbg8": (1, cv2.COLOR_BayerGRBG2RGB),
 }
 
-# Of each message its time in the header and in the bag [ns], and what it holds.
+# A message: its time in the header and in the bag [ns], and its content.
 _Row = tuple[int, int, Any]
 
 
 def open_bag(path: Path, joints: JointLog | None) -> Episode:
-    """Opens a bag: a file of ROS 1, or a folder, mcap or db3 file of ROS 2.
+    """Open a bag: a file of ROS 1, or a folder, mcap or db3 file of ROS 2.
 
-    A camera is called by its topic without slashes and `image_raw` (`/hand/image_raw` is hand); its
-    times, and those of joints, are those of the messages' headers. Joints that several publishers
-    or topics have are put on the clock of the one that has most rows. A camera whose frame hangs on
-    others by `/tf_static` rides on the last of them.
+    A camera's name is its topic without slashes and `image_raw` (`/hand/image_raw` becomes `hand`).
+    The times of images and joint positions are those of the message headers. Joints published
+    separately are interpolated at the times of the publisher with most messages. A camera whose
+    frame is attached to others by `/tf_static` is mounted on the last of these.
 
     Args:
-        joints: in place of its own.
+        path: the bag.
+        joints: joint log to use instead of the bag's.
 
-    Raises SceneError: it cannot be read, is cut short, or has no pictures.
+    Raises:
+        SceneError: the bag is unreadable, truncated, or has no images.
     """
     pictures, states, infos, parents, left_out = _scan(path)
     warnings = [f"{topic} is left out: {why}" for topic, why in left_out.items() if why != "depths"]
     if joints is None and states:
-        joints, said = _merge(states)
+        joints, said = _merge_joints(states)
         warnings += said
     cameras: dict[str, EpisodeCamera] = {}
-    # Of a camera that is recorded twice, what nobody compressed comes first.
+    # If a camera was recorded twice, prefer the uncompressed topic.
     for topic in sorted(pictures, key=lambda topic: (topic.endswith("/compressed"), topic)):
         parts = topic.strip("/").split("/")
         while len(parts) > 1 and parts[-1] in ("compressed", "image_raw", "image"):
@@ -63,11 +65,11 @@ def open_bag(path: Path, joints: JointLog | None) -> Episode:
         if (name := "_".join(parts)) in cameras:
             continue
         try:
-            camera = _of_topic(path, topic, pictures[topic], infos, warnings)
+            camera = _read_camera(path, topic, pictures[topic], infos, warnings)
         except SceneError as error:
             warnings.append(f"camera '{name}' is left out: {error}")
             continue
-        # The link that its frame is fixed to, over however many others, and its pose in it.
+        # Follow static frames to the link that carries the camera, and its pose there.
         frame, link, X_LC, passed = pictures[topic][0][2], None, np.eye(4), set[str]()
         while frame in parents and frame not in passed:
             passed.add(frame)
@@ -79,15 +81,17 @@ def open_bag(path: Path, joints: JointLog | None) -> Episode:
 
 
 def _scan(path: Path) -> tuple[Any, Any, Any, Any, Any]:
-    """What one pass through a bag finds.
+    """Read a bag once, without decoding images.
 
-    Pictures (what they hold is their frame) by topic, joint positions by topic and names,
-    CameraInfos by topic, the parents and poses of static frames, and why topics are left out.
+    Returns:
+        Images by topic (their content is the frame's name), joint positions by topic and names,
+        CameraInfos by topic, parent and pose of each static frame by name, and the reasons why
+        topics are ignored, by topic.
     """
     pictures, states = defaultdict[str, list[_Row]](list), defaultdict[Any, list[_Row]](list)
     infos, parents, left_out = {}, {}, {}
     sensors = "Image", "CompressedImage", "JointState", "CameraInfo"
-    with _faults(path), _unopened(path) as reader:
+    with _translate_errors(path), _make_reader(path) as reader:
         wanted = [
             one
             for one in reader.connections
@@ -126,29 +130,29 @@ def _scan(path: Path) -> tuple[Any, Any, Any, Any, Any]:
     return pictures, states, infos, parents, left_out
 
 
-def _unopened(path: Path) -> Any:
-    """The reader of a bag, whose messages have the usual types where it does not define them."""
+def _make_reader(path: Path) -> Any:
+    """Return a reader of a bag; message types that it does not define are the usual ones."""
     types = import_reader("rosbags.typesys", path)
     known = types.get_typestore(types.Stores.LATEST)
     return import_reader("rosbags.highlevel", path).AnyReader([path], default_typestore=known)
 
 
 @contextmanager
-def _faults(path: Path) -> Iterator[None]:
-    """Makes a SceneError of whatever a bag that is cut short or damaged makes rosbags raise."""
+def _translate_errors(path: Path) -> Iterator[None]:
+    """Convert any error that rosbags raises on a truncated or damaged bag to a SceneError."""
     try:
         yield
     except DrakePoseError:
         raise
-    except Exception as error:  # Those of its decompressors have no common base.
+    except Exception as error:  # The decompressors' errors have no common base class.
         raise SceneError(
-            f"{path}: not a whole bag of ROS 1 or 2 ({type(error).__name__}: {error}); 'rosbag "
-            "reindex' or 'ros2 bag reindex' mends one that was cut short"
+            f"{path}: not a whole bag of ROS 1 or 2 ({type(error).__name__}: {error}); a truncated "
+            "bag can be repaired by 'rosbag reindex' or 'ros2 bag reindex'"
         ) from error
 
 
-def _seconds(rows: Sequence[_Row], what: str, warnings: list[str]) -> tuple[Array, Indices]:
-    """The headers' times [s], or the bag's where they have none, and which rows are in order."""
+def _ordered_times(rows: Sequence[_Row], what: str, warnings: list[str]) -> tuple[Array, Indices]:
+    """Return times [s] and indices of the rows in order; the bag's times if headers have none."""
     stamps = np.array([row[:2] for row in rows])
     clock = 0 if stamps[:, 0].any() else 1
     if clock:
@@ -159,16 +163,19 @@ def _seconds(rows: Sequence[_Row], what: str, warnings: list[str]) -> tuple[Arra
     return times[kept], kept
 
 
-def _merge(
+def _merge_joints(
     groups: Mapping[tuple[str, tuple[str, ...]], Sequence[_Row]],
 ) -> tuple[JointLog, list[str]]:
-    """All joints at the times of the publisher that has most rows, which also owns its joints."""
+    """Return all joints at the times of the publisher with most rows, and warnings.
+
+    If several publish the same joint, the one with more rows is used.
+    """
     warnings: list[str] = []
     base: JointLog | None = None
     columns: dict[str, Array] = {}
     owners: dict[str, str] = {}
     for (topic, names), rows in sorted(groups.items(), key=lambda one: -len(one[1])):
-        times, kept = _seconds(rows, f"{topic}: rows of {names[0]}", warnings)
+        times, kept = _ordered_times(rows, f"{topic}: rows of {names[0]}", warnings)
         log = JointLog(names, times, np.array([row[2] for row in rows])[kept])
         base = base or log
         assert base.times is not None
@@ -184,11 +191,11 @@ def _merge(
     return JointLog(ordered, base.times, positions), warnings
 
 
-def _of_topic(
+def _read_camera(
     path: Path, topic: str, rows: Sequence[_Row], infos: Mapping[str, Any], warnings: list[str]
 ) -> EpisodeCamera:
-    """The camera of a topic, which is called like that."""
-    times, kept = _seconds(rows, f"{topic}: pictures", warnings)
+    """Return the camera of a topic; its name is the topic."""
+    times, kept = _ordered_times(rows, f"{topic}: pictures", warnings)
     source = _TopicPictures(path, topic, np.array([row[1] for row in rows])[kept])
     height, width = source.read(0).shape[:2]
     base = topic.removesuffix("/compressed")
@@ -209,14 +216,18 @@ def _of_topic(
 
 
 def _field(info: Any, name: str) -> Array:
-    """A field of a CameraInfo, whose names are capital in ROS 1."""
+    """Return a field of a CameraInfo; ROS 1 has upper-case names."""
     return np.asarray(getattr(info, name, getattr(info, name.upper(), None)), dtype=np.float64)
 
 
 def _lens(info: Any, *, is_rectified: bool, where: str) -> Lens:
-    """The lens of a CameraInfo; SceneError where its distortion is of a kind nobody knows.
+    """Return the lens of a CameraInfo.
 
-    The distortion is that of raw pictures: rectified ones have their camera matrix in P, and none.
+    The distortion applies to raw images. Rectified images have no distortion, and their camera
+    matrix is in P.
+
+    Raises:
+        SceneError: the distortion model is unknown.
     """
     size, K, D, P = (info.width, info.height), *(_field(info, one) for one in ("k", "d", "p"))
     K = P.reshape(3, 4)[:, :3] if is_rectified and P.any() else K
@@ -229,7 +240,7 @@ def _lens(info: Any, *, is_rectified: bool, where: str) -> Lens:
 
 
 class _TopicPictures:
-    """The pictures of a topic: the next one costs nothing more, any other a look into the index."""
+    """Images of a topic, best read in sequence; any other than the next one needs a seek."""
 
     def __init__(self, path: Path, topic: str, log_times: Indices) -> None:
         self._path, self._topic, self._log_times = path, topic, log_times
@@ -238,11 +249,15 @@ class _TopicPictures:
         self._next = -1
 
     def read(self, k: int) -> Picture:
-        """Picture k (H, W, 3), red, green, blue; SceneError where it is damaged."""
+        """Return image k (H, W, 3), red, green, blue.
+
+        Raises:
+            SceneError: it is damaged.
+        """
         wanted, where = int(self._log_times[k]), f"{self._path}: {self._topic}, picture {k}"
-        with _faults(self._path):
+        with _translate_errors(self._path):
             if self._reader is None:
-                self._reader = _unopened(self._path)
+                self._reader = _make_reader(self._path)
                 self._reader.open()
             if k != self._next:
                 own = [one for one in self._reader.connections if one.topic == self._topic]

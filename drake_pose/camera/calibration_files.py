@@ -1,7 +1,7 @@
-"""What calibration tools write: ROS, Kalibr, OpenCV, and the TOML of anipose and Pose2Sim.
+"""Read the files of calibration tools: ROS, Kalibr, OpenCV, and the TOML of anipose and Pose2Sim.
 
-The formats are told apart by their content, not by the file's name. All of them count pixel
-centres at integers. Their poses take points of the world to the camera, p_C = R p_W + T [m].
+The format is recognised by the content, not by the file's name. In all of them pixel centres are at
+integers, and poses map points of the world to the camera, p_C = R p_W + T [m].
 """
 
 import re
@@ -24,15 +24,18 @@ FORMATS = (
     "camchain, OpenCV's FileStorage (camera_matrix, distortion_coefficients, image_width, "
     "image_height, R, T), and the TOML of anipose, Pose2Sim or Caliscope"
 )
-"""The camera files that are read."""
+"""Supported formats of camera files, for messages."""
 
 
 def read_camera_content(path: Path, largest: int = 1 << 20) -> Any:
-    """The content of a YAML, JSON, TOML or FileStorage file as plain values and arrays.
+    """Return the content of a YAML, JSON, TOML or FileStorage file as plain values and arrays.
 
-    largest: size of a file that is read [byte].
+    Args:
+        path: the file.
+        largest: maximum size of the file [byte].
 
-    Raises CameraError: it cannot be read.
+    Raises:
+        CameraError: the file cannot be read.
     """
     try:
         data = read_regular(path, largest + 1)
@@ -43,7 +46,7 @@ def read_camera_content(path: Path, largest: int = 1 << 20) -> Any:
         try:
             storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
             return _plain(storage.root())
-        # OpenCV's bindings raise the second where a file ends too early.
+        # OpenCV raises SystemError if the file is truncated.
         except (cv2.error, SystemError) as error:
             raise CameraError(f"{path}: not a file of OpenCV's FileStorage: {error}") from error
     lines = (line.strip() for line in text.splitlines())
@@ -59,13 +62,21 @@ def read_camera_content(path: Path, largest: int = 1 << 20) -> Any:
 def calibrated_cameras(
     content: Mapping[Any, Any], path: Path
 ) -> dict[str, tuple[Lens, Array | None]]:
-    """The cameras of a calibration tool's file by name; none: it is no such file.
+    """Return the cameras in a calibration tool's file, by name; empty if it is not such a file.
 
-    Each is a lens and a pose X_WC (4, 4) [m], None where the file has none. Of Kalibr's chain the
-    first camera is the world. A file of one camera that has no name is called as the file is.
+    In Kalibr's camchain the first camera is the world. A single camera without a name gets the
+    file's.
 
-    Raises CameraError: a field is missing or wrong, a lens is of a kind that OpenCV does not know,
-    or a camera stands so far away that lengths are no metres.
+    Args:
+        content: content of the file, as from ``read_camera_content``.
+        path: the file, for messages.
+
+    Returns:
+        By name, the lens and the pose X_WC (4, 4) [m] of each camera; None: the file has no pose.
+
+    Raises:
+        CameraError: a field is missing or invalid, OpenCV does not have the lens model, or a camera
+            is so far away that lengths cannot be in metres.
     """
     if "camera_matrix" in content:
         name = str(content.get("camera_name", path.stem))
@@ -75,7 +86,7 @@ def calibrated_cameras(
             raise CameraError(f"{where}: needs image_width and image_height [pixel]: add them")
         numbers = content["camera_matrix"], content.get("distortion_coefficients", ())
         lens = lens_of(size, *numbers, str(content.get("distortion_model", "plumb_bob")), where)
-        # A camera_info's R rectifies pictures; it has no T.
+        # The R of a camera_info rectifies images and is not a pose; it has no T.
         return {name: (lens, _pose(content, "R", "T", where) if "T" in content else None)}
     entries = {str(key): one for key, one in content.items() if isinstance(one, dict)}
     chain = {k: one for k, one in entries.items() if {"camera_model", "intrinsics"} <= {*one}}
@@ -94,7 +105,7 @@ def calibrated_cameras(
 
 
 def _plain(node: Any) -> Any:
-    """A node of OpenCV's FileStorage: mappings, lists, arrays, texts and numbers."""
+    """Return a node of OpenCV's FileStorage as mappings, lists, arrays, texts and numbers."""
     if node.isMap():
         if {"rows", "cols", "data"} <= {*node.keys()}:
             return np.asarray(node.mat(), dtype=np.float64)
@@ -105,7 +116,7 @@ def _plain(node: Any) -> Any:
 
 
 def _numbers(value: Any) -> Array | None:
-    """(n,) numbers of an array, a list, or a mapping with ``data``; None: it is none of these."""
+    """Return the numbers (n,) of an array, a list, or a mapping with ``data``; else None."""
     if isinstance(value, dict):
         value = value.get("data")
     if not isinstance(value, list | tuple | np.ndarray):
@@ -118,7 +129,18 @@ def _numbers(value: Any) -> Array | None:
 
 
 def lens_of(size: Any, matrix: Any, distortion: Any, model: str, where: str) -> Lens:
-    """The lens of a distortion model as ROS and Kalibr call it; CameraError: it is not known."""
+    """Return a lens by the name that ROS and Kalibr give to its distortion model.
+
+    Args:
+        size: width and height [pixel].
+        matrix: (3, 3) camera matrix [pixel].
+        distortion: OpenCV's distortion coefficients.
+        model: name of the distortion model.
+        where: start of the error message.
+
+    Raises:
+        CameraError: the model is unknown, or a value is invalid.
+    """
     kinds = {"plumb_bob": False, "rational_polynomial": False, "radtan": False, "none": False}
     kinds |= {"equidistant": True, "fisheye": True}  # OpenCV's fisheye.
     if model not in kinds:
@@ -131,7 +153,7 @@ def lens_of(size: Any, matrix: Any, distortion: Any, model: str, where: str) -> 
 def _kalibr(
     chain: Mapping[str, Mapping[str, Any]], path: Path
 ) -> Iterator[tuple[str, tuple[Lens, Array | None]]]:
-    """The cameras of Kalibr's camchain: T_cn_cnm1 takes points of the camera before to each."""
+    """Yield the cameras of a camchain; T_cn_cnm1 is the previous camera's pose in each camera."""
     is_chain = any("T_cn_cnm1" in entry for entry in chain.values())
     X_CW: Array | None = np.eye(4) if is_chain else None
     for k, (name, entry) in enumerate(chain.items()):
@@ -161,10 +183,14 @@ def _lens(
     where: str,
     largest_skew: float = 1e-3,
 ) -> Lens:
-    """A lens from a size [pixel], a camera matrix (3, 3) and OpenCV's coefficients.
+    """Return a lens from a size [pixel], a camera matrix (3, 3) [pixel] and OpenCV's coefficients.
 
-    largest_skew: of the camera matrix, as a fraction of f_x, which is dropped: half a pixel at the
-    edge of a picture.
+    Args:
+        size, matrix, distortion: values of the file.
+        fisheye: whether the coefficients are those of OpenCV's fisheye.
+        where: start of the error message.
+        largest_skew: maximum skew that is ignored [f_x]; it amounts to half a pixel at the edge of
+            an image.
     """
     sides, K, D = (_numbers(one) for one in (size, matrix, distortion))
     if sides is None or sides.size != 2:
@@ -197,10 +223,14 @@ def _lens(
 def _pose(
     content: Mapping[Any, Any], rotation: str, translation: str, where: str, farthest: float = 100.0
 ) -> Array | None:
-    """X_WC (4, 4) of p_C = R p_W + T, R a matrix or a rotation vector; None: it has neither.
+    """Return X_WC (4, 4) of p_C = R p_W + T; None if there is neither R nor T.
 
-    farthest: of a camera from the world's origin, beyond which lengths are taken for millimetres
-    [m].
+    Args:
+        content: the mapping.
+        rotation, translation: keys of R, a matrix or a rotation vector [rad], and T [m].
+        where: start of the error message.
+        farthest: maximum distance from the world's origin [m]; beyond it lengths are taken to be in
+            millimetres.
     """
     if rotation not in content and translation not in content:
         return None

@@ -1,4 +1,4 @@
-"""Camera files: our own YAML, one entry a camera; Drake's; and what calibration tools write."""
+"""Read and write this program's camera files; read those of Drake and of calibration tools."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
@@ -46,29 +46,33 @@ _OPTIONAL = {
 
 
 def load_cameras(path: str | Path) -> dict[str, Camera]:
-    """Reads the cameras of a YAML file, in its order; CameraError names file, camera and field.
+    """Return the cameras of a file by name, in the file's order.
 
     A pinhole camera has `width height focal_x focal_y center_x center_y` [pixel, pixel centres at
-    integers, or at i + 0.5 with `pixel_centers: drake`] and `X_WC` (4 x 4) [m], and may have
-    `projection: pinhole` and `clipping_near` [m]. A parallel camera has `projection: parallel` and
+    integers, or at i + 0.5 with `pixel_centers: drake`] and `X_WC` (4 x 4) [m]; `projection:
+    pinhole` and `clipping_near` [m] are optional. A parallel camera has `projection: parallel` and
     `pixels_per_metre` instead of focal lengths.
 
-    A file of Drake's is known by its fields: a Scenario (``cameras:``, also below one name), a
-    mapping of CameraConfigs, or a single one. Their principal points count from half a pixel less.
-    So are those of calibration tools: ROS, Kalibr, OpenCV, anipose, Pose2Sim and Caliscope.
+    Drake's files are recognised by their fields: a Scenario (``cameras:``, possibly below one
+    name), a mapping of CameraConfigs, or a single one; their principal points are converted. Files
+    of ROS, Kalibr, OpenCV, anipose, Pose2Sim and Caliscope are recognised likewise.
+
+    Raises:
+        CameraError: names the file, the camera and the field at fault. Cameras without a pose, on
+            moving links, or with distortion are refused.
     """
     found = load_camera_file(path)
     for name, link in found.links.items():
         raise CameraError(
-            f"{path}: camera '{name}' rides on link '{link}' of a robot (link, X_LC), so it stands "
-            "elsewhere in each frame: cameras that stand still (X_WC) are needed here; leave it "
-            "out, or for a frame give it X_WC = X_WL X_LC, where X_WL is the link's pose then"
+            f"{path}: camera '{name}' rides on link '{link}' of a robot (link, X_LC), so its pose "
+            "changes from frame to frame, but static cameras (X_WC) are needed here; remove it, or "
+            "for a single frame give X_WC = X_WL X_LC with the link's pose X_WL in that frame"
         )
     for name in found.unplaced:
         kind = "parallel" if isinstance(found.cameras[name], ParallelCamera) else "pinhole"
         raise CameraError(
-            f"{path}: camera '{name}': a {kind} camera needs X_WC; drake-pose register finds it "
-            "from masks of a robot whose joint positions are known, a calibration tool from "
+            f"{path}: camera '{name}': a {kind} camera needs X_WC; drake-pose register estimates "
+            "it from masks of a robot with known joint positions, and a calibration tool from "
             "pictures of a board"
         )
     return found.cameras
@@ -76,14 +80,15 @@ def load_cameras(path: str | Path) -> dict[str, Camera]:
 
 @dataclass(frozen=True)
 class CameraFile:
-    """What a camera file says, which need not say where the cameras stand.
+    """Content of a camera file, in which poses are optional.
 
     Args:
-        cameras: by name, in the file's order, of pictures without distortion; those without X_WC
-            at the world's origin.
-        unplaced: the names of these, but for those that ride on a link.
-        links: by camera that rides on a link, the link; its X_WC holds X_LC, its pose in that.
-        lenses: of the pictures as taken, by camera that has distortion.
+        cameras: pinhole or parallel cameras by name, in the file's order, for undistorted images. A
+            camera without pose is at the world's origin.
+        unplaced: names of the cameras without pose.
+        links: link of each camera that is mounted on one, by the camera's name; its X_WC holds
+            X_LC, the pose in the link.
+        lenses: lens of each camera with distortion, for the images as taken.
     """
 
     cameras: dict[str, Camera]
@@ -93,9 +98,14 @@ class CameraFile:
 
 
 def load_camera_file(path: str | Path, *, distorted: bool = False) -> CameraFile:
-    """Reads a camera file as load_cameras does, in which X_WC may be missing.
+    """Read a camera file as load_cameras does, but allow cameras without X_WC.
 
-    distorted: whether cameras may have a `distortion`, which the caller takes out of pictures.
+    Args:
+        path: the file.
+        distorted: allow cameras with `distortion`, which the caller removes from images.
+
+    Raises:
+        CameraError: names the file, the camera and the field at fault.
     """
     path = Path(path)
     content = read_camera_content(path)
@@ -104,7 +114,7 @@ def load_camera_file(path: str | Path, *, distorted: bool = False) -> CameraFile
     calibrated = calibrated_cameras(content, path)
     configs = None if calibrated else _find_configs(content, path)
     if configs is not None:
-        # Drake takes a while to load, and our own files do not need it.
+        # Import Drake only if needed, because it loads slowly.
         from drake_pose.camera.drake import read_configs
 
         read = read_configs(configs, path)
@@ -136,15 +146,19 @@ def load_camera_file(path: str | Path, *, distorted: bool = False) -> CameraFile
         lenses |= {name: lens} if lens is not None and lens.distortion.any() else {}
     if lenses and not distorted:
         raise CameraError(
-            f"{path}: camera '{next(iter(lenses))}' has distortion, of which pictures and masks "
-            "must be free here: take it out of the pictures, which gives the cameras without it "
-            f"(drake-pose undistort RECORDING --cameras {path} --out SCENE)"
+            f"{path}: camera '{next(iter(lenses))}' has distortion, but undistorted pictures and "
+            "masks are needed here: undistort the pictures, which also writes cameras without "
+            f"distortion (drake-pose undistort RECORDING --cameras {path} --out SCENE)"
         )
     return CameraFile(cameras, tuple(unplaced), links, lenses)
 
 
 def save_cameras(path: str | Path, cameras: Mapping[str, Camera] | Iterable[Camera]) -> None:
-    """Writes cameras to a YAML file for load_cameras, to the last digit; or raises CameraError."""
+    """Write cameras to a YAML file for load_cameras, without rounding.
+
+    Raises:
+        CameraError: the file cannot be written.
+    """
     write_file(path, dump_cameras(cameras), "the cameras")
 
 
@@ -153,7 +167,7 @@ def dump_cameras(
     links: Mapping[str, str] | None = None,
     unplaced: Iterable[str] = (),
 ) -> str:
-    """The text of a camera file; links and unplaced are those of CameraFile."""
+    """Return the text of a camera file; links and unplaced as of CameraFile."""
     content = {camera.name: describe_camera(camera) for camera in camera_tuple(cameras)}
     for name, link in (links or {}).items():
         if name in content:
@@ -164,9 +178,9 @@ def dump_cameras(
 
 
 def _find_configs(content: dict[Any, Any], path: Path) -> dict[str, Any] | None:
-    """Returns the CameraConfigs by name, of which nothing is checked; None: the file is ours."""
+    """Return unchecked CameraConfigs by name; None if the file is not one of Drake's."""
     if _is_config(content):
-        # Drake calls one without a name so.
+        # Drake's default name of a camera.
         return {str(content.get("name", "preview_camera")): content}
     scenarios = (
         {"": content}
@@ -175,8 +189,8 @@ def _find_configs(content: dict[Any, Any], path: Path) -> dict[str, Any] | None:
     )
     if len(scenarios) > 1:
         raise CameraError(
-            f"{path}: holds several scenarios ({', '.join(map(str, scenarios))}); keep the one "
-            "whose cameras are meant"
+            f"{path}: holds several scenarios ({', '.join(map(str, scenarios))}); keep only the "
+            "one with the cameras"
         )
     for scenario in scenarios.values():
         cameras = scenario["cameras"]
@@ -189,7 +203,7 @@ def _find_configs(content: dict[Any, Any], path: Path) -> dict[str, Any] | None:
 
 
 def _is_scenario(entry: Any) -> bool:
-    """Whether an entry has cameras, and is not a file of ours with a camera of that name."""
+    """Return whether an entry has cameras, and is not our file with a camera named `cameras`."""
     if not isinstance(entry, dict) or "cameras" not in entry:
         return False
     cameras = entry["cameras"]
@@ -197,7 +211,7 @@ def _is_scenario(entry: Any) -> bool:
 
 
 def _is_config(entry: dict[Any, Any]) -> bool:
-    """Whether an entry has fields of a CameraConfig, and none that only our cameras have."""
+    """Return whether an entry has fields of a CameraConfig, and none that only our cameras have."""
     theirs = {
         *("focal", "X_PB", "X_BC", "X_BD", "name", "fps", "rgb", "depth", "label", "show_rgb"),
         *("clipping_far", "z_near", "z_far", "renderer_name", "renderer_class", "background"),
@@ -208,15 +222,15 @@ def _is_config(entry: dict[Any, Any]) -> bool:
 
 
 def _check_name(key: Any, path: Path) -> str:
-    """Returns a camera's name, which must be fit for a folder's name."""
+    """Return a camera's name; CameraError if it cannot be a folder's name."""
     name = str(key)
     if not isinstance(key, str | int) or name in ("", ".", "..") or set(name) & set("/\\\0"):
-        raise CameraError(f"{path}: {name[:40]!r} is not fit for a camera's name")
+        raise CameraError(f"{path}: {name[:40]!r} is not a valid camera name")
     return name
 
 
 def _read_camera(name: str, entry: Any, path: Path) -> Camera:
-    """Returns the camera of one entry of a file."""
+    """Return the camera of one entry of a file."""
     where = f"{path}: camera '{name}'"
     if not isinstance(entry, dict):
         raise CameraError(f"{where}: expected a mapping from field names to values")
@@ -247,8 +261,8 @@ def _read_camera(name: str, entry: Any, path: Path) -> Camera:
     pixel_centers = entry.get("pixel_centers", "integers")
     if pixel_centers not in ("integers", "drake"):
         raise CameraError(
-            f"{where}: pixel_centers must be integers (OpenCV's, the default) or drake (at i + 0.5,"
-            f" as CameraInfo counts), not {pixel_centers!r}"
+            f"{where}: pixel_centers must be integers (OpenCV's convention, the default) or drake "
+            f"(at i + 0.5), not {pixel_centers!r}"
         )
     if pixel_centers == "drake":
         for field in ("center_x", "center_y"):
@@ -262,7 +276,11 @@ def _read_camera(name: str, entry: Any, path: Path) -> Camera:
 
 
 def _read_lens(camera: Camera, value: Any, where: str) -> Lens | None:
-    """The lens of a camera with OpenCV's coefficients, or CameraError; None: it has none."""
+    """Return the lens with OpenCV's coefficients of a camera; None if there are none or all are 0.
+
+    Raises:
+        CameraError: the coefficients are invalid.
+    """
     if value is None:
         return None
     counts = (4, 5, 8, 12, 14)
@@ -278,7 +296,7 @@ def _read_lens(camera: Camera, value: Any, where: str) -> Lens | None:
 
 
 def describe_camera(camera: Camera) -> dict[str, Any]:
-    """The entry of a camera in a file: plain values."""
+    """Return a camera's entry in a file, as plain values."""
     is_parallel = isinstance(camera, ParallelCamera)
     focal = ("pixels_per_metre",) if is_parallel else ("focal_x", "focal_y")
     fields = ("width", "height", *focal, "center_x", "center_y")

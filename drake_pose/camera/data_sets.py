@@ -1,4 +1,4 @@
-"""Episodes of LeRobot data sets (2.0, 2.1: a file an episode; 3.0: many in a file) and of DROID.
+"""Read episodes of LeRobot data sets (versions 2.0, 2.1 and 3.0) and of DROID.
 
 DROID's raw folders, `trajectory.h5` and a video of each ZED camera, are written by `robot_env.py`
 and `camera_utils/camera_readers/zed_camera.py` of droid-dataset/droid.
@@ -23,16 +23,17 @@ TRAJECTORY = "trajectory.h5"
 
 
 def open_lerobot(path: Path, joints: JointLog | None, episode: int | None) -> Episode:
-    """Opens an episode of a LeRobot data set, which may be here in part.
+    """Open an episode of a LeRobot data set, which may be incomplete.
 
     Args:
-        joints: in place of its `observation.state`.
-        episode: its number; None: the only one that is here.
+        path: folder of the data set.
+        joints: joint log to use instead of `observation.state`.
+        episode: number of the episode; None: the only one that is present.
 
     Raises:
-        SceneError: files cannot be read or are not as `meta/info.json` says, or several episodes
-            are here and none was asked for.
-        UnknownNameError: the episode is not here.
+        SceneError: files are unreadable or do not match `meta/info.json`, or several episodes are
+            present and none was chosen.
+        UnknownNameError: the episode is not present.
     """
     parquet, state = import_reader("pyarrow.parquet", path), "observation.state"
     try:
@@ -53,7 +54,7 @@ def open_lerobot(path: Path, joints: JointLog | None, episode: int | None) -> Ep
             values = [np.array(columns[key], dtype=np.float64) for key in states]
             positions = np.column_stack([one.reshape(len(times), -1) for one in values])
             names = [name for key in states for name in _names(key, features[key])]
-            # Names with their places where several are the same.
+            # Append the index to duplicate names.
             names = [n if names.count(n) == 1 else f"{n}_{k}" for k, n in enumerate(names)]
             joints = JointLog(tuple(names), times[kept], positions[kept])
         cameras = []
@@ -77,7 +78,7 @@ def open_lerobot(path: Path, joints: JointLog | None, episode: int | None) -> Ep
                 span = np.array([float(rows[number][f"videos/{key}/{end}"]) for end in ends])
             half = 0.5 / float(info["fps"])
             cameras.append(_video_camera(name, video, span, half, len(times), warnings))
-    # What a damaged file, or one that lacks something, makes Python and pyarrow raise.
+    # Python and pyarrow raise these errors on damaged or incomplete files.
     except (
         OSError, ValueError, LookupError, TypeError, AttributeError, NotImplementedError
     ) as error:  # fmt: skip
@@ -89,11 +90,15 @@ def open_lerobot(path: Path, joints: JointLog | None, episode: int | None) -> Ep
 
 
 _Rows = Mapping[int, Mapping[str, Any]] | None
-"""Of a data set of version 3 the row of each episode's meta data."""
+"""Metadata row of each episode, in version 3 of the format."""
 
 
 def _episode_rows(path: Path, info: Mapping[str, Any], parquet: Any) -> _Rows:
-    """The rows of `meta/episodes`; None: version 2. SceneError: it is of another version."""
+    """Return the rows of `meta/episodes` by episode; None for version 2.
+
+    Raises:
+        SceneError: the data set has another version.
+    """
     version = str(info["codebase_version"])
     if not version.startswith(("v2.", "v3.")):
         raise SceneError(
@@ -104,7 +109,7 @@ def _episode_rows(path: Path, info: Mapping[str, Any], parquet: Any) -> _Rows:
         return None
     rows: dict[int, dict[str, Any]] = {}
     for file in sorted(path.glob("meta/episodes/*/*.parquet")):
-        # Statistics are most of the columns, and of no use here.
+        # Skip the statistics, which are most of the columns.
         known = parquet.read_schema(file).names
         used = [name for name in known if name.startswith(("episode_index", "data/", "videos/"))]
         found = parquet.read_table(file, columns=used).to_pylist()
@@ -113,7 +118,7 @@ def _episode_rows(path: Path, info: Mapping[str, Any], parquet: Any) -> _Rows:
 
 
 def _file(path: Path, info: Mapping[str, Any], rows: _Rows, number: int, key: str = "") -> Path:
-    """The file of an episode's data, or of a camera's pictures."""
+    """Return the file of an episode's data, or of a camera's video if its key is given."""
     chunk = number // int(info.get("chunks_size", 1000))
     values = {"video_key": key, "episode_index": number, "episode_chunk": chunk}
     if rows is not None:
@@ -124,7 +129,7 @@ def _file(path: Path, info: Mapping[str, Any], rows: _Rows, number: int, key: st
 
 
 def _choose_episode(path: Path, info: Mapping[str, Any], rows: _Rows, wanted: int | None) -> int:
-    """The episode that is asked for, or the only one of which the data are here."""
+    """Return the wanted episode, or the only one whose data are present."""
     numbers = list(rows or range(int(info["total_episodes"])))
     asked = numbers if wanted is None else [one for one in numbers if one == wanted]
     here = [one for one in asked if _file(path, info, rows, one).is_file()]
@@ -141,7 +146,7 @@ def _choose_episode(path: Path, info: Mapping[str, Any], rows: _Rows, wanted: in
 
 
 def _names(key: str, feature: Mapping[str, Any]) -> list[str]:
-    """The names of a vector's entries, which may be lists in each other; else numbers."""
+    """Return names of a vector's entries, from possibly nested lists; by default numbers."""
     size, names = int(np.prod(feature["shape"])), feature.get("names")
     if isinstance(names, dict):
         names = [one if isinstance(one, list) else name for name, one in names.items()]
@@ -154,14 +159,23 @@ def _names(key: str, feature: Mapping[str, Any]) -> list[str]:
 
 
 def _stored_pictures(stored: Sequence[bytes], file: Path) -> Callable[[int], Picture]:
-    """What gives a picture of a table that holds them as PNG or JPEG."""
+    """Return a function that decodes image k of a table's PNG or JPEG images."""
     return lambda k: decode_colours(stored[k], file, SceneError)
 
 
 def _video_camera(
     name: str, file: Path, span: Array, half: float, count: int, warnings: list[str]
 ) -> EpisodeCamera:
-    """A camera whose pictures are those of a video's span [s], begun half a period earlier."""
+    """Return the camera of a video, restricted to a time span.
+
+    Args:
+        name: name of the camera.
+        file: the video.
+        span: (2,) start and end of the episode in the video [s].
+        half: half a period between images, by which the span is advanced [s].
+        count: number of rows of the episode.
+        warnings: warnings are appended.
+    """
     video = TimedVideo(file)
     first, last = np.searchsorted(video.times, span - half).tolist()
     if first == last:
@@ -183,16 +197,18 @@ def _video_camera(
 
 
 def open_droid(path: Path, joints: JointLog | None) -> Episode:
-    """Opens a folder with `trajectory.h5` and `recordings/MP4/<serial>.mp4`.
+    """Open a folder with `trajectory.h5` and `recordings/MP4/<serial>.mp4`.
 
-    Picture k is that of row k, at the time stamp that it has there; or at that of
-    `<serial>_timestamps.json`, where it lies beside the video. The arm's joints are joint1 to
-    joint7 [rad]; gripper_position is 0 where it is open and 1 where it is closed.
+    Image k belongs to row k. Its time is the row's time stamp, or that in
+    `<serial>_timestamps.json` beside the video. The arm's joints are joint1 to joint7 [rad];
+    gripper_position is 0 for open and 1 for closed.
 
     Args:
-        joints: in place of its own.
+        path: the folder.
+        joints: joint log to use instead of the trajectory's.
 
-    Raises SceneError: names what is missing or damaged.
+    Raises:
+        SceneError: names the file that is missing or damaged.
     """
     h5py = import_reader("h5py", path)
     where, folder = path / TRAJECTORY, path / "recordings" / "MP4"
@@ -225,7 +241,7 @@ def open_droid(path: Path, joints: JointLog | None) -> Episode:
 
 
 def _dataset(file: Any, name: str, where: Path) -> Array:
-    """A table of the file; SceneError, which says what is there instead, where there is none."""
+    """Return a table of the file; SceneError if it is missing."""
     found = file
     for part in name.split("/"):
         if part not in found:
@@ -242,11 +258,14 @@ def _zed_cameras(
     stereo: float = 2.5,
     calibrated: tuple[int, int] = (1280, 720),
 ) -> list[EpisodeCamera]:
-    """The camera of a video, or both of a stereo one, whose pictures are side by side.
+    """Return the camera of a video, or both cameras of a side-by-side stereo video.
 
     Args:
-        stereo: pictures more than so many times as wide as high are two.
-        calibrated: width and height of the pictures that the intrinsics are of: HD720 [pixel].
+        file: the open trajectory.
+        path: the video.
+        warnings: warnings are appended.
+        stereo: minimum ratio of width to height of a stereo video.
+        calibrated: width and height of the images to which the intrinsics apply: HD720 [pixel].
     """
     video, serial = TimedVideo(path), path.stem.removesuffix("-stereo")
     times = _picture_times(file, path, serial, len(video.times), warnings)
@@ -275,7 +294,7 @@ def _zed_cameras(
 
 
 def _picture_times(file: Any, path: Path, serial: str, count: int, warnings: list[str]) -> Array:
-    """When each of a video's pictures was taken [s], as far as there are time stamps."""
+    """Return the times [s] of a video's images; fewer than ``count`` if some are missing."""
     stamps = "observation/timestamp/cameras"
     kinds = ("estimated_capture", "frame_received", "read_end")
     known = [kind for kind in kinds if f"{stamps}/{serial}_{kind}" in file] or [kinds[0]]
@@ -283,7 +302,7 @@ def _picture_times(file: Any, path: Path, serial: str, count: int, warnings: lis
     times, source = read[0], TRAJECTORY
     beside = path.with_name(f"{path.stem}_timestamps.json")
     if beside.exists():
-        # These are times of receipt: what the camera took until then is told by the rows.
+        # These are reception times: subtract the camera's delay, known from the rows.
         delay = np.median(read[1] - times) if known[:2] == [*kinds[:2]] else 0.0
         times, source = np.array(json.loads(read_regular(beside))) - delay, beside.name
     if len(times) != count:

@@ -1,6 +1,6 @@
-"""Cameras to and from Drake's render cameras, CameraConfig and Scenario files.
+"""Convert cameras to and from Drake's render cameras, CameraConfig and Scenario files.
 
-Drake puts pixel centres at i + 0.5, drake_pose at i: principal points differ by half a pixel.
+Drake puts pixel centres at i + 0.5 and drake_pose at i, so principal points differ by half a pixel.
 """
 
 import math
@@ -29,18 +29,21 @@ from drake_pose.errors import CameraError
 def camera_to_drake(
     camera: Camera, *, renderer_name: str, depth_range: tuple[float, float] | None = None
 ) -> tuple[ColorRenderCamera, DepthRenderCamera, RigidTransform]:
-    """Drake's render cameras, and the pose X_WC that the sensor must have.
+    """Return Drake's colour and depth render cameras, and the pose X_WC of the sensor.
 
-    Drake knows pinholes only: a parallel camera becomes a tele camera 30 km behind the middle of
-    the depth range.
+    Drake has pinhole cameras only, so a parallel camera becomes a telephoto camera 30 km behind the
+    middle of the depth range.
 
     Args:
-        depth_range: nearest and farthest visible depth [m]; left out, `near` to 1 km. Of a parallel
-            camera: depths of the body in its frame (may be negative), tight, since the depth buffer
-            has few bits; left out, -2 to 2 m.
+        camera: the camera.
+        renderer_name: name of the renderer in the SceneGraph.
+        depth_range: minimum and maximum visible depth [m]; None: `near` to 1 km. For a parallel
+            camera: depths of the body in the camera's frame, possibly negative and as tight as
+            possible, because of the depth buffer's resolution; None: -2 to 2 m.
 
-    Raises CameraError: the principal point of a pinhole lies outside the picture (Drake refuses
-    it), or the depth range is not finite, positive and increasing.
+    Raises:
+        CameraError: the principal point of a pinhole lies outside the image (Drake refuses it), or
+            the depth range is not finite, positive and increasing.
     """
     X_CT = RigidTransform()
     if isinstance(camera, PinholeCamera):
@@ -56,12 +59,12 @@ def camera_to_drake(
     else:
         nearest, farthest = depth_range or (-2.0, 2.0)
         middle, half = 0.5 * (nearest + farthest), 0.5 * (farthest - nearest)
-        # Nearer, the rays are less parallel; farther, the renderer's 32 bit floats run out
-        # (measured: the masks differ least from 30 to 100 km, touching links in proportion).
+        # At smaller distances rays are less parallel, at larger ones 32-bit floats are too coarse.
+        # Masks differ least at 30 to 100 km.
         distance = max(3.0e4, 10.0 * half)
         near, far = distance - half, distance + half
         focal = camera.pixels_per_metre * distance
-        # Drake's principal point must lie inside the picture: stand behind the picture's middle.
+        # Drake needs the principal point inside the image: move the camera behind its centre.
         center_x, center_y = 0.5 * camera.width, 0.5 * camera.height
         aside = np.array([center_x - camera.center_x, center_y - camera.center_y]) - HALF_PIXEL
         X_CT = RigidTransform(np.array([*(aside / camera.pixels_per_metre), middle - distance]))
@@ -80,11 +83,13 @@ def camera_to_drake(
 def camera_from_drake(
     name: str, source: CameraInfo | RenderCameraCore, X_WC: np.ndarray | RigidTransform
 ) -> PinholeCamera:
-    """The camera of a Drake CameraInfo or RenderCameraCore.
+    """Return the camera of a Drake CameraInfo or RenderCameraCore.
 
     Args:
-        source: a RenderCameraCore brings its near clipping plane and its sensor offset X_BS too.
-        X_WC: the pose of the camera (with a RenderCameraCore: of its body B) in the world.
+        name: name of the camera.
+        source: the intrinsics; a RenderCameraCore also provides the near plane and the sensor's
+            pose X_BS in its body.
+        X_WC: pose of the camera in the world; with a RenderCameraCore the pose of its body B.
     """
     pose = X_WC.GetAsMatrix4() if isinstance(X_WC, RigidTransform) else np.asarray(X_WC)
     if isinstance(source, CameraInfo):
@@ -98,7 +103,7 @@ def camera_from_drake(
 def _pinhole(
     name: str, source: CameraInfo | CameraConfig, X_WC: np.ndarray, near: float = PinholeCamera.near
 ) -> PinholeCamera:
-    """The camera of what has Drake's intrinsics."""
+    """Return the camera with Drake's intrinsics at X_WC."""
     if isinstance(source, CameraInfo):
         size, center = (source.width(), source.height()), (source.center_x(), source.center_y())
     else:
@@ -109,32 +114,33 @@ def _pinhole(
 
 
 def camera_from_config(config: CameraConfig) -> PinholeCamera:
-    """The camera of a CameraConfig's colour and label sensor, at X_PB X_BC.
+    """Return the camera of a CameraConfig's colour and label sensor, at X_PB X_BC.
 
-    Raises CameraError: the camera hangs on a frame other than the world, a pose is drawn by lot, or
-    a number is none that a camera can have.
+    Raises:
+        CameraError: the camera is attached to a frame other than the world, a pose is stochastic,
+            or a value is invalid.
     """
     where = f"camera '{config.name}'"
     frame = config.X_PB.base_frame
     if frame not in (None, "", "world") or config.X_BC.base_frame not in (None, ""):
         raise CameraError(
-            f"{where}: its pose is given in '{frame or config.X_BC.base_frame}', but only cameras "
-            "that stand in the world can be read: leave base_frame out of X_PB and X_BC, and give "
-            "the pose in the world"
+            f"{where}: its pose is given in '{frame or config.X_BC.base_frame}', but poses must be "
+            "in the world: remove base_frame from X_PB and X_BC, and give the pose in the world"
         )
     poses = []
     for name, pose in (("X_PB", config.X_PB), ("X_BC", config.X_BC)):
         if not pose.IsDeterministic():
-            raise CameraError(f"{where}: {name} is drawn by lot; give the pose that was drawn")
+            raise CameraError(f"{where}: {name} is stochastic; give a deterministic pose")
         poses.append(pose.GetDeterministicValue())
     X_WC = (poses[0] @ poses[1]).GetAsMatrix4()
     return _pinhole(config.name, config, X_WC, near=config.clipping_near)
 
 
 def camera_to_config(camera: Camera) -> CameraConfig:
-    """A CameraConfig with label images on; everything else is Drake's default.
+    """Return a CameraConfig with label images enabled and Drake's defaults otherwise.
 
-    Raises CameraError: a parallel camera, or one whose principal point lies outside its picture.
+    Raises:
+        CameraError: a parallel camera, or a principal point outside the image.
     """
     if not isinstance(camera, PinholeCamera):
         raise CameraError(f"camera '{camera.name}': a CameraConfig is a pinhole, not parallel")
@@ -156,7 +162,7 @@ def camera_to_config(camera: Camera) -> CameraConfig:
         X_PB=pose,
         label=True,
     )
-    # Drake refuses a depth sensor that looks beyond the clipping planes.
+    # Drake refuses a depth range beyond the clipping planes.
     config.clipping_far = max(config.clipping_far, 2.0 * camera.near)
     config.z_near = max(config.z_near, camera.near)
     config.z_far = max(config.z_far, 2.0 * camera.near)
@@ -164,11 +170,16 @@ def camera_to_config(camera: Camera) -> CameraConfig:
 
 
 def read_configs(entries: Mapping[str, Any], path: Path) -> dict[str, PinholeCamera]:
-    """The cameras of CameraConfig entries as ``read_yaml`` gives them with their tags.
+    """Return the cameras of CameraConfig entries as read by ``read_yaml`` with tags, by name.
 
-    An entry's key is the camera's name unless its ``name`` says another.
+    A camera's name is its ``name``, or else the entry's key.
 
-    Raises CameraError: names the file, the camera and what is wrong.
+    Args:
+        entries: entries by key.
+        path: the file, for messages.
+
+    Raises:
+        CameraError: names the file, the camera and the problem.
     """
     cameras: dict[str, PinholeCamera] = {}
     for key, entry in entries.items():
@@ -183,15 +194,15 @@ def read_configs(entries: Mapping[str, Any], path: Path) -> dict[str, PinholeCam
             camera = camera_from_config(config)
         except CameraError as error:
             raise CameraError(f"{path}: {error}") from error
-        # What yaml_load_typed raises; some values of CameraConfig end a process that does not ask.
+        # yaml_load_typed raises these; some values of CameraConfig even raise SystemExit.
         except (
             RuntimeError, ValueError, TypeError, KeyError, AttributeError, AssertionError,
             SystemExit, yaml.YAMLError,
         ) as error:  # fmt: skip
-            # Drake asserts that a field which has fields is a mapping, and says its value alone.
+            # Drake's assertion that a field is a mapping only shows the value.
             bare = "expected NAME: VALUE fields, not " if isinstance(error, AssertionError) else ""
             why = " ".join(str(error).split())
-            raise CameraError(f"{where}: no CameraConfig: {bare}{why}") from error
+            raise CameraError(f"{where}: invalid CameraConfig: {bare}{why}") from error
         if camera.name in cameras:
             raise CameraError(f"{path}: camera '{camera.name}' is given twice")
         cameras[camera.name] = camera
@@ -201,12 +212,15 @@ def read_configs(entries: Mapping[str, Any], path: Path) -> dict[str, PinholeCam
 def dump_scenario(
     cameras: Mapping[str, Camera] | Iterable[Camera], links: Mapping[str, str] | None = None
 ) -> str:
-    """The text of a Scenario with these cameras and label images on, for ``LoadScenario``.
+    """Return the text of a Scenario, for ``LoadScenario``, with cameras that render label images.
 
     Args:
-        links: by name of a camera that rides on a link, the link in whose frame its pose is.
+        cameras: the cameras.
+        links: link of each camera that is mounted on one, by the camera's name; its pose is in the
+            link's frame.
 
-    Raises CameraError: a parallel camera, or one whose principal point lies outside its picture.
+    Raises:
+        CameraError: a parallel camera, or a principal point outside the image.
     """
     content = {}
     for camera in camera_tuple(cameras):
@@ -219,13 +233,14 @@ def dump_scenario(
 
 
 def save_scenario(path: str | Path, cameras: Mapping[str, Camera] | Iterable[Camera]) -> None:
-    """Writes the ``cameras`` of a Drake Scenario, which ``load_cameras`` reads, too.
+    """Write the ``cameras`` of a Drake Scenario, which ``load_cameras`` also reads.
 
-    Raises CameraError: as ``dump_scenario``; and when the file cannot be written.
+    Raises:
+        CameraError: as for ``dump_scenario``, or the file cannot be written.
     """
     write_file(path, dump_scenario(cameras), "the cameras")
 
 
 def _rigid_transform(X_AB: np.ndarray) -> RigidTransform:
-    """Returns a pose (4, 4) as Drake's type, its rotation made exact to the last digit."""
+    """Return a pose (4, 4) as Drake's type, with its rotation orthonormalised."""
     return RigidTransform(RotationMatrix.ProjectToRotationMatrix(X_AB[:3, :3]), X_AB[:3, 3])

@@ -1,4 +1,4 @@
-"""One episode, as every reader gives it, and what is wrong with its times."""
+"""One recorded episode, as all readers return it, and checks of its time stamps."""
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
@@ -14,13 +14,13 @@ from drake_pose.errors import SceneError, UnknownNameError
 
 @dataclass(frozen=True, eq=False)
 class JointLog:
-    """Joint positions as a robot logged them, in the units that it has.
+    """Joint positions as logged by a robot, in the log's units.
 
     Args:
-        names: as the log has them.
-        times: (n,) ascending [s]; None where only frames say what the rows are of.
-        positions: (n, m) as logged; nan where there is no reading.
-        frames: (n,) names or numbers of the rows' frames; empty where only times say.
+        names: names of the joints in the log.
+        times: (n,) ascending times [s]; None: rows are identified by frames only.
+        positions: (n, m) positions; nan where there is no reading.
+        frames: (n,) names or numbers of the rows' frames; empty: rows are identified by times only.
     """
 
     names: tuple[str, ...]
@@ -29,14 +29,15 @@ class JointLog:
     frames: tuple[str, ...] = ()
 
     def at(self, times: Array) -> Array:
-        """(k, m) positions at times (k,) [s], linear between rows.
+        """Return (k, m) positions at times (k,) [s], interpolated linearly.
 
-        They are nan where the log has begun or ended by more than half a usual step.
+        Times more than half the median step outside the log give nan.
 
-        Raises SceneError: its rows have frames alone.
+        Raises:
+            SceneError: the log has no times.
         """
         if self.times is None:
-            raise SceneError("the joint log's rows are of frames and have no times [s]")
+            raise SceneError("the joint log's rows have frames, but no times [s]")
         wanted = np.asarray(times, dtype=np.float64)
         slack = 0.5 * float(np.median(np.diff(self.times))) if len(self.times) > 1 else 0.0
         inside = (wanted >= self.times[0] - slack) & (wanted <= self.times[-1] + slack)
@@ -46,12 +47,13 @@ class JointLog:
         return found
 
     def of_frames(self, frames: Iterable[str]) -> Array:
-        """(k, m) positions in frames by name, 7 being 0007; nan where no row is of a frame.
+        """Return (k, m) positions by frame; 7 and 0007 are the same frame. Missing frames give nan.
 
-        Raises SceneError: its rows have times alone.
+        Raises:
+            SceneError: the log has no frames.
         """
         if not self.frames:
-            raise SceneError("the joint log's rows have times and are of no frames")
+            raise SceneError("the joint log's rows have times, but no frames")
         rows = dict(zip(map(frame_key, self.frames), self.positions, strict=True))
         missing = np.full(len(self.names), np.nan)
         return np.array([rows.get(frame_key(frame), missing) for frame in frames])
@@ -59,16 +61,18 @@ class JointLog:
 
 @dataclass(frozen=True, eq=False)
 class EpisodeCamera:
-    """The pictures of one camera.
+    """One camera of an episode, and its images.
 
     Args:
-        times: (n,) of the pictures [s], ascending; nan where nothing tells them.
-        camera: of the pictures that `read` gives, as far as the recording knows; where it rides on
-            a link X_WC holds its pose in that, else nobody knows its pose.
-        link: what it rides on, as the recording calls it.
-        recorded: gives picture k (H, W, 3) as recorded.
-        frames: (n,) the pictures' names, where they have some.
-        lens: takes out the pictures' distortion.
+        name: name of the camera.
+        width, height: size of the images [pixel].
+        times: (n,) ascending times of the images [s]; nan if unknown.
+        camera: calibrated camera of the undistorted images, if recorded. Its X_WC is the pose in
+            ``link``; without a link the pose is unknown.
+        link: link on which the camera is mounted, named as in the recording.
+        recorded: returns image k (H, W, 3) as recorded.
+        frames: (n,) names of the images, if they have names.
+        lens: lens that undistorts the images.
     """
 
     name: str
@@ -82,9 +86,10 @@ class EpisodeCamera:
     lens: Lens | None = None
 
     def read(self, k: int) -> Picture:
-        """Picture k (H, W, 3), red, green, blue, free of distortion.
+        """Return image k (H, W, 3), red, green, blue, without distortion.
 
-        Raises SceneError: there is none, it cannot be read, or it is of another size.
+        Raises:
+            SceneError: there is no such image, it is unreadable, or it has another size.
         """
         where, last = f"camera '{self.name}'", len(self.times) - 1
         if not 0 <= k <= last:
@@ -100,7 +105,14 @@ class EpisodeCamera:
 
 @dataclass(frozen=True, eq=False)
 class Episode:
-    """What was recorded in one episode, and what is wrong with it but leaves enough to go on."""
+    """A recorded episode.
+
+    Attributes:
+        path: file or folder of the recording.
+        cameras: cameras by name.
+        joints: joint log; None if there is none.
+        warnings: problems of the recording that do not prevent its use.
+    """
 
     path: Path
     cameras: Mapping[str, EpisodeCamera]
@@ -115,15 +127,22 @@ class Episode:
         joints: JointLog | None,
         said: Iterable[str] = (),
     ) -> "Episode":
-        """An episode with warnings of what is odd in its times and positions, after those given.
+        """Return an episode; warnings about its times and positions are appended to given ones.
 
-        Raises SceneError: no camera, no row, or pictures that nothing puts beside rows.
+        Args:
+            path: file or folder of the recording.
+            cameras: the cameras.
+            joints: the joint log.
+            said: warnings of the reader.
+
+        Raises:
+            SceneError: there is no camera or no row, or images cannot be associated with rows.
         """
         found, warnings = {camera.name: camera for camera in cameras}, list(said)
         if not found:
             raise SceneError(f"{path}: holds no camera's pictures {'; '.join(warnings)}".rstrip())
         for name, camera in found.items():
-            warnings += _gaps(camera.times, f"camera '{name}'", "picture")
+            warnings += _gap_warnings(camera.times, f"camera '{name}'", "picture")
         if joints is None:
             return cls(path, found, None, (*warnings, f"{path}: holds no joint positions"))
         if not joints.positions.size:
@@ -137,24 +156,32 @@ class Episode:
             if not column.all()
         ]
         if joints.times is not None:
-            warnings += _gaps(joints.times, "the joint log", "row")
+            warnings += _gap_warnings(joints.times, "the joint log", "row")
         for camera in found.values():
-            warnings += _compare(path, camera, joints)
+            warnings += _comparison_warnings(path, camera, joints)
         return cls(path, found, joints, tuple(warnings))
 
     def camera(self, name: str) -> EpisodeCamera:
-        """A camera by its name; UnknownNameError, which lists all, where there is none."""
+        """Return a camera by name.
+
+        Raises:
+            UnknownNameError: there is no such camera.
+        """
         if name not in self.cameras:
             raise UnknownNameError("camera", name, self.cameras, str(self.path))
         return self.cameras[name]
 
 
-def ascending(times: Array, what: str, most: float = 0.1) -> tuple[Indices, list[str]]:
-    """Which time stamps (n,) come after all before them, and a warning of the others.
+def ascending(times: Array, what: str, max_fraction: float = 0.1) -> tuple[Indices, list[str]]:
+    """Return the indices of time stamps later than all before them, and a warning of the others.
 
-    most: fraction of others above which the clock cannot be trusted.
+    Args:
+        times: (n,) time stamps [s].
+        what: what has these times, for messages.
+        max_fraction: maximum fraction of time stamps out of order.
 
-    Raises SceneError: there is none, or too many others, so that the clock cannot be trusted.
+    Raises:
+        SceneError: there are none, or more than this fraction are out of order.
     """
     stamps = np.where(np.isfinite(times), times, np.nan)
     before = np.fmax.accumulate(np.concatenate([[-np.inf], stamps]))[:-1]
@@ -168,16 +195,16 @@ def ascending(times: Array, what: str, most: float = 0.1) -> tuple[Indices, list
         f"{what}: number {late[0]} (counted from 0) has the time {times[late[0]]:.6f} s, which "
         f"does not come after {before[late[0]]:.6f} s before it"
     )
-    if len(late) > most * len(stamps):
+    if len(late) > max_fraction * len(stamps):
         raise SceneError(
             f"{text}, nor do {len(late)} of {len(stamps)} in all: the clock runs backwards or "
-            "stands still; put right the times, or cut the recording where it was set"
+            "stands still; correct the times, or split the recording where the clock was set"
         )
     return np.flatnonzero(is_later), [f"{text}; {len(late)} of {len(stamps)} such are left out"]
 
 
-def _gaps(times: Array, what: str, one: str, gap: float = 1.5) -> list[str]:
-    """Steps in time that are longer than the usual one times `gap`."""
+def _gap_warnings(times: Array, what: str, one: str, gap: float = 1.5) -> list[str]:
+    """Return a warning if time steps are longer than ``gap`` times the median step."""
     if len(times) < 2:
         return [f"{what}: has one {one} only"]
     steps = np.diff(times)
@@ -191,8 +218,8 @@ def _gaps(times: Array, what: str, one: str, gap: float = 1.5) -> list[str]:
     ]
 
 
-def _compare(path: Path, camera: EpisodeCamera, joints: JointLog) -> list[str]:
-    """What is wrong between a camera's pictures and the rows of joint positions."""
+def _comparison_warnings(path: Path, camera: EpisodeCamera, joints: JointLog) -> list[str]:
+    """Return warnings about mismatches between a camera's images and the joint log's rows."""
     count, where = len(camera.times), f"camera '{camera.name}'"
     if joints.frames and camera.frames:
         known, seen = ({*map(frame_key, one.frames)} for one in (joints, camera))

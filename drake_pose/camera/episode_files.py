@@ -1,4 +1,4 @@
-"""Episodes in folders: pictures or videos of cameras beside a table of joint positions."""
+"""Open recorded episodes of any format, and read folders of images or videos with a joint table."""
 
 import math
 import os
@@ -19,10 +19,10 @@ from drake_pose.camera.picture_files import (
     VIDEOS,
     TimedVideo,
     find_pictures,
+    find_recorded_files,
     frame_key,
     in_order,
     read_picture,
-    recorded_files,
 )
 from drake_pose.camera.sources import CAMERAS, TIME_STAMPS, read_time_stamps
 from drake_pose.csv_files import read_csv, read_number
@@ -33,10 +33,13 @@ JOINT_TABLE = "joint_angles.csv"
 
 
 def read_joint_table(path: Path) -> tuple[JointLog, list[str]]:
-    """A table with a column `time` [s] or `frame`, or both, and one for each joint; and warnings.
+    """Return a joint log from a CSV table, and warnings.
 
-    Raises SceneError: it cannot be read, has neither column, a cell that is no number, a frame
-    twice, or times that run backwards.
+    The table has a column `time` [s] or `frame`, or both, and one column per joint.
+
+    Raises:
+        SceneError: the table is unreadable, has neither column, a cell that is not a number, a
+            duplicate frame, or times that run backwards.
     """
     header, rows = read_csv(path, SceneError)
     columns = dict(zip(header, zip(*(cells for _, cells in rows), strict=True), strict=False))
@@ -67,14 +70,15 @@ def read_joint_table(path: Path) -> tuple[JointLog, list[str]]:
 
 
 def open_folder(path: Path, joints: JointLog | None) -> Episode:
-    """Opens `videos/<camera>.mp4` or `images/<camera>/<frame>.png`, and the table beside them.
+    """Open a folder with `videos/<camera>.mp4` or `images/<camera>/<frame>.png`, and a joint table.
 
     Args:
-        joints: in place of the folder's `joint_angles.csv`.
+        path: the folder.
+        joints: joint log to use instead of the folder's `joint_angles.csv`.
 
     Raises:
-        SceneError: pictures or the table cannot be used.
-        CameraError: the camera file cannot be used.
+        SceneError: images or the table are unusable.
+        CameraError: the camera file is unusable.
     """
     warnings: list[str] = []
     if joints is None and (path / JOINT_TABLE).exists():
@@ -86,11 +90,11 @@ def open_folder(path: Path, joints: JointLog | None) -> Episode:
     names += [one.stem for one in sorted(path.glob("videos/*")) if one.suffix.lower() in VIDEOS]
     cameras = []
     for name in dict.fromkeys([*known.cameras, *names]):
-        files = recorded_files(path, name)
+        files = find_recorded_files(path, name)
         if isinstance(files, dict):
-            camera, said = _of_images(name, path / "images" / name, path / "scene.yaml", joints)
+            camera, said = _image_camera(name, path / "images" / name, path / "scene.yaml", joints)
         elif files is not None:
-            # Its pictures are called as a scene's are.
+            # Frames are named as in a scene.
             video = TimedVideo(files)
             frames = tuple(f"{k:06d}" for k in range(len(video.times)))
             size, said = (video.width, video.height), video.warnings
@@ -101,14 +105,14 @@ def open_folder(path: Path, joints: JointLog | None) -> Episode:
         warnings += said
         if name not in known.cameras:
             warnings.append(f"camera '{name}' has no entry in {CAMERAS}: its lens is unknown")
-        cameras.append(with_intrinsics(camera, known, path / CAMERAS))
+        cameras.append(add_calibration(camera, known, path / CAMERAS))
     return Episode.checked(path, cameras, joints, warnings)
 
 
-def _of_images(
+def _image_camera(
     name: str, folder: Path, scene: Path, joints: JointLog | None
 ) -> tuple[EpisodeCamera, list[str]]:
-    """A camera whose pictures lie in a folder, and frames without picture or time."""
+    """Return a camera whose images are in a folder, and warnings about incomplete frames."""
     files, stamps, warnings = find_pictures(folder, name), folder / TIME_STAMPS, list[str]()
     frames = in_order(files)
     times = np.full(len(frames), np.nan)
@@ -139,12 +143,14 @@ def _of_images(
 
 
 def read_sequence(path: Path, sequence: bool = False) -> tuple[bool, float | None]:
-    """Whether frames follow each other, and at what rate [Hz], by a scene.yaml that may be missing.
+    """Return whether frames are a sequence, and their rate [Hz] or None, by a scene.yaml.
 
     Args:
-        sequence: what holds where it does not say.
+        path: the file.
+        sequence: default if the file does not say.
 
-    Raises SceneError: it cannot be read, or says something else.
+    Raises:
+        SceneError: the file is unreadable or has other content.
     """
     if not os.path.lexists(path):
         return sequence, None
@@ -167,8 +173,12 @@ def read_sequence(path: Path, sequence: bool = False) -> tuple[bool, float | Non
     return sequence, float(rate)
 
 
-def with_intrinsics(camera: EpisodeCamera, known: CameraFile, path: Path) -> EpisodeCamera:
-    """A camera as its file has it, where that has it; CameraError: it is of other pictures."""
+def add_calibration(camera: EpisodeCamera, known: CameraFile, path: Path) -> EpisodeCamera:
+    """Return a camera with the calibration of the camera file, if it has any.
+
+    Raises:
+        CameraError: the calibration does not fit the images.
+    """
     found, where = known.cameras.get(camera.name), f"{path}: camera '{camera.name}'"
     if found is None:
         return camera
@@ -183,8 +193,8 @@ def with_intrinsics(camera: EpisodeCamera, known: CameraFile, path: Path) -> Epi
     return replace(camera, camera=found, link=link, lens=lens)
 
 
-def format_of(path: Path) -> Literal["lerobot", "droid", "bag", "folder", ""]:
-    """What a recording of pictures is, by its files' names; "": none, as a folder of masks is."""
+def recording_format(path: Path) -> Literal["lerobot", "droid", "bag", "folder", ""]:
+    """Return the format of a recording, recognised by file names; "" for none, such as masks."""
     inside = sorted(one.name for one in path.iterdir()) if path.is_dir() else []
     if (path / INFO).exists():
         return "lerobot"
@@ -198,9 +208,11 @@ def format_of(path: Path) -> Literal["lerobot", "droid", "bag", "folder", ""]:
 
 
 def require_recording(path: Path) -> None:
-    """SceneError: a folder has neither masks nor pictures; names those in it that have."""
+    """Raise SceneError if a folder has neither masks nor images; name subfolders that do."""
     inside = sorted(one for one in path.iterdir() if one.is_dir()) if path.is_dir() else []
-    found = [one.name for one in (path, *inside) if (one / "masks").is_dir() or format_of(one)]
+    found = [
+        one.name for one in (path, *inside) if (one / "masks").is_dir() or recording_format(one)
+    ]
     if not found or found[0] != path.name:
         raise SceneError(
             f"{path}: has no folder masks/<camera>/<frame>.png, and no pictures, videos, data set "
@@ -211,18 +223,19 @@ def require_recording(path: Path) -> None:
 def open_episode(
     path: str | Path, *, joints: str | Path | None = None, episode: int | None = None
 ) -> Episode:
-    """Opens an episode in a folder or file of any of the formats in `tutorials/file_formats.md`.
+    """Open an episode of any of the formats in `tutorials/file_formats.md`.
 
     Args:
-        joints: a table of joint positions, in place of the recording's own.
-        episode: its number in a LeRobot data set; None: the only one that is there.
+        path: the folder or file.
+        joints: table of joint positions to use instead of the recording's own.
+        episode: number of the episode in a LeRobot data set; None: the only one that is present.
 
     Raises:
-        SceneError: names what was found and what is expected, or what is damaged or missing; and
-            the extra `episodes`, where a library of it is.
-        UnknownNameError: a data set has no such episode here.
-        SettingsError: a number for what holds one episode only.
-        CameraError: a camera file cannot be used.
+        SceneError: names what was found and expected, what is damaged or missing, or a missing
+            library of the extra `episodes`.
+        UnknownNameError: the data set does not contain the episode.
+        SettingsError: a number was given for a recording with a single episode.
+        CameraError: a camera file is unusable.
     """
     path = Path(path)
     expected = (
@@ -233,7 +246,7 @@ def open_episode(
     if not path.exists():
         raise SceneError(f"{path}: no such folder or file; {expected}")
     log, warnings = (None, []) if joints is None else read_joint_table(Path(joints))
-    kind = format_of(path)
+    kind = recording_format(path)
     if episode is not None and kind != "lerobot":
         raise SettingsError(f"--episode {episode}: {path} is no LeRobot data set, but one episode")
     inside = sorted(one.name for one in path.iterdir()) if path.is_dir() else []

@@ -1,8 +1,8 @@
-"""Cameras as ROS and MuJoCo take them; drake_pose.camera.drake writes Drake's.
+"""Write cameras for ROS and MuJoCo; drake_pose.camera.drake writes Drake's.
 
-Both have the camera's picture without distortion. ROS counts pixel centres at integers, as we do,
-and its optical frame is our camera frame. MuJoCo's principal point is an offset from the picture's
-middle, and its camera looks along -z with y up.
+All describe undistorted images. ROS has pixel centres at integers and its optical frame is our
+camera frame. MuJoCo's principal point is an offset from the image centre, and its camera looks
+along -z with y up.
 """
 
 import re
@@ -19,11 +19,12 @@ from drake_pose.errors import CameraError
 
 
 def ros_camera_info(camera: Camera) -> str:
-    """The YAML of a CameraInfo as ROS's camera_calibration_parsers reads it.
+    """Return a CameraInfo in the YAML format of ROS's camera_calibration_parsers.
 
-    It is that of pictures without distortion: D is 0, R the identity, P is K.
+    The images have no distortion: D is 0, R the identity, and P is K.
 
-    Raises CameraError: a parallel camera.
+    Raises:
+        CameraError: a parallel camera.
     """
     one = _pinhole(camera, "a CameraInfo")
     K = np.array([[one.focal_x, 0.0, one.center_x], [0.0, one.focal_y, one.center_y], [0, 0, 1.0]])
@@ -43,10 +44,11 @@ def ros_camera_info(camera: Camera) -> str:
 def ros_transforms(
     cameras: Mapping[str, Camera] | Iterable[Camera], frames: Mapping[str, str]
 ) -> str:
-    """A launch file (XML) of ROS 2 with a static_transform_publisher for each optical frame.
+    """Return a launch file (XML) of ROS 2 with a static_transform_publisher for each optical frame.
 
     Args:
-        frames: by camera's name, the frame in which its pose X_WC [m] is given.
+        cameras: the cameras.
+        frames: parent frame of each pose X_WC [m], by the camera's name.
     """
     launch = ElementTree.Element("launch")
     for camera in camera_tuple(cameras):
@@ -61,12 +63,13 @@ def ros_transforms(
 
 
 def mujoco_cameras(cameras: Mapping[str, Camera] | Iterable[Camera]) -> str:
-    """MuJoCo's <camera> elements, to be included in <worldbody>, or the body they ride on.
+    """Return MuJoCo's <camera> elements, to be included in <worldbody> or the carrying body.
 
-    Raises CameraError: a parallel camera.
+    Raises:
+        CameraError: a parallel camera.
     """
     root = ElementTree.Element("mujocoinclude")
-    pixel = 1e-5  # A sensor's pixel [m]: any, for focal lengths are told in pixels.
+    pixel = 1e-5  # Size of a sensor pixel [m]; arbitrary, because focal lengths are in pixels.
     R_CM = np.diag([1.0, -1.0, -1.0])  # From MuJoCo's frame, y up and z backward, to ours.
     for camera in camera_tuple(cameras):
         one = _pinhole(camera, "a camera of MuJoCo here")
@@ -87,7 +90,7 @@ def mujoco_cameras(cameras: Mapping[str, Camera] | Iterable[Camera]) -> str:
 
 
 def _pinhole(camera: Camera, what: str) -> PinholeCamera:
-    """A pinhole camera, or CameraError."""
+    """Return the camera if it is a pinhole, else raise CameraError."""
     if isinstance(camera, PinholeCamera):
         return camera
     raise CameraError(
@@ -96,15 +99,17 @@ def _pinhole(camera: Camera, what: str) -> PinholeCamera:
 
 
 def _matrix(values: Array) -> dict[str, object]:
+    """Return a matrix as ROS's YAML mapping."""
     rows, cols = values.shape
     return {"rows": rows, "cols": cols, "data": values.ravel().tolist()}
 
 
 def _ros_name(name: str) -> str:
-    """A name of the letters, digits and underscores that ROS's names are made of."""
+    """Return a name with all but letters, digits and underscores replaced, as ROS requires."""
     return re.sub(r"[^A-Za-z0-9_]", "_", name)
 
 
 def _xml(root: ElementTree.Element) -> str:
+    """Return an element as indented text."""
     ElementTree.indent(root)
     return ElementTree.tostring(root, encoding="unicode") + "\n"

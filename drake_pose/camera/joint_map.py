@@ -1,4 +1,4 @@
-"""Which column of a joint log is which joint of a model, and in which units it is."""
+"""Map the columns of a joint log to the joints of a model, and convert their units."""
 
 import math
 import re
@@ -16,13 +16,17 @@ from drake_pose.errors import CameraError, SceneError, SettingsError, UnknownNam
 from drake_pose.yaml_files import read_yaml
 
 UNITS = {"rad": 1.0, "deg": math.pi / 180.0}
-"""What one unit of an angle is [rad]."""
+"""Units of angles [rad]."""
 
 
 class Column(NamedTuple):
-    """What makes a joint's positions of a column: position = scale reading + offset [rad or m].
+    """Linear map from a column to a joint: position = scale * reading + offset [rad or m].
 
-    ends: between which its readings are; one at an end says "here, or beyond".
+    Attributes:
+        name: name of the column.
+        scale, offset: the linear map.
+        ends: range of the readings, if they are clipped to one; a reading at an end means that the
+            joint is there or beyond.
     """
 
     name: str
@@ -33,14 +37,16 @@ class Column(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class MappedJoints:
-    """A joint log in a model's terms.
+    """A joint log in the names, order and units of a model.
 
     Args:
-        log: by the model's names, in its order [rad or m]; nan where a joint is not logged.
-        clipped: (n, m) which readings are at an end of their range: the joint is there, or beyond.
-        not_logged: the model's joints that no column is of, to be held.
-        unused: the columns that are of no joint.
-        warnings: what was taken for what, and what is odd.
+        log: positions by the model's names and order [rad or m]; nan for joints that are not
+            logged.
+        clipped: (n, m) whether a reading is at an end of its range, so that the joint is there or
+            beyond.
+        not_logged: joints of the model without a column.
+        unused: columns without a joint.
+        warnings: assumptions that were made, and anomalies.
     """
 
     log: JointLog
@@ -60,19 +66,20 @@ def map_joints(
     units: str | None = None,
     table: Mapping[str, Column] | None = None,
 ) -> MappedJoints:
-    """Puts a joint log in a model's names, order and units.
+    """Convert a joint log to a model's names, order and units.
 
     Args:
-        names: (m,) the model's joints.
-        lower, upper: (m,) their limits, infinite where they have none [rad or m].
-        is_angle: (m,) which of them turn.
-        units: of angles that the table does not have: "rad" or "deg"; None: what the limits say.
-        table: the columns of some joints, as `read_joint_map` gives them.
+        log: the joint log.
+        names: (m,) joints of the model.
+        lower, upper: (m,) their limits, infinite if there are none [rad or m].
+        is_angle: (m,) whether a joint is revolute.
+        units: unit of angles not in ``table``: "rad" or "deg"; None: inferred from the limits.
+        table: columns of some joints, as from `read_joint_map`.
 
     Raises:
-        SceneError: no column is a joint, or the readings look like neither radians nor degrees.
-        UnknownNameError: the table has a joint or a column that is not there.
-        SettingsError: other units.
+        SceneError: no column is a joint, or the readings fit neither radians nor degrees.
+        UnknownNameError: the table has an unknown joint or column.
+        SettingsError: unknown units.
     """
     if units not in (None, *UNITS):
         raise SettingsError(f"units must be {' or '.join(UNITS)}, not {units!r}")
@@ -122,11 +129,14 @@ def map_joints(
 
 
 def match_names(logged: Sequence[str], wanted: Sequence[str]) -> tuple[dict[str, str], list[str]]:
-    """Which logged name is which of the wanted ones, and what was taken for what.
+    """Match logged names to the wanted ones, and return warnings about guesses.
 
-    Names are the same that differ in case, separators, a leading k or a last "joint"; then those of
-    which one ends as the other alone does. Where a log has only numbers that are not the model's,
-    they are its joints in order, if there are as many.
+    Names match if they differ only in case, separators, a leading k or a final "joint"; then if one
+    ends as the other one. If a log has numbered names that are not the model's, they are its joints
+    in order, provided the number of joints is the same.
+
+    Returns:
+        The wanted name of each matched logged name, and the warnings.
     """
     matched = {name: name for name in logged if name in wanted}
     guesses: dict[str, str] = {}
@@ -157,7 +167,7 @@ def match_names(logged: Sequence[str], wanted: Sequence[str]) -> tuple[dict[str,
 
 
 def _words(name: str) -> list[str]:
-    """The words and numbers of a name, without what says only that it is a joint."""
+    """Return a name's words and numbers, without affixes that only say that it is a joint."""
     words = [word.lower() for word in re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+", name)]
     if len(words) > 1 and re.match("k[A-Z]", name):
         words = words[1:]
@@ -167,7 +177,7 @@ def _words(name: str) -> list[str]:
 
 
 def _is_suffix(a: Sequence[str], b: Sequence[str]) -> bool:
-    """Whether one of two names ends as the other, which is more than a number."""
+    """Return whether one of two names ends as the other one, which is more than a number."""
     short, long = sorted((a, b), key=len)
     return any(word.isalpha() for word in short) and long[-len(short) :] == short
 
@@ -182,20 +192,22 @@ def _find_unit(
     full_turn: float = 2.0 * math.pi,
     normalised: tuple[float, float] = (99.0, 100.001),
 ) -> tuple[str, str]:
-    """The unit of the columns (n,) of angles, and why.
+    """Return the unit of columns of angles, and the reason.
 
     Args:
-        others: all readings that nobody has told the units of.
-        lower, upper: limits of each column's joint [rad].
-        slack: readings are inside limits up to this [rad].
-        full_turn: nothing in radians is this far beyond its limits [rad]; a joint without limits
-            turns twice as far at most.
-        normalised: between which the largest of LeRobot's normalised readings is.
+        readings: readings (rows,) of the n columns of revolute joints, by name.
+        others: all readings whose units are unknown.
+        lower, upper: (n,) limits of each column's joint [rad].
+        slack: tolerance of the limits [rad].
+        full_turn: readings further beyond the limits than this [rad] are not in radians; a joint
+            without limits is assumed to stay within twice this.
+        normalised: range of the maximum of readings that LeRobot normalised to -100 ... 100.
 
-    Raises SceneError: they look like neither radians nor degrees.
+    Raises:
+        SceneError: the readings fit neither radians nor degrees.
     """
     low, high = np.maximum(lower, -2.0 * full_turn), np.minimum(upper, 2.0 * full_turn)
-    # These pass over readings that are missing.
+    # fmin and fmax ignore missing readings (nan).
     least, most = (f.reduce(list(readings.values()), axis=1) for f in (np.fmin, np.fmax))
     off = {k: np.fmax(low - one * least, one * most - high) for k, one in UNITS.items()}
     worst = {unit: float(np.fmax.reduce(one)) for unit, one in off.items()}
@@ -231,11 +243,15 @@ def _positions(
     slack: float = 0.1,
     at_end: float = 1e-6,
 ) -> tuple[Array, Mask, list[str]]:
-    """A joint's positions, which readings are at an end, and what is odd in the column.
+    """Return a joint's positions, which readings are at an end of their range, and anomalies.
 
     Args:
-        slack: positions are inside limits up to this [rad]; lengths over their range.
-        at_end: a reading is at an end of its range within this, over the range.
+        column: the column's linear map.
+        readings: (rows,) readings.
+        limits: lower and upper limit [rad or m].
+        is_angle: whether the joint is revolute.
+        slack: tolerance of the limits [rad; for lengths a fraction of the range].
+        at_end: tolerance within which a reading is at an end of its range [fraction of the range].
     """
     found, said = column.scale * readings + column.offset, list[str]()
     clipped = np.zeros(len(readings), dtype=np.bool_)
@@ -250,7 +266,7 @@ def _positions(
             )
     lower, upper = limits
     if not math.isfinite(upper - lower):
-        # Between readings on either side of half a turn it is there, and not at 0.
+        # Unwrap: interpolation between readings at +-180 degrees must not pass through 0.
         is_known = np.isfinite(found)
         found[is_known] = np.unwrap(found[is_known]) if is_angle else found[is_known]
         return found, clipped, said
@@ -265,11 +281,14 @@ def _positions(
 
 
 def read_joint_map(path: Path) -> dict[str, Column]:
-    """Reads the columns of joints; SceneError names the file, the joint and the field.
+    """Read a joint map: the columns of joints.
 
-    A joint has `column`, its own name where not given, and either `from` and `to` (the ends of the
-    readings, and the positions there [rad or m]), or `scale` and `offset` (position = scale reading
-    + offset), or `unit` (rad, deg, m, mm).
+    An entry has `column` (default: the joint's name) and either `from` and `to` (two readings and
+    the positions there [rad or m]), or `scale` and `offset` (position = scale * reading + offset),
+    or `unit` (rad, deg, m, mm).
+
+    Raises:
+        SceneError: names the file, the joint and the field at fault.
     """
     content = read_yaml(path, SceneError)
     if not isinstance(content, dict) or not content:
@@ -284,7 +303,7 @@ def read_joint_map(path: Path) -> dict[str, Column]:
 
 
 def _read_column(joint: str, entry: Any, where: str) -> Column:
-    """The column of one entry of a joint map; CameraError where it is none."""
+    """Return the column of an entry of a joint map; CameraError if it is invalid."""
     units = {**UNITS, "m": 1.0, "mm": 1e-3}
     ways = [{"from", "to"}, {"scale", "offset"}, {"scale"}, {"offset"}, {"unit"}, set[str]()]
     given = set(entry) - {"column"} if isinstance(entry, dict) else {None}
@@ -303,7 +322,7 @@ def _read_column(joint: str, entry: Any, where: str) -> Column:
 
 
 def _pair(value: Any, field: str, where: str) -> tuple[float, float]:
-    """Two different numbers."""
+    """Return two different numbers."""
     low, high = value if isinstance(value, list) and len(value) == 2 else (0.0, 0.0)
     low, high = (check_number(one, field, where) for one in (low, high))
     if low == high:

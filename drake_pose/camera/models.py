@@ -1,4 +1,4 @@
-"""The two cameras, pinhole and parallel (Kameda), what they may be, and ready rigs of several."""
+"""Pinhole and parallel cameras, checks of their parameters, lenses, and rigs of several cameras."""
 
 import dataclasses
 import math
@@ -19,7 +19,7 @@ LARGEST_SIDE = 16384
 
 
 def check_side(value: Any, field: str, where: str) -> int:
-    """A width or height [pixel], a whole number from 1 to LARGEST_SIDE, or CameraError."""
+    """Return a width or height as an int from 1 to LARGEST_SIDE [pixel], or raise CameraError."""
     number = check_number(value, field, where)
     if number != math.floor(number) or not 1 <= number <= LARGEST_SIDE:
         raise CameraError(
@@ -30,9 +30,9 @@ def check_side(value: Any, field: str, where: str) -> int:
 
 
 def check_number(value: Any, field: str, where: str, *, positive: bool = False) -> float:
-    """A finite (and on request positive) number as a float, or CameraError.
+    """Return a finite (and, if required, positive) number as a float, or raise CameraError.
 
-    YAML 1.1 reads ``1e-3`` as text, so text that spells a number is accepted.
+    Text that spells a number is accepted, because YAML 1.1 reads ``1e-3`` as text.
     """
     try:
         if isinstance(value, bool) or not isinstance(
@@ -49,11 +49,17 @@ def check_number(value: Any, field: str, where: str, *, positive: bool = False) 
 
 
 def check_pose(value: Any, field: str, where: str) -> np.ndarray:
-    """A rigid transform, Drake's or a matrix, as a read-only (4, 4) float64 array.
+    """Return a rigid transform, Drake's or a matrix, as a read-only (4, 4) float64 array.
 
-    A rounded rotation is replaced by the nearest exact one, on which Drake insists.
+    A rounded rotation is replaced by the nearest exact one, as Drake requires.
 
-    Raises CameraError: not a finite 4 x 4 matrix, a last row that is not 0 0 0 1, or no rotation.
+    Args:
+        value: the transform.
+        field, where: field and start of the error message.
+
+    Raises:
+        CameraError: not a finite 4 x 4 matrix, its last row is not 0 0 0 1, or it is not a
+            rotation.
     """
     value = value.GetAsMatrix4() if hasattr(value, "GetAsMatrix4") else value
     rows = value.tolist() if isinstance(value, np.ndarray) else value
@@ -94,7 +100,13 @@ def check_pose(value: Any, field: str, where: str) -> np.ndarray:
 
 
 def write_file(path: str | Path, text: str, what: str) -> None:
-    """Writes a text; CameraError, which says what it holds, where that cannot be."""
+    """Write a text file; CameraError if it cannot be written.
+
+    Args:
+        path: the file.
+        text: its content.
+        what: name of the content, for the message.
+    """
     try:
         Path(path).write_text(text, encoding="utf-8")
     except OSError as error:
@@ -102,7 +114,7 @@ def write_file(path: str | Path, text: str, what: str) -> None:
 
 
 def _short(value: Any) -> str:
-    """A value as text that cannot flood a message."""
+    """Return a value as text of limited length, for messages."""
     if isinstance(value, dict | list | tuple | set):
         return f"a {type(value).__name__} of {len(value)}"
     if isinstance(value, np.ndarray):
@@ -112,7 +124,7 @@ def _short(value: Any) -> str:
 
 
 class _PosedCamera:
-    """What both cameras have: a name, a picture's size and principal point, and a pose."""
+    """Checks and pose of both kinds of cameras."""
 
     name: str
     X_WC: np.ndarray
@@ -132,16 +144,16 @@ class _PosedCamera:
 
     @cached_property
     def X_CW(self) -> np.ndarray:
-        """(4, 4) the world's pose in the camera."""
+        """(4, 4) pose of the world in the camera."""
         return inverse_pose(self.X_WC)
 
     def _in_camera(self, p_W: np.ndarray) -> np.ndarray:
-        """Points (n, 3) of the world in the camera's frame."""
+        """Return world points (n, 3) in the camera's frame [m]."""
         X_CW = self.X_CW
         return np.asarray(p_W, dtype=np.float64).reshape(-1, 3) @ X_CW[:3, :3].T + X_CW[:3, 3]
 
     def with_pose(self: "_Camera", X_WC: np.ndarray) -> "_Camera":
-        """Returns the same camera at another pose (4, 4)."""
+        """Return the same camera at another pose X_WC (4, 4)."""
         return dataclasses.replace(self, X_WC=X_WC)  # type: ignore[type-var]
 
 
@@ -153,14 +165,15 @@ class PinholeCamera(_PosedCamera):
     """A pinhole camera without distortion.
 
     Args:
-        width, height, focal_x, focal_y: [pixel].
-        center_x, center_y: the principal point [pixel], pixel centres at integers.
-        X_WC: the camera's pose in the world, x right, y down, z forward [m]: a RigidTransform or a
-            matrix (4, 4), which it is kept as, read-only.
-        near: the nearest visible depth [m].
+        name: name of the camera.
+        width, height, focal_x, focal_y: size of the image and focal lengths [pixel].
+        center_x, center_y: principal point [pixel], pixel centres at integers.
+        X_WC: pose of the camera in the world, x right, y down, z forward [m]: a RigidTransform or a
+            matrix (4, 4); it is stored as a read-only matrix.
+        near: minimum visible depth [m].
 
-    Raises CameraError: a parameter is not finite or out of its range, or X_WC is no rigid
-    transform.
+    Raises:
+        CameraError: a parameter is not finite or out of range, or X_WC is not a rigid transform.
     """
 
     name: str
@@ -174,7 +187,7 @@ class PinholeCamera(_PosedCamera):
     near: float = 0.01
 
     def project(self, p_W: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """World points (n, 3) [m] to (n, 2) pixels, NaN where depth <= 0, and (n,) depths [m]."""
+        """Project world points (n, 3) [m] to (n, 2) pixels and (n,) depths; NaN if depth <= 0."""
         p_C = self._in_camera(p_W)
         depth = p_C[:, 2]
         visible = np.where(depth > 0.0, depth, np.nan)
@@ -183,7 +196,7 @@ class PinholeCamera(_PosedCamera):
         return np.column_stack([u, v]), depth
 
     def resized(self, width: int, height: int) -> "PinholeCamera":
-        """Returns the camera of the same pictures at another size [pixel]."""
+        """Return the camera of the same images at another size [pixel]."""
         x, y = width / self.width, height / self.height
         return dataclasses.replace(
             self,
@@ -196,21 +209,21 @@ class PinholeCamera(_PosedCamera):
         )
 
     def mirrored(self) -> "PinholeCamera":
-        """The camera of the same pictures with left and right exchanged."""
+        """Return the camera of the same images with left and right exchanged."""
         return dataclasses.replace(self, center_x=self.width - 1 - self.center_x)
 
     def kernel_parameters(self) -> np.ndarray:
-        """Returns (8,) kind (0: pinhole), f_x, f_y, c_x, c_y, near, width, height."""
+        """Return (8,) kind (0: pinhole), f_x, f_y, c_x, c_y, near, width, height."""
         projection = [0.0, self.focal_x, self.focal_y, self.center_x, self.center_y, self.near]
         return np.array([*projection, self.width, self.height], dtype=np.float64)
 
 
 @dataclass(frozen=True, eq=False)
 class ParallelCamera(_PosedCamera):
-    """A camera of parallel rays (Kameda, Minoh and Ikeda, section 6: 2.26 pixels a centimetre).
+    """A camera with parallel rays (Kameda, Minoh and Ikeda, section 6: 2.26 pixels per centimetre).
 
-    u = center_x + pixels_per_metre * x_C, v = center_y + pixels_per_metre * y_C; the other
-    parameters, and what is raised, are those of a PinholeCamera.
+    u = center_x + pixels_per_metre * x_C and v = center_y + pixels_per_metre * y_C. The other
+    parameters, and the errors, are those of a PinholeCamera.
     """
 
     name: str
@@ -222,7 +235,7 @@ class ParallelCamera(_PosedCamera):
     X_WC: np.ndarray
 
     def project(self, p_W: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Projects points (n, 3) [m] of the world to (n, 2) pixels and (n,) depths [m]."""
+        """Project world points (n, 3) [m] to (n, 2) pixels and (n,) depths [m]."""
         p_C = self._in_camera(p_W)
         uv = np.array([self.center_x, self.center_y]) + self.pixels_per_metre * p_C[:, :2]
         return uv, p_C[:, 2]
@@ -235,17 +248,17 @@ class ParallelCamera(_PosedCamera):
 
 
 HALF_PIXEL = 0.5
-"""What Drake's principal point has more than ours [pixel]."""
+"""Difference of Drake's principal point from ours [pixel]."""
 
 Camera = PinholeCamera | ParallelCamera
 """A camera of either kind."""
 
 
 def camera_tuple(cameras: Mapping[str, Camera] | Iterable[Camera]) -> tuple[Camera, ...]:
-    """Cameras in their order, by name as ``load_cameras`` gives them or one after another.
+    """Return cameras, given by name or as a sequence, as a tuple.
 
     Raises:
-        CameraError: they are no cameras, or one camera alone.
+        CameraError: an element is not a camera, or a single camera is given.
     """
     if isinstance(cameras, Camera):
         raise CameraError(
@@ -264,7 +277,7 @@ def camera_tuple(cameras: Mapping[str, Camera] | Iterable[Camera]) -> tuple[Came
 
 
 def inverse_pose(X_AB: np.ndarray) -> np.ndarray:
-    """Returns X_BA of a pose X_AB (4, 4)."""
+    """Return X_BA of a pose X_AB (4, 4)."""
     X_BA = np.eye(4)
     X_BA[:3, :3] = X_AB[:3, :3].T
     X_BA[:3, 3] = -X_AB[:3, :3].T @ X_AB[:3, 3]
@@ -285,20 +298,23 @@ def circle_of_cameras(
     size: tuple[int, int] = (640, 480),
     face_camera: bool = True,
 ) -> dict[str, PinholeCamera]:
-    """Cameras evenly on a circle that look at its middle, and one that looks at the face.
+    """Return cameras on a circle that look at its centre, and one that looks at the face.
 
     Date et al. (figure 1) have eight "horizontal" cameras about 45 degrees apart and one for the
-    face. The world's z is up; a person in the middle who faces +x looks into the face camera.
+    face. The world's z axis points up; a person at the centre who faces +x looks into the face
+    camera.
 
     Args:
-        count: cameras on the circle, camera_0, camera_1 ... counterclockwise from above; the x axis
-            lies half-way between the last and the first.
-        radius, height: where the cameras of the circle are [m].
-        target: (3,) the point they look at [m].
-        field_of_view: of a camera on the circle, upright [rad].
-        size: width and height of the pictures [pixel].
+        count: number of cameras on the circle, camera_0, camera_1 ... counterclockwise from above;
+            the x axis bisects the angle between the last and the first one.
+        radius, height: radius of the circle and height of its cameras [m].
+        target: (3,) point they look at [m].
+        field_of_view: vertical field of view of the cameras on the circle [rad].
+        size: width and height of the images [pixel].
+        face_camera: whether there is a camera for the face.
 
-    Raises CameraError when there is no camera, or a number is out of its range.
+    Raises:
+        CameraError: there is no camera, or a number is out of range.
     """
     if count < 1 and not face_camera:
         raise CameraError("a rig needs at least one camera")
@@ -311,7 +327,7 @@ def circle_of_cameras(
         name = f"camera_{k}"
         cameras[name] = _camera(name, look_at(eye, target), field_of_view, size)
     if face_camera:
-        # As high as a grown person's face; a narrow view, for the face should fill the picture.
+        # Height of an adult's face, and a narrow view in which the face fills the image.
         height, view = 1.6, math.radians(22.0)
         face, eye = [target[0], target[1], height], [target[0] + radius, target[1], height]
         cameras[FACE_CAMERA] = _camera(FACE_CAMERA, look_at(eye, face), view, size)
@@ -321,9 +337,14 @@ def circle_of_cameras(
 def look_at(
     eye: Sequence[float] | Array, target: Sequence[float] | Array, up: Sequence[float] = (0, 0, 1)
 ) -> Array:
-    """The pose X_WC (4, 4) of a camera at `eye` (3,) that looks at `target` (3,) [m].
+    """Return the pose X_WC (4, 4) of a camera at `eye` (3,) that looks at `target` (3,) [m].
 
-    Raises CameraError when both points coincide, or the camera looks along `up`.
+    Args:
+        eye, target: (3,) points [m].
+        up: (3,) direction that is up in the image.
+
+    Raises:
+        CameraError: both points coincide, or the camera looks along `up`.
     """
     forward = np.asarray(target, dtype=np.float64) - np.asarray(eye, dtype=np.float64)
     right = np.cross(forward, np.asarray(up, dtype=np.float64))
@@ -338,6 +359,7 @@ def look_at(
 
 
 def _camera(name: str, X_WC: Array, field_of_view: float, size: tuple[int, int]) -> PinholeCamera:
+    """Return a centred camera with square pixels and a vertical field of view [rad]."""
     width, height = size
     focal = 0.5 * height / math.tan(0.5 * field_of_view)
     center = 0.5 * (width - 1), 0.5 * (height - 1)
@@ -346,13 +368,13 @@ def _camera(name: str, X_WC: Array, field_of_view: float, size: tuple[int, int])
 
 @dataclass(frozen=True, eq=False)
 class Lens:
-    """A pinhole with radial and tangential distortion, or a fisheye, as OpenCV has them.
+    """A pinhole with radial and tangential distortion, or a fisheye, as in OpenCV.
 
     Args:
-        width, height: [pixel].
-        matrix: (3, 3) camera matrix of the pictures as taken [pixel], pixel centres at integers.
-        distortion: OpenCV's coefficients k1, k2, p1, p2, k3 ...; of a fisheye (4,) k1 to k4.
-        fisheye: whether it is OpenCV's fisheye, which ROS and Kalibr call equidistant.
+        width, height: size of the images [pixel].
+        matrix: (3, 3) camera matrix of the images as taken [pixel], pixel centres at integers.
+        distortion: OpenCV's coefficients k1, k2, p1, p2, k3 ...; for a fisheye (4,) k1 to k4.
+        fisheye: whether it is OpenCV's fisheye, called equidistant by ROS and Kalibr.
     """
 
     width: int
@@ -362,8 +384,8 @@ class Lens:
     fisheye: bool = False
 
     @cached_property
-    def straight_matrix(self) -> Array:
-        """(3, 3) the camera matrix of the undistorted pictures, each pixel of which was seen."""
+    def undistorted_matrix(self) -> Array:
+        """(3, 3) camera matrix of the undistorted images, which have no blank pixels."""
         if not self.distortion.any():
             return self.matrix
         size = (self.width, self.height)
@@ -377,20 +399,20 @@ class Lens:
 
     @cached_property
     def _maps(self) -> tuple[np.ndarray, np.ndarray]:
-        """Where each pixel of an undistorted picture comes from, as cv2.remap takes it."""
+        """Source of each pixel of an undistorted image, as cv2.remap takes it."""
         maps = cv2.fisheye.initUndistortRectifyMap if self.fisheye else cv2.initUndistortRectifyMap
         size = (self.width, self.height)
         return maps(
-            self.matrix, self.distortion, np.eye(3), self.straight_matrix, size, cv2.CV_16SC2
+            self.matrix, self.distortion, np.eye(3), self.undistorted_matrix, size, cv2.CV_16SC2
         )
 
     def camera(self, name: str, X_WC: Array) -> PinholeCamera:
-        """The camera, free of distortion, that took the undistorted pictures from X_WC (4, 4)."""
-        (fx, _, cx), (_, fy, cy), _ = self.straight_matrix.tolist()
+        """Return the camera at X_WC (4, 4) for the undistorted images."""
+        (fx, _, cx), (_, fy, cy), _ = self.undistorted_matrix.tolist()
         return PinholeCamera(name, self.width, self.height, fx, fy, cx, cy, X_WC)
 
     def undistort(self, picture: Picture) -> Picture:
-        """Frees a picture (H, W) or (H, W, 3) from distortion; CameraError: another size."""
+        """Return an image (H, W) or (H, W, 3) without distortion; CameraError for another size."""
         if picture.shape[:2] != (self.height, self.width):
             raise CameraError(
                 f"a picture of {picture.shape[1]} x {picture.shape[0]} pixels (width x height) is "

@@ -1,4 +1,4 @@
-"""Pictures, masks and videos in files; and the order of frames' names."""
+"""Read images, masks and videos from files, and order frames by name."""
 
 import io
 import re
@@ -19,45 +19,53 @@ from drake_pose.regular_files import read_regular, require_regular
 
 SUFFIXES = (".png", ".jpg", ".jpeg")
 VIDEOS = (".mp4", ".avi", ".mkv", ".mov", ".webm", ".m4v", ".mpg", ".mpeg")
-"""How names of pictures and of videos end."""
+"""Suffixes of image and video files."""
 
 
 def natural_key(name: str) -> tuple[tuple[str, int], ...]:
-    """What names are sorted by: texts and the numbers in them in turn, so that 2 precedes 10."""
+    """Return a sort key of texts and numbers, by which 2 precedes 10."""
     texts = re.split("([0-9]+)", name)
     return tuple(zip(texts[::2], [*map(int, texts[1::2]), -1], strict=True))
 
 
 def in_order(frames: Iterable[str]) -> tuple[str, ...]:
-    """Frames in natural order, each once."""
+    """Return unique frames in natural order."""
     return tuple(sorted(set(frames), key=lambda name: (natural_key(name), name)))
 
 
 def frame_number(frame: str) -> int | None:
-    """Returns the number that a frame's name is, or None."""
-    # No file's name is longer; Python refuses to read numbers of thousands of digits.
+    """Return the number that a frame's name is, or None."""
+    # File names are shorter; Python refuses to parse numbers with thousands of digits.
     is_number = frame.isascii() and frame.isdigit() and len(frame) < 256
     return int(frame) if is_number else None
 
 
 def frame_key(cell: str) -> int | str:
-    """A frame's number, which a table may have written as 3.0, or its name."""
+    """Return a frame's number, which a table may write as 3.0, or else its name."""
     number = frame_number(cell.removesuffix(".0"))
     return cell if number is None else number
 
 
 def read_picture(path: Path, error_type: type[DrakePoseError]) -> Picture:
-    """Reads a PNG or JPEG picture (H, W, 3) red, green, blue; the error names the file."""
+    """Return a PNG or JPEG image (H, W, 3) red, green, blue.
+
+    Raises:
+        error_type: the file is unreadable; the message names it.
+    """
     return decode_colours(_read(path, error_type), path, error_type)
 
 
 def decode_colours(data: bytes, path: Path, error_type: type[DrakePoseError]) -> Picture:
-    """A picture (H, W, 3) red, green, blue of a file's content; the error names the file."""
+    """Return an image (H, W, 3) red, green, blue from the content of a PNG or JPEG file.
+
+    Raises:
+        error_type: the content is invalid; the message names the file.
+    """
     picture = _decode(data, cv2.IMREAD_COLOR, path, error_type)
     return np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB), dtype=np.uint8)
 
 
-def read_two_colours(
+def read_binary_mask(
     path: Path,
     error_type: type[DrakePoseError],
     size: tuple[int | None, int | None] = (None, None),
@@ -65,15 +73,18 @@ def read_two_colours(
     may_be_empty: bool = False,
     lossy: bool = False,
 ) -> Mask:
-    """Reads a mask (H, W): a PNG picture of black and one other colour, the object.
+    """Return a mask (H, W) from a PNG image of black and one other colour on the object.
 
     Args:
-        size: width and height that it must have [pixel]; None: any.
-        may_be_empty: whether a picture that shows nothing is as good as any.
-        lossy: whether a JPEG, whose values its compression blurs, will do: dark, and light.
+        path: the file.
+        error_type: type of the error that is raised.
+        size: required width and height [pixel]; None: any.
+        may_be_empty: accept a mask without any object.
+        lossy: accept JPEG files, whose values are thresholded.
 
-    The error names the file; when it cannot be read, is damaged, of another size, empty or full, or
-    has more than two values.
+    Raises:
+        error_type: the file is unreadable, damaged, of another size, empty or full, or has more
+            than two values; the message names it.
     """
     data = _read(path, error_type)
     picture = _decode(data, cv2.IMREAD_UNCHANGED, path, error_type, only_png=not lossy)
@@ -86,11 +97,11 @@ def read_two_colours(
         )
     layers = picture[:, :, None] if picture.ndim == 2 else picture
     if layers.shape[2] == 4 and (layers[:, :, 3] == layers[0, 0, 3]).all():
-        layers = layers[:, :, :3]  # an alpha channel that says nothing
+        layers = layers[:, :, :3]  # The alpha channel is constant.
     elif layers.shape[2] == 4 and (layers[:, :, :3] == layers[0, 0, :3]).all():
-        layers = layers[:, :, 3:]  # one that says all
+        layers = layers[:, :, 3:]  # Only the alpha channel varies.
     if data.startswith(b"\xff\xd8"):
-        mask, is_one_colour = mask_of_picture(picture, str(path), error_type), True
+        mask, is_one_colour = threshold_mask(picture, str(path), error_type), True
     else:
         layers = np.ascontiguousarray(layers)
         mask = cv2.inRange(layers, (0, 0, 0, 0), (0, 0, 0, 0)) == 0
@@ -106,16 +117,16 @@ def read_two_colours(
         values = len(np.unique(layers.reshape(-1, layers.shape[2]), axis=0))
         raise error_type(
             f"{path}: the mask has {values} values, but must have two: black, and one other on the "
-            "object; threshold it first (or give a camera's source a background instead of masks)"
+            "object; threshold it first (or give the camera's source a background instead of masks)"
         )
     return np.asarray(mask, dtype=np.bool_)
 
 
 def list_pictures(folder: Path, error_type: type[DrakePoseError]) -> dict[str, Path]:
-    """A folder's picture files by frame, in the order of the names; the error: a frame twice."""
+    """Return a folder's image files by frame, sorted by name; error if a frame occurs twice."""
     files: dict[str, Path] = {}
     for path in sorted(folder.iterdir()):
-        # Hidden ones are such as those that macOS leaves behind.
+        # Skip hidden files, such as those of macOS.
         if path.suffix.lower() in SUFFIXES and not path.name.startswith("."):
             if path.stem in files:
                 raise error_type(f"{path}: the folder has frame {path.stem} twice; remove one")
@@ -124,7 +135,7 @@ def list_pictures(folder: Path, error_type: type[DrakePoseError]) -> dict[str, P
 
 
 def find_pictures(folder: Path, camera: str) -> dict[str, Path]:
-    """The pictures of a camera's folder as list_pictures has them; SceneError: there is none."""
+    """Return a camera's image files as list_pictures does; SceneError if there is none."""
     if not folder.is_dir():
         raise SceneError(f"{folder}: no such folder of camera '{camera}'s pictures")
     files = list_pictures(folder, SceneError)
@@ -133,13 +144,13 @@ def find_pictures(folder: Path, camera: str) -> dict[str, Path]:
     return files
 
 
-def recorded_files(folder: Path, camera: str) -> dict[str, Path] | Path | None:
-    """A camera's pictures in the folder of a recording, wherever one is read.
+def find_recorded_files(folder: Path, camera: str) -> dict[str, Path] | Path | None:
+    """Return a camera's images in a recording: files by frame, a video, or None.
 
-    The files of images/<camera> by frame; where there is no such folder the video
-    videos/<camera>.mp4; None: it has neither.
+    These are the files in images/<camera>, or else videos/<camera>.mp4 or another video suffix.
 
-    Raises SceneError: a frame is there twice.
+    Raises:
+        SceneError: a frame occurs twice.
     """
     if (own := folder / "images" / camera).is_dir():
         return list_pictures(own, SceneError)
@@ -147,22 +158,25 @@ def recorded_files(folder: Path, camera: str) -> dict[str, Path] | Path | None:
     return next((file for file in videos if file.is_file()), None)
 
 
-def mask_of_picture(picture: Picture, where: str, error_type: type[DrakePoseError]) -> Mask:
-    """The mask (H, W) of a picture (H, W) or (H, W, 3) that compression blurred: what is light.
+def threshold_mask(picture: Picture, where: str, error_type: type[DrakePoseError]) -> Mask:
+    """Return the mask (H, W) of the bright pixels of a lossily compressed mask (H, W) or (H, W, 3).
 
-    The error names the picture by ``where``: much is neither dark nor light.
+    Raises:
+        error_type: more than a tenth of the pixels are neither dark nor bright; the message begins
+            with ``where``.
     """
     grey = picture if picture.ndim == 2 else cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)
     between = float(((grey > 64) & (grey < 192)).mean())
     if between > 0.1:
         raise error_type(
-            f"{where}: {between:.0%} of it is neither dark nor light: no mask but a picture, in "
-            "which the object is to be found first (drake-pose masks --background, --box, --model)"
+            f"{where}: {between:.0%} of it is neither dark nor light, so it is a picture and not a "
+            "mask: segment the object first (drake-pose masks --background, --box, --model)"
         )
     return np.asarray(grey >= 128, dtype=np.bool_)
 
 
 def _read(path: Path, error_type: type[DrakePoseError]) -> bytes:
+    """Return a file's content, or raise the error."""
     try:
         return read_regular(path)
     except OSError as error:
@@ -177,18 +191,27 @@ def _decode(
     *,
     only_png: bool = False,
 ) -> Picture:
-    """A whole PNG or JPEG picture as OpenCV gives it; the error names a file that is none.
+    """Return a complete PNG or JPEG image as OpenCV decodes it.
 
-    So are pictures refused whose pixels would fill the memory.
+    Args:
+        data: content of the file.
+        how: OpenCV's reading mode.
+        path: the file, for messages.
+        error_type: type of the error that is raised.
+        only_png: refuse JPEG.
+
+    Raises:
+        error_type: the content is no such image, damaged, or so large that it would fill the
+            memory.
     """
     is_jpeg = data.startswith(b"\xff\xd8") and not only_png
     if is_jpeg and not data.rstrip(b"\0").endswith(b"\xff\xd9"):
         raise error_type(f"{path}: the JPEG picture is cut short")
-    # OpenCV's decoders differ from version to version in what they make of half a picture.
+    # Check completeness here, because OpenCV's versions differ in decoding truncated images.
     if not (is_jpeg or data.startswith(b"\x89PNG\r\n\x1a\n")):
         raise error_type(f"{path}: not a PNG picture")
     try:
-        # Pillow warns of what it takes for a bomb, and raises at twice as many pixels alone.
+        # Pillow only warns of decompression bombs up to twice its limit: raise there, too.
         with warnings.catch_warnings():
             warnings.simplefilter("error", Image.DecompressionBombWarning)
             with Image.open(io.BytesIO(data)) as picture:
@@ -198,7 +221,7 @@ def _decode(
         OSError, SyntaxError, ValueError, Image.DecompressionBombError,
         Image.DecompressionBombWarning,
     ) as error:  # fmt: skip
-        # What cannot be identified at all is told by its address in the memory.
+        # Pillow's message for an unidentified image only has a memory address.
         why = "" if isinstance(error, UnidentifiedImageError) else f": {error}"
         raise error_type(f"{path}: the picture is cut short, damaged or too large{why}") from error
     if max(width, height) > LARGEST_SIDE:
@@ -211,7 +234,7 @@ def _decode(
         decoded = None
     if decoded is None:
         raise error_type(f"{path}: not a whole PNG or JPEG picture")
-    # Of 16 bits OpenCV keeps the upper eight: 12-bit values would turn black.
+    # OpenCV keeps the upper 8 of 16 bits, so 12-bit values would turn black.
     if how == cv2.IMREAD_COLOR and data[24:25] == b"\x10" and not is_jpeg:
         deep = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
         brightest = 0 if deep is None else int(deep.max())
@@ -224,7 +247,7 @@ def _decode(
 
 
 def import_reader(library: str, path: Path) -> Any:
-    """A library of the extra `episodes`; SceneError, which names both and the file, without it."""
+    """Import a library of the extra `episodes`; SceneError names it and the file if missing."""
     try:
         return import_module(library)
     except ImportError as error:
@@ -235,12 +258,13 @@ def import_reader(library: str, path: Path) -> Any:
 
 
 class VideoPictures:
-    """The pictures of a video, counted from 0; SceneError where it cannot be read.
-
-    By OpenCV; AV1, which OpenCV's packages do not decode, as TimedVideo.
+    """Images of a video, counted from 0, decoded by OpenCV, or by TimedVideo for AV1.
 
     Attributes:
-        time: of the picture that was read last [s].
+        time: time of the last image read [s].
+
+    Raises:
+        SceneError: the video cannot be read.
     """
 
     def __init__(self, path: Path) -> None:
@@ -255,17 +279,17 @@ class VideoPictures:
 
     @property
     def count(self) -> int:
-        """How many pictures there are, as the file says."""
+        """Number of images according to the file."""
         return int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT))
 
     @property
     def rate_hz(self) -> float | None:
-        """Pictures a second, where the file says."""
+        """Images per second according to the file; None if unknown."""
         rate = float(self._capture.get(cv2.CAP_PROP_FPS))
         return rate if rate > 0.0 else None
 
     def read(self, number: int) -> Picture:
-        """A picture (H, W, 3), red, green, blue; SceneError where the video ends before it."""
+        """Return an image (H, W, 3), red, green, blue; SceneError if the video ends before it."""
         if self._timed is not None:
             timed = self._timed.read(number)
             self.time = float(self._timed.times[number])
@@ -273,7 +297,7 @@ class VideoPictures:
         if number < self._next:
             self._capture.release()
             self._capture, self._next = cv2.VideoCapture(str(self._path)), 0
-        # Not every video can be wound to a picture: those between are passed over.
+        # Not every video can seek, so images in between are skipped one by one.
         while self._next < number and self._capture.grab():
             self._next += 1
         found, picture = self._capture.read()
@@ -281,7 +305,7 @@ class VideoPictures:
             what = f"is cut short: it ends after {self._next} pictures, but says {self.count}"
             what = what if number < self.count else f"has no picture {number}"
             raise SceneError(
-                f"{self._path}: {what}; leave the rest out (--frame), or make it whole: ffmpeg -i "
+                f"{self._path}: {what}; leave the rest out (--frame), or repair it: ffmpeg -i "
                 f"{self._path.name} -c copy NEW"
             )
         self._next += 1
@@ -290,17 +314,18 @@ class VideoPictures:
 
 
 class TimedVideo:
-    """The pictures of a video with their times, each read from the keyframe before it, by PyAV.
+    """Images of a video with their times, decoded by PyAV.
 
-    The next picture costs one decoding; any other those from the last keyframe before it.
+    The next image costs one decoding; any other one is decoded from the preceding keyframe.
 
     Attributes:
-        times: (n,) of the pictures that the file holds, from the first one on, ascending [s].
-        width, height: [pixel].
-        warnings: what is wrong with it.
+        times: (n,) ascending times of the images, relative to the first one [s].
+        width, height: size of the images [pixel].
+        warnings: problems of the file.
 
-    Raises SceneError: it is no video, has no picture, is cut short so that it cannot be read, or
-    PyAV is missing.
+    Raises:
+        SceneError: it is not a video, has no image, is truncated and unreadable, or PyAV is
+            missing.
     """
 
     def __init__(self, path: Path) -> None:
@@ -332,22 +357,22 @@ class TimedVideo:
         self.height, self.width = self.read(0).shape[:2]
 
     def _scan(self) -> Iterator[tuple[int, bool]]:
-        """The time stamp of each whole picture that is to be shown, and if it is a keyframe."""
+        """Yield the time stamp of each displayed, complete image, and whether it is a keyframe."""
         try:
             for packet in self._container.demux(self._stream):
                 if packet.pts is not None and not (packet.is_corrupt or packet.is_discard):
                     yield packet.pts, packet.is_keyframe
         except self._errors:
-            return  # What is there is used; _promised says that there was more.
+            return  # Use the images so far; _promised reveals that some are missing.
 
     def _decode(self) -> Iterator[Any]:
-        """The pictures from where the file was wound to; a packet that is cut off has none."""
+        """Yield the images from the current position; truncated packets are skipped."""
         for packet in self._container.demux(self._stream):
             if not packet.is_corrupt:
                 yield from packet.decode()
 
     def read(self, number: int) -> Picture:
-        """A picture (H, W, 3), red, green, blue; SceneError: there is none, or it is damaged."""
+        """Return an image (H, W, 3), red, green, blue; SceneError if it is missing or damaged."""
         if not 0 <= number < len(self._stamps):
             cut = "is cut short: it " if self._promised > len(self._stamps) else ""
             raise SceneError(f"{self._path}: {cut}has pictures 0 to {len(self._stamps) - 1} only")
@@ -356,7 +381,7 @@ class TimedVideo:
         previous = int(self._stamps[number - 1]) if number else None
         follows = self._last is not None and (self._last == previous or key <= self._last < wanted)
         try:
-            # From the start where the file's keyframes are not what it says.
+            # Retry from the start, in case the file's keyframe flags are wrong.
             for start in ((None,) if follows else ()) + (key, int(self._stamps[0])):
                 if start is not None:
                     self._container.seek(start, stream=self._stream)

@@ -1,7 +1,6 @@
-"""Where cameras' pictures come from: folders, videos, live cameras; and pictures of one moment.
+"""Image sources of cameras: folders, videos and live cameras, specified in `sources.yaml`.
 
-What is wrong with one picture costs only that picture, and is said in `problems`. Pictures of
-several cameras are grouped by their time stamps. `sources.yaml` says where the pictures are.
+A problem with one image costs only that image, and is reported in `problems`.
 """
 
 import abc
@@ -25,9 +24,9 @@ from drake_pose.camera.models import Camera, check_number
 from drake_pose.camera.picture_files import (
     VideoPictures,
     find_pictures,
-    mask_of_picture,
+    read_binary_mask,
     read_picture,
-    read_two_colours,
+    threshold_mask,
 )
 from drake_pose.csv_files import read_csv
 from drake_pose.errors import CameraError, SceneError, SettingsError, listed
@@ -40,20 +39,22 @@ Clock = Callable[[], float]
 
 @dataclass(frozen=True)
 class SourceSpecification:
-    """Where a camera's pictures come from; plain values, so that another machine may open it.
+    """Source of a camera's images; plain values, so that another machine can open it.
 
     Args:
-        kind: folder: of pictures `<frame>.png` or `.jpg`, perhaps with a `timestamps.csv` (frame,
+        camera: name of the camera.
+        kind: folder: images `<frame>.png` or `.jpg`, optionally with a `timestamps.csv` (frame,
             time [s]); video: a file that OpenCV reads; device: a live camera.
-        location: the folder's or file's path; a device's number or address.
-        width, height: of the pictures that the camera is calibrated for [pixel].
-        rate_hz: pictures a second. A folder without time stamps needs it; a video's own is used
-            where not given; a live camera's pictures bear the time at which they come.
-        background: a folder of pictures of the empty room; None: the source delivers masks.
-        offset: is added to time stamps [s], where cameras' clocks differ.
-        beside: other cameras' folders whose pictures of the same name were taken at the same time.
+        location: path of the folder or file; number or address of a device.
+        width, height: size of the images for which the camera is calibrated [pixel].
+        rate_hz: images per second. A folder without time stamps needs it; a video's own rate is the
+            default; images of a device have the time of their arrival.
+        background: folder of images of the empty room; None: the source provides masks.
+        offset: added to time stamps [s], if the cameras' clocks differ.
+        beside: folders of other cameras whose images with the same name have the same time.
 
-    Raises SettingsError: an unknown kind, a size or a rate that cannot be.
+    Raises:
+        SettingsError: an unknown kind, or an invalid size or rate.
     """
 
     camera: str
@@ -71,26 +72,34 @@ class SourceSpecification:
         if self.kind not in ("folder", "video", "device"):
             raise SettingsError(f"{where}: kind must be folder, video, device, not {self.kind!r}")
         if self.width < 1 or self.height < 1:
-            raise SettingsError(f"{where}: pictures of {self.width} x {self.height} cannot be")
+            raise SettingsError(f"{where}: invalid picture size {self.width} x {self.height}")
         if self.rate_hz is not None and not (math.isfinite(self.rate_hz) and self.rate_hz > 0):
             raise SettingsError(f"{where}: rate_hz must be a positive number, not {self.rate_hz}")
 
     @property
     def live(self) -> bool:
-        """Whether pictures come by themselves, and are gone where nobody takes them."""
+        """Whether images arrive by themselves and are lost if they are not read."""
         return self.kind == "device"
 
     @property
     def gives_masks(self) -> bool:
-        """Whether the source delivers masks of the person instead of pictures."""
+        """Whether the source provides masks of the person instead of images."""
         return self.background is None
 
-    def seen_in(self, picture: Picture, where: str) -> Picture | Mask:
-        """What the source delivers in a picture; SceneError: it should be a mask and is none."""
-        return mask_of_picture(picture, where, SceneError) if self.gives_masks else picture
+    def convert(self, picture: Picture, where: str) -> Picture | Mask:
+        """Return an image, or its mask if the source provides masks.
 
-    def wrong_size(self, picture: Picture | Mask) -> str:
-        """What is wrong with a picture's size; "" where it is the calibrated one."""
+        Args:
+            picture: (H, W, 3) image.
+            where: start of the error message.
+
+        Raises:
+            SceneError: the image should be a mask and is not.
+        """
+        return threshold_mask(picture, where, SceneError) if self.gives_masks else picture
+
+    def size_problem(self, picture: Picture | Mask) -> str:
+        """Return a message about an image's size; "" if it is the calibrated one."""
         height, width = picture.shape[:2]
         if (width, height) == (self.width, self.height):
             return ""
@@ -102,7 +111,7 @@ class SourceSpecification:
 
 @dataclass(frozen=True, eq=False)
 class TimedPicture:
-    """A picture (H, W, 3) red, green, blue, or a mask (H, W), and its time stamp [s]."""
+    """An image (H, W, 3) red, green, blue, or a mask (H, W), with its time stamp [s] and frame."""
 
     time: float
     frame: str
@@ -110,11 +119,11 @@ class TimedPicture:
 
 
 class FrameSource(abc.ABC):
-    """One camera's pictures, in the order of their time stamps.
+    """Images of one camera, in the order of their time stamps.
 
     Attributes:
-        problems: what was wrong so far, each with the camera's name; a reader may empty the list.
-        dropped: how many pictures were lost for that.
+        problems: problems so far, each with the camera's name; the caller may clear the list.
+        dropped: number of images lost to problems.
     """
 
     def __init__(self, specification: SourceSpecification) -> None:
@@ -126,25 +135,25 @@ class FrameSource(abc.ABC):
     @property
     @abc.abstractmethod
     def ended(self) -> bool:
-        """Whether no picture will come any more."""
+        """Whether no more images will come."""
 
     @property
     def rate_hz(self) -> float | None:
-        """About how many pictures come a second; None where nobody knows."""
+        """Approximate images per second; None if unknown."""
         return self.specification.rate_hz
 
     @abc.abstractmethod
     def close(self) -> None:
-        """Lets go of the file or camera; may be called twice."""
+        """Release the file or camera; may be called twice."""
 
     @abc.abstractmethod
     def _read(self) -> TimedPicture | None:
-        """The next picture, whatever its time stamp."""
+        """Return the next image, whatever its time stamp."""
 
     def read(self) -> TimedPicture | None:
-        """The next picture, a live camera's newest; None: none now, or none any more (`ended`).
+        """Return the next image, the latest one of a live camera; None if there is none (yet).
 
-        A picture whose time stamp does not lie after the last one's is dropped.
+        An image whose time stamp does not exceed the previous one's is dropped.
         """
         while (one := self._read()) is not None:
             if self._last is None or one.time > self._last.time:
@@ -156,24 +165,25 @@ class FrameSource(abc.ABC):
         return None
 
     def drop(self, reason: str, count: int = 1) -> None:
-        """Notes that pictures were lost."""
+        """Record that images were lost."""
         self.dropped += count
         self.report(f"{reason}; it is left out")
 
     def report(self, problem: str) -> None:
-        """Notes a problem."""
+        """Record a problem."""
         self.problems.append(f"camera '{self.specification.camera}': {problem}")
 
 
 class DeviceSource(FrameSource):
-    """A live camera: its newest picture, with the time at which it came by the clock [s].
+    """A live camera: its latest image, with its time of arrival by the clock [s].
 
-    A slow reader never sees old pictures: those that were not read in time are gone. A camera that
-    cannot be opened or fails is reported once and opened again, after growing pauses.
+    Images that are not read in time are lost. A camera that cannot be opened or fails is reported
+    once and reopened repeatedly, with growing pauses.
 
     Args:
-        pauses: before it is opened again after a failure, at first and at most; each is twice as
-            long as the one before [s].
+        specification: the source.
+        clock: returns the time [s].
+        pauses: initial and maximum pause before reopening [s]; each pause doubles the previous one.
     """
 
     def __init__(
@@ -194,19 +204,19 @@ class DeviceSource(FrameSource):
 
     @property
     def ended(self) -> bool:
-        """Whether it was closed, or gives pictures of a wrong size."""
+        """Whether it was closed, or provides images of a wrong size."""
         return self._stop.is_set()
 
     def close(self) -> None:
-        """Ends the thread, which lets go of the camera."""
+        """Stop the thread, which releases the camera."""
         self._stop.set()
-        self._thread.join(2.0)  # [s]; OpenCV may hang on a network camera.
+        self._thread.join(2.0)  # Timeout [s], because OpenCV may hang on a network camera.
 
     def _read(self) -> TimedPicture | None:
         return self._newest.pop() if self._newest else None
 
     def _run(self) -> None:
-        """Reads until closed; opens the camera again and again."""
+        """Read until closed; reopen the camera after failures."""
         (first, longest), count = self._pauses, 0
         pause = first
         while not self.ended:
@@ -227,7 +237,7 @@ class DeviceSource(FrameSource):
             pause = min(2.0 * pause, longest)
 
     def _open(self) -> cv2.VideoCapture | None:
-        """The camera, asked for pictures of the calibrated size."""
+        """Return the open camera, set to the calibrated image size; None on failure."""
         given = self.specification
         by_number = given.location.isdigit()
         with suppress(cv2.error):
@@ -243,7 +253,7 @@ class DeviceSource(FrameSource):
         return None
 
     def _keep_newest(self, capture: cv2.VideoCapture, count: int) -> int:
-        """Reads until the camera fails or is not wanted; the number of pictures in all."""
+        """Read until the camera fails or is closed; return the total number of images."""
         while not self.ended:
             found, picture = False, None
             with suppress(cv2.error):
@@ -252,7 +262,7 @@ class DeviceSource(FrameSource):
                 return count
             time = self._clock() + self.specification.offset
             rgb = np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB), dtype=np.uint8)
-            if wrong := self.specification.wrong_size(rgb):
+            if wrong := self.specification.size_problem(rgb):
                 self.report(f"'{self.specification.location}' {wrong}")
                 self._stop.set()
                 return count
@@ -260,7 +270,7 @@ class DeviceSource(FrameSource):
                 self.report(f"'{self.specification.location}' answers again")
                 self._failed = False
             try:
-                seen = self.specification.seen_in(rgb, f"'{self.specification.location}'")
+                seen = self.specification.convert(rgb, f"'{self.specification.location}'")
             except SceneError as error:
                 self.report(str(error))
                 self._stop.set()
@@ -271,14 +281,16 @@ class DeviceSource(FrameSource):
 
 
 class RecordedSource(FrameSource):
-    """Pictures of a folder or a video, one of them read ahead, so that the end is known.
+    """Images of a folder or a video; one image is read ahead to detect the end.
 
-    A folder has pictures or masks `<frame>.png` or `.jpg`; their times are those of its
-    `timestamps.csv` (frame, time [s]). Without it the frames follow each other in the order of
-    their names at the given rate, and frames of the same name in the folders `beside` are of the
-    same time; a number in a name means nothing. A video's masks are white on the person.
+    A folder has images or masks `<frame>.png` or `.jpg`, with times in `timestamps.csv` (frame,
+    time [s]). Without that file frames follow each other in the order of their names at the given
+    rate, and equal names in the folders `beside` have the same time; numbers in names do not count.
+    Masks in a video are white on the person.
 
-    Raises SceneError: names the folder or file; no picture, or the first is of another size.
+    Raises:
+        SceneError: names the folder or file that has no image, or whose first image has another
+            size.
     """
 
     def __init__(self, specification: SourceSpecification) -> None:
@@ -296,16 +308,16 @@ class RecordedSource(FrameSource):
 
     @property
     def ended(self) -> bool:
-        """Whether all pictures were read."""
+        """Whether all images were read."""
         return self._ahead is None
 
     @property
     def rate_hz(self) -> float | None:
-        """The given rate, or that of the time stamps or of the video."""
+        """The given rate, or that of the time stamps or the video."""
         return self.specification.rate_hz or self._own_rate
 
     def close(self) -> None:
-        """Lets go of the file."""
+        """Release the file."""
         self._ahead = None
         self._pictures.close()
 
@@ -316,9 +328,9 @@ class RecordedSource(FrameSource):
         return taken
 
     def _advance(self) -> TimedPicture | None:
-        """The next picture of the calibrated size."""
+        """Return the next image of the calibrated size."""
         for path, one in self._pictures:
-            wrong = self.specification.wrong_size(one.picture)
+            wrong = self.specification.size_problem(one.picture)
             if not wrong:
                 return one
             if self._ahead is None:
@@ -327,11 +339,11 @@ class RecordedSource(FrameSource):
         return None
 
     def _of_folder(self) -> Generator[tuple[Path, TimedPicture]]:
-        """The pictures that can be read, and the file of each."""
+        """Yield the readable images of a folder, each with its file."""
         given, folder = self.specification, Path(self.specification.location)
         files = find_pictures(folder, given.camera)
         stamped = folder / TIME_STAMPS
-        times = read_time_stamps(stamped) if stamped.is_file() else _counted(given, files)
+        times = read_time_stamps(stamped) if stamped.is_file() else _times_from_rate(given, files)
         for what, where, frames in (
             ("picture", folder, [frame for frame in times if frame not in files]),
             ("time", stamped, [frame for frame in files if frame not in times]),
@@ -349,7 +361,7 @@ class RecordedSource(FrameSource):
             seen: Picture | Mask
             try:
                 if given.gives_masks:
-                    seen = read_two_colours(files[frame], SceneError, may_be_empty=True, lossy=True)
+                    seen = read_binary_mask(files[frame], SceneError, may_be_empty=True, lossy=True)
                 else:
                     seen = read_picture(files[frame], SceneError)
             except SceneError as error:
@@ -358,7 +370,7 @@ class RecordedSource(FrameSource):
             yield files[frame], TimedPicture(times[frame] + given.offset, frame, seen)
 
     def _of_video(self) -> Generator[tuple[Path, TimedPicture]]:
-        """The pictures of a video, each with the video's name."""
+        """Yield the images of a video, each with the video's path."""
         given, path = self.specification, Path(self.specification.location)
         try:
             video = VideoPictures(path)
@@ -376,15 +388,15 @@ class RecordedSource(FrameSource):
                 return
             time = video.time if given.rate_hz is None else k / given.rate_hz
             try:
-                seen = given.seen_in(picture, f"{path}: picture {k}")
+                seen = given.convert(picture, f"{path}: picture {k}")
             except SceneError as error:
                 self.drop(str(error))
                 continue
             yield path, TimedPicture(time + given.offset, f"{k:06d}", seen)
 
 
-def _counted(given: SourceSpecification, files: Mapping[str, Path]) -> dict[str, float]:
-    """The times of a folder's frames by their rate."""
+def _times_from_rate(given: SourceSpecification, files: Mapping[str, Path]) -> dict[str, float]:
+    """Return the times [s] of a folder's frames from their order and rate."""
     folder = Path(given.location)
     if given.rate_hz is None:
         raise SceneError(
@@ -409,7 +421,7 @@ def _counted(given: SourceSpecification, files: Mapping[str, Path]) -> dict[str,
 
 
 def read_time_stamps(path: Path) -> dict[str, float]:
-    """The times [s] by frame of a `timestamps.csv`; SceneError names the file and the line."""
+    """Return the times [s] by frame from a `timestamps.csv`; SceneError names the file and line."""
     header, rows = read_csv(path, SceneError)
     if not {"frame", "time"} <= set(header):
         raise SceneError(f"{path}: needs the columns frame and time [s] in its first line")
@@ -430,19 +442,19 @@ def read_time_stamps(path: Path) -> dict[str, float]:
 def load_sources(
     path: str | Path, cameras: Mapping[str, Camera] | None = None
 ) -> dict[str, SourceSpecification]:
-    """Reads where the pictures of all cameras come from, in the order of the calibration.
+    """Return the image sources of all cameras by name, in the order of the calibration.
 
     A camera's entry has `kind` (folder, video, device) and `location` (relative to the file; a
-    device's number or address), and either `masks: true`, where the source delivers masks, or
-    `background`, a folder of pictures of the empty room. It may have `rate_hz` and `offset` [s].
+    device's number or address), and either `masks: true`, if the source provides masks, or
+    `background`, a folder of images of the empty room. `rate_hz` and `offset` [s] are optional.
 
     Args:
-        path: a `sources.yaml`, or the folder that holds it.
-        cameras: the calibrated cameras; those of the `cameras.yaml` beside it where not given.
+        path: a `sources.yaml`, or its folder.
+        cameras: the calibrated cameras; None: those of the `cameras.yaml` in the same folder.
 
     Raises:
-        SceneError: names the file, the camera and the field.
-        CameraError: the camera file is wrong.
+        SceneError: names the file, the camera and the field at fault.
+        CameraError: the camera file is invalid.
     """
     path = Path(path)
     path = path / SOURCES if path.is_dir() else path
@@ -464,7 +476,7 @@ def load_sources(
             f"it out of {CAMERAS}"
         )
     found = {name: _read_entry(camera, entries[name], path) for name, camera in cameras.items()}
-    # Folders without time stamps share their frames' names with others of the same rate.
+    # Folders without time stamps, at the same rate, share one numbering of frames.
     counted = {
         name: one.rate_hz
         for name, one in found.items()
@@ -477,10 +489,11 @@ def load_sources(
 
 
 def open_source(specification: SourceSpecification, clock: Clock = time.monotonic) -> FrameSource:
-    """Opens a source; the clock gives the time stamps of a live camera's pictures [s].
+    """Open a source; the clock gives the time stamps of a live camera's images [s].
 
-    Raises SceneError: a folder or video that cannot be read, is empty, or whose pictures are not of
-    the calibrated size. A live camera that cannot be opened is tried again and again.
+    Raises:
+        SceneError: a folder or video is unreadable, empty, or has images of another size than the
+            calibrated one. A live camera does not raise; opening it is retried.
     """
     if specification.live:
         return DeviceSource(specification, clock)
@@ -488,9 +501,10 @@ def open_source(specification: SourceSpecification, clock: Clock = time.monotoni
 
 
 def load_background_pictures(specification: SourceSpecification) -> list[Picture]:
-    """The pictures (H, W, 3) of the empty room that a camera's specification names.
+    """Return the images (H, W, 3) of the empty room from a specification's folder.
 
-    Raises SceneError: there is none, or one cannot be read or is not of the calibrated size.
+    Raises:
+        SceneError: there is none, or one is unreadable or not of the calibrated size.
     """
     camera = specification.camera
     if specification.background is None:
@@ -504,13 +518,13 @@ def load_background_pictures(specification: SourceSpecification) -> list[Picture
     pictures = []
     for file in find_pictures(folder, camera).values():
         pictures.append(read_picture(file, SceneError))
-        if wrong := specification.wrong_size(pictures[-1]):
+        if wrong := specification.size_problem(pictures[-1]):
             raise SceneError(f"{file}: camera '{camera}' {wrong}")
     return pictures
 
 
 def _read_entry(camera: Camera, entry: Any, path: Path) -> SourceSpecification:
-    """The specification of one entry of a file."""
+    """Return the specification of one entry of a file."""
     where = f"{path}: camera '{camera.name}'"
     if not isinstance(entry, dict):
         raise SceneError(f"{where}: expected a mapping with kind, location and more")

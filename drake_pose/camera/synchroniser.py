@@ -1,4 +1,4 @@
-"""Groups the pictures of several cameras by their time stamps."""
+"""Group the images of several cameras by their time stamps."""
 
 import math
 from collections import deque
@@ -11,9 +11,9 @@ Item = TypeVar("Item")
 
 
 class SynchronisedFrames(NamedTuple, Generic[Item]):
-    """What the cameras saw at one moment: its earliest time stamp [s], and the items by camera.
+    """Synchronised frames: their earliest time stamp [s], and the items by camera.
 
-    A camera that saw nothing then is missing.
+    Cameras without an image at that time are missing.
     """
 
     time: float
@@ -21,10 +21,11 @@ class SynchronisedFrames(NamedTuple, Generic[Item]):
 
 
 class CameraChange(NamedTuple):
-    """A camera that is waited for no more, or again.
+    """A camera that stopped or returned.
 
-    Args:
-        time: its last, or its first, time stamp [s]; nan where it never gave a picture.
+    Attributes:
+        camera: name of the camera.
+        time: its last (stopped) or first (returned) time stamp [s]; nan if it never had an image.
         stopped: whether it stopped; else it returned.
     """
 
@@ -34,65 +35,73 @@ class CameraChange(NamedTuple):
 
 
 class Synchroniser(Generic[Item]):
-    """Groups the pictures of several cameras to moments.
+    """Groups the images of several cameras into synchronised frames.
 
-    A moment begins with the earliest picture not used yet; every other camera gives its earliest
-    one, if that is at most the tolerance later. A moment is complete when every camera has given
-    its picture or a later one. A camera that gives none is waited for a while; then it is left out
-    of this moment and waited for no more until it gives a picture again. A picture that comes after
-    its moment is dropped, and counted in `late` by camera.
+    A group starts with the earliest unused image; each other camera contributes its earliest image
+    if that is at most the tolerance later. A group is complete once each camera has provided its
+    image or a later one. A camera that provides none is awaited for the timeout, then left out of
+    the group, and not awaited again until it provides an image. An image that arrives after its
+    group is dropped, and counted in `late` by camera.
 
     Args:
-        tolerance: how far apart the pictures of one moment may be [s]; half of the time between two
-            frames where the cameras are triggered together.
-        patience: how long a moment waits for a camera [s], at least the tolerance.
+        cameras: names of the cameras.
+        tolerance: maximum time between images of one group [s]; half a period for cameras that are
+            triggered together.
+        timeout: timeout for a camera [s], at least the tolerance.
 
-    Raises SettingsError: no camera, one twice, or times that cannot be.
+    Raises:
+        SettingsError: no camera, a duplicate camera, or invalid times.
     """
 
-    def __init__(self, cameras: Iterable[str], tolerance: float, patience: float) -> None:
+    def __init__(self, cameras: Iterable[str], tolerance: float, timeout: float) -> None:
         self.cameras = tuple(cameras)
         if not self.cameras or len(set(self.cameras)) != len(self.cameras):
-            raise SettingsError(f"different cameras are synchronised, not {list(self.cameras)}")
+            raise SettingsError(f"expected different cameras, not {list(self.cameras)}")
         if not (math.isfinite(tolerance) and tolerance >= 0.0):
             raise SettingsError(f"the tolerance must be 0 s or more, not {tolerance}")
-        if not (math.isfinite(patience) and patience >= tolerance):
+        if not (math.isfinite(timeout) and timeout >= tolerance):
             raise SettingsError(
-                f"the patience must be the tolerance ({tolerance:g} s) or more, not {patience}"
+                f"the timeout must be at least the tolerance ({tolerance:g} s), not {timeout}"
             )
-        self.tolerance, self.patience = tolerance, patience
+        self.tolerance, self.timeout = tolerance, timeout
         self.late = dict.fromkeys(self.cameras, 0)
         self._queues = {name: deque[tuple[float, Item]]() for name in self.cameras}
         self._last_times: dict[str, float] = {}
         self._newest = -math.inf
-        self._moment_time = -math.inf
-        self._moment_cameras: set[str] = set()
-        self._left_out: set[str] = set()
+        self._group_time = -math.inf
+        self._group_cameras: set[str] = set()
+        self._ignored_cameras: set[str] = set()
         self._finished: set[str] = set()
         self._changes: list[CameraChange] = []
 
     @property
-    def left_out(self) -> tuple[str, ...]:
-        """The cameras that are not waited for now."""
-        return tuple(name for name in self.cameras if name in self._left_out)
+    def ignored_cameras(self) -> tuple[str, ...]:
+        """Cameras that are not awaited now."""
+        return tuple(name for name in self.cameras if name in self._ignored_cameras)
 
     def waiting(self, camera: str) -> int:
-        """How many of a camera's pictures wait for their moment."""
+        """Return the number of a camera's images that wait for their group."""
         return len(self._queues[camera])
 
     def add(self, camera: str, time: float, item: Item) -> bool:
-        """Takes a camera's next picture, of a time stamp [s]; whether it can be part of a moment.
+        """Add a camera's next image; return whether it can be part of a group.
 
-        Raises UnknownNameError: there is no such camera.
+        Args:
+            camera: name of the camera.
+            time: time stamp [s].
+            item: the image.
+
+        Raises:
+            UnknownNameError: there is no such camera.
         """
         if camera not in self._queues:
             raise UnknownNameError("camera", camera, self.cameras, "the synchroniser")
-        missed = time <= self._moment_time + self.tolerance and camera not in self._moment_cameras
-        if missed or time <= self._moment_time or time <= self._last_times.get(camera, -math.inf):
+        missed = time <= self._group_time + self.tolerance and camera not in self._group_cameras
+        if missed or time <= self._group_time or time <= self._last_times.get(camera, -math.inf):
             self.late[camera] += 1
             return False
-        if camera in self._left_out:
-            self._left_out.discard(camera)
+        if camera in self._ignored_cameras:
+            self._ignored_cameras.discard(camera)
             self._changes.append(CameraChange(camera, time, stopped=False))
         self._queues[camera].append((time, item))
         self._last_times[camera] = time
@@ -100,14 +109,14 @@ class Synchroniser(Generic[Item]):
         return True
 
     def finish(self, camera: str) -> None:
-        """Tells that a camera will give no more pictures, so that nobody waits for it."""
+        """Declare that a camera will provide no more images, so that it is not awaited."""
         self._finished.add(camera)
 
     def take(self, now: float | None = None) -> SynchronisedFrames[Item] | None:
-        """The next moment; None where there is none, or one that still waits for a camera.
+        """Return the next group; None if there is none, or a camera is still awaited.
 
         Args:
-            now: the time [s]; the newest time stamp where not given.
+            now: the time [s]; None: the latest time stamp.
         """
         heads = {name: queue[0][0] for name, queue in self._queues.items() if queue}
         if not heads:
@@ -116,12 +125,14 @@ class Synchroniser(Generic[Item]):
         awaited = [
             name
             for name in self.cameras
-            if name not in heads and name not in self._left_out and name not in self._finished
+            if name not in heads
+            and name not in self._ignored_cameras
+            and name not in self._finished
         ]
         if awaited:
-            if (self._newest if now is None else max(now, self._newest)) < begin + self.patience:
+            if (self._newest if now is None else max(now, self._newest)) < begin + self.timeout:
                 return None
-            self._left_out.update(awaited)
+            self._ignored_cameras.update(awaited)
             for name in awaited:
                 last = self._last_times.get(name, math.nan)
                 self._changes.append(CameraChange(name, last, stopped=True))
@@ -130,10 +141,10 @@ class Synchroniser(Generic[Item]):
             for name in self.cameras
             if name in heads and heads[name] <= begin + self.tolerance
         }
-        self._moment_time, self._moment_cameras = begin, set(items)
+        self._group_time, self._group_cameras = begin, set(items)
         return SynchronisedFrames(begin, items)
 
     def take_changes(self) -> list[CameraChange]:
-        """The cameras that stopped or returned since this was asked last."""
+        """Return the cameras that stopped or returned since the last call."""
         changes, self._changes = self._changes, []
         return changes

@@ -10,7 +10,7 @@ import numpy as np
 from drake_pose.arrays import Picture
 from drake_pose.camera.camera_files import CameraFile, load_camera_file
 from drake_pose.camera.episode import Episode
-from drake_pose.camera.episode_files import format_of, open_episode
+from drake_pose.camera.episode_files import open_episode, recording_format
 from drake_pose.camera.picture_files import (
     SUFFIXES,
     VIDEOS,
@@ -157,7 +157,7 @@ def open_source(path: Path, camera_file: Path | None = None, episode: int | None
         camera_file = path / CAMERA_FILE
     cameras = None if camera_file is None else load_camera_file(camera_file)
     try:
-        if episode is not None or format_of(path) in ("lerobot", "droid", "bag"):
+        if episode is not None or recording_format(path) in ("lerobot", "droid", "bag"):
             found = Source(path, episode=open_episode(path, episode=episode))
         else:
             found = _open_file(path) if path.is_file() else _open_folder(path)

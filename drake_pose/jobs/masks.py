@@ -19,9 +19,9 @@ from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.camera.picture_files import (
     SUFFIXES,
     find_pictures,
-    mask_of_picture,
+    read_binary_mask,
     read_picture,
-    read_two_colours,
+    threshold_mask,
 )
 from drake_pose.errors import (
     CameraError,
@@ -324,12 +324,12 @@ def _read_given(source: Source, settings: MaskSettings) -> Iterator[FoundMask]:
         yield FoundMask(camera, frame, where, mask, warnings=warnings)
     for camera, files in source.pictures.items():
         for frame, path in files.items():
-            mask = read_two_colours(path, MaskError, may_be_empty=True, lossy=True)
+            mask = read_binary_mask(path, MaskError, may_be_empty=True, lossy=True)
             source.check_size(camera, mask.shape, str(path))
             yield FoundMask(camera, frame, str(path), mask)
     for camera in (name for name in source.names if name not in source.pictures):
         for frame, where, picture in source.read(camera):
-            yield FoundMask(camera, frame, where, mask_of_picture(picture, where, MaskError))
+            yield FoundMask(camera, frame, where, threshold_mask(picture, where, MaskError))
 
 
 def _by_box(

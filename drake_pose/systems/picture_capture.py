@@ -108,7 +108,7 @@ class PictureCapture(PortedSystem):
         if tolerance is None:
             tolerance = (0.9 if devices else 0.5) * self.period
         self._synchroniser: Synchroniser[TimedPicture] = Synchroniser(
-            self._sources, tolerance, patience=max(4.0 * self.period, tolerance)
+            self._sources, tolerance, timeout=max(4.0 * self.period, tolerance)
         )
         self._clock, self._opening = clock, opening
         self._since: float | None = None

@@ -130,7 +130,7 @@ def test_a_camera_on_a_hand_and_two_publishers_of_joints(tmp_path, kind):
     order = [*range(COUNT), 3, 3, 11, 0, 1]
     assert [number_of(side.read(k)) - 100 for k in order] == order
     np.testing.assert_array_equal([hand.recorded(k) for k in order], [numbered(k) for k in order])
-    straight = cv2.undistort(numbered(5), K, np.array(PLUMB), None, hand.lens.straight_matrix)
+    straight = cv2.undistort(numbered(5), K, np.array(PLUMB), None, hand.lens.undistorted_matrix)
     np.testing.assert_array_equal(hand.read(5), straight)
     assert hand.link == "hand"
     np.testing.assert_allclose(hand.camera.X_WC, pose(1) @ pose(2), rtol=0, atol=1e-9)

@@ -104,9 +104,9 @@ def test_points_land_where_opencv_projects_them(tmp_path, text, name, placed, co
     pose = (RVEC, T) if placed else (np.zeros(3), np.zeros(3))
     points = POINTS if placed else POINTS + np.array([0, 0, 3])
     uv = cv2.projectPoints(points, *pose, K, lens.distortion)[0]
-    straight = cv2.undistortPoints(uv, K, lens.distortion, P=lens.straight_matrix)
+    straight = cv2.undistortPoints(uv, K, lens.distortion, P=lens.undistorted_matrix)
     np.testing.assert_allclose(camera.project(points)[0], straight[:, 0], atol=0.01)
-    exact = cv2.projectPoints(points, *pose, lens.straight_matrix, None)[0].reshape(-1, 2)
+    exact = cv2.projectPoints(points, *pose, lens.undistorted_matrix, None)[0].reshape(-1, 2)
     np.testing.assert_allclose(camera.project(points)[0], exact, atol=1e-9)
 
 
@@ -117,7 +117,7 @@ def test_fisheyes_are_undistorted_as_opencv_does(tmp_path):
         assert lens.fisheye
         picture = np.random.default_rng(1).integers(0, 255, (*SIZE[::-1], 3), dtype=np.uint8)
         picture = cv2.GaussianBlur(picture, (0, 0), 3)
-        expected = cv2.fisheye.undistortImage(picture, K, FISHEYE, Knew=lens.straight_matrix)
+        expected = cv2.fisheye.undistortImage(picture, K, FISHEYE, Knew=lens.undistorted_matrix)
         off = np.abs(lens.undistort(picture).astype(int) - expected)
         assert np.percentile(off, 99) <= 1
 
@@ -185,11 +185,11 @@ def test_pictures_are_undistorted_and_their_cameras_written(tmp_path):
     assert set(written) == {("left", "7"), ("right", "7")}
     lens, cameras = load_camera_file(file, distorted=True).lenses["left"], tmp_path / "out"
     own = cv2.imread(str(written["left", "7"]))
-    expected = cv2.undistort(picture, K, RADIAL, None, lens.straight_matrix)
+    expected = cv2.undistort(picture, K, RADIAL, None, lens.undistorted_matrix)
     assert np.percentile(np.abs(own.astype(int) - expected), 99) <= 1
     np.testing.assert_array_equal(cv2.imread(str(written["right", "7"])), picture)
     found = load_cameras(cameras / "cameras.yaml")
-    np.testing.assert_allclose(found["left"].focal_x, lens.straight_matrix[0, 0])
+    np.testing.assert_allclose(found["left"].focal_x, lens.undistorted_matrix[0, 0])
     np.testing.assert_allclose(found["left"].X_WC, found["right"].X_WC)
     # What a lens saw has no black rim.
     white = np.full((*SIZE[::-1], 3), 255, np.uint8)

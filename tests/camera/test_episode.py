@@ -190,9 +190,9 @@ def test_rows_of_frames_are_found_by_name_or_number():
     rows = JointLog(("x",), None, np.array([[1.0], [2.0], [3.0]]), ("7", "last", "12.0"))
     found = rows.of_frames(["0012", "007", "last", "8"])
     np.testing.assert_array_equal(found[:, 0], [3.0, 1.0, 2.0, np.nan])
-    with pytest.raises(SceneError, match="frames and have no times"):
+    with pytest.raises(SceneError, match="frames, but no times"):
         rows.at(TIMES)
-    with pytest.raises(SceneError, match="are of no frames"):
+    with pytest.raises(SceneError, match="but no frames"):
         log(TIMES).of_frames(["7"])
 
 

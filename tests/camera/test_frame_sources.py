@@ -322,7 +322,11 @@ class TestSourcesFile:
 
 @pytest.mark.parametrize(
     ("more", "why"),
-    [({"kind": "film"}, "kind"), ({"rate_hz": 0.0}, "rate_hz"), ({"width": 0}, "be")],
+    [
+        ({"kind": "film"}, "kind"),
+        ({"rate_hz": 0.0}, "rate_hz"),
+        ({"width": 0}, "invalid picture size"),
+    ],
 )
 def test_specification_checks_itself(more, why):
     with pytest.raises(SettingsError, match=why):

@@ -67,7 +67,7 @@ def test_camera_that_stops_is_waited_for_left_out_and_taken_back():
         assert synchroniser.take() is None
     assert synchroniser.take(now=0.36).time == pytest.approx(0.1)
     assert synchroniser.take_changes() == [CameraChange("b", 0.01, stopped=True)]
-    assert synchroniser.left_out == ("b",)
+    assert synchroniser.ignored_cameras == ("b",)
     # Nobody waits for it any more, and nothing is said twice.
     assert dict(synchroniser.take().items) == {"a": "a2"}
     assert dict(synchroniser.take().items) == {"a": "a3"}
@@ -76,7 +76,7 @@ def test_camera_that_stops_is_waited_for_left_out_and_taken_back():
     # Its picture of a moment that is over is too late, and no return.
     assert not synchroniser.add("b", 0.31, "b3")
     assert synchroniser.late == {"a": 0, "b": 1}
-    assert synchroniser.left_out == ("b",)
+    assert synchroniser.ignored_cameras == ("b",)
     assert synchroniser.add("b", 0.41, "b4")
     assert synchroniser.take_changes() == [CameraChange("b", 0.41, stopped=False)]
     assert synchroniser.take() is None, "a is waited for"

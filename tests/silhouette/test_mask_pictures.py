@@ -9,7 +9,7 @@ import pytest
 from matplotlib.path import Path as MplPath
 from pycocotools import mask as coco
 
-from drake_pose.camera.picture_files import mask_of_picture, read_picture, read_two_colours
+from drake_pose.camera.picture_files import read_binary_mask, read_picture, threshold_mask
 from drake_pose.errors import MaskError, SceneError
 from drake_pose.silhouette.mask_pictures import (
     decode_run_lengths,
@@ -45,14 +45,14 @@ def test_a_photograph_is_no_mask_that_compression_blurred(classes, tmp_path):
     for k, picture in enumerate((blurred, grey)):
         cv2.imwrite(str(tmp_path / f"{k}.jpg"), picture)
     for found in (
-        mask_of_picture(np.dstack([blurred] * 3), "a.mp4", MaskError),
-        read_two_colours(tmp_path / "0.jpg", MaskError, lossy=True),
+        threshold_mask(np.dstack([blurred] * 3), "a.mp4", MaskError),
+        read_binary_mask(tmp_path / "0.jpg", MaskError, lossy=True),
     ):
         assert (found == (classes > 0)).mean() > 0.99
-    with pytest.raises(MaskError, match=r"a\.mp4.*no mask but a picture"):
-        mask_of_picture(grey, "a.mp4", MaskError)
-    with pytest.raises(MaskError, match=r"1\.jpg.*no mask but a picture"):
-        read_two_colours(tmp_path / "1.jpg", MaskError, lossy=True)
+    with pytest.raises(MaskError, match=r"a\.mp4.*a picture and not a mask"):
+        threshold_mask(grey, "a.mp4", MaskError)
+    with pytest.raises(MaskError, match=r"1\.jpg.*a picture and not a mask"):
+        read_binary_mask(tmp_path / "1.jpg", MaskError, lossy=True)
 
 
 def star(rng, count=9):

@@ -14,7 +14,7 @@ from drake_pose.body import ParsedModel, PoseTree
 from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.camera.camera_files import load_camera_file
 from drake_pose.camera.episode import Episode, EpisodeCamera, JointLog
-from drake_pose.camera.episode_files import format_of, open_episode, with_intrinsics
+from drake_pose.camera.episode_files import add_calibration, open_episode, recording_format
 from drake_pose.camera.joint_map import map_joints, read_joint_map
 from drake_pose.camera.picture_files import frame_key
 from drake_pose.csv_files import read_csv, read_number
@@ -221,7 +221,7 @@ def is_episode(path: Path, settings: EpisodeSettings) -> bool:
     """Whether a path is one of pictures and joints, and no scene of masks."""
     if path.is_file() or settings.episode is not None:
         return True
-    return not (path / "masks").is_dir() and format_of(path) != ""
+    return not (path / "masks").is_dir() and recording_format(path) != ""
 
 
 def cameras_of(
@@ -245,7 +245,7 @@ def cameras_of(
     if camera_path is None and not file.is_file():
         return PlacedCameras(chosen, frozenset())
     given = load_camera_file(file, distorted=True)
-    chosen = [with_intrinsics(one, given, file) for one in chosen]
+    chosen = [add_calibration(one, given, file) for one in chosen]
     return PlacedCameras(chosen, frozenset(given.cameras) - {*given.unplaced, *given.links})
 
 

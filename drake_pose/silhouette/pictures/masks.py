@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from PIL import Image
 
-from drake_pose.camera.picture_files import read_two_colours
+from drake_pose.camera.picture_files import read_binary_mask
 from drake_pose.errors import MaskError
 
 
@@ -29,7 +29,7 @@ def read_mask(
     ``width`` and ``height`` [pixel], is empty or full, or has more than two values.
     """
     size = width, height
-    return read_two_colours(Path(path), MaskError, size, may_be_empty=may_be_empty)
+    return read_binary_mask(Path(path), MaskError, size, may_be_empty=may_be_empty)
 
 
 def write_mask(path: str | Path, mask: np.ndarray) -> None:

@@ -17,11 +17,11 @@ from drake_pose.camera.models import Camera, ParallelCamera
 from drake_pose.camera.picture_files import (
     VIDEOS,
     VideoPictures,
+    find_recorded_files,
     frame_number,
     in_order,
     natural_key,
     read_picture,
-    recorded_files,
 )
 from drake_pose.errors import SceneError, SettingsError, UnknownNameError
 from drake_pose.silhouette.pictures.masks import read_mask
@@ -411,7 +411,7 @@ def find_images(
     found: dict[tuple[str, str], Path] = {}
     known = {int(frame): frame for frame in frames if frame.isdecimal()}
     for camera in cameras:
-        files = recorded_files(folder, camera)
+        files = find_recorded_files(folder, camera)
         if isinstance(files, Path):
             numbers = range(VideoPictures(files).count)
             # No picture takes less than a byte. A recording that was not closed has no number.

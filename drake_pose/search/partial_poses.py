@@ -97,7 +97,7 @@ class SilhouetteBits:
         ones = [np.arange((count // WORD + 1) * WORD) < count for count in pixels]
         self.all_pixels = np.packbits(np.concatenate(ones), bitorder="little").view(np.uint64)
         if self.has_bands:
-            pixels += [int(view.band[-1, -1]) for view in self.bit_views]
+            pixels += [int(view.margin[-1, -1]) for view in self.bit_views]
         self.part_starts = np.concatenate([[0], np.cumsum([n // WORD + 1 for n in pixels])])
 
     def draw_node(

@@ -1,1 +1,1 @@
-"""Silhouettes: projected areas by the span kernel, Drake label images, masks and scenes."""
+"""Silhouettes: exact projected areas, masks, label images, scenes and segmentation of pictures."""

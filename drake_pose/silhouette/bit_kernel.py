@@ -1,8 +1,8 @@
-"""Bit masks of one surface at many poses: the span kernel's pixels, decided by its arithmetic.
+"""Bit masks of a surface's silhouettes at many poses, equal to the span kernel's masks.
 
-A silhouette's pixels of a span have consecutive numbers, so its prefix sums tell which run of bits
-a span sets, and a mask of a body of 20,000 pixels is 300 words. Contour edges are looked for among
-the few that can be on the contour (CelledOutline).
+The pixels of a silhouette have consecutive numbers, row after row. Prefix sums along the rows give
+the run of bits that a span sets, so a mask of 20,000 pixels takes about 300 words. Contour edges
+are searched among the few candidates of a cell of viewing directions (``CelledOutline``).
 """
 
 import math
@@ -25,68 +25,77 @@ from drake_pose.silhouette.span_kernel import (
 )
 
 WORD = 64
+"""Number of bits of a word."""
+
 NEAREST_STRIDE = 32768
-"""Of rows in BitView.nearest."""
+"""Row stride of the pixel numbers in ``BitView.nearest``."""
 
 
 class BitView(NamedTuple):
-    """One silhouette and the band around it, cropped to a window of the picture.
+    """A silhouette and the margin around it, cropped to a window of the image.
 
-    camera: (8,) kernel parameters; X_CW: (4, 4); window: (4,) int64 first row, first column,
-    height h and width w; inside: (h, w + 1) int32 the number of silhouette pixels before each
-    pixel, row after row; band: the same of the band's pixels, (0, 0) where there is no band;
-    nearest: (h, w) int32 row * NEAREST_STRIDE + column [picture] of about the nearest pixel of the
-    picture outside the silhouette for each silhouette pixel, -1 where there is none; sums:
-    (h + 1, w + 1) int32 the number of silhouette pixels above and left of each corner.
+    Attributes:
+        camera: (8,) kernel parameters.
+        X_CW: (4, 4) pose of the world in the camera.
+        window: (4,) int64 first row, first column, height h and width w.
+        inside: (h, w + 1) int32 number of silhouette pixels before each pixel, row after row.
+        margin: (h, w + 1) int32 the same for the pixels of the margin; (0, 0) without a margin.
+        nearest: (h, w) int32 for each silhouette pixel, about the nearest pixel outside the
+            silhouette, as row * NEAREST_STRIDE + column in the image; -1 where there is none.
+        sums: (h + 1, w + 1) int32 number of silhouette pixels above and left of each corner.
     """
 
     camera: np.ndarray
     X_CW: np.ndarray
     window: np.ndarray
     inside: np.ndarray
-    band: np.ndarray
+    margin: np.ndarray
     nearest: np.ndarray
     sums: np.ndarray
 
 
 def make_bit_view(
-    mask: np.ndarray, camera_parameters: np.ndarray, X_CW: np.ndarray, band: int
+    mask: np.ndarray, camera_parameters: np.ndarray, X_CW: np.ndarray, width: int
 ) -> BitView:
-    """The bits of a silhouette (H, W) bool that is not empty; X_CW (4, 4).
+    """Return the bit view of a silhouette.
 
-    ``band`` is the band's width [pixel]; 0: none, and only bodies that stay inside the silhouette
-    can be told apart by their bits.
+    Args:
+        mask: (H, W) bool, not empty.
+        camera_parameters: (8,) kernel parameters.
+        X_CW: (4, 4) pose of the world in the camera.
+        width: width of the margin around the silhouette [pixel]; 0: no margin, and only bodies that
+            stay inside the silhouette are distinguished by their bits.
     """
     rows = np.flatnonzero(mask.any(axis=1))
     columns = np.flatnonzero(mask[rows[0] : rows[-1] + 1].any(axis=0))
-    margin = max(1, band)
-    top, left = max(0, rows[0] - margin), max(0, columns[0] - margin)
-    bottom = min(mask.shape[0], rows[-1] + 1 + margin)
-    right = min(mask.shape[1], columns[-1] + 1 + margin)
+    padding = max(1, width)
+    top, left = max(0, rows[0] - padding), max(0, columns[0] - padding)
+    bottom = min(mask.shape[0], rows[-1] + 1 + padding)
+    right = min(mask.shape[1], columns[-1] + 1 + padding)
     pixels = np.ascontiguousarray(mask[top:bottom, left:right]).view(np.uint8)
-    around = np.zeros((0, 0), dtype=np.int32)
-    if band:
-        square = np.ones((2 * band + 1, 2 * band + 1), dtype=np.uint8)
-        around = _number_pixels(cv2.dilate(pixels, square) - pixels)
+    margin = np.zeros((0, 0), dtype=np.int32)
+    if width:
+        square = np.ones((2 * width + 1, 2 * width + 1), dtype=np.uint8)
+        margin = _number_pixels(cv2.dilate(pixels, square) - pixels)
     return BitView(
         camera=camera_parameters,
         X_CW=np.ascontiguousarray(X_CW, dtype=np.float64),
         window=np.array([top, left, *pixels.shape], dtype=np.int64),
         inside=_number_pixels(pixels),
-        band=around,
+        margin=margin,
         nearest=_find_nearest(pixels, int(top), int(left)),
         sums=cv2.integral(pixels),
     )
 
 
 def _number_pixels(mask: np.ndarray) -> np.ndarray:
-    """(h, w + 1) int32: how many pixels of a mask (h, w) uint8 come before each."""
+    """Return (h, w + 1) int32, the number of set pixels of a mask (h, w) uint8 before each."""
     ends = np.cumsum(mask, dtype=np.int32).reshape(mask.shape)
     return np.concatenate([ends[:, :1] - mask[:, :1], ends], axis=1)
 
 
 def _find_nearest(mask: np.ndarray, top: int, left: int) -> np.ndarray:
-    """BitView.nearest of a mask (h, w) uint8."""
+    """Return ``BitView.nearest`` of a mask (h, w) uint8 whose window begins at (top, left)."""
     if mask.all():
         return np.full(mask.shape, -1, dtype=np.int32)
     _, labels = cv2.distanceTransformWithLabels(
@@ -107,25 +116,26 @@ def draw_bits(
     pairs: np.ndarray,
     limit: float,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Draws a surface at many poses as bits.
+    """Draw a surface at many poses as bits; skip poses that lie too far outside the silhouette.
 
     Args:
-        celled: the surface; its band of skin, if it has one, is bent as at the pair's sample.
-        X_WP: (g, 4, 4) poses of the parent.
+        celled: the surface; its skin band, if any, is deformed to the pair's sample.
+        view: the silhouette.
+        X_WP: (g, 4, 4) poses of the parent in the world.
         X_PN: (n, 4, 4) poses of the node in its parent at its samples.
-        pairs: (m, 2) int32 parent pose and sample.
-        limit: the area that may lie outside the silhouette [pixel].
+        pairs: (m, 2) int32 indices of a parent pose and a sample.
+        limit: largest area outside the silhouette [pixel].
 
     Returns:
-        kept (m,) bool: the pairs that stay inside the limit. The rest is about them alone, in the
-        order of the pairs: areas (m', 3) int32 inside the silhouette, in the band, and outside of
-        both; runs (m', 2, 3) int64 for the silhouette and the band the first word, the number of
-        words, and where they begin in words; words (n,) uint64.
+        kept (m,) bool, whether the pair is within the limit. The other arrays are about the m' kept
+            pairs, in order: areas (m', 3) int32 inside the silhouette, in the margin, and outside
+            both [pixel]; runs (m', 2, 3) int64, for silhouette and margin, the first word, the
+            number of words, and their start in words; words (n,) uint64.
     """
     camera, packed, e = view.camera, celled.packed, celled.edges.shape[0] + 1
     rows, crossings = make_rows(packed, camera)
-    # Of contour edges their number, weight, first row crossed and the row after the last, and of
-    # those that cross a row the upper and the lower end.
+    # Edge index, weight, first row and row after the last of contour edges; upper and lower end of
+    # the edges that cross a row.
     scratch = (np.empty((4, e), dtype=np.int32), np.empty((e, 4)))
     bends, part = celled.bands.shape[0] > 0, np.array([[1, 0, 0, 0]])
     X_WN, X_CN = np.zeros((4, 4)), np.empty((2, 3, 4))
@@ -134,8 +144,8 @@ def draw_bits(
     areas = np.empty((pairs.shape[0], 3), dtype=np.int32)
     runs = np.zeros((pairs.shape[0], 2, 3), dtype=np.int64)
     inside_size = view.inside[-1, -1] // WORD + 1
-    band_size = view.band[-1, -1] // WORD + 1 if view.band.shape[0] else 0
-    words = np.empty(16 * (inside_size + band_size) + pairs.shape[0], dtype=np.uint64)
+    margin_size = view.margin[-1, -1] // WORD + 1 if view.margin.shape[0] else 0
+    words = np.empty(16 * (inside_size + margin_size) + pairs.shape[0], dtype=np.uint64)
     spans = np.empty((4 * int(camera[7]) + int(camera[6]), 3), dtype=np.int32)
     found, used = 0, 0
     for i in range(pairs.shape[0]):
@@ -155,11 +165,11 @@ def draw_bits(
         count, spans = _gather_spans(view, crossings, rows, limit, spans, areas[found])
         if count < 0:
             continue
-        if words.shape[0] < used + inside_size + band_size:
-            words = grow_rows(words, used, 2 * words.shape[0] + inside_size + band_size)
+        if words.shape[0] < used + inside_size + margin_size:
+            words = grow_rows(words, used, 2 * words.shape[0] + inside_size + margin_size)
         used = write_runs(view.inside, spans, count, words, used, runs[found, 0])
-        if band_size:
-            used = write_runs(view.band, spans, count, words, used, runs[found, 1])
+        if margin_size:
+            used = write_runs(view.margin, spans, count, words, used, runs[found, 1])
         kept[i] = True
         found += 1
     return kept, areas[:found].copy(), runs[:found].copy(), words[:used].copy()
@@ -174,13 +184,25 @@ def _walk_cell(
     rows: Rows,
     scratch: tuple[np.ndarray, np.ndarray],
 ) -> bool:
-    """Walks the contour edges of the cell exactly as the span kernel does."""
+    """Walk the contour edges of the viewing direction's cell, with the span kernel's arithmetic.
+
+    Args:
+        celled: the surface.
+        X: (3, 4) pose of the surface in the camera.
+        camera: (8,) kernel parameters.
+        crossings: (height, capacity) output.
+        rows: scratch of the span kernel.
+        scratch: integer and floating-point scratch for edges.
+
+    Returns:
+        Whether the cells are valid at this pose; if not, nothing is written.
+    """
     counts, reach = rows.counts, rows.reach
     if celled.edges.shape[0] == 0:
         return True
     ball, parallel, cx, cy = celled.packed.balls[0], camera[0] == 1.0, camera[3], camera[4]
-    e0, e1, e2, share = viewpoint_in_node(X, camera)
-    d0, d1, d2 = e0 - share * ball[0], e1 - share * ball[1], e2 - share * ball[2]
+    e0, e1, e2, w = viewpoint_in_node(X, camera)
+    d0, d1, d2 = e0 - w * ball[0], e1 - w * ball[1], e2 - w * ball[2]
     c0, c1, c2, c3 = X[2, 0], X[2, 1], X[2, 2], X[2, 3]
     if not parallel:
         distance = np.sqrt(d0 * d0 + d1 * d1 + d2 * d2)
@@ -195,19 +217,19 @@ def _walk_cell(
     b0, b1, b2, b3 = fy * X[1, 0], fy * X[1, 1], fy * X[1, 2], fy * X[1, 3]
     if parallel:
         a3, b3 = a3 + cx, b3 + cy
-    planes, edges, points, chosen = celled.planes, celled.edges, celled.points, celled.cell_edges
-    # Three passes without unforeseeable branches in the first two: a mispredicted branch costs as
-    # much as all the arithmetic of an edge.
+    planes, edges, points, listed = celled.planes, celled.edges, celled.points, celled.cell_edges
+    # The first two of three passes are free of unpredictable branches: a mispredicted branch costs
+    # as much as all the arithmetic of an edge.
     contour, weights = scratch[0][0], scratch[0][1]
     firsts, lasts, lines = scratch[0][2], scratch[0][3], scratch[1]
     number, crossing = 0, 0
     for k in range(begin, end):
-        e = chosen[k]
+        e = listed[k]
         t = edges[e, 2]
-        side = planes[t, 0] * e0 + planes[t, 1] * e1 + planes[t, 2] * e2 - planes[t, 3] * share
+        side = planes[t, 0] * e0 + planes[t, 1] * e1 + planes[t, 2] * e2 - planes[t, 3] * w
         weight = int(side > 0.0) - int(side < 0.0)
         t = edges[e, 3]
-        side = planes[t, 0] * e0 + planes[t, 1] * e1 + planes[t, 2] * e2 - planes[t, 3] * share
+        side = planes[t, 0] * e0 + planes[t, 1] * e1 + planes[t, 2] * e2 - planes[t, 3] * w
         weight += edges[e, 4] * (int(side > 0.0) - int(side < 0.0))
         contour[number], weights[number] = e, weight
         number += weight != 0
@@ -262,12 +284,23 @@ def _gather_spans(
     spans: np.ndarray,
     areas: np.ndarray,
 ) -> tuple[int, np.ndarray]:
-    """Reads the rows' spans and empties the rows."""
-    window, inside, band = view.window, view.inside, view.band
+    """Collect the spans of all rows inside the window, and empty the rows.
+
+    Args:
+        view: the silhouette.
+        crossings, rows: output of the span kernel.
+        limit: largest area outside the silhouette [pixel].
+        spans: (k, 3) output: row of the window, and columns [a, b); grown as needed.
+        areas: (3,) output: area inside the silhouette, in the margin, and outside both [pixel].
+
+    Returns:
+        The number of spans, or -1 if the limit is exceeded, and the spans.
+    """
+    window, inside, margin = view.window, view.inside, view.margin
     first_row, end_row = window[0], window[0] + window[2]
     first_column, width = window[1], window[3]
-    has_band = band.shape[0] > 0
-    covered, near, total, count = 0, 0, 0, 0
+    has_margin = margin.shape[0] > 0
+    covered, in_margin, total, count = 0, 0, 0, 0
     for row in range(rows.reach[0], rows.reach[1]):
         number = find_spans(row, crossings, rows.counts, rows.changes, rows.spans)
         if count + number > spans.shape[0]:
@@ -281,15 +314,15 @@ def _gather_spans(
             a, b = max(0, a - first_column), min(width, b - first_column)
             if a < b:
                 covered += inside[r, b] - inside[r, a]
-                if has_band:
-                    near += band[r, b] - band[r, a]
+                if has_margin:
+                    in_margin += margin[r, b] - margin[r, a]
                 spans[count, 0], spans[count, 1], spans[count, 2] = r, a, b
                 count += 1
         if total - covered > limit:
             for later in range(row + 1, rows.reach[1]):
                 rows.counts[later] = 0
             return -1, spans
-    areas[0], areas[1], areas[2] = covered, near, total - covered - near
+    areas[0], areas[1], areas[2] = covered, in_margin, total - covered - in_margin
     return count, spans
 
 
@@ -302,7 +335,16 @@ def write_runs(
     used: int,
     run: np.ndarray,
 ) -> int:
-    """Writes the bits of spans behind the words in use; returns how many words are then in use."""
+    """Write the bits of spans behind the used words; return the new number of used words.
+
+    Args:
+        numbers: (h, w + 1) pixel numbers, such as ``BitView.inside``.
+        spans: (k, 3) row, and columns [a, b).
+        count: number of spans.
+        words: (n,) uint64 output.
+        used: number of used words.
+        run: (3,) output: first word, number of words, and their start in ``words``.
+    """
     first, last, full = -1, -1, np.uint64(0xFFFFFFFFFFFFFFFF)
     for k in range(count):
         row = spans[k, 0]
@@ -338,17 +380,20 @@ def prune_by_balls(
     pairs: np.ndarray,
     limit: float,
 ) -> np.ndarray:
-    """Which pairs (m,) bool no ball inside the surface shows to lie outside by more than the limit.
+    """Return (m,) bool, whether no ball inside the surface proves that a pair exceeds the limit.
+
+    No pair within the limit is pruned.
 
     Args:
-        X_WP: (g, 4, 4) poses of the parent.
-        p_PB: (n, k, 3) places of k balls in the parent's frame at each sample of the node [m].
-        radii: (k,) of the balls [m].
-        pairs: (m, 2) int32 parent pose and sample.
-        limit: the area that may lie outside the silhouette [pixel]; no pair within it is lost.
+        view: the silhouette.
+        X_WP: (g, 4, 4) poses of the parent in the world.
+        p_PB: (n, k, 3) centres of k balls in the parent's frame at each sample of the node [m].
+        radii: (k,) radii of the balls [m].
+        pairs: (m, 2) int32 indices of a parent pose and a sample.
+        limit: largest area outside the silhouette [pixel].
     """
     camera, window, X_CW = view.camera, view.window, view.X_CW
-    left = np.ones(pairs.shape[0], dtype=np.bool_)
+    kept = np.ones(pairs.shape[0], dtype=np.bool_)
     scale, parallel = min(camera[1], camera[2]), camera[0] == 1.0
     X_CP = np.empty((3, 4))
     group = -1
@@ -373,7 +418,7 @@ def prune_by_balls(
             if not (-0.5 < u < camera[6] - 0.5 and -0.5 < v < camera[7] - 0.5):
                 continue
             if limit < 1.0:
-                # A disc that leaves the silhouette: a pixel outside lies in it.
+                # The disc leaves the silhouette if it contains the nearest pixel outside.
                 row, column = round(v), round(u)
                 r, c = row - window[0], column - window[1]
                 if 0 <= r < window[2] and 0 <= c < window[3] and view.nearest[r, c] >= 0:
@@ -383,16 +428,16 @@ def prune_by_balls(
             else:
                 outside = _square_outside(view.sums, window, camera, u, v, 0.7071 * radius) > limit
             if outside:
-                left[i] = False
+                kept[i] = False
                 break
-    return left
+    return kept
 
 
 @compiled
 def _square_outside(
     sums: np.ndarray, window: np.ndarray, camera: np.ndarray, u: float, v: float, half: float
 ) -> int:
-    """Returns how many pixels of the picture under a square are not in the silhouette."""
+    """Return the number of image pixels in a square about (u, v) outside the silhouette."""
     a, b = max(0, int(np.ceil(u - half))), min(int(camera[6]), int(np.ceil(u + half)))
     c, d = max(0, int(np.ceil(v - half))), min(int(camera[7]), int(np.ceil(v + half)))
     if a >= b or c >= d:
@@ -409,12 +454,17 @@ def _square_outside(
 def draw_discs(
     view: BitView, X_WP: np.ndarray, p_PB: np.ndarray, radius: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Draws discs that hold the picture of a ball (p_PB (3,), radius [m]) as the silhouette's bits.
+    """Draw discs that contain the image of a ball, as bits of the silhouette's pixels.
 
-    ``X_WP``: (g, 4, 4) poses of the frame that the ball is fixed in.
+    Args:
+        view: the silhouette.
+        X_WP: (g, 4, 4) poses of the frame P that the ball is fixed in.
+        p_PB: (3,) the ball's centre in frame P [m].
+        radius: the ball's radius [m].
 
     Returns:
-        runs (g, 3) int64 first word, number of words, where they begin in words; words (n,) uint64.
+        runs (g, 3) int64, the first word, the number of words, and their start in words; words (n,)
+        uint64.
     """
     camera, window = view.camera, view.window
     height, width = window[2], window[3]

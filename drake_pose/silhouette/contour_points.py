@@ -1,13 +1,14 @@
-"""The visible contour of a silhouette as points, and which edges can be on it, by direction.
+"""Points on the visible contour of a silhouette, and tables of possible contour edges by direction.
 
-Where the winding number along a row of a raster rises from zero or falls back to it, the row enters
-or leaves the union of all surfaces. A stretch of contour whose normal is nearer to a row is sampled
-by rows, else by columns. Points lie on the contour to rounding; sums over them times their lengths
-are sums along the contour.
+Contour points: where the winding number along a row of a raster rises from zero or falls back to
+zero, the row enters or leaves the union of all surfaces. Parts of the contour whose normals are
+nearer to a row's direction are sampled by rows, the others by columns. Points lie on the contour to
+rounding. Sums over points, weighted by their lengths, approximate integrals along the contour.
 
-Directions are divided into cells: squares on three faces of a cube, as a direction and its opposite
-have the same contour. An edge both of whose triangles turn clearly to one side at the middle of a
-cell is on the contour for no direction in it; some tenth of the edges is left.
+Tables: viewing directions are divided into square cells on three faces of a cube, because a
+direction and its opposite have the same contour. An edge is left out of a cell's table if both its
+triangles clearly face the same way at the cell's middle, so that it is on the contour for no
+direction in the cell. About a tenth of the edges remain.
 """
 
 import itertools
@@ -33,9 +34,12 @@ from drake_pose.silhouette.span_kernel import make_rows
 class Segments(NamedTuple):
     """Projected contour edges.
 
-    ends: (n, 4) u, v of their start and end [pixel]; depths: (n, 2) there [m]; ones for a parallel
-    camera; weights: (n,) int64 how the winding number changes across; nodes: (n,) int64; vertices:
-    (n, 2) int64 indices into the packed points.
+    Attributes:
+        ends: (n, 4) u, v of the start and u, v of the end [pixel].
+        depths: (n, 2) depths of both ends [m]; ones for a parallel camera.
+        weights: (n,) int64 change of the winding number across the edge.
+        nodes: (n,) int64 index of the surface.
+        vertices: (n, 2) int64 indices of both ends in the packed points.
     """
 
     ends: np.ndarray
@@ -47,11 +51,17 @@ class Segments(NamedTuple):
 
 @compiled
 def find_segments(
-    packed: PackedOutlines, X_CN: np.ndarray, camera: np.ndarray, wanted: np.ndarray
+    packed: PackedOutlines, X_CN: np.ndarray, camera: np.ndarray, selected: np.ndarray
 ) -> Segments:
-    """The projected contour edges, beyond the near plane, of surfaces at X_CN (nodes, 4, 4).
+    """Return the projected contour edges of surfaces.
 
-    wanted: (nodes,) bool which surfaces.
+    Triangles nearer than the near plane are left out.
+
+    Args:
+        packed: the surfaces.
+        X_CN: (nodes, 4, 4) poses of the surfaces in the camera.
+        camera: (8,) kernel parameters.
+        selected: (nodes,) bool, which surfaces.
     """
     rows, _ = make_rows(packed, camera)
     capacity, count = 1024, 0
@@ -60,7 +70,7 @@ def find_segments(
     u, v, facings, points = rows.u, rows.v, rows.facings, packed.points
     chosen = np.empty(packed.edges.shape[1], dtype=np.uint32)
     for node in range(X_CN.shape[0]):
-        if not wanted[node]:
+        if not selected[node]:
             continue
         project(packed, node, X_CN, camera, u, v)
         find_facings(packed, node, X_CN, camera, facings)
@@ -80,7 +90,7 @@ def find_segments(
         before, behind = packed.edges[2, begin:end], packed.edges[3, begin:end]
         found = 0
         for e in range(len(sides)):
-            # No branch, which the processor would guess wrong.
+            # Branch-free, because the branch would be unpredictable.
             chosen[found] = e
             found += facings[before[e]] + sides[e] * facings[behind[e]] != 0
         if count + found > capacity:
@@ -108,33 +118,39 @@ def find_segments(
 def find_crossings(
     segments: Segments, across: int, first: float, spacing: float, lines: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Where contour edges cross lines of a raster, sorted along each line; upper ends excluded.
+    """Return where contour edges cross the lines of a raster, sorted along each line.
+
+    An edge crosses lines from its upper end, included, to its lower end, excluded.
 
     Args:
-        across: 0: the lines are rows, along u; 1: columns, along v.
-        first, spacing: the first line on the other axis, and from line to line [pixel].
+        segments: the contour edges.
+        across: 0: the lines are rows, along u; 1: the lines are columns, along v.
+        first: coordinate of the first line on the other axis [pixel].
+        spacing: distance between lines [pixel].
+        lines: number of lines.
 
     Returns:
-        starts (lines + 1,) of the lines' crossings, their places (n,) [pixel] and segments (n,).
+        starts (lines + 1,) index of each line's first crossing, places (n,) of the crossings along
+        their lines [pixel], and indices (n,) of their edges.
     """
     ends = segments.ends
     starts = np.zeros(lines + 1, dtype=np.int64)
-    # By how many more edges than the one before it a line is crossed.
-    more = np.zeros(lines + 1, dtype=np.int64)
-    # (n, 3) those that cross a line, which most are too short for, and from where to where.
-    crossing, count, share = np.empty((ends.shape[0] + 1, 3), dtype=np.int64), 0, 1.0 / spacing
+    # Difference array of the number of edges that cross each line.
+    changes = np.zeros(lines + 1, dtype=np.int64)
+    # (n, 3) the edges that cross a line, each with its first line and the line after its last.
+    crossing, count, scale = np.empty((ends.shape[0] + 1, 3), dtype=np.int64), 0, 1.0 / spacing
     for s in range(ends.shape[0]):
-        a, b = (ends[s, 1 - across] - first) * share, (ends[s, 3 - across] - first) * share
+        a, b = (ends[s, 1 - across] - first) * scale, (ends[s, 3 - across] - first) * scale
         begin = np.int64(np.ceil(min(max(min(a, b), 0.0), float(lines))))
         after = np.int64(np.ceil(min(max(max(a, b), 0.0), float(lines))))
-        # No branch, which the processor would guess wrong.
+        # Branch-free, because the branch would be unpredictable.
         crossing[count, 0], crossing[count, 1], crossing[count, 2] = s, begin, after
         count += int(begin < after)
-        more[begin] += 1
-        more[after] -= 1
+        changes[begin] += 1
+        changes[after] -= 1
     crossed = 0
     for line in range(lines):
-        crossed += more[line]
+        crossed += changes[line]
         starts[line + 1] = starts[line] + crossed
     found, at = np.empty((starts[lines], 3), dtype=np.int64), np.empty(starts[lines])
     n, low, high = 0, np.inf, -np.inf
@@ -146,11 +162,11 @@ def find_crossings(
             at[n] = ends[s, across] + (first + line * spacing - a) * slope
             found[n, 0], found[n, 1] = line, s
             low, high, n = min(low, at[n]), max(high, at[n]), n + 1
-    # About in order of their places first: then few are exchanged on the lines.
+    # Bucket sort by place first, so that the insertion sort on each line moves few crossings.
     size = 128
-    buckets, fine = np.zeros(size + 2, dtype=np.int64), size / max(high - low, 1e-9)
+    buckets, per_pixel = np.zeros(size + 2, dtype=np.int64), size / max(high - low, 1e-9)
     for k in range(n):
-        found[k, 2] = min(max(int((at[k] - low) * fine), 0), size)
+        found[k, 2] = min(max(int((at[k] - low) * per_pixel), 0), size)
         buckets[found[k, 2] + 1] += 1
     for k in range(size + 1):
         buckets[k + 1] += buckets[k]
@@ -181,20 +197,27 @@ def find_line_spans(
     line: int,
     spans: np.ndarray,
 ) -> int:
-    """Writes the covered spans of one line as indices of crossings (k, 2); returns their number."""
+    """Write the covered spans of one line as index pairs of crossings; return the number of spans.
+
+    Args:
+        segments, across: as for ``find_crossings``.
+        starts, places, owners: the result of ``find_crossings``.
+        line: index of the line.
+        spans: (k, 2) output, indices of the crossings at which each span begins and ends.
+    """
     found, winding, start = 0, 0, 0
-    # Narrower slits and overlaps [pixel] are rounding where surfaces touch.
-    slit = 1e-6
+    # Gaps and overlaps up to this width [pixel] are rounding errors where surfaces touch.
+    tolerance = 1e-6
     ends = segments.ends
     for k in range(starts[line], starts[line + 1]):
         s = owners[k]
         if winding == 0:
             start = k
-        # Both runs of an edge cross a line at one place, in opposite directions.
+        # The weight holds for an edge that descends the lines; else it has the opposite sign.
         rising = ends[s, 1 - across] < ends[s, 3 - across]
         winding += segments.weights[s] if rising else -segments.weights[s]
-        if winding == 0 and places[k] - places[start] > slit:
-            if found > 0 and places[start] - places[spans[found - 1, 1]] <= slit:
+        if winding == 0 and places[k] - places[start] > tolerance:
+            if found > 0 and places[start] - places[spans[found - 1, 1]] <= tolerance:
                 spans[found - 1, 1] = k
             else:
                 spans[found, 0], spans[found, 1] = start, k
@@ -203,17 +226,17 @@ def find_line_spans(
 
 
 class ContourPoints(NamedTuple):
-    """Points of the contour of a body's silhouette inside the picture.
+    """Points on the contour of a body's silhouette inside the image.
 
     Attributes:
-        uv: (n, 2) where they are seen [pixel].
-        normals: (n, 2) unit normals out of the silhouette.
-        lengths: (n,) the length of contour that each stands for [pixel].
-        nodes: (n,) int64 the surface each lies on.
-        p_N: (n, 3) the point of that surface, in its frame N [m].
-        clearances: (n, 2) how far along the normals it is inwards to where the silhouette ends
-            again, and outwards to where it begins again, inf where it does not, as if the
-            contour there were parallel to here [pixel].
+        uv: (n, 2) image coordinates [pixel].
+        normals: (n, 2) outward unit normals.
+        lengths: (n,) length of contour that each point represents [pixel].
+        nodes: (n,) int64 index of the surface that each point lies on.
+        p_N: (n, 3) the surface point in the surface's frame N [m].
+        clearances: (n, 2) distances along the normal [pixel], inwards to where the silhouette ends
+            and outwards to where it begins again, as if the contour there were parallel; inf if it
+            does not begin again.
     """
 
     uv: np.ndarray
@@ -228,14 +251,15 @@ class ContourPoints(NamedTuple):
 def sample_contour(
     packed: PackedOutlines, X_CN: np.ndarray, camera: np.ndarray, spacing: float
 ) -> ContourPoints:
-    """Points of the visible contour of the union of surfaces.
+    """Return points on the visible contour of the union of surfaces.
 
     Args:
-        X_CN: (nodes, 4, 4) their poses in the camera; for a parallel camera their rotations may be
-            scaled uniformly.
-        camera: (8,) kernel parameters. Triangles nearer than its near plane are left out.
-        spacing: from row to row and from column to column [pixel], positive; the first row and
-            column are pixel centres, and with a spacing of 1 all are.
+        packed: the surfaces.
+        X_CN: (nodes, 4, 4) poses of the surfaces in the camera; rotations may be scaled uniformly
+            for a parallel camera.
+        camera: (8,) kernel parameters. Triangles nearer than the near plane are left out.
+        spacing: distance between sampled rows and between columns [pixel]; the first row and column
+            are pixel centres.
     """
     segments = find_segments(packed, X_CN, camera, np.ones(len(X_CN), dtype=np.bool_))
     ends = segments.ends
@@ -264,49 +288,54 @@ def sample_contour(
                     continue
                 size = np.sqrt(du * du + dv * dv)
                 n0, n1 = dv / size, -du / size
-                # Out of the silhouette: back along the line where it enters, on where it leaves.
+                # Outward: backwards along the line where it enters, forwards where it leaves.
                 sign = 1.0 if (n0 if across == 0 else n1) > 0.0 else -1.0
                 sign = sign if k % 2 == 1 else -sign
                 normals[count, 0], normals[count, 1] = sign * n0, sign * n1
                 lengths[count] = spacing / abs(normals[count, across])
                 uv[count, across], uv[count, 1 - across] = place, line * spacing
-                share = (line * spacing - ends[s, 1 - across]) / (dv if across == 0 else du)
-                # Straight in the picture is not at even pace along the edge (perspective).
+                fraction = (line * spacing - ends[s, 1 - across]) / (dv if across == 0 else du)
+                # Perspective-correct interpolation along the edge.
                 near, far = segments.depths[s, 0], segments.depths[s, 1]
-                share = share * near / (share * near + (1.0 - share) * far)
+                fraction = fraction * near / (fraction * near + (1.0 - fraction) * far)
                 a, b = segments.vertices[s, 0], segments.vertices[s, 1]
                 for i in range(3):
-                    p_N[count, i] = (1.0 - share) * packed.points[i, a] + share * packed.points[
-                        i, b
-                    ]
+                    p_N[count, i] = (1.0 - fraction) * packed.points[
+                        i, a
+                    ] + fraction * packed.points[i, b]
                 nodes[count] = segments.nodes[s]
-                straight = abs(normals[count, across])
-                clearances[count, 0] = straight * (
+                cosine = abs(normals[count, across])
+                clearances[count, 0] = cosine * (
                     places[spans[k // 2, 1]] - places[spans[k // 2, 0]]
                 )
                 clearances[count, 1] = np.inf
                 if k % 2 == 1 and k + 1 < 2 * found:
-                    clearances[count, 1] = straight * (places[spans[k // 2 + 1, 0]] - place)
+                    clearances[count, 1] = cosine * (places[spans[k // 2 + 1, 0]] - place)
                 elif k % 2 == 0 and k > 0:
-                    clearances[count, 1] = straight * (place - places[spans[k // 2 - 1, 1]])
+                    clearances[count, 1] = cosine * (place - places[spans[k // 2 - 1, 1]])
                 count += 1
     return ContourPoints(
         uv[:count], normals[:count], lengths[:count], nodes[:count], p_N[:count], clearances[:count]
     )
 
 
-_CELLS_A_SIDE = 20
+# Number of cells along each side of a face of the cube.
+_CELLS_PER_SIDE = 20
 
 
 class CelledOutline(NamedTuple):
-    """One surface with the edges of every cell, and its band of skin.
+    """A surface with the possible contour edges of every cell of directions, and its skin band.
 
-    points: (n, 4) vertices, a record each; planes: (m + 1, 4) likewise, and a plane that faces
-    nowhere; edges: (e, 5) int32 v0, v1, t0, t1, s1 as packed; cell_starts: (cells + 1,) int64;
-    cell_edges: (k,) int32 indices into edges, cell after cell; reach: (1,) the sine of how far the
-    directions in which a camera sees the surface's points may differ from that of its ball's
-    centre; packed: the surface, then its band, which kernels bend in place; bands: (n, v, 3) the
-    band's vertices at the samples of its node [m], n = 0 where there is none.
+    Attributes:
+        points: (n, 4) vertices x, y, z, 1 [m].
+        planes: (m + 1, 4) planes of the triangles, and a zero plane for missing triangles.
+        edges: (e, 5) int32 v0, v1, t0, t1, s1 as packed.
+        cell_starts: (cells + 1,) int64 index of each cell's first entry in ``cell_edges``.
+        cell_edges: (k,) int32 indices of edges, cell after cell.
+        reach: (1,) sine of the largest angle between the viewing directions of the surface's points
+            and of its ball's centre for which the cells are valid.
+        packed: the surface, then its band, which kernels deform in place.
+        bands: (n, v, 3) vertices of the band at the samples of its node [m]; n = 0 without a band.
     """
 
     points: np.ndarray
@@ -325,16 +354,17 @@ def divide_outline(
     band: TriangleMesh | None = None,
     bands: np.ndarray | None = None,
 ) -> CelledOutline:
-    """The surface with its cells.
+    """Return a surface with its cells of directions.
 
     Args:
-        spread: how far the directions in which a camera sees the surface's points may differ from
-            that of its ball's centre [rad]: 0 for parallel rays.
-        band: the band of skin that belongs to the surface, at rest; it gets no cells.
-        bands: (n, v, 3) its vertices at the samples of its node [m].
+        outline: the surface.
+        spread: largest angle between the viewing directions of the surface's points and of its
+            ball's centre [rad]; 0 for parallel rays.
+        band: the surface's skin band at rest, which gets no cells; None: no band.
+        bands: (n, v, 3) vertices of the band at the samples of its node [m].
     """
     rigid, skin = pack((outline,)), band or TriangleMesh.empty()
-    starts, edges = _find_cell_edges(rigid, _CELLS_A_SIDE, spread)
+    starts, edges = _find_cell_edges(rigid, _CELLS_PER_SIDE, spread)
     records = np.vstack([rigid.edges, rigid.sides]).T
     return CelledOutline(
         points=np.column_stack([outline.vertices, np.ones(len(outline.vertices))]),
@@ -350,7 +380,7 @@ def divide_outline(
 
 @compiled
 def find_cell(x: float, y: float, z: float) -> int:
-    """Returns the cell of a direction (of any length but 0)."""
+    """Return the index of a direction's cell; the direction may have any length but 0."""
     ax, ay, az = abs(x), abs(y), abs(z)
     if ax >= ay and ax >= az:
         face, s, t = 0, y / x, z / x
@@ -358,23 +388,27 @@ def find_cell(x: float, y: float, z: float) -> int:
         face, s, t = 1, x / y, z / y
     else:
         face, s, t = 2, x / z, y / z
-    half = 0.5 * _CELLS_A_SIDE
-    column = min(int((s + 1.0) * half), _CELLS_A_SIDE - 1)
-    row = min(int((t + 1.0) * half), _CELLS_A_SIDE - 1)
-    return (face * _CELLS_A_SIDE + row) * _CELLS_A_SIDE + column
+    half = 0.5 * _CELLS_PER_SIDE
+    column = min(int((s + 1.0) * half), _CELLS_PER_SIDE - 1)
+    row = min(int((t + 1.0) * half), _CELLS_PER_SIDE - 1)
+    return (face * _CELLS_PER_SIDE + row) * _CELLS_PER_SIDE + column
 
 
 def _find_cell_edges(
     packed: PackedOutlines, side: int, spread: float, margin: float = 1e-6
 ) -> tuple[np.ndarray, np.ndarray]:
-    """CelledOutline's cell_starts and cell_edges.
+    """Return ``cell_starts`` and ``cell_edges`` of ``CelledOutline``.
 
-    ``margin``: a little more than rounding can move a direction [rad].
+    Args:
+        packed: the surface.
+        side: number of cells along each side of a face.
+        spread: as for ``divide_outline`` [rad].
+        margin: tolerance for rounding errors of directions [rad].
     """
     normals, edges = packed.planes[:3].T, packed.edges
     lengths = np.linalg.norm(normals, axis=1, keepdims=True)
     middles = (2.0 * np.arange(side) + 1.0) / side - 1.0
-    # An edge of one triangle, or of two that run the same way, is always a contour.
+    # An edge of one triangle, or of two that traverse it alike, is always on the contour.
     always = packed.sides[:, None] != -1
     counts, found = [0], [np.zeros(0, dtype=np.int64)]
     for face, t in itertools.product(range(3), middles):
@@ -386,19 +420,19 @@ def _find_cell_edges(
         angles = np.arccos(lowest) + spread + margin
         limits = np.where(angles < 0.5 * math.pi, np.sin(angles), 2.0)
         heights = normals @ directions.T
-        surely = limits * lengths
+        thresholds = limits * lengths
         facings = np.zeros((len(normals) + 1, side), dtype=np.int8)
-        np.subtract(heights > surely, heights < -surely, out=facings[:-1], dtype=np.int8)
-        one, other = facings[edges[2]], facings[edges[3]]
-        apart = (one == 0) | always | (one != other)
-        cells, chosen = np.nonzero(np.ascontiguousarray(apart.T))
+        np.subtract(heights > thresholds, heights < -thresholds, out=facings[:-1], dtype=np.int8)
+        first, second = facings[edges[2]], facings[edges[3]]
+        possible = (first == 0) | always | (first != second)
+        cells, chosen = np.nonzero(np.ascontiguousarray(possible.T))
         counts += np.bincount(cells, minlength=side).tolist()
         found.append(chosen)
     return np.cumsum(counts), np.concatenate(found).astype(np.int32)
 
 
 def _directions(face: int, s: np.ndarray, t: float) -> np.ndarray:
-    """Unit directions (n, 3) of points (s, t) of a face, s (n,)."""
+    """Return unit directions (n, 3) of the points (s, t) of a cube's face, s (n,)."""
     columns = [s, np.full_like(s, t)]
     columns.insert(face, np.ones_like(s))
     directions = np.stack(columns, axis=1)

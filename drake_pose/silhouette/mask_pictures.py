@@ -1,7 +1,8 @@
-"""Masks of other tools: black and white videos, COCO's polygons and run lengths.
+"""Masks from COCO annotation files: polygons and run lengths.
 
-A polygon's corners lie between pixels (pixel 0 is 0..1), and a pixel belongs to what its centre
-lies in; OpenCV's ``fillPoly`` takes every pixel that the border touches, half a pixel too many.
+A polygon's coordinates are continuous: pixel 0 spans 0..1. A pixel belongs to the polygon that
+contains its centre. OpenCV's ``fillPoly`` adds every pixel that the border touches, which is half a
+pixel too many.
 """
 
 import json
@@ -20,7 +21,13 @@ from drake_pose.regular_files import read_regular
 
 @dataclass(frozen=True)
 class AnnotatedPicture:
-    """A picture of a COCO file, with its size [pixel] and annotations, each with its class."""
+    """A picture of a COCO file with its annotations.
+
+    Attributes:
+        file: the picture's file name.
+        width, height: size [pixel].
+        annotations: class name and COCO entry of each annotation.
+    """
 
     file: str
     width: int
@@ -28,7 +35,10 @@ class AnnotatedPicture:
     annotations: Sequence[tuple[str, Mapping[str, Any]]] = ()
 
     def draw(self, classes: Container[str]) -> Mask:
-        """The areas of some classes together (H, W); ValueError names what cannot be drawn."""
+        """Return the union (H, W) of the areas of some classes.
+
+        Raises ValueError, which names the annotation: an area cannot be drawn.
+        """
         mask = np.zeros((self.height, self.width), dtype=np.bool_)
         for name, entry in self.annotations:
             if name not in classes:
@@ -44,7 +54,14 @@ class AnnotatedPicture:
 
 @dataclass(frozen=True)
 class Annotations:
-    """A COCO file's pictures in its order, classes' names by number, and what was left out."""
+    """The content of a COCO file.
+
+    Attributes:
+        path: the file.
+        pictures: the pictures, in the file's order.
+        names: class names by class number.
+        warnings: what was left out.
+    """
 
     path: Path
     pictures: tuple[AnnotatedPicture, ...]
@@ -60,23 +77,24 @@ class Annotations:
 
 
 def read_coco(path: Path) -> Annotations:
-    """Reads a COCO file; MaskError names the file, and the annotation at fault."""
+    """Read a COCO file; MaskError names the file and the invalid annotation."""
     try:
         content = json.loads(read_regular(path, 1 << 30))
     except OSError as error:
         raise MaskError(f"{path}: cannot be read: {error.strerror}") from error
     except (ValueError, RecursionError) as error:
-        raise MaskError(f"{path}: is no JSON file: {error}") from error
+        raise MaskError(f"{path}: is not a JSON file: {error}") from error
     if not isinstance(content, dict) or not {"images", "annotations"} <= set(content):
-        raise MaskError(f"{path}: is no COCO file: it needs images and annotations")
+        raise MaskError(f"{path}: is not a COCO file: it needs images and annotations")
     try:
         return _annotations(content, path)
     except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
         what = f"lacks {error}" if isinstance(error, KeyError) else str(error)
-        raise MaskError(f"{path}: is no COCO file as it should be: {what}") from error
+        raise MaskError(f"{path}: is not a valid COCO file: {what}") from error
 
 
 def _annotations(content: Mapping[str, Any], path: Path) -> Annotations:
+    """Return the content of a COCO file; the caller converts the exceptions."""
     names = {entry["id"]: str(entry["name"]) for entry in content.get("categories", ())}
     of_image: dict[Any, list[tuple[str, Mapping[str, Any]]]] = {}
     for entry in content["images"]:
@@ -88,7 +106,7 @@ def _annotations(content: Mapping[str, Any], path: Path) -> Annotations:
         image = entry["image_id"]
         if image not in of_image:
             raise ValueError(
-                f"annotation {entry.get('id')} is of image {image}, which is not there"
+                f"annotation {entry.get('id')} is of image {image}, which does not exist"
             )
         if entry.get("segmentation"):
             category = entry["category_id"]
@@ -110,12 +128,14 @@ def _annotations(content: Mapping[str, Any], path: Path) -> Annotations:
 
 
 def _file_name(value: Any) -> str:
+    """Return a picture's file name; ValueError if it is invalid."""
     if not isinstance(value, str) or not value.isprintable():
-        raise ValueError(f"{value!r} is no name of a picture's file")
+        raise ValueError(f"{value!r} is not a name of a picture file")
     return value
 
 
 def _side(value: Any) -> int:
+    """Return a picture's width or height [pixel]; ValueError if it is invalid."""
     if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= LARGEST_SIDE:
         raise ValueError(
             f"a picture's width and height must be whole numbers of 1 to {LARGEST_SIDE} pixels"
@@ -124,7 +144,7 @@ def _side(value: Any) -> int:
 
 
 def _draw(segmentation: Any, height: int, width: int) -> Mask:
-    """The area (H, W) of a segmentation: run lengths, or a list of polygons."""
+    """Return the area (H, W) of a segmentation: run lengths, or a list of polygons."""
     if isinstance(segmentation, dict):
         if list(segmentation["size"]) != [height, width]:
             raise ValueError(
@@ -138,13 +158,13 @@ def _draw(segmentation: Any, height: int, width: int) -> Mask:
 
 
 def fill_polygon(corners: Array, height: int, width: int) -> Mask:
-    """The pixels (H, W) whose centres lie in a polygon (n, 2) by the even-odd rule.
+    """Return the pixels (H, W) whose centres lie in a polygon (n, 2) by the even-odd rule.
 
-    Raises ValueError for fewer than three corners, or one that is no finite number.
+    Raises ValueError: there are fewer than three corners, or one is not finite.
     """
     if len(corners) < 3 or not np.isfinite(corners).all():
-        raise ValueError("a polygon needs three corners (x, y) or more, finite numbers")
-    # Each edge toggles what lies right of it.
+        raise ValueError("a polygon needs three or more finite corners (x, y)")
+    # Each edge toggles the pixels to its right.
     toggled = np.zeros((height, width + 1), dtype=np.bool_)
     for (x0, y0), (x1, y1) in zip(corners, np.roll(corners, -1, axis=0), strict=True):
         ends = np.ceil(np.sort([y0, y1]) - 0.5).clip(0, height).astype(int)
@@ -156,9 +176,11 @@ def fill_polygon(corners: Array, height: int, width: int) -> Mask:
 
 
 def decode_run_lengths(counts: Sequence[int] | str, height: int, width: int) -> Mask:
-    """The area (H, W) of run lengths, or of the text that they are compressed to.
+    """Return the area (H, W) of COCO run lengths, as numbers or compressed text.
 
-    Raises ValueError where they do not fill the picture, MaskError without pycocotools.
+    Raises:
+        ValueError: the run lengths do not fill the picture.
+        MaskError: pycocotools is not installed.
     """
     try:
         from pycocotools import mask as coco
@@ -179,7 +201,7 @@ def decode_run_lengths(counts: Sequence[int] | str, height: int, width: int) -> 
             )
         packed = coco.frPyObjects(packed | {"counts": list(counts)}, height, width)
     mask = coco.decode(packed)
-    # Where text ends too early the rest is uninitialised memory.
+    # pycocotools leaves the rest of the mask uninitialised if the text ends too early.
     if isinstance(counts, str) and coco.encode(mask)["counts"] != packed["counts"]:
         raise ValueError(
             f"the run lengths do not fill a picture of {width} x {height} (width x height)"

@@ -1,4 +1,4 @@
-"""A surface made ready for the span kernel."""
+"""Triangle surfaces prepared for the span kernel: their edges, planes and skin bands."""
 
 from __future__ import annotations
 
@@ -24,17 +24,19 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Outline:
-    """A triangle surface and its edges, each with the one or two triangles it bounds.
+    """A triangle surface and its edges, each with the one or two triangles that it bounds.
 
-    Any set of triangles will do: holes, inner parts and edges of three triangles (of which there
-    are several records) included.
+    Any set of triangles is allowed, with holes, inner parts, and edges of three or more triangles,
+    which have several records.
 
     Args:
         vertices: (n, 3) float64 points in the surface's own frame N [m].
         triangles: (m, 3) int32 vertex indices, in any orientation.
-        edges: (e, 5) int32 records v0, v1, t0, t1, s1: the triangle t0 runs from v0 to v1; s1 is +1
-            where t1 does, too, and -1 where it runs back; t1 = -1, s1 = 0: no second triangle.
-        rest: the surface that this is with some vertices moved; what they share is packed once.
+        edges: (e, 5) int32 records v0, v1, t0, t1, s1. Triangle t0 traverses the edge from v0 to
+            v1. s1 is +1 if triangle t1 does, too, and -1 if t1 traverses it backwards; t1 = -1 and
+            s1 = 0 if there is no second triangle.
+        rest: the surface at rest, if this one differs from it in vertices only; the arrays that
+            both share are packed once.
     """
 
     vertices: np.ndarray
@@ -44,13 +46,13 @@ class Outline:
 
     @cached_property
     def moments(self) -> np.ndarray:
-        """(4, 4) means of the products of x, y, z and 1 over the vertices [m^2, m, 1]."""
+        """(4, 4) means over the vertices of products of x, y, z and 1 [m^2, m, 1]."""
         points = np.column_stack([self.vertices, np.ones(len(self.vertices))])
         return points.T @ points / max(len(points), 1)
 
     @cached_property
     def planes(self) -> np.ndarray:
-        """(m, 4) twice the area times the unit normal [m^2], and its product with a corner."""
+        """(m, 4) normals of length twice the area [m^2], and their products with a corner."""
         corners = self.vertices[self.triangles]
         normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         offsets = np.einsum("ij,ij->i", normals, corners[:, 0])
@@ -58,7 +60,7 @@ class Outline:
 
     @cached_property
     def is_closed(self) -> bool:
-        """Whether all parts are closed, and run around counter-clockwise seen from outside."""
+        """Whether all parts are closed with outward normals (counter-clockwise from outside)."""
         neighbours = self.edges[:, [2, 3]]
         if not np.all(self.edges[:, 4] == -1):
             return False
@@ -71,7 +73,7 @@ class Outline:
 
     @cached_property
     def ball(self) -> np.ndarray:
-        """(4,) centre of a ball around the vertices, and its radius [m]."""
+        """(4,) centre and radius [m] of a ball around the vertices."""
         if len(self.vertices) == 0:
             return np.zeros(4)
         center = 0.5 * (self.vertices.min(axis=0) + self.vertices.max(axis=0))
@@ -80,14 +82,19 @@ class Outline:
 
 
 class PackedOutlines(NamedTuple):
-    """Several outlines one after the other, in the arrays that the kernel walks.
+    """Several outlines, one after the other, in the arrays that kernels take.
 
-    points: (3, n) float64; planes: (4, m) float64; balls: (nodes, 4) float64;
-    triangles: (m, 3) int32; edges: (4, e) uint32 rows v0, v1, t0, t1, where indices count from
-    the outline's own first vertex and triangle and t1 = the outline's number of triangles where
-    there is none; sides: (e,) int8 s1; starts: (nodes + 1, 3) int64 first vertex, triangle and edge
-    of each outline; ordinary_ends: (nodes,) int64 where the edges end whose triangles run in
-    opposite directions (s1 = -1); they come first.
+    Attributes:
+        points: (3, n) float64 vertices [m].
+        planes: (4, m) float64 planes, as ``Outline.planes``.
+        balls: (nodes, 4) float64 bounding balls, as ``Outline.ball``.
+        triangles: (m, 3) int32 vertex indices, counted from the outline's own first vertex.
+        edges: (4, e) uint32 rows v0, v1, t0, t1, counted from the outline's own first vertex and
+            triangle; t1 is the outline's number of triangles if there is no second triangle.
+        sides: (e,) int8 s1 of ``Outline.edges``.
+        starts: (nodes + 1, 3) int64 first vertex, triangle and edge of each outline.
+        ordinary_ends: (nodes,) int64 end of each outline's ordinary edges (s1 = -1), which come
+            first.
     """
 
     points: np.ndarray
@@ -101,7 +108,7 @@ class PackedOutlines(NamedTuple):
 
 
 def outline_from_mesh(mesh: TriangleMesh) -> Outline:
-    """The outline of a mesh; vertices at equal places are merged, null triangles left out."""
+    """Return the outline of a mesh, with equal vertices merged and without degenerate triangles."""
     places = np.asarray(mesh.vertices, dtype=np.float64).reshape(-1, 3) + 0.0  # -0.0 becomes 0.0
     vertices, renumbered = np.unique(places, axis=0, return_inverse=True)
     triangles = renumbered.reshape(-1)[np.asarray(mesh.triangles, dtype=np.int64).reshape(-1, 3)]
@@ -112,21 +119,21 @@ def outline_from_mesh(mesh: TriangleMesh) -> Outline:
 
 
 def outline_of_triangles(vertices: np.ndarray, triangles: np.ndarray) -> Outline:
-    """The outline of vertices (n, 3) and triangles (m, 3) as they are."""
+    """Return the outline of vertices (n, 3) [m] and triangles (m, 3) without merging."""
     indices = np.asarray(triangles, dtype=np.int32).reshape(-1, 3)
     return Outline(np.asarray(vertices).reshape(-1, 3), indices, edge_records(indices))
 
 
 def edge_records(triangles: np.ndarray) -> np.ndarray:
-    """Returns the records of Outline.edges."""
+    """Return the records (e, 5) of ``Outline.edges`` for triangles (m, 3)."""
     heads = triangles.T.reshape(-1).astype(np.int64)
     tails = triangles[:, [1, 2, 0]].T.reshape(-1).astype(np.int64)
     owners = np.tile(np.arange(len(triangles)), 3)
     forward = heads < tails
     low, high = np.minimum(heads, tails), np.maximum(heads, tails)
-    # Order the uses of an edge forward, backward, forward, backward, ..., then what is left over,
-    # and pair them from the start: as many pairs as can be run in opposite directions, which
-    # cancel wherever both triangles face the same way.
+    # Sort the uses of an edge alternately forward and backward, the surplus last, and pair them
+    # from the start. This gives the most pairs in opposite directions, which cancel wherever both
+    # triangles face the same way.
     order = np.lexsort((owners, ~forward, high, low))
     rank = _position_in_run(low[order], high[order], forward[order])
     order = order[np.lexsort((~forward[order], rank, high[order], low[order]))]
@@ -147,7 +154,7 @@ def edge_records(triangles: np.ndarray) -> np.ndarray:
 
 
 def _position_in_run(*keys: np.ndarray) -> np.ndarray:
-    """Returns each entry's position in its run of equal keys."""
+    """Return each entry's position in its run of equal keys."""
     index = np.arange(len(keys[0]))
     begins = np.ones(len(index), dtype=bool)
     begins[1:] = np.any([key[1:] != key[:-1] for key in keys], axis=0)
@@ -155,11 +162,11 @@ def _position_in_run(*keys: np.ndarray) -> np.ndarray:
 
 
 EMPTY_OUTLINE = outline_of_triangles(np.zeros((0, 3)), np.zeros((0, 3)))
-"""The outline of a part without a surface."""
+"""The outline of a node without geometry."""
 
 
 def pack(outlines: tuple[Outline, ...]) -> PackedOutlines:
-    """Returns outlines in the kernel's arrays (remembered: outlines are immutable)."""
+    """Return outlines in the kernel's arrays; results are cached, as outlines are immutable."""
     packed = _pack_rest(tuple(outline.rest or outline for outline in outlines))
     if all(outline.rest is None for outline in outlines):
         return packed
@@ -171,7 +178,7 @@ def pack(outlines: tuple[Outline, ...]) -> PackedOutlines:
 
 
 def mutable_copy(packed: PackedOutlines) -> PackedOutlines:
-    """The surfaces with points, planes and balls that may be changed."""
+    """Return packed outlines with writable copies of points, planes and balls."""
     return packed._replace(
         points=packed.points.copy(), planes=packed.planes.copy(), balls=packed.balls.copy()
     )
@@ -179,7 +186,7 @@ def mutable_copy(packed: PackedOutlines) -> PackedOutlines:
 
 @lru_cache(maxsize=256)
 def _pack_rest(outlines: tuple[Outline, ...]) -> PackedOutlines:
-    """As pack, for outlines that are at rest."""
+    """As ``pack``, for outlines at rest."""
     starts = np.zeros((len(outlines) + 1, 3), dtype=np.int64)
     sizes = [(len(o.vertices), len(o.triangles), len(o.edges)) for o in outlines]
     starts[1:] = np.cumsum(np.array(sizes, dtype=np.int64).reshape(-1, 3), axis=0)
@@ -199,23 +206,30 @@ def _pack_rest(outlines: tuple[Outline, ...]) -> PackedOutlines:
 
 
 def _kernel_edges(outline: Outline) -> np.ndarray:
-    """Returns the records (e, 5) as the kernel has them, those with s1 = -1 first."""
+    """Return the records (e, 5) in the kernel's order and convention, those with s1 = -1 first."""
     v0, v1, t0, t1, s1 = outline.edges.T
-    other = np.where(s1 == 0, len(outline.triangles), t1)
-    order = np.lexsort((t0, s1 != -1))  # neighbours in memory, too
-    return np.column_stack([v0, v1, t0, other, s1])[order]
+    second = np.where(s1 == 0, len(outline.triangles), t1)
+    # Sorted by triangle for memory locality.
+    order = np.lexsort((t0, s1 != -1))
+    return np.column_stack([v0, v1, t0, second, s1])[order]
 
 
 def _stacked(parts: Sequence[np.ndarray], columns: int, dtype: type) -> np.ndarray:
-    """Returns arrays (k, columns) below each other; none gives (0, columns)."""
+    """Return arrays (k, columns) stacked vertically; (0, columns) if there are none."""
     return np.ascontiguousarray(np.vstack([np.empty((0, columns), dtype), *parts]), dtype=dtype)
 
 
 @compiled
 def viewpoint_in_node(X: np.ndarray, camera: np.ndarray) -> tuple[float, float, float, float]:
-    """Where a camera stands, or the way it looks, in a node's frame, times a last number.
+    """Return the viewpoint (e0, e1, e2, w) in a node's frame, in homogeneous coordinates.
 
-    That is 0 for a parallel camera's way; else 1, where the pose X has not grown.
+    A triangle with plane (n, d) faces a pinhole camera if n . e - d w > 0. For a parallel camera w
+    is 0 and e is the viewing direction; facings then have the opposite sign. For a pinhole camera w
+    is the squared scale of the pose X, 1 for a rigid one, and the viewpoint is e / w [m].
+
+    Args:
+        X: (3 or 4, 4) pose of the node in the camera, possibly scaled uniformly.
+        camera: (8,) kernel parameters.
     """
     if camera[0] != 0.0:
         return X[2, 0], X[2, 1], X[2, 2], 0.0
@@ -237,7 +251,15 @@ def project(
     u: np.ndarray,
     v: np.ndarray,
 ) -> None:
-    """Writes u, v [pixel] of one surface's points, whatever their depth."""
+    """Write the image coordinates u, v [pixel] of one surface's points, at any depth.
+
+    Args:
+        packed: the surfaces.
+        node: index of the surface.
+        X_CN: (nodes, 3 or 4, 4) poses in the camera.
+        camera: (8,) kernel parameters.
+        u, v: (points,) output.
+    """
     fx, fy, cx, cy = camera[1], camera[2], camera[3], camera[4]
     begin, end = packed.starts[node, 0], packed.starts[node + 1, 0]
     x, y = packed.points[0, begin:end], packed.points[1, begin:end]
@@ -262,13 +284,17 @@ def project(
 def find_facings(
     packed: PackedOutlines, node: int, X_CN: np.ndarray, camera: np.ndarray, facings: np.ndarray
 ) -> None:
-    """Writes which side of each triangle the camera sees: +1, 0 or -1; 0 after the last."""
-    e0, e1, e2, share = viewpoint_in_node(X_CN[node], camera)
+    """Write which side of each triangle the camera sees: +1, 0 or -1, and 0 after the last one.
+
+    The sign is +1 where a pinhole camera sees the triangle counter-clockwise; for a parallel camera
+    it is the opposite.
+    """
+    e0, e1, e2, w = viewpoint_in_node(X_CN[node], camera)
     begin, end = packed.starts[node, 1], packed.starts[node + 1, 1]
     n0, n1 = packed.planes[0, begin:end], packed.planes[1, begin:end]
     n2, offset = packed.planes[2, begin:end], packed.planes[3, begin:end]
     for i in range(n0.shape[0]):
-        side = n0[i] * e0 + n1[i] * e1 + n2[i] * e2 - offset[i] * share
+        side = n0[i] * e0 + n1[i] * e1 + n2[i] * e2 - offset[i] * w
         facings[i] = np.int8(side > 0.0) - np.int8(side < 0.0)
     facings[n0.shape[0]] = 0
 
@@ -282,11 +308,18 @@ def clip_triangle(
     camera: np.ndarray,
     corners: np.ndarray,
 ) -> int:
-    """Writes u, v and 1 / depth of the corners of a triangle's part beyond a pinhole's near plane.
+    """Write u, v [pixel] and 1 / depth [1/m] of a triangle's part beyond a pinhole's near plane.
 
-    ``t`` is the triangle among its own; ``X_CN`` (nodes, 3 or 4, 4); ``corners`` (4, 3).
+    Args:
+        packed: the surfaces.
+        node: index of the surface.
+        t: index of the triangle within its surface.
+        X_CN: (nodes, 3 or 4, 4) poses in the camera.
+        camera: (8,) kernel parameters.
+        corners: (4, 3) output.
 
-    Returns how many corners there are: 0, 3 or 4.
+    Returns:
+        The number of corners: 0, 3 or 4.
     """
     X, near, size = X_CN[node], camera[5], 0
     begin, first = packed.starts[node, 0], packed.starts[node, 1]
@@ -305,11 +338,11 @@ def clip_triangle(
             corners[size, 2] = 1.0 / p_C[a, 2]
             size += 1
         if visible != (p_C[b, 2] >= near):
-            # From the visible end to the hidden one, whichever way the triangle runs.
+            # Interpolate from the visible end, so that both triangles of an edge get equal points.
             i, o = (a, b) if visible else (b, a)
-            share = (near - p_C[i, 2]) / (p_C[o, 2] - p_C[i, 2])
-            x = p_C[i, 0] + share * (p_C[o, 0] - p_C[i, 0])
-            y = p_C[i, 1] + share * (p_C[o, 1] - p_C[i, 1])
+            fraction = (near - p_C[i, 2]) / (p_C[o, 2] - p_C[i, 2])
+            x = p_C[i, 0] + fraction * (p_C[o, 0] - p_C[i, 0])
+            y = p_C[i, 1] + fraction * (p_C[o, 1] - p_C[i, 1])
             corners[size, 0] = camera[1] * x / near + camera[3]
             corners[size, 1] = camera[2] * y / near + camera[4]
             corners[size, 2] = 1.0 / near
@@ -318,30 +351,31 @@ def clip_triangle(
 
 
 @compiled
-def bend(own: PackedOutlines, parts: np.ndarray, band: np.ndarray) -> None:
-    """Puts the vertices of surfaces' bands at other places; the surfaces' balls only grow.
+def bend(packed: PackedOutlines, parts: np.ndarray, band: np.ndarray) -> None:
+    """Move the vertices of skin bands in place and update planes and balls; balls only grow.
 
     Args:
-        parts: (k, 4) int64 each surface, its first vertex of the band and its first triangle of the
-            band, both counted from the surface's own first; the band's first row in ``band``.
-        band: (v, 3) places of the vertices of all bands [m].
+        packed: the surfaces, changed in place.
+        parts: (k, 4) int64, for each band: its surface, its first vertex and its first triangle,
+            both counted from the surface's own first, and its first row in ``band``.
+        band: (v, 3) positions of the vertices of all bands [m].
     """
     for part in parts:
         node, row = part[0], part[3]
-        begin, first = own.starts[node, 0], own.starts[node, 1]
-        points, planes, ball = own.points, own.planes, own.balls[node]
-        farthest = 0.0
-        for i in range(begin + part[1], own.starts[node + 1, 0]):
+        begin, first = packed.starts[node, 0], packed.starts[node, 1]
+        points, planes, ball = packed.points, packed.planes, packed.balls[node]
+        max_squared = 0.0
+        for i in range(begin + part[1], packed.starts[node + 1, 0]):
             x, y, z = band[row, 0], band[row, 1], band[row, 2]
             row += 1
             points[0, i], points[1, i], points[2, i] = x, y, z
-            away = (x - ball[0]) ** 2 + (y - ball[1]) ** 2 + (z - ball[2]) ** 2
-            farthest = max(farthest, away)
-        ball[3] = max(ball[3], math.sqrt(farthest))
-        for t in range(first + part[2], own.starts[node + 1, 1]):
-            a = begin + own.triangles[t, 0]
-            b = begin + own.triangles[t, 1]
-            c = begin + own.triangles[t, 2]
+            squared = (x - ball[0]) ** 2 + (y - ball[1]) ** 2 + (z - ball[2]) ** 2
+            max_squared = max(max_squared, squared)
+        ball[3] = max(ball[3], math.sqrt(max_squared))
+        for t in range(first + part[2], packed.starts[node + 1, 1]):
+            a = begin + packed.triangles[t, 0]
+            b = begin + packed.triangles[t, 1]
+            c = begin + packed.triangles[t, 2]
             x, y, z = points[0, a], points[1, a], points[2, a]
             bx, by, bz = points[0, b] - x, points[1, b] - y, points[2, b] - z
             cx, cy, cz = points[0, c] - x, points[1, c] - y, points[2, c] - z
@@ -355,9 +389,11 @@ if TYPE_CHECKING:
 
 
 class BendingOutline:
-    """A rigid surface and a band in its frame N, whose vertices move and whose triangles do not.
+    """A rigid surface and a skin band in its frame N, whose vertices move.
 
-    ``rest``: both, the band at rest; its first vertices and triangles are the rigid part's.
+    Attributes:
+        rigid: the rigid part.
+        rest: both parts with the band at rest; the rigid part's vertices and triangles come first.
     """
 
     def __init__(self, rigid: Outline, band: TriangleMesh) -> None:
@@ -377,18 +413,18 @@ class BendingOutline:
 
     @cached_property
     def _band_triangles(self) -> np.ndarray:
-        """(m, 3) the band's triangles, indices into the band's own vertices."""
+        """(m, 3) the band's triangles, as indices of the band's own vertices."""
         return self.rest.triangles[len(self.rigid.triangles) :] - len(self.rigid.vertices)
 
     def at(self, band: np.ndarray) -> Outline:
-        """The whole surface with the band's vertices at (v, 3) [m] in frame N."""
+        """Return the whole surface with the band's vertices at (v, 3) [m] in frame N."""
         outline = Outline(
             np.concatenate([self.rigid.vertices, band]),
             self.rest.triangles,
             self.rest.edges,
             self.rest,
         )
-        # Nothing but the band's own planes is new: a cached property may be set where it is kept.
+        # Fill the cached property: only the planes of the band's triangles change.
         bent = Outline(band, self._band_triangles, self.rest.edges[:0])
         vars(outline)["planes"] = np.concatenate([self.rigid.planes, bent.planes])
         return outline
@@ -398,7 +434,7 @@ _node_outlines: WeakKeyDictionary[TriangleMesh, Outline] = WeakKeyDictionary()
 
 
 def _node_outline(mesh: TriangleMesh) -> Outline:
-    """The outline of a node's mesh; a search and a tracker of one tree share it."""
+    """Return the outline of a node's mesh; it is shared by searches and trackers of one tree."""
     outline = _node_outlines.get(mesh)
     if outline is None:
         outline = _node_outlines[mesh] = outline_from_mesh(mesh)
@@ -408,8 +444,11 @@ def _node_outline(mesh: TriangleMesh) -> Outline:
 class TreeSurfaces:
     """The surfaces of a pose tree's nodes at any values, each in its node's frame.
 
-    ``bending`` and ``skins``: rigid part and band, and the band's motion; None without a band;
-    ``value_counts``: how many values each node has.
+    Attributes:
+        value_counts: number of values of each node.
+        skins: the skin band of each node; None: it has none.
+        rigid: the rigid part of each node.
+        bending: the rigid part and band of each node; None: it has no band.
     """
 
     def __init__(self, tree: PoseTree) -> None:
@@ -423,7 +462,7 @@ class TreeSurfaces:
         ]
 
     def with_rigid(self, rigid: Sequence[Outline]) -> TreeSurfaces:
-        """The same bands beside other rigid parts."""
+        """Return the surfaces with the same bands and other rigid parts."""
         other = copy.copy(self)
         other.rigid = list(rigid)
         other.bending = [
@@ -434,36 +473,39 @@ class TreeSurfaces:
 
     @property
     def bends(self) -> bool:
-        """Whether any node has a band."""
+        """Whether any node has a skin band."""
         return any(bending is not None for bending in self.bending)
 
     def whole(self, node: int) -> Outline | BendingOutline:
-        """A node's surface: bending where the node has a band."""
+        """Return a node's surface, with its band if it has one."""
         return self.bending[node] or self.rigid[node]
 
     def at_rest(self, node: int) -> Outline:
-        """A node's surface with its skin at rest."""
+        """Return a node's surface with its band at rest."""
         bending = self.bending[node]
         return self.rigid[node] if bending is None else bending.rest
 
     def node_at(self, node: int, values: np.ndarray) -> Outline:
-        """A node's whole surface in its frame at its values (k,) [rad or m]."""
+        """Return a node's whole surface in its frame at its values (k,) [rad or m]."""
         bending, skin = self.bending[node], self._nodes[node].skin
         if bending is None or skin is None:
             return self.rigid[node]
         return bending.at(skin.vertices(np.asarray(values)[None])[0])
 
     def at(self, values: Sequence[np.ndarray]) -> list[Outline]:
-        """All nodes' whole surfaces, each in its node's frame, at each node's values (k_i,)."""
+        """Return all nodes' surfaces in their own frames, given each node's values (k_i,)."""
         return [self.node_at(node, part) for node, part in enumerate(values)]
 
 
 class PackedSurfaces:
-    """A tree's surfaces as kernels take them; rigid parts may have fewer triangles than its own."""
+    """A tree's surfaces in the kernel's arrays, deformed to values of the tree.
+
+    The rigid parts may be simplified ones.
+    """
 
     def __init__(self, surfaces: TreeSurfaces) -> None:
         self._rest = pack(tuple(surfaces.at_rest(node) for node in range(len(surfaces.rigid))))
-        # Of each node's band its place, as in ``bend``, and which of all values are the node's.
+        # Each band's entry for ``bend``, and the range of its node's values.
         ends = np.cumsum([0, *surfaces.value_counts])
         skins, parts, ranges, vertices = [], [], [], 0
         for node, bending in enumerate(surfaces.bending):
@@ -476,26 +518,29 @@ class PackedSurfaces:
         self._bands = join_bands(skins) if skins else None
         self._parts, self._ranges = np.array(parts), np.array(ranges)
         self._shapes = (1, ends[-1]), (1, vertices, 3)
-        # Threads bend side by side.
+        # Each thread bends its own copy.
         self._threads = threading.local()
 
     def at(self, values: np.ndarray) -> PackedOutlines:
-        """All nodes' surfaces at all values (m,) [rad or m]."""
+        """Return all nodes' surfaces at all values (m,) [rad or m]."""
         return self._rest if self._bands is None else mutable_copy(self.bend_to(values))
 
     def bend_to(self, values: np.ndarray | None) -> PackedOutlines:
-        """As at, in arrays that the thread's next call changes; None: as they are."""
+        """As ``at``, in arrays that the thread's next call overwrites.
+
+        ``values``: (m,) [rad or m]; None: leave the bands as they are.
+        """
         if self._bands is None:
             return self._rest
         if not hasattr(self._threads, "bent"):
-            bent, placed = (np.full(shape, np.nan) for shape in self._shapes)
-            self._threads.bent = mutable_copy(self._rest), bent, placed
-        own, bent, placed = self._threads.bent
+            last_values, placed = (np.full(shape, np.nan) for shape in self._shapes)
+            self._threads.bent = mutable_copy(self._rest), last_values, placed
+        packed, last_values, placed = self._threads.bent
         if values is not None:
             values = np.ascontiguousarray(values, dtype=np.float64)[None]
-            changed = place_bands(self._bands, self._ranges, values, bent, placed)[0]
+            changed = place_bands(self._bands, self._ranges, values, last_values, placed)[0]
             if changed.any():
                 parts = self._parts[changed]
-                own.balls[parts[:, 0]] = self._rest.balls[parts[:, 0]]
-                bend(own, parts, placed[0])
-        return own
+                packed.balls[parts[:, 0]] = self._rest.balls[parts[:, 0]]
+                bend(packed, parts, placed[0])
+        return packed

@@ -1,7 +1,8 @@
-"""Areas and masks of projected surfaces, by the span kernel, and what follows from masks.
+"""Areas and masks of projected surfaces, and the visual hull of a surface.
 
-A ball is in the visual hull if every line that meets it meets the surface; a point's distance to
-the edges of pictures from many sides bounds it. The mesh may have holes and inner parts.
+Areas and masks come from the span kernel. A ball lies in the visual hull if every line that meets
+the ball meets the surface; the distance of a projected point to the silhouette's edge in images
+from many directions bounds the ball's radius. Meshes may have holes and inner parts.
 """
 
 import math
@@ -23,7 +24,7 @@ from drake_pose.silhouette.span_kernel import paint, paint_labels, score
 
 
 def prefix_sums(weights: np.ndarray) -> np.ndarray:
-    """Returns (H, W + 1) int32: the sum of a mask or whole numbers (H, W) left of each pixel."""
+    """Return (H, W + 1) int32 sums of a mask or of integers (H, W) left of each pixel."""
     prefix = np.zeros((weights.shape[0], weights.shape[1] + 1), dtype=np.int32)
     np.cumsum(weights, axis=1, dtype=np.int32, out=prefix[:, 1:])
     return prefix
@@ -36,18 +37,22 @@ def score_bodies(
     prefixes: np.ndarray,
     bands: Sequence[np.ndarray] = (),
 ) -> np.ndarray:
-    """Areas of a body at many poses, its surfaces united exactly, and of intersections with sets.
+    """Return the areas of a body at many poses, and of its intersections with sets.
+
+    The union of the body's surfaces is exact.
 
     Args:
-        X_CN: (n, nodes, 4, 4) the surfaces' poses in the camera.
+        surfaces: the surfaces of the body's nodes.
+        X_CN: (n, nodes, 4, 4) poses of the surfaces in the camera.
+        camera: the camera.
         prefixes: (k, H, W + 1) int32 prefix sums of the sets; k may be 0.
-        bands: for each of the bending surfaces (n, v, 3) its band's vertices in its frame N at each
-            pose [m].
+        bands: for each bending surface, (n, v, 3) vertices of its band in its frame N at each pose
+            [m].
 
     Returns:
-        (n, 1 + k) int64 area inside the picture, then of the intersection with each set [pixel].
+        (n, 1 + k) int64 area inside the image, then area of the intersection with each set [pixel].
 
-    Raises ValueError: when poses, bands or sums have the wrong shape, or are not finite.
+    Raises ValueError: poses, bands or sums have the wrong shape or are not finite.
     """
     packed, poses = _check_body(surfaces, X_CN)
     parts, sizes = [], [0]
@@ -74,13 +79,13 @@ def score_bodies(
 
 
 def draw_mask(outlines: Sequence[Outline], X_CN: np.ndarray, camera: Camera) -> np.ndarray:
-    """Returns the mask (H, W) bool of a body at poses X_CN (nodes, 4, 4) in the camera."""
+    """Return the mask (H, W) bool of a body at poses X_CN (nodes, 4, 4) in the camera."""
     packed, poses = _check_body(outlines, np.asarray(X_CN)[None])
     return draw_packed(packed, poses[0], camera)
 
 
 def draw_packed(packed: PackedOutlines, X_CN: np.ndarray, camera: Camera) -> np.ndarray:
-    """As draw_mask, for surfaces that are packed, as ``PackedSurfaces`` gives them."""
+    """As ``draw_mask``, for packed surfaces such as ``PackedSurfaces`` returns."""
     poses = np.ascontiguousarray(X_CN[:, :3], dtype=np.float64)
     mask = np.zeros((camera.height, camera.width), dtype=np.uint8)
     paint(packed, poses, camera.kernel_parameters(), mask, 1)
@@ -94,9 +99,14 @@ def draw_labels(
     camera: Camera,
     empty: int = 0,
 ) -> np.ndarray:
-    """The label (H, W) int16 of the nearest surface in each pixel, or ``empty``.
+    """Return the label (H, W) int16 of the nearest surface in each pixel.
 
-    ``labels``: (nodes,); ``X_CN``: (nodes, 4, 4) the surfaces' poses in the camera.
+    Args:
+        outlines: the surfaces.
+        labels: (nodes,) non-negative labels of the surfaces.
+        X_CN: (nodes, 4, 4) poses of the surfaces in the camera.
+        camera: the camera.
+        empty: label of pixels without a surface.
     """
     packed, poses = _check_body(outlines, np.asarray(X_CN)[None])
     image = np.empty((camera.height, camera.width), dtype=np.int16)
@@ -113,12 +123,14 @@ def subtract_body(
     X_CN: np.ndarray,
     camera: Camera,
 ) -> None:
-    """Takes a body's picture out of a mask and brings the mask's prefix sums up to date.
+    """Remove a body's silhouette from a mask, and update the mask's prefix sums.
 
     Args:
-        mask: (H, W) bool; changed in place.
-        prefix: (H, W + 1) int32 its prefix sums; changed in place.
-        X_CN: (nodes, 4, 4) the surfaces' poses in the camera.
+        mask: (H, W) bool, changed in place.
+        prefix: (H, W + 1) int32 prefix sums of the mask, changed in place.
+        outlines: the surfaces of the body.
+        X_CN: (nodes, 4, 4) poses of the surfaces in the camera.
+        camera: the camera.
     """
     packed, poses = _check_body(outlines, np.asarray(X_CN)[None])
     first, end = paint(packed, poses[0], camera.kernel_parameters(), mask.view(np.uint8), 0)
@@ -128,7 +140,7 @@ def subtract_body(
 def _check_body(
     surfaces: Sequence[Outline | BendingOutline], X_CN: np.ndarray
 ) -> tuple[PackedOutlines, np.ndarray]:
-    """The kernel's arrays, and poses (n, nodes, 4, 4) as (n, nodes, 3, 4)."""
+    """Check a body; return its packed surfaces, and poses (n, nodes, 3, 4)."""
     poses = np.asarray(X_CN)
     if poses.ndim != 4 or poses.shape[1] != len(surfaces) or poses.shape[2:] != (4, 4):
         raise ValueError(f"poses must be (n, {len(surfaces)}, 4, 4), not {poses.shape}")
@@ -139,68 +151,76 @@ def _check_body(
 
 
 class VisualHull:
-    """A surface's distances to the edges of its pictures from many sides; may be empty."""
+    """A surface's visual hull, as images of distances to the silhouette's edge; may be empty."""
 
     def __init__(self, outline: Outline, side: int = 96, directions: int = 72) -> None:
-        """``side``: of a square picture [pixel]; ``directions``: from how many it is looked at."""
+        """Draw the images of a surface.
+
+        Args:
+            outline: the surface.
+            side: width and height of each image [pixel].
+            directions: number of viewing directions.
+        """
         self._center, self._side = outline.ball[:3], side
         self._size = float(outline.ball[3])
         self._views: list[tuple[np.ndarray, np.ndarray]] = []
         if self._size > 0.0 and len(outline.triangles):
             scale, middle = 0.46 * side / self._size, 0.5 * (side - 1)
             camera = ParallelCamera("hull", side, side, scale, middle, middle, np.eye(4))
-            self._views = [_look(outline, R_CN, camera) for R_CN in _rotations(directions)]
+            self._views = [
+                _distance_image(outline, R_CN, camera) for R_CN in _rotations(directions)
+            ]
             self._scale = scale
 
     def radii(self, p_N: np.ndarray, shrink: float = 0.97) -> np.ndarray:
-        """The radii (n,) [m] of the largest balls around points (n, 3) in the hull.
+        """Return the radii (n,) [m] of the largest balls around points (n, 3) [m] inside the hull.
 
-        ``shrink``: factor for the hull's width between the viewing directions.
+        ``shrink``: factor that allows for the hull's extent between the viewing directions.
         """
         if not self._views:
             return np.zeros(len(p_N))
-        smallest, left = np.full(len(p_N), np.inf), np.arange(len(p_N))
+        smallest, active = np.full(len(p_N), np.inf), np.arange(len(p_N))
         for rows, distances in self._views:
-            uv = (p_N[left] - self._center) @ rows.T + 0.5 * (self._side - 1)
-            # Which side of a pixel's edge a point falls is not left to the last digit.
+            uv = (p_N[active] - self._center) @ rows.T + 0.5 * (self._side - 1)
+            # Round first, so that rounding errors do not decide between two pixels.
             uv = np.rint(np.round(uv, 6)).astype(int)
             inside = np.all((uv >= 0) & (uv < self._side), axis=1)
             u, v = np.clip(uv, 0, self._side - 1).T
-            seen = np.where(inside, distances[v, u], 0.0)
-            smallest[left] = np.minimum(smallest[left], seen)
-            left = left[seen > 0.0]
-        # From a point to the nearest pixel centre, and from a distance between centres to the edge.
+            found = np.where(inside, distances[v, u], 0.0)
+            smallest[active] = np.minimum(smallest[active], found)
+            active = active[found > 0.0]
+        # Distance [pixel] from a point to its pixel's centre, and from there to the pixel's edge.
         rounding = 0.75 + 0.5
         return np.maximum(0.0, shrink * (smallest - rounding) / self._scale)
 
-    def spread_balls(self, count: int, points_a_side: int = 15) -> np.ndarray:
-        """(count or fewer, 4) centres and radii [m] of balls that reach far apart.
+    def spread_balls(self, count: int, points_per_side: int = 15) -> np.ndarray:
+        """Return (k, 4) centres and radii [m] of at most ``count`` balls spread over the hull.
 
-        ``points_a_side``: of the cube of points that may be centres.
+        ``points_per_side``: number of candidate centres along each side of a cubic grid.
         """
         if not self._views:
             return np.zeros((0, 4))
-        steps = np.linspace(-self._size, self._size, points_a_side)
+        steps = np.linspace(-self._size, self._size, points_per_side)
         grid = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), axis=-1).reshape(-1, 3)
         points = grid + self._center
         radii = self.radii(points)
         points, radii = points[radii > 0.0], radii[radii > 0.0]
         if len(points) == 0:
             return np.zeros((0, 4))
-        # Symmetric bodies have equals, of which the first is taken whatever the last digit says.
+        # Round, so that rounding errors do not decide between equal points of symmetric bodies.
         chosen = [int(np.argmax(np.round(radii, 9)))]
         beyond = np.full(len(points), np.inf)
         while len(chosen) < min(count, len(points)):
             last = chosen[-1]
             gap = np.linalg.norm(points - points[last], axis=1) - radii[last]
             beyond = np.minimum(beyond, gap)
-            # How far the ball reaches beyond all those chosen before.
+            # Choose the ball that reaches farthest beyond the chosen ones.
             chosen.append(int(np.argmax(np.round(beyond + radii, 9))))
         return np.column_stack([points, radii])[chosen]
 
 
 def _rotations(count: int) -> np.ndarray:
-    """Returns rotations R_CN (count, 3, 3) whose viewing directions fill half a sphere evenly."""
+    """Return R_CN (count, 3, 3) whose viewing directions fill half a sphere evenly."""
     index = np.arange(count) + 0.5
     z = index / count
     azimuth = index * np.pi * (1.0 + 5.0**0.5)
@@ -210,16 +230,20 @@ def _rotations(count: int) -> np.ndarray:
     return np.stack([right, np.cross(forward, right), forward], axis=1)
 
 
-def _look(
+def _distance_image(
     outline: Outline, R_CN: np.ndarray, camera: ParallelCamera
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the axes (2, 3) [pixel/m] of a picture and its pixels' distances to its edge."""
+    """Draw a surface from one direction and measure distances to its silhouette's edge.
+
+    Returns:
+        The image's axes (2, 3) in frame N [pixel/m], and each pixel's distance to the edge [pixel].
+    """
     X_CN = np.eye(4)
     X_CN[:3, :3] = R_CN
     X_CN[:3, 3] = -R_CN @ outline.ball[:3]
     mask = draw_mask([outline], X_CN[None], camera)
     distances = cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-    # Squares are whole numbers, but OpenCV's last digit depends on where a picture lies in memory.
+    # Squared distances are integers; OpenCV's rounding depends on the image's memory alignment.
     return camera.pixels_per_metre * R_CN[:2], np.sqrt(
         np.rint(np.square(distances, dtype=np.float64))
     )
@@ -228,12 +252,16 @@ def _look(
 def require_visible(
     outlines: Sequence[Outline], X_CN: np.ndarray, camera: Camera, max_pictures: float = 10.0
 ) -> None:
-    """Refuses a camera that cannot show a body whose surfaces are at X_CN (nodes, 4, 4).
+    """Raise CameraError, which names the camera, for a camera that cannot show a body.
 
-    ``max_pictures``: largest size of a body, in pictures.
+    The camera is refused if the whole body is behind it, if it is inside a surface, if the body is
+    far larger than the image, or if the body is outside the image.
 
-    Raises CameraError: names the camera; when the body is wholly behind it, when the camera is
-    inside one of the surfaces, when the body is far larger than the picture, or wholly outside.
+    Args:
+        outlines: the surfaces of the body.
+        X_CN: (nodes, 4, 4) poses of the surfaces in the camera.
+        camera: the camera.
+        max_pictures: largest size of the body, as a multiple of the image's diagonal.
     """
     solid = [
         (outline, np.asarray(X))
@@ -248,9 +276,9 @@ def require_visible(
                 f"{where} has the whole body behind it (z forward is the viewing direction); "
                 "check X_WC, which is the camera's pose in the world and not its inverse"
             )
-        if any(_winding_at_origin(p_C[outline.triangles]) > 0.5 for outline, p_C in placed):
+        if any(_winding_number(p_C[outline.triangles]) > 0.5 for outline, p_C in placed):
             raise CameraError(f"{where} is inside the body; check X_WC and the body's position")
-    # The diagonal of the body's box as it would look at its farthest point [pixel].
+    # Diagonal of the body's box, projected at the depth of its farthest point [pixel].
     corners, scale = np.vstack([p_C for _, p_C in placed]), float(camera.kernel_parameters()[1])
     if isinstance(camera, PinholeCamera):
         scale /= float(corners[:, 2].max())
@@ -270,9 +298,9 @@ def require_visible(
         )
 
 
-def _winding_at_origin(corners: np.ndarray) -> float:
-    """Returns how often triangles (m, 3, 3) enclose the origin: 1 inside a closed surface."""
-    # Solid angles: van Oosterom and Strackee (1983), equation 8.
+def _winding_number(corners: np.ndarray) -> float:
+    """Return how often triangles (m, 3, 3) enclose the origin: 1 inside a closed surface."""
+    # Solid angles after van Oosterom and Strackee (1983), equation 8.
     a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
     la, lb, lc = (np.linalg.norm(side, axis=1) for side in (a, b, c))
     numerator = np.einsum("ij,ij->i", a, np.cross(b, c))

@@ -1,4 +1,9 @@
-"""Objects in pictures: by their background, learnt or beside them, by a box, or by outlines."""
+"""Segmentation of objects in pictures: by a background model, a box, or strong outlines.
+
+Foreground pixels differ from a learnt background, or from the same pixel in pictures without the
+object. GrabCut segments the object in a box. Regions with strong outlines are candidates for an
+unknown object.
+"""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -15,75 +20,89 @@ from drake_pose.silhouette.pictures.masks import intersection_over_union
 
 
 class Background:
-    """An empty scene's mean colour (H, W, 3) and its standard deviation (H, W) [grey levels]."""
+    """A background model: mean colour and noise of each pixel of an empty scene.
 
-    def __init__(self, mean: Picture, deviation: Floats, deviations: float = 5.0) -> None:
-        """``deviations``: a colour farther off is not the background's [standard deviations]."""
-        self.mean, self.deviation, self._deviations = mean, deviation, deviations
-        off = np.minimum(np.floor(deviations * deviation), 255.0).astype(np.uint8)
-        self.tolerance = np.repeat(off[:, :, None], 3, axis=2)
-        """(H, W, 3) how far each channel may be off where only the background is seen."""
+    Attributes:
+        mean: (H, W, 3) uint8 mean colour [grey levels].
+        deviation: (H, W) float32 standard deviation [grey levels].
+    """
 
-    def with_noise(self, times: float) -> "Background":
-        """The same background with its noise multiplied."""
-        return Background(self.mean, times * self.deviation, self._deviations)
+    def __init__(self, mean: Picture, deviation: Floats, threshold: float = 5.0) -> None:
+        """Store the model.
+
+        ``threshold``: a colour that differs by more than this is not the background's [standard
+        deviations].
+        """
+        self.mean, self.deviation, self._threshold = mean, deviation, threshold
+        largest = np.minimum(np.floor(threshold * deviation), 255.0).astype(np.uint8)
+        self.tolerance = np.repeat(largest[:, :, None], 3, axis=2)
+        """(H, W, 3) largest difference of each channel from the mean [grey levels]."""
+
+    def with_noise(self, factor: float) -> "Background":
+        """Return the background with its standard deviations multiplied by a factor."""
+        return Background(self.mean, factor * self.deviation, self._threshold)
 
 
-def learn_background(pictures: Sequence[Picture], least_deviation: float = 3.0) -> Background:
-    """The background from pictures (H, W, 3) of the empty scene, all of one size.
+def learn_background(pictures: Sequence[Picture], min_deviation: float = 3.0) -> Background:
+    """Return the background model of pictures (H, W, 3) of the empty scene.
 
-    ``least_deviation``: the camera's noise is no less [grey levels]. Raises SettingsError for no
-    picture, or pictures of different sizes.
+    ``min_deviation``: lower bound of the standard deviation [grey levels].
+
+    Raises SettingsError: there is no picture, or sizes differ.
     """
     _require_one_size(pictures, 1, "a background needs one or more pictures of the same size")
     stack = np.stack([picture.astype(np.float32) for picture in pictures])
     deviation = np.sqrt(stack.var(axis=0).mean(axis=-1))
     mean = np.rint(stack.mean(axis=0)).astype(np.uint8)
-    return Background(mean, np.maximum(deviation, least_deviation))
+    return Background(mean, np.maximum(deviation, min_deviation))
 
 
-def background_of_recording(
-    pictures: Sequence[Picture], least_deviation: float = 3.0
-) -> Background:
-    """The background from three or more pictures (H, W, 3) of a recording: each pixel's median.
+def background_of_recording(pictures: Sequence[Picture], min_deviation: float = 3.0) -> Background:
+    """Return the background model of a recording: each pixel's median over three or more pictures.
 
-    What covers a pixel in half of the pictures, or never moves, is taken for background. Raises
-    SettingsError for too few pictures, or pictures of different sizes.
+    An object that covers a pixel in half of the pictures, or never moves, is taken for background.
+    The standard deviation is the same for all pixels.
+
+    ``min_deviation``: lower bound of the standard deviation [grey levels].
+
+    Raises SettingsError: there are too few pictures, or sizes differ.
     """
     message = "the median of a recording needs three or more pictures of one size"
     _require_one_size(pictures, 3, message)
     mean, spread = np.empty_like(pictures[0]), np.empty(pictures[0].shape[:2], dtype=np.float32)
-    # Row by row: all pictures as numbers with a point would fill the memory.
+    # Row by row, because all pictures as floats would fill the memory.
     for row in range(len(mean)):
         stack = np.stack([picture[row] for picture in pictures]).astype(np.float32)
         middle = np.median(stack, axis=0)
         mean[row] = np.rint(middle)
         spread[row] = np.median(np.abs(stack - middle), axis=0).mean(axis=-1)
-    # Where the body passes the spread is the body's: the camera's noise is that of most pixels.
-    # Normal noise deviates by 1.4826 medians of its absolute values.
-    noise = max(least_deviation, float(1.4826 * np.median(spread)))
+    # The spread of a pixel that the body covers at times is the body's, so the noise is the median
+    # over pixels. A normal standard deviation is 1.4826 median absolute deviations.
+    noise = max(min_deviation, float(1.4826 * np.median(spread)))
     return Background(mean, np.full(spread.shape, noise, dtype=np.float32))
 
 
-def _require_one_size(pictures: Sequence[Picture], least: int, message: str) -> None:
-    if len(pictures) < least or any(one.shape != pictures[0].shape for one in pictures):
+def _require_one_size(pictures: Sequence[Picture], min_count: int, message: str) -> None:
+    """Raise SettingsError unless there are enough pictures, all of one size."""
+    if len(pictures) < min_count or any(one.shape != pictures[0].shape for one in pictures):
         raise SettingsError(message)
 
 
 def background_support(pictures: Sequence[Picture], background: Background) -> Floats:
-    """(H, W) in what fraction of pictures each pixel shows the background."""
+    """Return (H, W) the fraction of pictures in which each pixel shows the background."""
     shown = np.zeros(background.deviation.shape, dtype=np.float32)
     for picture in pictures:
-        shown += _off(picture, background.mean, background.tolerance) == 0
+        shown += _differs(picture, background.mean, background.tolerance) == 0
     return np.asarray(shown / len(pictures), dtype=np.float32)
 
 
-def person_region(picture: Picture, background: Background, smallest: float = 0.1) -> Mask:
-    """Where a picture (H, W, 3 or 4) differs from its camera's background: the person, (H, W).
+def person_region(picture: Picture, background: Background, min_fraction: float = 0.1) -> Mask:
+    """Return the mask (H, W) where a picture (H, W, 3 or 4) differs from the background: a person.
 
-    Patches smaller than the fraction ``smallest`` of the largest are dropped as noise; the rest may
-    be several parts, or nothing. Raises SettingsError for a picture of another size than the
-    background.
+    The difference is opened and closed morphologically. Patches smaller than ``min_fraction`` of
+    the largest one are dropped as noise. Several patches or none may remain.
+
+    Raises SettingsError: picture and background have different sizes.
     """
     size = background.mean.shape[:2]
     if picture.shape not in ((*size, 3), (*size, 4)):
@@ -91,25 +110,25 @@ def person_region(picture: Picture, background: Background, smallest: float = 0.
             f"the picture is {picture.shape}, but its background {background.mean.shape}"
         )
     region, square = np.zeros(size, dtype=np.bool_), np.ones((3, 3), np.uint8)
-    # Opening leaves squares of 3 x 3 pixels: every third row tells where they may be.
+    # Opening keeps squares of 3 x 3 pixels, so every third row suffices to locate them.
     rows = slice(int(size[0] % 3 == 0), None, 3)
-    seen = picture, background.mean, background.tolerance
-    told = cv2.erode(_off(*(one[rows] for one in seen)), square[:1])
-    left, top, width, height = cv2.boundingRect(told)
+    inputs = picture, background.mean, background.tolerance
+    squares = cv2.erode(_differs(*(one[rows] for one in inputs)), square[:1])
+    left, top, width, height = cv2.boundingRect(squares)
     if not width:
         return region
     first, last = rows.start + 3 * top, rows.start + 3 * (top + height - 1)
 
-    def around(margin: int) -> tuple[slice, slice]:
-        """Rows and columns of the squares' middles with a margin, as far as in the picture."""
+    def window(margin: int) -> tuple[slice, slice]:
+        """Return the rows and columns of the squares' middles with a margin [pixel]."""
         ends = ((first - 1, last + 2), (left, left + width))
         down, across = (slice(max(0, a - margin), b + margin) for a, b in ends)
         return down, across
 
-    # The margin reaches to the squares' borders, as far as closing looks, and one to spare.
-    inner, middles = around(4), around(0)
-    eroded = cv2.erode(_off(*(one[inner] for one in seen)), square)
-    # Erosion takes what is beyond the inner part for the person: only squares' middles are right.
+    # The margin covers the squares' borders, the reach of closing, and one more pixel.
+    inner, middles = window(4), window(0)
+    eroded = cv2.erode(_differs(*(one[inner] for one in inputs)), square)
+    # Erosion counts pixels beyond the inner part as foreground: keep the squares' middles only.
     kept = np.zeros_like(eroded)
     place = tuple(
         slice(own.start - outer.start, own.stop - outer.start)
@@ -117,7 +136,7 @@ def person_region(picture: Picture, background: Background, smallest: float = 0.
     )
     kept[place] = eroded[place]
     patches = cv2.morphologyEx(cv2.dilate(kept, square), cv2.MORPH_CLOSE, square)
-    # The contours tell soon that there is but one patch, as there mostly is; areas take longer.
+    # Usually there is one patch; counting contours is faster than measuring areas.
     _, levels = cv2.findContours(patches, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_SIMPLE)
     if levels is None:
         return region
@@ -128,14 +147,17 @@ def person_region(picture: Picture, background: Background, smallest: float = 0.
     _, labels, statistics, _ = cv2.connectedComponentsWithStats(patches, connectivity=8)
     areas = statistics[:, cv2.CC_STAT_AREA].copy()
     areas[0] = 0
-    keep = areas >= smallest * areas.max()
+    keep = areas >= min_fraction * areas.max()
     keep[0] = False
     region[inner] = keep.take(labels)
     return region
 
 
-def _off(picture: Picture, mean: Picture, tolerance: Picture) -> NDArray[Any]:
-    """(H, W) not 0 where a channel of a picture (H, W, 3 or 4) is off; a fourth says nothing."""
+def _differs(picture: Picture, mean: Picture, tolerance: Picture) -> NDArray[Any]:
+    """Return (H, W), non-zero where a channel differs from the mean by more than the tolerance.
+
+    ``picture``: (H, W, 3 or 4); a fourth channel is ignored.
+    """
     seen = cv2.cvtColor(picture, cv2.COLOR_RGBA2RGB) if picture.shape[2] == 4 else picture
     off = cv2.compare(cv2.absdiff(seen, mean), tolerance, cv2.CMP_GT)
     return cv2.cvtColor(off, cv2.COLOR_RGB2GRAY)
@@ -144,71 +166,81 @@ def _off(picture: Picture, mean: Picture, tolerance: Picture) -> NDArray[Any]:
 def foreground_log_ratios(
     pictures: Sequence[Picture],
     probabilities: Sequence[Floats],
-    wanted: Sequence[int],
+    indices: Sequence[int],
     *,
-    beside: float = 0.1,
-    nowhere: float = 0.011,
+    max_background: float = 0.1,
+    min_probability: float = 0.011,
     min_count: int = 2,
     max_count: int = 40,
     exposure_pixels: int = 20_000,
-    least_deviation: float = 4.0,
-    unsure_deviation: float = 9.0,
-    even: float = 3.0,
+    min_deviation: float = 4.0,
+    uncertain_deviation: float = 9.0,
+    break_even: float = 3.0,
     bounds: tuple[float, float] = (-3.0, 6.0),
 ) -> list[Floats]:
-    """How much more likely each pixel's colour is the body's than the background's.
+    """Return the log-likelihood ratio of foreground against background at each pixel.
 
-    Pictures (H, W, 3) of one camera that stands still are brought to each other's exposure and
-    light; ``probabilities`` (H, W) say how likely the body is at each pixel.
+    Pictures (H, W, 3) of one fixed camera are brought to a common exposure. The background of a
+    pixel is the median over pictures in which the body is unlikely there. With d the RMS difference
+    over the channels and s the standard deviation, the log-likelihood ratio is (d^2 / s^2 -
+    break_even^2) / 2, within bounds.
 
     Args:
-        beside: a pixel shows the background where the body is less likely.
-        nowhere: nothing is looked at where the body is less likely in all that are wanted.
+        pictures: the pictures of the camera.
+        probabilities: (H, W) foreground probability at each pixel of each picture.
+        indices: indices of the pictures whose ratios are returned.
+        max_background: a pixel shows the background where its foreground probability is lower.
+        min_probability: pixels with a lower foreground probability in all returned pictures are
+            skipped.
         min_count: number of pictures that must show a pixel's background.
         max_count: largest number of pictures of a median.
-        exposure_pixels: largest number of pixels that tell the exposure.
-        least_deviation: least standard deviation of a colour [grey levels].
-        unsure_deviation: that of a colour which only ``min_count`` pictures show [grey levels].
-        even: distance at which a colour is as likely another's as the background's [standard
+        exposure_pixels: largest number of pixels from which exposure is estimated.
+        min_deviation: lower bound of a colour's standard deviation [grey levels].
+        uncertain_deviation: standard deviation where at most ``min_count`` pictures show the
+            background [grey levels].
+        break_even: difference at which foreground and background are equally likely [standard
             deviations].
-        bounds: of a log-likelihood ratio, for shadows, reflections and the body's own colours.
+        bounds: bounds of the log-likelihood ratio, against shadows, reflections, and a body that is
+            coloured like the background.
 
     Returns:
-        The log likelihood ratio (H, W) of each picture that is wanted; 0 where no other shows the
-        background, and the lowest where the body is likely in none of them.
+        (H, W) float32 log-likelihood ratio of each chosen picture: 0 where too few pictures show
+        the background, the lower bound at skipped pixels.
     """
-    near = np.max([probabilities[k] for k in wanted], axis=0) >= nowhere
-    # The channels' exposures (n, 3), by what surely is background in all pictures.
+    relevant = np.max([probabilities[k] for k in indices], axis=0) >= min_probability
+    # Exposure gains (n, 3) of the channels, from pixels that are background in all pictures.
     gains = np.ones((len(pictures), 3), np.float32)
-    sure = np.flatnonzero(np.max(probabilities, axis=0) < 0.5 * beside)
-    if len(sure):
-        sure = sure[:: -(-len(sure) // exposure_pixels)]
-        seen = np.stack([picture.reshape(-1, 3)[sure] for picture in pictures]).astype(np.float32)
-        gains = np.median((seen + 1.0) / (np.median(seen, axis=0) + 1.0), axis=1)
-    evened = [
-        np.minimum(picture[near] / gain, 255.0, dtype=np.float32)
+    background = np.flatnonzero(np.max(probabilities, axis=0) < 0.5 * max_background)
+    if len(background):
+        background = background[:: -(-len(background) // exposure_pixels)]
+        samples = np.stack([picture.reshape(-1, 3)[background] for picture in pictures]).astype(
+            np.float32
+        )
+        gains = np.median((samples + 1.0) / (np.median(samples, axis=0) + 1.0), axis=1)
+    equalised = [
+        np.minimum(picture[relevant] / gain, 255.0, dtype=np.float32)
         for picture, gain in zip(pictures, gains, strict=True)
     ]
-    step = -(-len(evened) // max_count)
-    hidden = np.stack([one[near] for one in probabilities[::step]]) >= beside
+    step = -(-len(equalised) // max_count)
+    hidden = np.stack([one[relevant] for one in probabilities[::step]]) >= max_background
     count = np.count_nonzero(~hidden, axis=0)
-    stack = np.stack(evened[::step])
+    stack = np.stack(equalised[::step])
     middle = _masked_median(stack, hidden, count)
     spread = _masked_median(np.abs(stack - middle), hidden, count).mean(axis=-1) * 1.4826
-    deviation = np.where(count > min_count, np.maximum(spread, least_deviation), unsure_deviation)
+    deviation = np.where(count > min_count, np.maximum(spread, min_deviation), uncertain_deviation)
     found = []
-    for k in wanted:
-        squares = np.mean((evened[k] - middle) ** 2, axis=-1) / deviation**2
+    for k in indices:
+        squares = np.mean((equalised[k] - middle) ** 2, axis=-1) / deviation**2
         lowest = bounds[0] if len(pictures) >= min_count else 0.0
-        ratio = np.full(near.shape, lowest, np.float32)
-        told = np.clip(0.5 * (squares - even**2), *bounds)
-        ratio[near] = np.where(count >= min_count, told, 0.0)
+        ratio = np.full(relevant.shape, lowest, np.float32)
+        log_ratio = np.clip(0.5 * (squares - break_even**2), *bounds)
+        ratio[relevant] = np.where(count >= min_count, log_ratio, 0.0)
         found.append(ratio)
     return found
 
 
 def _masked_median(stack: Floats, hidden: NDArray[np.bool_], count: NDArray[np.intp]) -> Floats:
-    """The median (p, 3) of a stack (n, p, 3) without what is hidden (n, p); 0 of nothing."""
+    """Return the median (p, 3) of a stack (n, p, 3) without hidden (n, p) entries, or 0."""
     values = np.sort(np.where(hidden[:, :, None], np.float32(np.inf), stack), axis=0)
     last, across = np.maximum(count - 1, 0), np.arange(len(count))
     middle = 0.5 * (values[last // 2, across] + values[(last + 1) // 2, across])
@@ -216,9 +248,14 @@ def _masked_median(stack: Floats, hidden: NDArray[np.bool_], count: NDArray[np.i
 
 
 def grab_cut_box(picture: Picture, box: Sequence[float]) -> Mask:
-    """The object (H, W) in a picture (H, W, 3) and a box x, y, width, height [pixel] around it.
+    """Segment the object in a box of a picture (H, W, 3) by GrabCut.
 
-    Raises SettingsError where the box lies outside the picture, or is all of it.
+    ``box``: x, y, width, height [pixel].
+
+    Returns:
+        (H, W) the object's mask.
+
+    Raises SettingsError: the box is outside the picture or is the whole picture.
     """
     height, width = picture.shape[:2]
     x, y, w, h = box
@@ -240,37 +277,56 @@ def grab_cut(
     picture: Picture,
     labels: NDArray[np.uint8],
     iterations: int = 6,
-    every: int = 1,
+    stride: int = 1,
     seed: int = 1,
 ) -> Mask:
-    """The object (H, W) by labels (H, W) of GrabCut (Rother et al., 2004), left as they are.
+    """Segment an object by GrabCut (Rother et al., 2004).
 
     Args:
-        every: colours are learnt from every nth row and column, and what is in doubt is cut once by
-            these; 1: all of it is cut in each of the iterations.
-        seed: GrabCut draws its first clusters at random.
+        picture: (H, W, 3) the picture.
+        labels: (H, W) GrabCut's labels; not changed.
+        iterations: number of iterations.
+        stride: colours are learnt from every n-th row and column, and uncertain pixels are then cut
+            once with these colours; 1: all uncertain pixels are cut in each iteration.
+        seed: seed of GrabCut's random initial clusters.
+
+    Returns:
+        (H, W) the object's mask.
     """
     found = labels.copy()
-    is_doubted = np.isin(labels, (cv2.GC_PR_FGD, cv2.GC_PR_BGD))
-    if is_doubted.any():
+    is_uncertain = np.isin(labels, (cv2.GC_PR_FGD, cv2.GC_PR_BGD))
+    if is_uncertain.any():
         cv2.setRNGSeed(seed)
-        colours, no_box = (np.zeros((1, 65)), np.zeros((1, 65))), (0, 0, 0, 0)
-        some, own = (np.ascontiguousarray(one[::every, ::every]) for one in (picture, found))
-        cv2.grabCut(some, own, no_box, *colours, iterations, cv2.GC_INIT_WITH_MASK)
-        if every == 1:
-            found = own
+        colours, no_rectangle = (np.zeros((1, 65)), np.zeros((1, 65))), (0, 0, 0, 0)
+        sampled, sampled_labels = (
+            np.ascontiguousarray(one[::stride, ::stride]) for one in (picture, found)
+        )
+        cv2.grabCut(
+            sampled, sampled_labels, no_rectangle, *colours, iterations, cv2.GC_INIT_WITH_MASK
+        )
+        if stride == 1:
+            found = sampled_labels
         else:
-            x, y, w, h = cv2.boundingRect(is_doubted.astype(np.uint8))
+            x, y, w, h = cv2.boundingRect(is_uncertain.astype(np.uint8))
             box = np.s_[max(0, y - 1) : y + h + 1, max(0, x - 1) : x + w + 1]
-            own = np.ascontiguousarray(found[box])
-            some = np.ascontiguousarray(picture[box])
-            cv2.grabCut(some, own, no_box, *colours, 1, cv2.GC_EVAL_FREEZE_MODEL)
-            found[box] = own
+            sampled_labels = np.ascontiguousarray(found[box])
+            sampled = np.ascontiguousarray(picture[box])
+            cv2.grabCut(
+                sampled, sampled_labels, no_rectangle, *colours, 1, cv2.GC_EVAL_FREEZE_MODEL
+            )
+            found[box] = sampled_labels
     return np.asarray((found == cv2.GC_FGD) | (found == cv2.GC_PR_FGD))
 
 
 class _Region(NamedTuple):
-    """A mask (h, w) in a smaller picture, how strong its outline is, and the threshold."""
+    """A region in a smaller picture.
+
+    Attributes:
+        mask: (h, w) the region.
+        strength: strength of its outline.
+        sign: 1 if the region is above its threshold, -1 if below.
+        level: the threshold [grey levels].
+    """
 
     mask: Mask
     strength: float
@@ -279,27 +335,32 @@ class _Region(NamedTuple):
 
 
 def find_regions(
-    picture: Picture, most: int, max_width: int = 480, levels: int = 16, same: float = 0.85
+    picture: Picture,
+    max_count: int,
+    max_width: int = 480,
+    levels: int = 16,
+    max_overlap: float = 0.85,
 ) -> list[Mask]:
-    """Regions (H, W) of a picture (H, W, 3) that may be one object, those with strong outlines.
+    """Return regions (H, W) of a picture with strong outlines, each of which may be an object.
 
-    Nothing is known of the object. Of lightness and of two channels of colour there are thresholds
-    at many levels; what is connected above or below one is a region, as in a tree of components
-    (MSER, Matas et al. 2002), its holes filled. Of regions that are about the same the one is kept
-    along whose outline the channel changes most; two of two channels may be about the same.
+    Lightness and two colour channels are thresholded at many levels. Each connected component above
+    or below a threshold, with its holes filled, is a region, as in a component tree (MSER, Matas et
+    al. 2002). Of regions of one channel that overlap, the one with the strongest outline is kept.
+    Regions of different channels may overlap.
 
     Args:
-        most: largest number of regions.
-        max_width: pictures are looked at so wide at most [pixel].
-        levels: thresholds of each channel.
-        same: regions that overlap more (IoU) are one.
+        picture: (H, W, 3) the picture.
+        max_count: largest number of regions.
+        max_width: width to which larger pictures are reduced [pixel].
+        levels: number of thresholds of each channel.
+        max_overlap: regions of one channel with a larger IoU are duplicates.
     """
     height, width = picture.shape[:2]
-    share = min(1.0, max_width / width)
-    size = max(1, round(share * width)), max(1, round(share * height))
+    scale = min(1.0, max_width / width)
+    size = max(1, round(scale * width)), max(1, round(scale * height))
     lab = cv2.cvtColor(picture, cv2.COLOR_RGB2LAB).astype(np.float32)
     whole = np.moveaxis(cv2.GaussianBlur(lab, (0, 0), 1.0), -1, 0)
-    strongest = []
+    by_channel = []
     for channel in (cv2.resize(one, size, interpolation=cv2.INTER_AREA) for one in whole):
         slopes = (cv2.Sobel(channel, cv2.CV_32F, *by) for by in ((1, 0), (0, 1)))
         change = np.hypot(*slopes)
@@ -312,33 +373,36 @@ def find_regions(
         ]
         kept = list[_Region]()
         for region in sorted(regions, key=lambda one: -one.strength):
-            if all(intersection_over_union(region.mask, other.mask) < same for other in kept):
+            if all(
+                intersection_over_union(region.mask, other.mask) < max_overlap for other in kept
+            ):
                 kept.append(region)
-            if len(kept) == most:
+            if len(kept) == max_count:
                 break
-        strongest.append(kept)
-    # A grey picture has all of them of its lightness.
-    rows = zip_longest(*strongest)
+        by_channel.append(kept)
+    # All regions of a grey picture come from its lightness.
+    rows = zip_longest(*by_channel)
     found = [(k, one) for row in rows for k, one in enumerate(row) if one is not None]
     return [
-        _enlarged(one.mask, one.sign * whole[k] > one.sign * one.level) for k, one in found[:most]
+        _upscaled(one.mask, one.sign * whole[k] > one.sign * one.level)
+        for k, one in found[:max_count]
     ]
 
 
-def _strength(mask: Mask, change: Floats, weakest: float = 0.25) -> float:
-    """How much a picture changes (h, w) along an outline, the longer the better.
+def _strength(mask: Mask, change: Floats, quantile: float = 0.25) -> float:
+    """Return the strength of an outline: a quantile of the change along it, times sqrt(area).
 
-    ``weakest``: the quantile of the change that tells how strong the outline is.
+    ``change``: (h, w) gradient magnitude of the channel.
     """
     inside = cv2.erode(mask.view(np.uint8), np.ones((3, 3), np.uint8), borderValue=1) > 0
     edge = change[mask & ~inside]
     if not len(edge):
         return 0.0
-    return float(np.quantile(edge, weakest)) * math.sqrt(np.count_nonzero(mask))
+    return float(np.quantile(edge, quantile)) * math.sqrt(np.count_nonzero(mask))
 
 
 def _components(above: Mask, sizes: tuple[float, float] = (0.003, 0.7)) -> Iterator[Mask]:
-    """What is connected in (H, W), its holes filled; ``sizes``: fractions of the picture."""
+    """Yield connected components (H, W), holes filled; ``sizes`` are fractions of the picture."""
     _, labels, stats, _ = cv2.connectedComponentsWithStats(above.view(np.uint8), connectivity=4)
     for k in np.flatnonzero(stats[1:, cv2.CC_STAT_AREA] >= sizes[0] * above.size) + 1:
         region = _filled(labels == k)
@@ -346,21 +410,21 @@ def _components(above: Mask, sizes: tuple[float, float] = (0.003, 0.7)) -> Itera
             yield region
 
 
-def _filled(region: Mask, at_border: float = 0.1) -> Mask:
-    """A region (H, W) without holes.
+def _filled(region: Mask, max_fraction: float = 0.1) -> Mask:
+    """Return a region (H, W) without holes.
 
-    ``at_border``: what it encloses together with the picture's border is a hole if it is smaller
-    than this fraction of it.
+    ``max_fraction``: an area enclosed together with the picture's border is a hole if it is smaller
+    than this fraction of the region.
     """
     _, labels, stats, _ = cv2.connectedComponentsWithStats((~region).view(np.uint8))
     u, v, width, height, area = stats.T
     inside = (u > 0) & (v > 0) & (u + width < region.shape[1]) & (v + height < region.shape[0])
-    fills = inside | (area < at_border * np.count_nonzero(region))
+    fills = inside | (area < max_fraction * np.count_nonzero(region))
     return np.asarray(region | fills[labels])
 
 
-def _enlarged(region: Mask, above: Mask) -> Mask:
-    """A region found in a smaller picture, in the whole one (H, W): as a threshold has it."""
+def _upscaled(region: Mask, above: Mask) -> Mask:
+    """Return a region at full size (H, W), refined by its threshold ``above`` (H, W)."""
     height, width = above.shape
     size = (width, height)
     rough = cv2.resize(region.view(np.uint8), size, interpolation=cv2.INTER_NEAREST)

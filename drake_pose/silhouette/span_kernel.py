@@ -1,15 +1,16 @@
-"""The span kernel: exact areas of projected triangle surfaces without drawing them.
+"""The span kernel: exact areas of projected triangle surfaces without rendering.
 
-Every projected triangle is run around counter-clockwise as the picture shows it. The sum of these
-closed curves winds around a point exactly as many times as triangles cover it, for any set of
-triangles. Along an edge the runs of its triangles cancel except on the contour, so only contour
-edges are walked: each leaves, in every row of pixel centres it crosses (half-open: a row on the
-upper end counts, on the lower end does not), the first pixel to the right of the crossing and a
-weight. Where the sum of weights along a row is not zero lies a span of covered pixels; the area of
-a set under the span [a, b) is P[row, b] - P[row, a] with P the row's prefix sums. The crossings of
-all surfaces in the same rows give the exact union.
+Each projected triangle is traversed counter-clockwise in the image. The winding number of all
+triangles at a point is the number of triangles that cover it, for any set of triangles. Along an
+edge, the traversals of its two triangles cancel except on the contour, so only contour edges are
+walked. In every row of pixel centres that it crosses, a contour edge leaves a crossing: the first
+pixel to its right, and a weight. An edge crosses rows v0 <= v < v1 between its upper and lower end.
 
-Numba pays for every slice and every array passed: arrays are passed whole, with an index.
+A span of covered pixels [a, b) lies where the sum of the weights along a row is not zero. The area
+of a set under the span is P[row, b] - P[row, a], with P the set's prefix sums along the row.
+Crossings of all surfaces in common rows give the exact union of the surfaces.
+
+Arrays are passed whole, with an index, because numba pays for every slice and every argument.
 """
 
 import math
@@ -21,16 +22,19 @@ from drake_pose.compiled import compiled
 from drake_pose.silhouette.outline import PackedOutlines, bend, clip_triangle, find_facings, project
 
 SHIFT, BIAS = 3, 4
-"""A crossing is kept as 8 * pixel + weight + BIAS; a weight is a whole number from -2 to 2."""
+"""A crossing is stored as 8 * pixel + weight + BIAS; a weight is an integer from -2 to 2."""
 
 
 class Rows(NamedTuple):
-    """What one body at one pose needs for a moment; made once a call.
+    """Scratch arrays for one body at one pose.
 
-    u, v: (points,) the projected points of one surface [pixel]; facings: (triangles + 1,) int8;
-    counts: (height,) int32 the number of every row's crossings; reach: (3,) int64 first row
-    touched, row after the last, whether a row had no room; changes: (width + 1,) int32 zeros;
-    spans: (width + 1, 2) int32.
+    Attributes:
+        u, v: (points,) image coordinates of one surface's points [pixel].
+        facings: (triangles + 1,) int8 output of ``find_facings``.
+        counts: (height,) int32 number of crossings of each row.
+        reach: (3,) int64 first row touched, row after the last one, and whether a row overflowed.
+        changes: (width + 1,) int32 difference array, zero between calls.
+        spans: (width + 1, 2) int32 spans [a, b) of one row.
     """
 
     u: np.ndarray
@@ -44,7 +48,10 @@ class Rows(NamedTuple):
 
 @compiled
 def make_rows(packed: PackedOutlines, camera: np.ndarray) -> tuple[Rows, np.ndarray]:
-    """Room for the greatest of some surfaces, and for crossings (height, capacity)."""
+    """Return scratch for the largest of the surfaces, and crossings (height, capacity) int32.
+
+    ``camera``: (8,) kernel parameters.
+    """
     width, height = int(camera[6]), int(camera[7])
     points, triangles = 0, 0
     for node in range(packed.starts.shape[0] - 1):
@@ -75,8 +82,13 @@ def _walk_edge(
     counts: np.ndarray,
     reach: np.ndarray,
 ) -> None:
-    """Leaves the crossings of the edge from a to b in the rows."""
-    if va > vb:  # always downwards, so that both runs of an edge cross at the very same places
+    """Append the crossings of the edge from (ua, va) to (ub, vb) [pixel] to the rows.
+
+    ``weight``: change of the winding number across the edge from left to right if it runs
+    downwards.
+    """
+    # Always downwards, so that both directions of an edge cross rows at identical places.
+    if va > vb:
         ua, va, ub, vb = ub, vb, ua, va
         weight = -weight
     if not (vb > 0.0 and va <= height - 1.0):
@@ -93,7 +105,7 @@ def _walk_edge(
     mark = weight + BIAS
     for row in range(first, end):
         u = ua + (row - va) * slope
-        # Beyond the picture's sides all places are one; no float is too large for this test.
+        # Clamp to the image before rounding, since u may be too large for an integer.
         pixel = math.ceil(u) if 0.0 < u < width else (0 if u < width else columns)
         count = counts[row]
         if count < capacity:
@@ -112,7 +124,7 @@ def _clip_near(
     crossings: np.ndarray,
     rows: Rows,
 ) -> None:
-    """Takes triangles nearer than the near plane out of facings, and walks those it cuts."""
+    """Walk the triangles that the near plane cuts, and set the facings of all nearer ones to 0."""
     X, points = X_CN[node], packed.points
     begin, first = packed.starts[node, 0], packed.starts[node, 1]
     hidden = np.empty(packed.starts[node + 1, 0] - begin, dtype=np.bool_)
@@ -121,15 +133,15 @@ def _clip_near(
         hidden[i] = X[2, 0] * x + X[2, 1] * y + X[2, 2] * z + X[2, 3] < camera[5]
     corners = np.empty((4, 3))
     for t in range(packed.starts[node + 1, 1] - first):
-        lost = 0
+        near_count = 0
         for k in range(3):
-            lost += hidden[packed.triangles[first + t, k]]
-        # As a plain integer, or the kernel that walks is compiled once more.
+            near_count += hidden[packed.triangles[first + t, k]]
+        # A plain integer, so that _walk_edge is not compiled for another type.
         weight = int(np.int64(rows.facings[t]))
-        if lost == 0 or weight == 0:
+        if near_count == 0 or weight == 0:
             continue
         rows.facings[t] = 0
-        if lost == 3:
+        if near_count == 3:
             continue
         size = clip_triangle(packed, node, t, X_CN, camera, corners)
         for a in range(size):
@@ -149,7 +161,7 @@ def add_surface(
     crossings: np.ndarray,
     rows: Rows,
 ) -> None:
-    """Leaves the crossings of one surface at poses X_CN (nodes, 3, 4) in the rows."""
+    """Append the crossings of one surface at poses X_CN (nodes, 3, 4) to the rows."""
     if packed.starts[node, 1] == packed.starts[node + 1, 1]:
         return
     cut = False
@@ -189,9 +201,10 @@ def fill_rows(
     crossings: np.ndarray,
     rows: Rows,
 ) -> np.ndarray:
-    """Leaves the crossings of surfaces first to end at poses X_CN (nodes, 3, 4) in empty rows.
+    """Write the crossings of the surfaces [first, end) at poses X_CN (nodes, 3, 4) into empty rows.
 
-    Returns the crossings, made wider until every row had room.
+    Returns:
+        The crossings, reallocated until every row has room.
     """
     counts, reach = rows.counts, rows.reach
     while True:
@@ -200,25 +213,36 @@ def fill_rows(
             add_surface(packed, node, X_CN, camera, crossings, rows)
         if reach[2] == 0:
             return crossings
-        most = 0
+        max_count = 0
         for row in range(reach[0], reach[1]):
-            most = max(most, counts[row])
+            max_count = max(max_count, counts[row])
             counts[row] = 0
-        crossings = np.empty((counts.shape[0], 2 * most), dtype=np.int32)
+        crossings = np.empty((counts.shape[0], 2 * max_count), dtype=np.int32)
 
 
 @compiled(inline="always")
 def find_spans(
     row: int, crossings: np.ndarray, counts: np.ndarray, changes: np.ndarray, spans: np.ndarray
 ) -> int:
-    """Writes one row's covered spans [a, b), empties the row, and returns the spans' number."""
+    """Write one row's covered spans [a, b), and empty the row.
+
+    Args:
+        row: index of the row.
+        crossings: (height, capacity) crossings.
+        counts: (height,) number of crossings; the row's entry is set to 0.
+        changes: (width + 1,) zeros, used as scratch.
+        spans: (width + 1, 2) output.
+
+    Returns:
+        The number of spans.
+    """
     count = counts[row]
     counts[row] = 0
     if count == 2:
-        one, other = crossings[row, 0] >> SHIFT, crossings[row, 1] >> SHIFT
-        spans[0, 0] = min(one, other)
-        spans[0, 1] = max(one, other)
-        return int(one != other)
+        first, second = crossings[row, 0] >> SHIFT, crossings[row, 1] >> SHIFT
+        spans[0, 0] = min(first, second)
+        spans[0, 1] = max(first, second)
+        return int(first != second)
     return _find_many_spans(row, count, crossings, changes, spans)
 
 
@@ -226,15 +250,15 @@ def find_spans(
 def _find_many_spans(
     row: int, count: int, crossings: np.ndarray, changes: np.ndarray, spans: np.ndarray
 ) -> int:
-    """As find_spans for any number of crossings."""
+    """As ``find_spans``, for any number of crossings."""
     found, winding, start = 0, 0, 0
-    if count <= 24:  # Few are sorted.
+    if count <= 24:  # Few crossings are sorted; many are summed in a difference array.
         for i in range(1, count):
-            moving, k = crossings[row, i], i
-            while k > 0 and crossings[row, k - 1] > moving:
+            crossing, k = crossings[row, i], i
+            while k > 0 and crossings[row, k - 1] > crossing:
                 crossings[row, k] = crossings[row, k - 1]
                 k -= 1
-            crossings[row, k] = moving
+            crossings[row, k] = crossing
         for k in range(count):
             pixel = crossings[row, k] >> SHIFT
             if winding == 0:
@@ -271,17 +295,18 @@ def score(
     camera: np.ndarray,
     prefixes: np.ndarray,
 ) -> np.ndarray:
-    """Areas of whole bodies, and of their intersections with sets.
+    """Return the areas of whole bodies and of their intersections with sets.
 
     Args:
-        packed: the surfaces, whose bands are bent in place.
-        parts: (b, 4) int64 the bands of skin, as in ``bend``; b may be 0.
-        bands: (n, v, 3) the vertices of all bands, one band after the other, at each pose [m].
-        X_CN: (n, nodes, 3, 4) the surfaces' poses in the camera.
+        packed: the surfaces, whose bands are deformed in place.
+        parts: (b, 4) int64 the skin bands, as in ``bend``; b may be 0.
+        bands: (n, v, 3) vertices of all bands, one band after the other, at each pose [m].
+        X_CN: (n, nodes, 3, 4) poses of the surfaces in the camera.
+        camera: (8,) kernel parameters.
         prefixes: (k, H, W + 1) int32 prefix sums of the sets.
 
     Returns:
-        (n, 1 + k) int64 area inside the picture, then area of intersection with each set [pixel].
+        (n, 1 + k) int64 area inside the image, then area of the intersection with each set [pixel].
     """
     rows, crossings = make_rows(packed, camera)
     areas = np.zeros((X_CN.shape[0], 1 + prefixes.shape[0]), dtype=np.int64)
@@ -303,9 +328,10 @@ def score(
 def paint(
     packed: PackedOutlines, X_CN: np.ndarray, camera: np.ndarray, mask: np.ndarray, value: int
 ) -> np.ndarray:
-    """Sets the pixels of a body at poses X_CN (nodes, 3, 4) in mask (H, W) uint8 to value.
+    """Set the pixels of a body at poses X_CN (nodes, 3, 4) in ``mask`` (H, W) uint8 to ``value``.
 
-    Returns (2,) int64 the first row touched, and the row after the last.
+    Returns:
+        (2,) int64 first row touched, and row after the last one.
     """
     rows, crossings = make_rows(packed, camera)
     crossings = fill_rows(packed, 0, X_CN.shape[0], X_CN, camera, crossings, rows)
@@ -315,7 +341,7 @@ def paint(
     return rows.reach[:2]
 
 
-# Contested pixels are noted by tiles of 8 x 8, too: most triangles are far from any.
+# Binary logarithm of the side [pixel] of tiles, which record where pixels are contested.
 _TILE = 3
 
 
@@ -329,22 +355,28 @@ def paint_labels(
     empty: int,
     image: np.ndarray,
 ) -> None:
-    """Draws which surface is nearest at each pixel centre into image (H, W) int16.
+    """Draw the label of the nearest surface at each pixel centre into ``image`` (H, W) int16.
+
+    Pixels that only one label covers are filled by spans. Only contested pixels need a depth test,
+    for which triangles are rasterised.
 
     Args:
-        labels: (nodes,) int16 their labels, not negative, none of them the empty one.
-        closed: (nodes,) bool which of them are closed and have their triangles run around
-            counter-clockwise seen from outside: only what is turned to the camera is drawn.
-        X_CN: (nodes, 3, 4) their poses in the camera.
-        empty: the label of pixels that show none.
+        packed: the surfaces.
+        labels: (nodes,) int16 non-negative labels, all different from ``empty``.
+        closed: (nodes,) bool, whether a surface is closed with outward normals; only its front
+            faces are then drawn.
+        X_CN: (nodes, 3, 4) poses of the surfaces in the camera.
+        camera: (8,) kernel parameters.
+        empty: label of pixels without a surface.
+        image: (H, W) int16 output.
     """
     height, width = image.shape
     for row in range(height):
         for column in range(width):
             image[row, column] = empty
-    # Of pixels for which surfaces of different labels contend, -1 - label in the image: by tiles,
-    # then how many tiles above and left of each (the first row and column stay zero), and the rows
-    # and columns [first, end) that hold them.
+    # A pixel is contested if surfaces of different labels cover it; image then holds -1 - label.
+    # sums: first marks of contested tiles, then their number above and left of each corner (the
+    # first row and column stay zero). bounds: rows and columns [first, end) with contested pixels.
     sums = np.zeros(((height >> _TILE) + 2, (width >> _TILE) + 2), dtype=np.int32)
     bounds = np.array([height, 0, width, 0])
     rows, crossings = make_rows(packed, camera)
@@ -362,17 +394,17 @@ def paint_labels(
             along += sums[i, j]
             sums[i, j] = sums[i - 1, j] + along
     top, left = bounds[0], bounds[2]
-    # How near what is drawn so far is, infinite where nothing contends.
+    # Nearness of the surface drawn so far; infinite where a pixel is not contested.
     depths = np.empty((bounds[1] - top, bounds[3] - left), dtype=np.float32)
     for i in range(depths.shape[0]):
         for j in range(depths.shape[1]):
             depths[i, j] = -np.inf if image[top + i, left + j] < 0 else np.inf
-    contest = (sums, bounds, depths)
+    contested = (sums, bounds, depths)
     for node in range(X_CN.shape[0]):
-        _draw_node(packed, node, labels[node], closed[node], X_CN, camera, image, contest, rows)
+        _draw_node(packed, node, labels[node], closed[node], X_CN, camera, image, contested, rows)
     for row in range(bounds[0], bounds[1]):
         for column in range(bounds[2], bounds[3]):
-            if image[row, column] < 0:  # By rounding no triangle covers it.
+            if image[row, column] < 0:  # No triangle covers the pixel, because of rounding.
                 image[row, column] = -1 - image[row, column]
 
 
@@ -387,14 +419,17 @@ def _paint_span(
     tiles: np.ndarray,
     bounds: np.ndarray,
 ) -> None:
-    """Writes a label to a row's pixels [a, b), and 1 to the tiles of those that had another."""
-    met = False
+    """Write a label to the pixels [a, b) of a row, and mark the tiles of contested pixels.
+
+    A pixel that has another label already gets -1 - label. ``bounds`` is extended by these pixels.
+    """
+    contested = False
     for column in range(a, b):
         before = image[row, column]
-        other = (before != empty) & (before != label)
-        image[row, column] = np.int16(-1 - label) if other else np.int16(label)
-        met |= other
-    if not met:
+        differs = (before != empty) & (before != label)
+        image[row, column] = np.int16(-1 - label) if differs else np.int16(label)
+        contested |= differs
+    if not contested:
         return
     while image[row, a] >= 0:
         a += 1
@@ -416,11 +451,14 @@ def _draw_node(
     X_CN: np.ndarray,
     camera: np.ndarray,
     image: np.ndarray,
-    contest: tuple[np.ndarray, np.ndarray, np.ndarray],
+    contested: tuple[np.ndarray, np.ndarray, np.ndarray],
     rows: Rows,
 ) -> None:
-    """Draws the triangles of one surface where pixels are contested."""
-    u, v, facings, X, sums = rows.u, rows.v, rows.facings, X_CN[node], contest[0]
+    """Draw the triangles of one surface at contested pixels.
+
+    ``contested``: sums of contested tiles, bounds [pixel], and nearness of what is drawn so far.
+    """
+    u, v, facings, X, sums = rows.u, rows.v, rows.facings, X_CN[node], contested[0]
     project(packed, node, X_CN, camera, u, v)
     find_facings(packed, node, X_CN, camera, facings)
     begin = packed.starts[node, 0]
@@ -439,7 +477,7 @@ def _draw_node(
     whole = parallel or lowest >= camera[5]
     for i in range(count):
         nearness[i] = -nearness[i] if parallel else 1.0 / nearness[i]
-    # Where rays are parallel, facings tell the way that the camera looks: they have opposite signs.
+    # The facings of a parallel camera have opposite signs: see viewpoint_in_node.
     hidden = 1 if parallel else -1
     corners = np.empty((4, 3))
     first = packed.starts[node, 1]
@@ -461,7 +499,7 @@ def _draw_node(
         else:
             size = clip_triangle(packed, node, t, X_CN, camera, corners)
         for k in range(2, size):
-            _draw_triangle(corners, k - 1, k, label, image, contest[1], contest[2])
+            _draw_triangle(corners, k - 1, k, label, image, contested[1], contested[2])
 
 
 @compiled(inline="always")
@@ -474,8 +512,11 @@ def _draw_triangle(
     bounds: np.ndarray,
     depths: np.ndarray,
 ) -> None:
-    """Draws the triangle 0, b, c of points p (n, 3) of pixel and nearness where it contends."""
-    # Nearness grows towards the camera and is linear in the picture: 1 / z, or -z (parallel).
+    """Draw the triangle of the points 0, b, c of ``p`` (n, 3) at contested pixels.
+
+    A point is u, v [pixel] and nearness.
+    """
+    # Nearness increases towards the camera and is linear in the image: 1 / z, or -z (parallel).
     ua, va, da = p[0, 0], p[0, 1], p[0, 2]
     ub, vb, db = p[b, 0], p[b, 1], p[b, 2]
     uc, vc, dc = p[c, 0], p[c, 1], p[c, 2]
@@ -487,7 +528,7 @@ def _draw_triangle(
         along_v = ((dc - da) * (ub - ua) - (db - da) * (uc - ua)) / twice_area
         at_origin = da - ua * along_u - va * along_v
         nearest, farthest = max(da, db, dc), min(da, db, dc)
-        # From top to bottom, so that neighbours' common edges cross rows at the very same places.
+        # Sort corners downwards, so that common edges of neighbours cross rows at equal places.
         if va > vb:
             ua, va, ub, vb = ub, vb, ua, va
         if vb > vc:
@@ -504,7 +545,7 @@ def _draw_triangle(
             at_row = at_origin + row * along_v
             i, first = row - bounds[0], bounds[2]
             for column in range(start, stop):
-                # A sliver's plane is steep: rounding must not carry it beyond its corners.
+                # Clamp, because the plane of a sliver is steep and amplifies rounding.
                 depth = np.float32(min(max(at_row + column * along_u, farthest), nearest))
                 if depth > depths[i, column - first]:
                     depths[i, column - first] = depth

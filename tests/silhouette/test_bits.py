@@ -85,7 +85,7 @@ def test_bits_are_the_pixels_of_the_span_kernel(camera, spread):
     for i, X in enumerate(X_WN):
         drawn = draw_mask([outline], (camera.X_CW @ X)[None], camera)
         assert np.array_equal(read_bits(view, view.inside, runs[i, 0], words), drawn & mask)
-        near = read_bits(view, view.band, runs[i, 1], words)
+        near = read_bits(view, view.margin, runs[i, 1], words)
         band |= near
         assert not (near & (mask | ~drawn)).any()
         far = int((drawn & ~mask & ~near).sum())

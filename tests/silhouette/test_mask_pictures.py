@@ -79,7 +79,7 @@ def test_a_rectangle_has_its_exact_pixels_and_crossings_are_even_odd():
     assert mask.sum() == 8
     assert not fill_polygon(np.vstack([box, box]), 8, 9).any()
     for wrong in (box[:2], np.where(box == 2.0, np.nan, box)):
-        with pytest.raises(ValueError, match="three corners"):
+        with pytest.raises(ValueError, match="three or more finite corners"):
             fill_polygon(wrong, 8, 9)
 
 
@@ -148,12 +148,12 @@ def test_annotations_are_drawn_by_class_and_picture(tmp_path, classes):
         ({"area": {"segmentation": {"size": [HEIGHT, WIDTH], "counts": [25]}}}, "fill 25 pixels"),
         ({"area": {"segmentation": [[1.0, 2.0, 3.0]]}}, "annotation 0 of image 5"),
         ({"area": {"segmentation": [["a", "b"] * 3]}}, "annotation 0 of image 5"),
-        ({"area": {"image_id": 77}}, "image 77, which is not there"),
+        ({"area": {"image_id": 77}}, "image 77, which does not exist"),
         ({"image": {"id": 6}}, "image 6 is given twice"),
         ({"image": {"width": True}}, "whole numbers of 1 to"),
-        ({"image": {"file_name": "a\0.png"}}, "no name of a picture"),
-        ({"image": {"file_name": 3}}, "no name of a picture"),
-        ({"content": {"images": 3}}, "no COCO file as it should be"),
+        ({"image": {"file_name": "a\0.png"}}, "not a name of a picture"),
+        ({"image": {"file_name": 3}}, "not a name of a picture"),
+        ({"content": {"images": 3}}, "not a valid COCO file"),
     ],
 )
 def test_damaged_annotations_are_refused(tmp_path, change, words):

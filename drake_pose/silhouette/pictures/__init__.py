@@ -1,1 +1,1 @@
-"""Pictures of silhouettes: mask files, scenes, and Drake's label images."""
+"""Mask files, scene folders, Drake label images, and their rendering."""

@@ -1,7 +1,7 @@
-"""Reference silhouettes: the label images of Drake's render engine, bands of skin included.
+"""Reference silhouettes: label images of Drake's render engine, skin bands included.
 
-Drake's deformable geometry is tetrahedra: each triangle of a band carries a flat one, its apex just
-inside the band.
+Drake's deformable geometry consists of tetrahedra. Each triangle of a band becomes the base of a
+flat tetrahedron whose apex lies just inside the band.
 """
 
 from __future__ import annotations
@@ -40,9 +40,13 @@ if TYPE_CHECKING:
 
 
 class DeformableSkin:
-    """A model's bands in a SceneGraph: a source whose configuration port is to be connected.
+    """A model's skin bands as a source of a SceneGraph, whose configuration port must be connected.
 
-    ``labels``: the render label of each band's child link, by name; 0 for those left out.
+    Args:
+        skin: the bands.
+        scene_graph: the SceneGraph to register with.
+        labels: render label of each band's child link, by name; bands of other links get 0.
+        name: name of the source.
     """
 
     def __init__(
@@ -70,7 +74,7 @@ class DeformableSkin:
             )
 
     def configuration(self, vertices: Sequence[np.ndarray]) -> GeometryConfigurationVector:
-        """What the source's configuration port takes, of each band's vertices (v, 3) [m]."""
+        """Return the source's port value, given each band's vertices (v, 3) in the world [m]."""
         configuration = GeometryConfigurationVector()
         for geometry, band, p_W in zip(self._geometries, self.skin.bands, vertices, strict=True):
             points = np.vstack([p_W, _apexes(p_W, band.mesh.triangles)])
@@ -79,10 +83,10 @@ class DeformableSkin:
 
 
 def _apexes(vertices: np.ndarray, triangles: np.ndarray, depth: float = 0.05) -> np.ndarray:
-    """Returns a point (m, 3) just inside the middle of each triangle.
+    """Return a point (m, 3) just inside the middle of each triangle.
 
-    depth: over the root of twice the triangle's area: deep enough to be hidden, flat enough to stay
-    inside thin bands.
+    ``depth``: depth of the point as a fraction of sqrt(2 area): large enough to be hidden, small
+    enough to stay inside thin bands.
     """
     a, b, c = (vertices[triangles[:, corner]] for corner in range(3))
     normals = np.cross(b - a, c - a)
@@ -92,7 +96,7 @@ def _apexes(vertices: np.ndarray, triangles: np.ndarray, depth: float = 0.05) ->
 
 
 def _tetrahedra(mesh: TriangleMesh) -> Mesh:
-    """Returns a closed band as tetrahedra, in the text of a VTK file."""
+    """Return a closed band as tetrahedra in an in-memory VTK file."""
     points = np.vstack([mesh.vertices, _apexes(mesh.vertices, mesh.triangles)])
     apexes = len(mesh.vertices) + np.arange(len(mesh.triangles))
     a, b, c = mesh.triangles.T
@@ -108,11 +112,12 @@ def _tetrahedra(mesh: TriangleMesh) -> Mesh:
 
 
 class LabelRenderer:
-    """Renders label images of a model with RenderEngineVtk, without a display or a diagram.
+    """Renders label images of a model by RenderEngineVtk, without a display or a diagram.
 
     Raises:
-        CameraError: on rendering, when Drake cannot draw for the camera.
-        RuntimeError: on rendering in another thread than made it: images would be wrong.
+        CameraError: on rendering, when Drake cannot render for the camera.
+        RuntimeError: on rendering in another thread than the one that made the renderer, where
+            images would be wrong.
     """
 
     def __init__(self, model: ParsedModel, camera: Camera) -> None:
@@ -138,7 +143,7 @@ class LabelRenderer:
         return dict(enumerate(link_names(self._plant)))
 
     def label_image(self, q: np.ndarray, X_WB: np.ndarray | None = None) -> np.ndarray:
-        """Labels (H, W) int16 of the model at q (nq,); EMPTY where there is no body.
+        """Return labels (H, W) int16 of the model at q (nq,); EMPTY where there is no body.
 
         ``X_WB``: (4, 4) pose of the plant's world frame B in the world; None: the identity.
         """
@@ -165,16 +170,16 @@ class LabelRenderer:
         return label_data(image).copy()
 
     def mask(self, q: np.ndarray, X_WB: np.ndarray | None = None) -> np.ndarray:
-        """Returns the model's mask (H, W) bool; arguments as label_image."""
+        """Return the model's mask (H, W) bool; arguments as ``label_image``."""
         return self.label_image(q, X_WB) != EMPTY
 
     def segments(self, q: np.ndarray, X_WB: np.ndarray | None = None) -> np.ndarray:
-        """Returns (H, W) int16 the link (see link_names) seen at each pixel, -1 where none is."""
+        """Return (H, W) int16 the label (see ``link_names``) of each pixel; -1 if none."""
         labels = self.label_image(q, X_WB)
         return np.where(labels == EMPTY, np.int16(-1), labels)
 
     def link_poses(self, q: np.ndarray) -> np.ndarray:
-        """Returns (bodies, 4, 4) the links' poses in the plant's world, by body index."""
+        """Return (bodies, 4, 4) poses of the links in the plant's world, by body index."""
         self._set_positions(q)
         count = self._plant.num_bodies()
         bodies = [self._plant.get_body(BodyIndex(i)) for i in range(count)]
@@ -186,17 +191,17 @@ class LabelRenderer:
         )
 
     def _set_positions(self, q: np.ndarray) -> None:
-        """Puts the plant at positions q (nq,)."""
+        """Set the plant's positions q (nq,); ValueError unless they are finite."""
         positions = np.asarray(q, dtype=np.float64)
         if positions.shape != (self._plant.num_positions(),) or not np.isfinite(positions).all():
-            # Drake ends the whole process here.
+            # Drake would abort the whole process.
             raise ValueError(f"q must be ({self._plant.num_positions()},) finite numbers")
         self._plant.SetPositions(self._plant_context, positions)
 
     def _depths(
         self, q: np.ndarray, bands: Sequence[np.ndarray], X_CB: np.ndarray
     ) -> tuple[float, float]:
-        """Returns the least and greatest depth of the body in the camera [m], with a margin."""
+        """Return the smallest and largest depth of the body in the camera [m], with a margin."""
         X_BL = self.link_poses(q)
         placed = [(X_CB @ X_BL[label], p_L) for label, p_L in self._vertices]
         placed += [(X_CB, p_B) for p_B in bands]

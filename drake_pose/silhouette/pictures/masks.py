@@ -1,4 +1,4 @@
-"""Mask files, two-valued PNG pictures, and how masks agree."""
+"""Mask files (two-valued PNG pictures), and measures of agreement between masks."""
 
 import io
 import zlib
@@ -21,19 +21,22 @@ def read_mask(
     *,
     may_be_empty: bool = False,
 ) -> np.ndarray:
-    """Reads a mask (H, W): a PNG picture of black (0) and one other value or colour, the object.
+    """Return the mask (H, W) of a PNG picture with black (0) and one other colour, the object's.
 
-    ``may_be_empty``: whether a picture that shows nothing is as good as any.
+    Args:
+        path: the picture.
+        width, height: required size [pixel]; None: any.
+        may_be_empty: whether a picture without an object is accepted.
 
-    Raises MaskError: names the file; when it cannot be read, is no whole PNG picture, is not of
-    ``width`` and ``height`` [pixel], is empty or full, or has more than two values.
+    Raises MaskError, which names the file: it cannot be read, is no complete PNG picture, has the
+    wrong size, is empty or full, or has more than two colours.
     """
     size = width, height
     return read_binary_mask(Path(path), MaskError, size, may_be_empty=may_be_empty)
 
 
 def write_mask(path: str | Path, mask: np.ndarray) -> None:
-    """Writes a mask (H, W) as encode_mask does; MaskError names an unwritable file."""
+    """Write a mask (H, W) as ``encode_mask`` does; MaskError names an unwritable file."""
     try:
         Path(path).write_bytes(encode_mask(mask))
     except OSError as error:
@@ -41,9 +44,9 @@ def write_mask(path: str | Path, mask: np.ndarray) -> None:
 
 
 def encode_mask(mask: np.ndarray) -> bytes:
-    """Returns a mask (H, W) as the content of a black and white PNG file, white on the object."""
+    """Return a mask (H, W) as the content of a black and white PNG file, white on the object."""
     stream = io.BytesIO()
-    # A bit a pixel is read in a third of the time of a byte. Areas are runs, which need no search.
+    # One bit per pixel is read three times as fast as one byte; run-length coding suits areas.
     image = Image.fromarray(np.asarray(mask, dtype=np.bool_))
     image.save(stream, "PNG", compress_level=1, compress_type=zlib.Z_RLE)
     return stream.getvalue()
@@ -51,60 +54,62 @@ def encode_mask(mask: np.ndarray) -> bytes:
 
 @dataclass(frozen=True)
 class MaskAgreement:
-    """How a frame's silhouettes and body agree.
+    """Agreement between the silhouettes of a frame and the body.
 
     Args:
-        wrong: the area where they differ [pixel].
-        area: the silhouettes' [pixel].
+        differing: area where silhouettes and body differ, over all cameras [pixel].
+        area: area of the silhouettes, over all cameras [pixel].
         ious: intersection over union by camera.
     """
 
-    wrong: int
+    differing: int
     area: int
     ious: Mapping[str, float]
 
     @property
     def E_total(self) -> float:
-        """The area where they differ over the silhouettes' area; NaN without a silhouette."""
-        return self.wrong / self.area if self.area else float("nan")
+        """The differing area as a fraction of the silhouettes' area; NaN without a silhouette."""
+        return self.differing / self.area if self.area else float("nan")
 
 
-def intersection_over_union(one: np.ndarray, other: np.ndarray) -> float:
-    """Of two masks (H, W) bool; 1 where both are empty."""
-    return _overlap(one, other)[2]
+def intersection_over_union(first: np.ndarray, second: np.ndarray) -> float:
+    """Return the intersection over union of two masks (H, W) bool; 1 if both are empty."""
+    return _overlap(first, second)[2]
 
 
-def _overlap(one: np.ndarray, other: np.ndarray) -> tuple[int, int, float]:
-    """The area where two masks differ, that of the first [pixel], and intersection over union."""
-    own, others, both = (int(np.count_nonzero(area)) for area in (one, other, one & other))
-    either = own + others - both
-    return either - both, own, both / either if either else 1.0
+def _overlap(first: np.ndarray, second: np.ndarray) -> tuple[int, int, float]:
+    """Return the area where two masks differ and that of the first [pixel], and their IoU."""
+    first_area, second_area, intersection = (
+        int(np.count_nonzero(area)) for area in (first, second, first & second)
+    )
+    union = first_area + second_area - intersection
+    return union - intersection, first_area, intersection / union if union else 1.0
 
 
 def compare_masks(
     masks: Mapping[str, np.ndarray], bodies: Mapping[str, np.ndarray]
 ) -> MaskAgreement:
-    """Compares masks (H, W) bool with the body's, both by camera."""
+    """Return the agreement of masks (H, W) bool with the body's masks, both by camera."""
     found = {camera: _overlap(mask, bodies[camera]) for camera, mask in masks.items()}
     return MaskAgreement(
-        sum(wrong for wrong, _, _ in found.values()),
+        sum(differing for differing, _, _ in found.values()),
         sum(area for _, area, _ in found.values()),
         {camera: iou for camera, (_, _, iou) in found.items()},
     )
 
 
 def count_edge_pixels(mask: np.ndarray) -> int:
-    """How many pixels of a mask (H, W) bool lie on its edge."""
-    # What a mask loses to a pixel's neighbours is its edge.
+    """Return the number of pixels on the edge of a mask (H, W) bool."""
+    # The edge is removed by erosion with the four neighbours.
     cross = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
     inner = cv2.erode(mask.view(np.uint8), cross)
     return int(np.count_nonzero(mask)) - int(np.count_nonzero(inner))
 
 
 def signed_distances(mask: np.ndarray) -> np.ndarray:
-    """(H, W) float32 distance from the edge of a mask, half way between pixels; positive outside.
+    """Return (H, W) float32 distances [pixel] to the edge of a mask; positive outside.
 
-    The picture's edge is no edge of the mask.
+    The edge runs half-way between pixels. The image border is not an edge of the mask.
     """
     inside = np.asarray(mask, dtype=np.uint8)
     if inside.all():

@@ -1,4 +1,4 @@
-"""What is wrong with a scene of several cameras but leaves enough to go on: each fault is named."""
+"""Checks of scenes with several cameras: each fault becomes a warning that names it."""
 
 import filecmp
 from collections.abc import Iterable, Mapping, Sequence
@@ -24,12 +24,17 @@ def read_scene(
     sequence: bool = False,
     every: int = 1,
 ) -> tuple[Scene, tuple[str, ...]]:
-    """A checked scene of the wanted cameras, and its wanted frames; none named: all.
+    """Return a checked scene of the wanted cameras, and its wanted frames.
 
-    Given ``cameras`` are used instead of the folder's; ``sequence`` as of ``load_scene``, ``every``
-    of ``Scene.every``.
+    Args:
+        path: the scene's folder.
+        wanted: names of cameras; empty: all.
+        frames: names or ranges of frames, as for ``select_frames``; empty: all.
+        cameras: cameras that replace those of the folder.
+        sequence: as for ``load_scene``.
+        every: keep every n-th frame, as ``Scene.every``.
 
-    Raises DrakePoseError: names the file, camera or frame that is wrong or not there.
+    Raises DrakePoseError, which names the file, camera or frame that is invalid or missing.
     """
     scene = check_scene(load_scene(path, cameras, wanted, sequence)).of_cameras(wanted)
     scene, frames = scene.every(every, frames)
@@ -37,57 +42,57 @@ def read_scene(
 
 
 def check_scene(scene: Scene) -> Scene:
-    """A scene with what its files' faults are, without masks of cameras that stood still alone."""
+    """Return a scene with warnings about its files, and without masks of cameras that froze."""
     if scene.scale_unknown:
         return scene
     warnings, known, seen = list(scene.warnings), scene.frames, {*scene.masks, *scene.images}
     several = len(scene.cameras) > 1
     for name in scene.cameras if several else ():
-        lacking = [frame for frame in known if (name, frame) not in seen]
-        if count := (len(known) - len(lacking)) * bool(lacking):
+        missing = [frame for frame in known if (name, frame) not in seen]
+        if count := (len(known) - len(missing)) * bool(missing):
             warnings.append(
                 f"camera '{name}' has {count} of {len(known)} frames; it lacks "
-                f"{frame_ranges(lacking, known)}, where the others go on without it"
+                f"{frame_ranges(missing, known)}, which are estimated without it"
             )
     if scene.sequence and not scene.images:
         warnings += _check_gaps(known)
         if several:
             frozen, repeated = _find_repeats(scene)
-            gone = {(name, frame) for name, frames in frozen.items() for frame in frames}
-            masks = {key: path for key, path in scene.masks.items() if key not in gone}
+            removed = {(name, frame) for name, frames in frozen.items() for frame in frames}
+            masks = {key: path for key, path in scene.masks.items() if key not in removed}
             scene = replace(scene, masks=masks)
             warnings += [
                 f"camera '{name}' shows its last picture again in frame "
                 f"{frame_ranges(frames, known)}, while the others' changed: left out there; did "
-                "the camera stand still, or drop frames?"
+                "the camera freeze or drop frames?"
                 for name, frames in frozen.items()
             ]
             if repeated:
                 warnings.append(
-                    f"frame {frame_ranges(repeated, known)}: all cameras show the frame before "
+                    f"frame {frame_ranges(repeated, known)}: all cameras show the previous frame "
                     "again; was it recorded twice?"
                 )
     return replace(scene, warnings=tuple(warnings))
 
 
-def check_upright(cameras: Iterable[Camera], clear: float = 0.5) -> tuple[str, ...]:
-    """Whether the pictures' up is the world's z, as it must be where a person is to stand.
+def check_upright(cameras: Iterable[Camera], min_component: float = 0.5) -> tuple[str, ...]:
+    """Return a warning unless up in the pictures is the world's z, as persons require.
 
-    clear: component of the mean up along an axis below which cameras look up or down steeply and
-    do not say where up is.
+    ``min_component``: largest component of the mean up direction below which cameras look so
+    steeply that up is undetermined.
     """
     up = -np.mean([camera.X_WC[:3, 1] for camera in cameras], axis=0)
     axis = int(np.argmax(np.abs(up)))
-    if (axis == 2 and up[2] > 0.0) or abs(up[axis]) < clear:
+    if (axis == 2 and up[2] > 0.0) or abs(up[axis]) < min_component:
         return ()
     return (
         f"cameras.yaml: up in the pictures is the world's {'+' if up[axis] > 0.0 else '-'}"
-        f"{'xyz'[axis]}, but should be +z: the world lies on its side or upside down; turn X_WC",
+        f"{'xyz'[axis]}, but should be +z: the world lies on its side or upside down; rotate X_WC",
     )
 
 
 def leave_out_unreadable(scene: Scene, frames: Iterable[str]) -> Scene:
-    """A scene without masks that cannot be read, where another camera has the frame, too.
+    """Return a scene without unreadable masks of frames that other cameras have, too.
 
     Raises MaskError: a mask cannot be read, and no other camera has a readable one of that frame.
     """
@@ -109,7 +114,7 @@ def leave_out_unreadable(scene: Scene, frames: Iterable[str]) -> Scene:
 
 
 def require_readable(refused: Mapping[tuple[str, str], str], scene: Scene) -> None:
-    """Refuses a scene none of whose masks can be read: SceneError says why of the first."""
+    """Raise SceneError, with the first reason, if none of a scene's masks can be read."""
     if refused and len(refused) == len(scene.masks):
         first = next(iter(refused.values()))
         raise SceneError(f"{scene.path}: none of {len(refused)} masks can be used: {first}")
@@ -118,7 +123,12 @@ def require_readable(refused: Mapping[tuple[str, str], str], scene: Scene) -> No
 def describe_unreadable(
     refused: Mapping[tuple[str, str], str], known: Sequence[str]
 ) -> tuple[str, ...]:
-    """One warning a camera of what is wrong with the masks of (camera, frame)."""
+    """Return one warning per camera about unreadable masks.
+
+    Args:
+        refused: reasons by (camera, frame).
+        known: the scene's frames.
+    """
     found = []
     for camera in dict.fromkeys(name for name, _ in refused):
         frames = [frame for name, frame in refused if name == camera]
@@ -127,20 +137,24 @@ def describe_unreadable(
     return tuple(found)
 
 
-def frame_ranges(frames: Iterable[str], known: Sequence[str], most: int = 6) -> str:
-    """Frames as text: those that follow each other as first-last; at most so many ranges."""
+def frame_ranges(frames: Iterable[str], known: Sequence[str], max_ranges: int = 6) -> str:
+    """Return frames as text, consecutive ones as first-last, with at most ``max_ranges`` ranges."""
     order = {frame: k for k, frame in enumerate(known)}
     places = np.sort([order[frame] for frame in frames]).astype(int)
     runs = np.split(places, np.flatnonzero(np.diff(places) > 1) + 1) if len(places) else []
     texts = [known[run[0]] + (f"-{known[run[-1]]}" if len(run) > 1 else "") for run in runs]
-    rest = sum(map(len, runs[most:]))
-    return ", ".join(texts[:most]) + (f" and {rest} more" if rest else "")
+    rest = sum(map(len, runs[max_ranges:]))
+    return ", ".join(texts[:max_ranges]) + (f" and {rest} more" if rest else "")
 
 
-def _find_repeats(scene: Scene, least: float = 0.02) -> tuple[dict[str, list[str]], list[str]]:
-    """By camera the frames in which it alone shows its last picture again; those where all do.
+def _find_repeats(scene: Scene, min_change: float = 0.02) -> tuple[dict[str, list[str]], list[str]]:
+    """Return the frames in which cameras show their last picture again.
 
-    least: change of the other cameras' silhouettes, over their area, by which one stood still.
+    ``min_change``: change of the other cameras' silhouettes, as a fraction of their area, from
+    which a camera that shows no change is frozen.
+
+    Returns:
+        By camera, the frames in which it alone repeats; and the frames in which all cameras repeat.
     """
     repeats = _repeated_files(scene)
     frozen: dict[str, list[str]] = {}
@@ -157,16 +171,16 @@ def _find_repeats(scene: Scene, least: float = 0.02) -> tuple[dict[str, list[str
                 with suppress(MaskError):
                     one, other = (scene.read(name, f, may_be_empty=True) for f in (last, frame))
                     changes.append((one != other).sum() / max(one.sum(), other.sum(), 1))
-            if changes and float(np.median(changes)) > least:
+            if changes and float(np.median(changes)) > min_change:
                 for name in alike:
                     frozen.setdefault(name, []).append(frame)
     return frozen, repeated
 
 
 def _repeated_files(scene: Scene) -> set[tuple[str, str]]:
-    """The masks, (camera, frame), whose file is that of the frame before again, byte for byte.
+    """Return (camera, frame) of each mask file that equals the previous frame's, byte for byte.
 
-    Files are read only where sizes are equal; what cannot be read is like none.
+    Files are read only where sizes are equal; an unreadable file equals none.
     """
     found = []
     for name in scene.cameras:
@@ -182,20 +196,23 @@ def _repeated_files(scene: Scene) -> set[tuple[str, str]]:
     return set(found)
 
 
-def _check_gaps(frames: Sequence[str], most: int = 6) -> list[str]:
-    """Numbers that no camera has between frames that are numbered one by one; most are listed."""
+def _check_gaps(frames: Sequence[str], max_gaps: int = 6) -> list[str]:
+    """Return a warning about numbers missing between consecutively numbered frames.
+
+    At most ``max_gaps`` gaps are listed.
+    """
     keys = [natural_key(frame) for frame in frames]
     if len(keys) < 3 or any(key[:-2] != keys[0][:-2] or key[-1][0] for key in keys):
         return []
     steps = np.diff([key[-2][1] for key in keys])
-    usual = int(np.median(steps))
-    wide = np.flatnonzero(steps > usual) if usual > 0 else np.empty(0, dtype=int)
+    usual_step = int(np.median(steps))
+    wide = np.flatnonzero(steps > usual_step) if usual_step > 0 else np.empty(0, dtype=int)
     if not len(wide):
         return []
-    texts = [f"between {frames[k]} and {frames[k + 1]}" for k in wide[:most]]
-    rest = f" and at {len(wide) - most} more places" if len(wide) > most else ""
-    missing = int((steps[wide] // usual - 1).sum())
+    texts = [f"between {frames[k]} and {frames[k + 1]}" for k in wide[:max_gaps]]
+    rest = f" and at {len(wide) - max_gaps} more places" if len(wide) > max_gaps else ""
+    missing = int((steps[wide] // usual_step - 1).sum())
     return [
         f"{missing} frames dropped by all cameras {', '.join(texts)}{rest}; the times of all later "
-        "frames count on without them"
+        "frames do not include them"
     ]

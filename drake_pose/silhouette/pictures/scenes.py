@@ -1,4 +1,4 @@
-"""Scenes: a folder of cameras and recorded masks."""
+"""Scenes: folders of calibrated cameras with masks, pictures or videos."""
 
 import os
 import zlib
@@ -28,28 +28,30 @@ from drake_pose.silhouette.pictures.masks import read_mask
 
 CAMERA_FILE, SCENE_FILE = "cameras.yaml", "scene.yaml"
 USUAL_RATE_HZ = 30.0
-"""Frames a second of a sequence that does not say."""
+"""Default frame rate of a sequence [frames/s]."""
 
 
 @dataclass(frozen=True)
 class Scene:
-    """A folder of masks, and the cameras that took them.
+    """A folder of masks and the cameras that took them.
 
     Args:
-        cameras: in the camera file's order.
-        frames: in natural order, 2 before 10; a frame may lack some cameras.
-        masks: the mask file of (camera, frame).
-        sequence: whether the frames follow each other in time.
-        scale_unknown: whether the cameras are uncalibrated: each is a parallel camera that looks
-            along the world's -x, and its pixels_per_metre and what it looks at are to be found.
-        images: the files, pictures or videos, of (camera, frame) of a sequence that has masks of
-            few frames, or none: where a camera has no mask the body is tracked by its colours.
-            Empty where there is a mask for every picture.
-        readers: by camera what gives its pictures (H, W, 3) by frame, where no file of its own is.
-        times: (frames,) of the frames as recorded [s], nan where nothing tells them.
-        joints: what the robot logged of its joints, by time or by frame.
+        path: the folder.
+        cameras: cameras by name, in the camera file's order.
+        frames: frame names in natural order (2 before 10); a frame may lack some cameras.
+        masks: mask file by (camera, frame).
+        sequence: whether the frames are consecutive in time.
+        frame_rate_hz: frame rate of a sequence [frames/s]; None: unknown.
+        scale_unknown: whether the cameras are uncalibrated. Each is then a parallel camera along
+            the world's -x whose scale and position are unknown.
+        images: picture or video file by (camera, frame), for a sequence with masks of few or no
+            frames. A frame without a mask is tracked by colours. Empty if every picture has a mask.
         unknown_folders: folders of masks that belong to no camera.
-        warnings: what is wrong with the folder, but leaves enough to go on.
+        warnings: faults of the folder that are not fatal.
+        readers: functions that return a camera's picture (H, W, 3) by frame, for cameras without
+            picture files.
+        times: (frames,) recorded times [s], NaN where unknown.
+        joints: the robot's recorded joint positions, by time or by frame.
     """
 
     path: Path
@@ -74,16 +76,16 @@ class Scene:
     )
 
     def cameras_of(self, frame: str) -> tuple[str, ...]:
-        """The names of the cameras with a mask of a frame; UnknownNameError for no such frame."""
+        """Return the cameras with a mask of a frame; UnknownNameError for an unknown frame."""
         names = tuple(camera for camera in self.cameras if (camera, frame) in self.masks)
         if not names and frame not in self.frames:
             raise UnknownNameError("frame", frame, self.frames, str(self.path))
         return names
 
     def of_cameras(self, wanted: Sequence[str]) -> "Scene":
-        """What the wanted cameras see; all that have masks where none is named.
+        """Return the scene of the wanted cameras; if none is named, of all cameras with files.
 
-        Raises UnknownNameError where there is no such camera.
+        Raises UnknownNameError: there is no such camera.
         """
         for name in wanted:
             if name not in self.cameras:
@@ -97,31 +99,34 @@ class Scene:
         )
 
     def frames_with_files(self, wanted: Sequence[str]) -> tuple[str, ...]:
-        """The wanted frames, as select_frames has them, that a camera has seen.
+        """Return the wanted frames (see ``select_frames``) that have a mask or a picture.
 
         Raises:
-            SceneError: there is none.
+            SceneError: there is no such frame with a file.
             UnknownNameError: there is no such frame.
         """
-        seen = {frame for _, frame in (*self.masks, *self.images)}
-        asked = select_frames(self.frames, wanted, str(self.path))
-        if seen.isdisjoint(asked):
+        with_files = {frame for _, frame in (*self.masks, *self.images)}
+        selected = select_frames(self.frames, wanted, str(self.path))
+        if with_files.isdisjoint(selected):
             names = ", ".join(self.cameras)
             raise SceneError(f"{self.path}: no mask of camera {names} in those frames")
-        return tuple(frame for frame in asked if frame in seen)
+        return tuple(frame for frame in selected if frame in with_files)
 
     def every(self, step: int, wanted: Sequence[str]) -> "tuple[Scene, tuple[str, ...]]":
-        """Every step-th frame alone, from the first wanted one on, and which of these are wanted.
+        """Return the scene with every ``step``-th frame, and those of its frames that are wanted.
 
-        Its frames follow each other at the true period, step times as long. Raises SettingsError
-        for a step below 1, UnknownNameError where there is no such frame.
+        The first wanted frame is kept. The frame rate is divided by ``step``.
+
+        Raises:
+            SettingsError: the step is below 1.
+            UnknownNameError: there is no such frame.
         """
         if step < 1:
             raise SettingsError(f"every must be 1 or more, not {step}")
-        asked = select_frames(self.frames, wanted, str(self.path))
-        if step == 1 or not asked:
+        selected = select_frames(self.frames, wanted, str(self.path))
+        if step == 1 or not selected:
             return self, tuple(wanted)
-        pick = slice(self.frames.index(asked[0]) % step, None, step)
+        pick = slice(self.frames.index(selected[0]) % step, None, step)
         kept = self.frames[pick]
         known, rate = set(kept), (self.frame_rate_hz or USUAL_RATE_HZ) / step
         scene = replace(
@@ -132,25 +137,27 @@ class Scene:
             images={key: file for key, file in self.images.items() if key[1] in known},
             frame_rate_hz=rate if self.sequence else self.frame_rate_hz,
         )
-        return scene, tuple(frame for frame in asked if frame in known)
+        return scene, tuple(frame for frame in selected if frame in known)
 
     def mask_path(self, camera: str, frame: str) -> Path:
-        """The mask file of a camera's frame; UnknownNameError where there is none."""
+        """Return the mask file of a camera's frame; UnknownNameError if there is none."""
         return self._file(self.masks, camera, frame)
 
     def read(self, camera: str, frame: str, *, may_be_empty: bool = False) -> np.ndarray:
-        """The mask (H, W) of a camera's frame, which may be asked to show somebody.
+        """Return the mask (H, W) of a camera's frame.
+
+        ``may_be_empty``: whether a mask without an object is accepted.
 
         Raises:
-            UnknownNameError: when there is no such camera, or it has no such frame.
-            MaskError: when the file is not a mask of the camera's size.
+            UnknownNameError: there is no such camera, or it has no such frame.
+            MaskError: the file is not a mask of the camera's size.
         """
         path, size = self.mask_path(camera, frame), self.cameras[camera]
         key = path, size.width, size.height
         if (packed := self._packed.get(key)) is None:
             mask = read_mask(path, size.width, size.height, may_be_empty=may_be_empty)
             if mask.any():
-                # In a kilobyte or two; a PNG takes ten times as long to be decoded again.
+                # Kept in one or two kilobytes; decoding the PNG again takes ten times as long.
                 self._packed[key] = zlib.compress(np.packbits(mask).tobytes(), level=1)
             return mask
         bits = np.frombuffer(zlib.decompress(packed), np.uint8)
@@ -158,11 +165,11 @@ class Scene:
         return mask.reshape(size.height, size.width)
 
     def read_image(self, camera: str, frame: str) -> np.ndarray:
-        """The picture (H, W, 3), red, green, blue, of a camera's frame.
+        """Return the picture (H, W, 3), RGB, of a camera's frame.
 
         Raises:
-            UnknownNameError: when there is no such camera, or it has no such picture.
-            SceneError: when the file is no picture of the camera's size.
+            UnknownNameError: there is no such camera, or it has no such picture.
+            SceneError: the file is not a picture of the camera's size.
         """
         file, size = self._file(self.images, camera, frame), self.cameras[camera]
         if self._latest.get(camera, ("",))[0] == frame:
@@ -180,11 +187,12 @@ class Scene:
                 f"{file}: is {picture.shape[1]} x {picture.shape[0]} pixels, but camera "
                 f"'{camera}' has {size.width} x {size.height}"
             )
-        # What is tracked in a picture is drawn over it next.
+        # Return a copy, since callers draw over the picture.
         self._latest[camera] = frame, picture
         return picture.copy()
 
     def _file(self, files: Mapping[tuple[str, str], Path], camera: str, frame: str) -> Path:
+        """Return the file of a camera's frame; UnknownNameError if there is none."""
         if camera not in self.cameras:
             raise UnknownNameError("camera", camera, self.cameras, str(self.path))
         if (camera, frame) not in files:
@@ -199,19 +207,29 @@ def load_scene(
     wanted: Sequence[str] = (),
     sequence: bool = False,
 ) -> Scene:
-    """Reads what a scene's folder holds; masks are read when they are asked for.
+    """Read the content of a scene's folder; masks and pictures are read on demand.
 
-    The folder has ``cameras.yaml``, ``masks/<camera>/<frame>.png`` and perhaps ``scene.yaml``
-    (``sequence: true|false``, ``frame_rate_hz``). A sequence may have pictures
-    ``images/<camera>/<frame>.png`` or ``.jpg``, or a video ``videos/<camera>.mp4``, where it has no
-    masks. A single camera's masks may lie in ``masks/<frame>.png``; without a camera file they were
-    taken by an uncalibrated camera, or by several where the pictures' sizes differ. Given
-    ``cameras`` are used instead of the folder's. Where all the ``wanted`` ones have an X_WC, others
-    may lack it. ``sequence``: whether it is one where scene.yaml does not say.
+    The folder has
+
+    - ``cameras.yaml``,
+    - ``masks/<camera>/<frame>.png``,
+    - optionally ``scene.yaml`` with ``sequence: true|false`` and ``frame_rate_hz``,
+    - for a sequence without masks, ``images/<camera>/<frame>.png`` or ``.jpg``, or
+      ``videos/<camera>.mp4``.
+
+    Masks of a single camera may lie in ``masks/<frame>.png``. Without a camera file, such masks
+    belong to one uncalibrated camera for each size of picture.
+
+    Args:
+        path: the folder.
+        cameras: cameras that replace those of the folder.
+        wanted: names of cameras; if all of them have a pose X_WC, other cameras of the file may
+            lack it.
+        sequence: whether the scene is a sequence if scene.yaml does not say.
 
     Raises:
-        SceneError: names the folder and what is missing or wrong in it.
-        CameraError: when the camera file is wrong.
+        SceneError: something is missing or invalid; the message names the folder.
+        CameraError: the camera file is invalid.
     """
     folder = Path(path)
     if not folder.is_dir():
@@ -248,13 +266,13 @@ def load_scene(
         frame_rate_hz or rate_hz,
         images=images,
         unknown_folders=unknown_folders,
-        # Of pictures with few masks it is no fault that masks are missing.
+        # A sequence with pictures may lack masks, so that is no reason for a warning.
         warnings=drifts if images else warnings,
     )
 
 
 def _unknown_cameras(folder: Path) -> tuple[dict[str, Camera], dict[tuple[str, str], Path]]:
-    """Returns a camera for every size of picture, and the masks."""
+    """Return a parallel camera for each size of picture, and the masks by (camera, frame)."""
     if not any((folder / "masks").glob("*.png")):
         raise SceneError(
             f"{folder}: has no cameras.yaml, so its cameras must be given; only masks that lie in "
@@ -265,7 +283,7 @@ def _unknown_cameras(folder: Path) -> tuple[dict[str, Camera], dict[tuple[str, s
     several = len(set(sizes.values())) > 1
     cameras: dict[str, Camera] = {}
     names = {}
-    # They look along the world's -x: the picture's right is y, its up is z. The scale is any.
+    # Looking along the world's -x: the image's right is y and its up is z. The scale is arbitrary.
     X_WC = np.array(
         [[0.0, 0.0, -1.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0, 0, 0, 1]]
     )
@@ -277,13 +295,15 @@ def _unknown_cameras(folder: Path) -> tuple[dict[str, Camera], dict[tuple[str, s
 
 
 def common_rate(
-    videos: Mapping[str, Path], most: float = 1.01
+    videos: Mapping[str, Path], max_ratio: float = 1.01
 ) -> tuple[float | None, tuple[str, ...]]:
-    """Pictures a second of cameras' videos, if one says so; a warning where they drift apart.
+    """Return the common frame rate of videos [frames/s] or None, and a warning if they drift apart.
 
-    most: ratio of the fastest to the slowest rate that are meant to be one.
+    Args:
+        videos: video files by camera.
+        max_ratio: largest ratio of the highest to the lowest rate.
 
-    Raises SceneError: a video cannot be read, or their rates are others.
+    Raises SceneError: a video cannot be read, or the rates differ.
     """
     opened = {name: VideoPictures(path) for name, path in videos.items()}
     rates = {name: one.rate_hz for name, one in opened.items() if one.rate_hz is not None}
@@ -291,23 +311,24 @@ def common_rate(
         return None, ()
     slow, fast = min(rates, key=lambda one: rates[one]), max(rates, key=lambda one: rates[one])
     ratio = rates[fast] / rates[slow]
-    off = min(one.count for one in opened.values()) * (ratio - 1.0)
+    drift = min(one.count for one in opened.values()) * (ratio - 1.0)
     text = (
         f"{videos[slow]} has {rates[slow]:.5g} pictures a second, {videos[fast]} {rates[fast]:.5g}:"
-        f" pictures of one number must be of one moment, but at the end they are {off:.0f} "
+        f" pictures of equal number must be synchronised, but at the end they are {drift:.0f} "
         "pictures apart; bring the videos to one rate (ffmpeg -i VIDEO -r RATE NEW)"
     )
-    if ratio > most:
+    if ratio > max_ratio:
         raise SceneError(text)
-    return next(iter(rates.values())), (text,) if off >= 1.0 else ()
+    return next(iter(rates.values())), (text,) if drift >= 1.0 else ()
 
 
 def select_frames(known: Sequence[str], wanted: Sequence[str], where: str) -> tuple[str, ...]:
-    """Returns the frames that were asked for, in the scene's order.
+    """Return the wanted frames in the scene's order.
 
     Args:
-        wanted: names, or ranges ``FIRST:LAST`` that include both ends; all frames where empty.
-            A number stands for the frame whose name is that number, with or without zeros before.
+        known: names of all frames.
+        wanted: names, or ranges ``FIRST:LAST`` with both ends included; empty: all frames. A number
+            stands for the frame with that number, with or without leading zeros.
         where: the scene, for messages.
 
     Raises:
@@ -317,6 +338,7 @@ def select_frames(known: Sequence[str], wanted: Sequence[str], where: str) -> tu
     places = {frame: k for k, frame in enumerate(known)}
 
     def place(name: str) -> int:
+        """Return the index of a frame."""
         if name in places:
             return places[name]
         number = frame_number(name)
@@ -338,16 +360,19 @@ def select_frames(known: Sequence[str], wanted: Sequence[str], where: str) -> tu
 def find_masks(
     folder: Path, cameras: Iterable[str]
 ) -> tuple[dict[tuple[str, str], Path], tuple[str, ...], tuple[str, ...]]:
-    """Finds masks/<camera>/<frame>.png, or masks/<frame>.png of a single camera.
+    """Find ``masks/<camera>/<frame>.png``, or ``masks/<frame>.png`` of a single camera.
 
-    Hidden files are passed over. Folders that belong to no camera, and files that are no PNG
-    pictures, are left over. Cameras that number their frames with and without leading zeros mean
-    the same frames.
+    Hidden files are ignored. Frames of equal number are the same, with or without leading zeros.
+
+    Args:
+        folder: the scene's folder.
+        cameras: names of the cameras.
 
     Returns:
-        The files by (camera, frame); folders of no camera; what is not used.
+        Mask files by (camera, frame); folders that belong to no camera; warnings about unused
+        files.
 
-    Raises SceneError: names a folder that cannot be read or holds no masks of a camera.
+    Raises SceneError: a folder cannot be read, or no camera has masks.
     """
     names, root = list(cameras), folder / "masks"
     if not root.is_dir():
@@ -384,7 +409,7 @@ def find_masks(
             f"{advice}"
         )
     warnings += [
-        f"camera '{name}' of cameras.yaml has no masks in masks/{name}; the others go on"
+        f"camera '{name}' of cameras.yaml has no masks in masks/{name} and is left out"
         for name in unused
     ]
     warnings += doubled
@@ -401,12 +426,19 @@ def find_masks(
 def find_images(
     folder: Path, cameras: Iterable[str], frames: Iterable[str] = ()
 ) -> dict[tuple[str, str], Path]:
-    """Finds images/<camera>/<frame>.png or .jpg by (camera, frame); none where there is no folder.
+    """Find ``images/<camera>/<frame>.png`` or ``.jpg``, or frames of ``videos/<camera>.mp4``.
 
-    Of a camera without such a folder the video videos/<camera>.mp4 is each of its frames, which are
-    named 000000, 000001 and so on, or as known ``frames`` of these numbers are named already.
+    A video's frames are named 000000, 000001 and so on, or like the known frame of that number.
 
-    Raises SceneError: a folder or video that cannot be read.
+    Args:
+        folder: the scene's folder.
+        cameras: names of the cameras.
+        frames: names of known frames.
+
+    Returns:
+        Picture or video files by (camera, frame).
+
+    Raises SceneError: a folder or video cannot be read.
     """
     found: dict[tuple[str, str], Path] = {}
     known = {int(frame): frame for frame in frames if frame.isdecimal()}
@@ -414,11 +446,11 @@ def find_images(
         files = find_recorded_files(folder, camera)
         if isinstance(files, Path):
             numbers = range(VideoPictures(files).count)
-            # No picture takes less than a byte. A recording that was not closed has no number.
+            # A picture takes at least a byte; an unfinished recording has no valid count.
             if not 0 < len(numbers) <= files.stat().st_size:
                 raise SceneError(
-                    f"{files}: does not say how many pictures it has, or more than it can hold; "
-                    f"make it whole: ffmpeg -i {files.name} -c copy NEW"
+                    f"{files}: its number of pictures is missing or too large for its size; "
+                    f"repair it: ffmpeg -i {files.name} -c copy NEW"
                 )
             found |= {(camera, known.get(k, f"{k:06d}")): files for k in numbers}
         elif files:
@@ -427,21 +459,21 @@ def find_images(
 
 
 def _visible(folder: Path) -> list[os.DirEntry[str]]:
-    """A folder's entries by name, but for hidden ones, such as those that macOS leaves behind."""
+    """Return a folder's entries sorted by name, without hidden ones."""
     try:
         with os.scandir(folder) as entries:
-            seen = [entry for entry in entries if not entry.name.startswith(".")]
+            visible = [entry for entry in entries if not entry.name.startswith(".")]
     except OSError as error:
         raise SceneError(f"{folder}: cannot be read: {error.strerror}") from error
-    for entry in seen:
-        # Python stands in for the bytes of other encodings by what cannot be written to any file.
+    for entry in visible:
+        # Python decodes bytes of other encodings to surrogates, which cannot be written to files.
         if any("\ud800" <= character <= "\udfff" for character in entry.name):
-            raise SceneError(f"{folder}: the name {entry.name!r} is no UTF-8 text; rename it")
-    return sorted(seen, key=lambda entry: entry.name)
+            raise SceneError(f"{folder}: the name {entry.name!r} is not UTF-8 text; rename it")
+    return sorted(visible, key=lambda entry: entry.name)
 
 
 def _list_masks(folder: Path) -> tuple[list[Path], list[str]]:
-    """The PNG files of a folder, and the names of its other files."""
+    """Return the PNG files of a folder, and the names of its other files."""
     names = [f"{entry.name}/" if entry.is_dir() else entry.name for entry in _visible(folder)]
     pictures = [name for name in names if name.lower().endswith(".png")]
     return [folder / name for name in pictures], [n for n in names if n not in pictures]
@@ -450,27 +482,30 @@ def _list_masks(folder: Path) -> tuple[list[Path], list[str]]:
 def _join_frames(
     files: Mapping[str, Sequence[Path]],
 ) -> tuple[dict[tuple[str, str], Path], list[str]]:
-    """Masks by camera and frame, whose longest spelling is its name, and what is there twice."""
-    spelt = {file.stem for own in files.values() for file in own}
+    """Merge the cameras' frames; a frame is named by its longest spelling.
+
+    Returns:
+        Mask files by (camera, frame), and warnings about duplicates.
+    """
+    spellings = {file.stem for own_files in files.values() for file in own_files}
     several = sum(map(bool, files.values())) > 1
     first: dict[object, str] = {}
     name_of = {
         stem: first.setdefault(natural_key(stem) if several else stem, stem)
-        for stem in sorted(spelt, key=lambda stem: (-len(stem), stem))
+        for stem in sorted(spellings, key=lambda stem: (-len(stem), stem))
     }
     masks: dict[tuple[str, str], Path] = {}
-    doubled = []
-    for camera, own in files.items():
+    warnings = []
+    for camera, own_files in files.items():
         by_frame: dict[str, list[Path]] = {}
-        for file in sorted(own, key=lambda file: (-len(file.stem), file.name)):
+        for file in sorted(own_files, key=lambda file: (-len(file.stem), file.name)):
             by_frame.setdefault(name_of[file.stem], []).append(file)
         for frame in in_order(by_frame):
-            used, *again = by_frame[frame]
+            used, *duplicates = by_frame[frame]
             masks[camera, frame] = used
-            if again:
-                names = ", ".join(file.name for file in again)
-                doubled.append(
-                    f"camera '{camera}', frame {frame}: {used.name} is used, {names} is the same "
-                    "frame again"
+            if duplicates:
+                names = ", ".join(file.name for file in duplicates)
+                warnings.append(
+                    f"camera '{camera}', frame {frame}: {used.name} is used; {names} is a duplicate"
                 )
-    return masks, doubled
+    return masks, warnings

@@ -74,7 +74,7 @@ SPOILT_SCENES = [
     (lambda folder: (folder / "scene.yaml").symlink_to("gone"), ("scene.yaml", "No such file")),
     (
         lambda folder: (folder / "masks/front" / os.fsdecode(b"\xfc.png")).touch(),
-        ("masks/front", r"'\udcfc.png' is no UTF-8 text"),
+        ("masks/front", r"'\udcfc.png' is not UTF-8 text"),
     ),
     (file("joint_angles.csv", "frame,lift\n0,20\n2,60\n"), ("'lift', frame 2", "in degrees")),
     (file("joint_angles.csv", "frame,lift\n0,1e308\n"), ("'lift', frame 0", "no joint's position")),

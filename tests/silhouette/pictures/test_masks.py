@@ -167,6 +167,6 @@ def test_masks_agree_by_what_is_wrong_over_all_cameras_silhouettes():
     body = MASK.copy()
     body[4:9, 3:5] = False
     found = compare_masks({"a": MASK, "b": MASK}, {"a": MASK, "b": body})
-    assert (found.wrong, found.area) == (10, 170)
+    assert (found.differing, found.area) == (10, 170)
     assert found.E_total == pytest.approx(10 / 170)
     assert found.ious == {"a": 1.0, "b": pytest.approx(75 / 85)}

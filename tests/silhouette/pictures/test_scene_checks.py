@@ -88,7 +88,9 @@ def test_a_video_that_lies_about_its_length_is_refused(tmp_path, count):
     # Without its index nothing else tells the number.
     video.write_bytes(data[: data.index(b"idx1")])
     begin = time.process_time()
-    with pytest.raises(SceneError, match=rf"{NAMES[0]}\.avi: does not say how many .*ffmpeg"):
+    with pytest.raises(
+        SceneError, match=rf"{NAMES[0]}\.avi: its number of pictures is missing .*ffmpeg"
+    ):
         load_scene(tmp_path)
     assert time.process_time() - begin < 1.0
 
@@ -104,7 +106,7 @@ def test_a_video_that_lies_about_its_length_is_refused(tmp_path, count):
             ["4", "5"],
             "'middle' shows its last picture again in frame 4-5",
         ),
-        ("1 2 3 4", NAMES, [], "frame 4: all cameras show the frame before again"),
+        ("1 2 3 4", NAMES, [], "frame 4: all cameras show the previous frame again"),
         (
             "f_02 f_04 f_06 f_12 f_14",
             (),

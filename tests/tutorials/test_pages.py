@@ -1,5 +1,7 @@
 """README, CONTRIBUTING and the pages under tutorials: links, examples, commands, formats."""
 
+import ast
+import json
 import os
 import pkgutil
 import re
@@ -12,6 +14,7 @@ from pathlib import Path
 import pytest
 import yaml
 
+import drake_pose
 from drake_pose.body import load_landmarks
 from drake_pose.camera.camera_files import load_cameras
 from drake_pose.camera.sources import load_sources
@@ -86,26 +89,62 @@ def test_a_camera_reaches_another_process_by_lcm() -> None:
 
 
 @pytest.mark.slow
-def test_the_readme_s_command_runs_as_pasted(
+def test_the_command_of_the_tutorials_runs_as_pasted(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for name in ("tutorials", "urdf"):
         (tmp_path / name).symlink_to(ROOT / name)
     monkeypatch.chdir(tmp_path)
-    (words,) = [line for line in shell_lines(TEXTS["README.md"]) if line[0] == "drake-pose"]
+    text = TEXTS["tutorials/README.md"]
+    (words,) = [line for line in shell_lines(text) if line[0] == "drake-pose"]
     result = run_command(words[1:])
     assert result.exit_code == 0, result.output
     out = tmp_path / words[words.index("--out") + 1]
     for file in ("report.html", "poses.csv", "joints.csv", "modes.csv"):
-        assert file in TEXTS["README.md"]
+        assert file in text
         assert (out / file).is_file()
 
 
-def test_the_readme_has_one_example_of_each_kind() -> None:
+def test_the_readme_fits_on_a_screen() -> None:
+    readme = TEXTS["README.md"]
     assert [name for name, _ in PYTHON].count("README.md") == 1
-    assert [words[0] for words in shell_lines(TEXTS["README.md"])].count("drake-pose") == 1
-    assert len(re.findall(r"!\[|<img", TEXTS["README.md"])) == 1
-    assert len(TEXTS["README.md"].splitlines()) < 130
+    assert [words[:2] for words in shell_lines(readme)] == [["make", "demo"]]
+    assert len(re.findall(r"!\[|<img", readme)) == 1
+    assert len(readme.splitlines()) <= 60
+    assert len(readme.encode()) <= 3500
+
+
+def python_sources() -> Iterator[tuple[str, str]]:
+    """The name and the Python code of every example and notebook."""
+    for name, text in SHOWN.items():
+        for language in ("python", "py"):
+            yield from ((name, code) for code in blocks(text, language))
+    for path in sorted(TUTORIALS.glob("*.ipynb")):
+        cells = json.loads(path.read_text(encoding="utf-8"))["cells"]
+        yield from (
+            (path.name, "".join(cell["source"])) for cell in cells if cell["cell_type"] == "code"
+        )
+
+
+def test_pages_and_notebooks_import_from_drake_pose_itself() -> None:
+    used = set()
+    for page, code in python_sources():
+        for node in ast.walk(ast.parse(code)):
+            if isinstance(node, ast.Import):
+                assert not any(one.name.startswith("drake_pose.") for one in node.names), page
+            elif isinstance(node, ast.ImportFrom) and f"{node.module}.".startswith("drake_pose."):
+                assert node.module == "drake_pose", f"{page}: from {node.module} import ..."
+                used |= {one.name for one in node.names}
+    assert used <= {*drake_pose.__all__}
+    # What pages describe and no example imports.
+    text = "\n".join(SHOWN.values())
+    unused = {*drake_pose.__all__} - used
+    assert all(re.search(rf"`{name}\b", text) for name in unused), unused
+
+
+def test_the_public_names_are_few_and_nothing_else_is_listed() -> None:
+    assert len(drake_pose.__all__) <= 45
+    assert dir(drake_pose) == sorted([*drake_pose.__all__, "__version__"])
 
 
 def test_every_command_has_an_example() -> None:

@@ -201,11 +201,11 @@ def shimada(
             warnings = [hand.warning() for hand in hands]
         elif one.hypotheses:
             truncation, seen = one.truncation or "sequential", one.observed or "lines"
-            fates = shimada.run_hypotheses_experiment(
+            hypotheses = shimada.run_hypotheses_experiment(
                 one.runs or 50, one.seed, truncation, seen, count, one.iterations or 1
             )
-            figures, table, warnings = fates.as_json(), fates.table(), []
-            if one.out is not None and not shimada_pictures.save_hypotheses(fates, one.out):
+            figures, table, warnings = hypotheses.as_json(), hypotheses.table(), []
+            if one.out is not None and not shimada_pictures.save_hypotheses(hypotheses, one.out):
                 warnings = ["no wrong hypothesis was rejected by an inequality: nothing to draw"]
         else:
             names = TRUNCATIONS if is_all else (one.truncation or "joint",)

@@ -1,1 +1,1 @@
-"""The papers' experiments: their figures beside ours."""
+"""Experiments of the three papers, whose printed figures are compared with ours."""

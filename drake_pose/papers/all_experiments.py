@@ -1,4 +1,4 @@
-"""All experiments of the three papers, one after another, and one page about them."""
+"""All experiments of the three papers in turn, and one page of their results."""
 
 import base64
 import io
@@ -23,15 +23,15 @@ from drake_pose.search import MultiStartSearch, PoseSearch
 from drake_pose.version import VERSION
 
 Outcome = tuple[Figures, Sequence[RenderableType], Sequence[tuple[Any, ...]]]
-"""Figures by method, their tables, and rows that show the paper's figures beside ours.
+"""Figures by method, their tables, and rows that compare the paper's figures with ours.
 
-A row: what it is, a form, then the paper, its method and ours: words, or figures that are put into
-the form.
+A row: label, format, then the entries of the paper, of its method here, and of ours. An entry is a
+text, or figures for the format.
 """
 
 
 class Experiment(NamedTuple):
-    """An experiment: folder, title, command for it alone, and `run(short, pictures, count)`."""
+    """An experiment: folder, title, command that runs it alone, `run(short, folder, count)`."""
 
     name: str
     title: str
@@ -82,7 +82,7 @@ def _kameda_pictures(experiment: str, short: bool, folder: Path, count: Count) -
 
 
 def _filters() -> tuple[tuple[str, str, int], ...]:
-    """The paper's filter and ours: names of their figures, truncations, linearisations."""
+    """Return name, truncation and number of linearisations of the paper's filter and of ours."""
     return ("paper", "sequential", 1), (
         "ours",
         "joint",
@@ -112,7 +112,7 @@ def _shimada(observed: str, runs: int, short: bool, folder: Path, count: Count) 
     rows = (
         (f"{r_13} 35 [pixel]", form, "right (figure 15)", *first),
         (f"{r_13} 40 [pixel]", form, "right (figure 16)", *second),
-        ("truths within two deviations", *inside, *first),
+        ("true values within two deviations", *inside, *first),
         (angles, "{angle_rmse_at_end:.1f}", "right (figure 14)", *first),
         ("sequences lost", "", "none of two", *lost),
         ("milliseconds a frame, median, without drawing", "{ms_per_update:.1f}", "-", *first),
@@ -134,8 +134,8 @@ def _shimada_hypotheses(short: bool, folder: Path, count: Count) -> Outcome:
     rows = (
         ("hypotheses rejected later than made", later, "one is shown", paper, ours),
         ("of these wrong", "{of_these_wrong}", "that one", paper, "-"),
-        ("frames from its birth to its end", "", "2 (18 to 20)", lived, "-"),
-        ("as two joints do not bend alike", coupled, "that one", paper, "-"),
+        ("frames from creation to rejection", "", "2 (18 to 20)", lived, "-"),
+        ("rejected by a coupling of two joints", coupled, "that one", paper, "-"),
     )
     return figures, shown, rows
 
@@ -156,7 +156,7 @@ def _date(short: bool, folder: Path, count: Count) -> Outcome:
     backs = [result.recoveries(way).get(REGISTERED) or "not" for way in both]
     rows += [
         ("a frame", "", "real time, a cluster (15 ms for the face)", *whole),
-        ("frames until the registered pose, shown, is right", "", "that frame", *map(str, backs)),
+        ("frames until the shown registered pose is right", "", "that frame", *map(str, backs)),
     ]
     return figures, [*result.tables(), result.costs()], rows
 
@@ -165,14 +165,14 @@ def _date_walk(short: bool, folder: Path, count: Count) -> Outcome:
     cameras, size = (4, (320, 240)) if short else (9, (640, 480))
     walk = date_walk.run_walk_through(cameras, 0, count, size)
     walk.save(folder)
-    followed = "{captured_s:.1f} s ({wrongly_s:.1f} s wrongly)"
+    followed = "{captured_s:.1f} s ({wrongly_s:.1f} s wrong)"
     rows: list[tuple[Any, ...]] = []
     for name in COMMANDS:
         one = walk.figures["commands"][name]
         true = f"{name} (true: {one['true_s']:.1f} s)"
         rows.append((true, followed, "works (figure 8)", one, "-"))
     end = "{place_error_m:.2f} m, {heading_error_deg:.0f} degrees"
-    rows.append(("off at the walk's end", end, "-", walk.figures, "-"))
+    rows.append(("error at the walk's end", end, "-", walk.figures, "-"))
     return walk.figures, [walk.table()], rows
 
 
@@ -235,14 +235,15 @@ EXPERIMENTS = (
 
 
 def reproduce_all(out: Path, short: bool, count: Count, say: Callable[[str], None]) -> Path:
-    """Runs all experiments that are not finished yet, writes the page after each, and returns it.
+    """Run all experiments that are not finished, and write the page after each; return its path.
 
-    An experiment's folder gets its name when it is finished, so that nothing half done looks whole.
+    An experiment's folder gets its final name only when the experiment is finished.
 
     Args:
-        short: a few images, runs and frames of each, to see that all of it works.
-        count: counts images, sequences and frames.
-        say: called with what happens.
+        out: folder of the results.
+        short: whether to run few images, runs and frames, as a test.
+        count: reports the progress.
+        say: called with messages.
 
     Raises:
         OutputError: the folder cannot be written, or holds a run with other settings.
@@ -259,7 +260,7 @@ def reproduce_all(out: Path, short: bool, count: Count, say: Callable[[str], Non
         for number, experiment in enumerate(EXPERIMENTS, start=1):
             folder, part = out / experiment.name, out / f"{experiment.name}.part"
             which = f"{number} of {len(EXPERIMENTS)}, {experiment.name}"
-            say(f"{which}: is there" if folder.is_dir() else which)
+            say(f"{which}: finished already" if folder.is_dir() else which)
             if not folder.is_dir():
                 shutil.rmtree(part, ignore_errors=True)
                 part.mkdir()
@@ -274,7 +275,7 @@ def reproduce_all(out: Path, short: bool, count: Count, say: Callable[[str], Non
 
 
 def _write_outcome(folder: Path, outcome: Outcome, cpu_seconds: float) -> None:
-    """Writes figures.json, tables.txt, and paper.json about the paper's figures beside ours."""
+    """Write figures.json, tables.txt, and paper.json with the rows that compare the figures."""
     figures, shown, rows = outcome
     beside = [
         {"what": what}
@@ -296,14 +297,14 @@ def _write_outcome(folder: Path, outcome: Outcome, cpu_seconds: float) -> None:
 
 
 def _write(path: Path, text: str) -> None:
-    """Writes a file beside its place and moves it there."""
+    """Write a file under another name and move it to its place."""
     beside = path.with_name(f"{path.name}.part")
     beside.write_text(text)
     os.replace(beside, path)
 
 
 def _page(out: Path, short: bool) -> str:
-    """The page about the experiments that are finished: the papers' figures beside ours first."""
+    """Return the page of the finished experiments: compared figures first."""
     finished = []
     for one in EXPERIMENTS:
         folder = out / one.name

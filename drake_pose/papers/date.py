@@ -1,4 +1,7 @@
-"""Date's experiment: a simulated person with known motion, captured by many cameras."""
+"""Experiment of Date et al. (section 6.1): a simulated person with known motion, many cameras.
+
+Compared are the paper's inverse kinematics alone, with the search, and one fit to all silhouettes.
+"""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -27,17 +30,21 @@ TITLES = {
     "paper": "the paper's search",
     "silhouette": "all silhouettes",
 }
-"""What the ways of capturing are called."""
+"""Names of the methods in tables."""
 
-# How long a destroyed track is watched [frames].
-_WATCHED = 30
+# Number of frames in which a perturbed track is observed.
+_OBSERVED_FRAMES = 30
 
 
-class Moment(NamedTuple):
-    """The middle frame of a motion: pictures (H, W, 3), `compared` side by side with all estimates.
+class MotionSample(NamedTuple):
+    """The middle frame of a motion, for pictures.
 
-    What the paper's stages saw: the person by camera, the features in space, and `faces`
-    (130, 80, 3), the seen face, nearest template, and the model's head, or none.
+    Attributes:
+        compared: (H, W, 3) true pose and all estimates, side by side.
+        picture: (H, W, 3) input of the shown camera.
+        views: the person as each camera sees it, for the paper's method.
+        found: features in space.
+        faces: (130, 80, 3) input face, nearest template and the model's face; () if not seen.
     """
 
     compared: Picture
@@ -48,18 +55,18 @@ class Moment(NamedTuple):
 
 
 class DateResult:
-    """What the experiment measures, frame by frame; see run_experiment.
+    """Measurements of the experiment, frame by frame; see run_experiment.
 
     Attributes:
         names: (n,) motion of each frame.
-        errors: by way of capturing, of the joint centres in each frame (k,) [mm].
-        found_errors: of the paper's stages, elbows and knees as found, before the model with its
-            stiff trunk is laid through them, in each frame (4,) in the order of LIMBS [mm]; nan
-            where the registered pose was recognised instead.
+        errors: by method: (k,) errors of the joint centres in each frame [mm].
+        found_errors: by paper's method: (4,) errors of elbows and knees in each frame, in the order
+            of LIMBS, before the model with its rigid trunk is fitted to them [mm]; nan where the
+            registered pose was recognised instead.
         face_errors: angle between true and estimated direction of the head in each frame [deg].
-        destroyed: tracks on their way back: way of capturing, the motion at the destruction, or
-            REGISTERED, the track, and the mean error of each frame since [mm].
-        moments: by motion, what pictures show.
+        perturbed: tracks that were set to a wrong pose: method, motion at that time or REGISTERED,
+            track, and mean error of each frame since then [mm].
+        samples: by motion, the frame for pictures.
     """
 
     def __init__(self, studio: Studio, motion: Motion, method: str, seed: int) -> None:
@@ -75,53 +82,55 @@ class DateResult:
         if method == "silhouette":
             self._tracks[method] = SilhouetteTrack.build(studio)
         self._generator = np.random.default_rng([seed, 2])
-        self._destroyed_at = frames_of_destruction(motion)
+        self._perturbed_at = perturbed_frames(motion)
         landmarks, tree = load_landmarks(studio.model.path), studio.model.pose_tree()
         del landmarks["head_top"]
         self._kinematics = TreeKinematics(tree)
         self._landmarks = landmarks_of_nodes(tree, landmarks)
-        self.errors: dict[str, list[Array]] = {way: [] for way in self._tracks}
+        self.errors: dict[str, list[Array]] = {method: [] for method in self._tracks}
         self.found_errors: dict[str, list[Array]] = {"ik_only": [], "paper": []}
         self.face_errors: list[float] = []
-        self.destroyed: list[tuple[str, str, PaperTrack | SilhouetteTrack, list[float]]] = []
-        self.moments: dict[str, Moment] = {}
+        self.perturbed: list[tuple[str, str, PaperTrack | SilhouetteTrack, list[float]]] = []
+        self.samples: dict[str, MotionSample] = {}
 
     def step(self, k: int) -> None:
-        """One more frame."""
+        """Process frame k."""
         studio, q = self.studio, self._motion.q[k]
-        shots = studio.pictures(q)
-        images = {name: picture_to_colour_image(shot) for name, shot in shots.items()}
-        if k in self._destroyed_at:
-            for way in dict.fromkeys((self._method, "paper")):
-                lost = self._tracks[way].destroyed(self._motion.q[k - 1], self._generator)
-                self.destroyed.append((way, self._destroyed_at[k], lost, []))
+        pictures = studio.pictures(q)
+        images = {name: picture_to_colour_image(shot) for name, shot in pictures.items()}
+        if k in self._perturbed_at:
+            for method in dict.fromkeys((self._method, "paper")):
+                perturbed_track = self._tracks[method].perturbed(
+                    self._motion.q[k - 1], self._generator
+                )
+                self.perturbed.append((method, self._perturbed_at[k], perturbed_track, []))
         estimates = {}
-        for way, track in self._tracks.items():
-            estimates[way] = track.step(images)
-            self.errors[way].append(self._joint_errors(estimates[way], q))
+        for method, track in self._tracks.items():
+            estimates[method] = track.step(images)
+            self.errors[method].append(self._joint_errors(estimates[method], q))
             if isinstance(track, PaperTrack):
                 true = [studio.skeleton.limb_points(q, name)[1] for name in LIMBS]
-                off = 1e3 * np.linalg.norm(track.middle_joints() - true, axis=1)
-                self.found_errors[way].append(off)
+                error = 1e3 * np.linalg.norm(track.middle_joints() - true, axis=1)
+                self.found_errors[method].append(error)
         heads = [studio.skeleton.head_rotation(one)[:, 2] for one in (estimates[self._method], q)]
         cosine = float(np.clip(heads[0] @ heads[1], -1.0, 1.0))
         self.face_errors.append(math.degrees(math.acos(cosine)))
-        for _, _, lost, errors in self.destroyed:
-            if len(errors) < _WATCHED:
-                errors.append(_mean(self._joint_errors(lost.step(images), q)))
+        for _, _, perturbed_track, errors in self.perturbed:
+            if len(errors) < _OBSERVED_FRAMES:
+                errors.append(_mean(self._joint_errors(perturbed_track.step(images), q)))
         if _is_middle(self._motion, k):
             paper = self._tracks["paper"]
             assert isinstance(paper, PaperTrack)
             views, found, faces = paper.seen()
             shown = [studio.shown_at(one, SHOWN_CAMERA) for one in (q, *estimates.values())]
             head = studio.face_at(estimates["paper"]) if faces else None
-            self.moments[self.names[k]] = Moment(
-                np.hstack(shown), shots[SHOWN_CAMERA], views, found,
+            self.samples[self.names[k]] = MotionSample(
+                np.hstack(shown), pictures[SHOWN_CAMERA], views, found,
                 () if head is None else (*faces, head),
             )  # fmt: skip
 
     def _joint_errors(self, found: Array, q: Array) -> Array:
-        """(k,) how far the joint centres at found positions (nq,) are off those at q (nq,) [mm]."""
+        """Return the errors (k,) of the joint centres at found positions (nq,) [mm]."""
         order = self.studio.skeleton.order
         places = [
             self._landmarks.positions(self._kinematics.poses(one[order])) for one in (found, q)
@@ -130,46 +139,46 @@ class DateResult:
 
     @property
     def motions(self) -> tuple[str, ...]:
-        """Those that were shown."""
+        """Motions that were shown."""
         return tuple(name for name in dict.fromkeys(self.names) if name != REGISTERED)
 
-    def recoveries(self, way: str) -> dict[str, int | None]:
-        """Frames until a destroyed track was right again, by motion; None: not while watched.
+    def recoveries(self, method: str) -> dict[str, int | None]:
+        """Return the number of frames until a perturbed track recovered, by motion.
 
-        It is right within twice its usual error, or 25 mm.
+        A track has recovered within twice its mean error, or 25 mm. None: not while observed.
         """
-        right = max(25.0, 2.0 * _mean(self.errors[way]))
+        right = max(25.0, 2.0 * _mean(self.errors[method]))
         return {
             motion: next((k for k, off in enumerate(errors, 1) if off <= right), None)
-            for own, motion, _, errors in self.destroyed
-            if own == way
+            for own, motion, _, errors in self.perturbed
+            if own == method
         }
 
     @property
     def slowest_recovery(self) -> float:
-        """The longest that a frame's pose took on the way back [ms]."""
-        own = [track for way, _, track, _ in self.destroyed if way == self._method]
+        """Longest time of a frame's pose in a perturbed track [ms]."""
+        own = [track for method, _, track, _ in self.perturbed if method == self._method]
         return max((lap["pose"] for track in own for lap in track.milliseconds), default=0.0)
 
-    def milliseconds(self, way: str) -> dict[str, float]:
-        """Processor time by stage, a frame, all cameras together; "all": of all stages."""
-        laps = self._tracks[way].milliseconds
+    def milliseconds(self, method: str) -> dict[str, float]:
+        """Return median processor times of a frame's stages, all cameras together [ms]; "all"."""
+        laps = self._tracks[method].milliseconds
         names = dict.fromkeys(name for lap in laps for name in lap)
         stages = {name: float(np.median([lap.get(name, 0.0) for lap in laps])) for name in names}
         return {**stages, "all": sum(stages.values())}
 
     def as_json(self) -> dict[str, object]:
-        """The figures; the registered pose's frames do not count."""
-        own = np.array(self.errors[self._method])[np.isin(self.names, self.motions)]
+        """Return the figures, without the frames of the registered pose."""
+        leading = np.array(self.errors[self._method])[np.isin(self.names, self.motions)]
         all_motions = self._of_motions(self.motions)
         recoveries, spent = self.recoveries(self._method), self.milliseconds(self._method)
         cameras = len(self.studio.cameras)
         anywhere = [n for motion, n in recoveries.items() if motion != REGISTERED]
-        soon = anywhere or list(recoveries.values())
-        known = [n for n in soon if n is not None]
+        counts = anywhere or list(recoveries.values())
+        known = [n for n in counts if n is not None]
         return {
-            "joint_error_mm": _mean(own),
-            "joint_error_p95_mm": float(np.percentile(own, 95)),
+            "joint_error_mm": _mean(leading),
+            "joint_error_p95_mm": float(np.percentile(leading, 95)),
             "ik_only_mm": all_motions["ik_only_mm"],
             "paper_mm": all_motions["paper_mm"],
             "elbows_and_knees": self._of_joints(("elbow", "knee")),
@@ -178,7 +187,7 @@ class DateResult:
             **self._as_found(UPRIGHT),
             "as_found": {motion: self._as_found((motion,)) for motion in self.motions},
             "face_error_deg": all_motions["face_error_deg"],
-            "frames_to_recover": max(known) if known and len(known) == len(soon) else None,
+            "frames_to_recover": max(known) if known and len(known) == len(counts) else None,
             "frames_to_recover_registered": recoveries.get(REGISTERED),
             "ms_of_slowest_recovering_frame": self.slowest_recovery,
             "ms_per_frame": spent,
@@ -191,35 +200,38 @@ class DateResult:
         }
 
     def _as_found(self, motions: Sequence[str]) -> dict[str, float]:
-        """Mean errors of elbows and knees as found, with the search and without [mm]."""
+        """Return mean errors of elbows and knees as found, with and without the search [mm]."""
         chosen = np.isin(self.names, motions)
         figures = {}
-        for way, ending in (("ik_only", "ik_mm"), ("paper", "mm")):
-            errors = np.array(self.found_errors[way])[chosen]
+        for method, ending in (("ik_only", "ik_mm"), ("paper", "mm")):
+            errors = np.array(self.found_errors[method])[chosen]
             errors = errors[np.isfinite(errors).all(axis=1)]
             for joint, limbs in (("elbow", errors[:, :2]), ("knee", errors[:, 2:])):
                 figures[f"{joint}_{ending}"] = _mean(limbs) if len(limbs) else math.nan
         return figures
 
     def _of_motions(self, motions: Sequence[str]) -> dict[str, float]:
-        """Mean errors in the frames of some motions."""
+        """Return mean errors [mm, deg] in the frames of some motions."""
         chosen = np.isin(self.names, motions)
-        errors = {f"{way}_mm": _mean(np.array(one)[chosen]) for way, one in self.errors.items()}
+        errors = {
+            f"{method}_mm": _mean(np.array(one)[chosen]) for method, one in self.errors.items()
+        }
         return {**errors, "face_error_deg": _mean(np.array(self.face_errors)[chosen])}
 
     def _of_joints(self, ends: tuple[str, ...]) -> dict[str, float]:
-        """Mean errors in all motions of the joints whose names end so, by way of capturing."""
+        """Return mean errors [mm] of the joints with these endings in all motions, by method."""
         moving = np.isin(self.names, self.motions)
         chosen = [i for i, name in enumerate(self._landmarks.names) if name.endswith(ends)]
         return {
-            f"{way}_mm": _mean(np.array(one)[moving][:, chosen]) for way, one in self.errors.items()
+            f"{method}_mm": _mean(np.array(one)[moving][:, chosen])
+            for method, one in self.errors.items()
         }
 
     def tables(self) -> tuple[Table, Table]:
-        """The errors in each motion; and elbows and knees as found, with the search and without."""
+        """Tabulate the errors in each motion, and those of elbows and knees as found."""
         rows = {motion: self._of_motions((motion,)) for motion in self.motions}
         found = {motion: self._as_found((motion,)) for motion in self.motions}
-        headings = {f"{way}_mm": f"{TITLES[way]} [mm]" for way in self.errors}
+        headings = {f"{method}_mm": f"{TITLES[method]} [mm]" for method in self.errors}
         found_headings = {
             f"{joint}_{ending}": f"{joint}s, {how}"
             for joint in ("elbow", "knee")
@@ -241,7 +253,7 @@ class DateResult:
         )
 
     def costs(self) -> str:
-        """What a frame costs, and how soon a destroyed track is right again."""
+        """Describe the times of a frame, and the recovery of perturbed tracks."""
         *stages, (_, whole) = self.milliseconds(self._method).items()
         parts = ", ".join(f"{name} {spent:.1f}" for name, spent in stages)
         soon = ", ".join(
@@ -251,8 +263,8 @@ class DateResult:
         return (
             f"One core, {TITLES[self._method]}: {whole:.1f} ms a frame ({parts}), "
             f"{1e3 / whole:.0f} frames a second.\n"
-            f"Frames until a destroyed track was right again: {soon}; "
-            f"the slowest of them took {self.slowest_recovery:.0f} ms."
+            f"Frames until a perturbed track recovered: {soon}; the slowest of these frames took "
+            f"{self.slowest_recovery:.0f} ms."
         )
 
 
@@ -264,17 +276,19 @@ def run_experiment(
     count: Count = uncounted,
     size: tuple[int, int] = (640, 480),
 ) -> DateResult:
-    """Captures a simulated person, by one core.
+    """Capture a simulated person on one core.
 
     Args:
-        cameras: how many, the face camera included.
-        seed: another one draws other motions.
-        method: whose figures lead: "paper", all as it prints it, alone; "silhouette", all
-            silhouettes at once, beside it.
+        cameras: number of cameras, including the face camera.
+        frames: number of frames.
+        seed: of the motions and the noise.
+        method: "paper": the paper's methods only; "silhouette": the fit to all silhouettes, too,
+            whose figures lead.
+        count: reports the progress.
         size: width and height of the pictures [pixel].
 
     Raises:
-        SettingsError: an argument is out of its range.
+        SettingsError: an argument is out of range.
     """
     require_choice("method", method, ("silhouette", "paper"))
     with one_core():
@@ -291,7 +305,7 @@ def run_experiment(
 def _table_of_motions(
     title: str, rows: Mapping[str, Mapping[str, float]], headings: Mapping[str, str], form: str
 ) -> Table:
-    """A row a motion, a column a figure."""
+    """Tabulate figures: a row per motion, a column per figure."""
     columns = {
         heading: {motion: figures[key] for motion, figures in rows.items()}
         for key, heading in headings.items()
@@ -299,10 +313,11 @@ def _table_of_motions(
     return figure_table(title, {motion: (motion, form) for motion in rows}, columns, "motion")
 
 
-def frames_of_destruction(motion: Motion) -> dict[int, str]:
-    """Where tracks are destroyed: amid each whole motion, and at the registered pose's return.
+def perturbed_frames(motion: Motion) -> dict[int, str]:
+    """Return the frames in which tracks are perturbed, and their motions.
 
-    None is destroyed in the last ten frames.
+    These are the middle of each motion, except in the last ten frames, and the first frame of the
+    registered pose's return.
     """
     count = len(motion.names)
     found = {k: motion.names[k] for k in range(count - 10) if _is_middle(motion, k)}
@@ -311,7 +326,7 @@ def frames_of_destruction(motion: Motion) -> dict[int, str]:
 
 
 def _is_middle(motion: Motion, k: int) -> bool:
-    """Whether frame k is the middle one of its motion."""
+    """Return whether frame k is the middle one of its motion."""
     same = [i for i, name in enumerate(motion.names) if name == motion.names[k]]
     return motion.names[k] != REGISTERED and k == same[len(same) // 2]
 

@@ -1,4 +1,4 @@
-"""Date's simulated studio, and the ways of capturing that are compared in it."""
+"""Simulated studio of Date's experiment, and the tracks of the methods that are compared in it."""
 
 import time
 from collections.abc import Iterable, Iterator, Mapping
@@ -41,9 +41,9 @@ from drake_pose.systems.images import colour_image_to_picture
 from drake_pose.systems.person import PersonTracker, build_silhouette_capture
 from drake_pose.systems.ports import StagedDiagram
 
-# A power of two: the time from frame to frame is exactly the same, and so is the motion expected.
+# A power of two, so that frame times and the predicted motion are exact.
 PERIOD = 1.0 / 32.0
-"""From frame to frame [s]."""
+"""Time between frames [s]."""
 
 
 Images = Mapping[str, ImageRgba8U]
@@ -51,7 +51,7 @@ Images = Mapping[str, ImageRgba8U]
 
 @contextmanager
 def one_core() -> Iterator[None]:
-    """Have OpenCV use one core meanwhile, as all else does that is measured."""
+    """Limit OpenCV to one thread, as all other measured code."""
     threads = cv2.getNumThreads()
     cv2.setNumThreads(1)
     try:
@@ -62,7 +62,7 @@ def one_core() -> Iterator[None]:
 
 @dataclass(frozen=True, eq=False)
 class Studio:
-    """The simulated person, cameras (the face camera among them), empty room and noise."""
+    """Simulated person, cameras (face camera included), backgrounds, and generator of the noise."""
 
     model: ArticulatedModel
     skeleton: Skeleton
@@ -74,9 +74,14 @@ class Studio:
 
     @staticmethod
     def build(cameras: int, size: tuple[int, int], generator: np.random.Generator) -> "Studio":
-        """A studio of this many cameras, face camera included, pictures of one size [pixel].
+        """Build a studio.
 
-        Raises SettingsError: too few cameras.
+        Args:
+            cameras: number of cameras, including the face camera.
+            size: width and height of the pictures [pixel].
+
+        Raises:
+            SettingsError: there are fewer than three cameras.
         """
         if cameras < 3:
             raise SettingsError(f"cameras must be 3 or more, not {cameras}")
@@ -84,45 +89,45 @@ class Studio:
         placed = circle_of_cameras(cameras - 1, size=size)
         rig = build_camera_rig(model, placed)
         context = rig.diagram.CreateDefaultContext()
-        away = np.array(model.default_positions)
-        away[model.position_index("position_z")] = -9.0
-        rig.set_positions(context, away)
-        rooms = {name: rig.picture(context, name) for name in placed}
+        absent = np.array(model.default_positions)
+        absent[model.position_index("position_z")] = -9.0
+        rig.set_positions(context, absent)
+        empty = {name: rig.picture(context, name) for name in placed}
         backgrounds = {
-            name: learn_background([noisy(room, generator) for _ in range(5)])
-            for name, room in rooms.items()
+            name: learn_background([noisy(picture, generator) for _ in range(5)])
+            for name, picture in empty.items()
         }
         skeleton = load_skeleton(model)
         return Studio(model, skeleton, placed, rig, context, backgrounds, generator)
 
     def pictures(self, q: Array) -> dict[str, Picture]:
-        """What all cameras see of a person at q (nq,), noise included."""
+        """Return the noisy pictures of all cameras of a person at q (nq,)."""
         self.rig.set_positions(self.context, q)
-        shots = {name: self.rig.picture(self.context, name) for name in self.cameras}
-        return {name: noisy(shot, self.generator) for name, shot in shots.items()}
+        pictures = {name: self.rig.picture(self.context, name) for name in self.cameras}
+        return {name: noisy(shot, self.generator) for name, shot in pictures.items()}
 
     def prepare(self, q: Array) -> CaptureSetup:
-        """What the paper's method must know before: faces, skin, and q (nq,), registered."""
-        shots = self.pictures(q)
+        """Prepare the paper's method with a person in the registered pose q (nq,)."""
+        pictures = self.pictures(q)
         return prepare_paper_capture(
-            self.model, self.cameras, FACE_CAMERA, q, shots, self.backgrounds
+            self.model, self.cameras, FACE_CAMERA, q, pictures, self.backgrounds
         )
 
     def shown_at(self, q: Array, camera: str) -> Picture:
-        """The person at q (nq,) as a camera sees it (H, W, 3), without noise."""
+        """Return the picture (H, W, 3) of a person at q (nq,) in a camera, without noise."""
         self.rig.set_positions(self.context, q)
         return self.rig.picture(self.context, camera)
 
     def face_at(self, q: Array) -> Picture | None:
-        """The face (130, 80, 3) of a person at q as the face camera sees it; None: no skin."""
+        """Return the face (130, 80, 3) of a person at q (nq,) in the face camera; None: no skin."""
         picture = self.shown_at(q, FACE_CAMERA)
         mask = self.rig.mask(self.context, FACE_CAMERA)
         return cut_face(picture, see_person(picture, mask, SkinColour()).blobs)
 
 
 def noisy(picture: Picture, generator: np.random.Generator, deviation: float = 3.0) -> Picture:
-    """A picture with a camera's noise, of this standard deviation in every pixel [grey levels]."""
-    # One byte a channel is enough for noise, and four times as fast as a double.
+    """Add Gaussian noise to every channel of a picture [standard deviation in grey levels]."""
+    # OpenCV's 16-bit noise is precise enough, and four times as fast as doubles.
     noise = np.empty(picture.shape, dtype=np.int16)
     cv2.setRNGSeed(int(generator.integers(1 << 31)))
     cv2.randn(noise, np.zeros(3), np.full(3, deviation))
@@ -130,7 +135,7 @@ def noisy(picture: Picture, generator: np.random.Generator, deviation: float = 3
 
 
 class _StagedRun:
-    """A diagram that is run frame by frame, with the processor time of each frame's stages [ms]."""
+    """A diagram run frame by frame, with the processor times of each frame's stages [ms]."""
 
     def __init__(self, staged: StagedDiagram[Any]) -> None:
         self.milliseconds: list[Mapping[str, float]] = []
@@ -140,11 +145,11 @@ class _StagedRun:
 
     @property
     def context(self) -> Context:
-        """The diagram's."""
+        """The diagram's context."""
         return self._simulator.get_mutable_context()
 
     def _begin_frame(self) -> None:
-        """Goes to just before the next frame's update, which so sees the images that follow."""
+        """Advance to just before the next frame's update, which reads the images fixed next."""
         if self._frames:
             self._simulator.AdvanceTo(PERIOD * self._frames)
         self._frames += 1
@@ -155,7 +160,7 @@ class _StagedRun:
             port.FixValue(self.context, AbstractValue.Make(image))
 
     def _finish_frame(self, stages: Iterable[str]) -> None:
-        """Evaluates stages and the pose, and notes their processor time."""
+        """Evaluate stages and the pose, and store their processor times."""
         laps, last = {}, time.process_time()
         for stage in (*stages, "pose"):
             if stage == "pose":
@@ -168,7 +173,7 @@ class _StagedRun:
 
 
 class PaperTrack(_StagedRun):
-    """The paper's way; frames in which the registered pose is recognised add no milliseconds."""
+    """Track of the paper's method; frames that recognise the registered pose store no times."""
 
     def __init__(self, capture: StagedDiagram[PaperPoseEstimator]) -> None:
         super().__init__(capture)
@@ -176,13 +181,14 @@ class PaperTrack(_StagedRun):
 
     @staticmethod
     def build(setup: CaptureSetup) -> "PaperTrack":
-        """A track that knows nothing yet."""
+        """Return a track without a pose."""
         return PaperTrack(build_paper_capture(setup, period=PERIOD))
 
     def step(self, images: Images) -> Array:
-        """The positions (nq,) of one more frame.
+        """Process a frame; return its positions (nq,).
 
-        Raises SettingsError where the registered pose was not recognised in the first frame.
+        Raises:
+            SettingsError: the registered pose was not recognised in the first frame.
         """
         self._begin_frame()
         self._fix(images)
@@ -199,14 +205,14 @@ class PaperTrack(_StagedRun):
         return q
 
     def middle_joints(self) -> Array:
-        """(4, 3) elbows and knees of the last frame by LIMBS [m]; nan where it was recognised."""
+        """Return elbows and knees of the last frame (4, 3), by LIMBS [m]; nan if recognised."""
         port = self._capture.diagram.GetOutputPort("limb_points")
         return np.array(port.Eval(self.context)).reshape(len(LIMBS), 3, 3)[:, 1]
 
     def seen(self) -> tuple[dict[str, PersonView], Features, tuple[Picture, ...]]:
-        """What was seen in the last frame: the person by camera, features, and the face.
+        """Return views by camera, features, and faces of the last frame.
 
-        The face (130, 80, 3) is as cut from the picture, and its nearest template; none: not seen.
+        The faces (130, 80, 3) are the input's and its nearest template; () if there was none.
         """
         setup, diagram, context = self._capture.estimator.setup, self._capture.diagram, self.context
         views = {
@@ -229,8 +235,8 @@ class PaperTrack(_StagedRun):
         template = np.clip(flat, 0, 255).astype(np.uint8).reshape(*FACE_SIZE[::-1], 3)
         return views, found, (face, template)
 
-    def destroyed(self, q: Array, generator: np.random.Generator) -> "PaperTrack":
-        """A track that is turned around, its left and right exchanged; q (nq,) is where it was."""
+    def perturbed(self, q: Array, generator: np.random.Generator) -> "PaperTrack":
+        """Return a track at q (nq,) turned around, with left and right features exchanged."""
         estimator = self._capture.estimator
         skeleton = estimator.setup.skeleton
         wrong = np.array(q)
@@ -243,7 +249,11 @@ class PaperTrack(_StagedRun):
 
 
 class SilhouetteTrack(_StagedRun):
-    """All silhouettes at once; those of another track of the same diagram that stepped before."""
+    """Track of all silhouettes at once, which can share another track's silhouettes.
+
+    Args:
+        shared: a track of the same diagram that processes each frame before this one.
+    """
 
     def __init__(
         self,
@@ -256,22 +266,23 @@ class SilhouetteTrack(_StagedRun):
 
     @staticmethod
     def build(studio: Studio) -> "SilhouetteTrack":
-        """A track that knows nothing yet, with an edge point every 8 of 480 rows of a picture."""
+        """Return a track without a pose; edge points are 8 rows of a 480-row picture apart."""
         tracker, views = PersonPoseTracker(ContourFit(studio.model.pose_tree())), studio.cameras
         capture = build_silhouette_capture(tracker, views, studio.backgrounds, PERIOD, 60.0)
         return SilhouetteTrack(capture, tracker)
 
     def step(self, images: Images) -> Array:
-        """The positions (nq,) of one more frame, even where the person is lost.
+        """Process a frame; return its positions (nq,), even where the person is lost.
 
-        Raises SettingsError where no person was seen in the first frame.
+        Raises:
+            SettingsError: fewer than two cameras saw the person in the first frame.
         """
         self._begin_frame()
         if self._shared is None:
             self._fix(images)
             self._finish_frame(self._capture.stages)
         else:
-            # What a fixed input is given comes before what the diagram connects it to.
+            # A fixed input takes precedence over the port's connection in the diagram.
             person = self._capture.estimator
             own = person.GetMyMutableContextFromRoot(self.context)
             other = person.GetMyContextFromRoot(self._shared.context)
@@ -281,8 +292,8 @@ class SilhouetteTrack(_StagedRun):
             self._finish_frame(())
         return self._tracker.positions(self._state().values)
 
-    def destroyed(self, q: Array, generator: np.random.Generator) -> "SilhouetteTrack":
-        """A track in a random pose half a metre away, turned anyhow."""
+    def perturbed(self, q: Array, generator: np.random.Generator) -> "SilhouetteTrack":
+        """Return a track with random angles, half a metre away."""
         fit, state = self._tracker.fit, self._state()
         values, angles = state.values.copy(), fit.kinematics.is_angle
         lower = np.where(np.isinf(fit.lower), -np.pi, fit.lower)
@@ -295,7 +306,7 @@ class SilhouetteTrack(_StagedRun):
         return track
 
     def place(self, q: Array) -> None:
-        """Has the person be known to be at q (nq,)."""
+        """Set the person's positions to q (nq,)."""
         self._set_state(self._tracker.start(self._tracker.values(q)))
 
     def _state(self) -> TrackState:

@@ -1,4 +1,7 @@
-"""Date's application (section 6.2): a walk through a place, figure 8; and pictures of the rest."""
+"""Application of Date et al. (section 6.2, figure 8): a walk through a virtual place by gestures.
+
+`save_pictures` draws the pictures of both experiments, as the paper's figures 2 to 4, 7 and 8.
+"""
 
 import math
 from collections.abc import Mapping
@@ -17,7 +20,7 @@ from rich.table import Table
 from drake_pose.arrays import Array, Mask, Picture
 from drake_pose.body import ArticulatedModel
 from drake_pose.camera.models import PinholeCamera, look_at
-from drake_pose.papers.date import SHOWN_CAMERA, TITLES, DateResult, Moment
+from drake_pose.papers.date import SHOWN_CAMERA, TITLES, DateResult, MotionSample
 from drake_pose.papers.date_capture import PERIOD, PaperTrack, Studio, one_core
 from drake_pose.papers.tables import (
     Count,
@@ -37,23 +40,23 @@ from drake_pose.systems.walk import Walker, add_garden, view_from_behind, walker
 
 
 class WalkThrough(NamedTuple):
-    """Captured gestures beside the true poses: figures, and figure 8's pictures by command."""
+    """Captured gestures compared with the true poses: figures, and figure 8 by command."""
 
     figures: dict[str, Any]
     pictures: Mapping[str, tuple[Picture, Picture]]
 
     def table(self) -> Table:
-        """How long each command was followed."""
+        """Tabulate the time for which each command was active."""
         columns = {
             key: {name: one[f"{key}_s"] for name, one in self.figures["commands"].items()}
             for key in ("true", "captured", "wrongly")
         }
-        end = "{same_command:.1%} of frames alike, {place_error_m:.2f} m off at the end"
+        end = "{same_command:.1%} of frames equal, final error {place_error_m:.2f} m"
         title = f"Walking through [s]: {end.format(**self.figures)}"
         return figure_table(title, {k: (k, "{:.2f}") for k in COMMANDS}, columns, "command")
 
     def save(self, folder: Path) -> Path:
-        """Draws figure 8: the input, and the walk through the place."""
+        """Draw figure 8: the input, and the walk through the place."""
         columns = list(self.pictures.values())
         figure = draw_panels(columns, list(self.pictures), ("input", "virtual walk"))
         return save_figure(figure, folder / "figure_08.png")
@@ -65,7 +68,7 @@ def run_walk_through(
     count: Count = uncounted,
     size: tuple[int, int] = (640, 480),
 ) -> WalkThrough:
-    """Captures table 1's gestures the paper's way, and lets them walk on the spot.
+    """Capture table 1's gestures by the paper's method, and walk by them.
 
     Arguments are those of papers.date.run_experiment.
     """
@@ -74,49 +77,50 @@ def run_walk_through(
         motion = make_gestures(studio.skeleton)
         names, model = np.array(motion.names), studio.model
         track = PaperTrack.build(studio.prepare(motion.q[0]))
-        advance, q, shots = count("frames", len(names)), np.empty_like(motion.q), []
+        advance, q, pictures_shown = count("frames", len(names)), np.empty_like(motion.q), []
         for k, true_q in enumerate(motion.q):
             seen = studio.pictures(true_q)
             q[k] = track.step({name: picture_to_colour_image(one) for name, one in seen.items()})
-            shots.append(seen[SHOWN_CAMERA])
+            pictures_shown.append(seen[SHOWN_CAMERA])
             advance(k + 1)
     commands, poses, _ = walk_by(model, motion.q)
     found_commands, found_poses, rests = walk_by(model, q)
     seconds = {}
-    for name, right in followed(commands).items():
-        captured = followed(found_commands)[name]
+    for name, true_frames in active_frames(commands).items():
+        captured = active_frames(found_commands)[name]
         counts = {
-            "true": right.sum(),
+            "true": true_frames.sum(),
             "captured": captured.sum(),
-            "wrongly": captured[~right].sum(),
+            "wrongly": captured[~true_frames].sum(),
         }
         seconds[name] = {f"{key}_s": PERIOD * float(number) for key, number in counts.items()}
-    off = found_poses[-1] - poses[-1]
+    error = found_poses[-1] - poses[-1]
     figures = {
         "same_command": float((commands == found_commands).all(axis=1).mean()),
         "commands": seconds,
-        "place_error_m": float(np.linalg.norm(off[:2])),
-        "heading_error_deg": abs(math.degrees(math.remainder(off[2], 2.0 * math.pi))),
+        "place_error_m": float(np.linalg.norm(error[:2])),
+        "heading_error_deg": abs(math.degrees(math.remainder(error[2], 2.0 * math.pi))),
         "frames": len(names), "cameras": cameras, "seed": seed, "method": "paper",
     }  # fmt: skip
     middles = {name: int(np.median(np.flatnonzero(names == name))) for name in COMMANDS}
     pictures = {
-        name: (shots[k], draw_walk(model, q[k], found_poses[k], rests[k]))
+        name: (pictures_shown[k], draw_walk(model, q[k], found_poses[k], rests[k]))
         for name, k in middles.items()
     }
     return WalkThrough(figures, pictures)
 
 
-def followed(commands: Array) -> dict[str, Mask]:
-    """(n,) in which frames each of COMMANDS is followed, of commands (n, 2)."""
+def active_frames(commands: Array) -> dict[str, Mask]:
+    """Return in which frames (n,) each of COMMANDS is active, given commands (n, 2)."""
     turn, walk = commands.T
     return dict(zip(COMMANDS, (turn > 0, turn < 0, walk > 0, walk < 0), strict=True))
 
 
 def walk_by(model: ArticulatedModel, q: Array) -> tuple[Array, Array, Array]:
-    """Walker's commands (n, 2), poses (n, 3) and rests (n, 5) by positions (n, nq).
+    """Simulate a Walker on positions (n, nq), one frame per PERIOD, walking on the spot.
 
-    A frame is shown each PERIOD; commands need walking on the spot.
+    Returns:
+        (n, 2) commands, (n, 3) poses and (n, 5) rest stances.
     """
     builder = DiagramBuilder()
     source = builder.AddSystem(TrajectorySource(held_positions(q, PERIOD)))
@@ -126,13 +130,13 @@ def walk_by(model: ArticulatedModel, q: Array) -> tuple[Array, Array, Array]:
     logs = [LogVectorOutput(port, builder, PERIOD) for port in ports]
     simulator = Simulator(builder.Build())
     simulator.AdvanceTo(PERIOD * len(q))
-    # What is logged at a time was known before the update at that time.
+    # A value logged at a time is the one before the update at that time.
     commands, poses, rests = (log.FindLog(simulator.get_context()).data()[:, 1:].T for log in logs)
     return commands, poses, rests
 
 
 def draw_walk(model: ArticulatedModel, q: Array, pose: Array, rest: Array) -> Picture:
-    """The place (H, W, 3) from behind the avatar at q (nq,), by Drake; pose, rest: of Walker."""
+    """Render the place (H, W, 3) from behind the avatar at q (nq,); pose, rest: of the Walker."""
     X_RP = walker_transform(pose, rest).inverse()
     builder = DiagramBuilder()
     scene_graph = add_garden(builder, X_RP)
@@ -148,14 +152,14 @@ def draw_walk(model: ArticulatedModel, q: Array, pose: Array, rest: Array) -> Pi
 
 
 def save_pictures(result: DateResult, folder: Path) -> list[Path]:
-    """Draw a moment of each motion (figures 7, 2 to 4), and errors over time; returns PNG files."""
+    """Draw a frame of each motion (figures 2, 3, 4, 7), and errors over time; return PNG files."""
     files = []
-    for motion, moment in result.moments.items():
-        files.append(save_picture(moment.compared, folder / f"figure_07_{motion}.png"))
-    for motion, moment in result.moments.items():
-        files.append(save_picture(_draw_skin(moment), folder / f"figure_02_{motion}.png"))
-        files.append(save_figure(_draw_points(result, moment), folder / f"figure_03_{motion}.png"))
-    faces = {name: one.faces for name, one in result.moments.items() if one.faces}
+    for motion, sample in result.samples.items():
+        files.append(save_picture(sample.compared, folder / f"figure_07_{motion}.png"))
+    for motion, sample in result.samples.items():
+        files.append(save_picture(_draw_skin(sample), folder / f"figure_02_{motion}.png"))
+        files.append(save_figure(_draw_points(result, sample), folder / f"figure_03_{motion}.png"))
+    faces = {name: one.faces for name, one in result.samples.items() if one.faces}
     if faces:
         columns = list(zip(*faces.values(), strict=True))
         figure = draw_panels(columns, ("input", "template", "avatar"), list(faces))
@@ -163,10 +167,10 @@ def save_pictures(result: DateResult, folder: Path) -> list[Path]:
     return [*files, save_figure(_draw_errors(result), folder / "errors.png")]
 
 
-def _draw_skin(moment: Moment) -> Picture:
-    """Figure 2: the input, with the skin that was found in it outlined and its centroids."""
-    picture, pink = np.ascontiguousarray(moment.picture), (255, 0, 160)
-    blobs = moment.views[SHOWN_CAMERA].blobs
+def _draw_skin(sample: MotionSample) -> Picture:
+    """Draw figure 2: the input with outlines and centroids of its skin-coloured blobs."""
+    picture, pink = np.ascontiguousarray(sample.picture), (255, 0, 160)
+    blobs = sample.views[SHOWN_CAMERA].blobs
     outlines, _ = cv2.findContours(
         blobs.mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE
     )
@@ -176,15 +180,15 @@ def _draw_skin(moment: Moment) -> Picture:
     return picture
 
 
-def _draw_points(result: DateResult, moment: Moment) -> Figure:
-    """Figure 3: where rays of skin meet, by the feature they were given to, and the features."""
-    found = moment.found
+def _draw_points(result: DateResult, sample: MotionSample) -> Figure:
+    """Draw figure 3: 3-D points of skin by the feature they belong to, and the features."""
+    found = sample.found
     figure = Figure(figsize=(6.0, 6.0))
     axes = figure.add_subplot(projection="3d")
-    for name, view in moment.views.items():
+    for name, view in sample.views.items():
         origins, directions = viewing_rays(result.studio.cameras[name], view.blobs.centroids)
         for origin, direction in zip(origins, directions, strict=True):
-            # As far as the person: from a little before the features to a little behind them.
+            # Draw rays from 0.1 m before the features to 0.1 m behind them.
             along = (found.places - origin) @ direction
             ends = origin + np.outer([along.min() - 0.1, along.max() + 0.1], direction)
             axes.plot(*ends.T, color="0.85", linewidth=0.5, zorder=0)
@@ -200,11 +204,11 @@ def _draw_points(result: DateResult, moment: Moment) -> Figure:
 
 
 def _draw_errors(result: DateResult) -> Figure:
-    """The joint centres' mean errors over time, by way of capturing."""
+    """Draw the joint centres' mean errors over time, by method."""
     figure = Figure(figsize=(9.0, 3.5))
     axes = figure.add_subplot()
-    for way, errors in result.errors.items():
-        axes.semilogy(np.mean(errors, axis=1), label=TITLES[way])
+    for method, errors in result.errors.items():
+        axes.semilogy(np.mean(errors, axis=1), label=TITLES[method])
     for k, name in enumerate(result.names):
         if k == 0 or name != result.names[k - 1]:
             axes.axvline(k, color="0.8", zorder=0)

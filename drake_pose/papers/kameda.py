@@ -1,6 +1,7 @@
-"""Kameda's experiments: a woman's random poses (A), and real silhouettes of a man (B), a hand (C).
+"""Experiments of Kameda, Minoh and Ikeda (section 6): one silhouette each, root position known.
 
-In A Drake's renderer draws the silhouettes. Each is of one view; the root's place is known.
+A: random poses of a female body, whose silhouettes Drake renders (6.1). B and C: stored real
+silhouettes of a man and of a hand (6.2). J is equation (1), E_total = J / area(S) equation (9).
 """
 
 import math
@@ -58,22 +59,22 @@ PAPER = {
     "mean_runs_without_worst_seven": 20.1,
     "min_runs": 15,
 }
-"""The figures of experiment A, section 6.1. The paper states no seconds."""
+"""Printed figures of experiment A (6.1). The paper states no processing times."""
 
 METHODS: Mapping[Literal["paper", "beam"], str] = {
     "paper": "the paper's method",
     "beam": "multi-start search",
 }
-"""What experiments B and C compare, and what tables call it."""
+"""Names in tables of the methods that experiments B and C compare."""
 
 
 class Causes(NamedTuple):
-    """Why a silhouette does not tell a wrong pose from the true one (6.1); both may hold.
+    """Why a wrong pose has the true pose's silhouette (6.1). Both causes may hold.
 
-    Neither holds where a segment turns about its own axis.
+    Neither holds where a segment only turns about its own axis.
 
     Attributes:
-        hidden: a segment whose angles are wrong is hidden in both poses: the paper's occlusion.
+        hidden: a segment with wrong angles is hidden in both poses: the paper's occlusion.
         inner_edges: edges inside the silhouette differ.
     """
 
@@ -83,15 +84,15 @@ class Causes(NamedTuple):
 
 @dataclass(frozen=True)
 class RandomPose:
-    """One pose of experiment A, and what the search makes of its silhouettes.
+    """One pose of experiment A, and the result of the search.
 
     Args:
-        true_values: the values drawn, one array for each node [rad or m].
+        true_values: the drawn values of each node [rad or m].
         inside: whether the whole body is inside the picture.
         seconds: processor time of the search.
         more_seconds: processor time of proof and modes, or of intervals.
-        tolerance: a silhouette is matched exactly that differs by no more [pixel].
-        causes: on the grid, why angles are wrong though the silhouette is matched exactly.
+        tolerance: silhouettes that differ by at most this are equal [pixel].
+        causes: why angles are wrong although the silhouette is matched; only on the grid.
     """
 
     true_values: tuple[np.ndarray, ...]
@@ -120,7 +121,7 @@ class RandomPose:
 
 @dataclass(frozen=True)
 class RandomPoses:
-    """All poses of experiment A, and how they were made; see run_experiment."""
+    """All poses of experiment A, with the cameras, the search and the seed; see run_experiment."""
 
     trials: tuple[RandomPose, ...]
     cameras: tuple[ParallelCamera, ...]
@@ -128,23 +129,24 @@ class RandomPoses:
     seed: int
 
     def view(self, trial: RandomPose) -> View:
-        """The silhouette that the first camera sees of the true pose."""
+        """Return the first camera's silhouette of the true pose."""
         tree, camera = self.search.tree, self.cameras[0]
         pose = tree.positions_from(trial.true_values)
         return View(camera, LabelRenderer(tree.model, camera).mask(*pose))
 
 
 def experiment_camera(angle: float = 0.0) -> ParallelCamera:
-    """The paper's camera: 700 x 700, parallel, 2.26 pixels a centimetre, the head right above.
+    """Return the paper's camera: 700 x 700 pixels, parallel, 2.26 pixels per centimetre.
 
-    The angle [rad] turns the camera about the body's upright axis, to the body's left.
+    The head's joint is above the picture's middle. `angle` [rad] turns the camera about the body's
+    vertical axis, to the body's left.
     """
     turn, X_WC = np.eye(4), np.eye(4)
     turn[:2, :2] = [[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]]
-    # World x faces the camera (the way the body looks), y is the picture's right, z its up.
+    # World x, the way the body looks, points to the camera; y is the picture's right, z its up.
     X_WC[:3] = [[0.0, 0.0, -1.0, 5.0], [1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0]]
     name = f"turned_{round(math.degrees(angle))}"
-    # Arms reach about as far above the head's joint as the legs reach below when the trunk leans:
+    # Arms reach about as far above the head's joint as the legs of a leaning body reach below it:
     # with this principal point few bodies leave the picture.
     return ParallelCamera(name, 700, 700, 226.0, 349.5, 260.0, turn @ X_WC)
 
@@ -152,7 +154,7 @@ def experiment_camera(angle: float = 0.0) -> ParallelCamera:
 def experiment_search(
     outside_limit: float = 200.0, candidate_limit: int = 5, interval_deg: float = 20.0
 ) -> PaperSearch:
-    """The paper's search for its female body: root = head, r [pixel], K and the interval [deg]."""
+    """Return the paper's search of its female body: r [pixel], K, sampling interval [deg] (5)."""
     settings = PaperSearchSettings(
         interval=math.radians(interval_deg),
         outside_limit=outside_limit,
@@ -162,20 +164,20 @@ def experiment_search(
 
 
 def beam_experiment_search(interval_deg: float = 20.0) -> BeamSearch:
-    """The beam search for the same body, which needs no threshold r."""
+    """Return the beam search of the same body, which needs no threshold r."""
     settings = BeamSearchSettings(interval=math.radians(interval_deg))
     return BeamSearch(experiment_tree(), settings)
 
 
 def experiment_tree() -> PoseTree:
-    """The female body's pose tree; the head is the root, and stands in the world's origin."""
+    """Return the female body's pose tree, its root the head, at the world's origin."""
     return load_model(bundled_model("woman")).pose_tree(root_position=np.zeros(3))
 
 
 def draw_values(
     search: PoseSearch, angles: str, generator: np.random.Generator
 ) -> list[np.ndarray]:
-    """Draw every node's values [rad or m]: on the search's "grid" or "continuous" in its limits."""
+    """Draw each node's values [rad, m]: on the search's "grid", or "continuous" within limits."""
     values = []
     tree = search.tree
     lower, upper = tree.model.lower, tree.model.upper
@@ -183,7 +185,7 @@ def draw_values(
         grid = search.sampled.values[i]
         drawn = grid[generator.integers(len(grid))].copy()
         if angles == "continuous":
-            # A position with one grid value only is known, not searched.
+            # A position with a single grid value is known, not searched.
             moving = np.ptp(grid, axis=0) > 0
             indices = np.array(node.positions, dtype=np.int64)
             uniform = generator.uniform(lower[indices], upper[indices])
@@ -199,15 +201,18 @@ def run_experiment(
     count: Count = uncounted,
     views: int = 1,
 ) -> RandomPoses:
-    """Draw poses, on the grid as the paper's or for a continuous search between, and match them.
+    """Draw random poses and search them in their silhouettes.
+
+    Poses are drawn on the grid, as in the paper, or between its samples for a continuous search.
 
     Args:
-        search: of ``experiment_search``, ``beam_experiment_search``, or a ``MultiStartSearch``
+        search: from ``experiment_search`` or ``beam_experiment_search``, or a ``MultiStartSearch``
             of ``experiment_tree``.
-        images: how many poses; the paper has 219.
+        images: number of poses; 219 in the paper.
         seed: of the random angles.
-        views: how many cameras see each pose, 180 degrees / views apart: a silhouette from behind
-            is the mirror image of that from before and says nothing new.
+        count: reports the progress.
+        views: number of cameras, 180 degrees / views apart: a silhouette from behind is the mirror
+            image of that from the front.
 
     Raises:
         SettingsError: if ``images`` or ``views`` is below 1.
@@ -241,12 +246,12 @@ def run_experiment(
         result = search.match(seen)
         seconds, more, causes = time.process_time() - start, 0.0, None
         if is_continuous:
-            # The search tells its own times by the clock.
+            # The search states its times by the wall clock.
             more = result.interval_seconds
             more *= seconds / max(result.seconds, 1e-9)
             seconds -= more
         if isinstance(search, BeamSearch):
-            # Tighter limits on time would make the figures those of one machine.
+            # With tighter time limits the figures would depend on the machine.
             limits = ExaminationSettings(
                 proof_time_limit=60.0,
                 mode_time_limit=60.0,
@@ -275,9 +280,9 @@ def causes_of_wrong_angles(
     found_values: Sequence[np.ndarray],
     unseen: int = 20,
 ) -> Causes:
-    """Why a pose is not told from another that has the same silhouette, by its nodes' values.
+    """Return why two poses have the same silhouette, given their nodes' values.
 
-    Fewer pixels than `unseen` of a segment, or of a difference, are not seen.
+    Segments and differences of fewer than `unseen` pixels count as hidden.
     """
     nodes = len(sampled.tree.nodes)
     images = [
@@ -297,8 +302,9 @@ def causes_of_wrong_angles(
 
 
 def grid_figures(*runs: RandomPoses) -> dict[str, Any]:
-    """The figures under the names of ``PAPER``; of runs with several seeds, the spread, too.
+    """Return the figures of experiment A, by the keys of ``PAPER`` and others.
 
+    Several runs must differ in the seed only; the result then also has the spread of each figure.
     E_total is over the silhouettes for which a pose was found; ``not_found`` counts the others.
     """
     every = [_grid_figures(run) for run in runs]
@@ -345,7 +351,7 @@ def _grid_figures(result: RandomPoses) -> dict[str, Any]:
     return {
         **figures,
         "method": "beam",
-        # None can be told from one that is matched within what renderers differ by.
+        # A match within the renderers' difference cannot be told from the optimum.
         "proved": sum(trial.exact or trial.result.proved_optimal for trial in trials),
         "exact_inside": sum(trial.exact for trial in trials if trial.inside),
         "truth_in_set": sum(named),
@@ -358,14 +364,14 @@ def _grid_figures(result: RandomPoses) -> dict[str, Any]:
 
 
 def grid_table(columns: Sequence[Sequence[RandomPoses]]) -> Table:
-    """The paper's figures and those of some searches, for each its runs, one for each seed."""
+    """Tabulate the paper's figures beside those of searches, each with one run per seed."""
     rows = {
         "images": ("silhouettes", "{}"),
         "tolerance": ("  equal within [pixel]", "{:.0f}"),
         "not_found": ("  no pose found", "{}"),
-        "mean_e_total": ("mean E_total of the others", "{:.2%}"),
+        "mean_e_total": ("mean E_total where a pose was found", "{:.2%}"),
         "exact": ("matched within the tolerance", "{}"),
-        "pose_equal": ("of these, every joint angle right", "{}"),
+        "pose_equal": ("  with every joint angle right", "{}"),
         "wrong_hidden": ("  else: a wrong segment is hidden", "{}"),
         "wrong_inner_edges": ("  else: edges inside differ", "{}"),
         "wrong_alike": ("  else: neither", "{}"),
@@ -375,21 +381,21 @@ def grid_table(columns: Sequence[Sequence[RandomPoses]]) -> Table:
         "min_runs": ("  minimum", "{}"),
         "median_seconds": ("processor seconds an image, median", "{:.3f}"),
         "p95_seconds": ("  95th percentile", "{:.3f}"),
-        "leaving_the_picture": ("bodies that leave the picture", "{}"),
-        "exact_inside": ("matched, of those that do not", "{}"),
-        "proved": ("proved: so matched, or the best of the grid", "{}"),
-        "budget_spent": ("proof or set ended by its time or memory", "{}"),
-        "truth_in_set": ("true pose in the set of poses as good", "{}"),
-        "complete_sets": ("sets that are complete", "{}"),
+        "leaving_the_picture": ("bodies partly outside the picture", "{}"),
+        "exact_inside": ("matched, of bodies inside the picture", "{}"),
+        "proved": ("proved: matched, or the optimum of the grid", "{}"),
+        "budget_spent": ("proof or set stopped by time or memory", "{}"),
+        "truth_in_set": ("true pose in the set of equally good poses", "{}"),
+        "complete_sets": ("complete sets", "{}"),
         "several_modes": ("silhouettes with several modes of poses", "{}"),
-        "free_joints": ("silhouettes that leave a joint free", "{}"),
+        "free_joints": ("silhouettes with an undetermined joint", "{}"),
         "examination_median_seconds": ("seconds for proof and set, median", "{:.3f}"),
     }
     shown: dict[str, Any] = {"paper": PAPER}
     for runs in columns:
         figures = [_grid_figures(run) for run in runs]
         if figures[0]["method"] == "beam":
-            # The runs of the beam search are other steps than the paper's.
+            # Runs of the beam search are other steps than the paper's, and not comparable.
             own = rows.keys() - {
                 "improved", "mean_runs", "mean_runs_without_worst_seven", "min_runs"
             }  # fmt: skip
@@ -400,10 +406,10 @@ def grid_table(columns: Sequence[Sequence[RandomPoses]]) -> Table:
 
 
 def continuous_figures(result: RandomPoses) -> dict[str, Any]:
-    """The figures: ratios as fractions, errors in degrees, seconds of the processor."""
+    """Return the figures of a continuous search: ratios 0 to 1, errors [deg], times [s]."""
     search = result.search
     assert isinstance(search, MultiStartSearch)
-    # Positions that the experiment holds have next to no span [rad or m].
+    # Positions that the experiment holds have a span of about 0.
     searched = np.concatenate([np.ptp(grid, axis=0) > 1e-9 for grid in search.sampled.values])
     errors, known, held = [], [], []
     for trial in result.trials:
@@ -435,7 +441,7 @@ def continuous_figures(result: RandomPoses) -> dict[str, Any]:
 
 
 def continuous_table(result: RandomPoses) -> Table:
-    """The figures of ``continuous_figures``."""
+    """Tabulate the figures of ``continuous_figures``."""
     rows = {
         "images": ("poses", "{}"),
         "views": ("cameras", "{}"),
@@ -444,8 +450,8 @@ def continuous_table(result: RandomPoses) -> Table:
         "median_determined_error_deg": ("error of determined joints, median [deg]", "{:.2f}"),
         "median_error_deg": ("  of all joints", "{:.2f}"),
         "determined": ("joints that are determined", "{:.0%}"),
-        "interval_coverage": ("truth inside their intervals", "{:.1%}"),
-        "interval_confidence": ("  as the intervals claim", "{:.1%}"),
+        "interval_coverage": ("true angles inside their intervals", "{:.1%}"),
+        "interval_confidence": ("  nominal", "{:.1%}"),
         "median_seconds": ("processor seconds a pose, median", "{:.2f}"),
         "mean_interval_seconds": ("  for its intervals", "{:.2f}"),
     }
@@ -454,7 +460,7 @@ def continuous_table(result: RandomPoses) -> Table:
 
 
 class RealPictures(NamedTuple):
-    """Experiment B or C: a stored scene, and the bundled model of another person."""
+    """Experiment B or C: a stored scene, and the bundled model of another individual."""
 
     title: str
     scene: str
@@ -463,10 +469,10 @@ class RealPictures(NamedTuple):
     paper_E_total: float
 
     def settings(self, scene: Path) -> EstimateSettings:
-        """For a copy of the scene: where the body's root is, and how far it may turn."""
+        """Return settings for a copy of the scene: the root's position and range of rotation."""
         if self.model == "man":
             return demo_settings(scene)
-        # The forearm points up in the pictures, by 30 degrees; the hand may show either side.
+        # The forearm points up in the pictures, within 30 degrees; the hand may show either side.
         return EstimateSettings(
             root="forearm",
             root_position=(scene / "root_position.csv", "wrist"),
@@ -483,17 +489,18 @@ REAL_EXPERIMENTS = {
 def run_real_experiment(
     experiment: str, images: int | None = None, out: Path | None = None, count: Count = uncounted
 ) -> dict[str, dict[str, Any]]:
-    """Search the poses in stored pictures with each of METHODS, each picture for itself.
+    """Search the poses in stored pictures with each of METHODS, each picture by itself.
 
-    The paper's method has samples every 10 degrees, the multi-start search continuous angles.
+    The paper's method samples every 10 degrees; the multi-start search has continuous angles.
 
     Args:
         experiment: "B" or "C".
-        images: how many, the first ones; None: all.
-        out: folder for the poses and overlays of each method; None writes nothing.
+        images: number of pictures, from the first; None: all.
+        out: folder for the poses and overlays of each method; None: write nothing.
+        count: reports the progress.
 
     Returns:
-        The figures by method; mean E_total is over the pictures in which a pose was found.
+        The figures by method. Mean E_total is over the pictures in which a pose was found.
 
     Raises:
         OutputError: the folder is not empty or cannot be written.
@@ -532,12 +539,12 @@ def run_real_experiment(
 
 
 def real_table(figures: Mapping[str, Figures]) -> Table:
-    """The paper's figures and those of each method, side by side; E_total of every picture."""
+    """Tabulate the paper's figures beside those of each method, with every picture's E_total."""
     first = next(iter(figures.values()))
     rows = {
         "images": ("silhouettes", "{}"),
         "not_found": ("  no pose found", "{}"),
-        "mean_e_total": ("mean E_total of the others", "{:.1%}"),
+        "mean_e_total": ("mean E_total where a pose was found", "{:.1%}"),
         **{name: (f"  {name}", "{:.1%}") for name in first["e_total"]},
         "seconds_an_image": ("processor seconds an image", "{:.1f}"),
     }

@@ -1,4 +1,4 @@
-"""Pictures of experiment A in the manner of the paper's figures 7 to 12, and of pose modes."""
+"""Pictures of experiment A, as the paper's figures 7 to 12, and of modes of poses."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -23,9 +23,14 @@ _COLOURS = "grey: agreement, blue: missing, orange: excess"
 def save_pictures(
     result: RandomPoses, folder: Path, examples: int = 4, most_sets: int = 3
 ) -> list[Path]:
-    """Draw examples of outcomes, the effort's histogram, poses as good; returns the PNG files.
+    """Draw examples of each outcome, a histogram of the effort, and sets of equally good poses.
 
-    At most `examples` poses of each outcome, and `most_sets` sets of poses are drawn.
+    Args:
+        examples: largest number of poses per outcome.
+        most_sets: largest number of pose sets.
+
+    Returns:
+        The PNG files.
     """
     matched = "silhouette matched exactly"
     kinds: dict[str, tuple[str, Callable[[RandomPose], bool]]] = {
@@ -51,8 +56,8 @@ def save_pictures(
         ),
     }
     figures = {}
-    for name, (title, belongs) in kinds.items():
-        trials = [trial for trial in result.trials if belongs(trial)][:examples]
+    for name, (title, is_kind) in kinds.items():
+        trials = [trial for trial in result.trials if is_kind(trial)][:examples]
         if trials:
             figures[name] = _draw_examples(title, trials, result)
     if isinstance(result.search, PaperSearch):
@@ -77,21 +82,21 @@ def save_pictures(
 
 
 def _draw_examples(title: str, trials: list[RandomPose], result: RandomPoses) -> Figure:
-    """True poses and estimates as the camera sees them, their silhouettes, and the side."""
+    """Draw true and estimated poses from the camera and from the side, and their silhouettes."""
     tree = result.search.tree
     front, side = (
         LabelRenderer(tree.model, camera)
         for camera in (result.cameras[0], experiment_camera(0.5 * np.pi))
     )
     names = [node.name for node in tree.nodes]
-    # Links without a surface would use up colours.
+    # Segments are coloured by node, because links without a surface would use up colours.
     order = [names.index(name) if name in names else 0 for name in front.link_names.values()]
     columns = []
     for trial in trials:
         both = tree.positions_from(trial.true_values)[0], trial.result.q
         true, found = _crop([front.segments(q) for q in both])
-        aside = _crop([side.segments(q) for q in both])
-        drawn = [_coloured(one, order) for one in (true, found, *aside)]
+        from_side = _crop([side.segments(q) for q in both])
+        drawn = [_coloured(one, order) for one in (true, found, *from_side)]
         drawn.insert(2, paint_agreement(true >= 0, found >= 0))
         columns.append(drawn)
     results = [trial.result for trial in trials]
@@ -102,13 +107,13 @@ def _draw_examples(title: str, trials: list[RandomPose], result: RandomPoses) ->
 
 
 def _coloured(segments: NDArray[Any], order: Sequence[int]) -> NDArray[np.float64]:
-    """Segments (H, W), -1 for none, in colours (H, W, 3) by their places in an order; on white."""
+    """Return segments (H, W), -1 for none, in colours (H, W, 3) by their place in `order`."""
     colours = matplotlib.colormaps["tab20"](np.array(order) % 20)[:, :3]
     return np.where(segments[..., None] >= 0, colours[segments], 1.0)
 
 
 def _crop(pictures: list[np.ndarray], margin: int = 20) -> list[np.ndarray]:
-    """Cut pictures of segments (H, W) to the square about what any of them shows."""
+    """Cut pictures of segments (H, W) to the square around all that they show."""
     rows, columns = np.nonzero(np.logical_or.reduce([picture >= 0 for picture in pictures]))
     side = margin + max(np.ptp(rows), np.ptp(columns))
     square = []
@@ -121,7 +126,7 @@ def _crop(pictures: list[np.ndarray], margin: int = 20) -> list[np.ndarray]:
 
 
 def _draw_histogram(values: np.ndarray, end: int, label: str) -> Figure:
-    """How often values (n,) occur; what is beyond the end is counted there."""
+    """Draw a histogram of values (n,); the last bin also counts all values beyond `end`."""
     figure = Figure(figsize=(6, 4))
     axis = figure.subplots()
     axis.hist(np.minimum(values, end), bins=np.linspace(0, end, 21).tolist(), color="0.4")
@@ -131,7 +136,7 @@ def _draw_histogram(values: np.ndarray, end: int, label: str) -> Figure:
 
 
 def _draw_chest_ranks(result: RandomPoses, limit: int) -> Figure:
-    """In how many images the true chest is among the first K of its list, against K."""
+    """Draw the fraction of images whose true chest is among its first K candidates, over K."""
     ranks, lengths = chest_ranks(result)
     Ks = range(1, max(2, int(lengths.max())) + 1)
     figure = Figure(figsize=(6, 4))
@@ -152,9 +157,10 @@ def _draw_chest_ranks(result: RandomPoses, limit: int) -> Figure:
 
 
 def chest_ranks(result: RandomPoses) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """By image the true chest's rank in its list of candidates, from 1, and the lists' lengths.
+    """Return the true chest's rank among its candidates in each image, and their numbers.
 
-    The head is true; there is no K (6.1, figure 12). 0: the chest leaves the silhouette by over r.
+    The head is at its true pose, and K is unlimited (6.1, figure 12). Ranks count from 1; 0: the
+    true chest leaves the silhouette by more than r.
     """
     search = result.search
     assert isinstance(search, PaperSearch)
@@ -169,7 +175,7 @@ def chest_ranks(result: RandomPoses) -> tuple[NDArray[np.int64], NDArray[np.int6
     for trial in result.trials:
         true = samples_at(search.sampled, trial.true_values)
         assert true is not None, "drawn from the grid"
-        # Steps 3 to 5 for the chest.
+        # Steps 3 to 5 of section 5.1 for the chest.
         X_WN = search.tree.node_poses(trial.true_values)
         scoring = Scoring(search.sampled, [result.view(trial)])
         uncovered = scoring.uncovered(ancestors, true, X_WN)
@@ -184,7 +190,7 @@ def chest_ranks(result: RandomPoses) -> tuple[NDArray[np.int64], NDArray[np.int6
 
 
 def ratio_within(ranks: NDArray[np.int64], limit: int) -> float:
-    """The ratio of images whose true chest is among the first of its list, up to a limit."""
+    """Return the fraction of images whose true chest has a rank of at most `limit`."""
     return float(((ranks > 0) & (ranks <= limit)).mean())
 
 
@@ -197,15 +203,17 @@ def save_modes(
     margin: int = 20,
     most_names: int = 5,
 ) -> Path:
-    """Draw the best modes as columns of a PNG file: what the silhouettes leave open.
+    """Draw the best modes of a pose set as columns of a PNG file.
 
-    Rows for every camera: the representative's segments, and where body and silhouette agree;
-    below, the joints that are free in the mode.
+    For each camera: the segments of the mode's representative, and where body and silhouette agree.
+    Below: the joints that are free in the mode.
 
     Args:
-        most: of modes.
-        margin: about the body [pixel].
-        most_names: of joints that are named below a mode.
+        answer: the pose set.
+        views: the silhouettes.
+        most: largest number of modes.
+        margin: around the body [pixel].
+        most_names: largest number of joints named below a mode.
     """
     modes = answer.modes[:most]
     renderers = [LabelRenderer(model, view.camera) for view in views]

@@ -1,6 +1,7 @@
-"""Shimada's experiment: a two-finger hand, 55 frames, lengths learned from one camera.
+"""Experiments of Shimada, Shirai, Kuno and Miura (section 6): a synthetic hand of two fingers.
 
-Section 6 measures numbers with noise; its figures 17 and 18 are of pictures, here Drake's.
+A truncated extended Kalman filter corrects joint angles and segment lengths over 55 frames of one
+camera. Measured are numbers with noise, or silhouettes that Drake renders (figures 17 and 18).
 """
 
 import math
@@ -49,21 +50,22 @@ from drake_pose.systems.bodies import held_positions
 from drake_pose.systems.truncated_ekf import build_hand_estimation
 
 CASES = {"r13_35": 35.0, "r13_40": 40.0}
-"""The two true lengths of finger 1's last segment [pixel at scale 1, mm]."""
+"""True lengths r_13 of finger 1's last segment, in two cases [pixel at scale 1, mm]."""
 
 PIXELS_PER_METRE = 1000.0
 LOST_ANGLE_ERROR = 20.0
-"""A sequence is lost that ends with a larger error of its joint angles [deg]."""
+"""A sequence is lost if the RMS error of its joint angles at the end exceeds this [deg]."""
 
 PICTURES = "pictures"
-"""Observed instead of OBSERVED: silhouettes by Drake's renderer, without parts."""
+"""Value of `observed`, besides OBSERVED, for silhouettes by Drake's renderer, parts unlabelled."""
 
 
 class FilteredHand(NamedTuple):
-    """One sequence, filtered.
+    """A filtered sequence.
 
     Attributes:
-        bound: (n,) at the end of a filter linearised at the truth, without limits; nan: pictures.
+        bound: (n,) final mean of a filter that linearises at the truth and has no limits; nan with
+            pictures.
     """
 
     sequence: SyntheticSequence
@@ -73,7 +75,7 @@ class FilteredHand(NamedTuple):
 
 @dataclass(frozen=True)
 class HandsResult:
-    """All runs, by the keys of ``CASES``."""
+    """All runs of both cases, by the keys of ``CASES``, and the settings."""
 
     trials: Mapping[str, tuple[FilteredHand, ...]]
     seed: int
@@ -83,7 +85,7 @@ class HandsResult:
     acceleration: float = 1.0
 
     def as_json(self) -> dict[str, object]:
-        """The figures over the runs of each case, and how they were made."""
+        """Return the figures of each case over its runs, and the settings."""
         return {
             **{key: _figures(case) for key, case in self.trials.items()},
             "runs": len(next(iter(self.trials.values()))),
@@ -97,20 +99,20 @@ class HandsResult:
 
 
 def result_table(*results: HandsResult) -> Table:
-    """The figures of both cases side by side, of one result or of several truncations."""
+    """Tabulate the figures of both cases, for one result or several truncations."""
     rows = {
         "length_error_mean": ("length error, mean [pixel]", "{:.2f}"),
         "length_error_p95": ("  95th percentile", "{:.2f}"),
-        "bound_length_error_mean": ("  linearised at the truth (a bound)", "{:.2f}"),
+        "bound_length_error_mean": ("  bound: linearised at the truth", "{:.2f}"),
         "angle_rmse": ("joint angles over all frames, RMS error [deg]", "{:.2f}"),
         "angle_rmse_at_end": ("  at the end", "{:.2f}"),
-        "length_error_largest": ("largest error of a length, share of it", "{:.1%}"),
-        "inside_2sigma": ("truths within 2 sigma", "{:.1%}"),
+        "length_error_largest": ("largest relative error of a length", "{:.1%}"),
+        "inside_2sigma": ("true values within 2 sigma", "{:.1%}"),
         "inside_2sigma_all": ("  in all frames", "{:.1%}"),
         "nees_inside": ("runs with the lengths' NEES in its 95 % band", "{:.1%}"),
         "ms_per_update": ("milliseconds an update, median", "{:.2f}"),
         "ms_per_update_p95": ("  95th percentile", "{:.2f}"),
-        "silhouette_difference": ("silhouette and matched pose differ by, median", "{:.1%}"),
+        "silhouette_difference": ("difference of silhouette and matched pose, median", "{:.1%}"),
         "mirrored": ("hypotheses made by mirroring", "{}"),
         "rejected_by_an_inequality": ("  rejected by an inequality", "{}"),
         "lost": ("lost", "{}"),
@@ -127,7 +129,7 @@ def result_table(*results: HandsResult) -> Table:
             for result in results
             for key, case in result.trials.items()
         },
-        "figure (at t = 55 where nothing is said)",
+        "figure (at t = 55 unless stated)",
     )
 
 
@@ -141,28 +143,29 @@ def run_experiment(
     noise: float = 1.0,
     acceleration: float = 1.0,
 ) -> HandsResult:
-    """Run the experiment of section 6 for r_13 = 35 and r_13 = 40: with numbers, or with pictures.
+    """Run the experiment of section 6 for r_13 = 35 and r_13 = 40.
 
-    Motion and noise, which the paper does not give, are drawn: 0.5 pixel for points, 1 pixel and
-    1 degree for lines. With pictures the same hands move, and Drake's renderer shows them.
+    The paper does not give motion and noise; they are drawn, with standard deviations of 0.5 pixel
+    for points, 1 pixel and 1 degree for lines. With pictures, Drake renders the same motions.
 
     Args:
-        runs: of each case.
-        seed: another one draws other motions, noise and first guesses.
+        runs: number of runs of each case.
+        seed: of the motions, the noise and the first guesses.
         truncation: "joint", "sequential" (the paper's), "clip" or "none".
         observed: "lines": axes, tips and the palm's outline, as in the paper; "lines_wrist": the
-            wrist's place, too; "full"; or PICTURES.
-        iterations: linearisations of an update at most; 1 is the paper's filter, None the default.
-        noise: so many times the noise, which the filter is told.
-        acceleration: so many times the accelerations that the filter expects.
+            wrist's position, too; "full": all; or PICTURES.
+        count: reports the progress.
+        iterations: largest number of linearisations per update; 1 in the paper; None: the default.
+        noise: factor on the noise, known to the filter.
+        acceleration: factor on the accelerations that the filter expects.
 
     Raises:
-        SettingsError: if an argument is not one of these.
+        SettingsError: an argument is not one of these.
     """
     require_counts(runs=runs)
     require_choice("observed", observed, (*OBSERVED, PICTURES))
     if observed == PICTURES and noise != 1.0:
-        raise SettingsError("pictures have no noise that could be multiplied: leave noise at 1")
+        raise SettingsError("noise does not apply to pictures: leave it at 1")
     settings = experiment_settings(truncation, iterations)
     hand_filter, observation = experiment_filter(settings, noise, acceleration)
     seen = "lines" if observed == PICTURES else observed
@@ -172,7 +175,7 @@ def run_experiment(
         generator = np.random.default_rng([seed, run, int(r_13)])
         return follow(hand_filter, make_sequence(r_13, seen, observation, generator))
 
-    # The first call of compiled code loads it, which belongs to no update.
+    # The first call loads compiled code, which must not count as an update's time.
     filtered(0, 35.0)
     advance = count(f"sequences, {truncation} truncation", runs * len(CASES))
     trials = {}
@@ -188,11 +191,14 @@ def run_experiment(
 def experiment_filter(
     settings: FilterSettings | None = None, noise: float = 1.0, acceleration: float = 1.0
 ) -> tuple[TruncatedFilter, HandObservation]:
-    """The filter of the experiment: table 1's rows from the bundled hand, and its observation.
+    """Return the experiment's filter, with table 1's rows from the bundled hand; its observation.
 
-    Without settings it has ``experiment_settings("joint")``.
+    Args:
+        settings: None: ``experiment_settings("joint")``.
+        noise, acceleration: factors as of ``run_experiment``.
 
-    `noise` and `acceleration` are factors, as for ``run_experiment``.
+    Raises:
+        SettingsError: a factor is not positive.
     """
     for name, factor in (("noise", noise), ("acceleration", acceleration)):
         if not 0 < factor < math.inf:
@@ -216,13 +222,13 @@ def _hand() -> ArticulatedModel:
 
 
 def angle_error(means: Array, truths: Array) -> Array:
-    """Root mean square error [deg] of the joint angles of states (..., n)."""
+    """Return the RMS error [deg] of the joint angles of states (..., n)."""
     errors = (means - truths)[..., HAND_STATE.indices((*SPREADS, *FLEXIONS))]
     return np.asarray(np.degrees(np.sqrt(np.mean(errors**2, axis=-1))))
 
 
 def _filter_sequence(hand_filter: TruncatedFilter, sequence: SyntheticSequence) -> FilteredHand:
-    """Filter a sequence; a filter that breaks down keeps its last belief."""
+    """Filter a sequence; after a failure the last belief is kept."""
     states, times, broken = [], [], False
     state = hand_filter.start(sequence.guess)
     for t, y in enumerate(sequence.measurements):
@@ -233,11 +239,11 @@ def _filter_sequence(hand_filter: TruncatedFilter, sequence: SyntheticSequence) 
                 state = hand_filter.update(hand_filter.predict(state) if t else state, y)
                 milliseconds = 1e3 * (time.thread_time() - begin)
             except SettingsError:
-                # A plain filter that has run away has no covariance any more: it is lost.
+                # A filter without limits that has diverged has no valid covariance: it is lost.
                 broken = True
         states.append(state)
         times.append(milliseconds)
-    # What a filter believes at the end that linearises at the truth, without limits.
+    # The bound: a filter that linearises at the truth and has no limits.
     belief = sequence.guess
     for t, (truth, y) in enumerate(zip(sequence.states, sequence.measurements, strict=True)):
         if t:
@@ -247,8 +253,8 @@ def _filter_sequence(hand_filter: TruncatedFilter, sequence: SyntheticSequence) 
 
 
 def _filter_pictures(hand_filter: TruncatedFilter, sequence: SyntheticSequence) -> FilteredHand:
-    """Filter the silhouettes of a hand as the sequence's moves: plant, renderer, sensor, filter."""
-    # A lens so long that perspective is weak: half the picture's width is .3 degrees.
+    """Filter a sequence's silhouettes in a diagram of plant, renderer, sensor and filter."""
+    # The focal length is so long that perspective is weak: half the picture is 0.3 degrees wide.
     width, height, distance, period = 480, 400, 50.0, 1.0 / 30.0
     center = (0.5 * (width - 1), 0.5 * (height - 1))
     focal, X_WC = PIXELS_PER_METRE * distance, np.eye(4)
@@ -256,7 +262,7 @@ def _filter_pictures(hand_filter: TruncatedFilter, sequence: SyntheticSequence) 
     camera = PinholeCamera(
         "camera", width, height, focal, focal, *center, X_WC, near=0.5 * distance
     )
-    # The palm's sizes along its axes.
+    # The palm's sizes along the axes of its frame.
     names = ("palm_height", "palm_thickness", "palm_width")
     sizes = sequence.states[0, HAND_STATE.indices(names)]
     factors = sizes / [TWO_FINGERS.sizes[name] for name in names]
@@ -268,13 +274,16 @@ def _filter_pictures(hand_filter: TruncatedFilter, sequence: SyntheticSequence) 
     positions = held_positions(np.array(q), period)
     silhouette = HandSilhouette(hand_filter, width, height, center)
     parts = build_hand_estimation(model, camera, silhouette, sequence.guess, positions, period)
-    # Three frames are kept to be drawn.
+    # Keep three frames for the pictures.
     track = follow_pictures(parts, period, FRAMES, (7, 23, 39))
     return FilteredHand(sequence, track, np.full(len(HAND_STATE), math.nan))
 
 
 def _figures(trials: Sequence[FilteredHand]) -> dict[str, float | int]:
-    """Figures of a case; a run's NEES of the six lengths is 6 on average if it is honest."""
+    """Return the figures of a case.
+
+    The NEES of the six lengths is 6 on average if the filter's covariance is consistent.
+    """
     lengths_of, angles_of = HAND_STATE.indices(LENGTHS), HAND_STATE.indices((*SPREADS, *FLEXIONS))
     truths = np.array([trial.sequence.states for trial in trials])
     tracks = [trial.track for trial in trials]
@@ -327,23 +336,24 @@ def _figures(trials: Sequence[FilteredHand]) -> dict[str, float | int]:
 
 
 OBLIQUENESS = math.radians(60)
-"""How far the fingers point out of the image plane, so that segments bend back through it."""
+"""Angle of the fingers out of the image plane, so that segments bend back through it [rad]."""
 
 COUPLED = ("flexion_12 - flexion_13", "flexion_22 - flexion_23")
-"""Rows of table 1 about two joints of one finger."""
+"""Rows of table 1 that couple two joints of one finger."""
 
 
 @dataclass(frozen=True, eq=False)
-class Fate:
-    """A hypothesis of one run from its birth to its end.
+class HypothesisHistory:
+    """A hypothesis of one run, from the frame in which it was made to its end.
 
     Attributes:
-        frames: (k,) the frames it lived in, from 1; the last is that of its end.
-        means: (k, n) what it believed, in the end without the limits.
-        weights: (k,) between 0 and 1; NaN in the end.
-        reason, row, c: as for ``Rejection``; the reason is "" where it outlived the sequence.
-        error, kept_error: of the joint angles [deg], RMS: its own when it was last believed, and
-            that of the heaviest hypothesis in the frame of its end.
+        run: index of the run.
+        frames: (k,) frames in which it lived, counted from 1; in the last one it ended.
+        means: (k, n) mean states; the last one before truncation if it was rejected.
+        weights: (k,) between 0 and 1; NaN in the last frame if it was rejected.
+        reason, row, c: as of ``Rejection``; the reason is "" if it outlived the sequence.
+        error: RMS error of its joint angles in its last valid frame [deg].
+        kept_error: that of the heaviest hypothesis in the frame of its end [deg].
     """
 
     run: int
@@ -357,61 +367,62 @@ class Fate:
     kept_error: float
 
     def at(self, frame: int) -> Array:
-        """(n,) what it believed in a frame that it lived in."""
+        """Return the mean state (n,) in a frame in which it lived."""
         return np.asarray(self.means[frame - self.frames[0]])
 
     @property
     def lived(self) -> int:
-        """In how many frames it was believed."""
+        """Number of frames in which it was valid."""
         return len(self.frames) - (1 if self.reason else 0)
 
     @property
     def wrong(self) -> bool:
-        """Whether it was further from the truth than what was kept."""
+        """Whether its error is larger than that of the hypothesis that was kept."""
         return self.error > self.kept_error
 
 
 @dataclass(frozen=True, eq=False)
 class HypothesesResult:
-    """All hypotheses' fates, and final errors (runs,) of the heaviest one's joint angles [deg]."""
+    """All hypotheses of all runs, and (runs,) final errors of the heaviest one's angles [deg]."""
 
-    fates: tuple[Fate, ...]
+    histories: tuple[HypothesisHistory, ...]
     sequences: tuple[SyntheticSequence, ...]
     final_errors: Array
     inequalities: Inequalities
     settings: Mapping[str, object]
 
-    def shown(self, lived: int = 2) -> tuple[Fate, Fate] | None:
-        """A wrong one that an inequality rejected, as in figure 9, and its survivor; None: none.
+    def example(self, lived: int = 2) -> tuple[HypothesisHistory, HypothesisHistory] | None:
+        """Return a wrong hypothesis that an inequality rejected, and its survivor (figure 9).
 
-        It had the largest weight of those that lived so many frames, by the paper's inequality if
-        possible; its survivor is the nearest to the truth.
+        Of those that lived `lived` frames or more, one that the paper's inequality rejected is
+        preferred, then the largest weight. Its survivor is the one nearest to the truth. None:
+        there is no such hypothesis.
         """
         rejected = [
             one
-            for one in self.fates
+            for one in self.histories
             if one.reason == "constraint" and one.wrong and one.lived >= lived
         ]
         rejected.sort(key=lambda one: (one.row.startswith(COUPLED), one.weights[-2]), reverse=True)
-        for dead in rejected:
-            end = int(dead.frames[-1])
+        for removed in rejected:
+            end = int(removed.frames[-1])
             beside = [
                 one
-                for one in self.fates
-                if one.run == dead.run and one.frames[0] < end < one.frames[-1]
+                for one in self.histories
+                if one.run == removed.run and one.frames[0] < end < one.frames[-1]
             ]
-            truth = self.sequences[dead.run].states[end - 1]
+            truth = self.sequences[removed.run].states[end - 1]
             if beside:
-                return dead, min(beside, key=lambda one: float(angle_error(one.at(end), truth)))
+                return removed, min(beside, key=lambda one: float(angle_error(one.at(end), truth)))
         return None
 
     def as_json(self) -> dict[str, object]:
-        """Counts over all sequences, and how it was made."""
-        rejected = [one for one in self.fates if one.reason == "constraint"]
+        """Return counts over all runs, and the settings."""
+        rejected = [one for one in self.histories if one.reason == "constraint"]
         later = [one for one in rejected if one.lived]
-        counts = Counter(one.reason for one in self.fates)
+        counts = Counter(one.reason for one in self.histories)
         return {
-            "mirrored": len(self.fates) - len(self.sequences),
+            "mirrored": len(self.histories) - len(self.sequences),
             "became_another": counts["twin"],
             "too_light": counts["weight"],
             "too_many": counts["cap"],
@@ -428,23 +439,20 @@ class HypothesesResult:
         }
 
     def table(self) -> Table:
-        """The counts, and which inequalities rejected."""
+        """Tabulate the counts."""
         rows = {
             "mirrored": ("made by mirroring", "{}"),
-            "became_another": ("the same as another, sooner or later", "{}"),
-            "too_many": ("given up as more than eight", "{}"),
-            "too_light": ("given up for their weight", "{}"),
+            "became_another": ("dropped as equal to another", "{}"),
+            "too_many": ("dropped as more than eight", "{}"),
+            "too_light": ("dropped for a small weight", "{}"),
             "alive_at_the_end": ("alive at the end", "{}"),
             "rejected_by_an_inequality": ("rejected by an inequality", "{}"),
-            "rejected_later_than_made": ("  of these believed for a frame or more", "{}"),
-            "of_these_wrong": ("    of these further from the truth than what was kept", "{}"),
-            "of_these_by_coupled_joints": (
-                "    of these as two joints of a finger did not bend alike",
-                "{}",
-            ),
-            "frames_lived_median": ("    frames believed, median", "{:.1f}"),
+            "rejected_later_than_made": ("  of these valid for a frame or more", "{}"),
+            "of_these_wrong": ("    of these with a larger error than the kept one", "{}"),
+            "of_these_by_coupled_joints": ("    of these by a coupling of two joints", "{}"),
+            "frames_lived_median": ("    frames valid, median", "{:.1f}"),
             "angle_error_at_end": ("joint angles at the end, RMS error, median [deg]", "{:.1f}"),
-            "lost": ("sequences that end more than 20 degrees off", "{}"),
+            "lost": ("sequences with an error above 20 degrees at the end", "{}"),
         }
         figures = self.as_json()
         title = (
@@ -465,19 +473,21 @@ def run_hypotheses_experiment(
 ) -> HypothesesResult:
     """Follow every hypothesis while fingers bend through the image plane, as in figure 9.
 
-    There frame 18's third segment is ambiguous in depth, the wrong hypothesis rejected in frame 20.
-    The motion is that of ``run_experiment`` with fingers out of the image plane; weights, which the
-    paper does not have, reject nothing. Arguments and errors as of ``run_experiment``.
+    In figure 9 the depth of a third segment is ambiguous in frame 18, and the wrong hypothesis is
+    rejected in frame 20. The motion is that of ``run_experiment``, with the fingers pointing out of
+    the image plane. Weights, which the paper does not have, reject nothing here.
+
+    Arguments and errors are those of ``run_experiment``.
     """
     require_counts(runs=runs)
     require_choice("observed", observed, OBSERVED)
-    # The paper has no weights: only inequalities end a hypothesis, another that is the same, or 8.
+    # A hypothesis ends only by an inequality, by being equal to another, or as one of more than 8.
     settings = replace(
         experiment_settings(truncation, iterations), hypothesis_cap=8, smallest_weight=0.0
     )
     hand_filter, observation = experiment_filter(settings)
     advance = count("sequences", runs)
-    fates: list[Fate] = []
+    histories: list[HypothesisHistory] = []
     sequences, final_errors = [], []
     for run in range(runs):
         generator = np.random.default_rng([seed, run])
@@ -486,20 +496,20 @@ def run_hypotheses_experiment(
         for t, y in enumerate(sequence.measurements):
             state = hand_filter.update(hand_filter.predict(state) if t else state, y)
             states.append(state)
-        fates += _fates(run, sequence.states, states)
+        histories += _histories(run, sequence.states, states)
         sequences.append(sequence)
         final_errors.append(angle_error(state.best.mean, sequence.states[-1]))
         advance(run + 1)
     made = {"runs": runs, "seed": seed, "observed": observed}
     made |= {"truncation": settings.truncation, "iterations": settings.iterations}
     return HypothesesResult(
-        tuple(fates), tuple(sequences), np.array(final_errors), hand_filter.inequalities, made
+        tuple(histories), tuple(sequences), np.array(final_errors), hand_filter.inequalities, made
     )
 
 
-def _fates(run: int, truths: Array, states: Sequence[FilterState]) -> list[Fate]:
-    """All hypotheses of one sequence, those that outlived it last."""
-    fates: list[Fate] = []
+def _histories(run: int, truths: Array, states: Sequence[FilterState]) -> list[HypothesisHistory]:
+    """Return all hypotheses of one run; those that outlived the sequence come last."""
+    histories: list[HypothesisHistory] = []
     believed: dict[tuple[int, int], list[tuple[int, Array, float]]] = {}
 
     def close(path: Sequence[tuple[int, Array, float]], kept: Array,
@@ -508,8 +518,10 @@ def _fates(run: int, truths: Array, states: Sequence[FilterState]) -> list[Fate]
         own = truths[frames - 1]
         last = -2 if reason and len(frames) > 1 else -1
         error, kept_error = angle_error(means[last], own[last]), angle_error(kept, own[-1])
-        fates.append(
-            Fate(run, frames, means, weights, reason, row, c, float(error), float(kept_error))
+        histories.append(
+            HypothesisHistory(
+                run, frames, means, weights, reason, row, c, float(error), float(kept_error)
+            )
         )
 
     for state in states:
@@ -522,4 +534,4 @@ def _fates(run: int, truths: Array, states: Sequence[FilterState]) -> list[Fate]
             path.append((state.step, one.belief.mean, one.weight))
     for path in believed.values():
         close(path, states[-1].best.mean)
-    return fates
+    return histories

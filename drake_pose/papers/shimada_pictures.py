@@ -1,4 +1,4 @@
-"""Pictures of Shimada's experiments in the manner of the paper's figures 9 to 18."""
+"""Pictures of Shimada's experiments, as the paper's figures 9 to 18."""
 
 from pathlib import Path
 
@@ -32,7 +32,7 @@ _DEGREES = 180 / np.pi
 
 
 def save_pictures(result: HandsResult, folder: Path) -> list[Path]:
-    """Draw the first run of each case; returns the PNG files written."""
+    """Draw the first run of each case; return the PNG files."""
     first = {key: trials[0] for key, trials in result.trials.items()}
     trial = first["r13_35"]
     curves = (
@@ -41,8 +41,8 @@ def save_pictures(result: HandsResult, folder: Path) -> list[Path]:
         ("figure_15_length_r13_35", "length_13", first["r13_35"], PIXELS_PER_METRE, "r_13 [pixel]"),
         ("figure_16_length_r13_40", "length_13", first["r13_40"], PIXELS_PER_METRE, "r_13 [pixel]"),
     )
-    # The scale is the quaternion's squared norm. Its deviation by linear propagation takes elements
-    # as independent: an upper bound where errors of rotation dominate.
+    # The scale is the quaternion's squared norm. Its deviation is propagated as if elements were
+    # independent: an upper bound where errors of rotation dominate.
     elements, track = HAND_STATE.indices(QUATERNION), trial.track
     true, estimate = (
         np.sum(one[:, elements] ** 2, axis=1) for one in (trial.sequence.states, track.means)
@@ -64,23 +64,23 @@ def save_pictures(result: HandsResult, folder: Path) -> list[Path]:
 
 
 def save_hypotheses(result: HypothesesResult, folder: Path) -> list[Path]:
-    """Draw the hypothesis that an inequality rejected and the one that it left, if there are any.
+    """Draw a hypothesis that an inequality rejected, and its survivor; return the PNG files.
 
-    They stand above with the truth; below are the joint that differs most, the inequality, weights.
+    Above: both with the truth. Below: the joint that differs most, the inequality, the weights.
     """
-    shown = result.shown()
+    shown = result.example()
     if shown is None:
         return []
-    dead, survivor = shown
+    rejected, survivor = shown
     truths, begin, end = (
-        result.sequences[dead.run].states,
-        int(dead.frames[0]),
-        int(dead.frames[-1]),
+        result.sequences[rejected.run].states,
+        int(rejected.frames[0]),
+        int(rejected.frames[-1]),
     )
     figure = Figure(figsize=(13, 7.5))
     figure.suptitle(
-        f"sequence {dead.run}: made in frame {begin}, rejected in frame {end} by {dead.row} "
-        f"(c = {dead.c:.1f})\ngrey: true, blue: kept, orange: rejected",
+        f"sequence {rejected.run}: made in frame {begin}, rejected in frame {end} by "
+        f"{rejected.row} (c = {rejected.c:.1f})\ngrey: true, blue: kept, orange: rejected",
         fontsize=10,
     )
     grid = figure.subplots(2, 3)
@@ -88,30 +88,30 @@ def save_hypotheses(result: HypothesesResult, folder: Path) -> list[Path]:
     for axes, frame in zip(grid[0], (both, end - 1, end), strict=True):
         _draw_hand(axes, truths[frame - 1], _TRUE)
         _draw_hand(axes, survivor.at(frame), _ESTIMATE)
-        _draw_hand(axes, dead.at(frame), _REJECTED)
+        _draw_hand(axes, rejected.at(frame), _REJECTED)
         axes.invert_yaxis()
         axes.set_title(f"t = {frame}" + (" (rejected)" if frame == end else ""), fontsize=9)
-    k = result.inequalities.rows.index(dead.row)
+    k = result.inequalities.rows.index(rejected.row)
     phi, b = result.inequalities.phi[k], float(result.inequalities.b[k])
-    apart = np.where(phi != 0, np.abs(dead.at(both) - survivor.at(both)), -1.0)
+    apart = np.where(phi != 0, np.abs(rejected.at(both) - survivor.at(both)), -1.0)
     widest = int(np.argmax(apart))
     name = HAND_STATE.names[widest]
     factor, unit = (
         (_DEGREES, "deg") if name in (*SPREADS, *FLEXIONS) else (PIXELS_PER_METRE, "pixel")
     )
-    side, sign = (">=", -1.0) if ">=" in dead.row else ("<=", 1.0)
-    row = f"{dead.row.split(side)[0]}{side} {sign * factor * b:.0f} {unit}"
+    side, sign = (">=", -1.0) if ">=" in rejected.row else ("<=", 1.0)
+    row = f"{rejected.row.split(side)[0]}{side} {sign * factor * b:.0f} {unit}"
     curves = ((np.eye(len(HAND_STATE))[widest], f"{name} [{unit}]"), (sign * phi, row))
     frames = np.arange(begin, min(FRAMES, end + 6) + 1)
     for axes, (direction, label) in zip(grid[1], curves, strict=False):
         axes.plot(frames, factor * truths[frames - 1] @ direction, color=_TRUE)
-        for one, colour in ((dead, _REJECTED), (survivor, _ESTIMATE)):
+        for one, colour in ((rejected, _REJECTED), (survivor, _ESTIMATE)):
             path = factor * one.means @ direction
             axes.plot(one.frames, path, "-o", color=colour, mfc="white", ms=4)
-        axes.plot(end, factor * dead.means[-1] @ direction, "x", color=_REJECTED, ms=12)
+        axes.plot(end, factor * rejected.means[-1] @ direction, "x", color=_REJECTED, ms=12)
         axes.set_ylabel(label)
     grid[1, 1].axhline(sign * factor * b, color="black", linestyle="--")
-    for one, colour in ((survivor, _ESTIMATE), (dead, _REJECTED)):
+    for one, colour in ((survivor, _ESTIMATE), (rejected, _REJECTED)):
         grid[1, 2].semilogy(one.frames, one.weights, "-o", color=colour, ms=4)
     grid[1, 2].set_ylabel("weight (rejects nothing here)")
     for axes in grid[1]:
@@ -139,13 +139,13 @@ def _draw_sequence(trial: FilteredHand) -> Figure:
         for axes, frame in zip(line, frames, strict=True):
             _draw_hand(axes, states[frame - 1], colour)
             axes.set_title(f"{label}, t = {frame}", fontsize=9)
-    # Pixels count downwards.
+    # Pixel rows count downwards.
     grid[0, 0].invert_yaxis()
     return figure
 
 
 def _draw_matches(track: HandTrack, observation: HandObservation = _OBSERVATION) -> Figure:
-    """Figure 17: silhouettes, the rough pose matched, the axes and tips measured, the estimate."""
+    """Draw figure 17: silhouettes, matched rough poses, measured axes and tips, and estimates."""
     kept = track.kept
     figure = Figure(figsize=(3.6 * len(kept), 11))
     grid = figure.subplots(4, len(kept))
@@ -178,14 +178,14 @@ def _draw_matches(track: HandTrack, observation: HandObservation = _OBSERVATION)
 
 
 def _rows_of(observation: HandObservation, first: str, second: str) -> NDArray[np.intp]:
-    """(2, k) where two kinds of number stand among what is measured."""
+    """Return the indices (2, k) of two kinds of measurements among all, by parts of their names."""
     names = list(enumerate(observation.names))
     kinds = [[k for k, name in names if part in name] for part in (first, second)]
     return np.array(kinds, dtype=np.intp)
 
 
 def save_sequence(result: SequenceResult, folder: Path) -> list[Path]:
-    """Figures 17 and 18 of a recorded sequence; returns the PNG files written."""
+    """Draw figures 17 and 18 of a recorded sequence; return the PNG files."""
     observation = result.observation
     figures = {
         "figure_17": _draw_matches(result.track, observation),
@@ -203,7 +203,7 @@ def save_sequence(result: SequenceResult, folder: Path) -> list[Path]:
 
 
 def _draw_shapes(first: dict[str, FilteredHand]) -> Figure:
-    """The hand laid flat: the first guess, the estimates and the truths."""
+    """Draw the hand laid flat: first guess, estimates and true shapes."""
     figure = Figure(figsize=(12, 4))
     grid = figure.subplots(1, 3, sharex=True, sharey=True)
     sequence = first["r13_35"].sequence
@@ -223,7 +223,7 @@ def _flat(state: Array, hand: HandModel = TWO_FINGERS) -> Array:
     flat = np.zeros_like(state)
     shape = hand.layout.indices(hand.layout.constant)
     flat[shape] = state[shape]
-    # A quarter turn about the fingers' axis: the palm faces the camera.
+    # A quarter turn about the fingers' axis makes the palm face the camera.
     flat[hand.layout.indices(QUATERNION)] = np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0
     return flat
 
@@ -234,7 +234,7 @@ def _draw_curve(label: str, true: Array, estimate: Array, deviation: Array) -> F
     frames = np.arange(1, len(true) + 1)
     axes.errorbar(frames, estimate, 2 * deviation, fmt="o", color=_ESTIMATE, mfc="white", ms=4)
     axes.plot(frames, true, color=_TRUE)
-    # Early bars may reach far beyond all that comes later.
+    # Limit the axis, because early bars may reach far beyond all later values.
     middle, reach = true.mean(), max(np.ptp(true), np.percentile(2 * deviation, 90), 1e-3)
     axes.set(xlabel="t", ylabel=label, ylim=(middle - 1.6 * reach, middle + 1.6 * reach))
     axes.set_title("line: true; circles: estimate; bars: 2 standard deviations", fontsize=9)

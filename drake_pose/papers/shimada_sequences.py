@@ -1,4 +1,8 @@
-"""The moving hand of Shimada's synthetic experiment: truth, measurements, first guess."""
+"""Shimada's experiments: the moving hand of the synthetic one, and recorded silhouettes.
+
+`make_sequence` draws true states, measurements and table 2's first guess; `run_sequence` filters a
+recorded hand (figures 17 and 18).
+"""
 
 import math
 import time
@@ -59,19 +63,19 @@ from drake_pose.systems.truncated_ekf import (
 
 FRAMES = 55
 OBSERVED = ("full", "lines", "lines_wrist")
-"""What is seen: everything; the fingers' axes and tips and the palm's outline; the wrist, too."""
+"""What is measured: all; axes and tips of the fingers and the palm's outline; the wrist, too."""
 
 ACCELERATIONS = {
     **dict.fromkeys(WRIST, 0.8),
     **dict.fromkeys(QUATERNION, 0.004),
     **dict.fromkeys((*SPREADS, *FLEXIONS), math.radians(0.8)),
 }
-"""Standard deviations of the accelerations per frame^2: [pixel], -, [rad]."""
+"""Standard deviations of the accelerations [pixel, 1, rad per frame^2]: theta's part of U (6)."""
 
 
 @dataclass(frozen=True, eq=False)
 class SyntheticSequence:
-    """True states (55, n), measurements (55, m) with noise, NaN: hidden, and table 2's guess."""
+    """True states (55, n), noisy measurements (55, m), nan where hidden, and table 2's guess."""
 
     states: Array
     measurements: Array
@@ -79,10 +83,12 @@ class SyntheticSequence:
 
 
 def true_states(r_13: float, phase: Array, yaw_middle: float = 0.0) -> Array:
-    """(55, n) a hand that moves, turns, flexes and comes closer and goes away.
+    """Return the states (55, n) of a hand that moves, turns, flexes, and changes its distance.
 
-    `r_13` is finger 1's last segment [mm], `phase` (6,) shifts of the swings [rad], `yaw_middle`
-    about what fingers swing away from the camera [rad]; negative: towards it.
+    Args:
+        r_13: length of finger 1's last segment [mm].
+        phase: (6,) phase shifts of the motions [rad].
+        yaw_middle: mean yaw of the fingers away from the camera [rad]; negative: towards it.
     """
     frames = np.arange(FRAMES)
     turn = 2 * np.pi * frames / FRAMES
@@ -93,7 +99,7 @@ def true_states(r_13: float, phase: Array, yaw_middle: float = 0.0) -> Array:
 
     put("wrist_x", -50 + 30 * np.sin(turn + phase[0]))
     put("wrist_y", 20 * np.sin(1.3 * turn + phase[1]))
-    # Starts seen from the back, fingers to the right; rolls about the fingers' axis, pitches, yaws.
+    # Seen from the back, fingers to the right; roll is about the fingers' axis.
     roll = math.radians(65) + math.radians(40) * np.sin(1.1 * turn + phase[2])
     yaw = yaw_middle + math.radians(25) * np.sin(0.9 * turn + phase[3])
     pitch = math.radians(20) * np.sin(1.2 * turn + phase[4])
@@ -108,7 +114,7 @@ def true_states(r_13: float, phase: Array, yaw_middle: float = 0.0) -> Array:
         put(f"flexion_{i}1", np.radians(40 + 28 * np.sin(turn + phase[4] + shift)))
         put(f"flexion_{i}2", np.radians(38 + 28 * wave))
         put(f"flexion_{i}3", np.radians(36 + 25 * np.sin(1.2 * turn + phase[5] + shift - 0.1)))
-    # Table 1 holds for r_13 = 35 and 40.
+    # These lengths satisfy table 1 for r_13 = 35 and 40.
     for name, length in zip(LENGTHS, (62.0, 41.0, r_13, 60.0, 40.0, 38.0), strict=True):
         put(name, length / 1000.0)
     for name, size in zip(PALM, (0.070, 0.080, 0.022), strict=True):
@@ -125,15 +131,18 @@ def make_sequence(
     generator: np.random.Generator,
     yaw_middle: float = 0.0,
 ) -> SyntheticSequence:
-    """Draw a sequence: its motion's phases, its noise, and table 2's first guess.
+    """Draw a sequence: phases of the motion, noise, and table 2's first guess.
 
-    `observed` is one of ``OBSERVED``; the rest as for ``true_states``.
+    Args:
+        observed: one of ``OBSERVED``.
+        observation: of the hand.
+        r_13, yaw_middle: as of ``true_states``.
     """
     states = true_states(r_13, generator.uniform(-0.6, 0.6, 6), yaw_middle)
     deviations = np.sqrt(observation.variances)
     measurements = np.array([observation.predict(x)[0] for x in states])
     measurements += deviations * generator.normal(size=measurements.shape)
-    # Table 2 gives the scale of the first frame, and of no other.
+    # Table 2 gives the scale in the first frame only.
     measurements[1:, MEASURED.index("scale")] = np.nan
     measurements[0, MEASURED.index("scale")] = 1.0
     if observed != "full":
@@ -144,9 +153,10 @@ def make_sequence(
 
 
 def first_guess(x: Array, generator: np.random.Generator) -> Belief:
-    """Table 2 around a true state: errors up to the values given there, its variances.
+    """Draw table 2's belief about a true state (n,): errors up to its values, its variances.
 
-    The palm's rotation is an angle; the scale, 1 with variance 0, is no part of the covariance.
+    Table 2 does not list the palm's rotation, which gets the joint angles' error and variance. The
+    scale is 1 with variance 0, so it is no part of the covariance.
     """
     mean = x.copy()
     moving = len(HAND_STATE.moving)
@@ -176,6 +186,7 @@ def first_guess(x: Array, generator: np.random.Generator) -> Belief:
 
 
 def _about(axis: str, angles: Array) -> Array:
+    """Return the quaternions (n, 4) of rotations about an axis by angles (n,) [rad]."""
     quaternions = np.zeros((len(angles), 4))
     quaternions[:, 0] = np.cos(0.5 * angles)
     quaternions[:, 1 + "xyz".index(axis)] = np.sin(0.5 * angles)
@@ -189,22 +200,23 @@ def _product(a: Array, b: Array) -> Array:
     return np.hstack([w * s - np.sum(v * u, axis=1, keepdims=True), vector])
 
 
-# A silhouette and the pose matched to it differ by less than the first fraction in a good frame,
-# by more than the second where the track is lost: the model is not the hand's own.
+# A frame is well matched if silhouette and matched pose differ by less than the first fraction; the
+# track is lost if they differ by more than the second. The model is not the recorded hand's own.
 _WELL_MATCHED, _UNMATCHED = 0.12, 0.4
 
 
 class HandTrack(NamedTuple):
-    """What a filter believed after each frame.
+    """Beliefs of a filter after each frame.
 
     Attributes:
         means, deviations: (frames, n) of the best hypothesis.
-        covariance: (n, n) of the last.
-        milliseconds: (frames,) of the processor for prediction and update, and for measuring where
-            there is a picture, without drawing it; nan once it broke down.
-        mirrored, rejected: hypotheses made by mirroring, and rejected by an inequality.
-        differences: (frames,) of a silhouette and the pose it was matched to; () without pictures.
-        kept: of pictures, a mask, its measurement (m,) and the rough pose (n,), by frame from 0.
+        covariance: (n, n) of the last one.
+        milliseconds: (frames,) processor time of prediction, update and, with pictures, of the
+            measurement, but not of rendering; nan after a failure.
+        mirrored, rejected: number of hypotheses made by mirroring, and rejected by an inequality.
+        differences: (frames,) fraction by which silhouette and matched pose differ; () without
+            pictures.
+        kept: mask, measurement (m,) and rough pose (n,) of some frames, by index.
     """
 
     means: Array
@@ -218,7 +230,7 @@ class HandTrack(NamedTuple):
 
 
 def track_of(states: Sequence[FilterState], milliseconds: Sequence[float]) -> HandTrack:
-    """The track of a filter's states after each frame."""
+    """Return the track of a filter from its states after each frame."""
     best = [state.best for state in states]
     ends = [end.reason for state in states for end in state.rejections]
     return HandTrack(
@@ -235,26 +247,36 @@ def follow_pictures(
     parts: tuple[Diagram, TruncatedEkf, HandSensor],
     period: float,
     frames: int,
-    shown: Sequence[int],
+    kept_frames: Sequence[int],
     advance: Advance = lambda _done: None,
 ) -> HandTrack:
-    """Run a diagram of ``build_hand_estimation``, or of recorded pictures; keep what is shown."""
+    """Run a diagram of ``build_hand_estimation`` or of recorded pictures frame by frame.
+
+    Args:
+        parts: the diagram, with the filter and the sensor in it.
+        period: between frames [s].
+        frames: number of frames.
+        shown: indices of the frames whose pictures are kept.
+        advance: called with the number of frames done.
+    """
     diagram, ekf, sensor = parts
     simulator = Simulator(diagram)
-    own, its = (one.GetMyContextFromRoot(simulator.get_context()) for one in (sensor, ekf))
+    sensor_context, ekf_context = (
+        one.GetMyContextFromRoot(simulator.get_context()) for one in (sensor, ekf)
+    )
     states, milliseconds, differences, kept = [], [], [], {}
     for t in range(frames):
-        mask = label_image_to_mask(sensor.GetInputPort("label_image").Eval(own))
+        mask = label_image_to_mask(sensor.GetInputPort("label_image").Eval(sensor_context))
         begin = time.thread_time()
         y, difference, rough = (
-            np.array(sensor.GetOutputPort(name).Eval(own))
+            np.array(sensor.GetOutputPort(name).Eval(sensor_context))
             for name in ("measurement", "difference", "rough_state")
         )
         differences.append(float(difference[0]))
-        if t in shown:
+        if t in kept_frames:
             kept[t] = (mask.copy(), y, rough)
         simulator.AdvanceTo((t + 1) * period)
-        states.append(ekf.filter_state(its))
+        states.append(ekf.filter_state(ekf_context))
         milliseconds.append(1e3 * (time.thread_time() - begin))
         advance(t + 1)
     track = track_of(states, milliseconds)
@@ -263,12 +285,12 @@ def follow_pictures(
 
 @dataclass(frozen=True, eq=False)
 class SequenceResult:
-    """A recorded sequence, filtered.
+    """A filtered recorded sequence.
 
     Attributes:
         observation: of the hand.
-        guess: the belief about the rough pose.
-        truth: (frames,) by angle [deg], as far as the sequence tells.
+        guess: belief about the rough pose of the first frame.
+        truth: (frames,) true values by name of the angle [deg], where the sequence has them.
     """
 
     name: str
@@ -278,21 +300,21 @@ class SequenceResult:
     truth: Mapping[str, Array]
 
     def warning(self) -> str:
-        """What to say of the frames that were not matched, and of the deviations."""
+        """Return a warning about badly matched frames, and about the deviations."""
         bad, lost = self._frames_beyond(_WELL_MATCHED), self._frames_beyond(_UNMATCHED)
         return (
-            f"{self.name}: a hand that nobody measured: deviations are too small, of the flexions "
-            f"in four such sequences 14 to 50 % lay within 2 sigma. In {bad} of "
-            f"{len(self.track.means)} frames pose and silhouette differ by more than "
-            f"{_WELL_MATCHED:.0%}: fingers may be exchanged or bent that are straight; in {lost} "
-            f"by more than {_UNMATCHED:.0%}: the track is lost, what is given is the prediction"
+            f"{self.name}: the hand was not measured, so deviations are too small: in four such "
+            "sequences 14 to 50 % of the flexions were within 2 sigma. Pose and silhouette differ "
+            f"by more than {_WELL_MATCHED:.0%} in {bad} of {len(self.track.means)} frames: fingers "
+            "may be exchanged, or bent where they are straight. They differ by more than "
+            f"{_UNMATCHED:.0%} in {lost} frames: the track is lost, and the pose is a prediction"
         )
 
     def _frames_beyond(self, difference: float) -> int:
         return int(np.count_nonzero(self.track.differences > difference))
 
     def as_json(self) -> dict[str, object]:
-        """Its figures; errors [deg] where the truth is known, lengths at the end [m]."""
+        """Return the figures: errors [deg] where the truth is known, lengths at the end [m]."""
         layout, track = self.observation.hand.layout, self.track
         figures: dict[str, object] = {
             "frames": len(track.means),
@@ -309,23 +331,23 @@ class SequenceResult:
             means, deviations = (
                 np.degrees(one[:, layout.indices(names)]) for one in (track.means, track.deviations)
             )
-            off = np.abs(means - np.column_stack([self.truth[name] for name in names]))
-            figures["flexion_error_median"] = float(np.median(off))
-            figures["flexion_error_mean"] = float(np.mean(off))
-            figures["inside_2sigma"] = float(np.mean(off < 2.0 * deviations))
+            errors = np.abs(means - np.column_stack([self.truth[name] for name in names]))
+            figures["flexion_error_median"] = float(np.median(errors))
+            figures["flexion_error_mean"] = float(np.mean(errors))
+            figures["inside_2sigma"] = float(np.mean(errors < 2.0 * deviations))
         return figures
 
 
 def sequence_table(results: Sequence[SequenceResult]) -> Table:
-    """The figures of sequences side by side."""
+    """Tabulate the figures of sequences side by side."""
     rows = {
         "frames": ("frames", "{}"),
-        "flexion_error_median": ("flexions of the four fingers off, median [deg]", "{:.1f}"),
+        "flexion_error_median": ("error of the four fingers' flexions, median [deg]", "{:.1f}"),
         "flexion_error_mean": ("  mean", "{:.1f}"),
         "inside_2sigma": ("  within 2 sigma", "{:.0%}"),
-        "silhouette_difference": ("silhouette and matched pose differ by, median", "{:.1%}"),
-        "badly_matched": ("  frames in which by more than 12 %", "{}"),
-        "lost": ("  by more than 40 %: lost", "{}"),
+        "silhouette_difference": ("difference of silhouette and matched pose, median", "{:.1%}"),
+        "badly_matched": ("  frames with more than 12 %", "{}"),
+        "lost": ("  frames with more than 40 %: lost", "{}"),
         "mirrored": ("hypotheses made by mirroring", "{}"),
         "rejected_by_an_inequality": ("  rejected by an inequality", "{}"),
         "ms_per_update": ("milliseconds a frame, median", "{:.0f}"),
@@ -335,7 +357,7 @@ def sequence_table(results: Sequence[SequenceResult]) -> Table:
 
 
 def experiment_settings(truncation: str, iterations: int | None = None) -> FilterSettings:
-    """The hand's: tangents, iterated, kept within a view; SettingsError where impossible."""
+    """Return the hand's filter settings; iterated tangents. SettingsError: impossible values."""
     return FilterSettings(
         truncation=cast(Truncation, truncation),
         linearisation="tangent",
@@ -350,17 +372,19 @@ def run_sequence(
     acceleration: float = 1.0,
     count: Count = uncounted,
 ) -> SequenceResult:
-    """Angles and lengths of a hand in recorded silhouettes of one parallel camera, scale unknown.
+    """Filter angles and lengths of a hand in silhouettes of one parallel camera of unknown scale.
 
-    The first frame is matched by the default search; from there on there is the filter alone.
+    The default search matches the first frame; the filter follows the others.
 
     Args:
-        folder: a scene whose frames follow one another; its ``joint_angles.csv``, if there is one,
-            has true angles: in degrees, where it has columns that the bundled hand lacks.
-        acceleration: so many times the accelerations that the filter expects.
+        folder: a scene whose frames follow one another. If it has a ``joint_angles.csv``, the true
+            angles are in it: [rad], or [deg] if it has columns that the bundled hand lacks.
+        settings: None: ``experiment_settings("joint")``.
+        acceleration: factor on the accelerations that the filter expects.
+        count: reports the progress.
 
     Raises:
-        DrakePoseError: the scene, which has several cameras, or no hand that can be matched.
+        DrakePoseError: the scene has several cameras, or no hand in it can be matched.
     """
     file = bundled_model("hand").with_name("right_hand.urdf")
     inputs = read_inputs(folder, file, EstimateSettings(unseen=("forearm",)), None)
@@ -368,8 +392,8 @@ def run_sequence(
     (camera, *others) = scene.cameras.values()
     if others or not isinstance(camera, ParallelCamera) or not scene.sequence:
         raise SceneError(
-            f"{folder}: a hand is filtered in frames of one parallel camera that follow each "
-            "other: sequence: true in scene.yaml, masks of one camera, no pinhole"
+            f"{folder}: a hand is filtered in successive frames of one parallel camera: the scene "
+            "needs sequence: true in scene.yaml, and the masks of one camera, which is no pinhole"
         )
     # The first frame's rough pose.
     frame, model, search = inputs.frames[0], inputs.model, inputs.search
@@ -387,22 +411,22 @@ def run_sequence(
     period = 1.0 / (scene.frame_rate_hz or 30.0)
 
     def of_kinds(wrist: float, turn: float, angle: float) -> Array:
-        """(moving,) of the wrist [pixel], the quaternion and angles [deg], in the state's units."""
+        """Return (moving,) deviations in the state's units: wrist [pixel], turn, angle [deg]."""
         return np.repeat((wrist, turn, math.radians(angle)), (2, 4, len(hand.angles)))
 
-    # Standard deviations of the rough pose, of its rates a frame, and of sizes over the model's.
+    # Standard deviations of the rough pose, of its rates per frame, and of the relative sizes.
     start, rates = of_kinds(10.0, 0.5 * math.radians(20.0), 25.0), of_kinds(5.0, 0.03, 4.0)
     shares = [0.15 if name in PALM else 0.2 for name in layout.constant]
     deviations = np.r_[start, rates, shares * sizes]
     guess = Belief(np.r_[moving, np.zeros(len(moving)), sizes], np.diag(deviations**2))
-    # Sizes are within half and one and a half of the model's.
+    # Sizes are between 0.5 and 1.5 times the model's.
     limits = from_bounds(layout.constant, 0.5 * sizes, 1.5 * sizes, layout.names)
     rows = stack([model_inequalities(model).restricted_to(layout.names), limits], layout.names)
-    # Accelerations per frame^2 at 30 Hz; a rate that is not seen fades within .15 s.
+    # Accelerations per frame^2 at 30 Hz; an unobserved rate fades with a time constant of 0.15 s.
     noise = acceleration * (30.0 * period) ** 2 * of_kinds(2.0, 0.008, 1.5)
     U = layout.process_noise(dict(zip(layout.moving, noise.tolist(), strict=True)))
     A = layout.transition(math.exp(-period / 0.15))
-    # How a hand is usually held is told once a second.
+    # The prior of usual flexions counts once per second.
     observation = HandObservation(scale, prior_frames=1.0 / period, hand=hand)
     motion, settings = LinearMotion(A, U, None), settings or experiment_settings("joint")
     hand_filter = TruncatedFilter(layout, observation, rows, motion, settings)
@@ -418,13 +442,13 @@ def run_sequence(
 
 
 def _truth(folder: Path, inputs: EstimateInputs, hand: HandModel) -> dict[str, Array]:
-    """True angles (frames,) [deg] of those that the sequence's file has columns of."""
+    """Return the true angles (frames,) [deg] of which the sequence's file has columns."""
     file = folder / JOINT_TABLE
     if not file.is_file():
         return {}
     header, lines = read_csv(file, SceneError)
     rows = {int(row[0]): row for _, row in lines}
-    # A file of the model's positions alone is in radians, as everywhere.
+    # A file with the model's positions only is in radians, as joint_angles.csv is elsewhere.
     unit = 1.0 if inputs.truth is None else 180.0 / math.pi
     return {
         name: np.array([unit * float(rows[int(k)][header.index(name)]) for k in inputs.frames])

@@ -1,4 +1,4 @@
-"""How all experiments count, compare and show: spread over seeds, one table, one picture."""
+"""Progress counts, tables and pictures shared by all experiments."""
 
 import math
 import textwrap
@@ -17,26 +17,26 @@ from drake_pose.errors import SettingsError
 
 Figures = Mapping[str, Any]
 Advance = Callable[[int], None]
-"""Called with how many are done."""
+"""Called with the number that is done."""
 
 Count = Callable[[str, int], Advance]
-"""Begins to count: called with what is counted and up to where."""
+"""Starts a count: called with what is counted, and the total number."""
 
 
 def uncounted(_what: str, _total: int) -> Advance:
-    """Counts nothing: the ``Count`` of who wants to see none."""
+    """A ``Count`` that reports nothing."""
     return lambda _done: None
 
 
 def require_counts(**counts: int) -> None:
-    """Raises SettingsError, which names the first count below 1."""
+    """Raise SettingsError, naming the count, if a count is below 1."""
     for name, count in counts.items():
         if count < 1:
             raise SettingsError(f"{name} must be 1 or more, not {count}")
 
 
 def require_choice(name: str, value: str, choices: Sequence[str]) -> None:
-    """Raises SettingsError, which names the choices, where a value is none of them."""
+    """Raise SettingsError, listing the choices, if a value is not among them."""
     if value not in choices:
         raise SettingsError(f"{name} must be one of {', '.join(choices)}, not '{value}'")
 
@@ -44,7 +44,7 @@ def require_choice(name: str, value: str, choices: Sequence[str]) -> None:
 def spread_over_seeds(
     runs: Sequence[Figures], without: Sequence[str] = ()
 ) -> dict[str, dict[str, float]]:
-    """Mean, smallest and largest of every outcome over runs that differ in the seed alone."""
+    """Return mean, minimum and maximum of each figure over runs that differ in the seed only."""
     spread = {}
     for key, first in runs[0].items():
         if key not in without and isinstance(first, int | float):
@@ -63,13 +63,12 @@ def figure_table(
     columns: Mapping[str, Figures | Sequence[Figures]],
     heading: str = "figure",
 ) -> Table:
-    """Figures side by side: a row each, as far as a column has it.
+    """Tabulate figures side by side, one row per figure; figures that no column has are omitted.
 
     Args:
-        rows: by key, what the row is called and the format of its figures.
-        columns: by heading, the figures; or those of several seeds, of which the mean is shown, and
-            the smallest and largest.
-        heading: of the rows.
+        rows: label and format of each figure, by key.
+        columns: figures by heading. Figures of several seeds are shown as mean, minimum, maximum.
+        heading: of the labels' column.
     """
     table = Table(title=title)
     table.add_column(heading)
@@ -85,7 +84,7 @@ def figure_table(
 
 
 def _cell(values: Sequence[Any], form: str) -> str:
-    """A figure of one run, or the mean of several with the smallest and largest."""
+    """Format a figure of one run, or mean, minimum and maximum of several runs."""
     if any(value is None or (isinstance(value, float) and math.isnan(value)) for value in values):
         return "-"
     if len(set(values)) == 1:
@@ -101,7 +100,7 @@ def draw_panels(
     below: Sequence[str] = (),
     title: str = "",
 ) -> Figure:
-    """Pictures (H, W, 3) in columns: titles above, texts below them, and labels of the rows."""
+    """Draw columns of pictures (H, W, 3), with titles above, texts below and labels of the rows."""
     figure = Figure(figsize=(3.1 * len(columns), 3.1 * len(columns[0])))
     axes = figure.subplots(len(columns[0]), len(columns), squeeze=False)
     for line, pictures in zip(axes.T, columns, strict=True):
@@ -121,7 +120,7 @@ def draw_panels(
 
 
 def save_figure(figure: Figure, path: Path) -> Path:
-    """Writes a drawing as a PNG file, in a folder that is made if it is not there."""
+    """Write a figure as a PNG file; its folder is made if missing."""
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.set_layout_engine("tight")
     figure.savefig(path, dpi=90)
@@ -129,7 +128,7 @@ def save_figure(figure: Figure, path: Path) -> Path:
 
 
 def save_picture(picture: NDArray[np.uint8], path: Path) -> Path:
-    """Writes a picture (H, W, 3) as a PNG file, in a folder that is made if it is not there."""
+    """Write a picture (H, W, 3) as a PNG file; its folder is made if missing."""
     path.parent.mkdir(parents=True, exist_ok=True)
     cv2.imwrite(str(path), np.ascontiguousarray(picture[:, :, ::-1]))
     return path

@@ -5,11 +5,11 @@ import numpy as np
 import pytest
 
 from drake_pose.errors import SettingsError
-from drake_pose.papers.date import frames_of_destruction, run_experiment
+from drake_pose.papers.date import perturbed_frames, run_experiment
 from drake_pose.papers.date_capture import PERIOD
 from drake_pose.papers.date_walk import (
+    active_frames,
     draw_walk,
-    followed,
     run_walk_through,
     save_pictures,
     walk_by,
@@ -46,9 +46,9 @@ class TestMotion:
         short, whole = (make_motion(skeleton, frames, 3) for frames in (50, 120))
         np.testing.assert_array_equal(short.q, whole.q[:50])
         assert short.names == whole.names[:50]
-        assert REGISTERED not in frames_of_destruction(short).values()
-        assert max(frames_of_destruction(short)) < 40
-        assert list(frames_of_destruction(whole).values()) == [*MOTIONS, REGISTERED]
+        assert REGISTERED not in perturbed_frames(short).values()
+        assert max(perturbed_frames(short)) < 40
+        assert list(perturbed_frames(whole).values()) == [*MOTIONS, REGISTERED]
 
     def test_too_few_frames(self, skeleton):
         with pytest.raises(SettingsError, match="40 frames"):
@@ -87,7 +87,7 @@ class TestWalkThrough:
         motion = make_gestures(skeleton)
         commands, poses, _ = walk_by(skeleton.model, motion.q)
         names = np.array(motion.names)
-        for name, own in followed(commands).items():
+        for name, own in active_frames(commands).items():
             assert set(names[own]) == {name}
             assert own.sum() > 0.4 * (names == name).sum()
         turns, ways = commands.sum(axis=0)

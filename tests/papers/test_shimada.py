@@ -35,7 +35,7 @@ def result():
 
 
 @pytest.fixture(scope="module")
-def fates():
+def hypotheses():
     return run_hypotheses_experiment(runs=20, seed=0)
 
 
@@ -188,10 +188,10 @@ def test_options_that_go_alone(words, others):
         assert f"{words[0]} " in reproduce(*words, *other, code=2)
 
 
-def test_a_hypothesis_is_born_lives_and_dies_once(fates):
-    assert len(fates.fates) > 20
+def test_a_hypothesis_is_born_lives_and_dies_once(hypotheses):
+    assert len(hypotheses.histories) > 20
     weights = np.zeros((20, 56))
-    for one in fates.fates:
+    for one in hypotheses.histories:
         assert np.array_equal(np.diff(one.frames), np.ones(len(one.frames) - 1))
         assert len(one.means) == len(one.frames)
         assert np.isnan(one.weights[-1]) == bool(one.reason)
@@ -199,11 +199,11 @@ def test_a_hypothesis_is_born_lives_and_dies_once(fates):
     assert weights[:, 1:] == pytest.approx(1.0)
 
 
-def test_inequalities_reject_wrong_hypotheses_that_the_pictures_did_not(fates):
-    later = [one for one in fates.fates if one.reason == "constraint" and one.lived]
+def test_inequalities_reject_wrong_hypotheses_that_the_pictures_did_not(hypotheses):
+    later = [one for one in hypotheses.histories if one.reason == "constraint" and one.lived]
     assert len(later) >= 3
     assert np.mean([one.wrong for one in later]) > 0.6
-    rows = fates.inequalities
+    rows = hypotheses.inequalities
     beyond = []
     for one in later:
         k = rows.rows.index(one.row)
@@ -214,14 +214,14 @@ def test_inequalities_reject_wrong_hypotheses_that_the_pictures_did_not(fates):
     assert np.mean(beyond) > 0.6
 
 
-def test_what_is_drawn_was_wrong_and_another_pose(fates, tmp_path):
-    dead, survivor = fates.shown()
-    assert dead.wrong
-    assert dead.lived >= 2
-    assert survivor.frames[0] < dead.frames[-1] < survivor.frames[-1]
-    before = int(dead.frames[-1]) - 1
-    assert np.degrees(np.abs(dead.at(before) - survivor.at(before))[6:14]).max() > 8
-    files = save_hypotheses(fates, tmp_path)
+def test_what_is_drawn_was_wrong_and_another_pose(hypotheses, tmp_path):
+    removed, survivor = hypotheses.example()
+    assert removed.wrong
+    assert removed.lived >= 2
+    assert survivor.frames[0] < removed.frames[-1] < survivor.frames[-1]
+    before = int(removed.frames[-1]) - 1
+    assert np.degrees(np.abs(removed.at(before) - survivor.at(before))[6:14]).max() > 8
+    files = save_hypotheses(hypotheses, tmp_path)
     assert [file.name for file in files] == ["figure_9_hypotheses.png"]
     assert files[0].stat().st_size > 20000
 
